@@ -49,7 +49,7 @@ CASES = [(50_000, 640, 426), (200_000, 960, 540), (1_000_000, 1920, 1080)]
 STAGES = {
     "project forward": "project", "project backward": "project_backward", "blend forward": "blend",
     "blend backward": "blend_backward", "gather gradients": "gather", "train adam": "adam",
-    "train count": "statistics",
+    "train collect_stats": "statistics",
 }  # fmt: skip
 """Stages by shader and function; of other shaders by the shader."""
 SHADERS = {"sort": "sort", "scan": "sort", "bin": "bin", "loss": "loss", "train": "loss"}
@@ -79,11 +79,11 @@ class Fastest:
 
 def peaks(device: Device, fastest: Fastest) -> tuple[float, float]:
     """GFLOP/s of dependent multiply-adds, and GB/s of a copy, read and written."""
-    source, goal = (device.empty(np.float32, WORDS) for _ in range(2))
+    source, destination = (device.empty(np.float32, WORDS) for _ in range(2))
 
     def run(entry: str, groups: int, numbers: tuple) -> None:
-        device.run("calibrate", entry, groups, numbers, source=source, goal=goal)
-        device.read(goal, WORDS - 1)
+        device.run("calibrate", entry, groups, numbers, source=source, destination=destination)
+        device.read(destination, WORDS - 1)
 
     adds = fastest(lambda: run("multiply_add", GROUPS, (GROUPS * LANES, ROUNDS)))
     copies = fastest(lambda: run("copy", WORDS // LANES // 4, (WORDS // 4, 1)))
@@ -118,9 +118,9 @@ class Case:
 def moved(device: Device, step: Callable[[], object]) -> int:
     """Bytes of a step between device and computer."""
     step()
-    before = device.moved
+    before = device.transferred
     step()
-    return device.moved - before
+    return device.transferred - before
 
 
 def stages_of(device: Device, step: Callable[[], object]) -> dict[str, float]:

@@ -16,5 +16,5 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     from ..rasterize.devices import Devices, describe
 
-    print(json.dumps(Devices.found().as_json()) if options.json else describe(options.time))
+    print(json.dumps(Devices.detect().as_json()) if options.json else describe(options.time))
     return 0

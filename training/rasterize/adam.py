@@ -1,4 +1,4 @@
-"""Adam over named tensors whose rows come and go."""
+"""Adam for named tensors whose rows change between steps."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ import torch
 
 LearningRate = float | torch.Tensor | np.ndarray
 BETAS, EPS = (0.9, 0.999), 1e-15
-"""3DGS's."""
+"""Values of 3DGS."""
 
 
 class Adam:
-    """Adam (Kingma and Ba 2015, Algorithm 1) over splat tensors, with moments that densification can index.
+    """Adam (Kingma and Ba 2015, Algorithm 1) for splat tensors, with moments that densification can index.
 
     Args:
         tensors: leaf tensors (N, ...) by name, contiguous float32, on the CPU or on a GPU.
-        lr: learning rate by name: a number, or an array that broadcasts against one row (for ``sh`` of shape
-            (N, K, 3) a (K, 1) array gives each coefficient its own). Change it between steps as you like.
-        betas, eps: as in the paper.
+        lr: learning rate by name: a number, or an array that broadcasts against one row. For ``sh`` of shape
+            (N, K, 3), a (K, 1) array sets one rate per coefficient. It may change between steps.
+        betas, eps: see the paper.
 
     Attributes:
         tensors: the tensors by name.
         state: (first moment, second moment) by name, tensors of the parameter's shape.
-        steps: how many steps each tensor has seen.
+        steps: number of steps of each tensor.
     """
 
     def __init__(
@@ -36,7 +36,7 @@ class Adam:
         eps: float = EPS,
     ) -> None:
         if set(tensors) != set(lr):
-            raise ValueError(f"learning rates for {sorted(lr)}, tensors for {sorted(tensors)}")
+            raise ValueError(f"learning rates for {sorted(lr)} do not match tensors {sorted(tensors)}")
         self.tensors: dict[str, torch.Tensor] = {}
         self.state: dict[str, tuple[torch.Tensor, torch.Tensor]] = {}
         self.steps = dict.fromkeys(tensors, 0)
@@ -49,18 +49,19 @@ class Adam:
     def replace(
         self, name: str, tensor: torch.Tensor, m: torch.Tensor | None = None, v: torch.Tensor | None = None
     ) -> None:
-        """Put another tensor in the place of ``name``, with moments of its shape (zeros by default)."""
+        """Replace the tensor ``name`` and its moments (zeros by default)."""
         m = torch.zeros_like(tensor, requires_grad=False) if m is None else m
         v = torch.zeros_like(tensor, requires_grad=False) if v is None else v
-        for each in (tensor, m, v):
-            if each.shape != tensor.shape or each.dtype != torch.float32 or not each.is_contiguous():
-                raise ValueError(f"{name} and its moments must be contiguous float32 of one shape")
+        for array in (tensor, m, v):
+            if array.shape != tensor.shape or array.dtype != torch.float32 or not array.is_contiguous():
+                raise ValueError(f"{name} and its moments must be contiguous float32 of the same shape")
         self.tensors[name] = tensor
         self.state[name] = (m, v)
 
     @torch.no_grad()
     def step(self, grads: Mapping[str, torch.Tensor] | None = None) -> None:
-        """One step in place, by the gradients given or each tensor's own; a tensor without one is left."""
+        """Make one step in place with ``grads`` or the tensors' own gradients; skip tensors without a
+        gradient."""
         from .cpu.adam import update
 
         for name, tensor in self.tensors.items():
@@ -69,17 +70,17 @@ class Adam:
                 continue
             self.steps[name] += 1
             arrays = tensor.detach(), gradient.contiguous(), *self.state[name]
-            rest = self.lr[name], self.betas, self.eps, self.steps[name]
+            constants = self.lr[name], self.betas, self.eps, self.steps[name]
             if tensor.device.type == "cpu":
-                update(*(array.numpy() for array in arrays), *rest)
+                update(*(array.numpy() for array in arrays), *constants)
             else:
-                update_in_torch(*arrays, *rest)
+                update_in_torch(*arrays, *constants)
 
     @torch.no_grad()
     def step_rows(self, rows: torch.Tensor, grads: Mapping[str, torch.Tensor | None]) -> None:
-        """One step in place for these rows (M,) int64 alone, by their gradients (M, ...); others stay.
+        """Make one step in place for rows (M,) int64 only, with gradients (M, ...).
 
-        What is out of sight costs nothing, and keeps its moments.
+        Other rows cost nothing and keep their moments.
         """
         from .cpu.adam import update_rows
 
@@ -88,24 +89,24 @@ class Adam:
             if gradient is None:
                 continue
             self.steps[name] += 1
-            rest = self.lr[name], self.betas, self.eps, self.steps[name]
+            constants = self.lr[name], self.betas, self.eps, self.steps[name]
             if tensor.device.type == "cpu":
                 arrays = tensor.detach(), rows, gradient.contiguous(), *self.state[name]
-                update_rows(*(array.numpy() for array in arrays), *rest)
+                update_rows(*(array.numpy() for array in arrays), *constants)
             else:
                 m, v = (moment[rows] for moment in self.state[name])
                 values = tensor.detach()[rows]
-                update_in_torch(values, gradient, m, v, *rest)
-                for whole, part in zip((tensor.detach(), *self.state[name]), (values, m, v), strict=True):
-                    whole[rows] = part
+                update_in_torch(values, gradient, m, v, *constants)
+                for target, updated in zip((tensor.detach(), *self.state[name]), (values, m, v), strict=True):
+                    target[rows] = updated
 
     def zero_grad(self) -> None:
-        """Forget the gradients, so that the next ``backward`` starts from nothing."""
+        """Clear the gradients of all tensors."""
         for tensor in self.tensors.values():
             tensor.grad = None
 
     def state_dict(self) -> dict[str, Any]:
-        """Moments and step counts: tensors and numbers, as ``torch.load(weights_only=True)`` reads them."""
+        """Return moments and step counts in a form that ``torch.load(weights_only=True)`` accepts."""
         return {
             "steps": dict(self.steps),
             "m": {name: m for name, (m, _) in self.state.items()},
@@ -113,16 +114,19 @@ class Adam:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Take up what :meth:`state_dict` gave; ValueError where names or shapes differ from the tensors'."""
+        """Restore the result of :meth:`state_dict`; ValueError if names or shapes differ from the
+        tensors'."""
         if set(state["steps"]) != set(self.tensors):
-            raise ValueError(f"state of {sorted(state['steps'])}, tensors {sorted(self.tensors)}")
+            raise ValueError(
+                f"state of {sorted(state['steps'])} does not match tensors {sorted(self.tensors)}"
+            )
         for name, tensor in self.tensors.items():
             self.replace(name, tensor, state["m"][name].clone(), state["v"][name].clone())
         self.steps = dict(state["steps"])
 
 
 def update_in_torch(parameter, gradient, m, v, lr, betas, eps, step) -> None:
-    """One Adam step in place, as ``cpu.adam.update`` makes it, on any device."""
+    """Make one Adam step in place on any device; same formula as ``cpu.adam.update``."""
     m.lerp_(gradient, 1 - betas[0])
     v.mul_(betas[1]).addcmul_(gradient, gradient, value=1 - betas[1])
     rate = torch.as_tensor(lr, dtype=torch.float32, device=m.device) / (1 - betas[0] ** step)

@@ -1,4 +1,4 @@
-"""What this computer can train on, and what would make training faster: ``lodgs devices``."""
+"""Detect and describe the devices on which this computer can train (``lodgs devices``)."""
 
 from __future__ import annotations
 
@@ -29,109 +29,110 @@ from .gpu.device import Adapter, adapters, open_device
 from .self_test import run_self_test
 
 SPLATS, SIZE = 50_000, (640, 426)
-"""Of what :func:`step_seconds` draws."""
+"""Scene and image size of :func:`step_seconds`."""
 SECONDS = 5.0
-"""That it takes, about."""
+"""Approximate duration of :func:`step_seconds`."""
 
 
 @dataclass
 class Devices:
-    """What was found.
+    """Detected devices.
 
     Attributes:
-        card: name of the NVIDIA card that torch sees; empty where there is none.
+        card: name of the NVIDIA GPU that torch detects; empty without one.
         adapters: graphics devices, best first.
-        chosen: the one that the gpu backend draws on; None where there is none that helps.
-        missing: why there is none; empty where there is.
+        selected: device of the gpu backend; None without a usable device.
+        reason: why no device is selected; empty otherwise.
     """
 
     card: str
     adapters: list[Adapter]
-    chosen: Adapter | None
-    missing: str
+    selected: Adapter | None
+    reason: str
 
     @classmethod
-    def found(cls) -> Devices:
-        """Asks the drivers; nothing is tried."""
+    def detect(cls) -> Devices:
+        """Query the drivers, without a self-test."""
         card = torch.cuda.get_device_name() if torch.cuda.is_available() else ""
         try:
-            found = adapters()
+            available = adapters()
         except LodgsError as problem:
             return cls(card, [], None, str(problem))
         try:
-            return cls(card, found, default_device.default_adapter(), "")
+            return cls(card, available, default_device.default_adapter(), "")
         except LodgsError as problem:
-            return cls(card, found, None, str(problem))
+            return cls(card, available, None, str(problem))
 
     @property
-    def sentence(self) -> str:
-        """What trains by itself, and what might be faster."""
-        cores = f"the processor ({thread_count()} thread{'s' * (thread_count() > 1)})"
+    def summary(self) -> str:
+        """Device that automatic training uses, and devices that may be faster."""
+        cores = f"the CPU ({thread_count()} thread{'s' * (thread_count() > 1)})"
         if self.card and find_spec("gsplat"):
-            return f"Automatic trains on {self.card} if gsplat works there, else on {cores}."
-        if self.chosen is not None and not self.chosen.software:
-            may = f"The graphics card may be faster: choose it to try {self.chosen.name}."
-        elif self.adapters or not self.missing:
-            may = "A graphics card might be faster, and none was found."
+            return f"Automatic trains on {self.card} if gsplat works, otherwise on {cores}."
+        if self.selected is not None and not self.selected.software:
+            hint = f"The graphics card may be faster: choose it to try {self.selected.name}."
+        elif self.adapters or not self.reason:
+            hint = "A graphics card may be faster, but none was detected."
         else:
-            may = self.missing
+            hint = self.reason
         if self.card:
-            may += f" So may {self.card} be with CUDA, once gsplat is installed."
-        return f"Automatic trains on {cores}. {may}"
+            hint += f" {self.card} may be faster with CUDA: install gsplat."
+        return f"Automatic trains on {cores}. {hint}"
 
     def as_json(self) -> dict:
-        """For Blender's preferences."""
-        return {"graphics": self.chosen.name if self.chosen else "", "sentence": self.sentence}
+        """Return the information that Blender's preferences show."""
+        return {"graphics": self.selected.name if self.selected else "", "sentence": self.summary}
 
 
 def describe(timed: bool = False) -> str:
-    """What there is, what of it works (it is tried), and what ``auto`` means here.
+    """Describe all devices, the results of their self-tests and the meaning of ``auto``.
 
     Args:
-        timed: measure a training step on each as well, some seconds for each.
+        timed: also measure a training step on each working device, which takes some seconds per device.
     """
-    found = Devices.found()
+    devices = Devices.detect()
     rows = [("cpu", f"{thread_count()} threads")]
     problem = cuda.problem()
-    rows.append(("cuda", str(problem) if problem else f"{found.card}, through gsplat"))
+    rows.append(("cuda", str(problem) if problem else f"{devices.card}, through gsplat"))
     working = ["cpu"] if problem else ["cpu", "cuda"]
-    for adapter in found.adapters:
-        told = [adapter.kind, adapter.api, adapter.driver]
-        if adapter == found.chosen:
-            said, works = _tried(adapter)
+    for adapter in devices.adapters:
+        properties = [adapter.kind, adapter.api, adapter.driver]
+        if adapter == devices.selected:
+            status, works = _test(adapter)
             working += ["gpu"] * works
-            told += said
+            properties += status
         else:
-            told.append(f"not chosen: {default_device.VARIABLE} may name it")
-        rows.append(("gpu", f"{adapter.name}: {', '.join(filter(None, told))}"))
-    if found.chosen is None:
-        rows.append(("gpu", found.missing))
+            properties.append(f"not selected: set {default_device.VARIABLE} to its name to use it")
+        rows.append(("gpu", f"{adapter.name}: {', '.join(filter(None, properties))}"))
+    if devices.selected is None:
+        rows.append(("gpu", devices.reason))
     rows.append(("auto", resolve_backend("auto")))
     lines = [f"{name:<6}{text}" for name, text in rows]
     if timed:
-        lines.append(f"A step with {SPLATS:,} splats, {SIZE[0]}x{SIZE[1]} pixels:")
+        lines.append(f"Training step with {SPLATS:,} splats, {SIZE[0]}x{SIZE[1]} pixels:")
         lines += [f"{name:<6}{1000 * step_seconds(name):.0f} ms" for name in working]
-    return "\n".join([*lines, found.sentence])
+    return "\n".join([*lines, devices.summary])
 
 
-def _tried(adapter: Adapter) -> tuple[list[str], bool]:
-    """What is to be said of the chosen device, and whether it works."""
+def _test(adapter: Adapter) -> tuple[list[str], bool]:
+    """Run the self-test of the selected device; return its status and whether it works."""
     try:
-        memory = f"{open_device(adapter.name).most_bytes >> 20} MB in one buffer"
-        differs = run_self_test(adapter)
+        memory = f"{open_device(adapter.name).binding_bytes >> 20} MB in one buffer"
+        reason = run_self_test(adapter)
     except LodgsError as problem:
         return [str(problem)], False
-    if differs:
-        return [memory, f"not used, as {differs}"], False
-    return [memory, "chosen, draws what the reference draws"], True
+    if reason:
+        return [memory, f"not used, because {reason}"], False
+    return [memory, "selected, passed the self-test"], True
 
 
 def step_seconds(backend: str) -> float:
-    """Seconds of a training step (picture, loss, gradients, Adam) on random splats: the median of some.
+    """Measure the median time in seconds of a training step (image, loss, gradients, Adam) on random splats.
 
-    It is made as plain steps are: where the backend keeps splats on its device, they stay there.
+    Splats stay on the device if the backend supports it, as in training.
     """
-    random, (width, height) = np.random.default_rng(0), SIZE
+    random = np.random.default_rng(0)
+    width, height = SIZE
     arrays = {
         "means": random.uniform((-1.5, -1, 2), (1.5, 1, 4), (SPLATS, 3)),
         "quats": random.normal(size=(SPLATS, 4)),
@@ -146,24 +147,27 @@ def step_seconds(backend: str) -> float:
     }
     camera = Camera("", width, height, 0.8 * width, 0.8 * width, width / 2, height / 2, np.eye(4))
     target = Target(random.uniform(0, 1, (height, width, 3)).astype(np.float32))
-    adam, taken = Adam(leaves, dict.fromkeys(leaves, 1e-4)), []
+    adam = Adam(leaves, dict.fromkeys(leaves, 1e-4))
     warm_up(backend)
-    twin = make_device_model(backend, adam, {})
+    device_model = make_device_model(backend, adam, {})
 
     def step() -> None:
-        if twin is not None:
-            twin.step(camera, target, near=0.01, sh_degree=3, background=(0.0, 0.0, 0.0), ssim_weight=0.2)
+        if device_model is not None:
+            device_model.step(
+                camera, target, near=0.01, sh_degree=3, background=(0.0, 0.0, 0.0), ssim_weight=0.2
+            )
             return
-        drawn = rasterize(Gaussians(**leaves), camera, backend=backend)
-        photometric_loss(drawn.image, target, backend=backend).backward()
+        rendering = rasterize(Gaussians(**leaves), camera, backend=backend)
+        photometric_loss(rendering.image, target, backend=backend).backward()
         adam.step()
         adam.zero_grad()
         if device.type == "cuda":
             torch.cuda.synchronize()
 
+    times: list[float] = []
     end = time.perf_counter() + SECONDS
-    while len(taken) < 3 or time.perf_counter() < end:
+    while len(times) < 3 or time.perf_counter() < end:
         begin = time.perf_counter()
         step()
-        taken.append(time.perf_counter() - begin)
-    return float(np.median(taken[1:]))
+        times.append(time.perf_counter() - begin)
+    return float(np.median(times[1:]))

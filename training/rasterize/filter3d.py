@@ -1,4 +1,4 @@
-"""Mip-Splatting's 3D filter as a function on splats."""
+"""Mip-Splatting's 3D smoothing filter."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from torch.nn.functional import logsigmoid
 def apply_filter3d(
     log_scales: torch.Tensor, opacity_logits: torch.Tensor, std: torch.Tensor | float
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Splats convolved with a round Gaussian, their mass kept; differentiable.
+    """Convolve splats with an isotropic Gaussian and preserve their mass; differentiable.
 
-    Sigma + std² I, and the opacity times sqrt(|Sigma| / |Sigma + std² I|) (Mip-Splatting, Eq. 9; LODGE,
-    Eq. 3).
+    The covariance Sigma becomes Sigma + std² I, and the opacity is multiplied by
+    sqrt(|Sigma| / |Sigma + std² I|) (Mip-Splatting, Eq. 9; LODGE, Eq. 3).
 
     Args:
         log_scales: (N, 3).
         opacity_logits: (N,).
-        std: (N,) or one number, of at least 0, in world units; in LODGE the root of the filter's variance in
-            square pixels, times a level's distance over the focal length.
+        std: (N,) or a number, non-negative, in world units. In LODGE it is the filter's standard deviation in
+            pixels, times a level's distance, divided by the focal length.
 
     Returns:
         log_scales (N, 3) and opacity_logits (N,).

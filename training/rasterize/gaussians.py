@@ -1,9 +1,10 @@
-"""Gaussian splats as torch tensors: the one value that every rasterizer takes."""
+"""Gaussian splats as torch tensors, the input of every rasterizer backend."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,20 +14,20 @@ from ..splats.gaussians import Splats
 
 @dataclass(frozen=True)
 class Gaussians:
-    """N Gaussians in the parametrisation that 3DGS files use (:class:`training.splats.gaussians.Splats`).
+    """N Gaussians, parametrised as in 3DGS files (:class:`training.splats.gaussians.Splats`).
 
-    All tensors are of one type and on one device; ``vars(gaussians)`` has them by name.
+    All tensors have the same type and device. ``vars(gaussians)`` lists them by name.
 
     Attributes:
-        means: (N, 3) in the world.
-        quats: (N, 4) rotations wxyz, of any length but zero.
+        means: (N, 3) in world coordinates.
+        quats: (N, 4) rotations wxyz, of any non-zero length.
         log_scales: (N, 3), natural logarithm of the standard deviation along each axis, in world units.
         opacity_logits: (N,); opacity = sigmoid(logit).
-        sh: (N, (d+1)², 3) spherical-harmonics coefficients, the colour is 0.5 + Σ c·Y, at least 0. Or (N, 3)
-            colours, the same from everywhere, at least 0 as well.
+        sh: (N, (d+1)², 3) spherical-harmonics coefficients of the colour max(0, 0.5 + Σ c·Y). Or (N, 3)
+            view-independent colours, also clamped at 0.
 
     Raises:
-        ValueError: for tensors whose shapes do not belong together.
+        ValueError: shapes do not match.
     """
 
     means: torch.Tensor
@@ -48,30 +49,30 @@ class Gaussians:
 
     @classmethod
     def of(cls, splats: Splats, device: torch.device | str = "cpu") -> Gaussians:
-        """Plain arrays as float32 tensors on a device; on the CPU they may share the arrays' memory."""
+        """Convert arrays to float32 tensors on a device; on the CPU they may share the arrays' memory."""
         columns = (np.ascontiguousarray(getattr(splats, f.name), np.float32) for f in fields(cls))
         return cls(*(torch.from_numpy(column).to(device) for column in columns))
 
     @classmethod
     def concatenated(cls, sets: Sequence[Gaussians]) -> Gaussians:
-        """All of several sets whose ``sh`` have one shape, in order."""
-        return cls(*map(torch.cat, zip(*(vars(one).values() for one in sets), strict=True)))
+        """Concatenate several sets whose ``sh`` have the same shape."""
+        return cls(*map(torch.cat, zip(*(vars(gaussians).values() for gaussians in sets), strict=True)))
 
     def __len__(self) -> int:
         return len(self.means)
 
     def map(self, function: Callable[[torch.Tensor], torch.Tensor]) -> Gaussians:
-        """These with every tensor changed by a function."""
+        """Apply a function to every tensor."""
         return Gaussians(*(function(tensor) for tensor in vars(self).values()))
 
-    def select(self, index) -> Gaussians:
-        """Those at ``index``: a slice, a boolean mask (N,) or integers (M,)."""
+    def select(self, index: Any) -> Gaussians:
+        """Select splats by a slice, a boolean mask (N,) or integers (M,)."""
         return self.map(lambda tensor: tensor[index])
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Gaussians:
-        """These on another device, of another type, or both."""
+        """Convert all tensors to another device or type."""
         return self.map(lambda tensor: tensor.to(device=device, dtype=dtype))
 
     def detach(self) -> Gaussians:
-        """The same values without their gradients' graph."""
+        """Detach all tensors from the autograd graph."""
         return self.map(torch.Tensor.detach)

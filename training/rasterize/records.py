@@ -1,9 +1,9 @@
-"""Splats in records, one after the other, with Adam's moments and what density control asks for.
+"""Splats stored as records of parameters, Adam moments and density statistics.
 
-A record holds C values (means, quaternions, log-scales, opacity logits, harmonics), their first and their
-second moments, and from column 3 C on STEPS, how many steps it has made; SCORE, the largest product of its
-gradient's norm in the image plane, its radius and opacity^(1/5) (LODGE, Eq. 6); SEEN, the number of the last
-step that had it in its image.
+A record holds C values (mean, quaternion, log-scales, opacity logit, harmonics), their first and their second
+moments, and three statistics at columns 3 C + STEPS, SCORE and LAST_STEP: the number of the record's steps,
+the maximum of gradient norm in the image plane times radius times opacity^(1/5) (LODGE, Eq. 6), and the
+number of the last step in which the splat was visible.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from . import adam
 from .gaussians import Gaussians
 from .rendering import Rendering
 
-STEPS, SCORE, SEEN = range(3)
+STEPS, SCORE, LAST_STEP = range(3)
 OPACITY_LOGIT = 10
-"""Its column."""
+"""Column of the opacity logit."""
 
 
 def gather_gaussians(records: torch.Tensor, places: np.ndarray, terms: int) -> Gaussians:
-    """The splats (M,) at places (M,) int64 of records (N, width), with so many harmonics: a copy."""
+    """Copy the splats at ``places`` (M,) int64 of records (N, width), with ``terms`` harmonics."""
     shapes = (3,), (4,), (3,), (), (terms, 3)
     if records.device.type == "cpu":
         from .cpu.records import gather as gather_on_cpu
@@ -49,18 +49,19 @@ def adam_step(
     betas: tuple[float, float] = adam.BETAS,
     eps: float = adam.EPS,
 ) -> None:
-    """One step of Adam in place for those of some records that are in the image, by their radii.
+    """Make one Adam step in place for the visible records among ``places``, i.e. those with positive radii.
 
-    Each has a number of steps of its own; what is out of the image stays as it is, moments and all.
+    Every record counts its own steps. Invisible records keep their values and moments.
 
     Args:
         records: (N, width).
-        places: (M,) int64 of those that move, each once.
-        gradients: (M, ...) of their values, in the order of ``Gaussians``.
-        rendering: of these splats, after ``backward``.
-        number: of the step, from 1; no record has made more.
+        places: (M,) int64, unique indices of the records to update.
+        gradients: (M, ...) gradients of their values, in the order of ``Gaussians``.
+        rendering: rendering of these splats, after ``backward``.
+        number: number of the step, from 1; at least the step count of every record.
         lr: (C,) learning rates.
-        shares: (M,) float32, each record's factor of them, 1 if None; those of share 0 stay as they are.
+        shares: (M,) float32, factor of the learning rates for each record; None means 1. Records of share 0
+            keep their values and moments.
     """
     if not len(places):
         return
@@ -68,26 +69,28 @@ def adam_step(
     if records.device.type == "cpu":
         from .cpu.records import step as step_on_cpu
 
-        told = [each.contiguous().numpy() for each in (*gradients, rendering.grad2d)]
-        *told, grad2d = told
-        radii, rates = rendering.radii.numpy(), np.ascontiguousarray(lr.numpy(), np.float32)
-        step_on_cpu(records.numpy(), places, told, grad2d, radii, number, rates, shares.numpy(), betas, eps)
+        *arrays, grad2d = [tensor.contiguous().numpy() for tensor in (*gradients, rendering.grad2d)]
+        radii = rendering.radii.numpy()
+        rates = np.ascontiguousarray(lr.numpy(), np.float32)
+        step_on_cpu(records.numpy(), places, arrays, grad2d, radii, number, rates, shares.numpy(), betas, eps)
         return
-    seen = rendering.radii > 0
-    at, count = torch.from_numpy(places).to(records.device)[seen], len(lr)
-    some, shares = records[at], shares[seen]
-    told = some[:, 3 * count :]
-    score = (
-        rendering.grad2d[seen].norm(dim=1) * rendering.radii[seen] * some[:, OPACITY_LOGIT].sigmoid() ** 0.2
-    )
-    told[:, SCORE] = torch.maximum(told[:, SCORE], score)
-    told[:, SEEN] = float(number)
-    moves = shares != 0
-    moving, share = some[moves], shares[moves, None]
+    count = len(lr)
+    visible = rendering.radii > 0
+    index = torch.from_numpy(places).to(records.device)[visible]
+    rows = records[index]
+    shares = shares[visible]
+    stats = rows[:, 3 * count :]
+    norm = rendering.grad2d[visible].norm(dim=1)
+    score = norm * rendering.radii[visible] * rows[:, OPACITY_LOGIT].sigmoid() ** 0.2
+    stats[:, SCORE] = torch.maximum(stats[:, SCORE], score)
+    stats[:, LAST_STEP] = float(number)
+    active = shares != 0
+    moving = rows[active]
+    share = shares[active, None]
     moving[:, 3 * count + STEPS] += 1
     values, m, v = (moving[:, i * count : (i + 1) * count] for i in range(3))
-    gradient = torch.cat([each.reshape(len(places), -1) for each in gradients], 1)[seen][moves]
-    times = moving[:, 3 * count + STEPS, None].double()
-    adam.update_in_torch(values, gradient, m, v, lr.to(share) * share, betas, eps, times)
-    some[moves] = moving
-    records[at] = some
+    gradient = torch.cat([tensor.reshape(len(places), -1) for tensor in gradients], 1)[visible][active]
+    steps = moving[:, 3 * count + STEPS, None].double()
+    adam.update_in_torch(values, gradient, m, v, lr.to(share) * share, betas, eps, steps)
+    rows[active] = moving
+    records[index] = rows

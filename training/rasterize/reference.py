@@ -1,7 +1,7 @@
-"""The definition: splatting and the photometric loss in plain torch, in any float type.
+"""Reference implementation of splatting and of the photometric loss, in plain torch and any float type.
 
 EWA splatting as in "3D Gaussian Splatting for Real-Time Radiance Field Rendering" (Kerbl et al. 2023), Eq. 3
-to 6, every splat against every pixel: memory grows with their product, so this is for small pictures.
+to 6. Every splat is evaluated at every pixel, so memory limits it to small images.
 """
 
 from __future__ import annotations
@@ -34,66 +34,70 @@ def rasterize(
     gaussians: Gaussians, weights: torch.Tensor | None, features: torch.Tensor, settings: RasterSettings
 ) -> BackendOutput:
     """See :func:`training.rasterize.rasterize`."""
-    means, view = gaussians.means, settings.view
+    means = gaussians.means
+    view = settings.view
     kind = {"dtype": means.dtype, "device": means.device}
-    weights = settings.weights(weights, gaussians.means)
-    seen = ellipses(gaussians, weights, settings)
-    drawn, mean2d, (xx, xy, yy), opacity = seen.drawn, seen.mean2d, seen.covariance, seen.opacity
+    weights = settings.mask_weights(weights, gaussians.means)
+    projected = ellipses(gaussians, weights, settings)
+    drawn, mean2d, opacity = projected.drawn, projected.mean2d, projected.opacity
+    xx, xy, yy = projected.covariance
     grad2d = torch.zeros(len(means), 2, dtype=torch.float32, device=means.device)
     absgrad2d = torch.zeros_like(grad2d) if settings.absolute else None
     to_ndc = torch.tensor([view.width / 2, view.height / 2], **kind)
 
-    def keep_gradient(gradient: torch.Tensor) -> None:
+    def store_gradient(gradient: torch.Tensor) -> None:
         grad2d[drawn] = (gradient * to_ndc).float()
 
     if mean2d.requires_grad:
-        mean2d.register_hook(keep_gradient)
+        mean2d.register_hook(store_gradient)
 
     values: list = [None] * harmonics.coefficient_count(settings.degree)
-    x, y, z = normalize(means[drawn] - torch.as_tensor(view.eye, **kind), dim=1).unbind(1)
+    x, y, z = normalize(means[drawn] - torch.as_tensor(view.position, **kind), dim=1).unbind(1)
     harmonics.basis(x, y, z, settings.degree, values)
     colour = (
         (torch.stack(values, 1)[:, :, None] * gaussians.sh[drawn, : len(values)]).sum(1).add(0.5).clamp_min(0)
     )
 
-    order = seen.depth.argsort(stable=True)
+    order = projected.depth.argsort(stable=True)
     offsets = pixel_offsets(mean2d[order], view)
-    hidden = None if settings.limit is None else seen.depth[order][:, None, None] > settings.limit
+    hidden = None if settings.limit is None else projected.depth[order][:, None, None] > settings.limit
     weight, transmittance = blend(offsets, xx[order], xy[order], yy[order], opacity[order], hidden)
     image = torch.einsum("nhw,nc->hwc", weight, colour[order])
     image = image + transmittance[..., None] * torch.tensor(settings.background, **kind)
-    if settings.absolute:  # features have no part in absgrad2d, so their gradient takes a way of its own
-        offsets_again = pixel_offsets(mean2d[order], view)
-        weight, _ = blend(offsets_again, xx[order], xy[order], yy[order], opacity[order], hidden)
+    if settings.absolute:  # features do not affect absgrad2d, so they get separate offsets
+        feature_offsets = pixel_offsets(mean2d[order], view)
+        weight, _ = blend(feature_offsets, xx[order], xy[order], yy[order], opacity[order], hidden)
     blended = torch.einsum("nhw,nc->hwc", weight, features[drawn[order]])
     if absgrad2d is not None and mean2d.requires_grad:
         for axis, offset in enumerate(offsets):
 
-            def keep_absolute(gradient: torch.Tensor, axis: int = axis) -> None:
+            def store_absolute(gradient: torch.Tensor, axis: int = axis) -> None:
                 absgrad2d[drawn[order], axis] = (gradient.abs().sum((1, 2)) * to_ndc[axis]).float()
 
-            offset.register_hook(keep_absolute)
-    counts = tile_counts(seen, view)
-    middle = None
+            offset.register_hook(store_absolute)
+    counts = tile_counts(projected, view)
+    median = None
     if settings.median:
-        left = 1 - weight.detach().cumsum(0)  # the transmittance, as Σ w = 1 - T
-        past = (left <= 0.5).to(torch.int32)
+        remaining = 1 - weight.detach().cumsum(0)  # the transmittance, as Σ w = 1 - T
+        reached = (remaining <= 0.5).to(torch.int32)
         splats = torch.cat([drawn[order], drawn.new_tensor([-1])])
-        none = past.new_ones(1, view.height, view.width)
-        middle = splats[torch.cat([past, none]).argmax(0)].int()
-    return BackendOutput(image, 1 - transmittance, seen.radii, grad2d, counts, absgrad2d, blended, middle)
+        sentinel = reached.new_ones(1, view.height, view.width)
+        median = splats[torch.cat([reached, sentinel]).argmax(0)].int()
+    return BackendOutput(
+        image, 1 - transmittance, projected.radii, grad2d, counts, absgrad2d, blended, median
+    )
 
 
 class Ellipses(NamedTuple):
-    """The n splats in front of a camera as ellipses on its image.
+    """The n splats in front of a camera, projected to ellipses on its image.
 
     Attributes:
-        drawn: (n,) int64, which splats they are.
+        drawn: (n,) int64, indices of the splats.
         depth: (n,) along the camera's z axis.
         mean2d, covariance, determinant: see :func:`project`.
-        opacity: (n,), with weights and the antialiasing's loss in it.
-        inside: (n,) bool, where the ellipse alpha = ALPHA_MIN meets the image.
-        radii: (N,) float32 of all splats, as ``Rendering.radii``.
+        opacity: (n,), including weights and the antialiasing factor.
+        inside: (n,) bool, true if the ellipse alpha = ALPHA_MIN intersects the image.
+        radii: (N,) float32 of all splats, see ``Rendering.radii``.
     """
 
     drawn: torch.Tensor
@@ -107,7 +111,7 @@ class Ellipses(NamedTuple):
 
 
 def ellipses(gaussians: Gaussians, weights: torch.Tensor | None, settings: RasterSettings) -> Ellipses:
-    """Which splats a camera sees, and where: differentiable in all but what is inside."""
+    """Project splats onto the image plane; differentiable except for ``inside`` and ``radii``."""
     means, view = gaussians.means, settings.view
     rotation, translation = (
         torch.as_tensor(v, dtype=means.dtype, device=means.device) for v in (view.rotation, view.translation)
@@ -121,13 +125,13 @@ def ellipses(gaussians: Gaussians, weights: torch.Tensor | None, settings: Raste
     opacity = opacity[drawn]
     scales = gaussians.log_scales[drawn].exp() + settings.min_scale
     half_covariance = rotation @ rotation_matrices(gaussians.quats[drawn]) * scales[:, None]
-    each = torch.as_tensor(settings.antialias, device=means.device).expand(len(means))[drawn]
-    dilation = torch.where(each, means.new_tensor(MIP_VARIANCE), means.new_tensor(DILATION))
+    filtered = torch.as_tensor(settings.antialias, device=means.device).expand(len(means))[drawn]
+    dilation = torch.where(filtered, means.new_tensor(MIP_VARIANCE), means.new_tensor(DILATION))
     mean2d, covariance, determinant, area = project(position, half_covariance, view, dilation)
-    opacity = torch.where(each, opacity * area, opacity)
+    opacity = torch.where(filtered, opacity * area, opacity)
     with torch.no_grad():
         xx, xy, yy = covariance
-        # where alpha falls to its minimum: sigma² = 2 ln(opacity / minimum), along x and along y
+        # distance at which alpha reaches its minimum: sigma² = 2 ln(opacity / minimum), along x and along y
         reach = squared_reach(opacity).sqrt()
         half_width, half_height = reach * xx.sqrt(), reach * yy.sqrt()
         inside = (mean2d[:, 0] + half_width > 0) & (mean2d[:, 0] - half_width < view.width)
@@ -140,20 +144,23 @@ def ellipses(gaussians: Gaussians, weights: torch.Tensor | None, settings: Raste
 
 
 def squared_reach(opacity: torch.Tensor) -> torch.Tensor:
-    """dᵀ cov⁻¹ d where alpha is at its minimum."""
+    """Return dᵀ cov⁻¹ d at the contour of minimum alpha."""
     return 2 * torch.log((opacity / ALPHA_MIN).clamp_min(1))
 
 
 def project(
     position: torch.Tensor, half_covariance: torch.Tensor, view: KernelCamera, dilation: float | torch.Tensor
-):
-    """Means (N, 2) in pixels, dilated covariances' xx, xy, yy, their determinant, and sqrt(det before / det
-    after), each (N,).
+) -> tuple[torch.Tensor, tuple[torch.Tensor, torch.Tensor, torch.Tensor], torch.Tensor, torch.Tensor]:
+    """Project means and covariances onto the image plane.
 
     Args:
         position: (N, 3) in camera coordinates.
         half_covariance: (N, 3, 3) M with covariance M Mᵀ, in camera coordinates.
-        dilation: in square pixels, of all or of each (N,).
+        dilation: variance in square pixels, a number or (N,).
+
+    Returns:
+        Means (N, 2) in pixels; xx, xy and yy of the dilated covariances, their determinant, and sqrt(det
+        before / det after), each (N,).
     """
     x, y, z = position.unbind(1)
     clamped_x = (x / z).clamp(*view.x_limits) * z
@@ -165,13 +172,13 @@ def project(
     row_y = row_y - (view.fy * clamped_y / z**2)[:, None] * half_covariance[:, 2]
     mean2d = torch.stack([view.fx * x / z + view.cx, view.fy * y / z + view.cy], 1)
     xx, xy, yy = (row_x**2).sum(1), (row_x * row_y).sum(1), (row_y**2).sum(1)
-    before = torch.linalg.cross(row_x, row_y).norm(dim=1)  # xx yy - xy² would cancel in float32
-    determinant = before**2 + dilation * (xx + yy) + dilation**2
-    return mean2d, (xx + dilation, xy, yy + dilation), determinant, before / determinant.sqrt()
+    root = torch.linalg.cross(row_x, row_y).norm(dim=1)  # xx yy - xy² would cancel in float32
+    determinant = root**2 + dilation * (xx + yy) + dilation**2
+    return mean2d, (xx + dilation, xy, yy + dilation), determinant, root / determinant.sqrt()
 
 
 def pixel_offsets(mean2d: torch.Tensor, view: KernelCamera) -> tuple[torch.Tensor, torch.Tensor]:
-    """From the means (N, 2) to the pixels' centres, along x and along y, each (N, H, W)."""
+    """Return the offsets from means (N, 2) to pixel centres, along x and along y, each (N, H, W)."""
     kind = {"dtype": mean2d.dtype, "device": mean2d.device}
     ys = torch.arange(view.height, **kind) + 0.5
     xs = torch.arange(view.width, **kind) + 0.5
@@ -181,22 +188,30 @@ def pixel_offsets(mean2d: torch.Tensor, view: KernelCamera) -> tuple[torch.Tenso
 
 
 @torch.no_grad()
-def tile_counts(seen: Ellipses, view: KernelCamera) -> torch.Tensor:
-    """How many ellipses alpha = ALPHA_MIN meet the rectangle of the pixel centres of each 16x16 tile."""
-    mean2d, (xx, xy, yy) = seen.mean2d[:, :, None, None], (v[:, None, None] for v in seen.covariance)
+def tile_counts(projected: Ellipses, view: KernelCamera) -> torch.Tensor:
+    """Count the ellipses alpha = ALPHA_MIN that intersect the rectangle of each 16x16 tile's pixel
+    centres."""
+    mean2d = projected.mean2d[:, :, None, None]
+    xx, xy, yy = (v[:, None, None] for v in projected.covariance)
     left = 16 * torch.arange(-(-view.width // 16), device=xx.device)
     top = 16 * torch.arange(-(-view.height // 16), device=xx.device)[:, None]
     conic = yy, -xy, xx
     offset = left + 0.5 - mean2d[:, 0], top + 0.5 - mean2d[:, 1]
-    determinant, reach = seen.determinant[:, None, None], squared_reach(seen.opacity)[:, None, None]
-    return (meets_tile(offset, conic, determinant, reach) & seen.inside[:, None, None]).sum(0)
+    determinant = projected.determinant[:, None, None]
+    reach = squared_reach(projected.opacity)[:, None, None]
+    return (intersects_tile(offset, conic, determinant, reach) & projected.inside[:, None, None]).sum(0)
 
 
-def meets_tile(offset, conic, determinant, reach) -> torch.Tensor:
-    """Whether ellipses meet the rectangle of a tile's pixel centres; all arguments broadcast.
+def intersects_tile(
+    offset: tuple[torch.Tensor, torch.Tensor] | torch.Tensor,
+    conic: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
+    determinant: torch.Tensor,
+    reach: torch.Tensor,
+) -> torch.Tensor:
+    """Test if ellipses intersect the rectangle of a tile's pixel centres; all arguments broadcast.
 
     Args:
-        offset: x and y from the ellipse's middle to the tile's first pixel centre.
+        offset: x and y from the ellipse's centre to the tile's first pixel centre.
         conic, determinant, reach: the ellipse is a x² + 2 b x y + c y² = reach · determinant.
     """
     (x0, y0), (a, b, c) = offset, conic
@@ -205,31 +220,39 @@ def meets_tile(offset, conic, determinant, reach) -> torch.Tensor:
     def distance(x, y):
         return (a * x * x + 2 * b * x * y + c * y * y) / determinant
 
-    # the form is convex: its least value on the rectangle is at the mean or on an edge
-    least = torch.where((x0 <= 0) & (x1 >= 0) & (y0 <= 0) & (y1 >= 0), 0.0, torch.inf)
+    # the form is convex, so its minimum on the rectangle is at the mean or on an edge
+    minimum = torch.where((x0 <= 0) & (x1 >= 0) & (y0 <= 0) & (y1 >= 0), 0.0, torch.inf)
     for x in (x0, x1):
-        least = torch.minimum(least, distance(x, torch.maximum(torch.minimum(-b * x / c, y1), y0)))
+        minimum = torch.minimum(minimum, distance(x, torch.maximum(torch.minimum(-b * x / c, y1), y0)))
     for y in (y0, y1):
-        least = torch.minimum(least, distance(torch.maximum(torch.minimum(-b * y / a, x1), x0), y))
-    return least <= reach
+        minimum = torch.minimum(minimum, distance(torch.maximum(torch.minimum(-b * y / a, x1), x0), y))
+    return minimum <= reach
 
 
 def contributions(
     gaussians: Gaussians, weights: torch.Tensor | None, settings: RasterSettings
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """See :func:`training.rasterize.contributions`: of one view, the largest, the sum, pixels and radii."""
-    count, means = len(gaussians), gaussians.means
+    """Return largest weights, sums, pixel counts and radii of one view; see :mod:`training.rasterize`."""
+    count = len(gaussians)
+    means = gaussians.means
     gaussians = replace(gaussians, sh=means.new_zeros(count, 1, 3))
-    drawn = rasterize(gaussians, weights, torch.eye(count).to(means), settings)
-    shares = drawn.features.flatten(0, 1)  # a feature of each splat's own: its weight in every pixel
-    return shares.amax(0).float(), shares.sum(0).float(), (shares > 0).sum(0), drawn.radii
+    output = rasterize(gaussians, weights, torch.eye(count).to(means), settings)
+    shares = output.features.flatten(0, 1)  # one-hot features blend to each splat's weight in every pixel
+    return shares.amax(0).float(), shares.sum(0).float(), (shares > 0).sum(0), output.radii
 
 
-def blend(offsets, xx, xy, yy, opacity, hidden=None) -> tuple[torch.Tensor, torch.Tensor]:
-    """Weights alpha T (N, H, W) of splats given front to back, and the T (H, W) left behind the last.
+def blend(
+    offsets: tuple[torch.Tensor, torch.Tensor],
+    xx: torch.Tensor,
+    xy: torch.Tensor,
+    yy: torch.Tensor,
+    opacity: torch.Tensor,
+    hidden: torch.Tensor | None = None,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Blend splats front to back; return weights alpha T (N, H, W) and the transmittance T (H, W) behind all.
 
     Args:
-        hidden: (N, H, W) bool, where a splat is not drawn; None: nowhere.
+        hidden: (N, H, W) bool, pixels in which a splat is not drawn; None means no pixels.
     """
     dx, dy = offsets
     xx, xy, yy = xx[:, None, None], xy[:, None, None], yy[:, None, None]
@@ -239,10 +262,10 @@ def blend(offsets, xx, xy, yy, opacity, hidden=None) -> tuple[torch.Tensor, torc
     if hidden is not None:
         alpha = alpha.masked_fill(hidden, 0)
 
-    behind = torch.cumprod(1 - alpha, 0)
-    before = torch.cat([torch.ones_like(behind[:1]), behind[:-1]]) if len(behind) else behind
-    alive = behind > TRANSMITTANCE_MIN
-    weight = torch.where(alive, alpha * before, 0)
+    back = torch.cumprod(1 - alpha, 0)
+    front = torch.cat([torch.ones_like(back[:1]), back[:-1]]) if len(back) else back
+    alive = back > TRANSMITTANCE_MIN
+    weight = torch.where(alive, alpha * front, 0)
     transmittance = torch.where(alive, 1 - alpha, 1).prod(0)
     return weight, transmittance
 
@@ -250,21 +273,25 @@ def blend(offsets, xx, xy, yy, opacity, hidden=None) -> tuple[torch.Tensor, torc
 def photometric_loss(image: torch.Tensor, target: Target, ssim_weight: float) -> torch.Tensor:
     """See :func:`training.rasterize.photometric_loss`."""
     truth = target.image.to(image)
-    return loss_to(image, truth, moments(truth), ssim_weight)
+    return loss_with_moments(image, truth, moments(truth), ssim_weight)
 
 
-def loss_to(image: torch.Tensor, truth: torch.Tensor, of_truth: Moments, ssim_weight: float) -> torch.Tensor:
-    """The loss against a photograph (H, W, 3) whose moments are known."""
+def loss_with_moments(
+    image: torch.Tensor, truth: torch.Tensor, truth_moments: Moments, ssim_weight: float
+) -> torch.Tensor:
+    """Compute the loss against a photo (H, W, 3) with precomputed moments."""
     difference = (image - truth).abs().mean()
-    return (1 - ssim_weight) * difference + ssim_weight * (1 - ssim(image, truth, of_truth))
+    return (1 - ssim_weight) * difference + ssim_weight * (1 - ssim(image, truth, truth_moments))
 
 
-def ssim(image: torch.Tensor, truth: torch.Tensor, of_truth: Moments) -> torch.Tensor:
-    """Mean structural similarity of two images (H, W, 3) in [0, 1] (Wang et al. 2004), as 3DGS has it:
-    11x11 Gaussian window of sigma 1.5, zeros outside the image."""
+def ssim(image: torch.Tensor, truth: torch.Tensor, truth_moments: Moments) -> torch.Tensor:
+    """Compute the mean structural similarity of two images (H, W, 3) in [0, 1] (Wang et al. 2004).
+
+    The 11x11 Gaussian window has sigma 1.5, with zeros outside the image, as in 3DGS.
+    """
     x, y = image.permute(2, 0, 1), truth.permute(2, 0, 1)
     mean_x, square_x, product = windowed(torch.cat([x, x * x, x * y])).split(3)
-    mean_y, variance_y = of_truth
+    mean_y, variance_y = truth_moments
     variance_x = square_x - mean_x**2
     covariance = product - mean_x * mean_y
     c1, c2 = 0.01**2, 0.03**2
@@ -273,17 +300,17 @@ def ssim(image: torch.Tensor, truth: torch.Tensor, of_truth: Moments) -> torch.T
 
 
 def moments(image: torch.Tensor) -> Moments:
-    """Local means and variances (3, H, W) of an image (H, W, 3)."""
+    """Compute the local means and variances (3, H, W) of an image (H, W, 3)."""
     planes = image.permute(2, 0, 1)
     mean, square = windowed(torch.cat([planes, planes * planes])).split(3)
     return mean, square - mean**2
 
 
 def windowed(planes: torch.Tensor) -> torch.Tensor:
-    """Local means of planes (C, H, W)."""
+    """Compute the local means of planes (C, H, W)."""
     offsets = torch.arange(11, dtype=planes.dtype, device=planes.device) - 5
     line = torch.exp(-(offsets**2) / (2 * 1.5**2))
     line = (line / line.sum()).expand(len(planes), 1, 1, 11)
-    # every plane a channel of its own: such convolutions keep float32's digits on GPUs, others may not (TF32)
+    # depthwise convolutions use full float32 on GPUs; others may use TF32
     along_x = conv2d(planes[None], line, padding=(0, 5), groups=len(planes))
     return conv2d(along_x, line.mT, padding=(5, 0), groups=len(planes))[0]

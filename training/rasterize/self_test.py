@@ -1,4 +1,4 @@
-"""Whether a graphics device draws what the reference draws: tried before it is first used."""
+"""Self-test of a graphics device: compare its results with the reference before its first use."""
 
 from __future__ import annotations
 
@@ -25,67 +25,68 @@ from .gaussians import Gaussians
 from .gpu.device import Adapter
 from .rendering import KernelCamera, RasterSettings, Target
 
-ANSWERS = "devices.json"
-"""File in the user's cache folder that keeps the answers."""
-PICTURE_TOLERANCE, GRADIENT_TOLERANCE = 2e-3, 1e-2
-"""Most that a device may differ by, of the norm of what the reference has. A pixel whose alpha is rounded
-across its threshold differs by a 255th."""
+RESULTS = "devices.json"
+"""File in the user's cache folder that stores the results."""
+IMAGE_TOLERANCE, GRADIENT_TOLERANCE = 2e-3, 1e-2
+"""Maximum L2 errors relative to the reference. A pixel whose alpha is rounded across its threshold differs by
+1/255."""
 
-MOST_REASON = 300
-"""Characters that are told of a failure; all of it goes to standard error."""
+REASON_LENGTH = 300
+"""Maximum length of a reported failure; standard error gets all of it."""
 
 
 @cache
 def failure(adapter: Adapter) -> str:
-    """In what the chosen device's pictures or gradients differ from the reference's; empty if in nothing.
+    """Return why the default device fails the self-test; empty if it passes.
 
-    A device is tested once for each of its drivers and each state of this backend; the answer is kept.
+    The result is stored, so each version of driver and backend is tested once.
 
     Raises:
-        LodgsError: it was lost, or is out of memory.
+        LodgsError: the device was lost or is out of memory.
     """
-    key, answers = _key(adapter), cache_folder() / ANSWERS
     with suppress(LodgsError):
-        if isinstance(known := read_json(answers).get(key), str):
-            return known
+        if isinstance(stored := read_json(cache_folder() / RESULTS).get(_key(adapter)), str):
+            return stored
     return run_self_test(adapter)
 
 
 def run_self_test(adapter: Adapter) -> str:
-    """:func:`failure`, found anew."""
+    """Run the self-test and store its result; see :func:`failure`."""
     try:
-        found = _compared()
+        reason = _compare()
     except LodgsError:
         raise
-    except Exception as error:  # of a driver's compiler, which nobody has seen
+    except Exception as error:  # shader compilers of drivers fail in unpredictable ways
         traceback.print_exc(file=sys.stderr)
-        found = f"it failed ({' '.join(f'{type(error).__name__}: {error}'.split())[:MOST_REASON]})"
+        reason = f"it failed ({' '.join(f'{type(error).__name__}: {error}'.split())[:REASON_LENGTH]})"
     with suppress(LodgsError):
-        _remember(_key(adapter), found)
-    return found
+        _store(_key(adapter), reason)
+    return reason
 
 
-def _compared() -> str:
-    """What the device that is chosen does otherwise than the reference."""
-    ours, again = (_drawn(gpu, torch.float32) for _ in range(2))
-    for name, truth in _truth().items():
-        most = PICTURE_TOLERANCE if name == "pictures" else GRADIENT_TOLERANCE
-        off = ((ours[name] - truth).norm() / truth.norm()).item()
-        if not off <= most:  # not a number is neither
-            return f"its {name} are {off:.0%} off"
-        if not torch.equal(ours[name], again[name]):
+def _compare() -> str:
+    """Return the difference between the default device's results and the reference's; empty if acceptable."""
+    first, second = (_results(gpu, torch.float32) for _ in range(2))
+    for name, truth in _reference_results().items():
+        tolerance = IMAGE_TOLERANCE if name == "images" else GRADIENT_TOLERANCE
+        error = ((first[name] - truth).norm() / truth.norm()).item()
+        if not error <= tolerance:  # also if NaN
+            return f"its {name} are {error:.0%} off"
+        if not torch.equal(first[name], second[name]):
             return f"its {name} change from run to run"
     return ""
 
 
 @cache
-def _truth() -> dict[str, torch.Tensor]:
-    return _drawn(reference, torch.float64)
+def _reference_results() -> dict[str, torch.Tensor]:
+    return _results(reference, torch.float64)
 
 
-def _drawn(backend: ModuleType, kind: torch.dtype) -> dict[str, torch.Tensor]:
-    """Pictures of some splats, and the gradients of what they lack of a photograph."""
-    random, count, size = np.random.default_rng(0), 200, (50, 75)
+def _results(backend: ModuleType, kind: torch.dtype) -> dict[str, torch.Tensor]:
+    """Render random splats and differentiate a loss; return images and gradients by name."""
+    random = np.random.default_rng(0)
+    count = 200
+    size = 50, 75
     arrays = {
         "means": random.uniform((-1, -1, 2), (1, 1, 4), (count, 3)),
         "quats": random.normal(size=(count, 4)),
@@ -110,16 +111,16 @@ def _drawn(backend: ModuleType, kind: torch.dtype) -> dict[str, torch.Tensor]:
     target = Target(torch.tensor(random.uniform(0, 1, (*size, 3)), dtype=torch.float32).to(kind))
     loss = backend.photometric_loss(plain.image, target, 0.2) + sharp.image.square().mean()
     (loss + plain.alpha.mean() + (plain.features * sharp.features).mean()).backward()
-    pictures = (plain.image, plain.features, sharp.image, sharp.alpha[..., None])
-    found = {"pictures": torch.cat(pictures, 2).detach()}
-    found |= {f"gradients of {name}": leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
-    found["gradients in the picture"] = torch.cat([plain.grad2d, plain.absgrad2d], 1)
-    return {name: tensor.double() for name, tensor in found.items()}
+    images = (plain.image, plain.features, sharp.image, sharp.alpha[..., None])
+    results = {"images": torch.cat(images, 2).detach()}
+    results |= {f"gradients of {name}": leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
+    results["image-plane gradients"] = torch.cat([plain.grad2d, plain.absgrad2d], 1)
+    return {name: tensor.double() for name, tensor in results.items()}
 
 
 @cache
 def _key(adapter: Adapter) -> str:
-    """What an answer counts for: an adapter with its driver, wgpu, and this backend as it is."""
+    """Return a key of a result: a digest of adapter, driver, wgpu and this backend's source."""
     digest = hashlib.sha256("\n".join([*adapter, metadata.version("wgpu")]).encode())
     for path in sorted((Path(__file__).parent / "gpu").rglob("*.*")):
         if path.suffix in (".py", ".wgsl"):
@@ -127,10 +128,11 @@ def _key(adapter: Adapter) -> str:
     return digest.hexdigest()[:32]
 
 
-def _remember(key: str, found: str) -> None:
-    path, known = cache_folder() / ANSWERS, {}
+def _store(key: str, reason: str) -> None:
+    path = cache_folder() / RESULTS
+    results = {}
     with suppress(LodgsError):
-        known = read_json(path)
-    newest = dict(list({**known, key: found}.items())[-50:])
+        results = read_json(path)
+    newest = dict(list({**results, key: reason}.items())[-50:])
     with atomic_write(path) as temporary:
         Path(temporary).write_text(json.dumps(newest), encoding="utf-8")

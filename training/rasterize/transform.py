@@ -1,4 +1,4 @@
-"""Splats that stand somewhere in a world: what a transform makes of them."""
+"""Affine transforms of splats."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from .features import rotation_matrices
 from .gaussians import Gaussians
 
 
-def transform_gaussians(own: Gaussians, matrix: np.ndarray) -> Gaussians:
-    """Splats where a transform (4, 4) puts them, any affine one; their harmonics stay as they are."""
-    linear, shift = torch.from_numpy(matrix).to(own.means.device)[:3].split([3, 1], 1)
-    means = (own.means.double() @ linear.T + shift[:, 0]).float()
-    turned, lengths = rotation_matrices(own.quats.double()), own.log_scales.double().exp()
+def transform_gaussians(gaussians: Gaussians, matrix: np.ndarray) -> Gaussians:
+    """Apply an affine transform (4, 4) to splats. Their harmonics are not rotated."""
+    linear, shift = torch.from_numpy(matrix).to(gaussians.means.device)[:3].split([3, 1], 1)
+    means = (gaussians.means.double() @ linear.T + shift[:, 0]).float()
+    turned, lengths = rotation_matrices(gaussians.quats.double()), gaussians.log_scales.double().exp()
     if is_similarity(matrix):
         unit = torch.linalg.det(linear) ** (1 / 3)
         turned, lengths = linear @ turned / unit, lengths * unit
     else:
-        # an ellipsoid's axes A = L Q diag(s) stay no axes then: those of A Aᵀ are
+        # the columns of A = L Q diag(s) are no longer orthogonal: use the principal axes of A Aᵀ
         turned, lengths, _ = torch.linalg.svd(linear @ turned * lengths[:, None])
         turned = turned * torch.linalg.det(turned).sign()[:, None, None]
     quats = Rotation.from_matrix(turned.cpu().numpy()).as_quat()[:, [3, 0, 1, 2]]
     return replace(
-        own,
+        gaussians,
         means=means,
         quats=torch.from_numpy(quats).to(means),
         log_scales=lengths.clamp_min(1e-30).log().float(),

@@ -95,7 +95,7 @@ def control_density(model: Model) -> None:
 @pytest.mark.parametrize("most", [1 << 27, 200 << 10])
 def test_splats_come_and_go_there_as_they_do_here(graphics, monkeypatch, most):
     """To the bit, also on a device that takes the moments of 512 at a time."""
-    monkeypatch.setattr(graphics, "most_bytes", most)
+    monkeypatch.setattr(graphics, "binding_bytes", most)
     one, other = trained(1000), trained(1000)
     other.adam.zero_grad()  # which brings it home
     for model in (one, other):
@@ -113,9 +113,9 @@ def test_splats_come_and_go_there_as_they_do_here(graphics, monkeypatch, most):
 
 def test_density_control_moves_a_few_numbers_of_a_splat(graphics):
     """Of which there are 750 bytes: those that it decides by, and the rows that come."""
-    model, before = trained(4000), graphics.moved
+    model, before = trained(4000), graphics.transferred
     control_density(model)
-    assert model.twin("gpu", False) is not None and graphics.moved - before < 100 * 4000
+    assert model.twin("gpu", False) is not None and graphics.transferred - before < 100 * 4000
 
 
 def _flat(state) -> list[torch.Tensor]:
@@ -149,6 +149,6 @@ def test_a_picture_there_is_read_when_it_is_asked_for(data, graphics):
     method, other = make("3dgs", data), make("3dgs", data, "cpu")
     made, expected = method.train_step(0), other.train_step(0)
     torch.testing.assert_close(made.image(), expected.image(), atol=2e-3, rtol=0)
-    before = graphics.moved
+    before = graphics.transferred
     made.image()
-    assert graphics.moved - before == 16 * made.target.image.shape[0] * made.target.image.shape[1]
+    assert graphics.transferred - before == 16 * made.target.image.shape[0] * made.target.image.shape[1]

@@ -26,14 +26,14 @@ def there(monkeypatch, tmp_path):
     def are(*found: Adapter) -> None:
         def adapters() -> list[Adapter]:
             if not found:
-                raise LodgsError("No graphics device with Vulkan, Metal or D3D12 was found.")
+                raise LodgsError("Cannot detect a graphics device.")
             return list(found)
 
         monkeypatch.setattr(default_device, "adapters", adapters)
         monkeypatch.setattr("training.rasterize.devices.adapters", adapters)
 
     class Opened:
-        most_bytes = 2 << 30
+        binding_bytes = 2 << 30
 
     monkeypatch.delenv(default_device.VARIABLE, raising=False)
     monkeypatch.setattr(self_test, "cache_folder", lambda: tmp_path)
@@ -65,10 +65,10 @@ def test_the_best_device_is_taken_and_software_never_by_itself(there, monkeypatc
     there(WITHIN, SOFTWARE)
     assert default_device.default_adapter() == WITHIN
     there(SOFTWARE)
-    with pytest.raises(LodgsError, match=r"no graphics device that helps: llvmpipe .* runs on the processor"):
+    with pytest.raises(LodgsError, match=r"llvmpipe .* runs on the CPU"):
         resolve_backend("gpu")
     there()
-    with pytest.raises(LodgsError, match="No graphics device"):
+    with pytest.raises(LodgsError, match="Cannot detect"):
         resolve_backend("gpu")
 
 
@@ -81,7 +81,7 @@ def test_a_name_or_a_part_of_it_takes_another(there, monkeypatch, name, expected
     monkeypatch.setenv(default_device.VARIABLE, name)
     assert default_device.default_adapter() == expected
     monkeypatch.setenv(default_device.VARIABLE, "voodoo")
-    with pytest.raises(LodgsError, match=r'no graphics device "voodoo".*LODGS_GPU.*There are: GeForce'):
+    with pytest.raises(LodgsError, match=r'"voodoo".*LODGS_GPU.*Choose from: GeForce'):
         default_device.default_adapter()
 
 
@@ -104,7 +104,7 @@ def test_a_device_that_draws_otherwise_is_not_used_and_it_is_said(there, spoiled
     there(CARD)
     assert resolve_backend("gpu") == "cpu"
     assert cpu_fallback_reason("gpu").startswith(
-        "GeForce RTX 4070 Laptop is not used: its pictures are 2% off."
+        "GeForce RTX 4070 Laptop is not used: its images are 2% off."
     )
     self_test.failure.cache_clear()
     assert resolve_backend("gpu") == "cpu", "remembered"
@@ -146,7 +146,7 @@ def test_what_is_not_the_same_twice_or_no_number_is_found(there, monkeypatch):
         return drawn._replace(image=drawn.image + next(noise))
 
     monkeypatch.setattr(gpu, "rasterize", restless, raising=False)
-    assert self_test.run_self_test(CARD) == "its pictures change from run to run"
+    assert self_test.run_self_test(CARD) == "its images change from run to run"
     assert "off" in self_test.run_self_test(CARD)
 
 
@@ -160,15 +160,15 @@ def test_a_driver_that_refuses_a_shader_is_not_used(there, monkeypatch):
     assert resolve_backend("gpu") == "cpu"
     said = cpu_fallback_reason("gpu")
     assert "is not used: it failed (RuntimeError: Validation Error error X3663: thread sync and more" in said
-    assert len(said) < 600 and said.endswith("The processor takes its place; a newer driver may help.")
+    assert len(said) < 600 and said.endswith("The CPU is used instead; a newer driver may help.")
 
 
 def test_a_spoiled_cache_is_as_none(there, tmp_path):
     there(CARD)
-    (tmp_path / self_test.ANSWERS).write_text("{no json")
+    (tmp_path / self_test.RESULTS).write_text("{no json")
     assert resolve_backend("gpu") == "gpu"
     self_test.failure.cache_clear()
-    (tmp_path / self_test.ANSWERS).write_text('{"x": 5}')
+    (tmp_path / self_test.RESULTS).write_text('{"x": 5}')
     assert resolve_backend("gpu") == "gpu"
 
 
@@ -186,10 +186,10 @@ def test_devices_are_described(there, monkeypatch, spoiled):
 
 def test_what_trains_is_a_sentence(there, monkeypatch):
     there()
-    sentence = Devices.found().sentence
+    sentence = Devices.detect().sentence
     assert "Automatic trains on the processor (" in sentence and sentence.endswith("was found.")
     there(SOFTWARE)
-    assert Devices.found().sentence.endswith("A graphics card might be faster, and none was found.")
+    assert Devices.detect().sentence.endswith("A graphics card might be faster, and none was found.")
     there(CARD)
     found = Devices("NVIDIA GeForce RTX 4070 Laptop GPU", [CARD], CARD, "")
     monkeypatch.setattr("training.rasterize.devices.find_spec", lambda name: None)
@@ -212,11 +212,11 @@ def test_lost_devices_are_a_sentence_and_are_tested_again(there, monkeypatch):
     there(CARD)
 
     def lost(*_):
-        raise LodgsError("GeForce RTX 4070 Laptop does not answer any more: lost.")
+        raise LodgsError("GeForce RTX 4070 Laptop stopped responding: lost.")
 
     monkeypatch.setattr(gpu, "rasterize", lost, raising=False)
-    with pytest.raises(LodgsError, match="does not answer"):
+    with pytest.raises(LodgsError, match="stopped responding"):
         resolve_backend("gpu")
-    assert "does not answer any more" in describe()
+    assert "stopped responding" in describe()
     monkeypatch.setattr(gpu, "rasterize", cpu.rasterize, raising=False)
     assert resolve_backend("gpu") == "gpu"

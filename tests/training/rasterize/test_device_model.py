@@ -83,8 +83,8 @@ def test_a_device_that_binds_little_trains_the_same(
 ):
     """Of 1500 splats it takes the moments of 512 at a time, and 4654 of their 5700 pairs."""
     found = []
-    for most in (graphics.most_bytes, 200 << 10):
-        monkeypatch.setattr(graphics, "most_bytes", most)
+    for most in (graphics.binding_bytes, 200 << 10):
+        monkeypatch.setattr(graphics, "binding_bytes", most)
         adam, stats = adam_of(make_splats(1500)), blank(1500)
         twin = make_device_model("gpu", adam, stats)
         assert twin is not None
@@ -137,9 +137,9 @@ def test_a_step_moves_a_few_numbers(graphics, make_splats, odd_camera, photograp
         twin = make_device_model("gpu", adam_of(make_splats(count)), blank(count))
         assert twin is not None
         twin.step(odd_camera, photograph, ssim_weight=0.2, shrink=1, **VIEW)
-        before = graphics.moved
+        before = graphics.transferred
         twin.step(odd_camera, photograph, ssim_weight=0.2, shrink=1, **VIEW)
-        moved.append(graphics.moved - before)
+        moved.append(graphics.transferred - before)
     assert max(moved) < 20_000
 
 

@@ -16,7 +16,7 @@ SIZES = [0, 1, 63, 64, 1024, 1025, 16_384, 16_385, 70_000]
 @pytest.fixture
 def narrow(graphics, monkeypatch) -> Device:
     """The same, to which work is given in pieces of no more than seven workgroups."""
-    monkeypatch.setattr(graphics, "most_groups", 7)
+    monkeypatch.setattr(graphics, "max_groups", 7)
     return graphics
 
 
@@ -24,7 +24,7 @@ def narrow(graphics, monkeypatch) -> Device:
 def test_sums_are_numpys(graphics, count):
     values = np.random.default_rng(count).integers(0, 50, count).astype(np.uint32)
     buffer = graphics.upload(values)
-    bin.sum_up(graphics, buffer)
+    bin.exclusive_scan(graphics, buffer)
     np.testing.assert_array_equal(graphics.read(buffer), np.cumsum(values) - values)
 
 
@@ -42,8 +42,8 @@ def test_sorts_are_numpys_stable_ones(narrow, count):
 def test_a_picture_does_not_depend_on_the_pieces(graphics, make_splats, odd_camera, monkeypatch):
     """Twenty tiles, seven at a time: as an image of more tiles than a device takes at once."""
     found = []
-    for most in (7, graphics.most_groups):
-        monkeypatch.setattr(graphics, "most_groups", most)
+    for most in (7, graphics.max_groups):
+        monkeypatch.setattr(graphics, "max_groups", most)
         found.append(drawn_and_differentiated("degree 3", make_splats, odd_camera, "gpu", torch.float32))
     for name, one in found[0].items():
         assert torch.equal(one, found[1][name]), name
@@ -104,8 +104,8 @@ def test_a_device_that_binds_little_draws_the_same(graphics, make_splats, odd_ca
         run(shader, entry, groups, *arguments, **buffers)
 
     monkeypatch.setattr(graphics, "run", spied)
-    for most in (graphics.most_bytes, 140 << 10):
-        monkeypatch.setattr(graphics, "most_bytes", most)
+    for most in (graphics.binding_bytes, 140 << 10):
+        monkeypatch.setattr(graphics, "binding_bytes", most)
         drawn = drawn_and_differentiated("crowd", make_splats, odd_camera, "gpu", torch.float32)
         share, _ = contributed("crowd", make_splats, odd_camera, "gpu", torch.float32)
         found.append(drawn | share)
@@ -122,7 +122,7 @@ def test_what_is_too_large_for_a_device_is_said(graphics, make_splats, odd_camer
         patch.setattr(graphics, "largest", 1 << 20)
         with pytest.raises(LodgsError, match=r"takes 1 MB at a time, and this scene needs 4 MB"):
             graphics.empty(np.float32, 1 << 20)
-    monkeypatch.setattr(graphics, "most_bytes", 1 << 16)
+    monkeypatch.setattr(graphics, "binding_bytes", 1 << 16)
     with pytest.raises(LodgsError, match=r"takes 0 MB at a time, and .* 1 MB\. .* cpu backend, fewer splats"):
         drawn_and_differentiated("crowd", make_splats, odd_camera, "gpu", torch.float32)
 
@@ -159,7 +159,7 @@ def test_a_lost_device_is_a_sentence_and_another_is_opened(graphics, monkeypatch
 
 def test_mistakes_of_ours_stay_what_they_are(graphics):
     with pytest.raises(KeyError):
-        graphics.run("scan", "few", 1, (1,), no_such_buffer=graphics.empty(np.uint32, 1))
+        graphics.run("scan", "scan_all", 1, (1,), no_such_buffer=graphics.empty(np.uint32, 1))
 
 
 def test_without_wgpu_or_a_driver_there_is_a_sentence(monkeypatch):

@@ -72,10 +72,10 @@ def test_stopped_run_on_a_device_gives_the_same_bits_and_measures(graphics, keys
     [
         (
             RuntimeError("Validation Error: Parent device is lost"),
-            "does not answer any more",
+            "stopped responding",
             "Resume the run",
         ),
-        (RuntimeError("Not enough memory left."), "has no more memory", "on the cpu"),
+        (RuntimeError("Not enough memory left."), "is out of memory", "on the cpu"),
     ],
 )
 def test_lost_device_or_low_memory_is_reported_and_the_run_can_be_resumed(
@@ -106,13 +106,13 @@ def test_lost_device_or_low_memory_is_reported_and_the_run_can_be_resumed(
 
 
 def test_cpu_replaces_a_device_that_renders_incorrectly(graphics, keys, monkeypatch):
-    monkeypatch.setattr(self_test, "failure", lambda adapter: "its pictures are 3% off")
+    monkeypatch.setattr(self_test, "failure", lambda adapter: "its images are 3% off")
     keys["parameters"]["steps"] = [1, 1, 1]
     code, events = run_in_process(keys)
     assert code == 0
     assert [event["backend"] for event in events if "backend" in event] == ["cpu"]
     (warning,) = [event["message"] for event in events if event["event"] == "warning"]
-    assert warning.startswith(f"{graphics.adapter.name} is not used: its pictures are 3% off. The CPU")
+    assert warning.startswith(f"{graphics.adapter.name} is not used: its images are 3% off. The CPU")
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""The Adam update."""
+"""Kernels of the Adam update."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from .compile import STRICT, f32, inlined, kernel, run_parallel, serialised
 
 ROW = 1024
 VALUES = 1 << 16
-"""How many a thread takes at a time."""
+"""Values in a thread's unit of work."""
 M_TINY = f32(1e-30)
 V_TINY = f32(1e-36)
 
 
 @inlined(STRICT)
-def moved(i, g, m, v, rate, keep_m, keep_v, scale_v, eps):
-    """Updates the moments of a value and returns by how much it gets smaller."""
+def adam_change(i, g, m, v, rate, keep_m, keep_v, scale_v, eps):
+    """Update the moments of a value; return the change to subtract from it."""
     first = keep_m * m[i] + (f32(1) - keep_m) * g
     second = keep_v * v[i] + (f32(1) - keep_v) * (g * g)
     first = first if abs(first) > M_TINY else f32(0)
@@ -29,10 +29,10 @@ def moved(i, g, m, v, rate, keep_m, keep_v, scale_v, eps):
 
 @kernel(STRICT)
 def _update(begin, end, parameter, gradient, m, v, lr, keep_m, keep_v, scale_v, eps):
-    """All arrays flat; ``lr`` (width,) repeats along them and has the first moment's bias correction in it.
+    """Update flat arrays. ``lr`` (width,) repeats along them and includes the first moment's bias correction.
 
-    Moments of splats that stay out of sight decay into denormal numbers, which are slow; they are cut off far
-    below where they could matter (the root of V_TINY is a thousandth of 3DGS's eps).
+    Moments of splats that stay invisible would decay to denormal numbers, which are slow. They are set to
+    zero far below relevant values: the root of V_TINY is a thousandth of 3DGS's eps.
     """
     width = lr.shape[0]
     total = parameter.shape[0]
@@ -40,23 +40,24 @@ def _update(begin, end, parameter, gradient, m, v, lr, keep_m, keep_v, scale_v, 
         start = row * width
         for j in range(min(width, total - start)):
             i = start + j
-            parameter[i] -= moved(i, gradient[i], m, v, lr[j], keep_m, keep_v, scale_v, eps)
+            parameter[i] -= adam_change(i, gradient[i], m, v, lr[j], keep_m, keep_v, scale_v, eps)
 
 
 @kernel(STRICT)
 def _update_rows(begin, end, parameter, rows, gradient, m, v, lr, keep_m, keep_v, scale_v, eps):
-    """The same for ``rows`` of the flat arrays, of the gradient's ``lr.shape[0]`` values each."""
+    """Update ``rows`` of the flat arrays; a row has ``lr.shape[0]`` values."""
     width = lr.shape[0]
     for k in range(begin, end):
         start = rows[k] * width
         for j in range(width):
             i = start + j
-            parameter[i] -= moved(i, gradient[k * width + j], m, v, lr[j], keep_m, keep_v, scale_v, eps)
+            parameter[i] -= adam_change(i, gradient[k * width + j], m, v, lr[j], keep_m, keep_v, scale_v, eps)
 
 
 @serialised
 def update_rows(parameter, rows, gradient, m, v, lr, betas, eps, step) -> None:
-    """One Adam step in place for ``rows`` (M,) int64; ``lr`` is a number or broadcasts against one row."""
+    """Make one Adam step in place for ``rows`` (M,) int64; ``lr`` is a number or broadcasts against one
+    row."""
     width = int(np.prod(parameter.shape[1:], dtype=int))
     rate = np.asarray(lr, np.float32) / np.float32(1 - betas[0] ** step)
     row = np.ascontiguousarray(np.broadcast_to(rate, parameter.shape[1:])).reshape(-1)
@@ -69,7 +70,7 @@ def update_rows(parameter, rows, gradient, m, v, lr, betas, eps, step) -> None:
 
 @serialised
 def update(parameter, gradient, m, v, lr, betas, eps, step) -> None:
-    """One Adam step in place; ``lr`` is a number or broadcasts against one row of ``parameter``."""
+    """Make one Adam step in place; ``lr`` is a number or broadcasts against one row of ``parameter``."""
     correction = 1 - betas[0] ** step
     lr = np.asarray(lr, np.float32) / np.float32(correction)
     if lr.size == 1:

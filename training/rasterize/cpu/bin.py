@@ -1,8 +1,8 @@
-"""Which splats touch which 16x16 tile, front to back: every tile's list of splats.
+"""List the splats of each 16x16 tile, front to back.
 
-A pair is one splat in one tile. Splats are sorted by depth once; pairs then go to their tiles by a counting
-sort that keeps that order. Chunks of the depth order, not threads, decide where a pair lies, so the result
-does not depend on the number of threads.
+A pair is one splat in one tile. Splats are sorted by depth once. A stable counting sort then distributes
+pairs to tiles. Chunks of the depth order, not threads, determine the position of a pair, so the result does
+not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -14,9 +14,8 @@ import numpy as np
 
 from ..rendering import ALPHA_MIN
 from .compile import STRICT, Buffers, f32, inlined, kernel, run_parallel, run_serial
-from .fastmath import fetch_ahead
+from .fastmath import prefetch
 from .project import (
-    AHEAD,
     CONIC_XX,
     CONIC_XY,
     CONIC_YY,
@@ -25,6 +24,7 @@ from .project import (
     LOG2_OPACITY,
     MEAN_X,
     MEAN_Y,
+    PREFETCH,
 )
 
 TILE = 16
@@ -39,9 +39,9 @@ class Pairs:
 
     Attributes:
         splat: (P,) int32, the splat of each pair.
-        tile_start: (tiles + 1,) int64, where each tile's pairs begin; tiles go row by row.
+        tile_start: (tiles + 1,) int64, index of each tile's first pair; tiles are in row-major order.
         first, count: (M,) int64 and int32: the pairs of splat i are row[first[i] : first[i] + count[i]].
-        row: int32, positions in ``splat``; some are unused.
+        row: int32, positions in ``splat``; may have unused entries.
     """
 
     splat: np.ndarray
@@ -52,13 +52,13 @@ class Pairs:
 
 
 @kernel(STRICT)
-def sort_by_depth(keys, splats, other_keys, other_splats):
-    """Sort ``splats`` by their keys, stably: three passes of a radix sort of 11 bits.
+def sort_by_depth(keys, splats, spare_keys, target_splats):
+    """Sort ``splats`` by their keys with a stable radix sort of three passes and 11 bits.
 
-    Keys are the bits of positive float32 numbers as uint32, which order as the numbers do. The sorted splats
-    are in ``other_splats``; all four arrays, of one length, are overwritten.
+    Keys are the bits of positive float32 numbers as uint32, which have the order of the numbers. The sorted
+    splats are stored in ``target_splats``. All four arrays have the same length and are overwritten.
     """
-    source_keys, source, target_keys, target = keys, splats, other_keys, other_splats
+    source_keys, source, target_keys, target = keys, splats, spare_keys, target_splats
     start = np.empty(2049, np.int64)
     for shift in (0, 11, 22):
         for digit in range(2049):
@@ -78,7 +78,7 @@ def sort_by_depth(keys, splats, other_keys, other_splats):
 
 @inlined(STRICT)
 def tile_range(middle, reach, tiles):
-    """The first tile and one past the last whose pixel centres may lie within ``reach`` of ``middle``."""
+    """Return the first tile and one past the last with pixel centres within ``reach`` of ``middle``."""
     low = math.floor((middle - reach - HALF) / f32(TILE))
     high = math.floor((middle + reach - HALF) / f32(TILE)) + 1
     return max(0, min(low, tiles)), max(0, min(high, tiles))
@@ -86,34 +86,34 @@ def tile_range(middle, reach, tiles):
 
 @inlined(STRICT)
 def touches(row, tile_x, tile_y):
-    """Whether the ellipse on which alpha is ALPHA_MIN meets the rectangle of a tile's pixel centres.
+    """Test if the ellipse alpha = ALPHA_MIN intersects the rectangle of a tile's pixel centres.
 
-    The quadratic form is convex, so outside the rectangle its minimum lies on one of the edges that face the
-    mean.
+    The quadratic form is convex. If the mean is outside the rectangle, the minimum is on an edge that faces
+    it.
     """
     left, top = f32(tile_x * TILE) + HALF - row[MEAN_X], f32(tile_y * TILE) + HALF - row[MEAN_Y]
     right, bottom = left + SPAN, top + SPAN
-    beside, above = left > 0 or right < 0, top > 0 or bottom < 0
-    if not beside and not above:
+    outside_x, outside_y = left > 0 or right < 0, top > 0 or bottom < 0
+    if not outside_x and not outside_y:
         return True
     a, b, c = row[CONIC_XX], row[CONIC_XY], row[CONIC_YY]
-    least = f32(np.inf)
-    if beside:
+    minimum = f32(np.inf)
+    if outside_x:
         dx = left if left > 0 else right
         dy = min(max(-b * dx / (TWO * c), top), bottom)
-        least = (a * dx + b * dy) * dx + c * dy * dy
-    if above:
+        minimum = (a * dx + b * dy) * dx + c * dy * dy
+    if outside_y:
         dy = top if top > 0 else bottom
         dx = min(max(-b * dy / (TWO * a), left), right)
-        least = min(least, (a * dx + b * dy) * dx + c * dy * dy)
-    return least <= row[LOG2_OPACITY] - LOG2_ALPHA_MIN
+        minimum = min(minimum, (a * dx + b * dy) * dx + c * dy * dy)
+    return minimum <= row[LOG2_OPACITY] - LOG2_ALPHA_MIN
 
 
 @kernel(STRICT)
 def box_sizes(begin, end, projected, order, tiles_x, tiles_y, sizes):
-    """How many tiles the bounding box of each splat covers, in depth order."""
+    """Count the tiles in the bounding box of each splat, in depth order."""
     for k in range(begin, end):
-        fetch_ahead(projected, order[min(k + AHEAD, order.shape[0] - 1)], 0)
+        prefetch(projected, order[min(k + PREFETCH, order.shape[0] - 1)], 0)
         row = projected[order[k]]
         x0, x1 = tile_range(row[MEAN_X], row[HALF_WIDTH], tiles_x)
         y0, y1 = tile_range(row[MEAN_Y], row[HALF_HEIGHT], tiles_y)
@@ -122,12 +122,12 @@ def box_sizes(begin, end, projected, order, tiles_x, tiles_y, sizes):
 
 @kernel(STRICT)
 def find_tiles(begin, end, projected, order, box_start, tiles_x, tiles_y, first, count, hits, histogram):
-    """The one test of splat against tile: list the tiles that each splat touches, and count them by chunk."""
+    """List the tiles that each splat touches, and count them by chunk."""
     total = order.shape[0]
     for chunk in range(begin, end):
         tally = histogram[chunk]
         for k in range(total * chunk // CHUNKS, total * (chunk + 1) // CHUNKS):
-            fetch_ahead(projected, order[min(k + AHEAD, total - 1)], 0)
+            prefetch(projected, order[min(k + PREFETCH, total - 1)], 0)
             row = projected[order[k]]
             x0, x1 = tile_range(row[MEAN_X], row[HALF_WIDTH], tiles_x)
             y0, y1 = tile_range(row[MEAN_Y], row[HALF_HEIGHT], tiles_y)
@@ -144,8 +144,8 @@ def find_tiles(begin, end, projected, order, box_start, tiles_x, tiles_y, first,
 
 
 @kernel(STRICT)
-def start_of_each(histogram, tile_start):
-    """Turn the counts of (chunk, tile) into the places where their pairs begin."""
+def pair_starts(histogram, tile_start):
+    """Replace the counts of (chunk, tile) by the positions of their first pairs."""
     place = 0
     for tile in range(histogram.shape[1]):
         tile_start[tile] = place
@@ -158,7 +158,7 @@ def start_of_each(histogram, tile_start):
 
 @kernel(STRICT)
 def place_pairs(begin, end, order, first, count, hits, histogram, splat):
-    """Put every pair in its place, and in ``hits`` the place instead of the tile."""
+    """Store every pair at its position, and replace the tiles in ``hits`` by these positions."""
     total = order.shape[0]
     for chunk in range(begin, end):
         place = histogram[chunk]
@@ -174,9 +174,9 @@ def place_pairs(begin, end, order, first, count, hits, histogram, splat):
 def bin_splats(
     projected: np.ndarray, drawn: np.ndarray, depths: np.ndarray, width: int, height: int, buffers: Buffers
 ) -> Pairs:
-    """Bin those of the projected splats (M, COLUMNS) that are ``drawn`` (D,) int32, at these depths (D,).
+    """Bin the splats at indices ``drawn`` (D,) int32 of ``projected`` (M, COLUMNS), with their depths (D,).
 
-    Both are overwritten; what is returned lives in ``buffers``.
+    ``drawn`` and ``depths`` are overwritten. The result uses memory of ``buffers``.
     """
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
     order = np.empty_like(drawn)
@@ -196,7 +196,7 @@ def bin_splats(
         projected, order, box_start, tiles_x, tiles_y, first, count, hits, histogram,
     )  # fmt: skip
     tile_start = np.zeros(tiles_x * tiles_y + 1, np.int64)
-    run_serial(start_of_each, histogram, tile_start)
+    run_serial(pair_starts, histogram, tile_start)
     splat = buffers.take("splat", np.int32, int(tile_start[-1]))
     run_parallel(place_pairs, CHUNKS, 1, order, first, count, hits, histogram, splat)
     return Pairs(splat, tile_start, first, count, hits)

@@ -1,7 +1,7 @@
 """L1 and structural similarity with their gradient, in two passes over blocks that fit the L1 cache.
 
-Loops that add up write nothing else: of one that does, the compiler makes two, and which of them runs, and
-so in which order it adds, hangs on where the system put the arrays.
+Reduction loops must not write arrays. Otherwise the compiler generates two versions of the loop with
+different orders of summation, and selects one at run time by the arrays' addresses.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from .compile import FAST, Buffers, f32, helper, kernel, run_parallel
 ROWS, COLUMNS = 16, 64
 """Size of a block."""
 BLOCKS = 32
-"""How many blocks a thread takes at a time."""
+"""Blocks in a thread's unit of work."""
 REACH = 5
 HIGH, WIDE = ROWS + 2 * REACH, 80
-"""Size of a block with the window's reach around it, zeros outside the image; as wide as SIMD likes it."""
+"""Size of a block padded by the window's reach; the width is a multiple of SIMD vectors."""
 
 _line = np.exp(-((np.arange(6) - 5.0) ** 2) / (2 * 1.5**2))
 _line /= 2 * _line[:5].sum() + _line[5]
@@ -28,7 +28,7 @@ C1, C2 = f32(0.01**2), f32(0.03**2)
 
 @helper(FAST)
 def read_padded(plane, y0, x0, out):
-    """Copy the padded block of a plane (H, W) whose inner part begins at (y0, x0) to ``out`` (HIGH, WIDE)."""
+    """Copy a padded block of a plane (H, W) with its inner part at (y0, x0) to ``out`` (HIGH, WIDE)."""
     height, width = plane.shape
     for r in range(HIGH):
         y = y0 + r - REACH
@@ -43,9 +43,10 @@ def read_padded(plane, y0, x0, out):
 
 @helper(FAST)
 def windowed(block, line, out):
-    """The window over a padded block (HIGH, WIDE), by columns and then by rows: ``out`` (ROWS, COLUMNS).
+    """Apply the window to a padded block (HIGH, WIDE), along columns, then rows; fill ``out`` (ROWS,
+    COLUMNS).
 
-    ``line`` (WIDE,) is for use in between.
+    ``line`` (WIDE,) is scratch memory.
     """
     for r in range(ROWS):
         for j in range(WIDE):
@@ -69,8 +70,9 @@ def windowed(block, line, out):
 
 
 @helper(FAST)
-def place_of(block, height, width):
-    """Channel, first row and column, and the rows and columns inside the image, of a block."""
+def locate_block(block, height, width):
+    """Return a block's channel, its first row and column, and its numbers of rows and columns in the
+    image."""
     across, down = -(-width // COLUMNS), -(-height // ROWS)
     y0, x0 = block // across % down * ROWS, block % across * COLUMNS
     rows = ROWS if height - y0 > ROWS else height - y0
@@ -80,13 +82,13 @@ def place_of(block, height, width):
 
 @kernel(FAST)
 def target_moments(begin, end, truth, mean_and_square):
-    """Windowed means of y and of y², (2, 3, H, W), of a photograph (3, H, W)."""
+    """Fill mean_and_square (2, 3, H, W) with the windowed means of y and y² of a photo (3, H, W)."""
     _, height, width = truth.shape
     wide = np.empty((2, HIGH, WIDE), np.float32)
     line = np.empty(WIDE, np.float32)
     moments = np.empty((2, ROWS, COLUMNS), np.float32)
     for block in range(begin, end):
-        channel, y0, x0, rows, columns = place_of(block, height, width)
+        channel, y0, x0, rows, columns = locate_block(block, height, width)
         read_padded(truth[channel], y0, x0, wide[0])
         for r in range(HIGH):
             for j in range(WIDE):
@@ -100,20 +102,20 @@ def target_moments(begin, end, truth, mean_and_square):
 
 @kernel(FAST)
 def similarity(begin, end, image, truth, moments_of_y, by_moments, sums):
-    """Sum of SSIM per block, and its derivatives by the windowed means of x, x² and xy, (3 of them, 3, H, W).
+    """Compute the sum of SSIM per block, and its derivatives by the windowed means of x, x² and xy.
 
     SSIM = n1 n2 / (d1 d2) with n1 = 2 mx my + C1, n2 = 2 (mxy − mx my) + C2, d1 = mx² + my² + C1 and
-    d2 = (mxx − mx²) + (myy − my²) + C2 (Wang et al. 2004, Eq. 13).
+    d2 = (mxx − mx²) + (myy − my²) + C2 (Wang et al. 2004, Eq. 13). by_moments is (3 means, 3, H, W).
     """
     _, height, width = image.shape
     wide = np.empty((3, HIGH, WIDE), np.float32)  # x, x², xy
     line = np.empty(WIDE, np.float32)
     moments = np.empty((3, ROWS, COLUMNS), np.float32)
-    of_y = np.empty((2, COLUMNS), np.float32)
-    for j in range(COLUMNS):  # beyond the image's border they stay
-        of_y[0, j], of_y[1, j] = ZERO, ZERO
+    target_means = np.empty((2, COLUMNS), np.float32)
+    for j in range(COLUMNS):  # columns outside the image stay zero
+        target_means[0, j], target_means[1, j] = ZERO, ZERO
     for block in range(begin, end):
-        channel, y0, x0, rows, columns = place_of(block, height, width)
+        channel, y0, x0, rows, columns = locate_block(block, height, width)
         read_padded(image[channel], y0, x0, wide[0])
         read_padded(truth[channel], y0, x0, wide[2])
         for r in range(HIGH):
@@ -126,13 +128,13 @@ def similarity(begin, end, image, truth, moments_of_y, by_moments, sums):
         total = ZERO
         for r in range(rows):
             for j in range(columns):
-                of_y[0, j] = moments_of_y[0, channel, y0 + r, x0 + j]
-                of_y[1, j] = moments_of_y[1, channel, y0 + r, x0 + j]
+                target_means[0, j] = moments_of_y[0, channel, y0 + r, x0 + j]
+                target_means[1, j] = moments_of_y[1, channel, y0 + r, x0 + j]
             for j in range(COLUMNS):
-                mx, my = moments[0, r, j], of_y[0, j]
+                mx, my = moments[0, r, j], target_means[0, j]
                 n1, n2 = TWO * mx * my + C1, TWO * (moments[2, r, j] - mx * my) + C2
                 d1 = mx * mx + my * my + C1
-                d2 = moments[1, r, j] - mx * mx + of_y[1, j] - my * my + C2
+                d2 = moments[1, r, j] - mx * mx + target_means[1, j] - my * my + C2
                 per_d1, per_d2 = ONE / d1, ONE / d2
                 per = per_d1 * per_d2
                 value = n1 * n2 * per
@@ -142,9 +144,9 @@ def similarity(begin, end, image, truth, moments_of_y, by_moments, sums):
                     TWO * my * n2 * per - TWO * mx * value * per_d1 - TWO * mx * by_xx - my * by_xy
                 )
                 moments[1, r, j], moments[2, r, j] = by_xx, by_xy
-                of_y[0, j] = value
+                target_means[0, j] = value
             for j in range(columns):
-                total += of_y[0, j]
+                total += target_means[0, j]
             for j in range(columns):
                 for k in range(3):
                     by_moments[k, channel, y0 + r, x0 + j] = moments[k, r, j]
@@ -153,17 +155,17 @@ def similarity(begin, end, image, truth, moments_of_y, by_moments, sums):
 
 @kernel(FAST)
 def loss_gradient(begin, end, image, truth, by_moments, l1_weight, ssim_weight, gradient, sums):
-    """d loss / d image (3, H, W), and the sum of |x − y| per block.
+    """Compute d loss / d image (3, H, W), and the sum of |x − y| per block.
 
-    The window is symmetric, so what the means' derivatives give back to a pixel is their own windowed mean; x
-    reaches the means of x, x² and xy with 1, 2x and y.
+    The window is symmetric, so the derivatives by the means propagate to a pixel as their windowed mean. The
+    derivatives of x, x² and xy by x are 1, 2x and y.
     """
     _, height, width = image.shape
     wide = np.empty((HIGH, WIDE), np.float32)
     line = np.empty(WIDE, np.float32)
     back = np.empty((3, ROWS, COLUMNS), np.float32)
     for block in range(begin, end):
-        channel, y0, x0, rows, columns = place_of(block, height, width)
+        channel, y0, x0, rows, columns = locate_block(block, height, width)
         for k in range(3):
             read_padded(by_moments[k, channel], y0, x0, wide)
             windowed(wide, line, back[k])
@@ -180,12 +182,12 @@ def loss_gradient(begin, end, image, truth, by_moments, l1_weight, ssim_weight, 
 
 
 def block_count(channels: int, height: int, width: int) -> int:
-    """Blocks of ROWS x COLUMNS pixels of one channel that cover an image (channels, height, width)."""
+    """Count the blocks of ROWS x COLUMNS pixels that cover all channels of an image."""
     return channels * -(-height // ROWS) * -(-width // COLUMNS)
 
 
 def moments_of(truth: np.ndarray) -> np.ndarray:
-    """What :func:`loss_and_gradient` wants to know about a photograph (3, H, W): (2, 3, H, W)."""
+    """Compute the moments (2, 3, H, W) of a photo (3, H, W) for :func:`loss_and_gradient`."""
     moments = np.empty((2, *truth.shape), np.float32)
     run_parallel(target_moments, block_count(*truth.shape), BLOCKS, truth, moments)
     return moments
@@ -194,7 +196,8 @@ def moments_of(truth: np.ndarray) -> np.ndarray:
 def loss_and_gradient(
     image: np.ndarray, truth: np.ndarray, moments: np.ndarray, ssim_weight: float
 ) -> tuple[float, np.ndarray]:
-    """(1 − ssim_weight) L1 + ssim_weight (1 − SSIM) of planes (3, H, W), and its gradient by the image."""
+    """Compute (1 − ssim_weight) L1 + ssim_weight (1 − SSIM) of planes (3, H, W), and its gradient by
+    image."""
     blocks = block_count(*image.shape)
     similar, different = np.empty(blocks, np.float32), np.empty(blocks, np.float32)
     buffers = Buffers()

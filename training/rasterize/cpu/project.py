@@ -1,4 +1,4 @@
-"""Splats to ellipses on the image, and the way back from the ellipses' gradients to the splats' parameters.
+"""Project splats to ellipses on the image, and propagate the ellipses' gradients to the splats' parameters.
 
 Notation: p = R m + t the mean in camera coordinates, M = R Q diag(s) with covariance M Mᵀ, J the Jacobian of
 (fx x/z, fy y/z) at p (clamped to a frustum a little wider than the image), cov = J M Mᵀ Jᵀ + dilation (EWA
@@ -15,36 +15,36 @@ from ...editing.bake_filter import MIP_VARIANCE
 from ...splats import sh as harmonics
 from ..rendering import ALPHA_MIN, DILATION, KernelCamera
 from .compile import FAST, f32, inlined, kernel
-from .fastmath import fetch_ahead
+from .fastmath import prefetch
 
-# The columns of a projected splat: all that blending reads, one row a splat.
+# Columns of a projected splat, the input of blending.
 MEAN_X, MEAN_Y = 0, 1
 """Mean in pixels."""
 CONIC_XX, CONIC_XY, CONIC_YY, LOG2_OPACITY = 2, 3, 4, 5
 """log2 alpha = LOG2_OPACITY − (CONIC_XX dx² + CONIC_XY dx dy + CONIC_YY dy²)."""
 RED, GREEN, BLUE = 6, 7, 8
 HALF_WIDTH, HALF_HEIGHT = 9, 10
-"""Reach of the ellipse on which alpha is ALPHA_MIN, along x and y, in pixels."""
+"""Half the size of the bounding box of the ellipse alpha = ALPHA_MIN, in pixels."""
 SLOPE, RISE, X_OF_TOP = 11, 12, 13
-"""At dx from the mean that ellipse lies between dy = SLOPE dx ± RISE sqrt(1 − (dx / HALF_WIDTH)²); its
-greatest dy, HALF_HEIGHT, is at dx = X_OF_TOP."""
+"""At offset dx this ellipse spans dy = SLOPE dx ± RISE sqrt(1 − (dx / HALF_WIDTH)²). Its maximum, dy =
+HALF_HEIGHT, is at dx = X_OF_TOP."""
 DEPTH = 14
 """Along the camera's z axis."""
 COLUMNS = 16
 """A row is one cache line of 64 bytes."""
 
-# The columns of what blending's backward pass sums up for a splat, with sigma = -ln(alpha / opacity) and
-# (dx, dy) = pixel − mean: g = d loss / d sigma, its moments, and d loss / d colour.
+# Columns of the sums of blending's backward pass, with sigma = -ln(alpha / opacity) and (dx, dy) = pixel −
+# mean: g = d loss / d sigma, its moments, and d loss / d colour.
 G, G_DX, G_DY, G_DXDX, G_DXDY, G_DYDY, G_RED, G_GREEN, G_BLUE = range(9)
 SUMS = 9
 
 GRAIN = 1024
-"""How many splats a thread takes at a time."""
-AHEAD = 8
-"""So many splats ahead memory is asked for what lies apart: splats that weights leave, sums of pairs."""
+"""Splats in a thread's unit of work."""
+PREFETCH = 8
+"""Prefetch distance in splats, for data that is scattered in memory: selected splats and sums of pairs."""
 ZERO, HALF, ONE, TWO = f32(0), f32(0.5), f32(1), f32(2)
 MARGIN = f32(1 / 64)
-"""Pixels by which the ellipse's rows and columns are taken too far, against rounding."""
+"""Pixels by which the ellipse's rows and columns are extended against rounding."""
 ALPHA_MIN32, DILATION32, MIP_VARIANCE32 = f32(ALPHA_MIN), f32(DILATION), f32(MIP_VARIANCE)
 LOG2_E, LN2 = f32(math.log2(math.e)), f32(math.log(2))
 
@@ -52,32 +52,32 @@ sh_basis = inlined(FAST)(harmonics.basis)
 sh_basis_gradient = inlined(FAST)(harmonics.basis_gradient)
 
 
-def lens_of(view: KernelCamera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The view as the kernels take it, float32: pose (3, 4), lens (9,) and eye (3,)."""
+def kernel_arguments(view: KernelCamera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Convert a view to float32 kernel arguments: pose (3, 4), lens (9,) and camera position (3,)."""
     pose = np.column_stack([view.rotation, view.translation]).astype(np.float32)
     lens = [view.fx, view.fy, view.cx, view.cy, *view.x_limits, *view.y_limits, view.near]
-    return np.ascontiguousarray(pose), np.array(lens, np.float32), view.eye.astype(np.float32)
+    return np.ascontiguousarray(pose), np.array(lens, np.float32), view.position.astype(np.float32)
 
 
 @inlined(FAST)
 def to_camera(pose, axis, mean):
-    """A point's coordinate along one of a camera's axes (world_to_camera (4, 4))."""
+    """Return a point's coordinate along one axis of a camera."""
     return pose[axis, 0] * mean[0] + pose[axis, 1] * mean[1] + pose[axis, 2] * mean[2] + pose[axis, 3]
 
 
 @inlined(FAST)
 def clamp(value, low, high):
-    """The value, kept between two bounds."""
+    """Clamp a value to a range."""
     return min(max(value, low), high)
 
 
 @inlined(FAST)
 def strip_rows(row, left, across, top, rows):
-    """The first row and one past the last that a splat's ellipse reaches in a strip of pixel columns.
+    """Return the first row and one past the last that a splat's ellipse reaches in a strip of pixel columns.
 
-    The strip's pixel centres lie between x = ``left`` and ``left + across``; its rows are at y = ``top``,
-    ``top`` + 1, … The ellipse is convex, so its greatest dy in the strip is where the strip comes closest to
-    X_OF_TOP; and by symmetry with the least.
+    The strip's pixel centres lie between x = ``left`` and ``left + across``. Its rows are at y = ``top``,
+    ``top`` + 1, … The ellipse is convex, so its maximum dy in the strip is at the dx closest to X_OF_TOP, and
+    its minimum at the dx closest to −X_OF_TOP.
     """
     half_width = row[HALF_WIDTH] + MARGIN
     near = left - row[MEAN_X]
@@ -90,7 +90,7 @@ def strip_rows(row, left, across, top, rows):
     dy_high = row[SLOPE] * highest + row[RISE] * math.sqrt(max(ONE - high * high, ZERO))
     dy_low = row[SLOPE] * lowest - row[RISE] * math.sqrt(max(ONE - low * low, ZERO))
     middle = row[MEAN_Y] - top + ONE
-    # clamped before they become whole numbers: a mean and a reach may be of millions of pixels
+    # clamp before conversion to int: mean and size may be millions of pixels
     first = int(clamp(middle + dy_low - MARGIN, ZERO, f32(rows)))
     last = int(clamp(middle + dy_high + MARGIN, ZERO, f32(rows)))
     return first, max(first, last)
@@ -98,7 +98,7 @@ def strip_rows(row, left, across, top, rows):
 
 @inlined(FAST)
 def camera_axes(pose, quat, log_scale, min_scale, scale, axes):
-    """Write scale (3,) and axes M (3, 3); return the normalised quaternion and one over its length."""
+    """Fill scale (3,) and axes M (3, 3); return the normalised quaternion and its inverse length."""
     inverse = ONE / math.sqrt(quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2] + quat[3] * quat[3])
     w, x, y, z = quat[0] * inverse, quat[1] * inverse, quat[2] * inverse, quat[3] * inverse
     for k in range(3):
@@ -122,26 +122,26 @@ def camera_axes(pose, quat, log_scale, min_scale, scale, axes):
 @kernel(FAST)
 def project_forward(
     begin, end, means, quats, log_scales, opacity_logits, sh, weights,
-    pose, lens, eye, width, height, degree, min_scale, antialias,
-    some, depths, projected, radii,
+    pose, lens, camera_position, width, height, degree, min_scale, antialias,
+    index, depths, projected, radii,
 ):  # fmt: skip
-    """Project the splats ``some`` (M,): fill depths (M,), 0 for those not drawn, and of the others the rows
-    of projected (M, COLUMNS) and radii (N,).
+    """Project the splats at ``index`` (M,).
 
-    ``weights`` is empty where all are one; ``antialias`` has one entry for all, or N.
+    Fill depths (M,), with 0 for splats that are not drawn, and for drawn splats the rows of projected
+    (M, COLUMNS) and radii (N,). ``weights`` is empty if all are 1. ``antialias`` has one entry, or N.
     """
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
     scale = np.empty(3, np.float32)
     axes = np.empty((3, 3), np.float32)
     basis = np.empty(25, np.float32)
     for k in range(begin, end):
-        i = some[k]
-        ahead = some[min(k + AHEAD, some.shape[0] - 1)]
-        fetch_ahead(means, ahead, 0)
-        fetch_ahead(quats, ahead, 0)
-        fetch_ahead(log_scales, ahead, 0)
+        i = index[k]
+        ahead = index[min(k + PREFETCH, index.shape[0] - 1)]
+        prefetch(means, ahead, 0)
+        prefetch(quats, ahead, 0)
+        prefetch(log_scales, ahead, 0)
         for line in range((sh.shape[1] * 3 + 15) // 16):
-            fetch_ahead(sh, ahead, line)
+            prefetch(sh, ahead, line)
         depths[k] = ZERO
         weight = weights[i] if weights.shape[0] > 0 else ONE
         mean = means[i]
@@ -205,7 +205,7 @@ def project_forward(
             uv / yy * half_height,
         )
 
-        dx, dy, dz = mean[0] - eye[0], mean[1] - eye[1], mean[2] - eye[2]
+        dx, dy, dz = mean[0] - camera_position[0], mean[1] - camera_position[1], mean[2] - camera_position[2]
         inverse = ONE / math.sqrt(dx * dx + dy * dy + dz * dz)
         sh_basis(dx * inverse, dy * inverse, dz * inverse, degree, basis)
         red, green, blue = HALF, HALF, HALF
@@ -219,7 +219,7 @@ def project_forward(
 
 @kernel(FAST)
 def gather_weights(begin, end, first_pair, pair_count, pair_row, pair_weights, weights):
-    """Fill weights (M, 3) from (P, 3): the largest of the first column, the sums of the others."""
+    """Reduce pair_weights (P, 3) to weights (M, 3): maximum of the first column, sums of the others."""
     for i in range(begin, end):
         largest, total, pixels = ZERO, ZERO, ZERO
         for pair in range(first_pair[i], first_pair[i] + pair_count[i]):
@@ -230,7 +230,7 @@ def gather_weights(begin, end, first_pair, pair_count, pair_row, pair_weights, w
 
 @kernel(FAST)
 def gather_sums(begin, end, first_pair, pair_count, pair_row, pair_sums, sums):
-    """Add what a splat's pairs hold, (P, K), to the splat's row of sums (M, K)."""
+    """Add the rows of a splat's pairs in pair_sums (P, K) to the splat's row of sums (M, K)."""
     for i in range(begin, end):
         if pair_count[i] > 0:
             for pair in range(first_pair[i], first_pair[i] + pair_count[i]):
@@ -240,10 +240,11 @@ def gather_sums(begin, end, first_pair, pair_count, pair_row, pair_sums, sums):
 
 @inlined(FAST)
 def covariance_gradient(row, sums):
-    """d loss / d (xx, xy, yy) of cov, where the two off-diagonal entries are one variable.
+    """Compute d loss / d (xx, xy, yy) of cov; the two off-diagonal entries are one variable.
 
     d loss / d conic = H with H_xx = ½ Σ g dx², H_xy = ½ Σ g dx dy (each of the two), H_yy = ½ Σ g dy²; and as
-    conic = cov⁻¹, d loss / d cov = −conic H conic. In float64: for a needle these products nearly cancel.
+    conic = cov⁻¹, d loss / d cov = −conic H conic. In float64, because these products nearly cancel for
+    needles.
     """
     ln2 = math.log(2.0)
     a, b, c = 2 * ln2 * row[CONIC_XX], ln2 * row[CONIC_XY], 2 * ln2 * row[CONIC_YY]
@@ -259,9 +260,10 @@ def covariance_gradient(row, sums):
 
 @inlined(FAST)
 def area_gradient(axes, j0, j2, k1, k2, by_log, by_area):
-    """The gradient of ln |u × v| by u and v, (2, 3), times by_log: (v × c, c × u) / |c|² with c = u × v.
+    """Fill by_area (2, 3) with the gradient of ln |u × v| by u and v, times by_log.
 
-    u and v are the rows of J M; that their cross product comes first keeps needles from cancelling.
+    The gradient is (v × c, c × u) / |c|² with c = u × v; u and v are the rows of J M. Computing the cross
+    product first avoids cancellation for needles.
     """
     u0, v0 = j0 * axes[0, 0] + j2 * axes[2, 0], k1 * axes[1, 0] + k2 * axes[2, 0]
     u1, v1 = j0 * axes[0, 1] + j2 * axes[2, 1], k1 * axes[1, 1] + k2 * axes[2, 1]
@@ -275,7 +277,7 @@ def area_gradient(axes, j0, j2, k1, k2, by_log, by_area):
 
 @inlined(FAST)
 def quat_gradient(w, x, y, z, inverse, by_rotation, gradient):
-    """d loss / d quat (4,) from d loss / d Q (3, 3): entries of Q differentiated, then the normalisation."""
+    """Compute d loss / d quat (4,) from d loss / d Q (3, 3), including the normalisation."""
     r = by_rotation
     by_w = TWO * (x * (r[2, 1] - r[1, 2]) + y * (r[0, 2] - r[2, 0]) + z * (r[1, 0] - r[0, 1]))
     by_x = -TWO * x * (r[1, 1] + r[2, 2]) + y * (r[0, 1] + r[1, 0]) + z * (r[0, 2] + r[2, 0])
@@ -294,12 +296,11 @@ def quat_gradient(w, x, y, z, inverse, by_rotation, gradient):
 @kernel(FAST)
 def project_backward(
     begin, end, means, quats, log_scales, opacity_logits, sh, weights,
-    pose, lens, eye, width, height, degree, min_scale, antialias,
-    some, projected, first_pair, pair_count, pair_row, pair_sums,
+    pose, lens, camera_position, width, height, degree, min_scale, antialias,
+    index, projected, first_pair, pair_count, pair_row, pair_sums,
     by_means, by_quats, by_log_scales, by_logits, by_sh, by_weights, grad2d,
 ):  # fmt: skip
-    """Fill the gradients of every parameter of the splats ``some``, and their grad2d, from the sums that
-    blending left per pair."""
+    """Fill the gradients of the parameters and grad2d of the splats at ``index`` from the pairs' sums."""
     fx, fy = lens[0], lens[1]
     scale = np.empty(3, np.float32)
     axes = np.empty((3, 3), np.float32)
@@ -311,14 +312,14 @@ def project_backward(
     basis_x = np.empty(25, np.float32)
     basis_y = np.empty(25, np.float32)
     basis_z = np.empty(25, np.float32)
-    count = some.shape[0]
+    count = index.shape[0]
     for s in range(begin, end):
-        i = some[s]
-        ahead = min(s + 2 * AHEAD, count - 1)
-        fetch_ahead(pair_row, first_pair[ahead], 0)
-        ahead = min(s + AHEAD, count - 1)
+        i = index[s]
+        ahead = min(s + 2 * PREFETCH, count - 1)
+        prefetch(pair_row, first_pair[ahead], 0)
+        ahead = min(s + PREFETCH, count - 1)
         for pair in range(first_pair[ahead], first_pair[ahead] + pair_count[ahead]):
-            fetch_ahead(pair_sums, pair_row[pair], 0)
+            prefetch(pair_sums, pair_row[pair], 0)
         if pair_count[s] == 0:
             for k in range(3):
                 by_means[i, k], by_log_scales[i, k] = ZERO, ZERO
@@ -349,7 +350,7 @@ def project_backward(
         grad2d[i, 0], grad2d[i, 1] = ndc_x, ndc_y
 
         if antialias[min(i, antialias.shape[0] - 1)]:
-            # opacity has the factor |u × v| / sqrt(det cov): its logarithm's gradient by u, v and det cov
+            # opacity has the factor |u × v| / sqrt(det cov): differentiate its logarithm by u, v and det cov
             by_log = -sums[G]
             area_gradient(axes, j0, j2, k1, k2, by_log, by_area)
             by_xx -= by_log * LN2 * row[CONIC_XX]
@@ -371,7 +372,7 @@ def project_backward(
             by_k2 += by_v * axes[2, k]
             by_axes[0, k], by_axes[1, k], by_axes[2, k] = j0 * by_u, k1 * by_v, j2 * by_u + k2 * by_v
 
-        # the mean is in its projection, fx x/z + cx, and in j0 = fx/z and j2 = −fx ratio_x/z,
+        # the mean affects its projection fx x/z + cx, and j0 = fx/z and j2 = −fx ratio_x/z,
         by_x, by_y = by_mean_x * j0, by_mean_y * k1
         by_z = -(by_x * x + by_y * y + by_j0 * j0 + by_j2 * j2 + by_k1 * k1 + by_k2 * k2) * rz
         # where ratio_x = x/z unless it is clamped
@@ -405,7 +406,7 @@ def project_backward(
         red = sums[G_RED] if row[RED] > ZERO else ZERO
         green = sums[G_GREEN] if row[GREEN] > ZERO else ZERO
         blue = sums[G_BLUE] if row[BLUE] > ZERO else ZERO
-        dx, dy, dz = mean[0] - eye[0], mean[1] - eye[1], mean[2] - eye[2]
+        dx, dy, dz = mean[0] - camera_position[0], mean[1] - camera_position[1], mean[2] - camera_position[2]
         per_length = ONE / math.sqrt(dx * dx + dy * dy + dz * dz)
         dx, dy, dz = dx * per_length, dy * per_length, dz * per_length
         sh_basis(dx, dy, dz, degree, basis)
@@ -424,7 +425,7 @@ def project_backward(
             by_dz += by_basis * basis_z[k]
         for k in range(active, sh.shape[1]):
             by_sh[i, k, 0], by_sh[i, k, 1], by_sh[i, k, 2] = ZERO, ZERO, ZERO
-        # direction = (mean − eye) / length: only the part across the direction moves it
+        # direction = (mean − camera position) / length: only the perpendicular component changes it
         along = by_dx * dx + by_dy * dy + by_dz * dz
         by_means[i, 0] = (by_dx - along * dx) * per_length
         by_means[i, 1] = (by_dy - along * dy) * per_length

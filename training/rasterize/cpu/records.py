@@ -1,4 +1,4 @@
-"""Splats in records with Adam's moments: what is drawn of them, and the step that they make."""
+"""Kernels that gather and update records of splats; see ``rasterize.records``."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from .adam import moved
+from .adam import adam_change
 from .compile import STRICT, f32, inlined, kernel, run_parallel, serialised
 
 _GRAIN = 1 << 12
@@ -29,11 +29,11 @@ def _gather(begin, end, records, width, places, means, quats, log_scales, opacit
 
 @inlined(STRICT)
 def _move(records, first, count, extent, gradient, place, lr, keep, keep_m, keep_v, scale_v, eps):
-    """Values of a record from ``first`` of its ``count`` on, by a gradient's from ``place`` on."""
+    """Update ``extent`` values of a record from ``first`` on; their gradient begins at ``place``."""
     m, v = records[count:], records[2 * count :]
     for j in range(extent):
         g = gradient[place + j]
-        records[first + j] -= moved(first + j, g, m, v, lr[j] / keep, keep_m, keep_v, scale_v, eps)
+        records[first + j] -= adam_change(first + j, g, m, v, lr[j] / keep, keep_m, keep_v, scale_v, eps)
 
 
 @kernel(STRICT)
@@ -41,42 +41,42 @@ def _step(
     begin, end, records, width, places, means, quats, log_scales, opacity_logits, sh, grad2d, radii, number,
     lr, shares, bias_m, bias_v, keep_m, keep_v, eps,
 ):  # fmt: skip
-    """All arrays flat."""
+    """Update flat arrays."""
     count = lr.shape[0]
     terms = count - 11
     for k in range(begin, end):
         if radii[k] <= 0:
             continue
         i = places[k] * width
-        told = i + 3 * count
+        stats = i + 3 * count
         x, y = grad2d[2 * k], grad2d[2 * k + 1]
         opacity = 1 / (1 + np.exp(-records[i + 10]))
         score = np.sqrt(x * x + y * y) * radii[k] * opacity ** f32(0.2)
-        records[told + 1] = max(records[told + 1], score)
-        records[told + 2] = number
+        records[stats + 1] = max(records[stats + 1], score)
+        records[stats + 2] = number
         if shares[k] == 0:
             continue
-        records[told] += f32(1)
-        made = int(records[told])
-        keep, scale_v = bias_m[made] / shares[k], bias_v[made]
-        rest = keep, keep_m, keep_v, scale_v, eps
-        _move(records, i, count, 3, means, 3 * k, lr, *rest)
-        _move(records, i + 3, count, 4, quats, 4 * k, lr[3:], *rest)
-        _move(records, i + 7, count, 3, log_scales, 3 * k, lr[7:], *rest)
-        _move(records, i + 10, count, 1, opacity_logits, k, lr[10:], *rest)
-        _move(records, i + 11, count, terms, sh, terms * k, lr[11:], *rest)
+        records[stats] += f32(1)
+        steps = int(records[stats])
+        keep, scale_v = bias_m[steps] / shares[k], bias_v[steps]
+        constants = keep, keep_m, keep_v, scale_v, eps
+        _move(records, i, count, 3, means, 3 * k, lr, *constants)
+        _move(records, i + 3, count, 4, quats, 4 * k, lr[3:], *constants)
+        _move(records, i + 7, count, 3, log_scales, 3 * k, lr[7:], *constants)
+        _move(records, i + 10, count, 1, opacity_logits, k, lr[10:], *constants)
+        _move(records, i + 11, count, terms, sh, terms * k, lr[11:], *constants)
 
 
 @lru_cache(4)
 def _corrections(betas: tuple[float, float], count: int) -> tuple[np.ndarray, np.ndarray]:
-    """1 - b1^t and 1 / (1 - b2^t), (count,) float32, of t from 0, which is no step's number."""
+    """Return 1 - b1^t and 1 / (1 - b2^t), (count,) float32, for t from 0; entry 0 is unused."""
     first, second = (1 - np.power(beta, np.arange(count)) for beta in betas)
     first[0] = second[0] = 1
     return first.astype(np.float32), (1 / second).astype(np.float32)
 
 
 def gather(records, places, arrays) -> None:
-    """Copies the values of records (N, width) at places (M,) int64 to arrays (M, ...), in their order."""
+    """Copy the values of records (N, width) at ``places`` (M,) int64 to arrays (M, ...)."""
     *arrays, sh = arrays
     sh = sh.reshape(len(places), 3 * sh.shape[1])
     run_parallel(_gather, len(places), _GRAIN, records.reshape(-1), records.shape[1], places, *arrays, sh)
@@ -84,10 +84,10 @@ def gather(records, places, arrays) -> None:
 
 @serialised
 def step(records, places, gradients, grad2d, radii, number, lr, shares, betas, eps) -> None:
-    """As ``rasterize.records.step``, of arrays."""
-    made = _corrections(betas, 1 << int(number + 1).bit_length())
+    """Make one Adam step on arrays; see ``rasterize.records.adam_step``."""
+    corrections = _corrections(betas, 1 << int(number + 1).bit_length())
     flat = (array.reshape(-1) for array in (*gradients, grad2d))
     run_parallel(
         _step, len(places), _GRAIN, records.reshape(-1), records.shape[1], places, *flat, radii, f32(number),
-        lr, shares, *made, f32(betas[0]), f32(betas[1]), f32(eps),
+        lr, shares, *corrections, f32(betas[0]), f32(betas[1]), f32(eps),
     )  # fmt: skip

@@ -1,11 +1,11 @@
-"""The rasterizer on any graphics device: compute shaders in WGSL through wgpu, gradients by hand.
+"""Rasterizer for any graphics device: WGSL compute shaders through wgpu, with analytic gradients.
 
-As the cpu backend: ``project`` makes ellipses of splats, ``bin`` sorts them into tiles, ``blend`` makes
-pixels of them, and gradients are summed in a row of their own for each pair of splat and tile, then in a
-fixed order for each splat. So nothing is added by atomics, and a device gives the same bits every time.
+The stages are those of the cpu backend: ``project`` projects splats to ellipses, ``bin`` sorts them into
+tiles and ``blend`` renders pixels. Gradients are first summed per pair of splat and tile, then per splat in a
+fixed order. No atomics add floats, so a device gives the same bits every time.
 
-Tensors live on the CPU. What a picture needs is copied to the device, and what comes of it back. In training,
-plain splats can stay there (``twin``).
+Tensors are on the CPU. The inputs of an image are copied to the device, and the results back. In training,
+plain splats can stay on the device (``device_model``).
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from ..rendering import BackendOutput, RasterSettings, SideOutputs, Target, requ
 from .bin import TILE
 from .default_device import open_default_device
 from .device import Buffer, Device
-from .device_model import COLUMNS, STATS, GpuModel, packed
+from .device_model import COLUMNS, STATS, GpuModel, pack_splats
 from .loss import loss_and_gradient
-from .scene import BY_SPLAT, GEOMETRY, SUMS, Scene
+from .scene import BY_SPLAT, GEOMETRY, SUMS, ProjectedScene
 
 
 def rasterize(
     gaussians: Gaussians, weights: torch.Tensor | None, features: torch.Tensor, settings: RasterSettings
 ) -> BackendOutput:
-    """See :func:`training.rasterize.rasterize`. Tensors are float32 on the CPU; ValueError otherwise.
+    """See :func:`training.rasterize.rasterize`. Raise ValueError unless tensors are float32 on the CPU.
 
     Raises:
-        LodgsError: there is no device, it was lost, or has too little memory.
+        LodgsError: no device is available, or it was lost or has too little memory.
     """
     count = len(gaussians)
     weights = torch.ones(0) if weights is None else weights
@@ -50,15 +50,18 @@ def rasterize(
 def contributions(
     gaussians: Gaussians, weights: torch.Tensor | None, settings: RasterSettings
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """See :func:`training.rasterize.contributions`: of one view, the largest, the sum, pixels and radii."""
-    count, device = len(gaussians), open_default_device()
+    """Return largest weights, sums, pixel counts and radii of one view; see :mod:`training.rasterize`."""
+    count = len(gaussians)
+    device = open_default_device()
     gaussians = replace(gaussians, sh=gaussians.means.new_zeros(count, 1, 3))
     weights = torch.ones(0) if weights is None else weights
     with device.lock:
-        scene, some = _scene_of(device, [*vars(gaussians).values(), weights], settings)
-        everywhere, radii = np.zeros((count, 3), np.float32), np.zeros(count, np.float32)
-        everywhere[some], radii[some] = device.read(scene.weigh()), device.read(scene.radii)
-    largest, total, pixels = torch.from_numpy(everywhere).unbind(1)
+        scene, index = _upload_scene(device, [*vars(gaussians).values(), weights], settings)
+        all_weights = np.zeros((count, 3), np.float32)
+        radii = np.zeros(count, np.float32)
+        all_weights[index] = device.read(scene.weigh())
+        radii[index] = device.read(scene.radii)
+    largest, total, pixels = torch.from_numpy(all_weights).unbind(1)
     return largest, total, pixels.long(), torch.from_numpy(radii)
 
 
@@ -77,80 +80,81 @@ def photometric_loss(image: torch.Tensor, target: Target, ssim_weight: float) ->
 
 
 class _Rasterize(torch.autograd.Function):
-    """Features are blended as colours are, three to a pass that leaves everything else as it was."""
+    """Rasterization as an autograd function; extra passes blend features like colours, three at a time."""
 
     @staticmethod
     def forward(ctx, means, quats, log_scales, logits, sh, weights, features, settings, side):
-        tensors, device, view = (
-            [means, quats, log_scales, logits, sh, weights],
-            open_default_device(),
-            settings.view,
-        )
+        tensors = [means, quats, log_scales, logits, sh, weights]
+        device = open_default_device()
+        view = settings.view
         with device.lock:
-            scene, some = _scene_of(device, tensors, settings)
+            scene, index = _upload_scene(device, tensors, settings)
             limit = np.zeros(1, np.float32)
-            if settings.limit is not None:  # not every device knows an infinity
-                most = torch.finfo(torch.float32).max
-                limit = settings.limit.to(torch.float32).clamp_max(most).numpy()
-            limit, walked = device.upload(limit), device.empty(np.uint32, *scene.ranges.shape)
+            if settings.limit is not None:  # not every device supports infinity
+                maximum = torch.finfo(torch.float32).max
+                limit = settings.limit.to(torch.float32).clamp_max(maximum).numpy()
+            limit = device.upload(limit)
+            visited = device.empty(np.uint32, *scene.ranges.shape)
             median = device.empty(np.int32, view.height, view.width)
-            shades = [scene.colours, *_as_colours(device, features.detach().numpy()[some])]
-            pictures = [device.empty(np.float32, view.height, view.width, 4) for _ in shades]
-            for k, (shade, picture) in enumerate(zip(shades, pictures, strict=True)):
+            shades = [scene.colours, *_as_colours(device, features.detach().numpy()[index])]
+            images = [device.empty(np.float32, view.height, view.width, 4) for _ in shades]
+            for k, (shade, image) in enumerate(zip(shades, images, strict=True)):
                 scene.draw(
                     (0.0, 0.0, 0.0) if k else settings.background, settings.limit is not None,
-                    colours=shade, limit=limit, drawn=picture, walked=walked, median=median,
+                    colours=shade, limit=limit, drawn=image, visited=visited, median=median,
                 )  # fmt: skip
-            drawn, *blended = (torch.from_numpy(device.read(picture)) for picture in pictures)
-            side.radii.numpy()[some] = device.read(scene.radii)
+            drawn, *blended = (torch.from_numpy(device.read(image)) for image in images)
+            side.radii.numpy()[index] = device.read(scene.radii)
             begin, end = device.read(scene.ranges).astype(np.int64).T
             side.tile_counts.numpy()[:] = (end - begin).reshape(side.tile_counts.shape)
             if side.median is not None:
-                found = device.read(median)
-                side.median.numpy()[:] = np.append(some, -1)[found]
+                side.median.numpy()[:] = np.append(index, -1)[device.read(median)]
         ctx.save_for_backward(*tensors)
-        ctx.rest = scene, some, shades, pictures, walked, settings, side
-        blended = [drawn[..., :0], *(each[..., :3] for each in blended)]
+        ctx.saved = scene, index, shades, images, visited, settings, side
+        blended = [drawn[..., :0], *(image[..., :3] for image in blended)]
         features = torch.cat(blended, 2)[..., : features.shape[1]]
         return drawn[..., :3].contiguous(), 1 - drawn[..., 3], features.contiguous()
 
     @staticmethod
     def backward(ctx, by_image, by_alpha, by_features):
-        scene, some, shades, pictures, walked, settings, side = ctx.rest
-        device, count = scene.device, scene.count
+        scene, index, shades, images, visited, settings, side = ctx.saved
+        device = scene.device
+        count = scene.count
         sums = device.empty(np.float32, count, SUMS)
         by_shades = [device.empty(np.float32, count, 3) for _ in shades]
         with device.lock:
-            for k, (shade, picture, by_shade) in enumerate(zip(shades, pictures, by_shades, strict=True)):
-                by_picture = np.zeros(picture.shape, np.float32)
+            for k, (shade, image, by_shade) in enumerate(zip(shades, images, by_shades, strict=True)):
+                output_gradient = np.zeros(image.shape, np.float32)
                 if k:
-                    three = by_features[..., 3 * k - 3 : 3 * k]
-                    by_picture[..., : three.shape[2]] = three
+                    triple = by_features[..., 3 * k - 3 : 3 * k]
+                    output_gradient[..., : triple.shape[2]] = triple
                 else:
-                    by_picture[..., :3], by_picture[..., 3] = by_image, by_alpha
+                    output_gradient[..., :3] = by_image
+                    output_gradient[..., 3] = by_alpha
                 scene.differentiate(
-                    GEOMETRY if k else SUMS, settings.absolute and k == 0, sums, by_shade, walked,
-                    colours=shade, picture=picture, by_picture=device.upload(by_picture),
+                    GEOMETRY if k else SUMS, settings.absolute and k == 0, sums, by_shade, visited,
+                    colours=shade, image=image, by_image=device.upload(output_gradient),
                 )  # fmt: skip
             by_splats = device.empty(np.float32, count, BY_SPLAT)
             by_sh = device.empty(np.float32, *scene.sh.shape)
             scene.backward(sums, by_shades[0], by_splats, by_sh)
-            found, of_sh = device.read(by_splats), device.read(by_sh)
-            of_features = [device.read(by_shade) for by_shade in by_shades[1:]]
+            splat_gradients = device.read(by_splats)
+            sh_gradients = device.read(by_sh)
+            feature_gradients = [device.read(by_shade) for by_shade in by_shades[1:]]
         gradients = [torch.zeros_like(tensor, requires_grad=False) for tensor in ctx.saved_tensors]
         parts = [slice(0, 3), slice(4, 8), slice(8, 11), 3]
         for gradient, part in zip(gradients, parts, strict=False):
-            gradient.numpy()[some] = found[:, part]
-        gradients[4].numpy()[some, : of_sh.shape[1]] = of_sh
+            gradient.numpy()[index] = splat_gradients[:, part]
+        gradients[4].numpy()[index, : sh_gradients.shape[1]] = sh_gradients
         if len(gradients[5]):
-            gradients[5].numpy()[some] = found[:, 11]
-        side.grad2d.numpy()[some] = found[:, 12:14]
+            gradients[5].numpy()[index] = splat_gradients[:, 11]
+        side.grad2d.numpy()[index] = splat_gradients[:, 12:14]
         if side.absgrad2d is not None:
-            side.absgrad2d.numpy()[some] = found[:, 14:16]
-        of_all = np.zeros((len(gradients[0]), by_features.shape[2]), np.float32)
-        if of_features:
-            of_all[some] = np.concatenate(of_features, 1)[:, : by_features.shape[2]]
-        return *gradients, torch.from_numpy(of_all), None, None
+            side.absgrad2d.numpy()[index] = splat_gradients[:, 14:16]
+        all_features = np.zeros((len(gradients[0]), by_features.shape[2]), np.float32)
+        if feature_gradients:
+            all_features[index] = np.concatenate(feature_gradients, 1)[:, : by_features.shape[2]]
+        return *gradients, torch.from_numpy(all_features), None, None
 
 
 class _Photometric(torch.autograd.Function):
@@ -161,8 +165,8 @@ class _Photometric(torch.autograd.Function):
             if target.cache.get("gpu", (None,))[0] is not device:
                 target.cache["gpu"] = device, device.upload(_planes(target.image.float()))
             _, truth = target.cache["gpu"]
-            shown = device.upload(_planes(image.detach()))
-            loss, gradient = loss_and_gradient(device, shown, truth, ssim_weight)
+            planes = device.upload(_planes(image.detach()))
+            loss, gradient = loss_and_gradient(device, planes, truth, ssim_weight)
             ctx.gradient = torch.from_numpy(device.read(gradient)).permute(1, 2, 0).contiguous()
         return torch.tensor(loss, dtype=torch.float32)
 
@@ -171,34 +175,34 @@ class _Photometric(torch.autograd.Function):
         return (ctx.gradient if by_loss == 1 else ctx.gradient * by_loss), None, None
 
 
-def _scene_of(
+def _upload_scene(
     device: Device, tensors: list[torch.Tensor], settings: RasterSettings
-) -> tuple[Scene, np.ndarray]:
-    """Those splats that have a weight and are looked at, copied to a device, and which (M,) they are.
+) -> tuple[ProjectedScene, np.ndarray]:
+    """Copy the considered splats with positive weight to a device; return their scene and indices (M,).
 
     Args:
-        tensors: means, quats, log-scales, logits, coefficients and weights; the last are empty for ones.
+        tensors: means, quats, log-scales, logits, coefficients and weights; weights are empty if all are 1.
     """
     arrays = [tensor.detach().numpy() for tensor in tensors]
     weights = arrays[-1]
-    some = np.arange(len(arrays[0])) if settings.rows is None else settings.rows.numpy()
-    some = some[weights[some] > 0] if len(weights) else some
-    filtered = np.broadcast_to(np.asarray(settings.antialias), len(arrays[0]))[some]
-    weights = weights[some] if len(weights) else 1
-    splats = packed(*(array[some] for array in arrays[:4]), weights=weights, filtered=filtered)
-    sh = device.upload(arrays[4][some, : (settings.degree + 1) ** 2])
-    return Scene.of(device, device.upload(splats), sh, settings), some
+    index = np.arange(len(arrays[0])) if settings.rows is None else settings.rows.numpy()
+    index = index[weights[index] > 0] if len(weights) else index
+    filtered = np.broadcast_to(np.asarray(settings.antialias), len(arrays[0]))[index]
+    weights = weights[index] if len(weights) else 1
+    splats = pack_splats(*(array[index] for array in arrays[:4]), weights=weights, filtered=filtered)
+    sh = device.upload(arrays[4][index, : (settings.degree + 1) ** 2])
+    return ProjectedScene.of(device, device.upload(splats), sh, settings), index
 
 
 def _planes(image: torch.Tensor) -> np.ndarray:
-    """(3, H, W) of an image (H, W, 3)."""
+    """Convert an image (H, W, 3) to planes (3, H, W)."""
     return image.permute(2, 0, 1).numpy()
 
 
 def _as_colours(device: Device, features: np.ndarray) -> list[Buffer]:
-    """Features (M, F) as colours (M, 4), three at a time, zeros where they run out."""
-    found = []
+    """Upload features (M, F) as colours (M, 4), three per buffer, padded by zeros."""
+    buffers = []
     for first in range(0, features.shape[1], 3):
-        three = features[:, first : first + 3]
-        found.append(device.upload(np.pad(three, ((0, 0), (0, 4 - three.shape[1])))))
-    return found
+        triple = features[:, first : first + 3]
+        buffers.append(device.upload(np.pad(triple, ((0, 0), (0, 4 - triple.shape[1])))))
+    return buffers

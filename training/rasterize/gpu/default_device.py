@@ -1,4 +1,4 @@
-"""Which graphics device the gpu backend draws on."""
+"""Select the graphics device of the gpu backend."""
 
 from __future__ import annotations
 
@@ -8,35 +8,35 @@ from ...errors import LodgsError
 from .device import Adapter, Device, adapters, open_device
 
 VARIABLE = "LODGS_GPU"
-"""Environment variable with the name of the device to use, or a part of it; or "software"."""
+"""Environment variable with the name of the device, a part of its name, or "software"."""
 
 
 def default_adapter() -> Adapter:
-    """The device that is used: the one that ``LODGS_GPU`` names, else the best that is no software.
+    """Return the device that ``LODGS_GPU`` names, or the best device that is not software.
 
     Raises:
-        LodgsError: there is none.
+        LodgsError: no such device exists.
     """
-    wanted, found = os.environ.get(VARIABLE, "").strip().casefold(), adapters()
-    for adapter in found:
-        if wanted in (adapter.name.casefold(), adapter.kind):
+    name = os.environ.get(VARIABLE, "").strip().casefold()
+    available = adapters()
+    for adapter in available:
+        if name in (adapter.name.casefold(), adapter.kind):
             return adapter
-    for adapter in found:
-        if wanted in adapter.name.casefold() if wanted else not adapter.software:
+    for adapter in available:
+        if name in adapter.name.casefold() if name else not adapter.software:
             return adapter
-    names = ", ".join(adapter.name for adapter in found)
-    if wanted:
+    names = ", ".join(adapter.name for adapter in available)
+    if name:
         raise LodgsError(
-            f'There is no graphics device "{wanted}" here, as {VARIABLE} has it.', f"There are: {names}."
+            f'Cannot use graphics device "{name}" of {VARIABLE}: it does not exist.', f"Choose from: {names}."
         )
     raise LodgsError(
-        f"This computer has no graphics device that helps: {names} runs on the processor, slower than the "
-        "cpu backend.",
+        f"Cannot use the gpu backend: {names} runs on the CPU and is slower than the cpu backend.",
         "Train on the CPU (Training Device in Blender, backend = auto or cpu in a job), or install the GPU's "
         "driver.",
     )
 
 
 def open_default_device() -> Device:
-    """:func:`chosen`, opened once; LodgsError as there, or it cannot be opened."""
+    """Open :func:`default_adapter`; LodgsError if it does not exist or cannot be opened."""
     return open_device(default_adapter().name)

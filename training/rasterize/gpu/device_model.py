@@ -1,7 +1,7 @@
-"""Splats that are trained where they are drawn: a step moves a few numbers between computer and device.
+"""Train splats in device memory; a step transfers only a few numbers between host and device.
 
-A twin has the parameters of a model of splats, their moments and the statistics of density control on the
-device. Photographs stay there too, with eight bits a value, as long as their ``Target`` is kept here.
+A device model stores parameters, moments and density statistics on the device. Photos stay there too, with
+eight bits per value, as long as their ``Target`` exists.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ import torch
 from ...scenes.cameras import Camera
 from ..adam import Adam
 from ..rendering import KernelCamera, RasterSettings, Target
-from .bin import groups_of
+from .bin import group_count
 from .device import Buffer, Device
-from .loss import loss_of, sums_and_gradient
-from .scene import BY_SPLAT, SPLAT, SUMS, Scene
+from .loss import combine_loss, sums_and_gradient
+from .scene import BY_SPLAT, SPLAT, SUMS, ProjectedScene
 
 COLUMNS = {
     "means": slice(0, 3),
@@ -25,16 +25,16 @@ COLUMNS = {
     "quats": slice(4, 8),
     "log_scales": slice(8, 11),
 }
-"""Where a splat's numbers stand (project.wgsl)."""
+"""Columns of a splat's parameters (project.wgsl)."""
 TRAINED = 11
-"""So many of them are trained; the weight and the filter follow."""
+"""Number of trained columns; weight and filter flag follow."""
 STATS = ("gradient_sum", "seen", "gradient_max", "radius_max", "opacity_sum")
-"""The statistics that a device adds up (train.wgsl)."""
-STATE = ("_splats", "_sh", "_splat_moments", "_sh_moments", "_counted")
-"""A twin's buffers of what lasts from step to step."""
+"""Statistics that a device collects (train.wgsl)."""
+STATE = ("_splats", "_sh", "_splat_moments", "_sh_moments", "_stat_sums")
+"""Attributes with buffers that persist between steps."""
 
 
-def packed(
+def pack_splats(
     means: np.ndarray,
     quats: np.ndarray,
     log_scales: np.ndarray,
@@ -42,49 +42,54 @@ def packed(
     weights: np.ndarray | float,
     filtered: np.ndarray | bool,
 ) -> np.ndarray:
-    """(M, SPLAT) of arrays (M, ...) or, of the last two, of one number for all: as shaders take splats."""
-    found = np.empty((len(means), SPLAT), np.float32)
+    """Pack arrays (M, ...) to the splats (M, SPLAT) of shaders; the last two may be numbers."""
+    packed = np.empty((len(means), SPLAT), np.float32)
     for column, array in zip(COLUMNS.values(), (means, logits[:, None], quats, log_scales), strict=True):
-        found[:, column] = array
-    found[:, TRAINED], found[:, TRAINED + 1] = weights, filtered
-    return found
+        packed[:, column] = array
+    packed[:, TRAINED] = weights
+    packed[:, TRAINED + 1] = filtered
+    return packed
 
 
 class GpuModel:
-    """N splats on a device. What is here in the meantime is what they were; see :meth:`copy_to_host`.
+    """N splats in device memory; the host's copy is out of date until :meth:`copy_to_host`.
 
     Args:
-        adam: of what is trained, of which ``COLUMNS`` and ``sh`` go along.
-        stats: (N,) of each splat, by names of STATS; those that are brought home take their places.
-        antialias: as of ``rasterize``.
+        adam: optimizer whose tensors ``COLUMNS`` and ``sh`` are copied to the device.
+        stats: (N,) statistics by names of STATS; :meth:`copy_to_host` replaces them.
+        antialias: see ``rasterize``.
 
     Raises:
-        LodgsError: the device was lost, or has too little memory. Then what is here is still whole. Methods
+        LodgsError: the device was lost or has too little memory; the host's data is still valid. Methods
             raise it as the ``DeviceModel`` of :mod:`training.rasterize` says.
     """
 
     def __init__(
         self, device: Device, adam: Adam, stats: MutableMapping[str, torch.Tensor], antialias: bool
     ) -> None:
-        self.device, self._adam, self._stats, self._antialias = device, adam, stats, antialias
+        self.device = device
+        self._adam = adam
+        self._stats = stats
+        self._antialias = antialias
+        self._weighted = False
         arrays = {name: tensor.detach().numpy() for name, tensor in adam.tensors.items()}
         moments = {name: [m.numpy() for m in state] for name, state in adam.state.items()}
-        count, self._weighted = len(arrays["means"]), False
-        of_splats = np.empty((count, TRAINED, 2), np.float32)
+        count = len(arrays["means"])
+        splat_moments = np.empty((count, TRAINED, 2), np.float32)
         for name, column in COLUMNS.items():
             for k, moment in enumerate(moments[name]):
-                of_splats[:, column, k] = moment.reshape(count, -1)
-        counted = np.zeros((count, len(STATS)), np.float32)
+                splat_moments[:, column, k] = moment.reshape(count, -1)
+        stat_sums = np.zeros((count, len(STATS)), np.float32)
         for name, values in stats.items():
-            counted[:, STATS.index(name)] = values.numpy()
+            stat_sums[:, STATS.index(name)] = values.numpy()
         geometry = (arrays[name] for name in ("means", "quats", "log_scales", "opacity_logits"))
         with device.lock:
-            self._splats = device.upload(packed(*geometry, weights=1, filtered=antialias))
+            self._splats = device.upload(pack_splats(*geometry, weights=1, filtered=antialias))
             self._sh = device.upload(arrays["sh"])
-            self._splat_moments = device.upload(of_splats)
+            self._splat_moments = device.upload(splat_moments)
             self._sh_moments = device.upload(np.stack(moments["sh"], -1))
-            self._counted = device.upload(counted)
-            self._make_room()
+            self._stat_sums = device.upload(stat_sums)
+            self._allocate_gradients()
         self.drawn = device.empty(np.float32, 0, 0, 4)
 
     def __len__(self) -> int:
@@ -103,185 +108,198 @@ class GpuModel:
         min_scale: float = 0.0,
         shrink: float | None = None,
     ) -> float:
-        """One step by the photometric loss, which it returns.
+        """Make one step with the photometric loss, and return the loss.
 
         Args:
-            target: opaque and without a mask.
-            shrink: the statistics are added up, of a photograph that is so many times smaller; None: they
-                stay as they are.
-            others: as of ``rasterize`` and ``photometric_loss``.
+            target: opaque photo without a mask.
+            shrink: factor by which the photo was downscaled, for the statistics; None collects none.
+            camera, near, sh_degree, background, weights, min_scale: see ``rasterize``.
+            ssim_weight: see ``photometric_loss``.
 
         Raises:
-            LodgsError: the device was lost, or has too little memory. The splats are lost with it.
+            LodgsError: the device was lost or has too little memory. The splats are lost with it.
         """
-        device, count = self.device, len(self)
+        device = self.device
+        count = len(self)
         settings = RasterSettings(
             KernelCamera.of(camera, near), min_scale, self._antialias, background, sh_degree
         )
         with device.lock:
-            self._weigh(weights)
-            scene = Scene.of(device, self._splats, self._sh, settings)
+            self._set_weights(weights)
+            scene = ProjectedScene.of(device, self._splats, self._sh, settings)
             size = camera.height, camera.width
-            self.drawn, walked = (
-                device.empty(np.float32, *size, 4), device.empty(np.uint32, *scene.ranges.shape),
-            )  # fmt: skip
+            self.drawn = device.empty(np.float32, *size, 4)
+            visited = device.empty(np.uint32, *scene.ranges.shape)
             scene.draw(
-                background, False, colours=scene.colours, walked=walked, drawn=self.drawn,
+                background, False, colours=scene.colours, visited=visited, drawn=self.drawn,
                 limit=device.empty(np.float32, 1), median=device.empty(np.int32, *size),
             )  # fmt: skip
-            told, by_picture = self._loss(target, ssim_weight)
+            sums_of_loss, by_image = self._loss(target, ssim_weight)
             sums, by_colours = device.empty(np.float32, count, SUMS), device.empty(np.float32, count, 3)
             scene.differentiate(
-                SUMS, False, sums, by_colours, walked, colours=scene.colours, picture=self.drawn,
-                by_picture=by_picture,
+                SUMS, False, sums, by_colours, visited, colours=scene.colours, image=self.drawn,
+                by_image=by_image,
             )  # fmt: skip
             scene.backward(sums, by_colours, self._by_splats, self._by_sh)
             if shrink is not None:
                 self._run(
-                    "count", {"shrink": shrink}, radii=scene.radii, by_rows=self._by_splats,
-                    stats=self._counted, values=self._splats,
+                    "collect_stats", {"shrink": shrink}, radii=scene.radii, by_rows=self._by_splats,
+                    stats=self._stat_sums, values=self._splats,
                 )  # fmt: skip
-            self._move(scene.radii, 3 * (sh_degree + 1) ** 2)
-            l1, ssim = device.read(told)
-        return loss_of(l1, ssim, 3 * size[0] * size[1], ssim_weight)
+            self._adam_step(scene.radii, 3 * (sh_degree + 1) ** 2)
+            l1, ssim = device.read(sums_of_loss)
+        return combine_loss(l1, ssim, 3 * size[0] * size[1], ssim_weight)
 
     def last_image(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """The last step's (H, W, 3), and its alpha (H, W)."""
+        """Return the last step's image (H, W, 3) and alpha (H, W)."""
         drawn = torch.from_numpy(self.device.read(self.drawn))
         return drawn[..., :3], 1 - drawn[..., 3]
 
     def read(self, name: str) -> torch.Tensor:
-        """A tensor's values, or a statistic's, as they are now, a copy."""
+        """Copy the current values of a tensor or statistic to the host."""
         device = self.device
         with device.lock:
             if name == "sh":
                 return torch.from_numpy(device.read(self._sh))
-            values, at = self._splats, COLUMNS.get(name)
-            if at is None:
-                values, at = self._counted, slice(STATS.index(name), STATS.index(name) + 1)
-            found = device.empty(np.float32, len(self), _width(at))
-            numbers = {"width": _width(at), "stride": values.shape[1], "slot": at.start}
-            self._run("look", numbers, values=values, totals=found)
-            return _as_trained(device.read(found))
+            values = self._splats
+            columns = COLUMNS.get(name)
+            if columns is None:
+                values = self._stat_sums
+                columns = slice(STATS.index(name), STATS.index(name) + 1)
+            copied = device.empty(np.float32, len(self), _width(columns))
+            numbers = {"width": _width(columns), "stride": values.shape[1], "slot": columns.start}
+            self._run("read_columns", numbers, values=values, totals=copied)
+            return _as_tensor(device.read(copied))
 
     def read_rows(self, index: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Tensors' values at indices (M,), by name, a copy."""
+        """Copy the tensors' values at indices (M,) to the host, by name."""
         with self.device.lock:
-            wanted = self.device.upload(index.numpy().astype(np.uint32))
-            splats, sh = (self.device.read(self._taken(each, wanted)) for each in (self._splats, self._sh))
-        found = {name: _as_trained(splats[:, at]) for name, at in COLUMNS.items()}
-        return found | {"sh": torch.from_numpy(sh)}
+            rows = self.device.upload(index.numpy().astype(np.uint32))
+            splats = self.device.read(self._select_rows(self._splats, rows))
+            sh = self.device.read(self._select_rows(self._sh, rows))
+        tensors = {name: _as_tensor(splats[:, columns]) for name, columns in COLUMNS.items()}
+        return tensors | {"sh": torch.from_numpy(sh)}
 
     def select(self, index: torch.Tensor) -> None:
-        """Only the splats at indices (M,), at least one, stay, in this order."""
+        """Keep only the splats at indices (M,), at least one, in this order."""
         with self.device.lock:
-            wanted = self.device.upload(index.numpy().astype(np.uint32))
-            self._change(lambda name, buffer: self._taken(buffer, wanted))
+            rows = self.device.upload(index.numpy().astype(np.uint32))
+            self._replace_state(lambda name, buffer: self._select_rows(buffer, rows))
 
     def append(self, rows: Mapping[str, torch.Tensor]) -> None:
-        """Adds splats at the end, at least one, with moments and statistics of zero."""
+        """Append at least one splat, with zero moments and statistics."""
         arrays = {name: tensor.detach().numpy() for name, tensor in rows.items()}
         geometry = (arrays[name] for name in ("means", "quats", "log_scales", "opacity_logits"))
-        added = {"_splats": packed(*geometry, weights=1, filtered=self._antialias), "_sh": arrays["sh"]}
+        added = {"_splats": pack_splats(*geometry, weights=1, filtered=self._antialias), "_sh": arrays["sh"]}
         count = len(arrays["means"])
         with self.device.lock:
-            self._change(lambda name, buffer: self.device.extended(buffer, count, added.get(name)))
+            self._replace_state(lambda name, buffer: self.device.extended(buffer, count, added.get(name)))
 
     def assign(self, name: str, values: torch.Tensor) -> None:
-        """Gives a tensor new values and zero moments."""
+        """Replace a tensor's values and reset its moments to zero."""
         device = self.device
         with device.lock:
-            given = device.upload(values.numpy())
+            uploaded = device.upload(values.numpy())
             if name == "sh":
-                self._sh, self._sh_moments = given, device.empty(np.float32, *self._sh_moments.shape)
+                self._sh = uploaded
+                self._sh_moments = device.empty(np.float32, *self._sh_moments.shape)
                 return
-            at = COLUMNS[name]
-            self._run("put", {"width": _width(at), "slot": at.start}, parts=given, values=self._splats)
-            numbers = {"width": 2 * _width(at), "stride": 2 * TRAINED, "slot": 2 * at.start}
-            blank = device.empty(np.float32, len(self), numbers["width"])
-            self._run("put", numbers, parts=blank, values=self._splat_moments)
+            columns = COLUMNS[name]
+            numbers = {"width": _width(columns), "slot": columns.start}
+            self._run("write_columns", numbers, parts=uploaded, values=self._splats)
+            numbers = {"width": 2 * _width(columns), "stride": 2 * TRAINED, "slot": 2 * columns.start}
+            zeros = device.empty(np.float32, len(self), numbers["width"])
+            self._run("write_columns", numbers, parts=zeros, values=self._splat_moments)
 
     def reset_stats(self) -> None:
-        """Begins anew with what is added up."""
-        self._counted = self.device.empty(np.float32, *self._counted.shape)
+        """Reset all statistics to zero."""
+        self._stat_sums = self.device.empty(np.float32, *self._stat_sums.shape)
 
     def raise_log_scales(self, minimum: torch.Tensor) -> None:
-        """No log-scale of a splat is below its least one (N,) from here."""
-        lowest = minimum.numpy().clip(np.finfo(np.float32).min)  # not every device knows an infinity
+        """Raise every log-scale of a splat to at least its minimum (N,)."""
+        lowest = minimum.numpy().clip(np.finfo(np.float32).min)  # not every device supports infinity
         with self.device.lock:
-            self._run("widen", {}, parts=self.device.upload(lowest), values=self._splats)
+            self._run("raise_log_scales", {}, parts=self.device.upload(lowest), values=self._splats)
 
     def copy_to_host(self) -> None:
-        """Makes tensors, moments and statistics here what they are on the device."""
+        """Replace the host's tensors, moments and statistics by the device's values."""
         with self.device.lock:
-            splats, sh, of_splats, of_sh, counted = map(
-                self.device.read,
-                (self._splats, self._sh, self._splat_moments, self._sh_moments, self._counted),
+            splats, sh, splat_moments, sh_moments, stat_sums = (
+                self.device.read(getattr(self, name)) for name in STATE
             )
-        found = {
-            name: (splats[:, at], of_splats[:, at, 0], of_splats[:, at, 1]) for name, at in COLUMNS.items()
-        }
-        for name, arrays in found.items():
-            values, *moments = map(_as_trained, arrays)
+        for name, columns in COLUMNS.items():
+            values, *moments = map(
+                _as_tensor,
+                (splats[:, columns], splat_moments[:, columns, 0], splat_moments[:, columns, 1]),
+            )
             self._adam.replace(name, values.requires_grad_(), *moments)
-        first, second = (torch.from_numpy(of_sh[..., k].copy()) for k in range(2))
+        first, second = (torch.from_numpy(sh_moments[..., k].copy()) for k in range(2))
         self._adam.replace("sh", torch.from_numpy(sh).requires_grad_(), first, second)
         for name in self._stats:
-            self._stats[name] = torch.from_numpy(counted[:, STATS.index(name)].copy())
+            self._stats[name] = torch.from_numpy(stat_sums[:, STATS.index(name)].copy())
 
-    def _make_room(self) -> None:
-        """For gradients of as many splats as there are."""
+    def _allocate_gradients(self) -> None:
+        """Allocate the gradients of all splats."""
         self._by_splats = self.device.empty(np.float32, len(self), BY_SPLAT)
         self._by_sh = self.device.empty(np.float32, *self._sh.shape)
 
-    def _change(self, make: Callable[[str, Buffer], Buffer]) -> None:
-        """Puts others in the places of the buffers of STATE, one after the other: so few are there twice."""
+    def _replace_state(self, make: Callable[[str, Buffer], Buffer]) -> None:
+        """Replace the buffers of STATE one by one, so that at most one exists twice."""
         del self._by_splats, self._by_sh
         for name in STATE:
             setattr(self, name, make(name, getattr(self, name)))
             self.device.wait()
-        self._make_room()
+        self._allocate_gradients()
 
-    def _taken(self, buffer: Buffer, index: Buffer) -> Buffer:
-        """The rows of a buffer at indices (M,)."""
-        device, row = self.device, buffer.shape[1:]
-        found, width = device.empty(np.float32, *index.shape, *row), int(np.prod(row))
-        for given in device.parts(source=buffer):
-            first = (given["source"].offset - buffer.offset) // (4 * width)
-            end = first + given["source"].shape[0]
-            for part in device.parts(index=index, taken=found):
+    def _select_rows(self, buffer: Buffer, index: Buffer) -> Buffer:
+        """Copy the rows of a buffer at indices (M,)."""
+        device = self.device
+        row = buffer.shape[1:]
+        width = int(np.prod(row))
+        selected = device.empty(np.float32, *index.shape, *row)
+        for source in device.parts(source=buffer):
+            first = (source["source"].offset - buffer.offset) // (4 * width)
+            end = first + source["source"].shape[0]
+            for part in device.parts(index=index, selected=selected):
                 count = width * part["index"].shape[0]
-                device.run("gather", "take", groups_of(count), (count, width, first, end), **given, **part)
-        return found
+                numbers = count, width, first, end
+                device.run("gather", "select_rows", group_count(count), numbers, **source, **part)
+        return selected
 
-    def _weigh(self, weights: torch.Tensor | None) -> None:
-        """Gives splats their weights; None: ones."""
+    def _set_weights(self, weights: torch.Tensor | None) -> None:
+        """Set the splats' weights; None sets 1."""
         if weights is None and not self._weighted:
             return
-        ones = np.ones(len(self), np.float32)
-        given = ones if weights is None else weights.numpy().astype(np.float32, copy=False)
+        if weights is None:
+            array = np.ones(len(self), np.float32)
+        else:
+            array = weights.numpy().astype(np.float32, copy=False)
         self._weighted = weights is not None
-        self._run("put", {"slot": TRAINED}, parts=self.device.upload(given), values=self._splats)
+        self._run("write_columns", {"slot": TRAINED}, parts=self.device.upload(array), values=self._splats)
 
     def _loss(self, target: Target, ssim_weight: float) -> tuple[Buffer, Buffer]:
-        """What L1 and SSIM add up to (2,), and the gradient (H, W, 4) by the picture."""
-        device, (height, width, _) = self.device, self.drawn.shape
+        """Compute the sums of L1 and SSIM (2,), and the gradient (H, W, 4) by the image."""
+        device = self.device
+        height, width, _ = self.drawn.shape
         image, truth = (device.empty(np.float32, 3, height, width) for _ in range(2))
-        groups, numbers = groups_of(height * width), _numbers(height * width)
+        groups = group_count(height * width)
+        numbers = _numbers(height * width)
         device.run(
-            "train", "unpack", groups, numbers, photograph=_photograph(device, target), drawn=self.drawn,
+            "train", "unpack", groups, numbers, photo=_upload_photo(device, target), drawn=self.drawn,
             image=image, truth=truth,
         )  # fmt: skip
         *sums, gradient = sums_and_gradient(device, image, truth, ssim_weight)
-        by_picture, told = device.empty(np.float32, height, width, 4), device.empty(np.float32, 2)
-        device.run("train", "pack", groups, numbers, gradient=gradient, by_picture=by_picture)
-        for slot, each in enumerate(sums):
-            device.run("train", "total", 1, _numbers(each.shape[0], slot=slot), parts=each, totals=told)
-        return told, by_picture
+        by_image = device.empty(np.float32, height, width, 4)
+        totals = device.empty(np.float32, 2)
+        device.run("train", "pack", groups, numbers, gradient=gradient, by_image=by_image)
+        for slot, parts in enumerate(sums):
+            device.run("train", "total", 1, _numbers(parts.shape[0], slot=slot), parts=parts, totals=totals)
+        return totals, by_image
 
-    def _move(self, radii: Buffer, harmonics: int) -> None:
-        """Adam's step, of so many numbers of each splat's harmonics."""
-        adam, coefficients = self._adam, self._sh.shape[1]
+    def _adam_step(self, radii: Buffer, harmonics: int) -> None:
+        """Make the Adam step; ``harmonics`` is the number of active numbers in a splat's harmonics."""
+        adam = self._adam
+        coefficients = self._sh.shape[1]
         rates = {}
         for name in (*COLUMNS, "sh"):
             adam.steps[name] += 1
@@ -289,9 +307,9 @@ class GpuModel:
             shape = (coefficients, 3) if name == "sh" else (_width(COLUMNS[name]),)
             rate = np.broadcast_to(np.asarray(adam.lr[name], np.float32) / np.float32(first), shape)
             rates[name] = np.stack([rate.ravel(), np.full(rate.size, 1 / second, np.float32)], 1)
-        of_splats = np.concatenate([rates[name] for name in COLUMNS])
+        splat_rates = np.concatenate([rates[name] for name in COLUMNS])
         for values, moments, gradient, stride, by_stride, trained, rate in (
-            (self._splats, self._splat_moments, self._by_splats, SPLAT, BY_SPLAT, TRAINED, of_splats),
+            (self._splats, self._splat_moments, self._by_splats, SPLAT, BY_SPLAT, TRAINED, splat_rates),
             (self._sh, self._sh_moments, self._by_sh, *[3 * coefficients] * 2, harmonics, rates["sh"]),
         ):
             numbers = {
@@ -304,11 +322,11 @@ class GpuModel:
     def _run(
         self, entry: str, numbers: Mapping, shared: Mapping[str, Buffer] | None = None, **rows: Buffer
     ) -> None:
-        """Record a function of train.wgsl, for all rows of buffers that have one for each splat."""
+        """Record a function of train.wgsl for all rows of buffers with one row per splat."""
         for part in self.device.parts(**rows):
             count = numbers.get("width", 1) * next(iter(part.values())).shape[0]
-            given = {**part, **(shared or {})}
-            self.device.run("train", entry, groups_of(count), _numbers(count, **numbers), **given)
+            buffers = {**part, **(shared or {})}
+            self.device.run("train", entry, group_count(count), _numbers(count, **numbers), **buffers)
 
 
 def _numbers(
@@ -321,12 +339,12 @@ def _numbers(
     adam: tuple[float, float, float] = (0.0, 0.0, 0.0),
     shrink: float = 1.0,
 ) -> tuple:
-    """What train.wgsl is told."""
+    """Return the uniform of train.wgsl."""
     return count, width, stride, by_stride, trained, slot, *adam, float(shrink)
 
 
-def _as_trained(values: np.ndarray) -> torch.Tensor:
-    """Columns (M, C) of splats as a tensor of its own, (M,) where there is but one."""
+def _as_tensor(values: np.ndarray) -> torch.Tensor:
+    """Copy columns (M, C) of splats to a tensor, (M,) if C is 1."""
     return torch.from_numpy(np.ascontiguousarray(values[:, 0] if values.shape[1] == 1 else values))
 
 
@@ -334,10 +352,10 @@ def _width(columns: slice) -> int:
     return columns.stop - columns.start
 
 
-def _photograph(device: Device, target: Target) -> Buffer:
-    """A photograph (H, W) with a byte for each colour, which stays as long as its target."""
-    if target.cache.get("twin", (None,))[0] is not device:
+def _upload_photo(device: Device, target: Target) -> Buffer:
+    """Upload a photo (H, W) with one byte per colour; it is cached in its target."""
+    if target.cache.get("device_model", (None,))[0] is not device:
         bytes_ = np.zeros((*target.image.shape[:2], 4), np.uint8)
         bytes_[..., :3] = np.rint(255 * target.image.numpy())
-        target.cache["twin"] = device, device.upload(bytes_.view("<u4")[..., 0])
-    return target.cache["twin"][1]
+        target.cache["device_model"] = device, device.upload(bytes_.view("<u4")[..., 0])
+    return target.cache["device_model"][1]

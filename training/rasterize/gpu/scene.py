@@ -1,4 +1,4 @@
-"""Splats on a device, projected and binned for a view: what pictures, gradients and weights are made from."""
+"""Splats on a device, projected and binned for a view; the input of images, gradients and weights."""
 
 from __future__ import annotations
 
@@ -7,35 +7,35 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..rendering import KernelCamera, RasterSettings
-from .bin import TILE, Band, bin_splats, groups_of
+from .bin import TILE, Band, bin_splats, group_count
 from .device import Buffer, Device
 
 ROW = 12
-"""Numbers of a projected splat (``Row`` in common.wgsl)."""
+"""Size of a projected splat (``Row`` in common.wgsl)."""
 SPLAT, BY_SPLAT = 13, 16
-"""Numbers of a splat on the device, and of its gradient (project.wgsl)."""
+"""Sizes of a splat and of its gradient on the device (project.wgsl)."""
 SUMS, PAIR_SUMS = 8, 11
-"""Numbers that blending's backward pass sums up for a splat, and for a pair (common.wgsl)."""
+"""Numbers of sums per splat and per pair in blending's backward pass (common.wgsl)."""
 GEOMETRY = 6
-"""Those of a splat without the absolute gradients, in which features have no part."""
+"""Number of sums per splat without absolute gradients, which exclude features."""
 TILES = 1024
-"""That a device blends at a time, so that it gets to other work in between."""
+"""Tiles per dispatch, so that the device can do other work in between."""
 
 BLACK = 0.0, 0.0, 0.0
-"""The background where none is meant."""
+"""Background of passes without one."""
 
 
 @dataclass
-class Scene:
-    """M splats as a view sees them.
+class ProjectedScene:
+    """M splats, projected and binned for a view.
 
     Attributes:
-        count: M.
-        lens, degree: what project.wgsl knows of the view, and of harmonics.
+        count: number of splats M.
+        lens, degree: view and degree of the harmonics, as project.wgsl reads them.
         splats, sh: (M, SPLAT) and (M, coefficients, 3).
-        rows, colours, radii: (M, ROW), (M, 4) and (M,), projected.
-        bands: with the tiles that they touch; no more than a device takes gradients of at a time.
-        ranges: (tiles, 2) where the pairs of each tile begin and end in its band.
+        rows, colours, radii: (M, ROW), (M, 4) and (M,), projected splats.
+        bands: pairs of splats and tiles, in bands whose gradients fit into one buffer.
+        ranges: (tiles, 2), range of each tile's pairs in its band.
     """
 
     device: Device
@@ -52,18 +52,19 @@ class Scene:
     ranges: Buffer
 
     @classmethod
-    def of(cls, device: Device, splats: Buffer, sh: Buffer, settings: RasterSettings) -> Scene:
-        """Projects and bins; LodgsError where the device was lost, or has too little memory."""
-        view, count = settings.view, splats.shape[0]
-        lens = np.append(_lens_of(view), np.float32(settings.min_scale))
+    def of(cls, device: Device, splats: Buffer, sh: Buffer, settings: RasterSettings) -> ProjectedScene:
+        """Project and bin splats; LodgsError if the device was lost or has too little memory."""
+        view = settings.view
+        count = splats.shape[0]
+        lens = np.append(_lens(view), np.float32(settings.min_scale))
         rows, colours = device.empty(np.float32, count, ROW), device.empty(np.float32, count, 4)
         depths, radii = device.empty(np.uint32, count), device.empty(np.float32, count)
         _project(
             device, "forward", lens, settings.degree, splats=splats, sh=sh, rows=rows, colours=colours,
             depths=depths, radii=radii,
         )  # fmt: skip
-        most = device.most_bytes // (4 * PAIR_SUMS)
-        bands, ranges = bin_splats(device, rows, depths, view.width, view.height, most)
+        max_pairs = device.binding_bytes // (4 * PAIR_SUMS)
+        bands, ranges = bin_splats(device, rows, depths, view.width, view.height, max_pairs)
         return cls(
             device, view, count, lens, settings.degree, splats, sh, rows, colours, radii, bands, ranges
         )
@@ -71,23 +72,23 @@ class Scene:
     def draw(
         self, background: tuple[float, float, float], limited: bool, colours: Buffer, **buffers: Buffer
     ) -> None:
-        """Record ``forward`` of blend.wgsl."""
+        """Record the function ``forward`` of blend.wgsl."""
         for band in self.bands:
             self._blend("forward", band, background, limited, colours=colours, ranges=self.ranges, **buffers)
 
     def weigh(self) -> Buffer:
-        """Record how much each splat shows, (M, 3): its largest weight, their sum, and how many pixels."""
-        found = self.device.empty(np.float32, self.count, 3)
+        """Record the weights of splats, (M, 3): largest weight, sum of weights, and number of pixels."""
+        weights = self.device.empty(np.float32, self.count, 3)
         for band in self.bands:
             shares = self.device.empty(np.float32, band.count, 3)
             self._blend(
                 "weigh", band, ranges=self.ranges, sorted_pairs=band.sorted_pairs, pair_weights=shares
             )
             self.device.run(
-                "gather", "contributions", groups_of(self.count), (self.count, 0), spans=band.spans,
-                pair_weights=shares, weights=found,
+                "gather", "contributions", group_count(self.count), (self.count, 0), spans=band.spans,
+                pair_weights=shares, weights=weights,
             )  # fmt: skip
-        return found
+        return weights
 
     def differentiate(
         self,
@@ -95,26 +96,26 @@ class Scene:
         absolute: bool,
         sums: Buffer,
         by_colours: Buffer,
-        walked: Buffer,
+        visited: Buffer,
         **buffers: Buffer,
     ) -> None:
-        """Record ``backward`` of blend.wgsl, and that sums get so many columns of what it finds for pairs."""
+        """Record ``backward`` of blend.wgsl, and add ``columns`` columns of its pair sums to ``sums``."""
         for band in self.bands:
             pair_sums = self.device.empty(np.float32, band.count, PAIR_SUMS)
             self._blend(
-                "backward", band, BLACK, False, absolute, ranges=walked, sorted_pairs=band.sorted_pairs,
+                "backward", band, BLACK, False, absolute, ranges=visited, sorted_pairs=band.sorted_pairs,
                 pair_sums=pair_sums, **buffers,
             )  # fmt: skip
             self.device.run(
-                "gather", "gradients", groups_of(self.count), (self.count, columns), spans=band.spans,
+                "gather", "gradients", group_count(self.count), (self.count, columns), spans=band.spans,
                 pair_sums=pair_sums, sums=sums, by_colours=by_colours,
             )  # fmt: skip
 
     def backward(self, sums: Buffer, by_colours: Buffer, by_splats: Buffer, by_sh: Buffer) -> None:
-        """Record how sums of :meth:`differentiate` reach splats that were drawn: these rows are written."""
+        """Record the gradients of drawn splats from the sums of :meth:`differentiate`; other rows stay."""
         _project(
             self.device, "backward", self.lens, self.degree, splats=self.splats, sh=self.sh,
-            projected=self.rows, seen_colours=self.colours, sums=sums, by_colours=by_colours,
+            projected=self.rows, projected_colours=self.colours, sums=sums, by_colours=by_colours,
             by_splats=by_splats, by_sh=by_sh,
         )  # fmt: skip
 
@@ -137,15 +138,15 @@ class Scene:
 
 
 def _project(device: Device, entry: str, lens: np.ndarray, degree: int, **buffers: Buffer) -> None:
-    """Record a function of project.wgsl, for all splats."""
+    """Record a function of project.wgsl for all splats."""
     for part in device.parts(**buffers):
         count, terms, _ = part["sh"].shape
-        device.run("project", entry, groups_of(count), (lens, count, degree, terms), **part)
+        device.run("project", entry, group_count(count), (lens, count, degree, terms), **part)
 
 
-def _lens_of(view: KernelCamera) -> np.ndarray:
-    """The view as project.wgsl takes it, as far as ``near``."""
+def _lens(view: KernelCamera) -> np.ndarray:
+    """Convert a view to the first numbers of project.wgsl's uniform, up to ``near``."""
     pose = np.column_stack([view.rotation, view.translation])
     limits = np.array([view.x_limits, view.y_limits]).T
     numbers = 0, view.fx, view.fy, view.cx, view.cy, *limits.flat, view.width, view.height, view.near
-    return np.concatenate([pose.flat, view.eye, numbers], dtype=np.float32)
+    return np.concatenate([pose.flat, view.position, numbers], dtype=np.float32)

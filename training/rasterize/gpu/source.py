@@ -1,7 +1,7 @@
-"""The text of the shaders: the definition's constants and harmonics, what all share, and a file of their own.
+"""Assemble the source of shaders from constants, harmonics, shared code and the shader's file.
 
-WGSL has no imports, so the constants of :mod:`..rendering` and the basis of :mod:`...splats.sh` are written
-into it: nothing stands twice.
+WGSL has no imports. The constants of :mod:`..rendering` and the basis of :mod:`...splats.sh` are therefore
+generated from Python, so they are defined once.
 """
 
 from __future__ import annotations
@@ -31,48 +31,48 @@ CONSTANTS = {
 
 @cache
 def source_of(shader: str) -> str:
-    """The text of a shader, by the name of its file without the ending."""
+    """Return the source of a shader by its file name without extension."""
     constants = "\n".join(f"const {name}: f32 = {value!r};" for name, value in CONSTANTS.items())
     shared, own = ((SHADERS / f"{name}.wgsl").read_text(encoding="utf-8") for name in ("common", shader))
     return "\n".join([constants, shared, _harmonics() if "basis" in own else "", own])
 
 
 class _Term:
-    """An expression in WGSL that grows as Python calculates with it."""
+    """A WGSL expression, built by arithmetic in Python."""
 
     def __init__(self, text: str) -> None:
         self.text = text
 
     @staticmethod
-    def _joined(one: Any, sign: str, other: Any) -> _Term:
-        texts = (each.text if isinstance(each, _Term) else repr(float(each)) for each in (one, other))
+    def _operation(a: Any, sign: str, b: Any) -> _Term:
+        texts = (x.text if isinstance(x, _Term) else repr(float(x)) for x in (a, b))
         return _Term(f"({f' {sign} '.join(texts)})")
 
-    def __add__(self, other: Any) -> _Term:
-        return self._joined(self, "+", other)
+    def __add__(self, value: Any) -> _Term:
+        return self._operation(self, "+", value)
 
-    def __radd__(self, other: Any) -> _Term:
-        return self._joined(other, "+", self)
+    def __radd__(self, value: Any) -> _Term:
+        return self._operation(value, "+", self)
 
-    def __sub__(self, other: Any) -> _Term:
-        return self._joined(self, "-", other)
+    def __sub__(self, value: Any) -> _Term:
+        return self._operation(self, "-", value)
 
-    def __rsub__(self, other: Any) -> _Term:
-        return self._joined(other, "-", self)
+    def __rsub__(self, value: Any) -> _Term:
+        return self._operation(value, "-", self)
 
-    def __mul__(self, other: Any) -> _Term:
-        return self._joined(self, "*", other)
+    def __mul__(self, value: Any) -> _Term:
+        return self._operation(self, "*", value)
 
-    def __rmul__(self, other: Any) -> _Term:
-        return self._joined(other, "*", self)
+    def __rmul__(self, value: Any) -> _Term:
+        return self._operation(value, "*", self)
 
 
 def _harmonics() -> str:
-    """``basis`` and ``basis_gradient`` of :mod:`...splats.sh` as WGSL, band by band."""
-    most = harmonics.coefficient_count(harmonics.MAX_DEGREE)
+    """Generate ``basis`` and ``basis_gradient`` of :mod:`...splats.sh` in WGSL, degree by degree."""
+    count = harmonics.coefficient_count(harmonics.MAX_DEGREE)
     direction = _Term("d.x"), _Term("d.y"), _Term("d.z")
-    values: list[Any] = [None] * most
-    slopes: list[list[Any]] = [[None] * most for _ in range(3)]
+    values: list[Any] = [None] * count
+    slopes: list[list[Any]] = [[None] * count for _ in range(3)]
     harmonics.basis(*direction, harmonics.MAX_DEGREE, values)
     harmonics.basis_gradient(*direction, harmonics.MAX_DEGREE, *slopes)
 
@@ -87,7 +87,7 @@ def _harmonics() -> str:
                 f"    (*out)[{k}] = {lines[k]};\n"
                 for k in range(degree**2, harmonics.coefficient_count(degree))
             )
-        return f"fn {name}(d: vec3f, degree: u32, out: ptr<function, array<{kind}, {most}>>) {{\n{body}}}\n"
+        return f"fn {name}(d: vec3f, degree: u32, out: ptr<function, array<{kind}, {count}>>) {{\n{body}}}\n"
 
     triples = [f"vec3f({', '.join(map(text, triple))})" for triple in zip(*slopes, strict=True)]
     return function("basis", "f32", [text(value) for value in values]) + function(

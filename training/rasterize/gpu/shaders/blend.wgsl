@@ -1,42 +1,42 @@
-// Every tile's splats blended front to back, and the gradients on the way back.
+// Blend the splats of every tile front to back, and compute the gradients in the backward pass.
 //
-// A workgroup is a tile: each of its 64 invocations has one column and four rows, so what it knows of its pixels are
-// vectors of four; eight side by side are a strip of 8x4 pixels. Splats come to the tile 64 at a time, and each strip
-// looks at those alone that touch it. A pixel sees the sum of w c with w = alpha T, T the transmittance of what lies in
-// front (3DGS, Eq. 3). T turns negative when a pixel is finished, and is so from the start outside the image: whatever
-// follows then fails the test against TRANSMITTANCE_MIN, and |T| stays.
+// A workgroup renders a tile. Each of its 64 invocations has one column and four rows of pixels, stored in vec4s; eight
+// neighbouring invocations form a strip of 8x4 pixels. Splats are fetched 64 at a time, and each strip blends only
+// those that touch it. The colour of a pixel is the sum of w c with w = alpha T, where T is the transmittance of the
+// splats in front (3DGS, Eq. 3). T becomes negative when a pixel is finished, and is negative from the start outside
+// the image. All later splats then fail the test against TRANSMITTANCE_MIN, and |T| is preserved.
 
 struct Parameters { background: vec4f, width: u32, height: u32, across: u32, limited: u32, absolute: u32 }
 @group(0) @binding(0) var<uniform> u: Parameters;
 @group(0) @binding(1) var<storage, read> rows: array<Row>;
 @group(0) @binding(2) var<storage, read> colours: array<vec4f>;
-@group(0) @binding(3) var<storage, read> owners: array<u32>;  // the splats of pairs, tile by tile
-@group(0) @binding(4) var<storage, read> ranges: array<vec2u>;  // of each tile
+@group(0) @binding(3) var<storage, read> owners: array<u32>;  // splats of the pairs, tile by tile
+@group(0) @binding(4) var<storage, read> ranges: array<vec2u>;  // range of pairs of each tile
 @group(0) @binding(5) var<storage, read> limit: array<f32>;  // (H, W)
 @group(0) @binding(6) var<storage, read_write> drawn: array<vec4f>;  // (H, W): colour and T
-@group(0) @binding(7) var<storage, read_write> walked: array<vec2u>;  // ranges, as far as any pixel took light
-@group(0) @binding(8) var<storage, read_write> median: array<i32>;  // (H, W): the splat that brings T to a half
+@group(0) @binding(7) var<storage, read_write> visited: array<vec2u>;  // ranges up to the last pair that any pixel uses
+@group(0) @binding(8) var<storage, read_write> median: array<i32>;  // (H, W): splat that reduces T to a half
 @group(0) @binding(9) var<storage, read> sorted_pairs: array<u32>;
-@group(0) @binding(10) var<storage, read> picture: array<vec4f>;  // what drawn was
-@group(0) @binding(11) var<storage, read> by_picture: array<vec4f>;  // (H, W): gradient by colour and by alpha
+@group(0) @binding(10) var<storage, read> image: array<vec4f>;  // (H, W): the forward pass's drawn
+@group(0) @binding(11) var<storage, read> by_image: array<vec4f>;  // (H, W): gradient by colour and by alpha
 @group(0) @binding(12) var<storage, read_write> pair_sums: array<f32>;  // (P, PAIR_SUMS)
 @group(0) @binding(13) var<storage, read_write> pair_weights: array<f32>;  // (P, 3): largest, sum, pixels
 
 const STRIPS: u32 = 8;
 const STRIP_LANES: u32 = 8;
 const FOUR_ROWS = vec4f(0.0, 1.0, 2.0, 3.0);
-const AT_ONCE: u32 = 4;  // splats whose shares are summed over the tile at a time
-const APART: u32 = LANES + 1u;  // between the shares of one sum and the next, so that lanes read from other banks
+const BATCH: u32 = 4;  // splats whose shares are summed over the tile together
+const STRIDE: u32 = LANES + 1u;  // from one sum's shares to the next, to avoid bank conflicts
 
 var<workgroup> batch_rows: array<Row, LANES>;
 var<workgroup> batch_colours: array<vec3f, LANES>;
-var<workgroup> strips_of: array<u32, LANES>;  // a bit for each strip that a splat touches
-var<workgroup> touching: array<atomic<u32>, 2 * STRIPS>;  // a bit for each splat that touches a strip
+var<workgroup> strips_of: array<u32, LANES>;  // bit mask of the strips that each splat touches
+var<workgroup> touching: array<atomic<u32>, 2 * STRIPS>;  // bit mask of the splats that touch each strip
 var<workgroup> furthest: atomic<u32>;
-var<workgroup> shares: array<f32, AT_ONCE * PAIR_SUMS * APART>;
+var<workgroup> shares: array<f32, BATCH * PAIR_SUMS * STRIDE>;
 
 struct Pixels {
-    first: vec2u,  // the uppermost of the four
+    first: vec2u,  // topmost of the four
     center: vec2f,
     inside: vec4<bool>,
 }
@@ -48,7 +48,7 @@ fn pixels_of(tile: u32, lane: u32) -> Pixels {
     return Pixels(first, vec2f(first) + 0.5, inside);
 }
 
-// The first pixel of a tile's strip.
+// Return the first pixel of a tile's strip.
 fn corner_of(tile: u32, strip: u32) -> vec2u {
     return vec2u(tile % u.across, tile / u.across) * TILE + vec2u(strip % 2u * STRIP_LANES, strip / 2u * 4u);
 }
@@ -57,7 +57,7 @@ fn index_of(pixels: Pixels, k: u32) -> u32 {
     return (pixels.first.y + k) * u.width + pixels.first.x;
 }
 
-// Brings the next splats to the tile, and finds out which strips they touch. All invocations come here together.
+// Fetch the next splats of the tile and find the strips that they touch; call in uniform control flow.
 fn fetch(tile: u32, first: u32, count: u32, lane: u32) {
     workgroupBarrier();
     if (lane < 2u * STRIPS) { atomicStore(&touching[lane], 0u); }
@@ -116,67 +116,67 @@ fn forward(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index)
     var blue = vec4f(0.0);
     var middle = vec4i(-1);
     var reached = range.x;
-    if (lane == 0u) { atomicStore(&furthest, 0u); }  // not every driver clears what workgroups share
+    if (lane == 0u) { atomicStore(&furthest, 0u); }  // not every driver clears workgroup memory
     for (var first = range.x; first < range.y; first += LANES) {
         let count = min(LANES, range.y - first);
         fetch(tile, first, count, lane);
         for (var half = 0u; half < 2u; half++) {
-            var left = atomicLoad(&touching[lane / STRIP_LANES * 2u + half]);
-            while (left != 0u && any(t > vec4f(0.0))) {
-                let k = half * 32u + countTrailingZeros(left);
-                left &= left - 1u;
+            var remaining = atomicLoad(&touching[lane / STRIP_LANES * 2u + half]);
+            while (remaining != 0u && any(t > vec4f(0.0))) {
+                let k = half * 32u + countTrailingZeros(remaining);
+                remaining &= remaining - 1u;
                 reached = first + k + 1u;
                 let a = alpha_of(batch_rows[k], pixels.center).alpha;
-                let behind = t - a * t;
-                var takes = behind > vec4f(TRANSMITTANCE_MIN);
+                let t_next = t - a * t;
+                var takes = t_next > vec4f(TRANSMITTANCE_MIN);
                 if (u.limited != 0u) { takes = takes & (vec4f(batch_rows[k].depth) <= limits); }
                 let w = select(vec4f(0.0), a * t, takes);
                 red += w * batch_colours[k].x;
                 green += w * batch_colours[k].y;
                 blue += w * batch_colours[k].z;
-                let halves = takes & (t > vec4f(0.5)) & (behind <= vec4f(0.5));
+                let halves = takes & (t > vec4f(0.5)) & (t_next <= vec4f(0.5));
                 if (any(halves)) { middle = select(middle, vec4i(i32(owners[first + k])), halves); }
-                t = select(-abs(t), behind, takes);
+                t = select(-abs(t), t_next, takes);
             }
         }
     }
     workgroupBarrier();
     atomicMax(&furthest, reached);
     workgroupBarrier();
-    if (lane == 0u) { walked[tile] = vec2u(range.x, atomicLoad(&furthest)); }
+    if (lane == 0u) { visited[tile] = vec2u(range.x, atomicLoad(&furthest)); }
     for (var k = 0u; k < 4u; k++) {
         if (pixels.inside[k]) {
-            let left = abs(t[k]);
-            drawn[index_of(pixels, k)] = vec4f(vec3f(red[k], green[k], blue[k]) + left * u.background.xyz, left);
+            let t_end = abs(t[k]);
+            drawn[index_of(pixels, k)] = vec4f(vec3f(red[k], green[k], blue[k]) + t_end * u.background.xyz, t_end);
             median[index_of(pixels, k)] = middle[k];
         }
     }
 }
 
 fn share(splat: u32, column: u32, lane: u32, lanes: vec4f) {
-    shares[(splat * PAIR_SUMS + column) * APART + lane] = lanes.x + lanes.y + lanes.z + lanes.w;
+    shares[(splat * PAIR_SUMS + column) * STRIDE + lane] = lanes.x + lanes.y + lanes.z + lanes.w;
 }
 
-// What the strips with these bits share of a sum.
-fn sum_of(column: u32, strips: u32) -> f32 {
+// Sum the shares of the strips in a bit mask.
+fn sum_strips(column: u32, strips: u32) -> f32 {
     var sum = 0.0;
-    var left = strips;
-    while (left != 0u) {
-        let first = column * APART + countTrailingZeros(left) * STRIP_LANES;
-        left &= left - 1u;
+    var remaining = strips;
+    while (remaining != 0u) {
+        let first = column * STRIDE + countTrailingZeros(remaining) * STRIP_LANES;
+        remaining &= remaining - 1u;
         for (var k = 0u; k < STRIP_LANES; k++) { sum += shares[first + k]; }
     }
     return sum;
 }
 
-// Each pair's share of its splat's gradients.
+// Compute each pair's share of its splat's gradients.
 //
-// With h = d loss / d colour, the loss gets the sum of w (c.h) + T_end (background.h - d loss / d alpha) from a pixel.
-// Let Q_i be the part of that sum that lies behind splat i. Then
+// With h = d loss / d colour, a pixel contributes the sum of w (c.h) + T_end (background.h - d loss / d alpha) to the
+// loss. Let Q_i be the part of this sum behind splat i. Then
 //     d loss / d alpha_i = T_i (c_i.h) - Q_i / (1 - alpha_i)
 // and, as sigma = -ln alpha + const,
 //     g = d loss / d sigma = alpha_i Q_i / (1 - alpha_i) - w_i (c_i.h).
-// Q starts as the whole sum, colour.h - T_end d loss / d alpha, and is walked down front to back with T.
+// Q starts as the complete sum, colour.h - T_end d loss / d alpha, and is reduced front to back together with T.
 @compute @workgroup_size(LANES)
 fn backward(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
     let tile = group_of(group);
@@ -189,9 +189,9 @@ fn backward(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index
     var by_blue = vec4f(0.0);
     for (var k = 0u; k < 4u; k++) {
         if (pixels.inside[k]) {
-            let seen = picture[index_of(pixels, k)];
-            let h = by_picture[index_of(pixels, k)];
-            q[k] = dot(seen.xyz, h.xyz) - seen.w * h.w;
+            let pixel = image[index_of(pixels, k)];
+            let h = by_image[index_of(pixels, k)];
+            q[k] = dot(pixel.xyz, h.xyz) - pixel.w * h.w;
             by_red[k] = h.x;
             by_green[k] = h.y;
             by_blue[k] = h.z;
@@ -200,22 +200,23 @@ fn backward(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index
     for (var first = range.x; first < range.y; first += LANES) {
         let count = min(LANES, range.y - first);
         fetch(tile, first, count, lane);
-        for (var some = 0u; some < count; some += AT_ONCE) {
-            let here = min(AT_ONCE, count - some);
-            var left = (atomicLoad(&touching[lane / STRIP_LANES * 2u + some / 32u]) >> (some % 32u)) % (1u << AT_ONCE);
-            while (left != 0u) {
-                let k = countTrailingZeros(left);
-                left &= left - 1u;
-                let colour = batch_colours[some + k];
-                let a = alpha_of(batch_rows[some + k], pixels.center);
-                let behind = t - a.alpha * t;
-                let takes = behind > vec4f(TRANSMITTANCE_MIN);
+        for (var start = 0u; start < count; start += BATCH) {
+            let batch_size = min(BATCH, count - start);
+            let touching_bits = atomicLoad(&touching[lane / STRIP_LANES * 2u + start / 32u]);
+            var remaining = (touching_bits >> (start % 32u)) % (1u << BATCH);
+            while (remaining != 0u) {
+                let k = countTrailingZeros(remaining);
+                remaining &= remaining - 1u;
+                let colour = batch_colours[start + k];
+                let a = alpha_of(batch_rows[start + k], pixels.center);
+                let t_next = t - a.alpha * t;
+                let takes = t_next > vec4f(TRANSMITTANCE_MIN);
                 let w = select(vec4f(0.0), a.alpha * t, takes);
-                t = select(-abs(t), behind, takes);
-                let seen = w * (colour.x * by_red + colour.y * by_green + colour.z * by_blue);
-                q -= seen;
+                t = select(-abs(t), t_next, takes);
+                let received = w * (colour.x * by_red + colour.y * by_green + colour.z * by_blue);
+                q -= received;
                 let moves = takes & (a.uncapped < vec4f(ALPHA_MAX));
-                let g = select(vec4f(0.0), a.alpha * q / (1.0 - a.alpha) - seen, moves);
+                let g = select(vec4f(0.0), a.alpha * q / (1.0 - a.alpha) - received, moves);
                 let g_x = g * a.e_x;
                 let g_y = g * a.e_y;
                 share(k, G, lane, g);
@@ -233,11 +234,11 @@ fn backward(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index
                 share(k, RED + 2u, lane, w * by_blue);
             }
             workgroupBarrier();
-            if (lane < here * PAIR_SUMS) {
-                let k = some + lane / PAIR_SUMS;
+            if (lane < batch_size * PAIR_SUMS) {
+                let k = start + lane / PAIR_SUMS;
                 let column = lane % PAIR_SUMS;
                 if (u.absolute != 0u || (column != ABS_X && column != ABS_Y)) {
-                    pair_sums[sorted_pairs[first + k] * PAIR_SUMS + column] = sum_of(lane, strips_of[k]);
+                    pair_sums[sorted_pairs[first + k] * PAIR_SUMS + column] = sum_strips(lane, strips_of[k]);
                 }
             }
             workgroupBarrier();
@@ -245,21 +246,21 @@ fn backward(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index
     }
 }
 
-// Of each pair the largest weight in a pixel, the sum of weights, and the number of pixels that have one.
+// Compute the largest weight, the sum of weights and the number of pixels of each pair.
 @compute @workgroup_size(LANES)
 fn weigh(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
     let tile = group_of(group);
     let pixels = pixels_of(tile, lane);
     let range = ranges[tile];
     var t = select(vec4f(-1.0), vec4f(1.0), pixels.inside);
-    for (var first = range.x; first < range.y; first += AT_ONCE) {
-        let here = min(AT_ONCE, range.y - first);
-        for (var k = 0u; k < here; k++) {
+    for (var first = range.x; first < range.y; first += BATCH) {
+        let batch_size = min(BATCH, range.y - first);
+        for (var k = 0u; k < batch_size; k++) {
             let a = alpha_of(rows[owners[first + k]], pixels.center).alpha;
-            let behind = t - a * t;
-            let takes = behind > vec4f(TRANSMITTANCE_MIN);
+            let t_next = t - a * t;
+            let takes = t_next > vec4f(TRANSMITTANCE_MIN);
             let w = select(vec4f(0.0), a * t, takes);
-            t = select(-abs(t), behind, takes);
+            t = select(-abs(t), t_next, takes);
             let largest = max(max(w.x, w.y), max(w.z, w.w));
             share(k, 0u, lane, vec4f(largest, 0.0, 0.0, 0.0));
             share(k, 1u, lane, w);
@@ -268,10 +269,10 @@ fn weigh(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) l
         workgroupBarrier();
         let k = lane / 3u;
         let column = lane % 3u;
-        if (k < here) {
+        if (k < batch_size) {
             var result = 0.0;
-            for (var other = 0u; other < LANES; other++) {
-                let value = shares[(k * PAIR_SUMS + column) * APART + other];
+            for (var i = 0u; i < LANES; i++) {
+                let value = shares[(k * PAIR_SUMS + column) * STRIDE + i];
                 result = select(result + value, max(result, value), column == 0u);
             }
             pair_weights[sorted_pairs[first + k] * 3u + column] = result;

@@ -1,11 +1,11 @@
-// How fast a device multiplies and copies, to compare other shaders with.
+// Measure multiply-add and copy rates of a device, as a scale for other shaders.
 
 struct Parameters { count: u32, rounds: u32 }
 @group(0) @binding(0) var<uniform> u: Parameters;
 @group(0) @binding(1) var<storage, read> source: array<vec4f>;
-@group(0) @binding(2) var<storage, read_write> goal: array<vec4f>;
+@group(0) @binding(2) var<storage, read_write> destination: array<vec4f>;
 
-// Four chains of multiply-adds of vectors of four, each as long as there are rounds.
+// Four chains of vec4 multiply-adds, with u.rounds operations each.
 @compute @workgroup_size(LANES)
 fn multiply_add(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
     let i = group_of(group) * LANES + lane;
@@ -21,11 +21,11 @@ fn multiply_add(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_i
         c = fma(c, by, by);
         d = fma(d, by, by);
     }
-    goal[i] = a + b + c + d;
+    destination[i] = a + b + c + d;
 }
 
 @compute @workgroup_size(LANES)
 fn copy(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
     let i = group_of(group) * LANES + lane;
-    if (i < u.count) { goal[i] = source[i]; }
+    if (i < u.count) { destination[i] = source[i]; }
 }

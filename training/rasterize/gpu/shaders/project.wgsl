@@ -1,22 +1,22 @@
-// Splats to ellipses on the image, and the way back from the ellipses' gradients to the splats' parameters.
+// Project splats to ellipses on the image, and propagate the ellipses' gradients to the splats' parameters.
 //
-// p = R m + t the mean in camera coordinates, M = R Q diag(s) with covariance M Mt, J the Jacobian of
+// Notation: p = R m + t the mean in camera coordinates, M = R Q diag(s) with covariance M Mt, J the Jacobian of
 // (fx x/z, fy y/z) at p (clamped to a frustum a little wider than the image), cov = J M Mt Jt + dilation (EWA
 // splatting, Zwicker et al. 2001, as in 3DGS Eq. 5). u and v are the rows of J M.
 
 struct View {
     pose: array<vec4f, 3>,  // world to camera, row by row
-    eye: vec4f,
+    position: vec4f,  // camera centre in the world
     focal: vec2f,
     center: vec2f,
-    low: vec2f,  // range of x/z and y/z in which the Jacobian is taken
+    low: vec2f,  // x/z and y/z are clamped from low to high in the Jacobian
     high: vec2f,
     size: vec2f,  // of the image in pixels
     near: f32,
     min_scale: f32,
     count: u32,
-    degree: u32,  // of the harmonics to draw with
-    terms: u32,  // coefficients that there are
+    degree: u32,  // active degree of the harmonics
+    terms: u32,  // number of coefficients
 }
 @group(0) @binding(0) var<uniform> u: View;
 @group(0) @binding(1) var<storage, read> splats: array<f32>;  // (M, SPLAT)
@@ -26,21 +26,21 @@ struct View {
 @group(0) @binding(5) var<storage, read_write> depths: array<u32>;
 @group(0) @binding(6) var<storage, read_write> radii: array<f32>;
 @group(0) @binding(7) var<storage, read> projected: array<Row>;
-@group(0) @binding(8) var<storage, read> seen_colours: array<vec4f>;
+@group(0) @binding(8) var<storage, read> projected_colours: array<vec4f>;
 @group(0) @binding(9) var<storage, read> sums: array<f32>;  // (M, SUMS)
 @group(0) @binding(10) var<storage, read> by_colours: array<f32>;  // (M, 3)
 @group(0) @binding(11) var<storage, read_write> by_splats: array<f32>;  // (M, BY_SPLAT)
 @group(0) @binding(12) var<storage, read_write> by_sh: array<f32>;  // (M, terms, 3)
 
-// Columns of splats: mean, logit of the opacity, quaternion, logarithms of the scales, weight, whether it is
-// filtered as Mip-Splatting does. by_splats has gradients in the place of the first twelve, then grad2d and absgrad2d.
+// Columns of splats: mean, opacity logit, quaternion, log-scales, weight, and Mip-Splatting filter flag. Columns of
+// by_splats: gradients of the first twelve, grad2d and absgrad2d.
 const SPLAT: u32 = 13;
 const BY_SPLAT: u32 = 16;
 
 struct Axes {
     turned: mat3x3f,  // R Q
     scale: vec3f,
-    quat: vec4f,  // of unit length, as x, y, z, w
+    quat: vec4f,  // unit length, as x, y, z, w
     per_length: f32,
 }
 
@@ -51,7 +51,7 @@ struct Ellipse {
     uu: f32,
     uv: f32,
     vv: f32,
-    cross: vec3f,  // u x v: its square is the determinant before dilation, without the cancellation of needles
+    cross: vec3f,  // u x v: its square is the determinant before dilation, without cancellation for needles
 }
 
 fn triple(first: u32) -> vec3f {
@@ -129,7 +129,7 @@ fn forward(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index)
     depths[i] = bitcast<u32>(p.z);
 
     var values: array<f32, 25>;
-    basis(normalize(mean - u.eye.xyz), u.degree, &values);
+    basis(normalize(mean - u.position.xyz), u.degree, &values);
     var colour = vec3f(0.5);
     for (var k = 0u; k < (u.degree + 1u) * (u.degree + 1u); k++) {
         let at = (i * u.terms + k) * 3u;
@@ -138,7 +138,7 @@ fn forward(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index)
     colours[i] = vec4f(max(colour, vec3f(0.0)), 0.0);
 }
 
-// d loss / d quat from d loss / d Q: entries of Q differentiated, then the normalisation. r[column][row].
+// Compute d loss / d quat from d loss / d Q, including the normalisation. r[column][row].
 fn quat_gradient(q: vec4f, per_length: f32, r: mat3x3f) -> vec4f {
     let by_w = 2.0 * (q.x * (r[1][2] - r[2][1]) + q.y * (r[2][0] - r[0][2]) + q.z * (r[0][1] - r[1][0]));
     let by_x = 2.0 * (
@@ -157,7 +157,7 @@ fn quat_gradient(q: vec4f, per_length: f32, r: mat3x3f) -> vec4f {
     return (by - dot(by, q) * q) * per_length;
 }
 
-// Gradients of splats that have been drawn; those of the others stay zero.
+// Compute the gradients of drawn splats; those of other splats stay zero.
 @compute @workgroup_size(LANES)
 fn backward(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
     let i = group_of(group) * LANES + lane;
@@ -173,7 +173,7 @@ fn backward(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index
     let j = e.jacobian;
 
     // sums are of g = d loss / d sigma with sigma = d . conic d / 2, and of g e and g e et with e = conic d:
-    // d sigma / d mean = -e, and d sigma / d cov = -e et / 2. Summing e, not d, spares needles a cancellation.
+    // d sigma / d mean = -e, and d sigma / d cov = -e et / 2. Sums of e instead of d avoid cancellation for needles.
     let by_log_opacity = -sums[at + G];
     let by_mean2d = -vec2f(sums[at + G_X], sums[at + G_Y]);
     var by_cov = vec3f(-0.5 * sums[at + G_XX], -sums[at + G_XY], -0.5 * sums[at + G_YY]);  // xx, xy (as one), yy
@@ -199,16 +199,16 @@ fn backward(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index
     let m2 = m[2] * axes.scale;
     let by_j = vec4f(dot(by_u, m0), dot(by_u, m2), dot(by_v, m1), dot(by_v, m2));
 
-    // the mean is in its projection, fx x/z + cx, and in j0 = fx/z and j2 = -fx ratio_x/z,
+    // the mean affects its projection fx x/z + cx, and j0 = fx/z and j2 = -fx ratio_x/z,
     let per_z = 1.0 / p.z;
     let ratio = p.xy * per_z;
-    let kept = clamp(ratio, u.low, u.high);
+    let clamped = clamp(ratio, u.low, u.high);
     var by_p = vec3f(by_mean2d * vec2f(j.x, j.z), 0.0);
     by_p.z = -(dot(by_p.xy, p.xy) + dot(by_j, j)) * per_z;
     // where ratio_x = x/z unless it is clamped
     let free = (u.low < ratio) & (ratio < u.high);
     let by_ratio = select(vec2f(0.0), -vec2f(by_j.y * j.x, by_j.w * j.z) * per_z, free);
-    by_p += vec3f(by_ratio, -dot(by_ratio, kept));
+    by_p += vec3f(by_ratio, -dot(by_ratio, clamped));
 
     // M = R Q diag(s): d loss / d Q = Rt (d loss / d M) diag(s), and s = exp(log_scale) + min_scale
     let by_m0 = j.x * by_u;
@@ -227,11 +227,11 @@ fn backward(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index
     }
     by_splats[out + 11u] = by_log_opacity / splats[first + 11u];
 
-    let shown = vec3f(by_colours[3u * i], by_colours[3u * i + 1u], by_colours[3u * i + 2u]);
-    let by_colour = select(vec3f(0.0), shown, seen_colours[i].xyz > vec3f(0.0));
-    let towards = mean - u.eye.xyz;
-    let per_length = 1.0 / length(towards);
-    let direction = towards * per_length;
+    let gradient = vec3f(by_colours[3u * i], by_colours[3u * i + 1u], by_colours[3u * i + 2u]);
+    let by_colour = select(vec3f(0.0), gradient, projected_colours[i].xyz > vec3f(0.0));
+    let offset = mean - u.position.xyz;
+    let per_length = 1.0 / length(offset);
+    let direction = offset * per_length;
     var values: array<f32, 25>;
     var slopes: array<vec3f, 25>;
     basis(direction, u.degree, &values);
@@ -242,7 +242,7 @@ fn backward(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index
         by_direction += dot(vec3f(sh[c], sh[c + 1u], sh[c + 2u]), by_colour) * slopes[k];
         for (var channel = 0u; channel < 3u; channel++) { by_sh[c + channel] = values[k] * by_colour[channel]; }
     }
-    // direction = (mean - eye) / length: only the part across the direction moves it
+    // direction = (mean - position) / length: only the perpendicular component changes it
     let through_colour = (by_direction - dot(by_direction, direction) * direction) * per_length;
     let by_mean = through_colour + transpose(camera_rotation()) * by_p;
     for (var k = 0u; k < 3u; k++) { by_splats[out + k] = by_mean[k]; }

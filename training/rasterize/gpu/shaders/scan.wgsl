@@ -1,37 +1,37 @@
-// Exclusive prefix sums of unsigned integers, in place. One workgroup sums up a few thousand; of more, the sum of each
-// block of 1024 is taken first, and what lies before each is added in the end.
+// Exclusive prefix sums of unsigned integers, in place. One workgroup scans up to a few thousand values. Longer arrays
+// are summed in blocks of 1024, and the prefix sum of the blocks is added in the end.
 
 struct Parameters { count: u32 }
 @group(0) @binding(0) var<uniform> u: Parameters;
 @group(0) @binding(1) var<storage, read_write> values: array<u32>;
-@group(0) @binding(2) var<storage, read_write> totals: array<u32>;  // of each block
-@group(0) @binding(3) var<storage, read> starts: array<u32>;  // what lies before each block
+@group(0) @binding(2) var<storage, read_write> totals: array<u32>;  // sum of each block
+@group(0) @binding(3) var<storage, read> starts: array<u32>;  // sum before each block
 
-const EACH: u32 = 16;  // values that an invocation takes, one after the other
-const BLOCK: u32 = LANES * EACH;
-var<workgroup> shares: array<u32, LANES>;
+const PER_LANE: u32 = 16;  // consecutive values per invocation
+const BLOCK: u32 = LANES * PER_LANE;
+var<workgroup> lane_sums: array<u32, LANES>;
 
-// Each invocation's share of a block's sum; all invocations come here together.
-fn share_out(block: u32, lane: u32) {
+// Sum the values of each invocation; call in uniform control flow.
+fn sum_lanes(block: u32, lane: u32) {
     var sum = 0u;
-    let first = block * BLOCK + lane * EACH;
-    for (var k = first; k < min(first + EACH, u.count); k++) { sum += values[k]; }
+    let first = block * BLOCK + lane * PER_LANE;
+    for (var k = first; k < min(first + PER_LANE, u.count); k++) { sum += values[k]; }
     workgroupBarrier();
-    shares[lane] = sum;
+    lane_sums[lane] = sum;
     workgroupBarrier();
 }
 
-// The sum of the shares of the invocations before this one.
-fn before(lane: u32) -> u32 {
+// Return the sum of all invocations before this one.
+fn sum_before(lane: u32) -> u32 {
     var sum = 0u;
-    for (var k = 0u; k < lane; k++) { sum += shares[k]; }
+    for (var k = 0u; k < lane; k++) { sum += lane_sums[k]; }
     return sum;
 }
 
 fn write_sums(block: u32, lane: u32, start: u32) {
-    var at = start + before(lane);
-    let first = block * BLOCK + lane * EACH;
-    for (var k = first; k < min(first + EACH, u.count); k++) {
+    var at = start + sum_before(lane);
+    let first = block * BLOCK + lane * PER_LANE;
+    for (var k = first; k < min(first + PER_LANE, u.count); k++) {
         let value = values[k];
         values[k] = at;
         at += value;
@@ -41,23 +41,23 @@ fn write_sums(block: u32, lane: u32, start: u32) {
 @compute @workgroup_size(LANES)
 fn total(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
     let block = group_of(group);
-    share_out(block, lane);
-    if (lane == 0u) { totals[block] = before(LANES); }
+    sum_lanes(block, lane);
+    if (lane == 0u) { totals[block] = sum_before(LANES); }
 }
 
 @compute @workgroup_size(LANES)
-fn spread(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+fn scan_blocks(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
     let block = group_of(group);
-    share_out(block, lane);
+    sum_lanes(block, lane);
     write_sums(block, lane, starts[block]);
 }
 
 @compute @workgroup_size(LANES)
-fn few(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+fn scan_all(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
     var done = 0u;
     for (var block = group_of(group); block * BLOCK < u.count; block++) {
-        share_out(block, lane);
+        sum_lanes(block, lane);
         write_sums(block, lane, done);
-        done += before(LANES);
+        done += sum_before(LANES);
     }
 }

@@ -1,5 +1,5 @@
-// One pass of a stable radix sort of keys with values, by four bits. A block of 1024 pairs counts its digits;
-// the counts, digit by digit and block by block, are summed up elsewhere; then every pair goes to its place.
+// One pass of a stable radix sort of keys with values, by four bits. Blocks of 1024 pairs count their digits, the
+// shader `scan` sums the counts by digit and block, and every pair is copied to its position.
 
 struct Parameters { count: u32, shift: u32, blocks: u32 }
 @group(0) @binding(0) var<uniform> u: Parameters;
@@ -10,7 +10,7 @@ struct Parameters { count: u32, shift: u32, blocks: u32 }
 @group(0) @binding(5) var<storage, read_write> sorted_values: array<u32>;
 
 const DIGITS: u32 = 16;
-const EACH: u32 = 16;  // pairs that an invocation takes, one after the other: so the sort is stable
+const PER_LANE: u32 = 16;  // consecutive pairs per invocation, which makes the sort stable
 var<workgroup> tally: array<u32, DIGITS * LANES>;  // (digits, lanes)
 
 fn digit_of(key: u32) -> u32 {
@@ -19,7 +19,7 @@ fn digit_of(key: u32) -> u32 {
 
 fn count_digits(first: u32, lane: u32) {
     for (var digit = 0u; digit < DIGITS; digit++) { tally[digit * LANES + lane] = 0u; }
-    for (var k = first; k < min(first + EACH, u.count); k++) {
+    for (var k = first; k < min(first + PER_LANE, u.count); k++) {
         tally[digit_of(keys[k]) * LANES + lane] += 1u;
     }
 }
@@ -27,7 +27,7 @@ fn count_digits(first: u32, lane: u32) {
 @compute @workgroup_size(LANES)
 fn count(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
     let block = group_of(group);
-    count_digits((block * LANES + lane) * EACH, lane);
+    count_digits((block * LANES + lane) * PER_LANE, lane);
     workgroupBarrier();
     if (lane < DIGITS) {
         var sum = 0u;
@@ -39,10 +39,10 @@ fn count(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) l
 @compute @workgroup_size(LANES)
 fn scatter(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
     let block = group_of(group);
-    let first = (block * LANES + lane) * EACH;
+    let first = (block * LANES + lane) * PER_LANE;
     count_digits(first, lane);
     workgroupBarrier();
-    if (lane < DIGITS) {  // from how many to where
+    if (lane < DIGITS) {  // from counts to positions
         var at = places[lane * u.blocks + block];
         for (var k = 0u; k < LANES; k++) {
             let count = tally[lane * LANES + k];
@@ -51,7 +51,7 @@ fn scatter(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index)
         }
     }
     workgroupBarrier();
-    for (var k = first; k < min(first + EACH, u.count); k++) {
+    for (var k = first; k < min(first + PER_LANE, u.count); k++) {
         let place = digit_of(keys[k]) * LANES + lane;
         let at = tally[place];
         tally[place] = at + 1u;

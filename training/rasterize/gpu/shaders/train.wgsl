@@ -1,25 +1,24 @@
-// What a training step does besides drawing, where splats stay on the device: photographs to numbers, statistics of
-// density control, and Adam.
+// Training steps on splats in device memory: convert photos, collect the statistics of density control, and run Adam.
 
 struct Parameters {
-    count: u32,  // invocations that have something to do
-    width: u32,  // numbers of a row that are trained
-    stride: u32,  // from a row of values to the next
-    by_stride: u32,  // from a row of gradients to the next
-    trained: u32,  // of the width, the first ones, that have a gradient
-    slot: u32,
+    count: u32,  // active invocations
+    width: u32,  // trained numbers per row
+    stride: u32,  // from one row of values to the next
+    by_stride: u32,  // from one row of gradients to the next
+    trained: u32,  // first numbers of a row, which have a gradient
+    slot: u32,  // first column, or index of the total
     keep_m: f32,  // Adam's betas
     keep_v: f32,
     eps: f32,
-    shrink: f32,  // how many times smaller the photograph is
+    shrink: f32,  // factor by which the photo was downscaled
 }
 @group(0) @binding(0) var<uniform> u: Parameters;
-@group(0) @binding(1) var<storage, read> photograph: array<u32>;  // (H, W) of four bytes
+@group(0) @binding(1) var<storage, read> photo: array<u32>;  // (H, W), four bytes per pixel
 @group(0) @binding(2) var<storage, read> drawn: array<vec4f>;  // (H, W)
 @group(0) @binding(3) var<storage, read_write> image: array<f32>;  // (3, H, W)
 @group(0) @binding(4) var<storage, read_write> truth: array<f32>;  // (3, H, W)
 @group(0) @binding(5) var<storage, read> gradient: array<f32>;  // (3, H, W)
-@group(0) @binding(6) var<storage, read_write> by_picture: array<vec4f>;  // (H, W)
+@group(0) @binding(6) var<storage, read_write> by_image: array<vec4f>;  // (H, W)
 @group(0) @binding(7) var<storage, read> parts: array<f32>;
 @group(0) @binding(8) var<storage, read_write> totals: array<f32>;
 @group(0) @binding(9) var<storage, read> radii: array<f32>;  // (N,)
@@ -27,70 +26,70 @@ struct Parameters {
 @group(0) @binding(11) var<storage, read_write> stats: array<f32>;  // (N, STATS)
 @group(0) @binding(12) var<storage, read_write> values: array<f32>;  // (N, stride)
 @group(0) @binding(13) var<storage, read_write> moments: array<vec2f>;  // (N, width): first and second
-@group(0) @binding(14) var<storage, read> rates: array<vec2f>;  // (width): rates, and scales of second moments
+@group(0) @binding(14) var<storage, read> rates: array<vec2f>;  // (width): learning rates and scales of second moments
 
-// Columns of stats, as Model has them by name.
+// Columns of stats, in the order of STATS in device_model.py.
 const GRADIENT_SUM: u32 = 0;
 const SEEN: u32 = 1;
 const GRADIENT_MAX: u32 = 2;
 const RADIUS_MAX: u32 = 3;
 const OPACITY_SUM: u32 = 4;
 const STATS: u32 = 5;
-// Columns of splats and of their gradients (project.wgsl).
+// Columns of splats and their gradients (project.wgsl).
 const LOGIT: u32 = 3;
 const LOG_SCALES: u32 = 8;
 const BY_MEAN2D: u32 = 12;
-// Moments below these are cut off, as on the processor.
+// Smaller moments are set to zero, as on the CPU.
 const M_TINY: f32 = 1e-30;
 const V_TINY: f32 = 1e-36;
 
-var<workgroup> shares: array<f32, LANES>;
+var<workgroup> lane_sums: array<f32, LANES>;
 
-// A picture and its photograph as the loss takes them.
+// Convert an image and its photo to the inputs of the loss.
 @compute @workgroup_size(LANES)
 fn unpack(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
     let at = group_of(group) * LANES + lane;
     if (at >= u.count) { return; }
-    let seen = drawn[at];
-    let photographed = unpack4x8unorm(photograph[at]);
+    let pixel = drawn[at];
+    let photo_colour = unpack4x8unorm(photo[at]);
     for (var k = 0u; k < 3u; k++) {
-        image[k * u.count + at] = seen[k];
-        truth[k * u.count + at] = photographed[k];
+        image[k * u.count + at] = pixel[k];
+        truth[k * u.count + at] = photo_colour[k];
     }
 }
 
-// The loss's gradient as blending takes it.
+// Convert the loss's gradient to the input of blending.
 @compute @workgroup_size(LANES)
 fn pack(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
     let at = group_of(group) * LANES + lane;
     if (at >= u.count) { return; }
-    by_picture[at] = vec4f(gradient[at], gradient[u.count + at], gradient[2u * u.count + at], 0.0);
+    by_image[at] = vec4f(gradient[at], gradient[u.count + at], gradient[2u * u.count + at], 0.0);
 }
 
-// The sum of all parts, by one workgroup.
+// Sum all parts in one workgroup.
 @compute @workgroup_size(LANES)
 fn total(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
     var sum = 0.0;
     for (var k = group_of(group) * LANES + lane; k < u.count; k += LANES) { sum += parts[k]; }
-    shares[lane] = sum;
+    lane_sums[lane] = sum;
     workgroupBarrier();
     if (lane == 0u) {
         sum = 0.0;
-        for (var k = 0u; k < LANES; k++) { sum += shares[k]; }
+        for (var k = 0u; k < LANES; k++) { sum += lane_sums[k]; }
         totals[u.slot] = sum;
     }
 }
 
-// Some columns of values, from the slot on, become what is in parts.
+// Copy parts to columns of values, from column slot on.
 @compute @workgroup_size(LANES)
-fn put(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+fn write_columns(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
     let k = group_of(group) * LANES + lane;
     if (k < u.count) { values[k / u.width * u.stride + u.slot + k % u.width] = parts[k]; }
 }
 
-// Log-scales rise to the least one of each splat, in parts.
+// Raise the log-scales of each splat to at least its minimum in parts.
 @compute @workgroup_size(LANES)
-fn widen(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+fn raise_log_scales(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
     let i = group_of(group) * LANES + lane;
     if (i >= u.count) { return; }
     for (var k = 0u; k < 3u; k++) {
@@ -99,29 +98,30 @@ fn widen(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) l
     }
 }
 
-// Some columns of values, from the slot on.
+// Copy columns of values, from column slot on, to totals.
 @compute @workgroup_size(LANES)
-fn look(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+fn read_columns(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
     let k = group_of(group) * LANES + lane;
     if (k < u.count) { totals[k] = values[k / u.width * u.stride + u.slot + k % u.width]; }
 }
 
-// What density control decides by.
+// Collect the statistics of density control.
 @compute @workgroup_size(LANES)
-fn count(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+fn collect_stats(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
     let i = group_of(group) * LANES + lane;
     if (i >= u.count || radii[i] == 0.0) { return; }
     let by = i * u.by_stride + BY_MEAN2D;
-    let steep = length(vec2f(by_rows[by], by_rows[by + 1u])) / u.shrink;
+    let norm = length(vec2f(by_rows[by], by_rows[by + 1u])) / u.shrink;
     let at = i * STATS;
-    stats[at + GRADIENT_SUM] += steep;
+    stats[at + GRADIENT_SUM] += norm;
     stats[at + SEEN] += 1.0;
-    stats[at + GRADIENT_MAX] = max(stats[at + GRADIENT_MAX], steep);
+    stats[at + GRADIENT_MAX] = max(stats[at + GRADIENT_MAX], norm);
     stats[at + RADIUS_MAX] = max(stats[at + RADIUS_MAX], radii[i]);
     stats[at + OPACITY_SUM] += 1.0 / (1.0 + exp(-values[i * u.stride + LOGIT]));
 }
 
-// A step of Adam (Kingma and Ba 2015, Algorithm 1), a number each. What was not drawn has a gradient of zero.
+// Make an Adam step (Kingma and Ba 2015, Algorithm 1), one number per invocation. Splats that were not drawn have zero
+// gradients.
 @compute @workgroup_size(LANES)
 fn adam(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
     let k = group_of(group) * LANES + lane;
