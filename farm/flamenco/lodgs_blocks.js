@@ -1,33 +1,33 @@
-// Splats of a scene that is too large for one computer, trained in cells on a Flamenco farm.
+// Train Gaussian splats of a large scene in cells on a Flamenco farm.
 //
-// Put this file into the folder `scripts` beside the Flamenco Manager, and give the manager a variable {lodgs}:
-// on each platform the path of the command `lodgs`. Workers have to see the scene and the output folder.
-// Every task can run again: it goes on where it was, and what is finished is not made anew.
+// Copy this file to the folder `scripts` next to the Flamenco Manager, and define a manager variable {lodgs}:
+// the path of the command `lodgs` on each platform. Workers must access the scene and the output folder.
+// Every task can run again: it resumes, and finished parts are not trained again.
 
 const JOB_TYPE = {
     label: "LODGS: splats in cells",
-    description: "Divide a COLMAP scene into cells on the ground, train each, and put them together",
+    description: "Divide a COLMAP scene into cells on the ground, train each cell and merge the results",
     settings: [
         { key: "scene", type: "string", subtype: "dir_path", required: true,
           description: "Folder of the COLMAP scene" },
         { key: "output", type: "string", subtype: "dir_path", required: true,
-          description: "Folder of the run, as all workers see it" },
+          description: "Run folder, accessible to all workers under this path" },
         { key: "columns", type: "int32", default: 2, propargs: { min: 1, max: 64 },
-          description: "How many columns of cells, across the longer side of the ground" },
+          description: "Number of columns along the longer side of the ground" },
         { key: "rows", type: "int32", default: 2, propargs: { min: 1, max: 64 },
-          description: "How many cells in each column" },
+          description: "Number of cells per column" },
         { key: "method", type: "string", default: "flod", choices: ["flod", "octree", "clod", "lodge", "tree", "3dgs"],
-          description: "What to train" },
+          description: "Training method" },
         { key: "preset", type: "string", default: "draft", choices: ["draft", "standard", "paper"],
-          description: "How long to train" },
+          description: "Preset: draft trains for minutes, paper for hours" },
         { key: "image_scale", type: "float", default: 0.5, propargs: { min: 0.01, max: 1 },
-          description: "Size of training images over photographs" },
+          description: "Size of training images relative to the photos" },
         { key: "polish", type: "int32", default: 300, propargs: { min: 0 },
-          description: "Steps that fit each cell's borders to the cells beside it; 0 for none" },
+          description: "Steps that fit each cell's borders to its neighbours; 0 disables" },
         { key: "options", type: "string", default: "",
-          description: "Further options of lodgs train, such as --set max_splats=500000" },
+          description: "Additional options of lodgs train, such as --set max_splats=500000" },
         { key: "lodgs", type: "string", default: "{lodgs}", visible: "hidden",
-          description: "The command lodgs, by the manager's variable" },
+          description: "Path of the command lodgs, from the manager's variable" },
     ],
 };
 
@@ -43,13 +43,13 @@ function compileJob(job) {
     const coarse = part("coarse", [plan]);
     const blocks = numbers.map((number) => part(`block-${number}`, [coarse]));
     const seams = polish ? numbers.map((number) => part(`seam-${number}`, blocks)) : blocks;
-    task(job, "put together", lodgs, ["blocks", "run", output], seams);
+    task(job, "merge", lodgs, ["blocks", "run", output], seams);
 }
 
 function task(job, name, exe, args, after = []) {
-    const made = author.Task(name, "misc");
-    made.addCommand(author.Command("exec", { exe, args }));
-    for (const other of after) made.addDependency(other);
-    job.addTask(made);
-    return made;
+    const added = author.Task(name, "misc");
+    added.addCommand(author.Command("exec", { exe, args }));
+    for (const dependency of after) added.addDependency(dependency);
+    job.addTask(added);
+    return added;
 }

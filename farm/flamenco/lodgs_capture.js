@@ -1,32 +1,32 @@
-// A Blender scene as photographs with exact cameras, to train splats from, rendered on a Flamenco farm.
+// Render a Blender scene as photos with exact cameras, as training data for splats, on a Flamenco farm.
 //
-// Put this file into the folder `scripts` beside the Flamenco Manager. Every worker's Blender has to have the
-// extension LODGS, and the one that makes the model its trainer: by the preferences, or by the environment
-// variable LODGS_TRAINER_PYTHON. Workers have to see the .blend and the output folder.
-// Every task can run again: what is rendered is not rendered anew. The last one renders what is missing.
+// Copy this file to the folder `scripts` next to the Flamenco Manager. Every worker's Blender needs the LODGS
+// extension. The worker that creates the model also needs its trainer: set it in the preferences or in the
+// environment variable LODGS_TRAINER_PYTHON. Workers must access the .blend file and the output folder.
+// Every task can run again: existing images are kept, and the last task renders missing ones.
 
 const JOB_TYPE = {
     label: "LODGS: capture a Blender scene",
-    description: "Render views of a Blender scene with its own engine, and make a COLMAP scene of them",
+    description: "Render views of a Blender scene with its own engine, as a COLMAP scene",
     settings: [
         { key: "blendfile", type: "string", required: true, visible: "web",
-          description: "The .blend to capture" },
+          description: "Blender file to capture" },
         { key: "output", type: "string", subtype: "dir_path", required: true,
-          description: "Folder that becomes the COLMAP scene, as all workers see it" },
+          description: "Folder of the COLMAP scene, accessible to all workers under this path" },
         { key: "views_from", type: "string", default: "around", choices: ["around", "above", "cameras", "animation", "curve"],
-          description: "From where: around or above what is selected, every camera, the animated camera, or along a curve" },
+          description: "Viewpoints: around or above the selection, all cameras, the animated camera, or along a curve" },
         { key: "curve", type: "string", default: "",
-          description: "Name of the curve to walk along" },
+          description: "Name of the curve to follow" },
         { key: "views", type: "int32", default: 64, propargs: { min: 2, max: 2000 },
-          description: "How many views; of cameras, how many there are" },
+          description: "Number of views; for cameras, the number of cameras" },
         { key: "chunk", type: "int32", default: 8, propargs: { min: 1 },
-          description: "How many views a task renders" },
+          description: "Number of views per task" },
         { key: "width", type: "int32", default: 960, propargs: { min: 32, max: 8192 },
-          description: "Width of the pictures in pixels" },
+          description: "Image width in pixels" },
         { key: "height", type: "int32", default: 640, propargs: { min: 32, max: 8192 },
-          description: "Height of the pictures in pixels" },
+          description: "Image height in pixels" },
         { key: "blender", type: "string", default: "{blender}", visible: "hidden",
-          description: "The command blender, by the manager's variable" },
+          description: "Path of the command blender, from the manager's variable" },
     ],
 };
 
@@ -46,9 +46,9 @@ function compileJob(job) {
 }
 
 function task(job, name, exe, args, after = []) {
-    const made = author.Task(name, "misc");
-    made.addCommand(author.Command("exec", { exe, args }));
-    for (const other of after) made.addDependency(other);
-    job.addTask(made);
-    return made;
+    const added = author.Task(name, "misc");
+    added.addCommand(author.Command("exec", { exe, args }));
+    for (const dependency of after) added.addDependency(dependency);
+    job.addTask(added);
+    return added;
 }

@@ -1,4 +1,4 @@
-"""The job type for Flamenco that captures a Blender scene: what it compiles, and what its commands do."""
+"""Flamenco job type that captures a Blender scene: its tasks and their commands."""
 
 import importlib.util
 import subprocess
@@ -26,7 +26,7 @@ BLENDER = [sys.executable, str(ROOT / "tests" / "blender" / "as_blender.py")]
 
 
 @needs_node
-def test_ranges_hold_each_view_once_and_the_model_waits_for_all(tmp_path):
+def test_ranges_cover_each_view_once_and_the_model_depends_on_all(tmp_path):
     tasks = compiled(tmp_path, SCRIPT, blendfile="/a.blend", output="/out", views=21, chunk=8)["tasks"]
     *parts, last = tasks
     ranges = [task["commands"][0]["args"][-1] for task in parts]
@@ -37,17 +37,17 @@ def test_ranges_hold_each_view_once_and_the_model_waits_for_all(tmp_path):
         (command,) = task["commands"]
         assert (task["type"], command["name"], command["exe"]) == ("misc", "exec", "{blender}")
     assert "--around" in last["commands"][0]["args"] and "--range" not in last["commands"][0]["args"]
-    (walk, _) = compiled(tmp_path, SCRIPT, views_from="curve", curve="My Way", views=4)["tasks"]
-    at = walk["commands"][0]["args"].index("--curve")
-    assert walk["commands"][0]["args"][at + 1] == "My Way"
+    (walk, _) = compiled(tmp_path, SCRIPT, views_from="curve", curve="My Path", views=4)["tasks"]
+    arguments = walk["commands"][0]["args"]
+    assert arguments[arguments.index("--curve") + 1] == "My Path"
 
 
 @needs_node
 @pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("bpy") is None, reason="Blender's module is not installed")
-def test_its_commands_one_after_the_other_give_the_scene_of_one_command(tmp_path, monkeypatch):
+def test_commands_of_the_tasks_give_the_same_scene_as_one_command(tmp_path, monkeypatch):
     monkeypatch.setenv("LODGS_TRAINER_PYTHON", sys.executable)
-    blend, farm, one = tmp_path / "scene.blend", tmp_path / "farm", tmp_path / "one"
+    blend, farm, single = tmp_path / "scene.blend", tmp_path / "farm", tmp_path / "single"
     subprocess.run([sys.executable, "-c", SCENE, str(blend)], check=True)
     tasks = compiled(
         tmp_path, SCRIPT, blendfile=str(blend), output=str(farm), views=5, chunk=2, width=64, height=48
@@ -57,14 +57,14 @@ def test_its_commands_one_after_the_other_give_the_scene_of_one_command(tmp_path
         assert not (farm / "sparse").exists()
         for command in task["commands"]:
             subprocess.run([*BLENDER, *command["args"]], check=True)
-    last = [word if word != str(farm) else str(one) for word in tasks[-1]["commands"][0]["args"]]
+    last = [word if word != str(farm) else str(single) for word in tasks[-1]["commands"][0]["args"]]
     subprocess.run([*BLENDER, *last], check=True)
-    assert kept(farm) == kept(one) and len(read_scene(farm).points)
+    assert contents(farm) == contents(single) and len(read_scene(farm).points)
 
 
-def kept(folder: Path) -> dict[str, bytes]:
-    """What a capture has left, by name, without the dates that Blender writes into its files."""
+def contents(folder: Path) -> dict[str, bytes]:
+    """Return the files of a capture by name; of images only the pixels, because Blender stores dates."""
     exact = [file for file in folder.rglob("*") if file.suffix in (".json", ".bin")]
-    pictures = {file.name: np.asarray(Image.open(file)).tobytes() for file in folder.rglob("*.png")}
-    assert len(pictures) == 5 and len(exact) == 8
-    return pictures | {file.name: file.read_bytes() for file in exact}
+    images = {file.name: np.asarray(Image.open(file)).tobytes() for file in folder.rglob("*.png")}
+    assert len(images) == 5 and len(exact) == 8
+    return images | {file.name: file.read_bytes() for file in exact}
