@@ -1,6 +1,7 @@
 """Flamenco job type that captures a Blender scene: its tasks and their commands."""
 
 import importlib.util
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -13,16 +14,27 @@ from tests.training.farm.test_flamenco import ROOT, compiled, needs_node
 from training.scenes.colmap import read_scene
 
 SCRIPT = ROOT / "farm" / "flamenco" / "lodgs_capture.js"
-SCENE = """
-import sys, bpy
+COMMANDS = """
+import importlib, json, os, sys
+from pathlib import Path
+from tools.blender_module import EXTENSION, start_blender
+
+bpy = start_blender()
+blend, model, commands = sys.argv[1], Path(sys.argv[2]), json.loads(sys.argv[3])
 bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
 bpy.ops.mesh.primitive_plane_add(size=9)
 bpy.ops.mesh.primitive_cube_add(location=(0, 0, 1))
 bpy.context.scene.render.engine, bpy.context.scene.cycles.samples = "CYCLES", 1
-bpy.ops.wm.save_as_mainfile(filepath=sys.argv[1])
-sys.stdout.flush(), __import__("os")._exit(0)
+bpy.ops.wm.save_as_mainfile(filepath=blend)
+main = importlib.import_module(f"{EXTENSION}.blender_lodgs.commands").main
+for number, command in enumerate(commands):
+    assert command[:2] == ["--command", "lodgs"]
+    assert model.exists() == (number == 4)  # written by the fourth command
+    assert main(command[2:]) == 0
+sys.stdout.flush()
+os._exit(0)
 """
-BLENDER = [sys.executable, str(ROOT / "tests" / "blender" / "as_blender.py")]
+"""Create a scene and run the commands in one Blender process."""
 
 
 @needs_node
@@ -48,17 +60,16 @@ def test_ranges_cover_each_view_once_and_the_model_depends_on_all(tmp_path):
 def test_commands_of_the_tasks_give_the_same_scene_as_one_command(tmp_path, monkeypatch):
     monkeypatch.setenv("LODGS_TRAINER_PYTHON", sys.executable)
     blend, farm, single = tmp_path / "scene.blend", tmp_path / "farm", tmp_path / "single"
-    subprocess.run([sys.executable, "-c", SCENE, str(blend)], check=True)
     tasks = compiled(
         tmp_path, SCRIPT, blendfile=str(blend), output=str(farm), views=5, chunk=2, width=64, height=48
     )["tasks"]  # fmt: skip
     assert len(tasks) == 4
-    for task in tasks:
-        assert not (farm / "sparse").exists()
-        for command in task["commands"]:
-            subprocess.run([*BLENDER, *command["args"]], check=True)
-    last = [word if word != str(farm) else str(single) for word in tasks[-1]["commands"][0]["args"]]
-    subprocess.run([*BLENDER, *last], check=True)
+    commands = [command["args"] for task in tasks for command in task["commands"]]
+    commands.append([str(single) if word == str(farm) else word for word in commands[-1]])
+    subprocess.run(
+        [sys.executable, "-c", COMMANDS, str(blend), str(farm / "sparse"), json.dumps(commands)],
+        cwd=ROOT, check=True,
+    )  # fmt: skip
     assert contents(farm) == contents(single) and len(read_scene(farm).points)
 
 
