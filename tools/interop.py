@@ -21,7 +21,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from training.splats.bundle import read_bundle, write_bundle
-from training.splats.formats import STREAMED, lods_of  # noqa: E402
+from training.splats.formats import STREAMED_FILE, level_arguments  # noqa: E402
 from training.splats.gaussians import Splats  # noqa: E402
 from training.splats.level_folder import write_folder
 from training.splats.levels import Bundle, Level
@@ -112,9 +112,9 @@ def checks(bundle: Bundle):
     folder = FOLDER / "folder"
     shutil.rmtree(folder, ignore_errors=True)
     write_folder(folder, bundle)
-    meta = folder / "web" / STREAMED
+    meta = folder / "web" / STREAMED_FILE
     # Its compression of view-dependent colour takes minutes on a CPU and changes no count: -H 0 drops it.
-    result = splat_transform("-w", "-g", "cpu", *lods_of(folder, len(counts)), str(meta), "-H", "0")
+    result = splat_transform("-w", "-g", "cpu", *level_arguments(folder, len(counts)), str(meta), "-H", "0")
     theirs = json.loads(meta.read_text("utf-8"))["counts"] if meta.exists() else failure(result)
     complete = [sum(counts[lod:]) for lod in range(len(counts))] if bundle.cumulative else counts
     yield "folder: lod-meta.json counts", complete, theirs

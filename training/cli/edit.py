@@ -111,7 +111,7 @@ def run(options: argparse.Namespace) -> int:
     from ..editing.cleaning import Cleaning
     from ..editing.edit import edit
     from ..runs.folder import RunFolder
-    from ..splats.formats import as_ply
+    from ..splats.formats import open_as_ply
 
     limits: dict[str, Any] = _limits(options)
     crops = _crops(options)
@@ -139,7 +139,7 @@ def run(options: argparse.Namespace) -> int:
         )
     cleaning = Cleaning(tuple(crops), drop_floaters=options.drop_floaters, **limits)
     folder = RunFolder(options.source)
-    with as_ply(folder.bundle if folder.bundle.exists() else folder.path) as source:
+    with open_as_ply(folder.bundle if folder.bundle.exists() else folder.path) as source:
         print(
             edit(
                 source, options.out, cleaning, warn,

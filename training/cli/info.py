@@ -20,9 +20,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    from ..splats.formats import as_ply
+    from ..splats.formats import open_as_ply
 
-    with as_ply(options.file) as path:
+    with open_as_ply(options.file) as path:
         print(describe(path).replace(str(path), str(options.file)))
     return 0
 

@@ -15,7 +15,7 @@ from ..lod.tree.shape import complete_levels
 from ..splats.bundle import open_bundle, write_bundle
 from ..splats.dialects import Warn, comments_from_meta, ignore, meta_from_comments
 from ..splats.file_rows import DrawableRows
-from ..splats.formats import PLY, SPLAT, format_of, program, write_splats, write_streamed
+from ..splats.formats import PLY, SPLAT, find_format, find_splat_transform, write_splats, write_streamed_levels
 from ..splats.gaussians import SplatRows, Splats
 from ..splats.level_folder import read_folder, write_folder
 from ..splats.levels import Bundle, Level
@@ -69,9 +69,9 @@ def edit(
     for path in (out, *plain, folder, streamed):
         if path is not None and path.resolve() == source.resolve():
             raise LodgsError(f"{path} is what is to be edited.", "Give another name.")
-    kinds = {format_of(path) for path in plain}
+    kinds = {find_format(path) for path in plain}
     if streamed is not None or not kinds <= {PLY, SPLAT}:
-        program()  # is missed before minutes of work
+        find_splat_transform()  # is missed before minutes of work
     if source.is_dir():
         bundle = read_folder(source, warn)
     else:
@@ -98,14 +98,14 @@ def edit(
         for before, after in zip(bundle.levels, found.levels, strict=True)
     ]
     for path in plain:
-        form = found if antialiased or format_of(path).antialiased else bake_filter(found)
+        form = found if antialiased or find_format(path).antialiased else bake_filter(found)
         run_to_end(write_splats(path, ConcatenatedRows.upto(form, form.levels[-1].number), form.meta))
     if folder is not None or streamed is not None:
         levels = complete_levels(_in_memory(found)) if is_tree(found) else found
         if folder is not None:
             write_folder(folder, levels)
         if streamed is not None:
-            run_to_end(write_streamed(streamed, levels if antialiased else bake_filter(levels)))
+            run_to_end(write_streamed_levels(streamed, levels if antialiased else bake_filter(levels)))
     paths = [path for path in (out, *plain, folder, streamed) if path is not None]
     return "\n".join([*lines, *(f"{path}: written" for path in paths)])
 

@@ -1,4 +1,4 @@
-"""Other kinds of files. What splat-transform makes of ours, and we of its, where it is installed."""
+"""Splat files of other programs, exchanged with splat-transform if it is installed."""
 
 import os
 import shutil
@@ -14,32 +14,32 @@ from training.splats.bundle import read_bundle, write_bundle
 from training.splats.formats import (
     FORMATS,
     PROGRAM,
-    STREAMED,
-    as_ply,
-    format_of,
+    STREAMED_FILE,
+    find_format,
+    open_as_ply,
     read_splat,
-    run,
+    run_splat_transform,
     write_splat,
     write_splats,
-    write_streamed,
+    write_streamed_levels,
 )
 from training.splats.gaussians import SH_C0, Splats
 from training.splats.level_folder import read_folder
 from training.splats.levels import Bundle, Level
 from training.splats.ply import read_ply
 
-HERE = Path(__file__).parents[3] / "build" / "interop" / "node_modules" / ".bin"
-"""Where ``make interop`` has npm put it."""
+NODE_PROGRAMS = Path(__file__).parents[3] / "build" / "interop" / "node_modules" / ".bin"
+"""npm's program folder after ``make interop``."""
 
 
 @pytest.fixture
-def theirs(monkeypatch):
-    monkeypatch.setenv("PATH", f"{HERE}{os.pathsep}{os.environ['PATH']}")
+def splat_transform(monkeypatch):
+    monkeypatch.setenv("PATH", f"{NODE_PROGRAMS}{os.pathsep}{os.environ['PATH']}")
     if not shutil.which(PROGRAM):
-        pytest.skip("splat-transform is not installed; make interop installs it, where Node.js is")
+        pytest.skip("splat-transform is not installed; make interop installs it if Node.js is available")
 
 
-def splats_of(count, degree=0, seed=0):
+def random_splats(count, degree=0, seed=0):
     rng = np.random.default_rng(seed)
 
     def normal(*shape):
@@ -49,154 +49,156 @@ def splats_of(count, degree=0, seed=0):
     return Splats(normal(count, 3), normal(count, 4), normal(count, 3) - 3, 2 * normal(count), sh)
 
 
-def finish(work):
-    for _ in work:
+def finish(steps):
+    for _ in steps:
         pass
 
 
-def alike(found, splats, shifts=1e-2, scales=0.1, opacities=0.02, colours=0.05):
-    """Whether splats in any order are the same but for what compression loses."""
+def assert_similar(actual, splats, shifts=1e-2, scales=0.1, opacities=0.02, colours=0.05):
+    """Compare splats in any order, up to losses of compression."""
     order = np.lexsort(np.round(splats.means, 1).T)
-    nearest = [np.linalg.norm(found.means - mean, axis=1).argmin() for mean in splats.means[order]]
+    nearest = [np.linalg.norm(actual.means - mean, axis=1).argmin() for mean in splats.means[order]]
     assert len(set(nearest)) == len(splats)
-    found, splats = found.select(np.array(nearest)), splats.select(order)
-    assert np.abs(found.means - splats.means).max() < shifts
-    assert np.abs(found.log_scales - splats.log_scales).max() < scales
+    actual, splats = actual.select(np.array(nearest)), splats.select(order)
+    assert np.abs(actual.means - splats.means).max() < shifts
+    assert np.abs(actual.log_scales - splats.log_scales).max() < scales
     unit = splats.quats / np.linalg.norm(splats.quats, axis=1, keepdims=True)
-    other = found.quats / np.linalg.norm(found.quats, axis=1, keepdims=True)
-    assert np.abs((unit * other).sum(1)).min() > 0.999
-    seen, was = (1 / (1 + np.exp(-each.opacity_logits)) for each in (found, splats))
-    assert np.abs(seen - was).max() < opacities
-    # SOG has 256 colours for all splats: of few, some are far off
-    assert np.quantile(np.abs(found.sh[:, 0] - splats.sh[:, 0]), 0.95) < colours
+    actual_unit = actual.quats / np.linalg.norm(actual.quats, axis=1, keepdims=True)
+    assert np.abs((unit * actual_unit).sum(1)).min() > 0.999
+    actual_opacity, opacity = (1 / (1 + np.exp(-x.opacity_logits)) for x in (actual, splats))
+    assert np.abs(actual_opacity - opacity).max() < opacities
+    # SOG has 256 colours for all splats, so a few are far off
+    assert np.quantile(np.abs(actual.sh[:, 0] - splats.sh[:, 0]), 0.95) < colours
 
 
-def test_a_row_of_splat_is_what_its_page_says(tmp_path):
-    one = Splats(
+def test_splat_row_matches_its_specification(tmp_path):
+    splats = Splats(
         np.float32([[1, 2, 3]]), np.float32([[1, -1, 1, 1]]), np.log(np.float32([[0.1, 0.2, 0.3]])),
         np.float32([0]), np.float32([[[0.1 / SH_C0, -0.5 / SH_C0, 1 / SH_C0]]]),
     )  # fmt: skip
-    write_splat(tmp_path / "a.splat", one)
+    write_splat(tmp_path / "a.splat", splats)
     row = struct.unpack("<6f8B", (tmp_path / "a.splat").read_bytes())
     assert np.allclose(row[:6], [1, 2, 3, 0.1, 0.2, 0.3])
     assert row[6:] == (153, 0, 255, 128, 192, 64, 192, 192)
 
 
-def test_splat_comes_back(tmp_path):
-    splats = splats_of(70_000)
+def test_splat_round_trips(tmp_path):
+    splats = random_splats(70_000)
     write_splat(tmp_path / "a.splat", splats)
-    found = read_splat(tmp_path / "a.splat")
-    assert np.array_equal(found.means, splats.means)
-    assert np.allclose(found.log_scales, splats.log_scales, atol=1e-5)
-    alpha, was = (1 / (1 + np.exp(-each.opacity_logits)) for each in (found, splats))
-    assert np.abs(alpha - was).max() <= 0.51 / 255
+    actual = read_splat(tmp_path / "a.splat")
+    assert np.array_equal(actual.means, splats.means)
+    assert np.allclose(actual.log_scales, splats.log_scales, atol=1e-5)
+    actual_opacity, opacity = (1 / (1 + np.exp(-x.opacity_logits)) for x in (actual, splats))
+    assert np.abs(actual_opacity - opacity).max() <= 0.51 / 255
     inside = np.abs(SH_C0 * splats.sh) < 0.5
-    assert np.abs((found.sh - splats.sh) * SH_C0)[inside].max() <= 0.51 / 255
+    assert np.abs((actual.sh - splats.sh) * SH_C0)[inside].max() <= 0.51 / 255
 
 
-def test_a_splat_file_cut_short_is_one_sentence(tmp_path):
+def test_truncated_splat_file_raises_one_sentence(tmp_path):
     (tmp_path / "a.splat").write_bytes(bytes(33))
-    with pytest.raises(LodgsError, match="no rows of 32"):
+    with pytest.raises(LodgsError, match="not a multiple of 32"):
         read_splat(tmp_path / "a.splat")
 
 
-def test_they_read_our_splat(tmp_path, theirs):
-    from training.splats.formats import run
-
-    splats = splats_of(300)
+def test_splat_transform_reads_our_splat(tmp_path, splat_transform):
+    splats = random_splats(300)
     write_splat(tmp_path / "a.splat", splats)
-    run([str(tmp_path / "a.splat"), str(tmp_path / "b.ply")])
-    alike(read_ply(tmp_path / "b.ply"), splats, colours=6)  # colours beyond 0 and 1 are clipped
+    run_splat_transform([str(tmp_path / "a.splat"), str(tmp_path / "b.ply")])
+    assert_similar(read_ply(tmp_path / "b.ply"), splats, colours=6)  # colours beyond 0 and 1 are clipped
 
 
 @pytest.mark.parametrize("ending", [".spz", ".compressed.ply", ".sog"])
-def test_what_they_write_comes_back_alike(tmp_path, theirs, ending):
-    splats = splats_of(300, degree=0 if ending == ".sog" else 2)
+def test_converted_files_round_trip(tmp_path, splat_transform, ending):
+    splats = random_splats(300, degree=0 if ending == ".sog" else 2)
     finish(write_splats(tmp_path / f"a{ending}", splats, {"antialias": True}))
-    if ending != ".sog":  # which takes some kB whatever is in it
+    if ending != ".sog":  # takes some kB even if empty
         assert (tmp_path / f"a{ending}").stat().st_size < 0.4 * len(splats) * 4 * (
             14 + 3 * splats.sh.shape[1]
         )
-    with as_ply(tmp_path / f"a{ending}") as there:
-        assert there.name == "a.ply"
-        bundle = read_bundle(there)
-    alike(bundle.levels[0].splats, splats)
+    with open_as_ply(tmp_path / f"a{ending}") as ply:
+        assert ply.name == "a.ply"
+        bundle = read_bundle(ply)
+    assert_similar(bundle.levels[0].splats, splats)
     if ending == ".spz":
         assert bundle.antialias
-    assert not there.exists() and {path.name for path in tmp_path.iterdir()} == {f"a{ending}"}
+    assert not ply.exists() and {path.name for path in tmp_path.iterdir()} == {f"a{ending}"}
 
 
-def test_a_compressed_ply_is_known_by_what_is_in_it(tmp_path, theirs):
-    finish(write_splats(tmp_path / "a.compressed.ply", splats_of(50), {}))
+def test_compressed_ply_is_detected_by_its_contents(tmp_path, splat_transform):
+    finish(write_splats(tmp_path / "a.compressed.ply", random_splats(50), {}))
     (tmp_path / "a.compressed.ply").rename(tmp_path / "b.ply")
-    with as_ply(tmp_path / "b.ply") as there:
-        assert len(read_ply(there)) == 50
+    with open_as_ply(tmp_path / "b.ply") as ply:
+        assert len(read_ply(ply)) == 50
 
 
-def test_streamed_levels_come_back_with_all_splats(tmp_path, theirs):
-    levels = [Level(number, splats_of(100 * number, seed=number)) for number in (1, 2, 3)]
+def test_streamed_levels_round_trip(tmp_path, splat_transform):
+    levels = [Level(number, random_splats(100 * number, seed=number)) for number in (1, 2, 3)]
     folder = tmp_path / "web"
-    finish(write_streamed(folder, Bundle("flod", levels)))
-    with as_ply(folder) as there:
-        found = read_folder(there)
-    assert [level.number for level in found.levels] == [1, 2, 3]
-    for level, before in zip(found.levels, levels, strict=True):
-        alike(level.splats, before.splats)
-    finish(write_streamed(folder, Bundle("flod", levels[:2])))  # in place of those
-    with as_ply(folder / STREAMED) as there:
-        assert len(read_folder(there).levels) == 2
+    finish(write_streamed_levels(folder, Bundle("flod", levels)))
+    with open_as_ply(folder) as plain:
+        bundle = read_folder(plain)
+    assert [level.number for level in bundle.levels] == [1, 2, 3]
+    for level, original in zip(bundle.levels, levels, strict=True):
+        assert_similar(level.splats, original.splats)
+    finish(write_streamed_levels(folder, Bundle("flod", levels[:2])))  # replaces them
+    with open_as_ply(folder / STREAMED_FILE) as plain:
+        assert len(read_folder(plain).levels) == 2
     assert {path.name for path in tmp_path.iterdir()} == {"web"}
 
 
-def test_a_level_that_a_crop_has_emptied_is_not_streamed(tmp_path, theirs):
-    levels = [Level(1, splats_of(0)), Level(2, splats_of(200, seed=2)), Level(3, splats_of(300, seed=3))]
-    finish(write_streamed(tmp_path / "web", Bundle("flod", levels)))
-    with as_ply(tmp_path / "web") as there:
-        found = read_folder(there)
-    for level, before in zip(found.levels, levels[1:], strict=True):
-        alike(level.splats, before.splats)
-    with pytest.raises(LodgsError, match="no splats"):
-        finish(write_streamed(tmp_path / "none", Bundle("flod", levels[:1])))
+def test_empty_levels_are_not_streamed(tmp_path, splat_transform):
+    levels = [
+        Level(1, random_splats(0)),
+        Level(2, random_splats(200, seed=2)),
+        Level(3, random_splats(300, seed=3)),
+    ]
+    finish(write_streamed_levels(tmp_path / "web", Bundle("flod", levels)))
+    with open_as_ply(tmp_path / "web") as plain:
+        bundle = read_folder(plain)
+    for level, original in zip(bundle.levels, levels[1:], strict=True):
+        assert_similar(level.splats, original.splats)
+    with pytest.raises(LodgsError, match="contain no splats"):
+        finish(write_streamed_levels(tmp_path / "none", Bundle("flod", levels[:1])))
 
 
-def test_streamed_levels_replace_nothing_else(tmp_path, theirs):
+def test_streamed_levels_replace_no_foreign_files(tmp_path, splat_transform):
     (tmp_path / "web").mkdir()
     (tmp_path / "web" / "thesis.txt").touch()
-    with pytest.raises(LodgsError, match="holds other files"):
-        finish(write_streamed(tmp_path / "web", Bundle("", [Level(1, splats_of(9))])))
+    with pytest.raises(LodgsError, match="contains other files"):
+        finish(write_streamed_levels(tmp_path / "web", Bundle("", [Level(1, random_splats(9))])))
     assert (tmp_path / "web" / "thesis.txt").exists()
 
 
-def test_a_conversion_that_is_stopped_leaves_nothing(tmp_path, theirs):
-    work = write_splats(tmp_path / "a.spz", splats_of(300), {})
-    next(work)
-    work.close()
+def test_stopped_conversion_leaves_no_files(tmp_path, splat_transform):
+    steps = write_splats(tmp_path / "a.spz", random_splats(300), {})
+    next(steps)
+    steps.close()
     assert not list(tmp_path.iterdir())
 
 
-def test_what_they_cannot_read_is_one_sentence(tmp_path, theirs):
+def test_unreadable_file_raises_one_sentence(tmp_path, splat_transform):
     (tmp_path / "a.spz").write_bytes(b"no splats")
-    with pytest.raises(LodgsError, match="splat-transform ended with"), as_ply(tmp_path / "a.spz"):
+    with pytest.raises(LodgsError, match="splat-transform failed"), open_as_ply(tmp_path / "a.spz"):
         pass
 
 
-def test_without_the_program_it_is_said_how_to_get_it(tmp_path, monkeypatch):
+def test_missing_program_error_tells_how_to_install_it(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setattr("training.splats.formats._FOLDERS", ())
     with pytest.raises(LodgsError, match="npm install --global @playcanvas/splat-transform"):
-        finish(write_splats(tmp_path / "a.spz", splats_of(3), {}))
-    finish(write_splats(tmp_path / "a.splat", splats_of(3), {}))
-    finish(write_splats(tmp_path / "a.ply", splats_of(3), {}))
+        finish(write_splats(tmp_path / "a.spz", random_splats(3), {}))
+    finish(write_splats(tmp_path / "a.splat", random_splats(3), {}))
+    finish(write_splats(tmp_path / "a.ply", random_splats(3), {}))
     assert {path.name for path in tmp_path.iterdir()} == {"a.splat", "a.ply"}
 
 
 @pytest.fixture
 def stand_in(tmp_path, monkeypatch):
-    """``stand_in(lines)``: a shell script in the program's place, in the current folder; its path."""
+    """Return ``stand_in(lines)``, which replaces the program with a shell script and returns its path."""
     if os.name == "nt":
-        pytest.skip("the program that stands in is a shell script")
+        pytest.skip("the replacement is a shell script")
 
-    def made(lines):
+    def write(lines):
         program = tmp_path / PROGRAM
         program.write_text(f"#!/bin/sh\n{lines}\n")
         program.chmod(0o755)
@@ -204,32 +206,32 @@ def stand_in(tmp_path, monkeypatch):
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
-    return made
+    return write
 
 
-def test_a_processor_clusters_colours_in_fewer_rounds(stand_in):
-    program = stand_in('echo "$*" >> "$0.said"\ncase "$*" in *"-g cpu"*) touch a.sog;; *) exit 1;; esac')
-    run(["a.ply", "a.sog"])
-    first, second = Path(f"{program}.said").read_text().splitlines()
+def test_cpu_clusters_colours_in_fewer_rounds(stand_in):
+    program = stand_in('echo "$*" >> "$0.log"\ncase "$*" in *"-g cpu"*) touch a.sog;; *) exit 1;; esac')
+    run_splat_transform(["a.ply", "a.sog"])
+    first, second = Path(f"{program}.log").read_text().splitlines()
     assert " -i " not in first and "-g cpu -i 3 a.ply a.sog" in second
 
 
-def test_a_program_that_writes_nothing_has_failed_whatever_it_returns(stand_in):
-    """Older versions of it take some options to mean something else."""
+def test_program_without_output_file_has_failed(stand_in):
+    """Older versions interpret some options differently and return 0."""
     stand_in("echo No adapters found")
-    with pytest.raises(LodgsError, match=r"wrote no file\. Look whether its version is 3"):
-        run(["-L", "0", "lod-meta.json", "lod0.ply"])
+    with pytest.raises(LodgsError, match=r"no output\)\. Check that its version is 3"):
+        run_splat_transform(["-L", "0", "lod-meta.json", "lod0.ply"])
 
 
-def test_kinds_are_known_by_name():
-    assert [format_of(Path(f"a.b{kind.suffix}".upper())) for kind in FORMATS] == list(FORMATS)
+def test_formats_are_found_by_name():
+    assert [find_format(Path(f"a.b{kind.suffix}".upper())) for kind in FORMATS] == list(FORMATS)
     with pytest.raises(LodgsError, match=r"\.obj"):
-        format_of(Path("a.obj"))
+        find_format(Path("a.obj"))
 
 
-def test_sizes_of_kinds_without_compression_are_exact(tmp_path):
+def test_sizes_of_uncompressed_formats_are_exact(tmp_path):
     for degree in range(5):
-        splats = splats_of(256, degree)
+        splats = random_splats(256, degree)
         for kind in FORMATS:
             if kind.suffix == ".ply" or (kind.suffix == ".splat" and degree == 0):
                 path = tmp_path / f"a{kind.suffix}"
@@ -239,8 +241,8 @@ def test_sizes_of_kinds_without_compression_are_exact(tmp_path):
 
 
 @pytest.mark.parametrize("cumulative", [False, True])
-def test_one_command_writes_all_forms_alike(tmp_path, monkeypatch, capsys, cumulative):
-    levels = [Level(number, splats_of(200 * number, 1, seed=number)) for number in (1, 2)]
+def test_edit_command_writes_all_formats_alike(tmp_path, monkeypatch, capsys, cumulative):
+    levels = [Level(number, random_splats(200 * number, 1, seed=number)) for number in (1, 2)]
     facts = {"d_max": 5.0, "d_max_focal": 300.0} if cumulative else {}
     for level in levels:
         level.splats.extras["lod_bias"] = np.zeros(len(level.splats), np.float32)
@@ -251,14 +253,15 @@ def test_one_command_writes_all_forms_alike(tmp_path, monkeypatch, capsys, cumul
     command += " --plain one.ply --plain one.splat --folder all"
     monkeypatch.chdir(tmp_path)
     assert main(command.split()) == 0, capsys.readouterr().err
-    out, one, folder = read_bundle("out.ply"), read_ply("one.ply"), read_folder("all")
-    kept = [level.splats.select(np.linalg.norm(level.splats.means, axis=1) <= 1) for level in levels]
-    want = [2 * each.means @ np.float32([[1, 0, 0], [0, 0, 1], [0, -1, 0]]).T + (0, 0, 1) for each in kept]
-    for level, other, means in zip(out.levels, folder.levels, want, strict=True):
+    out, plain, folder = read_bundle("out.ply"), read_ply("one.ply"), read_folder("all")
+    cropped = [level.splats.select(np.linalg.norm(level.splats.means, axis=1) <= 1) for level in levels]
+    rotation = np.float32([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+    expected = [2 * splats.means @ rotation.T + (0, 0, 1) for splats in cropped]
+    for level, folder_level, means in zip(out.levels, folder.levels, expected, strict=True):
         assert np.allclose(level.splats.means, means, atol=1e-5)
-        assert np.array_equal(level.splats.means, other.splats.means)
-    finest = np.concatenate(want) if cumulative else want[-1]
-    assert np.allclose(one.means, finest, atol=1e-5)
-    assert np.array_equal(read_splat(tmp_path / "one.splat").means, one.means)
+        assert np.array_equal(level.splats.means, folder_level.splats.means)
+    finest = np.concatenate(expected) if cumulative else expected[-1]
+    assert np.allclose(plain.means, finest, atol=1e-5)
+    assert np.array_equal(read_splat(tmp_path / "one.splat").means, plain.means)
     assert np.array_equal(out.up_rotation, np.eye(3))
     assert main(["edit", "in.ply"]) == 2  # nothing to write
