@@ -1,12 +1,12 @@
-"""Trainers killed at random moments and disks that fill up: nothing is lost, and every end is told.
+"""Kill trainers at random times and fill disks: results must not change, and errors must be reported.
 
     python tools/attacks.py [--kills 60] [--disks 20] [--seed 0]
 
-Runs of seconds on a tiny scene with a distorted lens, one of a tree without room for its nodes; not on
-Windows, where processes do not fork. A killed run is resumed, and killed again, and must end with the bits of
-an undisturbed one, with no file too many. A disk (a tmpfs, for which one has to be root on Linux) that is too
-small must be told as Blender's panel tells it, in a sentence, and given room the run must end as well
-as any. Figures go to build/attacks.json.
+Runs take seconds on a tiny scene with a distorted lens; one trains a tree with too little memory for its
+nodes. Needs fork, so not on Windows. A killed run is resumed and killed again; it must give the bits and
+files of an undisturbed run. Running out of disk space (a small tmpfs, which needs root on Linux) must end in
+the message that Blender's panel shows, and the run must finish once there is space. Results are written to
+build/attacks.json.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ os.environ |= {"LODGS_CHECKPOINT_SECONDS": "0", "OMP_NUM_THREADS": "1"}
 
 import numpy as np  # noqa: E402
 
-import training.runs.train  # noqa: E402, F401 - loaded once for all that are killed
+import training.runs.train  # noqa: E402, F401 - loaded once, before forking
 from tests.training.conftest import FOCAL, HEIGHT, WIDTH, write_tiny_scene  # noqa: E402
-from tools.attacks_blocks import FULL_SAYS, contents, disk  # noqa: E402
+from tools.attacks_blocks import DISK_FULL_MESSAGES, contents, small_disk  # noqa: E402
 from training import __main__, files  # noqa: E402
 from training.errors import LodgsError  # noqa: E402
 from training.optimize.method import Method  # noqa: E402
@@ -53,34 +53,36 @@ PARAMETERS: dict[str, dict] = {
     "tree": {"tune_steps": 40, "pixels": 3.0, "resize_interval": 9, "sh_degree": 3},
 }
 BASE_SPLATS = 3000
-"""Of the base of a tree, whose nodes take several times the one megabyte that its job gives them."""
+"""Splats of a tree's base. Its nodes need several times the megabyte that the job allows."""
 KINDS = ("undistort", "checkpoint", "level", "bundle", "event", "step", "rows")
-"""What a trainer is busy with when it is killed."""
-KILLS_A_RUN = 3
+"""Activities during which a trainer is killed."""
+KILLS_PER_RUN = 3
 FORK = get_context("fork")
 
 
-# -- the victim ------------------------------------------------------------------------------------------
+# -- trainer ------------------------------------------------------------------------------------------
 
 
-def victim(job: Path, kind: str, number: int, share: float, counts_file: Path | None) -> None:
-    """Trains a job, counts what it is busy with, and kills itself at the N-th time of a kind.
+def train_until_killed(job: Path, kind: str, number: int, share: float, counts_file: Path | None) -> None:
+    """Train a job, count activities, and kill this process at the given activity.
 
     Args:
-        kind: one of KINDS; another one for none.
-        share: how much of what it was writing has got to the disk.
-        counts_file: where to write what was counted.
+        job: job file.
+        kind: one of KINDS; any other value never kills.
+        number: how many activities of this kind to complete first.
+        share: share of the data being written that reaches the disk.
+        counts_file: output file for the counts.
     """
     counts: dict[str, int] = dict.fromkeys(KINDS, 0) | {"peak": 0}
 
-    def moment(now: str, before=None) -> None:
-        counts[now] += 1
-        if now == kind and counts[now] > number:
-            if before:
-                before()
+    def activity(current: str, write_part=None) -> None:
+        counts[current] += 1
+        if current == kind and counts[current] > number:
+            if write_part:
+                write_part()
             os.kill(os.getpid(), signal.SIGKILL)
 
-    def busy_with(path: str) -> str:
+    def kind_of(path: str) -> str:
         names = {"checkpoints": "checkpoint", "levels": "level"}
         return "bundle" if "bundle.ply" in path else names.get(Path(path).parent.name, "event")
 
@@ -90,11 +92,11 @@ def victim(job: Path, kind: str, number: int, share: float, counts_file: Path | 
     write = row_file._write
 
     def sync(descriptor: int) -> None:
-        place = f"/proc/self/fd/{descriptor}"
-        path = os.readlink(place) if os.path.exists(place) else ""
-        if path.endswith(".tmp"):  # as much of it as had got to the disk
+        link = f"/proc/self/fd/{descriptor}"
+        path = os.readlink(link) if os.path.exists(link) else ""
+        if path.endswith(".tmp"):
             size = os.fstat(descriptor).st_size
-            moment(busy_with(path), lambda: os.truncate(path, int(size * share)))
+            activity(kind_of(path), lambda: os.truncate(path, int(size * share)))
         fsync(descriptor)
 
     def move(source, target) -> None:
@@ -102,26 +104,26 @@ def victim(job: Path, kind: str, number: int, share: float, counts_file: Path | 
             run = Path(target).parents[target.parent.name in ("checkpoints", "levels")]
             sizes = sum(path.stat().st_size + 4096 for path in run.rglob("*") if path.is_file())
             counts["peak"] = max(counts["peak"], sizes)
-            moment(busy_with(str(target)))
+            activity(kind_of(str(target)))
         replace(source, target)
         if str(source).endswith(".tmp"):
-            moment(busy_with(str(target)))
+            activity(kind_of(str(target)))
 
     def step(self, number: int):
-        moment("step")
+        activity("step")
         return train_step(self, number)
 
-    def say(self, data: bytes) -> None:
-        moment("event", lambda: self._file.write(data[: int(len(data) * share)]))
+    def append_event(self, data: bytes) -> None:
+        activity("event", lambda: self._file.write(data[: int(len(data) * share)]))
         append(self, data)
 
     def write_back(file, blocks) -> None:
-        moment("rows", lambda: write(file, blocks.reshape(-1)[: int(blocks.size * share)]))
+        activity("rows", lambda: write(file, blocks.reshape(-1)[: int(blocks.size * share)]))
         write(file, blocks)
 
     row_file._write = write_back
     files.os.fsync, files.os.replace = sync, move  # type: ignore[assignment]
-    Method.train_step, EventWriter._append = step, say  # pyright: ignore
+    Method.train_step, EventWriter._append = step, append_event  # pyright: ignore
     code = __main__.main(["train", str(job)])
     if counts_file is not None:
         counts_file.write_text(json.dumps(counts))
@@ -131,35 +133,39 @@ def victim(job: Path, kind: str, number: int, share: float, counts_file: Path | 
 # -- attacks ---------------------------------------------------------------------------------------------
 
 
-class Bench:
-    """Scenes, jobs and what they give undisturbed.
+class TrainerAttack:
+    """Scene, jobs, and the results of undisturbed runs.
 
     Args:
-        work: a folder for all of it.
-        chance: what draws moments.
+        work: working folder.
+        rng: random generator for the times of attacks.
     """
 
-    def __init__(self, work: Path, chance: random.Random) -> None:
-        self.work, self.chance = work, chance
+    def __init__(self, work: Path, rng: random.Random) -> None:
+        self.work = work
+        self.rng = rng
         self.scene = write_tiny_scene(work / "scene")
-        (self.scene / CACHE_FOLDER).touch()  # no folder: each run has to straighten photographs for itself
+        (
+            self.scene / CACHE_FOLDER
+        ).touch()  # a file instead of a folder, so that each run undistorts photos itself
         model = self.scene / "sparse" / "0"
         camera = f"1 SIMPLE_RADIAL {WIDTH} {HEIGHT} {FOCAL} {WIDTH / 2} {HEIGHT / 2} 0.02\n"
         (model / "cameras.txt").write_text(camera)
         points = (model / "points3D.txt").read_text().splitlines()
         without_tracks = [" ".join(line.split()[:8]) + "\n" for line in points]
         (model / "points3D.txt").write_text("".join(without_tracks))
-        write_ply(work / "base.ply", base())
-        self.counts, self.truth = {}, {}
+        write_ply(work / "base.ply", base_splats())
+        self.counts = {}
+        self.expected = {}
         for method in PARAMETERS:
             out = work / f"undisturbed-{method}"
             counts = work / f"{method}.json"
-            code = ended(self._victim(self.job(method, out), counts=counts))
-            assert code == 0, f"an undisturbed run ends with {code}"
-            self.counts[method], self.truth[method] = json.loads(counts.read_text()), contents(out)
+            code = exit_code(self._start(self.job(method, out), counts=counts))
+            assert code == 0, f"undisturbed run ended with {code}"
+            self.counts[method], self.expected[method] = json.loads(counts.read_text()), contents(out)
 
     def job(self, method: str, out: Path) -> Path:
-        """A job file of a run in a folder."""
+        """Write the job file of a run; return its path."""
         path = out.with_name(f"{out.name}.json")
         keys = {
             "scene": str(self.scene), "out": str(out), "method": method, "backend": "cpu", "image_scale": 1.0,
@@ -170,64 +176,65 @@ class Bench:
         path.write_text(json.dumps(keys))
         return path
 
-    def _victim(self, job: Path, kind="-", number=0, share=0.0, counts: Path | None = None) -> Process:
-        """A trainer at work; forked, so that it need not load torch."""
-        process = FORK.Process(target=victim, args=(job, kind, number, share, counts))
+    def _start(self, job: Path, kind="-", number=0, share=0.0, counts: Path | None = None) -> Process:
+        """Fork a trainer, which saves loading torch."""
+        process = FORK.Process(target=train_until_killed, args=(job, kind, number, share, counts))
         process.start()
         return process
 
     def kill_runs(self, kills: int) -> dict:
-        """Kills trainers until that many are dead; what became of their runs."""
-        found = {"killed": dict.fromkeys(KINDS, 0), "runs": 0, "outlived": 0, "wrong": []}
+        """Kill this many trainers; return the results of their runs."""
+        results = {"killed": dict.fromkeys(KINDS, 0), "runs": 0, "outlived": 0, "wrong": []}
         kinds = [kind for _ in range(kills) for kind in KINDS]
-        while sum(found["killed"].values()) < kills:
-            method = list(PARAMETERS)[found["runs"] % len(PARAMETERS)]
+        while sum(results["killed"].values()) < kills:
+            method = list(PARAMETERS)[results["runs"] % len(PARAMETERS)]
             out = self.work / "killed"
             shutil.rmtree(out, ignore_errors=True)
             job = self.job(method, out)
-            for _ in range(KILLS_A_RUN):
+            for _ in range(KILLS_PER_RUN):
                 possible = {"undistort": not any(out.glob("undistorted/*")), "rows": method == "tree"}
                 kind = next((k for k in kinds if possible.get(k, True)), "-")
                 if kind == "undistort":
-                    dead = self._kill_undistorting(job, out, found)
+                    killed = self._kill_undistorting(job, out, results)
                 else:
-                    most = self.counts[method].get(kind, 0)
-                    number = self.chance.randrange(max(most // (1 if most < 9 else KILLS_A_RUN), 1))
-                    dead = ended(self._victim(job, kind, number, self.chance.random())) == -signal.SIGKILL
-                if dead:
+                    total = self.counts[method].get(kind, 0)
+                    number = self.rng.randrange(max(total // (1 if total < 9 else KILLS_PER_RUN), 1))
+                    killed = exit_code(self._start(job, kind, number, self.rng.random())) == -signal.SIGKILL
+                if killed:
                     kinds.remove(kind)
-                    found["killed"][kind] += 1
-                    state, said = run_outcome(RunFolder(out), None)
+                    results["killed"][kind] += 1
+                    state, message = run_outcome(RunFolder(out), None)
                     if state not in ("interrupted", "done"):
-                        found["wrong"].append(f"{method}, {kind}: {state} {said}")
-            self._finish(method, job, out, found, found["killed"])
-        return found
+                        results["wrong"].append(f"{method}, {kind}: {state} {message}")
+            self._finish(method, job, out, results, results["killed"])
+        return results
 
-    def _kill_undistorting(self, job: Path, out: Path, found: dict) -> bool:
-        trainer = self._victim(job)
+    def _kill_undistorting(self, job: Path, out: Path, results: dict) -> bool:
+        trainer = self._start(job)
         while not any(out.glob("undistorted/undistorting-*")):
             if not trainer.is_alive():
                 return False
             time.sleep(0.002)
-        time.sleep(self.chance.uniform(0, 1.2))
-        listed = Path(f"/proc/{trainer.pid}/task/{trainer.pid}/children")
-        children = listed.read_text().split() if listed.exists() else []
+        time.sleep(self.rng.uniform(0, 1.2))
+        children_file = Path(f"/proc/{trainer.pid}/task/{trainer.pid}/children")
+        children = children_file.read_text().split() if children_file.exists() else []
         trainer.kill()
-        dead = ended(trainer) == -signal.SIGKILL
-        end = time.monotonic() + 10
-        while any(map(alive, children)) and time.monotonic() < end:
+        killed = exit_code(trainer) == -signal.SIGKILL
+        deadline = time.monotonic() + 10
+        while any(map(is_alive, children)) and time.monotonic() < deadline:
             time.sleep(0.05)
-        found["outlived"] += sum(map(alive, children))
-        return dead
+        results["outlived"] += sum(map(is_alive, children))
+        return killed
 
     def fill_disks(self, disks: int) -> dict:
-        """Trains on disks that are too small, from nearly nothing to nearly enough; how that was told."""
-        found = {"full": 0, "runs": 0, "wrong": [], "told": {}}
+        """Train on disks that are too small, from nearly empty to nearly sufficient; return the results."""
+        results = {"full": 0, "runs": 0, "wrong": [], "messages": {}}
         for number in range(disks):
             method = list(PARAMETERS)[number % len(PARAMETERS)]
             size = int(self.counts[method]["peak"] * (0.02 + 0.96 * number / max(disks - 1, 1)))
-            with disk(self.work / "disk", size) as place:
-                run, log = RunFolder(place / "run"), place / "run" / "trainer.log"
+            with small_disk(self.work / "disk", size) as folder:
+                run = RunFolder(folder / "run")
+                log = run.log
                 try:
                     run.create()
                     Job.from_file(self.job(method, self.work / "full")).resolved().write(run.job)
@@ -236,54 +243,54 @@ class Bench:
                 except LodgsError as error:
                     state, problem = "failed", str(error)
                 text = log.read_text() if log.exists() else ""
-                told = any(words in problem for words in FULL_SAYS)
-                if state == "failed" and told and "Traceback" not in text:
-                    found["full"] += 1
-                    words = problem.replace(str(place), "RUN")
-                    found["told"][words] = found["told"].get(words, 0) + 1
+                reported = any(message in problem for message in DISK_FULL_MESSAGES)
+                if state == "failed" and reported and "Traceback" not in text:
+                    results["full"] += 1
+                    message = problem.replace(str(folder), "RUN")
+                    results["messages"][message] = results["messages"].get(message, 0) + 1
                 elif state != "done":
-                    found["wrong"].append(f"{method}, {size} bytes: {state}: {problem} {text[-300:]}")
-                subprocess.run(["mount", "-o", "remount,size=1g", str(place)], check=True)
+                    results["wrong"].append(f"{method}, {size} bytes: {state}: {problem} {text[-300:]}")
+                subprocess.run(["mount", "-o", "remount,size=1g", str(folder)], check=True)
                 Job.from_file(self.job(method, run.path)).resolved().write(run.job)
-                (place / "run.json").unlink()
-                self._finish(method, run.job, run.path, found, size)
-        return found
+                (folder / "run.json").unlink()
+                self._finish(method, run.job, run.path, results, size)
+        return results
 
     def _train(self, run: RunFolder) -> int:
-        """A trainer whose output lies beside its run, as Blender starts it."""
+        """Train a run with its output in the run folder, as Blender does."""
         command = [sys.executable, "-m", "training", "train", str(run.job), "--out", str(run.path)]
         with open(run.output, "wb") as output, open(run.log, "ab") as log:
             return subprocess.call(command, cwd=ROOT, stdout=output, stderr=log)
 
-    def _finish(self, method: str, job: Path, out: Path, found: dict, about: object) -> None:
-        """Resumes a run to its end and compares it with the undisturbed one."""
-        code = ended(self._victim(job))
-        found["runs"] += 1
-        truth, now = self.truth[method], contents(out)
-        odd = [name for name in truth.keys() | now.keys() if truth.get(name) != now.get(name)]
-        if code or odd:
-            found["wrong"].append(f"{method}, {about}: code {code}, otherwise: {sorted(odd)}")
+    def _finish(self, method: str, job: Path, out: Path, results: dict, attack: object) -> None:
+        """Resume a run to its end and compare it with the undisturbed one."""
+        code = exit_code(self._start(job))
+        results["runs"] += 1
+        expected = self.expected[method]
+        files = contents(out)
+        differing = [name for name in expected.keys() | files.keys() if expected.get(name) != files.get(name)]
+        if code or differing:
+            results["wrong"].append(f"{method}, {attack}: code {code}, different: {sorted(differing)}")
 
 
-def base() -> Splats:
-    """Splats about where the tiny scene's points are."""
+def base_splats() -> Splats:
+    """Return random splats near the points of the tiny scene."""
     rng = np.random.default_rng(0)
     means = rng.normal(0, rng.choice([0.2, 0.8], (BASE_SPLATS, 1)), (BASE_SPLATS, 3))
     quats, log_scales = rng.normal(size=(BASE_SPLATS, 4)), rng.normal(-4.5, 0.4, (BASE_SPLATS, 3))
     logits, sh = rng.normal(0, 2, BASE_SPLATS), rng.normal(0, 0.3, (BASE_SPLATS, 16, 3))
-    arrays = (each.astype(np.float32) for each in (means, quats, log_scales, logits, sh))
-    means, quats, log_scales, logits, sh = arrays
-    return Splats(means, quats, log_scales, logits, sh)
+    arrays = (means, quats, log_scales, logits, sh)
+    return Splats(*(array.astype(np.float32) for array in arrays))
 
 
-def ended(process: Process) -> int | None:
-    """The exit code of a process, when it has ended."""
+def exit_code(process: Process) -> int | None:
+    """Wait for a process and return its exit code."""
     process.join()
     return process.exitcode
 
 
-def alive(pid: str) -> bool:
-    """Whether a process runs, on Linux."""
+def is_alive(pid: str) -> bool:
+    """Return whether a process runs, on Linux."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
     except OSError:
@@ -291,19 +298,19 @@ def alive(pid: str) -> bool:
 
 
 def main() -> int:
-    """Attacks, prints figures, writes them; returns 1 where something was lost, left or not told."""
+    """Run the attacks, print and write results; return 1 if results differ or an error was not reported."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--kills", type=int, default=60)
     parser.add_argument("--disks", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
-    chosen = parser.parse_args()
+    options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="lodgs-attacks-") as folder:
-        bench = Bench(Path(folder), random.Random(chosen.seed))
-        figures = {"kills": bench.kill_runs(chosen.kills)}
+        attack = TrainerAttack(Path(folder), random.Random(options.seed))
+        figures = {"kills": attack.kill_runs(options.kills)}
         if sys.platform == "linux" and os.geteuid() == 0:
-            figures["disks"] = bench.fill_disks(chosen.disks)
+            figures["disks"] = attack.fill_disks(options.disks)
         else:
-            print("Disks are not filled: only root on Linux can make small ones (mount -t tmpfs).")
+            print("Skipping full disks: mounting a small tmpfs needs root on Linux.")
     report = ROOT / "build" / "attacks.json"
     report.parent.mkdir(exist_ok=True)
     report.write_text(json.dumps(figures, indent=1))

@@ -1,13 +1,13 @@
-"""Blocks of a scene in cells on a Dask cluster of this computer, with everything killed that there is.
+"""Train a scene in cells on a local Dask cluster while killing its processes.
 
     python tools/attacks_blocks.py [--kills 10] [--seed 0]
 
-A scheduler and two workers are started by hand, and ``lodgs blocks run --on tcp://...`` trains a plan on
-them. Killed at random moments are trainers, Dask's worker processes, and whole computers, which are a worker
-with all that runs under it, or told to shut down; then, once, the scheduler, and the command itself, which
-are started again. One run has a disk (a tmpfs, for which one has to be root on Linux) that is too small, and
-some are stopped, by Ctrl-C as a whole and in one block, and gone on with. All must end with the bits of an
-undisturbed run. Not on Windows. Figures go to build/attacks_blocks.json.
+``lodgs blocks run --on tcp://...`` trains a plan with a scheduler and two workers. The attack kills at random
+times: trainers, Dask's worker processes, and simulated computers (a worker with all its child processes, by
+kill or by shutdown); then once the scheduler and once the command, which are restarted. One run has too
+little disk space (a small tmpfs, which needs root on Linux). Some runs are stopped with Ctrl-C or by
+cancelling one block, and resumed. All must give the bits of an undisturbed run. Not on Windows. Results are
+written to build/attacks_blocks.json.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ from training.runs.folder import RunFolder  # noqa: E402
 CHECKPOINT_SECONDS = 1.0
 WORKERS = 2
 PAUSE = 0.5, 4.0
-"""Seconds between two kills."""
-PATIENCE = 600.0
-"""Seconds in which anything must end."""
+"""Minimum and maximum seconds between kills."""
+TIMEOUT = 600.0
+"""Maximum seconds for a run."""
 JOB = {"method": "flod", "image_scale": 1.0, "test_every": 4, "cells": "2x1"}
 PARAMETERS = {"levels": 3, "footprint": 6.0, "max_splats": 300}
 STEPS = (1500, 2000, 2500)
@@ -50,60 +50,62 @@ ENVIRONMENT = {
 }  # fmt: skip
 KINDS = ("worker", "trainer", "computer", "shutdown")
 ONCE = ("scheduler", "command")
-FULL_SAYS = ("No space left on device", "disk is full")
+DISK_FULL_MESSAGES = ("No space left on device", "disk is full")
 
 
 class Cluster:
-    """A scheduler and workers, each started as a user does, on this computer.
+    """A Dask scheduler and workers on this computer, started by their commands.
 
     Attributes:
-        address: of the scheduler, now and after it has been started again.
+        address: address of the scheduler; stays the same after a restart.
     """
 
     def __init__(self, work: Path) -> None:
-        with socket.create_server(("127.0.0.1", 0)) as free:
-            self.address = "tcp://{}:{}".format(*free.getsockname())
-        self.work, self.workers = work, []
+        with socket.create_server(("127.0.0.1", 0)) as server:
+            self.address = "tcp://{}:{}".format(*server.getsockname())
+        self.work = work
+        self.workers = []
         self.start_scheduler()
         for _ in range(WORKERS):
             self.start_worker()
 
     def start_scheduler(self) -> None:
-        """Begins to give tasks out."""
+        """Start the scheduler."""
         port = self.address.rpartition(":")[2]
         self.scheduler = self._start("scheduler", "--host", "127.0.0.1", "--port", port)
 
     def start_worker(self) -> None:
-        """One more computer."""
-        place = ("--local-directory", str(self.work / "dask"))
-        self.workers.append(self._start("worker", self.address, "--nthreads", "1", *place))
+        """Start another worker."""
+        folder = ("--local-directory", str(self.work / "dask"))
+        self.workers.append(self._start("worker", self.address, "--nthreads", "1", *folder))
 
-    def _start(self, *what: str) -> psutil.Process:
+    def _start(self, *arguments: str) -> psutil.Process:
         with (self.work / "dask.log").open("ab") as log:
-            made = subprocess.Popen(
-                [sys.executable, "-m", "dask", *what, "--dashboard-address", ":0"], env=ENVIRONMENT,
+            process = subprocess.Popen(
+                [sys.executable, "-m", "dask", *arguments, "--dashboard-address", ":0"], env=ENVIRONMENT,
                 stdout=log, stderr=log, start_new_session=True,
             )  # fmt: skip
-        return psutil.Process(made.pid)
+        return psutil.Process(process.pid)
 
     def trainers(self) -> list[tuple[int, psutil.Process, psutil.Process]]:
-        """Of each worker whose trainer makes steps: its place, its process below the nanny, the trainer."""
-        found = []
-        for place, nanny in enumerate(self.workers):
+        """Return index, worker process and trainer of each worker whose trainer makes steps."""
+        active = []
+        for index, nanny in enumerate(self.workers):
             with suppress(psutil.Error):
                 for worker in nanny.children():
-                    found += [(place, worker, each) for each in worker.children() if makes_steps(each)]
-        return found
+                    trainers = [child for child in worker.children() if makes_steps(child)]
+                    active += [(index, worker, trainer) for trainer in trainers]
+        return active
 
-    def kill(self, kind: str, chance: random.Random) -> bool:
-        """Kills what trains now, if anything does: one of KINDS."""
-        busy = self.trainers()
-        if not busy:
+    def kill(self, kind: str, rng: random.Random) -> bool:
+        """Kill a process of one of KINDS that is training; return whether one was found."""
+        active = self.trainers()
+        if not active:
             return False
-        place, worker, trainer = chance.choice(busy)
+        index, worker, trainer = rng.choice(active)
         with suppress(psutil.Error):
             if kind in ("computer", "shutdown"):
-                for process in (self.workers.pop(place), worker, trainer):
+                for process in (self.workers.pop(index), worker, trainer):
                     process.kill() if kind == "computer" else process.terminate()
                 self.start_worker()
             else:
@@ -112,40 +114,41 @@ class Cluster:
         return False
 
     def kill_scheduler(self) -> None:
-        """Kills it, and the workers' side of it, as when its computer is switched off."""
+        """Kill the scheduler."""
         self.scheduler.kill()
         self.scheduler.wait()
 
     def close(self) -> None:
-        """Ends all that is left."""
+        """Kill all remaining processes."""
         for process in (self.scheduler, *self.workers):
             with suppress(psutil.Error):
-                for each in (*process.children(recursive=True), process):
+                for member in (*process.children(recursive=True), process):
                     with suppress(psutil.Error):
-                        each.kill()
+                        member.kill()
 
 
 class BlockAttack:
-    """A scene, a cluster, and what the plan gives undisturbed.
+    """Scene, cluster, and the result of an undisturbed run.
 
     Args:
-        work: a folder for all of it.
-        chance: what draws moments.
-        steps: of each level.
+        work: working folder.
+        rng: random generator for the times of attacks.
+        steps: steps of each level.
     """
 
-    def __init__(self, work: Path, chance: random.Random, steps: Sequence[int] = STEPS) -> None:
-        self.work, self.chance = work, chance
+    def __init__(self, work: Path, rng: random.Random, steps: Sequence[int] = STEPS) -> None:
+        self.work = work
+        self.rng = rng
         self.parameters = {**PARAMETERS, "steps": list(steps)}
         self.scene = write_tiny_scene(work / "scene")
-        calm = self.plan(work / "undisturbed")
-        code, said = self.run(calm, "here")
-        assert code == 0, said
-        self.truth = contents(calm.path)
+        undisturbed = self.plan(work / "undisturbed")
+        code, event = self.run(undisturbed, "here")
+        assert code == 0, event
+        self.expected = contents(undisturbed.path)
         self.cluster = Cluster(work)
 
     def plan(self, out: Path) -> RunFolder:
-        """A run's folder with a plan in it."""
+        """Write a plan; return its run folder."""
         path = self.work / "job.json"
         job = {**JOB, "scene": str(self.scene), "out": str(out), "parameters": self.parameters}
         path.write_text(json.dumps(job))
@@ -156,7 +159,7 @@ class BlockAttack:
         return RunFolder(out)
 
     def start(self, run: RunFolder, on: str = "") -> subprocess.Popen:
-        """``lodgs blocks run`` in a process group of its own, as a terminal has it."""
+        """Start ``lodgs blocks run`` in a separate process group, as a terminal does."""
         with (run.path / "trainer.out").open("wb") as output, run.log.open("ab") as log:
             return subprocess.Popen(
                 [sys.executable, "-m", "training", "blocks", "run", str(run.path), "--on",
@@ -164,68 +167,70 @@ class BlockAttack:
                 env=ENVIRONMENT, stdout=output, stderr=log, start_new_session=True,
             )  # fmt: skip
 
-    def run(self, run: RunFolder, on: str = "", meanwhile: Callable = lambda process: None):
-        """Trains a plan to its end; exit code and last event."""
+    def run(self, run: RunFolder, on: str = "", poll: Callable = lambda process: None):
+        """Train a plan; return exit code and final event. ``poll`` is called repeatedly."""
         process = self.start(run, on)
-        until = time.monotonic() + PATIENCE
+        deadline = time.monotonic() + TIMEOUT
         while process.poll() is None:
-            if time.monotonic() > until:
+            if time.monotonic() > deadline:
                 os.killpg(process.pid, signal.SIGKILL)
-                return None, {"what": f"no end in {PATIENCE:.0f} s"}
-            meanwhile(process)
+                return None, {"what": f"not finished after {TIMEOUT:.0f} s"}
+            poll(process)
             time.sleep(0.1)
         return process.returncode, run.end_event() or {}
 
     def kill_all(self, kills: int, once: Sequence[str] = ONCE) -> dict:
-        """Kills workers, trainers and computers until so many are dead, then of ONCE what is asked for."""
-        kinds, once = [KINDS[i % len(KINDS)] for i in range(kills)], list(once)
-        found = {"killed": dict.fromkeys(kinds, 0), "runs": 0, "begun_again": 0, "wrong": [], "lost_s": []}
+        """Kill this many workers, trainers and computers, then the processes named by ``once``."""
+        kinds = [KINDS[i % len(KINDS)] for i in range(kills)]
+        once = list(once)
+        results = {"killed": dict.fromkeys(kinds, 0), "runs": 0, "restarts": 0, "wrong": [], "lost_s": []}
         while kinds or once:
-            run, due = self.plan(self.work / "killed"), [time.monotonic() + self.chance.uniform(*PAUSE)]
+            run = self.plan(self.work / "killed")
+            due = [time.monotonic() + self.rng.uniform(*PAUSE)]
 
             def attack(process: subprocess.Popen, due=due) -> None:
                 if time.monotonic() < due[0]:
                     return
-                due[0] = time.monotonic() + self.chance.uniform(*PAUSE)
-                if kinds and self.cluster.kill(kinds[0], self.chance):
-                    found["killed"][kinds[0]] += 1
+                due[0] = time.monotonic() + self.rng.uniform(*PAUSE)
+                if kinds and self.cluster.kill(kinds[0], self.rng):
+                    results["killed"][kinds[0]] += 1
                     del kinds[0]
                 elif not kinds and once and self.cluster.trainers():
-                    what = once.pop(0)
-                    found["killed"][what] = 1
-                    process.kill() if what == "command" else self.cluster.kill_scheduler()
+                    target = once.pop(0)
+                    results["killed"][target] = 1
+                    process.kill() if target == "command" else self.cluster.kill_scheduler()
 
-            code, said = self.run(run, meanwhile=attack)
-            while code not in (0, None) and found["begun_again"] < 5:
+            code, event = self.run(run, poll=attack)
+            while code not in (0, None) and results["restarts"] < 5:
                 if not self.cluster.scheduler.is_running() or self.cluster.scheduler.status() == "zombie":
-                    found["told"] = f"{said.get('what')} {said.get('remedy', '')}"
+                    results["message"] = f"{event.get('what')} {event.get('remedy', '')}"
                     self.cluster.close()
                     self.cluster = Cluster(self.work)
-                found["begun_again"] += 1
-                code, said = self.run(run, meanwhile=attack)
-            found["lost_s"] += list(lost(run))
-            self._compare(run, code, said, found)
-        found["lost_s"] = [round(each, 2) for each in sorted(found["lost_s"])]
-        return found
+                results["restarts"] += 1
+                code, event = self.run(run, poll=attack)
+            results["lost_s"] += list(lost_seconds(run))
+            self._compare(run, code, event, results)
+        results["lost_s"] = [round(seconds, 2) for seconds in sorted(results["lost_s"])]
+        return results
 
     def fill_disk(self) -> dict:
-        """A disk that has room for half of what the run writes, then for all."""
-        found = {"wrong": [], "told": "", "runs": 0}
-        size = sum(map(len, self.truth.values()))
-        with disk(self.work / "disk", size // 2 + (1 << 18)) as place:
-            run = self.plan(place / "run")
-            code, said = self.run(run)
-            found["told"] = f"{said.get('what')} {said.get('remedy', '')}".replace(str(place), "RUN")
-            if code != 2 or not any(words in found["told"] for words in FULL_SAYS):
-                found["wrong"].append(f"a full disk ends with {code}: {found['told']}")
-            subprocess.run(["mount", "-o", "remount,size=1g", str(place)], check=True)
-            code, said = self.run(run)
-            self._compare(run, code, said, found)
-        return found
+        """Train on a disk with half of the required space, then with enough."""
+        results = {"wrong": [], "message": "", "runs": 0}
+        size = sum(map(len, self.expected.values()))
+        with small_disk(self.work / "disk", size // 2 + (1 << 18)) as folder:
+            run = self.plan(folder / "run")
+            code, event = self.run(run)
+            results["message"] = f"{event.get('what')} {event.get('remedy', '')}".replace(str(folder), "RUN")
+            if code != 2 or not any(message in results["message"] for message in DISK_FULL_MESSAGES):
+                results["wrong"].append(f"full disk: code {code}: {results['message']}")
+            subprocess.run(["mount", "-o", "remount,size=1g", str(folder)], check=True)
+            code, event = self.run(run)
+            self._compare(run, code, event, results)
+        return results
 
     def stop(self, on: str) -> dict:
-        """Cancels one block, then all by Ctrl-C, and goes on, with the one by its own job first."""
-        found = {"wrong": [], "runs": 0, "stopped": []}
+        """Cancel one block, then all with Ctrl-C; resume one block by its own job, then all."""
+        results = {"wrong": [], "runs": 0, "stopped": []}
         run = self.plan(self.work / "stopped")
         blocks = [RunFolder(path) for path in sorted(run.blocks.glob("[0-9]*"))]
 
@@ -233,110 +238,110 @@ class BlockAttack:
             if blocks[1].last_event("progress") and not blocks[1].last_event("cancelled"):
                 blocks[1].request_cancel()
 
-        code, said = self.run(run, on, cancel_one)
-        found["stopped"].append(said.get("message"))
-        if code != 3 or "block 2" not in said.get("message", ""):
-            found["wrong"].append(f"a block was cancelled: {code} {said}")
+        code, event = self.run(run, on, cancel_one)
+        results["stopped"].append(event.get("message"))
+        if code != 3 or "block 2" not in event.get("message", ""):
+            results["wrong"].append(f"cancelled block: {code} {event}")
         shutil.rmtree(run.path)
 
-        run, asked = self.plan(run.path), []
+        run = self.plan(run.path)
+        interrupts = []
 
         def interrupt(process: subprocess.Popen) -> None:
-            if not asked and all(
+            if not interrupts and all(
                 block.last_event("progress") for block in blocks[: WORKERS if on != "here" else 1]
             ):
-                asked.append(os.killpg(process.pid, signal.SIGINT))
+                interrupts.append(os.killpg(process.pid, signal.SIGINT))
 
-        code, said = self.run(run, on, interrupt)
-        found["stopped"].append(said.get("message"))
+        code, event = self.run(run, on, interrupt)
+        results["stopped"].append(event.get("message"))
         if code != 3 or any(block.running for block in blocks):
-            found["wrong"].append(f"Ctrl-C: {code} {said}, {[block.state() for block in blocks]}")
-        alone = [sys.executable, "-m", "training", "train", str(blocks[1].job)]
-        code = subprocess.run(alone, env=ENVIRONMENT, stdout=subprocess.DEVNULL, check=False).returncode
+            results["wrong"].append(f"Ctrl-C: {code} {event}, {[block.state() for block in blocks]}")
+        command = [sys.executable, "-m", "training", "train", str(blocks[1].job)]
+        code = subprocess.run(command, env=ENVIRONMENT, stdout=subprocess.DEVNULL, check=False).returncode
         if code or blocks[1].state() != "done":
-            found["wrong"].append(f"a block by itself: {code} {blocks[1].state()}")
-        code, said = self.run(run, on)
-        self._compare(run, code, said, found)
-        return found
+            results["wrong"].append(f"single block: {code} {blocks[1].state()}")
+        code, event = self.run(run, on)
+        self._compare(run, code, event, results)
+        return results
 
-    def _compare(self, run: RunFolder, code: int | None, said: dict, found: dict) -> None:
-        """Holds a run that is over against the undisturbed one, and removes it."""
-        found["runs"] += 1
-        now = contents(run.path)
-        odd = [name for name in self.truth.keys() | now.keys() if self.truth.get(name) != now.get(name)]
-        if code or odd:
-            found["wrong"].append(f"code {code} {said.get('what', '')}, otherwise: {sorted(odd)}")
+    def _compare(self, run: RunFolder, code: int | None, event: dict, results: dict) -> None:
+        """Compare a finished run with the undisturbed one, and delete it."""
+        results["runs"] += 1
+        expected = self.expected
+        files = contents(run.path)
+        differing = [name for name in expected.keys() | files.keys() if expected.get(name) != files.get(name)]
+        if code or differing:
+            results["wrong"].append(f"code {code} {event.get('what', '')}, different: {sorted(differing)}")
         shutil.rmtree(run.path)
 
 
 def makes_steps(trainer: psutil.Process) -> bool:
-    """Whether a trainer is past its start."""
-    jobs = [
-        Path(each) for each in trainer.cmdline() if each.endswith("job.toml")
-    ]  # none of one that has ended
-    told = RunFolder(jobs[0].parent).last_event("hello", "progress") if jobs else None
-    return told is not None and told["event"] == "progress" and trainer.create_time() < told["time"]
+    """Return whether a trainer has reported a training step."""
+    jobs = [Path(argument) for argument in trainer.cmdline() if argument.endswith("job.toml")]
+    event = RunFolder(jobs[0].parent).last_event("hello", "progress") if jobs else None
+    return event is not None and event["event"] == "progress" and trainer.create_time() < event["time"]
 
 
-def lost(run: RunFolder) -> Iterator[float]:
-    """Seconds of work that each loss of a trainer has cost: from where the next one went on to its end."""
+def lost_seconds(run: RunFolder) -> Iterator[float]:
+    """Yield the seconds of work that each killed trainer had done since its last checkpoint."""
     for file in run.blocks.rglob("events.jsonl"):
         last: dict = {}
         for event in RunFolder(file.parent).events()[0]:
             if event["event"] == "progress":
                 last = event
-            elif event.get("message", "").startswith("Going on from step ") and last:
-                step = int(event["message"].split()[4])
+            elif event.get("message", "").startswith("Resuming at step ") and last:
+                step = int(event["message"].split()[3])
                 yield max(last["step"] - step, 0) / max(last["steps_per_s"], 1e-6)
 
 
 def contents(run: Path) -> dict[str, bytes]:
-    """A run's files by name; of those that tell of times and places nothing but that they are there."""
+    """Return a run's files by name, without the contents of files with times and paths."""
     changing = {"events.jsonl", "lock", "job.toml"}
-    outside = {"trainer.log", "trainer.out"}
+    excluded = {"trainer.log", "trainer.out"}
     files = {path.relative_to(run).as_posix(): path for path in run.rglob("*") if path.is_file()}
     return {
         name: b"" if path.name in changing else path.read_bytes()
         for name, path in files.items()
-        if path.name not in outside
+        if path.name not in excluded
     }
 
 
 @contextmanager
-def disk(place: Path, size: int):
-    """A disk of so many bytes."""
-    place.mkdir(exist_ok=True)
-    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "lodgs", str(place)], check=True)
+def small_disk(folder: Path, size: int):
+    """Mount a tmpfs of this many bytes at a folder."""
+    folder.mkdir(exist_ok=True)
+    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "lodgs", str(folder)], check=True)
     try:
-        yield place
+        yield folder
     finally:
-        subprocess.run(["umount", str(place)], check=True)
+        subprocess.run(["umount", str(folder)], check=True)
 
 
 @contextmanager
-def bench(chance: random.Random, steps: Sequence[int] = STEPS) -> Iterator[BlockAttack]:
-    """All that attacks need, in a folder of its own."""
+def block_attack(rng: random.Random, steps: Sequence[int] = STEPS) -> Iterator[BlockAttack]:
+    """Set up an attack in a temporary folder."""
     with tempfile.TemporaryDirectory(prefix="lodgs-attacks-") as folder:
-        made = BlockAttack(Path(folder), chance, steps)
+        attack = BlockAttack(Path(folder), rng, steps)
         try:
-            yield made
+            yield attack
         finally:
-            made.cluster.close()
+            attack.cluster.close()
 
 
 def main() -> int:
-    """Attacks, prints figures, writes them; returns 1 where bits differ or an end was not told."""
+    """Run the attacks, print and write results; return 1 if results differ or an error was not reported."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--kills", type=int, default=10)
     parser.add_argument("--seed", type=int, default=0)
-    chosen = parser.parse_args()
-    with bench(random.Random(chosen.seed)) as made:
-        figures = {"kills": made.kill_all(chosen.kills)}
-        figures |= {f"stops, on {on}": made.stop(on) for on in ("here", "local:2", made.cluster.address)}
+    options = parser.parse_args()
+    with block_attack(random.Random(options.seed)) as attack:
+        figures = {"kills": attack.kill_all(options.kills)}
+        figures |= {f"stops, on {on}": attack.stop(on) for on in ("here", "local:2", attack.cluster.address)}
         if sys.platform == "linux" and os.geteuid() == 0:
-            figures["disk"] = made.fill_disk()
+            figures["disk"] = attack.fill_disk()
         else:
-            print("No disk is filled: only root on Linux can make small ones (mount -t tmpfs).")
+            print("Skipping the full disk: mounting a small tmpfs needs root on Linux.")
     report = ROOT / "build" / "attacks_blocks.json"
     report.parent.mkdir(exist_ok=True)
     report.write_text(json.dumps(figures, indent=1))

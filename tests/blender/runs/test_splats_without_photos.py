@@ -181,7 +181,7 @@ def test_the_real_trainer_adds_levels_to_splats_without_photos(bpy, lodgs, root,
     messages = []
     jobs.follow(watch, lambda watch: messages.append(watch.message))
     assert (watch.state, watch.problem) == ("done", "")
-    assert any("Drawing view" in message for message in messages)
+    assert any("Rendering view" in message for message in messages)
     levels = {item.number: item.object for item in root.lodgs.levels}
     assert list(levels) == [1, 2, 3] and levels[3] == imported and imported.name.endswith("level 3")
     finest = lodgs("data.scenes").read_level(root, 3)
