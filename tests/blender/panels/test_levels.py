@@ -117,7 +117,7 @@ def test_chunk_of_the_camera_and_loaded_splats_are_shown(bpy, lodgs, town, draw)
     assert f"110 loaded, {110 * per_splat:.1f} MB" in texts
     texts = draw_at((-1, 0, 0), chunks=False)
     assert not any("Chunk" in text or "loaded" in text for text in texts)
-    assert "Only chunks fade into each other." in texts
+    assert "Only chunks fade." in texts
 
 
 def test_loaded_splats_are_counted_again_when_splats_change(bpy, lodgs, town):

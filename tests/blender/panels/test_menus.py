@@ -121,7 +121,7 @@ def test_the_status_bar_shows_work_and_a_notice_of_its_end(bpy, lodgs, work, mon
 
 def test_work_that_ended_unobserved_has_no_notice(lodgs, work):
     work.running = False
-    assert lodgs("panels.status").shown(0.0) == []
+    assert lodgs("panels.status").visible_work(0.0) == []
 
 
 def test_new_work_with_a_reused_id_has_no_notice(lodgs, work):
