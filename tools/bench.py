@@ -1,7 +1,7 @@
-"""Measure the rasterizer by stage, against the machine's own limit: part of ``make bench``.
+"""Measure the rasterizer by stage, relative to the machine's peak performance. Part of ``make bench``.
 
-Prints tables, saves build/bench/bench.json and bench.png; ``--base old.json`` compares with an earlier run.
-Compare runs of one machine only, and trust none that says the machine was busy.
+Prints tables and writes build/bench/bench.json and bench.png; ``--base old.json`` compares with an earlier
+run. Compare only runs on the same machine, and discard runs that report a busy machine.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ CASES = [
     for width, height in ((320, 240), (640, 480), (960, 540))
 ]
 FORWARD_FLOPS, BACKWARD_FLOPS = 26, 47
-"""Operations for each lane of a row that a splat reaches in a tile, counted in the source of ``blend``."""
+"""Operations per lane of a row that a splat covers in a tile, counted in the source of ``blend``."""
 KERNELS = {
     "project_forward": "project",
     "blend_forward": "blend",
@@ -71,7 +71,7 @@ STAGES = ("project", "bin", "blend", "loss", "blend_backward", "project_backward
 
 
 def synthetic_splats(count: int, seed: int = 0) -> Gaussians:
-    """Random splats in a frustum, of log-normal anisotropic scales: about 46 blends a pixel at any count."""
+    """Return random splats in a frustum with log-normal scales; about 46 blends per pixel at any count."""
     random = np.random.default_rng(seed)
     z = random.uniform(2, 10, count)
     means = np.stack([random.uniform(-0.55, 0.55, count) * z, random.uniform(-0.42, 0.42, count) * z, z], 1)
@@ -96,7 +96,7 @@ def synthetic_camera(width: int, height: int) -> Camera:
 
 
 class Step:
-    """A full training step on the synthetic scene."""
+    """A complete training step on the synthetic scene."""
 
     def __init__(self, count: int, width: int, height: int, device: str = "cpu") -> None:
         self.splats = synthetic_splats(count).map(lambda tensor: tensor.to(device).requires_grad_())
@@ -106,15 +106,15 @@ class Step:
 
     def __call__(self) -> None:
         self.adam.zero_grad()
-        drawn = rasterize(self.splats, self.camera)
-        photometric_loss(drawn.image, self.target).backward()
+        rendering = rasterize(self.splats, self.camera)
+        photometric_loss(rendering.image, self.target).backward()
         self.adam.step()
 
 
-class Stopwatch:
-    """Adds up the time spent in the stages of the cpu backend, by wrapping them while it is in use."""
+class StageTimer:
+    """Context manager that sums the time of each stage of the cpu backend by wrapping its functions."""
 
-    def __enter__(self) -> Stopwatch:
+    def __enter__(self) -> StageTimer:
         self.seconds = dict.fromkeys(STAGES, 0.0)
         self.originals = {stage: getattr(module, name) for stage, (module, name) in FUNCTIONS.items()}
         for stage, (module, name) in FUNCTIONS.items():
@@ -138,26 +138,25 @@ class Stopwatch:
 
 
 def measure(step: Callable[[], None], seconds: float) -> tuple[dict[str, float], float]:
-    """Milliseconds by stage of the fastest of as many steps as fit, "step" the whole; and CPU time by wall
-    time."""
+    """Return milliseconds per stage of the fastest step, in total as "step", and CPU time over wall time."""
     step()
     best: dict[str, float] = {"step": float("inf")}
     start, cpu_start = time.perf_counter(), time.process_time()
     while time.perf_counter() - start < seconds or best["step"] == float("inf"):
-        with Stopwatch() as watch:
-            began = time.perf_counter()
+        with StageTimer() as timer:
+            step_start = time.perf_counter()
             step()
-            whole = time.perf_counter() - began
-        if whole * 1e3 < best["step"]:
-            best = {stage: 1e3 * spent for stage, spent in watch.seconds.items()}
-            best["around"] = 1e3 * whole - sum(best.values())
-            best["step"] = 1e3 * whole
+            total = time.perf_counter() - step_start
+        if total * 1e3 < best["step"]:
+            best = {stage: 1e3 * spent for stage, spent in timer.seconds.items()}
+            best["around"] = 1e3 * total - sum(best.values())
+            best["step"] = 1e3 * total
     return best, (time.process_time() - cpu_start) / (time.perf_counter() - start)
 
 
 @kernel(frozenset({"contract"}))
 def multiply_add(begin, end, values, rounds):
-    """8 dependent multiply-adds an element, 4096 elements a thread in the L1 cache."""
+    """Compute 8 dependent multiply-adds per element, on 4096 elements per thread in the L1 cache."""
     for thread in range(begin, end):
         line = values[thread]
         for _ in range(rounds):
@@ -169,7 +168,7 @@ def multiply_add(begin, end, values, rounds):
 
 
 def measured_peak() -> float:
-    """Float32 operations a second (1e9) that multiply-adds reach on all threads."""
+    """Return the measured float32 peak of multiply-adds on all threads, in GFLOP/s."""
     values, rounds = np.ones((thread_count(), 4096), np.float32), 16_000
     run_parallel(multiply_add, len(values), 1, values, 1)
     seconds = []
@@ -182,39 +181,39 @@ def measured_peak() -> float:
 
 @kernel(FAST)
 def count_work(begin, end, projected, splat, tile_start, tiles_x, walked, height, lanes, blends):
-    """Per tile: lanes executed, and splats that a pixel takes light from (pixels beyond the border
-    included)."""
+    """Count per tile the executed lanes and the blends, including pixels beyond the image border."""
     for tile in range(begin, end):
         x0, y0 = tile % tiles_x * 16, tile // tiles_x * 16
         t = np.ones((16, 16), np.float32)
         for pair in range(tile_start[tile], tile_start[tile] + walked[tile]):
             row = projected[splat[pair]]
-            left, top = f32(x0) + f32(0.5), f32(y0) + f32(0.5)
-            first, last = strip_rows(row, left, SPAN, top, min(16, height - y0))
+            x_left, y_top = f32(x0) + f32(0.5), f32(y0) + f32(0.5)
+            first, last = strip_rows(row, x_left, SPAN, y_top, min(16, height - y0))
             lanes[tile] += 16 * max(0, last - first)
             for r in range(first, last):
                 for j in range(16):
-                    dx, dy = f32(j) + left - row[0], f32(r) + top - row[1]
+                    dx, dy = f32(j) + x_left - row[0], f32(r) + y_top - row[1]
                     log2_alpha = row[5] - row[2] * dx * dx - row[3] * dx * dy - row[4] * dy * dy
                     alpha = min(exp2(log2_alpha), CAP)
                     if log2_alpha >= LOG2_ALPHA_MIN and t[r, j] > 0:
-                        behind = t[r, j] * (f32(1) - alpha)
-                        blends[tile] += behind > T_MIN
-                        t[r, j] = behind if behind > T_MIN else -t[r, j]
+                        remaining = t[r, j] * (f32(1) - alpha)
+                        blends[tile] += remaining > T_MIN
+                        t[r, j] = remaining if remaining > T_MIN else -t[r, j]
 
 
 def work(step: Step) -> tuple[int, float]:
-    """Lanes that one pass executes, and blends a pixel."""
-    seen = {}
+    """Return the lanes that one pass executes, and the blends per pixel."""
+    counts = {}
 
     def spy(kernel, total, grain, *args):
         run_parallel(kernel, total, grain, *args)
         if kernel is cpu.blend_forward:
             projected, splat, tile_start, tiles_x, _, _, _, transmittance, walked, _ = args
             lanes, blends = np.zeros((2, len(walked)), np.int64)
-            rest = projected, splat, tile_start, tiles_x, walked, len(transmittance), lanes, blends
-            run_parallel(count_work, total, grain, *rest)
-            seen["lanes"], seen["blends"] = int(lanes.sum()), int(blends.sum()) / transmittance.size
+            arguments = projected, splat, tile_start, tiles_x, walked, len(transmittance), lanes, blends
+            run_parallel(count_work, total, grain, *arguments)
+            counts["lanes"] = int(lanes.sum())
+            counts["blends"] = int(blends.sum()) / transmittance.size
 
     cpu.run_parallel = spy
     try:
@@ -222,32 +221,32 @@ def work(step: Step) -> tuple[int, float]:
             rasterize(step.splats, step.camera)
     finally:
         cpu.run_parallel = run_parallel
-    return seen["lanes"], seen["blends"]
+    return counts["lanes"], counts["blends"]
 
 
-def bytes_a_pair(step: Step) -> float:
-    """Memory of a step that grows with pairs of splat and tile, for each of them."""
-    taken = {}
+def bytes_per_pair(step: Step) -> float:
+    """Return the memory of a step per pair of splat and tile, in bytes."""
+    sizes = {}
     take = Buffers.take
 
     def spy(self, name: str, kind, *shape: int):
-        found = take(self, name, kind, *shape)
-        taken[name] = found.nbytes
-        return found
+        buffer = take(self, name, kind, *shape)
+        sizes[name] = buffer.nbytes
+        return buffer
 
     Buffers.take = spy
     try:
         step()
     finally:
         Buffers.take = take
-    pairs = taken["splat"] / np.dtype(np.int32).itemsize
-    return sum(taken[name] for name in ("hits", "splat", "reached", "pair_sums")) / pairs
+    pairs = sizes["splat"] / np.dtype(np.int32).itemsize
+    return sum(sizes[name] for name in ("hits", "splat", "reached", "pair_sums")) / pairs
 
 
 def bench(seconds: float) -> dict:
     peak = measured_peak()
-    count_of_threads = thread_count()
-    print(f"{count_of_threads} threads, FP32 peak measured {peak:.0f} GFLOP/s")
+    threads = thread_count()
+    print(f"{threads} threads, FP32 peak measured {peak:.0f} GFLOP/s")
     columns = [*STAGES, "around", "step"]
     print(
         f"{'splats':>7} {'pixels':>8} {'blends':>6} "
@@ -264,7 +263,7 @@ def bench(seconds: float) -> dict:
         cases.append(
             {
                 "splats": count, "width": width, "height": height, "blends_per_pixel": round(blends, 1),
-                "threads": count_of_threads, "step_ms": {name: round(best[name], 2) for name in columns},
+                "threads": threads, "step_ms": {name: round(best[name], 2) for name in columns},
                 "kernel_share_of_peak": round(share, 3), "cpu_by_wall_time": round(busy, 2),
             }
         )  # fmt: skip
@@ -275,93 +274,108 @@ def bench(seconds: float) -> dict:
         )
     busy = min(case["cpu_by_wall_time"] for case in cases if case["splats"] >= 50_000)
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0
-    if load > count_of_threads + 1 or busy < 0.75 * count_of_threads:
+    if load > threads + 1 or busy < 0.75 * threads:
         print(
-            f"The machine had other work (load {load:.1f}, {busy:.1f} of {count_of_threads} threads "
-            "at work): these times are too long."
+            f"The machine was busy (load {load:.1f}, {busy:.1f} of {threads} threads available): "
+            "do not use these results."
         )
-    pair = bytes_a_pair(Step(200_000, 960, 540))
-    print(f"memory beyond the splats, 200k at 960x540: {pair:.0f} bytes a pair of splat and tile")
+    pair = bytes_per_pair(Step(200_000, 960, 540))
+    print(f"memory besides splats, 200k at 960x540: {pair:.0f} bytes per pair of splat and tile")
     return {"peak_gflops": round(peak, 1), "cases": cases, "bytes_a_pair": round(pair, 1)}
 
 
-def least(function: Callable[[], object], seconds: float) -> float:
-    """Milliseconds of the fastest of as many calls as fit, after one."""
+def fastest(function: Callable[[], object], seconds: float) -> float:
+    """Return the milliseconds of the fastest call within a time limit, after one warm-up call."""
     function()
     best, start = float("inf"), time.perf_counter()
     while time.perf_counter() - start < seconds:
-        began = time.perf_counter()
+        call_start = time.perf_counter()
         function()
-        best = min(best, time.perf_counter() - began)
+        best = min(best, time.perf_counter() - call_start)
     return 1e3 * best
 
 
-def further(seconds: float) -> dict:
-    """What is not a training step: forward only, weights, threads, the first compilation."""
-    found: dict[str, Any] = {}
+def measure_other(seconds: float) -> dict:
+    """Measure forward passes, weights, selection, thread counts, compilation and the cuda backend."""
+    results: dict[str, Any] = {}
     splats, camera = synthetic_splats(200_000), synthetic_camera(960, 540)
-    found["forward_ms"] = least(lambda: next(render(splats, [camera])), seconds)
+    results["forward_ms"] = fastest(lambda: next(render(splats, [camera])), seconds)
+    results["weights_by_removed"] = weights_over_removed(splats, camera)
+    results["choosing_ms"], results["asking_each_ms"] = selection_ms(splats, camera, seconds)
+    steps, peaks = measure_threads(seconds)
+    results["step_ms_by_threads"], results["peak_by_threads"] = steps, peaks
+    results |= compilation_seconds()
+    if resolve_backend("auto") == "cuda":
+        step = Step(200_000, 960, 540, "cuda")
+        results["cuda_step_ms"] = fastest(lambda: (step(), torch.cuda.synchronize()), seconds)
+        print(f"training step on the GPU, 200k splats at 960x540: {results['cuda_step_ms']:.1f} ms")
+    print(f"forward only, 200k splats at 960x540: {results['forward_ms']:.1f} ms")
+    print(f"70 % of the weights zero, relative to removing these splats: {results['weights_by_removed']:.3f}")
+    print(
+        f"selection by distance, two levels of 200k splats: {results['choosing_ms']:.2f} ms, "
+        f"splat by splat {results['asking_each_ms']:.2f} ms"
+    )
+    gains = (
+        f"{n}: {ms:.1f} ms ({steps[1] / ms:.2f}x, multiply-adds {peaks[n] / peaks[1]:.2f}x)"
+        for n, ms in steps.items()
+    )
+    print("step by number of threads, and gain of multiply-adds: " + ", ".join(gains))
+    print(f"first compilation: {results['cold_s']:.1f} s, from the cache: {results['cached_s']:.2f} s")
+    return results
 
+
+def weights_over_removed(splats: Gaussians, camera: Camera) -> float:
+    """Return the time with 70 % zero weights relative to that without these splats."""
     weights = torch.from_numpy((np.random.default_rng(2).random(200_000) > 0.7).astype(np.float32))
-    kept = splats.select(weights > 0)
+    visible = splats.select(weights > 0)
 
-    def draw(some: Gaussians, **options) -> Callable:
-        return lambda: next(render(some, [camera], **options))
+    def draw(gaussians: Gaussians, **options) -> Callable:
+        return lambda: next(render(gaussians, [camera], **options))
 
-    some, removed = draw(splats, weights=weights), draw(kept)
-    turns = [[least(drawn, 1e-3) for drawn in (some, removed)] for _ in range(40)]  # noise hits both alike
-    found["weights_by_removed"] = float(np.divide(*np.median(turns, axis=0)))
+    functions = draw(splats, weights=weights), draw(visible)
+    times = [[fastest(function, 1e-3) for function in functions] for _ in range(40)]  # interleave noise
+    return float(np.divide(*np.median(times, axis=0)))
 
-    found["choosing_ms"], found["asking_each_ms"] = choosing(splats, camera, seconds)
 
-    step, before = Step(50_000, 640, 480), thread_count()
-    by_threads, peaks = {}, {}
+def measure_threads(seconds: float) -> tuple[dict[int, float], dict[int, float]]:
+    """Return milliseconds per step and measured peak, by number of threads."""
+    step, default = Step(50_000, 640, 480), thread_count()
+    steps, peaks = {}, {}
     try:
-        for count in sorted({1, 2, before, 16}):
+        for count in sorted({1, 2, default, 16}):
             set_thread_count(count)
-            by_threads[count] = least(step, seconds)
+            steps[count] = fastest(step, seconds)
             peaks[count] = measured_peak()
     finally:
-        set_thread_count(before)
-    found["step_ms_by_threads"], found["peak_by_threads"] = by_threads, peaks
+        set_thread_count(default)
+    return steps, peaks
 
+
+def compilation_seconds() -> dict[str, float]:
+    """Return the seconds of the first compilation of the kernels, and of loading them from the cache."""
     program = (
         "import time, torch\nfrom training.rasterize import warm_up\nt = time.perf_counter()\nwarm_up()\n"
+        "print(time.perf_counter() - t)"
     )
-    program += "print(time.perf_counter() - t)"
-    for name in ("cold_s", "cached_s"):
-        found[name] = float("inf")
+    results = {"cold_s": float("inf"), "cached_s": float("inf")}
     for _ in range(3):
         with tempfile.TemporaryDirectory() as folder:
             environment = os.environ | {"NUMBA_CACHE_DIR": folder}
-            for name in ("cold_s", "cached_s"):
-                run = [sys.executable, "-c", program]
-                said = subprocess.run(
-                    run, cwd=ROOT, env=environment, capture_output=True, text=True, check=True
-                )
-                found[name] = min(found[name], float(said.stdout))
-    if resolve_backend("auto") == "cuda":
-        step = Step(200_000, 960, 540, "cuda")
-        found["cuda_step_ms"] = least(lambda: (step(), torch.cuda.synchronize()), seconds)
-        print(f"training step on the GPU, 200k splats at 960x540: {found['cuda_step_ms']:.1f} ms")
-    print(f"forward only, 200k splats at 960x540: {found['forward_ms']:.1f} ms")
-    print(f"70 % of the weights zero, against those splats removed: {found['weights_by_removed']:.3f}")
-    print(
-        f"choosing by distance, two levels of 200k splats: {found['choosing_ms']:.2f} ms, "
-        f"splat by splat {found['asking_each_ms']:.2f} ms"
-    )
-    gains = (
-        f"{n}: {ms:.1f} ms ({by_threads[1] / ms:.2f}x, multiply-adds {peaks[n] / peaks[1]:.2f}x)"
-        for n, ms in by_threads.items()
-    )
-    print("step by threads, and what the machine itself gains: " + ", ".join(gains))
-    print(f"first compilation: {found['cold_s']:.1f} s, from the cache: {found['cached_s']:.2f} s")
-    return found
+            for name, best in results.items():
+                process = subprocess.run(
+                    [sys.executable, "-c", program],
+                    cwd=ROOT, env=environment, capture_output=True, text=True, check=True,
+                )  # fmt: skip
+                results[name] = min(best, float(process.stdout))
+    return results
 
 
-def choosing(splats: Gaussians, camera: Camera, seconds: float) -> tuple[float, float]:
-    """Milliseconds to choose what FLoD's rule shows a view of two levels of the same splats, which meet in
-    their middle: in blocks, of which only those at the border are looked at, and splat by splat."""
+def selection_ms(splats: Gaussians, camera: Camera, seconds: float) -> tuple[float, float]:
+    """Return milliseconds to select two levels by FLoD's rule, by blocks and splat by splat.
+
+    Both levels have the same splats, and the border between them is at their median distance. By blocks, only
+    blocks at the border are evaluated per splat.
+    """
     order = spatial_order(splats.means.numpy())
     means, log_scales = splats.means.numpy()[order], splats.log_scales.numpy()[order]
     chooser, values = SplatSelector(means, {}, log_scales), (("gamma", 1.0), ("first", 1), ("last", 2))
@@ -372,13 +386,13 @@ def choosing(splats: Gaussians, camera: Camera, seconds: float) -> tuple[float, 
         for facts in (collect_facts(BANDS, {}, levels, number) for number, _ in levels)
     ]
     return (
-        least(lambda: [chooser.chosen(choice, camera, 0.01) for choice in choices], seconds),
-        least(lambda: [np.flatnonzero(choice.weights(means, {})) for choice in choices], seconds),
+        fastest(lambda: [chooser.chosen(choice, camera, 0.01) for choice in choices], seconds),
+        fastest(lambda: [np.flatnonzero(choice.weights(means, {})) for choice in choices], seconds),
     )
 
 
 def plot(cases: list[dict], path: Path) -> None:
-    """Stacked bars of the stages of every case."""
+    """Plot the stages of each case as stacked bars."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, 5), layout="constrained")
@@ -389,13 +403,13 @@ def plot(cases: list[dict], path: Path) -> None:
         heights = np.array([case["step_ms"][stage] for case in cases])
         axes.bar(labels, heights, bottom=bottom, label=stage)
         bottom += heights
-    axes.set_ylabel("ms a training step")
+    axes.set_ylabel("ms per training step")
     axes.legend()
     figure.savefig(path, dpi=120)
 
 
 def compare(new: dict, base: dict) -> None:
-    """Print each case's step against the same case of an earlier run."""
+    """Print the step time of each case relative to an earlier run."""
     earlier = {(case["splats"], case["width"], case["height"]): case for case in base["cases"]}
     for case in new["cases"]:
         key = case["splats"], case["width"], case["height"]
@@ -406,13 +420,13 @@ def compare(new: dict, base: dict) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seconds", type=float, default=3.0, help="time for each case")
-    parser.add_argument("--base", type=Path, help="a bench.json to compare with")
+    parser.add_argument("--seconds", type=float, default=3.0, help="time limit per case")
+    parser.add_argument("--base", type=Path, help="earlier bench.json to compare with")
     parser.add_argument("--out", type=Path, default=Path("build/bench/bench.json"))
     options = parser.parse_args()
     torch.set_num_threads(1)
     result = bench(options.seconds)
-    result |= further(options.seconds)
+    result |= measure_other(options.seconds)
     options.out.parent.mkdir(parents=True, exist_ok=True)
     plot(result["cases"], options.out.with_suffix(".png"))
     options.out.write_text(json.dumps(result, indent=1) + "\n")

@@ -1,8 +1,8 @@
-"""Measure the gpu backend on the device that is chosen, or that LODGS_GPU names: part of ``make bench``.
+"""Measure the gpu backend on the default device, or that of LODGS_GPU. Part of ``make bench``.
 
-A training step that stays on the device, its stages, the same through copies, and on the cpu, in one run; the
-share that it has of the multiply-adds and the copies that the device makes by itself; bytes moved in a step.
-Saves build/bench/gpu.json. On software that stands for a card these are sanity checks.
+Measures in one run: a training step on the device and its stages, a step through copies, and a step on the
+cpu; the share of the device's measured peak of multiply-adds and copies; and bytes transferred per step.
+Writes build/bench/gpu.json. Results of a software device are only sanity checks.
 """
 
 from __future__ import annotations
@@ -45,40 +45,41 @@ from training.rasterize.gpu.default_device import open_default_device  # noqa: E
 from training.rasterize.gpu.device import LANES, Device  # noqa: E402
 
 CASES = [(50_000, 640, 426), (200_000, 960, 540), (1_000_000, 1920, 1080)]
-"""Splats, width and height; on software the first one alone."""
+"""Splats, width and height. A software device runs only the first case."""
 STAGES = {
     "project forward": "project", "project backward": "project_backward", "blend forward": "blend",
     "blend backward": "blend_backward", "gather gradients": "gather", "train adam": "adam",
     "train collect_stats": "statistics",
 }  # fmt: skip
-"""Stages by shader and function; of other shaders by the shader."""
+"""Stages by shader and function; for other shaders, by shader only."""
 SHADERS = {"sort": "sort", "scan": "sort", "bin": "bin", "loss": "loss", "train": "loss"}
 WORDS, ROUNDS, GROUPS = 1 << 24, 4096, 1024
-"""Of the measurements of copies and of multiply-adds."""
+"""Sizes of the measurements of copies and multiply-adds."""
 MULTIPLY_ADDS = 4
-"""Vectors of four in each round."""
-BYTES_A_NUMBER = 24
-"""That Adam moves: a value and two moments, there and back; and a gradient of which most are not read."""
+"""Multiply-adds of four-component vectors per round."""
+BYTES_PER_NUMBER = 24
+"""Bytes that Adam transfers per number: value and two moments, in and out; few gradients are read."""
 
 
 class Fastest:
-    """Seconds of the fastest of some calls."""
+    """Callable that returns the seconds of the fastest call within a time limit."""
 
     def __init__(self, seconds: float) -> None:
         self._seconds = seconds
 
     def __call__(self, call: Callable[[], object]) -> float:
         call()
-        found, end = [], time.perf_counter() + self._seconds
-        while not found or time.perf_counter() < end:
+        times = []
+        deadline = time.perf_counter() + self._seconds
+        while not times or time.perf_counter() < deadline:
             begin = time.perf_counter()
             call()
-            found.append(time.perf_counter() - begin)
-        return min(found)
+            times.append(time.perf_counter() - begin)
+        return min(times)
 
 
 def peaks(device: Device, fastest: Fastest) -> tuple[float, float]:
-    """GFLOP/s of dependent multiply-adds, and GB/s of a copy, read and written."""
+    """Return GFLOP/s of dependent multiply-adds, and GB/s of a copy (read and write)."""
     source, destination = (device.empty(np.float32, WORDS) for _ in range(2))
 
     def run(entry: str, groups: int, numbers: tuple) -> None:
@@ -91,7 +92,7 @@ def peaks(device: Device, fastest: Fastest) -> tuple[float, float]:
 
 
 class Case:
-    """A scene's training steps."""
+    """Training steps of one scene."""
 
     def __init__(self, count: int, width: int, height: int) -> None:
         self.camera, self.size = synthetic_camera(width, height), (count, width, height)
@@ -103,28 +104,28 @@ class Case:
 
     def through_torch(self, backend: str) -> None:
         self.adam.zero_grad()
-        drawn = rasterize(Gaussians(**self.adam.tensors), self.camera, backend=backend)
-        photometric_loss(drawn.image, self.target, backend=backend).backward()
+        rendering = rasterize(Gaussians(**self.adam.tensors), self.camera, backend=backend)
+        photometric_loss(rendering.image, self.target, backend=backend).backward()
         self.adam.step()
 
-    def there(self) -> Callable[[], object]:
-        """A step that stays on the device."""
+    def on_device(self) -> Callable[[], object]:
+        """Return a step that stays on the device."""
         twin = make_device_model("gpu", self.adam, self.stats)
         assert twin is not None
         options = {"near": 0.01, "sh_degree": 3, "background": (0.0, 0.0, 0.0), "ssim_weight": 0.2}
         return lambda: twin.step(self.camera, self.target, shrink=1, **options)
 
 
-def moved(device: Device, step: Callable[[], object]) -> int:
-    """Bytes of a step between device and computer."""
+def transferred_bytes(device: Device, step: Callable[[], object]) -> int:
+    """Return the bytes transferred between device and host in a step."""
     step()
-    before = device.transferred
+    previous = device.transferred
     step()
-    return device.transferred - before
+    return device.transferred - previous
 
 
 def stages_of(device: Device, step: Callable[[], object]) -> dict[str, float]:
-    """Milliseconds of the stages of a step, with the device waited for after each dispatch."""
+    """Return milliseconds per stage of a step, synchronising the device after each dispatch."""
     run, spent, wait = device.run, defaultdict(float), device.empty(np.float32, 1)
 
     def timed(shader: str, entry: str, *arguments, **buffers) -> None:
@@ -153,25 +154,25 @@ def bench(seconds: float) -> dict:
         case = Case(*size)
         copied = fastest(lambda case=case: case.through_torch("gpu"))
         cpu = fastest(lambda case=case: case.through_torch("cpu"))
-        copied_bytes = moved(device, lambda case=case: case.through_torch("gpu"))
-        step = case.there()
-        there, bytes_moved = fastest(step), moved(device, step)
+        copied_bytes = transferred_bytes(device, lambda case=case: case.through_torch("gpu"))
+        step = case.on_device()
+        device_seconds, bytes_moved = fastest(step), transferred_bytes(device, step)
         stages = stages_of(device, step)
         numbers = size[0] * (scene.SPLAT - 2 + 48)
-        adam_bandwidth = BYTES_A_NUMBER * numbers / (stages["adam"] / 1e3) / 1e9
+        adam_bandwidth = BYTES_PER_NUMBER * numbers / (stages["adam"] / 1e3) / 1e9
         lanes, _ = work(Step(*size))
         blending = (stages["blend"] + stages["blend_backward"]) / 1e3
         blended = lanes * (FORWARD_FLOPS + BACKWARD_FLOPS) / 1e9 / blending
-        found = {
+        result = {
             "splats": size[0], "width": size[1], "height": size[2],
-            "step_ms": round(1e3 * there, 2), "copied_step_ms": round(1e3 * copied, 2),
-            "cpu_step_ms": round(1e3 * cpu, 2), "over_cpu": round(there / cpu, 2), "stages_ms": stages,
-            "bytes_moved": bytes_moved, "copied_bytes_moved": copied_bytes,
+            "step_ms": round(1e3 * device_seconds, 2), "copied_step_ms": round(1e3 * copied, 2),
+            "cpu_step_ms": round(1e3 * cpu, 2), "over_cpu": round(device_seconds / cpu, 2),
+            "stages_ms": stages, "bytes_moved": bytes_moved, "copied_bytes_moved": copied_bytes,
             "blending_share_of_peak": round(blended / flops, 3),
             "adam_share_of_copies": round(adam_bandwidth / bandwidth, 3),
         }  # fmt: skip
-        print(json.dumps(found))
-        cases.append(found)
+        print(json.dumps(result))
+        cases.append(result)
     adapter = device.adapter._asdict()
     return {
         "device": adapter,
@@ -183,16 +184,16 @@ def bench(seconds: float) -> dict:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seconds", type=float, default=3.0, help="time for each measurement")
+    parser.add_argument("--seconds", type=float, default=3.0, help="time limit per measurement")
     parser.add_argument("--out", type=Path, default=Path("build/bench/gpu.json"))
     options = parser.parse_args()
     torch.set_num_threads(1)
     try:
         if resolve_backend("gpu") != "gpu":
-            raise LodgsError("The graphics device does not draw what the reference draws.")
+            raise LodgsError("The graphics device renders incorrectly.")
         result = bench(options.seconds)
     except LodgsError as problem:
-        print(f"No figures of a graphics device: {problem}")
+        print(f"gpu: not measured. {problem}")
         return
     options.out.parent.mkdir(parents=True, exist_ok=True)
     options.out.write_text(json.dumps(result, indent=1) + "\n")
