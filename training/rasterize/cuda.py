@@ -55,8 +55,8 @@ def problem() -> LodgsError | None:
         # standard output is reserved for the trainer's events; concurrent compilations corrupt each other
         with redirect_stdout(sys.stderr), exclusive("gsplat"):
             gsplat = _gsplat()
-            one = torch.ones(1, 3, device=DEVICE)
-            gsplat.spherical_harmonics(0, one, one[None]).cpu()
+            ones = torch.ones(1, 3, device=DEVICE)
+            gsplat.spherical_harmonics(0, ones, ones[None]).cpu()
     except ModuleNotFoundError as error:
         return LodgsError(
             f"Cannot use the cuda backend: the Python package {error.name} is not installed.",

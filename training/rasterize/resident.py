@@ -221,7 +221,8 @@ class ResidentBundle:
         source: a bundle, or a bundle's file.
         backend: rasterizer backend.
         warn: see ``read_bundle``.
-        most: see ``open_if_large``; for files without regions.
+        max_in_memory: maximum number of splats to read from a file without regions at once; 0 means the default
+            of ``open_if_large``.
 
     Attributes:
         bundle: the bundle; without splats if the source is a file.
@@ -237,7 +238,7 @@ class ResidentBundle:
         source: Bundle | str | Path,
         backend: str = "auto",
         warn: Warn = ignore,
-        most: int = 0,
+        max_in_memory: int = 0,
     ) -> None:
         self._path = None if isinstance(source, Bundle) else Path(source)
         self.bundle = source if isinstance(source, Bundle) else read_header_and_tables(source)
@@ -249,7 +250,7 @@ class ResidentBundle:
         self._resident: tuple[Region | None, frozenset[int]] | None = None
         self._rule = check_rule(self.bundle)
         if self._path is not None:
-            self.bundle = open_if_large(self._path, most) or self.bundle
+            self.bundle = open_if_large(self._path, max_in_memory) or self.bundle
         self._sights: dict[int, CulledReader] = {}
         self._row_bytes = 0
         self._facts: dict[int, tuple[tuple[str, float], ...]] = {}

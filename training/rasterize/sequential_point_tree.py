@@ -1,10 +1,10 @@
-"""Cuts of a large tree of splats for one camera after another: the hierarchical sequential point tree.
+"""Hierarchical sequential point tree (HSPT): fast cuts of a large splat tree for many cameras.
 
-A LoD of Gaussians, Sec. 4.1 and 4.3: the upper tree is walked from the root down, and what is out of the
-image is left out with all below it; the subtrees under it are lists by size, which are looked at from the
-largest node down to where all are fine enough. The nodes found are those of the rule ``cut``
-(``lod.rules.cut``), to the bit. In the paper a list is cut by the distance of its root alone, finer than
-asked for behind it and, without M_d, coarser before it.
+A LoD of Gaussians, Sec. 4.1 and 4.3. The upper tree is traversed from the root, and subtrees outside the
+image are culled. The subtrees below the upper tree are lists sorted by size, which are scanned from the
+largest node to the first position from which all nodes are fine enough. The cut is bit-identical to that of
+the rule ``cut`` (``lod.rules.cut``). The paper instead cuts a list by the distance of its root only. This is
+finer than required for nodes behind the root and, without M_d, coarser for nodes in front of it.
 """
 
 from __future__ import annotations
@@ -21,112 +21,130 @@ from ..scenes.cameras import Camera
 from .cpu.compile import STRICT, Buffers, f32, inlined, kernel, run_parallel, run_serial
 
 SLACK = 1e-5
-"""Share by which single precision may get distances and sizes wrong, and more."""
+"""Upper bound of the relative rounding errors of distances and sizes in single precision."""
 LEAF = 1 << 24
-"""Rank of leaves in lists, which they are not in: after all others."""
+"""Rank of leaves, which are not stored in lists; it is larger than all other ranks."""
 _GRAIN = 128
-"""Lists that a thread takes at a time."""
-_NONE = np.empty(0, np.int32)
+"""Lists in a thread's unit of work."""
+_NO_NODES = np.empty(0, np.int32)
 
 
 class UpperTree:
-    """The upper tree with the roots of the lists, which is walked.
+    """Upper tree, whose leaves are the roots of the lists.
 
     Args:
-        tree: of G leaves, each the root of a list.
+        tree: tree of G leaves; every leaf is the root of a list.
         balls: (2G - 1, 4) float32, means and sizes.
-        boxes: (2G - 1, 7) float64 of all that is at or below each: the middle and half the extent of the
-            means, and how far the largest splat reaches from its mean.
+        boxes: (2G - 1, 7) float64, bounds of each node's subtree: centre and half the extent of the means,
+            and the largest reach of a splat from its mean.
     """
 
     def __init__(self, tree: Tree, balls: np.ndarray, boxes: np.ndarray) -> None:
-        self.balls, self.boxes = balls, boxes
-        order, beyond = _preorder(tree)
-        self._walked = order, beyond, order < tree.leaves, balls[order], boxes[order]
+        self.balls = balls
+        self.boxes = boxes
+        order, subtree_end = _preorder(tree)
+        self._arrays = order, subtree_end, order < tree.leaves, balls[order], boxes[order]
 
     @classmethod
     def from_bounds(
         cls, tree: Tree, means: np.ndarray, log_scales: np.ndarray, sizes: np.ndarray, bounds: Bounds
     ) -> UpperTree:
-        """That of a tree, (2G - 1, ...) of each node, whose leaves have bounds, (G, ...)."""
+        """Create it from arrays (2G - 1, ...) of all nodes, and bounds (G, ...) of the lists at its
+        leaves."""
         own = zip(bounds, node_bounds(means, log_scales), strict=True)
-        low, high, reach = (np.append(below, each[tree.leaves :], axis=0) for below, each in own)
+        low, high, reach = (np.append(lists, nodes[tree.leaves :], axis=0) for lists, nodes in own)
         for layer in reversed(tree.layers):
-            one, other = tree.children[layer - tree.leaves].T
+            first, second = tree.children[layer - tree.leaves].T
             for bound, extreme in ((low, np.minimum), (high, np.maximum), (reach, np.maximum)):
-                bound[layer] = extreme(bound[layer], extreme(bound[one], bound[other]))
-        least, most = low.astype(np.float64), high.astype(np.float64)
-        boxes = np.concatenate([(least + most) / 2, (most - least) / 2, reach[:, None]], axis=1)
+                bound[layer] = extreme(bound[layer], extreme(bound[first], bound[second]))
+        low = low.astype(np.float64)
+        high = high.astype(np.float64)
+        boxes = np.concatenate([(low + high) / 2, (high - low) / 2, reach[:, None]], axis=1)
         return cls(tree, np.concatenate([means, sizes[:, None]], axis=1), boxes)
 
-    def traverse(self, eye: np.ndarray, k: float, image: np.ndarray | None) -> tuple[np.ndarray, ...]:
-        """What is fine enough, and where a list has to be looked at.
+    def traverse(
+        self, position: np.ndarray, k: float, borders: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Find the nodes that are fine enough, and the lists to search.
 
         Args:
-            eye: (3,).
-            k: the detail.
-            image: as of :func:`image_borders`; None: nothing is left out.
+            position: (3,) camera position.
+            k: level of detail.
+            borders: see :func:`image_borders`; None disables culling.
 
         Returns:
-            Nodes to draw, (M,) int32, those below G roots of lists; lists, (L,) int32, neighbours together;
-            and of each, (L, 2) float32, two sizes: a node in it that is smaller than the first is fine
-            enough, and one that is larger than the second is not.
+            Nodes to draw, (M,) int32, where nodes below G are roots of lists; lists to search, (L,) int32, in
+            spatial order; and size ranges (L, 2) float32: nodes smaller than the first size are fine enough,
+            and nodes larger than the second are not.
         """
-        image = np.zeros((0, 6)) if image is None else image
+        borders = np.zeros((0, 6)) if borders is None else borders
         nodes, lists = np.empty((2, len(self.balls)), np.int32)
         bands, counts = np.empty((len(self.balls), 2), np.float32), np.zeros(2, np.int64)
         run_serial(
-            _walk, *self._walked, np.asarray(eye, np.float32), f32(k), image, nodes, lists, bands, counts
+            _traverse,
+            *self._arrays,
+            np.asarray(position, np.float32),
+            f32(k),
+            borders,
+            nodes,
+            lists,
+            bands,
+            counts,
         )
         return nodes[: counts[0]], lists[: counts[1]], bands[: counts[1]]
 
 
 def _preorder(tree: Tree) -> tuple[np.ndarray, np.ndarray]:
-    """The nodes (2G - 1,) int32 from the root, each before those below it and these in the order of leaves;
-    and where (2G - 1,) int32 in this order what is below each has an end."""
-    leaves, count = tree.leaves, len(tree)
-    many, first = np.ones(count, np.int32), np.arange(count)
+    """Return the nodes (2G - 1,) int32 in preorder, and the end (2G - 1,) int32 of each node's subtree in it.
+
+    Siblings are in the order of their leaves.
+    """
+    leaves = tree.leaves
+    count = len(tree)
+    sizes = np.ones(count, np.int32)
+    first_leaf = np.arange(count)
     for layer in reversed(tree.layers):
-        below = tree.children[layer - leaves]
-        many[layer] += many[below].sum(axis=1)
-        first[layer] = first[below].min(axis=1)
+        children = tree.children[layer - leaves]
+        sizes[layer] += sizes[children].sum(axis=1)
+        first_leaf[layer] = first_leaf[children].min(axis=1)
     place = np.zeros(count, np.int32)
     for layer in tree.layers:
-        one, other = tree.children[layer - leaves].T
-        one, other = np.where(first[one] < first[other], [one, other], [other, one])
-        place[one] = place[layer] + 1
-        place[other] = place[one] + many[one]
+        a, b = tree.children[layer - leaves].T
+        first, second = np.where(first_leaf[a] < first_leaf[b], [a, b], [b, a])
+        place[first] = place[layer] + 1
+        place[second] = place[first] + sizes[first]
     order = np.empty(count, np.int32)
     order[place] = np.arange(count, dtype=np.int32)
-    return order, place[order] + many[order]
+    return order, place[order] + sizes[order]
 
 
 Bounds = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Of each of some nodes: the least and the greatest mean, (., 3) float32, and the reach, (.,) float32."""
+"""Minimum and maximum of the means (n, 3) float32, and maximum reach (n,) float32."""
 
 
 def node_bounds(means: np.ndarray, log_scales: np.ndarray, begins: np.ndarray | None = None) -> Bounds:
-    """Of nodes (N, 3) themselves, or of all from each of ``begins`` (G,) to the next."""
+    """Return the bounds of N nodes, or of the groups of nodes that begin at ``begins`` (G,)."""
     reach = (REACH * np.exp(np.minimum(log_scales.max(axis=1), 60))).astype(np.float32)
     if begins is None:
         return means, means, reach
-    least, most = np.minimum.reduceat(means, begins, axis=0), np.maximum.reduceat(means, begins, axis=0)
-    return least, most, np.maximum.reduceat(reach, begins)
+    low = np.minimum.reduceat(means, begins, axis=0)
+    high = np.maximum.reduceat(means, begins, axis=0)
+    return low, high, np.maximum.reduceat(reach, begins)
 
 
 class SequentialPointTree:
-    """The nodes of a tree, ready to be cut.
+    """Tree of splats, prepared for fast cuts.
 
     Args:
-        tree: of N leaves.
+        tree: tree of N leaves.
         means: (2N - 1, 3) float32 of all nodes.
         sizes: (2N - 1,) float32, saturated (``Tree.sizes``).
         log_scales: (2N - 1, 3) float32.
-        longest: most leaves below the root of a list; 0: a sixth of the square root of the number of nodes.
-            The longer, the more is found that is out of the image; the shorter, the more is walked.
+        longest: maximum number of leaves below the root of a list; 0 means a sixth of the square root of the
+            number of nodes. Longer lists cull less outside the image; shorter lists cost more traversal.
 
     Attributes:
-        lists: how many there are.
+        lists: number of lists.
     """
 
     def __init__(
@@ -141,8 +159,8 @@ class SequentialPointTree:
         )
         self.lists = len(forest.counts)
         above = inside[inside >= tree.leaves]
-        of_list = np.repeat(np.arange(self.lists, dtype=np.int32), forest.counts - 1)
-        nodes = above[np.lexsort((-sizes[above], of_list))]
+        list_index = np.repeat(np.arange(self.lists, dtype=np.int32), forest.counts - 1)
+        nodes = above[np.lexsort((-sizes[above], list_index))]
         ranks = np.full(len(tree), LEAF, np.int32)
         ranks[nodes] = np.arange(len(nodes)) - np.repeat(forest.list_begins, forest.counts - 1)
         entries = np.empty((len(nodes), 8), np.float32)
@@ -153,35 +171,35 @@ class SequentialPointTree:
         balls[:, :3], balls[:, 3] = means[nodes], sizes[nodes]
 
     def cut(self, camera: Camera, pixels: float, near: float = 0.01) -> np.ndarray:
-        """The nodes (M,) int32 to draw for a camera, but for those that are out of its image; in any order.
+        """Return the nodes (M,) int32 to draw for a camera, in any order, without those outside its image.
 
         Args:
-            pixels: the rule's control.
-            near: depth at which drawing begins, in world units.
+            pixels: maximum node size in pixels, the control of the rule ``cut``.
+            near: near depth in world units.
         """
         return self.cut_at(camera.center, detail_of(camera.focal, pixels), image_borders(camera, near))
 
-    def cut_at(self, eye: np.ndarray, k: float, image: np.ndarray | None = None) -> np.ndarray:
-        """The same for an eye (3,) and a detail k.
+    def cut_at(self, position: np.ndarray, k: float, borders: np.ndarray | None = None) -> np.ndarray:
+        """Return the nodes (M,) int32 to draw for a camera position (3,) and a level of detail k.
 
         Args:
-            image: as of :func:`image_borders`; None: nothing is left out.
+            borders: see :func:`image_borders`; None disables culling.
         """
-        nodes, lists, bands = self._upper.traverse(eye, k, image)
-        found, _ = search_lists(*self._lists, lists, bands, eye, k, self._names[nodes])
-        return found
+        nodes, lists, bands = self._upper.traverse(position, k, borders)
+        cut, _ = search_lists(*self._lists, lists, bands, position, k, self._names[nodes])
+        return cut
 
 
-def first_below(sizes: np.ndarray, begins: np.ndarray, ends: np.ndarray, least: np.ndarray) -> np.ndarray:
-    """Where lists come to sizes below their least, (L,) int64.
+def first_below(sizes: np.ndarray, begins: np.ndarray, ends: np.ndarray, limits: np.ndarray) -> np.ndarray:
+    """Return the first position (L,) int64 in each list whose size is below the list's limit.
 
     Args:
-        sizes: (E,) float32, falling from each list's begin, (L,) int64, to its end, (L,).
-        least: (L,) float64.
+        sizes: (E,) float32, descending from each list's begin, (L,) int64, to its end, (L,).
+        limits: (L,) float64.
     """
-    found = np.empty_like(begins)
-    run_serial(_cut_off, sizes, begins, ends, least, found)
-    return found
+    positions = np.empty_like(begins)
+    run_serial(_first_below, sizes, begins, ends, limits, positions)
+    return positions
 
 
 def search_lists(
@@ -190,96 +208,99 @@ def search_lists(
     borders: np.ndarray,
     lists: np.ndarray,
     bands: np.ndarray,
-    eye: np.ndarray,
+    position: np.ndarray,
     k: float,
-    before: np.ndarray = _NONE,
+    prefix: np.ndarray = _NO_NODES,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Of lists whose roots are not fine enough, the nodes that are and whose parents are not (Eq. 5).
+    """Find the nodes of lists that are fine enough and whose parents are not (Eq. 5).
+
+    The roots of the lists must not be fine enough.
 
     Args:
-        links: (E, 4) int32, of each node of the lists its two children, and their ranks: where they are in
-            the list, or LEAF.
-        balls: (E, 4) float32, mean and size, which falls within a list. Quickest where ``links`` and these
-            lie side by side in memory.
-        borders: (G + 1,) int64, where each list, or its first part, begins, and the last one's end.
-        lists: (L,), which of these.
-        bands: (L, 2) as ``UpperTree.traverse`` says them.
-        eye: (3,).
-        k: the detail.
-        before: nodes to begin with.
+        links: (E, 4) int32, two children of each node and their ranks, which are positions in the list or
+            LEAF.
+        balls: (E, 4) float32, mean and size, which descends within a list. Access is fastest if ``links`` and
+            ``balls`` are adjacent in memory.
+        borders: (G + 1,) int64, begin of each list, or of its first part, and the end of the last list.
+        lists: (L,), indices of the lists to search.
+        bands: (L, 2), size ranges of ``UpperTree.traverse``.
+        position: (3,) camera position.
+        k: level of detail.
+        prefix: nodes to put in front of the result.
 
     Returns:
-        Nodes (M,) int32, one list's after the other's; and how many are of each list, (L,) int64.
+        Nodes (M,) int32, list after list; and their number in each list, (L,) int64.
     """
     longest = int(np.diff(borders).max(initial=0))
     buffers = Buffers()
-    found = buffers.take("cut", np.int32, 2 * longest * len(lists))
+    cut = buffers.take("cut", np.int32, 2 * longest * len(lists))
     counts = np.empty(len(lists), np.int64)
-    asked = np.asarray(eye, np.float32), f32(k), longest
-    run_parallel(_search, len(lists), _GRAIN, links, balls, borders, lists, bands, *asked, found, counts)
+    criterion = np.asarray(position, np.float32), f32(k), longest
+    run_parallel(_search, len(lists), _GRAIN, links, balls, borders, lists, bands, *criterion, cut, counts)
     chunks = range(0, len(lists), _GRAIN)
     sums = np.add.reduceat(counts, chunks) if chunks else chunks
     places = (2 * longest * chunk for chunk in chunks)
-    parts = [found[place : place + count] for place, count in zip(places, sums, strict=True)]
-    return np.concatenate([before, *parts]), counts
+    parts = [cut[place : place + count] for place, count in zip(places, sums, strict=True)]
+    return np.concatenate([prefix, *parts]), counts
 
 
 def image_borders(camera: Camera, near: float) -> np.ndarray:
-    """(5, 6) float64: what ``lod.blocks.Blocks.in_view`` asks, here of a box, one border of the image a row.
+    """Return the frustum planes (5, 6) float64 for culling boxes, one row per border of the image.
 
-    (n, c, s, p): out of the image is where n · middle + c > |n| · half + s reach + p depth, depth that of the
-    box's far end. The first row is the near plane, and has the near depth as p.
+    The test is that of ``lod.blocks.Blocks.in_view``. A row is (n, c, s, p), and a box is outside if
+    n · centre + c > |n| · half + s reach + p depth, where depth is the depth of the box's far end. The first
+    row is the near plane and has the near depth as p.
     """
     turn, shift = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
     rows = [(*-turn[2], near - shift[2], 0.0, near)]
-    for axis, focal, least, most in (
+    for axis, focal, low, high in (
         (0, camera.fx, -camera.cx, camera.width - camera.cx),
         (1, camera.fy, -camera.cy, camera.height - camera.cy),
     ):
-        for sign, border in ((1, most / focal), (-1, -least / focal)):
+        for sign, border in ((1, high / focal), (-1, -low / focal)):
             normal, offset = (sign * part[axis] - border * part[2] for part in (turn, shift))
             rows.append((*normal, offset, math.hypot(1, SLANT * border), PIXELS / focal))
     return np.array(rows)
 
 
 @inlined(STRICT)
-def _fine(balls, i, eye, k):
-    """``lod.rules.cut.is_fine_enough`` of a node, bit for bit."""
-    x, y, z = balls[i, 0] - eye[0], balls[i, 1] - eye[1], balls[i, 2] - eye[2]
+def _is_fine(balls, i, position, k):
+    """Compute ``lod.rules.cut.is_fine_enough`` of a node, bit for bit."""
+    x, y, z = balls[i, 0] - position[0], balls[i, 1] - position[1], balls[i, 2] - position[2]
     return np.sqrt(x * x + y * y + z * z) >= k * balls[i, 3]
 
 
 @kernel(STRICT)
-def _walk(order, beyond, is_list, balls, boxes, eye, k, image, nodes, lists, bands, counts):
-    """Down the upper tree, from the root: nodes to draw, and lists to look at.
+def _traverse(order, subtree_end, is_list, balls, boxes, position, k, borders, nodes, lists, bands, counts):
+    """Traverse the upper tree from the root; fill nodes to draw and lists to search.
 
-    What is within a border of the image is not asked again below; ``asked`` has a bit for each border that is
-    to be, for as long as ``until`` says.
+    Borders that contain a whole box are not tested again for its subtree. ``pending`` is a stack of bit masks
+    of borders to test, and each mask is valid until position ``valid_until``.
     """
     count, used, top, i = 0, 0, 0, 0
-    until, asked = np.empty(len(order) + 1, np.int32), np.empty(len(order) + 1, np.int32)
-    until[0], asked[0] = len(order), (1 << len(image)) - 1
+    valid_until, pending = np.empty(len(order) + 1, np.int32), np.empty(len(order) + 1, np.int32)
+    valid_until[0], pending[0] = len(order), (1 << len(borders)) - 1
     while i < len(order):
-        while i >= until[top]:
+        while i >= valid_until[top]:
             top -= 1
-        crossed = asked[top]
+        crossed = pending[top]
         if crossed:
-            crossed = _borders(boxes[i], image, crossed)
+            crossed = _crossed_borders(boxes[i], borders, crossed)
             if crossed < 0:
-                i = beyond[i]
+                i = subtree_end[i]
                 continue
-            if crossed != asked[top] and not is_list[i]:
+            if crossed != pending[top] and not is_list[i]:
                 top += 1
-                until[top], asked[top] = beyond[i], crossed
-        if _fine(balls, i, eye, k):
+                valid_until[top], pending[top] = subtree_end[i], crossed
+        if _is_fine(balls, i, position, k):
             nodes[count] = order[i]
             count += 1
-            i = beyond[i]
+            i = subtree_end[i]
             continue
         if is_list[i]:
             near, far = 0.0, 0.0
             for axis in range(3):
-                away, half = abs(np.float64(eye[axis]) - boxes[i, axis]), boxes[i, 3 + axis]
+                away, half = abs(np.float64(position[axis]) - boxes[i, axis]), boxes[i, 3 + axis]
                 near += max(away - half, 0.0) ** 2
                 far += (away + half) ** 2
             lists[used] = order[i]
@@ -291,78 +312,78 @@ def _walk(order, beyond, is_list, balls, boxes, eye, k, image, nodes, lists, ban
 
 
 @inlined(STRICT)
-def _borders(box, image, asked):
-    """Of the borders that are asked for those that a box crosses; -1 where it is beyond one."""
+def _crossed_borders(box, borders, pending):
+    """Return the bit mask of the pending borders that a box crosses; -1 if it is outside one of them."""
     x, y, z = box[0], box[1], box[2]
     a, b, c = box[3], box[4], box[5]
-    ahead = image[0, 0] * x + image[0, 1] * y + image[0, 2] * z + image[0, 3]
-    across = abs(image[0, 0]) * a + abs(image[0, 1]) * b + abs(image[0, 2]) * c
-    depth = max(across - ahead + image[0, 5], 0.0)
-    crossed = asked
-    for i in range(len(image)):
-        if (asked >> i) & 1:
-            row = image[i]
+    ahead = borders[0, 0] * x + borders[0, 1] * y + borders[0, 2] * z + borders[0, 3]
+    across = abs(borders[0, 0]) * a + abs(borders[0, 1]) * b + abs(borders[0, 2]) * c
+    depth = max(across - ahead + borders[0, 5], 0.0)
+    crossed = pending
+    for i in range(len(borders)):
+        if (pending >> i) & 1:
+            row = borders[i]
             away = row[0] * x + row[1] * y + row[2] * z + row[3]
-            room = abs(row[0]) * a + abs(row[1]) * b + abs(row[2]) * c
-            if away > room + (row[4] * box[6] + row[5] * depth if i else 0.0):
+            half = abs(row[0]) * a + abs(row[1]) * b + abs(row[2]) * c
+            if away > half + (row[4] * box[6] + row[5] * depth if i else 0.0):
                 return -1
-            if away < -room:
+            if away < -half:
                 crossed &= ~(1 << i)
     return crossed
 
 
 @kernel(STRICT)
-def _cut_off(sizes, begins, ends, least, found):
+def _first_below(sizes, begins, ends, limits, positions):
     for i in range(len(begins)):
         low, high = begins[i], ends[i]
         while low < high:
             middle = (low + high) // 2
-            if sizes[middle] >= least[i]:
+            if sizes[middle] >= limits[i]:
                 low = middle + 1
             else:
                 high = middle
-        found[i] = low
+        positions[i] = low
 
 
 @kernel(STRICT)
-def _search(begin, end, links, balls, borders, lists, bands, eye, k, longest, found, counts):
-    """Of lists, the nodes that are fine enough and whose parents are not (Eq. 5).
+def _search(begin, end, links, balls, borders, lists, bands, position, k, longest, cut, counts):
+    """Find the nodes of lists that are fine enough and whose parents are not (Eq. 5).
 
-    Sizes alone decide about most. A parent comes before its children: those whose sizes say nothing wait at
-    their ranks until it is their turn. Where there are many, nothing branches that cannot be foreseen: every
-    child is written, and the next one over it where it is not wanted. Numbers have no sign, as those that
-    have are looked at for whether they count from the end.
+    Sizes alone decide for most nodes. Parents precede their children, so nodes whose sizes are undecided are
+    queued at their ranks. The inner loops have no unpredictable branches: every child is written, and
+    overwritten by the next node if it is not part of the cut. Indices are unsigned, because signed indices
+    require a test for negative values.
     """
-    waiting, leaf = np.empty(longest + 1, np.int32), np.uint32(longest)  # what leaves leave there is not read
-    place, one = np.uint64(2 * longest * begin), np.uint64(1)
+    queue, leaf = np.empty(longest + 1, np.int32), np.uint32(longest)  # the entry of leaves is not read
+    place, step = np.uint64(2 * longest * begin), np.uint64(1)
     for part in range(begin, end):
-        before, first, last = place, np.uint64(borders[lists[part]]), np.uint64(borders[lists[part] + 1])
-        least, most = bands[part, 0], bands[part, 1]
-        sure = first
-        while sure < last and balls[sure, 3] > most:
-            sure += one
-        many = sure
-        while many < last and balls[many, 3] >= least:
-            waiting[many - first] = -1
-            many += one
-        ranks = np.uint32(many - first)
-        for i in range(first, sure):
-            place = _hand_down(links, i, ranks, leaf, waiting, found, place)
-        for i in range(sure, many):
-            if _fine(balls, i, eye, k):
-                found[place] = waiting[i - first]
-                place += np.uint64(waiting[i - first] >= 0)
+        start, first, last = place, np.uint64(borders[lists[part]]), np.uint64(borders[lists[part] + 1])
+        low, high = bands[part, 0], bands[part, 1]
+        coarse_end = first
+        while coarse_end < last and balls[coarse_end, 3] > high:
+            coarse_end += step
+        fine_start = coarse_end
+        while fine_start < last and balls[fine_start, 3] >= low:
+            queue[fine_start - first] = -1
+            fine_start += step
+        ranks = np.uint32(fine_start - first)
+        for i in range(first, coarse_end):
+            place = _refine(links, i, ranks, leaf, queue, cut, place)
+        for i in range(coarse_end, fine_start):
+            if _is_fine(balls, i, position, k):
+                cut[place] = queue[i - first]
+                place += np.uint64(queue[i - first] >= 0)
             else:
-                place = _hand_down(links, i, ranks, leaf, waiting, found, place)
-        counts[part] = place - before
+                place = _refine(links, i, ranks, leaf, queue, cut, place)
+        counts[part] = place - start
 
 
 @inlined(STRICT)
-def _hand_down(links, i, ranks, leaf, waiting, found, place):
-    """The children of a node that is not fine enough: those beyond ``ranks`` are found, others wait."""
+def _refine(links, i, ranks, leaf, queue, cut, place):
+    """Replace a node by its children: add those with rank >= ``ranks`` to the cut, and queue the others."""
     for child in range(2):
         node, rank = links[i, child], np.uint32(links[i, 2 + child])
-        found[place] = node
+        cut[place] = node
         place += np.uint64(rank >= ranks)
-        waiting[min(rank, leaf)] = node
+        queue[min(rank, leaf)] = node
     return place
