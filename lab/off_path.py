@@ -22,7 +22,7 @@ sys.path.insert(0, str(HERE))
 from examples.write_model import depths_of, read_positions  # noqa: E402
 from training.errors import LodgsError  # noqa: E402
 from training.evaluate.metrics import to_8_bit  # noqa: E402
-from training.evaluate.views import Evaluation, full_detail_selector  # noqa: E402
+from training.evaluate.views import Evaluation, full_detail_source  # noqa: E402
 from training.rasterize import Gaussians, rasterize  # noqa: E402
 from training.runs.data import training_data  # noqa: E402
 from training.runs.folder import RunFolder  # noqa: E402
@@ -88,7 +88,7 @@ def report(run: Path, rendered: Path) -> Iterator[str]:
     folder = RunFolder(run)
     job, bundle = Job.from_file(folder.job), read_bundle(folder.bundle)
     evaluation = Evaluation(training_data(job, folder), job.backend, bundle.antialias)
-    everything, _ = full_detail_selector(bundle, bundle.levels[-1])(evaluation.data.train[0])
+    everything, _ = full_detail_source(bundle, bundle.levels[-1])(evaluation.data.train[0])
     splats = evaluation.load(everything)
     aside = [camera.scaled(job.image_scale) for camera in read_offset_views(Path(job.scene))]
     for name, cameras in (("off the path", aside), ("on the path", evaluation.data.test)):

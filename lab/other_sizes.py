@@ -20,7 +20,7 @@ sys.path.insert(0, str(HERE))
 
 from training.editing.bake_filter import bake_filter  # noqa: E402
 from training.errors import LodgsError  # noqa: E402
-from training.evaluate.views import Evaluation, full_detail_selector  # noqa: E402
+from training.evaluate.views import Evaluation, full_detail_source  # noqa: E402
 from training.lod.selection import standalone_levels  # noqa: E402
 from training.runs.data import training_data  # noqa: E402
 from training.runs.folder import RunFolder  # noqa: E402
@@ -67,7 +67,7 @@ def psnr_by_size(run: Path) -> Iterator[tuple[int, str, dict[int, float]]]:
                 {
                     level.number: float(
                         evaluation.compare_views(
-                            evaluation.cameras, full_detail_selector(bundle, level)
+                            evaluation.cameras, full_detail_source(bundle, level)
                         ).mean()
                     )
                     for level in standalone_levels(bundle)

@@ -1,1 +1,1 @@
-"""How good a trained model is on views that it has not seen."""
+"""Measures of the quality and speed of trained splats."""

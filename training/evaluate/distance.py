@@ -1,4 +1,4 @@
-"""What levels of detail are worth from far away: fewer splats, the same picture, and no jumps on the way."""
+"""Effects of levels of detail at a distance: fewer splats, image quality and popping."""
 
 from __future__ import annotations
 
@@ -14,87 +14,94 @@ from ..rasterize.resident import ResidentBundle
 from ..scenes.cameras import Camera
 from ..splats.levels import Bundle
 from .metrics import psnr
-from .views import Evaluation, full_detail_selector
+from .views import Evaluation, full_detail_source
 
 FACTORS = (1, 2, 4, 8)
+"""Multiples of the distance at which views are compared."""
 FRAMES = 120
+"""Number of frames of the camera move that shows popping."""
 
 
 def pull_back(camera: Camera, factor: float, depth: float) -> Camera:
-    """The view from ``factor`` times as far away from what lies at ``depth`` before it."""
+    """Move a camera back until a point at ``depth`` in front of it is ``factor`` times as far away."""
     pose = camera.world_to_camera.copy()
     pose[2, 3] += (factor - 1) * depth
     return replace(camera, world_to_camera=pose)
 
 
 def measure_farther_views(evaluation: Evaluation, bundle: Bundle, values: Values) -> list[dict]:
-    """The evaluation's views, pulled back: splats drawn by distance and at full detail, how alike they look.
+    """Compare levels selected by distance with full detail, on views that are pulled back.
 
-    Weights at full detail are those that the view has before it is pulled back.
+    Full detail keeps the weights of the original camera.
+
+    Args:
+        values: values of the rule's controls.
 
     Returns:
-        For each of FACTORS ``factor``, ``drawn`` and ``drawn_full`` (splats in the image), and ``psnr`` of
-        the picture by distance against that of full detail, means over views.
+        ``factor`` of FACTORS, ``drawn`` and ``drawn_full`` (splats in the image, by distance and at full
+        detail), and ``psnr`` of the image by distance against full detail; means over views.
     """
-    rows, full_detail = [], full_detail_selector(bundle, bundle.levels[-1])
+    rows = []
+    source = full_detail_source(bundle, bundle.levels[-1])
     resident = ResidentBundle(bundle, evaluation.backend)
     for factor in FACTORS:
-        found = []
+        samples = []
         for camera in evaluation.cameras:
             view = pull_back(camera, factor, evaluation.data.median_depth)
-            everything, fixed = full_detail(view if bundle.on_disk else camera)
-            full = evaluation.render(everything, view, fixed)
-            some = resident.draw(view, values, near=evaluation.data.near)
-            counts = [int((rendering.radii > 0).sum()) for rendering in (some, full)]
-            found.append((*counts, psnr(some.image.cpu(), full.image.cpu())))
-        drawn, drawn_full, alike = np.mean(found, axis=0)
+            splats, weights = source(view if bundle.on_disk else camera)
+            full = evaluation.render(splats, view, weights)
+            selected = resident.draw(view, values, near=evaluation.data.near)
+            counts = [int((rendering.radii > 0).sum()) for rendering in (selected, full)]
+            samples.append((*counts, psnr(selected.image.cpu(), full.image.cpu())))
+        drawn, drawn_full, quality = np.mean(samples, axis=0)
         rows.append(
             {
                 "factor": factor,
                 "drawn": round(float(drawn)),
                 "drawn_full": round(float(drawn_full)),
-                "psnr": round(float(alike), 2),
+                "psnr": round(float(quality), 2),
             }
         )
     return rows
 
 
 def measure_popping(evaluation: Evaluation, bundle: Bundle, values: Values, camera: Camera) -> dict:
-    """How much more neighbouring frames differ on the way out than with all splats in all frames.
+    """Measure the largest jump between frames while the camera moves back, relative to full detail.
 
-    The camera is pulled back from 1 to 8 times its distance in FRAMES equal factors. A jump is the mean
-    absolute difference of two neighbouring frames over that of the same two at full detail, where these
-    differ at all.
+    The camera moves back from 1 to 8 times its distance in FRAMES equal factors. A jump is the mean absolute
+    difference of two consecutive frames, divided by that of the same frames at full detail unless it is 0.
+
+    Args:
+        values: values of the rule's controls.
 
     Returns:
-        The largest jump, by what it is of: ``by distance``; where the rule's levels fade, ``faded`` and
-        ``hard``, with levels switched on and off.
+        The largest jump as ``by distance``; or as ``faded`` and ``hard`` (levels switched without fading) if
+        the rule can fade levels.
     """
-    shown, resident = (
-        full_detail_selector(bundle, bundle.levels[-1]),
-        ResidentBundle(bundle, evaluation.backend),
-    )
-    everything, fixed = shown(camera)
-    everything = evaluation.load(everything)
+    source = full_detail_source(bundle, bundle.levels[-1])
+    resident = ResidentBundle(bundle, evaluation.backend)
+    full_splats, weights = source(camera)
+    full_splats = evaluation.load(full_splats)
     views = [
         pull_back(camera, factor, evaluation.data.median_depth)
         for factor in np.geomspace(FACTORS[0], FACTORS[-1], FRAMES)
     ]
 
-    def differences(pictures: Iterable[np.ndarray]) -> np.ndarray:
-        return np.array([np.abs(b - a).mean() for a, b in pairwise(pictures)])
+    def differences(images: Iterable[np.ndarray]) -> np.ndarray:
+        return np.array([np.abs(second - first).mean() for first, second in pairwise(images)])
 
-    def largest(values: Values) -> float:
-        drawn = (resident.draw(view, values, near=evaluation.data.near) for view in views)
-        pictures = (rendering.image.cpu().numpy() for rendering in drawn)
-        moved = still > 0
-        return round(float((differences(pictures)[moved] / still[moved]).max(initial=0)), 3)
+    def largest_jump(values: Values) -> float:
+        renderings = (resident.draw(view, values, near=evaluation.data.near) for view in views)
+        images = (rendering.image.cpu().numpy() for rendering in renderings)
+        moved = full_differences > 0
+        jumps = differences(images)[moved] / full_differences[moved]
+        return round(float(jumps.max(initial=0)), 3)
 
-    def full(view: Camera) -> np.ndarray:
-        splats = shown(view)[0] if bundle.on_disk else everything
-        return evaluation.draw(splats, view, fixed).numpy()
+    def draw_full(view: Camera) -> np.ndarray:
+        splats = source(view)[0] if bundle.on_disk else full_splats
+        return evaluation.draw(splats, view, weights).numpy()
 
-    still = differences(map(full, views))
+    full_differences = differences(map(draw_full, views))
     if any(control.name == "fade" for control in require_rule(bundle).controls):
-        return {"faded": largest({**values, "fade": 1}), "hard": largest({**values, "fade": 0})}
-    return {"by distance": largest(values)}
+        return {"faded": largest_jump({**values, "fade": 1}), "hard": largest_jump({**values, "fade": 0})}
+    return {"by distance": largest_jump(values)}

@@ -1,4 +1,4 @@
-"""A bundle as one camera sees it: every level, the selective view and the photograph side by side."""
+"""Contact sheet of a bundle's levels for one camera."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from .views import Evaluation
 def write_level_sheet(
     path: Path, bundle: Bundle, evaluation: Evaluation, camera: Camera, values: Values
 ) -> None:
-    """Writes a PNG: levels coarse to fine, the selective view, its levels in colours, the photograph.
+    """Write a PNG: levels from coarse to fine, the view by distance, its levels in colours, and the photo.
 
     Args:
         path: file to write.
-        camera: a view with its photograph. Of levels that are not in memory only what it has in sight counts.
-        values: of the rule's controls, for what is chosen by distance; without use where there is no rule.
+        camera: view with a photo. Of levels on disk, only the splats that it sees are read and counted.
+        values: values of the rule's controls for the view by distance.
     """
     target = evaluation.target(camera)
     if bundle.on_disk:
@@ -49,29 +49,29 @@ def write_level_sheet(
     if rule and rule.sweep:
         name, steps = rule.sweep
         for step in steps:
-            shown = select(bundle, camera.center, camera.focal, {**values, name: step})
-            tiles.append(tile(f"{name} = {step:g}", *shown))
+            splats, weights = select(bundle, camera.center, camera.focal, {**values, name: step})
+            tiles.append(tile(f"{name} = {step:g}", splats, weights))
     elif rule:
         view = (camera.center, camera.focal, values)
         tiles.append(tile("by distance", *select(bundle, *view)))
         colored, weights = select(_in_level_colors(bundle), *view)
-        tiles.append(("which level where", evaluation.draw(colored, camera, weights)))
-    tiles.append(("photograph", target.image))
-    _write_sheet(path, tiles)
+        tiles.append(("levels in colours", evaluation.draw(colored, camera, weights)))
+    tiles.append(("photo", target.image))
+    _write_tiles(path, tiles)
 
 
 def _in_level_colors(bundle: Bundle) -> Bundle:
     levels = []
     for level in bundle.levels:
         color = np.array(level_color(level.number), np.float32)
-        # the level's colour, with the splats' own lightness so that the scene stays readable
+        # keep the splats' lightness, so that the scene stays recognizable
         lightness = (0.5 + SH_C0 * level.splats.sh[:, 0]).clip(0, 1).mean(1, keepdims=True)
         sh = ((0.35 + 0.65 * lightness) * color - 0.5) / SH_C0
         levels.append(replace(level, splats=replace(level.splats, sh=sh[:, None].astype(np.float32))))
     return replace(bundle, levels=levels)
 
 
-def _write_sheet(
+def _write_tiles(
     path: Path, tiles: list[tuple[str, torch.Tensor]], columns: int = 4, caption: int = 22
 ) -> None:
     from PIL import Image, ImageDraw, ImageFont
@@ -80,9 +80,11 @@ def _write_sheet(
     rows = -(-len(tiles) // columns)
     columns = min(columns, len(tiles))
     sheet = Image.new("RGB", (columns * (width + 4) - 4, rows * (height + caption)), (24, 24, 24))
-    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=13)
-    for place, (name, image) in enumerate(tiles):
-        x, y = place % columns * (width + 4), place // columns * (height + caption)
+    draw = ImageDraw.Draw(sheet)
+    font = ImageFont.load_default(size=13)
+    for number, (name, image) in enumerate(tiles):
+        x = number % columns * (width + 4)
+        y = number // columns * (height + caption)
         pixels = (image.clamp(0, 1) * 255).round().byte().numpy()
         sheet.paste(Image.fromarray(pixels), (x, y + caption))
         draw.text((x + 6, y + 3), name, fill=(230, 230, 230), font=font)

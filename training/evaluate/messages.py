@@ -1,12 +1,12 @@
-"""A run's measures in words, for the table, the command line and Blender's panel. No torch."""
+"""Measures of a run as sentences for reports, the command line and Blender's panel. No torch."""
 
 from __future__ import annotations
 
-NOT_HELD_OUT = "No views were held out: quality is of training views."
+NOT_HELD_OUT = "No held-out views: quality is measured on training views."
 
 
 def summary_lines(measures: dict) -> list[str]:
-    """``evaluate.summary``'s numbers and ``aside``, as short lines; what is missing or odd has no line."""
+    """Format the results of ``evaluate.summary`` and ``aside`` as short lines; missing values are skipped."""
     lines = []
     match measures.get("train_psnr"):
         case int() | float() as quality:
@@ -19,15 +19,15 @@ def summary_lines(measures: dict) -> list[str]:
             lines.append(f"Held-out views, exposure fitted: {quality:.1f} dB")
     match measures.get("aside"):
         case {"psnr": int() | float() as quality, "views": list(views)}:
-            lines.append(f"Off the path: {quality:.1f} dB ({len(views)} views)")
+            lines.append(f"Offset views: {quality:.1f} dB ({len(views)} views)")
     match measures.get("veil"):
-        case {"mean": int() | float() as mean, "max": int() | float() as most}:
-            lines.append(f"Between views: {mean:.1%} veiled, {most:.1%} at worst")
+        case {"mean": int() | float() as mean, "max": int() | float() as maximum}:
+            lines.append(f"Between views: {mean:.1%} veiled, {maximum:.1%} at worst")
     match measures.get("frame_s"):
-        case {"by_distance": int() | float() as chosen, "full": int() | float() as full} if full:
+        case {"by_distance": int() | float() as by_distance, "full": int() | float() as full} if full:
             lines.append(
-                f"A frame by distance: {1e3 * chosen:.1f} ms, {chosen / full:.0%} of full detail's "
-                f"{1e3 * full:.1f} ms"
+                f"Frame time by distance: {1e3 * by_distance:.1f} ms, {by_distance / full:.0%} of "
+                f"{1e3 * full:.1f} ms at full detail"
             )
     match measures.get("oversized"):
         case int() as count if count:

@@ -1,67 +1,67 @@
-"""Image quality, through torchmetrics, on images rounded to 8 bits as published numbers are."""
+"""Image metrics from torchmetrics, on images rounded to 8 bits as in publications."""
 
 from __future__ import annotations
 
 import torch
 
 MAX_PSNR = 100.0
-"""What equal images count as, in dB, so that means over views stay numbers."""
-
-
+"""PSNR of equal images in dB, which keeps means over views finite."""
 MASK_THRESHOLD = 0.5
-"""Pixels whose mask is above this count."""
+"""Pixels count if their mask exceeds this value."""
 
 
 def to_8_bit(image: torch.Tensor) -> torch.Tensor:
-    """Clamped to [0, 1] and rounded to the 256 values that a file holds, still float32."""
+    """Clamp to [0, 1] and round to the 256 values of 8-bit files, as float32."""
     return (image.detach().clamp(0, 1) * 255).round() / 255
 
 
 def psnr(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> float:
-    """Peak signal-to-noise ratio in dB of two images (H, W, 3), display-coded; MOST_PSNR at most.
+    """Return the peak signal-to-noise ratio in dB, at most MAX_PSNR, of display-coded images (H, W, 3).
 
     Args:
-        mask: (H, W), only pixels where it is above a half count, if there are such.
+        mask: (H, W); only pixels above MASK_THRESHOLD count, or all if there are none.
     """
     from torchmetrics.functional.image import peak_signal_noise_ratio
 
-    image, target = map(to_8_bit, _counted(image, target, mask))
+    image, target = map(to_8_bit, _masked_pixels(image, target, mask))
     return min(float(peak_signal_noise_ratio(image, target, data_range=1.0)), MAX_PSNR)
 
 
 def fit_exposure(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> torch.Tensor:
-    """An image (H, W, 3) with the gain and offset of each channel that bring it closest to a target.
+    """Fit an image (H, W, 3) to a target by a gain and an offset per channel, with least squares.
 
-    Least squares; what ``optimize.exposure`` learns of a training view, found for one that was held out.
+    ``optimize.exposure`` learns the same model for training views; this fits it for held-out ones.
 
     Args:
-        mask: as of :func:`psnr`.
+        mask: as for :func:`psnr`.
     """
-    pixels, wanted = _counted(image, target, mask)
-    mean, goal = pixels.mean(0), wanted.mean(0)
-    around = pixels - mean
-    gain = (around * (wanted - goal)).sum(0) / (around**2).sum(0).clamp_min(1e-12)
-    return (image - mean) * gain + goal
+    pixels, goal = _masked_pixels(image, target, mask)
+    mean, goal_mean = pixels.mean(0), goal.mean(0)
+    centered = pixels - mean
+    gain = (centered * (goal - goal_mean)).sum(0) / (centered**2).sum(0).clamp_min(1e-12)
+    return (image - mean) * gain + goal_mean
 
 
 def ssim(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> float:
-    """Structural similarity of (H, W, 3) images, 11x11 Gaussian window of sigma 1.5 (Wang et al. 2004).
+    """Return the structural similarity of (H, W, 3) images, 11x11 Gaussian window of sigma 1.5.
+
+    Wang et al. 2004.
 
     Args:
-        mask: (H, W), where it is not above a half the target stands for the image.
+        mask: (H, W); pixels up to MASK_THRESHOLD are replaced with the target.
     """
     from torchmetrics.functional.image import structural_similarity_index_measure
 
     if mask is not None:
         image = torch.where((mask > MASK_THRESHOLD)[..., None], image, target)
-    pair = [to_8_bit(each).permute(2, 0, 1)[None] for each in (image, target)]
+    pair = [to_8_bit(x).permute(2, 0, 1)[None] for x in (image, target)]
     return float(structural_similarity_index_measure(*pair, data_range=1.0))  # type: ignore[arg-type]
 
 
-def _counted(
+def _masked_pixels(
     image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Of two images (H, W, 3) the pixels that count, (P, 3)."""
+    """Return the pixels (P, 3) of two images (H, W, 3) that count."""
     if mask is not None and bool((mask > MASK_THRESHOLD).any()):
         return image[mask > MASK_THRESHOLD], target[mask > MASK_THRESHOLD]
     return image.reshape(-1, 3), target.reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""What a finished run is worth, in the few numbers that people judge it by."""
+"""Summary of a finished run in a few measures."""
 
 from __future__ import annotations
 
@@ -8,34 +8,36 @@ from ..scenes.cameras import pick_evenly
 from ..splats.levels import Bundle
 from .metrics import fit_exposure, psnr
 from .offset_views import count_oversized, measure_veil
-from .views import MAX_TRAINING_VIEWS, Evaluation, full_detail_selector
+from .views import MAX_TRAINING_VIEWS, Evaluation, full_detail_source
 
 
 def summarize(evaluation: Evaluation, bundle: Bundle) -> dict:
-    """Measures of a bundle's finest level, as its cameras are shown it.
+    """Measure a bundle's finest level.
 
     Returns:
-        ``train_psnr``: dB, mean over training views, ``MOST_TRAINING_VIEWS`` at most; ``veil`` and
-        ``oversized``, see ``evaluate.offset_views``; where views are held out ``worst``, the ``view`` of the lowest
-        ``psnr``, and ``fitted_psnr``, the mean over them where each picture has its photograph's exposure.
+        ``train_psnr``: mean over at most ``MAX_TRAINING_VIEWS`` training views in dB.
+        ``veil`` and ``oversized``: see ``evaluate.offset_views``.
+        ``worst``: ``view`` and ``psnr`` of the worst held-out view, if views are held out.
+        ``fitted_psnr``: mean over held-out views after fitting each image's exposure to its photo.
     """
-    data, shown = evaluation.data, full_detail_selector(bundle, bundle.levels[-1])
-    train = evaluation.compare_views(pick_evenly(data.train, MAX_TRAINING_VIEWS), shown)
-    found = {
-        "train_psnr": round(float(train.mean()), 3),
-        "veil": measure_veil(evaluation, shown),
-        "oversized": count_oversized(data, shown),
+    data = evaluation.data
+    source = full_detail_source(bundle, bundle.levels[-1])
+    train_psnr = evaluation.compare_views(pick_evenly(data.train, MAX_TRAINING_VIEWS), source)
+    measures = {
+        "train_psnr": round(float(train_psnr.mean()), 3),
+        "veil": measure_veil(evaluation, source),
+        "oversized": count_oversized(data, source),
     }
     if data.test:
-        quality, fitted = evaluation.compare_views(data.test, shown, _as_it_is_and_exposed).T
-        found["fitted_psnr"] = round(float(fitted.mean()), 3)
+        quality, fitted = evaluation.compare_views(data.test, source, _psnr_and_fitted_psnr).T
+        measures["fitted_psnr"] = round(float(fitted.mean()), 3)
         worst = int(quality.argmin())
-        found["worst"] = {"view": data.test[worst].name, "psnr": round(float(quality[worst]), 3)}
-    return found
+        measures["worst"] = {"view": data.test[worst].name, "psnr": round(float(quality[worst]), 3)}
+    return measures
 
 
-def _as_it_is_and_exposed(
+def _psnr_and_fitted_psnr(
     image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None
 ) -> tuple[float, float]:
-    """The PSNR of a picture, and of the same with its photograph's exposure."""
+    """Return the PSNR of an image before and after fitting its exposure."""
     return psnr(image, target, mask), psnr(fit_exposure(image, target, mask), target, mask)

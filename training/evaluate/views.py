@@ -1,4 +1,4 @@
-"""The views of a scene that pictures of splats are measured on: held-out ones, where there are some."""
+"""Quality and speed of rendered images, measured on the held-out views of a scene if it has some."""
 
 from __future__ import annotations
 
@@ -21,87 +21,89 @@ from ..splats.levels import Bundle, Level
 from .metrics import psnr, ssim
 
 MAX_TRAINING_VIEWS = 24
-"""How many training views tell the quality of all."""
+"""Maximum number of training views that are measured."""
 REPEATS = 3
-"""How often a view is drawn to time it."""
+"""Repetitions per view and variant when frames are timed."""
 
 Measure = Callable[[torch.Tensor, torch.Tensor, torch.Tensor | None], float | tuple[float, ...]]
-"""What is found of a picture and its photograph, (H, W, 3) both, and of the mask of what counts of it."""
-SplatSelector = Callable[[Camera], tuple[Splats, np.ndarray | None]]
-"""What a camera is shown: splats, all that there are or those in its sight, and weights (N,) in [0, 1] on
-opacities; None: all 1."""
+"""Compares a rendered image with its photo, both (H, W, 3), where an optional mask (H, W) allows it."""
+SplatSource = Callable[[Camera], tuple[Splats, np.ndarray | None]]
+"""Returns the splats to draw for a camera, all or only visible ones, and weights (N,) in [0, 1] on their
+opacities; None means 1."""
 
 
-def full_detail_selector(bundle: Bundle, level: Level) -> SplatSelector:
-    """What a camera is shown at full detail up to a level.
+def full_detail_source(bundle: Bundle, level: Level) -> SplatSource:
+    """Return a source of the splats at full detail up to a level.
 
-    That is all that is drawn at the level, but for rules whose weights always count: there splats without
-    them are not what was trained, and each camera is shown what the rule gives it. Of levels that are not in
-    memory it is what the camera has in sight.
+    The source returns all splats of the level. Rules that are always active weight them, because the method
+    trained with these weights. Of levels on disk, the source reads only splats that the camera sees.
     """
     if bundle.on_disk:
-        return _in_sight(bundle, level)
+        return _visible_source(bundle, level)
     rule = find_rule(bundle.rule)
     if rule is None or not rule.always_active:
-        everything = complete_splats(bundle, level)
-        return lambda camera: (everything, None)
-    alone = replace(bundle, levels=bundle.drawn_levels(level.number))
-    choice, values = BundleSelector(alone), resolve_controls(alone, {})
-    return lambda camera: (choice.splats, choice.weights(camera.center, camera.focal, values))
+        splats = complete_splats(bundle, level)
+        return lambda camera: (splats, None)
+    drawn = replace(bundle, levels=bundle.drawn_levels(level.number))
+    selector = BundleSelector(drawn)
+    controls = resolve_controls(drawn, {})
+    return lambda camera: (selector.splats, selector.weights(camera.center, camera.focal, controls))
 
 
-def _in_sight(bundle: Bundle, level: Level) -> SplatSelector:
-    sights = [CulledReader(each.rows) for each in bundle.drawn_levels(level.number)]
-    parts: list[Splats | None] = [None] * len(sights)
+def _visible_source(bundle: Bundle, level: Level) -> SplatSource:
+    readers = [CulledReader(drawn.rows) for drawn in bundle.drawn_levels(level.number)]
+    parts: list[Splats | None] = [None] * len(readers)
 
-    def shown_to(camera: Camera) -> tuple[Splats, None]:
-        for i, sight in enumerate(sights):
-            missing = sight.missing(camera)
+    def read_visible(camera: Camera) -> tuple[Splats, None]:
+        for i, reader in enumerate(readers):
+            missing = reader.missing(camera)
             if missing is not None:
-                parts[i] = None  # so that both are never in memory
-                parts[i] = sight.read(missing)
+                parts[i] = None  # free the old part before reading the new one
+                parts[i] = reader.read(missing)
         return Splats.concatenated([part for part in parts if part is not None]), None
 
-    return shown_to
+    return read_visible
 
 
 class Evaluation:
-    """Views of a scene, ready to be compared with.
+    """Comparison of rendered images with the photos of a scene.
 
     Args:
-        data: the scene at training size.
-        backend: rasterizer.
-        antialias: how splats are drawn, see ``Bundle.antialias``.
+        data: scene at training size.
+        backend: rasterizer backend.
+        antialias: as ``Bundle.antialias``.
 
     Attributes:
-        cameras: the held-out views; where none are, training views, ``MOST_TRAINING_VIEWS`` at most.
-        prefix: of the names that quality on ``cameras`` goes by: none, or ``train_`` for training views.
+        cameras: held-out views; without any, at most ``MAX_TRAINING_VIEWS`` training views.
+        prefix: prefix of the names of quality measures on ``cameras``: "", or "train_" for training views.
     """
 
     def __init__(self, data: TrainingData, backend: str = "auto", antialias: bool = False) -> None:
-        self.data, self.backend, self.device = data, backend, tensor_device(backend)
+        self.data = data
+        self.backend = backend
+        self.device = tensor_device(backend)
         self.antialias = antialias
         self.cameras = data.test or pick_evenly(data.train, MAX_TRAINING_VIEWS)
         self.prefix = "" if data.test else "train_"
 
     def target(self, camera: Camera) -> Target:
-        """The photograph of a view, on black where it is transparent, and what of it counts."""
+        """Return the photo of a view, with transparent parts black, and its mask."""
         return self.data.photographs.target(camera)
 
     def load(self, splats: Splats | Gaussians) -> Gaussians:
-        """Splats where they are drawn, for those that are drawn again and again."""
+        """Copy splats to the rasterizer's device, for repeated drawing."""
         return splats if isinstance(splats, Gaussians) else Gaussians.of(splats, self.device)
 
     def draw(
         self, splats: Splats | Gaussians, camera: Camera, weights: np.ndarray | None = None
     ) -> torch.Tensor:
-        """A picture of splats on black, (H, W, 3), on the CPU, with a weight on each splat's opacity."""
+        """Draw splats on black, with optional weights (N,) on their opacities; (H, W, 3) on the CPU."""
         return self.render(splats, camera, weights).image.cpu()
 
     def render(
         self, splats: Splats | Gaussians, camera: Camera, weights: np.ndarray | None = None
     ) -> Rendering:
-        """The same with all that a rendering tells."""
+        """Draw splats as :meth:`draw` does and return the complete rendering."""
         with torch.no_grad():
             return rasterize(
                 self.load(splats),
@@ -119,45 +121,46 @@ class Evaluation:
     def compare_views(
         self,
         cameras: Sequence[Camera],
-        shown_to: SplatSelector,
+        source: SplatSource,
         measure: Measure = psnr,
     ) -> np.ndarray:
-        """The PSNR of each of some views with a photograph, in dB, (V,); or what else ``measure`` finds."""
-        found = []
+        """Return the measure of each view, by default PSNR in dB, (V,)."""
+        values = []
         for camera in cameras:
-            splats, weights = shown_to(camera)
+            splats, weights = source(camera)
             target = self.target(camera)
-            found.append(measure(self.draw(splats, camera, weights), target.image, target.mask))
-        return np.array(found)
+            values.append(measure(self.draw(splats, camera, weights), target.image, target.mask))
+        return np.array(values)
 
     def measure(self, render: Callable[[Camera], Rendering], count: Callable[[Camera], int]) -> dict:
-        """Mean quality, splats that have a weight and seconds a frame over ``cameras``.
+        """Measure quality, number of splats and seconds per frame over ``cameras``.
 
         Args:
-            render: what a camera sees, choosing included.
-            count: how many splats have a weight for it, in sight or not.
+            render: selects and draws the splats of a camera.
+            count: returns the number of splats with a weight for a camera, visible or not.
 
         Returns:
-            ``splats`` (mean count), ``drawn`` (of these in the image), ``psnr`` (dB), ``ssim``, ``frame_s``
-            (median, selection included); on training views ``train_psnr`` and ``train_ssim``.
+            ``splats`` (mean count), ``drawn`` (mean number in the image), ``psnr`` (dB), ``ssim``,
+                ``frame_s``
+            (median, with selection). Names on training views are ``train_psnr`` and ``train_ssim``.
         """
         drawn = []
 
-        def picture(camera: Camera) -> torch.Tensor:
+        def draw_image(camera: Camera) -> torch.Tensor:
             rendering = render(camera)
             drawn.append(int((rendering.radii > 0).sum()))
             return rendering.image.cpu()
 
-        quality = self.measure_images(picture)
+        quality = self.measure_images(draw_image)
         splats = np.mean([count(camera) for camera in self.cameras])
         return {"splats": round(float(splats)), "drawn": round(float(np.mean(drawn))), **quality}
 
-    def measure_images(self, picture: Callable[[Camera], torch.Tensor]) -> dict:
-        """Quality and ``frame_s`` as :meth:`measure`, of pictures however they are made."""
+    def measure_images(self, draw_image: Callable[[Camera], torch.Tensor]) -> dict:
+        """Measure quality and ``frame_s`` as :meth:`measure` does, for images from any source."""
         rows = []
         for camera in self.cameras:
             started = time.perf_counter()
-            image = picture(camera)
+            image = draw_image(camera)
             seconds = time.perf_counter() - started
             target = self.target(camera)
             pair = image, target.image, target.mask
@@ -170,40 +173,41 @@ class Evaluation:
         }
 
     def measure_by_distance(self, resident: ResidentBundle, values: Values) -> dict:
-        """The same of what each view is shown of a bundle by its rule, with these values of the controls."""
+        """Measure a bundle with the levels that its rule selects for the given control values."""
 
         def count(camera: Camera) -> int:
-            shown = resident.select_by_rule(camera, values).values()
-            return sum(len(one.splats.select_visible(one.query)[0]) for one in shown)
+            sets = resident.select_by_rule(camera, values).values()
+            return sum(len(part.splats.select_visible(part.query)[0]) for part in sets)
 
         return self.measure(lambda camera: resident.draw(camera, values, **self._options), count)
 
     def measure_level(self, bundle: Bundle, level: Level) -> dict:
-        """The same of all that is drawn at a level; by the bundle's rule where its weights always count."""
-        rule, alone = find_rule(bundle.rule), replace(bundle, levels=bundle.drawn_levels(level.number))
-        resident = ResidentBundle(alone, self.backend)
+        """Measure a complete level, weighted by the bundle's rule if it is always active."""
+        rule = find_rule(bundle.rule)
+        drawn = replace(bundle, levels=bundle.drawn_levels(level.number))
+        resident = ResidentBundle(drawn, self.backend)
         if rule is not None and rule.always_active:
-            return self.measure_by_distance(resident, resolve_controls(alone, {}))
-        total = sum(len(each.rows) for each in alone.levels)
+            return self.measure_by_distance(resident, resolve_controls(drawn, {}))
+        total = sum(len(part.rows) for part in drawn.levels)
         return self.measure(
             lambda camera: resident.draw_level(level.number, camera, **self._options), lambda camera: total
         )
 
     def measure_splats(self, splats: Splats, weights: np.ndarray | None = None) -> dict:
-        """The same for one set of splats that every view is shown."""
-        shown = [WeightedSet(SplatSet(splats, weights, self.backend), None)]
+        """Measure one set of splats that is the same for all views."""
+        sets = [WeightedSet(SplatSet(splats, weights, self.backend), None)]
         return self.measure(
-            lambda camera: draw(shown, camera, backend=self.backend, **self._options),
+            lambda camera: draw(sets, camera, backend=self.backend, **self._options),
             lambda camera: len(splats),
         )
 
     def frame_times(self, draws: Mapping[str, Callable[[Camera], object]]) -> dict[str, float]:
-        """Seconds a frame of several ways to draw, by name: the median over views, drawn in turn."""
-        found: dict[str, list[float]] = {name: [] for name in draws}
+        """Measure the median seconds per frame of several ways to draw, by name, drawn in turn."""
+        times: dict[str, list[float]] = {name: [] for name in draws}
         for camera in pick_evenly(self.cameras, MAX_TRAINING_VIEWS):
             for _ in range(REPEATS):
-                for name, one in draws.items():
+                for name, draw_view in draws.items():
                     started = time.perf_counter()
-                    one(camera)
-                    found[name].append(time.perf_counter() - started)
-        return {name: round(float(np.median(seconds)), 5) for name, seconds in found.items()}
+                    draw_view(camera)
+                    times[name].append(time.perf_counter() - started)
+        return {name: round(float(np.median(seconds)), 5) for name, seconds in times.items()}

@@ -13,7 +13,7 @@ from ..evaluate.level_sheet import write_level_sheet
 from ..evaluate.messages import summary_lines
 from ..evaluate.offset_views import measure_veil
 from ..evaluate.summary import summarize
-from ..evaluate.views import Evaluation, full_detail_selector
+from ..evaluate.views import Evaluation, full_detail_source
 from ..files import atomic_write
 from ..lod.on_disk import open_if_large
 from ..lod.rule import Rule, Values, find_rule
@@ -123,7 +123,7 @@ def _measure_levels(job: Job, evaluation: Evaluation, bundle: Bundle) -> dict:
     levels = standalone_levels(bundle)
     *coarser, finest = levels
     summary = summarize(evaluation, bundle)
-    veils = [measure_veil(evaluation, full_detail_selector(bundle, level)) for level in coarser]
+    veils = [measure_veil(evaluation, full_detail_source(bundle, level)) for level in coarser]
     veils.append(summary["veil"])
     rows = [
         {"level": level.number, **level.facts, **evaluation.measure_level(bundle, level), "veil": veil}
@@ -139,7 +139,7 @@ def _measure_levels(job: Job, evaluation: Evaluation, bundle: Bundle) -> dict:
         "selective": [],
     }
     if offset_cameras:
-        quality = float(evaluation.compare_views(offset_cameras, full_detail_selector(bundle, finest)).mean())
+        quality = float(evaluation.compare_views(offset_cameras, full_detail_source(bundle, finest)).mean())
         names = [camera.name for camera in offset_cameras]
         report["aside"] = {"psnr": round(quality, 3), "views": names}
     return report

@@ -228,7 +228,7 @@ def test_results_after_training(bpy, lodgs, root, draw, watch, fake):
     del watch.summary["worst"]
     watch.levels[1] = {"level": 1, "splats": 1234, "train_psnr": 20.04}
     texts = draw().texts
-    assert "No views were held out: quality is of training views." in texts
+    assert "No held-out views: quality is measured on training views." in texts
     assert {"Quality on training views", "Level 1: 1,234 splats, 20.0 dB"} <= set(texts)
     watch.summary = {}
     empty = draw().texts

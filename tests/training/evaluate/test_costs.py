@@ -1,4 +1,4 @@
-"""The cost curve in words and as a plot: its points are where the numbers say, and odd ones do no harm."""
+"""Cost curves as lines and as a plot."""
 
 import numpy as np
 import pytest
@@ -8,22 +8,22 @@ from training.evaluate import costs
 from training.evaluate.costs import cost_curves, cost_lines, write_cost_plot
 from training.lod.colors import level_color
 
-FOUND = [
+CURVES = [
     {"level": 2, "distances": [4.0, 10.0, 16.0], "costs": [812.0, 301.2, 400.0], "before": 830.4},
     {"level": 1, "distances": [20.0, 40.0], "costs": [290.0, 1250.0]},
 ]
 
 
-def test_each_level_has_a_line():
-    assert cost_lines({"costs": FOUND}, "{:.1f} m".format) == [
+def test_each_level_has_one_line():
+    assert cost_lines({"costs": CURVES}, "{:.1f} m".format) == [
         "Level 2 from 10.0 m: 830 → 301",
         "Level 1 from 20.0 m: 290",
     ]
-    assert cost_curves({"costs": FOUND})[0].chosen == (10.0, 301.2)
+    assert cost_curves({"costs": CURVES})[0].chosen == (10.0, 301.2)
 
 
 @pytest.mark.parametrize(
-    "odd",
+    "invalid",
     [
         3, [3], [{}], [{"level": 1}], [{"level": "one", "distances": [1], "costs": [1]}],
         [{"level": 1, "distances": [], "costs": []}], [{"level": 1, "distances": [1, 2], "costs": [1]}],
@@ -33,27 +33,27 @@ def test_each_level_has_a_line():
         [{"level": 0, "distances": [1], "costs": [1]}],
     ],
 )  # fmt: skip
-def test_what_is_odd_is_passed_over(odd):
-    assert cost_lines({"costs": odd}) == [] == cost_lines({})
+def test_invalid_curves_are_ignored(invalid):
+    assert cost_lines({"costs": invalid}) == [] == cost_lines({})
 
 
-def test_the_plot_has_its_points_where_the_numbers_are(tmp_path):
-    write_cost_plot(tmp_path / "costs.png", {"costs": FOUND})
+def test_plot_draws_points_at_their_values(tmp_path):
+    write_cost_plot(tmp_path / "costs.png", {"costs": CURVES})
     pixels = np.asarray(Image.open(tmp_path / "costs.png"))
     width, height = costs.PLOT_SIZE
     assert pixels.shape == (height, width, 3)
-    for entry in FOUND:
+    for entry in CURVES:
         color = np.round(255 * np.array(level_color(entry["level"])))
         rows, columns = np.nonzero((np.abs(pixels - color) < 3).all(-1) & (np.arange(width) < 775))
-        # axes go from 0 to the first round number that holds all: 40 and 1500
+        # axes end at the first round number that is large enough: 40 and 1500
         for distance, cost in zip(entry["distances"], entry["costs"], strict=True):
             x, y = 80 + 680 * distance / 40, 476 - 412 * cost / 1500
             assert np.hypot(columns - x, rows - y).min() < 2
 
 
-@pytest.mark.parametrize("most", [1e-9, 0.049, 1, 1.0001, 4.2, 50, 51, 830, 99_999])
-def test_ticks_are_round_and_hold_all(most):
-    ticks = costs._ticks(most)
-    assert 4 <= len(ticks) <= 12 and ticks[0] == 0 and ticks[-2] < most <= ticks[-1] * (1 + 1e-12)
+@pytest.mark.parametrize("maximum", [1e-9, 0.049, 1, 1.0001, 4.2, 50, 51, 830, 99_999])
+def test_ticks_are_round_and_cover_the_range(maximum):
+    ticks = costs._ticks(maximum)
+    assert 4 <= len(ticks) <= 12 and ticks[0] == 0 and ticks[-2] < maximum <= ticks[-1] * (1 + 1e-12)
     step = ticks[1] / 10 ** np.floor(np.log10(ticks[1] * (1 + 1e-9)))
-    assert min(abs(step - each) for each in (1, 2, 5)) < 1e-6
+    assert min(abs(step - size) for size in (1, 2, 5)) < 1e-6

@@ -1,4 +1,4 @@
-"""From farther away: the camera, the rule on a whole bundle, and what fading is good for."""
+"""Views that are pulled back: camera, rule of a bundle, and popping."""
 
 from types import SimpleNamespace
 
@@ -44,7 +44,7 @@ def evaluation(camera) -> Evaluation:
     return Evaluation(data, "cpu")  # pyright: ignore[reportArgumentType]
 
 
-def test_what_lies_at_the_depth_is_so_many_times_as_far(camera):
+def test_pulled_back_camera_multiplies_the_distance(camera):
     rng = np.random.default_rng(0)
     pose = np.eye(4)
     pose[:3, :3] = np.linalg.qr(rng.normal(size=(3, 3)))[0]
@@ -52,35 +52,35 @@ def test_what_lies_at_the_depth_is_so_many_times_as_far(camera):
     view = Camera("a", 64, 64, 100.0, 100.0, 32.0, 32.0, pose)
     target = np.linalg.inv(pose) @ [0, 0, 5, 1]  # straight ahead
     for factor in (1, 2, 8):
-        back = pull_back(view, factor, 5.0)
-        assert np.linalg.norm(target[:3] - back.center) == pytest.approx(5 * factor)
-        assert np.allclose((back.world_to_camera @ target)[:2], 0)
+        moved = pull_back(view, factor, 5.0)
+        assert np.linalg.norm(target[:3] - moved.center) == pytest.approx(5 * factor)
+        assert np.allclose((moved.world_to_camera @ target)[:2], 0)
 
 
-def test_the_rule_on_a_whole_bundle(bundle):
-    eye, focal = np.array([0.5, 0, -7.0]), 80.0
-    chosen, weights = select(bundle, eye, focal, resolve_controls(bundle, {"offset": 0.25}))
+def test_octree_weights_match_the_formula(bundle):
+    center, focal = np.array([0.5, 0, -7.0]), 80.0
+    chosen, weights = select(bundle, center, focal, resolve_controls(bundle, {"offset": 0.25}))
     assert weights is not None
     expected = []
-    for level in bundle.levels:  # splat by splat: L* = log2(d_max / d) + offset, rounded in half a level
+    for level in bundle.levels:  # per splat: L* = log2(d_max / d) + offset, rounded in half a level
         for mean in level.splats.means:
-            distance = np.linalg.norm(mean - eye) * 100 / focal
-            wanted = min(max(np.log2(32 / distance) + 0.25, 0), 2)
-            weight = min(max(2 * (wanted + 1 - level.number + 0.5) + 0.5, 0), 1)
+            distance = np.linalg.norm(mean - center) * 100 / focal
+            target = min(max(np.log2(32 / distance) + 0.25, 0), 2)
+            weight = min(max(2 * (target + 1 - level.number + 0.5) + 0.5, 0), 1)
             if weight > 0:
                 expected.append((*mean, weight))
     assert len(expected) > 300 and sum(0 < weight < 1 for *_, weight in expected) > 50
     np.testing.assert_allclose(np.column_stack([chosen.means, weights]), expected, atol=1e-5)
 
 
-def test_a_level_comes_with_all_coarser_ones_only_where_they_add_up(bundle):
+def test_only_cumulative_levels_include_coarser_ones(bundle):
     assert len(complete_splats(bundle, bundle.levels[1])) == 260
-    apart = Bundle("flod", bundle.levels)
-    assert len(complete_splats(apart, apart.levels[1])) == 200
+    separate = Bundle("flod", bundle.levels)
+    assert len(complete_splats(separate, separate.levels[1])) == 200
 
 
 @pytest.mark.slow
-def test_fewer_splats_are_drawn_from_farther_away(bundle, evaluation):
+def test_farther_views_draw_fewer_splats(bundle, evaluation):
     rows = measure_farther_views(evaluation, bundle, resolve_controls(bundle, {}))
     assert [row["factor"] for row in rows] == [1, 2, 4, 8]
     drawn = [row["drawn"] for row in rows]
@@ -89,12 +89,12 @@ def test_fewer_splats_are_drawn_from_farther_away(bundle, evaluation):
     assert all(np.isfinite(row["psnr"]) for row in rows[2:])
 
 
-def test_fading_takes_the_jumps_away(bundle, evaluation, camera):
-    found = measure_popping(evaluation, bundle, resolve_controls(bundle, {}), camera)
-    assert found["faded"] < found["hard"]
+def test_fading_reduces_popping(bundle, evaluation, camera):
+    popping = measure_popping(evaluation, bundle, resolve_controls(bundle, {}), camera)
+    assert popping["faded"] < popping["hard"]
 
 
-def test_where_nothing_is_seen_nothing_jumps(bundle, evaluation, camera):
+def test_invisible_splats_do_not_pop(bundle, evaluation, camera):
     for level in bundle.levels:
         level.splats.opacity_logits[:] = -20
     assert measure_popping(evaluation, bundle, resolve_controls(bundle, {}), camera) == {

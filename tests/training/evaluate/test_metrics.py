@@ -1,4 +1,4 @@
-"""Metrics by hand, and the selective view against a loop over the paper's inequality."""
+"""Image metrics compared with hand calculations, and FLoD's selection with the paper's inequality."""
 
 import math
 
@@ -18,14 +18,14 @@ def test_psnr_of_a_known_difference():
     assert psnr(target + 10 / 255, target) == pytest.approx(20 * math.log10(25.5), abs=1e-3)
 
 
-def test_images_are_clamped_and_rounded_to_8_bits_first():
+def test_images_are_clamped_and_rounded_to_8_bits():
     image = torch.tensor([[[-0.2, 0.5003, 1.7]]])
     assert (to_8_bit(image) * 255).tolist() == [[[0, 128, 255]]]
     nearly = torch.full((8, 8, 3), 0.5) + 0.0004  # rounds to the same byte as 0.5
     assert psnr(nearly, torch.full((8, 8, 3), 0.5)) == MAX_PSNR == 100
 
 
-def test_a_fitted_exposure_is_the_lines_of_least_squares():
+def test_fitted_exposure_matches_least_squares():
     rng = np.random.default_rng(1)
     image, noise = (torch.from_numpy(rng.uniform(size=(9, 7, 3)).astype(np.float32)) for _ in range(2))
     gains, offsets = torch.tensor([0.5, 1.3, 0.9]), torch.tensor([0.1, -0.05, 0.0])
@@ -33,20 +33,20 @@ def test_a_fitted_exposure_is_the_lines_of_least_squares():
     target = image * gains + offsets + 0.1 * noise
     expected = np.empty((9, 7, 3))
     for channel in range(3):
-        x, y = (each[..., channel].numpy().ravel() for each in (image, target))
+        x, y = (values[..., channel].numpy().ravel() for values in (image, target))
         expected[..., channel] = np.polyval(np.polyfit(x, y, 1), x).reshape(9, 7)
     np.testing.assert_allclose(fit_exposure(image, target), expected, atol=1e-5)
     mask = torch.zeros(9, 7)
     mask[:5] = 1
-    target[5:] = 0  # what does not count
+    target[5:] = 0  # masked
     upper = np.polyfit(image[:5, :, 1].numpy().ravel(), target[:5, :, 1].numpy().ravel(), 1)
     fitted = fit_exposure(image, target, mask)[..., 1]
     np.testing.assert_allclose(fitted, np.polyval(upper, image[..., 1].numpy()), atol=1e-5)
-    flat = torch.full((9, 7, 3), 0.25)  # no gain makes anything of one colour into another picture
+    flat = torch.full((9, 7, 3), 0.25)  # a gain cannot vary one colour
     torch.testing.assert_close(fit_exposure(flat, target), target.mean((0, 1)).expand(9, 7, 3))
 
 
-def test_ssim_is_one_for_equal_images_and_falls_with_noise():
+def test_ssim_is_one_for_equal_images_and_decreases_with_noise():
     rng = np.random.default_rng(0)
     image = torch.from_numpy(rng.uniform(size=(32, 40, 3)).astype(np.float32))
     assert ssim(image, image) == pytest.approx(1.0)
@@ -66,28 +66,28 @@ def random_splats(count: int, seed: int) -> Splats:
 
 
 @pytest.mark.parametrize("start, end", [(3, 5), (2, 3), (4, 4), (1, 5)])
-def test_the_selective_view_is_the_papers_inequality(start, end):
+def test_selection_matches_the_papers_inequality(start, end):
     s_min = [0.4, 0.1, 0.025, 0.00625, 0.0]
     levels = [Level(n, random_splats(200, n), {"s_min": s_min[n - 1]}) for n in range(1, 6)]
     bundle = Bundle("flod", levels, "bands")
-    eye, focal, gamma = np.array([1.0, 2, 3]), 900.0, 1.5
+    center, focal, gamma = np.array([1.0, 2, 3]), 900.0, 1.5
     expected = []
-    for number in range(start, end + 1):  # Eq. 7, splat by splat
+    for number in range(start, end + 1):  # Eq. 7, per splat
         for mean in bundle.levels[number - 1].splats.means:
-            distance = math.dist(mean, eye)
+            distance = math.dist(mean, center)
             near = 0 if number == end else s_min[number - 1] / gamma * focal
             far = math.inf if number == start else s_min[number - 2] / gamma * focal
             if near <= distance < far:
                 expected.append(mean)
     values = resolve_controls(bundle, {"gamma": gamma, "first": start, "last": end})
-    chosen, weights = select(bundle, eye, focal, values)
+    chosen, weights = select(bundle, center, focal, values)
     assert weights is None
     np.testing.assert_array_equal(chosen.means, np.array(expected, np.float32).reshape(-1, 3))
     assert len(chosen.sh) == len(chosen.means)
 
 
-def test_only_what_a_mask_leaves_counts():
-    """By hand: within it all pixels are off by 0.1, beside it by 0.9."""
+def test_only_unmasked_pixels_count():
+    """Errors are 0.1 inside the mask and 0.9 outside."""
     target = torch.full((20, 20, 3), 0.05)
     image, mask = target + 0.9, torch.zeros(20, 20)
     image[:, :10], mask[:, :10] = target[:, :10] + 0.1, 1.0

@@ -1,4 +1,4 @@
-"""A step aside of the photographs: places found by hand, walls whose veil is known, splats counted by eye."""
+"""Veils and oversized splats between cameras, for positions and walls with known results."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -17,7 +17,7 @@ MEDIAN_DEPTH = 10.0
 
 
 def camera(x: float, turn: float = 0.0, width: int = 64) -> Camera:
-    """At (x, 0, 0), looking along +z and turned by an angle about y; 90 degrees across and down."""
+    """Return a camera at (x, 0, 0) that looks along +z, turned about y, with a field of view of 90°."""
     pose = np.eye(4)
     pose[:3, :3] = [[np.cos(turn), 0, -np.sin(turn)], [0, 1, 0], [np.sin(turn), 0, np.cos(turn)]]
     pose[:3, 3] = -pose[:3, :3] @ [x, 0, 0]
@@ -25,7 +25,7 @@ def camera(x: float, turn: float = 0.0, width: int = 64) -> Camera:
 
 
 def wall(depth: float, left: float = -1.2, right: float = 1.2, opacity_logit: float = 6.0) -> Splats:
-    """Small round splats side by side at z = ``depth``, from ``left`` to ``right`` times the depth."""
+    """Return a grid of small round splats at z = ``depth``, from ``left`` to ``right`` times the depth."""
     x, y = (
         axis.ravel() * depth for axis in np.meshgrid(np.arange(left, right, 0.04), np.arange(-1.2, 1.2, 0.04))
     )
@@ -40,7 +40,7 @@ def wall(depth: float, left: float = -1.2, right: float = 1.2, opacity_logit: fl
 
 
 def evaluation(*cameras: Camera) -> Evaluation:
-    centers = np.array([one.center for one in cameras])
+    centers = np.array([camera.center for camera in cameras])
     data = SimpleNamespace(
         train=list(cameras), test=[], median_depth=MEDIAN_DEPTH, near=0.01 * MEDIAN_DEPTH,
         mean_camera=centers.mean(0), extent=2.0,
@@ -48,29 +48,29 @@ def evaluation(*cameras: Camera) -> Evaluation:
     return Evaluation(data, "cpu")  # pyright: ignore[reportArgumentType]
 
 
-def test_places_lie_halfway_to_the_first_second_and_fourth_nearest_and_look_as_the_camera():
+def test_positions_are_halfway_to_the_first_second_and_fourth_nearest():
     cameras = [camera(x, turn) for x, turn in ((0, 0.1), (1, 0.2), (3, 0.3), (7, 0.4), (15, 0.5))]
-    places = halfway(cameras)
-    assert [round(float(place.center[0]), 6) for place in places] == [
+    offset_cameras = halfway(cameras)
+    assert [round(float(offset.center[0]), 6) for offset in offset_cameras] == [
         0.5, 1.5, 7.5,  # from 0: to 1, 3 and 15
         0.5, 2.0, 8.0,  # from 1: to 0, 3 and 15
         2.0, 1.5, 9.0,  # from 3: to 1, 0 and 15
         5.0, 4.0, 11.0,  # from 7: to 3, 1 and 15
         11.0, 9.0, 7.5,  # from 15: to 7, 3 and 0
     ]  # fmt: skip
-    for number, place in enumerate(places):
+    for number, offset in enumerate(offset_cameras):
         np.testing.assert_array_equal(
-            place.world_to_camera[:3, :3], cameras[number // 3].world_to_camera[:3, :3]
+            offset.world_to_camera[:3, :3], cameras[number // 3].world_to_camera[:3, :3]
         )
-        assert place.image is None
+        assert offset.image is None
 
 
-def test_two_cameras_have_one_place_between_them_each():
-    assert [place.center[0] for place in halfway([camera(-1), camera(1)])] == [0, 0]
+def test_two_cameras_share_their_midpoint():
+    assert [offset.center[0] for offset in halfway([camera(-1), camera(1)])] == [0, 0]
 
 
-def test_at_most_so_many_places_of_every_kind_are_chosen():
-    chosen = pick_evenly(range(3 * MAX_POSITIONS), MAX_POSITIONS)  # as of so many cameras
+def test_positions_are_limited_evenly():
+    chosen = pick_evenly(range(3 * MAX_POSITIONS), MAX_POSITIONS)  # three per camera
     assert len(chosen) == len(set(chosen)) == MAX_POSITIONS
     assert (chosen[0], chosen[-1]) == (0, 3 * MAX_POSITIONS - 1)
     kinds = np.bincount(np.array(chosen) % 3)
@@ -85,20 +85,20 @@ def test_at_most_so_many_places_of_every_kind_are_chosen():
         (wall(0.95), 1.0),
         (wall(1.05), 0.0),
         (wall(5.0), 0.0),
-        (wall(0.05), 0.0),  # nearer than anything is drawn
+        (wall(0.05), 0.0),  # in front of the near plane
         (wall(0.5, right=0.0), 0.5),
         (wall(0.5, left=0.5), 0.25),
-        (wall(0.5, opacity_logit=-4.0), 0.0),  # stops less than half of the light
+        (wall(0.5, opacity_logit=-4.0), 0.0),  # absorbs less than half of the light
         (wall(0.5, opacity_logit=-4.0).select(slice(0, 0)), 0.0),
     ],
 )
-def test_the_veil_of_a_wall_is_the_share_of_the_view_that_it_covers(splats, share):
-    found = measure_veil(evaluation(camera(-1), camera(1)), lambda place: (splats, None))
-    assert found["mean"] == found["max"] == pytest.approx(share, abs=0.03)  # its edge is half a splat soft
+def test_veil_of_a_wall_is_its_share_of_the_image(splats, share):
+    result = measure_veil(evaluation(camera(-1), camera(1)), lambda camera: (splats, None))
+    assert result["mean"] == result["max"] == pytest.approx(share, abs=0.03)  # soft edge of half a splat
 
 
-def test_a_veiled_pixel_has_its_median_depth_before_the_limit():
-    """Splats at random, and what the reference says of the depth at which half of the light is stopped."""
+def test_veiled_pixels_have_a_median_depth_below_the_limit():
+    """Compare with the reference rasterizer's median depth of random splats."""
     rng = np.random.default_rng(3)
     splats = wall(1.0).select(slice(0, 400))
     means = rng.uniform((-1, -1, 0.2), (1, 1, 3), (400, 3)).astype(np.float32)
@@ -106,35 +106,35 @@ def test_a_veiled_pixel_has_its_median_depth_before_the_limit():
     splats = replace(
         splats, means=means, opacity_logits=logits.astype(np.float32), log_scales=scales.astype(np.float32)
     )
-    here = evaluation(camera(-1), camera(1))
+    views = evaluation(camera(-1), camera(1))
     depth = rasterize(
-        Gaussians.of(splats), camera(0), near=here.data.near, outputs=("median_depth",), backend="reference"
+        Gaussians.of(splats), camera(0), near=views.data.near, outputs=("median_depth",), backend="reference"
     ).median_depth
     assert depth is not None
     share = float(((depth > 0) & (depth < VEIL_DEPTH * MEDIAN_DEPTH)).float().mean())
     assert 0.05 < share < 0.95
-    assert measure_veil(here, lambda place: (splats, None))["mean"] == pytest.approx(share, abs=1e-3)
+    assert measure_veil(views, lambda camera: (splats, None))["mean"] == pytest.approx(share, abs=1e-3)
 
 
-def test_weights_count_and_are_those_of_the_place():
+def test_weights_of_each_position_are_applied():
     splats = wall(0.5)
-    asked = []
+    positions = []
 
-    def shown(place):
-        asked.append(float(place.center[0]))
-        return splats, np.full(len(splats), 0.0 if len(asked) % 2 else 1.0, np.float32)
+    def source(camera):
+        positions.append(float(camera.center[0]))
+        return splats, np.full(len(splats), 0.0 if len(positions) % 2 else 1.0, np.float32)
 
-    found = measure_veil(evaluation(camera(-1), camera(1)), shown)
-    assert asked == [0, 0] and found == {"mean": 0.5, "max": 1.0}
-
-
-def test_mean_and_maximum_are_over_places():
-    # places: 0 and 49 from -1, 0 and 50 from 1, 100 and 50 from 99, 100 and 51 from 101; the wall is at 0
-    places = evaluation(camera(-1), camera(1), camera(99), camera(101))
-    assert measure_veil(places, lambda place: (wall(0.5), None)) == {"mean": 0.25, "max": 1.0}
+    result = measure_veil(evaluation(camera(-1), camera(1)), source)
+    assert positions == [0, 0] and result == {"mean": 0.5, "max": 1.0}
 
 
-def test_oversized_are_opaque_splats_among_the_cameras_larger_than_half_the_median_depth():
+def test_mean_and_maximum_are_over_positions():
+    # positions: 0 and 49 from -1, 0 and 50 from 1, 100 and 50 from 99, 100 and 51 from 101; the wall is at 0
+    views = evaluation(camera(-1), camera(1), camera(99), camera(101))
+    assert measure_veil(views, lambda camera: (wall(0.5), None)) == {"mean": 0.25, "max": 1.0}
+
+
+def test_oversized_splats_are_opaque_large_and_among_the_cameras():
     large, small, opaque, clear = np.log(5.1), np.log(4.9), 0.1, -0.1
     rows = [  # x, largest scale, opacity
         (0.0, large, opaque),  # counted
@@ -151,6 +151,6 @@ def test_oversized_are_opaque_splats_among_the_cameras_larger_than_half_the_medi
         log_scales=np.stack([scale - 3, scale, scale - 1], 1),
     )
     data = evaluation(camera(-1), camera(1)).data
-    assert count_oversized(data, lambda place: (splats, None)) == 2
+    assert count_oversized(data, lambda camera: (splats, None)) == 2
     weights = np.float32([1.0, 0.9, 1, 1, 1])  # 0.9 of 0.525 is not opaque
-    assert count_oversized(data, lambda place: (splats, weights)) == 1
+    assert count_oversized(data, lambda camera: (splats, weights)) == 1

@@ -6,7 +6,7 @@ from math import exp, log
 import numpy as np
 import pytest
 
-from training.evaluate.views import full_detail_selector
+from training.evaluate.views import full_detail_source
 from training.lod.rule import rules
 from training.lod.rules.decay import attenuation, max_visible_scale
 from training.runs.base import read_base
@@ -127,7 +127,7 @@ def test_as_a_base_and_as_full_detail_splats_have_the_weights_that_a_camera_sees
     assert 0 < len(expected) < 300 and len(base) == len(expected)
     np.testing.assert_allclose(1 / (1 + np.exp(-base.opacity_logits)), expected, rtol=1e-4)
     camera = Camera("a", 64, 64, 100.0, 100.0, 32.0, 32.0, np.eye(4))
-    seen, fixed = full_detail_selector(bundle, bundle.levels[-1])(camera)
+    seen, fixed = full_detail_source(bundle, bundle.levels[-1])(camera)
     np.testing.assert_allclose(fixed, weights(means, columns), rtol=1e-4)
     assert len(seen) == len(fixed) == 300
 

@@ -124,7 +124,7 @@ def test_quality_without_held_out_views_is_reported_for_training_views(finished,
     for row in (*report["levels"], *report["selective"]):
         assert "psnr" not in row and row["train_ssim"] > 0
     lines = format_report(report).splitlines()
-    assert "No views were held out: quality is of training views." in lines
+    assert "No held-out views: quality is measured on training views." in lines
     assert (tmp_path / "levels.png").is_file()
 
 
@@ -140,7 +140,7 @@ def test_views_off_the_path_are_measured(finished, scene, splats, capsys):
     report = evaluate_run(run)
     offset_views = report["aside"]
     assert offset_views["views"] == ["a.jpg", "b.jpg"]
-    assert "Off the path:" in format_report(report)
+    assert "Offset views:" in format_report(report)
     full_size = evaluate_run(finished(test_every=4))["aside"]
     assert full_size["psnr"] == pytest.approx(
         np.mean([quality(splats, camera) for camera in cameras]), abs=0.02
