@@ -1,11 +1,10 @@
-"""Quality against seconds: every method on every scene, trained for shares of its preset's steps.
+"""Measure quality over training time: all methods on all scenes, for several shares of the preset's steps.
 
-    python tools/bench_quality.py examples/lantern_walk DIR ...      validation views, to choose by
-    python tools/bench_quality.py --report --base ../before DIR ...  test views, beside another checkout
+    python tools/bench_quality.py examples/lantern_walk DIR ...      validation views, for choosing settings
+    python tools/bench_quality.py --report --base ../other DIR ...   test views, compared with a checkout
 
-A point of a curve is a whole run, so that schedules end as they should. Runs of two checkouts take turns with
-each other, on the same cores; both are measured by this one. What was trained is kept, so that a bench that
-was ended goes on.
+Each point is a complete run, because schedules depend on the number of steps. Runs of two checkouts alternate
+on the same cores; this checkout measures both. Finished runs are reused when the benchmark is repeated.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ COLUMNS = ("psnr", "fitted_psnr", "worst", "train_psnr", "veil", "veil_max", "ov
 
 @dataclass
 class Point:
-    """One run: which it was, and what it was worth at its finest level."""
+    """Settings of a run and the quality of its finest level."""
 
     scene: str
     method: str
@@ -50,10 +49,10 @@ class Point:
 
 
 def train(checkout: Path, out: Path, scene: Path, method: str, share: float, seed: int, args) -> None:
-    """Trains in a checkout of the project, unless that was done before.
+    """Train with a checkout of the project, unless the run is finished.
 
     Raises:
-        LodgsError: the trainer says what is wrong, or what was done before is another run.
+        LodgsError: training failed, or the folder holds another run.
     """
     preset = METHODS[method].preset(args.preset)
     scaled = [
@@ -65,28 +64,29 @@ def train(checkout: Path, out: Path, scene: Path, method: str, share: float, see
         sys.executable, "-m", "training", "train", "--scene", str(scene), "--out", str(out),
         "--method", method, "--preset", args.preset, "--seed", str(seed),
         "--image-scale", str(args.image_scale),
-        *scaled, *(f"--set={each}" for each in args.set), *([] if args.report else ["--validation"]),
+        *scaled, *(f"--set={assignment}" for assignment in args.set),
+        *([] if args.report else ["--validation"]),
     ]  # fmt: skip
-    asked = json.dumps([_version(checkout), *command[2:]])
+    key = json.dumps([_version(checkout), *command[2:]])
     record = out.with_name(f".{out.name}.json")
     if (out / "bundle.ply").exists():
-        if not record.exists() or record.read_text(encoding="utf-8") != asked:
+        if not record.exists() or record.read_text(encoding="utf-8") != key:
             raise LodgsError(
-                f"{out} was trained with other options, or by another version.",
-                "Name another folder: --out DIR.",
+                f"The run {out} was trained with other options or another version.",
+                "Choose another folder with --out DIR.",
             )
         return
     out.parent.mkdir(parents=True, exist_ok=True)
-    record.write_text(asked, encoding="utf-8")
+    record.write_text(key, encoding="utf-8")
     environment = os.environ | {"PYTHONPATH": "", "OMP_NUM_THREADS": "1"}
-    ran = subprocess.run(command, cwd=checkout, env=environment, capture_output=True, text=True)
-    if ran.returncode:
-        last = ran.stdout.strip().splitlines()[-1:] or [ran.stderr]
-        raise LodgsError(f"{method} on {scene.name} in {checkout}: {last[0]}")
+    process = subprocess.run(command, cwd=checkout, env=environment, capture_output=True, text=True)
+    if process.returncode:
+        last = process.stdout.strip().splitlines()[-1:] or [process.stderr]
+        raise LodgsError(f"Cannot train {method} on {scene.name} with {checkout}: {last[0]}")
 
 
 def _version(checkout: Path) -> str:
-    """What a checkout holds, as far as git knows."""
+    """Return git's description of a checkout."""
     command = ["git", "-C", str(checkout), "describe", "--always", "--dirty", "--abbrev=40"]
     return subprocess.run(command, capture_output=True, text=True).stdout.strip()
 
@@ -94,11 +94,11 @@ def _version(checkout: Path) -> str:
 def _scaled(steps: int | tuple[int, ...], share: float) -> int | list[int]:
     if isinstance(steps, int):
         return max(round(share * steps), 1)
-    return [max(round(share * each), 1) for each in steps]
+    return [max(round(share * count), 1) for count in steps]
 
 
-def measured(out: Path, **run) -> Point:
-    """What a finished run is worth."""
+def measure(out: Path, **run) -> Point:
+    """Measure a finished run."""
     events = [json.loads(line) for line in (out / "events.jsonl").read_text(encoding="utf-8").splitlines()]
     report = evaluate_run(out)
     finest = report["levels"][-1]
@@ -110,7 +110,7 @@ def measured(out: Path, **run) -> Point:
 
 
 def table(points: Iterable[Point]) -> str:
-    """The points as Markdown."""
+    """Format points as a Markdown table."""
     names = ("scene", "method", "version", "share", "seed", *COLUMNS)
     rows = [
         [f"{value:.4g}" if isinstance(value, float) else str(value) for value in asdict(p).values()]
@@ -120,7 +120,7 @@ def table(points: Iterable[Point]) -> str:
 
 
 def plot(points: list[Point], path: Path) -> None:
-    """PSNR and veil against seconds: scenes side by side, methods in colours, versions dashed."""
+    """Plot PSNR and veil over seconds: a column per scene, a colour per method, a line style per version."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -142,39 +142,49 @@ def plot(points: list[Point], path: Path) -> None:
                     for p in points:
                         if (p.scene, p.method, p.version) == (scene, method, version):
                             curve.setdefault(p.share, []).append(p)
-                    across, up = (
-                        [sum(getattr(p, key) for p in some) / len(some) for _, some in sorted(curve.items())]
+                    x, y = (
+                        [sum(getattr(p, key) for p in runs) / len(runs) for _, runs in sorted(curve.items())]
                         for key in ("seconds", name)
                     )
                     style = {"color": f"C{color}", "linestyle": ["-", "--", ":"][dash % 3], "marker": "o"}
-                    axis.plot(across, up, label=f"{method}, {version}", **style)
+                    axis.plot(x, y, label=f"{method}, {version}", **style)
     axes[0, 0].legend(fontsize="small")
     figure.tight_layout()
     figure.savefig(path, dpi=110)
 
 
-def main() -> int:
+def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("scenes", nargs="+", type=Path, metavar="SCENE")
-    parser.add_argument("--base", type=Path, help="another checkout to train with as well; needs --report")
-    parser.add_argument("--report", action="store_true", help="measure on test views instead")
+    parser.add_argument("--base", type=Path, help="another checkout to compare with; requires --report")
+    parser.add_argument(
+        "--report", action="store_true", help="measure test views instead of validation views"
+    )
     parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS))
     parser.add_argument("--preset", default="draft")
-    parser.add_argument("--shares", nargs="+", type=float, default=[0.25, 0.5, 1.0], help="of the steps")
+    parser.add_argument(
+        "--shares", nargs="+", type=float, default=[0.25, 0.5, 1.0], help="shares of the preset's steps"
+    )
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--image-scale", type=float, default=0.5)
-    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="as train has it")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="parameter of the method, as for lodgs train",
+    )
     parser.add_argument("--out", type=Path, default=HERE / "build" / "quality")
-    args = parser.parse_args()
+    args = parser.parse_args(arguments)
     if args.base and not args.report:
-        parser.error("--base needs --report: an older version may not know validation views")
+        parser.error("--base requires --report: older versions may not support validation views")
     versions = {"this": HERE} | ({"base": args.base.resolve()} if args.base else {})
     if args.base and not (args.base / "training").is_dir():
-        parser.error(f"--base {args.base} is no checkout of the project")
+        parser.error(f"--base {args.base} is not a checkout of the project")
     if not all(0 < share <= 10 for share in args.shares):
-        parser.error("--shares are of a preset's steps, above 0 and at most 10")
+        parser.error("--shares must be above 0 and at most 10")
     args.out = args.out.resolve()
     points = []
     try:
@@ -185,9 +195,9 @@ def main() -> int:
                         for version, checkout in versions.items():
                             run = {"scene": scene.name, "method": method, "version": version}
                             run |= {"share": share, "seed": seed}
-                            out = args.out / "-".join(str(each) for each in run.values())
+                            out = args.out / "-".join(map(str, run.values()))
                             train(checkout, out, scene.resolve(), method, share, seed, args)
-                            points.append(measured(out, **run))
+                            points.append(measure(out, **run))
                             print(table(points[-1:]).splitlines()[-1], flush=True)
     except LodgsError as error:
         print(error.what, error.remedy, file=sys.stderr)
@@ -197,7 +207,7 @@ def main() -> int:
         json.dumps([asdict(p) for p in points], indent=1), encoding="utf-8"
     )
     plot(points, args.out / "quality.png")
-    print(f"{args.out / 'quality.md'} and quality.png are written.")
+    print(f"Wrote {args.out / 'quality.md'} and quality.png.")
     return 0
 
 

@@ -10,13 +10,13 @@ from pathlib import Path
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 EXTENSION = "bl_ext.user_default.lodgs"
-"""The package that the extension is imported as."""
+"""Package name of the installed extension."""
 
 
 def start_blender():
-    """Imports bpy and enables the extension, in a Blender user folder of its own; returns the module.
+    """Import bpy, enable the extension in a temporary Blender user folder, and return the module.
 
-    Only once in a process. The user's own Blender settings are neither read nor written.
+    Call it once per process. The user's Blender settings are neither read nor written.
     """
     resources = Path(tempfile.mkdtemp(prefix="lodgs-blender-"))
     link = resources / "extensions" / "user_default" / "lodgs"
@@ -25,7 +25,7 @@ def start_blender():
     os.environ["BLENDER_USER_RESOURCES"] = str(resources)
 
     import bpy  # isort: skip
-    import addon_utils  # known only once bpy has been imported
+    import addon_utils  # importable only after bpy
 
     def fail(error: Exception):
         raise error

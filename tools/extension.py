@@ -1,6 +1,6 @@
-"""Builds dist/lodgs-VERSION.zip with Blender's own tool, and has the same tool validate it.
+"""Build dist/lodgs-VERSION.zip with Blender's extension tool, and validate it.
 
-Run from anywhere with a Python that has pip and the bpy wheel: ``python tools/extension.py``.
+Needs a Python with pip and the bpy wheel: ``python tools/extension.py``.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def blender_tool() -> Path:
-    """The extension tool inside the bpy wheel. Exits with a sentence if there is none."""
-    found = importlib.util.find_spec("bpy")  # not imported: Blender need not start
-    for folder in found.submodule_search_locations or [] if found else []:
+    """Return the extension tool of the bpy wheel; exit with a message if it is missing."""
+    spec = importlib.util.find_spec("bpy")  # finds the tool without starting Blender
+    for folder in spec.submodule_search_locations or [] if spec else []:
         for tool in Path(folder).glob("*/scripts/addons_core/bl_pkg/cli/blender_ext.py"):
             return tool
-    sys.exit("extension: the package bpy is missing in this Python; run `make setup` first.")
+    sys.exit("extension: the package bpy is not installed. Run `make setup` first.")
 
 
 def fetch_wheels(wheels: list[str]) -> None:
-    """Download the wheels that the manifest names unless they are there, and make sure of their hashes."""
+    """Download missing wheels of the manifest, and verify their hashes."""
     lock = (ROOT / "requirements" / "trainer.txt").read_text(encoding="utf-8")
     for wheel in (ROOT / name for name in wheels):
         if not wheel.exists():
@@ -35,19 +35,19 @@ def fetch_wheels(wheels: list[str]) -> None:
                 "--dest", str(wheel.parent), f"{name}=={version}",
             ]  # fmt: skip
             if subprocess.run(command, check=False).returncode:
-                sys.exit(f"extension: {wheel.name} could not be downloaded; check the network.")
+                sys.exit(f"extension: cannot download {wheel.name}. Check the network.")
         if f"--hash=sha256:{hashlib.sha256(wheel.read_bytes()).hexdigest()}" not in lock:
-            sys.exit(f"extension: {wheel} is not the wheel of requirements/trainer.txt; remove it.")
+            sys.exit(f"extension: {wheel} differs from the wheel in requirements/trainer.txt. Delete it.")
 
 
 def build(folder: Path) -> Path:
     """Build and validate the zip.
 
     Args:
-        folder: where the zip goes; made if it is missing.
+        folder: output folder; created if it does not exist.
 
     Returns:
-        The zip. Exits with Blender's message if it refuses something.
+        The zip file. Exits with Blender's message on errors.
     """
     manifest = tomllib.loads((ROOT / "blender_manifest.toml").read_text(encoding="utf-8"))
     fetch_wheels(manifest["wheels"])

@@ -1,9 +1,8 @@
-"""Let another program judge our files: ``make interop``.
+"""Check that another program reads our files. Part of ``make interop``.
 
-Gives bundles, a plain PLY and a folder of levels to PlayCanvas' splat-transform (from npm, run on the CPU)
-and compares its counts, and the values it writes back, with ours. ``python tools/interop.py [BUNDLE.ply]``
-takes a bundle at hand; without one, five levels of random splats are made. Exit code 0: all agree;
-1: something does not; 2: nothing could be checked.
+Passes bundles, a plain PLY and a folder of levels to PlayCanvas' splat-transform (from npm, run on the CPU),
+and compares its counts and rewritten values with ours. ``python tools/interop.py [BUNDLE.ply]`` uses a given
+bundle, or five levels of random splats. Exit code 0: all agree; 1: differences; 2: nothing was checked.
 """
 
 from __future__ import annotations
@@ -20,11 +19,11 @@ from plyfile import PlyData
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from training.splats.bundle import read_bundle, write_bundle
+from training.splats.bundle import read_bundle, write_bundle  # noqa: E402
 from training.splats.formats import STREAMED_FILE, level_arguments  # noqa: E402
 from training.splats.gaussians import Splats  # noqa: E402
-from training.splats.level_folder import write_folder
-from training.splats.levels import Bundle, Level
+from training.splats.level_folder import write_folder  # noqa: E402
+from training.splats.levels import Bundle, Level  # noqa: E402
 from training.splats.ply import write_ply  # noqa: E402
 
 PACKAGE = "@playcanvas/splat-transform"
@@ -34,30 +33,30 @@ FOLDER = ROOT / "build" / "interop"
 
 def main() -> int:
     if not shutil.which("node") or not shutil.which("npm"):
-        print("Nothing was checked: Node.js is missing; install it (with npm) and run this again.")
+        print("interop: Node.js is not installed. Install it with npm and repeat.")
         return 2
     if not install():
-        print(f"Nothing was checked: npm could not install {PACKAGE} {VERSION} (see above).")
+        print(f"interop: npm cannot install {PACKAGE} {VERSION}, see above.")
         return 2
     bundle = read_bundle(sys.argv[1]) if len(sys.argv) > 1 else random_bundle()
     if bundle.levels[0].splats.sh_degree > 3:
-        print(f"Nothing was checked: {PACKAGE} reads spherical harmonics up to degree 3.")
+        print(f"interop: {PACKAGE} only reads spherical harmonics up to degree 3.")
         return 2
-    rows = [(what, ours, theirs, ours == theirs) for what, ours, theirs in checks(bundle)]
+    rows = [(check, ours, theirs, ours == theirs) for check, ours, theirs in checks(bundle)]
     print(f"{'splat-transform ' + VERSION:<34}  {'ours':<34}  {'theirs':<34}")
-    for what, ours, theirs, same in rows:
-        print(f"{what:<34}  {ours!s:<34}  {theirs!s:<34}  {'ok' if same else 'DIFFERENT'}")
+    for check, ours, theirs, same in rows:
+        print(f"{check:<34}  {ours!s:<34}  {theirs!s:<34}  {'ok' if same else 'DIFFERENT'}")
     return 0 if all(same for *_, same in rows) else 1
 
 
 def install(name: str = PACKAGE, version: str = VERSION) -> bool:
-    """Install a pinned version from npm into build/interop unless it is there."""
+    """Install a pinned version from npm into build/interop, unless installed."""
     package = FOLDER / "node_modules" / name / "package.json"
     if package.exists() and json.loads(package.read_text("utf-8"))["version"] == version:
         return True
     FOLDER.mkdir(parents=True, exist_ok=True)
     command = ["npm", "install", "--prefix", str(FOLDER), "--no-audit", "--no-fund", f"{name}@{version}"]
-    if not (FOLDER / "package.json").exists():  # npm finds a project in a parent folder otherwise
+    if not (FOLDER / "package.json").exists():  # otherwise npm uses a project in a parent folder
         (FOLDER / "package.json").write_text('{"private": true}\n')
     return subprocess.run([shutil.which("npm") or "npm", *command[1:]]).returncode == 0
 
@@ -84,24 +83,24 @@ def random_bundle() -> Bundle:
 
 
 def checks(bundle: Bundle):
-    """Yield (what, our answer, splat-transform's answer)."""
+    """Yield name, our result and splat-transform's result of each check."""
     counts = [len(level.splats) for level in reversed(bundle.levels)]
     finest = bundle.levels[-1].splats
-    whole = sum(counts) if bundle.cumulative else counts[0]
+    total = sum(counts) if bundle.cumulative else counts[0]
 
     path = FOLDER / "bundle.ply"
     write_bundle(path, bundle)
-    yield "bundle, finest first: splats, SH", (whole, finest.sh_degree), info(path)
+    yield "bundle, finest first: splats, SH", (total, finest.sh_degree), info(path)
     yield "bundle: values of the finest level", "equal", values(path)
 
-    # The judge must be able to say no.
+    # splat-transform must be able to reject a file
     short = FOLDER / "short.ply"
     short.write_bytes(path.read_bytes()[:-1])
-    yield "bundle, one byte short", "refused", "refused" if info(short) is None else "accepted"
+    yield "bundle, one byte short", "rejected", "rejected" if info(short) is None else "accepted"
 
     path = FOLDER / "stream.ply"
     write_bundle(path, bundle, order="stream")
-    first = whole if bundle.cumulative else counts[-1]
+    first = total if bundle.cumulative else counts[-1]
     yield "bundle, coarsest first: splats, SH", (first, finest.sh_degree), info(path)
 
     path = FOLDER / "plain.ply"
@@ -113,7 +112,7 @@ def checks(bundle: Bundle):
     shutil.rmtree(folder, ignore_errors=True)
     write_folder(folder, bundle)
     meta = folder / "web" / STREAMED_FILE
-    # Its compression of view-dependent colour takes minutes on a CPU and changes no count: -H 0 drops it.
+    # -H 0 drops view-dependent colour, whose compression takes minutes on a CPU
     result = splat_transform("-w", "-g", "cpu", *level_arguments(folder, len(counts)), str(meta), "-H", "0")
     theirs = json.loads(meta.read_text("utf-8"))["counts"] if meta.exists() else failure(result)
     complete = [sum(counts[lod:]) for lod in range(len(counts))] if bundle.cumulative else counts
@@ -121,12 +120,12 @@ def checks(bundle: Bundle):
 
 
 def failure(result: subprocess.CompletedProcess[str]) -> str:
-    """What splat-transform said, on one line."""
+    """Return splat-transform's error message on one line."""
     return " ".join(result.stderr.split())[:200] or f"exit code {result.returncode}"
 
 
 def info(path: Path) -> tuple[int, int] | None:
-    """Splats and SH degree as splat-transform reads them; None when it refuses the file."""
+    """Return splats and SH degree as read by splat-transform; None if it rejects the file."""
     result = splat_transform("-q", str(path), "--info", "json", "null")
     if result.returncode:
         return None
@@ -135,7 +134,7 @@ def info(path: Path) -> tuple[int, int] | None:
 
 
 def values(path: Path) -> str:
-    """Whether splat-transform writes back every value of ``vertex`` as it read it."""
+    """Compare the values of ``vertex`` with those that splat-transform writes back."""
     back = path.with_suffix(".back.ply")
     back.unlink(missing_ok=True)
     result = splat_transform("-w", str(path), str(back))

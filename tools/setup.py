@@ -1,7 +1,7 @@
-"""Makes the environments that `make` uses. Standard library only; runs on the Python that a machine has.
+"""Create the environments for `make`. Standard library only; runs on the system's Python.
 
-python3 tools/setup.py            .venv (Python 3.11: the trainer, Blender 4.5 as a module, the checks) and,
-                                  where Python 3.13 is found, .venv-blender-5.2 (Blender 5.2 as a module)
+python3 tools/setup.py            .venv (Python 3.11: trainer, Blender 4.5 as a module, checks) and, if
+                                  Python 3.13 is installed, .venv-blender-5.2 (Blender 5.2 as a module)
 python3 tools/setup.py 5.0        .venv-blender-5.0 (Blender 5.0, Python 3.11)
 """
 
@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def find_python(version: str) -> str | None:
-    """An interpreter of this version ("3.11") that can make virtual environments, or None."""
+    """Find an interpreter of a version such as "3.11" that can create virtual environments, or None."""
     home = Path.home()
     candidates = [
         sys.executable,
@@ -37,15 +37,15 @@ def find_python(version: str) -> str | None:
         f"/opt/homebrew/bin/python{version}",
     ]
     if os.name == "nt" and shutil.which("py"):
-        found = subprocess.run(
+        launcher = subprocess.run(
             ["py", f"-{version}", "-c", "import sys; print(sys.executable)"],
             capture_output=True,
             text=True,
             check=False,
         )
-        candidates.append(found.stdout.strip())
-    wanted = tuple(map(int, version.split(".")))
-    test = f"import sys, venv, ensurepip; sys.exit(sys.version_info[:2] != {wanted})"
+        candidates.append(launcher.stdout.strip())
+    numbers = tuple(map(int, version.split(".")))
+    test = f"import sys, venv, ensurepip; sys.exit(sys.version_info[:2] != {numbers})"
     for candidate in filter(None, candidates):
         try:
             if (
@@ -61,13 +61,13 @@ def find_python(version: str) -> str | None:
 
 
 def make(folder: str, python: str, lock: str) -> None:
-    """A virtual environment with the packages of a lock; nothing happens when it is as it should be."""
+    """Create a virtual environment with the packages of a lock file, unless it is up to date."""
     environment, requirements = ROOT / folder, ROOT / "requirements" / lock
-    wanted = hashlib.sha256(requirements.read_bytes()).hexdigest()
+    digest = hashlib.sha256(requirements.read_bytes()).hexdigest()
     stamp = environment / "requirements.sha256"
-    if stamp.exists() and stamp.read_text() == wanted:
+    if stamp.exists() and stamp.read_text() == digest:
         return
-    print(f"setup: {folder} with {python} (a few minutes the first time)", flush=True)
+    print(f"setup: {folder} with {python} (a few minutes on first use)", flush=True)
     scripts = environment / ("Scripts" if os.name == "nt" else "bin")
     if not (scripts / "pip").exists() and not (scripts / "pip.exe").exists():
         subprocess.run([python, "-m", "venv", "--clear", str(environment)], check=True)
@@ -81,22 +81,22 @@ def make(folder: str, python: str, lock: str) -> None:
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     if loaded.returncode:
-        said = (loaded.stderr.strip().splitlines() or ["it ended without a word"])[-1]
-        print(f"setup: Blender's module cannot be loaded ({said}).", file=sys.stderr)
+        message = (loaded.stderr.strip().splitlines() or ["no error message"])[-1]
+        print(f"setup: Cannot load Blender's module ({message}).", file=sys.stderr)
         print(
-            "setup: it wants the usual desktop libraries; on Debian: libx11-6 libxi6 libxrender1",
+            "setup: Install its system libraries, on Debian: libx11-6 libxi6 libxrender1",
             file=sys.stderr,
         )
         print("setup: libxfixes3 libgl1 libxkbcommon0 libsm6 libice6.", file=sys.stderr)
         sys.exit(1)
-    stamp.write_text(wanted)
+    stamp.write_text(digest)
 
 
 def main() -> int:
     python = find_python("3.11")
     if python is None:
         print(
-            "setup: Python 3.11 with pip and venv is missing; install it and run make again.", file=sys.stderr
+            "setup: Python 3.11 with pip and venv not found. Install it and run make again.", file=sys.stderr
         )
         return 1
     try:
@@ -108,16 +108,16 @@ def main() -> int:
         if newer is not None:
             make(".venv-blender-5.2", newer, "blender-5.2.txt")
         elif not (ROOT / ".venv-blender-5.2").exists():
-            print("setup: no Python 3.13 here, so the tests in Blender 5.2 are left out.", file=sys.stderr)
+            print("setup: Python 3.13 not found; tests in Blender 5.2 will be skipped.", file=sys.stderr)
         if sys.platform.startswith("linux") and not ctypes.util.find_library("vulkan"):
             print(
-                "setup: no Vulkan here, so tests of the gpu backend are left out; on Debian software",
+                "setup: Vulkan not found; tests of the gpu backend will be skipped. On Debian, install",
                 file=sys.stderr,
             )
-            print("setup: Vulkan is in mesa-vulkan-drivers.", file=sys.stderr)
+            print("setup: mesa-vulkan-drivers for software rendering.", file=sys.stderr)
     except subprocess.CalledProcessError as error:
-        print(f"setup: this command failed: {' '.join(error.cmd)}", file=sys.stderr)
-        print("setup: is the package index reachable, and is there room on the disk?", file=sys.stderr)
+        print(f"setup: Command failed: {' '.join(error.cmd)}", file=sys.stderr)
+        print("setup: Check the network and the free disk space.", file=sys.stderr)
         return 1
     return 0
 

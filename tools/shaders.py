@@ -1,9 +1,8 @@
-"""Let naga translate our shaders to what macOS and Windows take: ``make interop``.
+"""Translate our shaders with naga to the languages of macOS and Windows. Part of ``make interop``.
 
-wgpu gives every WGSL shader to its compiler naga, which writes MSL for Metal, HLSL for Direct3D 12 and SPIR-V
-for Vulkan. naga-wasm (from npm) is that compiler for Node. Whether Apple's and Microsoft's own compilers take
-what it writes is seen on their systems only. Exit code 0: all are translated; 1: one is not; 2: nothing could
-be checked.
+wgpu compiles WGSL shaders with naga to MSL for Metal, HLSL for Direct3D 12 and SPIR-V for Vulkan; naga-wasm
+(from npm) is this compiler for Node. Apple's and Microsoft's compilers are not tested here. Exit code 0: all
+shaders are translated; 1: errors; 2: nothing was checked.
 """
 
 from __future__ import annotations
@@ -24,27 +23,27 @@ PACKAGE, VERSION = "naga-wasm", "30.1.0"
 PROGRAM = """
 import { readFileSync } from "node:fs";
 import { nagaVersion, parseWgsl, validate, writeHlsl, writeMsl, writeSpirv } from "naga-wasm";
-const found = { naga: nagaVersion, shaders: {} };
+const result = { naga: nagaVersion, shaders: {} };
 for (const [name, source] of Object.entries(JSON.parse(readFileSync(0, "utf8")))) {
   try {
     const module = parseWgsl(source), info = validate(module);
-    found.shaders[name] = {
+    result.shaders[name] = {
       metal: writeMsl(module, info, {}), hlsl: writeHlsl(module, info, { shaderModel: "5_1" }),
       spirv: "x".repeat(writeSpirv(module, info, {}).length),
     };
   } catch (error) {
-    found.shaders[name] = { error: String(error.formatted ?? error) };
+    result.shaders[name] = { error: String(error.formatted ?? error) };
   }
 }
-console.log(JSON.stringify(found));
+console.log(JSON.stringify(result));
 """
 
 
-def translated() -> dict:
-    """naga's version, and of each shader the texts by language, or an ``error``.
+def translate() -> dict:
+    """Return naga's version, and for each shader its translations by language or an ``error``.
 
     Raises:
-        RuntimeError: Node could not run it.
+        RuntimeError: Node cannot run the compiler.
     """
     names = sorted(path.stem for path in SHADERS.glob("*.wgsl") if path.stem != "common")
     program = FOLDER / "shaders.mjs"
@@ -60,16 +59,16 @@ def translated() -> dict:
 
 def main() -> int:
     if not shutil.which("node") or not shutil.which("npm"):
-        print("No shader was translated: Node.js is missing; install it (with npm) and run this again.")
+        print("shaders: Node.js is not installed. Install it with npm and repeat.")
         return 2
     if not install(PACKAGE, VERSION):
-        print(f"No shader was translated: npm could not install {PACKAGE} {VERSION} (see above).")
+        print(f"shaders: npm cannot install {PACKAGE} {VERSION}, see above.")
         return 2
-    found = translated()
+    result = translate()
     texts = FOLDER / "shaders"
     texts.mkdir(exist_ok=True)
     failed = False
-    for name, written in found["shaders"].items():
+    for name, written in result["shaders"].items():
         if "error" in written:
             failed = True
             print(f"{name}: {written['error']}")
@@ -77,7 +76,7 @@ def main() -> int:
         (texts / f"{name}.metal").write_text(written["metal"], encoding="utf-8")
         (texts / f"{name}.hlsl").write_text(written["hlsl"], encoding="utf-8")
         sizes = ", ".join(f"{kind} {len(text):,}" for kind, text in written.items())
-        print(f"naga {found['naga']} translates {name}: {sizes}")
+        print(f"naga {result['naga']} translates {name}: {sizes}")
     return int(failed)
 
 

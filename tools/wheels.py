@@ -1,9 +1,9 @@
-"""Asks the package index whether a lock can be installed by wheels alone on systems that are not here.
+"""Check on the package index that a lock file can be installed from wheels only on all platforms.
 
 tools/wheels.py [requirements/trainer.txt]
 
-pip's own resolver answers (``--dry-run --platform``), with the lock's hashes. It takes markers for those of
-the system that it runs on, so lines for other systems are left out before. Takes minutes; installs nothing.
+Uses pip's resolver (``--dry-run --platform``) with the lock's hashes. pip evaluates markers for the current
+platform, so this script filters lines by marker first. Takes minutes and installs nothing.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from packaging.requirements import Requirement
 ROOT = Path(__file__).resolve().parents[1]
 PYTHONS = ("3.11", "3.13", "3.14")
 GLIBC = (*(f"_2_{minor}" for minor in (39, 34, 31, 28, 27, 25, 24, 18, 17, 14, 12, 5)), "2014")
-"""Versions of glibc as the tags of wheels name them."""
+"""Platform tags of wheels for Linux, by glibc version."""
 SYSTEMS = {
     "Windows, x86-64": ("win32", "Windows", "AMD64", ["win_amd64"]),
     "macOS 14, Apple": ("darwin", "Darwin", "arm64", [f"macosx_{v}_0_arm64" for v in (14, 13, 12, 11)]),
@@ -27,32 +27,34 @@ SYSTEMS = {
 
 
 def pins(lock: Path, system: str, python: str) -> list[str]:
-    """The lines of a lock that count on a system, without their markers."""
+    """Return the lines of a lock that apply to a platform, without their markers."""
     platform, name, machine, _ = SYSTEMS[system]
-    there = {
+    environment = {
         "sys_platform": platform, "platform_system": name, "platform_machine": machine,
         "python_version": python, "python_full_version": f"{python}.0", "implementation_name": "cpython",
     }  # fmt: skip
     lines = []
     for line in lock.read_text(encoding="utf-8").replace("\\\n", "").splitlines():
         if line and not line.lstrip().startswith("#"):
-            said, *hashes = line.split("--hash=")
-            wanted = Requirement(said.strip())
-            if wanted.marker is None or wanted.marker.evaluate(there):
-                lines.append(f"{wanted.name}{wanted.specifier} " + " ".join(f"--hash={h}" for h in hashes))
+            text, *hashes = line.split("--hash=")
+            requirement = Requirement(text.strip())
+            if requirement.marker is None or requirement.marker.evaluate(environment):
+                lines.append(
+                    f"{requirement.name}{requirement.specifier} " + " ".join(f"--hash={h}" for h in hashes)
+                )
     return lines
 
 
 def missing(lines: list[str], system: str, python: str) -> str:
-    """What pip says is not there, or nothing."""
+    """Return pip's message about missing wheels, or an empty string."""
     with tempfile.TemporaryDirectory() as folder:
-        wanted = Path(folder) / "pins.txt"
-        wanted.write_text("\n".join(lines), encoding="utf-8")
+        requirements = Path(folder) / "pins.txt"
+        requirements.write_text("\n".join(lines), encoding="utf-8")
         answer = subprocess.run(
             [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--dry-run",
              "--no-deps", "--ignore-requires-python", "--only-binary=:all:", "--target", folder,
              "--python-version", python, *(f"--platform={tag}" for tag in SYSTEMS[system][3]),
-             "--require-hashes", "-r", str(wanted)],
+             "--require-hashes", "-r", str(requirements)],
             capture_output=True, text=True, check=False,
         )  # fmt: skip
     errors = [line for line in answer.stderr.splitlines() if line.startswith("ERROR: No matching")]
@@ -67,7 +69,8 @@ def main() -> int:
             lines = pins(lock, system, python)
             problem = missing(lines, system, python)
             print(
-                f"{system}, Python {python}: {problem or f'{len(lines)} packages, all as wheels'}", flush=True
+                f"{system}, Python {python}: {problem or f'{len(lines)} packages, all available as wheels'}",
+                flush=True,
             )
             failed |= bool(problem)
     return int(failed)
