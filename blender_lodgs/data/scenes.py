@@ -260,7 +260,7 @@ def shown_splats(
     rule = find_rule(root.lodgs.rule)
     if not placed:
         return splats
-    return placement_of(root).splats(splats, *((rule.lengths, rule.places) if rule else ()))
+    return placement_of(root).transform_splats(splats, *((rule.lengths, rule.places) if rule else ()))
 
 
 def count_shown(context: bpy.types.Context, root: bpy.types.Object) -> tuple[int, int]:

@@ -111,7 +111,7 @@ def test_a_click_on_splats_selects_them_whatever_was_selected(
         bpy.ops.object.select_all(action="DESELECT")
         return True
 
-    monkeypatch.setattr(pick, "_blenders_own", blenders_own)
+    monkeypatch.setattr(pick, "_blender_click", blenders_own)
     bpy.ops.object.select_all(action="DESELECT")
     if tool == "selects by a click":
         other.select_set(True)

@@ -174,7 +174,7 @@ def test_the_ground_is_found(bpy, lodgs, capfd):
     bpy.context.view_layer.update()
     up = lodgs("data.placement").placement_of(root).rotation[:, 2]
     bpy.ops.lodgs.set_ground(by="FOUND")
-    told = re.search(r"turned by ([\d.]+)°", capfd.readouterr().out)
+    told = re.search(r"rotated by ([\d.]+)°", capfd.readouterr().out)
     assert told and float(told[1]) == pytest.approx(np.degrees(np.arccos(up[2])), abs=0.6)
     bpy.context.view_layer.update()
     placement = lodgs("data.placement").placement_of(root)

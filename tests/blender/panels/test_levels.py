@@ -67,7 +67,7 @@ def test_one_level_warns_if_splats_are_trained_for_distances(root, draw, name):
 
 def test_levels_without_a_known_rule_cause_a_hint(root, draw):
     root("")
-    assert "These levels are not made for distances." in draw().texts
+    assert "These levels cannot be selected by distance." in draw().texts
     root("weave")
     assert any("'weave', which this version does not know." in text for text in draw().texts)
 
