@@ -1,4 +1,4 @@
-"""A Blender scene becomes a COLMAP scene: cameras are Blender's, depths and points lie on its surfaces."""
+"""Capture of a Blender scene as a COLMAP scene: exact cameras, and depths and points on its surfaces."""
 
 import os
 import subprocess
@@ -21,7 +21,7 @@ needs_trainer = pytest.mark.skipif(not TRAINER, reason="no trainer; set LODGS_TR
 
 @pytest.fixture
 def scene(bpy):
-    """Two cubes on a ground of 12 m, under a sun: a sample a pixel, through its centre."""
+    """Two cubes on a ground of 12 m with a sun, rendered with one sample through each pixel centre."""
     scene = bpy.context.scene
     bpy.ops.mesh.primitive_plane_add(size=12)
     bpy.ops.mesh.primitive_cube_add(location=(2.5, 1.5, 1))
@@ -48,8 +48,8 @@ def new_camera(bpy, location, turn, **data):
     return camera
 
 
-def odd_cameras(bpy):
-    """Cameras of which each has something that an exact pose or lens trips over."""
+def unusual_cameras(bpy):
+    """Cameras with shift, roll, other sensor fits, depth of field and a scaled parent."""
     carrier = bpy.data.objects.new("Carrier", None)
     carrier.location, carrier.scale, carrier.rotation_euler = (0, 0, 1), (2, 2, 2), (0, 0, 0.4)
     bpy.context.scene.collection.objects.link(carrier)
@@ -66,7 +66,7 @@ def odd_cameras(bpy):
 
 @pytest.fixture
 def capture(bpy, lodgs, tmp_path):
-    """``capture("--around", ...)``: the exit code of capturing the file as it is now to tmp_path/out."""
+    """``capture("--around", ...)`` captures the current file to tmp_path/out. Returns the exit code."""
 
     def run(*arguments, out="out"):
         bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
@@ -76,8 +76,8 @@ def capture(bpy, lodgs, tmp_path):
     return run
 
 
-def depth_of(folder: Path, name: str) -> np.ndarray:
-    """Depths by the trainer's reader in a Python that has OpenEXR."""
+def read_depth(folder: Path, name: str) -> np.ndarray:
+    """Read a depth map with the trainer's reader, in a Python that has OpenEXR."""
     code = (
         "import sys, numpy, pathlib; from training.scenes.rendered_views import read_exr_depth;"
         "numpy.save(sys.argv[2], read_exr_depth(pathlib.Path(sys.argv[1])))"
@@ -88,12 +88,12 @@ def depth_of(folder: Path, name: str) -> np.ndarray:
     return np.load(saved)
 
 
-def test_views_are_blenders_own_to_a_fraction_of_a_pixel(bpy, scene, capture, tmp_path):
+def test_cameras_match_blender_within_a_fraction_of_a_pixel(bpy, scene, capture, tmp_path):
     from bpy_extras.object_utils import world_to_camera_view
     from mathutils import Vector
 
     scene.render.pixel_aspect_x, scene.render.pixel_aspect_y = 1.0, 1.4
-    cameras = odd_cameras(bpy)
+    cameras = unusual_cameras(bpy)
     assert capture("--cameras", "--range", "1-4") == 0
     views, _ = read_camera_folder(tmp_path / "out" / "cameras")
     rng, scene = np.random.default_rng(0), bpy.context.scene
@@ -104,67 +104,69 @@ def test_views_are_blenders_own_to_a_fraction_of_a_pixel(bpy, scene, capture, tm
         points = rng.uniform((-3, -3, 0), (3, 3, 2), (50, 3))
         pixels, depths = view.project(points)
         for point, pixel, depth in zip(points, pixels, depths, strict=True):
-            x, y, away = world_to_camera_view(scene, camera, Vector(point))
-            assert away > 0 and depth == pytest.approx(away, rel=1e-5)
+            x, y, distance = world_to_camera_view(scene, camera, Vector(point))
+            assert distance > 0 and depth == pytest.approx(distance, rel=1e-5)
             assert pixel == pytest.approx((x * view.width, (1 - y) * view.height), abs=2e-3)
 
 
 @needs_trainer
-def test_depths_are_where_rays_through_pixels_meet_surfaces(bpy, scene, capture, tmp_path):
-    odd_cameras(bpy)
+def test_depths_match_ray_casts(bpy, scene, capture, tmp_path):
+    unusual_cameras(bpy)
     assert capture("--cameras", "--range", "1-4") == 0
     scene, depsgraph = bpy.context.scene, bpy.context.evaluated_depsgraph_get()
     views, _ = read_camera_folder(tmp_path / "out" / "cameras")
     for view in views:
-        depths, met, sky = depth_of(tmp_path / "out", view.name), 0, 0
+        depths = read_depth(tmp_path / "out", view.name)
+        hits = 0
+        sky = 0
         for y in range(1, view.height, 5):
             for x in range(2, view.width, 5):
                 far = view.unproject(np.array([[x + 0.5, y + 0.5]]), np.ones(1))[0]
-                hit, place, *_ = scene.ray_cast(depsgraph, view.center, far - view.center)
-                around = depths[y - 1 : y + 2, x - 1 : x + 2]
-                if hit and np.ptp(around) < 1:  # not at an outline, which float32 may put a hair beside
-                    assert depths[y, x] == pytest.approx(view.view_space(np.array([place]))[0, 2], rel=2e-4)
-                    met += 1
-                elif not hit and around.min() > 100:
+                hit, point, *_ = scene.ray_cast(depsgraph, view.center, far - view.center)
+                window = depths[y - 1 : y + 2, x - 1 : x + 2]
+                if hit and np.ptp(window) < 1:  # skip outlines, which float32 may shift
+                    assert depths[y, x] == pytest.approx(view.view_space(np.array([point]))[0, 2], rel=2e-4)
+                    hits += 1
+                elif not hit and window.min() > 100:
                     assert depths[y, x] > 1e6
                     sky += 1
-        assert met > 40 and (sky or view is not views[0])
+        assert hits > 40 and (sky or view is not views[0])
 
 
 @needs_trainer
-def test_depths_are_of_the_view_layers_that_pictures_show(bpy, lodgs, scene, capture, tmp_path):
-    """Blender's picture is the first layer's, or what a compositor makes of all."""
-    apart = bpy.data.collections.new("Apart")
-    scene.collection.children.link(apart)
+def test_depths_belong_to_the_view_layers_of_the_image(bpy, lodgs, scene, capture, tmp_path):
+    """Without a compositor, Blender's image is the first layer."""
+    excluded = bpy.data.collections.new("Excluded")
+    scene.collection.children.link(excluded)
     cube = bpy.data.objects["Cube"]
     cube.users_collection[0].objects.unlink(cube)
-    apart.objects.link(cube)
+    excluded.objects.link(cube)
     scene.view_layers.new("Second")
-    scene.view_layers[0].layer_collection.children["Apart"].exclude = True
+    scene.view_layers[0].layer_collection.children["Excluded"].exclude = True
     new_camera(bpy, (2.5, 1.5, 9), (0, 0, 0))
     new_camera(bpy, (2.5, 1.6, 9), (0, 0, 0))
     assert capture("--cameras", "--range", "1-1") == 0
-    assert depth_of(tmp_path / "out", "view_0001")[24, 32] == pytest.approx(9, abs=1e-3)
+    assert read_depth(tmp_path / "out", "view_0001")[24, 32] == pytest.approx(9, abs=1e-3)
     scene = bpy.context.scene
     for layer in scene.view_layers:
         layer.use = True
     tree = lodgs("compat").compositor_tree(scene)
     tree.nodes.clear()
-    picture = lodgs("compat").compositor_output(tree)
-    tree.links.new(tree.nodes.new("CompositorNodeRLayers").outputs["Image"], picture)
+    output = lodgs("compat").compositor_output(tree)
+    tree.links.new(tree.nodes.new("CompositorNodeRLayers").outputs["Image"], output)
     assert capture("--cameras", "--range", "1-1", out="both") == 0
-    assert depth_of(tmp_path / "both", "view_0001")[24, 32] == pytest.approx(7, abs=1e-3)
+    assert read_depth(tmp_path / "both", "view_0001")[24, 32] == pytest.approx(7, abs=1e-3)
 
 
 @needs_trainer
-def test_the_model_imports_with_points_on_the_scenes_surfaces(bpy, scene, capture, tmp_path):
+def test_imported_points_lie_on_the_surfaces(bpy, scene, capture, tmp_path):
     assert capture("--around", "--views", "8") == 0
     assert not (tmp_path / "out" / ".model.tmp").exists()
     bpy.context.scene.lodgs_capture.folder = str(tmp_path / "out")
     assert bpy.ops.lodgs.import_capture() == {"FINISHED"}
     assert not any(obj.hide_get() for obj in bpy.context.view_layer.objects)
     (root,) = [obj for obj in bpy.context.scene.objects if obj.lodgs.is_root]
-    assert np.allclose(root.matrix_world, np.eye(4)), "it lies where the Blender scene is"
+    assert np.allclose(root.matrix_world, np.eye(4)), "it has the coordinates of the Blender scene"
     assert len(root.lodgs.cameras.objects) == 8
     cloud = root.lodgs.points.data
     points = np.empty(3 * len(cloud.points), np.float32)
@@ -175,31 +177,32 @@ def test_the_model_imports_with_points_on_the_scenes_surfaces(bpy, scene, captur
         np.abs(points - middle) - half
         for middle, half in (((0, 0, 1), 1.0), ((2.5, 1.5, 1), 1.0), ((0, 0, 0), (6, 6, 0)))
     ]
-    away = [np.linalg.norm(np.maximum(box, 0), axis=1) + np.abs(box.max(axis=1).clip(max=0)) for box in boxes]
+    distances = [
+        np.linalg.norm(np.maximum(box, 0), axis=1) + np.abs(box.max(axis=1).clip(max=0)) for box in boxes
+    ]
     sky = np.linalg.norm(points, axis=1) > 20
-    assert np.min(away, axis=0)[~sky].max() < 0.01 and sky.mean() <= 0.1
-    assert all((distance < 0.01).sum() > 20 for distance in away), "on each of them"
+    assert np.min(distances, axis=0)[~sky].max() < 0.01 and sky.mean() <= 0.1
+    assert all((distance < 0.01).sum() > 20 for distance in distances), "points on each surface"
 
 
-def test_a_dome_begins_on_the_level_and_shows_what_is_selected(bpy, scene, capture, tmp_path):
+def test_dome_views_see_the_selection(bpy, scene, capture, tmp_path):
     assert capture("--around", "--views", "9", "--range", "1-9") == 0
     views, _ = read_camera_folder(tmp_path / "out" / "cameras")
     corners = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (0, 2)], float)
     for view in views:
         assert view.center[2] >= 1 and view.sees(corners).all()
-        assert view.world_to_camera[1, 2] <= 1e-6, "up is up"
-    lows, highs = views[0].center[2], views[-1].center[2]
-    assert lows < 2 < highs
+        assert view.world_to_camera[1, 2] <= 1e-6, "views are upright"
+    assert views[0].center[2] < 2 < views[-1].center[2]
 
 
-def test_frames_of_a_camera_that_moves(bpy, scene, capture, tmp_path):
+def test_views_of_an_animated_camera(bpy, scene, capture, tmp_path):
     camera = scene.camera = new_camera(bpy, (0, -9, 3), (75, 0, 0))
     for frame, x in ((1, -4), (21, 4)):
         camera.location.x = x
         camera.keyframe_insert("location", frame=frame)
     scene.frame_end = 21
     scene.timeline_markers.new("first", frame=1).camera = camera
-    scene.timeline_markers.new("other", frame=15).camera = new_camera(bpy, (9, 0, 3), (75, 0, 90))
+    scene.timeline_markers.new("second", frame=15).camera = new_camera(bpy, (9, 0, 3), (75, 0, 90))
     assert capture("--animation", "--views", "5", "--range", "1-5") == 0
     views, _ = read_camera_folder(tmp_path / "out" / "cameras")
     scene = bpy.context.scene
@@ -209,19 +212,19 @@ def test_frames_of_a_camera_that_moves(bpy, scene, capture, tmp_path):
     assert views[-1].center[0] == pytest.approx(9), "the marker's camera"
 
 
-def test_a_walk_along_a_curve(bpy, scene, capture, tmp_path, capfd):
+def test_views_along_a_curve(bpy, scene, capture, tmp_path, capfd):
     bpy.ops.curve.primitive_bezier_circle_add(radius=5, location=(0, 0, 1.7))
     bpy.context.object.name = "Way"
     assert capture("--curve", "Way", "--views", "6", "--range", "1-6") == 0
     views, _ = read_camera_folder(tmp_path / "out" / "cameras")
-    eyes = np.array([view.center for view in views])
-    np.testing.assert_allclose(np.hypot(*eyes[:, :2].T), 5, atol=0.1)
-    np.testing.assert_allclose(eyes[:, 2], 1.7, atol=1e-5)
+    centers = np.array([view.center for view in views])
+    np.testing.assert_allclose(np.hypot(*centers[:, :2].T), 5, atol=0.1)
+    np.testing.assert_allclose(centers[:, 2], 1.7, atol=1e-5)
     assert capture("--curve", "Why", "--views", "6", "--range", "1-6") == 2
-    assert "has no curve 'Why'" in capfd.readouterr().err
+    assert "'Why'" in capfd.readouterr().err
 
 
-def test_near_things_are_seen_where_a_way_is_small(bpy, scene, capture, tmp_path):
+def test_near_clipping_follows_the_size_of_the_curve(bpy, scene, capture, tmp_path):
     for radius, near in ((5, 0.1), (0.005, 2 * np.pi * 0.005 / 6 / 4)):
         bpy.ops.curve.primitive_bezier_circle_add(radius=radius, location=(0, 0, 1.7))
         bpy.context.object.name = f"Way {radius}"
@@ -229,18 +232,18 @@ def test_near_things_are_seen_where_a_way_is_small(bpy, scene, capture, tmp_path
         assert read_camera_folder(tmp_path / f"out {radius}" / "cameras")[1] == pytest.approx(near, rel=0.01)
 
 
-def test_views_above_show_what_is_selected(bpy, scene, capture, tmp_path):
+def test_views_above_see_the_selection(bpy, scene, capture, tmp_path):
     select(bpy, "Plane")
     bpy.context.scene.lodgs_capture.height = 20
     assert capture("--above", "--views", "10", "--range", "1-10") == 0
     views, _ = read_camera_folder(tmp_path / "out" / "cameras")
     np.testing.assert_allclose([view.center[2] for view in views], 20, atol=1e-5)
-    seen = [view.sees(np.array([[0.0, 0, 0]])).all() for view in views]
-    assert all(seen), "from 20 m each sees the middle"
+    visible = [view.sees(np.array([[0.0, 0, 0]])).all() for view in views]
+    assert all(visible), "from 20 m, each view sees the middle"
     assert len({tuple(view.world_to_camera[2, :3].round(3)) for view in views}) == 5
 
 
-def test_a_dome_shows_what_a_collections_instance_shows(bpy, scene, capture, tmp_path):
+def test_dome_views_see_a_collection_instance(bpy, scene, capture, tmp_path):
     cubes = bpy.data.collections.new("Cubes")
     cubes.instance_offset = (0, 0, 1)
     for name in ("Plane", "Cube", "Cube.001"):
@@ -263,41 +266,45 @@ def test_a_dome_shows_what_a_collections_instance_shows(bpy, scene, capture, tmp
 
 
 @needs_trainer
-def test_another_scene_is_never_captured_into(bpy, scene, capture, tmp_path, capfd):
+def test_folder_with_another_scene_is_rejected(bpy, scene, capture, tmp_path, capfd):
     model = tmp_path / "out" / "sparse" / "0" / "points3D.bin"
     model.parent.mkdir(parents=True)
     model.write_bytes(b"precious")
     assert capture("--around", "--views", "2") == 2
-    assert "holds another scene" in capfd.readouterr().err
+    assert "contains another scene" in capfd.readouterr().err
     assert [path for path in (tmp_path / "out").rglob("*") if path.is_file()] == [model]
 
 
-def test_what_is_there_is_not_rendered_again(bpy, scene, capture, tmp_path, capfd):
+def test_existing_views_are_not_rendered_again(bpy, scene, capture, tmp_path, capfd):
     assert capture("--around", "--views", "4", "--range", "2-3") == 0
     out = tmp_path / "out"
     assert {file.stem for file in (out / "images").iterdir()} == {"view_0002", "view_0003"}
     dates = {file: file.stat().st_mtime_ns for file in out.rglob("*.*")}
-    (out / "cameras" / "view_0003.json").unlink()  # as where Blender was killed before it
+    (out / "cameras" / "view_0003.json").unlink()  # as if Blender had been killed before writing it
     capfd.readouterr()
     assert capture("--around", "--views", "4", "--range", "1-9") == 0
-    said = capfd.readouterr().err.splitlines()
-    assert sum(line.startswith("warning: Without a denoiser 1 sample leaves noise") for line in said) == 1
-    assert [line for line in said if line.startswith("View")] == ["View 1 of 4", "View 3 of 4", "View 4 of 4"]
+    lines = capfd.readouterr().err.splitlines()
+    assert sum(line.startswith("warning: Without a denoiser, 1 sample leaves noise") for line in lines) == 1
+    assert [line for line in lines if line.startswith("View")] == [
+        "View 1 of 4",
+        "View 3 of 4",
+        "View 4 of 4",
+    ]
     for file, date in dates.items():
         if "0002" in file.name:
             assert file.stat().st_mtime_ns == date
     assert sorted(file.name for file in out.rglob("*") if file.is_file()) == sorted(
-        f"view_000{number}.{ending}" for number in (1, 2, 3, 4) for ending in ("exr", "json", "png")
+        f"view_000{number}.{suffix}" for number in (1, 2, 3, 4) for suffix in ("exr", "json", "png")
     )
     bpy.context.scene.render.engine = "BLENDER_WORKBENCH"
-    assert capture("--around", "--views", "4", "--range", "1-4") == 0, "nothing is left to render"
+    assert capture("--around", "--views", "4", "--range", "1-4") == 0, "all views exist"
     assert "Workbench needs a GPU" in capfd.readouterr().err
-    for other in (["--views", "5"], ["--views", "3"]):
-        assert capture("--around", *other, "--range", "1-5") == 2
-        assert "holds other views" in capfd.readouterr().err
+    for count in ("5", "3"):
+        assert capture("--around", "--views", count, "--range", "1-5") == 2
+        assert "contains other views" in capfd.readouterr().err
 
 
-def test_nothing_but_the_views_is_written_and_nothing_is_blurred_or_cut(bpy, lodgs, scene, capture, tmp_path):
+def test_only_views_are_written_without_borders_and_file_outputs(bpy, lodgs, scene, capture, tmp_path):
     compat = lodgs("compat")
     tree = compat.compositor_tree(scene)
     layers, store = tree.nodes.new("CompositorNodeRLayers"), tree.nodes.new("CompositorNodeOutputFile")
@@ -318,16 +325,16 @@ def test_nothing_but_the_views_is_written_and_nothing_is_blurred_or_cut(bpy, lod
         assert image_size(file) == (64, 48)
 
 
-def test_transparent_films_give_pictures_with_alpha(bpy, scene, capture, tmp_path):
+def test_transparent_film_gives_images_with_alpha(bpy, scene, capture, tmp_path):
     scene.render.film_transparent = True
     bpy.data.objects.remove(bpy.data.objects["Plane"])
     assert capture("--around", "--views", "2", "--range", "1-2") == 0
-    picture = bpy.data.images.load(str(tmp_path / "out" / "images" / "view_0001.png"))
-    assert picture.depth == 32 and {0, 1} <= set(np.array(picture.pixels[:])[3::4])
+    image = bpy.data.images.load(str(tmp_path / "out" / "images" / "view_0001.png"))
+    assert image.depth == 32 and {0, 1} <= set(np.array(image.pixels[:])[3::4])
 
 
 @pytest.mark.parametrize(
-    ("spoil", "arguments", "says"),
+    ("change", "arguments", "message"),
     [
         (lambda bpy: None, ["--cameras"], "has 0 camera(s)"),
         (lambda bpy: None, ["--animation"], "has no camera"),
@@ -339,49 +346,49 @@ def test_transparent_films_give_pictures_with_alpha(bpy, scene, capture, tmp_pat
          ["--cameras"], "is pano"),
         (lambda bpy: [bpy.data.objects.remove(obj) for obj in list(bpy.data.objects)], ["--around"],
          "nothing to look at"),
-        (lambda bpy: setattr(bpy.context.scene.render, "engine", "LODGS"), ["--around"], "renders splats"),
-        (lambda bpy: setattr(bpy.context.view_layer, "use", False), ["--around"], "No view layer"),
+        (lambda bpy: setattr(bpy.context.scene.render, "engine", "LODGS"), ["--around"], "only splats"),
+        (lambda bpy: setattr(bpy.context.view_layer, "use", False), ["--around"], "none of its view layers"),
         (lambda bpy: None, ["--around", "--views", "1"], "views = 1 is not possible"),
-        (lambda bpy: None, ["--around", "--range", "0-3"], "not FIRST-LAST"),
-        (lambda bpy: None, ["--around", "--range", "5-3"], "not FIRST-LAST"),
+        (lambda bpy: None, ["--around", "--range", "0-3"], "FIRST-LAST"),
+        (lambda bpy: None, ["--around", "--range", "5-3"], "FIRST-LAST"),
         (lambda bpy: None, ["--around", "--cameras"], "not allowed with"),
         (lambda bpy: None, ["--around", "--size", "0x5"], "not WIDTHxHEIGHT"),
     ],
 )  # fmt: skip
-def test_mistakes_end_with_a_sentence(bpy, scene, capture, tmp_path, capfd, spoil, arguments, says):
-    spoil(bpy)
+def test_mistakes_are_reported(bpy, scene, capture, tmp_path, capfd, change, arguments, message):
+    change(bpy)
     bpy.context.view_layer.update()
     assert capture("--range", "1-2", *arguments) == 2
-    said = capfd.readouterr().err
-    assert says in said and "Traceback" not in said
+    errors = capfd.readouterr().err
+    assert message in errors and "Traceback" not in errors
     assert not (tmp_path / "out").exists()
 
 
-def test_a_folder_that_cannot_be_written(bpy, scene, capture, tmp_path, capfd):
+def test_folder_that_is_not_writable(bpy, scene, capture, tmp_path, capfd):
     (tmp_path / "out").write_text("a file")
     assert capture("--around", "--views", "2", "--range", "1-2") == 2
     assert str(tmp_path / "out") in capfd.readouterr().err
 
 
-def test_a_compositor_without_an_output_is_named(bpy, scene, capture, tmp_path, capfd):
+def test_compositor_without_an_output_is_reported(bpy, scene, capture, tmp_path, capfd):
     if not hasattr(scene, "compositing_node_group"):
-        pytest.skip("a scene's own compositor tree without an output leaves the picture as it is")
+        pytest.skip("in this Blender, a compositor tree without an output leaves the image unchanged")
     scene.compositing_node_group = bpy.data.node_groups.new("Compositor", "CompositorNodeTree")
     assert capture("--around", "--views", "2", "--range", "1-2") == 2
     assert "connect the compositor's output" in capfd.readouterr().err
     assert not [*(tmp_path / "out").glob("cameras/*")]
 
 
-def test_without_a_trainer_nothing_is_rendered(bpy, scene, capture, tmp_path, capfd, monkeypatch):
+def test_nothing_is_rendered_without_a_trainer(bpy, scene, capture, tmp_path, capfd, monkeypatch):
     monkeypatch.delenv("LODGS_TRAINER_PYTHON", raising=False)
     assert capture("--around", "--views", "2") == 2
     assert "not installed" in capfd.readouterr().err and not (tmp_path / "out").exists()
 
 
 @needs_trainer
-def test_the_panel_captures_the_scene_as_it_is_now(bpy, lodgs, scene, blender, tmp_path):
+def test_the_operator_captures_the_current_scene(bpy, lodgs, scene, blender, tmp_path):
     settings, background_capture = scene.lodgs_capture, lodgs("runs.background_capture")
-    with pytest.raises(RuntimeError, match="not saved yet"):
+    with pytest.raises(RuntimeError, match="not saved"):
         bpy.ops.lodgs.capture_scene()
     settings.folder, settings.views, settings.view_width = str(tmp_path / "out"), 4, 64
     scene.render.resolution_x, scene.render.resolution_y = 400, 300
@@ -389,7 +396,7 @@ def test_the_panel_captures_the_scene_as_it_is_now(bpy, lodgs, scene, blender, t
     assert bpy.ops.lodgs.capture_scene() == {"FINISHED"}
     work = background_capture.current
     assert (work.message, work.fraction, work.problem) == ("Captured", 1.0, "")
-    assert len(bpy.data.objects) == objects and not bpy.data.filepath, "the artist's file is as it was"
+    assert len(bpy.data.objects) == objects and not bpy.data.filepath, "the open file is unchanged"
     assert not (tmp_path / "out" / "capture.blend").exists()
     assert bpy.ops.lodgs.import_capture() == {"FINISHED"}
     (root,) = [obj for obj in scene.objects if obj.lodgs.is_root]
@@ -398,7 +405,7 @@ def test_the_panel_captures_the_scene_as_it_is_now(bpy, lodgs, scene, blender, t
 
 
 @needs_trainer
-def test_python_drivers_run_as_they_do_for_the_artist(bpy, lodgs, scene, blender, tmp_path, monkeypatch):
+def test_python_drivers_run_if_they_are_enabled(bpy, lodgs, scene, blender, tmp_path, monkeypatch):
     preferences = bpy.context.preferences.filepaths
     monkeypatch.setattr(preferences, "use_scripts_auto_execute", True)
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
@@ -408,7 +415,7 @@ def test_python_drivers_run_as_they_do_for_the_artist(bpy, lodgs, scene, blender
     for name in "ab":
         new_camera(bpy, (0, -9, 3), (75, 0, 0)).name = name
     driver = bpy.data.objects["b"].driver_add("location", 0).driver
-    driver.expression = "sum([1, 2]) / 2"  # no simple one
+    driver.expression = "sum([1, 2]) / 2"  # not a simple expression
     settings = scene.lodgs_capture
     settings.folder, settings.views_from, settings.view_width = str(tmp_path / "out"), "CAMERAS", 64
     bpy.context.view_layer.update()
@@ -417,24 +424,24 @@ def test_python_drivers_run_as_they_do_for_the_artist(bpy, lodgs, scene, blender
     assert [view.center[0] for view in views] == pytest.approx([0, 1.5], abs=1e-5)
 
 
-def test_a_blender_that_crashes_says_what_to_do(bpy, lodgs, fake, scene, blender, tmp_path):
+def test_crash_of_blender_is_reported(bpy, lodgs, fake, scene, blender, tmp_path):
     fake()
     blender.write_text("#!/bin/sh\nkill -SEGV $$\n")
     scene.lodgs_capture.folder = str(tmp_path / "out")
-    with pytest.raises(RuntimeError, match="EEVEE and Workbench need graphics"):
+    with pytest.raises(RuntimeError, match="EEVEE and Workbench need a graphics card"):
         bpy.ops.lodgs.capture_scene()
     blender.write_text("#!/bin/sh\necho 'error: The disk is full.' >&2\nexit 2\n")
     with pytest.raises(RuntimeError, match="The disk is full"):
         bpy.ops.lodgs.capture_scene()
 
 
-def test_a_capture_that_is_stopped_says_so(bpy, lodgs, fake, scene, blender, tmp_path):
+def test_cancelled_capture_is_reported(bpy, lodgs, fake, scene, blender, tmp_path):
     fake()
     background_capture = lodgs("runs.background_capture")
     settings = scene.lodgs_capture
     settings.folder, settings.views, settings.view_width = str(tmp_path / "out"), 30, 64
     work = background_capture.start(bpy.context)
-    with pytest.raises(RuntimeError, match="at work already"):
+    with pytest.raises(RuntimeError, match="already running"):
         bpy.ops.lodgs.capture_scene()
     end = time.monotonic() + 60
     while work.step() and not work.message.startswith("View"):
@@ -443,12 +450,14 @@ def test_a_capture_that_is_stopped_says_so(bpy, lodgs, fake, scene, blender, tmp
     assert bpy.ops.lodgs.cancel_capture() == {"FINISHED"}
     while work.step():
         time.sleep(0.02)
-    there = len(list((tmp_path / "out" / "cameras").glob("*.json")))  # one that was being written is no view
-    assert 0 < there < 30 and work.message == f"Stopped after {there} of 30 views" and not work.problem
+    rendered = len(list((tmp_path / "out" / "cameras").glob("*.json")))  # complete views only
+    assert 0 < rendered < 30 and work.message == f"Stopped after {rendered} of 30 views" and not work.problem
     for kind in ("images", "depths"):
-        assert len([f for f in (tmp_path / "out" / kind).iterdir() if f.suffix in (".png", ".exr")]) >= there
+        assert (
+            len([f for f in (tmp_path / "out" / kind).iterdir() if f.suffix in (".png", ".exr")]) >= rendered
+        )
     settings.views = 20  # other views
-    with pytest.raises(RuntimeError, match="holds other views"):
+    with pytest.raises(RuntimeError, match="contains other views"):
         bpy.ops.lodgs.capture_scene()
     settings.views_from = "CAMERAS"
     with pytest.raises(RuntimeError, match="has 0 camera"):

@@ -1,4 +1,4 @@
-"""Frames of a video: those that are sharp, as they were drawn."""
+"""Extraction of sharp video frames."""
 
 import struct
 from pathlib import Path
@@ -13,7 +13,7 @@ BLURRED = (1, 2, 4, 7, 8, 10, 11)
 
 
 def blurred(pixels: np.ndarray) -> np.ndarray:
-    """The mean over 9x9 pixels."""
+    """Return the mean over 9x9 pixels."""
     total = np.zeros(pixels.shape)
     for y in range(-4, 5):
         for x in range(-4, 5):
@@ -22,29 +22,29 @@ def blurred(pixels: np.ndarray) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def drawn() -> list[np.ndarray]:
-    """Twelve frames of a walk along EYES; some are blurred."""
-    along = np.linspace(0, len(CAMERA_POSITIONS) - 1, 12)
-    eyes = np.stack(
-        [np.interp(along, range(len(CAMERA_POSITIONS)), column) for column in CAMERA_POSITIONS.T], axis=1
-    )
-    frames = [render_photo(eye) for eye in eyes]
-    return [blurred(frame) if number in BLURRED else frame for number, frame in enumerate(frames)]
+def frames() -> list[np.ndarray]:
+    """Twelve frames along a path, some of them blurred."""
+    path = np.linspace(0, len(CAMERA_POSITIONS) - 1, 12)
+    indices = range(len(CAMERA_POSITIONS))
+    positions = np.stack([np.interp(path, indices, column) for column in CAMERA_POSITIONS.T], axis=1)
+    images = [render_photo(position) for position in positions]
+    return [blurred(image) if number in BLURRED else image for number, image in enumerate(images)]
 
 
-def coded(bpy, lodgs, drawn: list[np.ndarray], path: Path, kind: str, codec: str) -> Path:
-    """A video of these frames, losslessly coded by Blender."""
-    for number, pixels in enumerate(drawn):
+def encode(bpy, lodgs, frames: list[np.ndarray], path: Path, kind: str, codec: str) -> Path:
+    """Encode frames losslessly as a video with Blender."""
+    for number, pixels in enumerate(frames):
         write_png(path.parent / f"{number:02d}.png", pixels)
-    scene, compat = bpy.data.scenes.new("made"), lodgs("compat")
+    scene = bpy.data.scenes.new("encode")
+    compat = lodgs("compat")
     strip = compat.strips(scene).new_image("a", str(path.parent / "00.png"), channel=1, frame_start=1)
-    for number in range(1, len(drawn)):
+    for number in range(1, len(frames)):
         strip.elements.append(f"{number:02d}.png")
-    strip.frame_final_duration = len(drawn)
+    strip.frame_final_duration = len(frames)
     render = scene.render
     render.resolution_x, render.resolution_y, render.resolution_percentage = 320, 240, 100
     scene.view_settings.view_transform = "Standard"
-    scene.frame_start, scene.frame_end = 1, len(drawn)
+    scene.frame_start, scene.frame_end = 1, len(frames)
     if hasattr(render.image_settings, "media_type"):
         render.image_settings.media_type = "VIDEO"
     render.image_settings.file_format = "FFMPEG"
@@ -57,17 +57,19 @@ def coded(bpy, lodgs, drawn: list[np.ndarray], path: Path, kind: str, codec: str
 
 
 @pytest.fixture
-def video(bpy, lodgs, drawn, tmp_path) -> Path:
-    return coded(bpy, lodgs, drawn, tmp_path / "walk.mkv", "MKV", "FFV1")
+def video(bpy, lodgs, frames, tmp_path) -> Path:
+    return encode(bpy, lodgs, frames, tmp_path / "walk.mkv", "MKV", "FFV1")
 
 
-def test_a_phone_that_was_held_upright(bpy, lodgs, drawn, tmp_path):
-    """Its video says by how much it is turned: the matrix of the track's header, ISO/IEC 14496-12."""
-    path = coded(bpy, lodgs, drawn[:3], tmp_path / "phone.mp4", "MPEG4", "H264")
+def test_rotated_video_of_a_phone(bpy, lodgs, frames, tmp_path):
+    """The track header has the rotation matrix (ISO/IEC 14496-12)."""
+    path = encode(bpy, lodgs, frames[:3], tmp_path / "phone.mp4", "MPEG4", "H264")
     data = bytearray(path.read_bytes())
-    place = data.index(b"tkhd") + 44
-    assert struct.unpack_from(">9i", data, place) == (65536, 0, 0, 0, 65536, 0, 0, 0, 1 << 30)
-    struct.pack_into(">9i", data, place, 0, -65536, 0, 65536, 0, 0, 0, 0, 1 << 30)  # a quarter to the left
+    offset = data.index(b"tkhd") + 44
+    assert struct.unpack_from(">9i", data, offset) == (65536, 0, 0, 0, 65536, 0, 0, 0, 1 << 30)
+    struct.pack_into(
+        ">9i", data, offset, 0, -65536, 0, 65536, 0, 0, 0, 0, 1 << 30
+    )  # a quarter turn to the left
     path.write_bytes(data)
     lodgs("render.video").extract_frames(path, tmp_path / "out", 3)
     for number in range(3):
@@ -75,34 +77,35 @@ def test_a_phone_that_was_held_upright(bpy, lodgs, drawn, tmp_path):
         assert tuple(image.size) == (240, 320)
         pixels = np.array(image.pixels[:]).reshape(320, 240, -1)[::-1, :, :3]
         bpy.data.images.remove(image)
-        assert np.abs(pixels - np.rot90(drawn[number]) / 255).mean() < 0.05
+        assert np.abs(pixels - np.rot90(frames[number]) / 255).mean() < 0.05
 
 
-def test_of_each_part_the_sharpest_frame_is_kept(bpy, lodgs, video, drawn, tmp_path):
-    scenes, images, told = len(bpy.data.scenes), len(bpy.data.images), []
+def test_sharpest_frame_of_each_interval_is_kept(bpy, lodgs, video, frames, tmp_path):
+    scenes, images = len(bpy.data.scenes), len(bpy.data.images)
+    calls = []
     extract = lodgs("render.video").extract_frames
-    assert extract(video, tmp_path / "out", 4, lambda *each: told.append(each)) == 4
-    kept = sorted(path.name for path in (tmp_path / "out").iterdir())
-    assert len(kept) == 4
-    for name in kept:
+    assert extract(video, tmp_path / "out", 4, lambda *arguments: calls.append(arguments)) == 4
+    names = sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert len(names) == 4
+    for name in names:
         number = int(name[6:12]) - 1
         assert number not in BLURRED
         image = bpy.data.images.load(str(tmp_path / "out" / name))
         pixels = np.array(image.pixels[:]).reshape(240, 320, -1)[::-1, :, :3]
         bpy.data.images.remove(image)
-        assert np.abs(pixels - drawn[number] / 255).mean() < 0.01
-    assert told == [(number, 4) for number in (1, 2, 3, 4)]
+        assert np.abs(pixels - frames[number] / 255).mean() < 0.01
+    assert calls == [(number, 4) for number in (1, 2, 3, 4)]
     assert (len(bpy.data.scenes), len(bpy.data.images)) == (scenes, images)
 
 
-def test_it_goes_on_where_it_was(lodgs, video, tmp_path):
+def test_existing_frames_are_kept(lodgs, video, tmp_path):
     extract = lodgs("render.video").extract_frames
     extract(video, tmp_path / "out", 4)
     first, *_, last = sorted((tmp_path / "out").iterdir())
     last.unlink()
-    first.write_bytes(b"kept")
+    first.write_bytes(b"unchanged")
     extract(video, tmp_path / "out", 4)
-    assert first.read_bytes() == b"kept" and last.is_file()
+    assert first.read_bytes() == b"unchanged" and last.is_file()
 
 
 def test_all_frames_of_a_short_video(lodgs, video, tmp_path):
@@ -111,20 +114,20 @@ def test_all_frames_of_a_short_video(lodgs, video, tmp_path):
 
 
 @pytest.mark.parametrize("content", [b"", b"no video", None])
-def test_what_is_no_video(lodgs, tmp_path, content, capfd):
+def test_unreadable_videos_are_reported(lodgs, tmp_path, content, capfd):
     path = tmp_path / "a.mp4"
     if content is not None:
         path.write_bytes(content)
     assert lodgs("commands").main(["frames", str(path), "--out", str(tmp_path / "out")]) == 2
-    said = capfd.readouterr().err
-    assert "cannot be read as a video" in said or "does not exist" in said
+    errors = capfd.readouterr().err
+    assert "as a video" in errors or str(path) in errors
     assert not (tmp_path / "out").exists()
 
 
-def test_a_folder_that_cannot_be_written(lodgs, video, tmp_path, capfd):
+def test_folder_that_is_not_writable(lodgs, video, tmp_path, capfd):
     (tmp_path / "out").write_text("no folder")
     assert lodgs("commands").main(["frames", str(video), "--out", str(tmp_path / "out")]) == 2
-    assert "out could not be written: File exists. Choose another folder." in capfd.readouterr().err
+    assert "out: File exists. Choose another folder." in capfd.readouterr().err
 
 
 def test_a_video_becomes_a_scene(bpy, lodgs, video, blender, tmp_path):

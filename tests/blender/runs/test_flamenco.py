@@ -270,7 +270,7 @@ def test_invalid_jobs_are_rejected_before_any_request(bpy, lodgs, manager, root,
     with pytest.raises(RuntimeError, match="contains a run"):
         submit(bpy, folder=str(run))
     settings.method = "octree_neural"
-    assert_rejected("cannot train cells one by one")
+    assert_rejected("cannot train a scene in cells")
     settings.method = "flod"
     settings.output = ""
     assert_rejected("not saved")

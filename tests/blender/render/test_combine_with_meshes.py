@@ -1,4 +1,4 @@
-"""Combining with meshes can be taken back, and leaves the scene as it was."""
+"""Combining splats with meshes and separating them again."""
 
 import pytest
 
@@ -9,10 +9,10 @@ from training.splats.levels import Bundle, Level
 
 @pytest.fixture
 def scene(bpy, tmp_path):
-    """A scene with splats and an object of the artist's."""
+    """A scene with splats and an object of the user."""
     write_bundle(tmp_path / "b.ply", Bundle("flod", [Level(1, splats(5))]))
     assert bpy.ops.lodgs.import_splats(filepath=str(tmp_path / "b.ply")) == {"FINISHED"}
-    bpy.context.scene.collection.objects.link(bpy.data.objects.new("the artist's", None))
+    bpy.context.scene.collection.objects.link(bpy.data.objects.new("user object", None))
     return bpy.context.scene
 
 
@@ -28,11 +28,11 @@ def state(bpy, lodgs):
 
 
 @pytest.mark.parametrize("transparent", [False, True])
-def test_it_leaves_the_scene_as_it_was(bpy, lodgs, scene, transparent):
+def test_separating_restores_the_scene(bpy, lodgs, scene, transparent):
     scene.render.film_transparent = scene.view_layers[0].use_pass_z = transparent
     before = state(bpy, lodgs)
     assert not bpy.ops.lodgs.separate_meshes.poll()
-    for _ in range(2):  # pressed again, combining remembers what was before the first time
+    for _ in range(2):  # the second call keeps the values from before the first one
         assert bpy.ops.lodgs.combine_with_meshes() == {"FINISHED"}
     assert scene.lodgs_render.meshes.cycles.samples == 128
     assert state(bpy, lodgs)[:4] == (2, True, True, True)
@@ -43,7 +43,7 @@ def test_it_leaves_the_scene_as_it_was(bpy, lodgs, scene, transparent):
 
 def test_undo_combines_again(bpy, lodgs, scene):
     bpy.ops.ed.undo_push(message="before")
-    bpy.ops.lodgs.combine_with_meshes("EXEC_DEFAULT", True)  # True: one undo step, as by hand
+    bpy.ops.lodgs.combine_with_meshes("EXEC_DEFAULT", True)  # True: one undo step, as in the interface
     combined = state(bpy, lodgs)
     bpy.ops.lodgs.separate_meshes("EXEC_DEFAULT", True)
     assert state(bpy, lodgs) != combined
@@ -51,16 +51,16 @@ def test_undo_combines_again(bpy, lodgs, scene):
     assert state(bpy, lodgs) == combined and bpy.context.scene.lodgs_render.meshes is not None
 
 
-def test_nodes_of_the_artists_are_not_taken_away(bpy, lodgs, scene):
+def test_nodes_of_the_user_are_not_removed(bpy, lodgs, scene):
     assert bpy.ops.lodgs.combine_with_meshes() == {"FINISHED"}
     lodgs("compat").compositor_tree(scene).nodes.new("CompositorNodeBlur")
     combined = state(bpy, lodgs)
-    with pytest.raises(RuntimeError, match="nodes of your own"):
+    with pytest.raises(RuntimeError, match="additional compositor nodes"):
         bpy.ops.lodgs.separate_meshes()
     assert state(bpy, lodgs) == combined
 
 
-def test_after_the_meshes_scene_is_deleted_it_combines_anew(bpy, lodgs, scene):
+def test_combining_works_again_after_deleting_the_mesh_scene(bpy, lodgs, scene):
     assert bpy.ops.lodgs.combine_with_meshes() == {"FINISHED"}
     bpy.data.scenes.remove(scene.lodgs_render.meshes)
     assert scene.lodgs_render.meshes is None
@@ -71,48 +71,48 @@ def test_after_the_meshes_scene_is_deleted_it_combines_anew(bpy, lodgs, scene):
     assert {node.scene for node in layers} == {scene, scene.lodgs_render.meshes}
 
 
-def test_the_meshes_scene_has_the_cameras_of_markers_and_no_collection_that_is_left_out(bpy, lodgs, scene):
+def test_mesh_scene_copies_markers_and_excluded_collections(bpy, lodgs, scene):
     cameras = [bpy.data.objects.new(name, bpy.data.cameras.new(name)) for name in "AB"]
-    hidden, aside = (bpy.data.collections.new(name) for name in ("hidden", "aside"))
-    for each in (hidden, aside):
-        scene.collection.children.link(each)
+    for name in ("hidden", "indirect"):
+        scene.collection.children.link(bpy.data.collections.new(name))
     for frame, camera in zip((1, 10), cameras, strict=True):
         scene.collection.objects.link(camera)
         scene.timeline_markers.new(camera.name, frame=frame).camera = camera
     layer = scene.view_layers[0].layer_collection.children
-    layer["hidden"].exclude, layer["aside"].indirect_only = True, True
+    layer["hidden"].exclude = True
+    layer["indirect"].indirect_only = True
     bpy.ops.lodgs.combine_with_meshes()
     meshes = scene.lodgs_render.meshes
     assert {marker.frame: marker.camera for marker in meshes.timeline_markers} == {
         1: cameras[0],
         10: cameras[1],
     }
-    there = meshes.view_layers[0].layer_collection.children
-    assert there["hidden"].exclude and there["aside"].indirect_only and not there["aside"].exclude
+    copied = meshes.view_layers[0].layer_collection.children
+    assert copied["hidden"].exclude and copied["indirect"].indirect_only and not copied["indirect"].exclude
 
 
-def test_splats_are_left_out_of_the_meshes_where_their_root_has_moved(bpy, lodgs, scene):
+def test_splats_of_a_moved_root_are_excluded_from_the_mesh_scene(bpy, lodgs, scene):
     [root] = lodgs("data.roots").roots(scene)
     [collection] = root.users_collection
     scene.collection.objects.link(root)
     collection.objects.unlink(root)
     bpy.ops.lodgs.combine_with_meshes()
-    there = scene.lodgs_render.meshes.view_layers[0].layer_collection.children
-    assert there[collection.name].exclude
+    copied = scene.lodgs_render.meshes.view_layers[0].layer_collection.children
+    assert copied[collection.name].exclude
 
 
-def test_frames_of_viewport_quality_are_no_movie(bpy, lodgs, scene):
-    compat = scene.render.image_settings
-    if hasattr(compat, "media_type"):
-        compat.media_type = "VIDEO"
-    scene.render.image_settings.file_format = "FFMPEG"
+def test_viewport_quality_cannot_render_a_video(bpy, lodgs, scene):
+    settings = scene.render.image_settings
+    if hasattr(settings, "media_type"):
+        settings.media_type = "VIDEO"
+    settings.file_format = "FFMPEG"
     with pytest.raises(lodgs("training.errors").LodgsError, match="image format"):
         next(lodgs("render.viewport_quality").render_animation(bpy.context, range(1, 2)))
 
 
-def test_captures_leave_splats_out_whichever_level_is_shown(bpy, lodgs, scene):
+def test_captures_hide_splats(bpy, lodgs, scene):
     [root] = lodgs("data.roots").roots(scene)
     assert [level.object.hide_render for level in root.lodgs.levels] == [False]
     lodgs("render.capture")._prepare(scene, 64, 48)
-    bpy.context.view_layer.update()  # when drivers have their say
+    bpy.context.view_layer.update()  # evaluates drivers
     assert [level.object.hide_render for level in root.lodgs.levels] == [True]

@@ -1,4 +1,4 @@
-"""F12 and pictures in viewport quality of what crops and hiding leave: those of the same splats alone."""
+"""Renders of cropped and hidden splats: equal to renders of the remaining splats."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def camera(bpy):
 @pytest.mark.usefixtures("renderer")
 @pytest.mark.parametrize("name", ["bands", "octree", "chunks", "decay"])
 @pytest.mark.parametrize("mode", ["SINGLE", "SELECTIVE"])
-def test_frames_show_what_is_left(bpy, lodgs, camera, tmp_path, name, mode):
+def test_frames_show_the_remaining_splats(bpy, lodgs, camera, tmp_path, name, mode):
     bundle = bundle_of(name, np.random.default_rng(0))
     for level in bundle.levels:
         level.splats.sh[:] *= 0.2
@@ -40,7 +40,7 @@ def test_frames_show_what_is_left(bpy, lodgs, camera, tmp_path, name, mode):
         return np.stack([planes[f"Combined.{channel}"] for channel in "RGB"], axis=2)
 
     root = importing.import_splats(bpy.context, tmp_path / "in.ply", upright=False)
-    whole = frame(root)
+    full = frame(root)
     bpy.ops.lodgs.add_crop(shape="SPHERE")
     crop = bpy.context.active_object
     crop.location, crop.scale = (1, -1, 0.5), (4, 5, 3)
@@ -52,13 +52,13 @@ def test_frames_show_what_is_left(bpy, lodgs, camera, tmp_path, name, mode):
     np.testing.assert_array_equal(frame(root), cropped)
     bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "out.ply"))
     lodgs("data.removal").remove(root)
-    alone = frame(importing.import_splats(bpy.context, tmp_path / "out.ply", upright=False))
-    np.testing.assert_allclose(cropped, alone, atol=1e-5)
-    assert np.abs(whole - cropped).max() > 0.05 and np.abs(moved - cropped).max() > 0.05
+    exported = frame(importing.import_splats(bpy.context, tmp_path / "out.ply", upright=False))
+    np.testing.assert_allclose(cropped, exported, atol=1e-5)
+    assert np.abs(full - cropped).max() > 0.05 and np.abs(moved - cropped).max() > 0.05
 
 
 @pytest.mark.usefixtures("renderer")
-def test_a_tree_that_is_read_from_its_file_is_cropped(bpy, lodgs, camera, tmp_path):
+def test_streamed_tree_is_cropped(bpy, lodgs, camera, tmp_path):
     write_in_pages(tmp_path / "tree.ply", tree_of(random_leaves(6000, np.random.default_rng(3), degree=1)))
     importing, engine = lodgs("data.importing"), lodgs("render.engine")
 
@@ -69,23 +69,23 @@ def test_a_tree_that_is_read_from_its_file_is_cropped(bpy, lodgs, camera, tmp_pa
         planes = engine.render_frame(depsgraph, 96, 64, (0, 0, 96, 64)).planes
         return np.stack([planes[f"Combined.{channel}"] for channel in "RGB"], axis=2)
 
-    pictures = []
+    images = []
     for budget in (3000, 0):
         root = importing.import_splats(bpy.context, tmp_path / "tree.ply", budget=budget, upright=False)
         assert bool(lodgs("data.streams").file_of(root)) == bool(budget)
-        whole = frame(root)
+        full = frame(root)
         bpy.ops.lodgs.add_crop(shape="BOX")
         box = bpy.context.active_object
         box.location, box.scale = (0.5, -1, 0), (3, 2, 2)
-        pictures.append(frame(root))
+        images.append(frame(root))
         if budget:
             placed = engine.placed_splats(bpy.context.evaluated_depsgraph_get())
             (crop,) = placed[0].choice.crops
             assert isinstance(placed[0], lodgs("render.renderer").PlacedTree)
             assert (crop.shape, crop.outside) == ("BOX", False)
-            wanted = Crop.at("BOX", np.array(box.matrix_world))
-            np.testing.assert_allclose(crop.to_own, wanted.to_own, rtol=1e-5)
+            expected = Crop.from_matrix("BOX", np.array(box.matrix_world))
+            np.testing.assert_allclose(crop.to_own, expected.to_own, rtol=1e-5)
         lodgs("data.removal").remove(root)
         assert "Crop Box" not in bpy.data.objects
-    np.testing.assert_allclose(*pictures, atol=1e-4)
-    assert np.abs(whole - pictures[0]).max() > 0.05
+    np.testing.assert_allclose(*images, atol=1e-4)
+    assert np.abs(full - images[0]).max() > 0.05

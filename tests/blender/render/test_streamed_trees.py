@@ -1,4 +1,4 @@
-"""F12 and pictures in viewport quality of a tree of which the scene holds the top: all that the file has."""
+"""Renders of a streamed tree: equal to renders of the fully loaded tree."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def camera(bpy):
 
 @pytest.fixture
 def frame(bpy, lodgs):
-    def drawn(root, pixels=2.0):
+    def render(root, pixels=2.0):
         root.lodgs.controls.pixels = pixels
         root.location, root.scale, root.rotation_euler = (0.3, 0.2, -1), (1.2,) * 3, (0.1, 0.2, 0.7)
         bpy.context.view_layer.update()
@@ -38,53 +38,56 @@ def frame(bpy, lodgs):
         planes = lodgs("render.engine").render_frame(depsgraph, 160, 120, (0, 0, 160, 120)).planes
         return np.stack([planes[f"Combined.{channel}"] for channel in "RGB"], axis=2)
 
-    return drawn
+    return render
 
 
-def test_frames_show_what_the_file_has(bpy, lodgs, path, camera, frame):
-    """Wherever the viewport has looked from, and whatever its budget."""
+def test_frames_of_a_streamed_tree_are_complete(bpy, lodgs, path, camera, frame):
+    """Frames depend neither on the viewport's camera nor on its budget."""
     importing = lodgs("data.importing")
     root = importing.import_splats(bpy.context, path, budget=BUDGET)
     assert sum(len(item.object.data.points) for item in root.lodgs.levels) <= BUDGET
     assert root.lodgs.eye == "VIEW"
     lodgs("data.selection").hold(root, (500, 500, 500), 20.0)
-    pictures = {pixels: frame(root, pixels) for pixels in (1.0, 8.0)}
+    streamed = {pixels: frame(root, pixels) for pixels in (1.0, 8.0)}
     root.lodgs.stream.file = ""
-    held = frame(root, 1.0)
+    without_file = frame(root, 1.0)
     lodgs("data.removal").remove(root)
-    whole = importing.import_splats(bpy.context, path)
-    assert (whole.lodgs.eye, whole.lodgs.stream.file) == ("CAMERA", "")
-    for pixels, picture in pictures.items():
-        np.testing.assert_allclose(picture, frame(whole, pixels), atol=1e-4)
-    assert np.abs(held - pictures[1.0]).max() > 0.05 and np.abs(pictures[8.0] - pictures[1.0]).max() > 0.01
+    loaded = importing.import_splats(bpy.context, path)
+    assert (loaded.lodgs.eye, loaded.lodgs.stream.file) == ("CAMERA", "")
+    for pixels, image in streamed.items():
+        np.testing.assert_allclose(image, frame(loaded, pixels), atol=1e-4)
+    assert np.abs(without_file - streamed[1.0]).max() > 0.05
+    assert np.abs(streamed[8.0] - streamed[1.0]).max() > 0.01
 
 
-def test_a_held_eye_stays_where_it_is(bpy, lodgs, path, camera, frame):
-    importing, found = lodgs("data.importing"), []
+def test_frozen_camera_selects_the_nodes(bpy, lodgs, path, camera, frame):
+    importing = lodgs("data.importing")
+    images = []
     for budget in (BUDGET, 0):
         root = importing.import_splats(bpy.context, path, budget=budget)
         root.lodgs.eye, root.lodgs.freeze = "CAMERA", True
         lodgs("data.selection").hold(root, (9, 9, 1), 100.0)
-        found.append(frame(root, 2.0))
+        images.append(frame(root, 2.0))
         lodgs("data.removal").remove(root)
-    np.testing.assert_allclose(*found, atol=1e-4)
+    np.testing.assert_allclose(*images, atol=1e-4)
 
 
-def test_a_file_that_is_gone_is_a_sentence(bpy, lodgs, path, camera, frame):
+def test_missing_file_is_reported(bpy, lodgs, path, camera, frame):
     root = lodgs("data.importing").import_splats(bpy.context, path, budget=BUDGET)
-    path.rename(path.with_name("elsewhere.ply"))
-    with pytest.raises(lodgs("training.errors").LodgsError, match=r"town\.ply cannot be read.*Streaming"):
+    path.rename(path.with_name("moved.ply"))
+    with pytest.raises(lodgs("training.errors").LodgsError, match=r"town\.ply.*Streaming"):
         frame(root)
-    root.lodgs.stream.file = str(path.with_name("elsewhere.ply"))
+    root.lodgs.stream.file = str(path.with_name("moved.ply"))
     assert frame(root).max() > 0.1
     write_in_pages(path, tree_of(random_leaves(50, np.random.default_rng(3), degree=1)))
 
 
-def test_viewport_quality_waits_for_what_it_needs(bpy, lodgs, path, camera, frame):
+def test_viewport_quality_waits_for_streaming(bpy, lodgs, path, camera, frame):
     gpu = pytest.importorskip("gpu")
     if not hasattr(gpu, "init"):
         pytest.skip("no graphics in background before Blender 5.2")
-    views, pictures = lodgs("viewport.views"), []
+    views = lodgs("viewport.views")
+    images = []
     for budget in (16_000, 0):
         root = lodgs("data.importing").import_splats(bpy.context, path, budget=budget)
         frame(root, 20.0)
@@ -92,14 +95,11 @@ def test_viewport_quality_waits_for_what_it_needs(bpy, lodgs, path, camera, fram
         if budget:
             assert views.stream(root).ready and views.stream(root).splats <= budget
         depsgraph = bpy.context.evaluated_depsgraph_get()
-        drawn = (
-            lodgs("render.viewport_quality")
-            ._render_frame(depsgraph, 160, 120, (0, 0, 160, 120), lambda *_: True)
-            .planes
-        )
-        pictures.append(np.stack([drawn[f"Combined.{channel}"] for channel in "RGB"], axis=2))
+        render = lodgs("render.viewport_quality")._render_frame
+        planes = render(depsgraph, 160, 120, (0, 0, 160, 120), lambda *_: True).planes
+        images.append(np.stack([planes[f"Combined.{channel}"] for channel in "RGB"], axis=2))
         views.clear()
         views.close_streams()
         lodgs("data.removal").remove(root)
-    np.testing.assert_allclose(*pictures, atol=2e-3)
-    assert pictures[0].max() > 0.1
+    np.testing.assert_allclose(*images, atol=2e-3)
+    assert images[0].max() > 0.1
