@@ -56,7 +56,7 @@ def _convert(options: argparse.Namespace) -> int:
     scene = convert_export(options.source, options.out)
     for message in scene.warnings:
         warn(message)
-    print(f"{scene.folder}: {scene.views} views, {scene.points:,} points, from {scene.what}")
+    print(f"{scene.folder}: {scene.views} views, {scene.points:,} points, from {scene.source}")
     return 0
 
 
@@ -71,12 +71,12 @@ def _reconstruct(options: argparse.Namespace) -> int:
 
     scene = reconstruct(
         options.photos, options.out, preset=options.preset, ordered=options.ordered, lens=options.lens,
-        masks=options.masks, tell=report,
+        masks=options.masks, report=report,
     )  # fmt: skip
-    for message in scene.left_out:
+    for message in scene.excluded:
         warn(message)
     print(
         f"{scene.folder}: {scene.points:,} points, mean reprojection error {scene.error:.2f} pixels. "
-        f"{scene.words}"
+        f"{scene.summary}"
     )
     return 0

@@ -1,1 +1,1 @@
-"""COLMAP scenes: cameras, points, photographs. numpy only, but for `undistort` and the pixels of `images`."""
+"""COLMAP scenes: cameras, points, photos. numpy only, except for ``undistort`` and pixels in ``images``."""

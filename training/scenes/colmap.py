@@ -1,4 +1,4 @@
-"""COLMAP scenes: a model and its photographs. numpy only, so that Blender can read scenes."""
+"""COLMAP scenes: a model and its photos. numpy only, so that Blender can read scenes."""
 
 from __future__ import annotations
 
@@ -29,35 +29,35 @@ from .images import image_size, quarter_turns
 from .orientation import up_rotation
 
 OUTLIER_FACTOR = 1000
-"""What lies so many times as far from the middle of the cameras as most cameras or points is an error."""
+"""Points and cameras farther from the camera centre than this multiple of the median distance are dropped."""
 MASKS, DEPTHS = "masks", "depths"
-"""Folders beside that of the photographs, or in the scene's where they are that."""
+"""Folders next to the image folder, or in the scene folder if the photos are there."""
 DEPTH_SUFFIXES = ".exr", ".png", ".npy"
-"""How names of depth maps end."""
+"""File name suffixes of depth maps."""
 MAX_DEPTH_CAMERAS = 500
-"""Cameras, evenly chosen, that tell the median depth."""
+"""Maximum number of cameras used to compute the median depth."""
 MAX_NAMED = 5
-"""Of so many views that are odd in one way each is named; more are summed up."""
+"""Maximum number of views named by warnings of one kind; the remaining ones are counted."""
 MAX_FOLDERS = 20_000
-"""Folders that models are looked for in."""
+"""Maximum number of folders searched for models."""
 
 Progress = Callable[[float], object]
-"""Called with the share of a scene that is read, from 0 to 1."""
+"""Callback that receives the completed fraction, from 0 to 1."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A COLMAP model with its photographs, in COLMAP's world.
+    """A COLMAP model with its photos, in COLMAP's world.
 
     Attributes:
-        folder, model, images_folder: where it was read.
-        cameras: the views whose photograph can be used, sorted by name; their size is the photograph's.
-        points: (P, 3) float32, possibly none.
+        folder, model, images_folder: source folders.
+        cameras: views with a usable photo, sorted by name; their size is the photo's size.
+        points: (P, 3) float32, possibly empty.
         point_colors: (P, 3) uint8.
-        distorted: names of views whose lens distorts; their cameras are the pinhole part of the lens.
-        warnings: one sentence for each thing that was left out or is odd.
-        point_ids: (P,) int64, the model's own; none where the points come from elsewhere.
-        names: of all views of the model, sorted, with and without a photograph; by default the cameras'.
+        distorted: names of views with lens distortion; their cameras are the pinhole part of the lens.
+        warnings: one sentence per skipped or suspicious item.
+        point_ids: (P,) int64 ids of the model; empty if the points come from another source.
+        names: names of all views of the model, sorted, with or without a photo. Default: the cameras' names.
     """
 
     folder: Path
@@ -72,37 +72,39 @@ class Scene:
     names: Sequence[str] = ()
 
     def split(self, test_every: int, validation: bool = False) -> tuple[list[Camera], list[Camera]]:
-        """Training and held-out cameras: of every `test_every` by name the first is held out; 0: none is.
+        """Split the cameras into training cameras and held-out cameras.
 
-        Views without a photograph are counted: where one gets lost, the others stay what they were.
+        The first of every ``test_every`` views by name is held out. Views without a photo are counted too, so
+        that a lost photo does not change the role of the other views.
 
         Args:
-            validation: leave those out altogether, and hold out the one in the middle between two of them.
+            test_every: distance between held-out views; 0 holds out none.
+            validation: exclude the test views, and hold out the middle view between two test views instead.
         """
         if test_every <= 0:
             return list(self.cameras), []
         middle = test_every // 2 if validation else 0
         names = self.names or [camera.name for camera in self.cameras]
-        rest = {name: number % test_every for number, name in enumerate(names)}
-        train = [camera for camera in self.cameras if rest[camera.name] not in (0, middle)]
-        return train, [camera for camera in self.cameras if rest[camera.name] == middle]
+        phase = {name: number % test_every for number, name in enumerate(names)}
+        train = [camera for camera in self.cameras if phase[camera.name] not in (0, middle)]
+        return train, [camera for camera in self.cameras if phase[camera.name] == middle]
 
     @property
     def center(self) -> np.ndarray:
-        """The mean of the cameras' eyes, (3,) float64."""
+        """Mean camera position, (3,) float64."""
         return np.array([camera.center for camera in self.cameras]).mean(axis=0)
 
     def up_rotation(self) -> np.ndarray:
-        """Rotation from this world to a z-up world, (3, 3) float64, see ``orientation.up_rotation``."""
+        """Return the rotation (3, 3) float64 to a z-up world, see ``orientation.up_rotation``."""
         return up_rotation(self.cameras)
 
     def extent(self, default: float | None = None) -> float:
-        """Return 1.1 x the largest distance of a camera from the mean camera position, in COLMAP units.
+        """Return 1.1 x the largest distance of a camera from the mean camera position, as 3DGS does.
 
-        3DGS defines it so. If all cameras have the same position, return the median depth.
+        The unit is COLMAP's. If all cameras share one position, return the median depth.
 
         Args:
-            default: value if there is no median depth either; None: raise an error.
+            default: value if there is no median depth either; None raises an error.
 
         Raises:
             LodgsError: as :meth:`median_depth`.
@@ -112,19 +114,22 @@ class Scene:
     def median_depth(self, default: float | None = None) -> float:
         """Return the median over the cameras of the median depth of their visible points, in COLMAP units.
 
-        A camera sees the points in front of it and inside its image. Uses at most 50,000 points, evenly
-        spaced in the model's order, and at most MAX_DEPTH_CAMERAS cameras.
+        A point is visible if it lies in front of the camera and inside its image. At most 50,000 evenly
+        spaced points and MAX_DEPTH_CAMERAS cameras are used.
 
         Args:
-            default: value if no camera sees a point; None: raise an error.
+            default: value if no camera sees a point; None raises an error.
 
         Raises:
-            LodgsError: no camera sees a point.
+            LodgsError: if no camera sees a point.
         """
         if np.isfinite(self._median_depth):
             return self._median_depth
         if default is None:
-            raise LodgsError(f"No camera of {self.model} sees a point.", "Reconstruct the scene with points.")
+            raise LodgsError(
+                f"Cannot determine the scale of {self.model}: no camera sees a point.",
+                "Reconstruct the scene with points.",
+            )
         return default
 
     @cached_property
@@ -139,10 +144,10 @@ class Scene:
         return float(np.median(medians)) if medians else float("nan")
 
     def near(self, default: float | None = None) -> float:
-        """Return the depth where rendering begins, in COLMAP units: a hundredth of the median depth.
+        """Return the near depth for rendering, in COLMAP units: a hundredth of the median depth.
 
         Args:
-            default: value if no camera sees a point; None: raise an error.
+            default: value if no camera sees a point; None raises an error.
 
         Raises:
             LodgsError: as :meth:`median_depth`.
@@ -153,35 +158,37 @@ class Scene:
 
 
 def find_models(folder: Path) -> list[Path]:
-    """Folders at or below `folder` that hold a COLMAP model (cameras and images, .bin or .txt).
+    """Return the folders at or below ``folder`` that hold a COLMAP model (cameras and images, .bin or .txt).
 
-    The model with the most registered images comes first; among equals the one nearest to `folder`, then by
-    name. Looks four levels deep, which covers `sparse/`, `sparse/0` and `dense/0/sparse`, through links too,
-    and in MOST_FOLDERS at most, the nearest first.
+    The model with the most registered images comes first, then the one closest to ``folder``, then by name.
+    The search follows links and goes four levels deep, which covers ``sparse/``, ``sparse/0`` and
+    ``dense/0/sparse``. It visits at most MAX_FOLDERS folders, upper levels first.
 
     Raises:
-        LodgsError: there is no such folder.
+        LodgsError: if the folder does not exist.
     """
     folder = _absolute(folder)
     check_folder(folder, "Choose the folder of a COLMAP scene.")
-    found, level, seen = [], [folder], {os.path.realpath(folder)}
-    around = [str(parent) for parent in Path(os.path.realpath(folder)).parents]
-    seen.update(around)  # a link upwards leads out of the scene
+    models = []
+    level = [folder]
+    real_folder = os.path.realpath(folder)
+    visited = {real_folder}
+    visited.update(str(parent) for parent in Path(real_folder).parents)  # links upwards leave the scene
     for depth in range(5):
-        found += [(-count_images(here), depth, here.parts, here) for here in level if model_suffix(here)]
-        below = []
-        for here in level if depth < 4 else ():
-            for path in _subfolders(here):
+        models += [(-count_images(path), depth, path.parts, path) for path in level if model_suffix(path)]
+        subfolders = []
+        for parent in level if depth < 4 else ():
+            for path in _subfolders(parent):
                 real = os.path.realpath(path)
-                if real not in seen and len(seen) < MAX_FOLDERS:
-                    seen.add(real)
-                    below.append(path)
-        level = below
-    return [entry[-1] for entry in sorted(found)]
+                if real not in visited and len(visited) < MAX_FOLDERS:
+                    visited.add(real)
+                    subfolders.append(path)
+        level = subfolders
+    return [entry[-1] for entry in sorted(models)]
 
 
 def _subfolders(folder: Path) -> list[Path]:
-    """By name, without hidden ones and those that may not be read."""
+    """Return the readable, visible subfolders sorted by name."""
     try:
         with os.scandir(folder) as entries:
             names = [entry.name for entry in entries if not entry.name.startswith(".") and entry.is_dir()]
@@ -193,49 +200,37 @@ def _subfolders(folder: Path) -> list[Path]:
 def read_scene(
     folder: Path, model: Path | None = None, images: Path | None = None, progress: Progress | None = None
 ) -> Scene:
-    """Read a COLMAP scene: cameras, points, and which photographs are there.
+    """Read the cameras and points of a COLMAP scene and locate its photos.
 
-    A view whose photograph cannot be used, or that cannot be, is left out with a warning, as is a point
-    without a place or astray (see ASTRAY).
+    Views with an unusable photo or camera, points without a finite position and outliers (see
+    OUTLIER_FACTOR) are skipped with a warning.
 
     Args:
-        folder: the scene, or a model folder within it.
-        model: the folder of the model; by default the largest one found.
-        images: the folder of the photographs; by default `images/`, or another folder in or beside the scene
-            where the model's names are found.
+        folder: the scene, or a model folder inside it.
+        model: folder of the model. Default: the largest model in the scene.
+        images: folder of the photos. Default: ``images/``, or another folder in or next to the scene that
+            contains the model's image names.
         progress: called now and then.
 
     Raises:
-        LodgsError: there is no folder, model or photograph, or a file of the model is damaged.
+        LodgsError: if there is no folder, model or photo, or a model file is damaged.
     """
     folder = _absolute(folder)
     warnings: list[str] = []
     model = _largest_model(folder, warnings) if model is None else _absolute(model)
-    if not model_suffix(model):
-        raise LodgsError(
-            f"{model} holds no cameras and images files.", "Choose the folder of a COLMAP model."
-        )
-    intrinsics = read_cameras(model)
-    poses = sorted(read_poses(model), key=lambda pose: pose.name)
-    if not poses:
-        raise LodgsError(f"{model} has no registered images.", "Choose a model that COLMAP has registered.")
-    for pose in poses:
-        if pose.camera_id not in intrinsics:
-            raise LodgsError(
-                f"{model / f'cameras{model_suffix(model)}'} lacks camera {pose.camera_id}, "
-                f"which {_shown(pose.name)} uses.",
-                DAMAGED_REMEDY,
-            )
+    intrinsics, poses = _read_registered(model)
     if images is None:
         images = find_image_folder(folder, model, [pose.name for pose in poses])
     images = _absolute(images)
     if not images.is_dir():
-        raise LodgsError(f"There is no image folder {images}.", "Choose the folder of the photographs.")
-    beside = folder if images == folder else images.parent
-    views = _Views(
+        raise LodgsError(
+            f"Cannot read scene: image folder {images} does not exist.", "Choose the folder of the photos."
+        )
+    base = folder if images == folder else images.parent
+    views = _ViewCollector(
         ImageFiles(images, folder),
-        SidecarFiles(beside / MASKS, ".png"),
-        SidecarFiles(beside / DEPTHS, *DEPTH_SUFFIXES),
+        SidecarFiles(base / MASKS, ".png"),
+        SidecarFiles(base / DEPTHS, *DEPTH_SUFFIXES),
     )
     for number, pose in enumerate(poses):
         if progress and number % 50 == 0:
@@ -243,23 +238,23 @@ def read_scene(
         views.add(pose, intrinsics[pose.camera_id])
     if not views.cameras:
         raise LodgsError(
-            f"None of the {len(poses)} views in {model} has a usable photograph in {images}."
-            + "".join(f" {_shown(name)}: {why}" for name, why in views.left_out[:1]),
-            "Choose the folder that holds the images under the names that the model uses.",
+            f"Cannot read scene: none of the {len(poses)} views of {model} has a usable photo in {images}."
+            + "".join(f" {_quote(name)}: {reason}" for name, reason in views.excluded[:1]),
+            "Choose the folder that holds the images under the names used by the model.",
         )
 
     points, colors, ids = read_points(model)
     if not len(points):
-        warnings.append(f"{model} has no points in points3D{model_suffix(model)}: the scene has no points.")
-    possible = (np.abs(points) <= MAX_COORDINATE).all(axis=1)
-    far, cameras = _astray(points[possible], views.cameras)
-    possible[possible] = ~far
-    if not possible.all():
+        warnings.append(f"The scene has no points: {model} has no points3D{model_suffix(model)} with points.")
+    valid = (np.abs(points) <= MAX_COORDINATE).all(axis=1)
+    outliers, inlier_cameras = _find_outliers(points[valid], views.cameras)
+    valid[valid] = ~outliers
+    if not valid.all():
         warnings.append(
-            f"{np.sum(~possible):,} points of {model} have no place, or lie over {OUTLIER_FACTOR:,} times as far "
-            "off as most, and are left out."
+            f"Skipped {np.sum(~valid):,} points of {model}: their position is not finite, or more than "
+            f"{OUTLIER_FACTOR:,} times the median distance from the cameras."
         )
-    views.keep(cameras)
+    views.drop_outliers(inlier_cameras)
     if progress:
         progress(1.0)
     return Scene(
@@ -267,199 +262,233 @@ def read_scene(
         model=model,
         images_folder=images,
         cameras=views.cameras,
-        points=points[possible],
-        point_colors=colors[possible],
-        point_ids=ids[possible],
+        points=points[valid],
+        point_colors=colors[valid],
+        point_ids=ids[valid],
         names=list(dict.fromkeys(pose.name.replace("\\", "/") for pose in poses)),
         distorted=views.distorted,
         warnings=[*warnings, *views.warnings(images)],
     )
 
 
-def exclude_views(scene: Scene, reasons: dict[str, str]) -> Scene:
-    """The scene without some of its views, and a warning of them.
-
-    Args:
-        reasons: by the view's name, a sentence that follows "it is left out:".
+def _read_registered(model: Path) -> tuple[dict[int, Intrinsics], list[Pose]]:
+    """Return the lenses by id and the poses sorted by name.
 
     Raises:
-        LodgsError: no view is left.
+        LodgsError: if a file is missing or damaged, or there is no pose.
+    """
+    suffix = model_suffix(model)
+    if not suffix:
+        raise LodgsError(
+            f"Cannot read COLMAP model: {model} has no cameras and images files.",
+            "Choose the folder of a COLMAP model.",
+        )
+    intrinsics = read_cameras(model)
+    poses = sorted(read_poses(model), key=lambda pose: pose.name)
+    if not poses:
+        raise LodgsError(
+            f"Cannot read COLMAP model: {model} has no registered images.",
+            "Choose a model with registered images.",
+        )
+    for pose in poses:
+        if pose.camera_id not in intrinsics:
+            raise LodgsError(
+                f"Cannot read COLMAP model: {model / f'cameras{suffix}'} lacks camera {pose.camera_id} "
+                f"of image {_quote(pose.name)}.",
+                DAMAGED_REMEDY,
+            )
+    return intrinsics, poses
+
+
+def exclude_views(scene: Scene, reasons: dict[str, str]) -> Scene:
+    """Return the scene without some of its views, with a warning for each.
+
+    Args:
+        reasons: a sentence by view name, which follows "Skipped <name>:".
+
+    Raises:
+        LodgsError: if no view remains.
     """
     if not reasons:
         return scene
-    kept = [camera for camera in scene.cameras if camera.name not in reasons]
-    if not kept:
-        name, why = next(iter(reasons.items()))
+    remaining = [camera for camera in scene.cameras if camera.name not in reasons]
+    if not remaining:
+        name, reason = next(iter(reasons.items()))
         raise LodgsError(
-            f"No view of {scene.folder} can be used. {_shown(name)}: {why}", "Check the photographs."
+            f"Cannot use any view of {scene.folder}. {_quote(name)}: {reason}", "Check the photos."
         )
     return replace(
         scene,
-        cameras=kept,
+        cameras=remaining,
         distorted=[name for name in scene.distorted if name not in reasons],
         warnings=[*scene.warnings, *exclusion_messages(list(reasons.items()))],
     )
 
 
 def observations(scene: Scene, names: Collection[str]) -> dict[str, np.ndarray]:
-    """Which of the scene's points some of its views observe, rows (O,) by the views' names; empty where the
-    model does not tell."""
+    """Return the indices (O,) of the scene points that the model records as observed, by view name.
+
+    The result is empty if the model has no observations of the scene's points.
+    """
     if not len(scene.point_ids):
         return {}
     order = np.argsort(scene.point_ids)
-    ordered, found = scene.point_ids[order], {}
+    sorted_ids = scene.point_ids[order]
+    indices = {}
     for name, ids in read_observations(scene.model, names).items():
-        places = np.searchsorted(ordered, ids).clip(max=len(order) - 1)
-        found[name] = order[places[ordered[places] == ids]]
-    return found if any(map(len, found.values())) else {}
+        slots = np.searchsorted(sorted_ids, ids).clip(max=len(order) - 1)
+        indices[name] = order[slots[sorted_ids[slots] == ids]]
+    return indices if any(map(len, indices.values())) else {}
 
 
 def observed_points(scene: Scene, names: Collection[str]) -> np.ndarray:
-    """Which of the scene's points some of its views, by name, observe, (P,).
+    """Return a mask (P,) of the scene points that the named views observe.
 
-    Where the model does not tell, as of points that come from elsewhere, those count that a view could see.
+    Without observations in the model, a point counts as observed if it projects into one of the images.
     """
-    seen = np.zeros(len(scene.points), bool)
-    for rows in observations(scene, names).values():
-        seen[rows] = True
-    if not seen.any():
+    mask = np.zeros(len(scene.points), bool)
+    for indices in observations(scene, names).values():
+        mask[indices] = True
+    if not mask.any():
         for camera in scene.cameras:
             if camera.name in names:
-                seen |= camera.sees(scene.points)
-    return seen
+                mask |= camera.sees(scene.points)
+    return mask
 
 
 def _absolute(path: Path | str) -> Path:
-    """Whole, so that it means the same in another process; links are kept as they are.
+    """Return an absolute path that is valid in other processes; links are kept.
 
     Raises:
-        LodgsError: it is no text, so that neither jobs nor Blender could name it.
+        LodgsError: if the path is not UTF-8, because jobs and Blender cannot store it.
     """
     path = Path(os.path.abspath(path))
     if printable(path) != str(path):
-        raise LodgsError(f"The path {printable(path)} is not UTF-8.", "Give its folders other names.")
+        raise LodgsError(f"Cannot use path {printable(path)}: it is not UTF-8.", "Rename its folders.")
     return path
 
 
 def _largest_model(folder: Path, warnings: list[str]) -> Path:
-    """The first of `find_models`; models that hold fewer views are warned of."""
+    """Return the first result of :func:`find_models`, and warn about smaller models."""
     models = find_models(folder)
     if not models:
         raise LodgsError(
-            f"{folder} holds no COLMAP model.",
-            "Choose a folder with sparse/0/cameras.bin, images.bin and points3D.bin (or .txt), or make one "
-            "of another program's export: lodgs scene --from DIR --out DIR.",
+            f"Cannot read scene: {folder} holds no COLMAP model.",
+            "Choose a folder with sparse/0/cameras.bin, images.bin and points3D.bin (or .txt), or convert "
+            "another program's export: lodgs scene --from DIR --out DIR.",
         )
-    views = [count_images(model) for model in models]
-    for model, count in zip(models, views, strict=True):
-        if count < views[0]:
-            warnings.append(f"{model} is a smaller model of {count} views, not read.")
+    counts = [count_images(model) for model in models]
+    for model, count in zip(models, counts, strict=True):
+        if count < counts[0]:
+            warnings.append(f"Skipped {model}: a smaller model of {count} views.")
     return models[0]
 
 
-class _Views:
-    """The views of a model that can be used, and what is odd about the others.
+class _ViewCollector:
+    """Collects the usable views of a model and the reasons for skipping the other views.
 
     Attributes:
-        left_out: names, and a sentence each.
+        excluded: (name, sentence) for each skipped view.
     """
 
     def __init__(self, files: ImageFiles, masks: SidecarFiles, depths: SidecarFiles) -> None:
-        self._files, self._masks, self._depths = files, masks, depths
+        self._files = files
+        self._masks = masks
+        self._depths = depths
         self._missing: list[str] = []
         self._reshaped: list[str] = []
         self.cameras: list[Camera] = []
         self.distorted: list[str] = []
-        self.left_out: list[tuple[str, str]] = []
+        self.excluded: list[tuple[str, str]] = []
 
     def add(self, pose: Pose, lens: Intrinsics) -> None:
-        """Takes a view, at the size of its photograph, or leaves it out."""
+        """Add a view at the size of its photo, or record the reason for skipping it."""
         name = pose.name.replace("\\", "/")
         try:
             if not lens.lens.focals:
-                raise LodgsError(f"its camera model {lens.lens.name} is a panorama, not a perspective view.")
+                raise LodgsError(f"camera model {lens.lens.name} is a panorama, not a perspective view.")
             if self.cameras and self.cameras[-1].name == name:
-                raise LodgsError("the model has another view of that name.")
+                raise LodgsError("the model has another view of the same name.")
             image = self._files.find(pose.name)
             if image is None:
                 self._missing.append(name)
                 return
             width, height = image_size(image)
-            beside = self._masks.find(name), self._depths.find(name)
+            sidecars = self._masks.find(name), self._depths.find(name)
             camera = Camera(
-                name, lens.width, lens.height, *lens.pinhole, pose.world_to_camera, image, *beside,
+                name, lens.width, lens.height, *lens.pinhole, pose.world_to_camera, image, *sidecars,
                 turns=quarter_turns(image),
             )  # fmt: skip
             if (width, height) != (lens.width, lens.height):
                 camera = camera.resized(width, height)
             if flaw := camera.flaw:
-                raise LodgsError(f"its {flaw}.")
+                raise LodgsError(f"{flaw}.")
         except LodgsError as error:
-            self.left_out.append((name, error.what))
+            self.excluded.append((name, error.what))
             return
         self.cameras.append(camera)
         if lens.distorted:
             self.distorted.append(name)
-        # beyond rounding to whole pixels
         stretch = np.log(width) + np.log(lens.height) - np.log(height) - np.log(lens.width)
-        if abs(stretch) > 0.01 + 1 / min(width, height):
+        if abs(stretch) > 0.01 + 1 / min(width, height):  # more than rounding to whole pixels explains
             self._reshaped.append(
-                f"{_shown(name)} is {width}x{height}, of other proportions than the model's "
-                f"{lens.width}x{lens.height}: make sure that it is neither turned nor cropped."
+                f"{_quote(name)} is {width}x{height}, but its camera in the model is "
+                f"{lens.width}x{lens.height}: check that the photo is neither rotated nor cropped."
             )
 
-    def keep(self, which: np.ndarray) -> None:
-        """Leaves out the cameras that are astray, all but ``which`` (V,)."""
-        astray = [camera.name for camera, kept in zip(self.cameras, which, strict=True) if not kept]
-        self.left_out += [
-            (name, f"it stands over {OUTLIER_FACTOR:,} times as far off as most of the model.")
-            for name in astray
+    def drop_outliers(self, inliers: np.ndarray) -> None:
+        """Drop the cameras outside the mask ``inliers`` (V,)."""
+        outliers = [camera.name for camera, inlier in zip(self.cameras, inliers, strict=True) if not inlier]
+        self.excluded += [
+            (name, f"its position exceeds {OUTLIER_FACTOR:,} times the median distance from the cameras.")
+            for name in outliers
         ]
-        self.cameras = [camera for camera in self.cameras if camera.name not in astray]
-        self.distorted = [name for name in self.distorted if name not in astray]
+        self.cameras = [camera for camera in self.cameras if camera.name not in outliers]
+        self.distorted = [name for name in self.distorted if name not in outliers]
 
     def warnings(self, folder: Path) -> list[str]:
-        """What is odd, in few sentences however many views there are."""
-        found = exclusion_messages(self.left_out)
+        """Return a limited number of warnings, whatever the number of views."""
+        messages = exclusion_messages(self.excluded)
         match self._missing:
             case []:
                 pass
             case [name]:
-                found.append(f"{_shown(name)} is left out: there is no such file in {folder}.")
+                messages.append(f"Skipped {_quote(name)}: {folder} has no such file.")
             case names:
                 more = ", ..." if len(names) > MAX_NAMED else ""
-                found.append(
-                    f"{len(names):,} views are left out: {folder} has no files of their names "
-                    f"({', '.join(map(_shown, names[:MAX_NAMED]))}{more})."
+                messages.append(
+                    f"Skipped {len(names):,} views without a file in {folder}: "
+                    f"{', '.join(map(_quote, names[:MAX_NAMED]))}{more}."
                 )
-        for what, beside in ("mask", self._masks), ("depth", self._depths):
-            if all(getattr(camera, what) is None for camera in self.cameras):
-                found += filter(None, [beside.misnamed(_shown(self.cameras[0].name))])
-        found += self._reshaped[:MAX_NAMED]
+        for attribute, sidecars in ("mask", self._masks), ("depth", self._depths):
+            if all(getattr(camera, attribute) is None for camera in self.cameras):
+                messages += filter(None, [sidecars.mismatch_warning(_quote(self.cameras[0].name))])
+        messages += self._reshaped[:MAX_NAMED]
         if len(self._reshaped) > MAX_NAMED:
-            found.append(f"{len(self._reshaped) - MAX_NAMED:,} more photographs have other proportions.")
-        return found
+            messages.append(f"{len(self._reshaped) - MAX_NAMED:,} more photos have another aspect ratio.")
+        return messages
 
 
-def exclusion_messages(left_out: Sequence[tuple[str, str]]) -> list[str]:
-    """Names and reasons as sentences; many are summed up."""
-    found = [f"{_shown(name)} is left out: {why}" for name, why in left_out[:MAX_NAMED]]
-    if len(left_out) > MAX_NAMED:
-        found.append(f"{len(left_out) - MAX_NAMED:,} more views are left out for reasons like these.")
-    return found
+def exclusion_messages(excluded: Sequence[tuple[str, str]]) -> list[str]:
+    """Return sentences for (name, reason) pairs; pairs after the first MAX_NAMED are summarised."""
+    messages = [f"Skipped {_quote(name)}: {reason}" for name, reason in excluded[:MAX_NAMED]]
+    if len(excluded) > MAX_NAMED:
+        messages.append(f"Skipped {len(excluded) - MAX_NAMED:,} more views for similar reasons.")
+    return messages
 
 
-def _shown(name: str) -> str:
-    """A view's name for a message: any text, and not too long."""
+def _quote(name: str) -> str:
+    """Return a view's name in printable form, with at most 200 characters."""
     return printable(name if len(name) <= 200 else f"{name[:200]}...")
 
 
-def _astray(points: np.ndarray, cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray]:
-    """Which points (P, 3) are too far off to be true (P,), and which cameras are not (V,)."""
-    eyes = np.array([camera.center for camera in cameras])
-    middle = np.median(eyes, axis=0)
-    away, eyes_away = (np.linalg.norm(places - middle, axis=1) for places in (points, eyes))
-    reach = max(np.median(eyes_away), np.median(away) if len(away) else 0.0)
-    if reach == 0:
+def _find_outliers(points: np.ndarray, cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray]:
+    """Return a mask (P,) of outlier points and a mask (V,) of inlier cameras."""
+    positions = np.array([camera.center for camera in cameras])
+    middle = np.median(positions, axis=0)
+    point_distances = np.linalg.norm(points - middle, axis=1)
+    camera_distances = np.linalg.norm(positions - middle, axis=1)
+    scale = max(np.median(camera_distances), np.median(point_distances) if len(point_distances) else 0.0)
+    if scale == 0:
         return np.zeros(len(points), bool), np.ones(len(cameras), bool)
-    return away > OUTLIER_FACTOR * reach, eyes_away <= OUTLIER_FACTOR * reach
+    return point_distances > OUTLIER_FACTOR * scale, camera_distances <= OUTLIER_FACTOR * scale

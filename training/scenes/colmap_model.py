@@ -1,8 +1,8 @@
-"""The files of a COLMAP model: cameras, poses and points, binary or text, of anybody's making. numpy only.
+"""Files of a COLMAP model: cameras, poses and points, binary or text. numpy only.
 
-File formats: https://colmap.github.io/format.html. rigs and frames of newer COLMAP versions are not needed:
-images.bin and images.txt hold each view's own pose there too. Time grows with the bytes of a file; memory is
-at most five times as much, and for text ten times.
+File formats: https://colmap.github.io/format.html. Rigs and frames of newer COLMAP versions are ignored,
+because images.bin and images.txt also hold each view's own pose. Time is linear in the file size; memory is
+at most five times the file size, or ten times for text.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,23 +20,23 @@ from ..documents import open_file
 from ..errors import LodgsError, printable
 from ..splats.similarity import Similarity
 
-DAMAGED_REMEDY = "Copy the model again, or write it anew with COLMAP's model_converter."
+DAMAGED_REMEDY = "Copy the model again, or rewrite it with COLMAP's model_converter."
 
-_LARGEST_SIDE = 1 << 31
-"""No image is so wide or high."""
+_MAX_SIDE = 1 << 31
+"""Exclusive limit of an image's width and height."""
 
 
 @dataclass(frozen=True)
 class _Lens:
-    """A COLMAP camera model: its parameters are focal length(s), cx, cy, then those of the distortion."""
+    """A COLMAP camera model; its parameters are focal length(s), cx, cy, then the distortion."""
 
     name: str
     parameters: int
     focals: int
-    perspective: bool = True  # a pinhole when the distortion is zero; fisheyes never are
+    perspective: bool = True  # a pinhole if the distortion is zero; a fisheye is never one
 
 
-# By COLMAP's model id (colmap/src/colmap/sensor/models.h).
+# Indexed by COLMAP's model id (colmap/src/colmap/sensor/models.h).
 _LENSES = dict(
     enumerate(
         [
@@ -68,8 +69,8 @@ class Intrinsics:
     """One record of cameras.bin or cameras.txt.
 
     Attributes:
-        width, height: in pixels, of the photographs that COLMAP has seen.
-        parameters: as COLMAP orders them for the lens; finite, focal lengths above 0.
+        width, height: size in pixels of the photos that COLMAP used.
+        parameters: in COLMAP's order for the lens; finite, focal lengths > 0.
     """
 
     lens: _Lens
@@ -79,15 +80,15 @@ class Intrinsics:
 
     @property
     def distorted(self) -> bool:
-        """Whether this is no pinhole."""
+        """True unless the lens is a pinhole."""
         distortion = self.parameters[self.lens.focals + 2 :]
-        if self.lens.name == "EUCM":  # alpha, beta: a pinhole at alpha = 0, whatever beta
+        if self.lens.name == "EUCM":  # alpha, beta: a pinhole if alpha = 0, for any beta
             distortion = distortion[:1]
-        return not self.lens.perspective or bool(np.any(np.abs(distortion) > 1e-8))  # as COLMAP has it
+        return not self.lens.perspective or bool(np.any(np.abs(distortion) > 1e-8))  # COLMAP's tolerance
 
     @property
     def pinhole(self) -> tuple[float, float, float, float]:
-        """fx, fy, cx, cy."""
+        """Pinhole part of the lens: fx, fy, cx, cy."""
         fx, fy = self.parameters[0], self.parameters[self.lens.focals - 1]
         cx, cy = self.parameters[self.lens.focals : self.lens.focals + 2]
         return float(fx), float(fy), float(cx), float(cy)
@@ -98,8 +99,8 @@ class Pose:
     """One record of images.bin or images.txt, without its 2D points.
 
     Attributes:
-        name: as the file system's names are decoded: what is not UTF-8 in it stands as surrogates.
-        world_to_camera: (4, 4) float64, rigid.
+        name: file name, decoded like file system names: bytes that are not UTF-8 become surrogates.
+        world_to_camera: (4, 4) float64 rigid transform.
     """
 
     name: str
@@ -108,7 +109,7 @@ class Pose:
 
 
 def model_suffix(folder: Path) -> str:
-    """The form in which a folder holds a model, ".bin" before ".txt", or an empty string."""
+    """Return the suffix of a folder's model files, ".bin" (preferred) or ".txt", or "" without a model."""
     for suffix in (".bin", ".txt"):
         if (folder / f"cameras{suffix}").is_file() and (folder / f"images{suffix}").is_file():
             return suffix
@@ -116,7 +117,7 @@ def model_suffix(folder: Path) -> str:
 
 
 def count_images(model: Path) -> int:
-    """How many images a model says or has; 0 where that cannot be read."""
+    """Return the number of registered images of a model; 0 if it cannot be read."""
     suffix = model_suffix(model)
     path = model / f"images{suffix}"
     try:
@@ -129,90 +130,112 @@ def count_images(model: Path) -> int:
 
 
 def read_cameras(model: Path) -> dict[int, Intrinsics]:
-    """The cameras of a model by COLMAP's id.
+    """Read the cameras of a model by COLMAP's id.
 
     Raises:
-        LodgsError: there is no such file, or it is damaged. So do the others here.
+        LodgsError: if the file is missing or damaged.
     """
-    return _read(model, "cameras", {".bin": _cameras_bin, ".txt": _cameras_txt})
+    return _read(model, "cameras", {".bin": _parse_cameras_bin, ".txt": _parse_cameras_txt})
 
 
 def read_poses(model: Path) -> list[Pose]:
-    """The registered images of a model, in the file's order."""
-    return _read(model, "images", {".bin": _images_bin, ".txt": _images_txt})
+    """Read the registered images of a model, in the file's order.
+
+    Raises:
+        LodgsError: if the file is missing or damaged.
+    """
+    return _read(model, "images", {".bin": _parse_images_bin, ".txt": _parse_images_txt})
 
 
 def read_observations(model: Path, names: Collection[str]) -> dict[str, np.ndarray]:
-    """The ids (O,) int64 of the points that some images observe, by the images' names."""
-    return _read(
-        model, "images", {".bin": partial(_seen_bin, names=names), ".txt": partial(_seen_txt, names=names)}
-    )
+    """Read the ids (O,) int64 of the points that the named images observe, by image name.
+
+    Raises:
+        LodgsError: if the file is missing or damaged.
+    """
+    parsers = {
+        ".bin": partial(_parse_observations_bin, names=names),
+        ".txt": partial(_parse_observations_txt, names=names),
+    }
+    return _read(model, "images", parsers)
 
 
 def read_points(model: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The points of a model: positions (P, 3) float32, finite or not, colours (P, 3) uint8, ids (P,) int64.
+    """Read positions (P, 3) float32, possibly not finite, colours (P, 3) uint8 and ids (P,) int64.
 
-    A model without a file of them has none.
+    A model without a points file has no points.
+
+    Raises:
+        LodgsError: if the file is damaged.
     """
     if not (model / f"points3D{model_suffix(model)}").is_file():
         return _NO_POINTS
-    return _read(model, "points3D", {".bin": _points_bin, ".txt": _points_txt})
+    return _read(model, "points3D", {".bin": _parse_points_bin, ".txt": _parse_points_txt})
 
 
-def _read(model: Path, name: str, parsers: dict):
-    """Parse a file of a model, or say that it is damaged."""
+def _read(model: Path, name: str, parsers: dict) -> Any:
+    """Parse a model file with the parser of its suffix.
+
+    Raises:
+        LodgsError: if the file is missing or damaged.
+    """
     suffix = model_suffix(model)
     path = model / f"{name}{suffix}"
     with open_file(path) as file:
         try:
             data = file.read()
         except OSError as error:
-            raise LodgsError(f"{path} cannot be read: {error.strerror}.", "Check the folder.") from error
+            raise LodgsError(f"Cannot read {path}: {error.strerror}.", "Check the folder.") from error
     try:
-        return parsers[suffix](data.removeprefix(_MARK) if suffix == ".txt" else data)
+        return parsers[suffix](data.removeprefix(_UTF8_MARK) if suffix == ".txt" else data)
     except (ValueError, IndexError, KeyError, struct.error) as error:
-        raise LodgsError(f"{path} is damaged or cut short ({error}).", DAMAGED_REMEDY) from error
+        raise LodgsError(
+            f"Cannot read {path}: the file is damaged or truncated ({error}).", DAMAGED_REMEDY
+        ) from error
 
 
-def _cameras_bin(data: bytes) -> dict[int, Intrinsics]:
-    (count,), at, cameras = struct.unpack_from("<Q", data), 8, {}
+def _parse_cameras_bin(data: bytes) -> dict[int, Intrinsics]:
+    (count,) = struct.unpack_from("<Q", data)
+    offset = 8
+    cameras = {}
     for _ in range(count):
-        camera_id, model_id, width, height = struct.unpack_from("<iiQQ", data, at)
+        camera_id, model_id, width, height = struct.unpack_from("<iiQQ", data, offset)
         lens = _LENSES.get(model_id)
         if lens is None:
             raise ValueError(f"camera model {model_id} is unknown")
-        parameters = np.frombuffer(data, "<f8", lens.parameters, at + 24)
-        at += 24 + 8 * lens.parameters
+        parameters = np.frombuffer(data, "<f8", lens.parameters, offset + 24)
+        offset += 24 + 8 * lens.parameters
         cameras[camera_id] = _intrinsics(lens, width, height, parameters)
     return cameras
 
 
-def _cameras_txt(data: bytes) -> dict[int, Intrinsics]:
+def _parse_cameras_txt(data: bytes) -> dict[int, Intrinsics]:
     cameras = {}
-    for line in _lines(data):
+    for line in _content_lines(data):
         camera_id, model_name, width, height, *parameters = line.split()
         lens = _LENS_BY_NAME.get(model_name)
         if lens is None:
             raise ValueError(f"camera model {model_name} is unknown")
         cameras[int(camera_id)] = _intrinsics(lens, int(width), int(height), np.array(parameters, float))
-    _expect(len(cameras), data, "cameras")
+    _check_count(len(cameras), data, "cameras")
     return cameras
 
 
 def _intrinsics(lens: _Lens, width: int, height: int, parameters: np.ndarray) -> Intrinsics:
     if len(parameters) != lens.parameters:
         raise ValueError(f"{lens.name} has {lens.parameters} parameters, not {len(parameters)}")
-    sized = 1 <= width < _LARGEST_SIDE and 1 <= height < _LARGEST_SIDE
-    if not sized or not np.isfinite(parameters).all() or (parameters[: lens.focals] <= 0).any():
-        raise ValueError("a camera has no size or focal length")
+    valid_size = 1 <= width < _MAX_SIDE and 1 <= height < _MAX_SIDE
+    if not valid_size or not np.isfinite(parameters).all() or (parameters[: lens.focals] <= 0).any():
+        raise ValueError("a camera has an invalid size, focal length or parameter")
     return Intrinsics(lens, width, height, parameters)
 
 
 def make_intrinsics(name: str, width: int, height: int, parameters: np.ndarray) -> Intrinsics:
-    """A record by the name of its lens.
+    """Return intrinsics for the name of a COLMAP camera model.
 
     Raises:
-        ValueError: there is no such lens, or it has no size or focal length.
+        ValueError: if the size, a focal length or a parameter is invalid.
+        KeyError: if the name is unknown.
     """
     return _intrinsics(_LENS_BY_NAME[name], width, height, parameters)
 
@@ -224,117 +247,128 @@ def write_model(
     points: np.ndarray,
     colors: np.ndarray,
 ) -> None:
-    """Writes a binary model without tracks; pycolmap, which writes these too, is not where Blender is.
+    """Write a binary model without tracks. Blender lacks pycolmap, which writes models with tracks.
 
     Args:
-        model: its folder, new.
-        lenses: of each view.
+        model: folder of the model; it must not exist.
+        lenses: lens of each view.
         poses: name and world_to_camera (4, 4) of each view.
-        points: (P, 3).
+        points: (P, 3) positions.
         colors: (P, 3) uint8.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: if a file cannot be written.
     """
     model.mkdir(parents=True)
-    numbers: dict[bytes, int] = {}
+    camera_ids: dict[bytes, int] = {}
     images = []
-    for place, (lens, (name, pose)) in enumerate(zip(lenses, poses, strict=True), 1):
-        model_id = next(number for number, each in _LENSES.items() if each is lens.lens)
+    for image_id, (lens, (name, pose)) in enumerate(zip(lenses, poses, strict=True), 1):
+        model_id = next(number for number, known_lens in _LENSES.items() if known_lens is lens.lens)
         camera = (
             struct.pack("<iQQ", model_id, lens.width, lens.height) + lens.parameters.astype("<f8").tobytes()
         )
-        number = numbers.setdefault(camera, len(numbers) + 1)
+        camera_id = camera_ids.setdefault(camera, len(camera_ids) + 1)
         values = *Similarity(pose[:3, :3], 1.0, pose[:3, 3]).quat, *pose[:3, 3]
-        text = name.encode("utf-8", "surrogateescape")
-        images.append(struct.pack("<i7di", place, *values, number) + text + b"\0" + struct.pack("<Q", 0))
-    cameras = [struct.pack("<i", number) + camera for camera, number in numbers.items()]
+        encoded = name.encode("utf-8", "surrogateescape")
+        images.append(
+            struct.pack("<i7di", image_id, *values, camera_id) + encoded + b"\0" + struct.pack("<Q", 0)
+        )
+    cameras = [struct.pack("<i", camera_id) + camera for camera, camera_id in camera_ids.items()]
     rows = np.zeros(len(points), _POINT)
-    rows["id"], rows["xyz"], rows["rgb"] = np.arange(1, len(points) + 1), points, colors
-    for file, count, parts in (
+    rows["id"] = np.arange(1, len(points) + 1)
+    rows["xyz"] = points
+    rows["rgb"] = colors
+    for file, count, records in (
         ("cameras.bin", len(cameras), cameras),
         ("images.bin", len(images), images),
         ("points3D.bin", len(rows), [rows.tobytes()]),
     ):
-        (model / file).write_bytes(struct.pack("<Q", count) + b"".join(parts))
+        (model / file).write_bytes(struct.pack("<Q", count) + b"".join(records))
 
 
-def _images_bin(data: bytes) -> list[Pose]:
-    (count,), at, poses = struct.unpack_from("<Q", data), 8, []
+def _parse_images_bin(data: bytes) -> list[Pose]:
+    (count,) = struct.unpack_from("<Q", data)
+    offset = 8
+    poses = []
     for _ in range(count):
-        _, *pose, camera_id = struct.unpack_from("<i7di", data, at)
-        end = data.index(b"\0", at + 64)
-        name = data[at + 64 : end]
+        _, *pose, camera_id = struct.unpack_from("<i7di", data, offset)
+        end = data.index(b"\0", offset + 64)
+        name = data[offset + 64 : end]
         (points2d,) = struct.unpack_from("<Q", data, end + 1)
-        at = end + 9 + 24 * points2d
-        if at > len(data):
-            raise ValueError(f"it ends within image {len(poses) + 1} of {count}")
+        offset = end + 9 + 24 * points2d
+        if offset > len(data):
+            raise ValueError(f"the file ends inside image {len(poses) + 1} of {count}")
         poses.append(_pose(name, camera_id, pose))
     return poses
 
 
-def _images_txt(data: bytes) -> list[Pose]:
-    """Two lines an image, the second (its 2D points, possibly none) passed over."""
-    poses, lines = [], iter(data.split(b"\n"))
+def _parse_images_txt(data: bytes) -> list[Pose]:
+    """Parse two lines per image; the second line, its 2D points, may be empty and is skipped."""
+    poses = []
+    lines = iter(data.split(b"\n"))
     for line in lines:
         line = line.strip()
         if not line or line.startswith(b"#"):
             continue
-        # NAME is everything after the ninth field: it may hold spaces.
+        # The name is the rest of the line: it may contain spaces.
         _, *pose, camera_id, name = line.split(maxsplit=9)
         next(lines, None)
         poses.append(_pose(name, int(camera_id), [float(number) for number in pose]))
-    _expect(len(poses), data, "images")
+    _check_count(len(poses), data, "images")
     return poses
 
 
-def _seen_bin(data: bytes, names: Collection[str]) -> dict[str, np.ndarray]:
-    (count,), at, seen = struct.unpack_from("<Q", data), 8, {}
+def _parse_observations_bin(data: bytes, names: Collection[str]) -> dict[str, np.ndarray]:
+    (count,) = struct.unpack_from("<Q", data)
+    offset = 8
+    point_ids = {}
     for _ in range(count):
-        end = data.index(b"\0", at + 64)
+        end = data.index(b"\0", offset + 64)
         (points2d,) = struct.unpack_from("<Q", data, end + 1)
-        if (name := _name(data[at + 64 : end])) in names:
-            seen[name] = _observed(np.frombuffer(data, _POINT2D, points2d, end + 9)["point"])
-        at = end + 9 + 24 * points2d
-    return seen
+        if (name := _decode_name(data[offset + 64 : end])) in names:
+            point_ids[name] = _valid_ids(np.frombuffer(data, _POINT2D, points2d, end + 9)["point"])
+        offset = end + 9 + 24 * points2d
+    return point_ids
 
 
-def _seen_txt(data: bytes, names: Collection[str]) -> dict[str, np.ndarray]:
-    seen, lines = {}, iter(data.split(b"\n"))
+def _parse_observations_txt(data: bytes, names: Collection[str]) -> dict[str, np.ndarray]:
+    point_ids = {}
+    lines = iter(data.split(b"\n"))
     for line in lines:
         line = line.strip()
         if not line or line.startswith(b"#"):
             continue
         points2d = next(lines, b"")
-        if (name := _name(line.split(maxsplit=9)[9])) in names:
-            seen[name] = _observed(np.array(points2d.split()[2::3], np.int64))
-    return seen
+        if (name := _decode_name(line.split(maxsplit=9)[9])) in names:
+            point_ids[name] = _valid_ids(np.array(points2d.split()[2::3], np.int64))
+    return point_ids
 
 
-def _observed(ids: np.ndarray) -> np.ndarray:
-    """Without the 2D points that are no point's, of which the id is -1."""
+def _valid_ids(ids: np.ndarray) -> np.ndarray:
+    """Drop the id -1 of 2D points without a 3D point."""
     return ids[ids >= 0]
 
 
-def _name(name: bytes) -> str:
-    """As `Camera.name` has it."""
+def _decode_name(name: bytes) -> str:
+    """Return the name in the form of ``Camera.name``."""
     return name.decode("utf-8", "surrogateescape").replace("\\", "/")
 
 
 def _pose(name: bytes, camera_id: int, pose: list[float]) -> Pose:
-    """Rotation from a unit quaternion (w, x, y, z) and translation, both world to camera."""
-    quaternion, translation = np.array(pose[:4]), np.array(pose[4:])
+    """Return a pose from a quaternion (w, x, y, z) and a translation, both world to camera."""
+    quaternion = np.array(pose[:4])
     text = name.decode("utf-8", "surrogateescape")
     if not (np.isfinite(pose).all() and quaternion.any()):
-        raise ValueError(f"image {printable(text)} has no pose")
+        raise ValueError(f"image {printable(text)} has no valid pose")
     world_to_camera = np.eye(4)
-    world_to_camera[:3, :3], world_to_camera[:3, 3] = rotation_matrix(quaternion), translation
+    world_to_camera[:3, :3] = rotation_matrix(quaternion)
+    world_to_camera[:3, 3] = pose[4:]
     return Pose(text, camera_id, world_to_camera)
 
 
 def rotation_matrix(quaternion: np.ndarray) -> np.ndarray:
-    """(3, 3) of a quaternion wxyz (4,) of any length above 0."""
-    # by a power of two, which rounds nothing, so that no square overflows
+    """Return the rotation matrix (3, 3) of a quaternion wxyz (4,) of any length > 0."""
+    # Scaling by a power of two is exact and keeps the squares from overflowing.
     quaternion = np.ldexp(quaternion, -np.frexp(np.abs(quaternion).max())[1])
     w, x, y, z = quaternion / np.linalg.norm(quaternion)
     return np.array([
@@ -344,96 +378,98 @@ def rotation_matrix(quaternion: np.ndarray) -> np.ndarray:
     ])  # fmt: skip
 
 
-# A record of points3D.bin, packed; `track` pairs of 4-byte integers follow it.
+# A packed record of points3D.bin, followed by `track` pairs of 4-byte integers.
 _POINT2D = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 _POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")])
-_TRACK_AT = 43
+_TRACK_OFFSET = 43
 _BLOCK = 1 << 17
 _NO_POINTS = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, np.int64)
-_MARK = b"\xef\xbb\xbf"  # Windows' programs begin UTF-8 with it
+_UTF8_MARK = b"\xef\xbb\xbf"  # Windows programs write it at the start of UTF-8 files
 
 
-def _points_bin(data: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _parse_points_bin(data: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     (count,) = struct.unpack_from("<Q", data)
     body = np.frombuffer(data, np.uint8, offset=8)
     starts = _point_starts(body)
     if len(starts) != count:
-        raise ValueError(f"it should hold {count} points")
+        raise ValueError(f"it has {len(starts)} points instead of {count}")
     if not count:
         return _NO_POINTS
     records = np.lib.stride_tricks.sliding_window_view(body, _POINT.itemsize)[starts].view(_POINT)[:, 0]
-    return _float32(records["xyz"]), records["rgb"].copy(), records["id"].astype(np.int64)
+    return _to_float32(records["xyz"]), records["rgb"].copy(), records["id"].astype(np.int64)
 
 
 def _point_starts(body: np.ndarray) -> np.ndarray:
-    """Where the records of points3D.bin begin, block by block of the file."""
-    found, at, count = [np.zeros(0, np.int64)], 0, 0
-    while at < len(body):
-        starts, end = _chain(body[at : at + _BLOCK])
+    """Return the offsets of the records of points3D.bin, computed block by block."""
+    offsets = [np.zeros(0, np.int64)]
+    offset = 0
+    count = 0
+    while offset < len(body):
+        starts, end = _record_chain(body[offset : offset + _BLOCK])
         count += len(starts)
-        if not len(starts) or at + end > len(body):
-            raise ValueError(f"it ends within point {max(count, 1)}")
-        found.append(starts + at)
-        at += end
-    return np.concatenate(found)
+        if not len(starts) or offset + end > len(body):
+            raise ValueError(f"the file ends inside point {max(count, 1)}")
+        offsets.append(starts + offset)
+        offset += end
+    return np.concatenate(offsets)
 
 
-def _chain(block: np.ndarray) -> tuple[np.ndarray, int]:
-    """Where the records begin that follow each other from the block's first byte on, and where the last ends.
+def _record_chain(block: np.ndarray) -> tuple[np.ndarray, int]:
+    """Return the offsets of the consecutive records from the block's first byte, and the end of the last one.
 
-    Each record tells its own length, so that a straight reading would take one step of Python a point.
-    Instead: a track length is a small number in 8 bytes, so a record can only begin where the right five
-    bytes are zero (tracks below 2^24 views). All of these places are taken for records, and the chain from
-    the first is followed in strides that double: 1, 2, 4, ... records.
+    Records have variable lengths, so sequential parsing would take one Python step per point. Instead, use
+    that the five upper bytes of the 8-byte track length are zero (tracks shorter than 2^24 views): treat
+    every offset with these zeros as a candidate record, then follow the chain from the first record in
+    doubling strides of 1, 2, 4, ... records.
     """
     zero = block == 0
     run = zero[:-1] & zero[1:]
     run = run[:-2] & run[2:]
     run = run[:-1] & zero[4 : len(run) + 3]
-    starts = np.flatnonzero(run[_TRACK_AT + 3 :])
-    low, middle, high = (block[starts + _TRACK_AT + byte].astype(np.int64) for byte in range(3))
+    starts = np.flatnonzero(run[_TRACK_OFFSET + 3 :])
+    low, middle, high = (block[starts + _TRACK_OFFSET + byte].astype(np.int64) for byte in range(3))
     ends = starts + _POINT.itemsize + 8 * (low + (middle << 8) + (high << 16))
-    none = len(starts)
-    number = np.full(len(block), none)
-    number[starts] = np.arange(none)
-    following = np.full(none + 1, none)
+    end_of_chain = len(starts)
+    number = np.full(len(block), end_of_chain)
+    number[starts] = np.arange(end_of_chain)
+    successor = np.full(end_of_chain + 1, end_of_chain)
     inside = ends < len(block)
-    following[:-1][inside] = number[ends[inside]]
+    successor[:-1][inside] = number[ends[inside]]
     chain = number[:1]
-    while chain[-1] < none:
-        chain = np.concatenate([chain, following[chain]])
-        following = following[following]
-    chain = chain[chain < none]
+    while chain[-1] < end_of_chain:
+        chain = np.concatenate([chain, successor[chain]])
+        successor = successor[successor]
+    chain = chain[chain < end_of_chain]
     return starts[chain], int(ends[chain[-1]]) if len(chain) else 0
 
 
-def _points_txt(data: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    lines = _lines(data)
-    _expect(len(lines), data, "points")
+def _parse_points_txt(data: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    lines = _content_lines(data)
+    _check_count(len(lines), data, "points")
     if not lines:
         return _NO_POINTS
     table = np.loadtxt(lines, usecols=range(7), ndmin=2)
     colors = np.nan_to_num(table[:, 4:]).clip(0, 255).astype(np.uint8)
-    return _float32(table[:, 1:4]), colors, np.nan_to_num(table[:, 0]).astype(np.int64)
+    return _to_float32(table[:, 1:4]), colors, np.nan_to_num(table[:, 0]).astype(np.int64)
 
 
-def _float32(positions: np.ndarray) -> np.ndarray:
-    """Infinite where they are too large for it."""
+def _to_float32(positions: np.ndarray) -> np.ndarray:
+    """Convert to float32; values above its range become infinite."""
     with np.errstate(over="ignore"):
         return positions.astype(np.float32)
 
 
-def _lines(data: bytes) -> list[str]:
-    """Lines that are neither blank nor comments."""
+def _content_lines(data: bytes) -> list[str]:
+    """Return the stripped lines without blank lines and comments."""
     lines = (line.strip() for line in data.decode("utf-8", "surrogateescape").split("\n"))
     return [line for line in lines if line and not line.startswith("#")]
 
 
-def _expect(count: int, data: bytes, what: str) -> None:
-    """COLMAP writes the number of records as a comment: fewer of them means that the file was cut."""
+def _check_count(count: int, data: bytes, kind: str) -> None:
+    """Raise ValueError if a truncated file has fewer records than COLMAP's comment in its header states."""
     for line in data[:1000].split(b"\n"):
-        before, _, after = line.partition(b":")
-        if before.strip() == f"# Number of {what}".encode():
-            expected = int(after.split(b",")[0])
+        key, _, value = line.partition(b":")
+        if key.strip() == f"# Number of {kind}".encode():
+            expected = int(value.split(b",")[0])
             if count < expected:
-                raise ValueError(f"it should hold {expected} {what} and holds {count}")
+                raise ValueError(f"it has {count} {kind} instead of {expected}")

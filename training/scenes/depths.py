@@ -1,4 +1,4 @@
-"""How deep photographs are: depth maps beside them, or the model's own points. numpy, Pillow and OpenEXR."""
+"""Depth priors of photos: from depth map files, or from the model's points. numpy, Pillow and OpenEXR."""
 
 from __future__ import annotations
 
@@ -16,172 +16,174 @@ from .images import area_average, check_image_size, load_image, same_proportions
 from .rendered_views import SKY_DEPTH, read_exr_depth, sample_surfaces
 
 DEPTH_KINDS = ("metric", "relative", "inverse", "points")
-"""What is known: depth in the scene's unit; depth, or inverse depth, of which scale and shift are each view's
-own; or only where the model's points are."""
+"""Sources of depth: maps in the scene's unit; maps of depth or inverse depth with unknown scale and shift per
+view; or the model's points."""
 UNIT = 1e-3
-"""A step of a map of whole numbers in the scene's unit, as nerfstudio and most sensors have it."""
-TRIED = 3
-"""Views by which maps are compared with the scene's points."""
-ALIKE = 1.25
-"""Metric maps are not used unless half of the points are no more than so many times as deep as there, or as
-little."""
-FEWEST = 20
-"""Points that scale and shift of a map are found by."""
+"""Scene units per step of an integer depth map, as in nerfstudio and most sensors."""
+TESTED_VIEWS = 3
+"""Number of views used to compare maps with the scene's points."""
+MAX_METRIC_RATIO = 1.25
+"""Maximum ratio between map and point depths of at least half of the points, for metric maps."""
+MIN_POINTS = 20
+"""Minimum number of points to fit scale and shift of a map."""
 ROUNDS = 3
-"""Least squares are repeated so often, without what is more than OUTLYING times as far off as most."""
-OUTLYING = 3.0
-EXPLAINED = 0.5
-"""A map that explains less than this share of the points' variance is not used."""
+"""Number of least-squares rounds; each drops residuals above OUTLIER_RATIO times the median."""
+OUTLIER_RATIO = 3.0
+MIN_EXPLAINED = 0.5
+"""Minimum fraction of the points' variance that a fitted map must explain."""
 FEW_POINTS = 1000
-"""Scenes with fewer points get some from their depth maps,"""
-MOST_POINTS = 100_000
-"""at most so many."""
-STEPS = 0.3, 1000
-"""What is shown is so many times as far away as the next photograph, or maps are in another unit."""
+"""Number of scene points below which depth maps add points."""
+MAX_ADDED_POINTS = 100_000
+"""Maximum number of points added from depth maps."""
+DISTANCE_RANGE = 0.3, 1000
+"""Plausible median depth of the maps, in distances to the nearest camera; others suggest a wrong unit."""
 
 
 class DepthPriors:
-    """What a scene knows of the depth in its photographs.
+    """Known depths in a scene's photos; false if there are none.
 
     Args:
-        scene: of pinhole cameras, with all of its points.
-        kind: one of KINDS.
+        scene: scene of pinhole cameras with all of its points.
+        kind: one of DEPTH_KINDS.
 
     Attributes:
-        warnings: a sentence where something is not used.
+        warnings: a sentence for each unusable source.
     """
 
     def __init__(self, scene: Scene, kind: str) -> None:
-        self.kind, self.warnings = kind, list[str]()
+        self.kind = kind
+        self.warnings = list[str]()
         self._points = scene.points
         self._maps = [camera for camera in scene.cameras if camera.depth is not None]
-        asked = scene.cameras if kind == "points" else self._maps
+        sources = scene.cameras if kind == "points" else self._maps
         if kind == "metric":
-            asked = pick_evenly(asked, TRIED)
-        self._seen = observations(scene, [camera.name for camera in asked]) if asked else {}
-        known = self._seen if kind == "points" else self._maps
-        if not known:
+            sources = pick_evenly(sources, TESTED_VIEWS)
+        names = [camera.name for camera in sources]
+        self._observations = observations(scene, names) if names else {}
+        available = bool(self._observations if kind == "points" else self._maps)
+        if not available:
             self.warnings.append(
-                "Depth is asked for, but the model does not tell which photographs see its points."
+                "Cannot use the depth of points: the model does not record their observations."
                 if kind == "points"
-                else "Depth is asked for, but no photograph has a depth map: put them into the folder depths "
-                "beside the photographs, or take the depth of the scene's points (depth = points)."
+                else "Cannot use depth maps: no photo has one. Add them to the folder depths next to the "
+                "photos, or use the depth of the scene's points (depth = points)."
             )
-        self._used = bool(known) and self._fits()
+        self._usable = available and self._matches_points()
 
     def inverse(self, camera: Camera) -> np.ndarray | None:
-        """1 / z of what a view shows, (H, W) float32 of its size, NaN where that is not known; or None.
+        """Return a view's inverse depth 1 / z, (H, W) float32, NaN where unknown; None without any depth.
 
         Raises:
-            LodgsError: its map cannot be read.
+            LodgsError: if the depth map cannot be read.
         """
-        return self._inverse(camera) if self._used else None
+        return self._inverse(camera) if self._usable else None
 
     def __bool__(self) -> bool:
-        """Whether anything is known."""
-        return self._used
+        return self._usable
 
     def _inverse(self, camera: Camera) -> np.ndarray | None:
         if self.kind == "points":
-            return self._of_points(camera)
+            return self._inverse_of_points(camera)
         if camera.depth is None:
             return None
-        values = _read_map(camera)
-        if self.kind == "inverse":
-            found = resample_known(values, camera.width, camera.height)
-        else:
-            found = resample_known(1 / values, camera.width, camera.height)
-        return found if self.kind == "metric" else self._fitted(camera, found)
+        values = _read_camera_map(camera)
+        resized = resample_known(
+            values if self.kind == "inverse" else 1 / values, camera.width, camera.height
+        )
+        return resized if self.kind == "metric" else self._fit_to_points(camera, resized)
 
-    def _fits(self) -> bool:
-        """Whether maps and points agree, as far as points tell; a sentence where they do not."""
-        tried = pick_evenly(self._maps, TRIED)
+    def _matches_points(self) -> bool:
+        """Return False, with a warning, if the maps contradict the scene's points."""
+        tested = pick_evenly(self._maps, TESTED_VIEWS)
         if self.kind in ("relative", "inverse"):
-            if any(self._inverse(camera) is not None for camera in tried):
+            if any(self._inverse(camera) is not None for camera in tested):
                 return True
             self.warnings.append(
-                "The depth maps are not used: they do not go with the scene's points, whatever their scale "
-                f"and shift. Say what they are with depth ({', '.join(DEPTH_KINDS[:3])})."
+                "Cannot use the depth maps: they contradict the scene's points for every scale and shift. "
+                f"Check the setting depth ({', '.join(DEPTH_KINDS[:3])})."
             )
             return False
-        if self.kind == "points" or not self._seen:
+        if self.kind == "points" or not self._observations:
             return True
         ratios = []
-        for camera in tried:
-            x, y, z = self._where(camera)
-            ratios.append(z / _read_map(camera, camera.width, camera.height)[y, x])
+        for camera in tested:
+            x, y, z = self._project_points(camera)
+            ratios.append(z / _read_camera_map(camera, camera.width, camera.height)[y, x])
         ratio = np.concatenate(ratios)
         ratio = ratio[np.isfinite(ratio)]
-        if len(ratio) < FEWEST or np.mean(np.abs(np.log(ratio)) < np.log(ALIKE)) >= 0.5:
+        if len(ratio) < MIN_POINTS or np.mean(np.abs(np.log(ratio)) < np.log(MAX_METRIC_RATIO)) >= 0.5:
             return True
         self.warnings.append(
-            "The depth maps are not used: depths in them are not those of the scene's points, but "
-            f"{1 / np.median(ratio):.3g} times as large, by the median. If they are only relative, say so "
-            "with depth (relative or inverse)."
+            f"Cannot use the depth maps: their median depth is {1 / np.median(ratio):.3g} times that of the "
+            "scene's points. For maps of unknown scale, set depth to relative or inverse."
         )
         return False
 
-    def _where(self, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Pixels, x and y, of the points that a view observes, and their depths, (M,) each; of all in its
-        image where the model does not tell."""
-        points = self._points[self._seen.get(camera.name, [])] if self._seen else self._points
+    def _project_points(self, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return pixel columns, pixel rows and depths, (M,) each, of the points that a view observes.
+
+        Without observations in the model, use all points inside the image.
+        """
+        points = self._points[self._observations.get(camera.name, [])] if self._observations else self._points
         points = points[camera.sees(points)]
         pixels, z = camera.project(points)
         x, y = np.floor(pixels).astype(int).T
         return x, y, z
 
-    def _of_points(self, camera: Camera) -> np.ndarray | None:
-        if camera.name not in self._seen:
+    def _inverse_of_points(self, camera: Camera) -> np.ndarray | None:
+        if camera.name not in self._observations:
             return None
-        x, y, z = self._where(camera)
+        x, y, z = self._project_points(camera)
         nearest_last = np.argsort(-z)
-        found = np.full((camera.height, camera.width), np.nan, np.float32)
-        found[y[nearest_last], x[nearest_last]] = 1 / z[nearest_last]
-        return found
+        inverse = np.full((camera.height, camera.width), np.nan, np.float32)
+        inverse[y[nearest_last], x[nearest_last]] = 1 / z[nearest_last]
+        return inverse
 
-    def _fitted(self, camera: Camera, values: np.ndarray) -> np.ndarray | None:
-        """A view's values, inverse depths of any scale, as inverse depths in the scene's unit."""
-        x, y, z = self._where(camera)
-        there = values[y, x]
-        known = np.isfinite(there)
-        depth = self.kind == "relative"
-        found = fit_scale_and_shift(1 / there[known] if depth else there[known], z[known], depth)
-        if found is None:
+    def _fit_to_points(self, camera: Camera, values: np.ndarray) -> np.ndarray | None:
+        """Convert a view's inverse depths of unknown scale to the scene's unit; None if the fit fails."""
+        x, y, z = self._project_points(camera)
+        samples = values[y, x]
+        finite = np.isfinite(samples)
+        is_depth = self.kind == "relative"
+        fit = fit_scale_and_shift(1 / samples[finite] if is_depth else samples[finite], z[finite], is_depth)
+        if fit is None:
             return None
-        scale, shift = found
+        scale, shift = fit
         with np.errstate(divide="ignore", invalid="ignore"):
-            inverse = 1 / (scale / values + shift) if depth else scale * values + shift
+            inverse = 1 / (scale / values + shift) if is_depth else scale * values + shift
         return np.where(inverse > 0, inverse, np.nan).astype(np.float32)
 
 
-def fit_scale_and_shift(values: np.ndarray, z: np.ndarray, depth: bool) -> tuple[float, float] | None:
-    """(scale, shift) that bring a view's values (M,) closest to depths z (M,); None where they do not go
-    together.
+def fit_scale_and_shift(values: np.ndarray, z: np.ndarray, is_depth: bool) -> tuple[float, float] | None:
+    """Return the (scale, shift) that best map a view's values (M,) to depths z (M,); None for a poor fit.
 
-    Least squares of inverse depths, repeated without what is far off.
+    Minimise squared errors of inverse depth, in rounds without outliers.
 
     Args:
-        depth: scale * values + shift is z; otherwise it is 1 / z.
+        is_depth: True to map to z, False to map to 1 / z.
     """
-    weight = 1 / z**2 if depth else np.ones_like(z)  # an error of z counts as the one of 1 / z that it makes
-    rows, goal, kept = np.stack([values * weight, weight], axis=1), 1 / z, np.ones(len(z), bool)
+    weight = 1 / z**2 if is_depth else np.ones_like(z)  # converts an error of z to one of 1 / z
+    rows = np.stack([values * weight, weight], axis=1)
+    goal = 1 / z
+    inliers = np.ones(len(z), bool)
     for _ in range(ROUNDS):
-        if kept.sum() < FEWEST:
+        if inliers.sum() < MIN_POINTS:
             return None
-        solution = np.linalg.lstsq(rows[kept], goal[kept], rcond=None)[0]
-        apart = np.abs(rows @ solution - goal)
-        kept = apart <= OUTLYING * np.median(apart[kept])
-    explained = 1 - np.mean(apart[kept] ** 2) / max(float(np.var(goal[kept])), 1e-30)
+        solution = np.linalg.lstsq(rows[inliers], goal[inliers], rcond=None)[0]
+        residuals = np.abs(rows @ solution - goal)
+        inliers = residuals <= OUTLIER_RATIO * np.median(residuals[inliers])
+    explained = 1 - np.mean(residuals[inliers] ** 2) / max(float(np.var(goal[inliers])), 1e-30)
     scale, shift = map(float, solution)
-    return (scale, shift) if scale > 0 and explained >= EXPLAINED else None
+    return (scale, shift) if scale > 0 and explained >= MIN_EXPLAINED else None
 
 
 def add_depth_points(scene: Scene) -> Scene:
-    """A scene of few points with such as its metric depth maps show, as close as pixels are and
-    coloured; with none of them where the maps are not those of the points that there are.
+    """Add coloured points from metric depth maps to a scene of few points, spaced like the maps' pixels.
+
+    Scenes whose maps contradict the existing points stay unchanged, apart from a warning.
 
     Raises:
-        LodgsError: a map or a photograph cannot be read.
+        LodgsError: if a map or a photo cannot be read.
     """
     views = [camera for camera in scene.cameras if camera.depth is not None]
     if len(scene.points) >= FEW_POINTS or not views:
@@ -192,47 +194,48 @@ def add_depth_points(scene: Scene) -> Scene:
 
     medians = []
 
-    def shown() -> Iterator[tuple[Camera, np.ndarray, np.ndarray]]:
+    def load_views() -> Iterator[tuple[Camera, np.ndarray, np.ndarray]]:
         for camera in views:
             assert camera.image is not None
-            picture = load_image(camera.image, camera.width, camera.height)
-            depth = _read_map(camera, camera.width, camera.height)
+            image = load_image(camera.image, camera.width, camera.height)
+            depth = _read_camera_map(camera, camera.width, camera.height)
             medians.append(np.median(depth[np.isfinite(depth)]) if np.isfinite(depth).any() else np.nan)
-            yield camera, np.where(np.isfinite(depth), depth, MAX_COORDINATE), picture
+            yield camera, np.where(np.isfinite(depth), depth, MAX_COORDINATE), image
 
-    points, colors, _ = sample_surfaces(shown(), len(views), MOST_POINTS, np.random.default_rng(0))
-    told = [f"{len(points):,} points to begin with are taken from the depth maps."]
-    times = float(np.nanmedian(medians)) / _apart(views) if len(points) else np.nan
-    if times < STEPS[0] or times > STEPS[1]:
-        told.append(
-            f"The depth maps show what is {times:.3g} times as far away as the next photograph: make sure "
-            "that they are in the scene's unit."
+    points, colors, _ = sample_surfaces(load_views(), len(views), MAX_ADDED_POINTS, np.random.default_rng(0))
+    messages = [f"Added {len(points):,} initial points from the depth maps."]
+    distance = float(np.nanmedian(medians)) / _median_spacing(views) if len(points) else np.nan
+    if distance < DISTANCE_RANGE[0] or distance > DISTANCE_RANGE[1]:
+        messages.append(
+            f"The median depth of the depth maps is {distance:.3g} times the distance between cameras: check "
+            "that the maps are in the scene's unit."
         )
     return replace(
         scene,
         points=np.concatenate([scene.points, points.astype(np.float32)]),
         point_colors=np.concatenate([scene.point_colors, np.rint(255 * colors).astype(np.uint8)]),
         point_ids=scene.point_ids[:0],
-        warnings=[*scene.warnings, *told],
+        warnings=[*scene.warnings, *messages],
     )
 
 
-def _apart(views: list[Camera]) -> float:
-    """How far views are from the next one, by the median; NaN where all stand in one place."""
-    eyes = np.array([camera.center for camera in pick_evenly(views, 500)])
-    apart = np.linalg.norm(eyes[:, None] - np.array([camera.center for camera in views]), axis=2)
-    nearest = np.where(apart > 0, apart, np.inf).min(axis=1)
+def _median_spacing(views: list[Camera]) -> float:
+    """Return the median distance from a view to the nearest other view; NaN if all share one position."""
+    sample = np.array([camera.center for camera in pick_evenly(views, 500)])
+    positions = np.array([camera.center for camera in views])
+    distances = np.linalg.norm(sample[:, None] - positions, axis=2)
+    nearest = np.where(distances > 0, distances, np.inf).min(axis=1)
     return float(np.median(nearest)) if np.isfinite(nearest).all() else np.nan
 
 
 def read_depth_map(path: Path) -> np.ndarray:
-    """The values of a depth map, (H, W) float64, NaN where there are none (0, or the sky of a renderer).
+    """Read a depth map, (H, W) float64, with NaN for missing depth (0, or a renderer's sky).
 
-    An EXR's are as they are stored: the nearest of its layers' Depth.Z, or what else is depth there. So are a
-    NPY's of floats; whole numbers, there and in a grey PNG, count UNIT each.
+    EXR and floating-point NPY files store scene units. In an EXR, the nearest of the layers' Depth.Z channels
+    counts, or another depth channel. Integers in NPY and grey PNG files count UNIT each.
 
     Raises:
-        LodgsError: it cannot be read, or holds no depth.
+        LodgsError: if the file cannot be read or contains no depth.
     """
     try:
         with open(path, "rb") as file:
@@ -241,7 +244,7 @@ def read_depth_map(path: Path) -> np.ndarray:
             depth = read_exr_depth(path)
             return np.where(depth < MAX_COORDINATE, depth, np.nan)
         if head == b"\x93NUMPY":
-            values = _of_numpy(path)
+            values = _read_numpy(path)
         else:
             from PIL import Image
 
@@ -249,26 +252,26 @@ def read_depth_map(path: Path) -> np.ndarray:
                 check_image_size(path, image.size)
                 if image.mode not in ("I;16", "I", "L"):
                     raise LodgsError(
-                        f"{path} is a picture in colours, not a depth map.",
-                        "Give grey PNGs of 16 bits, or EXR.",
+                        f"Cannot read {path}: it is a colour image, not a depth map.",
+                        "Export depth maps as grey 16-bit PNG or as EXR.",
                     )
                 values = np.asarray(image, np.float64) * UNIT
     except LodgsError:
         raise
-    except Exception as error:  # Pillow raises many kinds for damaged files
+    except Exception as error:  # Pillow raises many exception types for damaged files
         raise LodgsError(
-            f"{path} cannot be read as a depth map: {error}.", "Write it again, or take it away."
+            f"Cannot read {path} as a depth map: {error}.", "Export it again, or remove it."
         ) from error
     return np.where((values > 0) & (values < SKY_DEPTH), values, np.nan)
 
 
-def _of_numpy(path: Path) -> np.ndarray:
+def _read_numpy(path: Path) -> np.ndarray:
     stored = np.load(path, mmap_mode="r", allow_pickle=False)
-    if stored.ndim == 3 and 1 in (stored.shape[0], stored.shape[2]):  # a channel, first or last
+    if stored.ndim == 3 and 1 in (stored.shape[0], stored.shape[2]):  # one channel, first or last
         stored = stored.squeeze(0 if stored.shape[0] == 1 else 2)
     if stored.ndim != 2 or stored.dtype.kind not in "fiu":
         raise LodgsError(
-            f"{path} holds {stored.dtype} of shape {stored.shape}, not a depth map.",
+            f"Cannot read {path} as a depth map: it is a {stored.dtype} array of shape {stored.shape}.",
             "Save an array of height x width numbers.",
         )
     check_image_size(path, (stored.shape[1], stored.shape[0]))
@@ -276,23 +279,26 @@ def _of_numpy(path: Path) -> np.ndarray:
 
 
 def resample_known(values: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Values (H, W) at another size, (height, width) float32: the means of what is known; NaN where less than
-    half is."""
-    known = np.isfinite(values)
-    both = np.stack([np.where(known, values, 0), known], axis=-1)
-    total, share = area_average(area_average(both, height, 0), width, 1).transpose(2, 0, 1)
+    """Resample values (H, W) to (height, width) float32 by averaging finite values.
+
+    Pixels of which less than half is known become NaN.
+    """
+    finite = np.isfinite(values)
+    channels = np.stack([np.where(finite, values, 0), finite], axis=-1)
+    total, share = area_average(area_average(channels, height, 0), width, 1).transpose(2, 0, 1)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(share >= 0.5, total / share, np.nan).astype(np.float32)
 
 
-def _read_map(camera: Camera, width: int = 0, height: int = 0) -> np.ndarray:
-    """A view's map as it is, or depths at a size."""
+def _read_camera_map(camera: Camera, width: int = 0, height: int = 0) -> np.ndarray:
+    """Read a view's depth map as stored, or as depths at the given size."""
     assert camera.depth is not None
     values = read_depth_map(camera.depth)
-    high, wide = values.shape
-    if not same_proportions(wide, high, camera.width, camera.height):
+    map_height, map_width = values.shape
+    if not same_proportions(map_width, map_height, camera.width, camera.height):
         raise LodgsError(
-            f"{camera.depth} is {wide}x{high}, of other proportions than its photograph.",
-            "Write it again, or take it away.",
+            f"Cannot use depth map {camera.depth}: its size {map_width}x{map_height} does not match the "
+            f"aspect ratio of its photo ({camera.width}x{camera.height}).",
+            "Export it again, or remove it.",
         )
     return 1 / resample_known(1 / values, width, height) if width else values

@@ -1,4 +1,4 @@
-"""Which files a model's image names mean: found within the scene's folder, or not at all. numpy only."""
+"""Lookup of a model's image names as files inside the scene's folder. numpy only."""
 
 from __future__ import annotations
 
@@ -9,58 +9,65 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from ..errors import LodgsError
 
-_USUAL = ("images", "input", "image", "rgb", "photos")
+_COMMON_NAMES = ("images", "input", "image", "rgb", "photos")
 
 
 class ImageFiles:
-    """The files of an image folder, by the names that a model gives them.
+    """Files of an image folder by the names that a model uses.
 
     Args:
-        folder: of the photographs, a link or not.
-        scene: where links in that folder may lead besides.
+        folder: folder of the photos; it may be a link.
+        scene: second folder that links inside ``folder`` may point into.
     """
 
     def __init__(self, folder: Path, scene: Path) -> None:
         self._folder = folder
-        self._within = [Path(os.path.realpath(place)) for place in (folder, scene)]
-        self._normal: dict[str, Path] | None = None
+        self._allowed = [Path(os.path.realpath(path)) for path in (folder, scene)]
+        self._by_normal_name: dict[str, Path] | None = None
 
     def find(self, name: str) -> Path | None:
-        """The file of that name, or None; other Unicode forms (macOS) and backslashes (Windows) find it too.
+        """Return the file with this name, or None.
+
+        Other Unicode forms (macOS) and backslashes (Windows) match, too.
 
         Raises:
-            LodgsError: the name is no text or leads out of the folder, or the file is a link that leads out;
-                ``what`` goes on after "it is left out:".
+            LodgsError: if the name is not UTF-8 or leaves the folder, or the file is a link to another
+                folder. ``what`` continues a sentence such as "Skipped <name>:".
         """
         relative = relative_image_path(name)
-        found = self._folder / name
-        if not os.path.isfile(found):  # not Path.is_file, which raises for names too long
-            if self._normal is None:
-                files = (Path(where) / file for where, _, names in os.walk(self._folder) for file in names)
-                self._normal = {_normal(file.relative_to(self._folder).as_posix()): file for file in files}
-            found = self._normal.get(_normal(str(relative)))
-        if found is not None:
-            real = Path(os.path.realpath(found))
-            if not any(real.is_relative_to(place) for place in self._within):
-                raise LodgsError("it is a link that leads out of the scene's folder.")
-        return found
+        file = self._folder / name
+        if not os.path.isfile(file):  # Path.is_file raises for long names
+            if self._by_normal_name is None:
+                paths = (
+                    Path(parent) / entry for parent, _, names in os.walk(self._folder) for entry in names
+                )
+                self._by_normal_name = {
+                    _normalized(path.relative_to(self._folder).as_posix()): path for path in paths
+                }
+            file = self._by_normal_name.get(_normalized(str(relative)))
+        if file is not None:
+            real = Path(os.path.realpath(file))
+            if not any(real.is_relative_to(folder) for folder in self._allowed):
+                raise LodgsError("it is a link to a file outside the scene's folder.")
+        return file
 
 
 class SidecarFiles:
-    """What belongs to photographs, masks or depth maps, as COLMAP and nerfstudio name it.
+    """Masks or depth maps of photos, named as COLMAP or nerfstudio does.
 
     Args:
-        folder: it need not be there.
-        suffixes: of its files, the first one first.
+        folder: folder of the files; it may not exist.
+        suffixes: accepted suffixes, preferred ones first.
     """
 
     def __init__(self, folder: Path, *suffixes: str) -> None:
-        self.folder, self._suffixes = folder, suffixes
-        self._there = folder.is_dir()
+        self.folder = folder
+        self._suffixes = suffixes
+        self._exists = folder.is_dir()
 
     def find(self, name: str) -> Path | None:
-        """That of a photograph: of ``a/b.jpg`` ``a/b.jpg.png``, or ``a/b.png``; None where there is none."""
-        if not self._there:
+        """Return the file of a photo, or None. Photo ``a/b.jpg`` has ``a/b.jpg.png`` or ``a/b.png``."""
+        if not self._exists:
             return None
         for suffix in self._suffixes:
             for path in (self.folder / f"{name}{suffix}", (self.folder / name).with_suffix(suffix)):
@@ -68,23 +75,28 @@ class SidecarFiles:
                     return path
         return None
 
-    def misnamed(self, name: str) -> str:
-        """A sentence of files that belong to no photograph, of which this is one; "" where there are none."""
-        if not (self._there and any(path.is_file() for path in self.folder.rglob("*"))):
+    def mismatch_warning(self, name: str) -> str:
+        """Return a warning about files without a photo, or "" if the folder is empty.
+
+        Args:
+            name: a photo, whose file name serves as an example.
+        """
+        if not (self._exists and any(path.is_file() for path in self.folder.rglob("*"))):
             return ""
         file = name + self._suffixes[0]
-        return f"{self.folder} holds nothing for these photographs: of {name} it would be {file}."
+        return f"No file in {self.folder} matches a photo: the file of {name} must be named {file}."
 
 
 def relative_image_path(name: str) -> PurePosixPath:
-    """An image's name as a path in the folder of the images, on every system.
+    """Return an image name as a path relative to the image folder, on every operating system.
 
     Raises:
-        LodgsError: the name is no text, or leads out of a folder.
+        LodgsError: if the name is not UTF-8 or leaves the folder.
     """
-    path, there = PurePosixPath(name.replace("\\", "/")), PureWindowsPath(name)
-    if path.is_absolute() or there.drive or there.root or ".." in path.parts:
-        raise LodgsError("its name leads out of the image folder.")
+    path = PurePosixPath(name.replace("\\", "/"))
+    windows_path = PureWindowsPath(name)
+    if path.is_absolute() or windows_path.drive or windows_path.root or ".." in path.parts:
+        raise LodgsError("its name points outside the image folder.")
     try:
         name.encode()
     except UnicodeEncodeError:
@@ -93,18 +105,18 @@ def relative_image_path(name: str) -> PurePosixPath:
 
 
 def find_image_folder(folder: Path, model: Path, names: Sequence[str]) -> Path:
-    """The folder where most of the model's names are files, looked for around the model in the scene."""
+    """Return the folder in or around the scene that contains the most image names of the model."""
     roots = [folder, *(parent for parent in model.parents if folder in parent.parents)]
-    if "sparse" in (folder.name, folder.parent.name):  # only the model was chosen: the scene is around it
+    if "sparse" in (folder.name, folder.parent.name):  # the user chose the model; the scene is its parent
         roots += folder.parents[: 1 if folder.name == "sparse" else 2]
     elif folder == model:
         roots.append(folder.parent)
-    places = []
+    candidates = []
     for root in roots:
-        places += [*(root / name for name in _USUAL), *sorted(root.glob("images*")), root]
+        candidates += [*(root / name for name in _COMMON_NAMES), *sorted(root.glob("images*")), root]
     names = [name for name in names if _is_inside(name)]
-    counts = [sum(os.path.isfile(place / name) for name in names) for place in places]
-    return places[counts.index(max(counts))]
+    counts = [sum(os.path.isfile(candidate / name) for name in names) for candidate in candidates]
+    return candidates[counts.index(max(counts))]
 
 
 def _is_inside(name: str) -> bool:
@@ -114,5 +126,5 @@ def _is_inside(name: str) -> bool:
         return False
 
 
-def _normal(name: str) -> str:
+def _normalized(name: str) -> str:
     return unicodedata.normalize("NFC", name)

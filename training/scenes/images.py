@@ -1,15 +1,15 @@
-"""Photographs as arrays: sizes from file headers (numpy and stdlib only), pixels with Pillow and OpenEXR."""
+"""Image files: sizes from headers (numpy and standard library only), pixels with Pillow and OpenEXR."""
 
 from __future__ import annotations
 
 import io
 import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
+from typing import IO, TYPE_CHECKING
 
 import numpy as np
 
@@ -18,52 +18,55 @@ from ..errors import LodgsError
 from .color import srgb_from_linear
 from .exr import MAGIC, Truncated, exr_size, read_parts
 
+if TYPE_CHECKING:
+    from PIL import Image
+
 MAX_PIXELS = 178_956_970
-"""Pixels of an image that is read: Pillow opens no larger ones, which take it 4 bytes a pixel."""
+"""Maximum number of pixels of an input image: Pillow's own limit, at 4 bytes per pixel."""
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
-"""How names of photographs end, in lower case; beside ``.exr``, which only renderers write."""
+"""Lower-case file name suffixes of photos, without ``.exr``, which only renderers write."""
 
 _LARGE = 1 << 25
-"""Pixels from which on a JPEG is not decoded larger than twice the size that is needed."""
+"""Number of pixels above which an image is reduced while decoding, to at least twice the requested size."""
 _STRIP = 1 << 20
-"""Pixels that are averaged at a time, about; each takes some 100 bytes."""
+"""Approximate number of pixels averaged at a time; each takes about 100 bytes."""
 
-# JPEG markers that carry the size: every start of frame, which excludes DHT (C4), JPG (C8) and DAC (CC).
+# JPEG markers with the size: all start-of-frame markers, which excludes DHT (C4), JPG (C8) and DAC (CC).
 _START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _EXIF, _TIFF = b"Exif\0\0", (b"II*\0", b"MM\0*")
 _WIDTH, _HEIGHT, _ORIENTATION = 256, 257, 274
-_TURNS = {3: 2, 4: 2, 5: 1, 6: 1, 7: 3, 8: 3}
-"""By EXIF's orientation, which tells mirrored ones apart as well."""
-_TURNED = {2: 0, 3: 3, 4: 1, 5: 5, 6: 2, 7: 6, 8: 4}
-"""By the same: what undoes it, as ``Image.Transpose`` counts."""
+_QUARTER_TURNS = {3: 2, 4: 2, 5: 1, 6: 1, 7: 3, 8: 3}
+"""Clockwise quarter turns by EXIF orientation; mirroring is ignored."""
+_UNDO_TRANSPOSE = {2: 0, 3: 3, 4: 1, 5: 5, 6: 2, 7: 6, 8: 4}
+"""``Image.Transpose`` value that reverts Pillow's transposition, by EXIF orientation."""
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height in pixels of a photograph, from its header; EXIF rotation is ignored.
+    """Return the width and height in pixels from an image's header, without applying its EXIF orientation.
 
-    The kind, JPEG, PNG, TIFF, WebP or EXR, is told by the file's content, not by its name. The size of an EXR
-    is its display window, that of a TIFF its first picture's.
+    The format (JPEG, PNG, TIFF, WebP or EXR) is detected from the content, not from the name. The size of an
+    EXR is its display window; the size of a TIFF is that of its first image.
 
     Raises:
-        LodgsError: the file is missing, no regular file, empty, of another kind, cut short, or of no size
-            or more than MOST_PIXELS.
+        LodgsError: if the file is missing, not a regular file, empty, in another format or truncated, or has
+            no pixels or more than MAX_PIXELS.
     """
     with open_file(path) as file:
         try:
-            return check_image_size(path, _size(path, file))
+            return check_image_size(path, _read_size(path, file))
         except OSError as error:
-            raise LodgsError(
-                f"{path} cannot be read: {error.strerror}.", "Check the image folder."
-            ) from error
+            raise LodgsError(f"Cannot read {path}: {error.strerror}.", "Check the image folder.") from error
         except (struct.error, IndexError, KeyError, ValueError, Truncated) as error:
-            raise LodgsError(f"{path} is cut short.", "Copy the image again.") from error
+            raise LodgsError(
+                f"Cannot read {path}: the file is truncated.", "Copy the image again."
+            ) from error
 
 
-def _size(path: Path, file: IO[bytes]) -> tuple[int, int]:
+def _read_size(path: Path, file: IO[bytes]) -> tuple[int, int]:
     head = file.read(8)
     if not head:
-        raise LodgsError(f"{path} is empty.", "Copy the image again.")
+        raise LodgsError(f"Cannot read {path}: the file is empty.", "Copy the image again.")
     if head[:2] == b"\xff\xd8":
         return _jpeg_size(file)
     if head == b"\x89PNG\r\n\x1a\n":
@@ -71,45 +74,50 @@ def _size(path: Path, file: IO[bytes]) -> tuple[int, int]:
     if head[:4] == MAGIC:
         return exr_size(file)
     if head[:4] in _TIFF:
-        tags = _tiff_tags(file)
+        tags = _read_tiff_tags(file)
         return tags[_WIDTH], tags[_HEIGHT]
     if head[:4] == b"RIFF":
         return _webp_size(file)
-    raise LodgsError(f"{path} is not a JPEG, PNG, TIFF, WebP or EXR image.", "Convert it to one of these.")
+    raise LodgsError(
+        f"Cannot read {path}: it is not a JPEG, PNG, TIFF, WebP or EXR image.", "Convert it to one of these."
+    )
 
 
 def check_image_size(path: Path, size: tuple[int, int]) -> tuple[int, int]:
-    """The size, where it is one that is read.
+    """Return the size (width, height) of an image file if it is within the limits.
 
     Raises:
-        LodgsError: it is not.
+        LodgsError: if the image has no pixels or more than MAX_PIXELS.
     """
     width, height = size
     if width < 1 or height < 1:
-        raise LodgsError(f"{path} has no pixels.", "Export the image again.")
+        raise LodgsError(f"Cannot read {path}: the image has no pixels.", "Export the image again.")
     if width * height > MAX_PIXELS:
         raise LodgsError(
-            f"{path} has {width}x{height} pixels; {MAX_PIXELS:,} are read at most.", "Make it smaller."
+            f"Cannot read {path}: {width}x{height} pixels exceed the limit of {MAX_PIXELS:,}.",
+            "Reduce the image.",
         )
     return size
 
 
 def quarter_turns(path: Path) -> int:
-    """How many quarter turns clockwise stand a photograph upright, by its EXIF; 0 where that does not tell.
+    """Return the clockwise quarter turns that make a photo upright, from its EXIF data; 0 without EXIF.
 
-    Phones and cameras write what the sensor sees, and how they were held.
+    Phones and cameras store the sensor's image and record the orientation separately.
     """
     try:
         with open_file(path) as file:
             if (head := file.read(4))[:2] == b"\xff\xd8":
-                return _TURNS.get(_tiff_tags(io.BytesIO(_exif(file))).get(_ORIENTATION, 1), 0)
-            return _TURNS.get(_tiff_tags(file).get(_ORIENTATION, 1), 0) if head in _TIFF else 0
+                tags = _read_tiff_tags(io.BytesIO(_read_exif(file)))
+            else:
+                tags = _read_tiff_tags(file) if head in _TIFF else {}
     except (LodgsError, OSError, struct.error, IndexError, KeyError, ValueError, Truncated):
         return 0
+    return _QUARTER_TURNS.get(tags.get(_ORIENTATION, 1), 0)
 
 
-def _exif(file: IO[bytes]) -> bytes:
-    """A JPEG's EXIF, which is a TIFF."""
+def _read_exif(file: IO[bytes]) -> bytes:
+    """Return the EXIF data of a JPEG, which is in TIFF format."""
     for marker, length in _jpeg_segments(file):
         if marker == 0xE1 and (content := file.read(length)).startswith(_EXIF):
             return content.removeprefix(_EXIF)
@@ -119,11 +127,11 @@ def _exif(file: IO[bytes]) -> bytes:
 
 
 def _jpeg_size(file: IO[bytes]) -> tuple[int, int]:
-    """From the frame header, once it is sure that the end marker follows the first scan."""
+    """Read the size from the frame header, and check that the end marker follows the first scan."""
     size = None
     for marker, _ in _jpeg_segments(file):
         if marker == 0xDA:
-            _expect_end(file, b"\xff\xd9")
+            _check_end(file, b"\xff\xd9")
             break
         if marker in _START_OF_FRAME:
             height, width = struct.unpack(">xHH", file.read(5))
@@ -134,7 +142,7 @@ def _jpeg_size(file: IO[bytes]) -> tuple[int, int]:
 
 
 def _jpeg_segments(file: IO[bytes]) -> Iterator[tuple[int, int]]:
-    """The marker and the length of each segment, at whose content the file stands meanwhile."""
+    """Yield the marker and length of each segment, with the file positioned at the segment's content."""
     file.seek(2)
     while True:
         if file.read(1) != b"\xff":
@@ -142,7 +150,7 @@ def _jpeg_segments(file: IO[bytes]) -> Iterator[tuple[int, int]]:
         marker = file.read(1)[0]
         while marker == 0xFF:  # fill bytes
             marker = file.read(1)[0]
-        if marker == 0x01 or 0xD0 <= marker <= 0xD7:  # markers without a segment
+        if marker == 0x01 or 0xD0 <= marker <= 0xD7:  # markers without content
             continue
         if marker == 0xD9:
             raise Truncated
@@ -152,31 +160,31 @@ def _jpeg_segments(file: IO[bytes]) -> Iterator[tuple[int, int]]:
         file.seek(content + length - 2)
 
 
-def _png_size(file) -> tuple[int, int]:
+def _png_size(file: IO[bytes]) -> tuple[int, int]:
     length, kind, width, height = struct.unpack(">I4sII", file.read(16))
     if kind != b"IHDR" or length != 13:
         raise Truncated
-    _expect_end(file, b"IEND\xae\x42\x60\x82")
+    _check_end(file, b"IEND\xae\x42\x60\x82")
     return width, height
 
 
-def _tiff_tags(file: IO[bytes]) -> dict[int, int]:
-    """Width, height and orientation by their tags, from the first directory (TIFF 6.0)."""
+def _read_tiff_tags(file: IO[bytes]) -> dict[int, int]:
+    """Read width, height and orientation by tag number from the first directory (TIFF 6.0)."""
     file.seek(0)
     order = "<" if file.read(4)[:2] == b"II" else ">"
     (directory,) = struct.unpack(order + "I", file.read(4))
     file.seek(directory)
     (count,) = struct.unpack(order + "H", file.read(2))
-    found = {}
+    tags = {}
     for _ in range(count):
         tag, kind, _, value = struct.unpack(order + "HHI4s", file.read(12))
-        if tag in (_WIDTH, _HEIGHT, _ORIENTATION):  # values are of 16 or 32 bits
-            found[tag] = struct.unpack(order + ("H2x" if kind == 3 else "I"), value)[0]
-    return found
+        if tag in (_WIDTH, _HEIGHT, _ORIENTATION):  # values have 16 or 32 bits
+            tags[tag] = struct.unpack(order + ("H2x" if kind == 3 else "I"), value)[0]
+    return tags
 
 
-def _webp_size(file) -> tuple[int, int]:
-    """From the first chunk, whose kind says where it stands (RFC 9649); the file is as long as it says."""
+def _webp_size(file: IO[bytes]) -> tuple[int, int]:
+    """Read the size from the first chunk, whose type determines the layout (RFC 9649); check the length."""
     file.seek(4)
     length, kind, chunk = struct.unpack("<I4s4s", file.read(12))
     if kind != b"WEBP":
@@ -191,30 +199,29 @@ def _webp_size(file) -> tuple[int, int]:
     if chunk == b"VP8L":
         (packed,) = struct.unpack("<xI5x", body)
         return (packed & 0x3FFF) + 1, (packed >> 14 & 0x3FFF) + 1
-    across, down = body[4:7], body[7:10]
-    return int.from_bytes(across, "little") + 1, int.from_bytes(down, "little") + 1
+    return int.from_bytes(body[4:7], "little") + 1, int.from_bytes(body[7:10], "little") + 1
 
 
-def _expect_end(file, marker: bytes) -> None:
-    """The marker ends the file or, before what some cameras append, stands somewhere after this place."""
-    here = file.tell()
+def _check_end(file: IO[bytes], marker: bytes) -> None:
+    """Raise Truncated unless the marker follows the current position; some cameras append data to it."""
+    position = file.tell()
     file.seek(0, 2)
-    file.seek(max(here, file.tell() - len(marker)))
+    file.seek(max(position, file.tell() - len(marker)))
     if file.read() == marker:
         return
-    file.seek(here)
+    file.seek(position)
     if marker not in file.read():
         raise Truncated
 
 
 @dataclass(frozen=True)
-class _Source:
-    """An image whose rows are had when they are needed.
+class _LazyImage:
+    """Lazily decoded image.
 
     Attributes:
-        rows: (bottom - top, width, channels) float32 from ``top`` to ``bottom``.
-        channels: 3; or 4 with alpha, by which colours are multiplied then.
-        linear: whether values are light rather than coded.
+        rows: function of ``top`` and ``bottom`` that returns (bottom - top, width, channels) float32.
+        channels: 3, or 4 with alpha; colours are then premultiplied.
+        linear: True for linear light, False for display-coded values.
     """
 
     width: int
@@ -225,26 +232,25 @@ class _Source:
 
 
 def load_image(path: Path, width: int, height: int, exposure: float = 0.0, alpha: bool = False) -> np.ndarray:
-    """An image at the given size, (height, width, 3) float32 in [0, 1], display (sRGB) coded.
+    """Load an image at the given size, (height, width, 3) float32 in [0, 1], display (sRGB) coded.
 
-    Sizes below the file's are area averages (each pixel the mean of the rectangle that it covers: an exact
-    2x2 box at half size). All but EXR are averaged as they are coded; an EXR is taken as linear, averaged
-    so, multiplied by 2**exposure and coded by the sRGB transfer function (IEC 61966-2-1). Alpha is ignored
-    and grey becomes RGB.
+    Smaller sizes are area averages: each pixel is the mean of the rectangle that it covers, at half size an
+    exact 2x2 box. Display-coded values are averaged as stored. An EXR is averaged as linear light, multiplied
+    by 2**exposure and encoded with the sRGB transfer function (IEC 61966-2-1). Grey images become RGB.
 
     Args:
-        exposure: stops, for EXR only.
-        alpha: do not ignore it: the image over black, and alpha as a fourth channel.
+        exposure: exposure in stops, for EXR only.
+        alpha: return colours over black and alpha as a fourth channel. By default, alpha is ignored.
 
     Raises:
-        LodgsError: the file cannot be read.
+        LodgsError: if the file cannot be read.
     """
-    with _opened(path, width, height, large=_LARGE, alpha=alpha) as source:
+    with _open_image(path, width, height, large=_LARGE, alpha=alpha) as image:
         result = np.empty((height, width, 4 if alpha else 3), np.float32)
         top = 0
-        for strip in _strips(source, height):
+        for strip in _strips(image, height):
             pixels = area_average(strip, width, 1)
-            if source.linear:
+            if image.linear:
                 light = np.clip(pixels[..., :3] * 2.0**exposure, 0.0, 1.0)
                 pixels = np.concatenate([srgb_from_linear(light), pixels[..., 3:]], axis=-1)
             result[top : top + len(pixels)] = np.clip(pixels, 0.0, 1.0)
@@ -253,88 +259,87 @@ def load_image(path: Path, width: int, height: int, exposure: float = 0.0, alpha
 
 
 def load_mask(path: Path, width: int, height: int) -> np.ndarray:
-    """A photograph's mask at the given size, (height, width) float32: 0 where the photograph does not count.
+    """Load a photo's mask at the given size, (height, width) float32; 0 marks ignored pixels.
 
     Raises:
-        LodgsError: the file cannot be read, or has other proportions.
+        LodgsError: if the file cannot be read, or its aspect ratio differs from the given size.
     """
     check_mask(path, width, height)
     return load_image(path, width, height)[..., 0]
 
 
 def check_mask(path: Path, width: int, height: int) -> None:
-    """Looks at the head of a mask of a photograph of a size.
+    """Check the header of a mask for a photo of the given size.
 
     Raises:
-        LodgsError: it is no image, or has other proportions.
+        LodgsError: if the file is not an image, or its aspect ratio differs from the photo's.
     """
-    wide, high = image_size(path)
-    if not same_proportions(wide, high, width, height):
+    mask_width, mask_height = image_size(path)
+    if not same_proportions(mask_width, mask_height, width, height):
         raise LodgsError(
-            f"The mask {path} is {wide}x{high}, of other proportions than its photograph.",
-            "Write it again, or take it away.",
+            f"Cannot use mask {path}: its size {mask_width}x{mask_height} does not match the "
+            f"aspect ratio of its photo ({width}x{height}).",
+            "Export the mask again, or remove it.",
         )
 
 
-def same_proportions(wide: int, high: int, width: int, height: int) -> bool:
-    """Whether two sizes are of the same proportions; sides are whole pixels."""
-    least = min(wide, high, width, height)
-    return bool(abs(np.log(wide * height / (high * width))) <= 0.01 + 1 / least)
+def same_proportions(width_a: int, height_a: int, width_b: int, height_b: int) -> bool:
+    """Return True if two sizes have the same aspect ratio, up to rounding to whole pixels."""
+    shortest = min(width_a, height_a, width_b, height_b)
+    return bool(abs(np.log(width_a * height_b / (height_a * width_b))) <= 0.01 + 1 / shortest)
 
 
 def check_image(path: Path) -> None:
-    """Decodes an image, as small as its kind lets it, and forgets it.
+    """Decode an image at the smallest size that its format supports, and discard the result.
 
     Raises:
-        LodgsError: the file cannot be read.
+        LodgsError: if the file cannot be read.
     """
-    with _opened(path, 1, 1, large=0):
+    with _open_image(path, 1, 1, large=0):
         pass
 
 
 @contextmanager
-def _opened(path: Path, width: int, height: int, large: int, alpha: bool = False) -> Iterator[_Source]:
-    """The decoded image, of which a size is wanted; whatever goes wrong with it is a LodgsError.
+def _open_image(path: Path, width: int, height: int, large: int, alpha: bool = False) -> Iterator[_LazyImage]:
+    """Open an image for loading at the given size, and convert every failure to a LodgsError.
 
     Args:
-        large: an image of more pixels is first made as small as is still twice what is wanted: a JPEG where
-            it is decoded, others by whole numbers.
+        large: number of pixels above which the image is reduced to at least twice the given size: a JPEG
+            while decoding, other formats by an integer factor.
     """
     try:
         with open_file(path) as file:
             if file.read(4) == MAGIC:
-                yield _exr(path, alpha)
+                yield _open_exr(path, alpha)
                 return
             from PIL import Image
 
             file.seek(0)
             with Image.open(file, formats=("JPEG", "PNG", "TIFF", "WEBP")) as image:
-                if image.format == "TIFF":  # which Pillow, unlike all others, turns by its orientation
-                    turned = image.getexif().get(_ORIENTATION, 1)
+                if image.format == "TIFF":  # the only format that Pillow transposes by its orientation
+                    orientation = image.getexif().get(_ORIENTATION, 1)
                     image.load()
-                    if turned in _TURNED:
-                        image = image.transpose(Image.Transpose(_TURNED[turned]))
+                    if orientation in _UNDO_TRANSPOSE:
+                        image = image.transpose(Image.Transpose(_UNDO_TRANSPOSE[orientation]))
                 if image.width * image.height > large:
                     image.draft(None, (2 * width, 2 * height))
-                    times = min(image.width // (2 * width), image.height // (2 * height))
-                    if times > 1 and image.mode in ("L", "RGB"):
-                        image = image.reduce(times)
+                    factor = min(image.width // (2 * width), image.height // (2 * height))
+                    if factor > 1 and image.mode in ("L", "RGB"):
+                        image = image.reduce(factor)
                 image.load()
 
                 def rows(top: int, bottom: int) -> np.ndarray:
                     return _pillow_rows(image, top, bottom, alpha)
 
-                yield _Source(image.width, image.height, rows, 4 if alpha else 3)
+                yield _LazyImage(image.width, image.height, rows, 4 if alpha else 3)
     except LodgsError:
         raise
-    except Exception as error:  # the libraries raise many kinds for damaged files
-        raise LodgsError(
-            f"{path} cannot be read as an image: {error}.", "Copy or export it again."
-        ) from error
+    except Exception as error:  # the libraries raise many exception types for damaged files
+        raise LodgsError(f"Cannot read {path} as an image: {error}.", "Copy or export it again.") from error
 
 
-def _pillow_rows(image, top: int, bottom: int, alpha: bool) -> np.ndarray:
-    """Rows of a Pillow image, (H, W, 3) float32 in [0, 1], or 4."""
+def _pillow_rows(image: Image.Image, top: int, bottom: int, alpha: bool) -> np.ndarray:
+    """Return rows of a Pillow image, (H, W, 3) float32 in [0, 1], or (H, W, 4) with alpha."""
     rows = image.crop((0, top, image.width, bottom))
     if alpha:
         codes = np.ones((rows.height, rows.width, 4), np.float32)
@@ -344,57 +349,57 @@ def _pillow_rows(image, top: int, bottom: int, alpha: bool) -> np.ndarray:
         else:
             codes[..., :3] = _pillow_rows(image, top, bottom, alpha=False)
         return codes
-    if rows.mode.startswith("I"):  # 16-bit grey, which convert("RGB") would clip
+    if rows.mode.startswith("I"):  # convert("RGB") would clip 16-bit grey
         grey = np.asarray(rows, np.float32) / 65535
         return np.repeat(grey[..., None], 3, axis=2)
-    if rows.mode == "F":  # grey from 0 to 1, which convert("RGB") would take for 0 to 255
+    if rows.mode == "F":  # convert("RGB") would treat grey from 0 to 1 as 0 to 255
         return np.repeat(np.nan_to_num(np.asarray(rows, np.float32))[..., None], 3, axis=2)
     return np.asarray(rows.convert("RGB"), np.float32) / 255
 
 
-def _exr(path: Path, alpha: bool) -> _Source:
-    """Linear light over the display window; black where the data window leaves it empty."""
-    image_size(path)  # refuses a file cut short, of which OpenEXR would print and give nothing
+def _open_exr(path: Path, alpha: bool) -> _LazyImage:
+    """Return linear light over the display window, black outside the data window."""
+    image_size(path)  # rejects a truncated file, for which OpenEXR only prints a message
     part = next((part for part in read_parts(path) if _rgb_names(part[2])), None)
     if part is None:
-        raise LodgsError(f"{path} has no R, G and B channels.", "Export the combined pass.")
+        raise LodgsError(f"Cannot read {path}: it has no R, G and B channels.", "Export the combined pass.")
     _, header, channels = part
-    (left, above), _ = header["dataWindow"]
+    (data_left, data_top), _ = header["dataWindow"]
     low, high = (np.asarray(corner) for corner in header["displayWindow"])
-    across, down = high - low + 1
-    width, height = check_image_size(path, (int(across), int(down)))
-    x, y = int(left - low[0]), int(above - low[1])
+    columns, lines = high - low + 1
+    width, height = check_image_size(path, (int(columns), int(lines)))
+    x, y = int(data_left - low[0]), int(data_top - low[1])
     names = _rgb_names(channels)
     planes = [channels[name] for name in names]
     if alpha:
-        its = names[0][:-1] + "A"
-        planes.append(channels[its] if its in channels else np.ones_like(planes[0]))
+        alpha_name = names[0][:-1] + "A"
+        planes.append(channels[alpha_name] if alpha_name in channels else np.ones_like(planes[0]))
 
     def rows(top: int, bottom: int) -> np.ndarray:
         pixels = np.zeros((bottom - top, width, len(planes)), np.float32)
         for plane, channel in zip(planes, np.moveaxis(pixels, 2, 0), strict=True):
             data = plane[max(top - y, 0) : max(bottom - y, 0), max(-x, 0) :]
-            seen = channel[max(y - top, 0) :, max(x, 0) :][: data.shape[0], : data.shape[1]]
-            seen[:] = data[: seen.shape[0], : seen.shape[1]]
+            overlap = channel[max(y - top, 0) :, max(x, 0) :][: data.shape[0], : data.shape[1]]
+            overlap[:] = data[: overlap.shape[0], : overlap.shape[1]]
         return np.nan_to_num(pixels, posinf=float(np.finfo(np.float32).max))
 
-    return _Source(width, height, rows, len(planes), linear=True)
+    return _LazyImage(width, height, rows, len(planes), linear=True)
 
 
 def load_exr(path: Path) -> np.ndarray:
-    """The light of an EXR over its display window, and alpha, by which it is multiplied: (H, W, 4) float32.
+    """Load premultiplied linear light and alpha of an EXR over its display window, (H, W, 4) float32.
 
     Raises:
-        LodgsError: the file cannot be read.
+        LodgsError: if the file cannot be read.
     """
-    with _opened(path, 1, 1, large=_LARGE, alpha=True) as source:
-        if not source.linear:
-            raise LodgsError(f"{path} is no EXR image.", "Export it again.")
-        return source.rows(0, source.height)
+    with _open_image(path, 1, 1, large=_LARGE, alpha=True) as image:
+        if not image.linear:
+            raise LodgsError(f"Cannot read {path}: it is not an EXR image.", "Export it again.")
+        return image.rows(0, image.height)
 
 
-def _rgb_names(channels) -> list[str]:
-    """The colour channels: plain R, G, B, else those of the combined pass or first layer, else luminance."""
+def _rgb_names(channels: Collection[str]) -> list[str]:
+    """Return the colour channels: R, G, B, else those of the combined pass or first layer, else luminance."""
     layers = [name[:-1] for name in channels if name.rpartition(".")[2] == "R"]
     layers.sort(key=lambda layer: (layer != "", "Combined" not in layer, layer))
     for layer in layers:
@@ -403,31 +408,34 @@ def _rgb_names(channels) -> list[str]:
     return ["Y"] * 3 if "Y" in channels else []
 
 
-def _strips(source: _Source, height: int) -> Iterator[np.ndarray]:
-    """The image at another height, strip by strip: rows as :func:`area_average` makes them, to the bit."""
-    most, old = max(_STRIP // source.width, 1), source.height
+def _strips(image: _LazyImage, height: int) -> Iterator[np.ndarray]:
+    """Yield strips of the image at another height, bit-identical to :func:`area_average`."""
+    max_rows = max(_STRIP // image.width, 1)
+    old = image.height
     if old % height == 0:
-        each = old // height
-        step = max(most // each, 1)
+        factor = old // height
+        step = max(max_rows // factor, 1)
         for top in range(0, height, step):
             bottom = min(top + step, height)
-            yield area_average(source.rows(top * each, bottom * each), bottom - top, 0)
+            yield area_average(image.rows(top * factor, bottom * factor), bottom - top, 0)
         return
-    below, part = _edges(old, height)
-    step = max(most * height // old, 1)
-    before = np.zeros((source.width, source.channels))  # the sum of all rows before the strip's first
+    cells, fractions = _cell_edges(old, height)
+    step = max(max_rows * height // old, 1)
+    preceding = np.zeros((image.width, image.channels))  # sum of all rows above the strip
     for top in range(0, height, step):
-        place = slice(top, min(top + step, height) + 1)
-        first, last = below[place][0], below[place][-1]
-        total = np.concatenate([before[None], source.rows(first, last + 1)], dtype=np.float64)
+        edges = slice(top, min(top + step, height) + 1)
+        first, last = cells[edges][0], cells[edges][-1]
+        total = np.concatenate([preceding[None], image.rows(first, last + 1)], dtype=np.float64)
         np.cumsum(total, axis=0, out=total)
-        before = total[last - first]
-        yield _between(total, below[place] - first, part[place]) * (height / old)
+        preceding = total[last - first]
+        yield _sums_between(total, cells[edges] - first, fractions[edges]) * (height / old)
 
 
 def area_average(pixels: np.ndarray, size: int, axis: int) -> np.ndarray:
-    """Resample one axis of (H, W, C) to `size` cells, each the mean of what it covers: differences of the
-    running sum."""
+    """Resample one axis of (H, W, C) to ``size`` cells, each the mean of the area that it covers.
+
+    The means are differences of the running sum.
+    """
     old = pixels.shape[axis]
     if size == old:
         return pixels
@@ -437,29 +445,29 @@ def area_average(pixels: np.ndarray, size: int, axis: int) -> np.ndarray:
     else:
         total = np.zeros((old + 1, *pixels.shape[1:]))
         np.cumsum(pixels, axis=0, out=total[1:])
-        mean = _between(total, *_edges(old, size)) * (size / old)
+        mean = _sums_between(total, *_cell_edges(old, size)) * (size / old)
     return np.moveaxis(mean, 0, axis)
 
 
-def _edges(old: int, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Where each of `size` cells begins and the last one ends: the old cell, and the part of it before."""
+def _cell_edges(old: int, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the old cell of each of the ``size + 1`` new edges, and the edge's fractional position in it."""
     edges = np.arange(size + 1) * (old / size)
-    below = np.minimum(edges.astype(int), old - 1)
-    return below, (edges - below).reshape(-1, 1, 1)
+    cells = np.minimum(edges.astype(int), old - 1)
+    return cells, (edges - cells).reshape(-1, 1, 1)
 
 
-def _between(total: np.ndarray, below: np.ndarray, part: np.ndarray) -> np.ndarray:
-    """Differences of a running sum, linear between its cells, from edge to edge."""
-    return np.diff(total[below] * (1 - part) + total[below + 1] * part, axis=0)
+def _sums_between(total: np.ndarray, cells: np.ndarray, fractions: np.ndarray) -> np.ndarray:
+    """Return differences between edges of a running sum, interpolated linearly inside its cells."""
+    return np.diff(total[cells] * (1 - fractions) + total[cells + 1] * fractions, axis=0)
 
 
 def write_png(path: Path, codes: np.ndarray) -> None:
-    """Writes (H, W, 3) or (H, W, 4) uint8, display-coded, colours not multiplied by alpha.
+    """Write a PNG from display-coded (H, W, 3) or (H, W, 4) uint8 with straight alpha.
 
-    By hand (https://www.w3.org/TR/png-3/): Pillow's corrupts memory once pycolmap is loaded.
+    Pillow's encoder corrupts memory after pycolmap is loaded. Format: https://www.w3.org/TR/png-3/.
     """
     height, width, channels = codes.shape
-    # the filter "up": each row less the one above, which packs smooth pictures well
+    # Filter "up" stores the difference to the row above, which compresses smooth images well.
     lines = np.empty((height, 1 + width * channels), np.uint8)
     lines[:, 0] = 2
     rows = codes.reshape(height, -1)

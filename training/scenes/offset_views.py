@@ -1,8 +1,8 @@
-"""Views of a scene off the path that it was photographed on: what is right a step aside, where that is known.
+"""Offset views: ground-truth views of a scene away from the camera path of its photos, for evaluation only.
 
-    scene/  images/  sparse/0/  aside/NAME.json, each beside the picture that it names
+    scene/  images/  sparse/0/  aside/NAME.json, each next to the image that it names
 
-Nobody trains on them. A renderer can make them, or somebody who photographs and registers them besides.
+A renderer can create them, or they are extra photos registered with the scene.
 """
 
 from __future__ import annotations
@@ -17,24 +17,26 @@ from .images import image_size
 
 
 def read_offset_views(scene: Path) -> list[Camera]:
-    """The views in a scene's folder ``aside`` by file name, at their pictures' size; none without the folder.
+    """Read the views of a scene's folder ``aside``, sorted by file name, at their images' size.
 
-    Each is a JSON file as ``cameras.write_camera`` makes it, in the model's world; ``name`` is the picture's.
+    Each file has the format of ``cameras.write_camera``, in the model's world; ``name`` is the image's name.
+    Without the folder, the list is empty.
 
     Raises:
-        LodgsError: a camera or its picture cannot be read.
+        LodgsError: if a camera or its image cannot be read.
     """
-    found, pictures = [], ImageFiles(scene / "aside", scene)
+    views = []
+    files = ImageFiles(scene / "aside", scene)
     for path in sorted((scene / "aside").glob("*.json")):
         camera, _ = read_camera(path)
         try:
-            image = pictures.find(camera.name)
+            image = files.find(camera.name)
         except LodgsError as error:
-            raise LodgsError(f"The picture that {path} names cannot be taken: {error.what}") from error
+            raise LodgsError(f"Cannot use the image named in {path}: {error.what}") from error
         if image is None:
             raise LodgsError(
-                f"{path.with_name(printable(camera.name)[:200])} cannot be read: there is no such file.",
-                f"{path.name} names it.",
+                f"Cannot read {path.with_name(printable(camera.name)[:200])}: the file does not exist.",
+                f"Add the file, or change the name in {path.name}.",
             )
-        found.append(replace(camera.resized(*image_size(image)), image=image))
-    return found
+        views.append(replace(camera.resized(*image_size(image)), image=image))
+    return views

@@ -1,4 +1,4 @@
-"""Which way is up: COLMAP's world has no up of its own. numpy only."""
+"""Estimate of the up direction, which COLMAP's world does not define. numpy only."""
 
 from __future__ import annotations
 
@@ -8,20 +8,18 @@ import numpy as np
 
 from .cameras import Camera
 
-# Mean of unit vectors: 1 where all agree, 0 where they cancel out.
-_AGREE = 0.5
+_AGREEMENT = 0.5
+"""Minimum length of the mean of unit vectors: 1 if all agree, 0 if they cancel out."""
 
 
 def up_rotation(cameras: Sequence[Camera]) -> np.ndarray:
-    """Rotation from COLMAP's world to a z-up world, (3, 3) float64.
+    """Return the rotation from COLMAP's world to a z-up world, (3, 3) float64; the identity without cameras.
 
-    Up is the mean of the cameras' up directions: -y, or where EXIF turns the photograph what is then above.
-    Where these cancel out and the cameras look one way, they look straight down, as drones do: up is then the
-    normal of the plane that they fly in, or without such a plane the opposite of the mean view. The mean
-    view, where it has a horizontal part, turns to +y, so that Blender's front view sees what the cameras
-    see; otherwise the top of the first image does.
-
-    No cameras give the identity.
+    Up is the mean of the cameras' up directions: -y, corrected by EXIF orientation. If these cancel out while
+    the view directions agree, the cameras look straight down, as on a drone; up is then the normal of their
+    plane of flight or, without such a plane, opposite to the mean view direction. The horizontal part of the
+    mean view direction becomes +y, so that Blender's front view matches the cameras. Without a horizontal
+    part, the top of the first image becomes +y.
     """
     if not cameras:
         return np.eye(3)
@@ -29,14 +27,15 @@ def up_rotation(cameras: Sequence[Camera]) -> np.ndarray:
     turns = np.array([camera.turns for camera in cameras])
     tops = np.array([[0, -1, 0], [-1, 0, 0], [0, 1, 0], [1, 0, 0]])[turns]
     ups = np.einsum("ni,nij->nj", tops, axes)
-    view, image_up = axes[:, 2].mean(axis=0), ups.mean(axis=0)
+    view = axes[:, 2].mean(axis=0)
+    image_up = ups.mean(axis=0)
     up = image_up
-    if np.linalg.norm(image_up) < _AGREE <= np.linalg.norm(view):
+    if np.linalg.norm(image_up) < _AGREEMENT <= np.linalg.norm(view):
         up = _flight_normal(np.stack([camera.center for camera in cameras]), -view)
     if not np.any(up):
         up = ups[0]
     up = up / np.linalg.norm(up)
-    # The last cannot fail: two axes of one camera are not both vertical.
+    # The last candidate always works: two axes of one camera are not both vertical.
     for front in (view, ups[0], np.cross(axes[0, 2], ups[0])):
         front = front - up * (front @ up)
         if np.linalg.norm(front) > 0.3:
@@ -46,7 +45,7 @@ def up_rotation(cameras: Sequence[Camera]) -> np.ndarray:
 
 
 def _flight_normal(centers: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Normal of the plane through the centres where they are flat and it is within 30 degrees of up."""
+    """Return the normal of the centres' plane if they are flat and it is within 30 degrees of up, else up."""
     _, spread, directions = np.linalg.svd(centers - centers.mean(axis=0), full_matrices=False)
     if len(spread) < 3 or spread[2] > 0.25 * spread[1]:
         return up

@@ -1,6 +1,6 @@
-"""pycolmap in a process of its own: it may end the process, and Pillow corrupts memory beside it.
+"""Run pycolmap in a separate process: it may abort its process, and Pillow corrupts memory next to it.
 
-A module that is such a program begins with :func:`read_request` and says what it has to say in :func:`send`.
+A module that runs as such a program starts with :func:`read_request` and answers with :func:`send`.
 """
 
 from __future__ import annotations
@@ -15,30 +15,34 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from types import ModuleType
 
-_ROOM = 1 << 18  # bytes that are still free on a disk that is not full
+_MIN_FREE_BYTES = 1 << 18
+"""Free space below which a disk counts as full."""
 CHECK_SECONDS = 2.0
-"""Seconds between two looks at whether the disk is full."""
+"""Seconds between two checks of the free disk space."""
 
 
-def run_program(module: str, request: dict, work: Path, hear: Callable[[dict], object] | None = None) -> str:
-    """Runs a module of this folder as a program to its end.
+def run_program(
+    module: str, request: dict, work: Path, on_message: Callable[[dict], object] | None = None
+) -> str:
+    """Run a module of this package as a program and wait for it.
 
-    It ends as soon as this process does, however that comes, and where the disk is full.
+    The program stops when this process ends for any reason, and when the disk is full.
 
     Args:
-        module: its name.
-        request: what it is to do.
-        work: folder that it writes to.
-        hear: gets each object that it says.
+        module: module name.
+        request: JSON object that the program receives.
+        work: folder that the program writes to.
+        on_message: receives each object that the program sends.
 
     Returns:
-        Why it could not do it; empty where it did.
+        The error message of the program; "" after success.
 
     Raises:
-        OSError: there is no room on the disk, or it could not be started.
+        OSError: if the disk is full or the program cannot be started.
     """
-    package = Path(__file__).resolve().parents[1]  # training, or lodgs where pip has installed it
+    package = Path(__file__).resolve().parents[1]  # training, or lodgs after pip install
     with subprocess.Popen(
         [sys.executable, "-m", f"{package.name}.scenes.{module}"],
         cwd=package.parent,
@@ -49,18 +53,18 @@ def run_program(module: str, request: dict, work: Path, hear: Callable[[dict], o
         errors="replace",
     ) as child:
         assert child.stdin is not None and child.stdout is not None and child.stderr is not None
-        threading.Thread(target=_end_without_room, args=(child, work), daemon=True).start()
+        threading.Thread(target=_kill_on_full_disk, args=(child, work), daemon=True).start()
         problems: list[str] = []
         errors = child.stderr
         reader = threading.Thread(target=lambda: problems.extend(errors), daemon=True)
         reader.start()
         try:
-            with suppress(OSError):  # it has ended already, and said why
+            with suppress(OSError):  # the program may have ended already, with a message
                 child.stdin.write(json.dumps(request) + "\n")
-                child.stdin.flush()  # and stays open: the program ends when it is closed
+                child.stdin.flush()  # stdin stays open, because closing it stops the program
             for line in child.stdout:
-                if hear is not None and line.startswith("{"):
-                    hear(json.loads(line))
+                if on_message is not None and line.startswith("{"):
+                    on_message(json.loads(line))
             child.wait()
             reader.join()
             with suppress(OSError):
@@ -68,7 +72,7 @@ def run_program(module: str, request: dict, work: Path, hear: Callable[[dict], o
         except BaseException:
             child.kill()
             raise
-    _require_room(work)
+    _require_free_space(work)
     if not child.returncode:
         return ""
     lines = [line.strip() for line in problems if line.strip()] or [f"exit code {child.returncode}"]
@@ -76,8 +80,8 @@ def run_program(module: str, request: dict, work: Path, hear: Callable[[dict], o
 
 
 def read_request() -> dict:
-    """What this program is to do; from then on it ends when who started it does."""
-    found = json.loads(sys.stdin.readline())
+    """Return the request of this program, and stop the program as soon as its parent process ends."""
+    request = json.loads(sys.stdin.readline())
 
     def wait() -> None:
         while os.read(0, 4096):
@@ -85,39 +89,38 @@ def read_request() -> dict:
         os._exit(1)
 
     threading.Thread(target=wait, daemon=True).start()
-    return found
+    return request
 
 
-def load_pycolmap():
-    """pycolmap, which says what goes wrong on standard error and writes no log files; ends the program where
-    there is none."""
+def load_pycolmap() -> ModuleType:
+    """Import pycolmap with errors on standard error and no log files; exit if it cannot be imported."""
     try:
         import pycolmap
     except ImportError as error:
-        sys.exit(f"pycolmap cannot be loaded: {error}.")
+        sys.exit(f"pycolmap cannot be imported: {error}.")
     pycolmap.logging.logtostderr = True
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR.value)
     return pycolmap
 
 
 def send(**values: object) -> None:
-    """An object for whoever started this program."""
+    """Send an object to the parent process."""
     print(json.dumps(values), flush=True)
 
 
-def _end_without_room(child: subprocess.Popen[str], folder: Path) -> None:
-    """Ends a program when the disk that it writes to is full: COLMAP's threads may wait for good then."""
+def _kill_on_full_disk(child: subprocess.Popen[str], folder: Path) -> None:
+    """Kill a program when its disk is full: COLMAP's threads may then wait forever."""
     while child.poll() is None:
         try:
-            _require_room(folder)
+            _require_free_space(folder)
         except OSError:
             child.kill()
         time.sleep(CHECK_SECONDS)
 
 
-def _require_room(folder: Path) -> None:
-    """Raises OSError where a disk is full: COLMAP crashes then, or hangs, or writes half a photograph."""
+def _require_free_space(folder: Path) -> None:
+    """Raise OSError if the disk is full: COLMAP would crash, hang or write incomplete images."""
     with tempfile.TemporaryFile(dir=folder) as file:
-        file.write(os.urandom(_ROOM))
+        file.write(os.urandom(_MIN_FREE_BYTES))
         file.flush()
         os.fsync(file.fileno())

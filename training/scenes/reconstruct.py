@@ -1,9 +1,9 @@
-"""From photographs alone to a COLMAP scene: where each was taken, by COLMAP through pycolmap.
+"""COLMAP scenes from photos alone: camera poses and points by COLMAP, through pycolmap.
 
-out/  images/    the photographs, links or copies; WebP, which pycolmap does not read, as PNG
-      sparse/0/  the model
-      masks/     of the photographs, where there are some: the same in training
-      colmap/    what COLMAP knows of them, from which it goes on; pairs.png, which photographs show the same
+out/  images/    photos, as links or copies; WebP, which pycolmap cannot read, as PNG
+      sparse/0/  model
+      masks/     masks of the photos, if any; training uses the same masks
+      colmap/    COLMAP's intermediate results, used to resume; pairs.png, matches between photos
 """
 
 from __future__ import annotations
@@ -29,55 +29,57 @@ from .image_files import SidecarFiles
 from .images import IMAGE_SUFFIXES, check_mask, image_size, load_image, write_png
 
 PRESETS = {"draft": (1000, 2048), "standard": (1600, 4096)}
-"""Pixels of the longer side in which features are looked for, and at most so many of a photograph."""
+"""Longer side in pixels for feature extraction, and maximum number of features per photo."""
 LENSES = "one", "folder", "each"
-"""One lens took all photographs, all of a folder, or each its own."""
+"""Photos that share a lens: all, those of a folder, or none."""
 SETTINGS = "settings.json"
-"""What marks the folder of what COLMAP knows as ours, and says how it was found."""
-FEWEST = 3
-"""Photographs that make a scene."""
+"""File that marks the folder of intermediate results as ours, with the settings used."""
+MIN_PHOTOS = 3
+"""Minimum number of photos of a scene."""
+MIN_FEATURES = 100
+"""Number of features below which a photo counts as featureless."""
 STAGES = {
-    "features": "Features of photograph",
-    "vocabulary": "Learning what the photographs show",
-    "pairs": "Pairs compared:",
-    "cameras": "Photographs placed:",
+    "features": "Extracting features of photo",
+    "vocabulary": "Building the vocabulary tree",
+    "pairs": "Comparing pair",
+    "cameras": "Placing photo",
 }
 
 _WEBP = ".webp"
-_UNREAD = (
+_UNSUPPORTED = (
     ".heic", ".heif", ".avif", ".jxl", ".jp2", ".bmp", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf",
     ".rw2", ".pef",
 )  # fmt: skip
-"""How names of photographs end that are not read, in lower case."""
+"""Lower-case suffixes of photo formats that cannot be read."""
 _TABLES = {"features": "descriptors", "pairs": "two_view_geometries"}
-"""Of COLMAP's database, which have a row for each that is done."""
-_LOOKS = 0.5
+"""Tables of COLMAP's database with one row per completed item, by stage."""
+_POLL_SECONDS = 0.5
 
-Tell = Callable[[str, int, int], object]
-"""Is told what is done, how far it is, and of how much."""
+Report = Callable[[str, int, int], object]
+"""Callback that receives the stage, the number of completed items and their total."""
 
 
 @dataclass(frozen=True)
 class ReconstructionResult:
-    """What came of it.
+    """A reconstructed scene.
 
     Attributes:
-        folder: of the COLMAP scene.
-        photographs: how many were tried.
-        placed: names of those that found their place.
-        points: how many there are.
-        error: mean reprojection error in pixels of the photographs.
-        words: how it went, and what to do about it.
-        left_out: files that could not be tried, and why.
+        folder: folder of the COLMAP scene.
+        photos: number of photos used.
+        placed: names of the photos with a reconstructed camera.
+        points: number of points.
+        error: mean reprojection error in pixels of the photos.
+        summary: sentences about the result and possible improvements.
+        excluded: a sentence for each unusable file.
     """
 
     folder: Path
-    photographs: int
+    photos: int
     placed: list[str]
     points: int
     error: float
-    words: str
-    left_out: list[str]
+    summary: str
+    excluded: list[str]
 
 
 def reconstruct(
@@ -88,207 +90,209 @@ def reconstruct(
     ordered: bool = False,
     lens: str = "",
     masks: Path | None = None,
-    tell: Tell = lambda what, done, of: None,
+    report: Report = lambda stage, done, total: None,
 ) -> ReconstructionResult:
-    """Finds cameras and points of photographs, and writes the scene. Given again, it goes on where it was.
+    """Reconstruct cameras and points from photos and write the scene. A repeated call resumes.
 
     Args:
-        photos: their folder; folders in it, too.
-        out: the scene's folder.
-        preset: a name in PRESETS.
-        ordered: whether names follow the way that was walked, as frames of a video do: then neighbours are
-            compared, which takes less time.
-        lens: of LENSES; "": one, if all have the same size, else each its own.
-        masks: folder of pictures that are black where a photograph is not to be looked at: of ``a/b.jpg``
-            named ``a/b.jpg.png``, or ``a/b.png``.
+        photos: folder of the photos, with subfolders.
+        out: folder of the scene.
+        preset: a key of PRESETS.
+        ordered: True if the names follow the camera path, as for video frames; then only neighbouring photos
+            are compared, which is faster.
+        lens: one of LENSES; "" selects "one" if all photos have the same size, else "each".
+        masks: folder of masks that are black in ignored areas; the mask of ``a/b.jpg`` is ``a/b.jpg.png`` or
+            ``a/b.png``.
+        report: called with the progress.
 
     Raises:
-        LodgsError: there are too few photographs, too few overlap, or something could not be written.
+        LodgsError: if there are too few photos, too few overlap, or a file cannot be written.
     """
-    photos, out = Path(os.path.abspath(photos)), Path(os.path.abspath(out))
+    photos = Path(os.path.abspath(photos))
+    out = Path(os.path.abspath(out))
     masks = None if masks is None else Path(os.path.abspath(masks))
-    ours = [out / "colmap", out / "sparse", out / MASKS]
-    if not photos.is_relative_to(out):
-        ours.append(out / "images")
-    names, left_out, sizes = _photographs(photos, [*ours, *([masks] if masks else [])])
-    if len(names) < FEWEST:
-        raise LodgsError(
-            f"{photos} holds {len(names)} photographs that can be read; a scene takes {FEWEST}."
-            + "".join(f" {sentence}" for sentence in exclusion_messages(left_out)[:1]),
-            "Choose the folder of the photographs.",
-        )
     work = out / "colmap"
-    if not (work / SETTINGS).is_file():  # what is there is somebody's
-        if out.is_dir() and find_models(out):
-            raise LodgsError(f"{out} holds a COLMAP scene already.", "Choose another folder.")
-        if work.exists():
-            raise LodgsError(
-                f"{out} holds a folder {work.name} of somebody else's.", "Choose another folder."
-            )
+    outputs = [work, out / "sparse", out / MASKS]
+    if not photos.is_relative_to(out):
+        outputs.append(out / "images")
+    names, excluded, sizes = _list_photos(photos, [*outputs, *([masks] if masks else [])])
+    if len(names) < MIN_PHOTOS:
+        raise LodgsError(
+            f"Cannot reconstruct {photos}: found {len(names)} readable photos, need at least {MIN_PHOTOS}."
+            + "".join(f" {message}" for message in exclusion_messages(excluded)[:1]),
+            "Choose the folder of the photos.",
+        )
+    _check_output(out, work)
     size, features = PRESETS[preset]
     settings = {
         "size": size, "features": features,
         "lens": lens or ("one" if len(sizes) == 1 else "each"), "masks": str(masks or ""),
     }  # fmt: skip
-    found: dict = {}
-    progress = _Progress(work / "database.db", tell)
-
-    def hear(said: dict) -> None:
-        if "result" in said:
-            found.update(said["result"])
-        else:
-            progress.begin(said["stage"], said["done"], said["of"])
-
     try:
-        _begin(work, settings)
-        images, given = out / "images", names
-        if photos.is_relative_to(out):
-            images = photos
-        else:
-            names = [_taken_over(photos, name, images) for name in given]
-        asked = settings | {
-            "photos": str(images), "names": names, "ordered": ordered, "work": str(work),
-            "masks": str(_link_masks(masks, photos, dict(zip(given, names, strict=True)), out)) if masks else "",
+        _start_work(work, settings)
+        images = photos if photos.is_relative_to(out) else out / "images"
+        image_names = names if images == photos else [_import_photo(photos, name, images) for name in names]
+        masks_folder = ""
+        if masks:
+            masks_folder = str(_link_masks(masks, photos, dict(zip(names, image_names, strict=True)), out))
+        request = settings | {
+            "photos": str(images), "names": image_names, "ordered": ordered, "work": str(work),
+            "masks": masks_folder,
         }  # fmt: skip
-        with progress:
-            problem = pycolmap_process.run_program("sfm", asked, work, hear)
-        if problem:
-            raise LodgsError(
-                f"COLMAP has ended without a scene: {problem}", "Do it again: it goes on where it was."
-            )
+        result = _run_colmap(request, work, report)
         with atomic_write(work / "pairs.png") as temporary:
-            write_png(temporary, draw_pairs(names, found["pairs"], found["placed"]))
-        if len(found["placed"]) < FEWEST:
-            what, remedy = _nothing(names, found, work)
-            raise LodgsError(" ".join([what, *exclusion_messages(left_out)]), remedy)
+            write_png(temporary, draw_pairs(image_names, result["pairs"], result["placed"]))
+        if len(result["placed"]) < MIN_PHOTOS:
+            what, remedy = _explain_failure(image_names, result, work)
+            raise LodgsError(" ".join([what, *exclusion_messages(excluded)]), remedy)
         (out / "sparse").mkdir(exist_ok=True)
         shutil.rmtree(out / "sparse" / "0", ignore_errors=True)
         os.replace(work / "model", out / "sparse" / "0")
         shutil.rmtree(work / "models", ignore_errors=True)
     except OSError as error:
         raise LodgsError(
-            f"The scene {out} could not be written: {error.strerror or error}.",
-            "Free some space there or choose another folder.",
+            f"Cannot write scene {out}: {error.strerror or error}.",
+            "Free disk space or choose another folder.",
         ) from error
-    words = _words(names, found)
     return ReconstructionResult(
-        out, len(names), found["placed"], found["points"], found["error"], words, exclusion_messages(left_out)
-    )
+        out, len(image_names), result["placed"], result["points"], result["error"],
+        _summarize(image_names, result), exclusion_messages(excluded),
+    )  # fmt: skip
 
 
 def draw_pairs(names: Sequence[str], pairs: Sequence[Sequence], placed: Sequence[str]) -> np.ndarray:
-    """Which photographs show the same, (S, S, 3) uint8: a row and a column of each, by name.
+    """Draw a matrix of matches between photos, (S, S, 3) uint8, with a row and a column per photo.
 
-    A square is as bright as the logarithm of the number of features that two have in common, and what has
-    found no place is red.
+    A square's brightness is the logarithm of the number of common features. Photos without a camera are red.
     """
-    place = {name: number for number, name in enumerate(names)}
-    common = np.zeros((len(names), len(names)))
-    for one, other, count in pairs:
-        if one in place and other in place:
-            common[place[one], place[other]] = common[place[other], place[one]] = count
-    light = np.log1p(common) / max(np.log1p(common.max(initial=0)), 1)
-    there = np.isin(names, list(placed))
-    np.fill_diagonal(light, 1)
-    codes = np.repeat((40 + 215 * light)[..., None], 3, axis=2)
-    codes[~there[:, None] | ~there[None, :]] *= (1, 0.25, 0.25)
-    each = max(720 // len(names), 1)
-    return np.repeat(np.repeat(codes.astype(np.uint8), each, axis=0), each, axis=1)
+    index = {name: number for number, name in enumerate(names)}
+    matches = np.zeros((len(names), len(names)))
+    for first, second, count in pairs:
+        if first in index and second in index:
+            matches[index[first], index[second]] = matches[index[second], index[first]] = count
+    brightness = np.log1p(matches) / max(np.log1p(matches.max(initial=0)), 1)
+    has_camera = np.isin(names, list(placed))
+    np.fill_diagonal(brightness, 1)
+    codes = np.repeat((40 + 215 * brightness)[..., None], 3, axis=2)
+    codes[~has_camera[:, None] | ~has_camera[None, :]] *= (1, 0.25, 0.25)
+    square = max(720 // len(names), 1)
+    return np.repeat(np.repeat(codes.astype(np.uint8), square, axis=0), square, axis=1)
 
 
 class _Progress:
-    """Tells how far the program is, meanwhile: COLMAP's functions tell nobody, but its database grows.
+    """Reports progress by polling COLMAP's database, because COLMAP's functions report none.
 
-    It is read from here: two copies of SQLite in one process break each other's locks.
+    This process polls, because two copies of SQLite in one process break each other's locks.
     """
 
-    def __init__(self, database: Path, tell: Tell) -> None:
-        self._address, self._tell = f"{database.as_uri()}?mode=ro", tell
-        self._stage, self._of, self._over = "", 0, threading.Event()
-        self._thread = threading.Thread(target=self._look, daemon=True)
+    def __init__(self, database: Path, report: Report) -> None:
+        self._address = f"{database.as_uri()}?mode=ro"
+        self._report = report
+        self._stage = ""
+        self._total = 0
+        self._finished = threading.Event()
+        self._thread = threading.Thread(target=self._poll, daemon=True)
 
     def __enter__(self) -> None:
         self._thread.start()
 
     def __exit__(self, *_: object) -> None:
-        self._over.set()
+        self._finished.set()
         self._thread.join()
 
-    def begin(self, stage: str, done: int, of: int) -> None:
-        self._stage, self._of = stage, of
-        self._tell(STAGES[stage], done, of)
+    def begin(self, stage: str, done: int, total: int) -> None:
+        self._stage = stage
+        self._total = total
+        self._report(STAGES[stage], done, total)
 
-    def _look(self) -> None:
-        before: tuple[str, int] = "", 0
-        while not self._over.wait(_LOOKS):
-            stage, of = self._stage, self._of
+    def _poll(self) -> None:
+        last: tuple[str, int] = "", 0
+        while not self._finished.wait(_POLL_SECONDS):
+            stage, total = self._stage, self._total
             if stage not in _TABLES:
                 continue
             try:
                 with closing(sqlite3.connect(self._address, uri=True)) as database:
                     done = database.execute(f"select count(*) from {_TABLES[stage]}").fetchone()[0]
-            except sqlite3.Error:  # not there yet
+            except sqlite3.Error:  # COLMAP has not created the table yet
                 continue
-            if (stage, done) != before and stage == self._stage:
-                self._tell(STAGES[stage], min(done, of), of)
-                before = stage, done
+            if (stage, done) != last and stage == self._stage:
+                self._report(STAGES[stage], min(done, total), total)
+                last = stage, done
 
 
-def _photographs(
-    photos: Path, others: Sequence[Path]
+def _list_photos(
+    photos: Path, excluded_folders: Sequence[Path]
 ) -> tuple[list[str], list[tuple[str, str]], set[tuple[int, int]]]:
-    """Names of what can be read, by name; other pictures and why not; and the sizes that there are.
+    """Return the names of readable photos, (name, reason) pairs of unusable images, and the photos' sizes.
 
     Args:
-        others: folders of pictures that are no photographs.
+        excluded_folders: folders of images that are not photos.
     """
-    remedy = "Choose the folder of the photographs; of a video make one: blender --command lodgs frames."
+    remedy = "Choose a folder of photos. To extract frames of a video: blender --command lodgs frames."
     check_folder(photos, remedy)
-    names, left_out, sizes = [], [], set()
+    names, excluded, sizes = [], [], set()
     files = [
         path
         for path in sorted(photos.rglob("*"))
         if not any(part.startswith(".") for part in path.relative_to(photos).parts)
-        and not any(path.is_relative_to(other) for other in others)
+        and not any(path.is_relative_to(folder) for folder in excluded_folders)
     ]
-    taken = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES]
-    taken = taken or [path for path in files if path.suffix.lower() == ".exr"]  # else they are depth maps
-    known = {path.with_suffix("") for path in taken}
+    candidates = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES]
+    if not candidates:  # next to other photos, EXR files are depth maps
+        candidates = [path for path in files if path.suffix.lower() == ".exr"]
+    readable = {path.with_suffix("") for path in candidates}
     for path in files:
-        if path.suffix.lower() in _UNREAD and path.with_suffix("") not in known:
+        if path.suffix.lower() in _UNSUPPORTED and path.with_suffix("") not in readable:
             kind = path.suffix[1:].upper()
-            left_out.append((path.relative_to(photos).as_posix(), f"{kind} is not read. Make JPEGs of them."))
-    for path in taken:
+            excluded.append(
+                (path.relative_to(photos).as_posix(), f"format {kind} is not supported. Convert it to JPEG.")
+            )
+    for path in candidates:
         name = path.relative_to(photos).as_posix()
         try:
             sizes.add(image_size(path))
             name.encode()
         except UnicodeEncodeError:
-            left_out.append((name, "its name is not UTF-8."))
+            excluded.append((name, "its name is not UTF-8."))
         except LodgsError as error:
-            left_out.append((name, error.what))
+            excluded.append((name, error.what))
         else:
             names.append(name)
-    return names, left_out, sizes
+    return names, excluded, sizes
 
 
-def _taken_over(photos: Path, name: str, images: Path) -> str:
-    """Puts a photograph into the scene's folder; its name there."""
+def _check_output(out: Path, work: Path) -> None:
+    """Raise LodgsError if the scene's folder contains a scene or files of another program."""
+    if (work / SETTINGS).is_file():
+        return
+    if out.is_dir() and find_models(out):
+        raise LodgsError(f"Cannot write scene: {out} already holds a COLMAP scene.", "Choose another folder.")
+    if work.exists():
+        raise LodgsError(
+            f"Cannot write scene: {out} holds a folder {work.name} of another program.",
+            "Choose another folder.",
+        )
+
+
+def _import_photo(photos: Path, name: str, images: Path) -> str:
+    """Link or convert a photo into the scene's image folder and return its image name."""
     if not name.lower().endswith(_WEBP):
         link_or_copy(photos / name, images / name)
         return name
-    name_there = f"{name}.png"
-    if not (images / name_there).exists():
+    png_name = f"{name}.png"
+    if not (images / png_name).exists():
         width, height = image_size(photos / name)
         codes = np.rint(255 * load_image(photos / name, width, height)).astype(np.uint8)
-        with atomic_write(images / name_there) as temporary:
+        with atomic_write(images / png_name) as temporary:
             write_png(temporary, codes)
-    return name_there
+    return png_name
 
 
-def _begin(work: Path, settings: Mapping[str, object]) -> None:
-    """What was found with other settings is of no use."""
-    file, text = work / SETTINGS, json.dumps(settings)
+def _start_work(work: Path, settings: Mapping[str, object]) -> None:
+    """Create the folder of intermediate results, and discard those of other settings."""
+    file = work / SETTINGS
+    text = json.dumps(settings)
     if file.is_file() and file.read_text(encoding="utf-8") != text:
         shutil.rmtree(work)
     work.mkdir(parents=True, exist_ok=True)
@@ -296,53 +300,80 @@ def _begin(work: Path, settings: Mapping[str, object]) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def _link_masks(masks: Path, photos: Path, names: Mapping[str, str], out: Path) -> Path:
-    """A folder of masks of photographs as COLMAP names them, whose names there are by those that they had."""
-    there = out / MASKS
-    for given, name in names.items():
-        found = SidecarFiles(masks, ".png").find(given)
-        if found is not None:
-            check_mask(found, *image_size(photos / given))
-            link_or_copy(found, there / f"{name}.png")
-    if not there.is_dir():
-        first = next(iter(names))
-        raise LodgsError(f"{masks} holds no mask of these photographs.", f"That of {first} is {first}.png.")
-    return there
+def _link_masks(masks: Path, photos: Path, image_names: Mapping[str, str], out: Path) -> Path:
+    """Link the masks into the scene under COLMAP's names and return their folder.
+
+    Args:
+        image_names: image name by photo name.
+    """
+    folder = out / MASKS
+    for name, image_name in image_names.items():
+        mask = SidecarFiles(masks, ".png").find(name)
+        if mask is not None:
+            check_mask(mask, *image_size(photos / name))
+            link_or_copy(mask, folder / f"{image_name}.png")
+    if not folder.is_dir():
+        first = next(iter(image_names))
+        raise LodgsError(
+            f"Cannot use masks: {masks} holds no mask of these photos.",
+            f"Name the mask of {first} {first}.png.",
+        )
+    return folder
 
 
-def _words(names: Sequence[str], found: Mapping) -> str:
-    placed, count = set(found["placed"]), len(names)
-    if len(placed) == count:
-        return f"All {count} photographs found their place."
-    inside, outside = _edge(names, found["pairs"], placed)
+def _run_colmap(request: dict, work: Path, report: Report) -> dict:
+    """Run structure from motion in a separate process and return its result."""
+    result: dict = {}
+    progress = _Progress(work / "database.db", report)
+
+    def on_message(message: dict) -> None:
+        if "result" in message:
+            result.update(message["result"])
+        else:
+            progress.begin(message["stage"], message["done"], message["total"])
+
+    with progress:
+        problem = pycolmap_process.run_program("sfm", request, work, on_message)
+    if problem:
+        raise LodgsError(f"Cannot reconstruct the photos: COLMAP stopped: {problem}", "Try again to resume.")
+    return result
+
+
+def _summarize(names: Sequence[str], result: Mapping) -> str:
+    placed = set(result["placed"])
+    if len(placed) == len(names):
+        return f"All {len(names)} photos are placed."
+    inside, outside = _weakest_link(names, result["pairs"], placed)
     return (
-        f"{len(placed)} of {count} photographs found their place: too little overlap between "
-        f"{inside} and {outside}. Take some between them, or do without the others."
+        f"{len(placed)} of {len(names)} photos are placed: {inside} and {outside} overlap too little. "
+        "Take photos between them, or continue without the missing ones."
     )
 
 
-def _nothing(names: Sequence[str], found: Mapping, work: Path) -> tuple[str, str]:
-    bare = [name for name in names if found["features"].get(name, 0) < 100]
-    if len(bare) > len(names) / 2:
+def _explain_failure(names: Sequence[str], result: Mapping, work: Path) -> tuple[str, str]:
+    """Return the reason why no scene was reconstructed, and a remedy."""
+    featureless = [name for name in names if result["features"].get(name, 0) < MIN_FEATURES]
+    if len(featureless) > len(names) / 2:
         return (
-            f"{len(bare)} of {len(names)} photographs show hardly anything that could be recognised.",
-            "Take sharp photographs of things with texture.",
+            f"Cannot reconstruct the photos: {len(featureless)} of {len(names)} have almost no features.",
+            "Take sharp photos of textured objects.",
         )
     return (
-        f"None of the {len(names)} photographs found its place: no {FEWEST} of them overlap enough.",
-        f"Take photographs a step apart that share two thirds. {work / 'pairs.png'} shows which share some.",
+        f"Cannot reconstruct the photos: no {MIN_PHOTOS} of the {len(names)} photos overlap enough.",
+        "Take photos from close positions that share two thirds of the image. "
+        f"{work / 'pairs.png'} shows the overlaps.",
     )
 
 
-def _edge(names: Sequence[str], pairs: Sequence[Sequence], placed: set[str]) -> tuple[str, str]:
-    """Of what has a place and what has none the two that have the most in common, or that are neighbours."""
-    across = [
-        (count, one, other) if one in placed else (count, other, one)
-        for one, other, count in pairs
-        if (one in placed) != (other in placed)
+def _weakest_link(names: Sequence[str], pairs: Sequence[Sequence], placed: set[str]) -> tuple[str, str]:
+    """Return the placed and the missing photo with the most common features, or else adjacent names."""
+    links = [
+        (count, first, second) if first in placed else (count, second, first)
+        for first, second, count in pairs
+        if (first in placed) != (second in placed)
     ]
-    if across:
-        _, inside, outside = max(across)
+    if links:
+        _, inside, outside = max(links)
         return inside, outside
-    one, other = next((a, b) for a, b in pairwise(names) if (a in placed) != (b in placed))
-    return (one, other) if one in placed else (other, one)
+    first, second = next((a, b) for a, b in pairwise(names) if (a in placed) != (b in placed))
+    return (first, second) if first in placed else (second, first)

@@ -1,9 +1,9 @@
-"""Views that a renderer drew with exact cameras and depths become a COLMAP scene.
+"""COLMAP scenes from rendered views with exact cameras and depth maps.
 
-folder/  images/view_0001.png   the picture, as photographs are
-         depths/view_0001.exr   depth along the camera's z axis, in a channel Depth.Z, as Blender writes it
-         cameras/view_0001.json the camera, as ``write_camera`` writes it
-         sparse/0/*.bin         the model: what is made here
+folder/  images/view_0001.png    rendered image
+         depths/view_0001.exr    depth along the camera's z axis in a channel Depth.Z, as Blender writes it
+         cameras/view_0001.json  camera, as ``write_camera`` writes it
+         sparse/0/*.bin          the model written here
 """
 
 from __future__ import annotations
@@ -23,26 +23,26 @@ from .images import load_image
 from .visibility import visible_points
 
 IMAGES, CAMERAS = "images", "cameras"
-"""The folders of what was drawn."""
+"""Folders of the rendered images and their cameras."""
 MAX_POINTS = 100_000
-"""At most so many points a model gets."""
+"""Maximum number of points of a model."""
 SKY_DEPTH = 1e9
-"""Depths from here on are of nothing: renderers put 1e10 there."""
+"""Minimum depth of pixels without a surface; renderers write 1e10."""
 SKY_SHARE = 0.1
-"""At most so many of all points are of the sky."""
+"""Maximum fraction of the points that represents the sky."""
 SKY_FACTOR, MIN_SKY_DISTANCE = 2, 20
-"""How many times as far the sky is as the farthest surface, and at least, as the cameras are apart."""
-_LOOKS = 10
-"""Pixels that are looked at for each point, about."""
+"""Minimum radius of the sky, in multiples of the farthest surface's and of the farthest camera's distance."""
+_CANDIDATES_PER_POINT = 10
+"""Approximate number of pixels sampled per point."""
 _PRIMES = np.array([73856093, 19349663, 83492791, 15485863])
 
-Tell = Callable[[int, int], object]
-"""Is told before each view which one it is, from 1 on, and of how many."""
+Report = Callable[[int, int], object]
+"""Callback that receives the number of the next view, from 1, and the number of views."""
 
 
 @dataclass(frozen=True)
 class Sky:
-    """A sphere around all that views show, for what they show of no surface.
+    """A sphere around the scene that stands for everything without a surface.
 
     Attributes:
         center: (3,) in the world.
@@ -51,135 +51,143 @@ class Sky:
     center: np.ndarray
     radius: float
 
-    def behind(self, view: Camera, depth: np.ndarray) -> np.ndarray:
-        """A view's depths (H, W), where there is nothing the sphere's."""
+    def fill_depth(self, view: Camera, depth: np.ndarray) -> np.ndarray:
+        """Return a view's depths (H, W) with the sphere's depth at pixels without a surface."""
         y, x = np.nonzero(depth >= SKY_DEPTH)
-        eye = view.center - self.center
+        origin = view.center - self.center
         rays = view.unproject(np.column_stack([x, y]) + 0.5, np.ones(len(x))) - view.center
-        a, b, c = (rays**2).sum(1), rays @ eye, eye @ eye - self.radius**2
+        a, b, c = (rays**2).sum(1), rays @ origin, origin @ origin - self.radius**2
         filled = depth.copy()
         filled[y, x] = (np.sqrt(b**2 - a * c) - b) / a
         return filled
 
 
 def write_rendered_model(
-    folder: Path, most: int = MAX_POINTS, tell: Tell = lambda number, count: None
+    folder: Path, limit: int = MAX_POINTS, report: Report = lambda number, count: None
 ) -> tuple[int, int]:
-    """Writes folder/sparse/0/*.bin: the cameras, and points at random pixels, as close as pixels are.
+    """Write folder/sparse/0/*.bin with the cameras and surface points at random pixels.
 
-    Each has its pixel's colour, and a track of views that see it. Those of a sky that pictures show (not
-    where they are transparent) lie on a :class:`Sky`. Depths are read again for the tracks: one view is in
-    memory at a time.
+    Points are spaced like the pixels. Each has its pixel's colour and a track of views that see it. Opaque
+    pixels without a surface give points on a :class:`Sky`; transparent ones give none. Depth maps are read a
+    second time for the tracks, so only one view is in memory at a time.
+
+    Args:
+        limit: maximum number of points.
 
     Returns:
-        How many views and points there are.
+        The number of views and the number of points.
 
     Raises:
-        LodgsError: a view lacks a file or a depth, or no two views see the same.
+        LodgsError: if a view lacks a file or depth, or no two views show the same surface.
     """
-    from .write_colmap import write_visible_points  # pycolmap, which reading lacks
+    from .write_colmap import write_visible_points  # imports pycolmap, which reading must not require
 
-    drawn, _ = read_camera_folder(folder / CAMERAS)
-    views = [replace(view, name=f"{view.name}.png") for view in drawn]
-    files = [folder / DEPTHS / f"{view.name}.exr" for view in drawn]
+    cameras, _ = read_camera_folder(folder / CAMERAS)
+    views = [replace(camera, name=f"{camera.name}.png") for camera in cameras]
+    depth_files = [folder / DEPTHS / f"{view.name}.exr" for view in cameras]
 
-    def shown() -> Iterator[tuple[Camera, np.ndarray, np.ndarray]]:
-        for number, (view, file) in enumerate(zip(views, files, strict=True)):
-            tell(number + 1, len(views))
-            picture = load_image(folder / IMAGES / view.name, view.width, view.height, alpha=True)
+    def load_views() -> Iterator[tuple[Camera, np.ndarray, np.ndarray]]:
+        for number, (view, file) in enumerate(zip(views, depth_files, strict=True)):
+            report(number + 1, len(views))
+            image = load_image(folder / IMAGES / view.name, view.width, view.height, alpha=True)
             depth = read_exr_depth(file)
-            if depth.shape != picture.shape[:2]:
+            if depth.shape != image.shape[:2]:
                 raise LodgsError(
-                    f"{file} is not of its camera's size of {view.width}x{view.height}.",
+                    f"Cannot use depth map {file}: its size {depth.shape[1]}x{depth.shape[0]} differs "
+                    f"from its camera's {view.width}x{view.height}.",
                     "Render the view again.",
                 )
-            yield view, depth, picture
+            yield view, depth, image
 
-    points, colors, sky = sample_surfaces(shown(), len(views), most, np.random.default_rng(0))
+    points, colors, sky = sample_surfaces(load_views(), len(views), limit, np.random.default_rng(0))
 
     def depth_of(number: int) -> np.ndarray:
-        depth = read_exr_depth(files[number])
-        return depth if sky is None else sky.behind(views[number], depth)
+        depth = read_exr_depth(depth_files[number])
+        return depth if sky is None else sky.fill_depth(views[number], depth)
 
-    beside = folder / ".model.tmp"
+    temporary = folder / ".model.tmp"
     try:
-        shutil.rmtree(beside, ignore_errors=True)
-        count = write_visible_points(beside, views, depth_of, points, 255 * colors)
+        shutil.rmtree(temporary, ignore_errors=True)
+        count = write_visible_points(temporary, views, depth_of, points, 255 * colors)
         shutil.rmtree(folder / "sparse", ignore_errors=True)
-        (beside / "sparse").rename(folder / "sparse")
+        (temporary / "sparse").rename(folder / "sparse")
     except OSError as error:
         raise LodgsError(
-            f"The model in {folder} could not be written: {error.strerror or error}.",
-            "Free some space there.",
+            f"Cannot write the model in {folder}: {error.strerror or error}.", "Free disk space."
         ) from error
     finally:
-        shutil.rmtree(beside, ignore_errors=True)
+        shutil.rmtree(temporary, ignore_errors=True)
     return len(views), count
 
 
 def sample_surfaces(
-    views: Iterable[tuple[Camera, np.ndarray, np.ndarray]], count: int, most: int, rng: np.random.Generator
+    views: Iterable[tuple[Camera, np.ndarray, np.ndarray]], count: int, limit: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, Sky | None]:
-    """Places (P, 3), at most so many, at random pixels, as close as these are, see :func:`thin_by_grid`; and the
-    colours (P, 3) there.
+    """Sample surface points (P, 3) at random pixels, spaced like the pixels, see :func:`thin_by_grid`.
 
     Args:
-        views: each with its depths (H, W), from SKY on where there is nothing, and its picture (H, W, 3); or
-            (H, W, 4) over black, with alpha, where the sky is wanted.
-        count: how many views there are.
+        views: camera; depths (H, W), at least SKY_DEPTH without a surface; and image (H, W, 3), or (H, W, 4)
+            over black with alpha to include the sky.
+        count: number of views.
+        limit: maximum number of points.
 
     Returns:
-        The places, surfaces before sky; the colours; and where the sky is, if there is any.
+        The points, surfaces before sky; their colours (P, 3); and the sky, if visible.
     """
-    found, sizes, colors, eyes = [], [], [], []
-    for view, depth, picture in views:
-        there = depth < SKY_DEPTH
-        if picture.shape[2] == 4:
-            there |= picture[..., 3] > 0.99
-        y, x = np.nonzero(there)
-        some = rng.permutation(len(x))[: most * _LOOKS // count + 1]
-        y, x = y[some], x[some]
-        color = picture[y, x]
-        if picture.shape[2] == 4:
+    view_points, pixel_sizes, view_colors, positions = [], [], [], []
+    for view, depth, image in views:
+        valid = depth < SKY_DEPTH
+        if image.shape[2] == 4:
+            valid |= image[..., 3] > 0.99
+        y, x = np.nonzero(valid)
+        sample = rng.permutation(len(x))[: limit * _CANDIDATES_PER_POINT // count + 1]
+        y, x = y[sample], x[sample]
+        color = image[y, x]
+        if image.shape[2] == 4:
             color = color[:, :3] / np.maximum(color[:, 3:], 1e-3)
-        found.append(view.unproject(np.column_stack([x, y]) + 0.5, depth[y, x]))
-        sizes.append(depth[y, x] / view.focal)
-        colors.append(color)
-        eyes.append(view.center)
-    points, size, color = map(np.concatenate, (found, sizes, colors))
-    away = np.linalg.norm(points - (center := np.mean(eyes, axis=0)), axis=1)
-    above = away >= SKY_DEPTH
-    room = round(SKY_SHARE * most)
-    kept = np.flatnonzero(~above)
-    kept = kept[thin_by_grid(points[kept], size[kept], most - room if above.any() else most, rng)]
-    if not above.any() or not len(kept):
-        return points[kept], color[kept], None
-    apart = np.linalg.norm(eyes - center, axis=1).max()
-    sky = Sky(center, max(SKY_FACTOR * float(away[~above].max()), MIN_SKY_DISTANCE * float(apart)))
-    high = np.flatnonzero(above)
-    points[high] = center + sky.radius * (points[high] - center) / away[high, None]
-    high = high[thin_by_grid(points[high], size[high], min(room, round(SKY_SHARE * len(kept))), rng)]
-    kept = np.concatenate([kept, high])
-    return points[kept], color[kept], sky
+        view_points.append(view.unproject(np.column_stack([x, y]) + 0.5, depth[y, x]))
+        pixel_sizes.append(depth[y, x] / view.focal)
+        view_colors.append(color)
+        positions.append(view.center)
+    points, size, color = map(np.concatenate, (view_points, pixel_sizes, view_colors))
+    center = np.mean(positions, axis=0)
+    distance = np.linalg.norm(points - center, axis=1)
+    is_sky = distance >= SKY_DEPTH
+    max_sky = round(SKY_SHARE * limit)
+    chosen = np.flatnonzero(~is_sky)
+    chosen = chosen[
+        thin_by_grid(points[chosen], size[chosen], limit - max_sky if is_sky.any() else limit, rng)
+    ]
+    if not is_sky.any() or not len(chosen):
+        return points[chosen], color[chosen], None
+    camera_radius = np.linalg.norm(positions - center, axis=1).max()
+    radius = max(SKY_FACTOR * float(distance[~is_sky].max()), MIN_SKY_DISTANCE * float(camera_radius))
+    sky = Sky(center, radius)
+    sky_rows = np.flatnonzero(is_sky)
+    points[sky_rows] = center + sky.radius * (points[sky_rows] - center) / distance[sky_rows, None]
+    max_sky = min(max_sky, round(SKY_SHARE * len(chosen)))
+    sky_rows = sky_rows[thin_by_grid(points[sky_rows], size[sky_rows], max_sky, rng)]
+    chosen = np.concatenate([chosen, sky_rows])
+    return points[chosen], color[chosen], sky
 
 
 def sample_coverage(
-    views: Sequence[Camera], depths: Sequence[np.ndarray], most: int
+    views: Sequence[Camera], depths: Sequence[np.ndarray], limit: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Places (N, 3) on what V views show, at most so many, and how many views see each, (N,) from 1 on.
+    """Sample surface points (N, 3) of V views, and count the views that see each point, (N,) from 1.
 
     Args:
-        depths: (H, W) of each view along its z axis; its grid may be another one than the camera's.
-            0 where there is nothing.
+        depths: (H, W) of each view along its z axis, at any resolution; 0 without a surface.
+        limit: maximum number of points.
     """
-    found, away = [np.zeros((0, 3))], [np.zeros(0)]
+    view_points, view_depths = [np.zeros((0, 3))], [np.zeros(0)]
     for view, depth in zip(views, depths, strict=True):
         y, x = np.nonzero(depth)
         pixels = (np.column_stack([x, y]) + 0.5) * (view.width / depth.shape[1])
-        found.append(view.unproject(pixels, depth[y, x]))
-        away.append(depth[y, x])
-    points, distances = np.concatenate(found), np.concatenate(away)
-    points = points[thin_evenly(points, distances, most, np.random.default_rng(0))]
+        view_points.append(view.unproject(pixels, depth[y, x]))
+        view_depths.append(depth[y, x])
+    points, point_depths = np.concatenate(view_points), np.concatenate(view_depths)
+    points = points[thin_evenly(points, point_depths, limit, np.random.default_rng(0))]
     counts = np.zeros(len(points), np.int64)
     for view, depth in zip(views, depths, strict=True):
         counts += visible_points(depth, view, points)[1]
@@ -187,51 +195,57 @@ def sample_coverage(
 
 
 def read_exr_depth(file: Path) -> np.ndarray:
-    """Depths (H, W) float64 of an EXR, the nearest of its layers' Depth.Z; FARTHEST where there is nothing.
+    """Read depths (H, W) float64 of an EXR, with MAX_COORDINATE for pixels without a surface.
 
-    Where there is none of that name: of channels that are called Z, depth or V.
+    The depth is the nearest of the layers' Depth.Z channels. Without these, channels named Z, depth or V
+    count.
 
     Raises:
-        LodgsError: it cannot be read, or holds none.
+        LodgsError: if the file cannot be read or contains no depth.
     """
     try:
-        channels = [each for _, _, part in read_parts(file) for each in part.items()]
+        channels = [channel for _, _, part in read_parts(file) for channel in part.items()]
     except (RuntimeError, OSError, ValueError) as error:
-        raise LodgsError(f"{file} cannot be read: {error}.", "Render the view again.") from error
+        raise LodgsError(f"Cannot read {file}: {error}.", "Render the view again.") from error
     layers = [pixels for name, pixels in channels if name.endswith("Depth.Z")]
     if not layers:
         layers = [pixels for name, pixels in channels if name.lower() in ("z", "depth", "v")]
     if not layers:
-        raise LodgsError(f"{file} holds no depth.", "Render with an engine that has the pass Depth.")
+        raise LodgsError(
+            f"Cannot read depth from {file}: it has no depth channel.",
+            "Render with an engine that supports the Depth pass.",
+        )
     nearest = np.min(layers, axis=0).astype(np.float64)
     return np.where((nearest > 0) & (nearest < SKY_DEPTH), nearest, MAX_COORDINATE)
 
 
-def thin_evenly(points: np.ndarray, depths: np.ndarray, most: int, rng: np.random.Generator) -> np.ndarray:
-    """Which of some points (N, 3) to keep, at most so many: even in space up to the median of their depths
-    (N,), and beyond farther apart as they are deeper."""
-    return thin_by_grid(points, np.maximum(depths, np.median(depths)) if len(depths) else depths, most, rng)
+def thin_evenly(points: np.ndarray, depths: np.ndarray, limit: int, rng: np.random.Generator) -> np.ndarray:
+    """Return the indices of at most ``limit`` of the points (N, 3), evenly spaced.
+
+    Beyond the median of the depths (N,), the spacing grows with the depth.
+    """
+    return thin_by_grid(points, np.maximum(depths, np.median(depths)) if len(depths) else depths, limit, rng)
 
 
-def thin_by_grid(points: np.ndarray, sizes: np.ndarray, most: int, rng: np.random.Generator) -> np.ndarray:
-    """Which of some points (N, 3) to keep, at most so many: one in each cube of a grid, at random.
+def thin_by_grid(points: np.ndarray, sizes: np.ndarray, limit: int, rng: np.random.Generator) -> np.ndarray:
+    """Return the indices of at most ``limit`` points (N, 3), one random point per grid cube.
 
-    The cubes are the smallest that are few enough. They are as large as sizes (N,) are, those of the pixels
-    that show the points, but in powers of two.
+    The cubes are as small as the limit allows. Their sides are proportional to the pixel sizes (N,) of the
+    points, rounded to powers of two.
     """
     order = rng.permutation(len(points))
-    if len(points) <= most:
+    if len(points) <= limit:
         return order
-    middle = float(np.median(sizes))
-    octave = np.floor(np.log2(sizes / middle)).astype(np.int64)[order]
-    places = points[order] / 2.0 ** octave[:, None]
+    median_size = float(np.median(sizes))
+    octave = np.floor(np.log2(sizes / median_size)).astype(np.int64)[order]
+    scaled = points[order] / 2.0 ** octave[:, None]
 
-    def firsts(side: float) -> np.ndarray:
-        cubes = np.column_stack([np.floor(places / side).astype(np.int64), octave])
+    def first_per_cube(side: float) -> np.ndarray:
+        cubes = np.column_stack([np.floor(scaled / side).astype(np.int64), octave])
         return np.unique(cubes @ _PRIMES, return_index=True)[1]
 
-    low, high = np.log2([1e-3 * middle, 1e6 * middle])
+    low, high = np.log2([1e-3 * median_size, 1e6 * median_size])
     while high - low > 0.05:
         half = (low + high) / 2
-        low, high = (low, half) if len(firsts(2.0**half)) <= most else (half, high)
-    return order[firsts(2.0**high)[:most]]
+        low, high = (low, half) if len(first_per_cube(2.0**half)) <= limit else (half, high)
+    return order[first_per_cube(2.0**high)[:limit]]

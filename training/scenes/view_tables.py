@@ -1,9 +1,9 @@
-"""Where a scene was photographed from, as a table of a bundle: cameras without their pictures. numpy only.
+"""Views of a scene as bundle tables: cameras without their images. numpy only.
 
-The table ``views`` has a row for each view: ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy``, ``near``
-(the depth at which drawing begins), ``held_out`` (1 where training did not see it) and the first three rows
-of ``world_to_camera``, ``w2c_00`` to ``w2c_23``. Tables hold no text, so the names of the views are one after
-another in the table ``view_names``: UTF-8, each ended by a 0.
+The table ``views`` has one row per view: ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy``, ``near``
+(near depth for rendering), ``held_out`` (1 for views not used in training) and the first three rows of
+``world_to_camera``, ``w2c_00`` to ``w2c_23``. Tables cannot store text, so the table ``view_names`` holds the
+concatenated names in UTF-8, each terminated by a 0 byte.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from .cameras import Camera, camera_from_dict
 
 VIEWS, NAMES = "views", "view_names"
 VIEW_TABLES = (VIEWS, NAMES)
-"""What no rule reads, and removing splats does not touch."""
+"""Names of the tables, which are independent of rules and unaffected by the removal of splats."""
 _POSE = tuple(f"w2c_{row}{column}" for row in range(3) for column in range(4))
 _LENS = ("fx", "fy", "cx", "cy")
 
@@ -27,11 +27,11 @@ _LENS = ("fx", "fy", "cx", "cy")
 def make_view_tables(
     cameras: Sequence[Camera], near: float, held_out: Collection[str] = ()
 ) -> dict[str, Columns]:
-    """The tables of views by name; none where there are no views.
+    """Return the tables of views by table name; empty without views.
 
     Args:
-        near: depth at which drawing begins in all of them.
-        held_out: names of those that training did not see.
+        near: near depth of all views.
+        held_out: names of the views not used in training.
     """
     if not cameras:
         return {}
@@ -50,11 +50,12 @@ def make_view_tables(
 
 
 def read_view_tables(tables: dict[str, Columns]) -> tuple[list[Camera], float, set[str]]:
-    """What :func:`make_view_tables` was told: the views of a bundle, the depth at which drawing begins, and which of
-    them by name training did not see. No views where the tables are missing.
+    """Return the cameras, near depth and names of held-out views stored by :func:`make_view_tables`.
+
+    Without the tables, there are no cameras.
 
     Raises:
-        LodgsError: they are damaged.
+        LodgsError: if the tables are damaged.
     """
     views = tables.get(VIEWS)
     if views is None:
@@ -64,27 +65,28 @@ def read_view_tables(tables: dict[str, Columns]) -> tuple[list[Camera], float, s
         names = text.decode("utf-8", "surrogateescape").split("\0")[:-1]
         poses = np.stack([views[name] for name in _POSE], axis=1).reshape(-1, 3, 4)
         rows = [dict(zip(views, row, strict=True)) for row in zip(*views.values(), strict=True)]
-        found, held_out = [], set()
+        cameras = []
+        held_out = set()
         for name, row, pose in zip(names, rows, poses, strict=True):
             camera, _ = camera_from_dict(
                 row | {"name": name, "world_to_camera": [*pose, (0.0, 0.0, 0.0, 1.0)]}
             )
-            found.append(camera)
+            cameras.append(camera)
             if row["held_out"]:
                 held_out.add(name)
-        return found, min((float(row["near"]) for row in rows), default=0.0), held_out
+        return cameras, min((float(row["near"]) for row in rows), default=0.0), held_out
     except (KeyError, ValueError, TypeError) as error:
         raise LodgsError(
-            f"The views of these splats are damaged ({type(error).__name__}: {error}).",
-            "Another program may have changed the file; export it again.",
+            f"Cannot read the views of the splats: damaged tables ({type(error).__name__}: {error}).",
+            "Export the splats again; another program may have changed the file.",
         ) from error
 
 
-def transform_views(views: Columns, placement: Similarity) -> Columns:
-    """The table ``views`` of a scene that stands elsewhere: the pictures stay the same."""
-    found, (turn, shift) = dict(views), (placement.rotation, placement.translation)
+def transform_views(views: Columns, transform: Similarity) -> Columns:
+    """Return the table ``views`` of a transformed scene; the images stay the same."""
+    rotation, translation = transform.rotation, transform.translation
     poses = np.stack([views[name] for name in _POSE], axis=1).astype(np.float64).reshape(-1, 3, 4)
-    poses[:, :, :3] = poses[:, :, :3] @ turn.T
-    poses[:, :, 3] = placement.scale * poses[:, :, 3] - poses[:, :, :3] @ shift
-    found |= dict(zip(_POSE, poses.reshape(-1, 12).T, strict=True))
-    return found | {"near": views["near"] * placement.scale}
+    poses[:, :, :3] = poses[:, :, :3] @ rotation.T
+    poses[:, :, 3] = transform.scale * poses[:, :, 3] - poses[:, :, :3] @ translation
+    columns = dict(zip(_POSE, poses.reshape(-1, 12).T, strict=True))
+    return {**views, **columns, "near": views["near"] * transform.scale}

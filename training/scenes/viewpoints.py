@@ -1,4 +1,4 @@
-"""Where to look at splats from that no photograph shows: all around, above, or along a way. numpy only."""
+"""Cameras for capturing splats or Blender scenes: on a dome, from above, or along a path. numpy only."""
 
 from __future__ import annotations
 
@@ -9,173 +9,181 @@ from ..splats.gaussians import Splats
 from .cameras import Camera, look_at
 
 INSIDE = 0.9
-"""The share of opaque splats that a dome is to show whole."""
+"""Fraction of the opaque splats that each dome view contains."""
 OPAQUE = 0.5
+"""Minimum opacity of the splats that determine the views."""
 DOMES = (1.1, 2.2)
-"""Radii of a dome's two shells, in multiples of the distance from which the splats fill the picture."""
+"""Radii of the dome's two shells, in multiples of the distance at which the splats fill the image."""
 UP = (0.0, -1.0, 0.0)
-"""As in most COLMAP worlds."""
+"""Up direction of most COLMAP worlds."""
 NEAR_SHARE = 0.01
-"""Depth at which drawing begins, as a share of the distance to the splats' middle."""
+"""Near depth as a fraction of the distance to the splats' centre."""
 FOCAL = 1.2
-"""Focal length of the views, in heights of their picture."""
+"""Focal length of the views, in image heights."""
 HEIGHT = 2.0
-"""Height of views above an area, in multiples of how far they are apart."""
+"""Default height of aerial views above the top, in multiples of their spacing."""
 SIDES = ((0, 0), (0, 1), (1, 0), (0, -1), (-1, 0))
-"""From where views above an area look at it, in turn, in heights: straight down, and from four sides."""
+"""Horizontal offsets of aerial views, in multiples of their height: straight down, then from four sides."""
 TURNS = (0, 60, -60, 180, 120, -120)
-"""Where views along a way look, one after the other, in degrees from ahead: together all around."""
+"""Headings of consecutive path views, in degrees from the path's direction; they cover a full turn."""
 
 
 def dome_views(splats: Splats, count: int, width: int = 960, height: int = 640) -> tuple[list[Camera], float]:
-    """Views of splats from all around, on two shells, and the depth at which drawing begins.
+    """Return views of splats from all directions on two shells, and their near depth.
 
-    Which way is up, and whether splats are to be seen from inside, they do not say: for a room or a street
-    give a way to walk, or cameras of your own.
+    The up direction is assumed, and the views look from outside. For a room or a street, use a path or custom
+    cameras.
 
     Raises:
-        LodgsError: there is no opaque splat to look at.
+        LodgsError: if there is no opaque splat.
     """
     return dome_views_around(opaque_means(splats), count, width, height)
 
 
 def dome_views_around(
-    places: np.ndarray,
+    points: np.ndarray,
     count: int,
     width: int = 960,
     height: int = 640,
     up: tuple[float, float, float] = UP,
     lowest: float = -1.0,
 ) -> tuple[list[Camera], float]:
-    """As :func:`dome_views`, of places (N, 3) float64: of opaque splats or some of them, or of a thing's corners.
+    """Return views of points (N, 3) float64 as :func:`dome_views`, and their near depth.
 
     Args:
-        up: what is up in the pictures, along an axis.
-        lowest: sine of the elevation at which the dome begins: 0 on the level, -1 straight below.
+        points: means of opaque splats, a sample of them, or corners of an object.
+        up: up direction of the images, along an axis.
+        lowest: sine of the dome's lowest elevation: 0 is level, -1 straight below.
 
     Raises:
-        LodgsError: there are none.
+        LodgsError: if there is no point.
     """
-    if not len(places):
-        raise _nothing()
-    middle = np.median(places, axis=0)
-    radius = max(float(np.quantile(np.linalg.norm(places - middle, axis=1), INSIDE)), 1e-6)
-    fills = radius * np.hypot(1, 2 * FOCAL)  # a ball of that radius meets the upper and lower edge
+    if not len(points):
+        raise _no_splats_error()
+    middle = np.median(points, axis=0)
+    radius = max(float(np.quantile(np.linalg.norm(points - middle, axis=1), INSIDE)), 1e-6)
+    fill_distance = radius * np.hypot(1, 2 * FOCAL)  # a ball of this radius touches the top and bottom edges
     number = np.arange(count)
-    sine, turn = lowest + (1 - lowest) * (number + 0.5) / count, number * 2.399963  # evenly, along a spiral
-    ring = np.sqrt(1 - sine**2)
-    away = sine[:, None] * np.array(up)
-    away[:, np.flatnonzero(np.array(up) == 0)] = np.stack([ring * np.cos(turn), ring * np.sin(turn)], axis=1)
-    eyes = middle + fills * np.where(number % 2, *DOMES)[:, None] * away
+    elevation_sine = lowest + (1 - lowest) * (number + 0.5) / count
+    azimuth = number * 2.399963  # golden angle: an even spiral
+    ring = np.sqrt(1 - elevation_sine**2)
+    outward = elevation_sine[:, None] * np.array(up)
+    outward[:, np.flatnonzero(np.array(up) == 0)] = np.stack(
+        [ring * np.cos(azimuth), ring * np.sin(azimuth)], axis=1
+    )
+    positions = middle + fill_distance * np.where(number % 2, *DOMES)[:, None] * outward
     lens = _lens(width, height)
-    views = [Camera(f"dome_{n:04d}", *lens, look_at(eye, middle, up)) for n, eye in enumerate(eyes)]
-    return views, NEAR_SHARE * fills
+    views = [
+        Camera(f"dome_{n:04d}", *lens, look_at(position, middle, up)) for n, position in enumerate(positions)
+    ]
+    return views, NEAR_SHARE * fill_distance
 
 
 def aerial_views(
-    places: np.ndarray, count: int, width: int = 960, height: int = 640, raised: float = 0.0
+    points: np.ndarray, count: int, width: int = 960, height: int = 640, altitude: float = 0.0
 ) -> tuple[list[Camera], float]:
-    """Views of an area as a drone takes them: at one height, evenly spread, straight down and from four sides
-    in turn; and the depth at which drawing begins.
+    """Return evenly spaced views of an area from one height, and their near depth.
+
+    Like a drone's photos, they look straight down and obliquely from four sides in turn.
 
     Args:
-        places: (N, 3) float64 of splats, or of things' corners, z up. The few outermost do not count.
-        raised: how far the views are above the top; 0 for HEIGHT times as far as they are apart.
+        points: (N, 3) float64 splat means or object corners, z up; the outermost ones are ignored.
+        altitude: height above the top; 0 selects HEIGHT times the spacing of the views.
 
     Raises:
-        LodgsError: there are none, or they have no extent on the ground.
+        LodgsError: if there is no point, or the points have no horizontal extent.
     """
-    if not len(places):
-        raise _nothing()
-    low, high = np.quantile(places, [(1 - INSIDE) / 2, (1 + INSIDE) / 2], axis=0)
+    if not len(points):
+        raise _no_splats_error()
+    low, high = np.quantile(points, [(1 - INSIDE) / 2, (1 + INSIDE) / 2], axis=0)
     sides = high[:2] - low[:2]
     if not sides.max() > 0:
-        raise LodgsError("What is to be seen from above has no extent.", "Choose something larger.")
+        raise LodgsError("Cannot view the area from above: it has no extent.", "Choose a larger area.")
     shape = np.maximum(sides, 1e-3 * sides.max())
     rows = min(max(round(float(np.sqrt(count * shape[1] / shape[0]))), 1), count)
     number = np.arange(count)
     row = number * rows // count
-    first, many = np.searchsorted(row, row), np.bincount(row)[row]
+    first, columns = np.searchsorted(row, row), np.bincount(row)[row]
     column = number - first
-    across = np.stack([(column + 0.5) / many, (row + 0.5) / rows], axis=1)
-    raised = raised or HEIGHT * float(max(sides[0] * rows / count, sides[1] / rows))
-    targets = np.column_stack([low[:2] + across * sides, np.full(count, high[2])])
-    side = np.array(SIDES)[(column + 2 * row) % len(SIDES)]  # each kind evenly spread, too
-    eyes = targets + raised * np.column_stack([side, np.ones(count)])
+    fractions = np.stack([(column + 0.5) / columns, (row + 0.5) / rows], axis=1)
+    altitude = altitude or HEIGHT * float(max(sides[0] * rows / count, sides[1] / rows))
+    targets = np.column_stack([low[:2] + fractions * sides, np.full(count, high[2])])
+    side = np.array(SIDES)[(column + 2 * row) % len(SIDES)]  # spreads each kind of view evenly, too
+    positions = targets + altitude * np.column_stack([side, np.ones(count)])
     lens = _lens(width, height)
     views = [
-        Camera(f"above_{n:04d}", *lens, look_at(eye, target, (0.0, 0.0, 1.0)))
-        for n, (eye, target) in enumerate(zip(eyes, targets, strict=True))
+        Camera(f"above_{n:04d}", *lens, look_at(position, target, (0.0, 0.0, 1.0)))
+        for n, (position, target) in enumerate(zip(positions, targets, strict=True))
     ]
-    return views, NEAR_SHARE * raised
+    return views, NEAR_SHARE * altitude
 
 
 def walk_views(
-    splats: Splats, way: np.ndarray, up: np.ndarray, count: int, width: int = 960, height: int = 640
+    splats: Splats, path: np.ndarray, up: np.ndarray, count: int, width: int = 960, height: int = 640
 ) -> tuple[list[Camera], float]:
-    """Views evenly along a way, level, that look ahead, to both sides and back in turn.
+    """Return level views along a path that look ahead, to both sides and back in turn, and their near depth.
 
     Args:
-        way: (P, 3) its corners, in the splats' world.
-        up: (3,) what is up in the pictures, in the splats' world.
-
-    Returns:
-        The views and, as for a dome, the depth at which drawing begins.
+        path: (P, 3) corners in the splats' world.
+        up: (3,) up direction of the images in the splats' world.
 
     Raises:
-        LodgsError: as :func:`views_along`, or there is no opaque splat to look at.
+        LodgsError: as :func:`views_along`, or if there is no opaque splat.
     """
-    views = views_along(way, up, count, width, height)
-    eyes = np.array([view.center for view in views])
-    away = np.linalg.norm(opaque_means(splats) - np.median(eyes, axis=0), axis=1)
-    return views, NEAR_SHARE * float(np.median(away))
+    views = views_along(path, up, count, width, height)
+    positions = np.array([view.center for view in views])
+    distances = np.linalg.norm(opaque_means(splats) - np.median(positions, axis=0), axis=1)
+    return views, NEAR_SHARE * float(np.median(distances))
 
 
 def views_along(
-    way: np.ndarray, up: np.ndarray, count: int, width: int = 960, height: int = 640
+    path: np.ndarray, up: np.ndarray, count: int, width: int = 960, height: int = 640
 ) -> list[Camera]:
-    """The views of :func:`walk_views`, whatever there is to see.
+    """Return the views of :func:`walk_views`, independent of the splats.
 
     Raises:
-        LodgsError: the way has no length or leads straight up.
+        LodgsError: if the path has no length or is vertical.
     """
-    lengths = np.linalg.norm(np.diff(way, axis=0), axis=1)
-    reached = np.concatenate([[0], np.cumsum(lengths)])
-    places = (np.arange(count) + 0.5) / count * reached[-1]
+    lengths = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    knots = np.concatenate([[0], np.cumsum(lengths)])
+    stations = (np.arange(count) + 0.5) / count * knots[-1]
 
-    def at(places: np.ndarray) -> np.ndarray:
-        return np.stack([np.interp(places, reached, coordinate) for coordinate in way.T], axis=1)
+    def at(stations: np.ndarray) -> np.ndarray:
+        return np.stack([np.interp(stations, knots, coordinate) for coordinate in path.T], axis=1)
 
-    pause = reached[-1] / count / 2
-    eyes, ahead = at(places), at(places + pause) - at(places - pause)
+    step = knots[-1] / count / 2
+    positions = at(stations)
+    ahead = at(stations + step) - at(stations - step)
     up = up / np.linalg.norm(up)
     level = ahead - (ahead @ up)[:, None] * up
-    if not (np.linalg.norm(level, axis=1) > 1e-6 * pause).all():
-        raise LodgsError("The way to walk has no length, or leads straight up.", "Choose another curve.")
+    if not (np.linalg.norm(level, axis=1) > 1e-6 * step).all():
+        raise LodgsError(
+            "Cannot place views along the path: it has no length or is vertical.", "Choose another curve."
+        )
     level /= np.linalg.norm(level, axis=1)[:, None]
-    turn = np.radians(np.resize(TURNS, count))[:, None]
-    looks = np.cos(turn) * level + np.sin(turn) * np.cross(up, level)
+    heading = np.radians(np.resize(TURNS, count))[:, None]
+    directions = np.cos(heading) * level + np.sin(heading) * np.cross(up, level)
     lens = _lens(width, height)
     return [
-        Camera(f"walk_{n:04d}", *lens, look_at(eye, eye + look, up))
-        for n, (eye, look) in enumerate(zip(eyes, looks, strict=True))
+        Camera(f"walk_{n:04d}", *lens, look_at(position, position + direction, up))
+        for n, (position, direction) in enumerate(zip(positions, directions, strict=True))
     ]
 
 
 def opaque_means(splats: Splats) -> np.ndarray:
-    """Where opaque splats are, (N, 3) float64.
+    """Return the means of the opaque splats, (N, 3) float64.
 
     Raises:
-        LodgsError: there are none.
+        LodgsError: if there is no opaque splat.
     """
     means = splats.means[splats.opacity_logits > np.log(OPAQUE / (1 - OPAQUE))].astype(np.float64)
     if not len(means):
-        raise _nothing()
+        raise _no_splats_error()
     return means
 
 
-def _nothing() -> LodgsError:
-    return LodgsError("There is no opaque splat to look at.", "Give cameras of your own.")
+def _no_splats_error() -> LodgsError:
+    return LodgsError("Cannot place views: there is no opaque splat.", "Use custom cameras.")
 
 
 def _lens(width: int, height: int) -> tuple[int, int, float, float, float, float]:

@@ -100,7 +100,7 @@ def test_white_stays_white_and_nothing_is_brighter():
 
 def test_there_is_nothing_to_compare_without_tracks_or_of_too_many(copy, monkeypatch):
     scene = copy(lambda count: np.random.default_rng(1).uniform(-0.7, 0.7, count))
-    monkeypatch.setattr(exposures, "MOST", 47)
+    monkeypatch.setattr(exposures, "MAX_PHOTOS", 47)
     assert exposure_gains(scene, scene.cameras) == {}
     monkeypatch.undo()
     scene.point_ids.resize(0, refcheck=False)

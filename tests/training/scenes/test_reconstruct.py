@@ -100,7 +100,7 @@ def test_it_goes_on_where_the_scene_is_among_its_photographs(photos, tmp_path, w
     settings = (given / where / "colmap" / "settings.json").read_bytes()
     again = reconstruct(given, given / where)
     assert (given / where / "colmap" / "settings.json").read_bytes() == settings
-    assert again.placed == first.placed == [f"{number}.png" for number in range(6)] and again.photographs == 6
+    assert again.placed == first.placed == [f"{number}.png" for number in range(6)] and again.photos == 6
 
 
 def test_masks_of_webp_photographs_have_the_names_that_these_had(tmp_path):
@@ -149,7 +149,7 @@ def test_some_that_show_something_else_are_named(photos, tmp_path):
     (folder / "text.jpg").write_text("no picture")
     found = reconstruct(folder, tmp_path / "out", lens="one")
     assert found.placed == ["0.png", "1.tif", "2.webp.png", "3.jpg", "4.png", "5.png"]
-    assert found.photographs == 8
+    assert found.photos == 8
     assert "6 of 8 photographs found their place: too little overlap between" in found.words
     assert "x.png" in found.words or "y.png" in found.words
     assert found.left_out == [

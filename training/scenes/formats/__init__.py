@@ -1,7 +1,6 @@
-"""What other programs write of photographs and their cameras, as an ordinary COLMAP scene. No pycolmap, so
-that Blender does it without a trainer.
+"""Conversion of other programs' photos and cameras to COLMAP scenes. Works without pycolmap, inside Blender.
 
-Each format is a file here with ``NAME``, ``find`` and ``read``; nothing else knows it.
+Each format is a module with ``NAME``, ``find`` and ``read``, and independent of the other formats.
 """
 
 from __future__ import annotations
@@ -26,50 +25,52 @@ from . import bundler, metashape, openmvg, polycam, record3d, transforms
 from .exported import ExportedScene, ExportedView
 
 FORMATS = transforms, polycam, record3d, metashape, openmvg, bundler
-"""The first that finds itself in a folder is taken."""
+"""Supported formats; the first one that recognises a folder is used."""
 RANDOM_POINTS = 30_000
-"""So many are put where cameras look, if a program tells of no points."""
-FORMAT_NAMES = ", ".join(each.NAME for each in FORMATS)
+"""Number of random initial points for exports without points."""
+FORMAT_NAMES = ", ".join(module.NAME for module in FORMATS)
 
 
 @dataclass(frozen=True)
 class ConvertedScene:
-    """A COLMAP scene that has been made.
+    """A converted COLMAP scene.
 
     Attributes:
-        folder: of the scene.
-        what: the program whose export it was.
-        views, points: how many there are.
-        warnings: a sentence for each thing that was left out or is odd.
+        folder: folder of the scene.
+        source: name of the export's format.
+        views, points: number of views and points.
+        warnings: a sentence for each skipped or suspicious item.
     """
 
     folder: Path
-    what: str
+    source: str
     views: int
     points: int
     warnings: list[str]
 
 
 def find_export(folder: Path) -> tuple[ModuleType, Path] | None:
-    """The format that a folder is of, or one of the folders in it, and what it is read from; or None.
+    """Return the format of a folder or of its only exported subfolder, and the file or folder to read.
 
-    Only names are looked at, and of small files their begin.
+    Only names and the first bytes of small files are inspected. The result is None for unknown formats.
     """
-    for each in FORMATS:
-        if path := each.find(folder):
-            return each, path
+    for module in FORMATS:
+        if path := module.find(folder):
+            return module, path
     try:
-        below = [path for path in sorted(folder.iterdir()) if path.is_dir() and path.name[0] != "."]
+        subfolders = [path for path in sorted(folder.iterdir()) if path.is_dir() and path.name[0] != "."]
     except OSError:
         return None
-    # what was packed as a folder is unpacked into another
-    found = [[(each, path) for each in FORMATS if (path := each.find(place))] for place in below]
-    found = [formats[0] for formats in found if formats]
-    return found[0] if len(found) == 1 else None
+    # Unpacking an archive often adds a folder level.
+    matches = []
+    for subfolder in subfolders:
+        candidates = ((module, module.find(subfolder)) for module in FORMATS)
+        matches += [(module, path) for module, path in candidates if path][:1]
+    return matches[0] if len(matches) == 1 else None
 
 
 def ensure_colmap_scene(folder: Path, warn: Callable[[str], object]) -> Path:
-    """The folder itself; what another program has exported there is a COLMAP scene from then on.
+    """Convert another program's export in place unless the folder is a COLMAP scene, and return the folder.
 
     Raises:
         LodgsError: as :func:`convert_export`.
@@ -81,135 +82,142 @@ def ensure_colmap_scene(folder: Path, warn: Callable[[str], object]) -> Path:
 
 
 def convert_export(folder: Path, out: Path | None = None) -> ConvertedScene:
-    """Makes a COLMAP scene of what another program has exported: its model in ``sparse/0``.
+    """Convert another program's export to a COLMAP scene with its model in ``sparse/0``.
 
     Args:
-        out: the scene's folder, whose photographs are links or copies; None: the model is put beside them,
-            and no photograph is touched.
+        folder: folder of the export.
+        out: folder of the scene, which receives links to or copies of the photos. By default, the model is
+            written next to the photos, which stay unchanged.
 
     Raises:
-        LodgsError: it is of no known format, damaged, or the scene cannot be written.
+        LodgsError: if the format is unknown, the export is damaged, or the scene cannot be written.
     """
     folder = folder.absolute()
-    check_folder(folder, "Choose the folder that a program has exported.")
-    found = find_export(folder)
-    if found is None:
-        is_scene = bool(find_models(folder))
+    check_folder(folder, "Choose the folder of another program's export.")
+    export = find_export(folder)
+    if export is None:
+        if find_models(folder):
+            raise LodgsError(f"Cannot convert {folder}: it already is a COLMAP scene.", "Import it directly.")
         raise LodgsError(
-            f"{folder} is a COLMAP scene as it is." if is_scene else f"{folder} is no export that is known.",
-            "Import it."
-            if is_scene
-            else f"Known are {FORMAT_NAMES}; or choose the folder of a COLMAP scene.",
+            f"Cannot convert {folder}: its format is unknown.",
+            f"Choose an export of {FORMAT_NAMES}, or the folder of a COLMAP scene.",
         )
-    format_, path = found
+    module, path = export
     scene = folder if out is None else out
     if out is not None and out.is_dir() and find_models(out):
-        raise LodgsError(f"{out} holds a COLMAP scene already.", "Choose another folder.")
-    exported = format_.read(path)
-    views, left_out = _usable(exported)
+        raise LodgsError(f"Cannot write scene: {out} already holds a COLMAP scene.", "Choose another folder.")
+    exported = module.read(path)
+    views, excluded = _usable_views(exported)
     if not views:
-        why = f" {left_out[0][0]}: {left_out[0][1]}" if left_out else ""
-        raise LodgsError(f"{path} has no view that can be used.{why}", "Check the photographs beside it.")
-    warnings = [*exported.warnings, *exclusion_messages(left_out)]
-    if unmasked := [view.mask for view in views if view.mask is not None and not view.mask.is_file()]:
-        warnings.append(f"{len(unmasked)} masks are missing, such as {unmasked[0]}: nothing is masked there.")
+        reason = f" {excluded[0][0]}: {excluded[0][1]}" if excluded else ""
+        raise LodgsError(
+            f"Cannot convert {path}: it has no usable view.{reason}", "Check the photos next to it."
+        )
+    warnings = [*exported.warnings, *exclusion_messages(excluded)]
+    if missing := [view.mask for view in views if view.mask is not None and not view.mask.is_file()]:
+        warnings.append(
+            f"{len(missing)} masks are missing, such as {missing[0]}. Their photos are not masked."
+        )
     points, colors = exported.points, exported.colors
     if not len(points) and all(view.has_depth for view in views):
-        warnings.append(f"{format_.NAME} tells of no points here: training takes them from the depth maps.")
+        warnings.append(f"{module.NAME} has no points. Training creates them from the depth maps.")
     elif not len(points):
         points = random_start_points([view.camera(str(n)) for n, view in enumerate(views)])
         colors = np.full((len(points), 3), 128, np.uint8)
         warnings.append(
-            f"{format_.NAME} tells of no points here: {len(points):,} stand at random where cameras look."
+            f"{module.NAME} has no points. Added {len(points):,} random points in the cameras' view."
         )
     try:
         _write(scene, views, points, colors)
     except OSError as error:
         raise LodgsError(
-            f"The COLMAP scene {scene} could not be written: {error.strerror or error}.",
-            "Choose another folder to write to (lodgs scene --from DIR --out DIR).",
+            f"Cannot write COLMAP scene {scene}: {error.strerror or error}.",
+            "Choose another output folder (lodgs scene --from DIR --out DIR).",
         ) from error
-    return ConvertedScene(scene, format_.NAME, len(views), len(points), warnings)
+    return ConvertedScene(scene, module.NAME, len(views), len(points), warnings)
 
 
 def random_start_points(cameras: list[Camera], count: int = RANDOM_POINTS) -> np.ndarray:
-    """Places (N, 3) that at least two views see, if any two see the same, to begin training with.
+    """Return random initial points (N, 3) for training, visible in at least two views if any views overlap.
 
-    They lie on random pixels' rays, about as far as what the cameras look at together: the place nearest to
-    all their axes. Where there is no such place before them, as in a walk, about as far as three times the
-    cameras are from their neighbours.
+    The points lie on random pixels' rays, around the depth of the point closest to all optical axes. If most
+    cameras do not face that point, as on a walk, the depth is three times the distance between cameras.
     """
     rng = np.random.default_rng(0)
-    eyes = np.array([camera.center for camera in cameras])
+    positions = np.array([camera.center for camera in cameras])
     axes = np.array([camera.world_to_camera[2, :3] for camera in cameras])
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    focus = np.linalg.lstsq(across.sum(axis=0), np.einsum("nij,nj->i", across, eyes), rcond=None)[0]
-    depths = np.einsum("ni,ni->n", focus - eyes, axes)
+    projections = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    focus = np.linalg.lstsq(
+        projections.sum(axis=0), np.einsum("nij,nj->i", projections, positions), rcond=None
+    )[0]
+    depths = np.einsum("ni,ni->n", focus - positions, axes)
     if len(cameras) < 2 or np.mean(depths > 0) < 0.9:
-        apart = np.linalg.norm(eyes[:, None] - eyes[None, :200], axis=2)
-        nearest = np.where(apart > 0, apart, np.inf).min(axis=1, initial=np.inf)
+        distances = np.linalg.norm(positions[:, None] - positions[None, :200], axis=2)
+        nearest = np.where(distances > 0, distances, np.inf).min(axis=1, initial=np.inf)
         step = float(np.median(nearest[np.isfinite(nearest)])) if np.isfinite(nearest).any() else 1.0
         depths = np.full(len(cameras), 3 * step)
-    which = rng.integers(len(cameras), size=4 * count)
-    pixels, away = rng.random((4 * count, 2)), np.exp2(rng.uniform(-2, 1, 4 * count))
+    view = rng.integers(len(cameras), size=4 * count)
+    pixels = rng.random((4 * count, 2))
+    depth_factors = np.exp2(rng.uniform(-2, 1, 4 * count))
     points = np.empty((4 * count, 3))
-    for number in np.unique(which):
-        camera, rows = cameras[number], np.flatnonzero(which == number)
-        depth = max(float(depths[number]), 1e-6) * away[rows]
+    for number in np.unique(view):
+        camera, rows = cameras[number], np.flatnonzero(view == number)
+        depth = max(float(depths[number]), 1e-6) * depth_factors[rows]
         points[rows] = camera.unproject(pixels[rows] * (camera.width, camera.height), depth)
-    seen = np.zeros(len(points), np.int32)
+    view_counts = np.zeros(len(points), np.int32)
     for camera in cameras:
-        seen += camera.sees(points)
-    shared = points[seen >= min(2, len(cameras))]
+        view_counts += camera.sees(points)
+    shared = points[view_counts >= min(2, len(cameras))]
     return (shared if len(shared) >= count // 10 else points)[:count]
 
 
-def _usable(exported: ExportedScene) -> tuple[list[ExportedView], list[tuple[str, str]]]:
-    """Views with photographs and possible cameras, and why others are left out."""
-    views, left_out = [], list(exported.left_out)
+def _usable_views(exported: ExportedScene) -> tuple[list[ExportedView], list[tuple[str, str]]]:
+    """Return the views with a readable photo and a valid camera, and (name, reason) pairs of the others."""
+    views, excluded = [], list(exported.excluded)
     for view in exported.views:
         name = view.image.name
         try:
-            size = image_size(view.image)
+            width, height = image_size(view.image)
         except LodgsError as error:
-            left_out.append((name, error.what))
+            excluded.append((name, error.what))
             continue
         lens = view.lens
-        if not same_proportions(*size, lens.width, lens.height):
-            shape = f"{lens.width}x{lens.height}: it was turned or cropped."
-            left_out.append((name, f"it is {size[0]}x{size[1]}, and its camera's pictures are {shape}"))
+        if not same_proportions(width, height, lens.width, lens.height):
+            reason = f"its size {width}x{height} does not match its camera's {lens.width}x{lens.height}"
+            excluded.append((name, f"{reason}: the photo was rotated or cropped."))
             continue
-        view = view.sized(*size)
+        view = view.sized(width, height)
         if flaw := view.camera(name).flaw:
-            left_out.append((name, f"its {flaw}."))
+            excluded.append((name, f"{flaw}."))
         else:
             views.append(view)
-    return views, left_out
+    return views, excluded
 
 
 def _write(scene: Path, views: list[ExportedView], points: np.ndarray, colors: np.ndarray) -> None:
-    """The model whole or not at all; photographs first, where the scene is another folder than theirs."""
+    """Link photos outside the scene's folder, then write the model completely or not at all."""
     sparse = scene / "sparse"
     try:
         images = Path(os.path.commonpath([view.image.parent for view in views]))
-    except ValueError as error:  # on Windows
-        raise LodgsError("The photographs lie on several drives.", "Bring them to one.") from error
+    except ValueError as error:  # raised on Windows only
+        raise LodgsError(
+            f"Cannot write COLMAP scene {scene}: the photos are on several drives.", "Move them to one drive."
+        ) from error
     if not images.is_relative_to(scene):
         for view in views:
             link_or_copy(view.image, scene / "images" / view.image.relative_to(images))
     elif find_image_folder(scene, sparse / "0", [view.image.name for view in views]) != images:
         images = scene
     sparse.mkdir(parents=True, exist_ok=True)
-    for view in views:
+    names = [view.image.relative_to(images).as_posix() for view in views]
+    for view, name in zip(views, names, strict=True):
         if view.mask is not None and view.mask.is_file():
-            name = view.image.relative_to(images).as_posix()
             link_or_copy(view.mask, scene / MASKS / f"{name}.png")
         if view.depth is not None and view.has_depth:
-            name = view.image.relative_to(images).as_posix()
             link_or_copy(view.depth, scene / DEPTHS / f"{name}{view.depth.suffix.lower()}")
     with tempfile.TemporaryDirectory(dir=sparse, prefix=".model-") as work:
         model = Path(work) / "0"
         lenses = [view.lens for view in views]
-        poses = [(view.image.relative_to(images).as_posix(), view.world_to_camera) for view in views]
+        poses = [(name, view.world_to_camera) for name, view in zip(names, views, strict=True)]
         write_model(model, lenses, poses, points, colors)
         os.replace(model, sparse / "0")

@@ -1,4 +1,4 @@
-"""A view as other programs tell it, and what their files have in common."""
+"""Exported views, and helpers to parse other programs' files."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from ..colmap_model import Intrinsics, make_intrinsics
 from ..images import IMAGE_SUFFIXES
 
 MAX_JSON_BYTES = 1 << 26
-"""Bytes of a JSON file that is read: of 5,000 views it has some 4 million."""
+"""Maximum size of a JSON file; 5,000 views take about 4 million bytes."""
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-"""From OpenCV's camera axes to OpenGL's (x right, y up, looking along -z), or back."""
-_ENDINGS = *IMAGE_SUFFIXES, ".exr", *(suffix.upper() for suffix in IMAGE_SUFFIXES), ".EXR"
+"""Conversion between OpenCV's camera axes and OpenGL's (x right, y up, looking along -z)."""
+_SUFFIXES = *IMAGE_SUFFIXES, ".exr", *(suffix.upper() for suffix in IMAGE_SUFFIXES), ".EXR"
 _NO_POINTS = np.zeros((0, 3))
 
 
 @dataclass(frozen=True)
 class ExportedView:
-    """A photograph and the camera that took it.
+    """A photo and its camera.
 
     Attributes:
-        image: the file.
-        lens: as COLMAP has it, for photographs of its size; of no size (0) where the program does not tell.
+        image: image file; it may not exist.
+        lens: lens for photos of its size; its size is 0 if the program does not export it.
         world_to_camera: (4, 4), OpenCV axes.
-        mask: black where the photograph does not count; None: there is none.
-        depth: a depth map, as ``depths.read_map`` reads it in the scene's unit; None: there is none.
+        mask: mask that is black in ignored areas, or None.
+        depth: depth map in the scene's unit, see ``depths.read_depth_map``, or None.
     """
 
     image: Path
@@ -44,90 +44,92 @@ class ExportedView:
 
     @property
     def has_depth(self) -> bool:
-        """Whether there is a depth map of a kind that is read."""
+        """True if the depth map exists in a supported format."""
         return self.depth is not None and self.depth.suffix.lower() in DEPTH_SUFFIXES and self.depth.is_file()
 
     def sized(self, width: int, height: int) -> ExportedView:
-        """The same with the lens for photographs of that size; focal lengths scale with it."""
-        lens, count = self.lens, self.lens.lens.focals
+        """Return the view with the lens scaled to photos of the given size."""
+        lens = self.lens
+        focals = lens.lens.focals
         if (width, height) == (lens.width, lens.height):
             return self
-        parameters, across, down = lens.parameters.copy(), width / lens.width, height / lens.height
-        parameters[:count] *= (across,) if count == 1 else (across, down)
-        parameters[count : count + 2] *= across, down
+        parameters = lens.parameters.copy()
+        scale_x, scale_y = width / lens.width, height / lens.height
+        parameters[:focals] *= (scale_x,) if focals == 1 else (scale_x, scale_y)
+        parameters[focals : focals + 2] *= scale_x, scale_y
         return replace(self, lens=make_intrinsics(lens.lens.name, width, height, parameters))
 
     def camera(self, name: str) -> Camera:
-        """Its pinhole part."""
+        """Return the pinhole part of the camera."""
         lens = self.lens
         return Camera(name, lens.width, lens.height, *lens.pinhole, self.world_to_camera, self.image)
 
 
 @dataclass(frozen=True)
 class ExportedScene:
-    """What a program has exported.
+    """Content of an export.
 
     Attributes:
-        views: with files that may not be there.
-        points: (P, 3), possibly none; in the views' world.
+        views: views, whose files may not exist.
+        points: (P, 3) in the views' world, possibly empty.
         colors: (P, 3) uint8.
-        left_out: names of what cannot be used, and a sentence of each.
-        warnings: other sentences.
+        excluded: (name, sentence) for each unusable view.
+        warnings: further sentences.
     """
 
     views: list[ExportedView]
     points: np.ndarray = field(default_factory=lambda: _NO_POINTS)
     colors: np.ndarray = field(default_factory=lambda: _NO_POINTS.astype(np.uint8))
-    left_out: list[tuple[str, str]] = field(default_factory=list)
+    excluded: list[tuple[str, str]] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
 
 def read_document(path: Path) -> dict:
-    """As ``read_json``, of a file that tells of thousands of views."""
+    """Read a JSON file with thousands of views, see ``read_json``."""
     return read_json(path, max_bytes=MAX_JSON_BYTES)
 
 
-def get_number(values: Mapping[str, Any], name: str, otherwise: float | None = None) -> float:
-    """A number by name.
+def get_number(values: Mapping[str, Any], name: str, default: float | None = None) -> float:
+    """Return a number by name.
 
     Raises:
-        LodgsError: there is none, and nothing instead.
+        LodgsError: if there is neither a number nor a default.
     """
-    value = values.get(name, otherwise)
+    value = values.get(name, default)
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise LodgsError(f"it has no number '{name}'.")
     return float(value)
 
 
 def parse_array(value: Any, *shape: int) -> np.ndarray:
-    """An array of that shape, in lists or flat.
+    """Return nested or flat lists of numbers as an array of the given shape.
 
     Raises:
-        LodgsError: it is something else.
+        LodgsError: if the value has another shape, or contains anything but finite numbers.
     """
     try:
-        found = np.array(value, np.float64)
-        if not np.isfinite(found).all():
+        array = np.array(value, np.float64)
+        if not np.isfinite(array).all():
             raise ValueError
-        return found.reshape(shape)
+        return array.reshape(shape)
     except (TypeError, ValueError) as error:
         size = "x".join(map(str, shape))
-        raise LodgsError(f"where {size} numbers are expected it has something else.") from error
+        raise LodgsError(f"it has a value that is not {size} finite numbers.") from error
 
 
 def colmap_lens(
     width: float, height: float, focal: tuple[float, float], center: tuple[float, float],
     radial: tuple[float, ...] = (), tangential: tuple[float, float] = (0.0, 0.0), fisheye: bool = False,
 ) -> Intrinsics:  # fmt: skip
-    """A lens as COLMAP has it, the simplest that is enough.
+    """Return the simplest COLMAP lens with the given distortion.
 
     Args:
-        radial: OpenCV's k1, k2, k3, k4, ...: the first three are polynomial; k4 to k6 the rational model's
-            denominator, or k1 to k4 the fisheye's polynomial.
-        tangential: OpenCV's p1, p2; of a fisheye what they are of its angles.
+        radial: OpenCV's k1, k2, k3, k4, ...: the first three are a polynomial, and k4 to k6 the denominator
+            of the rational model. For a fisheye, k1 to k4 are a polynomial.
+        tangential: OpenCV's p1, p2; for a fisheye, the same terms of its angles.
 
     Raises:
-        LodgsError: there is no such lens.
+        LodgsError: if a parameter is invalid.
     """
     k = [*radial, *[0.0] * 6][: max(6, len(radial))]
     if fisheye and any(tangential):
@@ -147,34 +149,38 @@ def colmap_lens(
 
 
 def invert_pose(camera_to_world: np.ndarray, opengl: bool = False) -> np.ndarray:
-    """(4, 4) in OpenCV axes, of (3, 4) or (4, 4); a scale of the axes is left out.
+    """Return world_to_camera (4, 4) in OpenCV axes for a pose (3, 4) or (4, 4); its scale is dropped.
+
+    Args:
+        opengl: True for a pose in OpenGL's camera axes.
 
     Raises:
-        LodgsError: it is no rotation and translation.
+        LodgsError: if the pose is not a rotation and translation.
     """
     pose = np.eye(4)
     if len(camera_to_world) < 3:
-        raise LodgsError("its pose is no matrix of 3 or 4 rows.")
+        raise LodgsError("its pose is not a matrix of 3 or 4 rows.")
     pose[:3] = camera_to_world[:3]
     left, stretch, right = np.linalg.svd(pose[:3, :3])
     if not (stretch[2] > 0 and stretch[0] < 1.02 * stretch[2] and np.linalg.det(left @ right) > 0):
-        raise LodgsError("its pose is no rotation and translation.")
+        raise LodgsError("its pose is not a rotation and translation.")
     pose[:3, :3] = left @ right
     return np.linalg.inv(pose @ OPENGL if opengl else pose)
 
 
 def find_image(folder: Path, name: str) -> Path:
-    """A photograph by the name that a program gives it: with or without an ending or with another one,
-    perhaps of another computer's folder.
+    """Find a photo by an exported name.
+
+    The name may lack its suffix, have another one, or start with another computer's path.
 
     Returns:
-        A file in the folder or below; where there is none, the place where it should be.
+        A file in the folder or below it, or the expected path if there is no such file.
     """
     parts = [part for part in name.replace("\\", "/").split("/") if part not in ("", ".", "..")]
-    there = [folder.joinpath(*parts[start:]) for start in range(len(parts))] or [folder]
-    for place in there:
-        bare = place.stem if place.suffix in _ENDINGS else place.name
-        for each in (place, *(place.with_name(bare + ending) for ending in _ENDINGS)):
-            if each.is_file():
-                return each
-    return there[0]
+    candidates = [folder.joinpath(*parts[start:]) for start in range(len(parts))] or [folder]
+    for candidate in candidates:
+        stem = candidate.stem if candidate.suffix in _SUFFIXES else candidate.name
+        for path in (candidate, *(candidate.with_name(stem + suffix) for suffix in _SUFFIXES)):
+            if path.is_file():
+                return path
+    return candidates[0]

@@ -1,8 +1,8 @@
 """OpenMVG's sfm_data.json.
 
-Facts: https://openmvg.readthedocs.io/en/latest/software/SfM/SfM_OutputFormat/ (views, intrinsics, extrinsics
-as rotation from the world and centre, structure); radial_k3: k1, k2, k3; brown: k1, k2, k3, t1, t2; fisheye:
-k1 to k4.
+Format: https://openmvg.readthedocs.io/en/latest/software/SfM/SfM_OutputFormat/ (views, intrinsics, structure;
+extrinsics as world-to-camera rotation and camera centre). Distortion: radial_k3 has k1, k2, k3; brown has k1,
+k2, k3, t1, t2; fisheye has k1 to k4.
 """
 
 from __future__ import annotations
@@ -31,75 +31,77 @@ _POINTS = "structure"
 
 
 def find(folder: Path) -> Path | None:
-    """sfm_data.json, in the folder or in what OpenMVG makes there."""
+    """Return the path of sfm_data.json in the folder or in one of OpenMVG's output folders."""
     names = "sfm_data.json", "reconstruction/sfm_data.json", "reconstruction_sequential/sfm_data.json"
     return next((folder / name for name in names if (folder / name).is_file()), None)
 
 
 def read(path: Path) -> ExportedScene:
-    """Views and points; points have no colours there.
+    """Read the views and the points, which have no colours.
 
     Raises:
-        LodgsError: the file is damaged.
+        LodgsError: if the file is damaged.
     """
     document = read_document(path)
     try:
         lenses = {entry["key"]: entry["value"]["ptr_wrapper"]["data"] for entry in document["intrinsics"]}
         poses = {entry["key"]: entry["value"] for entry in document["extrinsics"]}
-        listed = [entry["value"]["ptr_wrapper"]["data"] for entry in document["views"]]
-        where = [entry["value"]["X"] for entry in document.get(_POINTS) or []]
-        points = parse_array(where, -1, 3) if where else np.zeros((0, 3))
+        entries = [entry["value"]["ptr_wrapper"]["data"] for entry in document["views"]]
+        positions = [entry["value"]["X"] for entry in document.get(_POINTS) or []]
+        points = parse_array(positions, -1, 3) if positions else np.zeros((0, 3))
         root = str(document.get("root_path", ""))
     except (KeyError, TypeError, AttributeError) as error:
         raise LodgsError(
-            f"{path} is no sfm_data of OpenMVG (it lacks {error}).", "Export it again."
+            f"Cannot read {path}: it is not an sfm_data file of OpenMVG (missing or invalid: {error}).",
+            "Export it again.",
         ) from error
     except LodgsError as error:
-        raise LodgsError(f"{path} is damaged: {error.what}", "Export it again.") from error
-    views, left_out = [], []
-    for each in listed:
-        name = str(each.get("filename", "")) if isinstance(each, dict) else ""
+        raise LodgsError(f"Cannot read {path}: {error.what}", "Export it again.") from error
+    views, excluded = [], []
+    for entry in entries:
+        name = str(entry.get("filename", "")) if isinstance(entry, dict) else ""
         try:
-            pose = poses.get(each.get("id_pose"))
+            pose = poses.get(entry.get("id_pose"))
             if pose is None:
-                raise LodgsError("OpenMVG has found no pose of it.")
-            lens = _lens(lenses.get(each.get("id_intrinsic")))
+                raise LodgsError("OpenMVG has no pose for it.")
+            lens = _parse_lens(lenses.get(entry.get("id_intrinsic")))
             rotation, center = parse_array(pose.get("rotation"), 3, 3), parse_array(pose.get("center"), 3)
-            image = _image(path.parent, root, str(each.get("local_path", "")), name)
+            image = _find_view_image(path.parent, root, str(entry.get("local_path", "")), name)
             views.append(ExportedView(image, lens, invert_pose(np.column_stack([rotation.T, center]))))
         except (LodgsError, AttributeError, TypeError) as error:
-            left_out.append((name, error.what if isinstance(error, LodgsError) else "it is damaged."))
-    return ExportedScene(views, points, np.full((len(points), 3), 128, np.uint8), left_out)
+            excluded.append((name, error.what if isinstance(error, LodgsError) else "its entry is damaged."))
+    return ExportedScene(views, points, np.full((len(points), 3), 128, np.uint8), excluded)
 
 
-def _lens(told: Any) -> Intrinsics:
-    if not isinstance(told, Mapping):
+def _parse_lens(values: Any) -> Intrinsics:
+    if not isinstance(values, Mapping):
         raise LodgsError("it has no lens.")
-    if "focal_length" not in told:  # the pinhole part, of those that distort
-        told = {**told.get("value0", {}), **told}
-    center = parse_array(told.get("principal_point"), 2)
-    focal = get_number(told, "focal_length")
-    size = get_number(told, "width"), get_number(told, "height")
+    if "focal_length" not in values:  # distorted lenses nest the pinhole part
+        values = {**values.get("value0", {}), **values}
+    center = parse_array(values.get("principal_point"), 2)
+    focal = get_number(values, "focal_length")
+    size = get_number(values, "width"), get_number(values, "height")
     radial, tangential, fisheye = (0.0,) * 3, (0.0, 0.0), False
-    for name, values in told.items():
+    for name, coefficients in values.items():
         match name:
             case "disto_k1":
-                radial = (float(parse_array(values, 1)[0]), 0.0, 0.0)
+                radial = (float(parse_array(coefficients, 1)[0]), 0.0, 0.0)
             case "disto_k3":
-                radial = tuple(parse_array(values, 3).tolist())
+                radial = tuple(parse_array(coefficients, 3).tolist())
             case "disto_t2":
-                *k, p1, p2 = parse_array(values, 5).tolist()
+                *k, p1, p2 = parse_array(coefficients, 5).tolist()
                 radial, tangential = tuple(k), (p1, p2)
             case "fisheye":
-                radial, fisheye = tuple(parse_array(values, 4).tolist()), True
-    return colmap_lens(
-        *size, (focal, focal), (float(center[0]), float(center[1])), radial, tangential, fisheye
-    )
+                radial, fisheye = tuple(parse_array(coefficients, 4).tolist()), True
+    principal_point = float(center[0]), float(center[1])
+    return colmap_lens(*size, (focal, focal), principal_point, radial, tangential, fisheye)
 
 
-def _image(folder: Path, root: str, local: str, name: str) -> Path:
-    """Beside the file, in ``images``, or where OpenMVG had it."""
-    places = [find_image(each, f"{local}/{name}") for each in (folder / "images", folder, folder.parent)]
+def _find_view_image(folder: Path, root: str, local: str, name: str) -> Path:
+    """Look for a photo next to the file, in ``images`` and at OpenMVG's own path."""
+    candidates = [
+        find_image(place, f"{local}/{name}") for place in (folder / "images", folder, folder.parent)
+    ]
     if root:
-        places.append(find_image(Path(root), f"{local}/{name}"))
-    return next((place for place in places if place.is_file()), places[0])
+        candidates.append(find_image(Path(root), f"{local}/{name}"))
+    return next((path for path in candidates if path.is_file()), candidates[0])

@@ -1,4 +1,4 @@
-"""Points with colours from any PLY."""
+"""Coloured points from any PLY."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from ...errors import LodgsError
 
 
 def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Points (P, 3) and their colours (P, 3) uint8, grey where there are none.
+    """Read the finite points (P, 3) and their colours (P, 3) uint8, grey by default.
 
     Raises:
-        LodgsError: the file is missing, damaged, or has no points.
+        LodgsError: if the file is missing or damaged, or has no points.
     """
     try:
         with open_file(path) as file:
@@ -24,7 +24,7 @@ def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
     except LodgsError:
         raise
     except (PlyParseError, KeyError, ValueError, TypeError, MemoryError, OSError) as error:
-        raise LodgsError(f"{path} holds no points ({error}).", "Export the points again.") from error
+        raise LodgsError(f"Cannot read points from {path}: {error}.", "Export the points again.") from error
     colors = np.full((len(points), 3), 128, np.uint8)
     names = ("red", "green", "blue")
     if set(names) <= set(vertices.dtype.names or ()):
@@ -32,5 +32,5 @@ def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
         if not np.issubdtype(values.dtype, np.integer):
             values = 255 * values
         colors = np.nan_to_num(values).clip(0, 255).astype(np.uint8)
-    whole = np.isfinite(points).all(axis=1)
-    return points[whole], colors[whole]
+    finite = np.isfinite(points).all(axis=1)
+    return points[finite], colors[finite]

@@ -1,6 +1,6 @@
-"""transforms.json, as nerfstudio, instant-ngp and Blender's exports for NeRF write it.
+"""transforms.json of nerfstudio, instant-ngp and Blender's NeRF exporters.
 
-Facts: https://docs.nerf.studio/quickstart/data_conventions.html; instant-ngp's docs/nerf_dataset_tips.md.
+Format: https://docs.nerf.studio/quickstart/data_conventions.html; instant-ngp's docs/nerf_dataset_tips.md.
 """
 
 from __future__ import annotations
@@ -26,75 +26,77 @@ from .point_cloud import read_points
 
 NAME = "transforms.json"
 _FILES = "transforms.json", "transforms_train.json"
-_PERSPECTIVE = ("", "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV_FISHEYE")
+_SUPPORTED_MODELS = (
+    "", "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV_FISHEYE",
+)  # fmt: skip
 
 
 def find(folder: Path) -> Path | None:
-    """The file; of NeRF's synthetic scenes, the one of the training views."""
+    """Return the path of the file; for NeRF's synthetic scenes, the file of the training views."""
     return next((folder / name for name in _FILES if (folder / name).is_file()), None)
 
 
 def read(path: Path) -> ExportedScene:
-    """Views, and points if a PLY is named.
+    """Read the views, and the points of a PLY if the file names one.
 
-    Of a scene in several files (train, val, test) the training views alone are read.
+    If a scene has several files (train, val, test), only the training views are read.
 
     Raises:
-        LodgsError: the file is damaged.
+        LodgsError: if the file is damaged.
     """
     document = read_document(path)
     frames = document.get("frames")
     if not isinstance(frames, list) or not frames:
-        raise LodgsError(f"{path} has no frames.", "Export it again.")
+        raise LodgsError(f"Cannot read {path}: it has no frames.", "Export it again.")
     common = {name: value for name, value in document.items() if name != "frames"}
-    views, left_out = [], []
-    for place, frame in enumerate(frames, 1):
-        told = common | (frame if isinstance(frame, dict) else {})
-        told = {name: value for name, value in told.items() if value is not None}
+    views, excluded = [], []
+    for number, frame in enumerate(frames, 1):
+        values = common | (frame if isinstance(frame, dict) else {})
+        values = {name: value for name, value in values.items() if value is not None}
         try:
-            views.append(_view(path.parent, told))
+            views.append(_parse_view(path.parent, values))
         except LodgsError as error:
-            left_out.append((str(told.get("file_path", f"frame {place}")), error.what))
-    cloud = document.get("ply_file_path")
-    if isinstance(cloud, str):
+            excluded.append((str(values.get("file_path", f"frame {number}")), error.what))
+    point_cloud = document.get("ply_file_path")
+    if isinstance(point_cloud, str):
         try:
-            return ExportedScene(views, *read_points(find_image(path.parent, cloud)), left_out)
+            return ExportedScene(views, *read_points(find_image(path.parent, point_cloud)), excluded)
         except LodgsError as error:
-            return ExportedScene(views, left_out=left_out, warnings=[error.what])
-    return ExportedScene(views, left_out=left_out)
+            return ExportedScene(views, excluded=excluded, warnings=[error.what])
+    return ExportedScene(views, excluded=excluded)
 
 
-def _view(folder: Path, told: Mapping[str, Any]) -> ExportedView:
-    if not isinstance(told.get("file_path"), str):
-        raise LodgsError("it names no file.")
-    image = find_image(folder, told["file_path"])
-    width, height = get_number(told, "w", 0), get_number(told, "h", 0)
+def _parse_view(folder: Path, values: Mapping[str, Any]) -> ExportedView:
+    if not isinstance(values.get("file_path"), str):
+        raise LodgsError("it has no file_path.")
+    image = find_image(folder, values["file_path"])
+    width, height = get_number(values, "w", 0), get_number(values, "h", 0)
     if not (width > 0 and height > 0):
         width, height = image_size(image)
-    if "fl_x" in told:
-        fx = get_number(told, "fl_x")
-        fy = get_number(told, "fl_y", fx)
+    if "fl_x" in values:
+        fx = get_number(values, "fl_x")
+        fy = get_number(values, "fl_y", fx)
     else:
-        fx = _focal(get_number(told, "camera_angle_x"), width)
-        fy = _focal(get_number(told, "camera_angle_y"), height) if "camera_angle_y" in told else fx
-    center = get_number(told, "cx", width / 2), get_number(told, "cy", height / 2)
-    kind = str(told.get("camera_model", "")).upper()
-    if kind not in _PERSPECTIVE:
-        raise LodgsError(f"its camera model {kind} is none that is known here.")
-    fisheye = kind == "OPENCV_FISHEYE" or told.get("is_fisheye") is True
-    radial = tuple(get_number(told, f"k{n}", 0) for n in range(1, 7))
+        fx = _focal_length(get_number(values, "camera_angle_x"), width)
+        fy = _focal_length(get_number(values, "camera_angle_y"), height) if "camera_angle_y" in values else fx
+    center = get_number(values, "cx", width / 2), get_number(values, "cy", height / 2)
+    model = str(values.get("camera_model", "")).upper()
+    if model not in _SUPPORTED_MODELS:
+        raise LodgsError(f"camera model {model} is not supported.")
+    fisheye = model == "OPENCV_FISHEYE" or values.get("is_fisheye") is True
+    radial = tuple(get_number(values, f"k{n}", 0) for n in range(1, 7))
     if not fisheye and radial[3] and not any(radial[4:]):
-        raise LodgsError("its k4 is of a lens that COLMAP does not have.")
-    tangential = (0.0, 0.0) if fisheye else (get_number(told, "p1", 0), get_number(told, "p2", 0))
+        raise LodgsError("its k4 has no equivalent among COLMAP's lenses.")
+    tangential = (0.0, 0.0) if fisheye else (get_number(values, "p1", 0), get_number(values, "p2", 0))
     lens = colmap_lens(width, height, (fx, fy), center, radial, tangential, fisheye)
-    pose = parse_array(told.get("transform_matrix"), -1, 4)
-    beside = (told.get(name) for name in ("mask_path", "depth_file_path"))
-    mask, depth = (find_image(folder, name) if isinstance(name, str) else None for name in beside)
+    pose = parse_array(values.get("transform_matrix"), -1, 4)
+    names = (values.get(key) for key in ("mask_path", "depth_file_path"))
+    mask, depth = (find_image(folder, name) if isinstance(name, str) else None for name in names)
     return ExportedView(image, lens, invert_pose(pose, opengl=True), mask, depth)
 
 
-def _focal(angle: float, size: float) -> float:
-    """In pixels, of a field of view in radians."""
+def _focal_length(angle: float, size: float) -> float:
+    """Return the focal length in pixels of a field of view in radians."""
     if not 0 < angle < 3.14:
-        raise LodgsError("its field of view is impossible.")
+        raise LodgsError(f"its field of view of {angle:g} radians is impossible.")
     return 0.5 * size / tan(0.5 * angle)
