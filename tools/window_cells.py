@@ -1,7 +1,7 @@
-"""The tour of a large scene, inside Blender: planned, trained in cells, put together.
+"""Script of ``make window`` with ``--cells``: plan and train a large scene in cells in Blender.
 
-``tools/window.py --cells`` starts it. The plan over the scene, two cells at once, one stopped and gone on
-with, the file closed and opened meanwhile, and levels that arrive.
+``tools/window.py --cells`` runs it inside Blender: show the plan, train two cells at a time, cancel and
+resume one, reopen the file meanwhile, and import the levels.
 """
 # pyright: reportAttributeAccessIssue=false, reportGeneralTypeIssues=false
 
@@ -16,7 +16,7 @@ from mathutils import Euler, Vector
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from tools.window_hands import (
+from tools.window_actions import (
     OUT,
     PLAN,
     Steps,
@@ -24,10 +24,10 @@ from tools.window_hands import (
     open_panels,
     press,
     region,
+    screenshot,
     scroll,
     settle,
     start,
-    take,
     until,
     viewport,
 )
@@ -39,7 +39,7 @@ TINY = {
 
 
 def tour() -> Steps:
-    """Everything in order. An assertion that fails ends the tour with its sentence."""
+    """Run all steps. A failed assertion ends the script with its message."""
     for name in ("Cube", "Light", "Camera"):
         bpy.data.objects.remove(bpy.data.objects[name])
     open_panels("panels.training_cells")
@@ -58,13 +58,13 @@ def plan(root: bpy.types.Object) -> Steps:
     settings = root.lodgs.training
     settings.columns = settings.rows = settings.at_once = 2
     yield from settle()
-    take("large-scene")
+    screenshot("large-scene")
     press("lodgs.plan_cells", "INVOKE_DEFAULT")
     yield from until(lambda: len(settings.planned_cells) == 4, 120)
     settings.active_cell = 1
     scroll(9)
     yield from settle()
-    take("plan", ", ".join(f"{cell.views} views" for cell in settings.planned_cells))
+    screenshot("plan", ", ".join(f"{cell.views} views" for cell in settings.planned_cells))
 
 
 def train(root: bpy.types.Object) -> Steps:
@@ -81,11 +81,11 @@ def train(root: bpy.types.Object) -> Steps:
     number = states().index("running") + 1
     scroll(4)
     yield from settle()
-    take("cells", f"{states()}")
+    screenshot("cells", f"{states()}")
     press("lodgs.cancel_block", block=number)
     yield from until(lambda: states()[number - 1] == "cancelled", 120)
     yield from settle()
-    take("one-cancelled", f"{states()}")
+    screenshot("one-cancelled", f"{states()}")
 
     blend = str(OUT / "town.blend")
     bpy.ops.wm.save_as_mainfile(filepath=blend)
@@ -95,30 +95,32 @@ def train(root: bpy.types.Object) -> Steps:
     yield 2.0
     root = module("data.scenes").active_root(bpy.context)
     watch = module("runs.watch").watch_of(root)
-    assert watch is not None and watch.running and watch.process is None, "The run is not found again."
+    assert watch is not None and watch.running and watch.process is None, (
+        "The run is not found after reopening the file."
+    )
     assert states()[number - 1] == "cancelled", f"{states()}"
     press("lodgs.resume_block", block=number)
     yield from until(lambda: states()[number - 1] in ("waiting", "running"), 60)
     yield from settle()
-    take("found-and-resumed", f"{states()}")
+    screenshot("found-and-resumed", f"{states()}")
 
     yield from until(lambda: not watch.running, 1500)
     yield from settle()
     assert watch.state == "done", watch.problem or watch.message
-    assert len(root.lodgs.levels) == TINY["levels"], "Not all levels came."
-    take("trained", ", ".join(f"{len(item.object.data.points):,}" for item in root.lodgs.levels))
+    assert len(root.lodgs.levels) == TINY["levels"], "Not all levels were imported."
+    screenshot("trained", ", ".join(f"{len(item.object.data.points):,}" for item in root.lodgs.levels))
 
 
 def _look_down(root: bpy.types.Object) -> None:
-    """From above and aside, with all cameras in sight."""
-    places = [view.matrix_world.translation for view in module("data.photographs").views(root)]
-    middle = sum(places, Vector()) / len(places)
-    looks = viewport()[1]
-    looks.view_perspective = "PERSP"
-    looks.view_rotation = Euler((math.radians(30), 0, math.radians(20))).to_quaternion()
-    reach = max((place - middle).length for place in places)
-    looks.view_location = middle + looks.view_rotation @ Vector((0.35 * reach, 0, 0))  # left of the sidebar
-    looks.view_distance = 2.9 * reach
+    """Look from above at an angle, with all cameras visible."""
+    positions = [view.matrix_world.translation for view in module("data.photographs").views(root)]
+    center = sum(positions, Vector()) / len(positions)
+    view = viewport()[1]
+    view.view_perspective = "PERSP"
+    view.view_rotation = Euler((math.radians(30), 0, math.radians(20))).to_quaternion()
+    radius = max((position - center).length for position in positions)
+    view.view_location = center + view.view_rotation @ Vector((0.35 * radius, 0, 0))  # left of the sidebar
+    view.view_distance = 2.9 * radius
 
 
 start(tour())

@@ -1,7 +1,7 @@
-"""The walk of ``make window WALK=1``, inside Blender: from photographs to a shot, as artists do.
+"""Script of ``make window WALK=1``: from photos to a rendered shot in Blender, as in the artists' guide.
 
-``tools/window.py`` starts it with ``--walk``; see ``window_tour``. Everything that is done with the splats is
-undone once, step by step, and done again.
+``tools/window.py --walk`` runs it inside Blender, as ``window_tour``. All edits of splats are undone step by
+step and redone.
 """
 # pyright: reportAttributeAccessIssue=false, reportGeneralTypeIssues=false, reportOptionalMemberAccess=false
 # pyright: reportArgumentType=false
@@ -20,11 +20,11 @@ from mathutils import Vector
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from examples.rig import LANTERN
-from tools.window_hands import (
+from tools.window_actions import (
     OUT,
     PLAN,
     Steps,
-    changed,
+    changed_share,
     click_at,
     drag,
     look_from,
@@ -33,10 +33,10 @@ from tools.window_hands import (
     press,
     press_f12,
     region,
+    screenshot,
     scroll,
     settle,
     start,
-    take,
     type_in,
     until,
     viewport,
@@ -47,13 +47,13 @@ JOB = {"max_splats": 60_000, "steps": (150, 250, 300, 450, 1000)} if PLAN["long"
     "densify_interval": (20,) * 3, "budget_ratio": 0.35, "footprint": 8.0,
 }  # fmt: skip
 TABLE_TOP, TABLE_ENDS = 0.78, ((-0.95, 0.0), (0.95, 0.0))
-"""Of the example's table, in metres, as ``LANTERN``: how high, and where its ends are."""
+"""Height and ends of the example's table, in metres, in the coordinates of ``LANTERN``."""
 PUMPKIN, FIGURE = (-0.2, 0.1, 0.87), (-0.36, -0.22)
-"""What is brushed over, and where on the table something is put."""
+"""Positions of the brush stroke, and of the added figure on the table."""
 
 
 def walk() -> Steps:
-    """Everything in order. An assertion that fails ends the walk with its sentence."""
+    """Run all steps. A failed assertion ends the script with its message."""
     for name in ("Cube", "Light", "Camera"):
         bpy.data.objects.remove(bpy.data.objects[name])
     open_panels("panels.placement", "panels.clean_up", "panels.look", "panels.rendering")
@@ -61,34 +61,34 @@ def walk() -> Steps:
     yield 1.0
     region("UI").active_panel_category = "LODGS"
     yield from settle()
-    take("empty")
+    screenshot("empty")
     press("lodgs.import_colmap", directory=PLAN["scene"])
     yield from settle()
-    take("imported")
+    screenshot("imported")
     yield from train()
     yield from search()
-    begun = state()
+    initial = state()
     steps = yield from edit()
-    yield from undo(steps, begun)
+    yield from undo(steps, initial)
     yield from click()
     yield from shoot()
 
 
 def scene_root() -> bpy.types.Object:
-    """The splat scene, which undo replaces by another object of its name."""
+    """Return the splat scene. Undo replaces the object, so do not keep it."""
     (root,) = module("data.scenes").roots(bpy.context.scene)
     return root
 
 
-def place_of(*place: float) -> Vector:
-    """Where a place of the photographed scene is in Blender's world."""
-    return scene_root().lodgs.axes.matrix_world @ Vector(place)
+def world_position(*position: float) -> Vector:
+    """Transform a position of the example scene to Blender's world."""
+    return scene_root().lodgs.axes.matrix_world @ Vector(position)
 
 
-def pixel_of(*place: float) -> tuple[int, int]:
-    """Where in the window it is seen."""
-    seen = location_3d_to_region_2d(region(), viewport()[1], place_of(*place))
-    return round(region().x + seen.x), round(region().y + seen.y)
+def window_pixel(*position: float) -> tuple[int, int]:
+    """Project a position of the example scene to a pixel of the window."""
+    pixel = location_3d_to_region_2d(region(), viewport()[1], world_position(*position))
+    return round(region().x + pixel.x), round(region().y + pixel.y)
 
 
 def train() -> Steps:
@@ -97,38 +97,39 @@ def train() -> Steps:
     jobs.follow(watch)
     yield from until(lambda: not watch.running or len(watch.levels) >= 1, 900)
     yield from settle()
-    take("training", watch.message)
+    screenshot("training", watch.message)
     yield from until(lambda: not watch.running, 1200)
     assert watch.state == "done", watch.problem or watch.message
     root.lodgs.cameras.hide_viewport = True
     root.lodgs.points.hide_set(True)
     press("ed.undo_push", message="Hide")
     yield from settle()
-    noticed = take("trained", f"{len(root.lodgs.levels)} levels")
-    seen = bool(status.visible_work(time.monotonic()))  # or drawing that took longer than it stands
+    with_notice = screenshot("trained", f"{len(root.lodgs.levels)} levels")
+    visible = bool(status.visible_work(time.monotonic()))  # False if drawing took longer than the notice
     yield from until(lambda: not status.visible_work(time.monotonic()), 200)
     yield 2.0
-    gone = take("notice-gone", redrawn=False)
-    assert not seen or changed(noticed, gone, part="STATUSBAR") > 0, "The notice stays."
+    without_notice = screenshot("notice-gone", redraw_first=False)
+    changed = changed_share(with_notice, without_notice, part="STATUSBAR")
+    assert not visible or changed > 0, "The notice does not disappear."
 
 
 def search() -> Steps:
-    """Blender's search finds the verbs by what they are called."""
+    """Find operators in Blender's search by their names."""
     for word in ("worst", "ground"):
-        press("wm.search_menu", way="INVOKE_DEFAULT")
+        press("wm.search_menu", mode="INVOKE_DEFAULT")
         yield 0.5
         yield from type_in(word)
         yield from settle()
-        take(f"search-{word}")
+        screenshot(f"search-{word}")
         yield from type_in("\x1b")
 
 
 def edit() -> Steps:
-    """Placed, cropped, cleaned and in another look; returns how many steps that was."""
-    look_from(place_of(-1.7, -2.5, 1.15), place_of(0.0, 0.3, 0.8))
+    """Place, crop and clean the splats; return the number of undo steps."""
+    look_from(world_position(-1.7, -2.5, 1.15), world_position(0.0, 0.3, 0.8))
     press("lodgs.set_ground", by="FOUND")
     for number, (x, y) in enumerate(TABLE_ENDS):
-        press("object.empty_add", way="EXEC_DEFAULT", radius=0.1, location=place_of(x, y, TABLE_TOP))
+        press("object.empty_add", mode="EXEC_DEFAULT", radius=0.1, location=world_position(x, y, TABLE_TOP))
         bpy.context.active_object.name = f"Table {number + 1}"
     ends = [obj for obj in bpy.context.scene.objects if obj.name.startswith("Table")]
     for obj in (*ends, root := scene_root()):
@@ -139,57 +140,57 @@ def edit() -> Steps:
     yield from settle()
     window = bpy.context.window_manager.windows[0]
     window.event_simulate(type="MOUSEMOVE", value="NOTHING", x=430, y=560)
-    press("lodgs.set_scale", way="INVOKE_DEFAULT")
+    press("lodgs.set_scale", mode="INVOKE_DEFAULT")
     yield from settle()
-    take("scale")
+    screenshot("scale")
     yield from type_in("\r")
     press("lodgs.set_scale", length=1.9)
     yield from settle()
-    low = min(place_of(x, y, 0).z for x, y in TABLE_ENDS)
-    assert abs(low) < 0.05, f"The table's feet are {low:.2f} m off the ground."
-    take("placed", f"the lantern is {place_of(*LANTERN).z:.2f} m above the ground")
+    low = min(world_position(x, y, 0).z for x, y in TABLE_ENDS)
+    assert abs(low) < 0.05, f"The table is {low:.2f} m above the ground."
+    screenshot("placed", f"the lantern is {world_position(*LANTERN).z:.2f} m above the ground")
 
     press("lodgs.add_crop", shape="SPHERE")
     crop = bpy.context.active_object
-    crop.matrix_world.translation, crop.scale = place_of(0.0, 0.05, 0.8), [1.4] * 3
+    crop.matrix_world.translation, crop.scale = world_position(0.0, 0.05, 0.8), [1.4] * 3
     press("ed.undo_push", message="Scale")
     press("lodgs.hide_splats", test="FLOATERS")
     scroll(26)
     yield from settle()
-    take("cropped", left())
+    screenshot("cropped", remaining())
 
-    look_from(place_of(-0.5, -1.7, 1.35), place_of(-0.05, 0.1, 0.9))
-    press("wm.tool_set_by_id", way="EXEC_DEFAULT", name="lodgs.brush")
+    look_from(world_position(-0.5, -1.7, 1.35), world_position(-0.05, 0.1, 0.9))
+    press("wm.tool_set_by_id", mode="EXEC_DEFAULT", name="lodgs.brush")
     yield from settle()
-    x, y = pixel_of(*PUMPKIN)
-    yield from drag([(x + along, y) for along in (-30, -10, 10, 30)])
+    x, y = window_pixel(*PUMPKIN)
+    yield from drag([(x + offset, y) for offset in (-30, -10, 10, 30)])
     yield from settle()
     selected = sum(module("data.cleaning").count_selected(scene_root()).values())
-    assert selected, "The brush selects nothing."
-    take("brushed", f"{selected:,} splats selected")
+    assert selected, "The brush selects no splats."
+    screenshot("brushed", f"{selected:,} splats selected")
     press("lodgs.hide_splats", test="SELECTED")
-    press("wm.tool_set_by_id", way="EXEC_DEFAULT", name="builtin.select_box")
+    press("wm.tool_set_by_id", mode="EXEC_DEFAULT", name="builtin.select_box")
     yield from settle()
-    take("brushed-away", left())
+    screenshot("brushed-away", remaining())
     return 11
 
 
-def undo(steps: int, begun: tuple) -> Steps:
-    done = state()
+def undo(steps: int, initial: tuple) -> Steps:
+    edited = state()
     for _ in range(steps):
-        press("ed.undo", way="EXEC_DEFAULT")
+        press("ed.undo", mode="EXEC_DEFAULT")
     yield from settle()
-    assert state() == begun, "It is not undone to where it began."
-    take("undone", left())
+    assert state() == initial, "Undo does not restore the initial state."
+    screenshot("undone", remaining())
     for _ in range(steps):
-        press("ed.redo", way="EXEC_DEFAULT")
+        press("ed.redo", mode="EXEC_DEFAULT")
     yield from settle()
-    assert state() == done, "It is not done again."
-    take("redone", left())
+    assert state() == edited, "Redo does not restore the edited state."
+    screenshot("redone", remaining())
 
 
 def state() -> tuple:
-    """What editing changes."""
+    """Return the state that editing changes."""
     bpy.context.view_layer.update()
     root = scene_root()
     counts = module("data.cleaning").count_left(root, bpy.context.evaluated_depsgraph_get())
@@ -197,64 +198,67 @@ def state() -> tuple:
     return counts, [*map(tuple, root.lodgs.axes.matrix_world)], names
 
 
-def left() -> str:
+def remaining() -> str:
     counts = state()[0]
-    return ", ".join(f"level {n}: {some:,} of {count:,} left" for n, (some, count) in counts.items())
+    return ", ".join(f"level {n}: {count:,} of {total:,} splats" for n, (count, total) in counts.items())
 
 
 def click() -> Steps:
-    """A click on nothing deselects; one on the splats selects their scene, also before a mesh; one on a mesh
-    before them the mesh."""
-    look_from(place_of(-1.0, -4.5, 2.2), place_of(0.3, 0.1, 0.7))
+    """Check clicks: empty space deselects, splats select their scene, a mesh in front selects the mesh."""
+    look_from(world_position(-1.0, -4.5, 2.2), world_position(0.3, 0.1, 0.7))
     yield from settle()
-    press("mesh.primitive_cube_add", way="EXEC_DEFAULT", size=0.2, location=place_of(0.0, 0.9, 0.8))
-    behind = bpy.context.active_object
-    away = pixel_of(*LANTERN)
-    nothing = region().x + 120, region().y + 3 * region().height // 5  # left of what is left of the scene
-    for place, chosen in ((nothing, None), (away, scene_root())):
-        yield from click_at(*place)
+    press("mesh.primitive_cube_add", mode="EXEC_DEFAULT", size=0.2, location=world_position(0.0, 0.9, 0.8))
+    cube = bpy.context.active_object
+    lantern = window_pixel(*LANTERN)
+    empty = region().x + 120, region().y + 3 * region().height // 5  # left of the cropped scene
+    for pixel, expected in ((empty, None), (lantern, scene_root())):
+        yield from click_at(*pixel)
         selected = bpy.context.view_layer.objects.selected[:]
-        assert selected == ([chosen] if chosen else []), f"A click at {place} selects {selected}."
-    eye = viewport()[1].view_matrix.inverted().translation
-    behind.location = eye.lerp(place_of(*LANTERN), 1.1)
+        assert selected == ([expected] if expected else []), f"A click at {pixel} selects {selected}."
+    position = viewport()[1].view_matrix.inverted().translation
+    cube.location = position.lerp(world_position(*LANTERN), 1.1)
     yield from settle()
-    yield from click_at(*nothing)
-    yield from click_at(*away)
-    assert bpy.context.view_layer.objects.selected[:] == [scene_root()], "The mesh behind is selected."
-    take("clicked")
-    behind.location = eye.lerp(place_of(*LANTERN), 0.8)
+    yield from click_at(*empty)
+    yield from click_at(*lantern)
+    assert bpy.context.view_layer.objects.selected[:] == [scene_root()], (
+        "The mesh behind the splats is selected."
+    )
+    screenshot("clicked")
+    cube.location = position.lerp(world_position(*LANTERN), 0.8)
     yield from settle()
-    yield from click_at(*away)
-    assert bpy.context.view_layer.objects.selected[:] == [behind], "The mesh before it is not selected."
-    behind.location = eye.lerp(place_of(*LANTERN), 1.1)
+    yield from click_at(*lantern)
+    assert bpy.context.view_layer.objects.selected[:] == [cube], (
+        "The mesh in front of the splats is not selected."
+    )
+    cube.location = position.lerp(world_position(*LANTERN), 1.1)
     for tool in ("builtin.select", "builtin.move", "builtin.select_box"):
-        behind.select_set(True)
-        press("wm.tool_set_by_id", way="EXEC_DEFAULT", name=tool)
+        cube.select_set(True)
+        press("wm.tool_set_by_id", mode="EXEC_DEFAULT", name=tool)
         yield from settle()
-        yield from click_at(*away)
+        yield from click_at(*lantern)
         selected = bpy.context.view_layer.objects.selected[:]
         assert selected == [scene_root()], f"With {tool} a click on splats selects {selected}."
-    bpy.data.objects.remove(behind)
+    bpy.data.objects.remove(cube)
 
 
 def shoot() -> Steps:
-    """The rest grey and dark around the still life; then a figure on the table, and the picture of both."""
+    """Darken the surroundings with a look; then add a figure to the table and render both."""
     root, scene = scene_root(), bpy.context.scene
     for crop in module("data.crops").crops_of(root):
         crop.lodgs_crop.use = False
     press("lodgs.show_hidden_splats")
-    look_from(place_of(-0.55, -2.6, 1.5), place_of(0.05, 0.3, 1.0))
+    look_from(world_position(-0.55, -2.6, 1.5), world_position(0.05, 0.3, 1.0))
     press("lodgs.add_crop", shape="SPHERE", keep="ALL")
-    there = bpy.context.active_object
-    there.matrix_world.translation, there.scale = place_of(0.0, 0.05, 0.75), [1.05, 0.75, 0.7]
-    look = there.lodgs_look
+    crop = bpy.context.active_object
+    crop.matrix_world.translation, crop.scale = world_position(0.0, 0.05, 0.75), [1.05, 0.75, 0.7]
+    look = crop.lodgs_look
     look.outside, look.exposure, look.saturation, look.temperature = True, -1.6, 0.35, 5200
     scroll(14)
     yield from settle()
-    take("looked")
+    screenshot("looked")
     look.outside = False
-    press("lodgs.reset_look", name=there.name)
-    bpy.data.objects.remove(there)
+    press("lodgs.reset_look", name=crop.name)
+    bpy.data.objects.remove(crop)
 
     set_figure()
     set_lights()
@@ -265,42 +269,42 @@ def shoot() -> Steps:
     press("lodgs.look_through", step=0)
     scene.render.resolution_percentage = 200
     press("lodgs.combine_with_meshes")
-    looks = viewport()[1]
-    looks.view_perspective, looks.view_camera_zoom, looks.view_camera_offset = "CAMERA", 10, (0.12, 0)
+    view = viewport()[1]
+    view.view_perspective, view.view_camera_zoom, view.view_camera_offset = "CAMERA", 10, (0.12, 0)
     scroll(60)
     yield from settle()
-    take("shot")
+    screenshot("shot")
     bpy.context.preferences.view.render_display_type = "AREA"  # this display has no window manager
     assert (yield from press_f12(600)) == "complete", "F12 was cancelled."
     bpy.data.images["Render Result"].save_render(str(OUT / "shot.png"))
     yield from settle()
-    take("f12")
+    screenshot("f12")
 
 
 def set_figure() -> None:
-    """A glazed figure on the table, and a shadow catcher under it."""
+    """Add a glazed figure on the table, and a shadow catcher below it."""
     size = 0.11
-    press("mesh.primitive_monkey_add", way="EXEC_DEFAULT", size=2 * size)
+    press("mesh.primitive_monkey_add", mode="EXEC_DEFAULT", size=2 * size)
     figure = bpy.context.active_object
-    figure.location = place_of(*FIGURE, TABLE_TOP + 0.9 * size)
+    figure.location = world_position(*FIGURE, TABLE_TOP + 0.9 * size)
     figure.rotation_euler = math.radians(-28), 0, math.radians(12)
     figure.modifiers.new("Smooth", "SUBSURF").render_levels = 3
-    press("object.shade_smooth", way="EXEC_DEFAULT")
+    press("object.shade_smooth", mode="EXEC_DEFAULT")
     glaze = bpy.data.materials.new("Glaze")
     glaze.use_nodes = True
     shader = next(node for node in glaze.node_tree.nodes if node.type == "BSDF_PRINCIPLED")
     shader.inputs["Base Color"].default_value = 0.01, 0.16, 0.2, 1
     shader.inputs["Roughness"].default_value = 0.18
     figure.data.materials.append(glaze)
-    press("mesh.primitive_plane_add", way="EXEC_DEFAULT", size=0.6)
+    press("mesh.primitive_plane_add", mode="EXEC_DEFAULT", size=0.6)
     catcher = bpy.context.active_object
-    catcher.location, catcher.is_shadow_catcher = place_of(*FIGURE, TABLE_TOP + 0.004), True
+    catcher.location, catcher.is_shadow_catcher = world_position(*FIGURE, TABLE_TOP + 0.004), True
     catcher.hide_set(True)
 
 
 def set_lights() -> None:
-    """As in the photographs: a low warm sun from the left behind them, a blue sky, the lantern's glow."""
-    for kind, energy, color, place in (
+    """Add lights as in the photos: a low warm sun from behind left, a blue sky, the lantern's glow."""
+    for kind, energy, color, position in (
         ("SUN", 3.0, (1.0, 0.72, 0.44), (-2.0, -2.5, 2.2)),
         ("POINT", 4.0, (1.0, 0.6, 0.2), (LANTERN[0], LANTERN[1] - 0.1, LANTERN[2])),
     ):
@@ -308,9 +312,9 @@ def set_lights() -> None:
         data.energy, data.color = energy, color
         light = bpy.data.objects.new(data.name, data)
         bpy.context.scene.collection.objects.link(light)
-        light.location = place_of(*place)
+        light.location = world_position(*position)
         light.rotation_euler = (
-            (light.location - place_of(*FIGURE, TABLE_TOP)).to_track_quat("Z", "Y").to_euler()
+            (light.location - world_position(*FIGURE, TABLE_TOP)).to_track_quat("Z", "Y").to_euler()
         )
     world = bpy.context.scene.world
     world.use_nodes = True

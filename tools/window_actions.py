@@ -1,6 +1,7 @@
-"""Hands and eyes in a real Blender window: what :mod:`window_tour` and :mod:`window_flight` press and see.
+"""Actions and checks in a real Blender window, shared by the scripts of ``make window``.
 
-Runs inside Blender, where a timer takes one step after the other, so that it draws and listens between them.
+Runs inside Blender. A timer runs one step after the other, so that Blender redraws and handles events between
+steps.
 """
 # pyright: reportAttributeAccessIssue=false, reportGeneralTypeIssues=false
 
@@ -25,47 +26,47 @@ PLAN = json.loads(sys.argv[-1])
 OUT = Path(PLAN["out"])
 
 Steps = Iterator[float]
-"""Seconds to wait before each further step."""
+"""Yields the seconds to wait before the next step."""
 
 
 def module(name: str):
-    """A module of the installed extension."""
+    """Import a module of the installed extension."""
     return importlib.import_module(f"{LODGS}.blender_lodgs.{name}")
 
 
 def training(name: str):
-    """A module of what it shares with the trainer."""
+    """Import a module of the extension's trainer package."""
     return importlib.import_module(f"{LODGS}.training.{name}")
 
 
 def viewport() -> tuple[bpy.types.Area, bpy.types.RegionView3D]:
-    """The 3D viewport and what it looks through."""
+    """Return the 3D viewport and its view."""
     for area in bpy.context.window_manager.windows[0].screen.areas:
         if area.type == "VIEW_3D":
             return area, area.spaces.active.region_3d
-    raise AssertionError("There is no 3D viewport.")
+    raise AssertionError("No 3D viewport found.")
 
 
 def region(kind: str = "WINDOW") -> bpy.types.Region:
     return next(part for part in viewport()[0].regions if part.type == kind)
 
 
-def press(operator: str, way: str = "", **settings) -> None:
-    """What a button does. Errors that Blender would show become the tour's."""
+def press(operator: str, mode: str = "", **settings) -> None:
+    """Run an operator as a button does. Operator errors raise."""
     group, name = operator.split(".")
     window = bpy.context.window_manager.windows[0]
     area = next((area for area in window.screen.areas if area.type == "VIEW_3D"), window.screen.areas[0])
     part = next(part for part in area.regions if part.type == "WINDOW")
     with bpy.context.temp_override(window=window, area=area, region=part):
-        way = way or ("EXEC_DEFAULT" if group == "lodgs" else "INVOKE_DEFAULT")
-        getattr(getattr(bpy.ops, group), name)(way, True, **settings)  # True: undoable, as by hand
+        mode = mode or ("EXEC_DEFAULT" if group == "lodgs" else "INVOKE_DEFAULT")
+        getattr(getattr(bpy.ops, group), name)(mode, True, **settings)  # True: add an undo step
 
 
 def open_panels(*names: str) -> None:
-    """Panels of these modules that begin closed begin open here: the pictures are to show them."""
+    """Open panels of these modules that are closed by default, for the screenshots."""
     for module_ in map(module, names):
         panels = [cls for cls in module_.CLASSES if issubclass(cls, bpy.types.Panel)]
-        for panel in reversed(panels):  # a panel's own before it
+        for panel in reversed(panels):  # subpanels first
             bpy.utils.unregister_class(panel)
         for panel in panels:
             panel.bl_options = set(getattr(panel, "bl_options", ())) - {"DEFAULT_CLOSED"}
@@ -73,7 +74,7 @@ def open_panels(*names: str) -> None:
 
 
 def scroll(times: int) -> None:
-    """Turn the mouse wheel over the sidebar, from its top on downwards."""
+    """Scroll the sidebar to its top, then down by a number of wheel steps."""
     with bpy.context.temp_override(
         window=bpy.context.window_manager.windows[0], area=viewport()[0], region=region("UI")
     ):
@@ -83,17 +84,17 @@ def scroll(times: int) -> None:
             bpy.ops.view2d.scroll_down(deltay=40)
 
 
-def look_at(place: Vector, back: float) -> None:
-    """Look at a place in the world from some way off, in the direction in which one looks already."""
-    looks = viewport()[1]
-    looks.view_location, looks.view_distance = place, back
+def look_at(target: Vector, distance: float) -> None:
+    """Look at a position in the world from a distance, keeping the view's direction."""
+    view = viewport()[1]
+    view.view_location, view.view_distance = target, distance
 
 
-def look_from(eye: Vector, target: Vector) -> None:
-    """Look from one place in the world at another."""
-    looks = viewport()[1]
-    looks.view_perspective, looks.view_rotation = "PERSP", (eye - target).to_track_quat("Z", "Y")
-    looks.view_location, looks.view_distance = target, (eye - target).length
+def look_from(position: Vector, target: Vector) -> None:
+    """Look from one position in the world at another."""
+    view = viewport()[1]
+    view.view_perspective, view.view_rotation = "PERSP", (position - target).to_track_quat("Z", "Y")
+    view.view_location, view.view_distance = target, (position - target).length
 
 
 def click_at(x: int, y: int) -> Steps:
@@ -103,10 +104,12 @@ def click_at(x: int, y: int) -> Steps:
 
 
 def drag(pixels: Sequence[Sequence[int]]) -> Steps:
-    """Press the left button at the first of some pixels of the window, and release it at the last."""
+    """Press the left button at the first pixel of the window, and release it at the last."""
     window = bpy.context.window_manager.windows[0]
     for number, (x, y) in enumerate(pixels):
-        assert (covering := covered(int(x), int(y))) is None, f"{covering} lies over the scene at {x}, {y}."
+        assert (covering := covering_region(int(x), int(y))) is None, (
+            f"{covering} covers the scene at {x}, {y}."
+        )
         window.event_simulate(type="MOUSEMOVE", value="NOTHING", x=int(x), y=int(y))
         yield 0.3
         if not number:
@@ -116,8 +119,8 @@ def drag(pixels: Sequence[Sequence[int]]) -> Steps:
     yield 0.3
 
 
-def covered(x: int, y: int) -> str | None:
-    """What of the viewport lies over the scene at a pixel of the window, such as its sidebar."""
+def covering_region(x: int, y: int) -> str | None:
+    """Return the region that covers the scene at a pixel of the window, such as the sidebar, or None."""
     for part in viewport()[0].regions:
         inside = 0 <= x - part.x < part.width and 0 <= y - part.y < part.height
         if part.type != "WINDOW" and min(part.width, part.height) > 1 and inside:
@@ -131,23 +134,24 @@ def type_in(text: str) -> Steps:
     for letter in text:
         key = {"\r": "RET", "\x1b": "ESC"}.get(letter, letter.upper())
         for value in ("PRESS", "RELEASE"):
-            known = {"unicode": letter} if letter.isalpha() and value == "PRESS" else {}
-            window.event_simulate(type=key, value=value, **known)
+            character = {"unicode": letter} if letter.isalpha() and value == "PRESS" else {}
+            window.event_simulate(type=key, value=value, **character)
         yield 0.2
 
 
 def leave_camera() -> None:
-    """Go on from the camera's place with a view of one's own that turns about what is in its middle."""
-    camera, looks = bpy.context.scene.camera, viewport()[1]
+    """Leave the camera view, keeping its position, with the orbit centre 3 m ahead."""
+    camera = bpy.context.scene.camera
+    view = viewport()[1]
     pose: Matrix = camera.matrix_world.normalized()
-    looks.view_perspective = "PERSP"
-    looks.view_rotation = pose.to_quaternion()
-    looks.view_distance = 3.0
-    looks.view_location = pose @ Vector((0, 0, -3.0))
+    view.view_perspective = "PERSP"
+    view.view_rotation = pose.to_quaternion()
+    view.view_distance = 3.0
+    view.view_location = pose @ Vector((0, 0, -3.0))
 
 
 def settle() -> Steps:
-    """Wait until the picture is complete: sorted splats in full resolution, and what follows the view."""
+    """Wait until the viewport is complete: splats sorted, full resolution, modifiers updated."""
     for _ in range(2):
         yield 0.6
         redraw()
@@ -159,41 +163,41 @@ def redraw() -> None:
 
 
 def until(condition: Callable[[], bool], seconds: float) -> Steps:
-    """Wait for something that comes by itself."""
-    end = time.monotonic() + seconds
+    """Wait for a condition."""
+    deadline = time.monotonic() + seconds
     while not condition():
-        assert time.monotonic() < end, f"Nothing came in {seconds:.0f} seconds."
+        assert time.monotonic() < deadline, f"Nothing happened within {seconds:.0f} seconds."
         yield 0.2
 
 
 def press_f12(seconds: float) -> Generator[float, None, str]:
-    """Press F12 and wait for its picture; which returns ``complete`` or ``cancelled``."""
-    done: list[str] = []
-    ended = (bpy.app.handlers.render_complete, bpy.app.handlers.render_cancel)
-    for handlers, word in zip(ended, ("complete", "cancelled"), strict=True):
-        handlers.append(lambda *_, word=word: done.append(word))
+    """Press F12 and wait; return ``complete`` or ``cancelled``."""
+    results: list[str] = []
+    handler_lists = (bpy.app.handlers.render_complete, bpy.app.handlers.render_cancel)
+    for handlers, result in zip(handler_lists, ("complete", "cancelled"), strict=True):
+        handlers.append(lambda *_, result=result: results.append(result))
     press("render.render")
-    yield from until(lambda: bool(done), seconds)
-    return done[0]
+    yield from until(lambda: bool(results), seconds)
+    return results[0]
 
 
-taken: list[str] = []
+screenshots: list[str] = []
 
 
-def take(name: str, fact: str = "", redrawn: bool = True) -> np.ndarray:
-    """Photograph the screen, drawn anew or as it is; return it as (H, W, 3) float32, rows from the top."""
-    taken.append(name)
-    title = f"{len(taken):02}-{name}"
+def screenshot(name: str, fact: str = "", redraw_first: bool = True) -> np.ndarray:
+    """Save a screenshot and log a fact; return pixels (H, W, 3) float32, rows from the top."""
+    screenshots.append(name)
+    title = f"{len(screenshots):02}-{name}"
     path = OUT / f"{title}.png"
-    if redrawn:
+    if redraw_first:
         redraw()
     subprocess.run([*PLAN["camera"], str(path)], check=True)
-    say(f"{title}: {fact}" if fact else title)
+    log(f"{title}: {fact}" if fact else title)
     return pixels(path)
 
 
 def pixels(path: Path) -> np.ndarray:
-    """A picture file as (H, W, 3) float32 with rows from the top, as the display shows it."""
+    """Read an image file as (H, W, 3) float32 display values, rows from the top."""
     image = bpy.data.images.load(str(path))
     width, height = image.size
     values = np.empty(width * height * 4, np.float32)
@@ -202,31 +206,36 @@ def pixels(path: Path) -> np.ndarray:
     return values.reshape(height, width, 4)[::-1, :, :3]
 
 
-def changed(before: np.ndarray, after: np.ndarray, by: float = 0.1, part: str = "WINDOW") -> float:
-    """The share of the viewport's pixels, or of the status bar's, that differ by more than this between two
-    pictures of the screen."""
+def changed_share(first: np.ndarray, second: np.ndarray, by: float = 0.1, part: str = "WINDOW") -> float:
+    """Return the share of pixels of a region that differ by more than ``by`` between two screenshots.
+
+    Args:
+        first, second: screenshots.
+        by: minimum difference of a channel.
+        part: region of the viewport, or STATUSBAR.
+    """
     if part == "STATUSBAR":
-        clear = slice(before.shape[0] - 20, None), slice(None)
+        area = slice(first.shape[0] - 20, None), slice(None)
     else:
-        seen = region(part)
-        top = before.shape[0] - seen.y - seen.height
-        clear = slice(top, top + seen.height), slice(seen.x, seen.x + seen.width)
-    return float((np.abs(before[clear] - after[clear]).max(axis=2) > by).mean())
+        bounds = region(part)
+        top = first.shape[0] - bounds.y - bounds.height
+        area = slice(top, top + bounds.height), slice(bounds.x, bounds.x + bounds.width)
+    return float((np.abs(first[area] - second[area]).max(axis=2) > by).mean())
 
 
-def alike(picture: np.ndarray, photograph: np.ndarray) -> float:
-    """PSNR in dB."""
-    assert picture.shape == photograph.shape, f"{picture.shape} is not the photograph's {photograph.shape}."
-    return -10 * math.log10(float(np.square(picture - photograph).mean()) + 1e-12)
+def psnr(image: np.ndarray, photo: np.ndarray) -> float:
+    """Return the PSNR in dB."""
+    assert image.shape == photo.shape, f"The image has shape {image.shape}, the photo {photo.shape}."
+    return -10 * math.log10(float(np.square(image - photo).mean()) + 1e-12)
 
 
-def say(line: str) -> None:
+def log(line: str) -> None:
     with open(OUT / "facts.txt", "a", encoding="utf-8") as facts:
         facts.write(f"{line}\n")
 
 
 def start(steps: Steps) -> None:
-    """Take all steps, then close Blender. The last line of facts.txt says how it ended."""
+    """Run all steps, then quit Blender. The last line of facts.txt is the result."""
     bpy.context.preferences.view.show_splash = False
     bpy.context.preferences.view.smooth_view = 0
     bpy.context.preferences.use_preferences_save = False
@@ -235,10 +244,11 @@ def start(steps: Steps) -> None:
         try:
             return next(steps)
         except StopIteration:
-            say("passed")
+            log("passed")
         except Exception as error:
             traceback.print_exc()
-            say(f"failed after {taken[-1] if taken else 'the start'}: {error or type(error).__name__}")
+            last = screenshots[-1] if screenshots else "the start"
+            log(f"failed after {last}: {error or type(error).__name__}")
         with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
             bpy.ops.wm.quit_blender()
         return None
