@@ -16,7 +16,7 @@ from ...training.editing import cleaning
 from ...training.errors import LodgsError
 from ...training.lod.crop import crop_mask
 from ...training.lod.rules.cut import RULE as CUT
-from ...training.lod.tree.paging import COLUMNS
+from ...training.lod.tree.resident import COLUMNS
 from ...training.scenes.cameras import Camera
 from ...training.splats.levels import Bundle
 from ..attributes import BASE, HIDDEN, SCALE, SELECTION, read_attribute, view_attribute, write_attribute

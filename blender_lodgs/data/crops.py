@@ -158,7 +158,7 @@ def _crop(
     """A crop in the space that ``to_own`` leads to from the world."""
     matrix = np.array(to_own @ obj.evaluated_get(depsgraph).matrix_world, np.float64)
     matrix[:, :3] *= size
-    return Crop.at("SPHERE" if sphere else "BOX", matrix, outside)
+    return Crop.from_matrix("SPHERE" if sphere else "BOX", matrix, outside)
 
 
 def _attach(obj: bpy.types.Object, crops: list[bpy.types.Object]) -> None:

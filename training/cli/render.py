@@ -57,7 +57,7 @@ def run(options: argparse.Namespace) -> int:
     if source.rule and find_rule(source.rule) is None and selected is None and not options.level:
         warn(" ".join(unknown_rule_error(source.rule)))
     rendered = render(
-        source, camera, near, options.out, level=options.level, given=selected,
+        source, camera, near, options.out, level=options.level, controls=selected,
         background=options.background, holdout=options.holdout, backend=options.backend, warn=warn,
     )  # fmt: skip
     megabytes = f" of {rendered.bytes_read / 1e6:.1f} MB" if rendered.bytes_read else ""

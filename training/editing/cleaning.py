@@ -18,7 +18,9 @@ from ..lod.partial_read import BLOCKS, block_table
 from ..lod.rule import find_rule
 from ..lod.rules.cut import PARENT, PARENT_SIZE
 from ..lod.selection import unknown_rule_error
-from ..lod.tree.paging import COLUMNS, ResidentTree, is_tree, page_table
+from ..lod.tree.pages import page_table
+from ..lod.tree.paging import is_tree
+from ..lod.tree.resident import COLUMNS, ResidentTree
 from ..scenes.cameras import Camera
 from ..scenes.view_tables import VIEW_TABLES
 from ..splats.gaussians import SplatRows, Splats

@@ -15,7 +15,14 @@ from ..lod.tree.shape import complete_levels
 from ..splats.bundle import open_bundle, write_bundle
 from ..splats.dialects import Warn, comments_from_meta, ignore, meta_from_comments
 from ..splats.file_rows import DrawableRows
-from ..splats.formats import PLY, SPLAT, find_format, find_splat_transform, write_splats, write_streamed_levels
+from ..splats.formats import (
+    PLY,
+    SPLAT,
+    find_format,
+    find_splat_transform,
+    write_splats,
+    write_streamed_levels,
+)
 from ..splats.gaussians import SplatRows, Splats
 from ..splats.level_folder import read_folder, write_folder
 from ..splats.levels import Bundle, Level

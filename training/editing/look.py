@@ -124,7 +124,7 @@ def change_colors(
     Colours that stay above black are what the matrices make of them, from everywhere.
     """
     for crop, look in looks:
-        some: Any = slice(None) if crop is None else np.flatnonzero(crop.holds(means) != crop.outside)
+        some: Any = slice(None) if crop is None else np.flatnonzero(crop.contains(means) != crop.outside)
         if crop is not None and not len(some):
             continue
         matrix = look.matrix

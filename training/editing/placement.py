@@ -11,7 +11,7 @@ from ..errors import LodgsError
 from ..lod.partial_read import BLOCKS
 from ..lod.rule import Rule, find_rule
 from ..lod.selection import rule_columns, unknown_rule_error
-from ..lod.tree.paging import BOUNDS, page_table
+from ..lod.tree.pages import BOUNDS, page_table
 from ..scenes import view_tables
 from ..scenes.ground import find_ground, ground_placement, points_near_cameras
 from ..splats.gaussians import SplatRows, Splats

@@ -1,1 +1,1 @@
-"""Level of detail: which splats an eye sees, as a weight in [0, 1] on the opacity of each."""
+"""Level of detail: weights in [0, 1] on the opacity of each splat, depending on the camera."""

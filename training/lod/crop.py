@@ -1,4 +1,4 @@
-"""Boxes and spheres that splats are kept in, or cut out of: one test, by places, for every level."""
+"""Crops: boxes and spheres that keep, or remove, the splats whose means are inside."""
 
 from __future__ import annotations
 
@@ -12,20 +12,19 @@ from ..errors import LodgsError
 
 SHAPES = ("BOX", "SPHERE")
 FACE_SQUARED = (1 + 1e-5) ** 2
-"""The square of how far a crop reaches in its own space: what lies on its face is in it, however numbers were
-rounded on the way there."""
+"""Squared half size of a crop in its own space, with a margin that keeps points on faces inside."""
 _NOWHERE = ((0.0, 0.0, 0.0, 2.0),) * 3
-"""The way into a crop that is flat: every place is outside."""
+"""``to_own`` of a flat crop, which has no inside."""
 
 
 @dataclass(frozen=True)
 class Crop:
-    """A box or a sphere somewhere in the splats' own space. Crops compare, and travel as JSON.
+    """A box or a sphere in the splats' space. Hashable and JSON-serialisable.
 
     Attributes:
         shape: "BOX", from -1 to 1 on each axis of its own space, or "SPHERE", of radius 1 there.
-        to_own: the rows of the (3, 4) transform from the splats' space to the crop's own.
-        outside: whether what lies in it is cut out; otherwise it is what stays.
+        to_own: rows of the (3, 4) transform from the splats' space to the crop's own.
+        outside: keep the outside instead of the inside.
     """
 
     shape: str
@@ -33,8 +32,8 @@ class Crop:
     outside: bool = False
 
     @classmethod
-    def at(cls, shape: str, matrix: np.ndarray, outside: bool = False) -> Crop:
-        """A crop where (4, 4) ``matrix`` puts the box from -1 to 1, or the sphere of radius 1."""
+    def from_matrix(cls, shape: str, matrix: np.ndarray, outside: bool = False) -> Crop:
+        """Return the crop with the (4, 4) transform from its own space to the splats' space."""
         matrix = np.asarray(matrix, np.float64)
         if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix[:3, :3])) < 1e-30:
             return cls(shape, _NOWHERE, outside)
@@ -42,40 +41,40 @@ class Crop:
         return cls(shape, tuple(map(tuple, rows.tolist())), outside)
 
     @classmethod
-    def box(cls, one: Sequence[float], other: Sequence[float], outside: bool = False) -> Crop:
-        """A box between two opposite corners (3,), along the axes.
+    def box(cls, corner: Sequence[float], opposite: Sequence[float], outside: bool = False) -> Crop:
+        """Return an axis-aligned box between two opposite corners (3,).
 
         Raises:
-            LodgsError: there is nothing between them, or no end.
+            LodgsError: the box is flat or infinite.
         """
-        low, high = np.minimum(one, other), np.maximum(one, other)
+        low, high = np.minimum(corner, opposite), np.maximum(corner, opposite)
         if not np.isfinite([low, high]).all():
-            raise LodgsError(f"The box from {one} to {other} has no end.", "Give two opposite corners.")
+            raise LodgsError(f"The box from {corner} to {opposite} is infinite.", "Use finite corners.")
         if not (high > low).all():
-            raise LodgsError(f"The box from {one} to {other} is flat.", "Give two opposite corners.")
+            raise LodgsError(f"The box from {corner} to {opposite} is flat.", "Use two opposite corners.")
         matrix = np.diag([*(high - low) / 2, 1])
         matrix[:3, 3] = (low + high) / 2
-        return cls.at("BOX", matrix, outside)
+        return cls.from_matrix("BOX", matrix, outside)
 
     @classmethod
     def sphere(cls, centre: Sequence[float], radius: float, outside: bool = False) -> Crop:
-        """A sphere around a centre (3,).
+        """Return a sphere around a centre (3,).
 
         Raises:
-            LodgsError: it has no radius, or no end.
+            LodgsError: the sphere is empty or infinite.
         """
         if not np.isfinite([*centre, radius]).all():
             raise LodgsError(
-                f"The sphere of radius {radius:g} around {centre} has no end.", "Give four finite numbers."
+                f"The sphere of radius {radius:g} around {centre} is infinite.", "Use finite numbers."
             )
         if not radius > 0:
-            raise LodgsError(f"A sphere of radius {radius:g} holds nothing.", "Give a radius above 0.")
+            raise LodgsError(f"A sphere of radius {radius:g} is empty.", "Use a radius above 0.")
         matrix = np.diag([radius, radius, radius, 1.0])
         matrix[:3, 3] = centre
-        return cls.at("SPHERE", matrix, outside)
+        return cls.from_matrix("SPHERE", matrix, outside)
 
-    def holds(self, means: np.ndarray) -> np.ndarray:
-        """(N,) bool, which means (N, 3) lie in it."""
+    def contains(self, means: np.ndarray) -> np.ndarray:
+        """Return (N,) bool: means (N, 3) inside the crop."""
         x, y, z = means.T
         squares = None
         for a, b, c, d in np.array(self.to_own, np.float32):
@@ -95,15 +94,17 @@ class Crop:
 
     @classmethod
     def from_text(cls, text: str) -> Crop:
-        """A crop in words: ``box X Y Z X Y Z`` (two opposite corners), ``sphere X Y Z R``, or either with the
-        12 numbers of ``to_own``, row by row, for what is turned or stretched.
+        """Parse a crop.
+
+        Valid are ``box X Y Z X Y Z`` (two opposite corners), ``sphere X Y Z R``, or either name with the 12
+        numbers of ``to_own``, row by row.
 
         Raises:
-            LodgsError: it is none, or holds nothing.
+            LodgsError: invalid text, or an empty crop.
         """
-        name, *told = text.split()
+        name, *words = text.split()
         try:
-            numbers = [float(each) for each in told]
+            numbers = [float(word) for word in words]
         except ValueError:
             numbers = []
         if np.isfinite(numbers).all():
@@ -116,35 +117,35 @@ class Crop:
                     rows = (tuple(numbers[at : at + 4]) for at in (0, 4, 8))
                     return cls(name.upper(), tuple(rows))
         raise LodgsError(
-            f"{quote(text)} is no box and no sphere.",
-            "Give box X Y Z X Y Z (two opposite corners), or sphere X Y Z RADIUS.",
+            f"{quote(text)} is neither a box nor a sphere.",
+            "Use box X Y Z X Y Z (two opposite corners), or sphere X Y Z RADIUS.",
         )
 
     def as_text(self) -> str:
-        """What ``from_text`` makes the same of, whatever lies in it stays or goes."""
+        """Return a text for :meth:`from_text`, which does not store ``outside``."""
         return " ".join([self.shape.lower(), *(repr(value) for row in self.to_own for value in row)])
 
     def as_dict(self) -> dict:
-        """The same as JSON has it."""
+        """Return the crop as a JSON-serialisable dict."""
         return {"shape": self.shape, "to_own": [list(row) for row in self.to_own], "outside": self.outside}
 
 
 def crop_mask(crops: Sequence[Crop], means: np.ndarray) -> np.ndarray:
-    """(N,) bool, which splats at means (N, 3) some crops leave.
+    """Return (N,) bool: splats at means (N, 3) that crops keep.
 
-    Those in any of the crops that keep what lies in them, or all where there is none such, but for those in
-    any that is cut out.
+    Kept are splats inside any crop that keeps its inside (all splats if there is no such crop), except those
+    inside any crop that keeps its outside.
     """
     inside = [crop for crop in crops if not crop.outside]
-    found = np.full(len(means), not inside)
+    mask = np.full(len(means), not inside)
     for crop in inside:
-        found |= crop.holds(means)
+        mask |= crop.contains(means)
     for crop in crops:
         if crop.outside:
-            found &= ~crop.holds(means)
-    return found
+            mask &= ~crop.contains(means)
+    return mask
 
 
 def is_crop_text(text: str) -> bool:
-    """Whether a text is meant to be one that :meth:`Crop.from_text` reads, and no path."""
+    """Return whether a text is meant for :meth:`Crop.from_text`, and is not a path."""
     return text.split(" ", 1)[0].upper() in SHAPES

@@ -1,4 +1,4 @@
-"""Splats of a level that stay in their file: of them is read what one camera may see. numpy only."""
+"""Levels on disk: read only the splats that a camera can see. numpy only."""
 
 from __future__ import annotations
 
@@ -19,30 +19,32 @@ from .rule import Rule, find_rule
 from .selection import rule_columns
 
 MAX_IN_MEMORY = 4_000_000
-"""Splats of a file that are all kept in memory, where nothing else is said: 1 GB of degree 3."""
-_ANYWHERE = np.float32(1e15)
-"""Farther than any splat is drawn."""
-_AT_ONCE = 64 * SIZE
-"""Splats that are looked at together when their places are found."""
+"""Default limit of splats to keep all of a file in memory: 1 GB at degree 3."""
+_FAR = np.float32(1e15)
+"""Coordinate beyond every drawable splat."""
+_BATCH = 64 * SIZE
+"""Splats per batch of the first pass over a file."""
 _GAP = 4
-"""So many blocks and fewer are read with those on both sides of them: less work than beginning again."""
-_SPARE = 2
-"""What has been read is kept as long as it is no more than so many times what a camera may see."""
+"""Read gaps of up to so many blocks along with their neighbours, instead of seeking."""
+_MAX_SURPLUS = 2
+"""Keep blocks in memory while they are at most so many times those that a camera can see."""
 
 
 def supports_culled_reads(rule: str) -> bool:
-    """Whether levels of a rule can be drawn by those splats alone that a camera may see."""
-    found = find_rule(rule)
-    return found is not None and found.apart and not found.tables
+    """Return whether levels of a rule can be drawn from only the splats that a camera can see."""
+    known = find_rule(rule)
+    return known is not None and known.apart and not known.tables
 
 
-def open_if_large(path: str | Path, most: int = 0) -> Bundle | None:
-    """A bundle of many splats, with its tables, whose levels are elsewhere: in their file.
-
-    None where it has fewer, or is another PLY, or its rule has to know of all splats at once or of regions.
+def open_if_large(path: str | Path, limit: int = 0) -> Bundle | None:
+    """Open a bundle with more splats than a limit; its levels stay on disk.
 
     Args:
-        most: splats that are not yet many; 0: IN_MEMORY.
+        limit: 0: MAX_IN_MEMORY.
+
+    Returns:
+        The bundle with its tables; None if it has at most ``limit`` splats, is another PLY, or has a rule
+        that needs all splats or regions.
 
     Raises:
         LodgsError: as ``read_bundle``.
@@ -50,7 +52,7 @@ def open_if_large(path: str | Path, most: int = 0) -> Bundle | None:
     if not supports_culled_reads(read_header(path).rule):
         return None
     bundle, rows = open_bundle(path)
-    if sum(map(len, rows.values())) <= (most or MAX_IN_MEMORY):
+    if sum(map(len, rows.values())) <= (limit or MAX_IN_MEMORY):
         return None
     for level in bundle.levels:
         level.on_disk = rows[level.number]
@@ -58,87 +60,94 @@ def open_if_large(path: str | Path, most: int = 0) -> Bundle | None:
 
 
 class CulledReader:
-    """A level's splats in blocks of rows, of which it is known where they are; all are read once for it.
+    """Reads blocks of a level's splats that a camera can see. Reads all splats once to find their bounds.
 
     Args:
-        rows: in an order in which neighbours come near each other, or few blocks are out of sight.
-        rule: the levels' own, or None.
+        rows: sorted by space, or few blocks can be skipped.
+        rule: of the levels, or None.
         path: of the file, for warnings.
 
     Attributes:
-        count: how many splats have been read.
+        splats_read: number of splats read so far.
     """
 
     def __init__(
         self, rows: SplatRows, rule: Rule | None = None, path: object = "", warn: Warn = ignore
     ) -> None:
-        self._rows, self._rule, self._path = rows, rule, str(path)
-        parts, of_columns, undrawable = [], [], 0
-        for begin in range(0, len(rows), _AT_ONCE):
-            splats = rows.select(slice(begin, begin + _AT_ONCE))
+        self._rows = rows
+        self._rule = rule
+        self._path = str(path)
+        bounds, maxima, undrawable = [], [], 0
+        for begin in range(0, len(rows), _BATCH):
+            splats = rows.select(slice(begin, begin + _BATCH))
             missing = len(splats) - len(drop_undrawable(splats, self._path))
             undrawable += missing
             blocks = Blocks.of(splats.means, splats.log_scales)
-            if missing:  # no numbers to go by
-                blocks.low[:], blocks.high[:] = -_ANYWHERE, _ANYWHERE
-            parts.append((blocks.low, blocks.high, blocks.reach))
+            if missing:  # coordinates may be invalid
+                blocks.low[:], blocks.high[:] = -_FAR, _FAR
+            bounds.append((blocks.low, blocks.high, blocks.reach))
             columns = {} if rule is None else rule_columns(rule, splats)
-            of_columns.append({name: blocks.highest(column) for name, column in columns.items()})
+            maxima.append({name: blocks.highest(column) for name, column in columns.items()})
         if undrawable:
             warn(dropped_message(undrawable, self._path))
-        none = Blocks.of(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32))
+        empty = Blocks.of(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32))
         low, high, reach = (
-            np.concatenate([getattr(none, name), *(part[i] for part in parts)])
+            np.concatenate([getattr(empty, name), *(batch[i] for batch in bounds)])
             for i, name in enumerate(("low", "high", "reach"))
         )
         self._blocks = Blocks(len(rows), low, high, reach)
-        names = of_columns[0] if of_columns else {}
-        self._highest = {name: np.concatenate([each[name] for each in of_columns]) for name in names}
-        self._held: np.ndarray | None = None
-        self.count = len(rows)
+        names = maxima[0] if maxima else {}
+        self._highest = {name: np.concatenate([batch[name] for batch in maxima]) for name in names}
+        self._in_memory: np.ndarray | None = None
+        self.splats_read = len(rows)
 
     def __len__(self) -> int:
         return len(self._rows)
 
-    def missing(self, camera: Camera, choice: LodQuery | None = None) -> np.ndarray | None:
-        """The blocks (B,) bool of all splats that a camera has in its image and, by a choice, a weight; None
-        where what was read last will do."""
-        wanted = self._blocks.in_view(camera, 0.0)
-        if choice is not None and self._rule is not None and self._rule.apart and choice.region() is None:
-            eye = np.array(choice.eye, np.float32)
-            wanted &= self._blocks.between(eye, *choice.distance_band(self._highest))[0]
-        most = max(_SPARE * np.count_nonzero(wanted), _AT_ONCE // SIZE)
-        if self._held is not None and not (wanted & ~self._held).any() and self._held.sum() <= most:
+    def missing(self, camera: Camera, query: LodQuery | None = None) -> np.ndarray | None:
+        """Return the blocks (B,) bool to read for a camera; None if those in memory suffice.
+
+        Args:
+            query: skip blocks whose splats have no weight by this query.
+        """
+        visible = self._blocks.in_view(camera, 0.0)
+        if query is not None and self._rule is not None and self._rule.apart and query.region() is None:
+            band = query.distance_band(self._highest)
+            visible &= self._blocks.in_band(np.array(query.eye, np.float32), *band)[0]
+        limit = max(_MAX_SURPLUS * np.count_nonzero(visible), _BATCH // SIZE)
+        in_memory = self._in_memory
+        if in_memory is not None and not (visible & ~in_memory).any() and in_memory.sum() <= limit:
             return None
-        return wanted
+        return visible
 
     def read(self, blocks: np.ndarray) -> Splats:
-        """The splats of blocks (B,), and of few between them, in the order of their rows."""
-        parts, self._held = [], np.zeros_like(blocks)
+        """Read the splats of blocks (B,) and of small gaps between them, in the order of rows."""
+        parts = []
+        self._in_memory = np.zeros_like(blocks)
         for begin, end in _runs(blocks):
             parts.append(self._rows.select(slice(begin * SIZE, end * SIZE)))
-            self._held[begin:end] = True
+            self._in_memory[begin:end] = True
         splats = Splats.concatenated(parts) if parts else self._rows.select(slice(0, 0))
-        self.count += len(splats)
+        self.splats_read += len(splats)
         return drop_undrawable(splats, self._path)
 
 
 def read_visible(bundle: Bundle, camera: Camera) -> Bundle:
-    """A bundle in memory as far as a camera may see it."""
+    """Return a bundle in memory that holds only splats that a camera can see."""
     levels = []
     for level in bundle.levels:
-        sight = CulledReader(level.rows)
-        blocks = sight.missing(camera)
+        reader = CulledReader(level.rows)
+        blocks = reader.missing(camera)
         assert blocks is not None, "nothing has been read yet"
-        levels.append(replace(level, splats=sight.read(blocks), on_disk=None))
+        levels.append(replace(level, splats=reader.read(blocks), on_disk=None))
     return replace(bundle, levels=levels)
 
 
-def _runs(wanted: np.ndarray) -> list[tuple[int, int]]:
-    """Where blocks (B,) begin and end that are read together."""
-    some = np.flatnonzero(wanted)
-    if not len(some):
+def _runs(mask: np.ndarray) -> list[tuple[int, int]]:
+    """Return begin and end of runs of blocks (B,), with small gaps closed."""
+    blocks = np.flatnonzero(mask)
+    if not len(blocks):
         return []
-    breaks = np.flatnonzero(np.diff(some) > _GAP) + 1
-    borders = pairwise([0, *breaks.tolist(), len(some)])
-    return [(int(some[begin]), int(some[end - 1]) + 1) for begin, end in borders]
+    breaks = np.flatnonzero(np.diff(blocks) > _GAP) + 1
+    borders = pairwise([0, *breaks.tolist(), len(blocks)])
+    return [(int(blocks[begin]), int(blocks[end - 1]) + 1) for begin, end in borders]

@@ -1,4 +1,4 @@
-"""Of a bundle larger than what is wanted of it: the part that a region can show, by ranges of the file."""
+"""Read only some levels of a bundle, or the splats of a region, by ranges of the file."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from .rule import Region, Rule
 from .selection import require_rule, rule_columns
 
 BLOCKS = "blocks"
-"""The table of blocks, SIZE rows of a level each, in the order of their rows: ``level``, and the rule's
-columns of bits, those of all rows of the block together."""
+"""Table of blocks of SIZE rows of a level, in the order of rows: ``level``, and the rule's bit columns, each
+combined by OR over the rows of a block."""
 
 
 def block_table(rule: Rule, levels: dict[int, Splats]) -> dict[str, np.ndarray]:
-    """The table for levels by number, of a rule whose columns are whole numbers of bits, float32."""
+    """Return the table of blocks of levels by number, for a rule whose float32 columns hold bits."""
     table: dict[str, list[np.ndarray]] = {"level": []}
     for number, splats in levels.items():
         begins = np.arange(0, len(splats), SIZE)
@@ -36,7 +36,7 @@ def block_table(rule: Rule, levels: dict[int, Splats]) -> dict[str, np.ndarray]:
 
 
 def read_header_and_tables(path: str | Path) -> Bundle:
-    """What a bundle says of its levels, which are without splats, with its tables.
+    """Return a bundle with its tables and levels, but without splats.
 
     Raises:
         LodgsError: as ``read_bundle``.
@@ -47,36 +47,38 @@ def read_header_and_tables(path: str | Path) -> Bundle:
 def read_part(
     path: str | Path, numbers: Collection[int], region: Region | None = None, warn: Warn = ignore
 ) -> tuple[Bundle, int]:
-    """Some levels of a bundle, or what eyes in a region may be shown of them; and how many bytes were read.
+    """Read some levels of a bundle, or their splats that are visible in a region.
 
-    Blocks that have none of these are not read. Splats are in the file's order; the other levels have none.
+    Skips blocks without such splats. Splats keep the file's order; other levels are empty.
 
     Args:
         numbers: of the levels.
-        region: None, or where the file has no table of blocks: everywhere.
+        region: None: all splats; also if the file has no table of blocks.
         warn: as for ``read_bundle``.
 
+    Returns:
+        The bundle, and the number of bytes read.
+
     Raises:
-        LodgsError: as ``read_bundle``; or, for a region, the rule of its levels is not known here.
+        LodgsError: as ``read_bundle``; unknown rule, if there is a region.
     """
     size = 0
 
     def rows_of(bundle: Bundle) -> dict[int, np.ndarray]:
         nonlocal size
         size = sum(column.nbytes for table in bundle.tables.values() for column in table.values())
-        found = {
-            level.number: np.zeros(0, np.int64) for level in bundle.levels if level.number not in numbers
-        }
+        rows = {level.number: np.zeros(0, np.int64) for level in bundle.levels if level.number not in numbers}
         table = bundle.tables.get(BLOCKS)
         if table is None or region is None:
-            return found
+            return rows
         rule = require_rule(bundle)
-        nothing = np.zeros(len(table["level"]), np.float32)
-        needed = rule.visible_in_region({name: table.get(name, nothing) for name in rule.columns}, region)
+        zeros = np.zeros(len(table["level"]), np.float32)
+        columns = {name: table.get(name, zeros) for name in rule.columns}
+        needed = rule.visible_in_region(columns, region)
         for number in numbers:
             blocks = np.flatnonzero(needed[table["level"] == number])
-            found[number] = (blocks[:, None] * SIZE + np.arange(SIZE)).reshape(-1)
-        return found
+            rows[number] = (blocks[:, None] * SIZE + np.arange(SIZE)).reshape(-1)
+        return rows
 
     bundle = read_bundle(path, warn, rows_of)
     rule = None if region is None or BLOCKS not in bundle.tables else require_rule(bundle)
@@ -84,5 +86,6 @@ def read_part(
         columns = columns_in_file(level.splats) | extra_columns(level.splats)
         size += sum(column.dtype.itemsize for column in columns.values()) * len(level.splats)
         if rule is not None and region is not None:
-            level.splats = level.splats.select(rule.visible_in_region(rule_columns(rule, level.splats), region))
+            visible = rule.visible_in_region(rule_columns(rule, level.splats), region)
+            level.splats = level.splats.select(visible)
     return bundle, size

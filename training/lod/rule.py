@@ -1,8 +1,8 @@
-"""What decides the detail that an eye sees: one object a rule, which everything else asks.
+"""Level-of-detail rules: a weight for each splat of a level, depending on the camera.
 
-A rule is a module of ``lod.rules``, found by itself: it names what it needs to know (facts of the scene and
-of each level, columns of the splats) and what an eye may turn (controls), and gives every splat a weight. The
-command line, Blender's panel and node groups, evaluation and both renderers take all of that from here.
+Each module of ``lod.rules`` defines a rule and is discovered automatically. A rule declares its inputs (facts
+of the scene and of each level, columns of the splats), its user controls, and the weights. The command line,
+Blender's panels and node groups, evaluation and both renderers use these declarations.
 """
 
 from __future__ import annotations
@@ -23,44 +23,44 @@ from ..splats.ply import Columns
 from ..splats.similarity import AxisNames
 
 STEP = 1.25
-"""Factor by which a viewer's budget raises a control at a time."""
+"""Factor of one step of :meth:`Rule.raise_control`."""
 
 NO_FINER = 1 << 30
-"""What the fact ``finer`` of the finest level is."""
+"""Value of the fact ``finer`` for the finest level."""
 
 OPACITY = "opacity"
-"""The column that every splat has: its own opacity, in [0, 1]."""
+"""Column of a splat's opacity, in [0, 1]; every splat has it."""
 
 HIDDEN = "hidden"
-"""The column of splats that somebody has hidden: not 0 where they are."""
+"""Column that is not 0 for splats hidden by the user."""
 
 Values = Mapping[str, float]
-"""A number for each control of a rule, by name."""
+"""Values of a rule's controls, by name."""
 
 Tables = Mapping[str, Mapping[str, np.ndarray]]
-"""Tables of a bundle, of columns (rows,) by name."""
+"""Tables of a bundle by name; each has columns (rows,) by name."""
 NO_TABLES: Tables = {}
 NO_COLUMNS: Mapping[str, np.ndarray] = {}
 
 Region = tuple[int, ...]
-"""Names a part of space; what it is made of is the rule's."""
+"""Identifies a part of space; its meaning depends on the rule."""
 
 
 @dataclass(frozen=True)
 class Control:
-    """What an eye may turn: a slider, an option of the command line, a number in a bundle.
+    """A user control of a rule: a slider, a command-line option, a number in a bundle.
 
     Attributes:
         name: in code, sockets, options and files.
-        default: where nothing else is said.
-        low, high: the smallest and the largest possible value.
-        soft: the range of a slider; None: it is no slider, but a box to tick or a number to type.
-        label, about: for people, a word or two and a sentence.
-        unit: Blender's subtype of such a property: "NONE", "PIXEL", "FACTOR".
-        whole: whether only whole numbers are possible; from 0 to 1 it is a box to tick.
-        step: what the arrows of a whole number add.
-        follows: "coarsest" or "finest" where the value is the number of such a level in use, which follows
-            the levels that there are (``Rule.defaults``), as long as nobody sets it.
+        default: default value.
+        low, high: minimum and maximum.
+        soft: range of the slider; None: a checkbox or a number field instead of a slider.
+        label, about: label and tooltip.
+        unit: Blender's subtype of the property: "NONE", "PIXEL", "FACTOR".
+        whole: only whole numbers are valid; with the range 0 to 1 the control is a checkbox.
+        step: step of the arrows of a whole number.
+        follows: "coarsest" or "finest" if the value is the number of a level and follows the existing levels
+            (``Rule.defaults``) until the user sets it.
     """
 
     name: str
@@ -77,47 +77,46 @@ class Control:
 
     @property
     def flag(self) -> bool:
-        """Whether it is a box to tick."""
+        """Whether the control is a checkbox."""
         return self.whole and (self.low, self.high) == (0, 1)
 
     def validate(self, value: float) -> float:
-        """The value as this control takes it.
+        """Return the value as int or float.
 
         Raises:
-            LodgsError: it is no such number, or out of range.
+            LodgsError: wrong type, or out of range.
         """
         number = isinstance(value, int | float | np.number) and self.low <= value <= self.high
         if not number or (self.whole and value != int(value)):
             kind = "a whole number" if self.whole else "a number"
             raise LodgsError(
-                f"{self.name} = {value!r} is not possible.",
-                f"Give {kind} from {self.low:g} to {self.high:g}.",
+                f"{self.name} = {value!r} is invalid.",
+                f"Use {kind} from {self.low:g} to {self.high:g}.",
             )
         return int(value) if self.whole else float(value)
 
 
 class Rule(ABC):
-    """How splats are weighted for an eye.
+    """A rule that gives each splat of a level a weight, depending on the camera.
 
     Attributes:
-        name: stands in the head of bundles and in .blend files.
-        cumulative: whether levels add up; otherwise each replaces the coarser ones.
-        controls: what an eye may turn.
+        name: identifies the rule in bundles and .blend files.
+        cumulative: levels add up; otherwise each replaces the coarser ones.
+        controls: user controls.
         scene_facts: names of numbers that belong to the whole scene.
         level_facts: names of numbers that each level has.
-        columns: names of per-splat columns, (N,) float32; zeros where splats lack one. OPACITY is each
+        columns: names of per-splat columns, (N,) float32; a missing column counts as zeros. OPACITY is the
             splat's own.
-        tables: names of tables of the bundle; where one is missing, the rule does without it.
-        lengths: which of its facts, its columns and the columns of its tables are lengths in scene units.
-        places: names, as x, y and z, of those of its columns, or of its tables', that are places.
-        linked_columns: whether columns of one splat have to agree with those of others: see :meth:`reconcile`.
-        always_active: whether its weights belong to the picture at full detail, too: without them a level is not
-            what was trained.
-        apart: whether the weight of a splat does not depend on other splats, so that a few can be asked for.
-        binary: whether every splat within its level's :meth:`distance_band` has the weight 1.
-        complete: whether each level, with the coarser ones where levels add up, is a scene by itself;
-            otherwise only the finest is, and coarser ones are there to choose from.
-        sweep: a control, and values of it that a report measures one by one; None: it needs no such curve.
+        tables: names of tables of the bundle; the rule works without a missing one.
+        lengths: the facts, columns and table columns that are lengths in scene units.
+        places: the columns and table columns that are positions, as names of x, y and z.
+        linked_columns: columns of a splat must agree with those of others, see :meth:`reconcile`.
+        always_active: weights apply at full detail, too: without them a level is not as trained.
+        apart: the weight of a splat does not depend on other splats, so a subset can be evaluated.
+        binary: every splat inside its level's :meth:`distance_band` has weight 1.
+        complete: each level, with the coarser ones if levels add up, is a complete scene; otherwise only the
+            finest is.
+        sweep: a control and values of it that a report measures one by one; None for no such curve.
     """
 
     name: ClassVar[str]
@@ -140,23 +139,23 @@ class Rule(ABC):
     def weights(
         self,
         means: np.ndarray,
-        eye: np.ndarray,
+        position: np.ndarray,
         focal_px: float,
         columns: Mapping[str, np.ndarray],
         facts: Mapping[str, float],
         values: Values,
         tables: Tables = NO_TABLES,
     ) -> np.ndarray:
-        """Weights (N,) in [0, 1] of the splats of one level; those of weight 0 are not drawn at all.
+        """Return weights (N,) in [0, 1] of the splats of one level; weight 0 means not drawn.
 
         Args:
             means: (N, 3) float32 in scene units.
-            eye: (3,) from where distances are measured, in the same space.
-            focal_px: the eye's focal length in pixels (``Camera.focal``: the smaller of fx and fy).
+            position: (3,) of the camera, in the same space.
+            focal_px: the camera's focal length in pixels (``Camera.focal``: the smaller of fx and fy).
             columns: (N,) of each of the rule's columns.
             facts: of the scene and of the level, see :func:`collect_facts`.
             values: of every control.
-            tables: of the bundle, those of the rule at least; coordinates are in the same space.
+            tables: at least the rule's tables of the bundle; coordinates are in the same space.
         """
 
     def distance_band(
@@ -166,107 +165,111 @@ class Rule(ABC):
         values: Values,
         highest: Mapping[str, np.ndarray] = NO_COLUMNS,
     ) -> tuple[float, float | np.ndarray]:
-        """The distances near <= d < far from the eye outside which no splat of a level has a weight.
+        """Return camera distances near and far; weights are 0 outside near <= d < far.
 
-        For whoever can leave out many splats at once. Where a region counts (:meth:`region`), that does
-        instead.
+        Callers skip whole sets of splats with it. Inside a :meth:`region`, use that instead.
 
         Args:
-            highest: the greatest value of each column among splats of the level, (B,) of B sets of them;
-                ``far`` may then be (B,), too. Without it what depends on columns is taken for possible.
+            highest: maximum of each column in each of B sets of splats, (B,); ``far`` may then be (B,), too.
+                Without it, the band covers all possible column values.
         """
         return 0.0, inf
 
     def check(self, tables: Tables) -> None:
-        """Raises ValueError, with half a sentence, where tables are there but not what the rule reads."""
+        """Check the rule's tables.
+
+        Raises:
+            ValueError: a table is invalid; the message is a clause without a full stop.
+        """
         return
 
     def reconcile(self, before: Columns, after: Columns) -> Columns:
-        """Where the rule is ``linked_columns``: those columns (N,) that rounding has put out of step, made anew.
+        """Return columns (N,) that rounding has made inconsistent, corrected; for ``linked_columns``.
 
         Args:
             before: the rule's columns and x, y and z of the means, of the splats of all levels.
-            after: the same where these splats have been placed elsewhere.
+            after: the same after a transform of the splats.
         """
         return {}
 
-    def region(self, eye: np.ndarray, values: Values, tables: Tables) -> Region | None:
-        """Where an eye is, for rules whose splats can be told beforehand for a whole region; else None.
+    def region(self, position: np.ndarray, values: Values, tables: Tables) -> Region | None:
+        """Return the region of a camera position; None if the rule has no regions, or none here.
 
-        As long as the eye stays in the region, no splat has a weight that :meth:`visible_in_region` leaves out.
+        While the camera stays in the region, only splats of :meth:`visible_in_region` have a weight.
         """
         return None
 
     def visible_in_region(self, columns: Mapping[str, np.ndarray], region: Region) -> np.ndarray:
-        """(N,) bool, which splats of a level an eye in a region may be shown."""
+        """Return (N,) bool: splats of a level that may have a weight in a region."""
         raise NotImplementedError("this rule has no regions")
 
-    def region_label(self, eye: np.ndarray, values: Values, tables: Tables) -> str:
-        """Where an eye is, in a few words for people; empty where the rule tells no regions apart."""
+    def region_label(self, position: np.ndarray, values: Values, tables: Tables) -> str:
+        """Return a short description of the camera's region for the user; "" if the rule has no regions."""
         return ""
 
-    def inactive_controls(self, eye: np.ndarray, values: Values, tables: Tables) -> Mapping[str, str]:
-        """The controls that change nothing for an eye, by name, each with the reason in a sentence."""
+    def inactive_controls(self, position: np.ndarray, values: Values, tables: Tables) -> Mapping[str, str]:
+        """Return the controls without effect at a camera position, by name, each with a reason."""
         return {}
 
     def parts(self, means: np.ndarray, tables: Tables) -> np.ndarray:
-        """The number (N,), from 1 on, of that part of space where each place is, for pictures that tell
-        them apart; 0 where the rule has no such parts."""
+        """Return the number (N,), from 1 on, of the part of space at each position, for coloured overlays.
+
+        0 if the rule has no such parts.
+        """
         return np.zeros(len(means), np.float32)
 
     def standalone_levels(self, levels: Sequence[int]) -> Sequence[int]:
-        """The numbers of those levels that can be shown one at a time: all of them, or where levels are not
-        ``complete`` the finest.
+        """Return the numbers of the levels that are complete scenes: all, or only the finest.
 
         Args:
-            levels: numbers of the levels that there are, ascending.
+            levels: numbers of the existing levels, ascending.
         """
         return levels if self.complete else levels[-1:]
 
     def told_level(self, columns: Mapping[str, np.ndarray], facts: Mapping[str, float]) -> np.ndarray | float:
-        """The level (N,) of splats, or one for all, for pictures that tell which level is where."""
+        """Return the level (N,) of splats, or one for all, for overlays that colour splats by level."""
         return facts["level"]
 
     def wanted_level(
         self,
         means: np.ndarray,
-        eye: np.ndarray,
+        position: np.ndarray,
         focal_px: float,
         facts: Mapping[str, float],
         values: Values,
     ) -> np.ndarray:
-        """The level (N,) that is wanted where splats are, for pictures that tell which level is where."""
+        """Return the level (N,) that the rule aims at where splats are, for overlays."""
         return np.full(len(means), facts["level"], np.float32)
 
     def coarser(self, values: Values, levels: Sequence[int]) -> Values | None:
-        """The next coarser choice, for a viewer that can draw no more; None where there is none.
+        """Return control values for the next coarser detail, to stay within a budget; None if there are none.
 
         Args:
-            levels: numbers of the levels that there are, ascending.
+            levels: numbers of the existing levels, ascending.
         """
         return None
 
     def raise_control(self, values: Values, name: str) -> Values | None:
-        """The values with one control STEP times as large; None where that is beyond its range."""
+        """Return the values with one control multiplied by STEP; None if that exceeds its range."""
         value = values[name] * STEP
         high = next(control.high for control in self.controls if control.name == name)
         return {**values, name: value} if value <= high else None
 
     def defaults(self, levels: Sequence[int]) -> dict[str, float]:
-        """The value of every control that pictures and figures are made with where nothing else is said.
+        """Return the default value of every control.
 
         Args:
-            levels: numbers of the levels that there are, ascending.
+            levels: numbers of the existing levels, ascending.
         """
         return {control.name: control.default for control in self.controls}
 
     def resolve_controls(
         self, given: Values, levels: Sequence[int], recorded: Values | None = None
     ) -> Values:
-        """A value for every control: those given, then those that a bundle recorded, then :meth:`defaults`.
+        """Return a value for every control: given, else recorded in the bundle, else :meth:`defaults`.
 
         Raises:
-            LodgsError: the rule has no such control, a value is not possible, or no level is left in use.
+            LodgsError: unknown control, invalid value, or no level in use.
         """
         controls = {control.name: control for control in self.controls}
         for name in given:
@@ -275,25 +278,25 @@ class Rule(ABC):
                     f"The rule '{self.name}' has no option '{name}'.",
                     f"It has: {', '.join(controls) or 'none'}.",
                 )
-        found = self.defaults(levels) | dict(recorded or {}) | dict(given)
-        return {name: control.validate(found[name]) for name, control in controls.items()}
+        values = self.defaults(levels) | dict(recorded or {}) | dict(given)
+        return {name: control.validate(values[name]) for name, control in controls.items()}
 
 
 @cache
 def rules() -> dict[str, Rule]:
-    """Every rule by its name: the modules of ``lod.rules`` each have one as ``RULE``."""
+    """Return every rule by name: ``RULE`` of each module of ``lod.rules``."""
     from . import rules as package
 
-    modules = (import_module(f"{package.__name__}.{found.name}") for found in iter_modules(package.__path__))
+    modules = (import_module(f"{package.__name__}.{info.name}") for info in iter_modules(package.__path__))
     return {module.RULE.name: module.RULE for module in modules}
 
 
 class NoRule(Rule):
-    """What stands for a rule where there is none: all splats are drawn."""
+    """Substitute for a missing rule: draws all splats."""
 
     name = ""
 
-    def weights(self, means, eye, focal_px, columns, facts, values, tables=NO_TABLES) -> np.ndarray:
+    def weights(self, means, position, focal_px, columns, facts, values, tables=NO_TABLES) -> np.ndarray:
         return np.ones(len(means), np.float32)
 
 
@@ -301,22 +304,22 @@ NO_RULE = NoRule()
 
 
 def find_rule(name: str) -> Rule | None:
-    """The rule of that name; None where there is none, or this version does not know it."""
+    """Return the rule of that name; None if unknown."""
     return rules().get(name)
 
 
 def all_controls() -> dict[str, Control]:
-    """The controls of all rules by name; two rules that share a name share its meaning."""
+    """Return the controls of all rules by name; a name has the same meaning in all rules."""
     return {control.name: control for rule in rules().values() for control in rule.controls}
 
 
 def all_rule_columns() -> set[str]:
-    """The columns of all rules, but the opacity; and HIDDEN, which choices ask for beside them."""
+    """Return the columns of all rules except OPACITY, and HIDDEN."""
     return {name for rule in rules().values() for name in rule.columns} - {OPACITY} | {HIDDEN}
 
 
 def fact_names(rule: Rule) -> list[str]:
-    """The names of all that :func:`collect_facts` says of a level."""
+    """Return the names of the facts that :func:`collect_facts` returns."""
     coarser = [f"coarser_{name}" for name in rule.level_facts]
     return ["level", "finer", "coarser", "levels", *rule.scene_facts, *rule.level_facts, *coarser]
 
@@ -327,57 +330,57 @@ def collect_facts(
     levels: Sequence[tuple[int, Mapping[str, Any]]],
     number: int,
 ) -> dict[str, float]:
-    """All that a rule knows of one level.
+    """Return a rule's facts about one level.
 
     Args:
         scene: facts of the scene, by name.
-        levels: number and facts of every level that there is, coarse to fine.
-        number: of the level that is meant.
+        levels: number and facts of every level, coarse to fine.
+        number: of the level.
 
     Returns:
-        The rule's facts of the scene and of the level by name; of the next coarser level as ``coarser_NAME``
-        (0 where there is none); ``level``, ``finer`` and ``coarser``: the level's number and those of its
-        neighbours (NO_FINER and 0 where there are none); ``levels``: the number of the finest.
+        The rule's facts of the scene and of the level by name; those of the next coarser level as
+        ``coarser_NAME`` (0 without one); ``level``, ``finer`` and ``coarser``: the numbers of the level and
+        of its neighbours (NO_FINER and 0 without); ``levels``: the number of the finest.
 
     Raises:
-        LodgsError: a fact is missing, or is no number of at least 0.
+        LodgsError: a fact is missing, negative or not a number.
     """
-    numbers = [each for each, _ in levels]
-    place = numbers.index(number)
-    coarser = levels[place - 1] if place else (0, dict.fromkeys(rule.level_facts, 0.0))
-    found = {
+    numbers = [level for level, _ in levels]
+    index = numbers.index(number)
+    coarser = levels[index - 1] if index else (0, dict.fromkeys(rule.level_facts, 0.0))
+    facts = {
         "level": float(number),
-        "finer": float(numbers[place + 1]) if place + 1 < len(levels) else float(NO_FINER),
+        "finer": float(numbers[index + 1]) if index + 1 < len(levels) else float(NO_FINER),
         "coarser": float(coarser[0]),
         "levels": float(numbers[-1]),
     }
     try:
-        found |= {name: float(scene[name]) for name in rule.scene_facts}
-        found |= {name: float(levels[place][1][name]) for name in rule.level_facts}
-        found |= {f"coarser_{name}": float(coarser[1][name]) for name in rule.level_facts}
-        if below := [name for name, value in found.items() if not value >= 0]:
-            raise ValueError(f"'{below[0]}' is not at least 0")
+        facts |= {name: float(scene[name]) for name in rule.scene_facts}
+        facts |= {name: float(levels[index][1][name]) for name in rule.level_facts}
+        facts |= {f"coarser_{name}": float(coarser[1][name]) for name in rule.level_facts}
+        if invalid := [name for name, value in facts.items() if not value >= 0]:
+            raise ValueError(f"'{invalid[0]}' is not at least 0")
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise LodgsError(
-            f"The levels are to be chosen by the rule '{rule.name}', but its facts are incomplete ({error}).",
-            "Export or train them again.",
+            f"Cannot apply the rule '{rule.name}': facts are missing or invalid ({error}).",
+            "Export or train the levels again.",
         ) from error
-    return found
+    return facts
 
 
-def distances(means: np.ndarray, eye: np.ndarray) -> np.ndarray:
-    """Distances (N,) of means (N, 3) from an eye (3,), in the type of the means.
+def distances(means: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """Return the distances (N,) of means (N, 3) from a position (3,), in the dtype of the means."""
+    return axis_distances([*means.T], position)
 
-    Axis by axis, which numpy does four times as fast as rows of three.
+
+def axis_distances(axes: Sequence[np.ndarray], position: np.ndarray) -> np.ndarray:
+    """Return the distances (N,) of means, given as x, y and z (N,), from a position (3,).
+
+    Axis by axis is four times as fast in numpy as rows of three.
     """
-    return axis_distances([*means.T], eye)
-
-
-def axis_distances(axes: Sequence[np.ndarray], eye: np.ndarray) -> np.ndarray:
-    """The same of means whose x, y and z are (N,) each."""
     squares = np.zeros(len(axes[0]), axes[0].dtype)
-    for axis, place in zip(axes, np.asarray(eye, squares.dtype), strict=True):
-        away = axis - place
-        away *= away
-        squares += away
+    for axis, coordinate in zip(axes, np.asarray(position, squares.dtype), strict=True):
+        offset = axis - coordinate
+        offset *= offset
+        squares += offset
     return np.sqrt(squares, out=squares)

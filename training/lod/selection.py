@@ -1,4 +1,4 @@
-"""What an eye is shown of levels of detail: splats, and a weight in [0, 1] on the opacity of each."""
+"""Selection of splats of a bundle for a camera, with a weight in [0, 1] on each opacity."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from .rule import OPACITY, Rule, Values, collect_facts, find_rule
 
 @dataclass
 class SelectedLevel:
-    """What is shown of one level.
+    """Selected splats of one level.
 
     Attributes:
         number: of the level.
-        splats: those of its splats that have a weight.
-        weights: (N,), or None where all are 1.
+        splats: splats with a weight above 0.
+        weights: (N,); None if all are 1.
     """
 
     number: int
@@ -29,18 +29,19 @@ class SelectedLevel:
 
 
 def check_rule(bundle: Bundle) -> Rule | None:
-    """The rule that a bundle's levels are chosen by; None where they have none, or it is not known here.
+    """Return the rule of a bundle; None if it has none, or an unknown one.
 
     Raises:
-        LodgsError: the bundle contradicts it.
+        LodgsError: the bundle contradicts its rule.
     """
     rule = find_rule(bundle.rule)
     if rule is not None and rule.cumulative != bundle.cumulative:
-        says, knows = (
-            "add up" if adds else "replace one another" for adds in (bundle.cumulative, rule.cumulative)
+        actual, expected = (
+            "add up" if cumulative else "replace one another"
+            for cumulative in (bundle.cumulative, rule.cumulative)
         )
         raise LodgsError(
-            f"The levels are said to {says}, but by their rule '{rule.name}' they {knows}.",
+            f"Cannot apply the rule '{rule.name}': levels {actual} in the file, but must {expected}.",
             "Another program may have changed the file; export it again.",
         )
     if rule is not None:
@@ -48,18 +49,17 @@ def check_rule(bundle: Bundle) -> Rule | None:
             rule.check(bundle.tables)
         except ValueError as error:
             raise LodgsError(
-                f"The levels are to be chosen by the rule '{rule.name}', but {error}.",
-                "Export or train them again.",
+                f"Cannot apply the rule '{rule.name}': {error}.",
+                "Export or train the levels again.",
             ) from error
     return rule
 
 
 def require_rule(bundle: Bundle) -> Rule:
-    """The rule that a bundle's levels are chosen by.
+    """Return the rule of a bundle.
 
     Raises:
-        LodgsError: they are not made for distances, this version does not know the rule, or they contradict
-            it.
+        LodgsError: no rule, an unknown one, or the bundle contradicts it.
     """
     rule = check_rule(bundle)
     if rule is None:
@@ -68,102 +68,109 @@ def require_rule(bundle: Bundle) -> Rule:
 
 
 def unknown_rule_error(name: str) -> tuple[str, str]:
-    """What to say, and what to do about it, where there is no such rule."""
+    """Return error and remedy for a missing or unknown rule."""
     if not name:
-        return "These levels are not made for distances.", "Leave out the options that choose by distance."
+        return "These levels cannot be selected by distance.", "Omit the options for selection by distance."
     return (
-        f"These levels are chosen by the rule '{name}', which this version does not know.",
-        "Update LODGS; until then the finest level is shown.",
+        f"The rule '{name}' of these levels is unknown to this version.",
+        "Update LODGS. Until then, the finest level is shown.",
     )
 
 
 def resolve_controls(bundle: Bundle, given: Values) -> Values:
-    """A value for every control of a bundle's rule: those given, else the bundle's own, else the rule's.
+    """Return a value for every control of a bundle's rule: given, else the bundle's, else the default.
 
     Raises:
-        LodgsError: as :func:`require_rule`, the rule has no such control, a value is not possible, or no level is
-            left in use.
+        LodgsError: as :func:`require_rule`; unknown control, invalid value, or no level in use.
     """
-    return require_rule(bundle).resolve_controls(given, [level.number for level in bundle.levels], bundle.controls)
+    numbers = [level.number for level in bundle.levels]
+    return require_rule(bundle).resolve_controls(given, numbers, bundle.controls)
 
 
 def select(
-    bundle: Bundle, eye: np.ndarray, focal_px: float, values: Values
+    bundle: Bundle, position: np.ndarray, focal_px: float, values: Values
 ) -> tuple[Splats, np.ndarray | None]:
-    """A copy of the splats of a bundle that an eye is shown by its rule, and their weights (None: all 1).
+    """Return a copy of the splats that a bundle's rule selects for a camera, and their weights (None: all 1).
 
-    For one eye after another see :class:`BundleSelector`.
+    For many cameras, use :class:`BundleSelector`.
 
     Args:
-        eye: (3,) world position that distances are measured from.
-        focal_px: focal length in pixels of the image that is looked at (``Camera.focal``).
+        position: (3,) world position of the camera.
+        focal_px: focal length of the camera in pixels (``Camera.focal``).
         values: of the rule's controls, see :func:`resolve_controls`.
 
     Raises:
         LodgsError: as :func:`require_rule`, or the rule's facts are incomplete.
     """
-    shown = select_levels(bundle, eye, focal_px, values)
-    splats = Splats.concatenated([one.splats for one in shown])
-    if all(one.weights is None for one in shown):
+    levels = select_levels(bundle, position, focal_px, values)
+    splats = Splats.concatenated([level.splats for level in levels])
+    if all(level.weights is None for level in levels):
         return splats, None
-    ones = [np.ones(len(one.splats), np.float32) if one.weights is None else one.weights for one in shown]
-    return splats, np.concatenate(ones)
+    weights = [
+        np.ones(len(level.splats), np.float32) if level.weights is None else level.weights for level in levels
+    ]
+    return splats, np.concatenate(weights)
 
 
-def select_levels(bundle: Bundle, eye: np.ndarray, focal_px: float, values: Values) -> list[SelectedLevel]:
-    """The same level by level, coarse to fine; levels of which nothing is shown have no splats."""
-    shown = []
-    of_levels = BundleSelector(bundle).level_weights(eye, focal_px, values)
-    for level, weights in zip(bundle.levels, of_levels, strict=True):
-        some = weights > 0
-        splats, weights = level.splats.select(some), weights[some]
-        shown.append(SelectedLevel(level.number, splats, None if (weights == 1).all() else weights))
-    return shown
+def select_levels(
+    bundle: Bundle, position: np.ndarray, focal_px: float, values: Values
+) -> list[SelectedLevel]:
+    """Return the selected splats level by level, coarse to fine, as :func:`select`; possibly empty levels."""
+    selected = []
+    level_weights = BundleSelector(bundle).level_weights(position, focal_px, values)
+    for level, weights in zip(bundle.levels, level_weights, strict=True):
+        positive = weights > 0
+        splats = level.splats.select(positive)
+        weights = weights[positive]
+        selected.append(SelectedLevel(level.number, splats, None if (weights == 1).all() else weights))
+    return selected
 
 
 class BundleSelector:
-    """A bundle's levels, to choose from for one eye after another: weights alone, and no copy of a splat.
+    """Computes weights of a bundle's splats for many cameras, without copying splats.
 
-    What a rule needs to know is gathered once. Whoever draws keeps ``splats`` where they are drawn, on a GPU
-    for example; splats of weight 0 cost a rasterizer next to nothing.
+    Callers keep ``splats`` where they render, for example on a GPU; splats of weight 0 cost a rasterizer next
+    to nothing.
 
     Raises:
         LodgsError: as :func:`require_rule`, or the rule's facts are incomplete.
     """
 
     def __init__(self, bundle: Bundle) -> None:
-        self._rule, self._levels, self._tables = require_rule(bundle), bundle.levels, bundle.tables
-        numbered = [(level.number, level.facts) for level in bundle.levels]
-        self._known = [
+        self._rule = require_rule(bundle)
+        self._levels = bundle.levels
+        self._tables = bundle.tables
+        facts = [(level.number, level.facts) for level in bundle.levels]
+        self._inputs = [
             (
                 rule_columns(self._rule, level.splats),
-                collect_facts(self._rule, bundle.facts, numbered, level.number),
+                collect_facts(self._rule, bundle.facts, facts, level.number),
             )
             for level in bundle.levels
         ]
 
     @cached_property
     def splats(self) -> Splats:
-        """The splats of all levels, coarse to fine."""
+        """Splats of all levels, coarse to fine."""
         return Splats.concatenated([level.splats for level in self._levels])
 
-    def level_weights(self, eye: np.ndarray, focal_px: float, values: Values) -> list[np.ndarray]:
-        """The weights of each level's splats; arguments as of :func:`select`."""
-        eye = np.asarray(eye, np.float32)
+    def level_weights(self, position: np.ndarray, focal_px: float, values: Values) -> list[np.ndarray]:
+        """Return the weights of each level's splats; arguments as for :func:`select`."""
+        position = np.asarray(position, np.float32)
         return [
-            self._rule.weights(level.splats.means, eye, focal_px, columns, facts, values, self._tables)
-            for level, (columns, facts) in zip(self._levels, self._known, strict=True)
+            self._rule.weights(level.splats.means, position, focal_px, columns, facts, values, self._tables)
+            for level, (columns, facts) in zip(self._levels, self._inputs, strict=True)
         ]
 
-    def weights(self, eye: np.ndarray, focal_px: float, values: Values) -> np.ndarray:
-        """The weights (N,) of ``splats``; those of weight 0 are not to be drawn."""
-        return np.concatenate(self.level_weights(eye, focal_px, values))
+    def weights(self, position: np.ndarray, focal_px: float, values: Values) -> np.ndarray:
+        """Return the weights (N,) of ``splats``; weight 0 means not drawn."""
+        return np.concatenate(self.level_weights(position, focal_px, values))
 
 
 def rule_columns(rule: Rule, splats: Splats) -> dict[str, np.ndarray]:
-    """What a rule needs to know of splats, (N,) float32 by name; zeros where they lack it."""
-    nothing = np.broadcast_to(np.float32(0), len(splats))
-    columns = {name: splats.extras.get(name, nothing) for name in rule.columns}
+    """Return a rule's columns of splats, (N,) float32 by name; missing ones are zeros."""
+    zeros = np.broadcast_to(np.float32(0), len(splats))
+    columns = {name: splats.extras.get(name, zeros) for name in rule.columns}
     if OPACITY in columns:
         with np.errstate(over="ignore"):
             columns[OPACITY] = 1 / (1 + np.exp(-splats.opacity_logits))
@@ -171,21 +178,21 @@ def rule_columns(rule: Rule, splats: Splats) -> dict[str, np.ndarray]:
 
 
 def standalone_levels(bundle: Bundle) -> list[Level]:
-    """The levels that can be shown one at a time, coarse to fine: see ``Rule.standalone_levels``."""
-    rule, numbers = find_rule(bundle.rule), [level.number for level in bundle.levels]
-    alone = numbers if rule is None else rule.standalone_levels(numbers)
-    return [level for level in bundle.levels if level.number in alone]
+    """Return the levels that are complete scenes, coarse to fine, see ``Rule.standalone_levels``."""
+    rule = find_rule(bundle.rule)
+    numbers = [level.number for level in bundle.levels]
+    standalone = numbers if rule is None else rule.standalone_levels(numbers)
+    return [level for level in bundle.levels if level.number in standalone]
 
 
 def standalone_error(number: int, finest: int) -> tuple[str, str]:
-    """What to say, and what to do about it, where a level is wanted that is no scene by itself."""
+    """Return error and remedy for a level that is not a complete scene."""
     return (
-        f"Level {number} is no scene by itself: its splats stand for groups of finer ones, where those are "
-        "not needed.",
-        f"Take level {finest}, or choose by distance.",
+        f"Cannot use level {number} on its own: its splats only replace groups of finer ones.",
+        f"Choose level {finest}, or select by distance.",
     )
 
 
 def complete_splats(bundle: Bundle, level: Level) -> Splats:
-    """All that is drawn at a level, as one set of splats."""
-    return Splats.concatenated([each.splats for each in bundle.drawn_levels(level.number)])
+    """Return all splats that are drawn at a level, as one set."""
+    return Splats.concatenated([drawn.splats for drawn in bundle.drawn_levels(level.number)])

@@ -306,7 +306,7 @@ class Method(ABC, Generic[P, D]):
         if region is None:
             return
         if OUTSIDE not in model.columns or due(INTERVAL, step):
-            outside = ~region.holds(model["means"].detach().cpu().numpy())
+            outside = ~region.contains(model["means"].detach().cpu().numpy())
             model.columns[OUTSIDE] = torch.from_numpy(outside).to(model["means"])
         for name in ("gradient_sum", PEAKS[0]):
             if name in model.stats:

@@ -71,7 +71,7 @@ class SplatSet:
         self._columns = {name: splats.extras[name] for name in all_rule_columns() if name in splats.extras}
         with np.errstate(over="ignore"):
             self._columns[OPACITY] = 1 / (1 + np.exp(-splats.opacity_logits))
-        self._chooser: SplatSelector | None = None
+        self._selector: SplatSelector | None = None
         self._transformed: tuple[bytes, Gaussians] | None = None
         self._concatenated: tuple[list[SplatSet], Gaussians] | None = None
         self._with_looks: tuple[Looks, SplatSet] | None = None
@@ -93,9 +93,9 @@ class SplatSet:
         Returns:
             Row indices (M,) int32, ascending, and weights (M,) float32.
         """
-        if self._chooser is None:
-            self._chooser = self._make_chooser()
-        rows, weights = self._chooser.chosen(query, camera, near)
+        if self._selector is None:
+            self._selector = self._make_selector()
+        rows, weights = self._selector.chosen(query, camera, near)
         if self._weights is None:
             return rows, weights
         weights = weights * self._weights[rows]
@@ -149,12 +149,12 @@ class SplatSet:
             for splat_set in sets:
                 end = begin + len(splat_set)
                 splat_set.gaussians = combined.select(slice(begin, end))
-                splat_set._chooser = splat_set._transformed = None  # they reference the replaced tensors
+                splat_set._selector = splat_set._transformed = None  # they reference the replaced tensors
                 begin = end
             self._concatenated = following, combined
         return self._concatenated[1]
 
-    def _make_chooser(self) -> SplatSelector:
+    def _make_selector(self) -> SplatSelector:
         own = self.gaussians
         return SplatSelector(own.means.cpu().numpy(), self._columns, own.log_scales.cpu().numpy())
 
@@ -338,7 +338,7 @@ class ResidentBundle:
             self._sets[number] = SplatSet(splats, None, self._backend, ordered=True)
             self._row_bytes = Element.from_columns("", all_columns(splats)).dtype.itemsize
         self.loaded = sum(map(len, self._sets.values()))
-        self.bytes_read = self._row_bytes * sum(sight.count for sight in self._sights.values())
+        self.bytes_read = self._row_bytes * sum(sight.splats_read for sight in self._sights.values())
         return self._sets[number]
 
     def _load(self, region: Region | None, numbers: frozenset[int]) -> None:

@@ -109,7 +109,7 @@ def thin_outside_region(scene: Scene, region: Crop, limit: int) -> Scene:
     Raises:
         LodgsError: the region contains no point.
     """
-    inside = region.holds(scene.points)
+    inside = region.contains(scene.points)
     if not inside.any():
         raise LodgsError(
             "Cannot train the region: it contains none of the scene's points.",

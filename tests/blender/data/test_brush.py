@@ -102,7 +102,7 @@ def test_a_lasso_selects_what_it_encloses_but_neither_hidden_nor_cropped_splats(
         pixels, depth = pixels_of(looks, size, level.splats.means)
         wanted = ((pixels > low) & (pixels < high)).all(axis=1) & (depth > 0.1)
         clear = (np.abs(pixels - low) > 1.5).all(axis=1) & (np.abs(pixels - high) > 1.5).all(axis=1)
-        wanted &= ~cleaning.hidden(item.object.data) & crops[0].holds(level.splats.means)
+        wanted &= ~cleaning.hidden(item.object.data) & crops[0].contains(level.splats.means)
         np.testing.assert_array_equal(cleaning.selected(item.object.data)[clear], wanted[clear])
         assert 10 < wanted.sum() < len(wanted) / 2
 

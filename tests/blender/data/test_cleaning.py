@@ -404,7 +404,7 @@ def test_what_lies_on_a_crops_face_is_in_it_for_nodes_and_for_numpy(bpy, lodgs, 
         bpy.context.view_layer.update()
         on_face = np.arange(1, len(level.splats), 2)
         np.testing.assert_array_equal(shown_rows(bpy, lodgs, item.object), on_face)
-        np.testing.assert_array_equal(np.flatnonzero(crops[0].holds(level.splats.means)), on_face)
+        np.testing.assert_array_equal(np.flatnonzero(crops[0].contains(level.splats.means)), on_face)
 
 
 def test_an_older_files_crops_are_given_this_versions_group(bpy, lodgs, scene_of):

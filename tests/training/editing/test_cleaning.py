@@ -22,7 +22,8 @@ from training.lod.partial_read import BLOCKS, block_table, read_part
 from training.lod.query import LodQuery, SplatSelector
 from training.lod.rule import OPACITY, collect_facts, rules
 from training.lod.selection import resolve_controls, select_levels
-from training.lod.tree.paging import COLUMNS, ResidentTree, TreeFile, read_budgeted
+from training.lod.tree.paging import TreeFile, read_budgeted
+from training.lod.tree.resident import COLUMNS, ResidentTree
 from training.scenes.cameras import Camera, look_at
 from training.splats.bundle import read_bundle, write_bundle
 from training.splats.gaussians import Splats
@@ -82,13 +83,13 @@ def test_a_turned_crop_holds_what_was_put_in_it(shape):
     away = np.abs(own).max(axis=1) if shape == "BOX" else np.linalg.norm(own, axis=1)
     clear = np.abs(away - 1) > 1e-4
     means = (own @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32)
-    np.testing.assert_array_equal(Crop.at(shape, matrix).holds(means)[clear], (away <= 1)[clear])
+    np.testing.assert_array_equal(Crop.from_matrix(shape, matrix).contains(means)[clear], (away <= 1)[clear])
 
 
 def test_a_flat_crop_holds_nothing_and_what_is_cut_out_goes_from_what_is_kept():
     means = np.float32([[0, 0, 0], [2, 0, 0], [9, 0, 0], [2, 0.5, 0]])
-    flat = Crop.at("BOX", np.diag([1.0, 1, 0, 1]))
-    assert not flat.holds(means).any()
+    flat = Crop.from_matrix("BOX", np.diag([1.0, 1, 0, 1]))
+    assert not flat.contains(means).any()
     one, other = Crop.sphere((0, 0, 0), 1), Crop.box((1, -1, -1), (3, 1, 1))
     np.testing.assert_array_equal(crop_mask([one, other], means), [True, True, False, True])
     np.testing.assert_array_equal(

@@ -13,7 +13,8 @@ from training.lod.partial_read import BLOCKS
 from training.lod.rule import rules
 from training.lod.rules.chunks import member_columns
 from training.lod.selection import BundleSelector, resolve_controls
-from training.lod.tree.paging import TreeFile, page_table, streaming_order
+from training.lod.tree.pages import page_table, streaming_order
+from training.lod.tree.paging import TreeFile
 from training.lod.tree.shape import Tree
 from training.splats.bundle import open_bundle, read_bundle, write_bundle
 from training.splats.gaussians import Splats

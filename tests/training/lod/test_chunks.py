@@ -188,7 +188,7 @@ def test_places_belong_to_the_nearest_chunk():
     ("change", "says"),
     [
         (lambda table: table.pop("radius"), "its table 'chunks' has no radius"),
-        (lambda table: table.update(y=np.float32([0, np.nan, 0])), "a chunk is nowhere"),
+        (lambda table: table.update(y=np.float32([0, np.nan, 0])), "out of range"),
         (lambda table: table.update({name: np.zeros(97) for name in table}), "97 chunks, of at most 96"),
     ],
 )

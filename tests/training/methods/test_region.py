@@ -21,7 +21,7 @@ def test_outside_nothing_asks_for_more(name, tiny_scene):
     for step in range(30):
         method.train_step(step)
         asked = method.model.stats["gradient_sum"].reshape(len(method.model), -1).sum(1).numpy()
-        outside = ~region.holds(method.model["means"].detach().numpy() - [0.3, 0, 0])  # some may wander
+        outside = ~region.contains(method.model["means"].detach().numpy() - [0.3, 0, 0])  # some may wander
         assert outside.any() and not asked[outside].any()
     assert asked.any()
 

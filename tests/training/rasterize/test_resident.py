@@ -1,4 +1,4 @@
-"""What a resident bundle draws is what selection and rasterizer give, whatever was left out on the way."""
+"""Compare resident bundles with plain selection and rasterization, and test culling and partial reads."""
 
 from dataclasses import replace
 
@@ -24,7 +24,7 @@ from training.splats.gaussians import Splats
 from training.splats.levels import Bundle, Level
 
 NEAR = 0.1
-EYES = [(0, 0, 0), (1.0, 0.4, 0), (1.9, 0, 0.2), (4.2, 1, 0), (0, 2.2, 0), (30, 0, 0)]
+POSITIONS = [(0, 0, 0), (1.0, 0.4, 0), (1.9, 0, 0.2), (4.2, 1, 0), (0, 2.2, 0), (30, 0, 0)]
 CENTRES = np.float32([[0, 0, 0], [2, 0, 0], [4, 0, 0]])
 
 
@@ -69,212 +69,230 @@ def bundle(rule: str) -> Bundle:
 
 
 def views():
-    for eye in EYES:
+    for position in POSITIONS:
         for target in ((6, 2, 0), (-6, 1, 0.5)):
             yield Camera(
                 "", 64, 48, 60.0, 62.0, 30.0, 25.0,
-                look_at(np.array(eye, float), np.array(target, float), (0, 0, 1)),
+                look_at(np.array(position, float), np.array(target, float), (0, 0, 1)),
             )  # fmt: skip
 
 
 @pytest.mark.parametrize(
-    ("rule", "given"),
+    ("rule", "controls"),
     [
         ("bands", {}), ("bands", {"gamma": 2.0, "last": 2}), ("octree", {}), ("octree", {"fade": 0}),
         ("decay", {}), ("decay", {"at_most": 2900}), ("chunks", {}), ("chunks", {"fade": 0}),
         ("chunks", {"chunks": 0, "distance_scale": 0.6}), ("cut", {}), ("cut", {"pixels": 1.8}),
     ],
 )  # fmt: skip
-def test_pictures_are_those_of_what_is_selected(rule, given):
-    shown, most = bundle(rule), 0
-    values, resident = resolve_controls(shown, given), ResidentBundle(shown, "cpu")
+def test_images_match_selection_and_rasterization(rule, controls):
+    source = bundle(rule)
+    values = resolve_controls(source, controls)
+    resident = ResidentBundle(source, "cpu")
+    drawn_count = 0
     for camera in views():
         ours = resident.draw(camera, values, near=NEAR)
-        splats, weights = select(shown, camera.center, camera.focal, values)
+        splats, weights = select(source, camera.center, camera.focal, values)
         weights = None if weights is None else torch.from_numpy(weights)
         theirs = rasterize(Gaussians.of(splats), camera, weights=weights, near=NEAR, backend="cpu")
-        # of equally deep splats another may come first
+        # splats of equal depth may have another order
         torch.testing.assert_close(ours.image, theirs.image, atol=2e-5, rtol=1e-5)
         assert int((ours.radii > 0).sum()) == int((theirs.radii > 0).sum())
-        most = max(most, int((ours.radii > 0).sum()))
-    assert most > 100
+        drawn_count = max(drawn_count, int((ours.radii > 0).sum()))
+    assert drawn_count > 100
 
 
 @pytest.mark.parametrize("rule", ["bands", "octree"])
-def test_a_level_is_drawn_with_all_that_belongs_to_it(rule):
-    shown, camera = bundle(rule), next(views())
-    resident = ResidentBundle(shown, "cpu")
+def test_level_includes_coarser_cumulative_levels(rule):
+    source, camera = bundle(rule), next(views())
+    resident = ResidentBundle(source, "cpu")
     for number in (1, 3):
-        one = next(level for level in shown.levels if level.number == number)
-        whole = rasterize(Gaussians.of(complete_splats(shown, one)), camera, near=NEAR, backend="cpu").image
-        torch.testing.assert_close(resident.draw_level(number, camera, near=NEAR).image, whole)
+        single = next(level for level in source.levels if level.number == number)
+        splats = Gaussians.of(complete_splats(source, single))
+        expected = rasterize(splats, camera, near=NEAR, backend="cpu").image
+        torch.testing.assert_close(resident.draw_level(number, camera, near=NEAR).image, expected)
 
 
 @pytest.mark.parametrize("rule", ["bands", "octree", "cut"])
-def test_of_a_large_file_a_camera_has_read_what_it_may_see(tmp_path, monkeypatch, rule):
+def test_large_files_are_read_by_visibility(tmp_path, monkeypatch, rule):
     monkeypatch.setattr(on_disk, "_GAP", 1)
-    monkeypatch.setattr(on_disk, "_AT_ONCE", 2 * SIZE)
-    shown = bundle(rule)
-    for each in shown.levels:  # a tree's are in an order already
-        if rule != "cut":
-            each.splats = each.splats.select(spatial_order(each.splats.means))
-    shown.levels[-1].splats.means[700] = np.nan  # which is left out
-    write_bundle(tmp_path / "bundle.ply", shown)
-    shown = read_bundle(tmp_path / "bundle.ply")
-    told, values, total = [], resolve_controls(shown, {}), sum(len(each.splats) for each in shown.levels)
-    whole, part = (
-        ResidentBundle(shown, "cpu"),
-        ResidentBundle(tmp_path / "bundle.ply", "cpu", told.append, most=1000),
-    )
-    finest, loaded, read = shown.levels[-1].number, [], []
+    monkeypatch.setattr(on_disk, "_BATCH", 2 * SIZE)
+    source = bundle(rule)
+    for detail in source.levels:
+        if rule != "cut":  # nodes of a tree are already ordered
+            detail.splats = detail.splats.select(spatial_order(detail.splats.means))
+    source.levels[-1].splats.means[700] = np.nan  # this splat is dropped
+    write_bundle(tmp_path / "bundle.ply", source)
+    source = read_bundle(tmp_path / "bundle.ply")
+    warnings: list[str] = []
+    values = resolve_controls(source, {})
+    total = sum(len(detail.splats) for detail in source.levels)
+    complete = ResidentBundle(source, "cpu")
+    partial = ResidentBundle(tmp_path / "bundle.ply", "cpu", warnings.append, max_in_memory=1000)
+    finest = source.levels[-1].number
+    loaded, read = [], []
     for camera in views():
-        for draw in (lambda one, c=camera: one.draw(c, values, near=NEAR),
-                     lambda one, c=camera: one.draw_level(finest, c, near=NEAR)):  # fmt: skip
-            ours, theirs = draw(part), draw(whole)
+        for draw in (lambda resident, c=camera: resident.draw(c, values, near=NEAR),
+                     lambda resident, c=camera: resident.draw_level(finest, c, near=NEAR)):  # fmt: skip
+            ours, theirs = draw(partial), draw(complete)
             torch.testing.assert_close(ours.image, theirs.image, atol=2e-5, rtol=1e-5)
             assert int((ours.radii > 0).sum()) == int((theirs.radii > 0).sum())
-            loaded.append(part.loaded)
-            read.append(part.bytes_read)
-    assert min(loaded) < 0.9 * total and len(told) == 1 and "left out" in told[0]
-    part.draw_level(finest, camera, near=NEAR)
-    assert part.bytes_read == read[-1] > read[0] > 0  # what is there does
+            loaded.append(partial.loaded)
+            read.append(partial.bytes_read)
+    assert min(loaded) < 0.9 * total and len(warnings) == 1 and "1 splats" in warnings[0]
+    partial.draw_level(finest, camera, near=NEAR)
+    assert partial.bytes_read == read[-1] > read[0] > 0  # resident splats are not read again
 
 
 def indexed(path) -> Bundle:
-    """A bundle of chunks, each with what is near it, in a file with a table of its blocks."""
-    shown, levels = bundle("chunks"), []
-    for each in shown.levels:
-        splats = each.splats.select(spatial_order(each.splats.means))
+    """Write a bundle of chunks with a block table; chunks contain the splats near their centres."""
+    source, levels = bundle("chunks"), []
+    for detail in source.levels:
+        splats = detail.splats.select(spatial_order(detail.splats.means))
         near = np.linalg.norm(splats.means - CENTRES[:, None], axis=2) < 7
-        levels.append(replace(each, splats=replace(splats, extras=member_columns(near))))
+        levels.append(replace(detail, splats=replace(splats, extras=member_columns(near))))
     table = block_table(rules()["chunks"], {x.number: x.splats for x in levels})
-    shown = replace(shown, levels=levels, tables={**shown.tables, BLOCKS: table})
-    write_bundle(path, shown)
-    return shown
+    source = replace(source, levels=levels, tables={**source.tables, BLOCKS: table})
+    write_bundle(path, source)
+    return source
 
 
-def members(shown: Bundle, *chunks: int) -> int:
+def member_count(source: Bundle, *chunks: int) -> int:
     bits = sum(1 << chunk for chunk in chunks)
-    return sum(int((x.splats.extras["chunks_0"].astype(int) & bits > 0).sum()) for x in shown.levels)
+    return sum(int((x.splats.extras["chunks_0"].astype(int) & bits > 0).sum()) for x in source.levels)
 
 
-def test_of_a_file_only_what_a_region_can_show_is_loaded_and_pictures_are_the_same_bits(tmp_path):
-    shown = indexed(tmp_path / "bundle.ply")
-    whole, part = ResidentBundle(shown, "cpu"), ResidentBundle(tmp_path / "bundle.ply", "cpu")
-    values, total = resolve_controls(shown, {}), sum(len(level.splats) for level in shown.levels)
-    assert part.loaded == part.bytes_read == 0
+def test_only_the_region_is_loaded_and_images_are_bit_identical(tmp_path):
+    source = indexed(tmp_path / "bundle.ply")
+    complete, partial = ResidentBundle(source, "cpu"), ResidentBundle(tmp_path / "bundle.ply", "cpu")
+    values = resolve_controls(source, {})
+    total = sum(len(level.splats) for level in source.levels)
+    assert partial.loaded == partial.bytes_read == 0
     loaded, read = [], []
-    for eye in ((0.0, 0, 0), (0.1, 0, 0), (0.6, 0, 0), (30.0, 0, 0), (0.0, 0, 0)):
+    for position in ((0.0, 0, 0), (0.1, 0, 0), (0.6, 0, 0), (30.0, 0, 0), (0.0, 0, 0)):
         for target in ((9.0, 0, 0), (-9.0, 3, 1)):
-            pose = look_at(np.array(eye), np.array(target), (0, 0, 1))
+            pose = look_at(np.array(position), np.array(target), (0, 0, 1))
             camera = Camera("", 64, 48, 60.0, 60.0, 32.0, 24.0, pose)
-            ours, theirs = (each.draw(camera, values, near=NEAR) for each in (part, whole))
+            ours, theirs = (resident.draw(camera, values, near=NEAR) for resident in (partial, complete))
             assert torch.equal(ours.image, theirs.image) and torch.equal(ours.alpha, theirs.alpha)
             assert int((ours.radii > 0).sum()) == int((theirs.radii > 0).sum()) > 0
-        loaded.append(part.loaded)
-        read.append(part.bytes_read)
-    assert loaded == [members(shown, 0), *[members(shown, 0, 1)] * 2, total, members(shown, 0)]
-    assert whole.loaded == total and whole.bytes_read == 0
+        loaded.append(partial.loaded)
+        read.append(partial.bytes_read)
+    assert loaded == [
+        member_count(source, 0),
+        *[member_count(source, 0, 1)] * 2,
+        total,
+        member_count(source, 0),
+    ]
+    assert complete.loaded == total and complete.bytes_read == 0
     steps = np.diff([0, *read])
-    assert steps[0] == steps[4] < steps[1] < steps[3] and steps[2] == 0  # of (0, 1) nothing again
+    assert (
+        steps[0] == steps[4] < steps[1] < steps[3] and steps[2] == 0
+    )  # the region of chunks 0 and 1 is read once
 
 
-def test_of_a_file_a_level_is_read_alone(tmp_path):
-    shown, camera = indexed(tmp_path / "bundle.ply"), next(views())
-    part = ResidentBundle(tmp_path / "bundle.ply", "cpu")
-    for level in shown.levels:
-        picture = part.draw_level(level.number, camera, near=NEAR).image
+def test_single_levels_are_read_separately(tmp_path):
+    source, camera = indexed(tmp_path / "bundle.ply"), next(views())
+    partial = ResidentBundle(tmp_path / "bundle.ply", "cpu")
+    for level in source.levels:
+        image = partial.draw_level(level.number, camera, near=NEAR).image
         assert torch.equal(
-            picture, ResidentBundle(shown, "cpu").draw_level(level.number, camera, near=NEAR).image
+            image, ResidentBundle(source, "cpu").draw_level(level.number, camera, near=NEAR).image
         )
-        assert part.loaded == len(level.splats)
+        assert partial.loaded == len(level.splats)
     with pytest.raises(LodgsError, match="Cannot draw level 7"):
-        part.draw_level(7, camera)
+        partial.draw_level(7, camera)
 
 
-def test_what_is_drawn_now_and_then_at_a_level_is_what_was(tmp_path):
-    """Sets are joined anew where others are drawn together."""
-    shown = bundle("octree")
-    resident, values, camera = ResidentBundle(shown, "cpu"), resolve_controls(shown, {}), next(views())
+def test_alternating_levels_and_rule_gives_the_same_image(tmp_path):
+    """Sets are concatenated again if they are drawn in another combination."""
+    source = bundle("octree")
+    resident = ResidentBundle(source, "cpu")
+    values = resolve_controls(source, {})
+    camera = next(views())
     first = resident.draw(camera, values, near=NEAR).image
     resident.draw_level(2, camera, near=NEAR)
     assert torch.equal(resident.draw(camera, values, near=NEAR).image, first)
 
 
 @pytest.mark.parametrize("rule", ["bands", "octree", "decay", "chunks"])
-def test_nothing_with_a_weight_is_passed_over(rule):
-    """Whatever is chosen for a camera, is all that has a weight among what it sees."""
-    shown = bundle(rule)
-    resident, values, passed = ResidentBundle(shown, "cpu"), resolve_controls(shown, {}), 0
+def test_culling_skips_only_invisible_splats(rule):
+    source = bundle(rule)
+    resident = ResidentBundle(source, "cpu")
+    values = resolve_controls(source, {})
+    culled_count = 0
     for camera in views():
-        for level in shown.levels:
-            splats, choice = resident.select_by_rule(camera, values)[level.number]
+        for level in source.levels:
+            splats, query = resident.select_by_rule(camera, values)[level.number]
             ordered = level.splats
             if len(ordered) >= SORT_THRESHOLD:
                 ordered = ordered.select(spatial_order(ordered.means))
             opacity, own = 1 / (1 + np.exp(-ordered.opacity_logits)), splats.gaussians
-            weights = choice.weights(ordered.means, ordered.extras | {"opacity": opacity})
-            everywhere, found = splats.select_visible(choice)
-            np.testing.assert_array_equal(everywhere, np.flatnonzero(weights > 0))
-            np.testing.assert_array_equal(found, weights[everywhere])
-            some, found = splats.select_visible(choice, camera, NEAR)
-            np.testing.assert_array_equal(found, weights[some])
-            left_out = torch.from_numpy(np.setdiff1d(everywhere, some)).long()
-            alone = rasterize(own.select(left_out), camera, near=NEAR, backend="cpu")
-            assert not (alone.radii > 0).any()
-            passed += len(left_out)
-    assert passed
+            weights = query.weights(ordered.means, ordered.extras | {"opacity": opacity})
+            all_rows, row_weights = splats.select_visible(query)
+            np.testing.assert_array_equal(all_rows, np.flatnonzero(weights > 0))
+            np.testing.assert_array_equal(row_weights, weights[all_rows])
+            rows, row_weights = splats.select_visible(query, camera, NEAR)
+            np.testing.assert_array_equal(row_weights, weights[rows])
+            culled = torch.from_numpy(np.setdiff1d(all_rows, rows)).long()
+            rendering = rasterize(own.select(culled), camera, near=NEAR, backend="cpu")
+            assert not (rendering.radii > 0).any()
+            culled_count += len(culled)
+    assert culled_count
 
 
-def test_within_a_band_nothing_is_asked_and_the_same_is_chosen(monkeypatch):
-    """Of blocks that a band holds whole; what is hidden or cropped is looked at all the same."""
-    shown, asked = bundle("bands"), []
-    one = shown.levels[1].splats
-    one = one.select(spatial_order(one.means))
+def test_blocks_inside_a_band_skip_the_rule(monkeypatch):
+    """The rule is evaluated only for blocks on a border of the band; hidden splats are still excluded."""
+    evaluated: list[int] = []
+    splats = bundle("bands").levels[1].splats
+    splats = splats.select(spatial_order(splats.means))
     rule = rules()["bands"]
     real = type(rule).weights
 
-    def counting(self, means, *rest):
-        asked.append(len(means))
-        return real(self, means, *rest)
+    def counting(self, means, *arguments):
+        evaluated.append(len(means))
+        return real(self, means, *arguments)
 
     monkeypatch.setattr(type(rule), "weights", counting)
-    chooser = SplatSelector(one.means, {}, one.log_scales)
-    away = np.linalg.norm(one.means, axis=1)
+    selector = SplatSelector(splats.means, {}, splats.log_scales)
+    away = np.linalg.norm(splats.means, axis=1)
     counts = []
     for s_min, coarser in ((0.0, 1e6), (0.0, 0.23), (0.02, 0.1), (0.3, 0.4)):
         facts = {"level": 2, "levels": 3, "finer": 3, "coarser": 1, "s_min": s_min, "coarser_s_min": coarser}
         values = {"gamma": 1.0, "first": 1, "last": 3}
-        choice = LodQuery("bands", (0.0, 0.0, 0.0), 60.0, tuple(facts.items()), tuple(values.items()))
+        query = LodQuery("bands", (0.0, 0.0, 0.0), 60.0, tuple(facts.items()), tuple(values.items()))
         expected = np.flatnonzero((away >= np.float32(60 * s_min)) & (away < np.float32(60 * coarser)))
-        asked.clear()
-        rows, weights = chooser.chosen(choice)
+        evaluated.clear()
+        rows, weights = selector.chosen(query)
         np.testing.assert_array_equal(rows, expected)
         assert rows.dtype == np.int32 and (weights == 1).all() and weights.dtype == np.float32
-        counts.append((sum(asked), len(expected)))
-        hidden = SplatSelector(one.means, {HIDDEN: (one.means[:, 0] > 0).astype(np.float32)}, one.log_scales)
-        rows, _ = hidden.chosen(replace(choice, crops=()))
-        np.testing.assert_array_equal(rows, expected[one.means[expected, 0] <= 0])
-    assert counts[0] == (0, len(one)) and 0 < counts[1][0] < 0.8 * counts[1][1] and counts[3] == (0, 0)
+        counts.append((sum(evaluated), len(expected)))
+        hidden = SplatSelector(
+            splats.means, {HIDDEN: (splats.means[:, 0] > 0).astype(np.float32)}, splats.log_scales
+        )
+        rows, _ = hidden.chosen(replace(query, crops=()))
+        np.testing.assert_array_equal(rows, expected[splats.means[expected, 0] <= 0])
+    assert counts[0] == (0, len(splats)) and 0 < counts[1][0] < 0.8 * counts[1][1] and counts[3] == (0, 0)
 
 
-def test_a_crop_may_come_while_the_eye_stays_in_its_region():
-    shown, camera = bundle("chunks"), next(views())
-    everything = ResidentBundle(shown, "cpu").select_by_rule(camera, resolve_controls(shown, {}))
-    for splats, choice in everything.values():
-        before = splats.select_visible(choice)[0]
-        np.testing.assert_array_equal(splats.select_visible(replace(choice, crops=()))[0], before)
+def test_empty_crop_in_the_same_region_keeps_selection():
+    source, camera = bundle("chunks"), next(views())
+    levels = ResidentBundle(source, "cpu").select_by_rule(camera, resolve_controls(source, {}))
+    for splats, query in levels.values():
+        rows = splats.select_visible(query)[0]
+        np.testing.assert_array_equal(splats.select_visible(replace(query, crops=()))[0], rows)
 
 
-@pytest.mark.parametrize("looked_first", [True, False])
-def test_looks_change_what_is_seen_and_not_what_is_chosen(looked_first):
-    shown = bundle("decay")
-    own = shown.levels[0].splats
+@pytest.mark.parametrize("looks_first", [True, False])
+def test_looks_do_not_change_selection(looks_first):
+    source = bundle("decay")
+    own = source.levels[0].splats
     camera, looks = next(views()), ((None, Look(opacity=0.2)),)
-    _, choice = ResidentBundle(shown, "cpu").select_by_rule(camera, resolve_controls(shown, {}))[1]
+    _, query = ResidentBundle(source, "cpu").select_by_rule(camera, resolve_controls(source, {}))[1]
     trained = {"opacity": 1 / (1 + np.exp(-own.opacity_logits)), **own.extras}
-    truth = np.flatnonzero(choice.weights(own.means, trained) > 0)
+    truth = np.flatnonzero(query.weights(own.means, trained) > 0)
     splats = SplatSet(own, backend="cpu", ordered=True)
-    for one in (splats.with_looks(looks), splats) if looked_first else (splats, splats.with_looks(looks)):
-        np.testing.assert_array_equal(one.select_visible(choice)[0], truth)
+    changed = splats.with_looks(looks)
+    for splat_set in (changed, splats) if looks_first else (splats, changed):
+        np.testing.assert_array_equal(splat_set.select_visible(query)[0], truth)
     assert 0 < len(truth) < len(own)

@@ -19,7 +19,7 @@ from training.scenes.colmap import read_scene
 from training.splats.bundle import read_bundle
 
 HALF = "box -9 -9 -1.5 0 9 9"  # the half with x < 0 of the points near the origin of the tiny scene
-TURNED = Crop.at("BOX", np.array([[0.6, -0.8, 0, 0.1], [0.8, 0.6, 0, 2], [0, 0, 3, 1], [0, 0, 0, 1.0]]))
+TURNED = Crop.from_matrix("BOX", np.array([[0.6, -0.8, 0, 0.1], [0.8, 0.6, 0, 2], [0, 0, 3, 1], [0, 0, 0, 1.0]]))
 
 
 @pytest.mark.parametrize("crop", [TURNED, Crop.box((0, 0, 0), (1, 2, 3)), Crop.sphere((1, 0, -2), 0.3)])
@@ -30,8 +30,8 @@ def test_text_form_round_trips_exactly(crop):
 def test_text_form_with_corners_in_any_order():
     box = Crop.from_text("box 1 0 2 -1 4 3")
     points = np.array([[0, 2, 2.5], [0.99, 3.9, 2.1], [1.1, 2, 2.5], [0, -0.1, 2.5], [0, 2, 1.9]])
-    assert box.holds(points).tolist() == [True, True, False, False, False]
-    assert Crop.from_text("SPHERE 0 0 1 2").holds(np.array([[0, 0, 2.9], [0, 2.1, 1]])).tolist() == [
+    assert box.contains(points).tolist() == [True, True, False, False, False]
+    assert Crop.from_text("SPHERE 0 0 1 2").contains(np.array([[0, 0, 2.9], [0, 2.1, 1]])).tolist() == [
         True,
         False,
     ]
@@ -63,10 +63,10 @@ def test_job_stores_the_region(tmp_path):
 
 def test_points_outside_the_region_are_thinned_evenly(tiny_scene):
     scene, region = read_scene(tiny_scene), Crop.from_text(HALF)
-    inside = region.holds(scene.points)
+    inside = region.contains(scene.points)
     assert 10 < inside.sum() < 40
     thinned = thin_outside_region(scene, region, 8)
-    kept_inside = region.holds(thinned.points)
+    kept_inside = region.contains(thinned.points)
     np.testing.assert_array_equal(thinned.points[kept_inside], scene.points[inside])
     np.testing.assert_array_equal(thinned.point_ids[kept_inside], scene.point_ids[inside])
     assert 4 <= (~kept_inside).sum() <= 8
@@ -84,7 +84,7 @@ def test_run_trains_a_region(tiny_scene, tmp_path, capsys):
     }  # fmt: skip
     job = Job.from_dict(keys)
     data = training_data(job, RunFolder(tmp_path / "run"))
-    assert data.region == job.crop and (~data.region.holds(data.scene.points)).sum() <= 6
+    assert data.region == job.crop and (~data.region.contains(data.scene.points)).sum() <= 6
     assert data.median_depth == read_scene(tiny_scene).median_depth()  # units come from the full scene
     assert train(job, sys.stdout) == 0
     means = read_bundle(tmp_path / "run" / "bundle.ply").levels[0].splats.means

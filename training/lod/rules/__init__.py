@@ -1,1 +1,1 @@
-"""The rules, one a module with its ``RULE``; found by ``lod.rule.rules``."""
+"""Level-of-detail rules, one per module as ``RULE``; ``lod.rule.rules`` discovers them."""

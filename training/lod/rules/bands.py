@@ -1,4 +1,4 @@
-"""FLoD's rule (Seo et al. 2025, Sec. 4.4): each level serves a band of distances, alone."""
+"""FLoD's rule (Seo et al. 2025, Sec. 4.4): one level for each band of camera distances."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from ...errors import LodgsError
 from ..rule import NO_COLUMNS, NO_TABLES, Control, Rule, Values, distances
 
 MAX_LEVEL = 64
-"""The largest number of a level that can be asked for: more than any scene has."""
+"""Maximum level number of the controls; more than any scene has."""
 
 
 def min_scales(s_min_1: float, rho: float, levels: int) -> list[float]:
-    """FLoD's 3D scale constraint of each level (Eq. 3): s_min_1 * rho**(1 - l), and 0 at the last.
+    """Return FLoD's 3D scale constraint of each level (Eq. 3): s_min_1 * rho**(1 - l), and 0 for the last.
 
     Args:
         s_min_1: constraint of level 1, in scene units (the paper's lambda).
-        rho: factor by which it shrinks from level to level.
-        levels: number of levels; with one level there is no constraint, which is plain 3DGS.
+        rho: factor between two levels.
+        levels: number of levels; one level has no constraint, which is plain 3DGS.
     """
     return [s_min_1 * rho ** (1 - level) for level in range(1, levels)] + [0.0]
 
@@ -28,8 +28,8 @@ def min_scales(s_min_1: float, rho: float, levels: int) -> list[float]:
 class Bands(Rule):
     """Level l is drawn where d_proj(l) <= d < d_proj(l - 1) (Eq. 7).
 
-    d_proj(l) = s_min(l) / gamma * focal_px (Eq. 8) is where the smallest detail of level l covers gamma
-    pixels. The finest level in use begins at 0, the coarsest has no end.
+    At the distance d_proj(l) = s_min(l) / gamma * focal_px (Eq. 8), the smallest detail of level l covers
+    gamma pixels. The finest level in use begins at 0, the coarsest has no end.
     """
 
     name = "bands"
@@ -39,16 +39,16 @@ class Bands(Rule):
     controls = (
         Control(
             "gamma", 1.0, 0.01, 1000.0, "Screen Size",
-            "γ: a finer level takes over where the smallest detail of the coarser one would cover this many "
-            "pixels. Smaller is finer",
+            "γ: switch to a finer level if the smallest detail of the coarser one covers this many pixels. "
+            "Smaller is finer",
             soft=(0.1, 10.0), unit="PIXEL",
         ),
         Control(
-            "first", 1, 1, MAX_LEVEL, "Coarsest", "Coarsest level in use: it is shown farthest away",
+            "first", 1, 1, MAX_LEVEL, "Coarsest", "Coarsest level in use, shown at the largest distances",
             whole=True, follows="coarsest",
         ),
         Control(
-            "last", MAX_LEVEL, 1, MAX_LEVEL, "Finest", "Finest level in use: it is shown nearest to the eye",
+            "last", MAX_LEVEL, 1, MAX_LEVEL, "Finest", "Finest level in use, shown nearest to the camera",
             whole=True, follows="finest",
         ),
     )  # fmt: skip
@@ -56,8 +56,8 @@ class Bands(Rule):
     def distance_band(
         self, focal_px: float, facts: Mapping[str, float], values: Values, highest=NO_COLUMNS
     ) -> tuple[float, float]:
-        """Near and far end of a level's band, in scene units; (inf, inf) for a level that is not in use."""
-        first = min(values["first"], values["last"], facts["levels"])  # sliders that cross leave some level
+        """Return near and far end of a level's band, in scene units; (inf, inf) for a level not in use."""
+        first = min(values["first"], values["last"], facts["levels"])  # crossed sliders still leave a level
         last = max(values["first"], values["last"])
         if not first <= facts["level"] <= last:
             return inf, inf
@@ -65,15 +65,15 @@ class Bands(Rule):
         far = facts["coarser_s_min"] / values["gamma"] * focal_px if facts["coarser"] >= first else inf
         return near, far
 
-    def weights(self, means, eye, focal_px, columns, facts, values, tables=NO_TABLES) -> np.ndarray:
+    def weights(self, means, position, focal_px, columns, facts, values, tables=NO_TABLES) -> np.ndarray:
         near, far = self.distance_band(focal_px, facts, values)
         if near == inf:
             return np.zeros(len(means), np.float32)
-        away = distances(means, eye)
-        return ((away >= np.float32(near)) & (away < np.float32(far))).astype(np.float32)
+        distance = distances(means, position)
+        return ((distance >= np.float32(near)) & (distance < np.float32(far))).astype(np.float32)
 
     def defaults(self, levels: Sequence[int]) -> dict[str, float]:
-        """The three finest levels, as published figures have them (Sec. 5)."""
+        """Use the three finest levels, like the published figures (Sec. 5)."""
         return super().defaults(levels) | {"first": levels[-3:][0], "last": levels[-1]}
 
     def resolve_controls(
@@ -83,7 +83,7 @@ class Bands(Rule):
         first, last = (int(values[name]) for name in ("first", "last"))
         if not levels[0] <= first <= last <= levels[-1]:
             raise LodgsError(
-                f"Levels {first} to {last} cannot be shown.",
+                f"Cannot show levels {first} to {last}.",
                 f"Choose levels from {levels[0]} to {levels[-1]}, coarse to fine.",
             )
         return values

@@ -9,21 +9,20 @@ import numpy as np
 from ..rule import NO_TABLES, OPACITY, Control, Rule, Values, distances
 
 SIGMA = "sigma_d"
-"""Column of each splat's decay, the paper's σ_d."""
+"""Column of each splat's decay rate, the paper's σ_d."""
 EPSILON = 1e-8
 """The paper's ε."""
 LIMIT_MARGIN = 1e-5
-"""Share by which a budget's virtual scale is larger than that of the first splat that it leaves out, so that
-rounding does not bring that one back."""
+"""Relative margin on the virtual scale of a budget, so that rounding does not exceed the budget."""
 NEWTON_STEPS = 6
-"""Steps of :func:`max_visible_scale`, of which each doubles the digits."""
+"""Newton steps of :func:`max_visible_scale`; each doubles the number of correct digits."""
 
 
 def attenuation(normalized, sigma, s_v: float):
-    """exp(−(d′ s_v)² / (2 ReLU(σ_d)² + ε)), (N,): the factor on the opacity (Eq. 2).
+    """Return the opacity factor exp(−(d′ s_v)² / (2 ReLU(σ_d)² + ε)), (N,) (Eq. 2).
 
     Args:
-        normalized: (N,) d′, distances over the reference distance, numpy or torch.
+        normalized: (N,) d′, distances divided by the reference distance, numpy or torch.
         sigma: (N,) σ_d.
         s_v: virtual distance scale.
     """
@@ -34,10 +33,10 @@ def attenuation(normalized, sigma, s_v: float):
 def max_visible_scale(
     normalized: np.ndarray, sigma: np.ndarray, opacity: np.ndarray, tau: float
 ) -> np.ndarray:
-    """The virtual scale (N,) at which each splat's attenuated opacity meets the threshold τ s_v.
+    """Return the virtual scale (N,) where each splat's attenuated opacity equals the threshold τ s_v.
 
-    α exp(−a s² / 2) = τ s with a = 2 d′² / (2 ReLU(σ_d)² + ε) has the one solution s = (α / τ) exp(−W / 2),
-    W exp(W) = a (α / τ)²: Lambert's W, here by Newton's method on ln W + W.
+    α exp(−a s² / 2) = τ s with a = 2 d′² / (2 ReLU(σ_d)² + ε) has the solution s = (α / τ) exp(−W / 2),
+    W exp(W) = a (α / τ)². Lambert's W is computed by Newton's method on ln W + W.
     """
     ratio = opacity / np.float32(tau)
     product = 2 * normalized**2 / (2 * sigma.clip(0) ** 2 + np.float32(EPSILON)) * ratio**2
@@ -49,27 +48,27 @@ def max_visible_scale(
 
 
 class Decay(Rule):
-    """The attenuation where α·attenuation > τ s_v, 0 elsewhere (Sec. 3.2).
+    """The attenuation where α·attenuation > τ s_v, else 0 (Sec. 3.2).
 
-    Splats do without levels: of several, each complete, the finest alone is drawn.
+    The rule needs no levels: of several complete levels, only the finest is drawn.
 
-    d′ is the distance over ``reference``, or where that is 0 over that of the farthest splat (in the paper,
-    of those in view). With ``at_most`` the virtual scale is as much larger than ``s_v`` as leaves no more
-    splats than that.
+    d′ is the distance divided by ``reference``, or if that is 0 by the distance of the farthest splat (in the
+    paper: of the splats in view). ``at_most`` raises the virtual scale above ``s_v`` until no more splats
+    than that remain.
     """
 
     name = "decay"
     scene_facts = ("reference", "tau")
-    lengths = ("reference",)  # σ_d is a share of it
+    lengths = ("reference",)  # σ_d is relative to it
     columns = (SIGMA, OPACITY)
     controls = (
         Control(
             "s_v", 1.0, 1.0, 100.0, "Distance Scale",
-            "s_v: as if the eye were so many times farther away. Larger shows fewer splats", soft=(1.0, 10.0),
+            "s_v: factor on camera distances. Larger shows fewer splats", soft=(1.0, 10.0),
         ),
         Control(
             "at_most", 0, 0, 2**30, "Splat Limit",
-            "Most splats that are shown: where there are more, s_v rises by itself. 0 is no limit",
+            "Maximum number of splats: raises s_v as needed. 0 disables",
             whole=True, step=1000,
         ),
     )  # fmt: skip
@@ -77,27 +76,28 @@ class Decay(Rule):
     apart = False
     sweep = ("s_v", (1.0, 1.5, 2.0, 3.0, 5.0))
 
-    def normalized(self, means: np.ndarray, eye: np.ndarray, facts: Mapping[str, float]) -> np.ndarray:
-        """d′ (N,) of splats at means (N, 3)."""
-        away = distances(means, eye)
-        reference = facts["reference"] or float(away.max(initial=0))
-        return away / np.float32(max(reference, 1e-20))
+    def normalized(self, means: np.ndarray, position: np.ndarray, facts: Mapping[str, float]) -> np.ndarray:
+        """Return d′ (N,) of splats at means (N, 3)."""
+        distance = distances(means, position)
+        reference = facts["reference"] or float(distance.max(initial=0))
+        return distance / np.float32(max(reference, 1e-20))
 
     def virtual_scale(
         self, normalized, columns: Mapping[str, np.ndarray], tau: float, values: Values
     ) -> float:
-        """``s_v``, or as much more as the budget asks for."""
+        """Return ``s_v``, raised as far as the budget requires."""
         s_v, at_most = values["s_v"], int(values["at_most"])
         if not 0 < at_most < len(normalized):
             return s_v
         limits = max_visible_scale(normalized, columns[SIGMA], columns[OPACITY], tau)
-        first_left_out = np.partition(limits, len(limits) - at_most - 1)[len(limits) - at_most - 1]
-        return max(s_v, float(first_left_out) * (1 + LIMIT_MARGIN))
+        first_excluded = np.partition(limits, len(limits) - at_most - 1)[len(limits) - at_most - 1]
+        return max(s_v, float(first_excluded) * (1 + LIMIT_MARGIN))
 
-    def weights(self, means, eye, focal_px, columns, facts, values, tables=NO_TABLES) -> np.ndarray:
+    def weights(self, means, position, focal_px, columns, facts, values, tables=NO_TABLES) -> np.ndarray:
         if facts["level"] < facts["levels"]:
             return np.zeros(len(means), np.float32)
-        normalized, tau = self.normalized(means, eye, facts), facts["tau"]
+        tau = facts["tau"]
+        normalized = self.normalized(means, position, facts)
         s_v = self.virtual_scale(normalized, columns, tau, values)
         weight = attenuation(normalized, columns[SIGMA], s_v).astype(np.float32)
         return np.where(columns[OPACITY] * weight > tau * s_v, weight, np.float32(0))

@@ -1,4 +1,4 @@
-"""A tree of splats in pieces, which together may be larger than memory. numpy only."""
+"""A tree of splats in pieces that may together be larger than memory. numpy only."""
 
 from __future__ import annotations
 
@@ -16,34 +16,36 @@ from ...splats.levels import NO_SPLATS, Level
 from ...splats.ply import Columns
 from ...splats.scratch import ScratchFile
 from ..rules.cut import NODE_SIZE, PARENT, PARENT_SIZE
-from .paging import page_table, streaming_order
+from .pages import page_table, streaming_order
 from .shape import LEAVES, NODES, Tree, UniqueSizes
 
 Piece = tuple[Splats, Tree]
-"""Splats, and the tree that they are the nodes of."""
+"""Splats, and the tree whose nodes they are."""
 _KEYS = (PARENT_SIZE, *PARENT)
 
 
 class Forest(Protocol):
-    """A tree of splats: subtrees, and the upper tree, whose leaves are the subtrees' roots in their order."""
+    """A tree of splats: subtrees, and an upper tree whose leaves are the subtrees' roots, in order."""
 
     def __iter__(self) -> Iterator[Piece]:
-        """The subtrees one after the other, as neighbours in space: the 2N - 1 nodes, and the tree, of each.
+        """Iterate over the subtrees, sorted by space: the 2N - 1 nodes and the tree of each.
 
-        A subtree of one leaf is a leaf that stands alone under the upper tree.
+        A subtree may be a single leaf.
         """
         ...
 
     @property
     def upper(self) -> Piece:
-        """The G - 1 nodes above G subtrees, without the roots of these, and the tree, which has these as its
-        leaves. It may be known only when all subtrees have been asked for."""
+        """The G - 1 inner nodes above the roots of G subtrees, and a tree with these roots as leaves.
+
+        It may be available only after iterating over all subtrees.
+        """
         ...
 
 
 @dataclass(frozen=True)
 class MemoryForest:
-    """A forest in memory; see :class:`Forest`."""
+    """A forest in memory, see :class:`Forest`."""
 
     subtrees: Sequence[Piece]
     upper: Piece
@@ -53,18 +55,20 @@ class MemoryForest:
 
 
 def max_subtree_leaves(leaves: int) -> int:
-    """Most leaves of a subtree of a tree of N leaves: half the square root of the number of nodes, so that
-    the upper tree and a subtree have about as many."""
+    """Return the maximum leaves of a subtree of a tree of N leaves: half the square root of the node count.
+
+    The upper tree and a subtree then have about the same size.
+    """
     return max(math.isqrt(2 * leaves - 1) // 2, 1)
 
 
 @dataclass(frozen=True)
 class ForestShape:
-    """Where the pieces of a tree are among its nodes, subtree after subtree, those of the upper tree last.
+    """Order of a forest's nodes: subtree after subtree, then the inner nodes of the upper tree.
 
     Attributes:
         counts: (G,) int64, leaves of each subtree.
-        upper: of G leaves.
+        upper: upper tree, of G leaves.
     """
 
     counts: np.ndarray
@@ -75,56 +79,57 @@ class ForestShape:
 
     @cached_property
     def begins(self) -> np.ndarray:
-        """(G,) int64, the first node of each subtree."""
+        """First node of each subtree, (G,) int64."""
         return self.ends - (2 * self.counts - 1)
 
     @cached_property
     def ends(self) -> np.ndarray:
-        """(G,) int64, one after the last node of each subtree, which is its root."""
+        """End of each subtree's nodes, (G,) int64; its last node is the root."""
         return np.cumsum(2 * self.counts - 1)
 
     @cached_property
     def list_begins(self) -> np.ndarray:
-        """(G,) int64, the first of the nodes above leaves of each subtree, counted through all subtrees."""
+        """First inner node of each subtree, (G,) int64, counted over the inner nodes of all subtrees."""
         return self.list_ends - (self.counts - 1)
 
     @cached_property
     def list_ends(self) -> np.ndarray:
-        """(G,) int64, one after the last of them."""
+        """End of each subtree's inner nodes, (G,) int64."""
         return np.cumsum(self.counts - 1)
 
     @property
     def ranges(self) -> list[tuple[int, int]]:
-        """The first node of each subtree, and one after its last."""
+        """First node and end of each subtree."""
         return list(zip(self.begins.tolist(), self.ends.tolist(), strict=True))
 
     @property
     def in_upper(self) -> np.ndarray:
-        """(2G - 1,) int64: the nodes of the upper tree, with its leaves, in its own numbering."""
+        """Nodes of the upper tree with its leaves, (2G - 1,) int64, in the upper tree's order."""
         return np.append(self.ends - 1, np.arange(self.ends[-1], len(self)))
 
 
-def forest_shape(tree: Tree, longest: int) -> tuple[np.ndarray, ForestShape]:
-    """The largest subtrees of at most ``longest`` leaves, by their first leaves.
+def forest_shape(tree: Tree, max_leaves: int) -> tuple[np.ndarray, ForestShape]:
+    """Split a tree into the largest subtrees of at most ``max_leaves`` leaves, sorted by their first leaves.
 
     Returns:
-        Which nodes (2N - 1,) int32 of the tree are those of the forest, one after the other, and its shape.
+        The nodes (2N - 1,) int32 of the tree in the order of the forest, and the forest's shape.
     """
     leaves, count = tree.leaves, len(tree)
-    within, parents = tree.leaves_below <= longest, tree.parents
-    roots = np.flatnonzero(within & ((parents < 0) | ~within[parents]))
-    owner = np.full(count, len(roots), np.int32)  # the number of a node's subtree; of those above, one more
+    small = tree.leaves_below <= max_leaves
+    parents = tree.parents
+    roots = np.flatnonzero(small & ((parents < 0) | ~small[parents]))
+    owner = np.full(count, len(roots), np.int32)  # subtree of each node; len(roots) for the upper tree
     owner[roots] = np.arange(len(roots))
     for layer in tree.layers:
-        inside = layer[within[layer]]
+        inside = layer[small[layer]]
         owner[tree.children[inside - leaves]] = owner[inside][:, None]
     _, first = np.unique(owner[:leaves], return_index=True)
     rank = np.empty(len(roots) + 1, np.int32)
     rank[np.append(np.argsort(first), len(roots))] = np.arange(len(roots) + 1)
     owner, roots = rank[owner], roots[np.argsort(first)]
-    last = parents < 0
-    last[roots] = True
-    order = np.lexsort((last, np.arange(count) >= leaves, owner)).astype(np.int32)
+    is_root = parents < 0
+    is_root[roots] = True
+    order = np.lexsort((is_root, np.arange(count) >= leaves, owner)).astype(np.int32)
     place = np.empty(count, np.int32)
     place[order[count - len(roots) + 1 :]] = len(roots) + np.arange(len(roots) - 1)
     place[roots] = np.arange(len(roots))
@@ -132,13 +137,13 @@ def forest_shape(tree: Tree, longest: int) -> tuple[np.ndarray, ForestShape]:
     return order, ForestShape(tree.leaves_below[roots].astype(np.int64), upper)
 
 
-def split_tree(splats: Splats, tree: Tree, longest: int) -> MemoryForest:
-    """A tree as a forest: the largest subtrees of at most ``longest`` leaves, by their first leaves.
+def split_tree(splats: Splats, tree: Tree, max_leaves: int) -> MemoryForest:
+    """Split a tree into the largest subtrees of at most ``max_leaves`` leaves, sorted by their first leaves.
 
     Args:
-        splats: its 2N - 1 nodes.
+        splats: the 2N - 1 nodes.
     """
-    order, shape = forest_shape(tree, longest)
+    order, shape = forest_shape(tree, max_leaves)
     splats, trees = splats.select(order), extract_subtrees(tree, order, shape)
     pieces = [splats.select(slice(*ends)) for ends in shape.ranges]
     upper = splats.select(slice(int(shape.ends[-1]), None)), shape.upper
@@ -146,24 +151,25 @@ def split_tree(splats: Splats, tree: Tree, longest: int) -> MemoryForest:
 
 
 def extract_subtrees(tree: Tree, order: np.ndarray, shape: ForestShape) -> list[Tree]:
-    """The subtrees of a tree that :func:`forest_shape` has found."""
+    """Return the subtrees of a tree, from the result of :func:`forest_shape`."""
     place = np.empty(len(tree), np.int32)
     place[order] = np.arange(len(tree), dtype=np.int32)
     trees = []
-    for (begin, end), own in zip(shape.ranges, shape.counts.tolist(), strict=True):
-        trees.append(Tree(place[tree.children[order[begin + own : end] - tree.leaves]] - np.int32(begin)))
+    for (begin, end), leaves in zip(shape.ranges, shape.counts.tolist(), strict=True):
+        children = tree.children[order[begin + leaves : end] - tree.leaves]
+        trees.append(Tree(place[children] - np.int32(begin)))
     return trees
 
 
 def combine_trees(leaves: np.ndarray, children: np.ndarray) -> tuple[np.ndarray, Tree]:
-    """Trees one after the other as one ``Tree`` of several.
+    """Combine separate trees into one ``Tree`` of several.
 
     Args:
         leaves: (T,) of each tree.
-        children: (., 2), of those above leaves in the order of their numbers, by number among all.
+        children: (., 2), of all inner nodes in order, as node numbers among all trees.
 
     Returns:
-        Which of the nodes (.,) int64 each of that tree is, and the tree.
+        The nodes (.,) int64 in the order of the combined tree, and that tree.
     """
     counts = 2 * leaves - 1
     begins = np.cumsum(counts) - counts
@@ -175,71 +181,75 @@ def combine_trees(leaves: np.ndarray, children: np.ndarray) -> tuple[np.ndarray,
 
 
 def merge_forest(forest: Forest) -> Piece:
-    """A forest as one tree in memory: all leaves in the order of subtrees, the nodes above them, the upper
-    tree's."""
+    """Return a forest as one tree in memory.
+
+    Nodes are ordered: all leaves by subtree, then the subtrees' inner nodes, then those of the upper tree.
+    """
     subtrees = list(forest)
-    above, upper = forest.upper
+    upper_splats, upper = forest.upper
     leaves = [splats.select(slice(0, tree.leaves)) for splats, tree in subtrees]
     inner = [splats.select(slice(tree.leaves, None)) for splats, tree in subtrees]
-    return Splats.concatenated([*leaves, *inner, above]), merge_trees([tree for _, tree in subtrees], upper)
+    return Splats.concatenated([*leaves, *inner, upper_splats]), merge_trees(
+        [tree for _, tree in subtrees], upper
+    )
 
 
 def merge_trees(trees: Sequence[Tree], upper: Tree) -> Tree:
-    """One tree of others: of the trees whose roots are the leaves of an upper one, in their order."""
+    """Return one tree of subtrees, whose roots are the leaves of an upper tree, in order."""
     counts = np.array([tree.leaves for tree in trees])
     first_leaf, first_inner = np.cumsum(counts) - counts, np.cumsum(counts - 1) - (counts - 1)
     leaves = int(counts.sum())
     children = []
-    for tree, own, leaf, inner in zip(trees, counts, first_leaf, first_inner, strict=True):
-        shift = np.where(tree.children < own, leaf, leaves + inner - own)
+    for tree, count, leaf, inner in zip(trees, counts, first_leaf, first_inner, strict=True):
+        shift = np.where(tree.children < count, leaf, leaves + inner - count)
         children.append(tree.children + shift)
     roots = np.where(counts == 1, first_leaf, leaves + first_inner + counts - 2)
-    beyond = leaves + int((counts - 1).sum()) - len(trees)
-    in_upper = upper.children
-    known = np.append(roots, 0)[np.minimum(in_upper, len(trees))]
-    children.append(np.where(in_upper < len(trees), known, in_upper + beyond))
+    shift = leaves + int((counts - 1).sum()) - len(trees)
+    subtree_roots = np.append(roots, 0)[np.minimum(upper.children, len(trees))]
+    children.append(np.where(upper.children < len(trees), subtree_roots, upper.children + shift))
     return Tree(np.concatenate(children).astype(np.int32).reshape(-1, 2))
 
 
 def build_levels(forest: Forest, folder: Path) -> tuple[list[Level], Columns]:
-    """The levels of a bundle, in the order of their rows, and its table of blocks; the splats stay in files.
+    """Return the levels of a bundle, on disk, and its table of blocks.
 
-    What they are is what ``Tree.levels`` makes of the same tree, but that of nodes alike another one may be
-    the larger. In memory are 20 bytes of each node, and up to 45 of those of one level.
+    The result equals that of ``Tree.levels``, except that of equal nodes another one may be enlarged. Uses 20
+    bytes of memory per node, and up to 45 for the nodes of one level.
 
     Args:
-        folder: where the files are, which have no names and go with the levels.
+        folder: for unnamed scratch files, which exist as long as the levels.
 
     Raises:
-        LodgsError: the folder takes no files.
+        LodgsError: cannot write to the folder.
     """
     files = {number: _LevelFile(folder) for number in (NODES, LEAVES)}
-    roots, places, apart = [], [], UniqueSizes()
+    roots, locations, unique = [], [], UniqueSizes()
     for splats, tree in forest:
-        columns = tree.columns(splats.means, apart.sizes(tree, splats.means, splats.log_scales))
+        columns = tree.columns(splats.means, unique.sizes(tree, splats.means, splats.log_scales))
         splats = replace(splats, extras=columns)
         roots.append(splats.select([-1]))  # a copy: a view would keep them all
         files[LEAVES].append(splats.select(slice(0, tree.leaves)))
         files[NODES].append(splats.select(slice(tree.leaves, None)))
         file = files[LEAVES if tree.leaves == 1 else NODES]
-        places.append((file, len(file.keys) - 1, len(file.splats) - 1))
-    above, upper = forest.upper
-    ends = Splats.concatenated(roots)
-    means, log_scales = np.concatenate([ends.means, above.means]), [ends.log_scales, above.log_scales]
-    sizes = apart.sizes(upper, means, np.concatenate(log_scales), ends.extras[NODE_SIZE])
+        locations.append((file, len(file.keys) - 1, len(file.splats) - 1))
+    upper_splats, upper = forest.upper
+    root_splats = Splats.concatenated(roots)
+    means = np.concatenate([root_splats.means, upper_splats.means])
+    log_scales = np.concatenate([root_splats.log_scales, upper_splats.log_scales])
+    sizes = unique.sizes(upper, means, log_scales, root_splats.extras[NODE_SIZE])
     columns = upper.columns(means, sizes)
-    for i, (root, (file, part, row)) in enumerate(zip(roots, places, strict=True)):  # parents are known now
+    for i, (root, (file, part, row)) in enumerate(zip(roots, locations, strict=True)):  # add the parents
         root.extras = {name: column[i : i + 1] for name, column in columns.items()}
         file.splats.write(row, root)
         file.keys[part][-1] = _keys(root)
-    above = replace(above, extras={name: column[upper.leaves :] for name, column in columns.items()})
-    files[NODES].append(above)
+    upper_columns = {name: column[upper.leaves :] for name, column in columns.items()}
+    files[NODES].append(replace(upper_splats, extras=upper_columns))
     levels, tables = zip(*(files.pop(number).finished(number) for number in (NODES, LEAVES)), strict=True)
     return list(levels), {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
 
 
 class _LevelFile:
-    """A level's splats in a file, and in memory by what they are put in order, (N, 4) float32 in parts."""
+    """A level's splats in a scratch file, and their sort keys (N, 4) float32 in memory, in parts."""
 
     def __init__(self, folder: Path) -> None:
         self.splats, self.keys = ScratchFile(folder), []
@@ -250,17 +260,17 @@ class _LevelFile:
             self.keys.append(_keys(splats))
 
     def finished(self, number: int) -> tuple[Level, Columns]:
-        """The level, and what the table of blocks says of it."""
+        """Return the level, sorted, and its rows of the table of blocks."""
         keys, self.keys = np.concatenate(self.keys), []
         columns: Columns = dict(zip(_KEYS, keys.T, strict=True))
         order = streaming_order(columns).astype(np.int32)
         table = page_table({number: {name: column[order] for name, column in columns.items()}})
-        return Level(number, NO_SPLATS, on_disk=_Ordered(self.splats, order)), table
+        return Level(number, NO_SPLATS, on_disk=_SortedRows(self.splats, order)), table
 
 
 @dataclass(frozen=True)
-class _Ordered:
-    """The splats of a file at rows (N,)."""
+class _SortedRows:
+    """Splats of a scratch file in another order, rows (N,)."""
 
     file: ScratchFile
     rows: np.ndarray
@@ -268,8 +278,8 @@ class _Ordered:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def select(self, some: slice | np.ndarray, /) -> Splats:
-        return self.file.select(self.rows[some])
+    def select(self, index: slice | np.ndarray, /) -> Splats:
+        return self.file.select(self.rows[index])
 
 
 def _keys(splats: Splats) -> np.ndarray:

@@ -86,7 +86,7 @@ def rows_at_distances(
     eye, found = np.asarray(eye, np.float32), {}
     for number, level in levels.items():
         of_level = collect_facts(RULE, {}, facts, number)
-        some = level.blocks.between(eye, *RULE.distance_band(1.0, of_level, values))[0]
+        some = level.blocks.in_band(eye, *RULE.distance_band(1.0, of_level, values))[0]
         rows = level.blocks.rows(some if blocks is None else some & blocks[number])
         found[number] = rows[RULE.weights(level.means[rows], eye, 1.0, {}, of_level, values) > 0]
     return found

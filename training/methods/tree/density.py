@@ -113,7 +113,7 @@ class Growing:
             score = leaves["score"].numpy()
             grows = (score > threshold) & ~dead
             if region is not None:
-                grows &= region.holds(leaves["means"].numpy())
+                grows &= region.contains(leaves["means"].numpy())
             chosen = np.flatnonzero(grows)
             scores.append(score[chosen])
             wanted.append(count + chosen)

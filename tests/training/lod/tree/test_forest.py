@@ -9,7 +9,8 @@ from training.lod.rule import rules
 from training.lod.selection import BundleSelector, resolve_controls, select_levels
 from training.lod.tree import paging
 from training.lod.tree.forest import build_levels, max_subtree_leaves, merge_forest, split_tree
-from training.lod.tree.paging import Pager, page_table
+from training.lod.tree.pages import page_table
+from training.lod.tree.paging import Pager
 from training.lod.tree.shape import Tree
 from training.methods.tree.build import build
 from training.splats.bundle import read_bundle, write_bundle

@@ -16,7 +16,9 @@ from training.lod.rule import rules
 from training.lod.rules.cut import ABOVE_ROOT
 from training.lod.selection import BundleSelector, select
 from training.lod.tree import paging
-from training.lod.tree.paging import Pager, ResidentTree, TreeFile, page_table, read_budgeted, streaming_order
+from training.lod.tree.pages import page_table, streaming_order
+from training.lod.tree.paging import Pager, TreeFile, read_budgeted
+from training.lod.tree.resident import ResidentTree
 from training.scenes.cameras import Camera, look_at
 from training.splats.bundle import read_bundle, write_bundle
 from training.splats.levels import Bundle, Level

@@ -7,7 +7,7 @@ import numpy as np
 from training.lod.blocks import spatial_order
 from training.lod.partial_read import BLOCKS
 from training.lod.rules.cut import ABOVE_ROOT, min_parent_size
-from training.lod.tree.paging import page_table, streaming_order
+from training.lod.tree.pages import page_table, streaming_order
 from training.lod.tree.shape import Tree
 from training.splats.bundle import write_bundle
 from training.splats.gaussians import Splats
