@@ -1,1 +1,1 @@
-"""Programs that run beside Blender: the trainer, its environment, captures and photo preparation."""
+"""Programs that run outside Blender: the trainer, its environment, captures and photo preparation."""

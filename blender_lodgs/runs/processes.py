@@ -1,4 +1,4 @@
-"""Starting and following programs that run beside Blender."""
+"""Starting and following programs that run outside Blender."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""LODGE's chunks in geometry nodes, worked by hand: two sets that fade into each other, distances beyond."""
+"""Node group of LODGE's chunks against values computed by hand."""
 
 import numpy as np
 import pytest
@@ -7,15 +7,16 @@ from training.lod.rules.chunks import member_columns
 
 NEITHER, FIRST, SECOND, BOTH = range(4)
 SETS = np.array([[0, 1, 0, 1], [0, 0, 1, 1]], bool)
-"""Of both chunks: which of four splats are in them."""
+"""Membership of four splats in both chunks."""
 CHUNKS = {"x": [0, 10], "y": [0, 0], "z": [0, 0], "radius": [10, 10]}
 
 
 @pytest.fixture
 def weights(bpy, lodgs):
-    """``weights(eye, **controls)``: those of four splats at the origin, of a level for distances below 20.
+    """``weights(camera, **controls)`` returns the weights of four splats at the origin.
 
-    ``weights.root`` is their scene, which stands askew and has a level for the rest as well.
+    The level of these splats is visible below distance 20.
+    ``weights.root`` is their scene. It has a transform, and a second level for larger distances.
     """
     from training.splats.levels import Bundle, Level
 
@@ -25,33 +26,33 @@ def weights(bpy, lodgs):
     table = {name: np.float32(values) for name, values in CHUNKS.items()}
     bundle = Bundle("lodge", levels, "chunks", tables={"chunks": table})
     with lodgs("data.importing").new_scene(bpy.context, "town") as root:
-        for one in levels:
-            scenes.put_level(root, one)
+        for level in levels:
+            scenes.put_level(root, level)
         scenes.set_bundle_facts(root, bundle)
         scenes.set_tables(root, bundle.tables)
     root.location, root.rotation_euler, root.scale = (5, 6, 7), (1, 2, 3), (2, 3, 4)
     root.lodgs.mode, root.lodgs.eye = "SELECTIVE", "TRAINING"
 
-    def asked(eye, **controls):
+    def compute(camera, **controls):
         for name, value in {"chunks": True, "fade": True, "distance_scale": 1.0, **controls}.items():
             setattr(root.lodgs.controls, name, value)
-        root.lodgs.camera_center = eye
+        root.lodgs.camera_center = camera
         depsgraph = bpy.context.evaluated_depsgraph_get()
         evaluated = root.lodgs.levels[1].object.evaluated_get(depsgraph)
-        found = np.zeros(4, np.float32)
+        weights = np.zeros(4, np.float32)
         if len(evaluated.data.points):
             read = lodgs("attributes").read_attribute
-            found[read(evaluated.data, "row")] = read(evaluated.data, "lod_weight")
+            weights[read(evaluated.data, "row")] = read(evaluated.data, "lod_weight")
         choice = lodgs("data.selection").choice(evaluated, depsgraph)
-        np.testing.assert_allclose(choice.weights(fine.means, fine.extras), found, atol=1e-6)
-        again = lodgs("data.selection").choice(evaluated, depsgraph)
-        assert choice == again and hash(choice) == hash(again)
+        np.testing.assert_allclose(choice.weights(fine.means, fine.extras), weights, atol=1e-6)
+        repeated = lodgs("data.selection").choice(evaluated, depsgraph)
+        assert choice == repeated and hash(choice) == hash(repeated)
         region = choice.region()
-        assert region is None or (choice.visible_in_region(fine.extras) >= (found > 0)).all()
-        return found.tolist()
+        assert region is None or (choice.visible_in_region(fine.extras) >= (weights > 0)).all()
+        return weights.tolist()
 
-    asked.root = root
-    return asked
+    compute.root = root
+    return compute
 
 
 def splats(sets):
@@ -66,7 +67,7 @@ def splats(sets):
     )  # fmt: skip
 
 
-def test_sets_fade_into_each_other_from_centre_to_centre(weights):
+def test_sets_are_blended_between_chunk_centres(weights):
     assert weights((0, 0, 0)) == [0, 1, 0, 1]
     assert weights((2.5, 3, 0)) == [0, 0.75, 0.25, 1]
     assert weights((10, 0, 0)) == [0, 0, 1, 1]
@@ -75,8 +76,8 @@ def test_sets_fade_into_each_other_from_centre_to_centre(weights):
     assert weights((7.5, 3, 0), fade=False) == [0, 0, 1, 1]
 
 
-def test_away_from_chunks_distances_count(weights):
-    assert weights((-11.25, 0, 0)) == [0.5, 1, 0.5, 1]  # half of the quarter of a radius
+def test_weights_by_distance_outside_the_chunks(weights):
+    assert weights((-11.25, 0, 0)) == [0.5, 1, 0.5, 1]  # half a quarter radius outside
     assert weights((-11.25, 0, 0), fade=False) == [1, 1, 1, 1]
     assert weights((-12.5, 0, 0)) == [1, 1, 1, 1]
     assert weights((-12.5, 0, 0), distance_scale=2) == [0, 0, 0, 0]
@@ -85,14 +86,14 @@ def test_away_from_chunks_distances_count(weights):
     assert weights((0, 9, 0), chunks=False) == [1, 1, 1, 1]
 
 
-def test_a_chunk_alone_has_its_radius(bpy, lodgs, weights):
-    one = {name: np.float32(values[1:]) for name, values in CHUNKS.items()}
-    lodgs("data.scenes").set_tables(weights.root, {"chunks": one})
+def test_single_chunk(bpy, lodgs, weights):
+    chunk = {name: np.float32(values[1:]) for name, values in CHUNKS.items()}
+    lodgs("data.scenes").set_tables(weights.root, {"chunks": chunk})
     assert weights((2.5, 0, 0)) == [0, 1, 0, 1]
     assert weights((-1.25, 0, 0)) == [0.5, 1, 0.5, 1]
 
 
-def test_without_its_table_the_eye_counts(bpy, lodgs, weights):
+def test_weights_by_distance_without_a_table(bpy, lodgs, weights):
     (item,) = weights.root.lodgs.tables
     bpy.data.objects.remove(item.object)
     assert weights((2.5, 3, 0)) == [1, 1, 1, 1]
@@ -100,28 +101,28 @@ def test_without_its_table_the_eye_counts(bpy, lodgs, weights):
     assert weights((2.5, 3, 0)) == [1, 1, 1, 1]
 
 
-@pytest.mark.parametrize("eye", ["CAMERA", "OBJECT", "VIEW", "frozen"])
-def test_every_eye_chooses_its_chunks(bpy, weights, eye):
-    root, place = weights.root, (2.5, 3, 0)
-    obj = bpy.data.objects.new("eye", bpy.data.cameras.new("eye") if eye == "CAMERA" else None)
+@pytest.mark.parametrize("source", ["CAMERA", "OBJECT", "VIEW", "frozen"])
+def test_chunks_are_selected_for_every_camera_source(bpy, weights, source):
+    root, position = weights.root, (2.5, 3, 0)
+    obj = bpy.data.objects.new("eye", bpy.data.cameras.new("eye") if source == "CAMERA" else None)
     bpy.context.scene.collection.objects.link(obj)
     bpy.context.view_layer.update()
-    obj.location = root.lodgs.axes.matrix_world @ obj.location.__class__(place)
-    if eye == "CAMERA":
+    obj.location = root.lodgs.axes.matrix_world @ obj.location.__class__(position)
+    if source == "CAMERA":
         bpy.context.scene.camera = obj
-    root.lodgs.eye_object, root.lodgs.held_eye = obj, place
-    if eye == "frozen":
+    root.lodgs.eye_object, root.lodgs.held_eye = obj, position
+    if source == "frozen":
         root.lodgs.eye, root.lodgs.freeze = "OBJECT", True
-        root.lodgs.held_eye = place
+        root.lodgs.held_eye = position
         obj.location = (100, 100, 100)
     else:
-        root.lodgs.eye = eye
-        root.lodgs.held_eye = place
+        root.lodgs.eye = source
+        root.lodgs.held_eye = position
     assert weights((100, 0, 0)) == pytest.approx([0, 0.75, 0.25, 1], abs=1e-5)
 
 
-def test_it_follows_an_animated_camera_and_files_without_handlers(bpy, lodgs, weights, tmp_path):
-    """As in background and for F12: nothing of this extension runs but what is saved in the file."""
+def test_animated_camera_works_without_handlers(bpy, lodgs, weights, tmp_path):
+    """Background renders evaluate only the node groups and drivers of the file."""
     root = weights.root
     camera = bpy.data.objects.new("eye", bpy.data.cameras.new("eye"))
     bpy.context.scene.collection.objects.link(camera)
@@ -134,24 +135,24 @@ def test_it_follows_an_animated_camera_and_files_without_handlers(bpy, lodgs, we
     path, name = str(tmp_path / "a.blend"), root.lodgs.levels[1].object.name
     bpy.ops.wm.save_as_mainfile(filepath=path)
     handlers = [getattr(bpy.app.handlers, kind) for kind in ("depsgraph_update_post", "load_post")]
-    kept = [list(kind) for kind in handlers]
+    functions = [list(kind) for kind in handlers]
     for kind in handlers:
         kind.clear()
     try:
         bpy.ops.wm.open_mainfile(filepath=path)
-        shown = []
+        visible = []
         for frame in (1, 11):
             bpy.context.scene.frame_set(frame)
             cloud = bpy.data.objects[name].evaluated_get(bpy.context.evaluated_depsgraph_get()).data
-            shown.append(lodgs("attributes").read_attribute(cloud, "row").tolist())
+            visible.append(lodgs("attributes").read_attribute(cloud, "row").tolist())
     finally:
-        for kind, functions in zip(handlers, kept, strict=True):
-            kind.extend(functions)
-    assert shown == [[FIRST, BOTH], [SECOND, BOTH]]
+        for kind, originals in zip(handlers, functions, strict=True):
+            kind.extend(originals)
+    assert visible == [[FIRST, BOTH], [SECOND, BOTH]]
 
 
-def test_a_render_evaluates_them_although_they_are_hidden(bpy, lodgs, weights):
-    seen = []
+def test_renders_evaluate_the_group(bpy, lodgs, weights):
+    records = []
 
     class Recorder(bpy.types.RenderEngine):
         bl_idname, bl_label = "LODGS_TEST_RECORDER", "Recorder"
@@ -159,7 +160,7 @@ def test_a_render_evaluates_them_although_they_are_hidden(bpy, lodgs, weights):
         def render(self, depsgraph):
             cloud = weights.root.lodgs.levels[1].object.evaluated_get(depsgraph).data
             read = lodgs("attributes").read_attribute
-            seen.append((depsgraph.mode, read(cloud, "row").tolist(), read(cloud, "lod_weight").tolist()))
+            records.append((depsgraph.mode, read(cloud, "row").tolist(), read(cloud, "lod_weight").tolist()))
 
     camera = bpy.data.objects.new("eye", bpy.data.cameras.new("eye"))
     bpy.context.scene.collection.objects.link(camera)
@@ -176,6 +177,6 @@ def test_a_render_evaluates_them_although_they_are_hidden(bpy, lodgs, weights):
     finally:
         bpy.context.scene.render.engine = "LODGS"
         bpy.utils.unregister_class(Recorder)
-    ((mode, rows, found),) = seen
+    ((mode, rows, values),) = records
     assert (mode, rows) == ("RENDER", [FIRST, SECOND, BOTH])
-    assert found == pytest.approx([0.75, 0.25, 1], abs=1e-5)
+    assert values == pytest.approx([0.75, 0.25, 1], abs=1e-5)

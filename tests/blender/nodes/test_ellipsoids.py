@@ -1,4 +1,4 @@
-"""Splats as ellipsoids for Cycles: the picture of one is the rasterizer's, and LODGS ignores them."""
+"""Ellipsoids for Cycles: a splat looks as in the rasterizer, and LODGS ignores the modifier."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from training.splats.gaussians import Splats
 
 
 def splats(**changes) -> Splats:
-    """One long splat, turned."""
+    """Return one elongated, rotated splat."""
     values = {
         "means": [[0.1, 0, 0.05]], "quats": [[0.9, 0.1, 0.35, 0.2]], "log_scales": np.log([[0.5, 0.15, 0.3]]),
         "opacity_logits": [1.5], "sh": np.full((1, 1, 3), (0.7 - 0.5) / 0.28209479177387814),
@@ -19,7 +19,7 @@ def splats(**changes) -> Splats:
 
 @pytest.fixture
 def scene(bpy, lodgs):
-    """One splat before a camera, 64x48, transparent film, rendered by Cycles."""
+    """One splat in front of a camera, rendered by Cycles with transparent film at 64x48 pixels."""
     scene = bpy.context.scene
     collection = bpy.data.collections.new("one")
     scene.collection.children.link(collection)
@@ -44,6 +44,7 @@ def scene(bpy, lodgs):
 
 
 def rendered(bpy, path) -> np.ndarray:
+    """Render to a file. Return its pixels, (H, W, 4)."""
     bpy.context.scene.render.filepath = str(path)
     bpy.ops.render.render(write_still=True)
     image = bpy.data.images.load(str(path))
@@ -54,40 +55,42 @@ def rendered(bpy, path) -> np.ndarray:
     return values.reshape(image.size[1], image.size[0], 4)
 
 
-def test_cycles_sees_what_the_rasterizer_draws(bpy, lodgs, scene, renderer, tmp_path):
+def test_cycles_matches_the_rasterizer(bpy, lodgs, scene, renderer, tmp_path):
     scene.lodgs_render.ellipsoids = True
     cycles = rendered(bpy, tmp_path / "cycles.png")
-    scene.render.engine = "LODGS"  # the ellipsoids are still wanted, by other engines
+    scene.render.engine = "LODGS"  # ellipsoids stay enabled for other engines
     drawn = rendered(bpy, tmp_path / "lodgs.png")
     assert drawn[..., 3].max() > 0.7
     difference = np.abs(cycles[..., 3] - drawn[..., 3])
     assert difference.max() < 0.06 and difference.mean() < 0.01
-    seen = drawn[..., 3] > 0.2
-    np.testing.assert_allclose(cycles[seen][:, :3], 0.7, atol=0.02)
+    visible = drawn[..., 3] > 0.2
+    np.testing.assert_allclose(cycles[visible][:, :3], 0.7, atol=0.02)
 
 
-@pytest.mark.parametrize(("ahead", "seen"), [(1.0, True), (-1.0, False)])
-def test_a_splat_around_the_camera_is_seen_if_its_middle_is_before_it(
-    bpy, lodgs, scene, tmp_path, ahead, seen
+@pytest.mark.parametrize(("depth", "visible"), [(1.0, True), (-1.0, False)])
+def test_splat_around_the_camera_is_visible_if_its_centre_is_in_front(
+    bpy, lodgs, scene, tmp_path, depth, visible
 ):
-    """Round, 2 wide: a ray that passes its middle in the distance d sees exp(-d²/8) of its opacity."""
+    """At distance d from the centre of this splat, alpha is opacity * exp(-d²/8)."""
     from training.splats.levels import Level
 
-    one = splats(means=[[0, -5 + ahead, 0]], quats=[[1, 0, 0, 0]], log_scales=np.log([[2.0, 2.0, 2.0]]))
-    lodgs("data.scenes").set_level(bpy.data.objects["one"], Level(1, one, 0.0))
+    splat = splats(means=[[0, -5 + depth, 0]], quats=[[1, 0, 0, 0]], log_scales=np.log([[2.0, 2.0, 2.0]]))
+    lodgs("data.scenes").set_level(bpy.data.objects["one"], Level(1, splat, 0.0))
     scene.lodgs_render.ellipsoids = True
     alpha = rendered(bpy, tmp_path / "cycles.png")[..., 3]
     x, y = np.meshgrid(np.arange(64) - 31.5, np.arange(48) - 23.5)
     size = scene.camera.data.sensor_width / scene.camera.data.lens / 64
-    tangent = np.hypot(x, y) * size  # of the angle at which a ray passes the middle
-    distance = ahead * tangent / np.hypot(1, tangent)
-    expected = np.exp(-(distance**2) / 8) / (1 + np.exp(-1.5)) if seen else np.zeros((48, 64))
+    tangent = np.hypot(x, y) * size  # of the angle between the ray and the axis
+    distance = depth * tangent / np.hypot(1, tangent)
+    expected = np.exp(-(distance**2) / 8) / (1 + np.exp(-1.5)) if visible else np.zeros((48, 64))
     np.testing.assert_allclose(alpha, expected, atol=0.015)
 
 
-def test_rays_go_on_through_many_ellipsoids(bpy, lodgs, scene, tmp_path):
-    """Thirty faint splats one behind the other, one ray a pixel: in the middle 1 - (1 - 0.1)^30 of them is
-    left, without noise. Cycles' own settings end most rays on the way."""
+def test_rays_pass_many_ellipsoids(bpy, lodgs, scene, tmp_path):
+    """Thirty faint splats in a row have an alpha of 1 - (1 - 0.1)^30 without noise.
+
+    With the default settings, Cycles would end most rays on the way.
+    """
     row = np.zeros((30, 3))
     row[:, 1] = np.arange(30) * 0.1
     many = splats(
@@ -103,20 +106,20 @@ def test_rays_go_on_through_many_ellipsoids(bpy, lodgs, scene, tmp_path):
     np.testing.assert_allclose(alpha, 1 - 0.9**30, atol=0.02)
 
 
-def test_they_are_there_only_where_they_are_wanted(bpy, lodgs, scene):
+def test_ellipsoids_are_on_only_if_enabled(bpy, lodgs, scene):
     obj = bpy.data.objects["one level 1"]
     scene.lodgs_render.ellipsoids = True
-    scene.lodgs_render.ellipsoids = True  # twice is once
+    scene.lodgs_render.ellipsoids = True  # enabling twice adds one modifier
     assert [modifier.name for modifier in obj.modifiers].count("LODGS Ellipsoids") == 1
     assert scene.cycles.transparent_max_bounces >= 256
     modifier = obj.modifiers["LODGS Ellipsoids"]
-    for wanted, engine, expected in (
+    for enabled, engine, expected in (
         (True, "CYCLES", True), (False, "CYCLES", False), (True, "LODGS", False), (True, "CYCLES", True),
     ):  # fmt: skip
-        scene.lodgs_render.ellipsoids, scene.render.engine = wanted, engine
+        scene.lodgs_render.ellipsoids, scene.render.engine = enabled, engine
         bpy.context.view_layer.update()
         assert modifier.show_render == expected
-    # a level that comes later has them too
+    # new levels have the modifier too
     from training.splats.levels import Level
 
     lodgs("data.scenes").set_level(bpy.data.objects["one"], Level(2, splats(), 0.0))

@@ -1,4 +1,4 @@
-"""Every rule's node group against the rule itself, splat by splat."""
+"""Node groups of all rules against the rules themselves, splat by splat."""
 
 import numpy as np
 import pytest
@@ -13,15 +13,15 @@ RANGES = {
     "node_size": (-0.05, 0.1), "parent_size": (0, 1.6), "parent_x": (-8, 8), "parent_y": (-8, 8),
     "parent_z": (-8, 8),
 }  # fmt: skip
-"""Of facts, controls and columns for which the usual ones would show everything or nothing."""
+"""Value ranges of facts, controls and columns whose default range would show everything or nothing."""
 FOCALS = {"cut": 300.0}
-"""Focal lengths in pixels of rules for which 2.5 would not count."""
+"""Focal lengths in pixels of rules for which 2.5 has no effect."""
 
 
-def numbers(rule, rng):
-    """Facts and values of a rule, drawn from what they may be."""
+def random_arguments(rule, rng):
+    """Return random facts and control values of a rule."""
     facts = {"level": 2, "finer": 3, "coarser": 1, "levels": 4}
-    if not (rule.cumulative or rule.level_facts):  # made for one level
+    if not (rule.cumulative or rule.level_facts):  # rules for a single level
         facts |= {"finer": 5, "levels": 2}
     names = [*rule.scene_facts, *rule.level_facts, *(f"coarser_{name}" for name in rule.level_facts)]
     facts |= {name: max(rng.uniform(*RANGES.get(name, (0.5, 6))), 0.0) for name in names}
@@ -34,8 +34,8 @@ def numbers(rule, rng):
     return facts, values
 
 
-def tables(rule, rng, count):
-    """Tables of a rule, of places with a radius; None: there are none."""
+def random_tables(rule, rng, count):
+    """Return random tables of a rule with positions and radii, or no tables for a count of None."""
     if count is None:
         return {}
     column = {name: rng.normal(0, 4, count).astype(np.float32) for name in "xyz"}
@@ -44,7 +44,7 @@ def tables(rule, rng, count):
 
 @pytest.fixture
 def level(bpy, lodgs):
-    """``level(rule, count, facts, values, rng, tables)``: an object with the modifier, and its splats."""
+    """``level(rule, count, facts, values, rng, tables)`` returns an object, its modifier and its splats."""
     from training.splats.gaussians import Splats
 
     objects, groups, compat = lodgs("data.objects"), lodgs("nodes.rules"), lodgs("compat")
@@ -81,56 +81,61 @@ def level(bpy, lodgs):
 WITH_TABLES = [
     (name, count) for name in RULES for count in ((None, 0, 1, 2, 3, 96) if rules()[name].tables else (None,))
 ]
-"""Each rule, and how many rows its tables have."""
+"""Rules with the number of rows of their tables."""
 
 
 @pytest.mark.parametrize(("name", "count"), WITH_TABLES)
-def test_the_node_group_weights_every_splat_as_the_rule_does(bpy, lodgs, level, name, count):
+def test_node_group_gives_the_weights_of_the_rule(bpy, lodgs, level, name, count):
     rule, weights = rules()[name], []
     compat, groups, selection = lodgs("compat"), lodgs("nodes.rules"), lodgs("data.selection")
     focal = FOCALS.get(name, 2.5)
     for seed in range(8):
         rng = np.random.default_rng(seed)
-        facts, values = numbers(rule, rng)
-        known = tables(rule, rng, count)
-        obj, modifier, splats = level(rule, 4000, facts, values, rng, known)
-        eye = rng.normal(0, 4, 3).astype(np.float32)
-        obj.location = (3, -2, 1)  # the object's place must not count
-        place = {groups.CAMERA_SOURCE: 2, groups.CAMERA_POSITION: tuple(map(float, eye)), groups.FOCAL: focal}
-        for socket, value in place.items():
+        facts, values = random_arguments(rule, rng)
+        rule_tables = random_tables(rule, rng, count)
+        obj, modifier, splats = level(rule, 4000, facts, values, rng, rule_tables)
+        camera = rng.normal(0, 4, 3).astype(np.float32)
+        obj.location = (3, -2, 1)  # the object's transform must have no effect
+        inputs = {
+            groups.CAMERA_SOURCE: 2,
+            groups.CAMERA_POSITION: tuple(map(float, camera)),
+            groups.FOCAL: focal,
+        }
+        for socket, value in inputs.items():
             compat.set_input(modifier, socket, value)
         depsgraph = bpy.context.evaluated_depsgraph_get()
         evaluated = obj.evaluated_get(depsgraph)
 
-        asked = selection.choice(evaluated, depsgraph)
-        assert (asked.rule, asked.focal_px) == (name, focal)
-        assert dict(asked.values) == pytest.approx(values) and dict(asked.facts) == pytest.approx(facts)
+        query = selection.choice(evaluated, depsgraph)
+        assert (query.rule, query.focal_px) == (name, focal)
+        assert dict(query.values) == pytest.approx(values) and dict(query.facts) == pytest.approx(facts)
         columns = splats.extras | {"opacity": 1 / (1 + np.exp(-splats.opacity_logits))}
-        wanted = rule.weights(splats.means, eye, focal, columns, dict(asked.facts), dict(asked.values), known)
-        np.testing.assert_array_equal(asked.weights(splats.means, columns), wanted)
-        found, cloud = np.zeros(len(splats), np.float32), evaluated.data
+        arguments = dict(query.facts), dict(query.values), rule_tables
+        expected = rule.weights(splats.means, camera, focal, columns, *arguments)
+        np.testing.assert_array_equal(query.weights(splats.means, columns), expected)
+        actual, cloud = np.zeros(len(splats), np.float32), evaluated.data
         if len(cloud.points):
             rows = np.empty(len(cloud.points), np.int32)
             cloud.attributes["row"].data.foreach_get("value", rows)
             weight = lodgs("attributes").read_attribute(cloud, "lod_weight")
-            found[rows] = 1 if weight is None else weight
-        # float32 numbers are rounded elsewhere in nodes: a splat on a border may fall on its other side
-        differ = np.abs(found - wanted) > 2e-4
+            actual[rows] = 1 if weight is None else weight
+        # nodes round float32 differently, so splats at a border may differ
+        differ = np.abs(actual - expected) > 2e-4
         assert differ.sum() <= 2
-        weights.append(wanted)
+        weights.append(expected)
     weights = np.concatenate(weights)
     assert 0.1 < (weights > 0).mean() < 0.9
 
 
 @pytest.fixture
 def splat_scene(bpy, lodgs):
-    """``splat_scene(name)``: the root of a scene whose few levels are chosen by that rule."""
+    """``splat_scene(name)`` returns the root of a scene whose levels are selected by a rule."""
     from training.splats.gaussians import Splats
     from training.splats.levels import Bundle, Level
 
     def make(name):
         rule, rng, scenes = rules()[name], np.random.default_rng(1), lodgs("data.scenes")
-        facts, _ = numbers(rule, rng)
+        facts, _ = random_arguments(rule, rng)
         levels = []
         for number in range(1, 4 if rule.cumulative or rule.level_facts else 2):
             names = [name for name in rule.columns if name != "opacity"]
@@ -143,8 +148,8 @@ def splat_scene(bpy, lodgs):
         scene = {fact: facts[fact] for fact in rule.scene_facts}
         bundle = Bundle("any", levels, name, scene, cumulative=rule.cumulative)
         with lodgs("data.importing").new_scene(bpy.context, "any") as root:
-            for one in bundle.levels:
-                scenes.put_level(root, one)
+            for level in bundle.levels:
+                scenes.put_level(root, level)
             scenes.set_bundle_facts(root, bundle)
         return root
 
@@ -152,7 +157,7 @@ def splat_scene(bpy, lodgs):
 
 
 @pytest.mark.parametrize("name", RULES)
-def test_an_older_group_is_renewed_and_whoever_used_it_gets_the_new_one(bpy, lodgs, splat_scene, name):
+def test_older_group_is_replaced_for_all_users(bpy, lodgs, splat_scene, name):
     groups, selection, root = lodgs("nodes.rules"), lodgs("data.selection"), splat_scene(name)
     used = root.lodgs.levels[0].object.modifiers[-1].node_group
     version = used["lodgs_version"]
@@ -169,25 +174,25 @@ def test_an_older_group_is_renewed_and_whoever_used_it_gets_the_new_one(bpy, lod
 
 @pytest.fixture
 def change(bpy):
-    """``change(group)``: what an artist may do: a group's last choice is turned round."""
+    """``change(group)`` edits a group as a user might: it inverts the selection."""
 
-    def changed(group):
+    def invert(group):
         keep = next(node for node in group.nodes if node.bl_idname == "GeometryNodeSeparateGeometry")
         end = next(node for node in group.nodes if node.bl_idname == "GeometryNodeSetMaterial")
         group.links.new(keep.outputs["Inverted"], end.inputs["Geometry"])
         bpy.context.view_layer.update()
 
-    return changed
+    return invert
 
 
 @pytest.fixture
 def half(bpy, lodgs, splat_scene):
-    """``half(name)``: a scene by distance of which about half is shown, seen from its scene's camera."""
+    """``half(name)`` returns a scene with levels by distance, about half of which is visible."""
 
-    def made(name):
+    def make(name):
         root = splat_scene(name)
         rule, rng = rules()[name], np.random.default_rng(1)
-        _, values = numbers(rule, rng)
+        _, values = random_arguments(rule, rng)
         root.lodgs.mode, root.lodgs.eye = "SELECTIVE", "TRAINING"
         camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
         camera.data.clip_start, camera.location = 0.01, (0, 0, 40)
@@ -201,13 +206,12 @@ def half(bpy, lodgs, splat_scene):
         bpy.context.view_layer.update()
         return root
 
-    return made
+    return make
 
 
 @pytest.mark.parametrize("name", RULES)
-def test_a_group_that_an_artist_has_changed_is_followed_by_all(bpy, lodgs, half, change, frame, name):
-    """The viewport's splats are those that F12 and exports have, with the rule's group and with a changed
-    one; and it is changed again once it is changed back."""
+def test_edited_group_is_used_everywhere(bpy, lodgs, half, change, frame, name):
+    """Viewport, F12 and exports show the same splats, with an original and with an edited group."""
     views, root = lodgs("viewport.views"), half(name)
     views.clear()
 
@@ -217,7 +221,7 @@ def test_a_group_that_an_artist_has_changed_is_followed_by_all(bpy, lodgs, half,
             len(item.object.evaluated_get(depsgraph).data.points) for item in root.lodgs.levels
             if item.object.visible_get()
         )  # fmt: skip
-        rendered = sum(map(chosen, lodgs("render.engine").placed_splats(depsgraph)))
+        rendered = sum(map(count_selected, lodgs("render.engine").placed_splats(depsgraph)))
         view, camera = views.ViewState(), bpy.context.scene.camera
         instances = lodgs("data.shown").splat_instances(depsgraph)
         drawn = []
@@ -230,7 +234,7 @@ def test_a_group_that_an_artist_has_changed_is_followed_by_all(bpy, lodgs, half,
         assert drawn == [exported] == [rendered]
         return exported
 
-    def chosen(placed):
+    def count_selected(placed):
         splats, _ = placed.read()
         if placed.choice is None:
             return len(splats)
@@ -240,18 +244,18 @@ def test_a_group_that_an_artist_has_changed_is_followed_by_all(bpy, lodgs, half,
     def everything():
         return sum(len(item.object.data.points) for item in root.lodgs.levels if item.object.visible_get())
 
-    as_ruled = agree()
+    original = agree()
     group = next(m.node_group for m in root.lodgs.levels[0].object.modifiers if "lodgs_rule" in m.node_group)
     assert not lodgs("nodes.building").is_edited(group)
     change(group)
     assert lodgs("nodes.building").is_edited(group)
-    assert agree() == everything() - as_ruled
-    assert 0 < as_ruled < everything()
+    assert agree() == everything() - original
+    assert 0 < original < everything()
     views.clear()
 
 
 @pytest.mark.parametrize("name", RULES)
-def test_a_changed_group_stays_in_use_and_is_kept_when_it_is_renewed(lodgs, splat_scene, change, name):
+def test_edited_group_stays_in_use_and_is_kept_when_replaced(lodgs, splat_scene, change, name):
     selection, root = lodgs("data.selection"), splat_scene(name)
     used = root.lodgs.levels[0].object.modifiers[-1].node_group
     change(used)
@@ -265,19 +269,19 @@ def test_a_changed_group_stays_in_use_and_is_kept_when_it_is_renewed(lodgs, spla
 
 
 @pytest.mark.parametrize("name", RULES)
-def test_a_group_is_as_made_after_saving(bpy, lodgs, splat_scene, change, tmp_path, name):
+def test_edits_are_recognized_after_saving(bpy, lodgs, splat_scene, change, tmp_path, name):
     splat_scene(name)
     path, group = str(tmp_path / "a.blend"), f"LODGS {name.title()}"
-    for changed in (False, True):
-        if changed:
+    for edited in (False, True):
+        if edited:
             change(bpy.data.node_groups[group])
         bpy.ops.wm.save_as_mainfile(filepath=path, check_existing=False)
         bpy.ops.wm.open_mainfile(filepath=path)
-        assert lodgs("nodes.building").is_edited(bpy.data.node_groups[group]) == changed
+        assert lodgs("nodes.building").is_edited(bpy.data.node_groups[group]) == edited
 
 
 @pytest.mark.parametrize("name", RULES)
-def test_an_emptied_group_stops_nothing(bpy, lodgs, half, name, capfd):
+def test_empty_group_causes_no_errors(bpy, lodgs, half, name, capfd):
     root = half(name)
     group = root.lodgs.levels[0].object.modifiers[-1].node_group
     group.interface.clear()
@@ -294,37 +298,40 @@ def test_an_emptied_group_stops_nothing(bpy, lodgs, half, name, capfd):
 
 
 @pytest.mark.parametrize("name", RULES)
-def test_sockets_are_driven_by_bare_names(splat_scene, name):
+def test_drivers_are_single_variables(splat_scene, name):
     obj = splat_scene(name).lodgs.levels[0].object
     title = f'modifiers["LODGS {name.title()}"]'
     drivers = [d for d in obj.animation_data.drivers if d.data_path.startswith(title)]
-    eyes = [d for d in drivers if not d.driver.expression.isidentifier()]
-    assert [(d.data_path, d.array_index) for d in eyes] == [(eyes[0].data_path, axis) for axis in range(3)]
-    bare = {d.data_path: d.driver for d in drivers if d not in eyes}
-    assert len(bare) == 2 + 4 + len(rules()[name].controls)
-    for driver in bare.values():
+    camera = [d for d in drivers if not d.driver.expression.isidentifier()]
+    assert [(d.data_path, d.array_index) for d in camera] == [
+        (camera[0].data_path, axis) for axis in range(3)
+    ]
+    simple = {d.data_path: d.driver for d in drivers if d not in camera}
+    assert len(simple) == 2 + 4 + len(rules()[name].controls)
+    for driver in simple.values():
         assert [variable.name for variable in driver.variables] == [driver.expression]
 
 
 @pytest.mark.parametrize("name", RULES)
-def test_a_scene_gives_its_bundle_back(bpy, lodgs, splat_scene, name, tmp_path):
+def test_scene_keeps_the_facts_of_its_bundle(bpy, lodgs, splat_scene, name, tmp_path):
     root, scenes = splat_scene(name), lodgs("data.scenes")
     bundle = scenes.read_levels(root)
     lodgs("training.splats.bundle").write_bundle(tmp_path / "bundle.ply", bundle)
-    again = scenes.read_levels(lodgs("data.importing").import_splats(bpy.context, tmp_path / "bundle.ply"))
-    assert (again.rule, again.facts, again.controls) == (name, bundle.facts, {})
-    assert [level.facts for level in again.levels] == [level.facts for level in bundle.levels]
+    reread = scenes.read_levels(lodgs("data.importing").import_splats(bpy.context, tmp_path / "bundle.ply"))
+    assert (reread.rule, reread.facts, reread.controls) == (name, bundle.facts, {})
+    assert [level.facts for level in reread.levels] == [level.facts for level in bundle.levels]
 
 
-def test_an_unknown_rule_shows_the_finest_level_and_says_so(bpy, lodgs, splat_scene, tmp_path):
-    scenes, said = lodgs("data.scenes"), []
+def test_unknown_rule_shows_the_finest_level_with_a_warning(bpy, lodgs, splat_scene, tmp_path):
+    scenes = lodgs("data.scenes")
+    warnings = []
     bundle = scenes.read_levels(splat_scene("bands"))
     bundle.rule = "telepathy"
     lodgs("training.splats.bundle").write_bundle(tmp_path / "bundle.ply", bundle)
-    root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "bundle.ply", warn=said.append)
-    assert "telepathy" in said[0] and "Update LODGS" in said[0]
+    root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "bundle.ply", warn=warnings.append)
+    assert "telepathy" in warnings[0]
     root.lodgs.mode = "SELECTIVE"
     scenes.set_bundle_facts(root, bundle)
     bpy.context.view_layer.update()
     assert [item.object.visible_get() for item in root.lodgs.levels] == [False, False, True]
-    assert scenes.read_levels(root).rule == "telepathy"  # it survives an export
+    assert scenes.read_levels(root).rule == "telepathy"  # the name is kept for exports

@@ -125,7 +125,7 @@ def test_impossible_plans_are_rejected(bpy, root, tmp_path, fake):
     fake()
     settings = root.lodgs.training
     settings.columns = 30
-    with pytest.raises(RuntimeError, match="48 views are too few for 30x1 cells"):
+    with pytest.raises(RuntimeError, match="30x1 cells with 48 views"):
         bpy.ops.lodgs.plan_cells()
     assert not settings.planned_cells and not settings.planned_for
     settings.rows = 30

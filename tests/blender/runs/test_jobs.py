@@ -363,7 +363,7 @@ def test_following_a_run_with_corrupt_events_never_raises(bpy, jobs, fake, root,
     while watch.step():
         pass
     assert list(_levels(root)) == [1] and watch.problem
-    assert len(watch.warnings) > 1
+    assert any("unknown format" in warning for warning in watch.warnings)
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes on this system")
