@@ -27,7 +27,7 @@ from ..training.splats.dialects import Warn
 from ..training.splats.formats import PLY, find_format, write_splats
 from . import extension
 from .data import importing, scenes, viewpoints
-from .render.capture import noise, render_views, write_model
+from .render.capture import noise_warning, render_views, write_model
 from .render.video import MAX_FRAMES, extract_frames
 from .runs import environment, job_settings, jobs, photo_preparation
 from .runs.messages import format_duration, level_line
@@ -278,7 +278,7 @@ def _capture(args: argparse.Namespace) -> int:
     if engine.startswith(("BLENDER_EEVEE", "BLENDER_WORKBENCH")):
         name = "Workbench" if "WORKBENCH" in engine else "EEVEE"
         _print(f"{name} needs a GPU, also in background mode. If Blender crashes now, use Cycles.")
-    if warning := noise(scene):
+    if warning := noise_warning(scene):
         _print(f"warning: {warning}")
     try:
         with _interrupts():

@@ -6,7 +6,7 @@ import bpy
 
 from ...training.errors import LodgsError
 from ..data import roots, viewpoints
-from ..render.capture import noise
+from ..render.capture import noise_warning
 from ..runs import background_capture, environment
 from ..viewport import coverage
 from .parts import Panel, draw_environment, draw_views, say, split_column
@@ -63,7 +63,7 @@ def _draw_settings(layout: bpy.types.UILayout, context: bpy.types.Context) -> No
         "lodgs.show_coverage", text=text, icon="HIDE_OFF" if measured else "HIDE_ON", depress=bool(measured)
     )
     say(layout, f"Renders images of {width} × {height} px with the scene's render engine.", "INFO")
-    if warning := noise(context.scene):
+    if warning := noise_warning(context.scene):
         say(layout, warning, "ERROR")
     split_column(layout).prop(settings, "folder")
 

@@ -87,7 +87,7 @@ def render_views(
     return len(shots)
 
 
-def noise(scene: bpy.types.Scene) -> str | None:
+def noise_warning(scene: bpy.types.Scene) -> str | None:
     """Return a warning if the renders of a scene are noisy, because splats learn noise. None otherwise."""
     if scene.render.engine != "CYCLES" or scene.cycles.samples >= LOW_NOISE_SAMPLES:
         return None
