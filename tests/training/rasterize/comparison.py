@@ -1,10 +1,13 @@
-"""Scenes that hold every backend against the reference, and everything that is compared on them."""
+"""Scenes and results that compare every backend with the reference."""
+
+import math
 
 import numpy as np
 import torch
 
 from training.rasterize import OUTPUTS, Gaussians, contributions, rasterize
 
+SH_C0 = 0.28209479177387814
 SCENES = [
     "degree 0", "degree 1", "degree 2", "degree 3", "degree 4", "active degree",
     "one", "antialiased", "antialiased some", "needles", "screen-filling", "behind and near", "caps", "crowd",
@@ -13,7 +16,7 @@ CONTRIBUTING = ["degree 3", "antialiased", "antialiased some", "needles", "scree
 
 
 def scene(name, make_splats):
-    """Splats and keyword arguments of ``rasterize``."""
+    """Return splats and keyword arguments of ``rasterize`` by the scene's name."""
     if name.startswith("degree"):
         return make_splats(250, coefficients=(int(name[-1]) + 1) ** 2), {}
     splats = make_splats({"one": 1, "crowd": 3000}.get(name, 250), seed=len(name))
@@ -46,10 +49,10 @@ def scene(name, make_splats):
 
 
 def drawn_and_differentiated(name, make_splats, camera, backend, kind, device="cpu"):
-    """Every output of ``rasterize``, and the gradients of a loss that all of them have a part in."""
+    """Return every output of ``rasterize``, and the gradients of a loss on all of them."""
     splats, options = scene(name, make_splats)
     random = torch.Generator().manual_seed(1)
-    weights = 1.25 * torch.rand(len(splats), generator=random).double()  # some make opacities more than 1
+    weights = 1.25 * torch.rand(len(splats), generator=random).double()  # some opacities exceed 1
     weights[3::7] = 0
     shade = torch.rand(50, 75, 3, generator=random).double().to(device, kind)
     tensors = (*vars(splats).values(), weights)
@@ -62,19 +65,37 @@ def drawn_and_differentiated(name, make_splats, camera, backend, kind, device="c
     loss = ((drawn.image - shade) ** 2).mean() + (drawn.alpha * shade[..., 0]).mean()
     loss = loss + 0.1 * (drawn.depth * shade[..., 1]).mean() + (drawn.normals * shade).mean()
     loss.backward()
-    found = {name: leaf.grad for name, leaf in (vars(leaves) | {"weights": weights}).items()}
-    found |= {name: getattr(drawn, name) for name in ("image", "alpha", "depth", "normals", "radii")}
-    found |= {name: getattr(drawn, name) for name in ("grad2d", "absgrad2d", "tile_counts")}
-    return {name: tensor.detach().cpu().double() for name, tensor in found.items()}
+    results = {name: leaf.grad for name, leaf in (vars(leaves) | {"weights": weights}).items()}
+    results |= {name: getattr(drawn, name) for name in ("image", "alpha", "depth", "normals", "radii")}
+    results |= {name: getattr(drawn, name) for name in ("grad2d", "absgrad2d", "tile_counts")}
+    return {name: tensor.detach().cpu().double() for name, tensor in results.items()}
 
 
 def contributed(name, make_splats, camera, backend, kind, device="cpu"):
-    """``contributions`` of a scene's first splats, and Σ alpha of the picture that they make."""
+    """Return the contributions of a scene's first splats, and Σ alpha of their image."""
     splats, options = scene(name, make_splats)
     splats = splats.select(slice(400)).to(device, kind)
     options.pop("sh_degree", None)
     weights = torch.linspace(0, 1, len(splats)).to(device, kind)
     options |= {"weights": weights, "min_scale": 0.01, "near": 0.2, "backend": backend}
     drawn = rasterize(splats, camera, **options)
-    found = contributions(splats, [camera], **options)
-    return {name: tensor.cpu() for name, tensor in vars(found).items()}, drawn.alpha.sum().item()
+    measured = contributions(splats, [camera], **options)
+    return {name: tensor.cpu() for name, tensor in vars(measured).items()}, drawn.alpha.sum().item()
+
+
+def isotropic(depths, sigma, opacities, colours, kind=torch.float32):
+    """Create isotropic splats on the z axis."""
+    count = len(depths)
+    means = torch.zeros(count, 3)
+    means[:, 2] = torch.tensor(depths)
+    quats = torch.tensor([[2.0, 0.0, 0.0, 0.0]]).repeat(count, 1)
+    logits = torch.logit(torch.tensor(opacities))
+    sh = (torch.tensor(colours).reshape(count, 1, 3) - 0.5) / SH_C0
+    log_scales = torch.full((count, 3), math.log(sigma))
+    return Gaussians(means, quats, log_scales, logits, sh).map(lambda t: t.to(kind).requires_grad_())
+
+
+def squared_distance():
+    """Return the squared distances from image point (16, 16) to the pixel centres of a 32x32 image."""
+    offset = np.arange(32) + 0.5 - 16
+    return offset[None, :] ** 2 + offset[:, None] ** 2

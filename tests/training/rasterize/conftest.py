@@ -1,4 +1,4 @@
-"""Scenes that the rasterizer's tests share."""
+"""Fixtures of the rasterizer's tests."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from training.scenes.cameras import Camera
 
 
 def random_splats(count: int, seed: int = 0, coefficients: int = 16) -> Gaussians:
-    """Splats in front of ``odd_camera``, of many sizes and opacities, float64."""
+    """Create float64 splats of many sizes and opacities in front of ``odd_camera``."""
     random = np.random.default_rng(seed)
     means = random.uniform((-1, -1, 2), (1, 1, 4), (count, 3))
     arrays = {
@@ -29,29 +29,29 @@ def make_splats():
     return random_splats
 
 
-def working(request) -> str:
-    """The backend of a fixture's parameter; the test is skipped where it cannot work."""
-    needed = {"cuda": "fake_card", "gpu": "graphics"}
-    if request.param in needed:
-        request.getfixturevalue(needed[request.param])
+def usable_backend(request) -> str:
+    """Return the backend of a fixture's parameter; skip the test if it cannot run."""
+    fixtures = {"cuda": "fake_card", "gpu": "graphics"}
+    if request.param in fixtures:
+        request.getfixturevalue(fixtures[request.param])
     return request.param
 
 
 @pytest.fixture(params=BACKENDS)
 def backend(request) -> str:
-    """Every backend by name; cuda on the CPU, as ``fake_card`` has it."""
-    return working(request)
+    """Every backend by name; cuda runs on the CPU through ``fake_card``."""
+    return usable_backend(request)
 
 
 @pytest.fixture(params=["cpu", "gpu"])
 def kernels(request) -> str:
-    """The backends with kernels of our own: what the reference is in float64, they are in float32."""
-    return working(request)
+    """Backends with their own kernels, float32 counterparts of the float64 reference."""
+    return usable_backend(request)
 
 
 @pytest.fixture
 def odd_camera() -> Camera:
-    """Turned, moved, off-centre, fx unlike fy, and of a size that no tile divides."""
+    """Rotated camera with an off-centre principal point, unequal fx and fy, and partial tiles."""
     angle = 0.2
     pose = np.eye(4)
     pose[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
@@ -61,5 +61,5 @@ def odd_camera() -> Camera:
 
 @pytest.fixture
 def axis_camera() -> Camera:
-    """At the origin, looking along z; the axis meets the image where four tiles do."""
+    """Camera at the origin that looks along z; its axis hits the corner of four tiles."""
     return Camera("axis", 32, 32, 40.0, 40.0, 16.0, 16.0, np.eye(4))

@@ -1,9 +1,9 @@
-"""What the cuda backend calls of gsplat 1.5, in plain torch on the CPU, for pictures of some thousand pixels.
+"""Functions of gsplat 1.5 that the cuda backend calls, in plain torch on the CPU, for small images.
 
-Written from gsplat's interface and from what its kernels do, not from their text: a leading camera dimension,
-int32 places and splats that index the flattened (camera, splat), alpha capped at 0.999, and the absolute
-gradients left during backward as ``absgrad`` on the very tensor of means that was given. It refuses what the
-kernels refuse or would misread. A test holds its signatures against the real ones where gsplat is installed.
+It is based on gsplat's interface and behaviour, not on its source: a leading camera dimension, int32 indices
+into the flattened (camera, splat) array, alpha capped at 0.999, and absolute gradients stored in backward as
+``absgrad`` of the input tensor of means. It rejects inputs that the kernels reject or would misread. A test
+compares its signatures with gsplat's if gsplat is installed.
 """
 
 import torch
@@ -18,9 +18,9 @@ CHANNELS = 513
 def spherical_harmonics(
     degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None
 ) -> Tensor:
-    """Σ c·Y (..., 3), without the half; directions need not have unit length.
+    """Compute Σ c·Y (..., 3), without the offset of 0.5; directions may have any length.
 
-    The signs and the order of gsplat's basis, compared by hand with this one's, are the same in all degrees.
+    The signs and the order of gsplat's basis, compared manually, are the same in all degrees.
     """
     assert masks is None
     assert (degrees_to_use + 1) ** 2 <= coeffs.shape[-2] and coeffs.shape[:-2] == dirs.shape[:-1]
@@ -46,7 +46,7 @@ def rasterize_to_pixels(
     packed: bool = False,
     absgrad: bool = False,
 ) -> tuple[Tensor, Tensor]:
-    """Colours (1, H, W, channels) and alphas (1, H, W, 1) of one camera."""
+    """Render colours (1, H, W, channels) and alphas (1, H, W, 1) of one camera."""
     cameras, count = means2d.shape[:2]
     channels = colors.shape[-1]
     assert cameras == 1 and masks is None and not packed
@@ -58,7 +58,7 @@ def rasterize_to_pixels(
     assert rows * tile_size >= image_height and columns * tile_size >= image_width
     assert isect_offsets.dtype == flatten_ids.dtype == torch.int32
     floats = [means2d, conics, colors, opacities, *([] if backgrounds is None else [backgrounds])]
-    assert all(each.dtype == torch.float32 for each in floats)
+    assert all(tensor.dtype == torch.float32 for tensor in floats)
     assert len(flatten_ids) == 0 or 0 <= flatten_ids.min() <= flatten_ids.max() < count
     return _Pixels.apply(
         means2d.contiguous(), conics.contiguous(), colors.contiguous(), opacities.contiguous(), backgrounds,
@@ -70,53 +70,53 @@ class _Pixels(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means, conics, colors, opacities, backgrounds, size, offsets, ids, absgrad):
         ctx.save_for_backward(means, conics, colors, opacities, backgrounds, offsets, ids)
-        ctx.rest = size, absgrad
+        ctx.settings = size, absgrad
         width, height, tile = size
         image, alpha = (
             means.new_zeros(1, height, width, colors.shape[-1]),
             means.new_zeros(1, height, width, 1),
         )
-        for some, (x, y) in _tiles(offsets, ids, tile):
-            shown, left = _blend(
-                *_deltas(means[0, some], x, y), conics[0, some], colors[0, some], opacities[0, some]
+        for index, (x, y) in _tiles(offsets, ids, tile):
+            pixels, remaining = _blend(
+                *_deltas(means[0, index], x, y), conics[0, index], colors[0, index], opacities[0, index]
             )
-            shown = shown if backgrounds is None else shown + left[:, None] * backgrounds[0]
-            there = (x < width) & (y < height)
-            image[0, y[there].long(), x[there].long()] = shown[there]
-            alpha[0, y[there].long(), x[there].long(), 0] = 1 - left[there]
+            pixels = pixels if backgrounds is None else pixels + remaining[:, None] * backgrounds[0]
+            inside = (x < width) & (y < height)
+            image[0, y[inside].long(), x[inside].long()] = pixels[inside]
+            alpha[0, y[inside].long(), x[inside].long(), 0] = 1 - remaining[inside]
         return image, alpha
 
     @staticmethod
     def backward(ctx, by_image, by_alpha):
         means, conics, colors, opacities, backgrounds, offsets, ids = ctx.saved_tensors
-        (width, height, tile), absgrad = ctx.rest
+        (width, height, tile), absgrad = ctx.settings
         signed, absolute = torch.zeros_like(means), torch.zeros_like(means)
-        others = [torch.zeros_like(each) for each in (conics, colors, opacities)]
-        for some, (x, y) in _tiles(offsets, ids, tile):
-            there = (x < width) & (y < height)
-            x, y = x[there], y[there]
+        gradients = [torch.zeros_like(tensor) for tensor in (conics, colors, opacities)]
+        for index, (x, y) in _tiles(offsets, ids, tile):
+            inside = (x < width) & (y < height)
+            x, y = x[inside], y[inside]
             leaves = [
-                *_deltas(means[0, some], x, y),
-                *(each[0, some] for each in (conics, colors, opacities)),
+                *_deltas(means[0, index], x, y),
+                *(tensor[0, index] for tensor in (conics, colors, opacities)),
             ]
             leaves = [leaf.detach().requires_grad_() for leaf in leaves]
             with torch.enable_grad():
-                shown, left = _blend(*leaves)
-                shown = shown if backgrounds is None else shown + left[:, None] * backgrounds[0]
-                loss = (shown * by_image[0, y.long(), x.long()]).sum()
-                loss = loss - (left * by_alpha[0, y.long(), x.long(), 0]).sum()
+                pixels, remaining = _blend(*leaves)
+                pixels = pixels if backgrounds is None else pixels + remaining[:, None] * backgrounds[0]
+                loss = (pixels * by_image[0, y.long(), x.long()]).sum()
+                loss = loss - (remaining * by_alpha[0, y.long(), x.long(), 0]).sum()
             *by_delta, by_conic, by_color, by_opacity = torch.autograd.grad(loss, leaves)
-            signed[0].index_add_(0, some, torch.stack(by_delta, -1).sum(1))
-            absolute[0].index_add_(0, some, torch.stack(by_delta, -1).abs().sum(1))
-            for total, part in zip(others, (by_conic, by_color, by_opacity), strict=True):
-                total[0].index_add_(0, some, part)
+            signed[0].index_add_(0, index, torch.stack(by_delta, -1).sum(1))
+            absolute[0].index_add_(0, index, torch.stack(by_delta, -1).abs().sum(1))
+            for total, part in zip(gradients, (by_conic, by_color, by_opacity), strict=True):
+                total[0].index_add_(0, index, part)
         if absgrad:
             means.absgrad = absolute
-        return signed, *others, None, None, None, None, None
+        return signed, *gradients, None, None, None, None, None
 
 
 def _tiles(offsets, ids, tile):
-    """The splats of each tile, front to back, and its pixels' centres."""
+    """Yield the splats of each tile, front to back, and its pixel centres."""
     starts = offsets.flatten().cpu().tolist()
     pixel = torch.arange(tile * tile, device=ids.device)
     for number, (start, end) in enumerate(zip(starts, [*starts[1:], len(ids)], strict=True)):
@@ -126,17 +126,17 @@ def _tiles(offsets, ids, tile):
 
 
 def _deltas(means, x, y):
-    """From pixels to means, (n, pixels) each."""
+    """Return the offsets from pixels to means, (n, pixels) each."""
     return means[:, :1] - x, means[:, 1:] - y
 
 
 def _blend(dx, dy, conics, colors, opacities):
-    """Colours (pixels, channels) without background, and the transmittance left (pixels,)."""
-    a, b, c = (each[:, None] for each in conics.unbind(1))
+    """Blend colours (pixels, channels) without background, and the remaining transmittance (pixels,)."""
+    a, b, c = (column[:, None] for column in conics.unbind(1))
     sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
     alpha = (opacities[:, None] * torch.exp(-sigma)).clamp_max(0.999)
     alpha = torch.where((sigma >= 0) & (alpha >= 1 / 255), alpha, 0)
-    behind = torch.cat([torch.ones_like(alpha[:1]), 1 - alpha]).cumprod(0)
-    taken = behind[1:] > 1e-4
-    weight = torch.where(taken, alpha * behind[:-1], 0)
-    return weight.T @ colors, torch.where(taken, 1 - alpha, 1).prod(0)
+    light = torch.cat([torch.ones_like(alpha[:1]), 1 - alpha]).cumprod(0)
+    active = light[1:] > 1e-4
+    weight = torch.where(active, alpha * light[:-1], 0)
+    return weight.T @ colors, torch.where(active, 1 - alpha, 1).prod(0)

@@ -1,4 +1,4 @@
-"""Adam against torch's own, and what densification and resuming need of it."""
+"""Compare Adam with torch's Adam, and test densification and resume."""
 
 import io
 
@@ -14,7 +14,7 @@ def gradients(step, shape):
     return torch.randn(shape, generator=torch.Generator().manual_seed(step))
 
 
-def test_it_steps_as_torchs_adam_does():
+def test_steps_match_torch():
     start = torch.randn(700, 5, 3, generator=torch.Generator().manual_seed(99))
     ours = start.clone()
     rates = torch.full((5, 1), 2e-3)
@@ -33,8 +33,8 @@ def test_it_steps_as_torchs_adam_does():
 
 
 @pytest.mark.parametrize("lr", [1e-2, torch.tensor([[1e-2], [1e-3], [1e-3], [2e-3]])])
-def test_plain_torch_steps_as_the_kernel_and_as_the_formula_do(lr):
-    """What GPUs run, on the CPU: against the kernel, and against Algorithm 1 in float64."""
+def test_torch_update_matches_kernel_and_formula(lr):
+    """Compare the GPU code path with the CPU kernel, and with Algorithm 1 in float64."""
     start = torch.randn(300, 4, 3, generator=torch.Generator().manual_seed(99))
     ours, kernels = ([start.clone(), torch.zeros_like(start), torch.zeros_like(start)] for _ in range(2))
     exact, m, v = start.double(), torch.zeros(()).double(), torch.zeros(()).double()
@@ -45,12 +45,12 @@ def test_plain_torch_steps_as_the_kernel_and_as_the_formula_do(lr):
         update(*arrays, lr, (0.9, 0.999), 1e-15, step)
         m, v = 0.9 * m + 0.1 * gradient.double(), 0.999 * v + 0.001 * gradient.double() ** 2
         exact -= lr * (m / (1 - 0.9**step)) / ((v / (1 - 0.999**step)).sqrt() + 1e-15)
-    for one, other in zip(ours, kernels, strict=True):
-        torch.testing.assert_close(one, other, atol=2e-6, rtol=2e-5)
+    for actual, expected in zip(ours, kernels, strict=True):
+        torch.testing.assert_close(actual, expected, atol=2e-6, rtol=2e-5)
     torch.testing.assert_close(ours[0].double(), exact, atol=2e-6, rtol=2e-5)
 
 
-def test_a_resumed_run_goes_on_to_the_same_bits():
+def test_resumed_optimizer_is_bit_identical():
     def run(adam, tensors, steps):
         for step in steps:
             for tensor in tensors.values():
@@ -75,25 +75,25 @@ def test_a_resumed_run_goes_on_to_the_same_bits():
         assert torch.equal(adam.state[name][1], resumed.state[name][1])
 
 
-def test_rows_come_and_go_with_their_moments():
+def test_rows_can_be_replaced_with_their_moments():
     tensor = torch.zeros(6, 3)
     adam = Adam({"means": tensor}, {"means": 0.1})
     adam.step({"means": gradients(0, (6, 3))})
     m, v = adam.state["means"]
     rows = torch.tensor([4, 1, 4])
-    kept = tensor[rows].clone()
-    adam.replace("means", kept, m[rows], v[rows])
+    selected = tensor[rows].clone()
+    adam.replace("means", selected, m[rows], v[rows])
     assert adam.steps["means"] == 1
     adam.step({"means": gradients(0, (6, 3))[rows]})
 
-    alone = torch.zeros(6, 3)
-    other = Adam({"means": alone}, {"means": 0.1})
+    full = torch.zeros(6, 3)
+    full_adam = Adam({"means": full}, {"means": 0.1})
     for _ in range(2):
-        other.step({"means": gradients(0, (6, 3))})
-    assert torch.equal(kept, alone[rows])
+        full_adam.step({"means": gradients(0, (6, 3))})
+    assert torch.equal(selected, full[rows])
 
 
-def test_a_tensor_without_a_gradient_stays():
+def test_tensor_without_gradient_stays():
     tensors = {"a": torch.ones(3), "b": torch.ones(3)}
     adam = Adam(tensors, {"a": 0.1, "b": 0.1})
     adam.step({"a": torch.ones(3)})
@@ -101,7 +101,7 @@ def test_a_tensor_without_a_gradient_stays():
     assert adam.steps == {"a": 1, "b": 0}
 
 
-def test_moments_of_what_is_never_seen_do_not_become_denormal():
+def test_moments_of_invisible_splats_do_not_become_denormal():
     tensor = torch.zeros(1000)
     adam = Adam({"a": tensor}, {"a": 1e-3})
     adam.step({"a": torch.full((1000,), 1e-12)})
@@ -111,7 +111,7 @@ def test_moments_of_what_is_never_seen_do_not_become_denormal():
         assert ((moment == 0) | (moment.abs() > 1.2e-38)).all()
 
 
-def test_what_it_cannot_step_is_refused():
+def test_invalid_tensors_raise():
     with pytest.raises(ValueError, match="learning rates"):
         Adam({"a": torch.zeros(2)}, {"b": 0.1})
     with pytest.raises(ValueError, match="contiguous float32"):

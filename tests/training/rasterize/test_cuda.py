@@ -1,7 +1,8 @@
-"""The cuda backend against the float64 reference: with gsplat's place taken on the CPU, and on a GPU if any.
+"""Compare the cuda backend with the float64 reference, with a fake gsplat on the CPU and on a GPU if
+available.
 
-gsplat caps alpha at 0.999. Where pictures and gradients are compared, the reference's cap is lifted to that:
-the cap, and nothing else, is what they are allowed to differ by.
+gsplat caps alpha at 0.999. For comparisons of images and gradients, the reference's cap is raised to this
+value.
 """
 
 import inspect
@@ -46,7 +47,7 @@ GSPLAT_CAP = 0.999
     ]
 )
 def device(request) -> str:
-    """Where the cuda backend draws: on the CPU as ``fake_card`` has it, and on a GPU with gsplat itself."""
+    """Device of the cuda backend: the CPU through ``fake_card``, and a GPU with gsplat."""
     if request.param == "cpu":
         request.getfixturevalue("fake_card")
     elif problem := cuda.problem():
@@ -56,67 +57,67 @@ def device(request) -> str:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SCENES)
-def test_it_agrees_with_the_reference(name, device, make_splats, odd_camera, monkeypatch):
-    """Every output and gradient, relative L2 at most 5e-4; the GPU's fast exponential may cost some more."""
-    found = drawn_and_differentiated(name, make_splats, odd_camera, "cuda", torch.float32, device)
+def test_results_match_reference(name, device, make_splats, odd_camera, monkeypatch):
+    """Relative L2 errors of all outputs and gradients are at most 5e-4, on GPUs with fast exp 2e-3."""
+    actual = drawn_and_differentiated(name, make_splats, odd_camera, "cuda", torch.float32, device)
     monkeypatch.setattr(reference, "ALPHA_MAX", GSPLAT_CAP)
     exact = drawn_and_differentiated(name, make_splats, odd_camera, "reference", torch.float64)
     assert exact["grad2d"].norm() > 0 and exact["absgrad2d"].norm() > exact["grad2d"].norm()
     bound = 5e-4 if device == "cpu" else 2e-3
     for output, expected in exact.items():
-        error = (found[output] - expected).norm() / expected.norm().clamp_min(1e-12)
-        # whether an ellipse just touches a tile is a matter of rounding
+        error = (actual[output] - expected).norm() / expected.norm().clamp_min(1e-12)
+        # rounding decides if an ellipse just touches a tile
         assert error <= (5e-3 if output == "tile_counts" else bound), f"{output}: {error:.1e}"
 
 
-def test_the_cap_is_all_that_differs_and_little(device, make_splats, odd_camera):
-    """One opaque splat changes a pixel by at most 0.999 - 0.99; below 0.99 nothing changes."""
+def test_alpha_cap_is_the_only_difference(device, make_splats, odd_camera):
+    """An opaque splat changes a pixel by at most 0.999 - 0.99; below 0.99 there is no difference."""
     splats = make_splats(1)
     splats.means[:] = torch.tensor([0.1, -0.2, 3.0])
     splats.log_scales[:] = -0.5
-    for logit, most in ((12.0, GSPLAT_CAP - 0.99), (4.0, 0.0)):
+    for logit, limit in ((12.0, GSPLAT_CAP - 0.99), (4.0, 0.0)):
         splats.opacity_logits[:] = logit
-        found, exact = (
+        actual, exact = (
             rasterize(splats.to(on, kind), odd_camera, backend=backend).alpha.cpu()
             for backend, kind, on in (
                 ("cuda", torch.float32, device),
                 ("reference", torch.float64, "cpu"),
             )
         )
-        difference = (found - exact).abs().max().item()
-        assert difference <= most + 1e-4 and (most == 0 or difference > 0.5 * most)
+        difference = (actual - exact).abs().max().item()
+        assert difference <= limit + 1e-4 and (limit == 0 or difference > 0.5 * limit)
 
 
 @pytest.mark.parametrize("name", CONTRIBUTING)
-def test_contributions_agree_with_the_reference(name, device, make_splats, odd_camera, monkeypatch):
-    """Also when a few splats at a time are walked over. These have the definition's cap of 0.99."""
+def test_contributions_match_reference(name, device, make_splats, odd_camera, monkeypatch):
+    """Contributions use the reference's cap of 0.99. Small chunks give the same results."""
     exact, alpha = contributed(name, make_splats, odd_camera, "reference", torch.float64)
     for pairs in (1 << 24, 20 * 256 * 3):
-        monkeypatch.setattr(cuda, "WALK", pairs)
-        found, _ = contributed(name, make_splats, odd_camera, "cuda", torch.float32, device)
-        torch.testing.assert_close(found["largest"], exact["largest"], rtol=1e-3, atol=1e-5)
-        torch.testing.assert_close(found["total"], exact["total"], rtol=1e-3, atol=2e-2)
-        assert (found["pixels"] - exact["pixels"]).abs().sum() <= 1e-3 * exact["pixels"].sum()
-        assert torch.equal(found["views"], exact["views"])
-        assert found["total"].sum().item() == pytest.approx(alpha, rel=1e-4)
+        monkeypatch.setattr(cuda, "CHUNK_PAIRS", pairs)
+        actual, _ = contributed(name, make_splats, odd_camera, "cuda", torch.float32, device)
+        torch.testing.assert_close(actual["largest"], exact["largest"], rtol=1e-3, atol=1e-5)
+        torch.testing.assert_close(actual["total"], exact["total"], rtol=1e-3, atol=2e-2)
+        assert (actual["pixels"] - exact["pixels"]).abs().sum() <= 1e-3 * exact["pixels"].sum()
+        assert torch.equal(actual["views"], exact["views"])
+        assert actual["total"].sum().item() == pytest.approx(alpha, rel=1e-4)
 
 
-def test_median_depths_agree_with_the_reference(device, make_splats, odd_camera, monkeypatch):
-    """Pixel for pixel, but for those where rounding decides which splat reaches the half."""
-    monkeypatch.setattr(cuda, "WALK", 20 * 256 * 4)
+def test_median_depth_matches_reference(device, make_splats, odd_camera, monkeypatch):
+    """Pixels may differ if rounding decides which splat reaches the median."""
+    monkeypatch.setattr(cuda, "CHUNK_PAIRS", 20 * 256 * 4)
     splats = make_splats(300)
-    found, exact = (
+    actual, exact = (
         rasterize(
             splats.to(on, kind), odd_camera, outputs=["median_depth"], backend=backend
         ).median_depth.cpu()
         for backend, kind, on in (("cuda", torch.float32, device), ("reference", torch.float64, "cpu"))
     )
-    assert ((found - exact).abs() < 1e-4).float().mean() > 0.999
+    assert ((actual - exact).abs() < 1e-4).float().mean() > 0.999
     assert 0.2 < (exact > 0).float().mean() < 1
 
 
-def test_every_splat_is_in_every_tile_it_touches_once_and_front_to_back(device, make_splats, odd_camera):
-    """Against a count over all pixels in float64, as the cpu backend's pairs."""
+def test_tiles_list_all_touching_splats_once_front_to_back(device, make_splats, odd_camera):
+    """Compare with a test of all pixels in float64."""
     splats, view = make_splats(400, seed=2), KernelCamera.of(odd_camera, 0.2)
     settings = RasterSettings(view, min_scale=0.01, antialias=False)
     visible = cuda.VisibleSplats.of(splats.to(device, torch.float32), None, settings)
@@ -134,21 +135,21 @@ def test_every_splat_is_in_every_tile_it_touches_once_and_front_to_back(device, 
     listed = torch.zeros(400, 4, 5, dtype=torch.int64)
     for tile, (start, count) in enumerate(zip(tiles.start.flatten(), tiles.counts.flatten(), strict=True)):
         rows = tiles.splat[start : start + count].long()
-        assert (rows.diff() > 0).all()  # the rows are front to back, so each once and in order
-        listed[visible.which[rows].cpu(), tile // 5, tile % 5] += 1
+        assert (rows.diff() > 0).all()  # rows are front to back, so increasing rows are unique and ordered
+        listed[visible.index[rows].cpu(), tile // 5, tile % 5] += 1
     assert tiles.counts.sum() == len(tiles.splat) and listed.max() == 1
-    depth = depths(splats.means[visible.which.cpu()], view)
+    depth = depths(splats.means[visible.index.cpu()], view)
     torch.testing.assert_close(depth, exact.depth[exact.inside].sort().values)
     assert (listed[expected] == 1).float().mean() > 0.999
     assert listed.sum() <= 1.15 * expected.sum()
 
 
-def test_the_loss_and_its_gradient_are_the_references(device):
+def test_loss_and_gradient_match_reference(device):
     random = torch.Generator().manual_seed(0)
     truth = torch.rand(50, 75, 3, generator=random)
     start, mask = (truth + 0.1 * torch.randn(truth.shape, generator=random)).clamp(0, 1), truth[..., 0]
     target = Target(truth, mask)
-    for _ in range(2):  # the second time from what the target keeps
+    for _ in range(2):  # the second time from the target's cache
         losses, gradients = [], []
         for backend, kind, on in (("cuda", torch.float32, device), ("reference", torch.float64, "cpu")):
             image = start.to(on, kind, copy=True).requires_grad_()
@@ -161,8 +162,8 @@ def test_the_loss_and_its_gradient_are_the_references(device):
     assert target.cache["cuda"][0].device.type == device
 
 
-def test_two_backwards_give_the_same_and_nothing_is_kept(device, make_splats, odd_camera):
-    """What a rendering holds goes with it: a cycle through autograd's graph would stay for ever."""
+def test_repeated_backward_is_consistent_and_frees_memory(device, make_splats, odd_camera):
+    """Deleting a rendering frees its tensors; a reference cycle through autograd's graph would leak."""
     import gc
     import weakref
 
@@ -177,15 +178,15 @@ def test_two_backwards_give_the_same_and_nothing_is_kept(device, make_splats, od
     for leaf in vars(leaves).values():
         leaf.grad = None
     loss.backward()
-    again = [leaf.grad for leaf in vars(leaves).values()] + [drawn.grad2d, drawn.absgrad2d]
-    rounding = {} if device == "cpu" else {"rtol": 1e-4, "atol": 1e-4}  # a GPU sums in any order
-    for one, other in zip(first, again, strict=True):
-        torch.testing.assert_close(one, other, **rounding)
+    second = [leaf.grad for leaf in vars(leaves).values()] + [drawn.grad2d, drawn.absgrad2d]
+    rounding = {} if device == "cpu" else {"rtol": 1e-4, "atol": 1e-4}  # a GPU sums in arbitrary order
+    for a, b in zip(first, second, strict=True):
+        torch.testing.assert_close(a, b, **rounding)
 
     node = loss.grad_fn
     while type(node).__name__ != "_BlendBackward":
         node = node.next_functions[0][0]
-    inputs = [weakref.ref(each) for each in node.inner[0]]
+    inputs = [weakref.ref(tensor) for tensor in node.inner[0]]
     gc.disable()
     try:
         del node, drawn, loss
@@ -194,7 +195,7 @@ def test_two_backwards_give_the_same_and_nothing_is_kept(device, make_splats, od
         gc.enable()
 
 
-def test_float32_on_the_card_is_asked_for(device, make_splats, odd_camera):
+def test_other_dtypes_and_devices_raise(device, make_splats, odd_camera):
     splats = make_splats(5).to(device, torch.float32)
     with pytest.raises(ValueError, match=r"float32 on a GPU, not torch\.float64"):
         rasterize(splats.to(dtype=torch.float64), odd_camera, backend="cuda")
@@ -202,12 +203,12 @@ def test_float32_on_the_card_is_asked_for(device, make_splats, odd_camera):
         rasterize(splats.to("meta"), odd_camera, backend="cuda")
 
 
-# -- which backend, and why not --------------------------------------------------------
+# -- selection of the backend ----------------------------------------------------------
 
 
 @pytest.fixture
 def card(monkeypatch):
-    """A computer on which torch sees a GPU (that computes on the CPU) and gsplat is installed."""
+    """Simulate a computer with an NVIDIA GPU and gsplat; the GPU computes on the CPU."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(cuda, "DEVICE", "cpu")
     monkeypatch.setitem(sys.modules, "gsplat", fake_gsplat)
@@ -216,7 +217,7 @@ def card(monkeypatch):
     cuda.problem.cache_clear()
 
 
-def test_auto_is_cuda_where_a_gpu_and_gsplat_are(card, monkeypatch):
+def test_auto_uses_cuda_with_gpu_and_gsplat(card, monkeypatch):
     assert resolve_backend("auto") == resolve_backend("cuda") == "cuda"
     monkeypatch.setattr(cuda, "DEVICE", "cuda")
     assert tensor_device("auto") == torch.device("cuda")
@@ -224,13 +225,13 @@ def test_auto_is_cuda_where_a_gpu_and_gsplat_are(card, monkeypatch):
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this computer has a GPU")
-def test_auto_is_cpu_without_a_gpu():
+def test_auto_uses_cpu_without_gpu():
     assert resolve_backend("auto") == "cpu" and tensor_device("auto") == torch.device("cpu")
-    with pytest.raises(LodgsError, match=r"no NVIDIA GPU that torch can use\..*auto or cpu"):
+    with pytest.raises(LodgsError, match=r"torch detects no NVIDIA GPU\..*auto or cpu"):
         resolve_backend("cuda")
 
 
-def test_auto_follows_the_tensors_that_it_is_given(card, monkeypatch, make_splats, odd_camera):
+def test_auto_follows_the_device_of_tensors(card, monkeypatch, make_splats, odd_camera):
     def refuse(*_, **__):
         raise AssertionError("tensors on the CPU went to the GPU")
 
@@ -239,7 +240,7 @@ def test_auto_follows_the_tensors_that_it_is_given(card, monkeypatch, make_splat
     assert rasterizer._backend("auto", SimpleNamespace(is_cuda=True)) is cuda  # type: ignore[arg-type]
 
 
-def test_what_is_missing_is_said_with_a_remedy(card, monkeypatch):
+def test_missing_requirements_are_reported_with_remedy(card, monkeypatch):
     def problem_with(gsplat) -> str:
         monkeypatch.setitem(sys.modules, "gsplat", gsplat)
         cuda.problem.cache_clear()
@@ -248,46 +249,47 @@ def test_what_is_missing_is_said_with_a_remedy(card, monkeypatch):
             resolve_backend("cuda")
         return str(caught.value)
 
-    assert "needs gsplat" in (said := problem_with(None)) and "pip install gsplat" in said
+    message = problem_with(None)
+    assert "package gsplat is not installed" in message and "pip install gsplat" in message
 
     def uncompiled(*_):
-        return getattr(None, "spherical_harmonics_fwd")  # noqa: B009, as gsplat does without nvcc
+        return getattr(None, "spherical_harmonics_fwd")  # noqa: B009, like gsplat without nvcc
 
     def failing(*_):
         print("setting up CUDA")
         raise RuntimeError("Error building extension 'gsplat_cuda': [1/30] nvcc, its options\nand more")
 
-    assert "nvcc was not found" in problem_with(SimpleNamespace(spherical_harmonics=uncompiled))
-    said = problem_with(SimpleNamespace(spherical_harmonics=failing))
-    assert "do not work here: Error building extension 'gsplat_cuda'." in said and "nvcc" not in said
+    assert "nvcc is not installed" in problem_with(SimpleNamespace(spherical_harmonics=uncompiled))
+    message = problem_with(SimpleNamespace(spherical_harmonics=failing))
+    assert "Error building extension 'gsplat_cuda'." in message and "nvcc" not in message
 
 
-def test_standard_output_stays_clear_while_gsplat_compiles(card, monkeypatch, capsys):
+def test_compilation_does_not_print_to_standard_output(card, monkeypatch, capsys):
     def loud(*args):
         print("setting up CUDA")
         return fake_gsplat.spherical_harmonics(*args)
 
     monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(spherical_harmonics=loud))
     assert cuda.problem() is None
-    said = capsys.readouterr()
-    assert said.out == "" and "setting up" in said.err
+    printed = capsys.readouterr()
+    assert printed.out == "" and "setting up" in printed.err
 
 
-def test_processes_compile_gsplat_one_after_the_other(card, monkeypatch, tmp_path):
+def test_compilation_holds_a_lock(card, monkeypatch, tmp_path):
     monkeypatch.setattr("training.files.cache_folder", lambda: tmp_path)
-    alone = []
+    locked = []
 
     def compiling(*args):
         with (tmp_path / "gsplat.lock").open("rb") as lock:
-            alone.append(not try_lock(lock))
+            locked.append(not try_lock(lock))
         return fake_gsplat.spherical_harmonics(*args)
 
     monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(spherical_harmonics=compiling))
-    assert cuda.problem() is None and alone == [True]
+    assert cuda.problem() is None and locked == [True]
 
 
 @pytest.mark.parametrize("name", ["rasterize_to_pixels", "spherical_harmonics"])
-def test_the_stand_in_is_called_as_gsplat_is(name):
+def test_fake_signatures_match_gsplat(name):
     gsplat = pytest.importorskip("gsplat", reason="gsplat is not installed")
     real, ours = (inspect.signature(getattr(module, name)) for module in (gsplat, fake_gsplat))
     assert [(p.name, p.default) for p in real.parameters.values()] == [
@@ -295,7 +297,7 @@ def test_the_stand_in_is_called_as_gsplat_is(name):
     ]
 
 
-def test_a_warm_up_is_a_step(fake_card, monkeypatch):
+def test_warm_up_makes_one_step(fake_card, monkeypatch):
     called = []
     original = cuda.rasterize
     monkeypatch.setattr(cuda, "rasterize", lambda *a, **k: called.append(1) or original(*a, **k))
@@ -303,8 +305,8 @@ def test_a_warm_up_is_a_step(fake_card, monkeypatch):
     assert called == [1]
 
 
-def test_a_camera_that_sees_nothing_leaves_the_background(device, make_splats):
-    """Nothing to look at in any tile: gsplat is not asked, and gradients are zeros."""
+def test_empty_view_renders_background(device, make_splats):
+    """Without visible splats, gsplat is not called and gradients are zero."""
     import numpy as np
 
     away = Camera("away", 20, 10, 10.0, 10.0, 5.0, 5.0, np.diag([-1.0, 1.0, -1.0, 1.0]))

@@ -1,4 +1,4 @@
-"""Splats that are trained on a device, against the same steps by the reference and torch's Adam."""
+"""Compare training in device memory with steps through torch."""
 
 import numpy as np
 import pytest
@@ -18,8 +18,8 @@ VIEW = {"near": 0.2, "sh_degree": 2, "background": (0.2, 0.4, 0.1), "min_scale":
 
 
 @pytest.fixture
-def photograph() -> Target:
-    """Of whole counts of 255, as files have them."""
+def photo() -> Target:
+    """Random photo with 8-bit values, as in files."""
     image = np.random.default_rng(3).integers(0, 256, (50, 75, 3)).astype(np.float32) / 255
     return Target(image)
 
@@ -29,139 +29,140 @@ def adam_of(splats: Gaussians) -> Adam:
     return Adam(tensors, RATES)
 
 
-def blank(count: int) -> dict[str, torch.Tensor]:
+def zero_stats(count: int) -> dict[str, torch.Tensor]:
     return {name: torch.zeros(count) for name in STATS}
 
 
-def expected(adam: Adam, stats: dict, camera, target: Target, weights, backend: str) -> float:
-    """A step as methods make it through torch."""
+def torch_step(adam: Adam, stats: dict, camera, target: Target, weights, backend: str) -> float:
+    """Make one step through torch, as methods do; return the loss."""
     drawn = rasterize(
         Gaussians(**adam.tensors), camera, weights=weights, backend=backend, antialias=True, **VIEW
     )
     loss = photometric_loss(drawn.image, target, backend=backend)
     loss.backward()
-    steep, seen = drawn.grad2d.norm(dim=1) / 2, drawn.radii > 0
-    stats["gradient_sum"] += steep
-    stats["seen"] += seen
-    stats["gradient_max"] = torch.maximum(stats["gradient_max"], steep)
+    norm = drawn.grad2d.norm(dim=1) / 2
+    visible = drawn.radii > 0
+    stats["gradient_sum"] += norm
+    stats["seen"] += visible
+    stats["gradient_max"] = torch.maximum(stats["gradient_max"], norm)
     stats["radius_max"] = torch.maximum(stats["radius_max"], drawn.radii)
-    stats["opacity_sum"] += torch.where(seen, adam.tensors["opacity_logits"].detach().sigmoid(), 0)
+    stats["opacity_sum"] += torch.where(visible, adam.tensors["opacity_logits"].detach().sigmoid(), 0)
     adam.step()
     adam.zero_grad()
     return float(loss.detach())
 
 
 @pytest.mark.parametrize("backend", ["cpu", "gpu"])
-def test_steps_are_those_through_torch(graphics, make_splats, odd_camera, photograph, backend):
-    """With weights and without, with moments that were there before, over all that is counted."""
-    one, other = adam_of(make_splats(300)), adam_of(make_splats(300))
-    stats, ours = blank(300), blank(300)
+def test_steps_match_torch(graphics, make_splats, odd_camera, photo, backend):
+    """Compare parameters, moments and statistics after steps with and without weights."""
+    torch_adam, device_adam = adam_of(make_splats(300)), adam_of(make_splats(300))
+    stats, device_stats = zero_stats(300), zero_stats(300)
     weights = torch.from_numpy(np.random.default_rng(1).choice([0.0, 0.5, 1.0], 300)).float()
-    expected(one, stats, odd_camera, photograph, None, "cpu")
-    expected(other, ours, odd_camera, photograph, None, "cpu")
-    twin = make_device_model("gpu", other, ours, antialias=True)
-    assert twin is not None
-    for given in (weights, None, weights):
-        told = twin.step(odd_camera, photograph, ssim_weight=0.2, weights=given, shrink=2, **VIEW)
-        assert told == pytest.approx(expected(one, stats, odd_camera, photograph, given, backend), rel=1e-4)
-    torch.testing.assert_close(twin.read("means"), one.tensors["means"].detach(), atol=2e-4, rtol=0)
-    twin.copy_to_host()
-    assert one.steps == other.steps
-    for name, tensor in one.tensors.items():
+    torch_step(torch_adam, stats, odd_camera, photo, None, "cpu")
+    torch_step(device_adam, device_stats, odd_camera, photo, None, "cpu")
+    model = make_device_model("gpu", device_adam, device_stats, antialias=True)
+    assert model is not None
+    for step_weights in (weights, None, weights):
+        loss = model.step(odd_camera, photo, ssim_weight=0.2, weights=step_weights, shrink=2, **VIEW)
+        expected = torch_step(torch_adam, stats, odd_camera, photo, step_weights, backend)
+        assert loss == pytest.approx(expected, rel=1e-4)
+    torch.testing.assert_close(model.read("means"), torch_adam.tensors["means"].detach(), atol=2e-4, rtol=0)
+    model.copy_to_host()
+    assert torch_adam.steps == device_adam.steps
+    for name, tensor in torch_adam.tensors.items():
         rate = float(torch.as_tensor(RATES[name]).max())
-        # a step is as long as the rate, whichever way a gradient points that is all but zero
-        apart = (tensor - other.tensors[name]).detach().abs()
-        assert apart.mean() < 0.01 * rate and apart.quantile(0.98) < 0.05 * rate, name
-        for ours_, theirs in zip(one.state[name], other.state[name], strict=True):
-            assert (ours_ - theirs).norm() < 1e-3 * ours_.norm(), name
+        # for gradients near zero, Adam's step has the full rate in an arbitrary direction
+        difference = (tensor - device_adam.tensors[name]).detach().abs()
+        assert difference.mean() < 0.01 * rate and difference.quantile(0.98) < 0.05 * rate, name
+        for moment, device_moment in zip(torch_adam.state[name], device_adam.state[name], strict=True):
+            assert (moment - device_moment).norm() < 1e-3 * moment.norm(), name
     for name, values in stats.items():
-        assert (values - ours[name]).norm() < 1e-3 * values.norm(), name
+        assert (values - device_stats[name]).norm() < 1e-3 * values.norm(), name
 
 
-def test_a_device_that_binds_little_trains_the_same(
-    graphics, make_splats, odd_camera, photograph, monkeypatch
-):
-    """Of 1500 splats it takes the moments of 512 at a time, and 4654 of their 5700 pairs."""
-    found = []
-    for most in (graphics.binding_bytes, 200 << 10):
-        monkeypatch.setattr(graphics, "binding_bytes", most)
-        adam, stats = adam_of(make_splats(1500)), blank(1500)
-        twin = make_device_model("gpu", adam, stats)
-        assert twin is not None
+def test_small_bindings_do_not_change_training(graphics, make_splats, odd_camera, photo, monkeypatch):
+    """Bindings of 200 KB hold the moments of 512 of 1500 splats, and 4654 of 5700 pairs."""
+    results = []
+    for binding_bytes in (graphics.binding_bytes, 200 << 10):
+        monkeypatch.setattr(graphics, "binding_bytes", binding_bytes)
+        adam, stats = adam_of(make_splats(1500)), zero_stats(1500)
+        model = make_device_model("gpu", adam, stats)
+        assert model is not None
         weights = torch.linspace(0, 1, 1500)
-        told = [
-            twin.step(odd_camera, photograph, ssim_weight=0.2, weights=w, shrink=1, **VIEW)
+        losses = [
+            model.step(odd_camera, photo, ssim_weight=0.2, weights=w, shrink=1, **VIEW)
             for w in (None, weights)
         ]
-        twin.raise_log_scales(torch.linspace(-4, -2, 1500))
-        seen = twin.read("quats")
-        twin.copy_to_host()
+        model.raise_log_scales(torch.linspace(-4, -2, 1500))
+        quats = model.read("quats")
+        model.copy_to_host()
         moments = [moment for state in adam.state.values() for moment in state]
         tensors = [tensor.detach() for tensor in adam.tensors.values()]
-        found.append([*tensors, *moments, *stats.values(), seen, torch.tensor(told)])
-    assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
+        results.append([*tensors, *moments, *stats.values(), quats, torch.tensor(losses)])
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
 
 
-def test_what_is_not_asked_for_stays(graphics, make_splats, odd_camera, photograph):
-    """Statistics where they are not wanted; harmonics of higher degrees; what is out of sight."""
-    adam, stats = adam_of(make_splats(50)), blank(50)
-    before = {name: tensor.detach().clone() for name, tensor in adam.tensors.items()}
+def test_unused_data_stays_unchanged(graphics, make_splats, odd_camera, photo):
+    """Statistics without shrink, inactive harmonics, and splats of weight 0 stay unchanged."""
+    adam, stats = adam_of(make_splats(50)), zero_stats(50)
+    initial = {name: tensor.detach().clone() for name, tensor in adam.tensors.items()}
     weights = torch.ones(50)
     weights[:10] = 0
-    twin = make_device_model("gpu", adam, stats)
-    assert twin is not None
-    twin.step(odd_camera, photograph, ssim_weight=0.2, weights=weights, **VIEW)
-    twin.copy_to_host()
+    model = make_device_model("gpu", adam, stats)
+    assert model is not None
+    model.step(odd_camera, photo, ssim_weight=0.2, weights=weights, **VIEW)
+    model.copy_to_host()
     assert all((values == 0).all() for values in stats.values())
-    after = {name: tensor.detach() for name, tensor in adam.tensors.items()}
-    assert torch.equal(after["sh"][:, 9:], before["sh"][:, 9:])
-    assert all(torch.equal(after[name][:10], before[name][:10]) for name in after)
-    assert not torch.equal(after["means"][10:], before["means"][10:])
+    final = {name: tensor.detach() for name, tensor in adam.tensors.items()}
+    assert torch.equal(final["sh"][:, 9:], initial["sh"][:, 9:])
+    assert all(torch.equal(final[name][:10], initial[name][:10]) for name in final)
+    assert not torch.equal(final["means"][10:], initial["means"][10:])
 
 
-def test_log_scales_rise_to_their_least(graphics, make_splats):
+def test_log_scales_are_raised_to_their_minimum(graphics, make_splats):
     adam = adam_of(make_splats(50))
-    twin, before = make_device_model("gpu", adam, {}), adam.tensors["log_scales"].detach().clone()
-    assert twin is not None
-    least = torch.linspace(-4, 0, 50)
-    least[7] = -torch.inf
-    twin.raise_log_scales(least)
-    assert torch.equal(twin.read("log_scales"), torch.maximum(before, least[:, None]))
-    assert torch.equal(adam.tensors["log_scales"], before)  # until it is brought home
+    model = make_device_model("gpu", adam, {})
+    initial = adam.tensors["log_scales"].detach().clone()
+    assert model is not None
+    minimum = torch.linspace(-4, 0, 50)
+    minimum[7] = -torch.inf
+    model.raise_log_scales(minimum)
+    assert torch.equal(model.read("log_scales"), torch.maximum(initial, minimum[:, None]))
+    assert torch.equal(adam.tensors["log_scales"], initial)  # unchanged until copy_to_host
 
 
-def test_a_step_moves_a_few_numbers(graphics, make_splats, odd_camera, photograph):
-    """However many splats there are."""
-    moved = []
+def test_steps_transfer_little_data(graphics, make_splats, odd_camera, photo):
+    """The transferred bytes per step do not depend on the number of splats."""
+    transferred = []
     for count in (100, 4000):
-        twin = make_device_model("gpu", adam_of(make_splats(count)), blank(count))
-        assert twin is not None
-        twin.step(odd_camera, photograph, ssim_weight=0.2, shrink=1, **VIEW)
-        before = graphics.transferred
-        twin.step(odd_camera, photograph, ssim_weight=0.2, shrink=1, **VIEW)
-        moved.append(graphics.transferred - before)
-    assert max(moved) < 20_000
+        model = make_device_model("gpu", adam_of(make_splats(count)), zero_stats(count))
+        assert model is not None
+        model.step(odd_camera, photo, ssim_weight=0.2, shrink=1, **VIEW)
+        start = graphics.transferred
+        model.step(odd_camera, photo, ssim_weight=0.2, shrink=1, **VIEW)
+        transferred.append(graphics.transferred - start)
+    assert max(transferred) < 20_000
 
 
-def test_a_step_is_the_same_however_often_its_numbers_fill_their_buffer(
-    graphics, make_splats, odd_camera, photograph, monkeypatch
-):
+def test_steps_do_not_depend_on_uniform_buffer_size(graphics, make_splats, odd_camera, photo, monkeypatch):
     def trained() -> torch.Tensor:
-        twin = make_device_model("gpu", adam_of(make_splats(300)), blank(300))
-        assert twin is not None
+        model = make_device_model("gpu", adam_of(make_splats(300)), zero_stats(300))
+        assert model is not None
         for _ in range(2):
-            twin.step(odd_camera, photograph, ssim_weight=0.2, shrink=1, **VIEW)
-        return torch.cat([twin.read(name).reshape(300, -1) for name in ("means", "sh", "gradient_sum")], 1)
+            model.step(odd_camera, photo, ssim_weight=0.2, shrink=1, **VIEW)
+        return torch.cat([model.read(name).reshape(300, -1) for name in ("means", "sh", "gradient_sum")], 1)
 
-    submit, submitted = graphics.submit, []
-    monkeypatch.setattr(graphics, "submit", lambda: (submitted.append(1), submit()))
-    at_once, few = trained(), len(submitted)
+    submit = graphics.submit
+    submissions = []
+    monkeypatch.setattr(graphics, "submit", lambda: (submissions.append(1), submit()))
+    expected = trained()
+    count = len(submissions)
     monkeypatch.setattr(graphics, "_numbers", graphics._numbers[:256])
-    assert torch.equal(trained(), at_once)
-    assert len(submitted) - few > few  # it was full in between
+    assert torch.equal(trained(), expected)
+    assert len(submissions) - count > count  # a full buffer causes submissions
 
 
-def test_only_splats_that_a_device_can_count_go_there(graphics, make_splats):
+def test_unsupported_models_stay_on_the_host(graphics, make_splats):
     adam = adam_of(make_splats(5))
     assert make_device_model("cpu", adam, {}) is None
     assert make_device_model("gpu", adam, {"something": torch.zeros(5)}) is None

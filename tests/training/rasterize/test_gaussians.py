@@ -1,4 +1,4 @@
-"""Gaussians hold together, and come from plain splats without loss."""
+"""Test validation and conversion of Gaussians."""
 
 from dataclasses import fields, replace
 
@@ -17,28 +17,28 @@ def splats(count: int = 7, columns: int = 4) -> Splats:
     return Splats(*(random.normal(size=shape).astype(np.float32) for shape in shapes))
 
 
-def same(one: Gaussians, other) -> bool:
-    """Name by name: a column in the wrong place is found."""
-    return all(np.array_equal(getattr(one, f.name), getattr(other, f.name)) for f in fields(Gaussians))
+def same(a: Gaussians, b: Gaussians | Splats) -> bool:
+    """Compare two sets of splats field by field."""
+    return all(np.array_equal(getattr(a, f.name), getattr(b, f.name)) for f in fields(Gaussians))
 
 
-def test_splats_come_back_from_a_model_of_their_gaussians_to_the_bit():
+def test_splats_survive_conversion_to_model_and_back():
     plain = splats()
     tensors = vars(Gaussians.of(plain)).copy()
     model = Model(tensors, dict.fromkeys(tensors, 0.0))
     assert same(model.gaussians.detach(), plain) and same(Gaussians.of(model.splats()), plain)
-    assert model.gaussians.means is model["means"], "what is trained is what is drawn"
+    assert model.gaussians.means is model["means"], "the model draws its trained tensors"
 
 
-def test_any_layout_and_type_of_arrays_is_taken():
+def test_any_array_layout_and_type_is_accepted():
     plain = splats()
     odd = replace(plain, means=np.asfortranarray(plain.means, np.float64), sh=plain.sh[:, ::-1])
-    found = Gaussians.of(odd)
-    assert same(found, odd)
-    assert all(x.dtype == torch.float32 and x.is_contiguous() for x in vars(found).values())
+    converted = Gaussians.of(odd)
+    assert same(converted, odd)
+    assert all(x.dtype == torch.float32 and x.is_contiguous() for x in vars(converted).values())
 
 
-def test_a_selection_is_of_every_tensor():
+def test_select_applies_to_every_tensor():
     plain = splats()
     gaussians = Gaussians.of(plain)
     mask = np.arange(7) % 2 == 0
@@ -49,7 +49,7 @@ def test_a_selection_is_of_every_tensor():
     assert same(Gaussians.concatenated(halves), plain)
 
 
-def test_detached_ones_share_their_values_and_not_their_graph():
+def test_detach_shares_values_but_not_graph():
     leaves = Gaussians.of(splats()).map(torch.Tensor.requires_grad_)
     detached = leaves.detach()
     assert not any(x.requires_grad for x in vars(detached).values()) and same(detached, detached)
@@ -58,7 +58,7 @@ def test_detached_ones_share_their_values_and_not_their_graph():
 
 
 @pytest.mark.parametrize("name", ["quats", "log_scales", "opacity_logits", "sh"])
-def test_tensors_of_other_numbers_are_refused(name):
+def test_mismatched_shapes_raise(name):
     gaussians = Gaussians.of(splats())
     with pytest.raises(ValueError, match=name):
         replace(gaussians, **{name: getattr(gaussians, name)[:3]})

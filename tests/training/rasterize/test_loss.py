@@ -1,4 +1,4 @@
-"""The photometric loss against scipy, and the fused gradient against autograd in float64."""
+"""Compare the photometric loss with scipy, and its gradient with autograd in float64."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from training.rasterize.cpu.loss import loss_and_gradient, moments_of
 
 
 def scipy_loss(image, truth, ssim_weight):
-    """In float64, with scipy's filter and the formula of Wang et al. 2004, Eq. 13."""
+    """Compute the loss in float64 with scipy's filter and the formula of Wang et al. 2004, Eq. 13."""
     line = np.exp(-(np.arange(-5.0, 6) ** 2) / 4.5)
     line /= line.sum()
 
@@ -26,7 +26,7 @@ def scipy_loss(image, truth, ssim_weight):
 
 
 @pytest.mark.parametrize("size", [(50, 75), (16, 64), (3, 5), (1, 130)])
-def test_the_loss_is_scipys(backend, size):
+def test_loss_matches_scipy(backend, size):
     random = np.random.default_rng(0)
     truth = random.random((*size, 3)).astype(np.float32)
     image = np.clip(truth + random.normal(0, 0.2, truth.shape), 0, 1).astype(np.float32)
@@ -37,7 +37,7 @@ def test_the_loss_is_scipys(backend, size):
 
 
 @pytest.mark.parametrize("size", [(50, 75), (16, 64), (3, 5), (1, 130)])
-def test_the_fused_gradient_is_autograds(kernels, size):
+def test_fused_gradient_matches_autograd(kernels, size):
     random = torch.Generator().manual_seed(0)
     truth = torch.rand(*size, 3, generator=random)
     start = (truth + 0.1 * torch.randn(*size, 3, generator=random)).clamp(0, 1)
@@ -50,25 +50,26 @@ def test_the_fused_gradient_is_autograds(kernels, size):
 
 
 @pytest.mark.parametrize("size", [(48, 64), (37, 53)])
-def test_the_same_bits_wherever_the_system_puts_arrays(size):
-    """A loop that adds up and writes may be compiled twice: for arrays that overlap, and for others."""
+def test_loss_is_bit_identical_for_any_array_address(size):
+    """Loops that sum and write may be compiled in two versions, for overlapping and separate arrays."""
     random = np.random.default_rng(0)
     truth, image = random.random((2, 3, *size), dtype=np.float32)
-    found, taken = set(), []
+    results = set()
+    fillers = []
     for _ in range(400):
         arrays = []
         for array in (image, truth):
-            taken[:] = [
+            fillers[:] = [
                 np.empty(length, np.uint8) for length in random.integers(100, 20_000, random.integers(30))
             ]
             arrays.append(array.copy())
         loss, gradient = loss_and_gradient(*arrays, moments_of(arrays[1]), 0.2)
-        found.add((loss, gradient.tobytes()))
-    assert len(found) == 1
+        results.add((loss, gradient.tobytes()))
+    assert len(results) == 1
 
 
-def test_what_is_masked_out_costs_nothing(backend):
-    """As if the photograph showed there what was drawn, and half of a difference where the mask is a half."""
+def test_masked_pixels_do_not_affect_loss(backend):
+    """Masked pixels act as if photo and image were equal; a mask of 0.5 halves the difference."""
     random = torch.Generator().manual_seed(0)
     truth, image = torch.rand(2, 40, 60, 3, generator=random)
     mask = torch.ones(40, 60)
@@ -76,17 +77,17 @@ def test_what_is_masked_out_costs_nothing(backend):
     leaf = image.clone().requires_grad_()
     loss = photometric_loss(leaf, Target(truth, mask), backend=backend)
     loss.backward()
-    seen = truth.clone()
-    seen[:, :30] = image[:, :30]
-    seen[:, 10:20] = (image[:, 10:20] + truth[:, 10:20]) / 2
-    expected = scipy_loss(seen.double().numpy(), truth.double().numpy(), 0.2)
+    masked = truth.clone()
+    masked[:, :30] = image[:, :30]
+    masked[:, 10:20] = (image[:, 10:20] + truth[:, 10:20]) / 2
+    expected = scipy_loss(masked.double().numpy(), truth.double().numpy(), 0.2)
     assert loss.item() == pytest.approx(expected, rel=2e-5)
     assert leaf.grad is not None and leaf.grad[:, 30:].abs().max() == 0 and leaf.grad[:, :30].abs().min() > 0
-    with pytest.raises(ValueError, match="mask has shape"):
+    with pytest.raises(ValueError, match="mask must have shape"):
         Target(truth, mask[:5])
 
 
-def test_equal_images_have_no_loss(backend):
+def test_equal_images_have_zero_loss(backend):
     image = torch.rand(20, 30, 3, requires_grad=True)
     loss = photometric_loss(image, Target(image.detach().clone()), backend=backend)
     loss.backward()

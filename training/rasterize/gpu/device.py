@@ -53,7 +53,7 @@ class Adapter(NamedTuple):
 
     @property
     def software(self) -> bool:
-        """Whether shaders run on the CPU instead of a graphics device."""
+        """True if shaders run on the CPU instead of a graphics device."""
         return self.kind == "software"
 
 
