@@ -221,8 +221,8 @@ class ResidentBundle:
         source: a bundle, or a bundle's file.
         backend: rasterizer backend.
         warn: see ``read_bundle``.
-        max_in_memory: maximum number of splats to read from a file without regions at once; 0 means the default
-            of ``open_if_large``.
+        max_in_memory: maximum number of splats to read at once from a file without regions; 0 means the
+            default of ``open_if_large``.
 
     Attributes:
         bundle: the bundle; without splats if the source is a file.

@@ -75,7 +75,7 @@ def blend_forward(
     """Fill image (3, H, W) and transmittance (H, W).
 
     Also fill ``visited`` with the number of pairs blended in each tile, and ``reached`` (P, 2) uint8 with the
-    rows that each of these pairs reaches. A lane's T becomes negative when its pixel is finished, and is
+    rows that they reach. A lane's T becomes negative when its pixel is finished, and is
     negative from the start outside the image. All later splats then fail the test against T_MIN, and |T| is
     preserved. The first splat deeper than the pixel's ``limit`` (H, W) finishes it too. If ``limit`` is None,
     Numba compiles a kernel without it.
