@@ -49,8 +49,8 @@ class LODGS_OT_show_coverage(bpy.types.Operator):
     bl_idname = "lodgs.show_coverage"
     bl_label = "Show Coverage"
     bl_description = (
-        "Show surfaces as dots: green if three or more views see them, orange for two views, red for one; the "
-        "button then shows the share of green dots"
+        "Show surfaces as dots: green if three or more views see them, orange for two views, red for one; "
+        "the button then shows the share of green dots"
     )
     bl_options = {"INTERNAL"}
 
