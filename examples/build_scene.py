@@ -1,13 +1,13 @@
-"""The lantern garden, modelled and rendered with Blender's own tools (the bpy module, Cycles on the CPU).
+"""Model and render the lantern garden with the bpy module and Cycles on the CPU.
 
-    python -m examples.build_scene build/example          88 views, some twenty minutes on two cores
+    python -m examples.build_scene build/example          88 views, about twenty minutes on two cores
 
-It writes images/view_NN.png, positions/view_NN.exr (world positions of the surfaces that the pixels see) of
-every set of cameras that rig.py states, and garden.blend; write_model.py makes photographs and COLMAP models
-of them. Lengths are metres, z is up, the table stands at the origin and the arcs of cameras look north (+y).
+Writes images/view_NN.png, positions/view_NN.exr (world positions of visible surfaces) for every set of
+cameras in rig.py, and garden.blend; write_model.py converts them to photos and COLMAP models. Lengths are in
+metres, z is up, the table is at the origin, and the arcs of cameras face north (+y).
 """
 
-# Blender's stubs give nodes, sockets, modifiers and object data their base classes' types.
+# Blender's stubs type nodes, sockets, modifiers and object data by their base classes.
 # pyright: reportAttributeAccessIssue=false, reportOptionalMemberAccess=false
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from mathutils import Matrix
 from . import rig
 
 rng = np.random.default_rng(7)
-TABLE = 0.78  # height of the table's top
-MILL = (6.0, 29.0)  # where the windmill stands
+TABLE = 0.78  # height of the table top
+MILL = (6.0, 29.0)  # position of the windmill
 
 
 # ------------------------------------------------------------------------------------------- materials
 
 
 def linear(color: str | tuple) -> tuple[float, float, float, float]:
-    """A colour as Blender wants it (linear RGBA) from '#rrggbb'."""
+    """Convert '#rrggbb' to linear RGBA."""
     if isinstance(color, tuple):
         return color
     srgb = np.array([int(color[i : i + 2], 16) for i in (1, 3, 5)]) / 255
@@ -53,14 +53,20 @@ def material(
     glow: float = 0.0,
     attribute: str | None = None,
 ) -> bpy.types.Material:
-    """A matt material: a procedural pattern through a colour ramp.
+    """Create a matte material: a procedural pattern with a colour ramp.
 
-    pattern is noise, rings, bands or cells; vary scatters brightness and hue from object to object; glow is
-    the strength of the light it gives; attribute names vertex colours that the pattern multiplies.
+    Args:
+        name: name of the material.
+        colors: stops of the ramp.
+        pattern: noise, rings, bands or cells.
+        scale, stretch, distortion, bump: parameters of the pattern.
+        vary: random variation of brightness and hue per object.
+        glow: emission strength.
+        attribute: name of vertex colours to multiply by the pattern.
     """
-    made = bpy.data.materials.new(name)
-    made.use_nodes = True
-    tree = made.node_tree
+    result = bpy.data.materials.new(name)
+    result.use_nodes = True
+    tree = result.node_tree
     nodes, links = tree.nodes, tree.links
     surface = nodes["Principled BSDF"]
     surface.inputs["Roughness"].default_value = 0.9
@@ -93,10 +99,10 @@ def material(
     stops = ramp.color_ramp.elements
     while len(stops) < len(colors):
         stops.new(0.5)
-    for place in range(len(colors)):
-        stops[place].position = low + (high - low) * place / max(len(colors) - 1, 1)
-    for place, color in enumerate(colors):
-        stops[place].color = linear(color)
+    for index in range(len(colors)):
+        stops[index].position = low + (high - low) * index / max(len(colors) - 1, 1)
+    for index, color in enumerate(colors):
+        stops[index].color = linear(color)
     links.new(value, ramp.inputs["Fac"])
     color = ramp.outputs["Color"]
 
@@ -120,7 +126,7 @@ def material(
         links.new(color, shift.inputs["Color"])
         color = shift.outputs["Color"]
     links.new(color, surface.inputs["Base Color"])
-    made.cycles.emission_sampling = "NONE"  # the glow is to be seen, it lights little
+    result.cycles.emission_sampling = "NONE"  # visible glow, little light
     if glow:
         links.new(color, surface.inputs["Emission Color"])
         surface.inputs["Emission Strength"].default_value = glow
@@ -130,14 +136,14 @@ def material(
         relief.inputs["Distance"].default_value = 0.02
         links.new(value, relief.inputs["Height"])
         links.new(relief.outputs["Normal"], surface.inputs["Normal"])
-    return made
+    return result
 
 
 # ---------------------------------------------------------------------------------------------- meshes
 
 
 def mesh(name, vertices, faces, made_of, *, at=(0, 0, 0), turn=0.0, smooth=True, colors=None):
-    """An object from vertices (N, 3) and faces (corners each); colors (N, 3) are painted on it."""
+    """Create an object from vertices (N, 3), faces and optional vertex colours (N, 3)."""
     data = bpy.data.meshes.new(name)
     data.from_pydata(np.asarray(vertices, float).tolist(), [], [list(face) for face in faces])
     if smooth:
@@ -151,7 +157,7 @@ def mesh(name, vertices, faces, made_of, *, at=(0, 0, 0), turn=0.0, smooth=True,
 
 
 def place(data, at, turn=0.0, scale=1.0, tilt=(0.0, 0.0)):
-    """One more object showing a mesh: where, turned about z (radians), scaled, tilted about x and y."""
+    """Add an object with a mesh, rotated about z (radians), scaled, and tilted about x and y."""
     thing = bpy.data.objects.new(data.name, data)
     thing.location, thing.rotation_euler = at, (tilt[0], tilt[1], turn)
     thing.scale = (scale,) * 3 if np.isscalar(scale) else scale
@@ -160,7 +166,7 @@ def place(data, at, turn=0.0, scale=1.0, tilt=(0.0, 0.0)):
 
 
 def wobble(points, seed, frequency, octaves=3, ridged=False):
-    """Smooth fractal noise in about [-1, 1] for points (N, D): sums of sines in random directions, (N,)."""
+    """Return smooth fractal noise (N,) in about [-1, 1] for points (N, D): sines in random directions."""
     source = np.random.default_rng(seed)
     total, weight = np.zeros(len(points)), 0.0
     for octave in range(octaves):
@@ -172,7 +178,7 @@ def wobble(points, seed, frequency, octaves=3, ridged=False):
 
 
 def box(name, size, made_of, *, at=(0, 0, 0), turn=0.0, bevel=0.008, tilt=(0.0, 0.0)):
-    """A box of the given size about its centre, edges a little rounded."""
+    """Create a box around its centre, with slightly rounded edges."""
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * np.array(size) / 2
     faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     thing = mesh(name, corners, faces, made_of, at=at, turn=turn, smooth=False)
@@ -184,7 +190,7 @@ def box(name, size, made_of, *, at=(0, 0, 0), turn=0.0, bevel=0.008, tilt=(0.0, 
 
 
 def lathe(name, profile, made_of, *, at=(0, 0, 0), segments=40, turn=0.0, ribs=0, depth=0.0):
-    """A body turned on the lathe: profile is a list of (radius, height); ribs press grooves into it."""
+    """Create a surface of revolution from a profile of (radius, height), with optional grooves."""
     profile = np.array(profile, float)
     angle = np.linspace(0, 2 * math.pi, segments, endpoint=False)
     swell = 1 + depth * (np.abs(np.cos(ribs * angle / 2)) - 1) if ribs else np.ones(segments)
@@ -195,16 +201,16 @@ def lathe(name, profile, made_of, *, at=(0, 0, 0), segments=40, turn=0.0, ribs=0
 
 
 def grid_faces(rows, columns, closed=False):
-    """Quads of a grid of vertices in row order; closed joins the last column with the first."""
+    """Return the quads of a grid of vertices in row order; ``closed`` joins the last and first columns."""
     row, column = np.meshgrid(np.arange(rows - 1), np.arange(columns - (0 if closed else 1)), indexing="ij")
-    after = (column + 1) % columns
-    quads = [row * columns + column, row * columns + after]
-    quads += [(row + 1) * columns + after, (row + 1) * columns + column]
+    following = (column + 1) % columns
+    quads = [row * columns + column, row * columns + following]
+    quads += [(row + 1) * columns + following, (row + 1) * columns + column]
     return np.stack(quads, axis=-1).reshape(-1, 4).tolist()
 
 
 def smooth_profile(points, count=24):
-    """A profile through few control points, rounded off (Catmull-Rom)."""
+    """Interpolate a profile through control points (Catmull-Rom)."""
     points = np.array(points, float)
     padded = np.concatenate([points[:1], points, points[-1:]])
     t = np.linspace(0, len(points) - 1 - 1e-9, count)
@@ -215,7 +221,7 @@ def smooth_profile(points, count=24):
 
 
 def ball(name, radius, made_of, *, at=(0, 0, 0), rough=0.0, frequency=6.0, seed=0, squash=1.0, detail=4):
-    """A sphere of little triangles, its surface made uneven by noise."""
+    """Create a sphere of small triangles with a surface roughened by noise."""
     bpy.ops.mesh.primitive_ico_sphere_add(subdivisions=detail, radius=1.0)
     thing = bpy.context.object
     data = thing.data
@@ -233,7 +239,7 @@ def ball(name, radius, made_of, *, at=(0, 0, 0), rough=0.0, frequency=6.0, seed=
 
 
 def scatter(name, points, made_of, *, blades, height, width, colors, lean=0.5, seed=0):
-    """Tufts of bent blades at points (N, 3), one mesh: grass, reeds, petals. height and width in metres."""
+    """Create tufts of bent blades (grass, reeds, petals) at points (N, 3); height and width in metres."""
     source = np.random.default_rng(seed)
     base = np.repeat(points, blades, axis=0)
     count = len(base)
@@ -260,12 +266,12 @@ def scatter(name, points, made_of, *, blades, height, width, colors, lean=0.5, s
 
 
 def path_x(y):
-    """Where the path runs: east of the axis at each distance north."""
+    """Return the path's x coordinate at y."""
     return 0.9 * np.sin(0.33 * y) * np.clip(y / 4, 0, 1) + 0.05 * y
 
 
 def ground(x, y):
-    """Height of the land: a level garden, meadows rising to hills, mountains all round."""
+    """Return the height of the land: a level garden, meadows, hills and mountains."""
     distance = np.hypot(x, y)
     points = np.stack([x, y], axis=-1).reshape(-1, 2)
     swell = wobble(points, 1, 0.12, 3).reshape(x.shape)
@@ -280,12 +286,12 @@ def ground(x, y):
 
 
 def on_ground(x, y, lift=0.0):
-    """A point on the land, or so much above it, (3,)."""
+    """Return a point (3,) on the land, or ``lift`` above it."""
     return np.array([x, y, float(ground(np.array([x]), np.array([y]))[0]) + lift])
 
 
 def land():
-    """The whole land as one disc, finer towards the garden, painted by place."""
+    """Create the land as one disc, finer towards the garden, with vertex colours."""
     rings = np.concatenate([[0.0], np.geomspace(0.4, 62, 250)])
     angle = np.linspace(0, 2 * math.pi, 640, endpoint=False)
     x = rings[:, None] * np.sin(angle)
@@ -313,7 +319,7 @@ def land():
     yard = np.hypot(plan[:, 0], plan[:, 1] * 1.25) - 1.9 - 0.25 * wobble(plan, 11, 2.0)
     bare = np.where(plan[:, 1] > 0, np.minimum(track, yard), yard)
     paint = blend(paint, tone("#b59a72"), (0.10 - bare) / 0.15 * (distance < 26))
-    paint = blend(paint, tone("#c3b6c8"), (distance - 14) / 75)  # the air between
+    paint = blend(paint, tone("#c3b6c8"), (distance - 14) / 75)  # atmospheric haze
     stuff = material(
         "land", ["#8a8a86", "#e9e6dc", "#ffffff"], scale=4.5, bump=0, attribute="paint", distortion=0.4
     )
@@ -321,10 +327,10 @@ def land():
 
 
 def sky():
-    """A painted dome that only cameras see: the sky at a distance. Light comes from world and sun."""
-    made = bpy.data.materials.new("sky")
-    made.use_nodes = True
-    nodes, links = made.node_tree.nodes, made.node_tree.links
+    """Create a sky dome that is visible to cameras only. Light comes from world and sun."""
+    painted = bpy.data.materials.new("sky")
+    painted.use_nodes = True
+    nodes, links = painted.node_tree.nodes, painted.node_tree.links
     nodes.clear()
     output, light = nodes.new("ShaderNodeOutputMaterial"), nodes.new("ShaderNodeEmission")
     coordinates, split = nodes.new("ShaderNodeTexCoord"), nodes.new("ShaderNodeSeparateXYZ")
@@ -358,13 +364,13 @@ def sky():
     bpy.ops.mesh.primitive_uv_sphere_add(segments=96, ring_count=48, radius=66)
     dome = bpy.context.object
     dome.name = "sky"
-    dome.data.materials.append(made)
+    dome.data.materials.append(painted)
     dome.data.shade_smooth()
     dome.visible_diffuse = dome.visible_glossy = dome.visible_shadow = dome.visible_transmission = False
 
 
 def lights():
-    """A low warm sun from the left behind the photographer, a blue sky."""
+    """Add a low warm sun from behind left and a blue sky."""
     world = bpy.data.worlds.new("world")
     bpy.context.scene.world = world
     world.use_nodes = True
@@ -382,7 +388,7 @@ def lights():
 
 
 def wood(name, tones=("#6b4526", "#94663a", "#b58350"), along=0, vary=0.18):
-    """Planed timber with its grain along one axis."""
+    """Create a wood material with its grain along an axis."""
     stretch = [7.0, 7.0, 7.0]
     stretch[along] = 0.6
     return material(
@@ -391,7 +397,7 @@ def wood(name, tones=("#6b4526", "#94663a", "#b58350"), along=0, vary=0.18):
 
 
 def paper_lantern(at, color, radius=0.13, tall=1.15):
-    """A round paper lantern, ribbed, glowing from within."""
+    """Add a round ribbed paper lantern that glows."""
     profile = [
         (radius * math.sin(t), -radius * tall * math.cos(t)) for t in np.linspace(0.28, math.pi - 0.28, 25)
     ]
@@ -420,7 +426,7 @@ def paper_lantern(at, color, radius=0.13, tall=1.15):
 
 
 def table():
-    """The table with all that lies on it."""
+    """Add the table and the objects on it."""
     plank, leg = wood("table", along=0), wood("legs", along=2)
     for i, y in enumerate(np.linspace(-0.36, 0.36, 5)):
         box("plank", (1.9 + 0.03 * (i % 2), 0.172, 0.045), plank, at=(0.01 * (i % 3), y, TABLE - 0.0225))
@@ -430,7 +436,7 @@ def table():
         box("rail", (0.05, 0.6, 0.09), leg, at=(x, 0, 0.22))
     box("rail", (1.64, 0.05, 0.1), plank, at=(0, -0.33, 0.66))
 
-    # the runner: a woven cloth across the middle that hangs down over the front
+    # the runner: a woven cloth across the middle that hangs over the front
     u = np.linspace(-0.80, 0.62, 90)
     v = np.linspace(-0.27, 0.27, 34)
     s, w = np.meshgrid(u, v, indexing="ij")
@@ -456,11 +462,11 @@ def table():
 
 
 def still_life():
-    """Fruit, jugs, books, bread and the lantern."""
+    """Add fruit, jugs, books, bread and the lantern."""
     dark = material("dark wood", ["#3a2417", "#5a3a22"], scale=3, stretch=(8, 8, 1), bump=0.2)
     brass = material("brass", ["#8a6a2c", "#c79a48"], scale=20, bump=0.1)
 
-    # the lantern: posts, a roof, panes of lit paper
+    # the lantern: posts, a roof, lit paper panes
     x, y, z = rig.LANTERN
     paper = material("pane", ["#ffb347", "#ffe2a0"], pattern="noise", scale=7, bump=0, glow=0.9)
     box("lantern foot", (0.2, 0.2, 0.025), dark, at=(x, y, TABLE + 0.0125))
@@ -554,7 +560,7 @@ def still_life():
     for i, (fx, fy) in enumerate([(-0.12, -0.25), (-0.02, -0.31), (0.36, -0.27)]):
         place(kinds[(i + 1) % 3], (fx, fy, TABLE + 0.05), turn=i, tilt=(0.25, 0.1))
 
-    # jug and bowl, glazed dull and striped
+    # jug and bowl, matte and striped glaze
     stripes = material(
         "stripes",
         ["#e9e2d0", "#e9e2d0", "#3c5f8c", "#e9e2d0", "#e9e2d0"],
@@ -654,7 +660,7 @@ def still_life():
 
 
 def pumpkin(at, radius, color):
-    """A ribbed pumpkin with its stalk."""
+    """Add a ribbed pumpkin with its stalk."""
     skin = material(f"pumpkin {color}", [color, "#efb04e"], scale=7, stretch=(1, 1, 0.3), bump=0.1)
     profile = smooth_profile(
         [(0, 0.06), (0.45, 0.0), (0.95, 0.35), (1.0, 0.7), (0.6, 1.15), (0.18, 1.12), (0, 1.02)], 30
@@ -673,7 +679,7 @@ def pumpkin(at, radius, color):
 
 
 def blossoms(points, size, colors, seed=0):
-    """Flowers of six petals facing up and outward at points (N, 3)."""
+    """Create flowers with six petals, facing up and outward, at points (N, 3)."""
     source = np.random.default_rng(seed + 100)
     count, petals = len(points), 6
     facing = source.normal(size=(count, 3)) * 0.45 + np.array([0, -0.25, 1.0])
@@ -707,7 +713,7 @@ def blossoms(points, size, colors, seed=0):
 
 
 def flower_pot(at, r, number):
-    """A clay pot of radius r with flowers in it; number chooses their colours."""
+    """Add a clay pot of radius r with flowers; ``number`` selects their colours."""
     x, y, z = at
     profile = [
         (0, 0),
@@ -742,7 +748,7 @@ def flower_pot(at, r, number):
 
 
 def garden():
-    """What stands around the table: lantern posts, pots, crates, stones, grass and flowers."""
+    """Add the surroundings of the table: lantern posts, pots, crates, stones, grass and flowers."""
     post = wood("post", ("#4b3220", "#6c4a2c", "#8a6440"), along=2)
     ends = [(-1.55, 0.95), (1.55, 0.95)]
     for x, y in ends:
@@ -789,7 +795,7 @@ def garden():
                 box("slat", (0.56, 0.02, 0.09), crate, at=(x + at.x, y + at.y, at.z), turn=turn, bevel=0.004)
                 at = turned @ Matrix.Translation((side * 1.35, 0, 0.06 + 0.11 * level)).translation
                 box("slat", (0.02, 0.38, 0.09), crate, at=(x + at.x, y + at.y, at.z), turn=turn, bevel=0.004)
-        apples = [one for one in bpy.data.meshes if one.name.startswith("fruit")]
+        apples = [data for data in bpy.data.meshes if data.name.startswith("fruit")]
         for _ in range(46):
             at = turned @ Matrix.Translation((*rng.uniform(-1, 1, 2) * [0.22, 0.15], 0)).translation
             place(
@@ -803,7 +809,7 @@ def garden():
     pumpkin((1.5, -0.45, 0.0), 0.22, "#cf6a1a")
     pumpkin((1.12, -0.62, 0.0), 0.12, "#d8c37a")
 
-    # flat stones on the path and about the table
+    # flat stones on the path and around the table
     stone = material("stone", ["#6d6a66", "#948f86", "#b5afa3"], scale=9, bump=0.5, vary=0.15)
     shapes = []
     for i in range(4):
@@ -821,7 +827,7 @@ def garden():
     for x, y, r in steps:
         place(shapes[int(rng.integers(4))], on_ground(x, y, -0.06 * r), turn=rng.uniform(0, 6), scale=r)
 
-    # grass and flowers, thinning with distance, none on the path
+    # grass and flowers, sparser with distance, none on the path
     grass = material("grass", ["#e0e0e0", "#ffffff"], scale=1.5, bump=0, attribute="paint")
 
     def meadow(count, near, far):
@@ -862,7 +868,7 @@ def garden():
 
 
 def path_side():
-    """What stands along the path in the walk alone, within arm's reach: lanterns on poles, pots, pumpkins."""
+    """Add objects close to the path, for the set ``walk`` only: lanterns on poles, pots, pumpkins."""
     post, colors = bpy.data.materials["post"], ("#f6b23c", "#5aa6a6", "#e8543f", "#f3d36b", "#d4577c")
     for i, y in enumerate(np.arange(2.9, 9.2, 0.8)):
         side = -1 if i % 2 else 1
@@ -880,11 +886,11 @@ def path_side():
         flower_pot((x, y, 0.645), 0.15, i + 1)
 
 
-# -------------------------------------------------------------------------------------------- far away
+# ----------------------------------------------------------------------------------------- background
 
 
 def trees():
-    """Broad trees with crowns of leaves and slim pines, instanced over meadows and hills."""
+    """Add broad trees and pines, instanced over meadows and hills."""
     bark = material("bark", ["#3e2c20", "#5f4632", "#7a5d45"], scale=5, stretch=(6, 6, 1), bump=0.5)
     foliage = material("foliage", ["#bdbdbd", "#ffffff"], scale=2, bump=0, attribute="paint")
     crowns = []
@@ -901,7 +907,7 @@ def trees():
         direction = source.normal(size=(9, 420, 3))
         direction /= np.linalg.norm(direction, axis=2, keepdims=True)
         leaves = (lumps[:, None] + direction * source.uniform(0.5, 0.75, (9, 420, 1))).reshape(-1, 3)
-        # each leaf a small diamond that faces about outward
+        # each leaf is a small diamond that faces roughly outward
         facing = direction.reshape(-1, 3) + source.normal(size=(len(leaves), 3)) * 0.5
         first = np.cross(facing, source.normal(size=(len(leaves), 3)))
         first /= np.linalg.norm(first, axis=1, keepdims=True)
@@ -969,7 +975,7 @@ def trees():
 
 
 def buildings():
-    """A hamlet to the left, a windmill on its hill, a fence along the path, haystacks."""
+    """Add a hamlet to the left, a windmill on its hill, a fence along the path, and haystacks."""
     plaster = material("plaster", ["#d9c8a8", "#efe4cb", "#f6eedb"], scale=2.5, bump=0.15, vary=0.06)
     beam = material("beam", ["#4a3323", "#63462f"], scale=4, bump=0.2)
     tiles = material(
@@ -988,8 +994,8 @@ def buildings():
         turned = Matrix.Translation(on_ground(x, y).tolist()) @ Matrix.Rotation(turn, 4, "Z")
 
         def put(name, size, at, stuff, tilt=(0.0, 0.0)):
-            where = turned @ Matrix.Translation(at).to_translation()
-            box(name, size, stuff, at=where, turn=turn, tilt=tilt, bevel=0.02)
+            position = turned @ Matrix.Translation(at).to_translation()
+            box(name, size, stuff, at=position, turn=turn, tilt=tilt, bevel=0.02)
 
         put("walls", (wide, deep, tall + 1.0), (0, 0, tall / 2 - 0.5), plaster)
         peak = 0.62 * deep
@@ -1028,7 +1034,7 @@ def buildings():
     house(-15.5, 8.5, 1.0, 3.2, 2.6, 2.2)
     house(16.5, 8.5, -1.1, 3.2, 2.6, 2.2)
 
-    # the windmill, built at the origin and carried to its hill
+    # the windmill, built at the origin and moved to its hill
     mill = [
         lathe("mill", [(1.75, -0.8), (1.5, 1.2), (1.2, 3.2), (1.02, 4.4), (0, 4.4)], plaster, segments=12),
         lathe(
@@ -1060,7 +1066,7 @@ def buildings():
     lying = wood("fence rail", ("#7a6248", "#9c8262", "#b59c7a"), along=0)
     for side in (-1.15, 1.15):
         y = np.arange(3.2, 14.5, 1.15)
-        spots = [on_ground(path_x(one) + side, one) for one in y]
+        spots = [on_ground(path_x(value) + side, value) for value in y]
         for a, b in itertools.pairwise(spots):
             box(
                 "fence post",
@@ -1099,11 +1105,11 @@ def buildings():
         )
 
 
-# -------------------------------------------------------------------------------------------- pictures
+# ------------------------------------------------------------------------------------------- rendering
 
 
 def build():
-    """The whole scene, in an empty file."""
+    """Build the scene in an empty file."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     land()
     sky()
@@ -1115,7 +1121,7 @@ def build():
 
 
 def set_up_rendering(samples: int, percentage: int):
-    """Cycles on the CPU, denoised, colours as they are (view transform Standard), no blur."""
+    """Set up Cycles on the CPU with denoising, view transform Standard and no blur."""
     scene = bpy.context.scene
     scene.render.engine = "CYCLES"
     scene.cycles.device = "CPU"
@@ -1144,14 +1150,14 @@ def set_up_rendering(samples: int, percentage: int):
 
 
 def render(out: Path, cameras: str, views: list[int] | None):
-    """Picture and world positions of each view of a set, or of some of them."""
+    """Render images and world positions of all or some views of a set."""
     scene = bpy.context.scene
     scene.use_nodes = True
     tree = scene.node_tree
     tree.nodes.clear()
     layers, store = tree.nodes.new("CompositorNodeRLayers"), tree.nodes.new("CompositorNodeOutputFile")
-    picture = tree.nodes.new("CompositorNodeComposite")
-    tree.links.new(layers.outputs["Image"], picture.inputs["Image"])
+    composite = tree.nodes.new("CompositorNodeComposite")
+    tree.links.new(layers.outputs["Image"], composite.inputs["Image"])
     store.base_path = str(out / "positions")
     store.format.file_format, store.format.color_depth, store.format.exr_codec = "OPEN_EXR", "32", "ZIP"
     store.file_slots[0].path = f"{cameras}_##"
@@ -1166,7 +1172,7 @@ def render(out: Path, cameras: str, views: list[int] | None):
 
 
 def animate(cameras: str):
-    """Lets the scene's camera go the way of a set, a frame a view."""
+    """Animate the scene's camera along a set, one frame per view."""
     scene = bpy.context.scene
     poses = np.linalg.inv(rig.world_to_cameras(cameras)) @ np.diag([1.0, -1.0, -1.0, 1.0])
     scene.camera.rotation_mode = "QUATERNION"
@@ -1183,15 +1189,15 @@ def main():
     )
     parser.add_argument("out", type=Path)
     parser.add_argument("--samples", type=int, default=16)
-    parser.add_argument("--percentage", type=int, default=100, help="of 480x320, for a quick look")
+    parser.add_argument("--percentage", type=int, default=100, help="render size as a percentage of 480x320")
     sets = list(rig.SETS)
-    parser.add_argument("--cameras", nargs="*", choices=sets, default=sets, help="only these sets")
-    parser.add_argument("--views", type=int, nargs="*", help="only these; all by default")
+    parser.add_argument("--cameras", nargs="*", choices=sets, default=sets, help="sets of cameras to render")
+    parser.add_argument("--views", type=int, nargs="*", help="numbers of the views to render; all by default")
     options = parser.parse_args()
     out = options.out.resolve()
     build()
     set_up_rendering(options.samples, options.percentage)
-    for cameras in sorted(options.cameras, key=sets.index):  # the walk last: it adds to the garden
+    for cameras in sorted(options.cameras, key=sets.index):  # walk last: it adds objects to the garden
         if cameras == "walk":
             path_side()
         render(out, cameras, options.views)

@@ -1,7 +1,7 @@
-"""``make demo``: the main job on the example scene, from photographs to levels, in Blender's Python.
+"""``make demo``: the main workflow on the example scene, from photos to levels, in Blender's Python.
 
-Imports the scene, trains levels in a background process, saves the .blend with its selection, exports the
-bundle, measures the held-out views and puts the levels side by side. Everything lands in ``build/demo``.
+Imports the scene, trains levels in a background process, saves a .blend file with selection by distance,
+exports the bundle, measures held-out views and compares the levels. Output folder: ``build/demo``.
 """
 
 from __future__ import annotations
@@ -25,31 +25,31 @@ from training.runs.folder import RunFolder  # noqa: E402
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description="train the example scene and show its levels")
+    parser = argparse.ArgumentParser(description="Train the example scene and compare its levels.")
     parser.add_argument("--scene", type=Path, default=ROOT / "examples" / "lantern_garden")
     parser.add_argument("--method", choices=list(METHODS), default="flod")
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "demo")
     parser.add_argument("--image-scale", type=float, default=1.0)
     parser.add_argument(
-        "--set", action="append", default=[], metavar="NAME=VALUE", help="a parameter of the method"
+        "--set", action="append", default=[], metavar="NAME=VALUE", help="parameter of the method"
     )
-    chosen = parser.parse_args()
+    options = parser.parse_args()
     started = time.monotonic()
-    out: Path = chosen.out
-    run = RunFolder(out / chosen.method)
-    if run.state() == "done":  # an interrupted demo is resumed, a finished one is made anew
+    out: Path = options.out
+    run = RunFolder(out / options.method)
+    if run.state() == "done":  # resume an interrupted demo, repeat a finished one
         shutil.rmtree(run.path)
     os.environ.setdefault("LODGS_TRAINER_PYTHON", sys.executable)
 
-    method = METHODS[chosen.method]
-    print(f"{method.label}, {method.about}: trained as a draft on {os.path.relpath(chosen.scene)}.")
+    method = METHODS[options.method]
+    print(f"Training {method.label} ({method.about}), draft preset, on {os.path.relpath(options.scene)}.")
     start_blender()
     commands = importlib.import_module(f"{EXTENSION}.blender_lodgs.commands")
     code = commands.main(
-        ["train", "--scene", str(chosen.scene), "--method", chosen.method, "--preset", "draft",
-         "--image-scale", str(chosen.image_scale), "--out", str(run.path),
+        ["train", "--scene", str(options.scene), "--method", options.method, "--preset", "draft",
+         "--image-scale", str(options.image_scale), "--out", str(run.path),
          "--blend", str(out / "scene.blend"), "--export", str(out / "bundle.ply"),
-         *(word for setting in chosen.set for word in ("--set", setting))]
+         *(word for setting in options.set for word in ("--set", setting))]
     )  # fmt: skip
     if code:
         return code
@@ -66,22 +66,22 @@ def main() -> int:
     if code:
         return code
     measured = json.loads(run.metrics.read_text())
-    report = {"scene": str(chosen.scene), "method": chosen.method, "levels": measured["levels"]}
+    report = {"scene": str(options.scene), "method": options.method, "levels": measured["levels"]}
     if measured["selective"]:
         per_view = measured["selective"][0]
-        report["selective"] = _drawn(per_view)
+        report["selective"] = _splat_count_row(per_view)
     if "curve" in measured:
-        report["curve"] = [_drawn(row) for row in measured["curve"]]
+        report["curve"] = [_splat_count_row(row) for row in measured["curve"]]
     (out / "report.json").write_text(json.dumps(report, indent=1))
-    print(f"{time.monotonic() - started:.0f} seconds. In {os.path.relpath(out)}: scene.blend, bundle.ply,")
-    print("levels.png (the levels side by side), report.json")
+    print(f"Finished in {time.monotonic() - started:.0f} seconds. Files in {os.path.relpath(out)}:")
+    print("scene.blend, bundle.ply, levels.png (comparison of the levels), report.json")
     if run.costs.exists():
-        print(f"In {os.path.relpath(run.path)}: costs.png (what finding the levels' distances has told)")
+        print(f"In {os.path.relpath(run.path)}: costs.png (costs measured to choose the levels' distances)")
     return 0
 
 
-def _drawn(row: dict) -> dict:
-    """A measured row with a plain name for the number of splats in the image."""
+def _splat_count_row(row: dict) -> dict:
+    """Return a measured row with a clear name for the number of splats in the image."""
     return {("splats_drawn" if name == "drawn" else name): value for name, value in row.items()}
 
 

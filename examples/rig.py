@@ -1,12 +1,11 @@
-"""The cameras of the lantern garden: what the renderer uses and what the COLMAP models state. numpy only.
+"""Cameras of the lantern garden, for the renderer and the COLMAP models. Uses numpy only.
 
-Three sets, each called by what the names of its pictures begin with:
+Three sets, named by the prefix of their image names:
 
-- ``view``   A photographer goes along three arcs round the table, to and fro: close and low, in the middle,
-  far and high. He starts a quarter along the first arc, so that every 8th view (held out) has neighbours on
-  both sides.
-- ``aside``  Some of these views, a step aside and turned: what somebody sees who leaves that way.
-- ``walk``   Somebody goes round the table and on up the path, at eye height, things close by on all sides.
+- ``view``   Three arcs around the table, back and forth: close and low, in the middle, far and high. The
+  first view is a quarter along the first arc, so that every 8th view (held out) has neighbours on both sides.
+- ``aside``  Some of these views, moved sideways and turned: views off the photographed path.
+- ``walk``   A walk around the table and along the path at eye height, with objects close by on all sides.
 """
 
 from __future__ import annotations
@@ -14,15 +13,15 @@ from __future__ import annotations
 import numpy as np
 
 WIDTH, HEIGHT = 480, 320
-FOCAL = 400.0  # pixels; 62 degrees across
+FOCAL = 400.0  # pixels; horizontal field of view 62 degrees
 VIEWS_PER_ARC = 16
-# radius and height in metres, half opening of the arc in degrees, and the point looked at: one row an arc
+# one row per arc: radius and height in metres, half its angle in degrees, and the target point
 ARCS = [
     (2.15, 1.30, 52.0, (0.0, 0.35, 1.12)),
     (2.75, 1.70, 58.0, (0.0, 0.40, 1.32)),
     (3.50, 2.15, 54.0, (0.0, 0.60, 1.46)),
 ]
-# of which view; metres to the right, up and ahead; metres that the point looked at moves to the right and up
+# view number; metres to the right, up and forward; metres that the target moves to the right and up
 ASIDE = [
     (3, (0.0, -0.40, 0.10), (-0.15, -0.10)),
     (0, (0.25, 0.0, 0.55), (-0.20, 0.0)),
@@ -35,7 +34,7 @@ ASIDE = [
     (41, (0.20, -0.80, -0.20), (-0.50, 0.0)),
     (36, (0.10, 0.60, 0.45), (0.40, -0.20)),
 ]
-# where the walker stands (x, y) and what he looks at (x, y, z), metres; from row to row takes equal time
+# position (x, y) and target (x, y, z) in metres, at equal time intervals
 WALK = [
     ((-2.35, 0.30), (0.2, 0.2, 0.95)),
     ((-2.15, -0.75), (0.2, 0.3, 0.95)),
@@ -52,17 +51,17 @@ WALK = [
 ]
 WALK_VIEWS = 30
 EYE_HEIGHT = 1.6
-LANTERN = np.array([-0.44, 0.16, 0.97])  # the heart of the lit lantern on the table: a landmark
+LANTERN = np.array([-0.44, 0.16, 0.97])  # centre of the lit lantern on the table, a landmark
 
 
 def arcs() -> tuple[np.ndarray, np.ndarray]:
-    """Eyes of the set ``view`` and the points they look at, (48, 3) float64 each, metres."""
-    eyes, targets = [], []
+    """Return positions and targets of the set ``view``, (48, 3) float64 each, in metres."""
+    positions, targets = [], []
     for arc, (radius, height, half_opening, target) in enumerate(ARCS):
         sweep = np.linspace(-1.0, 1.0, VIEWS_PER_ARC) * (-1.0 if arc % 2 else 1.0)
         azimuth = np.radians(half_opening) * sweep
-        bob = 0.10 * np.sin(5.0 * azimuth + arc)  # a hand does not keep a compass's distance
-        eyes.append(
+        bob = 0.10 * np.sin(5.0 * azimuth + arc)  # hand-held, so not a perfect circle
+        positions.append(
             np.stack(
                 [(radius + bob) * np.sin(azimuth), -(radius + bob) * np.cos(azimuth), height + 0.8 * bob],
                 axis=1,
@@ -70,40 +69,44 @@ def arcs() -> tuple[np.ndarray, np.ndarray]:
         )
         targets.append(np.tile(target, (VIEWS_PER_ARC, 1)))
     start = VIEWS_PER_ARC // 4
-    return np.roll(np.concatenate(eyes), -start, axis=0), np.roll(np.concatenate(targets), -start, axis=0)
+    return np.roll(np.concatenate(positions), -start, axis=0), np.roll(
+        np.concatenate(targets), -start, axis=0
+    )
 
 
 def aside() -> tuple[np.ndarray, np.ndarray]:
-    """Eyes of the set ``aside`` and the points they look at, (10, 3) float64 each, metres."""
+    """Return positions and targets of the set ``aside``, (10, 3) float64 each, in metres."""
     views, steps, shifts = (np.array(column) for column in zip(*ASIDE, strict=True))
-    eyes, targets = (points[views] for points in arcs())
-    right, down, ahead = np.moveaxis(look_at(eyes, targets)[:, :3, :3], 1, 0)  # each view's axes, (10, 3)
-    eyes = eyes + steps[:, :1] * right - steps[:, 1:2] * down + steps[:, 2:] * ahead
-    return eyes, targets + shifts[:, :1] * right - shifts[:, 1:] * down
+    positions, targets = (points[views] for points in arcs())
+    right, down, ahead = np.moveaxis(
+        look_at(positions, targets)[:, :3, :3], 1, 0
+    )  # each view's axes, (10, 3)
+    positions = positions + steps[:, :1] * right - steps[:, 1:2] * down + steps[:, 2:] * ahead
+    return positions, targets + shifts[:, :1] * right - shifts[:, 1:] * down
 
 
 def walk() -> tuple[np.ndarray, np.ndarray]:
-    """Eyes of the set ``walk`` and the points they look at, (30, 3) float64 each, metres."""
+    """Return positions and targets of the set ``walk``, (30, 3) float64 each, in metres."""
     time = np.linspace(0, len(WALK) - 1, WALK_VIEWS)
     knots = np.arange(len(WALK))
-    eyes, targets = (
+    positions, targets = (
         np.stack([np.interp(time, knots, column) for column in np.array(rows).T], axis=1)
         for rows in zip(*WALK, strict=True)
     )
-    height = EYE_HEIGHT + 0.06 * np.sin(2.3 * time)  # steps, and bending down a little
-    return np.column_stack([eyes, height]), targets
+    height = EYE_HEIGHT + 0.06 * np.sin(2.3 * time)  # walking motion
+    return np.column_stack([positions, height]), targets
 
 
-def look_at(eyes: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """Rigid transforms from the world (z up) to cameras (x right, y down, z forward), (V, 4, 4)."""
-    forward = (targets - eyes) / np.linalg.norm(targets - eyes, axis=1, keepdims=True)
+def look_at(positions: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    """Return transforms from the world (z up) to cameras (x right, y down, z forward), (V, 4, 4)."""
+    forward = (targets - positions) / np.linalg.norm(targets - positions, axis=1, keepdims=True)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right, axis=1, keepdims=True)
     down = np.cross(forward, right)
     rotation = np.stack([right, down, forward], axis=1)
-    matrices = np.tile(np.eye(4), (len(eyes), 1, 1))
+    matrices = np.tile(np.eye(4), (len(positions), 1, 1))
     matrices[:, :3, :3] = rotation
-    matrices[:, :3, 3] = -np.einsum("vij,vj->vi", rotation, eyes)
+    matrices[:, :3, 3] = -np.einsum("vij,vj->vi", rotation, positions)
     return matrices
 
 
@@ -111,17 +114,17 @@ SETS = {"view": arcs, "aside": aside, "walk": walk}
 
 
 def world_to_cameras(name: str) -> np.ndarray:
-    """The cameras of a set in the order of its views, as :func:`look_at` has them."""
+    """Return the cameras of a set in the order of its views, as from :func:`look_at`."""
     return look_at(*SETS[name]())
 
 
 def view_name(name: str, index: int) -> str:
-    """Name of a picture of a set without its ending: view_00, view_01, ..."""
+    """Return the name of an image of a set without suffix: view_00, view_01, ..."""
     return f"{name}_{index:02d}"
 
 
 def project(points: np.ndarray, world_to_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixel positions (N, 2), centres at +0.5, and depths (N,) of world points (N, 3) in one view."""
+    """Return pixel positions (N, 2), centres at +0.5, and depths (N,) of world points (N, 3) in a view."""
     local = points @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
     depth = local[:, 2]
     safe = np.where(np.abs(depth) > 1e-9, depth, 1e-9)[:, None]

@@ -1,11 +1,11 @@
-"""A town of as many splats as wanted, made by a program: its truth is known, and nothing was trained.
+"""Generate a town of any number of splats, as ground truth for experiments on large scenes.
 
-    python -m examples.town build/town --splats 3000000          town.ply, cameras/*.json: a minute
-    python -m examples.town build/town --splats 3000000 --views 120    scene/, a COLMAP scene of it, as well
+    python -m examples.town build/town --splats 3000000          town.ply, cameras/*.json (one minute)
+    python -m examples.town build/town --splats 3000000 --views 120    also scene/, a COLMAP scene
 
-Splats lie on the surfaces of what ``town_shapes`` plans, as discs as large as they stand apart. More splats
-are first smaller ones, then more blocks. Two ways lead through it: a walk in the streets at eye height, and a
-flight over the roofs. Nothing of it is kept in the repository but the program.
+Splats are discs on the surfaces of ``town_shapes``, as large as their spacing. More splats are first smaller,
+then fill more blocks. Two camera paths lead through the town: a walk along the streets at eye height and a
+flight over the roofs.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from .town_shapes import Plan
 
 WIDTH, HEIGHT, FOCAL = 960, 540, 760.0
 NEAR = 0.05  # metres
-FINEST = 80.0  # splats for each square metre of a wall, from which on more blocks are built
+FINEST = 80.0  # splats per square metre of a wall; beyond this density, the town gets more blocks
 HILLS, SKY = 0.05, 0.004  # shares of all splats
-POINTS = 60_000  # of the COLMAP scene, about
+POINTS = 60_000  # approximate number in the COLMAP scene
 BATCH = 500_000
-JITTER = 0.5  # of the distance between splats
-EYE = 1.65
+JITTER = 0.5  # share of the splats' spacing
+EYE_HEIGHT = 1.65
 
 
 class Discs(NamedTuple):
@@ -43,9 +43,9 @@ class Discs(NamedTuple):
     Attributes:
         means, normals: (N, 3).
         tangents: (N, 3), the direction of the first size.
-        sizes: (N, 1) or (N, 2) metres from one to the next.
+        sizes: (N, 1) or (N, 2) spacing in metres.
         colors: (N, 3) in display space.
-        gloss: (N,) how much of the sun they mirror.
+        gloss: (N,) strength of the sun's reflection.
     """
 
     means: np.ndarray
@@ -57,48 +57,51 @@ class Discs(NamedTuple):
 
 
 def plan_for(count: int, seed: int = 0) -> Plan:
-    """The largest town that so many splats can fill well."""
+    """Return the largest town that this many splats cover densely."""
     plan = shapes.lay_out(3, seed)
     while True:
         larger = shapes.lay_out(plan.blocks + 2, seed)
-        if _wanted(larger).sum() / shapes.DENSITY[shapes.WALL] * FINEST > count:
+        if _splat_demand(larger).sum() / shapes.DENSITY[shapes.WALL] * FINEST > count:
             return plan
         plan = larger
 
 
-def _wanted(plan: Plan) -> np.ndarray:
-    """How many splats sheets and then crowns want, in relation to each other."""
+def _splat_demand(plan: Plan) -> np.ndarray:
+    """Return the relative number of splats for each sheet, then for each crown."""
     sheets, crowns = plan.sheets, plan.crowns
     leaves = 4 * np.pi * crowns[:, 3] ** 1.3 * crowns[:, 4] ** 0.7 * shapes.CROWN_DENSITY
     return np.concatenate([sheets.areas * shapes.DENSITY[sheets.material], leaves])
 
 
 def build(plan: Plan, count: int, sh_degree: int = 1, seed: int = 0) -> Splats:
-    """The town's splats.
+    """Return the town's splats.
 
     Args:
-        count: how many.
-        sh_degree: 0 to 3; what shines does so from 1 on.
+        plan: the town.
+        count: number of splats.
+        sh_degree: 0 to 3; glossy surfaces need 1 or more.
+        seed: random seed.
     """
     rng = np.random.default_rng(seed)
     parts = [_sky(plan, int(count * SKY)), _hills(plan, int(count * HILLS), rng)]
-    ends, left = np.cumsum(_wanted(plan)), count - sum(len(means) for means, *_ in parts)
-    shares = np.diff(np.round(ends / ends[-1] * left).astype(int), prepend=0)
+    ends = np.cumsum(_splat_demand(plan))
+    remaining = count - sum(len(means) for means, *_ in parts)
+    shares = np.diff(np.round(ends / ends[-1] * remaining).astype(int), prepend=0)
     on_sheets = shares[: len(plan.sheets)]
-    parts += [_on_sheets(plan, some, on_sheets[some], rng) for some in _batches(on_sheets)]
+    parts += [_on_sheets(plan, batch, on_sheets[batch], rng) for batch in _batches(on_sheets)]
     parts += [_leaves(plan, shares[len(plan.sheets) :], rng)]
     return Splats.concatenated([_splats(part, sh_degree, rng) for part in parts])
 
 
 def _batches(counts: np.ndarray) -> Iterator[np.ndarray]:
-    """Which sheets to do together: none so many that the work arrays grow large."""
+    """Yield batches of sheets with few enough splats for small work arrays."""
     number = (np.cumsum(counts) // BATCH).astype(int)
-    for each in np.unique(number):
-        yield np.flatnonzero((number == each) & (counts > 0))
+    for batch in np.unique(number):
+        yield np.flatnonzero((number == batch) & (counts > 0))
 
 
 def _on_sheets(plan: Plan, which: np.ndarray, counts: np.ndarray, rng: np.random.Generator) -> Discs:
-    """Discs on some of the sheets, on a grid that is shaken a little."""
+    """Return discs on some of the sheets, on a jittered grid."""
     sheets = plan.sheets
     row = np.repeat(which, counts)
     number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
@@ -121,22 +124,22 @@ def _on_sheets(plan: Plan, which: np.ndarray, counts: np.ndarray, rng: np.random
 
 
 def _paint(plan, material, sheets, row, s, t, wide, means) -> tuple[np.ndarray, np.ndarray]:
-    """Colours (N, 3) and gloss (N,) of places s, t metres along the edges of their sheets."""
+    """Return colours (N, 3) and gloss (N,) at s, t metres along the edges of the sheets."""
     color, gloss, seed = sheets.color[row].copy(), shapes.GLOSS[material].copy(), sheets.seed[row]
     grain = shapes.chance(np.floor(s * 9), np.floor(t * 9), seed)[:, None]
     color *= 0.94 + 0.12 * grain
     for kind, paint in ((shapes.WALL, _wall), (shapes.ROOF, _roof), (shapes.GROUND, _ground)):
-        some = material == kind
-        if some.any():
-            what = plan, color[some], gloss[some], seed[some], s[some], t[some], wide[some], means[some]
-            color[some], gloss[some] = paint(*what)
+        rows = material == kind
+        if rows.any():
+            arguments = (array[rows] for array in (color, gloss, seed, s, t, wide, means))
+            color[rows], gloss[rows] = paint(plan, *arguments)
     leafy = np.isin(material, [shapes.HEDGE])
     color[leafy] *= 0.6 + 0.8 * grain[leafy]
     return color, gloss
 
 
 def _wall(plan, color, gloss, seed, s, t, wide, means):
-    """Windows with frames and shutters on every storey, a door, a base of stone."""
+    """Paint windows with frames and shutters on every storey, a door and a stone base."""
     bays = np.maximum(np.round((wide - 0.6) / 2.3), 1)
     bay = wide / bays
     x, storey = s % bay - bay / 2, np.floor(t / shapes.FLOOR)
@@ -166,7 +169,7 @@ def _wall(plan, color, gloss, seed, s, t, wide, means):
 
 
 def _roof(plan, color, gloss, seed, s, t, wide, means):
-    """Rows of tiles."""
+    """Paint rows of tiles."""
     course = np.floor(t / 0.32)
     tile = shapes.chance(np.floor(s / 0.24 + course % 2 / 2), course, seed)
     shade = 0.72 + 0.42 * tile + 0.12 * shapes.noise(s / 2, t / 2, 3.0)
@@ -175,13 +178,13 @@ def _roof(plan, color, gloss, seed, s, t, wide, means):
 
 
 def _ground(plan, color, gloss, seed, s, t, wide, means):
-    """Streets with pavements and markings, the cobbled square, gardens and meadows."""
+    """Paint streets with pavements and markings, the cobbled square, gardens and meadows."""
     x, y = means[:, 0], means[:, 1]
     pitch, half = shapes.PITCH, plan.half
     along = np.stack([(x + half) / pitch, (y + half) / pitch])
-    to_line = np.abs(along - np.round(along)) * pitch  # from the middle of the next street
+    to_line = np.abs(along - np.round(along)) * pitch  # from the centre line of the nearest street
     near = to_line.min(axis=0)
-    other = np.where(to_line[0] < to_line[1], y, x)
+    lengthwise = np.where(to_line[0] < to_line[1], y, x)
     fine, coarse = shapes.noise(x * 3, y * 3, 2.0), shapes.noise(x / 7, y / 7, 4.0)
     color = np.array([0.25, 0.42, 0.14]) * (1 + 0.18 * fine + 0.16 * coarse)[:, None]
     inside = np.maximum(np.abs(x), np.abs(y)) < half + shapes.STREET / 2
@@ -199,14 +202,14 @@ def _ground(plan, color, gloss, seed, s, t, wide, means):
     kerb = inside & (np.abs(near - shapes.STREET / 2 + shapes.PAVEMENT) < 0.12)
     color[kerb] = 0.7
     crossing = to_line.max(axis=0) < shapes.STREET / 2 - shapes.PAVEMENT
-    dashes = road & ~crossing & (near < 0.08) & (other % 3.0 < 1.6)
+    dashes = road & ~crossing & (near < 0.08) & (lengthwise % 3.0 < 1.6)
     stripes = road & (np.abs(to_line.max(axis=0) - 4.1) < 1.2) & (near % 0.9 < 0.45)
     color[(dashes | stripes) & inside] = 0.86
     return color, gloss
 
 
 def _leaves(plan: Plan, counts: np.ndarray, rng: np.random.Generator) -> Discs:
-    """The crowns of the trees: discs that look anywhere, most of them outwards."""
+    """Return the crowns of the trees: discs in random directions, mostly outwards."""
     crown = np.repeat(plan.crowns, counts, axis=0)
     number = np.repeat(np.arange(len(counts)), counts)
     out = rng.normal(size=(len(crown), 3))
@@ -227,20 +230,20 @@ def _leaves(plan: Plan, counts: np.ndarray, rng: np.random.Generator) -> Discs:
 
 
 def _hills(plan: Plan, count: int, rng: np.random.Generator) -> Discs:
-    """The land about the town, as dense as it is seen from the middle."""
+    """Return the land around the town, with uniform density as seen from the centre."""
     near, far = (plan.half + shapes.PITCH) * 1.0, (plan.half + shapes.PITCH) * 9
     golden = np.arange(count) * 2.399963
-    away = near * (far / near) ** ((np.arange(count) + rng.random(count)) / count)
-    x, y = away * np.cos(golden), away * np.sin(golden)
-    edge = np.maximum(np.abs(x), np.abs(y)) > near - 2  # the town's own ground is a square
-    x, y, away = x[edge], y[edge], away[edge]
+    distance = near * (far / near) ** ((np.arange(count) + rng.random(count)) / count)
+    x, y = distance * np.cos(golden), distance * np.sin(golden)
+    edge = np.maximum(np.abs(x), np.abs(y)) > near - 2  # the town's ground is a square
+    x, y, distance = x[edge], y[edge], distance[edge]
     z, step = shapes.hill(x, y, plan.half), 1.0
     slope = np.stack(
         [shapes.hill(x + step, y, plan.half) - z, shapes.hill(x, y + step, plan.half) - z], axis=1
     )
     normals = np.concatenate([-slope, np.full((len(x), 1), step)], axis=1)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    size = away[:, None] * np.sqrt(2 * np.pi * np.log(far / near) / count)
+    size = distance[:, None] * np.sqrt(2 * np.pi * np.log(far / near) / count)
     wood = shapes.noise(x / 60, y / 60, 11.0) + 0.4 * shapes.noise(x / 9, y / 9, 12.0, 2) > 0.1
     fields = shapes.chance(np.floor(x / 55), np.floor(y / 42), 13.0)[:, None]
     albedo = np.array([0.30, 0.46, 0.16]) * (1 - fields) + np.array([0.60, 0.56, 0.26]) * fields
@@ -249,13 +252,13 @@ def _hills(plan: Plan, count: int, rng: np.random.Generator) -> Discs:
     means = np.stack([x, y, z - 0.02], axis=1)
     light = np.clip(normals @ shapes.SUN, 0, 1)[:, None] * shapes.SUN_LIGHT + shapes.SKY_LIGHT
     color = (np.clip(albedo, 0, 1) ** 2.2 * light).clip(0, 1) ** (1 / 2.2)
-    haze = (1 - np.exp(-away / (5 * far / 9)))[:, None]
+    haze = (1 - np.exp(-distance / (5 * far / 9)))[:, None]
     color = color * (1 - haze) + np.array([0.74, 0.82, 0.90]) * haze
     return Discs(means, normals, np.cross(normals, [0.0, 1.0, 0.0]), size, color, np.zeros(len(x)))
 
 
 def _sky(plan: Plan, count: int) -> Discs:
-    """A dome with clouds, far behind the hills."""
+    """Return a sky dome with clouds, far behind the hills."""
     number = np.arange(count, dtype=np.float64)
     z = 1 - 1.12 * (number + 0.5) / count
     ring, turn = np.sqrt(np.maximum(1 - z * z, 0)), number * 2.399963
@@ -274,13 +277,13 @@ def _sky(plan: Plan, count: int) -> Discs:
 
 
 def _lit(plan: Plan, means: np.ndarray, normals: np.ndarray, albedo: np.ndarray) -> np.ndarray:
-    """Colours (N, 3) in display space: sun with shadows, sky, darker near the ground."""
+    """Shade surfaces with sun, shadows, sky and ambient occlusion; return display colours (N, 3)."""
     reach, size = plan.half + shapes.PITCH, len(plan.heights)
     sunny = np.clip(normals @ shapes.SUN, 0, 1)
     shadow = np.zeros(len(means), bool)
-    for away in np.geomspace(0.5, 34, 26):
-        x, y, z = (means + shapes.SUN * away).T
-        column, row = (((each + reach) / plan.cell).astype(int).clip(0, size - 1) for each in (x, y))
+    for distance in np.geomspace(0.5, 34, 26):
+        x, y, z = (means + shapes.SUN * distance).T
+        column, row = (((axis + reach) / plan.cell).astype(int).clip(0, size - 1) for axis in (x, y))
         shadow |= plan.heights[row, column] > z + 0.15
     sunny[shadow] = 0
     low = 0.72 + 0.28 * np.clip(means[:, 2] / 2.5, 0, 1)
@@ -290,7 +293,7 @@ def _lit(plan: Plan, means: np.ndarray, normals: np.ndarray, albedo: np.ndarray)
 
 
 def _splats(discs: Discs, sh_degree: int, rng: np.random.Generator) -> Splats:
-    """Discs on surfaces; what is glossy has a lobe of the sky's colour about the mirrored sun."""
+    """Convert discs to splats; glossy ones get a lobe around the sun's mirror direction."""
     means, normals, tangents, size, color, gloss = discs
     count = len(means)
     tangents = tangents - normals * np.sum(tangents * normals, axis=1, keepdims=True)
@@ -301,14 +304,14 @@ def _splats(discs: Discs, sh_degree: int, rng: np.random.Generator) -> Splats:
     opacity = rng.uniform(0.9, 0.99, count)
     sh = np.zeros((count, coefficient_count(sh_degree), 3), np.float32)
     sh[:, 0] = (color - 0.5) / SH_C0
-    # where the sun's light goes on to, mirrored; a camera that it meets looks the other way
+    # mirror direction of the sunlight; a camera that sees the reflection looks the opposite way
     onwards = 2 * normals * (normals @ shapes.SUN)[:, None] - shapes.SUN
     x, y, z = -onwards.T
-    about = np.zeros((coefficient_count(sh_degree), count))
-    basis(x, y, z, sh_degree, about)
+    directional = np.zeros((coefficient_count(sh_degree), count))
+    basis(x, y, z, sh_degree, directional)
     # exp(4 (cos - 1)) as zonal harmonics, degree by degree
-    lobe = np.repeat([1.5703, 1.1788, 0.6862, 0.3211], [1, 3, 5, 7])[: len(about)]
-    shine = (gloss + 0.03) * lobe[:, None] * about
+    lobe = np.repeat([1.5703, 1.1788, 0.6862, 0.3211], [1, 3, 5, 7])[: len(directional)]
+    shine = (gloss + 0.03) * lobe[:, None] * directional
     sh[:, 1:] = shine[1:].T[..., None] * np.array([1.0, 0.97, 0.9])
     quats = Rotation.from_matrix(frame).as_quat(scalar_first=True)
     return Splats(
@@ -317,21 +320,22 @@ def _splats(discs: Discs, sh_degree: int, rng: np.random.Generator) -> Splats:
     )  # fmt: skip
 
 
-# -- where to stand ------------------------------------------------------------------------------------
+# -- cameras ------------------------------------------------------------------------------------
 
 
-def looking(name: str, eye: np.ndarray, at: np.ndarray) -> Camera:
-    """A camera at an eye (3,) that looks at a point (3,), level."""
-    pose = look_at(eye, at, (0.0, 0.0, 1.0))
+def level_camera(name: str, position: np.ndarray, target: np.ndarray) -> Camera:
+    """Return a level camera at a position (3,) that looks at a target (3,)."""
+    pose = look_at(position, target, (0.0, 0.0, 1.0))
     return Camera(name, WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, pose)
 
 
 def walk(plan: Plan, count: int, phase: float = 0.0) -> list[Camera]:
-    """Views along the streets, at eye height: round the square, then round the blocks about it.
+    """Return views along the streets at eye height: around the square, then around the surrounding blocks.
 
     Args:
-        count: evenly along the way.
-        phase: in [0, 1): where between two of them the first one is; other phases are other places.
+        plan: the town.
+        count: number of views, evenly spaced along the path.
+        phase: offset of the views in [0, 1), as a share of their spacing.
     """
     corners = [(-0.5, -0.5)]
     for ring in range(max(plan.blocks // 2, 1)):
@@ -340,58 +344,59 @@ def walk(plan: Plan, count: int, phase: float = 0.0) -> list[Camera]:
     corners = np.array(corners) * shapes.PITCH
     lengths = np.append(0, np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1)))
     fine = np.linspace(0, lengths[-1], int(lengths[-1] * 4))
-    way = np.stack([np.interp(fine, lengths, each) for each in corners.T], axis=1)
+    path = np.stack([np.interp(fine, lengths, axis) for axis in corners.T], axis=1)
     smooth = np.hanning(41) / np.hanning(41).sum()
-    padded = np.pad(way, ((20, 20), (0, 0)), mode="edge")
-    way = np.stack([np.convolve(each, smooth, "valid") for each in padded.T], axis=1)
-    places = (np.arange(count) + phase) / count * (len(way) - 30)
-    at, ahead = (_along(way, places + shift) for shift in (0, 24))
-    turn = 0.45 * np.sin(places / len(way) * 2 * np.pi * 9)  # he looks at the houses on both sides
+    padded = np.pad(path, ((20, 20), (0, 0)), mode="edge")
+    path = np.stack([np.convolve(axis, smooth, "valid") for axis in padded.T], axis=1)
+    samples = (np.arange(count) + phase) / count * (len(path) - 30)
+    at, ahead = (_along(path, samples + shift) for shift in (0, 24))
+    turn = 0.45 * np.sin(samples / len(path) * 2 * np.pi * 9)  # look at the houses on both sides
     forward = ahead - at
-    left = np.stack([-forward[:, 1], forward[:, 0]], axis=1)
-    gaze = at + forward * np.cos(turn)[:, None] + left * np.sin(turn)[:, None]
-    side = 3.5 * left / np.linalg.norm(left, axis=1, keepdims=True)
-    eyes = np.column_stack([at - side, np.full(count, EYE)])
-    aims = np.column_stack([gaze - side, EYE + 0.35 + 0.4 * np.sin(places / 31)])
+    leftward = np.stack([-forward[:, 1], forward[:, 0]], axis=1)
+    gaze = at + forward * np.cos(turn)[:, None] + leftward * np.sin(turn)[:, None]
+    side = 3.5 * leftward / np.linalg.norm(leftward, axis=1, keepdims=True)
+    positions = np.column_stack([at - side, np.full(count, EYE_HEIGHT)])
+    targets = np.column_stack([gaze - side, EYE_HEIGHT + 0.35 + 0.4 * np.sin(samples / 31)])
     return [
-        looking(f"walk_{number:03d}", eye, aim)
-        for number, (eye, aim) in enumerate(zip(eyes, aims, strict=True))
+        level_camera(f"walk_{number:03d}", position, target)
+        for number, (position, target) in enumerate(zip(positions, targets, strict=True))
     ]
 
 
-def _along(way: np.ndarray, places: np.ndarray) -> np.ndarray:
-    return np.stack([np.interp(places, np.arange(len(way)), each) for each in way.T], axis=1)
+def _along(path: np.ndarray, samples: np.ndarray) -> np.ndarray:
+    return np.stack([np.interp(samples, np.arange(len(path)), axis) for axis in path.T], axis=1)
 
 
 def flight(plan: Plan, count: int, phase: float = 0.0) -> list[Camera]:
-    """Views of a flight over the roofs, in a rising spiral; arguments as of :func:`walk`."""
+    """Return views of a flight over the roofs in a rising spiral; arguments as for :func:`walk`."""
     share = (np.arange(count) + phase) / count
-    turn, away = share * 4 * np.pi, plan.half * (1.15 - 0.75 * share)
-    eyes = np.stack([away * np.cos(turn), away * np.sin(turn), 24 + 30 * share], axis=1)
-    aims = np.stack(
-        [0.35 * away * np.cos(turn + 1.1), 0.35 * away * np.sin(turn + 1.1), 2 + 0 * turn], axis=1
+    turn, distance = share * 4 * np.pi, plan.half * (1.15 - 0.75 * share)
+    positions = np.stack([distance * np.cos(turn), distance * np.sin(turn), 24 + 30 * share], axis=1)
+    targets = np.stack(
+        [0.35 * distance * np.cos(turn + 1.1), 0.35 * distance * np.sin(turn + 1.1), 2 + 0 * turn], axis=1
     )
-    return [looking(f"flight_{n:03d}", eye, aim) for n, (eye, aim) in enumerate(zip(eyes, aims, strict=True))]
+    poses = enumerate(zip(positions, targets, strict=True))
+    return [level_camera(f"flight_{n:03d}", position, target) for n, (position, target) in poses]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("out", type=Path, help="the folder that is filled")
+    parser.add_argument("out", type=Path, help="output folder")
     parser.add_argument("--splats", type=int, default=3_000_000)
     parser.add_argument("--sh-degree", type=int, default=1, choices=range(4))
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--cameras", type=int, default=48, help="of each way, as files")
+    parser.add_argument("--cameras", type=int, default=48, help="number of camera files per path")
     parser.add_argument(
-        "--views", type=int, default=0, help="photographs of each way: a COLMAP scene as well"
+        "--views", type=int, default=0, help="photos per path of a COLMAP scene; 0 writes none"
     )
     options = parser.parse_args()
     plan = plan_for(options.splats, options.seed)
     splats = build(plan, options.splats, options.sh_degree, options.seed)
     write_ply(options.out / "town.ply", splats)
-    for way in (walk, flight):
-        for camera in way(plan, options.cameras, 0.5):
+    for path in (walk, flight):
+        for camera in path(plan, options.cameras, 0.5):
             write_camera(options.out / "cameras" / f"{camera.name}.json", camera, NEAR)
     print(f"{len(splats):,} splats, {plan.blocks} x {plan.blocks} blocks: {options.out / 'town.ply'}")
     if options.views:

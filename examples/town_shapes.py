@@ -1,8 +1,8 @@
-"""The town's plan and shapes: streets, houses, a church and a square, trees, hills and a sky. numpy only.
+"""Plan and shapes of the town: streets, houses, a church and a square, trees, hills and sky. Uses numpy only.
 
-Everything is parallelograms (``Sheets``: walls, roofs, ground; narrowing to a point where they are gables and
-spires) and crowns of trees. Colours are functions of where a point lies on its sheet, so that splats may be
-as small as there are many. Lengths are metres, z is up, the square's middle is the origin.
+Shapes are parallelograms (``Sheets``: walls, roofs, ground; tapered for gables and spires) and crowns of
+trees. Colours are functions of the position on a sheet, so that splats can have any size. Lengths are in
+metres, z is up, the origin is the centre of the square.
 """
 
 from __future__ import annotations
@@ -11,16 +11,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-PITCH = 36.0  # from street to street
-STREET = 9.0  # between the front gardens' walls, pavements included
+PITCH = 36.0  # spacing of streets
+STREET = 9.0  # width between front walls, with pavements
 PAVEMENT = 2.0
 FLOOR = 2.9  # height of a storey
-SUN = np.array([0.52, -0.38, 0.76]) / np.linalg.norm([0.52, -0.38, 0.76])  # towards it
+SUN = np.array([0.52, -0.38, 0.76]) / np.linalg.norm([0.52, -0.38, 0.76])  # direction to the sun
 SKY_LIGHT, SUN_LIGHT = np.array([0.42, 0.46, 0.54]), np.array([1.02, 0.92, 0.74])
 
 WALL, ROOF, GROUND, PLAIN, CAR, WATER, HEDGE, STONE = range(8)
 DENSITY = np.array([12.0, 5.0, 1.2, 9.0, 16.0, 4.0, 6.0, 8.0])
-"""Splats for each square metre of a material, in relation to the ground's."""
+"""Splats per square metre of a material, relative to the ground."""
 CROWN_DENSITY = 5.0
 GLOSS = np.array([0.0, 0.03, 0.0, 0.02, 0.35, 0.4, 0.0, 0.05])
 
@@ -40,12 +40,12 @@ class Sheets:
     """Q parallelograms.
 
     Attributes:
-        corner: (Q, 3) the corner that both edges start from.
+        corner: (Q, 3) start of both edges.
         across, up: (Q, 3) the edges; the normal is across x up.
-        material: (Q,) of the constants above.
+        material: (Q,) one of the constants above.
         color: (Q, 3) in [0, 1], linear.
-        taper: (Q,) how much the far edge is shorter: 0 a parallelogram, 1 a triangle.
-        seed: (Q,) what is random about its looks.
+        taper: (Q,) shortening of the far edge: 0 for a parallelogram, 1 for a triangle.
+        seed: (Q,) seed of random details.
     """
 
     corner: np.ndarray
@@ -73,14 +73,14 @@ class Sheets:
 
 @dataclass
 class Plan:
-    """What stands where.
+    """Layout of a town.
 
     Attributes:
-        blocks: on a side; odd, the square is the middle one.
-        sheets: of everything with faces.
-        crowns: (T, 5) of trees: x, y, z of the middle, radius across, radius up.
-        heights: (H, H) what throws shadows: the height over each cell of the ground.
-        cell: side of such a cell, metres.
+        blocks: number of blocks per side; odd, with the square in the middle.
+        sheets: all surfaces.
+        crowns: (T, 5) crowns of trees: x, y, z of the centre, horizontal radius, vertical radius.
+        heights: (H, H) height map for shadows.
+        cell: cell size of the height map in metres.
     """
 
     blocks: int
@@ -91,7 +91,7 @@ class Plan:
 
     @property
     def half(self) -> float:
-        """From the middle to the outermost street's middle."""
+        """Distance from the centre to the centre line of the outermost street."""
         return self.blocks * PITCH / 2
 
 
@@ -106,7 +106,7 @@ class Builder:
         self._rows.append((corner, across, up, material, color, taper, self.rng.integers(1 << 30)))
 
     def box(self, at, turn, size, material, color, roof=None, bottom=0.0) -> None:
-        """Four walls and a lid of (material, color) ``roof``; ``at`` is the middle of its foot."""
+        """Add a box with a lid of (material, color) ``roof``; ``at`` is the centre of its base."""
         x, y = axes(turn)
         wide, deep, high = size
         lift, foot = np.array([0, 0, high]), np.array([*at[:2], at[2] + bottom])
@@ -118,21 +118,21 @@ class Builder:
         self.sheet(foot + lift - x * wide / 2 - y * deep / 2, x * wide, y * deep, lid, tint)
 
     def spire(self, at, turn, half, high, material, color) -> None:
-        """A pyramid on a square of side 2 half."""
+        """Add a pyramid with a square base of side 2 half."""
         for quarter in range(4):
             x, y = axes(turn + quarter * np.pi / 2)
             corner = at - y * half - x * half
             self.sheet(corner, 2 * half * x, y * half + np.array([0, 0, high]), material, color, 1.0)
 
     def house(self, at, turn, wide, deep, floors) -> None:
-        """Plastered walls, a gabled roof whose ridge runs along the street, a chimney."""
+        """Add a house with plastered walls, a gabled roof parallel to the street, and a chimney."""
         rng, (x, y) = self.rng, axes(turn)
         wall, tile = PLASTER[rng.integers(len(PLASTER))], TILES[rng.integers(len(TILES))]
         high, steep = floors * FLOOR + 0.6, rng.uniform(0.75, 1.05)
         at = np.array([*at, 0.0])
         self.box(at, turn, (wide, deep, high), WALL, wall, roof=(PLAIN, wall * 0.5))
         ridge, lift, over = steep * deep / 2, np.array([0, 0, high]), 0.45
-        for side in (1, -1):  # gables, then the two planes of the roof with their eaves
+        for side in (1, -1):  # gables, then the two roof planes with eaves
             foot = at + lift + side * x * wide / 2 - side * y * deep / 2
             self.sheet(foot, side * y * deep, np.array([0, 0, ridge]), PLAIN, wall * 0.96, 1.0)
             eave = at + lift - side * (y * (deep / 2 + over) + x * (wide / 2 + over))
@@ -156,13 +156,13 @@ class Builder:
 
 
 def axes(turn: float) -> tuple[np.ndarray, np.ndarray]:
-    """East and north, turned."""
+    """Return the rotated east and north axes."""
     c, s = np.cos(turn), np.sin(turn)
     return np.array([c, s, 0.0]), np.array([-s, c, 0.0])
 
 
 def lay_out(blocks: int, seed: int) -> Plan:
-    """A town of blocks x blocks, the square in the middle."""
+    """Lay out a town of blocks x blocks with the square in the middle."""
     build, rng, crowns = Builder(np.random.default_rng(seed)), np.random.default_rng([seed, 1]), []
     half = blocks * PITCH / 2
     reach = half + PITCH
@@ -180,7 +180,7 @@ def lay_out(blocks: int, seed: int) -> Plan:
                 _square(build, crowns, rng)
             else:
                 _block(build, crowns, rng, middle)
-    for line in np.arange(blocks + 1) * PITCH - half:  # along every street: lamps, and cars at the kerb
+    for line in np.arange(blocks + 1) * PITCH - half:  # lamps and parked cars along every street
         for at in np.arange(-half + 9, half - 4, 12.0):
             for x, y, turn in ((line, at, np.pi / 2), (at, line, 0.0)):
                 if (
@@ -205,18 +205,18 @@ def lay_out(blocks: int, seed: int) -> Plan:
 
 
 def _block(build: Builder, crowns: list, rng: np.random.Generator, middle: np.ndarray) -> None:
-    """Houses along the four streets about a garden with trees."""
-    inner = PITCH / 2 - STREET / 2  # from the block's middle to its edge
+    """Add houses along the four streets around a garden with trees."""
+    inner = PITCH / 2 - STREET / 2  # from the centre of the block to its edge
     for quarter in range(4):
         turn = quarter * np.pi / 2
         x, y = axes(turn)
-        place, end = -inner + rng.uniform(0.3, 1.0), inner - 9.0
-        while place < end - 6:
-            wide = min(rng.uniform(7.5, 11.5), end - place)
+        offset, limit = -inner + rng.uniform(0.3, 1.0), inner - 9.0
+        while offset < limit - 6:
+            wide = min(rng.uniform(7.5, 11.5), limit - offset)
             deep = rng.uniform(7.0, 8.4)
-            at = middle + x[:2] * (place + wide / 2) - y[:2] * (inner - deep / 2 - rng.uniform(0.1, 1.4))
+            at = middle + x[:2] * (offset + wide / 2) - y[:2] * (inner - deep / 2 - rng.uniform(0.1, 1.4))
             build.house(at, turn, wide, deep, int(rng.integers(2, 5)))
-            place += wide + (0.0 if rng.random() < 0.6 else rng.uniform(1.5, 3.0))
+            offset += wide + (0.0 if rng.random() < 0.6 else rng.uniform(1.5, 3.0))
         hedge = middle + x[:2] * (inner - 4.5) - y[:2] * (inner - 0.4)
         build.box(np.array([*hedge, 0.0]), turn, (7.5, 0.7, 1.3), HEDGE, np.array([0.16, 0.30, 0.10]))
     for _ in range(rng.integers(3, 6)):
@@ -235,7 +235,7 @@ def _tree(build: Builder, crowns: list, rng: np.random.Generator, at: np.ndarray
 
 
 def _square(build: Builder, crowns: list, rng: np.random.Generator) -> None:
-    """A church, a fountain, market stalls and rows of trees."""
+    """Add a church, a fountain, market stalls and rows of trees."""
     stone, slate = np.array([0.72, 0.66, 0.54]), np.array([0.24, 0.27, 0.30])
     build.house(np.array([-6.0, 5.5]), 0.0, 13.0, 8.0, 2)
     tower = np.array([3.4, 5.5, 0.0])
@@ -260,9 +260,9 @@ def _square(build: Builder, crowns: list, rng: np.random.Generator) -> None:
     )
     build.box(basin, 0.4, (0.5, 0.5, 2.6), STONE, stone)
     build.spire(basin + np.array([0, 0, 2.6]), 0.4, 0.5, 1.2, STONE, stone)
-    for place in (-9.0, -5.5, 5.5, 9.0):
+    for offset in (-9.0, -5.5, 5.5, 9.0):
         color = SHUTTERS[rng.integers(len(SHUTTERS))] * 1.5
-        at = np.array([place, -10.5, 0.0])
+        at = np.array([offset, -10.5, 0.0])
         build.box(at, 0.0, (2.4, 1.4, 0.9), PLAIN, np.array([0.40, 0.26, 0.14]))
         build.spire(at + np.array([0, 0, 2.1]), 0.0, 1.5, 0.9, PLAIN, color)
         for x in (-1.1, 1.1):
@@ -273,7 +273,7 @@ def _square(build: Builder, crowns: list, rng: np.random.Generator) -> None:
 
 
 def _heights(sheets: Sheets, crowns: np.ndarray, reach: float) -> tuple[np.ndarray, float]:
-    """How high things stand over each cell of the ground, from points all over them."""
+    """Return the height map from sample points on all surfaces, and its cell size."""
     cell = 0.4
     size = int(2 * reach / cell) + 1
     heights = np.zeros((size, size), np.float32)
@@ -293,7 +293,7 @@ def _heights(sheets: Sheets, crowns: np.ndarray, reach: float) -> tuple[np.ndarr
 
 
 def noise(x: np.ndarray, y: np.ndarray, seed: float = 0.0, octaves: int = 3) -> np.ndarray:
-    """Smooth noise in about [-1, 1] of points in the plane, one unit across at its coarsest."""
+    """Return smooth noise in about [-1, 1] for points in the plane, with a coarsest wavelength of one."""
     total, size = np.zeros(np.broadcast(x, y).shape), 1.0
     for octave in range(octaves):
         x0, y0 = np.floor(x), np.floor(y)
@@ -306,14 +306,14 @@ def noise(x: np.ndarray, y: np.ndarray, seed: float = 0.0, octaves: int = 3) -> 
 
 
 def chance(x: np.ndarray, y: np.ndarray, seed) -> np.ndarray:
-    """A number in [0, 1) for each cell of a grid, always the same."""
+    """Return a reproducible random number in [0, 1) for each cell of a grid."""
     mixed = np.sin(x * 127.1 + y * 311.7 + np.asarray(seed) % 1000 * 74.7) * 43758.5453
     return mixed - np.floor(mixed)
 
 
 def hill(x: np.ndarray, y: np.ndarray, half: float) -> np.ndarray:
-    """Height of the land about the town; level where the town stands."""
-    away = np.maximum(np.hypot(x, y) / (half + PITCH) - 1.15, 0)
-    rise = 1 - np.exp(-away * 0.55)
+    """Return the height of the land; level inside the town."""
+    distance = np.maximum(np.hypot(x, y) / (half + PITCH) - 1.15, 0)
+    rise = 1 - np.exp(-distance * 0.55)
     rolling = 0.5 + 0.35 * noise(x / (1.6 * half + 60), y / (1.6 * half + 60), 5.0)
     return rise * (0.55 * half + 26) * np.maximum(rolling, 0.06)
