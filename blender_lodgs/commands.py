@@ -244,7 +244,7 @@ def _export(args: argparse.Namespace) -> int:
         exported = bundle if find_format(args.bundle).antialiased else bake_filter(bundle)
         run_to_end(
             write_splats(
-                args.bundle, ConcatenatedRows.upto(exported, exported.levels[-1].number), exported.meta
+                args.bundle, ConcatenatedRows.of_level(exported, exported.levels[-1].number), exported.meta
             )
         )
     return DONE

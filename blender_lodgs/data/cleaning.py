@@ -296,7 +296,7 @@ def _with_nodes(root: bpy.types.Object, found: dict[int, np.ndarray]) -> dict[in
     if family is None:
         return found
     gone = {item.number: found[item.number] | hidden(item.object.data) for item in levels(root)}
-    stays = family.standing({number: ~mask for number, mask in gone.items()})
+    stays = family.with_ancestors({number: ~mask for number, mask in gone.items()})
     return {item.number: ~stays[item.number] & ~hidden(item.object.data) for item in levels(root)}
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-PROGRAM = "lodgs" if __package__.startswith("lodgs") else "python -m training"
+PROGRAM = "lodgs" if (__package__ or "").startswith("lodgs") else "python -m training"
 """Program name in help texts and messages."""
 
 COMMANDS = {

@@ -1,9 +1,9 @@
-"""Splats for programs that do not know Mip-Splatting's filter, as opaque as it shows them. numpy only.
+"""Baking of Mip-Splatting's filter into opacities, for programs without that filter. numpy only.
 
-What was trained with the filter is drawn with less than its opacity where it is small: times
-sqrt(det before / det after) of its covariance on the image (Mip-Splatting, Eq. 10). Others draw all of it.
-Here each splat gets the opacity that it has on average in the views that the scene was photographed from, at
-the size of training: a picture of that size then looks about as it should. This is not in the paper.
+With the filter, small splats are drawn with less than their opacity: times sqrt(det before / det after) of
+    the image covariance (Mip-Splatting, Eq. 10). Other programs draw the full opacity. Here, each splat gets
+    its average filtered opacity over the training views at training size, so that images of about that size
+    look right. Not in the paper.
 """
 
 from __future__ import annotations
@@ -19,29 +19,28 @@ from ..splats.gaussians import SplatRows, Splats
 from ..splats.levels import NO_SPLATS, Bundle, Level
 
 MIP_VARIANCE = 0.1
-"""Added to a splat's variance on the image, in square pixels, about a pixel's own extent (Yu et al. 2024,
-Eq. 10)."""
+"""Variance in square pixels that the filter adds: about a pixel's extent (Yu et al. 2024, Eq. 10)."""
 MAX_VIEWS = 24
-"""In so many views opacities are looked up."""
+"""Maximum number of views to average over."""
 VIEW_MARGIN = 0.5
-"""Views are as much wider on every side, as a share of their size: where photographs are continued."""
-_AT_ONCE = 1 << 16
+"""Views are extended by this fraction of their size on every side."""
+_BATCH = 1 << 16
 
 
 def bake_filter(bundle: Bundle) -> Bundle:
-    """Splats for programs that do not know the filter, which are not antialiased any more.
+    """Return a bundle with the filter baked into opacities, which is no longer antialiased.
 
-    The bundle itself where it is not antialiased, or does not know from where it was photographed.
+    Returns the bundle itself if it is not antialiased, or has no views.
 
     Raises:
-        LodgsError: its views are damaged.
+        LodgsError: corrupt views.
     """
     views, near, _ = read_view_tables(bundle.tables)
     if not (bundle.antialias and views):
         return bundle
     focal = float(np.median([view.focal for view in views]))
-    share = float(bundle.meta.get("focal_px", focal)) / focal  # views are of the photographs' own size
-    views = [view.scaled(share).widened(VIEW_MARGIN) for view in pick_evenly(views, MAX_VIEWS)]
+    scale = float(bundle.meta.get("focal_px", focal)) / focal  # views have the photos' size
+    views = [view.scaled(scale).widened(VIEW_MARGIN) for view in pick_evenly(views, MAX_VIEWS)]
     levels = [
         Level(level.number, NO_SPLATS, level.facts, RowsWithBakedFilter(level.rows, views, near))
         for level in bundle.levels
@@ -52,12 +51,12 @@ def bake_filter(bundle: Bundle) -> Bundle:
 
 @dataclass(frozen=True)
 class RowsWithBakedFilter:
-    """Splats with the opacity that the filter gives them in some views, as they are read.
+    """Splats whose opacities are filtered when they are read.
 
     Attributes:
-        rows: the splats with their own.
-        views: of the size of training.
-        near: depth at which drawing begins.
+        rows: splats with unfiltered opacities.
+        views: to average over, at training size.
+        near: depth where rendering begins.
     """
 
     rows: SplatRows
@@ -67,30 +66,32 @@ class RowsWithBakedFilter:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def select(self, some: slice | np.ndarray, /) -> Splats:
-        """The splats of a range of rows, or of some rows (M,) ascending."""
-        splats = self.rows.select(some)
+    def select(self, index: slice | np.ndarray, /) -> Splats:
+        """Read a range of rows, or some rows (M,) ascending."""
+        splats = self.rows.select(index)
         logits = splats.opacity_logits.copy()
-        for begin in range(0, len(splats), _AT_ONCE):
-            block = slice(begin, begin + _AT_ONCE)
+        for begin in range(0, len(splats), _BATCH):
+            block = slice(begin, begin + _BATCH)
             logits[block] = self._logits(splats.select(block))
         return replace(splats, opacity_logits=logits)
 
     def _logits(self, splats: Splats) -> np.ndarray:
-        shapes, total, seen = _shapes(splats), np.zeros(len(splats)), np.zeros(len(splats), np.int64)
+        shapes = _shapes(splats)
+        total = np.zeros(len(splats))
+        counts = np.zeros(len(splats), np.int64)
         for view in self.views:
             rows = np.flatnonzero(view.sees(splats.means, self.near))
-            total[rows] += _kept(splats.means[rows], shapes[rows], view)
-            seen[rows] += 1
-        # what no view sees keeps as much as all others do
-        share = np.where(seen, total / np.maximum(seen, 1), total.sum() / max(seen.sum(), 1) or 1.0)
-        log_opacity = np.log(np.maximum(share, 1e-6)) - np.logaddexp(0, -splats.opacity_logits)
+            total[rows] += _filter_factor(splats.means[rows], shapes[rows], view)
+            counts[rows] += 1
+        # splats outside all views get the average factor
+        factor = np.where(counts, total / np.maximum(counts, 1), total.sum() / max(counts.sum(), 1) or 1.0)
+        log_opacity = np.log(np.maximum(factor, 1e-6)) - np.logaddexp(0, -splats.opacity_logits)
         logits = log_opacity - np.log(-np.expm1(np.minimum(log_opacity, -1e-7)))
         return np.minimum(logits, splats.opacity_logits).astype(np.float32)
 
 
 def _shapes(splats: Splats) -> np.ndarray:
-    """(N, 3, 3) whose products with their transposes are the splats' covariances."""
+    """Return (N, 3, 3) matrices M with M M^T = covariance of each splat."""
     lengths = np.linalg.norm(splats.quats, axis=1, keepdims=True)
     w, x, y, z = (splats.quats / np.where(lengths > 0, lengths, 1)).astype(np.float64).T
     rows = (
@@ -101,8 +102,8 @@ def _shapes(splats: Splats) -> np.ndarray:
     return np.stack(rows, axis=1).reshape(-1, 3, 3) * np.exp(splats.log_scales.astype(np.float64))[:, None]
 
 
-def _kept(means: np.ndarray, shapes: np.ndarray, view: Camera) -> np.ndarray:
-    """What the filter leaves of opacities in a view, (N,) in [0, 1]: sqrt(det before / det after)."""
+def _filter_factor(means: np.ndarray, shapes: np.ndarray, view: Camera) -> np.ndarray:
+    """Return the filter's opacity factor in a view, (N,) in [0, 1]: sqrt(det before / det after)."""
     x, y, z = view.view_space(means).T
     right, down, ahead = view.world_to_camera[:3, :3]
     across = (view.fx / z)[:, None] * (right - (x / z)[:, None] * ahead)

@@ -1,4 +1,4 @@
-"""A file of splats without clutter, in another look, placed, in other forms: ``lodgs edit``."""
+"""Edit a file of splats: clean-up, looks, placement and export, for ``lodgs edit``."""
 
 from __future__ import annotations
 
@@ -50,105 +50,118 @@ def edit(
     streamed: Path | None = None,
     antialiased: bool = False,
 ) -> str:
-    """Writes what a cleaning leaves of a bundle, a folder of levels or any 3DGS PLY, placed elsewhere.
+    """Edit a bundle, a folder of levels or any 3DGS PLY, and write the result.
 
-    Of a binary PLY only some rows at a time are in memory.
+    Binary PLYs are processed in batches of rows.
 
     Args:
-        out: written in the source's form; None: not.
+        out: output in the format of the source; None: none.
         warn: as for ``read_ply``.
-        looks: what is made of the colours and opacities of what stays.
-        placement: where the scene is put, after it stands; crops and lengths of the cleaning are those of
-            the source.
-        upright, ground, points: see ``placing.standing``.
-        plain: files of the finest level alone, each the kind that its name asks for.
-        folder: receives a folder of levels.
-        streamed: folder that receives levels as browsers load them.
-        antialiased: ``plain`` and ``streamed`` are for programs that know Mip-Splatting's filter; otherwise
-            see :func:`.unfiltered.without_filter`, but for kinds of files that say that it is to be used.
+        looks: applied to the remaining splats.
+        placement: applied after the upright and ground transforms; crops and lengths of the cleaning are
+            those of the source.
+        upright, ground, points: see ``placement.upright_placement``.
+        plain: files for the finest level only, in the formats of their names.
+        folder: output folder of levels.
+        streamed: output folder of levels for streaming in browsers.
+        antialiased: keep opacities as trained in ``plain`` and ``streamed``; otherwise bake the filter into
+            them (:func:`.bake_filter.bake_filter`), except in formats that record the filter.
 
     Returns:
-        How many splats of each level stay, as a few lines of text.
+        A report of the remaining splats of each level, and of the files.
 
     Raises:
-        LodgsError: it cannot be read or written, contradicts its rule, or nothing is left.
+        LodgsError: cannot read or write a file, the source contradicts its rule, or no splats remain.
     """
     for path in (out, *plain, folder, streamed):
         if path is not None and path.resolve() == source.resolve():
-            raise LodgsError(f"{path} is what is to be edited.", "Give another name.")
+            raise LodgsError(f"Cannot overwrite the source {path}.", "Choose another output file.")
     kinds = {find_format(path) for path in plain}
     if streamed is not None or not kinds <= {PLY, SPLAT}:
-        find_splat_transform()  # is missed before minutes of work
-    if source.is_dir():
-        bundle = read_folder(source, warn)
-    else:
-        bundle, rows = open_bundle(source)
-        for level in bundle.levels:
-            level.on_disk = DrawableRows(rows[level.number], warn)
+        find_splat_transform()  # fail before minutes of work
+    bundle = _open(source, warn)
     check_rule(bundle)
-    found = apply_looks_to_levels(clean_bundle(bundle, cleaning), looks)
+    edited = apply_looks_to_levels(clean_bundle(bundle, cleaning), looks)
     if placement is not None or upright or ground:
-        stands = upright_placement(bundle, upright, ground, points)
-        found = transform_bundle(found, stands if placement is None else placement.compose(stands))
+        first = upright_placement(bundle, upright, ground, points)
+        edited = transform_bundle(edited, first if placement is None else placement.compose(first))
         if upright or ground:
-            found.meta["up_rotation"] = np.eye(3)
-    if out is None:
-        pass
-    elif source.is_dir():
-        write_folder(out, found)
-    elif bundle == Bundle("", bundle.levels[:1], meta=meta_from_comments(comments_from_meta(bundle.meta))):
-        write_ply(out, found.levels[0].rows, comments_from_meta(bundle.meta))
-    else:
-        write_bundle(out, found)
-    lines = [
+            edited.meta["up_rotation"] = np.eye(3)
+    if out is not None:
+        _write_like(source, bundle, out, edited)
+    report = [
         f"level {before.number}: {len(after.rows):,} of {len(before.rows):,} splats"
-        for before, after in zip(bundle.levels, found.levels, strict=True)
+        for before, after in zip(bundle.levels, edited.levels, strict=True)
     ]
     for path in plain:
-        form = found if antialiased or find_format(path).antialiased else bake_filter(found)
-        run_to_end(write_splats(path, ConcatenatedRows.upto(form, form.levels[-1].number), form.meta))
+        exported = edited if antialiased or find_format(path).antialiased else bake_filter(edited)
+        finest = ConcatenatedRows.of_level(exported, exported.levels[-1].number)
+        run_to_end(write_splats(path, finest, exported.meta))
     if folder is not None or streamed is not None:
-        levels = complete_levels(_in_memory(found)) if is_tree(found) else found
+        levels = complete_levels(_in_memory(edited)) if is_tree(edited) else edited
         if folder is not None:
             write_folder(folder, levels)
         if streamed is not None:
             run_to_end(write_streamed_levels(streamed, levels if antialiased else bake_filter(levels)))
     paths = [path for path in (out, *plain, folder, streamed) if path is not None]
-    return "\n".join([*lines, *(f"{path}: written" for path in paths)])
+    return "\n".join([*report, *(f"{path}: written" for path in paths)])
 
 
-def run_to_end(work: Iterator[str]) -> None:
-    """Waits for what goes on beside."""
-    for _ in work:
+def run_to_end(steps: Iterator[str]) -> None:
+    """Exhaust an iterator of progress messages."""
+    for _ in steps:
         pass
 
 
 @dataclass(frozen=True)
 class ConcatenatedRows:
-    """Splats of several sets, one after the other, as they are read: where levels add up, a whole scene."""
+    """Several sets of splats on disk as one."""
 
     sets: Sequence[SplatRows]
 
     @classmethod
-    def upto(cls, bundle: Bundle, number: int) -> ConcatenatedRows:
-        """All that is drawn at a level."""
+    def of_level(cls, bundle: Bundle, number: int) -> ConcatenatedRows:
+        """Return all splats that are drawn at a level."""
         return cls([level.rows for level in bundle.drawn_levels(number)])
 
     def __len__(self) -> int:
         return sum(map(len, self.sets))
 
-    def select(self, some: slice | np.ndarray, /) -> Splats:
-        """The splats of a range of all rows."""
-        assert isinstance(some, slice)
-        begin, end, _ = some.indices(len(self))
+    def select(self, index: slice | np.ndarray, /) -> Splats:
+        """Read a range of all rows."""
+        assert isinstance(index, slice)
+        begin, end, _ = index.indices(len(self))
         parts, first = [], 0
         for rows in self.sets:
-            here = slice(max(begin - first, 0), max(min(end - first, len(rows)), 0))
-            parts.append(rows.select(here))
+            parts.append(rows.select(slice(max(begin - first, 0), max(min(end - first, len(rows)), 0))))
             first += len(rows)
         return Splats.concatenated(parts)
 
 
+def _open(source: Path, warn: Warn) -> Bundle:
+    """Open a bundle or PLY on disk; read a folder of levels."""
+    if source.is_dir():
+        return read_folder(source, warn)
+    bundle, rows = open_bundle(source)
+    for level in bundle.levels:
+        level.on_disk = DrawableRows(rows[level.number], warn)
+    return bundle
+
+
+def _write_like(source: Path, bundle: Bundle, out: Path, edited: Bundle) -> None:
+    """Write an edited bundle in the format of its source: folder of levels, plain PLY or bundle."""
+    comments = comments_from_meta(bundle.meta)
+    if source.is_dir():
+        write_folder(out, edited)
+    elif bundle == Bundle("", bundle.levels[:1], meta=meta_from_comments(comments)):
+        write_ply(out, edited.levels[0].rows, comments)
+    else:
+        write_bundle(out, edited)
+
+
 def _in_memory(bundle: Bundle) -> Bundle:
-    levels = [Level(x.number, x.rows.select(slice(0, len(x.rows))), x.facts) for x in bundle.levels]
+    levels = [
+        Level(level.number, level.rows.select(slice(0, len(level.rows))), level.facts)
+        for level in bundle.levels
+    ]
     return replace(bundle, levels=levels)

@@ -1,4 +1,4 @@
-"""Levels of detail that stand elsewhere: they look the same there, and are chosen alike. numpy only."""
+"""Transforms of bundles by similarities: splats, facts, tables and metadata. numpy only."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from ..splats.similarity import Similarity, TransformedRows
 
 
 def transform_bundle(bundle: Bundle, placement: Similarity) -> Bundle:
-    """A bundle whose splats, and all that it says of places and lengths, stand elsewhere.
+    """Return a bundle with splats and all positions and lengths transformed.
 
-    Levels that are in files stay there until they are written. Of a rule whose columns are ``linked_columns`` these
-    are in memory, some 150 bytes a splat.
+    Levels on disk stay there until they are written. Columns of a rule with ``linked_columns`` are loaded
+    into memory, about 150 bytes per splat.
 
     Raises:
-        LodgsError: this version does not know the rule, and so not what it says of lengths.
+        LodgsError: unknown rule, whose lengths are unknown.
     """
     rule = find_rule(bundle.rule)
     if rule is None and bundle.rule:
@@ -36,22 +36,25 @@ def transform_bundle(bundle: Bundle, placement: Similarity) -> Bundle:
         )
     lengths, places = (rule.lengths, rule.places) if rule else ((), ())
 
-    def of(splats: Splats) -> Splats:
+    def transform(splats: Splats) -> Splats:
         return placement.transform_splats(splats, lengths, places)
 
-    def facts(known: dict[str, float]) -> dict[str, float]:
-        return {n: value * placement.scale if n in lengths else value for n, value in known.items()}
+    def scale(facts: dict[str, float]) -> dict[str, float]:
+        return {n: value * placement.scale if n in lengths else value for n, value in facts.items()}
 
-    remade = _agreed(bundle, rule, placement) if rule and rule.linked_columns else [{} for _ in bundle.levels]
+    if rule and rule.linked_columns:
+        new_columns = _linked_columns(bundle, rule, placement)
+    else:
+        new_columns = [{} for _ in bundle.levels]
     levels = []
-    for level, columns in zip(bundle.levels, remade, strict=True):
+    for level, columns in zip(bundle.levels, new_columns, strict=True):
         if level.on_disk is None:
-            splats = of(level.splats)
+            splats = transform(level.splats)
             splats.extras |= columns
-            levels.append(Level(level.number, splats, facts(level.facts)))
+            levels.append(Level(level.number, splats, scale(level.facts)))
         else:
-            rows = TransformedRows(level.on_disk, of, columns)
-            levels.append(Level(level.number, NO_SPLATS, facts(level.facts), rows))
+            rows = TransformedRows(level.on_disk, transform, columns)
+            levels.append(Level(level.number, NO_SPLATS, scale(level.facts), rows))
     tables = dict(bundle.tables)
     for name in rule.tables if rule else ():
         if name in tables:
@@ -59,75 +62,79 @@ def transform_bundle(bundle: Bundle, placement: Similarity) -> Bundle:
     if view_tables.VIEWS in tables:
         tables[view_tables.VIEWS] = view_tables.transform_views(tables[view_tables.VIEWS], placement)
     if BOUNDS[0] in tables.get(BLOCKS, {}):
-        tables[BLOCKS] = page_table({x.number: c for x, c in zip(bundle.levels, remade, strict=True)})
-    meta = _meta(bundle.meta, placement)
-    return replace(bundle, levels=levels, facts=facts(bundle.facts), tables=tables, meta=meta)
+        numbers = [level.number for level in bundle.levels]
+        tables[BLOCKS] = page_table(dict(zip(numbers, new_columns, strict=True)))
+    meta = _transform_meta(bundle.meta, placement)
+    return replace(bundle, levels=levels, facts=scale(bundle.facts), tables=tables, meta=meta)
 
 
 def upright_placement(
     bundle: Bundle, upright: bool = False, ground: bool = False, points: np.ndarray | None = None
 ) -> Similarity:
-    """What stands a bundle's scene upright, z up, and where it is asked for its ground on z = 0.
+    """Return the transform that turns a bundle's scene upright (z up), and optionally puts its ground at z =
+    0.
 
     Args:
-        points: (P, 3) among which the ground is looked for; None: where the finest level's opaque splats are,
-            which are read some at a time.
+        points: (P, 3) for ground detection; None: the means of the finest level's opaque splats.
 
     Raises:
-        LodgsError: no ground is found.
+        LodgsError: no ground detected.
     """
-    left, _, right = np.linalg.svd(bundle.up_rotation)  # of numbers that have been rounded
-    stands = Similarity(left @ right if upright or ground else np.eye(3), 1.0, np.zeros(3))
+    left, _, right = np.linalg.svd(bundle.up_rotation)  # makes the rounded matrix orthogonal
+    rotation = Similarity(left @ right if upright or ground else np.eye(3), 1.0, np.zeros(3))
     if not ground:
-        return stands
-    meta, places = bundle.meta, _opaque(bundle.levels[-1].rows) if points is None else points
-    center, depth = meta.get("camera_center"), meta.get("median_depth", 0)
+        return rotation
+    if points is None:
+        points = _opaque_means(bundle.levels[-1].rows)
+    center = bundle.meta.get("camera_center")
+    depth = bundle.meta.get("median_depth", 0)
     if center is not None and isinstance(depth, int | float):
-        places = points_near_cameras(places, np.asarray(center), depth)
+        points = points_near_cameras(points, np.asarray(center), depth)
     try:
-        plane = find_ground(stands.transform_points(places), np.array([0.0, 0.0, 1.0]))
+        plane = find_ground(rotation.transform_points(points), np.array([0.0, 0.0, 1.0]))
     except LodgsError as error:
         raise LodgsError(
-            error.what, "Name its photographs' folder with --scene, or place it by --rotate and --translate."
+            error.what, "Add the photos' folder with --scene, or use --rotate and --translate instead."
         ) from error
-    return ground_placement(*plane).compose(stands)
+    return ground_placement(*plane).compose(rotation)
 
 
-def _opaque(rows: SplatRows) -> np.ndarray:
-    """(P, 3) float32, where splats are that are more opaque than not."""
-    found = [np.zeros((0, 3), np.float32)]
+def _opaque_means(rows: SplatRows) -> np.ndarray:
+    """Return the means (P, 3) float32 of splats with an opacity above 1/2."""
+    means = [np.zeros((0, 3), np.float32)]
     for begin in range(0, len(rows), BATCH_ROWS):
-        some = rows.select(slice(begin, begin + BATCH_ROWS))
-        found.append(some.means[some.opacity_logits > 0])
-    return np.concatenate(found)
+        splats = rows.select(slice(begin, begin + BATCH_ROWS))
+        means.append(splats.means[splats.opacity_logits > 0])
+    return np.concatenate(means)
 
 
-def _meta(meta: dict, placement: Similarity) -> dict:
-    """What a bundle says of places, directions and lengths beside its splats."""
-    found = dict(meta) if placement.scale == 1 else _scaled(meta, placement.scale)
+def _transform_meta(meta: dict, placement: Similarity) -> dict:
+    """Return a bundle's metadata with transformed positions, directions and lengths."""
+    transformed = dict(meta) if placement.scale == 1 else _scale_lengths(meta, placement.scale)
     for name in ("camera_center", "view"):
         if name in meta:
             points = placement.transform_points(np.asarray(meta[name], np.float64).reshape(-1, 3))
-            found[name] = points.reshape(np.shape(meta[name])).tolist()
+            transformed[name] = points.reshape(np.shape(meta[name])).tolist()
     if "up_rotation" in meta:
-        found["up_rotation"] = (np.asarray(meta["up_rotation"]) @ placement.rotation.T).round(9).tolist()
-    return found
+        rotation = np.asarray(meta["up_rotation"]) @ placement.rotation.T
+        transformed["up_rotation"] = rotation.round(9).tolist()
+    return transformed
 
 
-def _scaled(value: Any, scale: float, length: bool = False) -> Any:
-    """What JSON holds, its lengths scaled, to six digits: headers have little room."""
+def _scale_lengths(value: Any, scale: float, is_length: bool = False) -> Any:
+    """Return a JSON value with scaled lengths, rounded to six digits to keep headers small."""
     match value:
         case dict():
-            return {name: _scaled(each, scale, name in META_LENGTHS) for name, each in value.items()}
+            return {name: _scale_lengths(item, scale, name in META_LENGTHS) for name, item in value.items()}
         case list():
-            return [_scaled(each, scale, length) for each in value]
-        case int() | float() if length:
+            return [_scale_lengths(item, scale, is_length) for item in value]
+        case int() | float() if is_length:
             return float(f"{value * scale:.6g}")
     return value
 
 
-def _agreed(bundle: Bundle, rule: Rule, placement: Similarity) -> list[Columns]:
-    """The rule's columns of each level where they stand then, as they agree with each other."""
+def _linked_columns(bundle: Bundle, rule: Rule, placement: Similarity) -> list[Columns]:
+    """Return the rule's columns of each level after the transform, corrected for rounding."""
     parts, ends = [], []
     for level in bundle.levels:
         for begin in range(0, max(len(level.rows), 1), BATCH_ROWS):

@@ -160,7 +160,7 @@ def test_of_a_tree_leaves_are_selected_and_nodes_that_stand_for_nothing_else(bpy
         np.testing.assert_array_equal(masks[level.number][asked], one[asked])
         some += int(one[asked].sum())
     assert some > 20
-    stays = family.standing({number: ~mask for number, mask in masks.items()})
+    stays = family.with_ancestors({number: ~mask for number, mask in masks.items()})
     for number, mask in masks.items():
         np.testing.assert_array_equal(mask, ~stays[number])
     assert sum(int((mask & ~leaves[number]).sum()) for number, mask in masks.items()) > 0

@@ -246,7 +246,7 @@ def test_a_tree_that_was_cropped_is_one_still():
 def test_nodes_of_a_tree_go_when_all_their_leaves_do():
     tree = tree_of(random_leaves(200, np.random.default_rng(6)))
     masks = {1: np.ones(199, bool), 2: np.arange(200) < 130}
-    stays, family = TreeRelations.of(tree).standing(masks), TreeRelations.of(tree)
+    stays, family = TreeRelations.of(tree).with_ancestors(masks), TreeRelations.of(tree)
     splats = Splats.concatenated([level.splats for level in tree.levels])
     place = {(size, *mean): i for i, (size, mean) in enumerate(
         zip(splats.extras["node_size"].tolist(), splats.means.tolist(), strict=True))}  # fmt: skip
