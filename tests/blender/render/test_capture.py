@@ -251,13 +251,13 @@ def test_dome_views_see_a_collection_instance(bpy, scene, capture, tmp_path):
         scene.collection.objects.unlink(obj)
         if name == "Cube.001":
             cubes.objects.link(obj)
-    outer, shown = bpy.data.collections.new("Outer"), bpy.data.objects.new("Shown", None)
-    for obj, instance in ((bpy.data.objects.new("Inner", None), cubes), (shown, outer)):
+    outer, instance_object = bpy.data.collections.new("Outer"), bpy.data.objects.new("Shown", None)
+    for obj, instance in ((bpy.data.objects.new("Inner", None), cubes), (instance_object, outer)):
         obj.instance_type, obj.instance_collection = "COLLECTION", instance
         obj.location.x = 10
     outer.objects.link(bpy.data.objects["Inner"])
-    shown.scale = (2, 2, 2)
-    scene.collection.objects.link(shown)
+    instance_object.scale = (2, 2, 2)
+    scene.collection.objects.link(instance_object)
     assert capture("--around", "--views", "9", "--range", "1-9") == 0
     views, _ = read_camera_folder(tmp_path / "out" / "cameras")
     corners = np.array([(x, y, z) for x in (28, 32) for y in (-2, 2) for z in (-2, 2)], float)

@@ -30,14 +30,14 @@ def state(bpy, lodgs):
 @pytest.mark.parametrize("transparent", [False, True])
 def test_separating_restores_the_scene(bpy, lodgs, scene, transparent):
     scene.render.film_transparent = scene.view_layers[0].use_pass_z = transparent
-    before = state(bpy, lodgs)
+    original = state(bpy, lodgs)
     assert not bpy.ops.lodgs.separate_meshes.poll()
     for _ in range(2):  # the second call keeps the values from before the first one
         assert bpy.ops.lodgs.combine_with_meshes() == {"FINISHED"}
     assert scene.lodgs_render.meshes.cycles.samples == 128
     assert state(bpy, lodgs)[:4] == (2, True, True, True)
     assert bpy.ops.lodgs.separate_meshes() == {"FINISHED"}
-    assert state(bpy, lodgs) == before and scene.lodgs_render.meshes is None
+    assert state(bpy, lodgs) == original and scene.lodgs_render.meshes is None
     assert not bpy.ops.lodgs.separate_meshes.poll()
 
 

@@ -320,5 +320,5 @@ def test_list_sorts_the_worst_view_first(bpy, lodgs, root):
     indices = np.argsort(order)
     assert indices[:3].tolist() == [5, 3, 9]
     fake.filter_name = "view_07"
-    shown, _ = filter_items(fake, bpy.context, root.lodgs.cameras, "objects")
-    assert sum(map(bool, shown)) == 1
+    visible, _ = filter_items(fake, bpy.context, root.lodgs.cameras, "objects")
+    assert sum(map(bool, visible)) == 1

@@ -431,7 +431,7 @@ def test_without_a_trainer_it_says_so(bpy, lodgs, scene, tmp_path, monkeypatch):
     lodgs("render.renderer").close()
     monkeypatch.delenv("LODGS_TRAINER_PYTHON")
     scene.render.filepath = str(tmp_path / "none.png")
-    with pytest.raises(RuntimeError, match="need a Python with PyTorch"):
+    with pytest.raises(RuntimeError, match="The trainer is not installed"):
         bpy.ops.render.render(write_still=True)
     assert not (tmp_path / "none.png").exists()
 
@@ -682,7 +682,7 @@ def test_a_moving_cube_holds_out_frame_by_frame(bpy, lodgs, fog_and_wall, tmp_pa
         same_to_the_pixel(held[..., 3] < 0.5, enters < leaves)
     scene.frame_set(2)
     scene.render.filepath = str(tmp_path / "none.png")
-    with pytest.raises(RuntimeError, match=r"meshes in frame 2 is missing: .*Scene_0002\.exr"):
+    with pytest.raises(RuntimeError, match=r"depth file of frame 2 is missing: .*Scene_0002\.exr"):
         bpy.ops.render.render(write_still=True)
     assert not (tmp_path / "none.png").exists()
     scene.frame_set(3)
@@ -708,7 +708,7 @@ def test_frames_have_their_numbers(bpy, lodgs, pattern, frame, name):
 def test_an_artists_compositor_is_left_alone(bpy, lodgs, scene):
     tree = lodgs("compat").compositor_tree(scene)
     tree.nodes.new("CompositorNodeBlur")
-    with pytest.raises(RuntimeError, match="has compositor nodes already"):
+    with pytest.raises(RuntimeError, match="has compositor nodes"):
         bpy.ops.lodgs.combine_with_meshes()
     assert len(bpy.data.scenes) == 1
 
@@ -804,6 +804,6 @@ def test_viewport_quality_looks_beyond_the_clip_end(bpy, scene, frame, tmp_path)
 
 def test_viewport_quality_refuses_to_hold_out(bpy, scene, frame, tmp_path):
     scene.lodgs_render.holdout = str(tmp_path / "depth_####.exr")
-    with pytest.raises(RuntimeError, match=r"cannot leave out what meshes hide.*Clear Hold Out"):
+    with pytest.raises(RuntimeError, match=r"mesh holdout.*Clear Hold Out"):
         bpy.ops.lodgs.render_quick()
     assert bpy.context.scene.render.engine == "LODGS" and bpy.context.scene.render.use_compositing

@@ -62,14 +62,14 @@ def test_frames_equal_those_of_the_export(bpy, lodgs, image, tmp_path, mode, mov
         return root
 
     root = imported(write_splats(tmp_path))
-    before = image()
+    original = image()
     sphere = with_looks(bpy, root)
     looked = image()
     sphere.lodgs_crop.use = False
     without = image()
     sphere.lodgs_crop.use = True
     np.testing.assert_array_equal(image(), looked)
-    assert np.abs(before - looked).max() > 0.05 and np.abs(without - looked).max() > 0.02
+    assert np.abs(original - looked).max() > 0.05 and np.abs(without - looked).max() > 0.02
     if moved:  # an export ignores transforms of levels
         return
     bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "out.ply"))
@@ -81,9 +81,9 @@ def test_frames_equal_those_of_the_export(bpy, lodgs, image, tmp_path, mode, mov
 @pytest.mark.usefixtures("renderer", "camera")
 def test_look_maps_the_colours_of_the_frame(bpy, lodgs, image, tmp_path):
     root = lodgs("data.importing").import_splats(bpy.context, write_splats(tmp_path), upright=False)
-    before, look = image(), Look(0.3, 5000, (1.0, 0.9, 0.7), 0.6)
+    original, look = image(), Look(0.3, 5000, (1.0, 0.9, 0.7), 0.6)
     give(root.lodgs_look, look)
-    np.testing.assert_allclose(image(), before @ look.matrix.T, atol=2e-4)
+    np.testing.assert_allclose(image(), original @ look.matrix.T, atol=2e-4)
 
 
 @pytest.mark.usefixtures("camera", "frame")
@@ -92,11 +92,11 @@ def test_viewports_equal_the_export(bpy, lodgs, image, tmp_path):
     importing = lodgs("data.importing")
     root = importing.import_splats(bpy.context, write_splats(tmp_path), upright=False)
     root.location, root.rotation_euler = (1, 2, 0), (0.1, 0.2, 0.7)
-    before = image(viewport_quality)
+    original = image(viewport_quality)
     sphere, views = with_looks(bpy, root), lodgs("viewport.views")
     looked = image(viewport_quality)
     read = views.reads
-    assert np.abs(before - looked).max() > 0.05
+    assert np.abs(original - looked).max() > 0.05
     sphere.lodgs_look.exposure += 1
     assert (
         np.abs(image(viewport_quality) - looked).max() > 0.02 and views.reads == read
@@ -143,17 +143,17 @@ def test_frames_with_paint_equal_those_of_the_export(bpy, lodgs, image, tmp_path
     scenes = lodgs("data.scenes")
     root = lodgs("data.importing").import_splats(bpy.context, write_splats(tmp_path), upright=False)
     root.lodgs.mode, root.lodgs.single_level = mode, 3
-    before = image()
+    original = image()
     lodgs("data.painting").write(root, half_painted(lodgs, root))
     painted = image()
-    assert np.abs(before - painted).max() > 0.05
+    assert np.abs(original - painted).max() > 0.05
     copy = scenes.shown_splats(bpy.context, root, looked=True)
     bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "out.ply"))
     lodgs("data.removal").remove(root)
-    again = lodgs("data.importing").import_splats(bpy.context, tmp_path / "out.ply", upright=False)
-    again.lodgs.mode, again.lodgs.single_level = mode, 3
+    reimported = lodgs("data.importing").import_splats(bpy.context, tmp_path / "out.ply", upright=False)
+    reimported.lodgs.mode, reimported.lodgs.single_level = mode, 3
     np.testing.assert_allclose(image(), painted, atol=1e-4)
-    np.testing.assert_allclose(scenes.shown_splats(bpy.context, again).sh, copy.sh, atol=1e-6)
+    np.testing.assert_allclose(scenes.shown_splats(bpy.context, reimported).sh, copy.sh, atol=1e-6)
 
 
 @pytest.mark.usefixtures("camera", "frame")
@@ -172,29 +172,29 @@ def test_viewports_show_paint_without_reading_splats_again(bpy, lodgs, image, tm
         ends = [nodes.nodes.new(name) for name in ("NodeGroupInput", "NodeGroupOutput")]
         nodes.links.new(ends[0].outputs[0], ends[1].inputs[0])
         root.lodgs.levels[2].object.modifiers.new("own", "NODES").node_group = nodes
-    before = image(viewport_quality)
+    original = image(viewport_quality)
     painting = lodgs("data.painting")
     paint = half_painted(lodgs, root)
     read = views.reads
     painting.show(root, paint)  # during a stroke
     during = image(viewport_quality)
     painting.show(root, {})
-    np.testing.assert_array_equal(image(viewport_quality), before)
+    np.testing.assert_array_equal(image(viewport_quality), original)
     painting.write(root, paint)
     painted = image(viewport_quality)
-    assert np.abs(before - painted).max() > 0.05 and (views.reads == read) == (not modifier)
-    np.testing.assert_array_equal(during, before if modifier else painted)
+    assert np.abs(original - painted).max() > 0.05 and (views.reads == read) == (not modifier)
+    np.testing.assert_array_equal(during, original if modifier else painted)
     painting.write(root, painting.over(paint, {n: np.full(len(x), 0.5) for n, x in paint.items()}, None))
     half = image(viewport_quality)
-    assert np.abs(before - half).max() > 0.02 and np.abs(painted - half).max() > 0.02
+    assert np.abs(original - half).max() > 0.02 and np.abs(painted - half).max() > 0.02
     painting.write(root, paint)
     np.testing.assert_array_equal(image(viewport_quality), painted)
     bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "out.ply"))
     painting.write(root, {number: 0 * values for number, values in paint.items()})
-    np.testing.assert_array_equal(image(viewport_quality), before)
+    np.testing.assert_array_equal(image(viewport_quality), original)
     lodgs("data.removal").remove(root)
-    again = importing.import_splats(bpy.context, tmp_path / "out.ply", upright=False)
-    again.lodgs.mode, again.lodgs.single_level = "SINGLE", 3
+    reimported = importing.import_splats(bpy.context, tmp_path / "out.ply", upright=False)
+    reimported.lodgs.mode, reimported.lodgs.single_level = "SINGLE", 3
     np.testing.assert_allclose(image(viewport_quality), painted, atol=0.01)
 
 
@@ -208,10 +208,10 @@ def test_streamed_tree_has_its_look(bpy, lodgs, image, tmp_path):
         )
         assert bool(lodgs("data.streams").write_splats(root)) == bool(budget)
         root.lodgs.controls.pixels = 0.1  # leaves
-        before = image()
+        original = image()
         with_looks(bpy, root)
         images.append(image())
-        assert np.abs(before - images[-1]).max() > 0.05
+        assert np.abs(original - images[-1]).max() > 0.05
         lodgs("data.removal").remove(root)
     np.testing.assert_allclose(*images, atol=2e-3)
 

@@ -127,12 +127,14 @@ def test_failed_installation_keeps_the_previous_environment(
     assert environments() == [] and "previous" not in str(failed.value)
     fake()
     assert bpy.ops.lodgs.make_environment() == {"FINISHED"} and environments() == ["1"]
-    before = lodgs("runs.environment").trainer_python()
+    previous = lodgs("runs.environment").trainer_python()
     fake(**behaviour)
     with pytest.raises(RuntimeError, match="The previous environment is still in use"):
         bpy.ops.lodgs.make_environment()
     assert (
-        environments() == ["1"] and before.exists() and lodgs("runs.environment").trainer_python() == before
+        environments() == ["1"]
+        and previous.exists()
+        and lodgs("runs.environment").trainer_python() == previous
     )
 
 
