@@ -108,7 +108,7 @@ def placement_of(options: argparse.Namespace) -> Similarity | None:
         return None if unmoved else Similarity.from_angles(options.rotate, options.scale, options.translate)
     if not unmoved:
         raise LodgsError(
-            "Cannot combine --matrix with --rotate, --scale or --translate.", "Use only one of these ways."
+            "Cannot combine --matrix with --rotate, --scale or --translate.", "Omit --matrix or the others."
         )
     return Similarity.from_matrix(np.reshape(options.matrix, (4, 4)))
 

@@ -90,8 +90,8 @@ def edit(
     if out is not None:
         _write_like(source, bundle, out, edited)
     report = [
-        f"level {before.number}: {len(after.rows):,} of {len(before.rows):,} splats"
-        for before, after in zip(bundle.levels, edited.levels, strict=True)
+        f"level {level.number}: {len(result.rows):,} of {len(level.rows):,} splats"
+        for level, result in zip(bundle.levels, edited.levels, strict=True)
     ]
     for path in plain:
         exported = edited if antialiased or find_format(path).antialiased else bake_filter(edited)

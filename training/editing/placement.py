@@ -141,8 +141,8 @@ def _linked_columns(bundle: Bundle, rule: Rule, placement: Similarity) -> list[C
             splats = level.rows.select(slice(begin, begin + BATCH_ROWS))
             parts.append(rule_columns(rule, splats) | dict(zip("xyz", splats.means.T.copy(), strict=True)))
         ends.append(len(level.rows))
-    before = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    after = placement.transform_columns(before, rule.lengths, (*rule.places, ("x", "y", "z")))
-    after |= rule.reconcile(before, after)
-    parts = [np.split(after[name], np.cumsum(ends)[:-1]) for name in rule.columns]
+    original = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    transformed = placement.transform_columns(original, rule.lengths, (*rule.places, ("x", "y", "z")))
+    transformed |= rule.reconcile(original, transformed)
+    parts = [np.split(transformed[name], np.cumsum(ends)[:-1]) for name in rule.columns]
     return [dict(zip(rule.columns, columns, strict=True)) for columns in zip(*parts, strict=True)]

@@ -32,8 +32,8 @@ _MAX_SURPLUS = 2
 
 def supports_culled_reads(rule: str) -> bool:
     """Return whether levels of a rule can be drawn from only the splats that a camera can see."""
-    known = find_rule(rule)
-    return known is not None and known.apart and not known.tables
+    resolved = find_rule(rule)
+    return resolved is not None and resolved.apart and not resolved.tables
 
 
 def open_if_large(path: str | Path, limit: int = 0) -> Bundle | None:

@@ -183,12 +183,12 @@ class Rule(ABC):
         """
         return
 
-    def reconcile(self, before: Columns, after: Columns) -> Columns:
+    def reconcile(self, original: Columns, transformed: Columns) -> Columns:
         """Return columns (N,) that rounding has made inconsistent, corrected; for ``linked_columns``.
 
         Args:
-            before: the rule's columns and x, y and z of the means, of the splats of all levels.
-            after: the same after a transform of the splats.
+            original: the rule's columns and x, y and z of the means, of the splats of all levels.
+            transformed: the same after a transform of the splats.
         """
         return {}
 
@@ -264,21 +264,21 @@ class Rule(ABC):
         return {control.name: control.default for control in self.controls}
 
     def resolve_controls(
-        self, given: Values, levels: Sequence[int], recorded: Values | None = None
+        self, changes: Values, levels: Sequence[int], recorded: Values | None = None
     ) -> Values:
-        """Return a value for every control: given, else recorded in the bundle, else :meth:`defaults`.
+        """Return a value for every control: changed, else recorded in the bundle, else :meth:`defaults`.
 
         Raises:
             LodgsError: unknown control, invalid value, or no level in use.
         """
         controls = {control.name: control for control in self.controls}
-        for name in given:
+        for name in changes:
             if name not in controls:
                 raise LodgsError(
                     f"The rule '{self.name}' has no option '{name}'.",
                     f"It has: {', '.join(controls) or 'none'}.",
                 )
-        values = self.defaults(levels) | dict(recorded or {}) | dict(given)
+        values = self.defaults(levels) | dict(recorded or {}) | dict(changes)
         return {name: control.validate(values[name]) for name, control in controls.items()}
 
 

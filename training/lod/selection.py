@@ -77,14 +77,14 @@ def unknown_rule_error(name: str) -> tuple[str, str]:
     )
 
 
-def resolve_controls(bundle: Bundle, given: Values) -> Values:
-    """Return a value for every control of a bundle's rule: given, else the bundle's, else the default.
+def resolve_controls(bundle: Bundle, changes: Values) -> Values:
+    """Return a value for every control of a bundle's rule: changed, else the bundle's, else the default.
 
     Raises:
         LodgsError: as :func:`require_rule`; unknown control, invalid value, or no level in use.
     """
     numbers = [level.number for level in bundle.levels]
-    return require_rule(bundle).resolve_controls(given, numbers, bundle.controls)
+    return require_rule(bundle).resolve_controls(changes, numbers, bundle.controls)
 
 
 def select(

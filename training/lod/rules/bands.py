@@ -77,9 +77,9 @@ class Bands(Rule):
         return super().defaults(levels) | {"first": levels[-3:][0], "last": levels[-1]}
 
     def resolve_controls(
-        self, given: Values, levels: Sequence[int], recorded: Values | None = None
+        self, changes: Values, levels: Sequence[int], recorded: Values | None = None
     ) -> Values:
-        values = super().resolve_controls(given, levels, recorded)
+        values = super().resolve_controls(changes, levels, recorded)
         first, last = (int(values[name]) for name in ("first", "last"))
         if not levels[0] <= first <= last <= levels[-1]:
             raise LodgsError(

@@ -131,25 +131,25 @@ class Cut(Rule):
         k = detail_of(focal_px, values["pixels"])
         return 0.0, (k + MIN_DETAIL) * (1 + 4 * ROUNDING) * highest[PARENT_SIZE].astype(np.float64)
 
-    def reconcile(self, before: Columns, after: Columns) -> Columns:
+    def reconcile(self, original: Columns, transformed: Columns) -> Columns:
         """Return sizes that keep cuts proper, and keep nodes at the same position distinguishable.
 
         Sizes are the scaled ones, or a few ulps larger.
         """
-        inside = (before[PARENT_SIZE] > 0) & (before[PARENT_SIZE] < ABOVE_ROOT)
+        inside = (original[PARENT_SIZE] > 0) & (original[PARENT_SIZE] < ABOVE_ROOT)
         # nodes know their parent by size and position: one key per parent, shared by its children
-        parent_hashes = hash_rows(node_keys(*(before[name] for name in (PARENT_SIZE, *PARENT)))[inside])
+        parent_hashes = hash_rows(node_keys(*(original[name] for name in (PARENT_SIZE, *PARENT)))[inside])
         keys, first, key_of_child = np.unique(parent_hashes, return_index=True, return_inverse=True)
-        own_hashes = hash_rows(node_keys(*(before[name] for name in (NODE_SIZE, *"xyz"))))
+        own_hashes = hash_rows(node_keys(*(original[name] for name in (NODE_SIZE, *"xyz"))))
         key_of_node = np.searchsorted(keys, own_hashes).clip(max=max(len(keys) - 1, 0))
-        is_parent = before[NODE_SIZE] > 0
+        is_parent = original[NODE_SIZE] > 0
         if len(keys):
             is_parent &= keys[key_of_node] == own_hashes
-        sizes = after[NODE_SIZE].copy()
-        parents = np.stack([after[axis][inside] for axis in PARENT], axis=1)
-        means = np.stack([after[axis][inside] for axis in "xyz"], axis=1)
+        sizes = transformed[NODE_SIZE].copy()
+        parents = np.stack([transformed[axis][inside] for axis in PARENT], axis=1)
+        means = np.stack([transformed[axis][inside] for axis in "xyz"], axis=1)
         distance = np.sqrt(np.square(means.astype(np.float64) - parents).sum(axis=1))
-        key_sizes = after[PARENT_SIZE][inside][first]
+        key_sizes = transformed[PARENT_SIZE][inside][first]
         key_positions = parents[first] + np.float32(0)
         while len(keys):
             sizes[is_parent] = key_sizes[key_of_node[is_parent]]
@@ -163,7 +163,7 @@ class Cut(Rule):
             if np.array_equal(larger, key_sizes):
                 break
             key_sizes = larger
-        parent_sizes = before[PARENT_SIZE].copy()
+        parent_sizes = original[PARENT_SIZE].copy()
         parent_sizes[inside] = key_sizes[key_of_child]
         return {NODE_SIZE: sizes, PARENT_SIZE: parent_sizes}
 

@@ -164,8 +164,8 @@ class UniqueSizes:
         """Return (N,) bool: keys that are neither taken nor repeated from an earlier row."""
         free = np.zeros(len(keys), bool)
         free[np.unique(keys, return_index=True)[1]] = True
-        for taken in self._taken:
-            free &= taken[np.searchsorted(taken, keys).clip(max=len(taken) - 1)] != keys
+        for keys_taken in self._taken:
+            free &= keys_taken[np.searchsorted(keys_taken, keys).clip(max=len(keys_taken) - 1)] != keys
         return free
 
     def _take(self, keys: np.ndarray) -> None:
