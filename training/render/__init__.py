@@ -1,1 +1,2 @@
-"""Pictures of splats: one view as a file (``render``), or frame after frame (``serve``)."""
+"""Rendering of splats: one view to a file (``render``), or frame after frame for another program
+(``serve``)."""

@@ -1,7 +1,8 @@
-"""``python -m training render``: one view of a bundle, of any 3DGS PLY or of a run as a picture file."""
+"""``python -m training render``: render one view of a bundle, any 3DGS PLY or a run to an image file."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,18 +21,18 @@ from ..splats.bundle import read_header, read_tables
 from ..splats.dialects import Warn, ignore
 from ..splats.level_folder import read_folder
 from ..splats.levels import Bundle
-from .image import read_depth, write_image
+from .image import check_suffix, read_depth, write_image
 from .scene import Instance, draw
 
 
 @dataclass(frozen=True)
 class RenderSource:
-    """What is rendered: levels, and where they were trained, the views that they were trained from.
+    """Levels to render, and the run that trained them.
 
     Attributes:
-        levels: a file, of which nothing but the header is read yet; or what was read of a folder of levels.
-        rule: by which they are chosen, see ``Bundle``.
-        run: the run that the file was found in, or None.
+        levels: file of which only the header has been read, or the contents of a folder of levels.
+        rule: name of the rule, see ``Bundle``.
+        run: run that contains the file, or None.
     """
 
     levels: Path | Bundle
@@ -40,22 +41,25 @@ class RenderSource:
 
     @classmethod
     def read(cls, path: Path, warn: Warn = ignore) -> RenderSource:
-        """A run's folder, a bundle, a folder of levels, or any 3DGS PLY.
+        """Open a run's folder, a bundle, a folder of levels, or any 3DGS PLY.
 
         Args:
-            warn: receives a sentence for each thing that is drawn otherwise than its maker shows it.
+            warn: receives one sentence for each omission or changed look.
 
         Raises:
-            LodgsError: there is nothing of that kind.
+            LodgsError: the path does not exist or has other contents.
         """
         path = Path(path)
         if not path.exists():
-            raise LodgsError(f"There is no {path}.", "Give a bundle, any 3DGS PLY, or a run's folder.")
+            raise LodgsError(
+                f"Cannot render {path}: it does not exist.",
+                "Choose a bundle, any 3DGS PLY or a run's folder.",
+            )
         run = RunFolder(path if path.is_dir() else path.parent)
         if path.is_dir() and run.job.exists():
             if not run.bundle.exists():
                 raise LodgsError(
-                    f"{path} holds no finished run (no bundle.ply).", "Train it to the end first."
+                    f"Cannot render {path}: the run is not finished (no bundle.ply).", "Train it to the end."
                 )
             path = run.bundle
         levels = read_folder(path, warn) if path.is_dir() else path
@@ -63,39 +67,46 @@ class RenderSource:
         return cls(levels, rule, run if run.job.exists() else None)
 
     def view(self, name: str, scene: Path | None = None) -> tuple[Camera, float]:
-        """A photograph's view in the photograph's own size, and the depth at which drawing begins.
+        """Find the view of a photo.
 
         Args:
-            name: the photograph's name, or its unmistakable end.
-            scene: folder of the COLMAP scene; None: the run's, or what the bundle says.
+            name: photo's path in the scene, file name, or file name without suffix.
+            scene: folder of the COLMAP scene; None: the bundle's views, or the run's scene.
+
+        Returns:
+            The camera in the photo's size, and the depth of the near plane.
 
         Raises:
-            LodgsError: there is no such photograph, or no scene.
+            LodgsError: no photo, or several photos have the name, or the scene is unknown.
         """
+        cameras, near = self._views(scene)
+        matches = [camera for camera in cameras if camera.name == name]
+        matches = matches or [camera for camera in cameras if Path(camera.name).name == name]
+        matches = matches or [camera for camera in cameras if Path(camera.name).stem == name]
+        if len(matches) != 1:
+            examples = ", ".join(camera.name for camera in (matches or cameras)[:3])
+            raise LodgsError(
+                f"Cannot find the view: {'several photos are' if matches else 'no photo is'} named {name}.",
+                f"Choose one of: {examples}, ...",
+            )
+        return matches[0], near
+
+    def _views(self, scene: Path | None) -> tuple[Sequence[Camera], float]:
+        """Return the cameras of all photos and the depth of the near plane."""
         if scene is not None:
-            cameras = read_scene(scene)
-            there, near = cameras.cameras, cameras.near()
-        else:
-            tables = self.levels.tables if isinstance(self.levels, Bundle) else read_tables(self.levels)
-            there, near, _ = read_view_tables(tables)
-        if not there and self.run is not None:
+            model = read_scene(scene)
+            return model.cameras, model.near()
+        tables = self.levels.tables if isinstance(self.levels, Bundle) else read_tables(self.levels)
+        cameras, near, _ = read_view_tables(tables)
+        if not cameras and self.run is not None:
             data = training_data(Job.from_file(self.run.job), self.run, pixels=False)
-            there, near = data.scene.cameras, data.near
-        if not there:
+            return data.scene.cameras, data.near
+        if not cameras:
             raise LodgsError(
-                "This file does not know the photographs that it was trained from.",
-                "Name their folder with --scene, or give a --camera.",
+                "Cannot find the view: the file does not list its training photos.",
+                "Give the scene's folder with --scene, or a --camera.",
             )
-        found = [camera for camera in there if camera.name == name]
-        found = found or [camera for camera in there if Path(camera.name).name == name]
-        found = found or [camera for camera in there if Path(camera.name).stem == name]
-        if len(found) != 1:
-            examples = ", ".join(camera.name for camera in (found or there)[:3])
-            raise LodgsError(
-                f"{'Several photographs are' if found else 'No photograph is'} called {name}.",
-                f"There are: {examples}, ...",
-            )
-        return found[0], near
+        return cameras, near
 
 
 def render(
@@ -105,49 +116,49 @@ def render(
     out: Path,
     *,
     level: int = 0,
-    given: Values | None = None,
+    controls: Values | None = None,
     background: tuple[float, float, float] | None = (0.0, 0.0, 0.0),
     holdout: Path | None = None,
     backend: str = "auto",
     warn: Warn = ignore,
 ) -> ResidentBundle:
-    """Draws one view into a file: a PNG, or an EXR with depth and levels besides.
+    """Render one view to a PNG, or to an EXR with depth and levels.
 
     Args:
-        near: depth at which drawing begins.
-        level: the level to draw; 0 is the finest.
-        given: controls of the bundle's rule by name: draw levels by their distance instead.
-        background: display-coded; None leaves it transparent.
-        holdout: an EXR with the depth of what hides splats, as :func:`.picture.read_depth` reads it.
-        warn: as for :meth:`Source.read`.
+        near: depth of the near plane.
+        level: level to draw; 0 is the finest.
+        controls: select levels by distance, with these values of the rule's controls by name; None: draw
+            ``level``.
+        background: display-coded; None is transparent.
+        holdout: EXR with the depth of meshes that hide splats, as for :func:`.image.read_depth`.
+        warn: as for :meth:`RenderSource.read`.
 
     Returns:
-        What was drawn: it tells how much was read for it.
+        The loaded splats, with the number of bytes that were read.
 
     Raises:
-        LodgsError: there is no such level or control, the bundle contradicts its rule, the holdout is not
-            one, or a file cannot be read or written.
+        LodgsError: the level or a control does not exist, the bundle contradicts its rule, the holdout is
+            invalid, or a file cannot be read or written.
     """
-    if out.suffix.lower() not in (".png", ".exr"):
-        raise LodgsError(f"{out.name} is neither .png nor .exr.", "Choose one of these endings.")
+    check_suffix(out)
     limit = None if holdout is None else read_depth(holdout, camera.width, camera.height, None)
     if problem := cpu_fallback_reason(backend):
         warn(problem)
     resident = ResidentBundle(source.levels, backend, warn)
     bundle, rule = resident.bundle, find_rule(source.rule)
-    if given is not None or (rule is not None and rule.always_active and not level):
-        shown = resident.select_by_rule(camera, resolve_controls(bundle, given or {}))
+    if controls is not None or (rule is not None and rule.always_active and not level):
+        sets = resident.select_by_rule(camera, resolve_controls(bundle, controls or {}))
     else:
-        shown = resident.select_level(level or bundle.levels[-1].number, camera)
+        sets = resident.select_level(level or bundle.levels[-1].number, camera)
     instances = [
-        Instance(one.splats, level=number, antialias=bundle.antialias, choice=one.choice)
-        for number, one in shown.items()
+        Instance(weighted.splats, level=number, antialias=bundle.antialias, query=weighted.query)
+        for number, weighted in sets.items()
     ]
-    everything = out.suffix.lower() == ".exr"
-    picture = draw(
-        instances, camera, near=near, background=background, depth=everything, levels=everything, limit=limit,
+    all_passes = out.suffix.lower() == ".exr"
+    image = draw(
+        instances, camera, near=near, background=background, depth=all_passes, levels=all_passes, limit=limit,
         backend=backend,
     )  # fmt: skip
-    assert picture is not None
-    write_image(out, picture)
+    assert image is not None
+    write_image(out, image)
     return resident

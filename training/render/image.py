@@ -1,4 +1,4 @@
-"""A rendered picture, in the colours of the display or in linear light, as PNG and multilayer EXR."""
+"""Rendered images, display-coded or linear, as PNG and multilayer EXR."""
 
 from __future__ import annotations
 
@@ -16,31 +16,30 @@ from ..scenes.exr import read_parts, write_exr
 from ..scenes.images import write_png
 
 NO_DEPTH = 1e10
-"""Depth where a pixel shows nothing, as Blender's renderers say it."""
+"""Depth of empty pixels, as in Blender's renderers."""
 
 _DEPTH = re.compile(r"(.*\.)?depth(\.[a-z])?|z|v", re.IGNORECASE)
-"""Names of channels that hold a depth: a layer's Depth.Z or Depth.V, or a file's own Z or V."""
+"""Names of depth channels: a layer's Depth.Z or Depth.V, or a file's Z or V."""
 
-_STRIP = 1 << 20
-"""Pixels that are coded at a time, about."""
+_STRIP_PIXELS = 1 << 20
+"""Approximate number of pixels that are coded at a time."""
 
-_CLEAR = 0.02
-"""Part of an 8-bit step that linear colours keep from the borders between two 8-bit values."""
+_ROUNDING_MARGIN = 0.02
+"""Distance of linear colours to the rounding thresholds of 8-bit values, in 8-bit steps."""
 
 
 @dataclass
 class RenderedImage:
-    """What a camera sees.
+    """A rendered image with its passes.
 
     Attributes:
-        image: (H, W, 3) float32, display-coded (sRGB) colours over the background; over black, and so
-            multiplied by alpha, where that is transparent. Not clamped above.
-        alpha: (H, W) float32; ones unless the background is transparent, or held out.
-        depth: (H, W) float32 along the camera's z axis in world units: of the splat that brings the light
-            let through to a half, or where none does the mean of all; NOTHING where there is none. Empty
-            where the pass was not drawn.
-        levels: number of each of the masks.
-        masks: (L, H, W) float32, how much of a pixel each level fills.
+        image: (H, W, 3) float32, display-coded (sRGB) colours over the background. Over a transparent
+            background they are multiplied by alpha. Not clamped above.
+        alpha: (H, W) float32; ones unless the background is transparent or held out.
+        depth: (H, W) float32 along the camera's z axis in world units: the depth at which half of the light
+            is stopped, or the mean depth if less is stopped, or NO_DEPTH. Empty if the pass was not drawn.
+        levels: level number of each mask.
+        masks: (L, H, W) float32, share of each pixel that a level covers.
     """
 
     image: np.ndarray
@@ -58,7 +57,7 @@ class RenderedImage:
         depth: bool = False,
         levels: list[int] | None = None,
     ) -> RenderedImage:
-        """A picture of nothing but the background."""
+        """Create an image of the background."""
         shape = height, width
         image = np.empty((*shape, 3), np.float32)
         image[:] = background or (0.0, 0.0, 0.0)
@@ -72,14 +71,14 @@ class RenderedImage:
 
     @property
     def level(self) -> np.ndarray:
-        """(H, W) float32, the number of the level that fills most of a pixel; 0 where nothing does."""
+        """Number of the level that covers most of each pixel, (H, W) float32; 0 for empty pixels."""
         if not self.levels:
             return np.zeros(self.alpha.shape, np.float32)
-        most = np.array(self.levels, np.float32)[self.masks.argmax(0)]
-        return np.where(self.masks.max(0) > 0, most, np.float32(0))
+        dominant = np.array(self.levels, np.float32)[self.masks.argmax(0)]
+        return np.where(self.masks.max(0) > 0, dominant, np.float32(0))
 
     def eight_bit(self) -> np.ndarray:
-        """(H, W, 3) uint8, or (H, W, 4) where something is transparent; colours not multiplied by alpha."""
+        """Convert to (H, W, 3) uint8, or (H, W, 4) with straight alpha if a pixel is transparent."""
         codes = np.empty((*self.alpha.shape, 3 if (self.alpha == 1).all() else 4), np.uint8)
         for rows in self._strips():
             values = np.concatenate([self._straight(rows), self.alpha[rows, :, None]], 2).astype(np.float64)
@@ -87,21 +86,21 @@ class RenderedImage:
         return codes
 
     def linear(self) -> np.ndarray:
-        """(H, W, 4) float32, colours in linear light multiplied by alpha, and alpha.
+        """Convert to (H, W, 4) float32: linear colours multiplied by alpha, and alpha.
 
-        The colours under the alpha are decoded, as a display transform will code them. They and the alpha
-        are first moved away, by 0.02 of an 8-bit step at most, from where rounding to 8 bits turns over: so
-        whoever codes them again has the 8 bits of :meth:`eight_bit`, however exact their arithmetic is.
+        Straight colours are decoded, because a display transform encodes them. Colours and alpha first move
+        away from 8-bit rounding thresholds by at most 0.02 of an 8-bit step. So programs that encode them
+        again obtain the 8 bits of :meth:`eight_bit`, even with inexact arithmetic.
         """
         linear = np.empty((*self.alpha.shape, 4), np.float32)
         for rows in self._strips():
-            alpha = _clear(self.alpha[rows, :, None].astype(np.float64)).clip(0, 1)
-            colours = _clear(self._straight(rows).astype(np.float64)).clip(0)
+            alpha = _avoid_thresholds(self.alpha[rows, :, None].astype(np.float64)).clip(0, 1)
+            colours = _avoid_thresholds(self._straight(rows).astype(np.float64)).clip(0)
             linear[rows, :, :3], linear[rows, :, 3:] = linear_from_srgb(colours) * alpha, alpha
         return linear
 
     def passes(self) -> dict[str, np.ndarray]:
-        """Planes (H, W) by name as Blender calls them: Combined.R to .A, Depth.Z, Level.X, Level 1.X, ..."""
+        """Return planes (H, W) by their Blender names: Combined.R to .A, Depth.Z, Level.X, Level 1.X, ..."""
         combined = self.linear()
         planes = {f"Combined.{channel}": combined[..., i] for i, channel in enumerate("RGBA")}
         if self.depth.size:
@@ -112,77 +111,85 @@ class RenderedImage:
         return planes
 
     def _straight(self, rows: slice) -> np.ndarray:
-        """Colours (H, W, 3) of some rows not multiplied by alpha, float32."""
+        """Return straight colours (H, W, 3) of a range of rows, float32."""
         image, alpha = self.image[rows], self.alpha[rows, :, None]
         return np.divide(image, alpha, out=np.zeros_like(image), where=alpha > 0)
 
     def _strips(self) -> Iterator[slice]:
-        """Rows that are worked on together, which takes some 200 bytes a pixel for a while."""
+        """Return ranges of rows that are converted together, with about 200 temporary bytes per pixel."""
         height, width = self.alpha.shape
-        step = max(_STRIP // width, 1)
+        step = max(_STRIP_PIXELS // width, 1)
         return (slice(top, top + step) for top in range(0, height, step))
 
 
-def _clear(values: np.ndarray) -> np.ndarray:
-    """Values in [0, 1], moved off the borders between two 8-bit ones; those that are 0 or 1 stay."""
+def _avoid_thresholds(values: np.ndarray) -> np.ndarray:
+    """Move values in [0, 1] away from the rounding thresholds of 8-bit values; 0 and 1 stay."""
     codes = values * 255
-    rest = codes - np.floor(codes) - 0.5
-    return (codes + np.where(rest >= 0, np.maximum(_CLEAR - rest, 0), np.minimum(-_CLEAR - rest, 0))) / 255
+    offset = codes - np.floor(codes) - 0.5
+    above = np.maximum(_ROUNDING_MARGIN - offset, 0)
+    below = np.minimum(-_ROUNDING_MARGIN - offset, 0)
+    return (codes + np.where(offset >= 0, above, below)) / 255
 
 
-def write_image(path: Path, picture: RenderedImage) -> None:
-    """Writes a PNG, or a multilayer EXR with every pass, by the file's ending.
+def check_suffix(path: Path) -> None:
+    """Raise LodgsError unless a file name ends with .png or .exr."""
+    if path.suffix.lower() not in (".png", ".exr"):
+        raise LodgsError(f"Cannot write {path.name}: unsupported image format.", "Use .png or .exr.")
+
+
+def write_image(path: Path, image: RenderedImage) -> None:
+    """Write a PNG, or a multilayer EXR with every pass, depending on the suffix.
 
     Raises:
-        LodgsError: another ending, or the file cannot be written.
+        LodgsError: the suffix is not supported, or the file cannot be written.
     """
-    writers = {".png": lambda to, shown: write_png(to, shown.eight_bit()), ".exr": _write_exr}
-    writer = writers.get(path.suffix.lower())
-    if writer is None:
-        raise LodgsError(f"{path.name} is neither .png nor .exr.", "Choose one of these endings.")
+    check_suffix(path)
     with atomic_write(path) as temporary:
-        writer(temporary, picture)
+        if path.suffix.lower() == ".png":
+            write_png(temporary, image.eight_bit())
+        else:
+            write_exr(temporary, {f"LODGS.{name}": plane for name, plane in image.passes().items()})
 
 
 def read_depth(path: Path, width: int, height: int, window: tuple[int, int, int, int] | None) -> np.ndarray:
-    """The Depth pass of an EXR as Blender's renderers and its compositor write it, (H, W) float32.
+    """Read the Depth pass of an EXR from Blender's renderers or compositor, (H, W) float32.
 
-    Of several layers' depths the nearest counts in each pixel.
+    If several layers have depths, the nearest counts in each pixel.
 
     Args:
-        width, height: of the whole picture; an EXR of the window alone is taken as well.
-        window: left, top, width and height of the part that is wanted; None: all.
+        width, height: size of the full image; the EXR may have the size of the window instead.
+        window: left, top, width and height of the part to return; None: all.
 
     Raises:
-        LodgsError: it cannot be read, has no depth, or is of another size.
+        LodgsError: the file cannot be read, has no depth, or has another size.
     """
     if not path.is_file():
-        raise LodgsError(f"There is no mesh depth {path}.", "Render it, or take the holdout away.")
+        raise LodgsError(
+            f"Cannot read the mesh depth {path}: it does not exist.", "Render it, or remove the holdout."
+        )
     try:
         parts = read_parts(path)
-        found = [
+        planes = [
             np.asarray(plane, np.float32)
-            for part, _, planes in parts
-            for name, plane in planes.items()
+            for part, _, channels in parts
+            for name, plane in channels.items()
             if _DEPTH.fullmatch(name) and (len(name) > 1 or len(parts) == 1 or _DEPTH.fullmatch(part))
         ]
     except (RuntimeError, OSError, ValueError, KeyError, TypeError) as error:
-        raise LodgsError(f"{path.name} cannot be read as an EXR: {error}.", "Render it anew.") from error
-    if not found or any(plane.shape != found[0].shape for plane in found):
+        raise LodgsError(f"Cannot read {path.name} as an EXR: {error}.", "Render it again.") from error
+    if not planes or any(plane.shape != planes[0].shape for plane in planes):
         raise LodgsError(
-            f"{path.name} has no Depth pass.", "Tick Depth among its view layer's passes and render it anew."
+            f"Cannot use {path.name} as a holdout: it has no Depth pass.",
+            "Enable the Depth pass of its view layer and render it again.",
         )
-    depth = np.nan_to_num(np.fmin.reduce(found), nan=NO_DEPTH, posinf=NO_DEPTH)  # half floats have no 1e10
-    left, top, across, up = window or (0, 0, width, height)
+    depth = np.nan_to_num(np.fmin.reduce(planes), nan=NO_DEPTH, posinf=NO_DEPTH)  # half floats have no 1e10
+    left, top, window_width, window_height = window or (0, 0, width, height)
     if depth.shape == (height, width):
-        return depth[top : top + up, left : left + across]
-    if depth.shape == (up, across):
+        return depth[top : top + window_height, left : left + window_width]
+    if depth.shape == (window_height, window_width):
         return depth
     raise LodgsError(
-        f"{path.name} has {depth.shape[1]}x{depth.shape[0]} pixels, the picture {width}x{height}.",
-        "Render the meshes' depth in the picture's size.",
+        f"Cannot use {path.name} as a holdout: its size is {depth.shape[1]}x{depth.shape[0]} pixels, "
+        f"that of the image {width}x{height}.",
+        "Render the depth of the meshes in the size of the image.",
     )
-
-
-def _write_exr(path: Path, picture: RenderedImage) -> None:
-    write_exr(path, {f"LODGS.{name}": plane for name, plane in picture.passes().items()})

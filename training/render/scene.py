@@ -1,4 +1,4 @@
-"""Sets of splats, wherever they stand, as one picture: what every command and Blender's F12 draw with."""
+"""Rendering of several sets of splats, each with its own transform, into one image."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch.nn.functional import normalize
 from ..editing.look import Looks
 from ..errors import LodgsError, is_out_of_memory
 from ..lod.query import LodQuery
-from ..rasterize import Gaussians, rasterize_strips
+from ..rasterize import Gaussians, Rendering, rasterize_strips
 from ..rasterize.resident import SplatSet, WeightedSet, combine_visible
 from ..scenes.cameras import Camera, check_render_size
 from ..splats.sh import basis, degree_from_count
@@ -20,10 +20,10 @@ from ..splats.similarity import is_similarity
 from .image import NO_DEPTH, RenderedImage
 
 STRIP_PIXELS = 1 << 20
-"""Pixels drawn between two calls of ``progress``."""
+"""Approximate number of pixels between two calls of ``progress``."""
 
 MAX_CONDITION = 1e6
-"""A transform that stretches one direction so many times as much as another is refused."""
+"""Maximum ratio of the largest to the smallest scale of a transform."""
 
 
 @dataclass
@@ -31,19 +31,43 @@ class Instance:
     """A set of splats in the world.
 
     Attributes:
+        splats: the set.
         matrix: (4, 4) float64, from the set's coordinates to the world.
-        level: number of the level of detail that it is; 0 where it is none.
-        antialias: how it is drawn, see ``Bundle.antialias``.
-        choice: by what its splats are weighted, on top of the set's own weights; None: by these alone.
-        looks: what is made of its colours and opacities, places in the set's coordinates.
+        level: level number of the set; 0 for none.
+        antialias: see ``Bundle.antialias``.
+        query: rule and arguments that weight the splats in addition to the set's own weights, or None.
+        looks: changes of colours and opacities, in the set's coordinates.
     """
 
     splats: SplatSet
     matrix: np.ndarray = field(default_factory=lambda: np.eye(4))
     level: int = 0
     antialias: bool = False
-    choice: LodQuery | None = None
+    query: LodQuery | None = None
     looks: Looks = ()
+
+
+@dataclass
+class _Frame:
+    """Splats of all instances in common coordinates.
+
+    Attributes:
+        gaussians: all N splats.
+        rows: rows to draw, or None for all.
+        weights: (N,), or None if all are 1.
+        counts: number of splats of each instance.
+        camera: camera in these coordinates.
+        near: depth of the near plane in these coordinates.
+        unit: world units per unit of these coordinates.
+    """
+
+    gaussians: Gaussians
+    rows: torch.Tensor | None
+    weights: torch.Tensor | None
+    counts: list[int]
+    camera: Camera
+    near: float
+    unit: float
 
 
 def draw(
@@ -59,128 +83,143 @@ def draw(
     backend: str = "auto",
     progress: Callable[[float], bool] = lambda share: True,
 ) -> RenderedImage | None:
-    """What a camera sees of splats, all sets sorted together.
+    """Render all sets of splats, sorted together.
 
-    Sets that stand together under one rotation, uniform scale and translation are drawn in their own
-    coordinates, so that it does not show, to the bit, where they stand. Else all are brought to the world.
+    Sets that share one similarity transform are drawn in their own coordinates, so the transform does not
+    change a bit of the image. Otherwise all splats are transformed to the world.
 
     Args:
-        near: depth in the world before which nothing is drawn.
-        background: display-coded colour behind the splats; None leaves it transparent.
-        depth: draw the pass as well.
-        levels: as well, how much of each pixel every level fills.
-        window: left, top, width and height in pixels of the part of the camera's image to draw; None: all.
-        limit: (H, W) of the window, depths of meshes along the camera's z axis in the world, NOTHING where
-            there are none: what lies behind is held out, the background as well.
-        backend: rasterizer.
-        progress: called with the share that is done; drawing is cancelled where it returns False.
+        near: depth of the near plane in the world.
+        background: display-coded colour behind the splats; None is transparent.
+        depth: draw the depth pass.
+        levels: draw the share of each pixel that each level covers.
+        window: left, top, width and height of the part of the image to draw in pixels; None: all.
+        limit: (H, W) of the window, depth of meshes along the camera's z axis in the world, or NO_DEPTH;
+            splats and background behind it are held out.
+        backend: rasterizer backend.
+        progress: receives the completed share; returning False cancels.
 
     Returns:
-        The picture, or None where it was cancelled.
+        The image, or None if drawing was cancelled.
 
     Raises:
-        LodgsError: a set's transform is flat, the picture too large, or there is not enough memory.
+        LodgsError: a set's transform is flat, the image is too large, or memory is insufficient.
     """
     width, height = window[2:] if window else (camera.width, camera.height)
     check_render_size(width, height)
-    for one in instances:
-        linear = one.matrix[:3, :3]
-        if not np.isfinite(one.matrix).all() or np.linalg.cond(linear) > MAX_CONDITION or not linear.any():
-            raise LodgsError("A set of splats is scaled to nothing.", "Give its object a scale above 0.")
-    numbers = sorted({one.level for one in instances}) if levels else []
+    _check_transforms(instances)
+    numbers = sorted({instance.level for instance in instances}) if levels else []
     try:
-        picture = RenderedImage.empty(width, height, background, depth, numbers)
-        behind = background or (0.0, 0.0, 0.0)
-        if limit is not None:  # the background, too, is behind meshes: over black here, added elsewhere
-            picture.image[limit < NO_DEPTH], picture.alpha[limit < NO_DEPTH] = 0, 0
-            behind = 0.0, 0.0, 0.0
+        image = RenderedImage.empty(width, height, background, depth, numbers)
+        back_color = background or (0.0, 0.0, 0.0)
+        if limit is not None:  # meshes also hide the background, so it is added to unlimited pixels later
+            image.image[limit < NO_DEPTH], image.alpha[limit < NO_DEPTH] = 0, 0
+            back_color = 0.0, 0.0, 0.0
         instances = [
-            replace(one, splats=one.splats.with_looks(one.looks)) for one in instances if len(one.splats)
+            replace(instance, splats=instance.splats.with_looks(instance.looks))
+            for instance in instances
+            if len(instance.splats)
         ]
         if not instances:
-            return picture
-        gaussians, rows, weights, counts, camera, near, unit = _in_one_frame(instances, camera, near)
-        each = torch.tensor(counts, device=gaussians.means.device)
-        features = _membership(instances, each, picture) if levels else None
-        for top, drawn in rasterize_strips(
-            gaussians, camera, rows=rows, weights=weights, background=behind, near=near,
-            antialias=_filtered(instances, each),
+            return image
+        frame = _common_frame(instances, camera, near)
+        counts = torch.tensor(frame.counts, device=frame.gaussians.means.device)
+        features = _membership(instances, counts, image) if levels else None
+        for top, strip in rasterize_strips(
+            frame.gaussians, frame.camera, rows=frame.rows, weights=frame.weights, background=back_color,
+            near=frame.near, antialias=_antialias_flags(instances, counts),
             outputs=("depth", "median_depth") if depth else (), features=features, window=window,
-            limit=None if limit is None else torch.from_numpy(limit / unit).to(gaussians.means),
+            limit=None if limit is None else torch.from_numpy(limit / frame.unit).to(frame.gaussians.means),
             strip=STRIP_PIXELS, backend=backend,
         ):  # fmt: skip
-            part = slice(top, top + len(drawn.alpha))
-            alpha = drawn.alpha.cpu().numpy()
-            kept = 0 if limit is None else (1 - alpha)[..., None] * picture.image[part]
-            picture.image[part] = drawn.image.cpu().numpy() + kept
-            picture.alpha[part] = np.maximum(picture.alpha[part], alpha)
-            if depth:
-                assert drawn.depth is not None and drawn.median_depth is not None
-                seen = torch.where(drawn.median_depth > 0, drawn.median_depth, drawn.depth) * unit
-                picture.depth[part] = torch.where(drawn.alpha > 0, seen, NO_DEPTH).cpu().numpy()
-            if drawn.features is not None:
-                picture.masks[:, part] = drawn.features.permute(2, 0, 1).cpu().numpy()
-            if not progress((top + len(drawn.alpha)) / height):
+            _copy_strip(image, top, strip, frame.unit, has_limit=limit is not None)
+            if not progress((top + len(strip.alpha)) / height):
                 return None
     except Exception as error:
         if not is_out_of_memory(error):
             raise
         raise LodgsError(
-            f"There is not enough memory to draw {sum(len(x.splats) for x in instances):,} splats "
-            f"at {width}x{height}.",
-            "Render a coarser level or a smaller picture.",
+            f"Cannot draw {sum(len(x.splats) for x in instances):,} splats at {width}x{height}: "
+            "not enough memory.",
+            "Render a coarser level or a smaller image.",
         ) from error
-    return picture
+    return image
 
 
-def _in_one_frame(
-    instances: list[Instance], camera: Camera, near: float
-) -> tuple[Gaussians, torch.Tensor | None, torch.Tensor | None, list[int], Camera, float, float]:
-    """Splats of all sets in one frame, which rows of them to look at (None: all), their weights (None: all
-    1), and how many are of each set; the camera and its near depth in that frame, and how many units of the
-    world one of its units is."""
+def _check_transforms(instances: Sequence[Instance]) -> None:
+    for instance in instances:
+        linear = instance.matrix[:3, :3]
+        is_flat = not np.isfinite(instance.matrix).all() or np.linalg.cond(linear) > MAX_CONDITION
+        if is_flat or not linear.any():
+            raise LodgsError(
+                "Cannot draw a set of splats: it is scaled to nothing.", "Give its object a scale above 0."
+            )
+
+
+def _copy_strip(image: RenderedImage, top: int, strip: Rendering, unit: float, has_limit: bool) -> None:
+    """Copy a strip into an image, over the background that a limit leaves visible."""
+    rows = slice(top, top + len(strip.alpha))
+    alpha = strip.alpha.cpu().numpy()
+    visible_background = (1 - alpha)[..., None] * image.image[rows] if has_limit else 0
+    image.image[rows] = strip.image.cpu().numpy() + visible_background
+    image.alpha[rows] = np.maximum(image.alpha[rows], alpha)
+    if image.depth.size:
+        assert strip.depth is not None and strip.median_depth is not None
+        depth = torch.where(strip.median_depth > 0, strip.median_depth, strip.depth) * unit
+        image.depth[rows] = torch.where(strip.alpha > 0, depth, NO_DEPTH).cpu().numpy()
+    if strip.features is not None:
+        image.masks[:, rows] = strip.features.permute(2, 0, 1).cpu().numpy()
+
+
+def _common_frame(instances: list[Instance], camera: Camera, near: float) -> _Frame:
+    """Bring all splats to the coordinates that they share, or else to the world."""
     first = instances[0].matrix
-    if is_similarity(first) and all(np.array_equal(one.matrix, first) for one in instances):
+    if is_similarity(first) and all(np.array_equal(instance.matrix, first) for instance in instances):
         camera, unit = camera.in_object_space(first)
-        chosen = [WeightedSet(one.splats, one.choice) for one in instances]
-        gaussians, rows, weights = combine_visible(chosen, camera, near / unit)
-        return gaussians, rows, weights, [len(one.splats) for one in instances], camera, near / unit, unit
-    there, weights = [], []
-    for one in instances:
-        inside, unit = camera.in_object_space(one.matrix) if is_similarity(one.matrix) else (None, 1.0)
-        rows, weight = (
-            torch.from_numpy(each) for each in one.splats.select_visible(one.choice, inside, near / unit)
-        )
-        there.append(_in_world(one, camera, rows.long()))
-        weights.append(weight.to(there[-1].means))
-    return Gaussians.concatenated(there), None, torch.cat(weights), list(map(len, there)), camera, near, 1.0
+        sets = [WeightedSet(instance.splats, instance.query) for instance in instances]
+        gaussians, rows, weights = combine_visible(sets, camera, near / unit)
+        counts = [len(instance.splats) for instance in instances]
+        return _Frame(gaussians, rows, weights, counts, camera, near / unit, unit)
+    parts, part_weights = [], []
+    for instance in instances:
+        own_camera, unit = None, 1.0
+        if is_similarity(instance.matrix):
+            own_camera, unit = camera.in_object_space(instance.matrix)
+        rows, weights = instance.splats.select_visible(instance.query, own_camera, near / unit)
+        parts.append(_to_world(instance, camera, torch.from_numpy(rows).long()))
+        part_weights.append(torch.from_numpy(weights).to(parts[-1].means))
+    gaussians = Gaussians.concatenated(parts)
+    return _Frame(gaussians, None, torch.cat(part_weights), list(map(len, parts)), camera, near, 1.0)
 
 
-def _in_world(one: Instance, camera: Camera, some: torch.Tensor) -> Gaussians:
-    """Some (M,) of a set's splats where its transform puts them, any affine one, in the colours that an eye
-    sees: harmonics turn, shrink and lean with the set."""
-    own = one.splats.gaussians
-    some = some.to(own.means.device)
-    placed, means, sh = one.splats.transformed(one.matrix).select(some), own.means[some], own.sh[some]
-    eye = np.linalg.solve(one.matrix, np.append(camera.center, 1.0))[:3]
-    directions = normalize(means - torch.as_tensor(eye).to(means), dim=1)
+def _to_world(instance: Instance, camera: Camera, rows: torch.Tensor) -> Gaussians:
+    """Transform rows (M,) of a set to the world, by any affine transform.
+
+    The harmonics become constant colours, evaluated for the camera in the set's coordinates.
+    """
+    own = instance.splats.gaussians
+    rows = rows.to(own.means.device)
+    transformed = instance.splats.transformed(instance.matrix).select(rows)
+    means, sh = own.means[rows], own.sh[rows]
+    position = np.linalg.solve(instance.matrix, np.append(camera.center, 1.0))[:3]
+    directions = normalize(means - torch.as_tensor(position).to(means), dim=1)
     values: list = [None] * sh.shape[1]
     x, y, z = directions.unbind(1)
     basis(x, y, z, degree_from_count(len(values)), values)
-    colours = (0.5 + torch.einsum("kn,nkc->nc", torch.stack(values), sh)).clamp_min(0)
-    return replace(placed, sh=colours)
+    colors = (0.5 + torch.einsum("kn,nkc->nc", torch.stack(values), sh)).clamp_min(0)
+    return replace(transformed, sh=colors)
 
 
-def _filtered(instances: list[Instance], counts: torch.Tensor) -> bool | torch.Tensor:
-    """Whether splats are antialiased: all or none, or (N,) of each where sets differ."""
-    flags = [one.antialias for one in instances]
+def _antialias_flags(instances: list[Instance], counts: torch.Tensor) -> bool | torch.Tensor:
+    """Return one flag for all splats, or flags (N,) if instances differ."""
+    flags = [instance.antialias for instance in instances]
     if len(set(flags)) == 1:
         return flags[0]
     return torch.tensor(flags, device=counts.device).repeat_interleave(counts)
 
 
-def _membership(instances: list[Instance], counts: torch.Tensor, picture: RenderedImage) -> torch.Tensor:
-    """(N, L) with 1 where a splat is of a level of the picture's."""
-    levels = torch.tensor(picture.levels, device=counts.device)
-    of = torch.tensor([one.level for one in instances], device=counts.device)
-    return (of[:, None] == levels).float().repeat_interleave(counts, 0)
+def _membership(instances: list[Instance], counts: torch.Tensor, image: RenderedImage) -> torch.Tensor:
+    """Return (N, L) with 1 where a splat belongs to one of the image's levels."""
+    levels = torch.tensor(image.levels, device=counts.device)
+    splat_levels = torch.tensor([instance.level for instance in instances], device=counts.device)
+    return (splat_levels[:, None] == levels).float().repeat_interleave(counts, 0)

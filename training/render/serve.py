@@ -1,8 +1,8 @@
-"""``python -m training serve``: pictures of splats for another program, one frame after the other.
+"""``python -m training serve``: rendering for another program, frame after frame.
 
-Requests are JSON objects, one a line, on standard input, answers (``runs.events.event_line``) on standard
-output; arrays lie in files of one folder (``wire``), which belongs to this process, as a mark in it says: it
-is removed when standard input ends, however the other program ended.
+Requests are JSON objects on standard input, one per line. Answers (``runs.events.event_line``) go to
+standard output. Arrays are in files of one folder (``wire``) that belongs to this process, as a marker file
+in it shows. The folder is removed when standard input ends, however the other program ended.
 
     {"frame": 7, "out": NAME, "camera": {...}, "near": 0.1, "background": [r, g, b] or null,
      "depth": true, "levels": true, "window": [left, top, width, height] or null,
@@ -12,18 +12,18 @@ is removed when standard input ends, however the other program ended.
               {"tree": PATH, "matrix": 4x4, "choice": {...}, "looks": [...]}, ...]}
     {"cancel": 7}
 
-answer ``progress`` (frame, share) and ``warning`` (frame, message), then one of ``frame`` (frame, passes,
-height, width, seconds; the planes are in the file OUT), ``cancelled`` (frame) and ``error`` (frame, what,
-remedy). A photograph is read in the frame's size, over black, and its planes follow the others,
-display-coded; ``psnr`` then says how alike both are, where the mask is not black. A holdout is an EXR with
-the depth of what hides splats, of the camera's size or the window's.
+Answers to a frame are ``progress`` (frame, share) and ``warning`` (frame, message), then ``frame`` (frame,
+passes, height, width, seconds; the planes are in the file OUT), ``cancelled`` (frame) or ``error`` (frame,
+what, remedy). A photograph is read in the frame's size, over black. Its display-coded planes follow the
+others, and ``psnr`` compares it with the image outside the black parts of the mask. A holdout is an EXR
+with the depth of objects that hide splats, in the size of the camera or the window.
 
-A set is read when its file is first named, and forgotten when a frame does not name it; its file may go after
-an answer ``frame``. With a choice (``lod.query``: ``rule``, ``eye`` in the set's coordinates, ``focal_px``,
-and by name ``facts``, ``values`` and ``tables``) its splats are weighted as the rule says, times the file's
-weights; what the rule knows of each splat are the file's columns of these names. A tree is a bundle of the
-rule ``cut``, of which is read what the frame shows. Looks (``editing.look``) are what is made of its colours and
-opacities: {"crop": {...} or null for everywhere, "look": {"exposure": 0.5, ...}}.
+A set is read when its file is first named, and discarded when a frame does not name it. Its file may be
+removed after an answer ``frame``. A choice (``lod.query``: ``rule``, ``eye`` in the set's coordinates,
+``focal_px``, and ``facts``, ``values`` and ``tables`` by name) weights the splats by a rule, in addition to
+the file's weights. The rule's columns are the file's columns of the same names. A tree is a bundle of the
+rule ``cut``, of which only the visible part is read. Looks (``editing.look``) change colours and opacities:
+{"crop": {...} or null for everywhere, "look": {"exposure": 0.5, ...}}.
 """
 
 from __future__ import annotations
@@ -58,16 +58,19 @@ from .requests import CancelRequest, FrameRequest, SetRequest, frame_number, par
 from .scene import Instance, SplatSet, draw
 
 MAX_LINE_BYTES = 1 << 20
-"""Bytes of a line that asks for something."""
+"""Maximum length of a request."""
 _WEIGHTS = ""
-"""Where weights stand among the columns of a set, which all have a name."""
+"""Temporary extra column for the weights; no other column has an empty name."""
 
 
 def serve(folder: Path, backend: str, requests: IO[bytes], answers: IO[str]) -> int:
-    """Answers until ``requests`` ends; then ``folder`` is removed. Returns an exit code.
+    """Answer requests until they end, then remove ``folder``.
+
+    Returns:
+        The exit code.
 
     Raises:
-        LodgsError: for a backend that does not work here, or a folder with other things in it.
+        LodgsError: the backend is not available, or the folder has other contents.
     """
     torch.set_num_threads(1)
     if problem := cpu_fallback_reason(backend):
@@ -75,7 +78,7 @@ def serve(folder: Path, backend: str, requests: IO[bytes], answers: IO[str]) -> 
     backend = resolve_backend(backend)
     wire.claim_folder(folder)
     server = _Server(folder, backend, answers)
-    server.say("hello", protocol=wire.PROTOCOL, version=VERSION, backend=backend, pid=os.getpid())
+    server.send("hello", protocol=wire.PROTOCOL, version=VERSION, backend=backend, pid=os.getpid())
     threading.Thread(target=server.listen, args=(requests,), daemon=True).start()
     server.work()
     return 0
@@ -83,22 +86,24 @@ def serve(folder: Path, backend: str, requests: IO[bytes], answers: IO[str]) -> 
 
 class _Server:
     def __init__(self, folder: Path, backend: str, answers: IO[str]) -> None:
-        self._folder, self._backend, self._answers = folder, backend, answers
+        self._folder = folder
+        self._backend = backend
+        self._answers = answers
         self._sets: dict[str, SplatSet] = {}
         self._trees: dict[Path, tuple[tuple[int, int], TreeFile]] = {}
         self._cuts: dict[tuple, list[tuple[int, SplatSet]]] = {}
         self._requests: queue.SimpleQueue[FrameRequest] = queue.SimpleQueue()
         self._cancelled: set[int] = set()
 
-    def say(self, kind: str, **values) -> None:
-        """One event. Where nobody listens any more, the end of the requests is the end."""
+    def send(self, kind: str, **values) -> None:
+        """Send an event, or exit if the other program has closed the stream."""
         try:
             print(event_line(kind, **values), file=self._answers, flush=True)
         except OSError:
-            self._end()
+            self._exit()
 
     def listen(self, requests: IO[bytes]) -> None:
-        """In a thread of its own, so that a frame that is being drawn can be cancelled."""
+        """Receive requests in a separate thread, so that a frame can be cancelled while it is drawn."""
         try:
             while line := requests.readline(MAX_LINE_BYTES + 1):
                 frame = None
@@ -107,32 +112,33 @@ class _Server:
                     frame = frame_number(values)
                     request = parse_request(values)
                 except LodgsError as error:
-                    while line and not line.endswith(b"\n"):  # the rest of one that is too long
+                    while line and not line.endswith(b"\n"):  # skip the remainder of a line that is too long
                         line = requests.readline(MAX_LINE_BYTES)
-                    self.say("error", frame=frame, what=error.what, remedy=error.remedy)
+                    self.send("error", frame=frame, what=error.what, remedy=error.remedy)
                     continue
                 if isinstance(request, CancelRequest):
                     self._cancelled.add(request.frame)
                 else:
                     self._requests.put(request)
         finally:
-            self._end()
+            self._exit()
 
     def work(self) -> None:
-        """Draws what is asked for, in order."""
+        """Draw the requested frames in order."""
         while True:
             request = self._requests.get()
             try:
                 self._answer(request)
             except LodgsError as error:
-                self.say("error", frame=request.frame, what=error.what, remedy=error.remedy)
+                self.send("error", frame=request.frame, what=error.what, remedy=error.remedy)
             except Exception as error:
                 traceback.print_exc()
-                what = f"The renderer could not use what it was given ({type(error).__name__}: {error})."
+                problem = f"Cannot draw the frame: unexpected {type(error).__name__} ({error})."
                 remedy = "Please report it with the log."
                 if is_out_of_memory(error):
-                    what, remedy = "There is not enough memory for this picture.", "Render a smaller one."
-                self.say("error", frame=request.frame, what=what, remedy=remedy)
+                    problem = "Cannot draw the frame: not enough memory."
+                    remedy = "Render a smaller image."
+                self.send("error", frame=request.frame, what=problem, remedy=remedy)
 
     def _answer(self, request: FrameRequest) -> None:
         started = time.perf_counter()
@@ -142,100 +148,107 @@ class _Server:
             limit = read_depth(request.holdout, camera.width, camera.height, window)
         instances = self._instances(frame, request)
         if frame in self._cancelled:
-            self.say("cancelled", frame=frame)
+            self.send("cancelled", frame=frame)
             return
 
         def progress(share: float) -> bool:
-            self.say("progress", frame=frame, share=round(share, 4))
+            self.send("progress", frame=frame, share=round(share, 4))
             return frame not in self._cancelled
 
-        picture = draw(
+        image = draw(
             instances, camera, near=request.near, background=request.background, depth=request.depth,
             levels=request.levels, window=window, limit=limit, backend=self._backend, progress=progress,
         )  # fmt: skip
-        if picture is None or frame in self._cancelled:
+        if image is None or frame in self._cancelled:
             self._cancelled.discard(frame)
-            self.say("cancelled", frame=frame)
+            self.send("cancelled", frame=frame)
             return
-        passes, (height, width), measured = picture.passes(), picture.alpha.shape, {}
+        passes, (height, width), measures = image.passes(), image.alpha.shape, {}
         if request.photograph:
             size = camera.width, camera.height
-            photograph = load_image(request.photograph, *size, alpha=True)[..., :3]
-            passes |= {f"Photograph.{channel}": photograph[..., i] for i, channel in enumerate("RGB")}
+            photo = load_image(request.photograph, *size, alpha=True)[..., :3]
+            passes |= {f"Photograph.{channel}": photo[..., i] for i, channel in enumerate("RGB")}
             mask = torch.from_numpy(load_mask(request.mask, *size)) if request.mask else None
-            measured["psnr"] = psnr(torch.from_numpy(picture.image), torch.from_numpy(photograph), mask)
+            measures["psnr"] = psnr(torch.from_numpy(image.image), torch.from_numpy(photo), mask)
         wire.write_planes(self._folder / request.out, list(passes.values()))
-        self.say(
+        self.send(
             "frame", frame=frame, passes=list(passes), height=height, width=width,
-            seconds=round(time.perf_counter() - started, 4), **measured,
+            seconds=round(time.perf_counter() - started, 4), **measures,
         )  # fmt: skip
 
     def _instances(self, frame: int, request: FrameRequest) -> list[Instance]:
-        """The sets of a frame; those of the last frame that are named again stay as they are."""
-        kept, instances = {}, []
-        cuts = {i: self._cut_of(one, request) for i, one in enumerate(request.sets) if one.tree is not None}
+        """Return the sets of a frame, and keep those that the last frame has loaded."""
+        sets: dict[str, SplatSet] = {}
+        instances = []
+        cuts = {
+            i: self._find_cut(item, request) for i, item in enumerate(request.sets) if item.tree is not None
+        }
         self._cuts = {key: self._cuts[key] for key, _ in cuts.values() if key in self._cuts}
-        for i, one in enumerate(request.sets):
+        for i, item in enumerate(request.sets):
             if i in cuts:
                 key, read = cuts[i]
                 if key not in self._cuts:
                     self._cuts[key] = read()
                 instances += [
-                    Instance(splats, one.matrix, level, one.antialias, one.choice, one.looks)
+                    Instance(splats, item.matrix, level, item.antialias, item.query, item.looks)
                     for level, splats in self._cuts[key]
                 ]
                 continue
-            if one.file not in kept:
-                there = self._sets.get(one.file)  # which may be empty
-                kept[one.file] = self._read_set(frame, one) if there is None else there
-            place = one.matrix, one.level, one.antialias, one.choice, one.looks
-            instances.append(Instance(kept[one.file], *place))
-        self._sets = kept
+            if item.file not in sets:
+                loaded = self._sets.get(item.file)
+                # an empty set is false, so compare with None
+                sets[item.file] = self._read_set(frame, item) if loaded is None else loaded
+            splats = sets[item.file]
+            instances.append(
+                Instance(splats, item.matrix, item.level, item.antialias, item.query, item.looks)
+            )
+        self._sets = sets
         return instances
 
-    def _cut_of(
-        self, one: SetRequest, request: FrameRequest
+    def _find_cut(
+        self, item: SetRequest, request: FrameRequest
     ) -> tuple[tuple, Callable[[], list[tuple[int, SplatSet]]]]:
-        """What a tree's cut depends on, and what reads it: sets by their levels' numbers.
+        """Return the cache key of a tree's cut, and a function that reads the cut as sets by level number.
 
         Raises:
             LodgsError: the file cannot be read.
         """
-        path, choice, camera, unit = one.tree, one.choice, None, 1.0
-        assert path is not None and choice is not None
+        path, query = item.tree, item.query
+        assert path is not None and query is not None
         try:
             stat = path.stat()
         except OSError as error:
             raise LodgsError(
-                f"{path} cannot be read: {error.strerror}.",
-                "Choose where the file is under Streaming, or clear it to draw what the scene holds.",
+                f"Cannot read {path}: {error.strerror}.",
+                "Choose the file again under Streaming, or clear it to draw the levels in the scene.",
             ) from error
         stamp = stat.st_mtime_ns, stat.st_size
         if path not in self._trees or self._trees[path][0] != stamp:
             self._trees[path] = stamp, TreeFile(path)
         file = self._trees[path][1]
-        if is_similarity(one.matrix):
-            camera, unit = request.camera.in_object_space(one.matrix)
+        camera, unit = None, 1.0
+        if is_similarity(item.matrix):
+            camera, unit = request.camera.in_object_space(item.matrix)
         near = request.near / unit
-        where = None if camera is None else json.dumps(camera_to_dict(camera, near))
+        camera_key = None if camera is None else json.dumps(camera_to_dict(camera, near))
 
         def read() -> list[tuple[int, SplatSet]]:
-            cut = file.cut(choice, camera, near)
+            cut = file.cut(query, camera, near)
             return [(level, SplatSet(splats, None, self._backend)) for level, splats in cut.items()]
 
-        return (path, stamp, choice, where), read
+        return (path, stamp, query, camera_key), read
 
-    def _read_set(self, frame: int, one: SetRequest) -> SplatSet:
-        """A set from its file, without what cannot be drawn."""
-        splats, weights = wire.read_set(self._folder / one.file, one.count, one.columns)
+    def _read_set(self, frame: int, item: SetRequest) -> SplatSet:
+        """Read a set from its file, without splats that cannot be drawn."""
+        splats, weights = wire.read_set(self._folder / item.file, item.count, item.columns)
         splats.extras[_WEIGHTS] = np.nan_to_num(weights)
         splats = drop_undrawable(
-            splats, "the scene", lambda text: self.say("warning", frame=frame, message=text)
+            splats, "the scene", lambda text: self.send("warning", frame=frame, message=text)
         )
         return SplatSet(splats, splats.extras.pop(_WEIGHTS), self._backend)
 
-    def _end(self) -> None:
-        """Clean up and go, whatever the other threads are at."""
+    def _exit(self) -> None:
+        """Remove the folder and exit the process, even if other threads are busy."""
         wire.release_folder(self._folder)
         sys.stderr.flush()
         os._exit(0)

@@ -1,4 +1,4 @@
-"""Splats that fill a small picture, and a camera that sees them."""
+"""Fixtures for rendering tests: splats that fill a small image, and a camera."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from training.splats.gaussians import Splats
 
 @pytest.fixture
 def make_splats():
-    """make_splats(count, degree=3, seed=0): random splats around the origin."""
+    """Return ``make_splats(count, degree=3, seed=0)``, which makes random splats around the origin."""
 
     def make(count: int, degree: int = 3, seed: int = 0) -> Splats:
         rng = np.random.default_rng(seed)
@@ -26,7 +26,7 @@ def make_splats():
 
 @pytest.fixture
 def camera() -> Camera:
-    """64x48, four units before the origin, principal point off the middle."""
+    """Camera of 64x48 pixels, four units in front of the origin, with an off-center principal point."""
     pose = np.eye(4)
     pose[:3, 3] = 0.1, -0.05, 4
     return Camera("", 64, 48, 60.0, 62.0, 30.5, 25.0, pose)
