@@ -1,10 +1,10 @@
-"""What levels of detail are worth on a large scene, as LODGE's Table 3 asks: ``make bench-lod``.
+"""Measure levels of detail on a large scene, as in LODGE's Table 3: ``make bench-lod``.
 
-A town of known truth (``examples.town``) is photographed, given levels and chunks, and drawn from places that
-no training saw: the whole model, levels alone, with chunks, what is visible of them, and blending; and FLoD's
-and Octree-GS's own levels, trained on the same photographs. Frames are timed in turn. Prints the table, and
-saves build/bench/lod.json. What was made is kept beside it, and taken up again where it was left; the first
-time takes about an hour on two cores. Stages can be asked for one by one: the table has what is there.
+Captures a generated town (``examples.town``), creates levels and chunks, and renders them from unseen
+positions: the full model, levels only, with chunks, with visibility, and with blending; and levels of FLoD
+and Octree-GS trained on the same photos. Frame times are measured alternately. Prints a table and writes
+build/bench/lod.json. Intermediate results are stored in the same folder and reused; the first run takes
+about an hour on two cores. Stages can be run separately; the table contains available results.
 """
 
 from __future__ import annotations
@@ -46,22 +46,22 @@ from training.splats.ply import extra_columns, read_ply, splat_columns, write_pl
 
 REPEATS = 7
 PACE = 1.5 / 24
-"""Metres from frame to frame of somebody who walks, where jumps are looked for."""
-PLACES = 12
-"""So many of the chunks' borders along the walk, and as many places between them, are looked at."""
+"""Metres per frame at walking pace, for measuring jumps."""
+POSITIONS = 12
+"""Number of chunk borders along the walk, and of positions between them, to measure."""
 FRAMES = 6
-"""Frames at each of these places."""
+"""Frames at each of these positions."""
 
 DISTANCES = (24.0, 10.0)
-"""From so many metres on LODGE's coarser levels are shown. Left to itself it takes 32 and 16."""
+"""Distances in metres beyond which LODGE's coarser levels are used. Its automatic choice is 32 and 16."""
 LODGE = {"chunks": 64, "keep": 0.35, "prune_weight": 0.03, "tune_steps": 240}
-"""Its other parameters: for 3 million splats 11 cm apart, of which each has a fair share of some pixel."""
-OTHERS = {
+"""Other parameters of LODGE, for 3 million splats at 11 cm spacing that each cover part of a pixel."""
+OTHER_METHODS = {
     "flod": {"steps": [400, 600, 800, 1200, 2000], "max_splats": 300_000},
     "octree": {"steps": 5000, "max_splats": 300_000},
 }
-"""The other methods, which begin with points and are trained on the photographs at half size, and their
-budget: draft presets with more steps and splats, for at most some 20 minutes each."""
+"""Parameters of the other methods, trained from points on photos at half size: draft presets with more steps
+and splats, at most about 20 minutes each."""
 STAGES = ("town", "lodge", "others", "table")
 
 Draw = Callable[[Camera], Rendering]
@@ -69,12 +69,12 @@ Draw = Callable[[Camera], Rendering]
 
 @dataclass
 class Row:
-    """One way to draw the town.
+    """One variant of rendering the town.
 
     Attributes:
-        resident: what is held ready.
-        draw: a picture of it.
-        bytes: of a splat.
+        resident: loaded bundle.
+        draw: renders a view.
+        bytes: bytes per splat.
     """
 
     name: str
@@ -84,7 +84,7 @@ class Row:
 
 
 def make_town(folder: Path, splats: int, views: int) -> None:
-    """Town and photographs, unless they are there: town.ply and scene/."""
+    """Create the town and its photos, town.ply and scene/, unless they exist."""
     plan = town.plan_for(splats, 0)
     if not (folder / "town.ply").exists():
         write_ply(folder / "town.ply", town.build(plan, splats, 1, 0))
@@ -94,7 +94,7 @@ def make_town(folder: Path, splats: int, views: int) -> None:
 
 
 def train(folder: Path, method: str, parameters: dict, *options: str) -> None:
-    """A run of a method on the photographs; taken up where it was left."""
+    """Start or resume a method's run on the photos."""
     run = folder / method
     if (run / "bundle.ply").exists():
         return
@@ -109,7 +109,7 @@ def train(folder: Path, method: str, parameters: dict, *options: str) -> None:
 
 
 def train_lodge(folder: Path, views: int, effort: float) -> None:
-    """LODGE's levels and chunks of the town itself."""
+    """Train LODGE's levels and chunks of the town's splats."""
     depth = read_scene(folder / "scene").median_depth()
     distances = [round(metres / depth, 4) for metres in DISTANCES] + [0]
     parameters = {"distances": distances, **LODGE, "tune_steps": scaled(LODGE["tune_steps"], effort)}
@@ -118,14 +118,14 @@ def train_lodge(folder: Path, views: int, effort: float) -> None:
 
 
 def scaled(steps, effort: float):
-    """Numbers of steps, or a share of them."""
+    """Scale numbers of steps."""
     if isinstance(steps, list):
-        return [scaled(each, effort) for each in steps]
+        return [scaled(count, effort) for count in steps]
     return max(round(effort * steps), 10)
 
 
 def without_visibility(file: Path) -> Path:
-    """The same chunks with all that Eq. 2 gives them at their centres, in a file beside."""
+    """Write the bundle with all members of the chunks by Eq. 2, without visibility; return its path."""
     path = file.with_name("without_visibility.ply")
     if path.exists() and path.stat().st_mtime > file.stat().st_mtime:
         return path
@@ -144,150 +144,155 @@ def without_visibility(file: Path) -> Path:
         for level in bundle.levels
     }
     tables = {**bundle.tables, BLOCKS: block_table(RULE, splats)}
-    found = [replace(level, splats=splats[level.number]) for level in bundle.levels]
-    write_bundle(path, replace(bundle, levels=found, tables=tables))
+    levels_out = [replace(level, splats=splats[level.number]) for level in bundle.levels]
+    write_bundle(path, replace(bundle, levels=levels_out, tables=tables))
     return path
 
 
-def rows_of(file: Path, others: dict[str, Path]) -> list[Row]:
-    """All ways to draw, the whole model first. Of each what it needs is read of its file."""
+def rows_of(file: Path, other_bundles: dict[str, Path]) -> list[Row]:
+    """Return all variants, the full model first. Each reads only the data it needs."""
 
-    def row(name: str, shown: Path, **values: float) -> Row:
-        resident = ResidentBundle(shown)
-        given = resolve_controls(resident.bundle, values)
+    def row(name: str, path: Path, **values: float) -> Row:
+        resident = ResidentBundle(path)
+        controls = resolve_controls(resident.bundle, values)
         return Row(
-            name, resident, lambda camera: resident.draw(camera, given, near=town.NEAR), bytes_of(shown)
+            name, resident, lambda camera: resident.draw(camera, controls, near=town.NEAR), bytes_of(path)
         )
 
-    alone, plain = ResidentBundle(file), bytes_of(file, extras=False)
-    finest = alone.bundle.levels[-1].number
-    found = [
-        Row("full", alone, lambda camera: alone.draw_level(finest, camera, near=town.NEAR), plain),
+    full, plain = ResidentBundle(file), bytes_of(file, extras=False)
+    finest = full.bundle.levels[-1].number
+    rows = [
+        Row("full", full, lambda camera: full.draw_level(finest, camera, near=town.NEAR), plain),
         row("levels", file, chunks=0),
     ]
-    if TABLE in alone.bundle.tables:
-        found += [
+    if TABLE in full.bundle.tables:
+        rows += [
             row("levels + chunks", without_visibility(file), chunks=1, fade=0),
             row("levels + chunks + visibility", file, chunks=1, fade=0),
             row("levels + chunks + visibility + blending", file, chunks=1, fade=1),
         ]
-    return found + [row(name, other) for name, other in others.items()]
+    return rows + [row(name, path) for name, path in other_bundles.items()]
 
 
 def bytes_of(file: Path, extras: bool = True) -> int:
-    """Of a splat in a file."""
+    """Return the bytes per splat of a file."""
     splats = read_part(file, [])[0].levels[-1].splats
     columns = splat_columns(splats) | (extra_columns(splats) if extras else {})
     return sum(column.dtype.itemsize for column in columns.values())
 
 
-def measure(rows: Sequence[Row], ways: dict[str, list[Camera]]) -> list[dict]:
-    """The table: every view drawn by every row, in turn."""
-    found = {row.name: {way: [] for way in ways} for row in rows}
-    for way, cameras in ways.items():
+def measure(rows: Sequence[Row], paths: dict[str, list[Camera]]) -> list[dict]:
+    """Render all views with all variants alternately; return the table."""
+    results = {row.name: {path: [] for path in paths} for row in rows}
+    for path, cameras in paths.items():
         for camera in cameras:
             truth = None
             for row in rows:
-                drawn = row.draw(camera)
-                truth = drawn.image if truth is None else truth
-                count = int((drawn.radii > 0).sum())
-                found[row.name][way].append([psnr(drawn.image, truth), count, row.resident.loaded, []])
+                rendering = row.draw(camera)
+                truth = rendering.image if truth is None else truth
+                count = int((rendering.radii > 0).sum())
+                results[row.name][path].append([psnr(rendering.image, truth), count, row.resident.loaded, []])
             for _ in range(REPEATS):
                 for row in rows:
                     started = time.perf_counter()
                     row.draw(camera)
-                    found[row.name][way][-1][3].append(time.perf_counter() - started)
+                    results[row.name][path][-1][3].append(time.perf_counter() - started)
     table = []
     for row in rows:
         line: dict = {"name": row.name}
-        for way, views in found[row.name].items():
-            line[way] = {
+        for path, views in results[row.name].items():
+            line[path] = {
                 "psnr_full": round(float(np.mean([view[0] for view in views])), 2),
                 "ms": round(1e3 * float(np.mean([statistics.median(view[3]) for view in views])), 1),
                 "drawn": round(float(np.mean([view[1] for view in views]))),
                 "loaded": round(float(np.mean([view[2] for view in views]))),
             }
-        both = list(found[row.name])
+        names = list(results[row.name])
         for name in ("psnr_full", "ms", "drawn", "loaded"):
-            line[name] = round(float(np.mean([line[way][name] for way in both])), 2)
+            line[name] = round(float(np.mean([line[path][name] for path in names])), 2)
         line["mb"] = round(line["loaded"] * row.bytes / 1e6, 1)
         table.append(line)
     return table
 
 
-def jumps(rows: Sequence[Row], bundle: Bundle, plan: town.Plan, picture: Path) -> dict[str, dict[str, float]]:
-    """How much frames at walking pace change where the nearest chunk does and elsewhere, over the full one's.
+def jumps(rows: Sequence[Row], bundle: Bundle, plan: town.Plan, image: Path) -> dict[str, dict[str, float]]:
+    """Measure changes between frames at walking pace, relative to the full model.
 
-    At a quicker pace all that moves hides the border.
+    At a faster pace, motion would hide the jumps.
 
     Args:
-        picture: PNG to write of the border that shows most: the frame before it, and ten times the difference
-            to the next frame of the full model, without blending, and with it.
+        rows: variants.
+        bundle: bundle with chunks.
+        plan: the town.
+        image: PNG to write for the most visible border: the frame before it, and ten times the difference to
+            the next frame for the full model, without blending and with blending.
 
     Returns:
-        By the row's name the largest ``border`` and ``elsewhere``.
+        The largest ratio at a ``border`` between chunks and ``elsewhere``, by variant.
     """
-    eyes = np.stack([camera.center for camera in town.walk(plan, 1000)])
-    views = town.walk(plan, round(np.linalg.norm(np.diff(eyes, axis=0), axis=1).sum() / PACE), 0.5)
+    centers = np.stack([camera.center for camera in town.walk(plan, 1000)])
+    views = town.walk(plan, round(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum() / PACE), 0.5)
     values = resolve_controls(bundle, {"fade": 0})
     nearest = [RULE.near_chunks(view.center, values, bundle.tables)[:1] for view in views]
     borders = [number for number, (a, b) in enumerate(pairwise(nearest)) if a != b]
-    places = {"border": borders, "elsewhere": [(a + b) // 2 for a, b in pairwise(borders)]}
-    places = {
-        name: [max(place - 2, 0) for place in pick_evenly(some, PLACES)] for name, some in places.items()
+    frames_by_kind = {"border": borders, "elsewhere": [(a + b) // 2 for a, b in pairwise(borders)]}
+    frames_by_kind = {
+        kind: [max(frame - 2, 0) for frame in pick_evenly(frames, POSITIONS)]
+        for kind, frames in frames_by_kind.items()
     }
-    shown = [rows[0], *rows[3:5]]
+    compared = [rows[0], *rows[3:5]]
 
-    def drawn(row: Row, place: int) -> list[np.ndarray]:
-        return [row.draw(view).image.numpy() for view in views[place : place + FRAMES]]
+    def render(row: Row, first: int) -> list[np.ndarray]:
+        return [row.draw(view).image.numpy() for view in views[first : first + FRAMES]]
 
-    def changes(row: Row, name: str) -> np.ndarray:
-        found = [[np.abs(b - a).mean() for a, b in pairwise(drawn(row, place))] for place in places[name]]
-        return np.array(found)
+    def frame_changes(row: Row, kind: str) -> np.ndarray:
+        frames = frames_by_kind[kind]
+        return np.array([[np.abs(b - a).mean() for a, b in pairwise(render(row, first))] for first in frames])
 
-    found = {name: [changes(row, name) for row in shown] for name in places}
-    worst = np.argmax((found["border"][1] / found["border"][0]).max(axis=1))
-    at = np.argmax(found["border"][1][worst] / found["border"][0][worst])
-    frames = [drawn(row, places["border"][worst])[at : at + 2] for row in shown]
+    changes = {kind: [frame_changes(row, kind) for row in compared] for kind in frames_by_kind}
+    worst = np.argmax((changes["border"][1] / changes["border"][0]).max(axis=1))
+    index = np.argmax(changes["border"][1][worst] / changes["border"][0][worst])
+    frames = [render(row, frames_by_kind["border"][worst])[index : index + 2] for row in compared]
     tiles = [frames[0][0], *(10 * np.abs(b - a) for a, b in frames)]
     sheet = np.concatenate([np.concatenate(tiles[:2], axis=1), np.concatenate(tiles[2:], axis=1)])
-    write_png(picture, np.round(255 * sheet.clip(0, 1)).astype(np.uint8))
+    write_png(image, np.round(255 * sheet.clip(0, 1)).astype(np.uint8))
     return {
         row.name: {
-            name: round(float((of_rows[number] / of_rows[0]).max()), 3) for name, of_rows in found.items()
+            kind: round(float((by_row[number] / by_row[0]).max()), 3) for kind, by_row in changes.items()
         }
-        for number, row in enumerate(shown[1:], 1)
+        for number, row in enumerate(compared[1:], 1)
     }
 
 
-def about(run: Path) -> dict:
-    """What another method was given and what it made of it, by its run's own files."""
+def describe_run(run: Path) -> dict:
+    """Return the settings and result of another method's run."""
     folder = RunFolder(run)
-    job, ended = Job.from_file(folder.job), folder.end_event() or {}
+    job = Job.from_file(folder.job)
+    end = folder.end_event() or {}
     steps = int(np.sum(job.resolved_parameters().steps))  # type: ignore[attr-defined]
     splats = [level["splats"] for level in folder.levels()]
-    found = {
+    result = {
         "steps": steps,
         "image_scale": job.image_scale,
         "splats": splats,
-        "seconds": ended.get("seconds"),
+        "seconds": end.get("seconds"),
     }
-    found["what"] = (
-        f"{steps:,} steps on photographs at {job.image_scale:g} of their size, from points; "
-        f"{sum(splats):,} splats on {len(splats)} levels, {found['seconds']:.0f} s"
+    result["what"] = (
+        f"{steps:,} steps on photos at scale {job.image_scale:g}, from points; "
+        f"{sum(splats):,} splats on {len(splats)} levels, {result['seconds']:.0f} s"
     )
-    return found
+    return result
 
 
 def write_table(folder: Path, out: Path, frames: int, splats: int) -> None:
-    """Draws, measures and prints all that is there."""
+    """Render, measure and print all available results."""
     file = folder / "lodge" / "bundle.ply"
-    others = {name: folder / name / "bundle.ply" for name in OTHERS}
-    others = {name: path for name, path in others.items() if path.exists()}
+    bundles = {name: folder / name / "bundle.ply" for name in OTHER_METHODS}
+    bundles = {name: path for name, path in bundles.items() if path.exists()}
     plan = town.plan_for(splats, 0)
-    ways = {"walk": town.walk(plan, frames, 0.5), "flight": town.flight(plan, frames, 0.5)}
-    rows = rows_of(file, others)
-    table = measure(rows, ways)
+    paths = {"walk": town.walk(plan, frames, 0.5), "flight": town.flight(plan, frames, 0.5)}
+    rows = rows_of(file, bundles)
+    table = measure(rows, paths)
     print(f"{'':<42}{'PSNR':>7}{'ms':>8}{'x':>6}{'drawn':>11}{'loaded':>11}{'MB':>8}")
     for line in table:
         times = table[0]["ms"] / line["ms"]
@@ -295,34 +300,35 @@ def write_table(folder: Path, out: Path, frames: int, splats: int) -> None:
             f"{line['name']:<42}{line['psnr_full']:>7.2f}{line['ms']:>8.1f}{times:>6.1f}"
             f"{line['drawn']:>11,.0f}{line['loaded']:>11,.0f}{line['mb']:>8.1f}"
         )
-    said = {"splats": splats, "rows": table, "others": {name: about(folder / name) for name in others}}
-    for name, given in said["others"].items():
-        print(f"{name}: {given['what']}")
+    report = {"splats": splats, "rows": table}
+    report["others"] = {name: describe_run(folder / name) for name in bundles}
+    for name, result in report["others"].items():
+        print(f"{name}: {result['what']}")
     bundle = rows[0].resident.bundle
-    said["chunks"] = len(bundle.tables[TABLE]["x"]) if TABLE in bundle.tables else 0
-    said["d_l"] = {level.number: level.facts["d_l"] for level in bundle.levels}
-    if said["chunks"]:
-        said["jumps"] = jumps(rows, bundle, plan, out / "lod-border.png")
-        for name, change in said["jumps"].items():
-            print(f"{name}: at chunks' borders {change['border']:.2f}, elsewhere {change['elsewhere']:.2f}")
-    (out / "lod.json").write_text(json.dumps(said, indent=1) + "\n", encoding="utf-8")
+    report["chunks"] = len(bundle.tables[TABLE]["x"]) if TABLE in bundle.tables else 0
+    report["d_l"] = {level.number: level.facts["d_l"] for level in bundle.levels}
+    if report["chunks"]:
+        report["jumps"] = jumps(rows, bundle, plan, out / "lod-border.png")
+        for name, change in report["jumps"].items():
+            print(f"{name}: at borders of chunks {change['border']:.2f}, elsewhere {change['elsewhere']:.2f}")
+    (out / "lod.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("stages", nargs="*", metavar="STAGE", help=f"of {', '.join(STAGES)}; otherwise all")
+    parser.add_argument("stages", nargs="*", metavar="STAGE", help=f"any of {', '.join(STAGES)}; default all")
     parser.add_argument("--splats", type=int, default=3_000_000)
-    parser.add_argument("--views", type=int, default=48, help="photographs of each way")
-    parser.add_argument("--frames", type=int, default=12, help="held-out views of each way")
-    parser.add_argument("--others", nargs="*", default=list(OTHERS), help="other methods to train")
-    parser.add_argument("--effort", type=float, default=1.0, help="share of all steps, to try it out")
+    parser.add_argument("--views", type=int, default=48, help="photos per path")
+    parser.add_argument("--frames", type=int, default=12, help="held-out views per path")
+    parser.add_argument("--others", nargs="*", default=list(OTHER_METHODS), help="other methods to train")
+    parser.add_argument("--effort", type=float, default=1.0, help="share of all steps, for a quick test")
     parser.add_argument("--out", type=Path, default=Path("build/bench"))
     options = parser.parse_args()
     stages = options.stages or STAGES
     if unknown := set(stages) - set(STAGES):
-        parser.error(f"there is no stage {', '.join(unknown)}")
+        parser.error(f"unknown stage: {', '.join(unknown)}")
     torch.set_num_threads(1)
     folder = options.out / f"town_{options.splats}"
     if "town" in stages:
@@ -330,7 +336,7 @@ def main() -> None:
     if "lodge" in stages:
         train_lodge(folder, options.views, options.effort)
     for name in options.others if "others" in stages else ():
-        parameters = OTHERS[name] | {"steps": scaled(OTHERS[name]["steps"], options.effort)}
+        parameters = OTHER_METHODS[name] | {"steps": scaled(OTHER_METHODS[name]["steps"], options.effort)}
         train(folder, name, parameters)
     if "table" in stages:
         write_table(folder, options.out, options.frames, options.splats)

@@ -1,12 +1,10 @@
-"""A copy of a scene whose photographs differ in exposure, to see what ``lr_exposure`` is worth.
+"""Copy a scene with random exposure changes of its photos, to evaluate ``lr_exposure``.
 
     python lab/jitter.py SCENE COPY [--stops 0.7]
     python tools/bench_quality.py COPY SCENE --report --methods 3dgs --shares 1 --set lr_exposure=0.01
 
-``psnr`` counts what exposure is missed as well, ``fitted_psnr`` only what is left without it.
-
-Every photograph is as if it had been exposed by a random number of stops more or less; those that ``train``
-holds out stay as they are, so that pictures are compared with the same truth.
+``psnr`` includes exposure errors, ``fitted_psnr`` does not. The exposure of each photo changes by a random
+number of stops; photos that ``train`` holds out stay unchanged, so that the ground truth is the same.
 """
 
 from __future__ import annotations
@@ -26,42 +24,44 @@ from training.errors import LodgsError  # noqa: E402
 from training.scenes.colmap import read_scene  # noqa: E402
 from training.scenes.color import linear_from_srgb, srgb_from_linear  # noqa: E402
 
-MOST_STOPS = 10.0
+MAX_STOPS = 10.0
 
 
 def exposed(pixels: np.ndarray, stops: float) -> np.ndarray:
-    """A photograph (H, W, 3) uint8 with 2^stops as much light; what is over white is lost."""
+    """Return a photo (H, W, 3) uint8 with 2^stops times the light; values above white are clipped."""
     linear = linear_from_srgb(pixels / 255.0) * 2.0**stops
     return np.round(255 * srgb_from_linear(np.clip(linear, 0, 1))).astype(np.uint8)
 
 
 def jittered(scene: Path, copy: Path, stops: float, seed: int, test_every: int) -> dict[str, float]:
-    """Writes the copy.
+    """Write a copy with changed exposures.
 
     Args:
-        stops: the most that a photograph's light is changed, up or down.
-        test_every: every so many-th photograph by name stays as it is, as ``Scene.split`` has it.
+        scene, copy: folders.
+        stops: maximum change, up or down.
+        seed: random seed.
+        test_every: every n-th photo by name stays unchanged, as in ``Scene.split``.
 
     Returns:
-        The stops of each photograph that was changed, by name.
+        The stops of each changed photo, by name.
 
     Raises:
         LodgsError: the scene cannot be read, or the copy exists.
     """
-    if not 0 <= stops <= MOST_STOPS:
-        raise LodgsError(f"Stops of {stops} are not possible.", f"Give 0 to {MOST_STOPS}.")
+    if not 0 <= stops <= MAX_STOPS:
+        raise LodgsError(f"Invalid stops = {stops}.", f"Give a number from 0 to {MAX_STOPS}.")
     if copy.exists():
-        raise LodgsError(f"{copy} exists.", "Choose another folder.")
+        raise LodgsError(f"Cannot write copy: {copy} already exists.", "Choose another folder.")
     train, _ = read_scene(scene).split(test_every)
-    drawn = np.random.default_rng(seed).uniform(-stops, stops, len(train))
+    changes = np.random.default_rng(seed).uniform(-stops, stops, len(train))
     shutil.copytree(scene, copy)
-    for camera, change in zip(train, drawn, strict=True):
+    for camera, change in zip(train, changes, strict=True):
         if camera.image is None:
             continue
         path = copy / camera.image.relative_to(scene)
         changed = exposed(np.asarray(Image.open(path).convert("RGB")), change)
         Image.fromarray(changed).save(path, quality=97)
-    return {camera.name: float(change) for camera, change in zip(train, drawn, strict=True)}
+    return {camera.name: float(change) for camera, change in zip(train, changes, strict=True)}
 
 
 def main() -> int:
@@ -75,11 +75,13 @@ def main() -> int:
     parser.add_argument("--test-every", type=int, default=8)
     args = parser.parse_args()
     try:
-        found = jittered(args.scene, args.copy, args.stops, args.seed, args.test_every)
+        changes = jittered(args.scene, args.copy, args.stops, args.seed, args.test_every)
     except LodgsError as error:
         print(error.what, error.remedy, file=sys.stderr)
         return 2
-    print(f"{len(found)} photographs by {min(found.values()):+.2f} to {max(found.values()):+.2f} stops")
+    print(
+        f"Changed {len(changes)} photos by {min(changes.values()):+.2f} to {max(changes.values()):+.2f} stops"
+    )
     return 0
 
 

@@ -1,10 +1,10 @@
-"""How a run's held-out views do at other sizes than it was trained at, against the photographs at that size.
+"""Measure a run's held-out views at other image sizes than in training, against photos of that size.
 
     python -m training train --scene DIR --out build/run --method 3dgs --image-scale 0.25 --validation
     python lab/other_sizes.py build/run
 
-A size at which photographs would have to be enlarged is left out. Of splats that were trained with
-Mip-Splatting's filter it also tells how programs do that do not know it.
+Sizes that exceed the photos are skipped. For splats trained with Mip-Splatting's filter, the result in
+programs without this filter is measured as well.
 """
 
 from __future__ import annotations
@@ -25,50 +25,48 @@ from training.lod.selection import standalone_levels  # noqa: E402
 from training.runs.data import training_data  # noqa: E402
 from training.runs.folder import RunFolder  # noqa: E402
 from training.runs.job import Job  # noqa: E402
-from training.splats.bundle import read_bundle
-from training.splats.levels import Bundle, Level
+from training.splats.bundle import read_bundle  # noqa: E402
+from training.splats.levels import Bundle, Level  # noqa: E402
 
 SIZES = (1, 2, 4)
-"""How many times the size of training."""
+"""Multiples of the training size."""
 
 
-def as_drawn(bundle: Bundle) -> dict[str, Bundle]:
-    """The bundle by who draws it: LODGS; and, of what is antialiased, programs that do not know the filter,
-    from a file that is made for them, and from the bundle itself."""
+def bundles_by_renderer(bundle: Bundle) -> dict[str, Bundle]:
+    """Return the bundle as rendered by LODGS and, if antialiased, by programs without the filter:
+    from a file with the filter baked, and from the bundle itself."""
     if not bundle.antialias:
         return {"": bundle}
-    made = bake_filter(bundle)
-    levels = [Level(level.number, level.rows.select(slice(None)), level.facts) for level in made.levels]
+    baked = bake_filter(bundle)
+    levels = [Level(level.number, level.rows.select(slice(None)), level.facts) for level in baked.levels]
     untold = {name: value for name, value in bundle.meta.items() if name != "antialias"}
     return {
         "": bundle,
-        ", a file for others": replace(made, levels=levels),
-        ", the bundle in others": replace(bundle, meta=untold),
+        ", filter baked, other programs": replace(baked, levels=levels),
+        ", original, other programs": replace(bundle, meta=untold),
     }
 
 
 def psnr_by_size(run: Path) -> Iterator[tuple[int, str, dict[int, float]]]:
-    """For each size, and each who draws it, the mean PSNR of each level's views, in dB.
+    """Yield size, renderer and mean PSNR of each level in dB.
 
     Raises:
         LodgsError: the run or its scene cannot be read.
     """
     folder = RunFolder(run)
-    job, ways = Job.from_file(folder.job), as_drawn(read_bundle(folder.bundle))
+    job, bundles = Job.from_file(folder.job), bundles_by_renderer(read_bundle(folder.bundle))
     for size in SIZES:
         if size * job.image_scale > 1:
             return
         data = training_data(replace(job, image_scale=size * job.image_scale), folder)
-        for who, bundle in ways.items():
+        for renderer, bundle in bundles.items():
             evaluation = Evaluation(data, job.backend, bundle.antialias)
             yield (
                 size,
-                who,
+                renderer,
                 {
                     level.number: float(
-                        evaluation.compare_views(
-                            evaluation.cameras, full_detail_source(bundle, level)
-                        ).mean()
+                        evaluation.compare_views(evaluation.cameras, full_detail_source(bundle, level)).mean()
                     )
                     for level in standalone_levels(bundle)
                 },
@@ -81,9 +79,9 @@ def main() -> int:
     )
     parser.add_argument("run", type=Path, metavar="RUN")
     try:
-        for size, who, levels in psnr_by_size(parser.parse_args().run):
+        for size, renderer, levels in psnr_by_size(parser.parse_args().run):
             by_level = ", ".join(f"{psnr:.2f}" for psnr in levels.values())
-            print(f"{size} times{who}: {by_level} dB", flush=True)
+            print(f"{size} times{renderer}: {by_level} dB", flush=True)
     except LodgsError as error:
         print(error.what, error.remedy, file=sys.stderr)
         return 2

@@ -1,9 +1,9 @@
-"""The pictures of docs/scenes.md that need no window: what masks, alpha, lenses and a region change.
+"""Create the images of docs/scenes.md that need no window: masks, alpha, lens distortion and a region.
 
     python lab/scene_images.py build/scene_images [masks alone lens region]
 
-Each is made by the commands that its page tells of, of the example or of a monkey that Blender renders; a few
-minutes on two cores. Then look at them, and copy what is to be shown to docs/images.
+Uses the commands of that page on the example or on a monkey rendered with Blender; takes a few minutes on two
+cores. Check the images and copy them to docs/images.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ sys.path.insert(0, str(ROOT))
 GARDEN = ROOT / "examples" / "lantern_garden"
 AS_BLENDER = ROOT / "tests" / "blender" / "as_blender.py"
 SEEN = "view_20.jpg"
-"""The view of the example that is shown; not one that is held out."""
+"""Displayed view of the example; not a held-out one."""
 HELD_OUT = "view_24.jpg"
 STEPS = 500
 WIDE = 360
-"""Pixels across each part of a picture."""
+"""Width of each tile in pixels."""
 LENS = 0.25, 0.05
-"""k1 and k2 of the lens that bends the example's lines."""
+"""k1 and k2 of the lens distortion added to the example."""
 MONKEY = """
 import bpy, sys
 bpy.ops.wm.read_factory_settings(use_empty=True)
@@ -60,7 +60,7 @@ Tile = tuple[str, Image.Image]
 
 
 def lodgs(*words: object) -> None:
-    """The command, which has to succeed."""
+    """Run a lodgs command; raise an error if it fails."""
     subprocess.run([sys.executable, "-m", "training", *map(str, words)], cwd=ROOT, check=True)
 
 
@@ -71,14 +71,14 @@ def train(scene: Path, run: Path, *words: object, scale: float = 0.5) -> Path:
     return run
 
 
-def drawn(run: Path, view: str, *words: object) -> Image.Image:
-    picture = run / "picture.png"
-    lodgs("render", run, "--view", view, "--out", picture, *words)
-    return Image.open(picture).convert("RGBA")
+def rendered(run: Path, view: str, *words: object) -> Image.Image:
+    path = run / "rendering.png"
+    lodgs("render", run, "--view", view, "--out", path, *words)
+    return Image.open(path).convert("RGBA")
 
 
 def copied(scene: Path, change: Callable[[Image.Image, int], Image.Image]) -> Path:
-    """The example with other photographs."""
+    """Copy the example with changed photos."""
     shutil.rmtree(scene, ignore_errors=True)
     shutil.copytree(GARDEN / "sparse", scene / "sparse")
     (scene / "images").mkdir()
@@ -87,41 +87,41 @@ def copied(scene: Path, change: Callable[[Image.Image, int], Image.Image]) -> Pa
     return scene
 
 
-def passer_by(number: int, size: tuple[int, int]) -> Image.Image:
-    """Where somebody stands in a photograph, white; each time elsewhere, as people walk on."""
-    picture = Image.new("L", size)
-    draw, middle = ImageDraw.Draw(picture), 60 + (number * 137) % 360
+def person_mask(number: int, size: tuple[int, int]) -> Image.Image:
+    """Return a mask of a walking person, white, at a position that depends on the photo's number."""
+    mask = Image.new("L", size)
+    draw, middle = ImageDraw.Draw(mask), 60 + (number * 137) % 360
     draw.ellipse((middle - 14, 70, middle + 14, 104), fill=255)
     draw.rounded_rectangle((middle - 26, 106, middle + 26, 230), 18, fill=255)
     draw.rectangle((middle - 20, 226, middle + 20, 319), fill=255)
-    return picture
+    return mask
 
 
 def masks(folder: Path) -> list[Tile]:
-    """People who walk through, with masks and without."""
+    """Train with people in the photos, with and without masks."""
 
-    def walked_through(picture: Image.Image, number: int) -> Image.Image:
+    def add_person(image: Image.Image, number: int) -> Image.Image:
         color = [(150, 40, 50), (40, 60, 140), (60, 110, 70)][number % 3]
-        picture.paste(color, mask=passer_by(number, picture.size))
-        return picture
+        image.paste(color, mask=person_mask(number, image.size))
+        return image
 
-    scene = copied(folder / "masked", walked_through)
+    scene = copied(folder / "masked", add_person)
     without = train(scene, folder / "without_masks")
     (scene / "masks").mkdir()
     for number, path in enumerate(sorted((scene / "images").iterdir())):
-        person = passer_by(number, Image.open(path).size)
+        person = person_mask(number, Image.open(path).size)
         Image.eval(person, lambda value: 255 - value).save(scene / "masks" / f"{path.name}.png")
     having = train(scene, folder / "with_masks")
     return [
         (f"images/{SEEN}", Image.open(scene / "images" / SEEN)),
         (f"masks/{SEEN}.png", Image.open(scene / "masks" / f"{SEEN}.png")),
-        ("trained without masks", drawn(without, SEEN)),
-        ("trained with masks", drawn(having, SEEN)),
+        ("trained without masks", rendered(without, SEEN)),
+        ("trained with masks", rendered(having, SEEN)),
     ]
 
 
 def alone(folder: Path) -> list[Tile]:
-    """A thing on transparent ground, from a Blender scene."""
+    """Train an object with transparent background from a Blender scene."""
     blend, scene, view = folder / "monkey.blend", folder / "monkey", "view_0006.png"
     subprocess.run([sys.executable, "-c", MONKEY, str(blend)], check=True)
     subprocess.run(
@@ -132,36 +132,36 @@ def alone(folder: Path) -> list[Tile]:
     run = train(scene, folder / "monkey_run", scale=1)
     return [
         ("a view, captured with a transparent film", over(Image.open(scene / "images" / view), None)),
-        ("splats, transparent", over(drawn(run, view, "--background", "transparent"), None)),
-        ("over white", drawn(run, view, "--background", "1,1,1")),
-        ("over magenta", drawn(run, view, "--background", "1,0,1")),
+        ("splats, transparent", over(rendered(run, view, "--background", "transparent"), None)),
+        ("over white", rendered(run, view, "--background", "1,1,1")),
+        ("over magenta", rendered(run, view, "--background", "1,0,1")),
     ]
 
 
-def over(picture: Image.Image, color: tuple[int, int, int] | None) -> Image.Image:
-    """A picture with alpha over a colour, or over a checkerboard."""
-    width, height = picture.size
+def over(image: Image.Image, color: tuple[int, int, int] | None) -> Image.Image:
+    """Composite an image with alpha over a colour or a checkerboard."""
+    width, height = image.size
     if color is None:
         light = 130 + 60 * ((np.arange(height)[:, None] // 12 + np.arange(width) // 12) % 2)
         ground = Image.fromarray(np.repeat(light[..., None], 3, axis=2).astype(np.uint8))
     else:
-        ground = Image.new("RGB", picture.size, color)
-    ground.paste(picture.convert("RGB"), mask=picture.convert("RGBA").getchannel("A"))
+        ground = Image.new("RGB", image.size, color)
+    ground.paste(image.convert("RGB"), mask=image.convert("RGBA").getchannel("A"))
     return ground
 
 
 def lens(folder: Path) -> list[Tile]:
-    """Photographs whose lens bends lines, as they are and straightened."""
-    subprocess.run([sys.executable, "-c", BENT, str(GARDEN), str(folder / "bent")], cwd=ROOT, check=True)
+    """Distort the example's photos and undistort them."""
+    subprocess.run([sys.executable, "-c", DISTORT, str(GARDEN), str(folder / "bent")], cwd=ROOT, check=True)
     lodgs("undistort", folder / "bent")
     straight = next((folder / "bent" / ".undistorted").rglob(SEEN))
     return [
-        ("as its lens took it", Image.open(folder / "bent" / "images" / SEEN)),
+        ("with lens distortion", Image.open(folder / "bent" / "images" / SEEN)),
         ("straightened", Image.open(straight)),
     ]
 
 
-BENT = f"""
+DISTORT = f"""
 import sys
 from pathlib import Path
 import numpy as np, pycolmap
@@ -191,35 +191,35 @@ for path in sorted((garden / "images").iterdir()):
 
 
 def region(folder: Path) -> list[Tile]:
-    """The table in detail, and all else coarsely."""
+    """Train the table in detail and the surroundings coarsely."""
     box = "box -1.2 -1.2 0.4 1.2 1.2 1.8"
     within = train(GARDEN, folder / "region", "--region", box)
-    whole = train(GARDEN, folder / "whole")
+    full = train(GARDEN, folder / "full")
     return [
-        ("a photograph that was held out", Image.open(GARDEN / "images" / HELD_OUT)),
-        ("trained as a whole", drawn(whole, HELD_OUT)),
-        (f"--region '{box}'", drawn(within, HELD_OUT)),
+        ("held-out photo", Image.open(GARDEN / "images" / HELD_OUT)),
+        ("full scene", rendered(full, HELD_OUT)),
+        (f"--region '{box}'", rendered(within, HELD_OUT)),
     ]
 
 
 def sheet(path: Path, tiles: Sequence[Tile], columns: int) -> None:
-    """Writes tiles with their captions side by side."""
+    """Write tiles with captions as one image."""
     tiles = [(name, image.convert("RGB")) for name, image in tiles]
     high = max(round(WIDE * image.height / image.width) for _, image in tiles)
-    whole = Image.new(
+    canvas = Image.new(
         "RGB", (columns * (WIDE + 4) - 4, -(-len(tiles) // columns) * (high + 22)), (24, 24, 24)
     )
-    draw, font = ImageDraw.Draw(whole), ImageFont.load_default(size=13)
-    for place, (name, image) in enumerate(tiles):
-        x, y = place % columns * (WIDE + 4), place // columns * (high + 22)
+    draw, font = ImageDraw.Draw(canvas), ImageFont.load_default(size=13)
+    for index, (name, image) in enumerate(tiles):
+        x, y = index % columns * (WIDE + 4), index // columns * (high + 22)
         size = WIDE, round(WIDE * image.height / image.width)
-        whole.paste(image.resize(size, Image.Resampling.LANCZOS), (x, y + 22))
+        canvas.paste(image.resize(size, Image.Resampling.LANCZOS), (x, y + 22))
         draw.text((x + 6, y + 3), name, fill=(230, 230, 230), font=font)
-    whole.save(path, quality=88)
+    canvas.save(path, quality=88)
     print(path)
 
 
-SHOWN = {"masks": (masks, 2), "alone": (alone, 2), "lens": (lens, 2), "region": (region, 3)}
+IMAGES = {"masks": (masks, 2), "alone": (alone, 2), "lens": (lens, 2), "region": (region, 3)}
 
 
 def main() -> int:
@@ -227,12 +227,12 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("out", type=Path)
-    parser.add_argument("which", nargs="*", choices=list(SHOWN), metavar="WHICH", help=", ".join(SHOWN))
-    chosen = parser.parse_args()
-    folder = chosen.out.resolve()
+    parser.add_argument("which", nargs="*", choices=list(IMAGES), metavar="WHICH", help=", ".join(IMAGES))
+    options = parser.parse_args()
+    folder = options.out.resolve()
     folder.mkdir(parents=True, exist_ok=True)
-    for name in chosen.which or SHOWN:
-        make, columns = SHOWN[name]
+    for name in options.which or IMAGES:
+        make, columns = IMAGES[name]
         sheet(folder / f"scenes-{name}.jpg", make(folder), columns)
     return 0
 

@@ -1,4 +1,4 @@
-"""The bench of trees larger than memory, on a small one."""
+"""Benchmark of trees larger than memory, with a small tree."""
 
 import json
 import subprocess
@@ -11,13 +11,13 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(sys.platform != "linux", reason="asks /proc for the resident memory")
-def test_a_tree_of_ten_times_the_budget_keeps_to_what_it_is_allowed(tmp_path):
-    """By the system's own count; were all nodes in memory, it would be 90 MB more."""
+@pytest.mark.skipif(sys.platform != "linux", reason="reads the resident memory from /proc")
+def test_tree_of_ten_times_the_budget_stays_within_its_memory_limit(tmp_path):
+    """With all nodes in memory, the process would need 90 MB more."""
     out = tmp_path / "tree.json"
     command = [sys.executable, "lab/bench_tree_memory.py", "--tiny", "--out", str(out)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    process = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert process.returncode == 0, process.stderr
     (row,) = json.loads(out.read_text(encoding="utf-8"))["rows"]
     assert row["budget_mb"] == 10 and row["splats"] * 180 > 9.9 * 10e6
     assert row["allowed_mb"] == pytest.approx(11 + row["program_mb"] + row["drawing_mb"])

@@ -1,4 +1,4 @@
-"""A copy of a scene in other exposures: linear light by as much as is said; held-out photographs stay."""
+"""Copies of scenes with changed exposure: linear light by the given stops; held-out photos unchanged."""
 
 import subprocess
 import sys
@@ -13,17 +13,17 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def linear(path: Path) -> np.ndarray:
-    """Linear light by the standard's formula, pixel by pixel; NaN where a code is too dark or white."""
+    """Decode sRGB to linear light; NaN for very dark or saturated values."""
     codes = np.asarray(Image.open(path).convert("RGB")).astype(float)
     light = ((codes / 255 + 0.055) / 1.055) ** 2.4
     return np.where((codes < 30) | (codes > 250), np.nan, light)
 
 
-def test_photographs_change_by_stops_and_held_out_ones_stay(tiny_scene, tmp_path):
+def test_photos_change_by_stops_and_held_out_photos_stay(tiny_scene, tmp_path):
     copy = tmp_path / "copy"
     command = [sys.executable, ROOT / "lab" / "jitter.py", tiny_scene, copy, "--test-every", "4"]
-    ran = subprocess.run([*map(str, command)], capture_output=True, text=True)
-    assert ran.returncode == 0, ran.stderr
+    process = subprocess.run([*map(str, command)], capture_output=True, text=True)
+    assert process.returncode == 0, process.stderr
     train, test = read_scene(tiny_scene).split(4)
     assert [camera.name for camera in read_scene(copy).cameras] == sorted(c.name for c in train + test)
     for camera in test:
@@ -32,8 +32,8 @@ def test_photographs_change_by_stops_and_held_out_ones_stay(tiny_scene, tmp_path
     for camera in train:
         ratio = np.log2(linear(copy / camera.image.relative_to(tiny_scene)) / linear(camera.image))
         stops.append(np.nanmedian(ratio))
-        assert (np.abs(ratio - stops[-1]) < 0.3)[np.isfinite(ratio)].mean() > 0.8  # all of its pixels alike
+        assert (np.abs(ratio - stops[-1]) < 0.3)[np.isfinite(ratio)].mean() > 0.8  # uniform over the image
     expected = np.random.default_rng(0).uniform(-0.7, 0.7, len(train))
     np.testing.assert_allclose(stops, expected, atol=0.05)
-    again = subprocess.run([*map(str, command)], capture_output=True, text=True)
-    assert again.returncode == 2 and "Choose another folder" in again.stderr
+    repeated = subprocess.run([*map(str, command)], capture_output=True, text=True)
+    assert repeated.returncode == 2 and "Choose another folder" in repeated.stderr

@@ -1,4 +1,4 @@
-"""The large scene that importing is measured by is one that COLMAP itself would read."""
+"""The generated large scene is a valid COLMAP scene."""
 
 import numpy as np
 import pycolmap
@@ -7,10 +7,10 @@ from lab.large_scene import TRACK, write_large
 from training.scenes.colmap import read_scene
 
 
-def test_it_is_a_scene_with_tracks(tmp_path):
-    picture = pycolmap.Bitmap.from_array(np.zeros((64, 96, 3), np.uint8))
-    picture.write(tmp_path / "picture.jpg")
-    write_large(tmp_path / "large", 200, 10, (tmp_path / "picture.jpg").read_bytes())
+def test_large_scene_has_consistent_tracks(tmp_path):
+    image = pycolmap.Bitmap.from_array(np.zeros((64, 96, 3), np.uint8))
+    image.write(tmp_path / "image.jpg")
+    write_large(tmp_path / "large", 200, 10, (tmp_path / "image.jpg").read_bytes())
     model = pycolmap.Reconstruction(tmp_path / "large" / "sparse" / "0")
     assert (model.num_points3D(), model.num_reg_images(), model.num_cameras()) == (200, 10, 1)
     for number, point in model.points3D.items():
