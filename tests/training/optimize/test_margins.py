@@ -127,7 +127,9 @@ def test_every_method_continues_its_photographs(data, name):
     steps = {"steps": [6, 6], "levels": 2, "finish_share": 0.0} if name == "flod" else {"steps": 12}
     made = {}
     for margin in (0.0, 0.5):
-        parameters = override(METHODS[name].preset("draft"), steps | {"margin": margin, "sh_degree": 0})
+        preset = METHODS[name].preset("draft")
+        tuning = {"tune_steps": 6} if hasattr(preset, "tune_steps") else {}
+        parameters = override(preset, steps | tuning | {"margin": margin, "sh_degree": 0})
         method, levels = create(name, data, parameters, seed=0, backend="cpu"), {}
         for step in range(method.steps):
             method.train_step(step)
