@@ -1,4 +1,4 @@
-"""``pip install`` from a checkout: the package ``lodgs`` and its command, where no checkout is."""
+"""``pip install`` of the package ``lodgs`` and its command, used outside the checkout."""
 
 import json
 import os
@@ -19,7 +19,10 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @pytest.fixture(scope="module")
 def lodgs(tmp_path_factory):
-    """``lodgs(words)`` runs the command of a fresh environment that has our wheel and borrows the rest."""
+    """Return ``lodgs(*arguments)``, which runs the command in a new environment with our wheel.
+
+    All other packages come from the test environment.
+    """
     folder = tmp_path_factory.mktemp("installed")
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check"]
     offline = ["--quiet", "--no-deps", "--no-index"]
@@ -29,31 +32,31 @@ def lodgs(tmp_path_factory):
     paths = {"base": str(folder / "venv"), "platbase": str(folder / "venv")}
     python = Path(sysconfig.get_path("scripts", "venv", paths)) / "python"
     site = Path(sysconfig.get_path("purelib", "venv", paths))
-    (site / "borrowed.pth").write_text(sysconfig.get_path("purelib") + "\n")
-    (built,) = folder.glob("lodgs-*.whl")
-    with zipfile.ZipFile(built) as file:
+    (site / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    (wheel_file,) = folder.glob("lodgs-*.whl")
+    with zipfile.ZipFile(wheel_file) as file:
         assert "lodgs/rasterize/gpu/shaders/sort.wgsl" in file.namelist()
-    subprocess.run([*pip, "--python", python, "install", *offline, built], check=True, timeout=120)
+    subprocess.run([*pip, "--python", python, "install", *offline, wheel_file], check=True, timeout=120)
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
 
-    def run(*words) -> str:
-        done = subprocess.run(
-            [python.with_name("lodgs"), *map(str, words)],
+    def run(*arguments) -> str:
+        process = subprocess.run(
+            [python.with_name("lodgs"), *map(str, arguments)],
             cwd=folder, env=environment, capture_output=True, text=True, timeout=240, check=False,
         )  # fmt: skip
-        assert done.returncode == 0, done.stdout + done.stderr
-        return done.stdout
+        assert process.returncode == 0, process.stdout + process.stderr
+        return process.stdout
 
     return run
 
 
 @pytest.mark.slow
-def test_the_installed_command_checks_trains_and_reads(lodgs, tiny_scene, tmp_path):
+def test_installed_command_checks_trains_and_reads(lodgs, tiny_scene, tmp_path):
     assert lodgs("--version") == f"lodgs {VERSION}\n"
-    found = json.loads(lodgs("check"))
-    wanted = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
-    names = {line.partition(">=")[0].lower() for line in wanted}
-    assert found["ok"] and names <= {name.lower() for name in found}
+    versions = json.loads(lodgs("check"))
+    dependencies = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
+    names = {line.partition(">=")[0].lower() for line in dependencies}
+    assert versions["ok"] and names <= {name.lower() for name in versions}
     events = lodgs(
         "train", "--scene", tiny_scene, "--out", tmp_path / "run", "--image-scale", 1, "--set", "levels=2",
         "--set", "steps=5",

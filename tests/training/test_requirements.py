@@ -1,4 +1,4 @@
-"""What is installed: locks answer what was asked for, with hashes, and the trainer is the same everywhere."""
+"""Lock files of packages: complete, with hashes, and with one trainer everywhere."""
 
 import hashlib
 import re
@@ -16,51 +16,51 @@ LOCKS = ["trainer", "cuda", "cluster", "develop", "blender-5.0", "blender-5.2"]
 PIN = r"(?P<name>[A-Za-z0-9._-]+)==(?P<version>[^\s;]+)(?P<marker> ; [^\\]+?)?"
 
 
-def asked(path: Path) -> set[tuple[str, str]]:
-    """(name, version) of each line of a .in file and those that it includes."""
-    found = set()
+def requested(path: Path) -> set[tuple[str, str]]:
+    """Return (name, version) of each line of a .in file and its included files."""
+    pins = set()
     for line in path.read_text().splitlines():
         if line.startswith("-r "):
-            found |= asked(path.parent / line[3:])
+            pins |= requested(path.parent / line[3:])
         elif line and not line.startswith(("#", "-c ")):
             pin = re.fullmatch(PIN, line)
             assert pin, f"{path.name} pins no version: {line}"
-            found.add((pin["name"].lower(), pin["version"]))
-    return found
+            pins.add((pin["name"].lower(), pin["version"]))
+    return pins
 
 
 def locked(path: Path) -> set[tuple[str, str]]:
-    """(name, version) of each package of a .txt file; each has a hash."""
-    found = set()
+    """Return (name, version) of each package of a .txt file; each needs a hash."""
+    pins = set()
     text = path.read_text().replace("\\\n", "")
     for line in text.splitlines():
         if not line.lstrip().startswith("#"):
             pin = re.fullmatch(PIN + r"\s+(--hash=sha256:[0-9a-f]{64}\s*)+", line)
             assert pin, f"{path.name} has no hash for: {line[:80]}"
-            found.add((pin["name"].lower(), pin["version"]))
-    return found
+            pins.add((pin["name"].lower(), pin["version"]))
+    return pins
 
 
-def test_every_lock_comes_from_a_file_that_asks():
+def test_every_lock_has_an_input_file():
     assert {path.stem for path in REQUIREMENTS.glob("*.txt")} == set(LOCKS)
     assert {path.stem for path in REQUIREMENTS.glob("*.in")} == {*LOCKS, "tests"}
 
 
 @pytest.mark.parametrize("name", LOCKS)
-def test_a_lock_has_what_was_asked_for_and_hashes(name):
-    wanted = asked(REQUIREMENTS / f"{name}.in")
-    assert wanted and not wanted - locked(REQUIREMENTS / f"{name}.txt"), "run `make pins`"
+def test_locks_contain_requested_versions_and_hashes(name):
+    pins = requested(REQUIREMENTS / f"{name}.in")
+    assert pins and not pins - locked(REQUIREMENTS / f"{name}.txt"), "run `make pins`"
 
 
 @pytest.mark.parametrize("name", ["cuda", "cluster", "develop"])
-def test_the_trainer_is_the_same_everywhere(name):
-    """What artists install is what tests use, to the last dependency."""
-    trainer, other = locked(REQUIREMENTS / "trainer.txt"), locked(REQUIREMENTS / f"{name}.txt")
+def test_trainer_versions_are_the_same_everywhere(name):
+    """Users and tests have the same versions of all dependencies."""
+    trainer, pins = locked(REQUIREMENTS / "trainer.txt"), locked(REQUIREMENTS / f"{name}.txt")
     names = {package for package, _ in trainer}
-    assert {pin for pin in other if pin[0] in names} == trainer
+    assert {pin for pin in pins if pin[0] in names} == trainer
 
 
-def test_the_zip_carries_the_wheel_that_tests_use(tmp_path, monkeypatch):
+def test_zip_contains_the_tested_wheel(tmp_path, monkeypatch):
     (wheel,) = tomllib.loads((ROOT / "blender_manifest.toml").read_text())["wheels"]
     name, version, *_ = Path(wheel).name.split("-")
     for lock in LOCKS:
@@ -77,17 +77,17 @@ def test_the_zip_carries_the_wheel_that_tests_use(tmp_path, monkeypatch):
         extension.fetch_wheels([wheel])
 
 
-def test_setup_installs_a_lock_once_and_again_when_it_changes(tmp_path, monkeypatch):
+def test_setup_installs_a_lock_once_per_change(tmp_path, monkeypatch):
     (tmp_path / "requirements").mkdir()
-    lock, said = tmp_path / "requirements" / "some.txt", tmp_path / "said"
-    python = tmp_path / "python"  # makes an environment of itself
+    lock, log = tmp_path / "requirements" / "some.txt", tmp_path / "log"
+    python = tmp_path / "python"  # copies itself into the environment
     python.write_text(
         '#!/bin/sh\nif [ "$2" = venv ]; then mkdir -p "$4/bin"; cp "$0" "$4/bin/python"; fi\n'
-        f'if [ "$2" = pip ]; then echo "$@" >> {said}; fi\n'
+        f'if [ "$2" = pip ]; then echo "$@" >> {log}; fi\n'
     )
     python.chmod(0o755)
     monkeypatch.setattr(setup, "ROOT", tmp_path)
     for text, times in (("one", 1), ("one", 1), ("two", 2)):
         lock.write_text(text)
         setup.make(".venv", str(python), "some.txt")
-        assert said.read_text().count(f"--require-hashes --only-binary=:all: -r {lock}\n") == times
+        assert log.read_text().count(f"--require-hashes --only-binary=:all: -r {lock}\n") == times

@@ -1,7 +1,7 @@
-"""What people see, as it was when somebody last looked: small renderings, tables, and the help of commands.
+"""Snapshots of small renderings, tables and the help of commands.
 
-After a change that is meant, ``pytest tests/training/test_snapshots.py --force-regen`` writes them anew; look
-at the difference before it is committed.
+After an intended change, update them with ``pytest tests/training/test_snapshots.py --force-regen`` and
+check the difference before the commit.
 """
 
 import numpy as np
@@ -16,11 +16,11 @@ from training.splats.levels import Bundle, Level
 from training.splats.ply import write_ply
 
 SHARE = 0.02
-"""Percent of the range that pixels may differ by on average: another processor rounds a few otherwise."""
+"""Allowed mean pixel difference in percent, because processors round differently."""
 
 
 def splats(count: int, seed: int, size: float) -> Splats:
-    """Random splats around the origin; ``size``: logarithm of their mean scale."""
+    """Return random splats around the origin; ``size`` is the logarithm of their mean scale."""
     random = np.random.default_rng(seed)
     return Splats(
         means=random.normal(0, 0.7, (count, 3)).astype(np.float32),
@@ -40,25 +40,25 @@ def levels() -> list[Splats]:
 def bundle(levels, tmp_path):
     path = tmp_path / "bundle.ply"
     sizes = (0.4, 0.1, 0.0)
-    made = [Level(n + 1, levels[n], {"s_min": sizes[n]}) for n in range(3)]
-    write_bundle(path, Bundle("flod", made, "bands"))
+    numbered = [Level(n + 1, levels[n], {"s_min": sizes[n]}) for n in range(3)]
+    write_bundle(path, Bundle("flod", numbered, "bands"))
     return path
 
 
 @pytest.fixture
-def drawn(tmp_path):
-    """``drawn(source, *options)``: the PNG of 64x48 pixels that ``render`` makes, as bytes."""
+def render(tmp_path):
+    """Return ``render(source, *options)``, which renders a PNG of 64x48 pixels and returns its bytes."""
     pose = np.eye(4)
     pose[:3, 3] = 0.1, -0.05, 3
     write_camera(tmp_path / "camera.json", Camera("", 64, 48, 60.0, 62.0, 30.5, 25.0, pose), 0.01)
 
-    def draw(source, *options: str) -> bytes:
-        out = tmp_path / "drawn.png"
-        words = ["render", source, "--camera", tmp_path / "camera.json", "--out", out, "--backend", "cpu"]
-        assert main([*map(str, words), *options]) == 0
+    def run(source, *options: str) -> bytes:
+        out = tmp_path / "image.png"
+        arguments = ["render", source, "--camera", tmp_path / "camera.json", "--out", out, "--backend", "cpu"]
+        assert main([*map(str, arguments), *options]) == 0
         return out.read_bytes()
 
-    return draw
+    return run
 
 
 @pytest.mark.parametrize(
@@ -69,25 +69,25 @@ def drawn(tmp_path):
         ("by distance", ["--first", "1", "--last", "3", "--gamma", "2"]),
     ],
 )
-def test_renderings_of_a_bundle(bundle, drawn, image_regression, name, options):
-    image_regression.check(drawn(bundle, *options), SHARE, basename=name.replace(" ", "_"))
+def test_rendering_of_a_bundle(bundle, render, image_regression, name, options):
+    image_regression.check(render(bundle, *options), SHARE, basename=name.replace(" ", "_"))
 
 
-def test_rendering_of_a_ply(levels, drawn, tmp_path, image_regression):
+def test_rendering_of_a_ply(levels, render, tmp_path, image_regression):
     write_ply(tmp_path / "splats.ply", levels[1])
     image_regression.check(
-        drawn(tmp_path / "splats.ply", "--background", "transparent"), SHARE, basename="ply"
+        render(tmp_path / "splats.ply", "--background", "transparent"), SHARE, basename="ply"
     )
 
 
-def test_what_info_says(bundle, levels, tmp_path, monkeypatch, capsys, file_regression):
+def test_info(bundle, levels, tmp_path, monkeypatch, capsys, file_regression):
     monkeypatch.chdir(tmp_path)
     write_ply(tmp_path / "splats.ply", levels[0])
     assert main(["info", "bundle.ply"]) == main(["info", "splats.ply"]) == 0
     file_regression.check(capsys.readouterr().out, basename="info")
 
 
-def test_the_table_of_evaluate(file_regression):
+def test_report_of_evaluate(file_regression):
     numbers = [(1, 0.08, 4_000, 19.5, 0.61), (2, 0.02, 21_000, 23.25, 0.755), (3, 0.0, 120_000, 28.125, 0.9)]
     rows = [
         {
@@ -129,7 +129,7 @@ def test_the_table_of_evaluate(file_regression):
 
 
 @pytest.mark.parametrize("name", ["", "flod"])
-def test_what_methods_says(name, capsys, file_regression):
+def test_methods(name, capsys, file_regression):
     assert main(["methods", *name.split()]) == 0
     file_regression.check(capsys.readouterr().out, basename=f"methods_{name or 'all'}")
 

@@ -1,4 +1,4 @@
-"""The pages that tools/tables.py writes say what methods and rules declare today."""
+"""Generated documentation pages match the declarations of methods and rules."""
 
 from pathlib import Path
 
@@ -12,12 +12,12 @@ DOCS = Path(__file__).parents[2] / "docs"
 
 
 @pytest.mark.parametrize("name", tables.PAGES)
-def test_the_committed_page_is_what_the_tool_writes(name):
-    written = (DOCS / name).read_text(encoding="utf-8")
-    assert written == tables.PAGES[name](), "run `make tables` and look at the difference"
+def test_committed_pages_are_up_to_date(name):
+    page = (DOCS / name).read_text(encoding="utf-8")
+    assert page == tables.PAGES[name](), "run `make tables` and check the difference"
 
 
-def test_every_parameter_and_control_has_a_row():
+def test_every_parameter_and_control_has_one_row():
     parameters, controls = tables.parameters_page(), tables.controls_page()
     for method in METHODS.values():
         section = parameters.split(f"\n`{method.name}`: ")[1].split("\n## ")[0]
