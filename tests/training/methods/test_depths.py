@@ -10,7 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.training.scenes.depth_walls import FITTED, METRIC, depth_of, put, view, write_walls
+from tests.training.scenes.depth_walls import (
+    FITTED,
+    METRIC,
+    depth_of,
+    make_view,
+    write_depth_scene,
+    write_walls,
+)
 from training.methods import METHODS, create
 from training.optimize.training_data import TrainingData
 from training.rasterize import Gaussians, rasterize
@@ -29,7 +36,7 @@ def walls(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def scene(walls, tmp_path_factory):
-    return read_scene(put(walls, tmp_path_factory.mktemp("metric"), METRIC["multilayer"]))
+    return read_scene(write_depth_scene(walls, tmp_path_factory.mktemp("metric"), METRIC["multilayer"]))
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +109,7 @@ def depth_error(run: Path) -> float:
     """Median relative error of the held-out views' depth, where something is drawn."""
     splats, errors = read_bundle(run / "bundle.ply").levels[-1].splats, []
     for number in (0, 3):
-        camera = view(number).scaled(0.25)
+        camera = make_view(number).scaled(0.25)
         drawn = rasterize(Gaussians.of(splats), camera, near=0.03, outputs=("depth",), backend="cpu")
         assert drawn.depth is not None
         truth = depth_of(camera)
@@ -120,7 +127,7 @@ def test_depth_is_better_with_it_and_it_can_begin_without_points(walls, tmp_path
     for name, kind, weight in (("off", "inverse", 0.0), ("on", "inverse", 0.3), ("bare", "metric", 0.3)):
         folder = tmp_path / name
         folder.mkdir()
-        put(walls, folder, FITTED["inverse"] if kind == "inverse" else METRIC["one layer"])
+        write_depth_scene(walls, folder, FITTED["inverse"] if kind == "inverse" else METRIC["one layer"])
         if name == "bare":
             without_points(folder)
         keys = {

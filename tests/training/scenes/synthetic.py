@@ -1,6 +1,6 @@
-"""COLMAP scenes made for tests and written by pycolmap; their photographs are written by pycolmap too.
+"""Synthetic COLMAP scenes and photos, written by pycolmap.
 
-Pillow saves no PNG here: beside pycolmap in one process that corrupts memory.
+Pillow must not save PNGs here: in one process with pycolmap, that corrupts memory.
 """
 
 from pathlib import Path
@@ -30,14 +30,14 @@ PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
 
 
 def camera(model: str, distortion=None) -> pycolmap.Camera:
-    """A camera of the given model; `distortion` replaces the usual parameters for it."""
-    made = pycolmap.Camera.create_from_model_name(1, model, 80.0, WIDTH, HEIGHT)
-    intrinsics = len(made.focal_length_idxs()) + 2
-    params = np.array(made.params, float)
+    """Return a camera of the given model; ``distortion`` replaces the default parameters."""
+    result = pycolmap.Camera.create_from_model_name(1, model, 80.0, WIDTH, HEIGHT)
+    intrinsics = len(result.focal_length_idxs()) + 2
+    params = np.array(result.params, float)
     params[:intrinsics] = [80.0, 47.0, 37.0] if intrinsics == 3 else [80.0, 82.0, 47.0, 37.0]
     params[intrinsics:] = DISTORTION.get(model, []) if distortion is None else distortion
-    made.params = params
-    return made
+    result.params = params
+    return result
 
 
 def write_scene(
@@ -48,12 +48,12 @@ def write_scene(
     model="sparse/0",
     pixels=None,
 ) -> pycolmap.Reconstruction:
-    """A scene of one camera, binary, whose photographs hold `pixels` or noise; tracks have 0 to 3 entries."""
+    """Write a binary scene of one camera with photos of ``pixels`` or noise; tracks have 0 to 3 entries."""
     random = np.random.default_rng(7)
     lens = lens or camera("PINHOLE")
     lens.camera_id = 1
-    made = pycolmap.Reconstruction()
-    made.add_camera_with_trivial_rig(lens)
+    scene = pycolmap.Reconstruction()
+    scene.add_camera_with_trivial_rig(lens)
     for number, name in enumerate(names, start=1):
         image = pycolmap.Image(name=name, camera_id=1, image_id=number)
         image.points2D = pycolmap.Point2DList(
@@ -63,22 +63,23 @@ def write_scene(
         pose = pycolmap.Rigid3d(
             pycolmap.Rotation3d(quaternion / np.linalg.norm(quaternion)), random.normal(size=3)
         )
-        made.add_image_with_trivial_frame(image, pose)
+        scene.add_image_with_trivial_frame(image, pose)
     for number in range(points):
         track = pycolmap.Track()
         for image in range(1, 1 + number % (len(names) + 1)):
             track.add_element(image, number)
-        # Black points, points at the origin: runs of zero bytes, in which a reader can lose its way.
+        # Black points and points at the origin: runs of zero bytes that could confuse the reader.
         color = random.integers(0, 256, 3).astype(np.uint8) * (number % 3 > 0)
-        made.add_point3D(random.normal(size=3) * (number % 5 > 0), track, color)
+        scene.add_point3D(random.normal(size=3) * (number % 5 > 0), track, color)
     (folder / model).mkdir(parents=True)
-    made.write_binary(str(folder / model))
+    scene.write_binary(str(folder / model))
     for name in names:
         write_image(folder / "images" / name, noise() if pixels is None else pixels)
-    return made
+    return scene
 
 
 def noise(width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
+    """Return random pixels, (height, width, 3) uint8."""
     return np.random.default_rng(3).integers(0, 256, (height, width, 3)).astype(np.uint8)
 
 

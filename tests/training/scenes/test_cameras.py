@@ -1,4 +1,4 @@
-"""Where cameras see points: worked by hand, and as pycolmap projects them."""
+"""Projection of points, computed by hand and by pycolmap."""
 
 import numpy as np
 import pycolmap
@@ -8,10 +8,10 @@ from scipy.spatial.transform import Rotation
 from training.scenes.cameras import Camera, look_at
 
 POSE = np.array([[0.0, 1, 0, -2], [-1, 0, 0, 3], [0, 0, 1, 4], [0, 0, 0, 1]])
-"""A quarter turn about z, then a step: a world point (x, y, z) is (y - 2, 3 - x, z + 4) to the camera."""
+"""A quarter turn about z and a translation: world point (x, y, z) is (y - 2, 3 - x, z + 4) in camera axes."""
 
 
-def test_points_worked_by_hand():
+def test_projection_computed_by_hand():
     camera = Camera("a", 100, 80, 50.0, 60.0, 40.5, 30.0, POSE)
     points = np.array([[3, 2, 0], [2, 4, 1], [3, 2, -8], [0, 2, 0]], np.float32)
     uv, depth = camera.project(points)
@@ -23,19 +23,19 @@ def test_points_worked_by_hand():
     assert camera.focal == 50 and Camera("b", 1, 1, 7.0, 6.0, 0, 0, POSE).focal == 6
 
 
-def test_the_borders_of_the_image():
-    """Its left and upper edges belong to it, its right and lower ones do not; a margin widens all four."""
+def test_image_includes_left_and_upper_edges_only():
+    """A margin extends all four edges."""
     camera = Camera("a", 8, 4, 1.0, 1.0, 0.0, 0.0, np.eye(4))
     uv = np.array([[0, 0], [8, 0], [0, 4], [7.75, 3.75], [-0.25, 0], [0, -0.25], [-2, -1], [9.75, 4.75]])
     points = np.column_stack([uv, np.ones(len(uv))])
     assert camera.sees(points).tolist() == [True, False, False, True, False, False, False, False]
     assert camera.sees(points, margin=0.25).all()
-    assert not camera.sees(points * [1, 1, 0]).any(), "nothing is seen at the eye's own depth"
+    assert not camera.sees(points * [1, 1, 0]).any(), "points at depth 0 are invisible"
     assert camera.sees(np.zeros((0, 3))).shape == (0,)
 
 
-def test_projections_are_colmaps():
-    """Pixel centres at +0.5, y down: pycolmap's own projection of the same points."""
+def test_projection_matches_pycolmap():
+    """Pixel centres lie at +0.5, and y points down."""
     random = np.random.default_rng(3)
     intrinsics = 61.5, 58.25, 47.25, 33.0
     lens = pycolmap.Camera(model="PINHOLE", width=96, height=72, params=intrinsics)
@@ -49,19 +49,19 @@ def test_projections_are_colmaps():
     np.testing.assert_allclose(depth, local[:, 2], rtol=1e-12)
     assert (depth > 0).all()
     np.testing.assert_allclose(uv, [lens.img_from_cam(point) for point in local], rtol=1e-10, atol=1e-9)
-    seen = camera.sees(points)
-    assert 0 < seen.sum() < len(seen)
-    assert np.array_equal(seen, ((uv >= 0) & (uv < (96, 72))).all(1))
+    visible = camera.sees(points)
+    assert 0 < visible.sum() < len(visible)
+    assert np.array_equal(visible, ((uv >= 0) & (uv < (96, 72))).all(1))
 
 
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, -1, 0), (3, 2, 1)])
-def test_an_eye_looks_at_its_target_with_up_above(up):
-    """(3, 2, 1) is the way that it looks itself: then any picture is upright."""
-    eye, target = np.array([1.0, -2.0, 0.5]), np.array([4.0, 0.0, 1.5])
-    pose = look_at(eye, target, up)
+def test_look_at_centres_target_with_up_above(up):
+    """(3, 2, 1) is the view direction itself, for which any roll is valid."""
+    position, target = np.array([1.0, -2.0, 0.5]), np.array([4.0, 0.0, 1.5])
+    pose = look_at(position, target, up)
     np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
     assert np.linalg.det(pose) == pytest.approx(1)
-    np.testing.assert_allclose(pose @ [*eye, 1], [0, 0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(pose @ [*position, 1], [0, 0, 0, 1], atol=1e-12)
     np.testing.assert_allclose(pose @ [*target, 1], [0, 0, np.sqrt(14), 1], atol=1e-12)
     x, y, _ = pose[:3, :3] @ up
-    assert abs(x) < 1e-12 and (y < -0.5 or up == (3, 2, 1))  # y is down
+    assert abs(x) < 1e-12 and (y < -0.5 or up == (3, 2, 1))  # y points down

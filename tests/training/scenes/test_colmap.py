@@ -1,4 +1,4 @@
-"""COLMAP models and scenes; pycolmap is the judge of what a model says."""
+"""COLMAP models and scenes, compared with pycolmap."""
 
 import os
 import shutil
@@ -30,7 +30,7 @@ VARIANTS = (
 
 
 def assert_same(scene: colmap.Scene, truth: pycolmap.Reconstruction, skipped: int = 0) -> None:
-    """Views, poses, intrinsics, points and colours are what pycolmap reads."""
+    """Compare views, poses, intrinsics, points and colours with pycolmap."""
     views = {image.name: image for image in truth.images.values()}
     assert [camera.name for camera in scene.cameras] == sorted(camera.name for camera in scene.cameras)
     assert len(scene.cameras) == len(views) - skipped
@@ -58,11 +58,14 @@ def assert_same(scene: colmap.Scene, truth: pycolmap.Reconstruction, skipped: in
 
 
 @pytest.mark.parametrize("name", [*SCENES, *(f"variants/{variant}" for variant in VARIANTS)])
-def test_real_scenes_read_as_pycolmap_reads_them(shared_scenes, tmp_path, name):
+def test_real_scenes_match_pycolmap(shared_scenes, tmp_path, name):
     scene = read_scene(shared_scenes / name)
     truth = pycolmap.Reconstruction(str(scene.model))
     skipped = 5 if "missing" in name else 0
-    warnings = {"variants/missing_images": 3, "variants/empty_points3D": 1}  # three are missing: one warning
+    warnings = {
+        "variants/missing_images": 3,
+        "variants/empty_points3D": 1,
+    }  # one warning for all missing images
     assert len(scene.warnings) == warnings.get(name, 0)
     assert bool(scene.distorted) == ("distorted" in name)
     assert_same(scene, truth, skipped)
@@ -73,7 +76,7 @@ def test_real_scenes_read_as_pycolmap_reads_them(shared_scenes, tmp_path, name):
 
 @pytest.mark.parametrize("points", [0, 1, 2000])
 @pytest.mark.parametrize("form", ["bin", "txt"])
-def test_synthetic_models_read_as_pycolmap_reads_them(tmp_path, points, form):
+def test_synthetic_models_match_pycolmap(tmp_path, points, form):
     names = ["frame 1.png", "up/a  b #1.png", "Säule.png", "写真 02.png", "памятник%20.png"]
     truth = synthetic.write_scene(tmp_path, names=names, points=points)
     if form == "txt":
@@ -85,7 +88,7 @@ def test_synthetic_models_read_as_pycolmap_reads_them(tmp_path, points, form):
     assert_same(scene, truth)
 
 
-def test_the_real_text_model_is_the_binary_one(shared_scenes):
+def test_text_model_equals_binary_model(shared_scenes):
     folder = shared_scenes / "variants" / "names_unicode_spaces"
     binary, text = read_scene(folder), read_scene(folder, model=folder / "sparse_txt" / "0")
     assert [camera.name for camera in binary.cameras] == [camera.name for camera in text.cameras]
@@ -94,7 +97,7 @@ def test_the_real_text_model_is_the_binary_one(shared_scenes):
 
 @pytest.mark.parametrize("model", [*synthetic.PINHOLES, *synthetic.DISTORTION])
 @pytest.mark.parametrize("form", ["bin", "txt"])
-def test_every_camera_model(tmp_path, model, form):
+def test_camera_models(tmp_path, model, form):
     truth = synthetic.write_scene(tmp_path, synthetic.camera(model), names=["a.png"], points=3)
     if form == "txt":
         truth.write_text(str(tmp_path / "sparse" / "0"))
@@ -105,19 +108,19 @@ def test_every_camera_model(tmp_path, model, form):
     assert scene.distorted == ([] if model in synthetic.PINHOLES else ["a.png"])
 
 
-def test_no_camera_model_of_pycolmap_is_unknown():
-    known = {number: (lens.name, lens.parameters) for number, lens in model_files._LENSES.items()}
-    theirs = {}
+def test_all_camera_models_of_pycolmap_are_supported():
+    supported = {number: (lens.name, lens.parameters) for number, lens in model_files._LENSES.items()}
+    expected = {}
     for name, number in pycolmap.CameraModelId.__members__.items():
         if name != "INVALID":
             camera = pycolmap.Camera.create_from_model_id(1, number, 50.0, 64, 48)
-            theirs[int(number)] = name, len(camera.params)
-    assert known == theirs
+            expected[int(number)] = name, len(camera.params)
+    assert supported == expected
 
 
 @pytest.mark.parametrize("model", [name for name in synthetic.DISTORTION if "FISHEYE" not in name])
 def test_zero_distortion_is_a_pinhole(tmp_path, model):
-    """By the projection itself: pycolmap's camera projects as a pinhole, so the view is not distorted."""
+    """pycolmap's camera projects like a pinhole, so the view is not distorted."""
     lens = synthetic.camera(
         model, [0.0, 1.0] if model == "EUCM" else [0.0] * len(synthetic.DISTORTION[model])
     )
@@ -132,13 +135,13 @@ def test_zero_distortion_is_a_pinhole(tmp_path, model):
 
 
 @pytest.mark.parametrize("model", [name for name in synthetic.DISTORTION if "FISHEYE" in name])
-def test_a_fisheye_without_further_distortion_is_no_pinhole(tmp_path, model):
+def test_ideal_fisheye_is_distorted(tmp_path, model):
     lens = synthetic.camera(model, [0.0] * len(synthetic.DISTORTION[model]))
     synthetic.write_scene(tmp_path, lens, names=["a.png"], points=3)
     assert read_scene(tmp_path).distorted == ["a.png"]
 
 
-def test_a_panorama_is_left_out(tmp_path):
+def test_panorama_is_skipped(tmp_path):
     synthetic.write_scene(tmp_path, names=["a.png"], points=3)
     (tmp_path / "text").mkdir()
     (tmp_path / "text" / "cameras.txt").write_text(
@@ -151,8 +154,8 @@ def test_a_panorama_is_left_out(tmp_path):
     assert any("points3D" in warning for warning in scene.warnings)
 
 
-def test_a_text_model_made_by_other_programs(tmp_path):
-    """No comments, Windows line ends, quaternions that are not quite of unit length, lines of 2D points."""
+def test_text_model_of_other_programs(tmp_path):
+    """No comments, Windows line ends, quaternions of other lengths, lines of 2D points."""
     synthetic.write_image(tmp_path / "images" / "my view.png", synthetic.noise())
     (tmp_path / "sparse").mkdir()
     (tmp_path / "sparse" / "cameras.txt").write_bytes(b"3 SIMPLE_PINHOLE 96 72 80 48 36\r\n")
@@ -161,14 +164,14 @@ def test_a_text_model_made_by_other_programs(tmp_path):
     scene = read_scene(tmp_path)
     (camera,) = scene.cameras
     assert camera.name == "my view.png" and not scene.warnings
-    # A quarter turn about z: x goes to y.
+    # A quarter turn about z maps x to y.
     expected = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
     np.testing.assert_allclose(camera.world_to_camera, expected, atol=1e-12)
     np.testing.assert_array_equal(scene.points, [[1, 2, 3], [-1, -2, -3]])
     np.testing.assert_array_equal(scene.point_colors, [[4, 5, 6], [0, 0, 255]])
 
 
-def test_a_view_of_an_unknown_camera_and_a_model_of_no_views(tmp_path):
+def test_model_with_unknown_camera_or_without_views_is_rejected(tmp_path):
     synthetic.write_scene(tmp_path)
     model = tmp_path / "text"
     model.mkdir()
@@ -181,13 +184,13 @@ def test_a_view_of_an_unknown_camera_and_a_model_of_no_views(tmp_path):
         read_scene(tmp_path, model=model)
 
 
-def test_one_view_measures_the_scene_by_its_depth(tmp_path):
+def test_extent_of_single_view_is_its_median_depth(tmp_path):
     synthetic.write_scene(tmp_path, names=["a.png"], points=2000)
     scene = read_scene(tmp_path)
     assert scene.extent() == scene.median_depth() > 0
 
 
-def test_models_by_size_then_nearness(tmp_path):
+def test_models_are_sorted_by_size_then_depth(tmp_path):
     for model, names in {
         "sparse/0": ["a.png"],
         "sparse/1": ["a.png", "b.png", "c.png"],
@@ -204,7 +207,7 @@ def test_models_by_size_then_nearness(tmp_path):
 
 @pytest.mark.parametrize("model", [".", "sparse", "sparse/0", "colmap/sparse/0"])
 @pytest.mark.parametrize("images", ["images", "input"])
-def test_wherever_model_and_images_lie(tmp_path, model, images):
+def test_folder_layouts(tmp_path, model, images):
     synthetic.write_scene(tmp_path, model=model if model != "." else "x")
     if model == ".":
         for file in (tmp_path / "x").iterdir():
@@ -212,46 +215,46 @@ def test_wherever_model_and_images_lie(tmp_path, model, images):
     (tmp_path / "images").rename(tmp_path / images)
     scene = read_scene(tmp_path)
     assert scene.images_folder == tmp_path / images and len(scene.cameras) == 3
-    if model.startswith("sparse"):  # choosing the model's folder finds the scene around it
+    if model.startswith("sparse"):  # the scene around a model folder is found
         assert read_scene(tmp_path / model).images_folder == tmp_path / images
 
 
-def test_images_of_another_size_scale_the_intrinsics(tmp_path):
+def test_intrinsics_scale_with_image_size(tmp_path):
     synthetic.write_scene(tmp_path, names=["a.png", "b.png"])
     synthetic.write_image(tmp_path / "images" / "a.png", synthetic.noise(48, 36))
     synthetic.write_image(tmp_path / "images" / "b.png", synthetic.noise(72, 96))
-    half, turned = read_scene(tmp_path).cameras
+    half, rotated = read_scene(tmp_path).cameras
     assert (half.width, half.height, half.fx, half.fy, half.cx, half.cy) == (48, 36, 40, 41, 23.5, 18.5)
     warnings = read_scene(tmp_path).warnings
-    assert len(warnings) == 1 and "b.png" in warnings[0] and "turned" in warnings[0]
-    assert (turned.width, turned.height) == (72, 96)
+    assert len(warnings) == 1 and "b.png" in warnings[0] and "rotated" in warnings[0]
+    assert (rotated.width, rotated.height) == (72, 96)
 
 
-def test_unusable_photographs_are_named_and_left_out(tmp_path):
+def test_unusable_photos_are_skipped_with_warnings(tmp_path):
     names = ["0.png", "absent.png", "cut.png", "empty.png", "folder.png", "text.png"]
     synthetic.write_scene(tmp_path, names=names)
     images = tmp_path / "images"
     (images / "absent.png").unlink()
     (images / "cut.png").write_bytes((images / "0.png").read_bytes()[:-20])
     (images / "empty.png").write_bytes(b"")
-    (images / "text.png").write_bytes(b"no picture at all")
+    (images / "text.png").write_bytes(b"not an image")
     (images / "folder.png").unlink()
     (images / "folder.png").mkdir()
     scene = read_scene(tmp_path)
     assert [camera.name for camera in scene.cameras] == ["0.png"]
-    *left_out, missing = scene.warnings
-    assert [warning.split()[0] for warning in left_out] == ["cut.png", "empty.png", "text.png"]
-    assert missing.startswith("2 views are left out") and "(absent.png, folder.png)" in missing
+    *skipped, missing = scene.warnings
+    assert [warning.split()[1] for warning in skipped] == ["cut.png:", "empty.png:", "text.png:"]
+    assert missing.startswith("Skipped 2 views") and "absent.png, folder.png" in missing
 
 
-def test_real_missing_images(shared_scenes):
+def test_missing_images_of_real_scene(shared_scenes):
     scene = read_scene(shared_scenes / "variants" / "missing_images")
-    left_out = [f"IMG_{number}.jpg" for number in (3026, 3028, 3031, 3033, 3044)]
-    assert all(any(name in warning for warning in scene.warnings) for name in left_out)
-    assert not {camera.name for camera in scene.cameras} & {*left_out, "not_in_model.jpg"}
+    missing = [f"IMG_{number}.jpg" for number in (3026, 3028, 3031, 3033, 3044)]
+    assert all(any(name in warning for warning in scene.warnings) for name in missing)
+    assert not {camera.name for camera in scene.cameras} & {*missing, "not_in_model.jpg"}
 
 
-def test_names_in_another_unicode_form_or_with_backslashes(tmp_path):
+def test_names_match_other_unicode_forms_and_backslashes(tmp_path):
     truth = synthetic.write_scene(tmp_path, names=["é/Säule.png"])
     decomposed = tmp_path / "images" / unicodedata.normalize("NFD", "é")
     (tmp_path / "images" / "é").rename(decomposed)
@@ -263,7 +266,7 @@ def test_names_in_another_unicode_form_or_with_backslashes(tmp_path):
     assert [camera.name for camera in scene.cameras] == ["é/Säule.png"]
 
 
-def test_a_name_too_long_for_a_file_is_left_out(tmp_path):
+def test_overlong_name_is_skipped(tmp_path):
     truth = synthetic.write_scene(tmp_path, names=["a.png", "b.png"])
     truth.write_text(str(tmp_path))
     text = (tmp_path / "images.txt").read_text()
@@ -272,27 +275,27 @@ def test_a_name_too_long_for_a_file_is_left_out(tmp_path):
     assert len(scene.cameras) == 1 and "no such file" in scene.warnings[0]
 
 
-def test_names_do_not_lead_out_of_the_image_folder(tmp_path):
+def test_names_cannot_leave_the_image_folder(tmp_path):
     synthetic.write_scene(tmp_path, names=["a.png", "../secret.png"])
     scene = read_scene(tmp_path)
-    assert len(scene.cameras) == 1 and "leads out" in scene.warnings[0]
+    assert len(scene.cameras) == 1 and "outside the image folder" in scene.warnings[0]
 
 
 @pytest.mark.parametrize("cut", [0, 4, 8, 20, 51, 60, -1, -30])
 @pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin"])
-def test_a_model_cut_short_says_so(tmp_path, file, cut):
+def test_truncated_model_is_rejected(tmp_path, file, cut):
     synthetic.write_scene(tmp_path)
     path = tmp_path / "sparse" / "0" / file
-    whole = path.read_bytes()
-    path.write_bytes(whole[:cut])
+    content = path.read_bytes()
+    path.write_bytes(content[:cut])
     with pytest.raises(LodgsError) as error:
         read_scene(tmp_path)
     assert str(path) in error.value.what and error.value.remedy
 
 
 @pytest.mark.parametrize("file", ["cameras.txt", "images.txt", "points3D.txt"])
-@pytest.mark.parametrize("damage", ["line lost", "letters"])
-def test_a_damaged_text_model_says_so(tmp_path, file, damage):
+@pytest.mark.parametrize("damage", ["missing line", "letters"])
+def test_damaged_text_model_is_rejected(tmp_path, file, damage):
     truth = synthetic.write_scene(tmp_path)
     model = tmp_path / "text"
     model.mkdir()
@@ -308,44 +311,44 @@ def test_a_damaged_text_model_says_so(tmp_path, file, damage):
     assert str(model / file) in error.value.what and error.value.remedy
 
 
-def test_random_bytes_never_give_a_traceback(tmp_path):
-    """Flipped bytes anywhere in a model are read, or refused with a sentence."""
+def test_random_bytes_raise_no_other_exceptions(tmp_path):
+    """A model with changed bytes is read or rejected with a LodgsError."""
     synthetic.write_scene(tmp_path)
     random = np.random.default_rng(0)
     for file in sorted((tmp_path / "sparse" / "0").glob("*.bin")):
-        whole = np.frombuffer(file.read_bytes(), np.uint8)
+        content = np.frombuffer(file.read_bytes(), np.uint8)
         for _ in range(60):
-            damaged = whole.copy()
-            damaged[random.integers(0, len(whole), 3)] = random.integers(0, 256, 3)
+            damaged = content.copy()
+            damaged[random.integers(0, len(content), 3)] = random.integers(0, 256, 3)
             file.write_bytes(damaged.tobytes())
             try:
                 scene = read_scene(tmp_path)
             except LodgsError:
                 continue
             assert np.isfinite(scene.points).all()
-        file.write_bytes(whole.tobytes())
+        file.write_bytes(content.tobytes())
 
 
-def test_what_is_not_there_is_said(tmp_path):
-    with pytest.raises(LodgsError, match="no folder"):
+def test_missing_files_are_reported(tmp_path):
+    with pytest.raises(LodgsError, match="absent"):
         read_scene(tmp_path / "absent")
     with pytest.raises(LodgsError, match="no COLMAP model"):
         read_scene(tmp_path)
     synthetic.write_scene(tmp_path)
-    with pytest.raises(LodgsError, match="no image folder"):
+    with pytest.raises(LodgsError, match=r"image folder .* does not exist"):
         read_scene(tmp_path, images=tmp_path / "nowhere")
     with pytest.raises(LodgsError, match="no cameras and images"):
         read_scene(tmp_path, model=tmp_path / "images")
     shutil.rmtree(tmp_path / "images")
-    with pytest.raises(LodgsError, match="no image folder"):
+    with pytest.raises(LodgsError, match=r"image folder .* does not exist"):
         read_scene(tmp_path)
     (tmp_path / "images").mkdir()
-    with pytest.raises(LodgsError, match="None of the 3 views"):
+    with pytest.raises(LodgsError, match="none of the 3 views"):
         read_scene(tmp_path)
 
 
-def test_point_records_are_found_among_zeros():
-    """Every place in this file looks like the beginning of a record; only the chain of lengths tells."""
+def test_point_records_among_zeros():
+    """Every offset looks like the start of a record; only the chain of lengths is unambiguous."""
     random = np.random.default_rng(1)
     lengths = random.integers(0, 40, 3000)
     records = [struct.pack("<Q3d3BdQ", 0, 0, 0, 0, 0, 0, 0, 0, n) + bytes(8 * int(n)) for n in lengths]
@@ -353,14 +356,14 @@ def test_point_records_are_found_among_zeros():
     np.testing.assert_array_equal(starts, np.concatenate([[0], np.cumsum(51 + 8 * lengths)[:-1]]))
 
 
-def test_split_extent_and_depth(tmp_path):
-    """Three cameras on a line, looking along z at points of known depths."""
+def test_split_extent_and_median_depth(tmp_path):
+    """Nine cameras on a line look along z at points of known depths."""
     synthetic.write_scene(tmp_path, names=[f"{i}.png" for i in range(9)], points=0)
     model = tmp_path / "text"
     model.mkdir()
     (model / "cameras.txt").write_text("1 PINHOLE 96 72 48 48 48 36\n")
     (model / "images.txt").write_text("".join(f"{i} 1 0 0 0 {-i} 0 0 1 {i}.png\n\n" for i in range(9)))
-    # In front of all cameras at depths 20, 30, 100; then behind, and in front but outside every image.
+    # Three points in front of all cameras, one behind them, one outside all images.
     points = [(4, 0, 20), (4, 0, 30), (4, 0, 100), (4, 0, -1), (400, 0, 1)]
     (model / "points3D.txt").write_text(
         "".join(f"{i} {x} {y} {z} 1 2 3 0\n" for i, (x, y, z) in enumerate(points))
@@ -371,36 +374,35 @@ def test_split_extent_and_depth(tmp_path):
     train, test = scene.split(8)
     assert [camera.name for camera in test] == ["0.png", "8.png"]
     assert [camera.name for camera in train] == [f"{i}.png" for i in range(1, 8)]
-    assert [len(part) for part in scene.split(0)] == [9, 0]
-    train, held = scene.split(8, validation=True)  # 0 and 8 have no part in it
-    assert [camera.name for camera in held] == ["4.png"]
+    assert [len(cameras) for cameras in scene.split(0)] == [9, 0]
+    train, held_out = scene.split(8, validation=True)  # excludes 0 and 8
+    assert [camera.name for camera in held_out] == ["4.png"]
     assert [camera.name for camera in train] == [f"{i}.png" for i in (1, 2, 3, 5, 6, 7)]
 
 
 @pytest.mark.parametrize("lens", ["PINHOLE", "SIMPLE_RADIAL"])
-def test_a_photograph_that_gets_lost_moves_no_other_one_in_or_out_of_training(tmp_path, lens):
+def test_lost_photo_does_not_change_the_split_of_other_photos(tmp_path, lens):
     synthetic.write_scene(tmp_path, lens=synthetic.camera(lens), names=[f"{i}.png" for i in range(9)])
     (tmp_path / "images" / "1.png").unlink()
     scene = read_scene(tmp_path)
     scene = undistort_scene(scene, tmp_path / "cache") if scene.distorted else scene
-    found = scene, exclude_views(scene, {"4.png": "it is damaged."})
-    for one in found:
-        train, test = one.split(4)
+    for variant in (scene, exclude_views(scene, {"4.png": "it is damaged."})):
+        train, test = variant.split(4)
         names = [camera.name for camera in test]
         assert names == [
-            name for name in ("0.png", "4.png", "8.png") if name in {c.name for c in one.cameras}
+            name for name in ("0.png", "4.png", "8.png") if name in {c.name for c in variant.cameras}
         ]
         assert [camera.name for camera in train] == [f"{i}.png" for i in (2, 3, 5, 6, 7)]
 
 
-def test_no_points_have_no_depth(tmp_path):
+def test_median_depth_needs_points(tmp_path):
     synthetic.write_scene(tmp_path, points=0)
     with pytest.raises(LodgsError, match="sees a point"):
         read_scene(tmp_path).median_depth()
 
 
-def test_reading_needs_no_trainer():
-    """Blender's Python has numpy alone: no library of the trainer is loaded by reading scenes."""
+def test_reading_loads_no_trainer_library():
+    """Blender's Python has only numpy."""
     import subprocess
     import sys
 

@@ -1,7 +1,6 @@
-"""What is known of depth: maps of every kind beside photographs, fitted or refused; points of the model and
-from maps.
+"""Depth priors: maps in all formats, fits and their rejection, points of the model and from maps.
 
-Truth is a floor and a wall whose depths are worked out by hand.
+The ground truth is a floor and a wall whose depths are computed by hand.
 """
 
 from __future__ import annotations
@@ -24,7 +23,16 @@ from training.scenes.images import load_image, write_png
 from training.scenes.undistort import undistort_scene
 
 from . import synthetic
-from .depth_walls import FITTED, METRIC, depth_of, exr, grey, npy, put, write_walls
+from .depth_walls import (
+    FITTED,
+    METRIC,
+    depth_of,
+    write_depth_scene,
+    write_exr_map,
+    write_npy_map,
+    write_png_map,
+    write_walls,
+)
 from .walls import HEIGHT, WIDTH, render_photo
 
 ONES = np.ones((HEIGHT, WIDTH), np.float32)
@@ -36,160 +44,168 @@ def walls(tmp_path_factory):
 
 
 @pytest.mark.parametrize("kind", METRIC)
-def test_metric_maps_are_read_as_they_are(walls, tmp_path, kind):
-    scene = read_scene(put(walls, tmp_path, METRIC[kind]))
+def test_metric_maps(walls, tmp_path, kind):
+    scene = read_scene(write_depth_scene(walls, tmp_path, METRIC[kind]))
     depths = DepthPriors(scene, "metric")
     assert depths and not depths.warnings
     for camera in scene.cameras[:2]:
-        found = depths.inverse(camera)
-        assert found is not None and found.dtype == np.float32
-        np.testing.assert_allclose(found, 1 / depth_of(camera), rtol=1e-3)
+        inverse = depths.inverse(camera)
+        assert inverse is not None and inverse.dtype == np.float32
+        np.testing.assert_allclose(inverse, 1 / depth_of(camera), rtol=1e-3)
         half = depths.inverse(camera.scaled(0.5))
         expected = (1 / depth_of(camera)).reshape(HEIGHT // 2, 2, WIDTH // 2, 2).mean(axis=(1, 3))
         np.testing.assert_allclose(half, expected, rtol=1e-3)
 
 
 @pytest.mark.parametrize("kind", FITTED)
-def test_scale_and_shift_are_found_for_each_view(walls, tmp_path, kind):
-    scene = read_scene(put(walls, tmp_path, FITTED[kind]))
+def test_maps_are_fitted_per_view(walls, tmp_path, kind):
+    scene = read_scene(write_depth_scene(walls, tmp_path, FITTED[kind]))
     depths = DepthPriors(scene, kind)
     assert depths and not depths.warnings
     for camera in scene.cameras:
-        found = depths.inverse(camera)
-        assert found is not None
-        np.testing.assert_allclose(found, 1 / depth_of(camera), rtol=0.02)
+        inverse = depths.inverse(camera)
+        assert inverse is not None
+        np.testing.assert_allclose(inverse, 1 / depth_of(camera), rtol=0.02)
 
 
-def test_scale_and_shift_whatever_is_hidden():
-    """A fifth of the points lie behind what the map shows."""
+def test_fit_ignores_occluded_points():
+    """A fifth of the points lie occluded the map's surface."""
     rng = np.random.default_rng(0)
     z = rng.uniform(2, 9, 400)
-    behind = z * np.where(rng.random(400) < 0.2, rng.uniform(1.2, 3, 400), 1)
-    scale, shift = fit_scale_and_shift(3 * (1 / z) + 0.7, behind, depth=False) or (0, 0)
+    occluded = z * np.where(rng.random(400) < 0.2, rng.uniform(1.2, 3, 400), 1)
+    scale, shift = fit_scale_and_shift(3 * (1 / z) + 0.7, occluded, is_depth=False) or (0, 0)
     assert (scale, shift) == pytest.approx((1 / 3, -0.7 / 3), abs=5e-3)
-    scale, shift = fit_scale_and_shift(0.5 * z + 0.2, behind, depth=True) or (0, 0)
+    scale, shift = fit_scale_and_shift(0.5 * z + 0.2, occluded, is_depth=True) or (0, 0)
     assert (scale, shift) == pytest.approx((2, -0.4), abs=0.05)
-    assert fit_scale_and_shift(rng.random(400), z, depth=False) is None
-    assert fit_scale_and_shift(z, z, depth=False) is None  # the wrong way round
-    assert fit_scale_and_shift(1 / z[:5], z[:5], depth=False) is None
+    assert fit_scale_and_shift(rng.random(400), z, is_depth=False) is None
+    assert fit_scale_and_shift(z, z, is_depth=False) is None  # a negative scale
+    assert fit_scale_and_shift(1 / z[:5], z[:5], is_depth=False) is None
 
 
-def test_maps_in_another_unit_are_not_used(walls, tmp_path):
-    scene = read_scene(put(walls, tmp_path, FITTED["inverse"]))
+def test_metric_maps_in_another_unit_are_rejected(walls, tmp_path):
+    scene = read_scene(write_depth_scene(walls, tmp_path, FITTED["inverse"]))
     depths = DepthPriors(scene, "metric")
     assert not depths and depths.inverse(scene.cameras[0]) is None
-    assert len(depths.warnings) == 1 and "times as large" in depths.warnings[0]
-    begun = add_depth_points(scene)
-    assert begun.points is scene.points and begun.warnings == scene.warnings + depths.warnings
+    assert len(depths.warnings) == 1 and "times that of the scene's points" in depths.warnings[0]
+    result = add_depth_points(scene)
+    assert result.points is scene.points and result.warnings == scene.warnings + depths.warnings
 
 
-def test_maps_that_fit_no_points_are_not_used(walls, tmp_path):
+def test_maps_that_contradict_points_are_rejected(walls, tmp_path):
     noise = np.random.default_rng(0)
     scene = read_scene(
-        put(walls, tmp_path, lambda folder, n, depth: exr(folder / f"{n}.exr", noise.random(depth.shape)))
+        write_depth_scene(
+            walls,
+            tmp_path,
+            lambda folder, n, depth: write_exr_map(folder / f"{n}.exr", noise.random(depth.shape)),
+        )
     )
     depths = DepthPriors(scene, "inverse")
-    assert not depths and "do not go with the scene's points" in depths.warnings[0]
+    assert not depths and "contradict the scene's points" in depths.warnings[0]
 
 
-def test_without_maps_nothing_is_known(walls):
+def test_missing_maps_give_a_warning(walls):
     for kind in ("metric", "relative", "inverse"):
         depths = DepthPriors(read_scene(walls), kind)
-        assert not depths and "no photograph has a depth map" in " ".join(depths.warnings)
+        assert not depths and "no photo has one" in " ".join(depths.warnings)
 
 
-def test_what_is_not_known_stays_so(walls, tmp_path):
-    """Zeros of sensors, the sky of renderers; of a mean only what is known counts."""
+def test_missing_depth_is_nan(walls, tmp_path):
+    """Sensors write 0 and renderers a large value; averages use known values only."""
 
     def write(folder, number, depth):
         depth[:100], depth[101, 7] = 1e10, 0
-        exr(folder / f"{number}.exr", depth)
+        write_exr_map(folder / f"{number}.exr", depth)
 
-    scene = read_scene(put(walls, tmp_path, write))
-    found = DepthPriors(scene, "metric").inverse(scene.cameras[0])
-    assert found is not None and np.isnan(found[:100]).all() and np.isnan(found[101, 7])
-    assert np.isfinite(found[100:]).sum() == (HEIGHT - 100) * WIDTH - 1
+    scene = read_scene(write_depth_scene(walls, tmp_path, write))
+    inverse = DepthPriors(scene, "metric").inverse(scene.cameras[0])
+    assert inverse is not None and np.isnan(inverse[:100]).all() and np.isnan(inverse[101, 7])
+    assert np.isfinite(inverse[100:]).sum() == (HEIGHT - 100) * WIDTH - 1
     values = np.array([[1.0, np.nan, np.nan, np.nan], [3.0, 2.0, np.nan, 4.0]])
     np.testing.assert_array_equal(resample_known(values, 2, 1), [[2.0, np.nan]])
 
 
-def test_the_models_points_are_known_where_they_are(walls):
+def test_depth_of_points(walls):
     scene = read_scene(walls)
     depths, camera = DepthPriors(scene, "points"), scene.cameras[2]
-    found = depths.inverse(camera)
-    assert depths and found is not None
-    known = np.isfinite(found)
+    inverse = depths.inverse(camera)
+    assert depths and inverse is not None
+    finite = np.isfinite(inverse)
     pixels, z = camera.project(scene.points[camera.sees(scene.points)])
-    assert 50 <= known.sum() <= len(pixels)
+    assert 50 <= finite.sum() <= len(pixels)
     x, y = np.floor(pixels).astype(int).T
-    np.testing.assert_allclose(found[y, x], 1 / z, rtol=0.2)  # two in one pixel: the nearer one
-    np.testing.assert_allclose(found[known], 1 / depth_of(camera)[known], rtol=0.02)
-    bare = replace(scene, point_ids=scene.point_ids[:0])  # nobody says who sees them
-    depths = DepthPriors(bare, "points")
-    assert not depths and "does not tell which photographs see its points" in " ".join(depths.warnings)
+    np.testing.assert_allclose(inverse[y, x], 1 / z, rtol=0.2)  # the nearer one of two in a pixel
+    np.testing.assert_allclose(inverse[finite], 1 / depth_of(camera)[finite], rtol=0.02)
+    unobserved = replace(scene, point_ids=scene.point_ids[:0])
+    depths = DepthPriors(unobserved, "points")
+    assert not depths and "does not record their observations" in " ".join(depths.warnings)
 
 
-def test_points_come_from_maps_where_there_are_few(walls, tmp_path):
-    scene = read_scene(put(walls, tmp_path, METRIC["multilayer"]))
-    found = add_depth_points(scene)
-    new = found.points[len(scene.points) :]
-    assert 20_000 < len(new) <= 100_000 and "are taken from the depth maps" in found.warnings[-1]
+def test_maps_add_points_to_scenes_of_few_points(walls, tmp_path):
+    scene = read_scene(write_depth_scene(walls, tmp_path, METRIC["multilayer"]))
+    result = add_depth_points(scene)
+    new = result.points[len(scene.points) :]
+    assert 20_000 < len(new) <= 100_000 and "initial points from the depth maps" in result.warnings[-1]
     _, y, z = new.T
     assert (np.minimum(np.abs(z), np.abs(y - 1)) < 1e-3).all()  # on the floor or the wall
     camera = scene.cameras[0]
-    colors = found.point_colors[len(scene.points) :]
+    colors = result.point_colors[len(scene.points) :]
     assert abs(float(colors.mean()) - render_photo(camera.center).mean()) < 12
-    assert add_depth_points(found) is found
+    assert add_depth_points(result) is result
     assert add_depth_points(read_scene(walls)).points is not None
 
 
-@pytest.mark.parametrize(("unit", "odd"), [(1, False), (1000, True), (0.001, True)])
-def test_points_from_maps_in_another_unit_are_warned_of(walls, tmp_path, unit, odd):
+@pytest.mark.parametrize(("unit", "warned"), [(1, False), (1000, True), (0.001, True)])
+def test_implausible_unit_of_maps_gives_a_warning(walls, tmp_path, unit, warned):
     def write(folder, number, depth):
-        npy(folder / f"{number}.npy", (unit * depth).astype(np.float32))
+        write_npy_map(folder / f"{number}.npy", (unit * depth).astype(np.float32))
 
-    scene = read_scene(put(walls, tmp_path, write))
-    nothing = replace(scene, points=scene.points[:0], point_ids=scene.point_ids[:0])
-    said = "".join(add_depth_points(nothing).warnings)
-    assert "are taken from the depth maps" in said and ("they are in the scene's unit" in said) == odd
+    scene = read_scene(write_depth_scene(walls, tmp_path, write))
+    empty = replace(scene, points=scene.points[:0], point_ids=scene.point_ids[:0])
+    text = "".join(add_depth_points(empty).warnings)
+    assert "initial points from the depth maps" in text and ("in the scene's unit" in text) == warned
 
 
 @pytest.mark.parametrize("lens", ["OPENCV", "OPENCV_FISHEYE"])
-def test_they_are_straightened_like_their_photographs(tmp_path, lens):
-    """A photograph that is its own depth map still is; the map has another size."""
+def test_maps_are_undistorted_like_their_photos(tmp_path, lens):
+    """A photo that equals its depth map still does; the map has another size."""
     y, x = np.mgrid[: synthetic.HEIGHT, : synthetic.WIDTH]
     ramp = (40 + x + y).astype(np.uint8)
     synthetic.write_scene(tmp_path, synthetic.camera(lens), pixels=np.repeat(ramp[..., None], 3, axis=2))
     for name in ("a.png", "b.png"):
-        grey(tmp_path / "depths" / name, np.repeat(np.repeat(ramp.astype(float), 2, axis=0), 2, axis=1))
+        write_png_map(
+            tmp_path / "depths" / name, np.repeat(np.repeat(ramp.astype(float), 2, axis=0), 2, axis=1)
+        )
     scene = undistort_scene(read_scene(tmp_path), tmp_path / "cache")
     assert [camera.depth is None for camera in scene.cameras] == [False, False, True]
     for camera in scene.cameras[:2]:
         assert camera.image is not None and camera.depth is not None
-        photograph = 255 * load_image(camera.image, camera.width, camera.height)[..., 0]
+        photo = 255 * load_image(camera.image, camera.width, camera.height)[..., 0]
         depth = 1000 * read_depth_map(camera.depth)
-        assert depth.shape == photograph.shape and np.isfinite(depth).mean() > 0.99
-        assert np.nanmean(np.abs(depth - photograph)) < 1 and np.ptp(photograph) > 60
+        assert depth.shape == photo.shape and np.isfinite(depth).mean() > 0.99
+        assert np.nanmean(np.abs(depth - photo)) < 1 and np.ptp(photo) > 60
 
 
 @pytest.mark.parametrize(
-    ("write", "words"),
+    ("write", "message"),
     [
-        (lambda path: write_png(path, np.zeros((HEIGHT, WIDTH, 3), np.uint8)), "is a picture in colours"),
-        (lambda path: grey(path, np.ones((HEIGHT, WIDTH // 2))), "other proportions"),
-        (lambda path: path.write_bytes(b"dear diary"), "cannot be read as a depth map"),
-        (lambda path: exr(path, ONES, "Combined.R"), "no depth"),
-        (lambda path: exr(path, ONES, "R", G=ONES), "no depth"),
-        (lambda path: npy(path, np.ones((HEIGHT, WIDTH, 3))), "of shape"),
-        (lambda path: npy(path, np.full((HEIGHT, WIDTH), "a")), "not a depth map"),
-        (lambda path: npy(path, np.full((HEIGHT, WIDTH), None)), "cannot be read as a depth map"),
-        (lambda path: npy(path, np.zeros((0, WIDTH))), "no pixels"),
-        (lambda path: path.write_bytes(b"\x93NUMPY\1\0v\0{'descr'"), "cannot be read as a depth map"),
+        (lambda path: write_png(path, np.zeros((HEIGHT, WIDTH, 3), np.uint8)), "is a colour image"),
+        (lambda path: write_png_map(path, np.ones((HEIGHT, WIDTH // 2))), "aspect ratio"),
+        (lambda path: path.write_bytes(b"dear diary"), "as a depth map"),
+        (lambda path: write_exr_map(path, ONES, "Combined.R"), "no depth"),
+        (lambda path: write_exr_map(path, ONES, "R", G=ONES), "no depth"),
+        (lambda path: write_npy_map(path, np.ones((HEIGHT, WIDTH, 3))), "of shape"),
+        (lambda path: write_npy_map(path, np.full((HEIGHT, WIDTH), "a")), "as a depth map"),
+        (lambda path: write_npy_map(path, np.full((HEIGHT, WIDTH), None)), "as a depth map"),
+        (lambda path: write_npy_map(path, np.zeros((0, WIDTH))), "no pixels"),
+        (lambda path: path.write_bytes(b"\x93NUMPY\1\0v\0{'descr'"), "as a depth map"),
     ],
-    ids=["colours", "proportions", "text", "one channel", "two channels", "channels of numbers", "words",
-         "objects", "nothing", "cut short"],
+    ids=["colour", "aspect ratio", "text", "one channel", "two channels", "array of channels", "strings",
+         "objects", "empty", "truncated"],
 )  # fmt: skip
-def test_what_is_no_depth_map_is_a_sentence(walls, tmp_path, write, words):
-    scene = read_scene(put(walls, tmp_path, lambda folder, n, depth: write(folder / f"{n}.png")))
-    with pytest.raises(LodgsError, match=words):
+def test_invalid_depth_map_is_rejected(walls, tmp_path, write, message):
+    scene = read_scene(
+        write_depth_scene(walls, tmp_path, lambda folder, n, depth: write(folder / f"{n}.png"))
+    )
+    with pytest.raises(LodgsError, match=message):
         DepthPriors(scene, "metric").inverse(scene.cameras[0])

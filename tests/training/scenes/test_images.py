@@ -1,4 +1,4 @@
-"""Photographs: sizes from headers and pixels, against arrays written here by other means."""
+"""Image sizes and pixels, compared with arrays written by independent code."""
 
 import os
 import struct
@@ -15,7 +15,7 @@ from training.scenes.images import image_size, load_image
 
 
 def write_png(path, pixels: np.ndarray) -> None:
-    """8 or 16 bits; 1, 2, 3 or 4 channels, as the PNG specification has it (Pillow cannot write them all)."""
+    """Write 8 or 16 bits and 1 to 4 channels as in the PNG specification; Pillow cannot write all of them."""
     height, width, channels = pixels.shape
     kind = {1: 0, 2: 4, 3: 2, 4: 6}[channels]
     rows = pixels.astype(pixels.dtype.newbyteorder(">")).reshape(height, -1)
@@ -41,7 +41,7 @@ def pixels():
     return np.random.default_rng(0).integers(0, 256, (30, 44, 3)).astype(np.uint8)
 
 
-def test_half_size_is_an_exact_box(tmp_path, pixels):
+def test_half_size_is_exact_box_average(tmp_path, pixels):
     write_png(tmp_path / "a.png", pixels)
     expected = pixels.reshape(15, 2, 22, 2, 3).astype(float).mean(axis=(1, 3)) / 255
     image = load_image(tmp_path / "a.png", 22, 15)
@@ -50,8 +50,8 @@ def test_half_size_is_an_exact_box(tmp_path, pixels):
 
 
 @pytest.mark.parametrize("size", [(44, 30), (43, 29), (31, 17), (13, 7), (1, 1)])
-def test_any_smaller_size_is_the_mean_over_each_pixels_area(tmp_path, pixels, size):
-    """Against the same average on a grid that both sizes divide."""
+def test_smaller_size_is_area_average(tmp_path, pixels, size):
+    """Compare with the average on a grid that both sizes divide."""
     width, height = size
     write_png(tmp_path / "a.png", pixels)
     fine = np.repeat(np.repeat(pixels / 255, height, axis=0), width, axis=1)
@@ -60,8 +60,8 @@ def test_any_smaller_size_is_the_mean_over_each_pixels_area(tmp_path, pixels, si
 
 
 @pytest.mark.parametrize("channels", [1, 2, 3, 4])
-def test_png_of_every_kind(tmp_path, channels):
-    """Grey becomes RGB and alpha is ignored, however transparent."""
+def test_png_channels(tmp_path, channels):
+    """Grey becomes RGB, and alpha is ignored."""
     pixels = np.random.default_rng(1).integers(0, 256, (5, 7, channels)).astype(np.uint8)
     write_png(tmp_path / "a.png", pixels)
     color = pixels[..., :3] if channels > 2 else np.repeat(pixels[..., :1], 3, axis=2)
@@ -70,7 +70,7 @@ def test_png_of_every_kind(tmp_path, channels):
 
 
 @pytest.mark.parametrize("channels", [1, 3])
-def test_png_of_16_bits(tmp_path, channels):
+def test_png_with_16_bits(tmp_path, channels):
     pixels = np.random.default_rng(1).integers(0, 65536, (5, 7, channels)).astype(np.uint16)
     write_png(tmp_path / "a.png", pixels)
     expected = np.broadcast_to(pixels / 65535, (5, 7, 3))
@@ -88,10 +88,10 @@ def test_jpeg(tmp_path, mode, options):
     assert load_image(path, 41, 23).shape == (23, 41, 3)
 
 
-def test_jpeg_with_something_appended_is_whole(tmp_path):
+def test_jpeg_with_appended_data_is_complete(tmp_path):
     path = tmp_path / "a.jpg"
     Image.new("RGB", (41, 23)).save(path)
-    path.write_bytes(path.read_bytes() + b"what a phone appends" * 99)
+    path.write_bytes(path.read_bytes() + b"data appended by a phone" * 99)
     assert image_size(path) == (41, 23)
 
 
@@ -113,26 +113,26 @@ def test_tiff(tmp_path, pixels, mode, options):
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
-@pytest.mark.parametrize("ending", ["jpg", "tif"])
-def test_pixels_are_as_they_are_stored_however_a_viewer_turns_them(tmp_path, pixels, orientation, ending):
-    """As COLMAP reads them."""
-    for tag, name in ((1, "straight"), (orientation, "turned")):
+@pytest.mark.parametrize("suffix", ["jpg", "tif"])
+def test_orientation_is_not_applied(tmp_path, pixels, orientation, suffix):
+    """COLMAP ignores the orientation, too."""
+    for tag, name in ((1, "upright"), (orientation, "rotated")):
         exif = Image.Exif()
         exif[274] = tag
-        Image.fromarray(pixels).save(tmp_path / f"{name}.{ending}", exif=exif)
-    straight, turned = (tmp_path / f"{name}.{ending}" for name in ("straight", "turned"))
-    assert image_size(turned) == (44, 30)
-    np.testing.assert_array_equal(load_image(turned, 44, 30), load_image(straight, 44, 30))
+        Image.fromarray(pixels).save(tmp_path / f"{name}.{suffix}", exif=exif)
+    upright, rotated = (tmp_path / f"{name}.{suffix}" for name in ("upright", "rotated"))
+    assert image_size(rotated) == (44, 30)
+    np.testing.assert_array_equal(load_image(rotated, 44, 30), load_image(upright, 44, 30))
 
 
-def test_tiff_of_grey_floats(tmp_path, pixels):
+def test_tiff_with_grey_floats(tmp_path, pixels):
     grey = (pixels[..., 0] / 255).astype(np.float32)
     Image.fromarray(grey).save(tmp_path / "a.tif")
     np.testing.assert_array_equal(load_image(tmp_path / "a.tif", 44, 30), np.stack([grey] * 3, axis=-1))
 
 
-def test_tiff_of_the_other_byte_order(tmp_path):
-    """By hand, as TIFF 6.0 has it: 5x3 grey, one strip, big-endian; width of 32 bits, height of 16."""
+def test_big_endian_tiff(tmp_path):
+    """A hand-made TIFF 6.0 of 5x3 grey pixels in one strip, with a 32-bit width and a 16-bit height."""
     tags = [(256, 4, 5), (257, 3, 3 << 16), (258, 3, 8 << 16), (259, 3, 1 << 16), (262, 3, 1 << 16),
             (273, 4, 8), (277, 3, 1 << 16), (278, 3, 3 << 16), (279, 4, 15)]  # fmt: skip
     grey = bytes(range(0, 150, 10))
@@ -149,34 +149,34 @@ def test_tiff_of_the_other_byte_order(tmp_path):
     [("RGB", {"quality": 100}), ("RGB", {"lossless": True}), ("RGBA", {"lossless": True})],
 )
 def test_webp(tmp_path, pixels, mode, options):
-    """Lossy, lossless and extended files say their size in three ways."""
+    """Lossy, lossless and extended files store their size in different ways."""
     image = Image.fromarray(pixels).convert(mode)
     if mode == "RGBA":
         image.putalpha(120)
     image.save(tmp_path / "a.webp", **options)
     assert image_size(tmp_path / "a.webp") == (44, 30)
-    off = np.abs(load_image(tmp_path / "a.webp", 44, 30) - pixels / 255)
-    assert off.max() <= 1e-6 if "lossless" in options else off.mean() < 0.2
+    error = np.abs(load_image(tmp_path / "a.webp", 44, 30) - pixels / 255)
+    assert error.max() <= 1e-6 if "lossless" in options else error.mean() < 0.2
 
 
-@pytest.mark.parametrize("part", [0.02, 0.3, 0.5, 0.9, 0.999])
+@pytest.mark.parametrize("share", [0.02, 0.3, 0.5, 0.9, 0.999])
 @pytest.mark.parametrize("kind", ["jpg", "png", "webp"])
-def test_a_file_cut_short_is_refused(tmp_path, pixels, kind, part):
+def test_truncated_file_is_rejected(tmp_path, pixels, kind, share):
     path = tmp_path / f"a.{kind}"
     if kind == "png":
         write_png(path, pixels)
     else:
-        # A thumbnail in the header is a whole JPEG, end marker and all.
+        # A thumbnail in the header is a complete JPEG with an end marker.
         Image.fromarray(pixels).save(path, exif=b"Exif\0\0\xff\xd8\xff\xd9")
-    whole = path.read_bytes()
-    path.write_bytes(whole[: int(len(whole) * part)])
-    with pytest.raises(LodgsError, match=r"cut short|not a JPEG") as error:
+    content = path.read_bytes()
+    path.write_bytes(content[: int(len(content) * share)])
+    with pytest.raises(LodgsError, match=r"truncated|not a JPEG") as error:
         image_size(path)
     assert str(path) in error.value.what
 
 
-def test_other_files_are_refused(tmp_path):
-    for name, data in {"empty": b"", "text": b"not a picture", "gif": b"GIF89a" + bytes(20)}.items():
+def test_other_formats_are_rejected(tmp_path):
+    for name, data in {"empty": b"", "text": b"not an image", "gif": b"GIF89a" + bytes(20)}.items():
         (tmp_path / name).write_bytes(data)
         with pytest.raises(LodgsError, match=name):
             image_size(tmp_path / name)
@@ -186,7 +186,7 @@ def test_other_files_are_refused(tmp_path):
         image_size(tmp_path / "absent")
 
 
-def test_real_sizes_are_pillows(shared_scenes):
+def test_sizes_of_real_photos_match_pillow(shared_scenes):
     paths = sorted(shared_scenes.glob("*/images/*"))[::5]
     assert paths
     for path in paths:
@@ -197,7 +197,7 @@ def test_real_sizes_are_pillows(shared_scenes):
 @pytest.mark.parametrize("names", [("R", "G", "B"), ("V.Combined.R", "V.Combined.G", "V.Combined.B"), ("Y",)])
 @pytest.mark.parametrize("kind", [np.float32, np.float16])
 def test_exr_is_linear_with_exposure(tmp_path, names, kind):
-    """Averaged as light, doubled by a stop, then coded; alpha and other passes are ignored."""
+    """Averaging and exposure apply to linear light; alpha and other passes are ignored."""
     random = np.random.default_rng(2)
     channels = {name: random.uniform(0, 1.2, (8, 10)).astype(kind) for name in names}
     color = np.stack([channels[names[i % len(names)]] for i in range(3)], axis=2).astype(float)
@@ -211,27 +211,27 @@ def test_exr_is_linear_with_exposure(tmp_path, names, kind):
         np.testing.assert_allclose(image, srgb_from_linear((half * 2.0**stops).clip(0, 1)), atol=1e-5)
 
 
-@pytest.mark.parametrize("part", [0.01, 0.03, 0.2, 0.5, 0.95, 0.999])
+@pytest.mark.parametrize("share", [0.01, 0.03, 0.2, 0.5, 0.95, 0.999])
 @pytest.mark.parametrize("compression", ["NO", "ZIPS", "ZIP", "PIZ", "DWAB"])
-def test_an_exr_cut_short_is_refused(tmp_path, capfd, compression, part):
-    """Before OpenEXR sees it, which would print to the standard output."""
+def test_truncated_exr_is_rejected(tmp_path, capfd, compression, share):
+    """It is rejected before OpenEXR reads it, which would print to the standard output."""
     path = tmp_path / "a.exr"
     noise = np.random.default_rng(2).uniform(0, 1, (70, 64)).astype(np.float32)
     header = {"compression": getattr(OpenEXR, f"{compression}_COMPRESSION"), "type": OpenEXR.scanlineimage}
     with OpenEXR.File(header, {"R": noise, "G": noise, "B": noise}) as file:
         file.write(str(path))
     assert image_size(path) == (64, 70)
-    whole = path.read_bytes()
-    path.write_bytes(whole[: int(len(whole) * part)])
+    content = path.read_bytes()
+    path.write_bytes(content[: int(len(content) * share)])
     for read in (image_size, lambda path: load_image(path, 64, 70)):
-        with pytest.raises(LodgsError, match="cut short") as error:
+        with pytest.raises(LodgsError, match="truncated") as error:
             read(path)
         assert str(path) in error.value.what
     assert capfd.readouterr().out == ""
 
 
 @pytest.mark.parametrize("kind", ["tiledimage", "parts"])
-def test_exr_of_other_layouts(tmp_path, kind):
+def test_exr_layouts(tmp_path, kind):
     path = tmp_path / "a.exr"
     light = np.random.default_rng(2).uniform(0, 1, (70, 64)).astype(np.float32)
     channels = {"R": light, "G": light, "B": light}
@@ -249,14 +249,14 @@ def test_exr_of_other_layouts(tmp_path, kind):
     )
 
 
-def test_exr_without_colour(tmp_path):
+def test_exr_without_color(tmp_path):
     write_exr(tmp_path / "a.exr", {"Depth.Z": np.ones((8, 10), np.float32)})
     with pytest.raises(LodgsError, match="R, G and B"):
         load_image(tmp_path / "a.exr", 10, 8)
 
 
 def test_exr_crop_and_overscan(tmp_path):
-    """The image is the display window: data beside it is dropped, what no data covers is black."""
+    """The image is the display window: data outside is dropped, and missing data is black."""
     data = np.ones((4, 5), np.float32)
     window = (np.array([-2, 3], np.int32), np.array([2, 6], np.int32))
     display = (np.array([0, 0], np.int32), np.array([9, 7], np.int32))
@@ -267,10 +267,10 @@ def test_exr_crop_and_overscan(tmp_path):
     np.testing.assert_allclose(load_image(tmp_path / "a.exr", 10, 8), expected, atol=1e-6)
 
 
-def test_a_missing_library_or_broken_pixels_are_a_sentence(tmp_path, pixels):
+def test_damaged_pixels_are_reported(tmp_path, pixels):
     path = tmp_path / "a.jpg"
     Image.fromarray(pixels).save(path)
     path.write_bytes(path.read_bytes()[: os.path.getsize(path) // 2])
-    with pytest.raises(LodgsError, match="cannot be read as an image") as error:
+    with pytest.raises(LodgsError, match="as an image") as error:
         load_image(path, 10, 10)
     assert str(path) in error.value.what and error.value.remedy

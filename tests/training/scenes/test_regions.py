@@ -1,4 +1,4 @@
-"""Cells on the ground: their borders and views against cases worked by hand, tracks against pycolmap's."""
+"""Cells: borders and views against hand-computed cases, observations against pycolmap."""
 
 from dataclasses import replace
 
@@ -14,8 +14,8 @@ from training.scenes.regions import CELL_MARGIN, MIN_IMAGE_SHARE, Region, plan_c
 from .synthetic import write_scene
 
 
-def looking(name, eye, target, width=64, height=48, focal=40.0):
-    pose = look_at(np.array(eye, float), np.array(target, float), np.array([0.0, 0, 1]))
+def looking(name, position, target, width=64, height=48, focal=40.0):
+    pose = look_at(np.array(position, float), np.array(target, float), np.array([0.0, 0, 1]))
     return Camera(name, width, height, focal, focal, width / 2, height / 2, pose)
 
 
@@ -26,7 +26,7 @@ def scene_of(cameras, points, tmp_path):
 
 @pytest.fixture
 def grid(tmp_path):
-    """4 by 2 views that stand 10 apart and look down; points all over the place, from z = 0 to 1."""
+    """4 by 2 downward views, 10 units apart, and scattered points from z = 0 to 1."""
     cameras = [
         looking(f"{x}{y}", (10 * x, 10 * y, 3), (10 * x, 10 * y + 0.1, 0)) for x in range(4) for y in range(2)
     ]
@@ -34,95 +34,95 @@ def grid(tmp_path):
     return scene_of(cameras, rng.uniform((-50, -50, 0), (80, 60, 1), (5000, 3)), tmp_path)
 
 
-def test_borders_lie_in_the_middle_between_views_and_every_point_is_in_one_cell(grid):
+def test_border_lies_midway_between_views_and_cells_do_not_overlap(grid):
     regions = plan_cells(grid, 2, 1)
     assert len(regions) == 2
-    of = np.array([region.contains(grid.points) for region in regions])
-    assert (of.sum(axis=0) == 1).all()
-    one = of[0] if of[0, grid.points[:, 0].argmin()] else of[1]
-    np.testing.assert_array_equal(one, grid.points[:, 0] < 15)
+    masks = np.array([region.contains(grid.points) for region in regions])
+    assert (masks.sum(axis=0) == 1).all()
+    left = masks[0] if masks[0, grid.points[:, 0].argmin()] else masks[1]
+    np.testing.assert_array_equal(left, grid.points[:, 0] < 15)
 
 
-def test_cells_have_equally_many_views_and_rows_stand_within_their_column(grid):
+def test_cells_have_equal_numbers_of_views(grid):
     regions = plan_cells(grid, 2, 2)
-    eyes = np.array([camera.center for camera in grid.cameras])
-    inside = np.array([region.contains(eyes) for region in regions])
+    positions = np.array([camera.center for camera in grid.cameras])
+    inside = np.array([region.contains(positions) for region in regions])
     assert (inside.sum(axis=0) == 1).all() and (inside.sum(axis=1) == 2).all()
     for region in regions:
-        assert np.isinf(region.cell).sum() == 2, "an outer corner has no end"
+        assert np.isinf(region.cell).sum() == 2, "outer corners are unbounded"
 
 
-def test_a_cell_is_enlarged_by_a_fifth_of_its_side(grid):
-    left = min(plan_cells(grid, 2, 1), key=lambda region: eyes_in(region, grid)[:, 0].max())
-    around = left.in_enlarged_cell(grid.points)
-    np.testing.assert_array_equal(around, grid.points[:, 0] < 15 + CELL_MARGIN * 15)
+def test_cell_is_enlarged_by_a_fifth_of_its_side(grid):
+    left = min(plan_cells(grid, 2, 1), key=lambda region: positions_in(region, grid)[:, 0].max())
+    enlarged = left.in_enlarged_cell(grid.points)
+    np.testing.assert_array_equal(enlarged, grid.points[:, 0] < 15 + CELL_MARGIN * 15)
 
 
-def test_borders_are_what_lies_within_a_fifth_of_the_side_of_another_cell(grid):
-    """The left cell ends at 15 and is 15 wide, so 3 of it; the right one is as wide as its views, too."""
-    left, right = sorted(plan_cells(grid, 2, 1), key=lambda region: eyes_in(region, grid)[:, 0].max())
+def test_border_zone_is_a_fifth_of_the_cell_wide(grid):
+    """The left cell ends at 15 and is 15 wide, so its border zone is 3 wide, and so is the right one's."""
+    left, right = sorted(plan_cells(grid, 2, 1), key=lambda region: positions_in(region, grid)[:, 0].max())
     x = grid.points[:, 0]
     np.testing.assert_array_equal(left.near_border(grid.points), (x >= 12) & (x < 15))
     np.testing.assert_array_equal(right.near_border(grid.points), (x >= 15) & (x < 18))
-    (alone,) = plan_cells(grid, 1, 1)
-    assert not alone.near_border(grid.points).any() and not alone.as_seam(grid).views
+    (region,) = plan_cells(grid, 1, 1)
+    assert not region.near_border(grid.points).any() and not region.as_seam(grid).views
 
 
-def test_a_seam_has_the_views_that_stand_at_borders_on_either_side(tmp_path):
+def test_seam_has_views_on_both_sides_of_the_border(tmp_path):
     cameras = [looking(f"{x:02}", (x, y, 3), (x, y + 0.1, 0)) for x in range(0, 20, 2) for y in (0,)]
     points = np.random.default_rng(0).uniform((-9, -9, 0), (30, 9, 1), (500, 3))
     scene = scene_of(cameras, points, tmp_path)
-    left = min(plan_cells(scene, 2, 1), key=lambda region: eyes_in(region, scene)[:, 0].max())
-    seam = left.as_seam(scene)  # the border lies at 9, and 9 wide is the cell: 1.8 on either side
+    left = min(plan_cells(scene, 2, 1), key=lambda region: positions_in(region, scene)[:, 0].max())
+    seam = left.as_seam(scene)  # border at 9, cell width 9: the zone is 1.8 on each side
     assert seam.views == ("08", "10") and seam.seam and not left.seam
     np.testing.assert_array_equal(seam.cell, left.cell)
     seam.write(tmp_path / "region.json")
     assert Region.read(tmp_path / "region.json").seam
 
 
-def test_cells_meet_those_beside_them_alone(tmp_path):
+def test_only_adjacent_cells_overlap(tmp_path):
     cameras = [looking(f"{x:02}", (x, x % 3, 3), (x, 0.1, 0)) for x in range(0, 40, 2)]
     points = np.random.default_rng(0).uniform((-9, -9, 0), (50, 9, 1), (500, 3))
     regions = plan_cells(scene_of(cameras, points, tmp_path), 4, 1)
-    for i, one in enumerate(regions):
-        for j, other in enumerate(regions):
-            assert one.overlaps(other) == (abs(i - j) <= 1)
+    for i, first in enumerate(regions):
+        for j, second in enumerate(regions):
+            assert first.overlaps(second) == (abs(i - j) <= 1)
 
 
-def eyes_in(region, scene):
-    eyes = np.array([camera.center for camera in scene.cameras])
-    return eyes[region.contains(eyes)]
+def positions_in(region, scene):
+    positions = np.array([camera.center for camera in scene.cameras])
+    return positions[region.contains(positions)]
 
 
 @pytest.mark.parametrize("focal, belongs", [(40.0, False), (4000.0, True)])
-def test_a_view_belongs_to_cells_that_fill_more_than_a_quarter_of_it(tmp_path, focal, belongs):
-    """The other cell begins 15.4 ahead and is 8.4 wide, 2 high: with the short lens a 27th of the image."""
+def test_view_belongs_to_cells_that_cover_a_quarter_of_its_image(tmp_path, focal, belongs):
+    """The other cell begins 15.4 ahead, 8.4 wide and 2 high: 1/27 of the image with the short lens."""
     points = [(x, y, z) for x in np.linspace(-9, 60, 30) for y in (-2.0, 9.0) for z in (0.0, 2.0)]
     cameras = [looking(f"{x}-{y}", (x, y, 1), (x, y + 0.1, 0)) for x in (0, 3, 6, 40, 43, 46) for y in (0, 6)]
     far = looking("far", (3, 3, 1), (43, 3, 1), focal=focal)
     scene = scene_of([*cameras, far], points, tmp_path)
-    right = max(plan_cells(scene, 2, 1), key=lambda region: eyes_in(region, scene)[:, 0].mean())
+    right = max(plan_cells(scene, 2, 1), key=lambda region: positions_in(region, scene)[:, 0].mean())
     assert ("far" in right.views) == belongs
     assert {f"{x}-{y}" for x in (40, 43, 46) for y in (0, 6)} <= set(right.views)
     assert "0-0" not in right.views
 
 
-def test_a_share_of_an_image_is_that_of_a_box_worked_by_hand():
+def test_share_of_image_computed_by_hand():
     from training.scenes.regions import _share_of_image
 
     view = looking("a", (0, 0, 0), (1, 0, 0), width=64, height=48, focal=32.0)
-    # at a distance of 10 the image is 20 wide and 15 high
+    # At distance 10, the image is 20 wide and 15 high.
     half = np.array([[10, 11], [0, 1000], [-1000, 1000.0]])
     assert _share_of_image(view, np.eye(3), half) == pytest.approx(0.5)
     part = np.array([[10, 10.001], [-5, 5], [-3.75, 3.75]])
     assert _share_of_image(view, np.eye(3), part) == pytest.approx(0.25, abs=0.01)
     assert _share_of_image(view, np.eye(3), part * [[-1], [1], [1]]) == 0, "behind"
-    assert _share_of_image(view, np.eye(3), np.array([[-1, 1]] * 3)) == 1, "from within"
+    assert _share_of_image(view, np.eye(3), np.array([[-1, 1]] * 3)) == 1, "from inside"
     assert 0 < MIN_IMAGE_SHARE < 1
 
 
 @pytest.mark.parametrize("text", [False, True])
-def test_which_points_views_observe_is_what_pycolmap_says(tmp_path, text):
+def test_observed_points_match_pycolmap(tmp_path, text):
     model = write_scene(tmp_path, names=("a.png", "b b.png", "c.png"))
     if text:
         folder = tmp_path / "sparse" / "0"
@@ -132,34 +132,34 @@ def test_which_points_views_observe_is_what_pycolmap_says(tmp_path, text):
     scene = read_scene(tmp_path)
     for names in (("b b.png",), ("a.png", "c.png"), ("none",)):
         ids = {image.image_id for image in model.images.values() if image.name in names}
-        seen = {
+        observed = {
             number
             for number, point in model.points3D.items()
             if any(element.image_id in ids for element in point.track.elements)
         }
-        if seen:
+        if observed:
             np.testing.assert_array_equal(
-                observed_points(scene, names), np.isin(scene.point_ids, sorted(seen))
+                observed_points(scene, names), np.isin(scene.point_ids, sorted(observed))
             )
-            assert 0 < len(seen) < len(scene.points)
+            assert 0 < len(observed) < len(scene.points)
         else:
             assert not observed_points(scene, names).any()
     assert pycolmap.__version__
 
 
-def test_without_tracks_those_points_count_that_a_view_could_see(grid):
-    seen = observed_points(grid, ["00"])
-    np.testing.assert_array_equal(seen, grid.cameras[0].sees(grid.points))
-    assert 0 < seen.sum() < len(seen)
+def test_points_in_the_image_count_as_observed_without_tracks(grid):
+    observed = observed_points(grid, ["00"])
+    np.testing.assert_array_equal(observed, grid.cameras[0].sees(grid.points))
+    assert 0 < observed.sum() < len(observed)
 
 
-def test_a_region_is_read_as_it_was_written(grid, tmp_path):
+def test_region_is_stored_bit_by_bit(grid, tmp_path):
     for region in plan_cells(grid, 2, 2):
         region.write(tmp_path / "region.json")
-        again = Region.read(tmp_path / "region.json")
+        stored = Region.read(tmp_path / "region.json")
         for name in ("ground", "cell", "area"):
-            np.testing.assert_array_equal(getattr(again, name), getattr(region, name))
-        assert again.views == region.views
+            np.testing.assert_array_equal(getattr(stored, name), getattr(region, name))
+        assert stored.views == region.views
 
 
 @pytest.mark.parametrize(
@@ -173,15 +173,15 @@ def test_a_region_is_read_as_it_was_written(grid, tmp_path):
         '{"ground": [[1,0,0],[0,1,0],[0,0,1]], "cell": [[0,1],[0,1]], "area": [[0,1],[0,1]], "views": [1]}',
     ],
 )  # fmt: skip
-def test_what_is_no_region_is_said_so(tmp_path, text):
+def test_invalid_region_file_is_rejected(tmp_path, text):
     (tmp_path / "region.json").write_text(text)
     with pytest.raises(LodgsError):
         Region.read(tmp_path / "region.json")
 
 
-def test_too_few_views_are_told(grid):
-    with pytest.raises(LodgsError, match="too few"):
+def test_too_few_views_are_rejected(grid):
+    with pytest.raises(LodgsError, match="8 views"):
         plan_cells(grid, 5, 1)
     same = replace(grid, cameras=[replace(grid.cameras[0], name=str(i)) for i in range(8)])
-    with pytest.raises(LodgsError, match="one place"):
+    with pytest.raises(LodgsError, match="one position"):
         plan_cells(same, 3, 1)

@@ -1,4 +1,4 @@
-"""What a renderer drew becomes a COLMAP scene: a ball on a ground, by formulas, in files like Blender's."""
+"""COLMAP scenes from rendered views: an analytic ball on the ground, in files like Blender's."""
 
 from dataclasses import replace
 
@@ -21,11 +21,11 @@ from training.scenes.rendered_views import (
     write_rendered_model,
 )
 
-WIDTH, HEIGHT, NOTHING = 64, 48, 1e10
+WIDTH, HEIGHT, NO_SURFACE = 64, 48, 1e10
 
 
 def views(count: int = 6) -> list[Camera]:
-    """Around the ball of radius 1 at (0, 0, 1), which stands on the ground z = 0; lenses are odd."""
+    """Return views around a ball of radius 1 at (0, 0, 1) on the ground z = 0, with an asymmetric lens."""
     turns = 2 * np.pi * np.arange(count) / count
     return [
         Camera(
@@ -36,41 +36,41 @@ def views(count: int = 6) -> list[Camera]:
     ]  # fmt: skip
 
 
-def seen(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Depths (H, W) and colours (H, W, 3): the ball red, the ground as far as 8 m green, else nothing."""
+def render(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Render depths (H, W) and colours (H, W, 3) of a red ball on green ground that ends at radius 8."""
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=-1)
     rays = rays @ camera.world_to_camera[:3, :3]
-    eye = camera.center
+    position = camera.center
     with np.errstate(divide="ignore", invalid="ignore"):
-        ground = -eye[2] / rays[..., 2]
-        place = eye + ground[..., None] * rays
-        ground = np.where((ground > 0) & (np.hypot(place[..., 0], place[..., 1]) < 8), ground, NOTHING)
-        a, b = (rays**2).sum(-1), rays @ (eye - [0, 0, 1])
-        root = b**2 - a * (((eye - [0, 0, 1]) ** 2).sum() - 1)
-        ball = np.where(root > 0, (-b - np.sqrt(root)) / a, NOTHING)
+        ground = -position[2] / rays[..., 2]
+        point = position + ground[..., None] * rays
+        ground = np.where((ground > 0) & (np.hypot(point[..., 0], point[..., 1]) < 8), ground, NO_SURFACE)
+        a, b = (rays**2).sum(-1), rays @ (position - [0, 0, 1])
+        root = b**2 - a * (((position - [0, 0, 1]) ** 2).sum() - 1)
+        ball = np.where(root > 0, (-b - np.sqrt(root)) / a, NO_SURFACE)
     color = np.select(
         [ball[..., None] < ground[..., None], ground[..., None] < SKY_DEPTH], [[200, 0, 0], [0, 90, 0]], 60
     )
     return np.minimum(ball, ground), color.astype(np.uint8)
 
 
-def draw(folder, cameras, channel="ViewLayer.Depth.Z"):
+def write_views(folder, cameras, channel="ViewLayer.Depth.Z"):
     for camera in cameras:
-        depth, color = seen(camera)
+        depth, color = render(camera)
         for kind in ("depths", "images"):
             (folder / kind).mkdir(exist_ok=True)
         header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-        far = np.full_like(depth, NOTHING, dtype=np.float32)
+        far = np.full_like(depth, NO_SURFACE, dtype=np.float32)
         channels = {channel: depth.astype(np.float32), "Other.Depth.Z": far} if channel else {"Y": far}
         OpenEXR.File(header, channels).write(str(folder / "depths" / f"{camera.name}.exr"))
         write_png(folder / "images" / f"{camera.name}.png", color)
         write_camera(folder / "cameras" / f"{camera.name}.json", camera, 0.1)
 
 
-def test_points_lie_on_what_is_seen_in_its_colours(tmp_path):
+def test_points_have_positions_and_colors_of_the_surfaces(tmp_path):
     cameras = views(12)
-    draw(tmp_path, cameras)
+    write_views(tmp_path, cameras)
     assert main(["model", str(tmp_path)]) == 0
     scene = read_scene(tmp_path)
     assert [camera.name for camera in scene.cameras] == [f"{camera.name}.png" for camera in cameras]
@@ -82,52 +82,52 @@ def test_points_lie_on_what_is_seen_in_its_colours(tmp_path):
     ground = np.abs(points[:, 2]) < 1e-4
     assert ball.sum() > 100 and ground.sum() > 100
     sky = ~ball & ~ground
-    away = np.linalg.norm(points[sky] - np.mean([camera.center for camera in cameras], axis=0), axis=1)
-    assert away == pytest.approx(MIN_SKY_DISTANCE * 5, rel=1e-5), "the sky is a sphere far beyond"
+    distance = np.linalg.norm(points[sky] - np.mean([camera.center for camera in cameras], axis=0), axis=1)
+    assert distance == pytest.approx(MIN_SKY_DISTANCE * 5, rel=1e-5), "the sky is a distant sphere"
     assert 0 < sky.mean() <= 0.1 and (scene.point_colors[sky] == 60).all()
-    assert 4 < scene.median_depth() < 7, "which is not what the scene is measured by"
+    assert 4 < scene.median_depth() < 7, "the sky does not change the scale"
     np.testing.assert_array_equal(scene.point_colors[ball & ~ground], [[200, 0, 0]] * (ball & ~ground).sum())
     np.testing.assert_array_equal(scene.point_colors[ground & ~ball], [[0, 90, 0]] * (ground & ~ball).sum())
 
 
-def test_coverage_counts_the_views_that_see_a_place():
+def test_coverage_counts_the_views_of_each_point():
     cameras = views()
-    depths = [np.where(depth < SKY_DEPTH, depth, 0) for depth, _ in map(seen, cameras)]
+    depths = [np.where(depth < SKY_DEPTH, depth, 0) for depth, _ in map(render, cameras)]
     points, counts = sample_coverage(cameras, depths, 3000)
     assert 1000 < len(points) <= 3000 and counts.min() >= 1
     for kind in (np.abs(points[:, 2]) < 1e-6, np.abs(np.linalg.norm(points - [0, 0, 1], axis=1) - 1) < 1e-6):
         assert kind.sum() > 100
-    least, most = np.zeros(len(points)), np.zeros(len(points))
-    for camera in cameras:  # a ray meets nothing of the ball before it comes to the point
-        eye = camera.center
-        ray = points - eye
-        along = np.clip(((np.array([0, 0, 1]) - eye) * ray).sum(1) / (ray**2).sum(1), 0, 1)
-        passes = np.linalg.norm(eye + along[:, None] * ray - [0, 0, 1], axis=1)
-        faces = ((points - [0, 0, 1]) * (eye - points)).sum(1)
+    low, high = np.zeros(len(points)), np.zeros(len(points))
+    for camera in cameras:  # a point is visible if the ball does not intersect its ray
+        position = camera.center
+        ray = points - position
+        closest = np.clip(((np.array([0, 0, 1]) - position) * ray).sum(1) / (ray**2).sum(1), 0, 1)
+        clearance = np.linalg.norm(position + closest[:, None] * ray - [0, 0, 1], axis=1)
+        facing = ((points - [0, 0, 1]) * (position - points)).sum(1)
         on_ball = points[:, 2] > 1e-6
-        slack = np.where(on_ball, faces / 3, passes - 1)  # where that is near 0, it lies at an outline
-        least += camera.sees(points, margin=-0.05) & (slack > 1) & (np.hypot(*points[:, :2].T) < 7)
-        most += camera.sees(points) & (slack > -1)
-    assert (counts <= most).all() and (counts >= least).all()
-    assert least.max() >= 2 and most.min() <= 2, "there is something to tell apart"
+        slack = np.where(on_ball, facing / 3, clearance - 1)  # about 0 at outlines
+        low += camera.sees(points, margin=-0.05) & (slack > 1) & (np.hypot(*points[:, :2].T) < 7)
+        high += camera.sees(points) & (slack > -1)
+    assert (counts <= high).all() and (counts >= low).all()
+    assert low.max() >= 2 and high.min() <= 2, "the bounds are not trivial"
     assert len(sample_coverage(cameras, [np.zeros((4, 6))] * len(cameras), 100)[0]) == 0
     assert len(sample_coverage([], [], 100)[0]) == 0
 
 
-def test_a_model_is_made_anew_whole(tmp_path):
-    draw(tmp_path, views())
-    _, before = write_rendered_model(tmp_path)
-    views_count, count = write_rendered_model(tmp_path, most=200)
-    assert views_count == 6 and count <= 200 < before
+def test_model_is_replaced(tmp_path):
+    write_views(tmp_path, views())
+    _, default_count = write_rendered_model(tmp_path)
+    views_count, count = write_rendered_model(tmp_path, limit=200)
+    assert views_count == 6 and count <= 200 < default_count
     assert len(read_scene(tmp_path).points) == count
     assert {path.name for path in tmp_path.iterdir()} == {"cameras", "depths", "images", "sparse"}
 
 
-def test_nothing_is_no_sky_where_pictures_are_transparent(tmp_path):
+def test_transparent_pixels_give_no_sky(tmp_path):
     cameras = views()
-    draw(tmp_path, cameras)
+    write_views(tmp_path, cameras)
     for camera in cameras:
-        depth, color = seen(camera)
+        depth, color = render(camera)
         alpha = np.where(depth < SKY_DEPTH, 255, 0)[..., None].astype(np.uint8)
         write_png(tmp_path / "images" / f"{camera.name}.png", np.concatenate([color, alpha], axis=2))
     write_rendered_model(tmp_path)
@@ -136,74 +136,74 @@ def test_nothing_is_no_sky_where_pictures_are_transparent(tmp_path):
     assert set(map(tuple, scene.point_colors)) == {(200, 0, 0), (0, 90, 0)}
 
 
-def test_the_sky_is_behind_all_that_is_seen_in_every_view():
+def test_sky_fills_missing_depth():
     rng, view = np.random.default_rng(0), views()[0]
     sky = Sky(np.array([1.0, 2, 3]), 50.0)
-    depth = np.where(rng.random((HEIGHT, WIDTH)) < 0.5, 3.0, NOTHING)
-    filled = sky.behind(view, depth)
+    depth = np.where(rng.random((HEIGHT, WIDTH)) < 0.5, 3.0, NO_SURFACE)
+    filled = sky.fill_depth(view, depth)
     np.testing.assert_array_equal(filled[depth < SKY_DEPTH], 3)
     y, x = np.nonzero(depth > SKY_DEPTH)
-    places = view.unproject(np.column_stack([x, y]) + 0.5, filled[y, x])
-    np.testing.assert_allclose(np.linalg.norm(places - sky.center, axis=1), 50, rtol=1e-9)
+    points = view.unproject(np.column_stack([x, y]) + 0.5, filled[y, x])
+    np.testing.assert_allclose(np.linalg.norm(points - sky.center, axis=1), 50, rtol=1e-9)
 
 
-def test_points_are_as_far_apart_as_pixels_are_large():
+def test_spacing_is_proportional_to_pixel_size():
     rng = np.random.default_rng(0)
-    places = rng.uniform(0, 1, (80_000, 3)) * [1, 1, 0]
-    places[40_000:, 0] += 10
+    points = rng.uniform(0, 1, (80_000, 3)) * [1, 1, 0]
+    points[40_000:, 0] += 10
     sizes = np.repeat([0.01, 0.04], 40_000)  # two octaves
-    kept = thin_by_grid(places, sizes, 3000, rng)
-    near = (kept < 40_000).sum()
-    assert 2000 < len(kept) <= 3000 and near / (len(kept) - near) == pytest.approx(16, rel=0.1)
-    few = thin_by_grid(places, sizes, 10**6, rng)
-    assert sorted(few) == list(range(80_000))
+    chosen = thin_by_grid(points, sizes, 3000, rng)
+    near = (chosen < 40_000).sum()
+    assert 2000 < len(chosen) <= 3000 and near / (len(chosen) - near) == pytest.approx(16, rel=0.1)
+    everything = thin_by_grid(points, sizes, 10**6, rng)
+    assert sorted(everything) == list(range(80_000))
 
 
-def test_places_are_even_in_space_and_farther_apart_far_away():
+def test_thin_evenly_spaces_near_points_evenly_and_far_points_wider():
     rng = np.random.default_rng(0)
     near = rng.uniform(0, 1, (40_000, 3)) * [1, 1, 0]
-    dense = rng.uniform(0, 0.1, (40_000, 3)) * [1, 1, 0]  # looked at more closely
+    dense = rng.uniform(0, 0.1, (40_000, 3)) * [1, 1, 0]  # more pixels
     far = rng.uniform(0, 8, (40_000, 3)) * [1, 1, 0] + [100, 0, 0]
     points = np.concatenate([near, dense, far])
-    depths = np.concatenate([np.full(80_000, 1.0), np.full(40_000, 8.5)])  # three octaves beyond
-    kept = thin_evenly(points, depths, 2000, rng)
-    assert 1500 < len(kept) <= 2000 and len(np.unique(kept)) == len(kept)
-    here = points[kept[kept < 80_000]]
-    corner = (here < 0.1).all(axis=1).sum()
-    assert corner / len(here) == pytest.approx(0.01, abs=0.008), (
-        "a hundredth of the area, in spite of most pixels"
+    depths = np.concatenate([np.full(80_000, 1.0), np.full(40_000, 8.5)])  # three octaves farther
+    chosen = thin_evenly(points, depths, 2000, rng)
+    assert 1500 < len(chosen) <= 2000 and len(np.unique(chosen)) == len(chosen)
+    near_chosen = points[chosen[chosen < 80_000]]
+    corner = (near_chosen < 0.1).all(axis=1).sum()
+    assert corner / len(near_chosen) == pytest.approx(0.01, abs=0.008), (
+        "a hundredth of the area, despite its many pixels"
     )
-    assert (kept >= 80_000).sum() == pytest.approx(len(here), rel=0.2), (
-        "64 times the area, cubes 8 times as large"
+    assert (chosen >= 80_000).sum() == pytest.approx(len(near_chosen), rel=0.2), (
+        "64 times the area, cubes 8 times larger"
     )
 
 
 @pytest.mark.parametrize(
-    ("spoil", "says"),
+    ("damage", "message"),
     [
-        (lambda folder: (folder / "depths" / "view_0002.exr").unlink(), "view_0002.exr cannot be read"),
+        (lambda folder: (folder / "depths" / "view_0002.exr").unlink(), "view_0002.exr"),
         (lambda folder: (folder / "images" / "view_0002.png").unlink(), "view_0002.png"),
-        (lambda folder: draw(folder, views(), channel=""), "holds no depth"),
-        (lambda folder: [path.unlink() for path in (folder / "cameras").iterdir()], "no two camera files"),
+        (lambda folder: write_views(folder, views(), channel=""), "no depth channel"),
+        (lambda folder: [path.unlink() for path in (folder / "cameras").iterdir()], "found 0 camera files"),
         (lambda folder: [write_camera(folder / "cameras" / f"{view.name}.json", view.resized(32, 24), 0.1)
-                         for view in views()], "not of its camera's size"),
-        (lambda folder: draw(folder, [replace(view, world_to_camera=look_at(
-            view.center, view.center + np.eye(3)[2], (1, 0, 0))) for view in views()]), "No two views see"),
+                         for view in views()], "differs from its camera's"),
+        (lambda folder: write_views(folder, [replace(view, world_to_camera=look_at(
+            view.center, view.center + np.eye(3)[2], (1, 0, 0))) for view in views()]), "no two views"),
     ],
 )  # fmt: skip
-def test_what_is_missing_is_said_in_a_sentence(tmp_path, capsys, spoil, says):
-    draw(tmp_path, views())
+def test_missing_or_invalid_files_are_reported(tmp_path, capsys, damage, message):
+    write_views(tmp_path, views())
     write_rendered_model(tmp_path)
-    spoil(tmp_path)
+    damage(tmp_path)
     assert main(["model", str(tmp_path)]) == 2
-    said = capsys.readouterr().err
-    assert says in said and "Traceback" not in said
-    assert len(read_scene(tmp_path).points) if "image" not in says and ".png" not in says else True
+    error = capsys.readouterr().err
+    assert message in error and "Traceback" not in error
+    assert len(read_scene(tmp_path).points) if "image" not in message and ".png" not in message else True
 
 
-def test_depth_is_of_the_nearest_layer_and_nothing_is_far_away(tmp_path):
+def test_depth_is_the_nearest_layer(tmp_path):
     view = views()[0]
-    draw(tmp_path, [view])
-    depth, truth = read_exr_depth(tmp_path / "depths" / f"{view.name}.exr"), seen(view)[0]
+    write_views(tmp_path, [view])
+    depth, truth = read_exr_depth(tmp_path / "depths" / f"{view.name}.exr"), render(view)[0]
     np.testing.assert_allclose(depth[truth < SKY_DEPTH], truth[truth < SKY_DEPTH], rtol=1e-6)
     assert (depth[truth > SKY_DEPTH] > SKY_DEPTH).all() and (truth > SKY_DEPTH).any()

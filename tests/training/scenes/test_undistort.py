@@ -1,4 +1,4 @@
-"""Undistortion, checked on what the pictures show against pycolmap's camera models."""
+"""Undistortion, compared with pycolmap's camera models pixel by pixel."""
 
 import errno
 import os
@@ -23,14 +23,14 @@ from training.scenes.undistort import undistort_scene
 
 
 def ramps() -> np.ndarray:
-    """Each pixel's own place as its colour: red is x, green is y, both over the whole range."""
+    """Return pixels whose red is proportional to x and whose green is proportional to y."""
     x, y = np.meshgrid(np.linspace(0, 255, synthetic.WIDTH), np.linspace(0, 255, synthetic.HEIGHT))
     return np.stack([x, y, 0 * x], axis=2).round().astype(np.uint8)
 
 
 @pytest.mark.parametrize("model", synthetic.DISTORTION)
-def test_every_model_becomes_the_pinhole_that_the_picture_shows(tmp_path, model):
-    """Each pixel of the result holds what the distorted lens saw along the pixel's ray."""
+def test_camera_models_become_pinholes(tmp_path, model):
+    """Each undistorted pixel shows the distorted image's colour along the same ray."""
     lens = synthetic.camera(model)
     synthetic.write_scene(tmp_path, lens, names=["a.png"], pixels=ramps())
     scene = read_scene(tmp_path)
@@ -43,31 +43,31 @@ def test_every_model_becomes_the_pinhole_that_the_picture_shows(tmp_path, model)
     image = load_image(camera.image, camera.width, camera.height)
     v, u = np.mgrid[2 : camera.height - 2 : 5, 2 : camera.width - 2 : 5]
     rays = [((u + 0.5 - camera.cx) / camera.fx).ravel(), ((v + 0.5 - camera.cy) / camera.fy).ravel()]
-    seen = np.array([lens.img_from_cam([x, y, 1.0]) for x, y in zip(*rays, strict=True)])
-    shown = image[v, u].reshape(-1, 3) * [synthetic.WIDTH - 1, synthetic.HEIGHT - 1, 0] + 0.5
-    inside = (seen > 1).all(axis=1) & (seen < [synthetic.WIDTH - 1, synthetic.HEIGHT - 1]).all(axis=1)
+    expected = np.array([lens.img_from_cam([x, y, 1.0]) for x, y in zip(*rays, strict=True)])
+    actual = image[v, u].reshape(-1, 3) * [synthetic.WIDTH - 1, synthetic.HEIGHT - 1, 0] + 0.5
+    inside = (expected > 1).all(axis=1) & (expected < [synthetic.WIDTH - 1, synthetic.HEIGHT - 1]).all(axis=1)
     assert inside.mean() > 0.9
-    assert np.abs(shown[:, :2] - seen)[inside].max() < 0.35
+    assert np.abs(actual[:, :2] - expected)[inside].max() < 0.35
 
 
-def test_an_ideal_fisheye_is_undone_too(tmp_path):
-    """COLMAP itself copies a fisheye whose further distortion is zero."""
+def test_ideal_fisheye_is_undistorted(tmp_path):
+    """COLMAP itself copies a fisheye without further distortion."""
     lens = synthetic.camera("OPENCV_FISHEYE", [0, 0, 0, 0])
     synthetic.write_scene(tmp_path, lens, names=["a.png"], pixels=ramps())
     result = undistort_scene(read_scene(tmp_path), tmp_path / "cache")
     (camera,) = result.cameras
     assert result.distorted == []
-    # r = f atan(tan) against r = f tan, at a pixel away from the middle
+    # r = f atan(tan) instead of r = f tan, at a pixel far from the centre
     u, v = camera.width - 12, int(camera.cy)
     tangent = (u + 0.5 - camera.cx) / camera.fx
-    shown = load_image(camera.image, camera.width, camera.height)[v, u, 0] * (synthetic.WIDTH - 1) + 0.5
-    assert shown == pytest.approx(47 + 80 * np.arctan(tangent), abs=0.35)
+    actual = load_image(camera.image, camera.width, camera.height)[v, u, 0] * (synthetic.WIDTH - 1) + 0.5
+    assert actual == pytest.approx(47 + 80 * np.arctan(tangent), abs=0.35)
     assert abs(80 * (tangent - np.arctan(tangent))) > 1
 
 
 @pytest.mark.parametrize("suffix", ["webp", "exr", "tif", "tiff"])
-def test_kinds_that_pycolmap_does_not_read_are_straightened_like_a_png(tmp_path, suffix):
-    """In floats and over 1, where they are linear; a TIFF of grey floats as the grey PNG."""
+def test_unsupported_formats_are_undistorted_like_a_png(tmp_path, suffix):
+    """EXR keeps floats above 1; a TIFF of grey floats equals the grey PNG."""
     grey = np.repeat(ramps()[..., :1], 3, axis=2)
     synthetic.write_scene(
         tmp_path, synthetic.camera("OPENCV"), names=["a.png"], pixels=grey if suffix == "tiff" else ramps()
@@ -80,7 +80,7 @@ def test_kinds_that_pycolmap_does_not_read_are_straightened_like_a_png(tmp_path,
     if suffix == "exr":
         light = linear_from_srgb(ramps() / 255) * 4
         OpenEXR.File({"type": OpenEXR.scanlineimage}, {"RGB": light.astype(np.float32)}).write(str(path))
-    else:  # by another process: Pillow's writing beside pycolmap corrupts memory
+    else:  # Pillow must not write in one process with pycolmap
         change = (
             "convert('F').point(lambda code: code * (1 / 255) + 0)" if suffix == "tiff" else "convert('RGB')"
         )
@@ -93,13 +93,13 @@ def test_kinds_that_pycolmap_does_not_read_are_straightened_like_a_png(tmp_path,
     assert camera.image is not None and plain.image is not None and camera.image.name == path.name
     assert (camera.width, camera.height, camera.fx) == (plain.width, plain.height, plain.fx)
     size = camera.width, camera.height
-    found = load_image(camera.image, *size, exposure=-2 if suffix == "exr" else 0)
-    np.testing.assert_allclose(found, load_image(plain.image, *size), atol=3 / 255)
+    actual = load_image(camera.image, *size, exposure=-2 if suffix == "exr" else 0)
+    np.testing.assert_allclose(actual, load_image(plain.image, *size), atol=3 / 255)
     assert camera.turns == ("tif" in suffix)
 
 
 def test_names_sizes_and_missing_images(tmp_path):
-    """Unicode, spaces, subfolders; photographs at half the model's size; views without one stay left out."""
+    """Unicode, spaces, subfolders, photos at half the model's size, and a missing photo."""
     names = ["a  b #1%20.png", "c/写真 01.png", "c/absent.png", "ä/ö/ü.png"]
     synthetic.write_scene(tmp_path, synthetic.camera("OPENCV"), names=names)
     for name in names:
@@ -114,30 +114,30 @@ def test_names_sizes_and_missing_images(tmp_path):
         assert load_image(camera.image, camera.width, camera.height).shape == (camera.height, camera.width, 3)
 
 
-def test_the_cache_is_known_by_content(tmp_path, monkeypatch):
+def test_cache_depends_on_content(tmp_path, monkeypatch):
     synthetic.write_scene(tmp_path, synthetic.camera("RADIAL"))
     cache = tmp_path / "cache"
     scene = read_scene(tmp_path)
     first = undistort_scene(scene, cache)
-    assert [path.name for path in cache.iterdir()] == [first.folder.name]  # and nothing half done beside it
+    assert [path.name for path in cache.iterdir()] == [first.folder.name]  # and no unfinished folder
 
     synthetic.write_image(tmp_path / "images" / "a.png", ramps())
     second = undistort_scene(read_scene(tmp_path), cache)
     assert second.folder != first.folder
 
-    monkeypatch.setattr(subprocess, "Popen", None)  # whatever starts a process now, fails
+    monkeypatch.setattr(subprocess, "Popen", None)  # makes any call fail
     assert undistort_scene(read_scene(tmp_path), cache).cameras[0].image == second.cameras[0].image
 
 
-def test_a_pinhole_scene_is_returned_as_it_is(tmp_path):
+def test_pinhole_scene_is_returned_unchanged(tmp_path):
     synthetic.write_scene(tmp_path)
     scene = read_scene(tmp_path)
     assert undistort_scene(scene, tmp_path / "cache") is scene
     assert not (tmp_path / "cache").exists()
 
 
-def test_pinhole_views_beside_distorted_ones(tmp_path):
-    """Two cameras: the pinhole one keeps its size, its intrinsics and its picture."""
+def test_pinhole_views_among_distorted_ones_stay_unchanged(tmp_path):
+    """Size, intrinsics and image of the pinhole view stay the same."""
     synthetic.write_scene(tmp_path, names=["a.png", "b.png"])
     model = tmp_path / "text"
     model.mkdir()
@@ -146,31 +146,40 @@ def test_pinhole_views_beside_distorted_ones(tmp_path):
     (model / "points3D.txt").write_text("")
     scene = read_scene(tmp_path, model=model)
     assert scene.distorted == ["b.png"]
-    kept, undone = undistort_scene(scene, tmp_path / "cache").cameras
-    assert (kept.width, kept.height, kept.fx, kept.fy, kept.cx, kept.cy) == (96, 72, 80, 82, 47, 37)
-    np.testing.assert_array_equal(load_image(kept.image, 96, 72), synthetic.noise().astype(np.float32) / 255)
-    assert (undone.width, undone.height) != (96, 72)
+    pinhole, undistorted = undistort_scene(scene, tmp_path / "cache").cameras
+    assert (pinhole.width, pinhole.height, pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy) == (
+        96,
+        72,
+        80,
+        82,
+        47,
+        37,
+    )
+    np.testing.assert_array_equal(
+        load_image(pinhole.image, 96, 72), synthetic.noise().astype(np.float32) / 255
+    )
+    assert (undistorted.width, undistorted.height) != (96, 72)
 
 
-def test_failures_are_a_sentence_and_leave_nothing(tmp_path):
-    """One camera whose photographs have two sizes; then a model that pycolmap cannot read."""
+def test_failures_are_reported_and_leave_no_files(tmp_path):
+    """Photos of one camera have two sizes; then pycolmap cannot read the model."""
     synthetic.write_scene(tmp_path, synthetic.camera("RADIAL"))
     synthetic.write_image(tmp_path / "images" / "a.png", synthetic.noise(48, 36))
     with pytest.raises(LodgsError, match="several sizes"):
         undistort_scene(read_scene(tmp_path), tmp_path / "cache")
     synthetic.write_image(tmp_path / "images" / "a.png", synthetic.noise())
     (tmp_path / "sparse" / "0" / "points3D.bin").unlink()
-    with pytest.raises(LodgsError, match="could not be undone") as error:
+    with pytest.raises(LodgsError, match="Cannot undistort") as error:
         undistort_scene(read_scene(tmp_path), tmp_path / "cache")
     assert "Traceback" not in str(error.value) and error.value.remedy
     assert os.listdir(tmp_path / "cache") == []
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(LodgsError, match="could not be undone"):
+    with pytest.raises(LodgsError, match="Cannot undistort"):
         undistort_scene(read_scene(tmp_path), tmp_path / "file")
 
 
-def test_real_lens_keeps_points_on_their_features(shared_scenes, tmp_path):
-    """Each SfM point projects by the pinhole to where pycolmap takes its undistorted keypoint."""
+def test_points_of_real_scene_project_to_their_features(shared_scenes, tmp_path):
+    """Each point projects to the position of pycolmap's undistorted keypoint."""
     scene = read_scene(shared_scenes / "variants" / "distorted_simple_radial")
     truth = pycolmap.Reconstruction(str(scene.model))
     views = {image.name: image for image in truth.images.values()}
@@ -188,31 +197,31 @@ def test_real_lens_keeps_points_on_their_features(shared_scenes, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="asks Linux for a process's children")
-def test_a_program_that_hangs_on_a_full_disk_is_ended_and_that_is_said(monkeypatch, tmp_path):
-    """COLMAP's threads wait for each other for good when one of them has met a full disk."""
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs Linux's list of child processes")
+def test_program_that_hangs_on_a_full_disk_is_killed_and_reported(monkeypatch, tmp_path):
+    """COLMAP's threads can wait for each other forever after one of them met a full disk."""
     synthetic.write_scene(tmp_path, synthetic.camera("OPENCV"), names=["a.png"], pixels=ramps())
     scene = read_scene(tmp_path)
     assert scene.distorted
-    real, room = subprocess.Popen, pycolmap_process._require_room
+    real, require_free_space = subprocess.Popen, pycolmap_process._require_free_space
     hangs = [sys.executable, "-c", "import sys, time; sys.stdin.readline(); time.sleep(600)"]
     monkeypatch.setattr(pycolmap_process.subprocess, "Popen", lambda _, **settings: real(hangs, **settings))
     monkeypatch.setattr(pycolmap_process, "CHECK_SECONDS", 0.05)
-    full = []
+    checks = []
 
-    def looks(folder):
-        full.append(folder)
-        if len(full) > 3:
+    def check(folder):
+        checks.append(folder)
+        if len(checks) > 3:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        room(folder)
+        require_free_space(folder)
 
-    monkeypatch.setattr(pycolmap_process, "_require_room", looks)
+    monkeypatch.setattr(pycolmap_process, "_require_free_space", check)
     with pytest.raises(LodgsError, match="No space left on device"):
         undistort_scene(scene, tmp_path / "cache")
     assert not list((tmp_path / "cache").iterdir())
 
 
-def test_nobody_undistorts_for_a_process_that_was_killed(tmp_path):
+def test_program_stops_when_its_parent_is_killed(tmp_path):
     names = [f"{number}.png" for number in range(120)]
     synthetic.write_scene(tmp_path, synthetic.camera("OPENCV"), names=names)
     large = np.kron(ramps(), np.ones((20, 20, 1), np.uint8))
@@ -226,7 +235,7 @@ def test_nobody_undistorts_for_a_process_that_was_killed(tmp_path):
         "undistort_scene(read_scene(Path(sys.argv[1])), Path(sys.argv[1]) / 'cache')"
     )
     parent = subprocess.Popen([sys.executable, "-c", program, str(tmp_path)], cwd=Path(__file__).parents[3])
-    while not (made := list(tmp_path.glob("cache/undistorting-*/undistorted/images/*"))):
+    while not list(tmp_path.glob("cache/undistorting-*/undistorted/images/*")):
         assert parent.poll() is None
         time.sleep(0.01)
     (child,) = Path(f"/proc/{parent.pid}/task/{parent.pid}/children").read_text().split()
@@ -234,5 +243,5 @@ def test_nobody_undistorts_for_a_process_that_was_killed(tmp_path):
     parent.wait()
     while Path(f"/proc/{child}").exists() and "Z" not in Path(f"/proc/{child}/stat").read_text().split()[2]:
         time.sleep(0.01)
-    made = list(tmp_path.glob("cache/undistorting-*/undistorted/images/*"))
-    assert len(made) < len(names)
+    images = list(tmp_path.glob("cache/undistorting-*/undistorted/images/*"))
+    assert len(images) < len(names)

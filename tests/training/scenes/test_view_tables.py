@@ -1,4 +1,4 @@
-"""Views as tables of a bundle: they come back, and go along where the scene is placed."""
+"""Views as bundle tables: lossless storage, transforms, damaged tables."""
 
 from dataclasses import replace
 
@@ -42,8 +42,8 @@ def bundle_of(views, count=50):
     return Bundle("3dgs", levels, tables=make_view_tables(views, 0.25, {views[1].name}))
 
 
-def check(found, views, near=0.25):
-    cameras, depth, held_out = read_view_tables(found.tables)
+def check(bundle, views, near=0.25):
+    cameras, depth, held_out = read_view_tables(bundle.tables)
     assert depth == near and held_out == {views[1].name}
     for camera, view in zip(cameras, views, strict=True):
         assert replace(camera, world_to_camera=None) == replace(view, world_to_camera=None)
@@ -51,7 +51,7 @@ def check(found, views, near=0.25):
 
 
 @pytest.mark.parametrize("count", [3, 400])
-def test_views_come_back_to_the_bit_and_the_header_stays_small(tmp_path, count):
+def test_views_are_stored_bit_by_bit_with_a_small_header(tmp_path, count):
     views = cameras(count)
     write_bundle(tmp_path / "b.ply", bundle_of(views))
     check(read_bundle(tmp_path / "b.ply"), views)
@@ -60,30 +60,30 @@ def test_views_come_back_to_the_bit_and_the_header_stays_small(tmp_path, count):
     check(read_folder(tmp_path / "f"), views)
 
 
-def test_views_of_a_placed_scene_see_the_same():
+def test_views_of_transformed_scene_keep_their_images():
     views, rng = cameras(), np.random.default_rng(2)
     placement = Similarity.from_angles((20, 40, 60), 2.5, (1, -2, 3))
-    there, near, _ = read_view_tables(transform_bundle(bundle_of(views), placement).tables)
+    moved, near, _ = read_view_tables(transform_bundle(bundle_of(views), placement).tables)
     assert near == 0.625
     points = rng.normal(size=(20, 3))
-    for before, after in zip(views, there, strict=True):
-        pixels, depths = before.project(points)
-        assert np.allclose(after.project(placement.transform_points(points))[0], pixels, atol=1e-8)
-        assert np.allclose(after.project(placement.transform_points(points))[1], 2.5 * depths)
+    for original, transformed in zip(views, moved, strict=True):
+        pixels, depths = original.project(points)
+        assert np.allclose(transformed.project(placement.transform_points(points))[0], pixels, atol=1e-8)
+        assert np.allclose(transformed.project(placement.transform_points(points))[1], 2.5 * depths)
 
 
-def test_cleaning_leaves_views_alone_whatever_the_rule():
+def test_cleaning_keeps_views_for_unknown_rules():
     bundle = replace(bundle_of(cameras()), rule="of a newer version")
-    left = clean_bundle(bundle, Cleaning((Crop.sphere((0, 0, 0), 1.0, False),)))
-    check(left, cameras())
+    cleaned = clean_bundle(bundle, Cleaning((Crop.sphere((0, 0, 0), 1.0, False),)))
+    check(cleaned, cameras())
 
 
-@pytest.mark.parametrize("name", ["names", "lacks", "pose"])
-def test_damaged_views_are_one_sentence(name):
+@pytest.mark.parametrize("name", ["names", "missing column", "pose"])
+def test_damaged_tables_are_rejected(name):
     tables = make_view_tables(cameras(), 0.1)
     if name == "names":
         tables[NAMES] = {"utf8": tables[NAMES]["utf8"][:5]}
-    elif name == "lacks":
+    elif name == "missing column":
         del tables[VIEWS][POSE[3]]
     else:
         tables[VIEWS][POSE[0]] = np.full(3, np.nan)
@@ -91,6 +91,6 @@ def test_damaged_views_are_one_sentence(name):
         read_view_tables(tables)
 
 
-def test_a_bundle_of_before_has_no_views():
+def test_bundle_without_tables_has_no_views():
     assert read_view_tables({}) == ([], 0.0, set())
     assert make_view_tables([], 0.0) == {}
