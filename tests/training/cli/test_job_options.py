@@ -1,4 +1,4 @@
-"""Options of ``train``: they say what a job file says."""
+"""Options of ``train`` are equivalent to a job file."""
 
 import argparse
 from dataclasses import fields, replace
@@ -20,14 +20,14 @@ def job(*words) -> Job:
 def test_every_key_of_a_job_has_an_option(capsys):
     with pytest.raises(SystemExit):
         job("--help")
-    said = capsys.readouterr().out
+    message = capsys.readouterr().out
     names = {field.name for field in fields(Job)} - {"parameters"} | {"set"}
-    assert [name for name in names if f"--{name.replace('_', '-')} " not in said] == []
+    assert [name for name in names if f"--{name.replace('_', '-')} " not in message] == []
 
 
-def test_options_and_a_file_say_the_same(tmp_path, monkeypatch):
+def test_options_and_file_give_the_same_job(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    told = job(
+    parts = job(
         "--scene", "photos", "--out", "run", "--method", "octree", "--preset", "standard",
         "--image-scale", 0.25, "--test-every", 0, "--seed", 7, "--backend", "cpu", "--exposure", -1.5,
         "--model", "sparse/1", "--images", "small", "--set", "max_splats=5000", "--set", "nearest=0.1",
@@ -38,21 +38,21 @@ def test_options_and_a_file_say_the_same(tmp_path, monkeypatch):
         'test_every = 0\nseed = 7\nbackend = "cpu"\nexposure = -1.5\nmodel = "sparse/1"\nimages = "small"\n'
         "validation = true\n[parameters]\nmax_splats = 5000\nnearest = 0.1\n"
     )
-    assert told == Job.from_file(tmp_path / "job.toml") == job("job.toml")
+    assert parts == Job.from_file(tmp_path / "job.toml") == job("job.toml")
 
 
-def test_what_is_not_given_is_the_jobs_default(tmp_path):
+def test_missing_options_use_defaults(tmp_path):
     assert job("--scene", "/a", "--out", "/b") == Job("/a", "/b")
 
 
-def test_options_go_before_what_the_file_says(tmp_path):
+def test_options_override_the_file(tmp_path):
     Job("/a", "/b", seed=1, parameters={"rho": 3, "footprint": 9}).write(tmp_path / "job.toml")
     changed = job(tmp_path / "job.toml", "--seed", 2, "--out", "/c", "--set", "rho=2")
     assert changed == Job("/a", "/c", seed=2, parameters={"rho": 2, "footprint": 9})
 
 
 @pytest.mark.parametrize(
-    "given",
+    "values",
     [
         Job("/a", "/b"),
         Job("/a b", "/b'c", "octree", "paper", seed=3, exposure=-1.5, test_every=0, validation=True,
@@ -60,12 +60,12 @@ def test_options_go_before_what_the_file_says(tmp_path):
         Job("/a", "/b", "lodge", base="/c", parameters={"distances": [8.0, 4.5, 0.0], "antialias": True}),
     ],
 )  # fmt: skip
-def test_a_job_is_what_its_options_say(given):
-    assert job(*options_of(given)) == given
-    assert job("--scene", "/x", *options_of(given, exclude=("scene",))) == replace(given, scene="/x")
+def test_options_of_a_job_recreate_it(values):
+    assert job(*options_of(values)) == values
+    assert job("--scene", "/x", *options_of(values, exclude=("scene",))) == replace(values, scene="/x")
 
 
-def test_a_word_needs_no_quotation_marks():
+def test_words_need_no_quotation_marks():
     for value in ("points", '"points"'):
         parameters = job("--scene", "a", "--out", "b", "--set", f"depth={value}").resolved_parameters()
         assert parameters.depth == "points"
@@ -74,27 +74,27 @@ def test_a_word_needs_no_quotation_marks():
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
-        ([], "not said what to train"),
+        ([], "no job, or no run folder"),
         (["--scene", "a"], "--out RUN"),
         (["--scene", "a", "--out", "b", "--set", "rho"], "--set rho is not NAME=VALUE"),
         (["--scene", "a", "--out", "b", "--set", "rho=4 5"], "--set rho=4 5 is not NAME=VALUE"),
-        (["--scene", "a", "--out", "b", "--set", "rho=four"], "rho = 'four'"),
-        (["--scene", "a", "--out", "b", "--set", "depth=deep"], "depth = 'deep'"),
-        (["--scene", "a", "--out", "b", "--set", "wings=2"], "unknown parameter 'wings'"),
-        (["--scene", "a", "--out", "b", "--image-scale", "7"], "image_scale = 7.0 is not possible"),
-        (["--scene", "a", "--out", "b", "--test-every", "1"], "test_every = 1 is not possible"),
-        (["--scene", "a", "--out", "b", "--base", "c"], "'flod' cannot begin with the splats"),
+        (["--scene", "a", "--out", "b", "--set", "rho=four"], "rho"),
+        (["--scene", "a", "--out", "b", "--set", "depth=deep"], "depth"),
+        (["--scene", "a", "--out", "b", "--set", "wings=2"], "'wings'"),
+        (["--scene", "a", "--out", "b", "--image-scale", "7"], "image_scale"),
+        (["--scene", "a", "--out", "b", "--test-every", "1"], "test_every"),
+        (["--scene", "a", "--out", "b", "--base", "c"], "base"),
         (["absent.toml"], r"absent\.toml"),
     ],
 )
-def test_mistakes_are_named(words, said):
-    with pytest.raises(LodgsError, match=said):
+def test_invalid_options_are_reported(words, message):
+    with pytest.raises(LodgsError, match=message):
         job(*words)
 
 
-def test_the_command_says_mistakes_as_events(capsys):
+def test_command_reports_errors_as_events(capsys):
     assert main(["train", "--scene", "a", "--out", "b", "--set", "wings=2"]) == 2
     out, err = capsys.readouterr()
-    assert "unknown parameter 'wings'" in out and out.startswith('{"event": "error"') and not err
+    assert "'wings'" in out and out.startswith('{"event": "error"') and not err

@@ -1,4 +1,4 @@
-"""Clutter found and left out, against places made for it, loops in Python, and what rules chose before."""
+"""Clean-up, compared with planted clutter, Python loops, and earlier selections of rules."""
 
 from collections import deque
 
@@ -46,7 +46,7 @@ def some_splats(rng, count, columns=()):
 
 
 def bundle_of(name, rng):
-    """Levels for a rule, with facts and a table of its own."""
+    """Return levels for a rule, with its facts and tables."""
     rule, count = rules()[name], 3
     columns = [column for column in rule.columns if column != OPACITY]
     levels = [
@@ -69,31 +69,33 @@ def bundle_of(name, rng):
 
 
 def turned(rng):
-    """A rotation (3, 3)."""
+    """Return a rotation (3, 3)."""
     q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     return q * np.sign(np.linalg.det(q))
 
 
 @pytest.mark.parametrize("shape", ["BOX", "SPHERE"])
-def test_a_turned_crop_holds_what_was_put_in_it(shape):
+def test_rotated_crop_contains_its_points(shape):
     rng = np.random.default_rng(0)
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = turned(rng) * (2.0, 0.5, 3.0), (4, -3, 7)
     own = rng.uniform(-2, 2, (5000, 3))
-    away = np.abs(own).max(axis=1) if shape == "BOX" else np.linalg.norm(own, axis=1)
-    clear = np.abs(away - 1) > 1e-4
+    distance = np.abs(own).max(axis=1) if shape == "BOX" else np.linalg.norm(own, axis=1)
+    clear = np.abs(distance - 1) > 1e-4
     means = (own @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32)
-    np.testing.assert_array_equal(Crop.from_matrix(shape, matrix).contains(means)[clear], (away <= 1)[clear])
+    np.testing.assert_array_equal(
+        Crop.from_matrix(shape, matrix).contains(means)[clear], (distance <= 1)[clear]
+    )
 
 
-def test_a_flat_crop_holds_nothing_and_what_is_cut_out_goes_from_what_is_kept():
+def test_flat_crops_are_empty_and_outside_crops_subtract():
     means = np.float32([[0, 0, 0], [2, 0, 0], [9, 0, 0], [2, 0.5, 0]])
     flat = Crop.from_matrix("BOX", np.diag([1.0, 1, 0, 1]))
     assert not flat.contains(means).any()
-    one, other = Crop.sphere((0, 0, 0), 1), Crop.box((1, -1, -1), (3, 1, 1))
-    np.testing.assert_array_equal(crop_mask([one, other], means), [True, True, False, True])
+    first, second = Crop.sphere((0, 0, 0), 1), Crop.box((1, -1, -1), (3, 1, 1))
+    np.testing.assert_array_equal(crop_mask([first, second], means), [True, True, False, True])
     np.testing.assert_array_equal(
-        crop_mask([one, other, Crop.sphere((2, 0, 0), 0.2, True)], means), [True, False, False, True]
+        crop_mask([first, second, Crop.sphere((2, 0, 0), 0.2, True)], means), [True, False, False, True]
     )
     np.testing.assert_array_equal(
         crop_mask([Crop.sphere((0, 0, 0), 1, True)], means), [False, True, True, True]
@@ -101,35 +103,35 @@ def test_a_flat_crop_holds_nothing_and_what_is_cut_out_goes_from_what_is_kept():
     assert crop_mask([], means).all()
 
 
-def naive_floaters(means, gap, most):
-    """The same by a queue over cells."""
+def naive_floaters(means, gap, limit):
+    """Find floaters with a queue over cells."""
     low = np.median(means, axis=0)
     cells = {}
     for number, mean in enumerate(means):
         cells.setdefault(tuple(np.floor((mean - low) / np.float32(gap)).astype(int)), []).append(number)
-    found, left = np.zeros(len(means), bool), set(cells)
-    while left:
-        queue, members = deque([left.pop()]), []
+    result, remaining = np.zeros(len(means), bool), set(cells)
+    while remaining:
+        queue, members = deque([remaining.pop()]), []
         while queue:
             x, y, z = cell = queue.popleft()
             members += cells[cell]
             around = {(x + i, y + j, z + k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)}
-            queue.extend(around & left)
-            left -= around
-        found[members] = len(members) <= most
-    return found
+            queue.extend(around & remaining)
+            remaining -= around
+        result[members] = len(members) <= limit
+    return result
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_what_has_no_end_is_no_crop(value):
-    """It would hold nothing, and leave nothing."""
-    for shape, *told in ((Crop.box, (0, 0, -1), (1, value, 1)), (Crop.sphere, (value, 0, 0), 1),
+def test_infinite_crops_are_rejected(value):
+    """They would remove all splats."""
+    for shape, *parts in ((Crop.box, (0, 0, -1), (1, value, 1)), (Crop.sphere, (value, 0, 0), 1),
                          (Crop.sphere, (0, 0, 0), value)):  # fmt: skip
-        with pytest.raises(LodgsError, match="no end"):
-            shape(*told)
+        with pytest.raises(LodgsError, match="infinite"):
+            shape(*parts)
 
 
-def test_floaters_are_those_that_were_planted():
+def test_finds_planted_floaters():
     rng = np.random.default_rng(1)
     ground = rng.uniform(-5, 5, (20_000, 3)) * (1, 1, 0.01)
     planted = np.concatenate(
@@ -137,55 +139,58 @@ def test_floaters_are_those_that_were_planted():
     )
     means = np.concatenate([ground, planted]).astype(np.float32)
     order = rng.permutation(len(means))
-    found = find_floaters(means[order])
-    np.testing.assert_array_equal(found, order >= len(ground))
-    np.testing.assert_array_equal(found, find_floaters(means[order]))
+    result = find_floaters(means[order])
+    np.testing.assert_array_equal(result, order >= len(ground))
+    np.testing.assert_array_equal(result, find_floaters(means[order]))
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_floaters_are_small_clusters_of_touching_cells(seed):
     rng = np.random.default_rng(seed)
     means = (rng.normal(0, 1, (600, 3)) * rng.uniform(0.2, 3, (600, 1))).astype(np.float32)
-    means[0] = 1e9  # beyond all cells that are told apart
+    means[0] = 1e9  # beyond all cells
     np.testing.assert_array_equal(find_floaters(means, 0.5, 0.02), naive_floaters(means, 0.5, 12))
 
 
-def test_far_and_unseen_ask_every_camera():
+def test_far_and_unseen_use_every_camera():
     rng = np.random.default_rng(2)
     means = rng.normal(0, 5, (400, 3)).astype(np.float32)
-    eyes = rng.normal(0, 4, (6, 3))
+    positions = rng.normal(0, 4, (6, 3))
     cameras = [
-        Camera("", 80, 60, 70, 75, 41, 29, look_at(eye, eye + rng.normal(size=3), (0, 0, 1))) for eye in eyes
+        Camera("", 80, 60, 70, 75, 41, 29, look_at(position, position + rng.normal(size=3), (0, 0, 1)))
+        for position in positions
     ]
-    away = np.array([[np.linalg.norm(mean - eye) for eye in eyes] for mean in means]).min(axis=1)
-    np.testing.assert_array_equal(find_far(means, eyes, 4.0), away > 4)
-    seen = sum(camera.sees(means.astype(np.float64)).astype(int) for camera in cameras)
-    for least in (1, 2, 3):
-        np.testing.assert_array_equal(find_unseen(means, cameras, least), seen < least)
+    distance = np.array([[np.linalg.norm(mean - position) for position in positions] for mean in means]).min(
+        axis=1
+    )
+    np.testing.assert_array_equal(find_far(means, positions, 4.0), distance > 4)
+    visible = sum(camera.sees(means.astype(np.float64)).astype(int) for camera in cameras)
+    for minimum in (1, 2, 3):
+        np.testing.assert_array_equal(find_unseen(means, cameras, minimum), visible < minimum)
 
 
 @pytest.mark.parametrize("name", NOT_TREES)
-def test_what_is_left_is_chosen_as_before(name):
+def test_selection_of_remaining_splats_is_unchanged(name):
     rng = np.random.default_rng(3)
     bundle = bundle_of(name, rng)
     crop = Crop.sphere((1, 0, -1), 4.0)
-    found = clean_bundle(bundle, Cleaning((crop,), max_size=0.4, min_opacity=0.05))
+    result = clean_bundle(bundle, Cleaning((crop,), max_size=0.4, min_opacity=0.05))
     values = resolve_controls(bundle, {})
     for _ in range(5):
-        eye = rng.normal(0, 4, 3)
-        before, after = (select_levels(one, eye, 3.0, values) for one in (bundle, found))
-        for one, other in zip(before, after, strict=True):
-            splats = one.splats
+        position = rng.normal(0, 4, 3)
+        original, updated = (select_levels(first, position, 3.0, values) for first in (bundle, result))
+        for first, second in zip(original, updated, strict=True):
+            splats = first.splats
             stays = np.linalg.norm(splats.means.astype(np.float64) - (1, 0, -1), axis=1) <= 4
             stays &= np.exp(splats.log_scales).max(axis=1) <= 0.4
             stays &= 1 / (1 + np.exp(-splats.opacity_logits)) >= 0.05
-            np.testing.assert_array_equal(other.splats.extras["row"], splats.extras["row"][stays])
-            weights = [np.ones(len(x.splats)) if x.weights is None else x.weights for x in (one, other)]
+            np.testing.assert_array_equal(second.splats.extras["row"], splats.extras["row"][stays])
+            weights = [np.ones(len(x.splats)) if x.weights is None else x.weights for x in (first, second)]
             np.testing.assert_array_equal(weights[1], weights[0][stays])
 
 
 @pytest.mark.parametrize("name", NOT_TREES)
-def test_a_choice_with_crops_is_the_rule_of_what_they_leave(name):
+def test_query_with_crops_equals_rule_on_cropped_splats(name):
     rng = np.random.default_rng(4)
     bundle, rule = bundle_of(name, rng), rules()[name]
     numbered = [(level.number, level.facts) for level in bundle.levels]
@@ -200,26 +205,36 @@ def test_a_choice_with_crops_is_the_rule_of_what_they_leave(name):
             tuple(collect_facts(rule, bundle.facts, numbered, level.number).items()),
             tuple(resolve_controls(bundle, {}).items()), crops=crops,
         )  # fmt: skip
-        rest = {key: column[stays] for key, column in columns.items()}
-        wanted = rule.weights(
-            splats.means[stays], np.float32([1, 2, 3]), 3.0, rest, dict(choice.facts), dict(choice.values)
+        remainder = {key: column[stays] for key, column in columns.items()}
+        expected = rule.weights(
+            splats.means[stays],
+            np.float32([1, 2, 3]),
+            3.0,
+            remainder,
+            dict(choice.facts),
+            dict(choice.values),
         )
         rows, weights = SplatSelector(splats.means, columns, splats.log_scales).chosen(choice)
-        np.testing.assert_array_equal(rows, np.flatnonzero(stays)[wanted > 0])
-        np.testing.assert_array_equal(weights, wanted[wanted > 0])
-    alone, _ = SplatSelector(splats.means, columns).chosen(LodQuery.from_crops(crops))
-    np.testing.assert_array_equal(alone, np.flatnonzero(stays))
+        np.testing.assert_array_equal(rows, np.flatnonzero(stays)[expected > 0])
+        np.testing.assert_array_equal(weights, expected[expected > 0])
+    single, _ = SplatSelector(splats.means, columns).chosen(LodQuery.from_crops(crops))
+    np.testing.assert_array_equal(single, np.flatnonzero(stays))
 
 
-def drawn_for_each_leaf(tree, eye, focal):
-    """How many of a leaf and the nodes above it an eye is shown, by parents known by size and place."""
+def drawn_for_each_leaf(tree, position, focal):
+    """Return the number of drawn nodes on the path to each leaf; parents are found by size and position."""
     splats = Splats.concatenated([level.splats for level in tree.levels])
     columns = splats.extras | dict(zip("xyz", splats.means.T, strict=True))
     standing = ResidentTree(columns)
     inner, reached = standing.update(np.arange(len(splats)))
     assert reached.all()  # every other node has two children
     weights = rules()["cut"].weights(
-        splats.means, np.float32(eye), focal, {name: columns[name] for name in COLUMNS}, {}, {"pixels": 1.0}
+        splats.means,
+        np.float32(position),
+        focal,
+        {name: columns[name] for name in COLUMNS},
+        {},
+        {"pixels": 1.0},
     )
     leaves = np.flatnonzero(~inner)
     count, node = np.zeros(len(leaves)), leaves
@@ -229,21 +244,21 @@ def drawn_for_each_leaf(tree, eye, focal):
     return splats.means[leaves], count
 
 
-def test_a_tree_that_was_cropped_is_one_still():
+def test_cropped_tree_is_a_valid_tree():
     rng = np.random.default_rng(5)
     tree = tree_of(surfaces(3000))
     crop = Crop.box((-4, -6, -2), (6, 3, 4))
-    found = clean_bundle(tree, Cleaning((crop,)))
+    result = clean_bundle(tree, Cleaning((crop,)))
     leaves = tree.levels[1].splats.means
     stays = ((leaves >= (-4, -6, -2)) & (leaves <= (6, 3, 4))).all(axis=1)
-    np.testing.assert_array_equal(found.levels[1].splats.means, leaves[stays])
-    assert len(found.levels[0].splats) == stays.sum() - 1
+    np.testing.assert_array_equal(result.levels[1].splats.means, leaves[stays])
+    assert len(result.levels[0].splats) == stays.sum() - 1
     for focal in (1e6, 300.0, 30.0, 8.0):
-        means, count = drawn_for_each_leaf(found, rng.normal(0, 8, 3), focal)
+        means, count = drawn_for_each_leaf(result, rng.normal(0, 8, 3), focal)
         assert len(means) == stays.sum() and (count == 1).all()
 
 
-def test_nodes_of_a_tree_go_when_all_their_leaves_do():
+def test_nodes_are_removed_with_their_last_leaf():
     tree = tree_of(random_leaves(200, np.random.default_rng(6)))
     masks = {1: np.ones(199, bool), 2: np.arange(200) < 130}
     stays, family = TreeRelations.of(tree).with_ancestors(masks), TreeRelations.of(tree)
@@ -262,84 +277,84 @@ def test_nodes_of_a_tree_go_when_all_their_leaves_do():
     assert (family.leaves[2]).all() and not family.leaves[1].any()
 
 
-def test_a_cropped_tree_in_a_file_is_read_in_pages(tmp_path):
+def test_cropped_tree_on_disk_can_be_paged(tmp_path):
     tree = tree_of(random_leaves(4000, np.random.default_rng(7)))
     write_in_pages(tmp_path / "tree.ply", tree)
     out = tmp_path / "cropped.ply"
     arguments = ["--crop-sphere", "2", "-1", "0", "5", "--min-opacity", "0.5"]
     assert main(["edit", str(tmp_path / "tree.ply"), "--out", str(out), *arguments]) == 0
-    whole = read_bundle(tmp_path / "tree.ply")
-    in_memory = clean_bundle(whole, Cleaning((Crop.sphere((2, -1, 0), 5),), min_opacity=0.5))
-    there = read_bundle(out)
-    for one, other in zip(in_memory.levels, there.levels, strict=True):
-        np.testing.assert_array_equal(one.splats.means, other.splats.means)
+    full = read_bundle(tmp_path / "tree.ply")
+    in_memory = clean_bundle(full, Cleaning((Crop.sphere((2, -1, 0), 5),), min_opacity=0.5))
+    present = read_bundle(out)
+    for first, second in zip(in_memory.levels, present.levels, strict=True):
+        np.testing.assert_array_equal(first.splats.means, second.splats.means)
         for name in COLUMNS:
-            np.testing.assert_array_equal(one.splats.extras[name], other.splats.extras[name])
-    np.testing.assert_equal(there.tables[BLOCKS], in_memory.tables[BLOCKS])
+            np.testing.assert_array_equal(first.splats.extras[name], second.splats.extras[name])
+    np.testing.assert_equal(present.tables[BLOCKS], in_memory.tables[BLOCKS])
 
     file = TreeFile(out)
     choice = LodQuery("cut", (1.0, 2.0, 3.0), 400.0, (), (("pixels", 2.0),))
-    wanted = select_levels(there, np.float32(choice.eye), 400.0, {"pixels": 2.0})
-    for one in wanted:
-        cut = file.cut(choice)[one.number]
-        assert sorted(map(tuple, cut.means)) == sorted(map(tuple, one.splats.means))
+    expected = select_levels(present, np.float32(choice.eye), 400.0, {"pixels": 2.0})
+    for first in expected:
+        cut = file.cut(choice)[first.number]
+        assert sorted(map(tuple, cut.means)) == sorted(map(tuple, first.splats.means))
     top, total = read_budgeted(out, 1024)
-    assert total == sum(len(level.splats) for level in there.levels)
+    assert total == sum(len(level.splats) for level in present.levels)
     _, count = drawn_for_each_leaf(top, (0, 0, 0), 1e5)
     assert (count == 1).all()
 
 
-def test_blocks_of_chunks_follow(tmp_path):
+def test_block_table_is_updated(tmp_path):
     bundle = bundle_of("chunks", np.random.default_rng(8))
     write_bundle(tmp_path / "all.ply", bundle)
     crop = ["--crop-box", "-3", "-3", "-3", "4", "4", "4"]
     assert main(["edit", str(tmp_path / "all.ply"), "--out", str(tmp_path / "some.ply"), *crop]) == 0
-    found = read_bundle(tmp_path / "some.ply")
-    levels = {level.number: level.splats for level in found.levels}
-    np.testing.assert_equal(found.tables[BLOCKS], block_table(rules()["chunks"], levels))
+    result = read_bundle(tmp_path / "some.ply")
+    levels = {level.number: level.splats for level in result.levels}
+    np.testing.assert_equal(result.tables[BLOCKS], block_table(rules()["chunks"], levels))
     part, _ = read_part(tmp_path / "some.ply", [3], (1,))
-    member = found.levels[2].splats.extras["chunks_0"].astype(int) & 2 != 0
-    np.testing.assert_array_equal(part.levels[2].splats.means, found.levels[2].splats.means[member])
+    member = result.levels[2].splats.extras["chunks_0"].astype(int) & 2 != 0
+    np.testing.assert_array_equal(part.levels[2].splats.means, result.levels[2].splats.means[member])
 
 
-def test_a_folder_of_levels_stays_one_and_counts_are_printed(tmp_path, capsys):
+def test_folder_stays_a_folder_and_counts_are_printed(tmp_path, capsys):
     bundle = bundle_of("octree", np.random.default_rng(9))
     write_folder(tmp_path / "all", bundle)
     arguments = ["--crop-sphere", "0", "0", "0", "4", "--keep", "outside", "--drop-floaters", "--gap", "2"]
     assert main(["edit", str(tmp_path / "all"), "--out", str(tmp_path / "some"), *arguments]) == 0
-    found, stays = read_folder(tmp_path / "some"), []
+    result, stays = read_folder(tmp_path / "some"), []
     for level in bundle.levels:
         stays.append(np.linalg.norm(level.splats.means, axis=1) > 4)
     means = np.concatenate([x.splats.means[stay] for x, stay in zip(bundle.levels, stays, strict=True)])
     floating = naive_floaters(means, 2.0, 0.001 * len(means))
     np.testing.assert_array_equal(
-        np.concatenate([level.splats.means for level in found.levels]), means[~floating]
+        np.concatenate([level.splats.means for level in result.levels]), means[~floating]
     )
     printed = capsys.readouterr().out
-    for level, before in zip(found.levels, bundle.levels, strict=True):
-        assert f"level {level.number}: {len(level.splats):,} of {len(before.splats):,} splats" in printed
+    for level, original in zip(result.levels, bundle.levels, strict=True):
+        assert f"level {level.number}: {len(level.splats):,} of {len(original.splats):,} splats" in printed
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (["--crop-box", *"000001"], "flat"),
         (["--crop-sphere", *"0000"], "radius"),
-        (["--max-size", "0"], "Nothing is left"),
+        (["--max-size", "0"], "No splats remain"),
         (["--min-opacity", "-1"], "--min-opacity cannot be -1"),
         (["--min-views", "1"], "--scene"),
-        (["--out", "all.ply"], "another name"),
+        (["--out", "all.ply"], "Cannot overwrite"),
     ],
 )
-def test_what_cannot_be_is_said(tmp_path, monkeypatch, capsys, arguments, said):
+def test_invalid_options_are_reported(tmp_path, monkeypatch, capsys, arguments, message):
     monkeypatch.chdir(tmp_path)
     write_bundle("all.ply", bundle_of("bands", np.random.default_rng(10)))
     assert main(["edit", "all.ply", "--out", "out.ply", *arguments]) == 2
-    assert said in capsys.readouterr().err
+    assert message in capsys.readouterr().err
     assert not (tmp_path / "out.ply").exists()
 
 
-def test_tables_of_an_unknown_rule_are_left_alone():
+def test_tables_of_unknown_rules_are_rejected():
     bundle = Bundle("new", [Level(1, some_splats(np.random.default_rng(0), 9))], "newer", tables={"x": {}})
     with pytest.raises(LodgsError, match="newer"):
         keep_splats(bundle, {1: np.arange(9) < 5})

@@ -1,4 +1,4 @@
-"""Looks of splats: against the sRGB curve, Planck's law, colours seen from anywhere, and pictures."""
+"""Looks of splats, compared with the sRGB curve, Planck's law, colours by direction, and images."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ LOOK = Look(exposure=-0.7, temperature=8000, tint=(1, 0.8, 0.9), saturation=0.4,
 
 
 def seen(splats, degree, direction):
-    """(N, 3) float64, colours from a direction, before black is their end."""
+    """Return colours (N, 3) float64 from a direction, not clamped at black."""
     values = np.empty(coefficient_count(degree))
     basis(*direction, degree, values)
     return 0.5 + np.einsum("k,nkc->nc", values, splats.sh.astype(np.float64))
@@ -32,26 +32,26 @@ def opacities(splats):
     return 1 / (1 + np.exp(-splats.opacity_logits.astype(np.float64)))
 
 
-def test_a_neutral_look_changes_nothing():
+def test_neutral_look_changes_nothing():
     splats = random_splats(20, 3)
     np.testing.assert_allclose(NEUTRAL.matrix, np.eye(3), atol=1e-12)
-    found = apply_looks(splats, [(None, NEUTRAL)])
-    np.testing.assert_allclose(found.sh, splats.sh, atol=1e-6)
-    np.testing.assert_array_equal(found.opacity_logits, splats.opacity_logits)
+    result = apply_looks(splats, [(None, NEUTRAL)])
+    np.testing.assert_allclose(result.sh, splats.sh, atol=1e-6)
+    np.testing.assert_array_equal(result.opacity_logits, splats.opacity_logits)
 
 
 @pytest.mark.parametrize("exposure", [-2, -1, 0.5, 1])
-def test_exposure_is_what_it_is_in_light(exposure):
+def test_exposure_scales_linear_light(exposure):
     codes = np.linspace(0.2, 0.65, 10)
     light = srgb_from_linear(2.0**exposure * linear_from_srgb(codes))
     np.testing.assert_allclose(Look(exposure=exposure).matrix[0, 0] * codes, light, atol=0.02)
 
 
 def planck_in_srgb(kelvins):
-    """(3,) linear sRGB of a black body: Planck's law, and the observer as Wyman et al. (2013) fit it."""
+    """Return linear sRGB (3,) of a black body: Planck's law, with the observer fit of Wyman et al. (2013)."""
 
-    def lobe(x, height, middle, left, right):
-        return height * np.exp(-0.5 * ((x - middle) * np.where(x < middle, left, right)) ** 2)
+    def lobe(x, height, middle, remaining, right):
+        return height * np.exp(-0.5 * ((x - middle) * np.where(x < middle, remaining, right)) ** 2)
 
     nm = np.arange(360.0, 831.0)
     power = nm**-5 / np.expm1(1.438777e7 / (nm * kelvins))
@@ -67,16 +67,16 @@ def planck_in_srgb(kelvins):
 
 
 @pytest.mark.parametrize("kelvins", [2500, 3200, 4000, 5000, 9000, 15000])
-def test_white_balance_makes_grey_in_that_light_grey(kelvins):
-    """Within 1 %, as coded, of what daylight makes of it."""
+def test_white_balance_neutralises_the_light(kelvins):
+    """Within 1 % of the display value in daylight."""
     grey = (0.3 * planck_in_srgb(kelvins) / planck_in_srgb(6500)) ** (1 / 2.2)
-    found = Look(temperature=kelvins).matrix @ grey
-    np.testing.assert_allclose(found / found.mean(), 1, atol=0.01)
+    result = Look(temperature=kelvins).matrix @ grey
+    np.testing.assert_allclose(result / result.mean(), 1, atol=0.01)
     white = Look(temperature=kelvins).matrix @ np.ones(3)
     assert white @ LUMA == pytest.approx(1) and (white[2] > white[0]) == (kelvins < 6500)
 
 
-def test_saturation_keeps_lightness_and_tint_is_what_white_becomes():
+def test_saturation_keeps_luma_and_tint_maps_white():
     color = np.array([0.7, 0.3, 0.1])
     grey = Look(saturation=0).matrix @ color
     np.testing.assert_allclose(grey, 0.2126 * 0.7 + 0.7152 * 0.3 + 0.0722 * 0.1, rtol=1e-12)
@@ -88,48 +88,53 @@ def test_saturation_keeps_lightness_and_tint_is_what_white_becomes():
 
 
 @pytest.mark.parametrize("degree", range(5))
-def test_every_degree_is_seen_as_the_matrix_has_it_from_anywhere(degree):
+def test_matrix_applies_to_every_degree_and_direction(degree):
     splats = random_splats(200, degree)
-    found = apply_looks(splats, [(None, LOOK)])
+    result = apply_looks(splats, [(None, LOOK)])
     for direction in ((0, 0, 1), (0.6, -0.8, 0), (-0.48, 0.6, 0.64)):
-        wanted = seen(splats, degree, direction) @ LOOK.matrix.T
-        np.testing.assert_allclose(seen(found, degree, direction), wanted, atol=1e-5)
-    np.testing.assert_allclose(opacities(found), 0.6 * opacities(splats), rtol=1e-5)
+        expected = seen(splats, degree, direction) @ LOOK.matrix.T
+        np.testing.assert_allclose(seen(result, degree, direction), expected, atol=1e-5)
+    np.testing.assert_allclose(opacities(result), 0.6 * opacities(splats), rtol=1e-5)
     for name in ("means", "quats", "log_scales"):
-        assert getattr(found, name) is getattr(splats, name)
+        assert getattr(result, name) is getattr(splats, name)
 
 
-def test_opacities_of_any_logit():
+def test_opacity_factor_for_extreme_logits():
     splats = replace(random_splats(5, 0), opacity_logits=np.float32([-200, -5, 0, 5, 200]))
     for factor in (0.0, 0.25, 1.0):
-        found = apply_looks(splats, [(None, Look(opacity=factor))])
-        assert np.isfinite(found.opacity_logits).all()
-        np.testing.assert_allclose(opacities(found), factor * opacities(splats), rtol=1e-4, atol=1e-5)
+        result = apply_looks(splats, [(None, Look(opacity=factor))])
+        assert np.isfinite(result.opacity_logits).all()
+        np.testing.assert_allclose(opacities(result), factor * opacities(splats), rtol=1e-4, atol=1e-5)
 
 
-def test_regions_come_upon_the_look_everywhere():
+def test_regions_combine_with_a_global_look():
     splats, ball = random_splats(500, 1), Crop.sphere((0.2, 0, 0), 0.8)
-    box, there = Crop.box((-2, -2, -2), (2, 2, 0), outside=True), Look(tint=(0.2, 1, 1))
-    found = apply_looks(splats, [(None, LOOK), (ball, there), (box, Look(opacity=0.5))])
-    held = np.linalg.norm(splats.means - np.float32([0.2, 0, 0]), axis=1) <= 0.8
+    box, present = Crop.box((-2, -2, -2), (2, 2, 0), outside=True), Look(tint=(0.2, 1, 1))
+    result = apply_looks(splats, [(None, LOOK), (ball, present), (box, Look(opacity=0.5))])
+    holder = np.linalg.norm(splats.means - np.float32([0.2, 0, 0]), axis=1) <= 0.8
     above = splats.means[:, 2] >= 0
-    assert 50 < held.sum() < 450 and 50 < above.sum() < 450
-    wanted = seen(splats, 1, (0, 0, 1)) @ LOOK.matrix.T
-    wanted[held] *= (0.2, 1, 1)
-    np.testing.assert_allclose(seen(found, 1, (0, 0, 1)), wanted, atol=1e-5)
-    np.testing.assert_allclose(opacities(found), 0.6 * opacities(splats) * np.where(above, 0.5, 1), rtol=1e-5)
+    assert 50 < holder.sum() < 450 and 50 < above.sum() < 450
+    expected = seen(splats, 1, (0, 0, 1)) @ LOOK.matrix.T
+    expected[holder] *= (0.2, 1, 1)
+    np.testing.assert_allclose(seen(result, 1, (0, 0, 1)), expected, atol=1e-5)
+    np.testing.assert_allclose(
+        opacities(result), 0.6 * opacities(splats) * np.where(above, 0.5, 1), rtol=1e-5
+    )
 
 
-def test_the_picture_is_the_colour_mapped_picture():
-    """Blending is linear in colours, and the matrix leaves black black: what is over black is mapped, too."""
+def test_rendered_image_equals_colour_mapped_image():
+    """Blending is linear in colours, and the matrix maps black to black."""
     splats = random_splats(300, 2)
     splats.sh[:, 0] = np.abs(splats.sh[:, 0]) / 2
     splats.sh[:, 1:] *= 0.1
     camera = Camera("", 96, 72, 90.0, 80.0, 50.0, 33.0, look_at((2.5, 0.4, 1.5)))
     look = replace(LOOK, exposure=0.6, opacity=1.0)
-    before, after = render(splats, camera, 0.01), render(apply_looks(splats, [(None, look)]), camera, 0.01)
-    assert before.std() > 0.1 and np.abs(after - before).max() > 0.1
-    np.testing.assert_allclose(after, before @ look.matrix.T, atol=2e-5)
+    original, updated = (
+        render(splats, camera, 0.01),
+        render(apply_looks(splats, [(None, look)]), camera, 0.01),
+    )
+    assert original.std() > 0.1 and np.abs(updated - original).max() > 0.1
+    np.testing.assert_allclose(updated, original @ look.matrix.T, atol=2e-5)
 
 
 @pytest.mark.parametrize(
@@ -137,13 +142,13 @@ def test_the_picture_is_the_colour_mapped_picture():
     [{"exposure": 11}, {"temperature": 900}, {"tint": (1, 2, 1)}, {"saturation": -1}, {"opacity": 1.5},
      {"exposure": float("nan")}],
 )  # fmt: skip
-def test_bad_values_are_told(values):
+def test_invalid_values_are_rejected(values):
     with pytest.raises(LodgsError, match=f"The {next(iter(values))} of a look cannot be"):
         Look(**values)
 
 
 @pytest.mark.parametrize("name", ["bands", "octree", "chunks", "decay"])
-def test_the_command_edits_every_level(name, tmp_path, capsys):
+def test_command_edits_every_level(name, tmp_path, capsys):
     bundle = bundle_of(name, np.random.default_rng(0))
     write_bundle(tmp_path / "in.ply", bundle)
     arguments = [
@@ -153,29 +158,33 @@ def test_the_command_edits_every_level(name, tmp_path, capsys):
     out = tmp_path / "out.ply"
     assert main(["edit", str(tmp_path / "in.ply"), "--out", str(out), *arguments]) == 0
     look = Look(0.5, 5000, (1, 0.9, 0.8), 0.8, 0.7)
-    found, before = read_bundle(out), read_bundle(tmp_path / "in.ply")
-    assert (found.rule, found.facts, list(found.tables)) == (before.rule, before.facts, list(before.tables))
-    for one, other in zip(found.levels, before.levels, strict=True):
-        wanted = 0.5 + SH_C0 * other.splats.sh[:, 0]
-        np.testing.assert_allclose(0.5 + SH_C0 * one.splats.sh[:, 0], wanted @ look.matrix.T, atol=1e-5)
-        np.testing.assert_allclose(opacities(one.splats), 0.7 * opacities(other.splats), rtol=1e-4)
-        np.testing.assert_array_equal(one.splats.means, other.splats.means)
+    result, original = read_bundle(out), read_bundle(tmp_path / "in.ply")
+    assert (result.rule, result.facts, list(result.tables)) == (
+        original.rule,
+        original.facts,
+        list(original.tables),
+    )
+    for first, second in zip(result.levels, original.levels, strict=True):
+        expected = 0.5 + SH_C0 * second.splats.sh[:, 0]
+        np.testing.assert_allclose(0.5 + SH_C0 * first.splats.sh[:, 0], expected @ look.matrix.T, atol=1e-5)
+        np.testing.assert_allclose(opacities(first.splats), 0.7 * opacities(second.splats), rtol=1e-4)
+        np.testing.assert_array_equal(first.splats.means, second.splats.means)
     assert "level 3:" in capsys.readouterr().out
 
 
-def test_the_command_edits_regions_and_folders(tmp_path, capsys):
+def test_command_edits_regions_and_folders(tmp_path, capsys):
     bundle = bundle_of("bands", np.random.default_rng(0))
     write_bundle(tmp_path / "in.ply", bundle)
     box = ["--keep", "all", "--crop-box", "0", "-99", "-99", "99", "99", "99"]
     out = tmp_path / "out.ply"
     command = ["edit", str(tmp_path / "in.ply"), "--out", str(out)]
     assert main([*command, *box, "--exposure", "1"]) == 0
-    for one, other in zip(read_bundle(out).levels, bundle.levels, strict=True):
-        held = other.splats.means[:, 0] >= 0
-        assert 0 < held.sum() < len(held) == len(one.splats)
-        np.testing.assert_array_equal((one.splats.sh != other.splats.sh).any(axis=(1, 2)), held)
+    for first, second in zip(read_bundle(out).levels, bundle.levels, strict=True):
+        holder = second.splats.means[:, 0] >= 0
+        assert 0 < holder.sum() < len(holder) == len(first.splats)
+        np.testing.assert_array_equal((first.splats.sh != second.splats.sh).any(axis=(1, 2)), holder)
     for wrong, text in (
-        (box, "nothing goes"), (["--opacity", "2"], "The opacity of a look cannot be 2. Choose from 0 to 1."),
+        (box, "--keep all"), (["--opacity", "2"], "The opacity of a look cannot be 2. Use 0 to 1."),
         (["--tint", "1", "1", "7"], "The tint of a look cannot be 1 1 7"),
     ):  # fmt: skip
         out.unlink(missing_ok=True)
@@ -183,7 +192,7 @@ def test_the_command_edits_regions_and_folders(tmp_path, capsys):
         assert text in capsys.readouterr().err
 
 
-def test_rows_that_are_read_by_and_by_are_the_same():
+def test_rows_on_disk_equal_rows_in_memory():
     splats = random_splats(50, 1)
     looks = [(None, LOOK), (Crop.sphere((0, 0, 0), 0.7), Look(exposure=1))]
     rows = RowsWithLook(splats, looks)

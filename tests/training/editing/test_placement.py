@@ -1,4 +1,4 @@
-"""Levels that stand elsewhere: every rule chooses there as it did, and files hold them."""
+"""Transformed bundles: every rule selects the same splats, in memory and in files."""
 
 import numpy as np
 import pytest
@@ -24,11 +24,11 @@ from training.splats.ply import write_ply
 from training.splats.similarity import Similarity
 
 QUARTER = np.array([[0, -2.0, 0, 0], [2, 0, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]])
-"""A quarter turn to twice the size: of float32 numbers it makes float32 numbers, without rounding."""
+"""A rotation by 90 degrees with scale 2, which is exact in float32."""
 
 
 def tree_bundle(seed: int, leaves: int = 400) -> tuple[Bundle, Tree]:
-    """A tree of deep and shallow branches; ``node`` says which node a splat is."""
+    """Return a tree with deep and shallow branches; the column ``node`` has node numbers."""
     rng = np.random.default_rng(seed)
     tree, splats = random_tree(rng, leaves), surfaces(2 * leaves - 1)
     splats.extras["node"] = np.arange(len(splats), dtype=np.int32)
@@ -38,7 +38,7 @@ def tree_bundle(seed: int, leaves: int = 400) -> tuple[Bundle, Tree]:
 
 
 def choosable(name: str, seed: int = 0) -> Bundle:
-    """A bundle of a rule, with the tables that it knows."""
+    """Return a bundle for a rule, with its tables."""
     if name == "cut":
         return tree_bundle(seed)[0]
     bundle, rng = bundle_of(name), np.random.default_rng(seed)
@@ -52,63 +52,67 @@ def choosable(name: str, seed: int = 0) -> Bundle:
     return bundle
 
 
-def general(scale: float, away: float) -> Similarity:
+def general(scale: float, distance: float) -> Similarity:
     matrix = np.eye(4)
     matrix[:3, :3] = scale * Rotation.random(random_state=3).as_matrix()
-    matrix[:3, 3] = away, -away, 2 * away
+    matrix[:3, 3] = distance, -distance, 2 * distance
     return Similarity.from_matrix(matrix)
 
 
 @pytest.mark.parametrize("name", RULES)
-def test_every_rule_chooses_as_before_bit_for_bit(name):
-    """Where nothing is rounded. A length or a place that a rule does not declare would show."""
+def test_exact_transform_preserves_selection(name):
+    """Without rounding. Detects lengths and positions that a rule does not declare."""
     bundle, placement, rng = choosable(name), Similarity.from_matrix(QUARTER), np.random.default_rng(1)
-    there, shown = transform_bundle(bundle, placement), 0
-    before, after = BundleSelector(bundle), BundleSelector(there)
+    present, selected = transform_bundle(bundle, placement), 0
+    original, updated = BundleSelector(bundle), BundleSelector(present)
     for _ in range(40):
-        eye, focal = np.float32(rng.normal(0, 4, 3)), rng.uniform(1, 90)
+        position, focal = np.float32(rng.normal(0, 4, 3)), rng.uniform(1, 90)
         values = resolve_controls(bundle, any_values(rules()[name], rng))
-        weights = before.weights(eye, focal, values)
-        shown += np.count_nonzero(weights)
-        np.testing.assert_array_equal(after.weights(placement.transform_points(eye), focal, values), weights)
-    assert 0 < shown < 40 * len(before.splats)
+        weights = original.weights(position, focal, values)
+        selected += np.count_nonzero(weights)
+        np.testing.assert_array_equal(
+            updated.weights(placement.transform_points(position), focal, values), weights
+        )
+    assert 0 < selected < 40 * len(original.splats)
 
 
 @pytest.mark.parametrize("name", RULES)
 @pytest.mark.parametrize("scale", [0.013, 7.7])
-def test_every_rule_chooses_as_before_anywhere(name, scale):
-    """But for what meets a border in the last bits of single precision."""
+def test_general_transform_preserves_selection(name, scale):
+    """Except for splats at a boundary within float32 rounding."""
     bundle, placement, rng = choosable(name), general(scale, 3 * scale), np.random.default_rng(1)
-    there = transform_bundle(bundle, placement)
-    before, after = BundleSelector(bundle), BundleSelector(there)
+    present = transform_bundle(bundle, placement)
+    original, updated = BundleSelector(bundle), BundleSelector(present)
     for _ in range(20):
-        eye, focal = np.float32(rng.normal(0, 4, 3)), rng.uniform(1, 90)
+        position, focal = np.float32(rng.normal(0, 4, 3)), rng.uniform(1, 90)
         values = resolve_controls(bundle, any_values(rules()[name], rng))
-        weights = before.weights(eye, focal, values)
-        same = np.isclose(after.weights(placement.transform_points(eye), focal, values), weights, atol=2e-4)
+        weights = original.weights(position, focal, values)
+        same = np.isclose(
+            updated.weights(placement.transform_points(position), focal, values), weights, atol=2e-4
+        )
         assert np.count_nonzero(~same) <= 1 + len(same) // 200
 
 
-@pytest.mark.parametrize("scale,away", [(1.0, 0.0), (0.3, 5000.0), (7.7, 100.0)])
-def test_cuts_of_a_placed_tree_are_proper(scale, away):
-    """Of each leaf and the nodes above it exactly one is shown, however much is rounded."""
+@pytest.mark.parametrize("scale,distance", [(1.0, 0.0), (0.3, 5000.0), (7.7, 100.0)])
+def test_cuts_of_a_transformed_tree_are_proper(scale, distance):
+    """Exactly one node on each path to a leaf is drawn, despite rounding."""
     bundle, tree = tree_bundle(1)
-    there, rng = transform_bundle(bundle, general(scale, away)), np.random.default_rng(2)
-    choice = BundleSelector(there)
+    present, rng = transform_bundle(bundle, general(scale, distance)), np.random.default_rng(2)
+    choice = BundleSelector(present)
     nodes, means = choice.splats.extras["node"], choice.splats.means
     for _ in range(200):
-        eye = means[rng.integers(len(means))] + scale * rng.normal(0, rng.choice([0.1, 3, 30]), 3)
+        position = means[rng.integers(len(means))] + scale * rng.normal(0, rng.choice([0.1, 3, 30]), 3)
         focal = 10 ** rng.uniform(0, 4)
-        shown = np.zeros(len(tree))
-        shown[nodes] = choice.weights(eye, focal, resolve_controls(there, {}))
-        above = shown.copy()
+        selected = np.zeros(len(tree))
+        selected[nodes] = choice.weights(position, focal, resolve_controls(present, {}))
+        above = selected.copy()
         for layer in tree.layers:
             above[tree.children[layer - tree.leaves]] += above[layer][:, None]
         np.testing.assert_array_equal(above[: tree.leaves], 1)
 
 
-def test_nodes_of_a_placed_tree_know_their_parents():
-    """Those alike in all but the last places of their size, too, which rounding makes one."""
+def test_nodes_of_a_transformed_tree_find_their_parents():
+    """Including nodes whose sizes differ only in the last bits, and become equal by rounding."""
     leaves = surfaces(64)
     leaves = leaves.select(np.zeros(64, int))  # all the same
     tree = random_tree(np.random.default_rng(0), 64)
@@ -123,25 +127,25 @@ def test_nodes_of_a_placed_tree_know_their_parents():
             assert np.isin(above[above < 3e38], sizes).all()
 
 
-def test_what_a_bundle_says_goes_along():
+def test_metadata_is_transformed():
     bundle = choosable("chunks")
     bundle.meta = {
         "camera_center": [1, 0, 0], "view": [[0, 0, 0], [0, 1, 0]], "up_rotation": np.eye(3),
         "median_depth": 4, "focal_px": 100.0, "costs": [{"level": 1, "distances": [1.5, 2]}], "seed": 3,
     }  # fmt: skip
-    there = transform_bundle(bundle, Similarity.from_matrix(QUARTER))
-    assert there.meta == {
+    present = transform_bundle(bundle, Similarity.from_matrix(QUARTER))
+    assert present.meta == {
         "camera_center": [0, 2, 0], "view": [[0, 0, 0], [-2, 0, 0]], "median_depth": 8.0,
         "up_rotation": [[0, 1, 0], [-1, 0, 0], [0, 0, 1]], "focal_px": 100.0,
         "costs": [{"level": 1, "distances": [3.0, 4.0]}], "seed": 3,
     }  # fmt: skip
-    np.testing.assert_array_equal(there.tables["chunks"]["radius"], 2 * bundle.tables["chunks"]["radius"])
-    np.testing.assert_array_equal(there.tables["chunks"]["y"], 2 * bundle.tables["chunks"]["x"])
-    assert [level.facts["d_l"] for level in there.levels] == [2 * x.facts["d_l"] for x in bundle.levels]
+    np.testing.assert_array_equal(present.tables["chunks"]["radius"], 2 * bundle.tables["chunks"]["radius"])
+    np.testing.assert_array_equal(present.tables["chunks"]["y"], 2 * bundle.tables["chunks"]["x"])
+    assert [level.facts["d_l"] for level in present.levels] == [2 * x.facts["d_l"] for x in bundle.levels]
 
 
 @pytest.mark.parametrize("name", RULES)
-def test_what_stays_in_a_file_is_placed_as_what_is_in_memory(name, tmp_path):
+def test_levels_on_disk_equal_levels_in_memory(name, tmp_path):
     bundle = choosable(name)
     write_bundle(tmp_path / "in.ply", bundle)
     head, rows = open_bundle(tmp_path / "in.ply")
@@ -149,29 +153,29 @@ def test_what_stays_in_a_file_is_placed_as_what_is_in_memory(name, tmp_path):
         level.on_disk = rows[level.number]
     placement = general(1.7, 2.0)
     write_bundle(tmp_path / "out.ply", transform_bundle(head, placement))
-    wanted, found = transform_bundle(bundle, placement), read_bundle(tmp_path / "out.ply")
-    assert (found.rule, found.facts) == (wanted.rule, wanted.facts)
-    for one, other in zip(found.levels, wanted.levels, strict=True):
-        assert one.facts == other.facts and one.splats.extras.keys() == other.splats.extras.keys()
+    expected, result = transform_bundle(bundle, placement), read_bundle(tmp_path / "out.ply")
+    assert (result.rule, result.facts) == (expected.rule, expected.facts)
+    for first, second in zip(result.levels, expected.levels, strict=True):
+        assert first.facts == second.facts and first.splats.extras.keys() == second.splats.extras.keys()
         for attribute in ("means", "quats", "log_scales", "sh"):
-            np.testing.assert_array_equal(getattr(one.splats, attribute), getattr(other.splats, attribute))
-        for column in one.splats.extras:
-            np.testing.assert_array_equal(one.splats.extras[column], other.splats.extras[column])
+            np.testing.assert_array_equal(getattr(first.splats, attribute), getattr(second.splats, attribute))
+        for column in first.splats.extras:
+            np.testing.assert_array_equal(first.splats.extras[column], second.splats.extras[column])
 
 
-def test_a_placed_tree_is_read_by_pages(tmp_path):
+def test_transformed_tree_can_be_paged(tmp_path):
     bundle, _ = tree_bundle(1, 3000)
     write_bundle(tmp_path / "t.ply", transform_bundle(bundle, general(2.3, 9.0)))
     file = TreeFile(tmp_path / "t.ply")
     table = file.bundle.tables[BLOCKS]
     del file.bundle.tables[BLOCKS]
-    index, anew = type(file.index()).of(table), file.index()
-    np.testing.assert_array_equal(index.low, anew.low)
-    np.testing.assert_array_equal(index.parent_size, anew.parent_size)
+    index, rebuilt = type(file.index()).of(table), file.index()
+    np.testing.assert_array_equal(index.low, rebuilt.low)
+    np.testing.assert_array_equal(index.parent_size, rebuilt.parent_size)
     assert (streaming_order(bundle.levels[0].splats.extras)[:5] == np.arange(5)).all()
 
 
-def test_an_unknown_rule_is_refused():
+def test_unknown_rule_is_rejected():
     bundle = Bundle("new", [Level(1, surfaces(5))], "of tomorrow")
     with pytest.raises(LodgsError, match="of tomorrow"):
         transform_bundle(bundle, Similarity.from_matrix(QUARTER))
@@ -179,8 +183,8 @@ def test_an_unknown_rule_is_refused():
     assert len(transform_bundle(bundle, Similarity.from_matrix(QUARTER)).levels[0].splats) == 5
 
 
-def test_the_command_writes_the_same_form(tmp_path, capsys):
-    """A bundle, a plain PLY with columns of its own, and a folder."""
+def test_command_keeps_the_format(tmp_path, capsys):
+    """A bundle, a plain PLY with extra columns, and a folder."""
     bundle, folder = choosable("bands"), tmp_path / "levels"
     bundle.meta["up_rotation"] = Rotation.from_euler("x", -90, degrees=True).as_matrix().round(6)
     write_bundle(tmp_path / "b.ply", bundle)
@@ -195,11 +199,15 @@ def test_the_command_writes_the_same_form(tmp_path, capsys):
         assert main(["edit", str(tmp_path / name), "--out", str(out), *options]) == 0
         assert f"{out}:" in capsys.readouterr().out
         read = read_folder if out.is_dir() else read_bundle
-        found, wanted = read(out), transform_bundle(read(tmp_path / name), placement)
-        assert (found.rule, found.facts, found.meta.keys()) == (wanted.rule, wanted.facts, wanted.meta.keys())
-        for one, other in zip(found.levels, wanted.levels, strict=True):
-            np.testing.assert_array_equal(one.splats.means, other.splats.means)
-            np.testing.assert_array_equal(one.splats.sh, other.splats.sh)
+        result, expected = read(out), transform_bundle(read(tmp_path / name), placement)
+        assert (result.rule, result.facts, result.meta.keys()) == (
+            expected.rule,
+            expected.facts,
+            expected.meta.keys(),
+        )
+        for first, second in zip(result.levels, expected.levels, strict=True):
+            np.testing.assert_array_equal(first.splats.means, second.splats.means)
+            np.testing.assert_array_equal(first.splats.sh, second.splats.sh)
     text = (tmp_path / "out_p.ply").read_bytes()[:4000]
     assert b"lodsplat" not in text and b"property float mine" in text and b"SplatRenderMode: mip" in text
     assert main(["edit", str(tmp_path / "b.ply"), "--out", str(tmp_path / "u.ply"), "--upright"]) == 0
@@ -212,12 +220,12 @@ def test_the_command_writes_the_same_form(tmp_path, capsys):
 @pytest.mark.parametrize(
     "options,words",
     [
-        (["--scale", "0"], "scale of 0"),
+        (["--scale", "0"], "by 0"),
         (["--matrix", "1,0,0,0,0,2,0,0,0,0,1,0,0,0,0,1"], "stretches"),
-        (["--matrix", "1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1", "--scale", "2"], "Choose one"),
+        (["--matrix", "1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1", "--scale", "2"], "Omit --matrix"),
     ],
 )
-def test_the_command_refuses_in_a_sentence(tmp_path, capsys, options, words):
+def test_invalid_options_are_reported(tmp_path, capsys, options, words):
     write_bundle(tmp_path / "b.ply", choosable("bands"))
     assert main(["edit", str(tmp_path / "b.ply"), "--out", str(tmp_path / "o.ply"), *options]) == 2
     assert words in capsys.readouterr().err and not (tmp_path / "o.ply").exists()

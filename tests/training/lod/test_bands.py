@@ -1,4 +1,4 @@
-"""FLoD's rule against the paper's numbers and formulas worked by hand."""
+"""FLoD's rule, compared with numbers of the paper and formulas by hand."""
 
 from math import inf
 
@@ -13,7 +13,7 @@ BANDS = rules()["bands"]
 
 
 def bands_of(s_min, focal_px, gamma, start, end):
-    """Near and far of every level."""
+    """Return near and far distance of every level."""
     levels = [(number, {"s_min": value}) for number, value in enumerate(s_min, 1)]
     values = {"gamma": gamma, "first": start, "last": end}
     return [
@@ -22,7 +22,7 @@ def bands_of(s_min, focal_px, gamma, start, end):
     ]
 
 
-def test_scale_constraints_are_the_published_ones():
+def test_scale_constraints_match_the_paper():
     # methods: lambda 0.2, rho 4, five levels -> .2 / .05 / .0125 / .003125 / 0
     assert min_scales(0.2, 4, 5) == pytest.approx([0.2, 0.05, 0.0125, 0.003125, 0])
 
@@ -56,29 +56,29 @@ def test_every_distance_belongs_to_exactly_one_level(start, end):
     assert (sum(weights) == 1).all()
 
 
-def test_a_level_that_was_deleted_leaves_no_gap():
+def test_deleted_level_leaves_no_gap():
     levels = [(number, {"s_min": s_min}) for number, s_min in ((1, 0.2), (3, 0.0125), (5, 0.0))]
     values = {"gamma": 1.0, "first": 1, "last": 5}
-    found = [
+    result = [
         BANDS.distance_band(100, collect_facts(BANDS, {}, levels, number), values) for number, _ in levels
     ]
     near, middle, far = (0, 1.25, 20)
     expected = [(far, inf), (middle, far), (near, middle)]
-    assert [pytest.approx(band) for band in expected] == found
+    assert [pytest.approx(band) for band in expected] == result
 
 
-def test_a_larger_gamma_brings_coarser_levels_nearer():
+def test_larger_gamma_moves_coarser_levels_closer():
     near = [bands_of(min_scales(0.2, 4, 5), 800, gamma, 3, 5)[2][0] for gamma in (0.5, 1, 2)]
     assert near == pytest.approx([20, 10, 5])
 
 
 @pytest.mark.parametrize("first, last, gamma", [(0, 3, 1), (4, 3, 1), (1, 6, 1), (1, 5, 0), (1.5, 5, 1)])
-def test_impossible_settings_are_refused(first, last, gamma):
+def test_invalid_controls_are_rejected(first, last, gamma):
     with pytest.raises(LodgsError):
         BANDS.resolve_controls({"first": first, "last": last, "gamma": gamma}, [1, 2, 3, 4, 5])
 
 
-def test_figures_are_of_the_three_finest_levels_unless_asked_otherwise():
+def test_default_is_the_three_finest_levels():
     assert BANDS.resolve_controls({}, [1, 2, 3, 4, 5]) == {"gamma": 1.0, "first": 3, "last": 5}
     assert BANDS.resolve_controls({"last": 4}, [1, 2, 3, 4, 5])["first"] == 3
     assert BANDS.resolve_controls({"first": 1}, [1, 2], {"gamma": 2.5}) == {
@@ -88,7 +88,7 @@ def test_figures_are_of_the_three_finest_levels_unless_asked_otherwise():
     }
 
 
-def test_a_budget_does_without_the_finest_level_in_use():
+def test_coarser_values_drop_the_finest_level():
     values = {"gamma": 1.0, "first": 2, "last": 5}
     values = BANDS.coarser(values, [1, 2, 4, 5])
     assert values == {"gamma": 1.0, "first": 2, "last": 4}

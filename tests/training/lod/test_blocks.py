@@ -1,4 +1,4 @@
-"""Blocks of splats: what they leave out is out of sight, to the bit."""
+"""Blocks of splats: culling does not change images, bit for bit."""
 
 from dataclasses import replace
 
@@ -16,16 +16,16 @@ COUNT = 40 * SIZE + 7  # of 41 blocks
 
 @pytest.fixture(scope="module")
 def splats():
-    """A wide field of splats, on one side large ones, some right before the eye."""
+    """A wide field of splats, with large ones on one side and some close to the camera."""
     rng = np.random.default_rng(3)
     means = (rng.uniform(-20, 20, (COUNT, 3)) * (1, 1, 0.05)).astype(np.float32)
     scales = rng.normal(-4, 0.7, (COUNT, 3)).astype(np.float32)
     scales[means[:, 0] > 14] += 3
-    found = Splats(
+    result = Splats(
         means, rng.normal(size=(COUNT, 4)).astype(np.float32), scales,
         rng.normal(0, 2, COUNT).astype(np.float32), rng.normal(size=(COUNT, 1, 3)).astype(np.float32),
     )  # fmt: skip
-    return found.select(spatial_order(means))
+    return result.select(spatial_order(means))
 
 
 def cameras():
@@ -36,12 +36,12 @@ def cameras():
         yield Camera(f"{number}", 96, 64, focal, focal * 1.2, rng.uniform(-20, 110), 30, pose)
 
 
-def test_what_blocks_leave_out_is_out_of_sight(splats):
+def test_culled_blocks_are_invisible(splats):
     blocks, gaussians, left_out = Blocks.of(splats.means, splats.log_scales), Gaussians.of(splats), 0
     for camera in cameras():
         for near in (0.05, 2.0):
-            seen = blocks.in_view(camera, near)
-            rows = torch.from_numpy(blocks.rows(seen))
+            visible = blocks.in_view(camera, near)
+            rows = torch.from_numpy(blocks.rows(visible))
             ours = rasterize(gaussians, camera, near=near, rows=rows, backend="cpu")
             everything = rasterize(gaussians, camera, near=near, backend="cpu")
             assert torch.equal(ours.image, everything.image)
@@ -50,8 +50,8 @@ def test_what_blocks_leave_out_is_out_of_sight(splats):
     assert left_out > 0.2 * 24 * COUNT
 
 
-def test_a_block_behind_the_eye_or_beside_the_image_is_left_out():
-    """Eight rows of splats along x, each at its own place."""
+def test_blocks_outside_the_image_are_culled():
+    """Eight rows of splats along x, at different positions."""
     means = np.zeros((8 * SIZE, 3), np.float32)
     means[:, 0] = np.repeat(np.arange(-35, 45, 10), SIZE)
     blocks = Blocks.of(means, np.full((8 * SIZE, 3), -5.0))
@@ -68,10 +68,10 @@ def test_a_block_behind_the_eye_or_beside_the_image_is_left_out():
 
 def test_bounds_and_distances(splats):
     blocks = Blocks.of(splats.means, splats.log_scales)
-    for eye in ((0, 0, 0), (30, -4, 2)):
-        away = np.linalg.norm(splats.means.astype(np.float64) - eye, axis=1)
-        least, most = (np.repeat(each, SIZE)[:COUNT] for each in blocks.distances(eye))
-        assert (least <= away + 1e-9).all() and (away <= most + 1e-9).all()
+    for position in ((0, 0, 0), (30, -4, 2)):
+        distance = np.linalg.norm(splats.means.astype(np.float64) - position, axis=1)
+        minimum, limit = (np.repeat(item, SIZE)[:COUNT] for item in blocks.distances(position))
+        assert (minimum <= distance + 1e-9).all() and (distance <= limit + 1e-9).all()
     tight = np.linalg.norm(blocks.high - blocks.low, axis=1)
     shuffled = splats.select(np.random.default_rng(0).permutation(COUNT))
     loose = np.linalg.norm(
@@ -85,9 +85,9 @@ def test_rows_of_blocks(splats):
     blocks = Blocks.of(splats.means, splats.log_scales)
     assert len(blocks.low) == 41
     np.testing.assert_array_equal(blocks.rows(np.ones(41, bool)), np.arange(COUNT))
-    some = np.zeros(41, bool)
-    some[[1, 40]] = True
-    np.testing.assert_array_equal(blocks.rows(some), [*range(SIZE, 2 * SIZE), *range(40 * SIZE, COUNT)])
+    subset = np.zeros(41, bool)
+    subset[[1, 40]] = True
+    np.testing.assert_array_equal(blocks.rows(subset), [*range(SIZE, 2 * SIZE), *range(40 * SIZE, COUNT)])
     assert blocks.rows(np.zeros(41, bool)).size == 0
     nothing = Blocks.of(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32))
     assert nothing.rows(np.zeros(0, bool)).size == 0 and spatial_order(np.zeros((0, 3))).size == 0
@@ -95,10 +95,10 @@ def test_rows_of_blocks(splats):
 
 def test_quantiles_within_blocks():
     values = np.random.default_rng(0).random(2 * SIZE + 100).astype(np.float32)
-    found = block_quantiles(values, 0.7)
+    result = block_quantiles(values, 0.7)
     for begin in (0, SIZE, 2 * SIZE):
-        block, kept = values[begin : begin + SIZE], (values >= found)[begin : begin + SIZE]
-        assert len(set(found[begin : begin + SIZE])) == 1
-        assert kept.mean() == pytest.approx(0.3, abs=1.1 / len(block))
+        block, retained = values[begin : begin + SIZE], (values >= result)[begin : begin + SIZE]
+        assert len(set(result[begin : begin + SIZE])) == 1
+        assert retained.mean() == pytest.approx(0.3, abs=1.1 / len(block))
     assert (block_quantiles(values, 0.0) <= values).all()
     assert block_quantiles(values[:0], 0.5).size == 0

@@ -1,4 +1,4 @@
-"""docs/bundle.md read by a stranger: what it says, with numpy and plyfile alone, chooses what we choose."""
+"""An implementation of docs/bundle.md with only numpy and plyfile selects the same splats as ours."""
 
 import json
 from pathlib import Path
@@ -29,7 +29,7 @@ CHOICES = {
 
 
 class Page:
-    """A bundle or a folder as the page describes it; ``means`` and ``columns`` by number of the level."""
+    """A bundle or a folder, read as documented; ``means`` and ``columns`` by level number."""
 
     def __init__(self, path: Path) -> None:
         if path.is_dir():
@@ -40,34 +40,36 @@ class Page:
         else:
             ply = PlyData.read(path)
             elements, begin, rows, extras = {e.name: e.data for e in ply.elements}, {}, {}, {}
-            said = [text.removeprefix("lodsplat ") for text in ply["vertex"].comments]
-            self.head, *others = [json.loads(text) for text in said]
-            self.meta = next(line["meta"] for line in others if "meta" in line)
-            lines = [line for line in others if "level" in line]
+            message = [text.removeprefix("lodsplat ") for text in ply["vertex"].comments]
+            self.head, *remaining_ones = [json.loads(text) for text in message]
+            self.meta = next(line["meta"] for line in remaining_ones if "meta" in line)
+            lines = [line for line in remaining_ones if "level" in line]
             for line in lines:
                 start = begin.get(line["element"], 0)
                 begin[line["element"]] = start + line["count"]
                 rows[line["level"]] = elements[line["element"]][start : begin[line["element"]]]
                 extras[line["level"]] = elements[line["extras"]] if "extras" in line else None
-            self.tables = {line["table"]: elements[line["element"]] for line in others if "table" in line}
+            self.tables = {
+                line["table"]: elements[line["element"]] for line in remaining_ones if "table" in line
+            }
         lines.sort(key=lambda line: line["level"])
         self.numbers = [line["level"] for line in lines]
         assert self.head["v"] == 2
         self.rule, self.facts, self.controls = (self.head[key] for key in ("rule", "facts", "controls"))
         self.cumulative = self.head["cumulative"]
         self.level_facts = {line["level"]: line.get("facts", {}) for line in lines}
-        self.means, self.opacities, self.columns, before = {}, {}, {}, 0
+        self.means, self.opacities, self.columns, original = {}, {}, {}, 0
         for n in self.numbers:
-            part, extra = rows[n][before:], extras[n]
+            part, extra = rows[n][original:], extras[n]
             self.means[n] = np.stack([part[axis] for axis in "xyz"], 1)
             self.opacities[n] = 1 / (1 + np.exp(-part["opacity"]))
             names = extra.dtype.names if extra is not None else ()
-            self.columns[n] = {name: extra[name][before:] for name in names}
+            self.columns[n] = {name: extra[name][original:] for name in names}
             if path.is_dir() and self.cumulative:  # each file has the coarser levels too
-                before = len(rows[n])
+                original = len(rows[n])
 
-    def weights(self, eye, f: float, given: dict) -> dict[int, np.ndarray]:
-        """w of every splat, level by level."""
+    def weights(self, position, f: float, arguments: dict) -> dict[int, np.ndarray]:
+        """Return w of every splat, by level."""
         first, last = self.numbers[-3:][0], self.numbers[-1]
         formula, defaults = {
             "bands": (self.bands, {"gamma": 1, "first": first, "last": last}),
@@ -76,18 +78,18 @@ class Page:
             "chunks": (self.chunks, {"distance_scale": 1, "chunks": 1, "fade": 1}),
             "cut": (self.cut, {"pixels": 1}),
         }[self.rule]
-        self.eye = np.array(eye, float)
-        values = defaults | self.controls | given
+        self.position = np.array(position, float)
+        values = defaults | self.controls | arguments
         return {
-            n: formula(n, np.sqrt(((means - np.float32(eye)) ** 2).sum(axis=1)), f, values)
+            n: formula(n, np.sqrt(((means - np.float32(position)) ** 2).sum(axis=1)), f, values)
             for n, means in self.means.items()
         }
 
     def bands(self, n: int, d: np.ndarray, f: float, values: dict) -> np.ndarray:
-        used = [each for each in self.numbers if values["first"] <= each <= values["last"]]
+        used = [item for item in self.numbers if values["first"] <= item <= values["last"]]
         if n not in used:
             return np.zeros(len(d))
-        border = {each: self.level_facts[each]["s_min"] / values["gamma"] * f for each in used}
+        border = {item: self.level_facts[item]["s_min"] / values["gamma"] * f for item in used}
         near = 0.0 if n == used[-1] else border[n]
         far = np.inf if n == used[0] else border[used[used.index(n) - 1]]
         return ((np.float32(near) <= d) & (d < np.float32(far))).astype(float)
@@ -102,19 +104,19 @@ class Page:
             return w
         table = self.tables["chunks"]
         centres = np.array([table[axis] for axis in "xyz"], float).T
-        away = [float(np.linalg.norm(self.eye - c)) for c in centres]
-        a = away.index(min(away))
+        distance = [float(np.linalg.norm(self.position - c)) for c in centres]
+        a = distance.index(min(distance))
         t = {
-            c: (self.eye - centres[a]) @ (centre - centres[a]) / ((centre - centres[a]) ** 2).sum()
+            c: (self.position - centres[a]) @ (centre - centres[a]) / ((centre - centres[a]) ** 2).sum()
             for c, centre in enumerate(centres)
             if c != a
         }
-        b, *others = sorted(t, key=lambda c: -t[c])
-        s = max([2 * t[c] - t[b] for c in others] + [0])
+        b, *remaining_ones = sorted(t, key=lambda c: -t[c])
+        s = max([2 * t[c] - t[b] for c in remaining_ones] + [0])
         with_b = values["fade"] and t[b] > 0
         share = (t[b] - s) / (1 - 2 * s) if with_b else 0
-        u = [1 - (away[c] / float(table["radius"][c]) - 1) / 0.25 for c in ((a, b) if with_b else (a,))]
-        u = min(max(*u, 0), 1) if values["fade"] else float(away[a] <= table["radius"][a])
+        u = [1 - (distance[c] / float(table["radius"][c]) - 1) / 0.25 for c in ((a, b) if with_b else (a,))]
+        u = min(max(*u, 0), 1) if values["fade"] else float(distance[a] <= table["radius"][a])
 
         def inside(c: int) -> np.ndarray:
             return (self.columns[n][f"chunks_{c // 24}"].astype(int) >> c % 24) % 2
@@ -124,7 +126,7 @@ class Page:
     def cut(self, n: int, d: np.ndarray, f: float, values: dict) -> np.ndarray:
         k, columns = np.float32(max(f / values["pixels"], 8)), self.columns[n]
         parent = np.stack([columns[f"parent_{axis}"] for axis in "xyz"], axis=1)
-        to_parent = np.sqrt(((parent - np.float32(self.eye)) ** 2).sum(axis=1))
+        to_parent = np.sqrt(((parent - np.float32(self.position)) ** 2).sum(axis=1))
         with np.errstate(over="ignore"):
             return (d >= k * columns["node_size"]) & ~(to_parent >= k * columns["parent_size"])
 
@@ -132,8 +134,8 @@ class Page:
         bias = self.columns[n].get("lod_bias", np.zeros(len(d), np.float32)) + np.float32(values["offset"])
         reach = np.float32(self.facts["d_max"] * f / self.facts["d_max_focal"])
         with np.errstate(divide="ignore"):
-            wanted = 1 + np.clip(np.log2(reach / d) + bias, 0, self.numbers[-1] - 1)
-        w = np.clip(2 * (wanted - n + np.float32(0.5)) + np.float32(0.5), 0, 1)
+            expected = 1 + np.clip(np.log2(reach / d) + bias, 0, self.numbers[-1] - 1)
+        w = np.clip(2 * (expected - n + np.float32(0.5)) + np.float32(0.5), 0, 1)
         return w if values["fade"] else (w >= 0.5).astype(float)
 
     def decay(self, n: int, d: np.ndarray, f: float, values: dict) -> np.ndarray:
@@ -176,8 +178,8 @@ def levels(facts: dict[int, dict], columns: tuple[str, ...]) -> list[Level]:
 
 
 @pytest.fixture
-def made(tmp_path):
-    """``made(name)``: a file or folder of that name, of version 2."""
+def write_named(tmp_path):
+    """``write_named(name)``: write a file or folder of that name."""
     sizes = {1: 0.4, 2: 0.1, 4: 0.03, 5: 0.01, 7: 0.0}  # numbers may have gaps
     bands = Bundle("flod", levels({n: {"s_min": s} for n, s in sizes.items()}, ()), "bands")
     bands.controls = {"gamma": 1.3, "first": 2}
@@ -243,32 +245,32 @@ BUNDLES = (
 
 
 @pytest.mark.parametrize("name", BUNDLES)
-def test_a_stranger_chooses_what_we_choose(name, made):
-    path = made(name)
+def test_selection_from_the_documentation_matches(name, write_named):
+    path = write_named(name)
     page, bundle = Page(path), (read_folder if path.is_dir() else read_bundle)(path)
     assert page.rule == bundle.rule and page.numbers == [level.number for level in bundle.levels]
     drawn = 0
-    for eye in EYES:
+    for position in EYES:
         for f in FOCAL:
-            for given in CHOICES[page.rule]:
-                theirs = page.weights(eye, f, given)
-                for ours in select_levels(bundle, np.array(eye), f, resolve_controls(bundle, given)):
+            for values in CHOICES[page.rule]:
+                theirs = page.weights(position, f, values)
+                for ours in select_levels(bundle, np.array(position), f, resolve_controls(bundle, values)):
                     weights, count = theirs[ours.number], len(ours.splats)
                     assert (weights > 0).sum() == count
                     total = count if ours.weights is None else ours.weights.sum(dtype=np.float64)
                     # a search for a budget ends at nearly the same scale
-                    near = 1e-3 if given.get("at_most") else 1e-6
+                    near = 1e-3 if values.get("at_most") else 1e-6
                     assert weights.sum(dtype=np.float64) == pytest.approx(total, rel=near, abs=1e-9)
                     drawn += count
     assert drawn > 1000
 
 
 @pytest.mark.parametrize("name", rules())
-def test_the_page_states_every_rule_and_control(name):
+def test_documentation_covers_every_rule_and_control(name):
     page = (ROOT / "docs" / "bundle.md").read_text(encoding="utf-8")
     assert f"## Rule `{name}`" in page
     section = page.split(f"## Rule `{name}`")[1].split("\n#")[0]
     rule = rules()[name]
     controls = [control.name for control in rule.controls]
     names = [*rule.scene_facts, *rule.level_facts, *rule.columns, *rule.tables, *controls]
-    assert [each for each in names if f"`{each}`" not in section] == []
+    assert [item for item in names if f"`{item}`" not in section] == []

@@ -1,4 +1,4 @@
-"""The rule of the tree: worked by hand, and proper on trees of any shape from any eye."""
+"""The rule of trees: by hand, and proper cuts of random trees for random cameras."""
 
 from math import log
 
@@ -13,12 +13,12 @@ from training.lod.rules.cut import ABOVE_ROOT, MIN_DETAIL, min_parent_size
 CUT = rules()["cut"]
 
 
-def weights(means, columns, eye=(0, 0, 0), focal=100.0, pixels=1.0):
-    return CUT.weights(means, np.array(eye), focal, columns, {}, {"pixels": pixels})
+def weights(means, columns, position=(0, 0, 0), focal=100.0, pixels=1.0):
+    return CUT.weights(means, np.array(position), focal, columns, {}, {"pixels": pixels})
 
 
 def columns_of(sizes, parents, means):
-    """Columns of nodes with sizes (N,), whose parents are rows (N,), -1 for the root."""
+    """Return the columns of nodes with sizes (N,) and parent rows (N,), -1 for the root."""
     above = sizes[parents]
     above[parents < 0] = ABOVE_ROOT
     x, y, z = means[parents].T
@@ -27,7 +27,7 @@ def columns_of(sizes, parents, means):
 
 
 def random_tree(rng, leaves, spread=1.0, place=0.0):
-    """Means and parents of a binary tree, parents before children, and its sizes as they have to be."""
+    """Return means, parents and saturated sizes of a binary tree, parents before children."""
     parents, ends = [-1], [0]
     while len(ends) < leaves:
         split = ends.pop(rng.integers(len(ends)))
@@ -42,13 +42,13 @@ def random_tree(rng, leaves, spread=1.0, place=0.0):
     sizes[inner] = rng.uniform(0, 0.1, len(inner))
     for node in range(len(parents) - 1, 0, -1):
         above = parents[node]
-        away = np.linalg.norm(means[node].astype(float) - means[above].astype(float))
-        needed = np.float32(min_parent_size(float(sizes[node]), away))
+        distance = np.linalg.norm(means[node].astype(float) - means[above].astype(float))
+        needed = np.float32(min_parent_size(float(sizes[node]), distance))
         sizes[above] = max(sizes[above], np.nextafter(needed, np.float32(np.inf)))
     return means, parents, sizes
 
 
-def test_a_node_is_drawn_where_it_is_fine_enough_and_its_parent_is_not():
+def test_fine_enough_nodes_with_coarse_parents_are_drawn():
     # k = 100 / 2 = 50: the node of size 0.1 from 5 on, its parent, 1 behind it, of size 0.2 from 10 on
     means = np.float32([[0, 0, 4.9], [0, 0, 5.1], [0, 0, 8.9], [0, 0, 9.1]])
     columns = columns_of(np.full(4, 0.1, np.float32), np.full(4, -1), means)
@@ -59,7 +59,7 @@ def test_a_node_is_drawn_where_it_is_fine_enough_and_its_parent_is_not():
     assert weights(means, columns, (0, 0, -1), focal=120, pixels=2.0).tolist() == [0, 1, 1, 1]
 
 
-def test_a_leaf_is_fine_at_any_distance_and_a_root_is_drawn_far_away():
+def test_leaves_are_drawn_nearby_and_the_root_far_away():
     means = np.float32([[0, 0, 0], [1, 0, 0]])
     columns = columns_of(np.float32([0.5, 0]), np.array([-1, 0]), means)
     assert weights(means, columns, (0, 0, 0)).tolist() == [0, 1]
@@ -73,15 +73,15 @@ def test_splats_without_columns_are_not_drawn():
     assert not weights(np.eye(3, dtype=np.float32), nothing).any()
 
 
-def test_detail_has_a_least_value():
+def test_detail_has_a_minimum():
     means, parents, sizes = random_tree(np.random.default_rng(1), 200)
     columns = columns_of(sizes, parents, means)
-    least = weights(means, columns, (3, 0, 0), MIN_DETAIL, 1.0)
-    np.testing.assert_array_equal(weights(means, columns, (3, 0, 0), MIN_DETAIL, 50.0), least)
+    minimum = weights(means, columns, (3, 0, 0), MIN_DETAIL, 1.0)
+    np.testing.assert_array_equal(weights(means, columns, (3, 0, 0), MIN_DETAIL, 50.0), minimum)
 
 
 @given(st.integers(0, 2**32), st.integers(1, 60), st.floats(MIN_DETAIL, 5000), st.floats(0.01, 200))
-def test_of_each_leaf_and_what_is_above_it_exactly_one_is_drawn(seed, leaves, k, reach):
+def test_each_path_to_a_leaf_has_one_drawn_node(seed, leaves, k, reach):
     rng = np.random.default_rng(seed)
     spread, place = rng.choice([1e-3, 1.0, 30.0]), rng.choice([0, 1000])  # where places are coarse
     means, parents, sizes = random_tree(rng, leaves, spread, place)
@@ -89,15 +89,19 @@ def test_of_each_leaf_and_what_is_above_it_exactly_one_is_drawn(seed, leaves, k,
     leaf = np.setdiff1d(np.arange(len(means)), parents)
     direction = rng.normal(size=3)
     direction /= np.linalg.norm(direction)
-    some = int(rng.integers(len(means)))  # on whose border an eye is, too
-    for eye in (means[some] + reach * direction, means[some] + k * sizes[some] * direction, means[some]):
-        drawn = weights(means, columns, eye, k) > 0
+    subset = int(rng.integers(len(means)))  # and the camera is on its boundary
+    for position in (
+        means[subset] + reach * direction,
+        means[subset] + k * sizes[subset] * direction,
+        means[subset],
+    ):
+        drawn = weights(means, columns, position, k) > 0
         for node in leaf:
-            found = 0
+            result = 0
             while node >= 0:
-                found += int(drawn[node])
+                result += int(drawn[node])
                 node = parents[node]
-            assert found == 1
+            assert result == 1
 
 
 def test_coarser_granularity_draws_less():
@@ -107,7 +111,7 @@ def test_coarser_granularity_draws_less():
     assert counts == sorted(counts, reverse=True) and counts[0] > 2 * counts[-1] > 0
 
 
-def test_a_viewers_budget_raises_the_granularity():
+def test_coarser_values_raise_the_granularity():
     values, steps = {"pixels": 1.0}, 0
     while (values := CUT.coarser(values, [1, 2])) is not None:
         assert values["pixels"] <= 100

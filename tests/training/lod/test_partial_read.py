@@ -1,4 +1,4 @@
-"""A chunk's splats by ranges of the file: the same as of the whole, with less read."""
+"""Partial reads of a region: the same splats as from the full file, with fewer bytes read."""
 
 from dataclasses import replace
 
@@ -16,12 +16,12 @@ from training.splats.levels import Bundle, Level
 
 COUNTS = {1: 300, 2: 5 * SIZE, 3: 20 * SIZE + 33}
 BYTES = 4 * (3 + 3 + 3 + 1 + 3 + 4 + 2)
-"""Of a splat of degree 0 with normals and two columns of bits."""
+"""Bytes of a splat of degree 0 with normals and two columns of bits."""
 
 
 @pytest.fixture
 def bundle():
-    """Thirty chunks along a line, each with the splats that are near it."""
+    """Thirty chunks along a line, each with the nearby splats."""
     rng, levels = np.random.default_rng(0), []
     for number, count in COUNTS.items():
         means = rng.uniform(0, 30, (count, 3)).astype(np.float32) * np.float32([1, 0.1, 0.1])
@@ -42,41 +42,43 @@ def bundle():
 
 @pytest.mark.parametrize("order", ["finest_first", "stream"])
 @pytest.mark.parametrize("region", [(3,), (3, 4), (25, 26), (0, 29)])
-def test_a_region_is_what_the_whole_has_of_it(tmp_path, bundle, order, region):
+def test_region_equals_selection_from_the_full_bundle(tmp_path, bundle, order, region):
     write_bundle(tmp_path / "bundle.ply", bundle, order)
     part, size = read_part(tmp_path / "bundle.ply", COUNTS, region)
-    for level, whole in zip(part.levels, read_bundle(tmp_path / "bundle.ply").levels, strict=True):
-        some = np.any([in_chunk(whole.splats.extras, chunk) for chunk in region], axis=0)
-        np.testing.assert_array_equal(level.splats.means, whole.splats.means[some])
-        np.testing.assert_array_equal(level.splats.sh, whole.splats.sh[some])
-        assert all(in_chunk(level.splats.extras, region[0]) == in_chunk(whole.splats.extras, region[0])[some])
+    for level, full in zip(part.levels, read_bundle(tmp_path / "bundle.ply").levels, strict=True):
+        subset = np.any([in_chunk(full.splats.extras, chunk) for chunk in region], axis=0)
+        np.testing.assert_array_equal(level.splats.means, full.splats.means[subset])
+        np.testing.assert_array_equal(level.splats.sh, full.splats.sh[subset])
+        assert all(
+            in_chunk(level.splats.extras, region[0]) == in_chunk(full.splats.extras, region[0])[subset]
+        )
     loaded, everything = sum(len(level.splats) for level in part.levels), sum(COUNTS.values())
     assert loaded * BYTES < size < 0.6 * everything * BYTES
 
 
-def test_a_file_without_blocks_is_read_whole(tmp_path, bundle):
+def test_files_without_blocks_are_read_completely(tmp_path, bundle):
     without = replace(bundle, tables={"chunks": bundle.tables["chunks"]})
     write_bundle(tmp_path / "a.ply", bundle)
     write_bundle(tmp_path / "b.ply", without)
-    (part, some), (same, size) = (read_part(tmp_path / name, COUNTS, (7, 8)) for name in ("a.ply", "b.ply"))
-    assert some < size >= sum(COUNTS.values()) * BYTES
-    for one, other in zip(part.levels, same.levels, strict=True):
-        inside = in_chunk(other.splats.extras, 7) | in_chunk(other.splats.extras, 8)
-        np.testing.assert_array_equal(one.splats.quats, other.splats.quats[inside])
+    (part, subset), (same, size) = (read_part(tmp_path / name, COUNTS, (7, 8)) for name in ("a.ply", "b.ply"))
+    assert subset < size >= sum(COUNTS.values()) * BYTES
+    for first, second in zip(part.levels, same.levels, strict=True):
+        inside = in_chunk(second.splats.extras, 7) | in_chunk(second.splats.extras, 8)
+        np.testing.assert_array_equal(first.splats.quats, second.splats.quats[inside])
 
 
 @pytest.mark.parametrize("numbers", [(2,), (1, 2)])
-def test_of_other_levels_nothing_is_read(tmp_path, bundle, numbers):
+def test_other_levels_are_not_read(tmp_path, bundle, numbers):
     write_bundle(tmp_path / "bundle.ply", bundle)
     part, size = read_part(tmp_path / "bundle.ply", numbers)
-    for level, whole in zip(part.levels, bundle.levels, strict=True):
-        wanted = whole.splats if level.number in numbers else whole.splats.select(slice(0))
-        np.testing.assert_array_equal(level.splats.means, wanted.means)
+    for level, full in zip(part.levels, bundle.levels, strict=True):
+        expected = full.splats if level.number in numbers else full.splats.select(slice(0))
+        np.testing.assert_array_equal(level.splats.means, expected.means)
     splats = sum(COUNTS[number] for number in numbers)
     assert splats * BYTES < size < splats * BYTES + 4000  # with the tables
 
 
-def test_blocks_that_contradict_the_levels_lose_rows_at_most(tmp_path, bundle):
+def test_contradicting_blocks_only_lose_rows(tmp_path, bundle):
     table = {name: np.tile(column, 3) for name, column in bundle.tables[BLOCKS].items()}
     write_bundle(tmp_path / "odd.ply", replace(bundle, tables={**bundle.tables, BLOCKS: table}))
     part, _ = read_part(tmp_path / "odd.ply", COUNTS, (3,))

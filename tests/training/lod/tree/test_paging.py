@@ -1,4 +1,4 @@
-"""Of a tree in a file what fits into a budget: complete cuts at any time, and the whole's where it fits."""
+"""Paged trees: complete cuts at any time, and the full cut within a sufficient budget."""
 
 import time
 from collections import Counter
@@ -29,7 +29,7 @@ LEAVES = 30_000
 
 
 class Truth:
-    """A whole tree: its nodes by their places, which none shares, and which is above which."""
+    """A full tree: its nodes by their unique positions, and their parents."""
 
     def __init__(self, bundle):
         self.bundle, self.choice = bundle, BundleSelector(bundle)
@@ -43,22 +43,22 @@ class Truth:
         )
         self.leaves = np.arange(len(bundle.levels[0].splats), len(splats))
 
-    def cut(self, eye, pixels):
-        return np.flatnonzero(self.choice.weights(np.float32(eye), FOCAL, {"pixels": pixels}))
+    def cut(self, position, pixels):
+        return np.flatnonzero(self.choice.weights(np.float32(position), FOCAL, {"pixels": pixels}))
 
     def nodes(self, means):
         return np.array([self.node_at[mean.tobytes()] for mean in means], int)
 
     def require_complete(self, drawn):
-        """Of every leaf and the nodes above it exactly one is drawn."""
+        """Check that exactly one node on each path to a leaf is drawn."""
         assert len(set(drawn.tolist())) == len(drawn)
-        there = np.zeros(len(self.parents) + 1, int)
-        there[drawn] = 1
-        above, found = self.leaves.copy(), np.zeros(len(self.leaves), int)
+        present = np.zeros(len(self.parents) + 1, int)
+        present[drawn] = 1
+        above, result = self.leaves.copy(), np.zeros(len(self.leaves), int)
         while (above >= 0).any():
-            found += there[above]
+            result += present[above]
             above = np.where(above >= 0, self.parents[above], -1)
-        assert (found == 1).all()
+        assert (result == 1).all()
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +80,7 @@ def path(request, truth, tmp_path):
 
 
 class Memory:
-    """Takes over what comes."""
+    """Memory that applies updates."""
 
     def __init__(self, pager):
         self.means = np.zeros((pager.rows, 3), np.float32)
@@ -94,15 +94,15 @@ class Memory:
                 self.columns[name][rows] = splats.extras[name]
         self.columns["node_size"], self.columns["parent_size"] = update.sizes
 
-    def shown(self, eye, pixels):
-        """The means of what an eye is shown."""
-        weights = CUT.weights(self.means, np.float32(eye), FOCAL, self.columns, {}, {"pixels": pixels})
+    def shown(self, position, pixels):
+        """Return the means of the splats that a camera sees."""
+        weights = CUT.weights(self.means, np.float32(position), FOCAL, self.columns, {}, {"pixels": pixels})
         return self.means[weights > 0]
 
 
-def come_in(pager, memory, eye, pixels):
-    """All that an eye needs comes in, update by update."""
-    while (update := pager.step(np.array(eye), max(FOCAL / pixels, 32))) is not None:
+def come_in(pager, memory, position, pixels):
+    """Apply updates until the camera needs no more pages."""
+    while (update := pager.step(np.array(position), max(FOCAL / pixels, 32))) is not None:
         memory.take(update)
         yield
 
@@ -110,79 +110,81 @@ def come_in(pager, memory, eye, pixels):
 EYES = [(0, 0, 3), (0.5, 0.2, 2), (-8, 8, 1), (7, -7, 0.5), (7, -6, 0.2), (60, 0, 20), (0, 0, 3)]
 
 
-def test_with_room_for_all_it_is_the_whole_files_cut(truth, path):
+def test_sufficient_budget_gives_the_full_cut(truth, path):
     pager = Pager(path, 10**6)
     memory = Memory(pager)
-    for eye in EYES:
+    for position in EYES:
         for pixels in (1.0, 4.0, 30.0):
-            list(come_in(pager, memory, eye, pixels))
-            drawn = truth.nodes(memory.shown(eye, pixels))
-            np.testing.assert_array_equal(np.sort(drawn), truth.cut(eye, pixels))
+            list(come_in(pager, memory, position, pixels))
+            drawn = truth.nodes(memory.shown(position, pixels))
+            np.testing.assert_array_equal(np.sort(drawn), truth.cut(position, pixels))
 
 
 @pytest.mark.parametrize("budget", [SIZE, 5000, 20_000])
-def test_within_a_budget_cuts_are_complete_whatever_is_there(truth, path, budget, monkeypatch):
-    """Also while pages come in, and from an eye that they are not for."""
+def test_cuts_are_complete_within_a_budget(truth, path, budget, monkeypatch):
+    """Also while pages arrive, and for other cameras."""
     monkeypatch.setattr(paging, "PAGES_PER_UPDATE", 3)
     pager, equal = Pager(path, budget), 0
     memory = Memory(pager)
     assert pager.rows <= budget
     memory.take(pager.step(None, 0.0))  # nothing is there before
-    for eye in EYES:
+    for position in EYES:
         for pixels in (30.0, 3.0):
-            for number, _ in enumerate(come_in(pager, memory, eye, pixels)):
+            for number, _ in enumerate(come_in(pager, memory, position, pixels)):
                 assert pager.splats <= budget
                 if number % 5 == 0:
-                    for other in (eye, (3, 3, 1)):
-                        truth.require_complete(truth.nodes(memory.shown(other, pixels)))
-            drawn = truth.nodes(memory.shown(eye, pixels))
+                    for second in (position, (3, 3, 1)):
+                        truth.require_complete(truth.nodes(memory.shown(second, pixels)))
+            drawn = truth.nodes(memory.shown(position, pixels))
             truth.require_complete(drawn)
-            needed = np.flatnonzero(pager._index.detail(np.array(eye)) < FOCAL / pixels * 1.001)
+            needed = np.flatnonzero(pager._index.detail(np.array(position)) < FOCAL / pixels * 1.001)
             if len(needed) <= budget // SIZE:
                 equal += 1
-                np.testing.assert_array_equal(np.sort(drawn), truth.cut(eye, pixels))
+                np.testing.assert_array_equal(np.sort(drawn), truth.cut(position, pixels))
     assert equal or budget < 20_000 or path.stem == "by size"  # where pages are wide
 
 
-def test_coarse_pages_come_first_and_those_of_no_use_for_longest_go_first(path):
+def test_coarse_pages_load_first_and_old_pages_are_evicted_first(path):
     file = TreeFile(path)
     order = file.index().order(np.array([7, -7, 0.5]), 1000.0)
     sizes, place = file.index().parent_size[order], np.arange(len(order))
     assert np.corrcoef(np.log(np.minimum(sizes, 100)), place)[0, 1] < -0.5
     pager = Pager(path, 12 * SIZE)
     a, b, c = ((0, 0, 40), 300.0), ((9, 9, 1), 60.0), ((-9, -9, 1), 60.0)
-    there = []
-    for eye, pixels in (a, b, c, a, b):
-        list(come_in(pager, Memory(pager), eye, pixels))
-        there.append(set(np.flatnonzero(pager._slot_of >= 0)))
-        assert len(there[-1]) <= 12 and pager.splats <= 12 * SIZE
-        needed = pager.file.index().detail(np.array(eye)) < max(FOCAL / pixels, 32) * (1 + paging.ROUNDING)
+    present = []
+    for position, pixels in (a, b, c, a, b):
+        list(come_in(pager, Memory(pager), position, pixels))
+        present.append(set(np.flatnonzero(pager._slot_of >= 0)))
+        assert len(present[-1]) <= 12 and pager.splats <= 12 * SIZE
+        needed = pager.file.index().detail(np.array(position)) < max(FOCAL / pixels, 32) * (
+            1 + paging.ROUNDING
+        )
         assert pager.short == (needed.sum() > 12)
-    assert there[0] <= there[1]  # there was room
+    assert present[0] <= present[1]  # there was room
 
 
-def test_a_thread_brings_in_what_is_asked_for(truth, path):
+def test_thread_reads_requested_pages(truth, path):
     pager = Pager(path, 10**6)
-    memory, taken = Memory(pager), 0
+    memory, used = Memory(pager), 0
     pager.start()
     try:
-        for eye in EYES[:4]:
-            pager.ask(np.array(eye), FOCAL)
-            wanted, until = truth.cut(eye, 1.0), time.monotonic() + 60
+        for position in EYES[:4]:
+            pager.ask(np.array(position), FOCAL)
+            expected, until = truth.cut(position, 1.0), time.monotonic() + 60
             while not pager.idle and time.monotonic() < until:
                 if (update := pager.take()) is not None:
                     memory.take(update)
-                    taken += 1
-                    truth.require_complete(truth.nodes(memory.shown(eye, 1.0)))
+                    used += 1
+                    truth.require_complete(truth.nodes(memory.shown(position, 1.0)))
                 time.sleep(0.01)
-            np.testing.assert_array_equal(np.sort(truth.nodes(memory.shown(eye, 1.0))), wanted)
-            assert taken == pager.arrived
+            np.testing.assert_array_equal(np.sort(truth.nodes(memory.shown(position, 1.0))), expected)
+            assert used == pager.arrived
     finally:
         pager.stop()
     assert not pager.problem
 
 
-def test_a_thread_that_fails_says_why(path, monkeypatch):
+def test_thread_reports_errors(path, monkeypatch):
     pager = Pager(path, 5000)
     monkeypatch.setattr(pager.file, "read", lambda pages: (_ for _ in ()).throw(OSError("the disk is gone")))
     pager.start()
@@ -192,35 +194,35 @@ def test_a_thread_that_fails_says_why(path, monkeypatch):
 
 
 @pytest.mark.parametrize("budget", [SIZE, 5000, 10**6])
-def test_the_top_of_a_tree_is_a_smaller_tree(truth, path, budget, tmp_path):
+def test_budgeted_read_gives_a_smaller_tree(truth, path, budget, tmp_path):
     bundle, total = read_budgeted(path, budget)
     assert total == 2 * LEAVES - 1
     assert 0 < sum(len(level.splats) for level in bundle.levels) <= budget
     write_bundle(tmp_path / "small.ply", bundle)
     choice = BundleSelector(read_bundle(tmp_path / "small.ply"))
-    for eye in EYES:
+    for position in EYES:
         for pixels in (1.0, 30.0):
-            some = choice.weights(np.float32(eye), FOCAL, {"pixels": pixels}) > 0
-            drawn = truth.nodes(choice.splats.means[some])
+            subset = choice.weights(np.float32(position), FOCAL, {"pixels": pixels}) > 0
+            drawn = truth.nodes(choice.splats.means[subset])
             truth.require_complete(drawn)
             if budget == 10**6:
-                np.testing.assert_array_equal(np.sort(drawn), truth.cut(eye, pixels))
+                np.testing.assert_array_equal(np.sort(drawn), truth.cut(position, pixels))
     finest = bundle.levels[-1].splats
     truth.require_complete(truth.nodes(finest.means))
     assert not finest.extras["node_size"].any() and set(finest.extras) == set(CUT.columns)
 
 
-def test_what_one_eye_needs_is_read_for_it(truth, path):
-    for eye in EYES[-2:]:
+def test_budgeted_read_for_one_camera(truth, path):
+    for position in EYES[-2:]:
         k = FOCAL / 20
-        part, _ = read_budgeted(path, 10**6, np.array(eye), k)
+        part, _ = read_budgeted(path, 10**6, np.array(position), k)
         assert sum(len(level.splats) for level in part.levels) < 1.8 * LEAVES
-        splats, _ = select(part, np.array(eye), FOCAL, {"pixels": 20.0})
-        np.testing.assert_array_equal(np.sort(truth.nodes(splats.means)), truth.cut(eye, 20.0))
+        splats, _ = select(part, np.array(position), FOCAL, {"pixels": 20.0})
+        np.testing.assert_array_equal(np.sort(truth.nodes(splats.means)), truth.cut(position, 20.0))
 
 
-def test_nodes_stand_for_what_is_missing():
-    """Worked by hand: 0 above 1 and 2, 1 above 3 and 4, 3 above 5 and 6; and one that nothing leads to."""
+def test_nodes_replace_missing_children():
+    """By hand: 0 is the parent of 1 and 2, 1 of 3 and 4, 3 of 5 and 6; and one unreachable node."""
     x = np.arange(8, dtype=np.float32)
     sizes = np.float32([8, 4, 0, 2, 0, 0, 0, 0])
     parents = np.array([-1, 0, 0, 1, 1, 3, 3, 3])
@@ -231,8 +233,8 @@ def test_nodes_stand_for_what_is_missing():
     columns["parent_size"][0] = ABOVE_ROOT
 
     def found(*rows):
-        here = ResidentTree({name: column[list(rows)] for name, column in columns.items()})
-        return [np.array(rows)[each].tolist() for each in here.update(np.arange(len(rows)))]
+        current = ResidentTree({name: column[list(rows)] for name, column in columns.items()})
+        return [np.array(rows)[item].tolist() for item in current.update(np.arange(len(rows)))]
 
     assert found(0, 1, 2, 3, 4, 5, 6) == [[0, 1, 3], [0, 1, 2, 3, 4, 5, 6]]
     assert found(6, 5, 4, 3, 2, 1, 0) == [[3, 1, 0], [6, 5, 4, 3, 2, 1, 0]]
@@ -245,13 +247,13 @@ def test_nodes_stand_for_what_is_missing():
     assert found(0, 1, 2, 3, 4, 5, 6, 7) == [[0, 1], [0, 1, 2, 3, 4]]  # three children are none
 
 
-def test_what_stands_follows_whatever_comes_and_goes(truth):
-    """Against what walking up from each splat finds, whichever some places hold at a time."""
+def test_links_follow_arbitrary_changes(truth):
+    """Compare with a walk from each splat to the root, for random contents of memory."""
     rng, splats = np.random.default_rng(3), truth.choice.splats
     top = np.argsort(-splats.extras["parent_size"], kind="stable")[:600]  # of several ways few go far down
-    whole = splats.extras | dict(zip("xyz", splats.means.T, strict=True))
+    full = splats.extras | dict(zip("xyz", splats.means.T, strict=True))
     columns = {name: np.zeros(len(top), np.float32) for name in (*CUT.columns, *"xyz")}
-    holds, here, most = np.full(len(top), -1), ResidentTree(columns), 0
+    holds, current, limit = np.full(len(top), -1), ResidentTree(columns), 0
     for _ in range(60):
         places = rng.permutation(len(top))[: rng.integers(1, 200)]
         free = np.setdiff1d(top, np.delete(holds, places))
@@ -260,38 +262,38 @@ def test_what_stands_follows_whatever_comes_and_goes(truth):
         holds[places[: len(come)]] = come
         for name, column in columns.items():
             column[places] = 0
-            column[places[: len(come)]] = whole[name][come]
-        there = {node: place for place, node in enumerate(holds.tolist()) if node >= 0}
-        children = Counter(truth.parents[node] for node in there)
+            column[places[: len(come)]] = full[name][come]
+        present = {node: place for place, node in enumerate(holds.tolist()) if node >= 0}
+        children = Counter(truth.parents[node] for node in present)
         inner, reached = np.zeros((2, len(top)), bool)
-        for node, place in there.items():
+        for node, place in present.items():
             inner[place] = children[node] == 2
             above = truth.parents[node]
-            while above >= 0 and above in there and children[above] == 2:
+            while above >= 0 and above in present and children[above] == 2:
                 above = truth.parents[above]
             reached[place] = above < 0
-        found = here.update(places)
-        np.testing.assert_array_equal(found[0], inner)
-        np.testing.assert_array_equal(found[1], reached)
-        most = max(most, int(reached.sum()))
-    assert most > 20, "nothing was ever complete"
+        result = current.update(places)
+        np.testing.assert_array_equal(result[0], inner)
+        np.testing.assert_array_equal(result[1], reached)
+        limit = max(limit, int(reached.sum()))
+    assert limit > 20, "some nodes are complete"
 
 
-def test_a_table_of_pages_is_what_reading_finds(truth, tmp_path):
+def test_page_table_equals_the_index_from_reading(truth, tmp_path):
     bundle = truth.bundle
     table = page_table({level.number: level.splats.extras for level in bundle.levels})
     write_bundle(tmp_path / "a.ply", bundle)
     write_bundle(tmp_path / "b.ply", replace(bundle, tables={BLOCKS: table}))
-    one, other = (TreeFile(tmp_path / name).index() for name in ("a.ply", "b.ply"))
+    single, second = (TreeFile(tmp_path / name).index() for name in ("a.ply", "b.ply"))
     for name in ("low", "high", "parent_size"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+        np.testing.assert_array_equal(getattr(single, name), getattr(second, name))
     means = truth.choice.splats.means[truth.parents]
     first = means[:SIZE][truth.parents[:SIZE] >= 0]
-    assert (one.low[0] <= first.min(axis=0)).all() and (one.high[0] >= first.max(axis=0)).all()
+    assert (single.low[0] <= first.min(axis=0)).all() and (single.high[0] >= first.max(axis=0)).all()
 
 
-def test_splats_that_cannot_be_drawn_leave_no_holes(truth, tmp_path):
-    """Their parents stand for them and for their siblings."""
+def test_undrawable_splats_leave_no_holes(truth, tmp_path):
+    """Parents replace them and their siblings."""
     above, leaves = (level.splats.select(slice(None)) for level in truth.bundle.levels)
     means = leaves.means.copy()
     means[5], means[7000] = np.nan, np.inf
@@ -303,66 +305,66 @@ def test_splats_that_cannot_be_drawn_leave_no_holes(truth, tmp_path):
     truth.require_complete(truth.nodes(memory.shown((0, 0, 3), 1.0)))
 
 
-def test_what_is_no_tree_or_has_no_room_is_a_sentence(truth, tmp_path):
+def test_other_rules_and_small_budgets_are_reported(truth, tmp_path):
     leaves = truth.bundle.levels[1].splats
     write_bundle(tmp_path / "a.ply", Bundle("flod", [Level(1, leaves, {"s_min": 0.0})], "bands"))
     write_bundle(tmp_path / "b.ply", truth.bundle)
     for read in (TreeFile, lambda path: read_budgeted(path, 10**5), lambda path: Pager(path, 10**5)):
-        with pytest.raises(LodgsError, match="is no tree of splats"):
+        with pytest.raises(LodgsError, match="not a tree of splats"):
             read(tmp_path / "a.ply")
     for read, budget in ((read_budgeted, 0), (Pager, 300)):
-        with pytest.raises(LodgsError, match=f"{budget} splats are too few"):
+        with pytest.raises(LodgsError, match=f"budget of {budget} splats is too small"):
             read(tmp_path / "b.ply", budget)
     bundle, _ = read_budgeted(tmp_path / "b.ply", 1)
     assert [len(level.splats) for level in bundle.levels] == [0, 1]
 
 
 @pytest.mark.parametrize("pixels", [1.0, 6.0, 30.0])
-def test_the_cut_of_a_file_is_read_from_it(truth, path, pixels):
-    """All of it; for a camera at least what it sees, and hardly more."""
+def test_cut_is_read_from_disk(truth, path, pixels):
+    """Complete without a camera; with a camera, all visible splats and few others."""
     file, shares = TreeFile(path), []
-    for eye in EYES:
-        choice = by_values.LodQuery("cut", eye, FOCAL, (), (("pixels", pixels),))
-        found = file.cut(choice)
-        wanted = truth.cut(eye, pixels)
-        drawn = truth.nodes(np.concatenate([splats.means for splats in found.values()]))
-        np.testing.assert_array_equal(np.sort(drawn), wanted)
-        assert not found[2].extras["node_size"].any() and found[1].extras["node_size"].all()
-        towards = look_at(np.array(eye), np.array([1, 2, 0.5]), (0, 0, 1))
-        camera = Camera("", 300, 200, 250, 250, 150, 100, towards)
-        seen = truth.nodes(np.concatenate([each.means for each in file.cut(choice, camera, 0.1).values()]))
-        assert set(seen) <= set(wanted)
-        assert set(wanted[camera.sees(truth.choice.splats.means[wanted], 0.1)]) <= set(seen)
-        shares.append(len(seen) / len(wanted))
+    for position in EYES:
+        choice = by_values.LodQuery("cut", position, FOCAL, (), (("pixels", pixels),))
+        result = file.cut(choice)
+        expected = truth.cut(position, pixels)
+        drawn = truth.nodes(np.concatenate([splats.means for splats in result.values()]))
+        np.testing.assert_array_equal(np.sort(drawn), expected)
+        assert not result[2].extras["node_size"].any() and result[1].extras["node_size"].all()
+        direction_to = look_at(np.array(position), np.array([1, 2, 0.5]), (0, 0, 1))
+        camera = Camera("", 300, 200, 250, 250, 150, 100, direction_to)
+        visible = truth.nodes(np.concatenate([item.means for item in file.cut(choice, camera, 0.1).values()]))
+        assert set(visible) <= set(expected)
+        assert set(expected[camera.sees(truth.choice.splats.means[expected], 0.1)]) <= set(visible)
+        shares.append(len(visible) / len(expected))
     assert min(shares) < 0.75 or pixels > 1 or path.stem == "by size"  # few splats are in wide blocks
 
 
-def test_what_an_eye_looks_at_comes_first(truth):
-    """Of what is as far away; and with it the nodes above, wherever these are."""
-    rng, eye = np.random.default_rng(4), np.array([1.0, 2.0, 3.0])
+def test_pages_in_view_load_first(truth):
+    """Among pages at the same distance; their ancestors load with them."""
+    rng, position = np.random.default_rng(4), np.array([1.0, 2.0, 3.0])
     direction = np.array([2.0, -1.0, 2.0]) / 3
-    towards = rng.normal(size=(500, 3))
-    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-    places = eye + 7 * towards
+    direction_to = rng.normal(size=(500, 3))
+    direction_to /= np.linalg.norm(direction_to, axis=1, keepdims=True)
+    places = position + 7 * direction_to
     index = paging.PageIndex(places, places, np.full(500, 1e-4))
-    for k, found in ((1e6, 500), (6e4, 0)):
-        assert len(index.order(eye, k, direction)) == found
-    ahead = np.degrees(np.arccos(towards @ direction)) < 50
-    order = index.order(eye, 1e6, direction)
+    for k, result in ((1e6, 500), (6e4, 0)):
+        assert len(index.order(position, k, direction)) == result
+    ahead = np.degrees(np.arccos(direction_to @ direction)) < 50
+    order = index.order(position, 1e6, direction)
     assert 20 < ahead.sum() < 200 and ahead[order[: ahead.sum()]].all()
 
     columns, below = truth.choice.splats.extras, truth.parents >= 0
     above = np.stack([columns[f"parent_{axis}"] for axis in "xyz"], 1).astype(np.float64)
     index = paging.PageIndex(above, above, columns["parent_size"].astype(np.float64))
-    found = index.ahead(np.array([-3.0, 2, 0.5]), direction)
-    assert 0.1 < found.mean() < 0.9
-    assert found[truth.parents[found & below]].all()
+    result = index.ahead(np.array([-3.0, 2, 0.5]), direction)
+    assert 0.1 < result.mean() < 0.9
+    assert result[truth.parents[result & below]].all()
 
 
-def test_within_a_budget_cuts_are_complete_wherever_an_eye_looks(truth, path):
+def test_cuts_are_complete_for_every_view_direction(truth, path):
     pager = Pager(path, 24 * SIZE)
-    memory, eye = Memory(pager), np.array([0, 0, 0.5])
+    memory, position = Memory(pager), np.array([0, 0, 0.5])
     for direction in ((1, 0, 0), (-1, 0, 0), (0, 1, 0)):
-        while (update := pager.step(eye, FOCAL, np.array(direction, float))) is not None:
+        while (update := pager.step(position, FOCAL, np.array(direction, float))) is not None:
             memory.take(update)
-            truth.require_complete(truth.nodes(memory.shown(eye, 1.0)))
+            truth.require_complete(truth.nodes(memory.shown(position, 1.0)))

@@ -1,4 +1,4 @@
-"""A tree's sizes and columns against a walk node by node."""
+"""Sizes and columns of trees, compared with a walk node by node."""
 
 import numpy as np
 import pytest
@@ -25,13 +25,13 @@ def nodes(rng, count):
     )
 
 
-def test_the_size_of_a_disc_is_its_radius():
+def test_size_of_a_disc_is_its_radius():
     assert splat_size(np.log([[2.0, 2.0, 1e-9]])) == pytest.approx(2)
     assert splat_area(np.log([[1.0, 2.0, 3.0]])) == pytest.approx(2 + 3 + 6)
 
 
 @pytest.mark.parametrize("leaves", [2, 3, 50, 400])
-def test_sizes_are_the_least_that_keep_cuts_proper(leaves):
+def test_sizes_are_minimal_for_proper_cuts(leaves):
     rng = np.random.default_rng(leaves)
     tree = random_tree(rng, leaves)
     splats = nodes(rng, len(tree))
@@ -41,19 +41,19 @@ def test_sizes_are_the_least_that_keep_cuts_proper(leaves):
     expected, means = np.zeros(len(tree)), splats.means.astype(float)
     for node in range(leaves, len(tree)):
         a, b, c = np.exp(splats.log_scales[node].astype(float))
-        least = (a * b + a * c + b * c) ** 0.5
+        minimum = (a * b + a * c + b * c) ** 0.5
         for child in tree.children[node - leaves]:
-            away = float(np.sqrt(((means[child] - means[node]) ** 2).sum()))
-            assert float(sizes[node]) >= (float(sizes[child]) + away / MIN_DETAIL) * (1 + 2**-20)
-            least = max(least, (expected[child] + away / MIN_DETAIL) * (1 + 2**-20))
+            distance = float(np.sqrt(((means[child] - means[node]) ** 2).sum()))
+            assert float(sizes[node]) >= (float(sizes[child]) + distance / MIN_DETAIL) * (1 + 2**-20)
+            minimum = max(minimum, (expected[child] + distance / MIN_DETAIL) * (1 + 2**-20))
             assert tree.parents[child] == node
-        expected[node] = least
+        expected[node] = minimum
     np.testing.assert_allclose(sizes, expected, rtol=1e-5)
     assert tree.parents[-1] == -1
     assert sorted(np.concatenate(tree.layers)) == list(range(leaves, len(tree)))
 
 
-def test_columns_are_the_parents_own_numbers():
+def test_columns_repeat_the_parents_values():
     rng = np.random.default_rng(0)
     tree = random_tree(rng, 60)
     splats = nodes(rng, len(tree))
@@ -66,8 +66,8 @@ def test_columns_are_the_parents_own_numbers():
     assert columns["parent_size"][-1] == np.float32(ABOVE_ROOT)
 
 
-def test_levels_in_a_file_are_a_proper_cut_from_everywhere(tmp_path):
-    """Splats of both levels that the rule shows, traced back by their colours: one above each leaf."""
+def test_cuts_of_a_file_are_proper(tmp_path):
+    """Identify drawn splats of both levels by colour: one on each path to a leaf."""
     rng = np.random.default_rng(1)
     tree = random_tree(rng, 300)
     splats = nodes(rng, len(tree))
@@ -80,55 +80,58 @@ def test_levels_in_a_file_are_a_proper_cut_from_everywhere(tmp_path):
     write_bundle(tmp_path / "a.ply", Bundle("tree", [above, leaves], "cut"))
     bundle = read_bundle(tmp_path / "a.ply")
     drawn = []
-    for eye in (np.zeros(3), np.array([40.0, 3, 1]), np.array([3e3, 0, 0]), splats.means[7]):
+    for position in (np.zeros(3), np.array([40.0, 3, 1]), np.array([3e3, 0, 0]), splats.means[7]):
         for pixels in (0.5, 8, 60):
-            shown = select_levels(bundle, eye, 500.0, resolve_controls(bundle, {"pixels": pixels}))
-            found = np.concatenate([one.splats.sh[:, 0, 0] for one in shown]).astype(int)
-            assert all(one.weights is None for one in shown)
-            seen = np.zeros(len(tree), bool)
-            seen[found] = True
+            selected = select_levels(bundle, position, 500.0, resolve_controls(bundle, {"pixels": pixels}))
+            result = np.concatenate([first.splats.sh[:, 0, 0] for first in selected]).astype(int)
+            assert all(first.weights is None for first in selected)
+            visible = np.zeros(len(tree), bool)
+            visible[result] = True
             for leaf in range(300):
                 path, node = [], leaf
                 while node >= 0:
                     path.append(node)
                     node = tree.parents[node]
-                assert seen[path].sum() == 1
-            drawn.append(len(found))
+                assert visible[path].sum() == 1
+            drawn.append(len(result))
     assert min(drawn) == 1 and max(drawn) == 300
 
 
-def test_levels_for_whoever_knows_no_trees_are_whole_scenes(tmp_path):
+def test_complete_levels_are_complete_scenes(tmp_path):
     rng = np.random.default_rng(4)
     tree = random_tree(rng, 9000)
     splats = nodes(rng, len(tree))
     splats.sh[:, 0, 0] = np.arange(len(tree))
     splats.extras["own"] = np.arange(len(tree), dtype=np.float32)
     bundle = Bundle("tree", tree.levels(splats), "cut", controls={"pixels": 2.0}, meta={"seed": 3})
-    found = complete_levels(bundle)
-    counts = [len(level.splats) for level in found.levels]
+    result = complete_levels(bundle)
+    counts = [len(level.splats) for level in result.levels]
     assert len(counts) == 3 and counts[2] == 9000 and counts[1] <= 2250 and 500 <= counts[0] <= counts[1] / 4
-    assert counts[1] > 1000 and [level.number for level in found.levels] == [1, 2, 3]
+    assert counts[1] > 1000 and [level.number for level in result.levels] == [1, 2, 3]
     sizes = tree.sizes(splats.means, splats.log_scales)
-    for level in found.levels:
-        seen = np.zeros(len(tree), bool)
-        seen[level.splats.sh[:, 0, 0].astype(int)] = True
-        covered = seen.copy()  # by itself, or by one above: never by two
+    for level in result.levels:
+        visible = np.zeros(len(tree), bool)
+        visible[level.splats.sh[:, 0, 0].astype(int)] = True
+        covered = visible.copy()  # by itself, or by one above: never by two
         for layer in tree.layers:
             below = tree.children[layer - tree.leaves]
-            assert not (covered[layer][:, None] & seen[below]).any()
+            assert not (covered[layer][:, None] & visible[below]).any()
             covered[below] |= covered[layer][:, None]
-        assert covered[: tree.leaves].all() and sizes[seen].max() <= level.facts["s_min"]
+        assert covered[: tree.leaves].all() and sizes[visible].max() <= level.facts["s_min"]
         assert list(level.splats.extras) == ["own"]
-    write_folder(tmp_path, found)
-    again = read_folder(tmp_path)
-    assert (again.rule, again.controls) == ("bands", {"gamma": 2.0, "first": 1}) and again.meta == {"seed": 3}
+    write_folder(tmp_path, result)
+    reread = read_folder(tmp_path)
+    assert (reread.rule, reread.controls) == ("bands", {"gamma": 2.0, "first": 1}) and reread.meta == {
+        "seed": 3
+    }
     near, far = (
-        select_levels(again, np.full(3, away), 100.0, resolve_controls(again, {})) for away in (0.0, 1e6)
+        select_levels(reread, np.full(3, distance), 100.0, resolve_controls(reread, {}))
+        for distance in (0.0, 1e6)
     )
-    assert [len(one.splats) for one in far] == [counts[0], 0, 0] and len(near[2].splats) > 0
+    assert [len(first.splats) for first in far] == [counts[0], 0, 0] and len(near[2].splats) > 0
 
 
-def test_leaves_without_a_tree_are_all_shown():
+def test_leaf_only_columns_draw_all_leaves():
     means, columns = np.zeros((5, 3), np.float32), leaf_only_columns(5)
     assert rules()["cut"].weights(means, np.ones(3), 100.0, columns, {}, {"pixels": 16.0}).all()
     rng = np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""Trees of splats to choose from, of any size: merged crudely, neighbour by neighbour, with proper sizes."""
+"""Trees of splats of any size for tests, from a crude merge of neighbours, with proper sizes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from training.splats.levels import Bundle, Level
 
 
 def random_tree(rng: np.random.Generator, leaves: int) -> Tree:
-    """Pairs merged at random: deep and shallow, and children far from each other."""
+    """Merge random pairs: deep and shallow branches, distant children."""
     free, children = list(range(leaves)), []
     while len(free) > 1:
         pair = [free.pop(rng.integers(len(free))) for _ in range(2)]
@@ -25,7 +25,7 @@ def random_tree(rng: np.random.Generator, leaves: int) -> Tree:
 
 
 def surfaces(count: int, degree: int = 0) -> Splats:
-    """Splats on a wavy ground and two walls, 20 units wide."""
+    """Return splats on a wavy ground and two walls, 20 units wide."""
     rng = np.random.default_rng(4)
     means = rng.uniform(-10, 10, (count, 3))
     means[: count // 2, 2] = 0.1 * np.sin(means[: count // 2, 0])
@@ -38,7 +38,7 @@ def surfaces(count: int, degree: int = 0) -> Splats:
 
 
 def random_leaves(count: int, rng: np.random.Generator, degree: int = 0, extent: float = 10.0) -> Splats:
-    """Splats on a rolling ground, small beside the distances of their neighbours."""
+    """Return splats on a rolling ground, small compared to the distances between neighbours."""
     means = rng.uniform(-extent, extent, (count, 3))
     means[:, 2] = np.sin(means[:, 0]) * np.cos(means[:, 1]) + rng.normal(0, 0.05, count)
     return Splats(
@@ -51,7 +51,7 @@ def random_leaves(count: int, rng: np.random.Generator, degree: int = 0, extent:
 
 
 def tree_of(leaves: Splats) -> Bundle:
-    """The tree over at least two splats; further columns of theirs are dropped."""
+    """Return a tree over at least two splats, without their extra columns."""
     leaves = leaves.select(spatial_order(leaves.means))
     count = len(leaves)
     total = 2 * count - 1
@@ -68,12 +68,12 @@ def tree_of(leaves: Splats) -> Bundle:
         weight = (opacity * squares)[two]
         weight /= weight.sum(axis=1, keepdims=True)
         means[new] = np.float32(np.einsum("nt,ntc->nc", weight, means[two]))  # as files have it
-        away = np.linalg.norm(means[two] - means[new][:, None], axis=2)
-        squares[new] = np.einsum("nt,nt->n", weight, squares[two] + away**2 / 3)
+        distance = np.linalg.norm(means[two] - means[new][:, None], axis=2)
+        squares[new] = np.einsum("nt,nt->n", weight, squares[two] + distance**2 / 3)
         sh[new] = np.einsum("nt,ntkc->nkc", weight, sh[two])
         opacity[new] = np.einsum("nt,nt->n", weight, opacity[two])
-        least = np.maximum(min_parent_size(sizes[two], away).max(axis=1), np.sqrt(3 * squares[new]))
-        sizes[new] = np.nextafter(np.float32(least), np.float32(np.inf))
+        minimum = np.maximum(min_parent_size(sizes[two], distance).max(axis=1), np.sqrt(3 * squares[new]))
+        sizes[new] = np.nextafter(np.float32(minimum), np.float32(np.inf))
         parents[two] = new[:, None]
         row, first = np.append(new, row[2 * pairs :]), first + pairs
     above = sizes[parents]
@@ -96,7 +96,7 @@ def tree_of(leaves: Splats) -> Bundle:
 
 
 def write_in_pages(path, tree):
-    """A tree as a file whose ranges are of one place, with the table that says of which."""
+    """Write a tree as a file sorted by space, with a page table."""
     levels = [Level(x.number, x.splats.select(streaming_order(x.splats.extras))) for x in tree.levels]
     table = page_table({level.number: level.splats.extras for level in levels})
     write_bundle(path, Bundle("tree", levels, "cut", tables={BLOCKS: table}))
