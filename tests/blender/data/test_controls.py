@@ -127,6 +127,6 @@ def test_levels_that_contradict_their_rule_are_refused_and_leave_nothing(bpy, lo
 
 def test_an_impossible_value_is_refused_and_leaves_nothing(bpy, lodgs, made):
     before = len(bpy.data.objects)
-    with pytest.raises(lodgs("training.errors").LodgsError, match="offset = 99 is not possible"):
+    with pytest.raises(lodgs("training.errors").LodgsError, match="offset = 99 is invalid"):
         made(rules()["octree"], {"offset": 99})
     assert len(bpy.data.objects) == before

@@ -78,13 +78,13 @@ def test_a_coarser_level_is_not_shown_alone_nor_exported(bpy, lodgs, root, tmp_p
     root.lodgs.mode = "SINGLE"
     assert [len(rows) for rows in shown_rows(bpy, lodgs, root)] == [0, LEAVES]
     for refused in (scenes.show_only, scenes.read_level):
-        with pytest.raises(LodgsError, match=r"Level 1 is no scene by itself.* Take level 2"):
+        with pytest.raises(LodgsError, match=r"Cannot use level 1 on its own.* Choose level 2"):
             refused(root, 1)
     scenes.show_only(root, 2)
     assert len(scenes.read_level(root, 2)) == LEAVES
-    with pytest.raises(RuntimeError, match="no scene by itself"):
+    with pytest.raises(RuntimeError, match="level 1 on its own"):
         bpy.ops.lodgs.show_only_level(level=1)
-    with pytest.raises(RuntimeError, match="no scene by itself"):
+    with pytest.raises(RuntimeError, match="level 1 on its own"):
         bpy.ops.lodgs.export_plain(filepath=str(tmp_path / "a.ply"), source="LEVEL", level=1)
     with pytest.raises(RuntimeError, match="coarsest level first"):
         bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "a.ply"), order="stream")
