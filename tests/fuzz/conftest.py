@@ -1,4 +1,4 @@
-"""How many inputs each door gets, and the table at the end of a long round."""
+"""Number of inputs per entry point, and the table at the end of a long round."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, Phase, settings
 
-from tests.fuzz.doors import LONG, RECORDS, Record
+from tests.fuzz.entry_points import LONG, RECORDS, Record
 
 REPORT = Path(__file__).resolve().parents[2] / "build" / "fuzz.json"
 SHORT = 60
-"""Inputs of a test in a short round, where it is not marked otherwise."""
+"""Default number of inputs of a test in a short round."""
 
-_doors: dict[str, dict] = {}
+_entry_points: dict[str, dict] = {}
 
 
 def pytest_configure(config):
@@ -26,21 +26,21 @@ def pytest_configure(config):
 
 
 def pytest_collection_modifyitems(items):
-    """Say how many inputs each test gets; tests say nothing of hypothesis's settings themselves."""
-    ours = [item for item in items if item.path.is_relative_to(Path(__file__).parent)]
-    for item in ours:
+    """Set hypothesis's settings, including the number of inputs, for each test."""
+    fuzz_items = [item for item in items if item.path.is_relative_to(Path(__file__).parent)]
+    for item in fuzz_items:
         item.add_marker("slow")
-    tests = [item for item in ours if hasattr(item.function, "hypothesis")]
+    tests = [item for item in fuzz_items if hasattr(item.function, "hypothesis")]
     weights = sum(_cases(item)[1] for item in tests)
     for item in {item.function: item for item in tests}.values():
         short, weight = _cases(item)
         common = {"deadline": None, "database": None, "suppress_health_check": list(HealthCheck)}
         if LONG:
             inputs = max(1, round(LONG * weight / weights))
-            chosen = settings(max_examples=inputs, phases=[Phase.generate], **common)
+            profile = settings(max_examples=inputs, phases=[Phase.generate], **common)
         else:
-            chosen = settings(max_examples=short, derandomize=True, **common)
-        chosen(item.function)
+            profile = settings(max_examples=short, derandomize=True, **common)
+        profile(item.function)
 
 
 def _cases(item) -> tuple[int, float]:
@@ -50,18 +50,18 @@ def _cases(item) -> tuple[int, float]:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call():
-    """A test of a long round fails at its end, where its door had a defect."""
-    before = {name: len(record.defects) for name, record in RECORDS.items()}
+    """Let a test of a long round fail at its end if its entry point had a defect."""
+    counts = {name: len(record.defects) for name, record in RECORDS.items()}
     result = yield
     for name, record in RECORDS.items():
-        new = list(record.defects)[before.get(name, 0) :]
+        new = list(record.defects)[counts.get(name, 0) :]
         assert not new, f"{name}: {', '.join(new)}"
     return result
 
 
 @pytest.hookimpl(trylast=True)
 def pytest_sessionfinish(session):
-    """A worker hands its records to the process that started it."""
+    """Pass a worker's records to the main process."""
     records = {name: asdict(record) for name, record in RECORDS.items()}
     if hasattr(session.config, "workeroutput"):
         session.config.workeroutput["fuzz"] = json.dumps(records)
@@ -75,30 +75,32 @@ def pytest_testnodedown(node):
 
 
 def _collect(records: dict[str, dict]) -> None:
-    """Add one process's records to all."""
+    """Add one process's records to the totals."""
     for name, new in records.items():
-        door = _doors.setdefault(name, asdict(Record()))
-        for key in ("tried", "clean", "told"):
-            door[key] += new[key]
+        totals = _entry_points.setdefault(name, asdict(Record()))
+        for key in ("tried", "accepted", "rejected"):
+            totals[key] += new[key]
         for key in ("slowest", "growth"):
-            door[key] = max(door[key], new[key])
-        for place, (count, *what) in new["defects"].items():
-            door["defects"].setdefault(place, [0, *what])[0] += count
+            totals[key] = max(totals[key], new[key])
+        for location, (count, *details) in new["defects"].items():
+            totals["defects"].setdefault(location, [0, *details])[0] += count
 
 
 def pytest_terminal_summary(terminalreporter):
-    """The table, and ``build/fuzz.json`` with each defect's traceback and input."""
-    if not LONG or not _doors:
+    """Print the table and write ``build/fuzz.json`` with each defect's traceback and input."""
+    if not LONG or not _entry_points:
         return
     row = "{:<24} {:>8} {:>8} {:>8} {:>8} {:>10} {:>10}"
     terminalreporter.write_sep("=", "fuzz")
-    terminalreporter.line(row.format("door", "tried", "clean", "told", "defects", "slowest s", "peak +MiB"))
-    for name, door in sorted(_doors.items()):
-        defects = sum(found[0] for found in door["defects"].values())
-        counts = (door["tried"], door["clean"], door["told"], defects)
+    terminalreporter.line(
+        row.format("entry point", "tried", "accepted", "rejected", "defects", "slowest s", "peak +MiB")
+    )
+    for name, totals in sorted(_entry_points.items()):
+        defects = sum(defect[0] for defect in totals["defects"].values())
+        counts = (totals["tried"], totals["accepted"], totals["rejected"], defects)
         terminalreporter.line(
-            row.format(name, *counts, f"{door['slowest']:.2f}", f"{door['growth'] / 2**20:.0f}")
+            row.format(name, *counts, f"{totals['slowest']:.2f}", f"{totals['growth'] / 2**20:.0f}")
         )
-    terminalreporter.line(f"{sum(door['tried'] for door in _doors.values())} inputs; {REPORT}")
+    terminalreporter.line(f"{sum(totals['tried'] for totals in _entry_points.values())} inputs; {REPORT}")
     REPORT.parent.mkdir(exist_ok=True)
-    REPORT.write_text(json.dumps(_doors, indent=1) + "\n")
+    REPORT.write_text(json.dumps(_entry_points, indent=1) + "\n")

@@ -1,4 +1,4 @@
-"""The door of checkpoints and networks: read whole and as written, or told; never in part."""
+"""Checkpoints and networks: read completely and unchanged, or rejected."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.fuzz.doors import attempt
-from tests.fuzz.mutations import spoiled
+from tests.fuzz.entry_points import attempt
+from tests.fuzz.mutations import corrupted
 from training.errors import LodgsError
 from training.runs import checkpoints
 from training.runs.arrays import read_arrays
@@ -33,7 +33,7 @@ def archive() -> bytes:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """A run with two checkpoints."""
+    """Create a run with two checkpoints."""
     folder = RunFolder(tmp_path_factory.mktemp("run"))
     folder.create()
     (folder.levels_folder / "level_1.ply").touch()
@@ -43,12 +43,12 @@ def run(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def whole(run) -> bytes:
+def checkpoint(run) -> bytes:
     return (run.checkpoints / "step_0000005.pt").read_bytes()
 
 
 def check(state: dict) -> None:
-    """A method is told what a checkpoint held, to the bit."""
+    """Check that the state is bit-identical."""
     assert state["steps"] == STATE["steps"]
     for name, tensor in STATE["model"].items():
         assert torch.equal(state["model"][name], tensor) and state["model"][name].dtype == tensor.dtype
@@ -56,26 +56,26 @@ def check(state: dict) -> None:
 
 @pytest.mark.cases(short=60, weight=1)
 @given(data=st.data())
-def test_the_newest_checkpoint_spoilt(run, whole, data):
-    content = data.draw(spoiled([whole]))
+def test_corrupt_newest_checkpoint(run, checkpoint, data):
+    content = data.draw(corrupted([checkpoint]))
     (run.checkpoints / "step_0000005.pt").write_bytes(content)
     warnings: list[str] = []
 
     def resume() -> None:
         try:
-            found = checkpoints.read_newest(run, "cpu", check, warnings.append)
+            result = checkpoints.read_newest(run, "cpu", check, warnings.append)
         except checkpoints.OtherVersion:
             raise
         except LodgsError as error:
-            raise AssertionError("the one before is whole") from error
-        assert found in ((5, LEVELS), (3, LEVELS)) and (found[0] == 5 or len(warnings) == 1)
+            raise AssertionError("the previous checkpoint is intact") from error
+        assert result in ((5, LEVELS), (3, LEVELS)) and (result[0] == 5 or len(warnings) == 1)
         "".join(warnings).encode()
 
     attempt("checkpoint", resume, content)
 
 
 @pytest.mark.cases(short=60, weight=1)
-@given(content=spoiled([archive()]))
+@given(content=corrupted([archive()]))
 def test_networks(run, content):
     run.model.write_bytes(content)
     if arrays := attempt("networks", lambda: read_arrays(run.model), content):

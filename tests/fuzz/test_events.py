@@ -1,4 +1,4 @@
-"""The door of a run's folder: its events and its log, as anybody may have written them."""
+"""Events and logs of a run's folder."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.fuzz.doors import attempt
-from tests.fuzz.mutations import spoiled, spoiled_value
+from tests.fuzz.entry_points import attempt
+from tests.fuzz.mutations import corrupted, corrupted_value
 from training.runs.folder import RunFolder
 
 META = {"camera_center": [0, 0, 1], "up_rotation": [[1, 0, 0], [0, 0, 1], [0, -1, 0]]}
@@ -46,12 +46,12 @@ def run(tmp_path_factory):
 
 
 def follow(run: RunFolder) -> None:
-    """What the panel does with a run: all that it shows is text, and all events fit their readers."""
+    """Use a run like the panel does: texts are printable, and events are valid for their readers."""
     events, offset = run.events()
     assert run.events(offset)[0] == []
     for event in events:
         json.dumps(event, allow_nan=False).encode()
-        assert event["event"] in {told["event"] for told in EVENTS}
+        assert event["event"] in {known["event"] for known in EVENTS}
     for level in run.levels():
         assert level["level"] >= 1 and level["splats"] >= 0
         assert (run.path / level["path"]).resolve().is_relative_to(run.path.resolve())
@@ -61,15 +61,15 @@ def follow(run: RunFolder) -> None:
 
 
 @pytest.mark.cases(short=80, weight=2)
-@given(content=spoiled([lines(EVENTS), lines(EVENTS[:5] * 3)]))
-def test_files_of_events(run, content):
+@given(content=corrupted([lines(EVENTS), lines(EVENTS[:5] * 3)]))
+def test_corrupt_event_files(run, content):
     run.events_file.write_bytes(content)
     run.log.write_bytes(content)
     attempt("events", lambda: follow(run), content)
 
 
 @pytest.mark.cases(short=80, weight=2)
-@given(values=st.lists(st.sampled_from(EVENTS).flatmap(spoiled_value), min_size=1, max_size=4))
-def test_events_with_odd_values(run, values):
+@given(values=st.lists(st.sampled_from(EVENTS).flatmap(corrupted_value), min_size=1, max_size=4))
+def test_events_with_unusual_values(run, values):
     run.events_file.write_bytes(lines(values))
     attempt("events", lambda: follow(run), values)

@@ -1,4 +1,4 @@
-"""The door of other programs' exports: each is a COLMAP scene that can be read, or a sentence."""
+"""Other programs' exports: converted to a readable COLMAP scene, or rejected."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.fuzz.doors import attempt
-from tests.fuzz.mutations import spoiled, spoiled_value
+from tests.fuzz.entry_points import attempt
+from tests.fuzz.mutations import corrupted, corrupted_value
 from tests.training.scenes.synthetic import noise, write_image
 from training.scenes.colmap import read_scene
 from training.scenes.formats import convert_export
@@ -52,9 +52,9 @@ METASHAPE = """<document version="2.0.0"><chunk><sensors><sensor id="0" type="fr
 </sensor></sensors><cameras><camera id="0" sensor_id="0" label="a">
 <transform>1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1</transform>
 </camera></cameras><transform><scale>2</scale></transform></chunk></document>"""
-CLOUD = "ply\nformat ascii 1.0\nelement vertex 2\n"
-CLOUD += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
-WHOLE = {
+PLY_HEADER = "ply\nformat ascii 1.0\nelement vertex 2\n"
+PLY_HEADER += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
+EXPORTS = {
     "transforms.json": json.dumps(TRANSFORMS),
     "keyframes/cameras/a.json": json.dumps(POLYCAM),
     "metadata": json.dumps(RECORD3D),
@@ -72,51 +72,51 @@ JSON = {
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Photographs where each format looks for them, and points."""
+    """Write photos to the folders of each format, and points."""
     folder = tmp_path_factory.mktemp("export")
-    for place in ("images", "rgb", "keyframes/images"):
+    for subfolder in ("images", "rgb", "keyframes/images"):
         for name in ("a.png", "b.png"):
-            write_image(folder / place / name, noise())
+            write_image(folder / subfolder / name, noise())
     (folder / "list.txt").write_text("images/a.png\nimages/b.png\n")
-    (folder / "points.ply").write_text(CLOUD + "0 0 5\n0 1 5\n")
+    (folder / "points.ply").write_text(PLY_HEADER + "0 0 5\n0 1 5\n")
     return folder
 
 
 def check(folder, name: str, content: bytes) -> None:
-    for each in WHOLE:
-        (folder / each).unlink(missing_ok=True)
+    for export in EXPORTS:
+        (folder / export).unlink(missing_ok=True)
     shutil.rmtree(folder / "sparse", ignore_errors=True)
     path = folder / name
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(content)
-    made = attempt(f"export {path.suffix}", lambda: convert_export(folder), (name, content))
-    if made is None:
+    result = attempt(f"export {path.suffix}", lambda: convert_export(folder), (name, content))
+    if result is None:
         assert not (folder / "sparse" / "0").exists()
     else:
         scene = attempt("COLMAP of an export", lambda: read_scene(folder), (name, content))
         assert scene is None or scene.cameras
 
 
-def test_the_seeds_are_exports(folder):
-    for name, content in WHOLE.items():
+def test_seeds_are_valid_exports(folder):
+    for name, content in EXPORTS.items():
         check(folder, name, content.encode())
         assert (folder / "sparse" / "0" / "cameras.bin").is_file(), name
 
 
 @pytest.mark.cases(short=120, weight=2)
-@given(data=st.data(), name=st.sampled_from(sorted(WHOLE)))
-def test_texts(folder, data, name):
-    check(folder, name, data.draw(spoiled([WHOLE[name].encode()])))
+@given(data=st.data(), name=st.sampled_from(sorted(EXPORTS)))
+def test_corrupt_texts(folder, data, name):
+    check(folder, name, data.draw(corrupted([EXPORTS[name].encode()])))
 
 
 @pytest.mark.cases(short=120, weight=2)
 @given(data=st.data(), name=st.sampled_from(sorted(JSON)))
-def test_values(folder, data, name):
-    check(folder, name, json.dumps(data.draw(spoiled_value(JSON[name]))).encode("utf-8", "surrogatepass"))
+def test_corrupt_values(folder, data, name):
+    check(folder, name, json.dumps(data.draw(corrupted_value(JSON[name]))).encode("utf-8", "surrogatepass"))
 
 
 @pytest.mark.cases(short=60, weight=1)
 @given(data=st.data())
-def test_points(folder, data):
-    (folder / "points.ply").write_bytes(data.draw(spoiled([(CLOUD + "0 0 5\n0 1 5\n").encode()])))
-    check(folder, "transforms.json", WHOLE["transforms.json"].encode())
+def test_corrupt_points(folder, data):
+    (folder / "points.ply").write_bytes(data.draw(corrupted([(PLY_HEADER + "0 0 5\n0 1 5\n").encode()])))
+    check(folder, "transforms.json", EXPORTS["transforms.json"].encode())

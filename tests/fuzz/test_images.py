@@ -1,4 +1,4 @@
-"""The doors of photographs, of every kind: their sizes and their pixels; and depths of meshes."""
+"""Image files of all formats: sizes, pixels and mesh depths."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from tests.fuzz.doors import attempt
-from tests.fuzz.mutations import spoiled
+from tests.fuzz.entry_points import attempt
+from tests.fuzz.mutations import corrupted
 from training.render.image import read_depth
 from training.scenes.images import MAX_PIXELS, check_image, image_size, load_image
 
@@ -22,10 +22,11 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def seeds(folder) -> list[bytes]:
-    """Images of each kind that photographs come in."""
+    """Return images in all photo formats."""
     noise = np.random.default_rng(0).integers(0, 256, (24, 40, 3)).astype(np.uint8)
-    image, found = Image.fromarray(noise), []
-    for name, made, options in (
+    image = Image.fromarray(noise)
+    contents = []
+    for name, variant, options in (
         ("a.jpg", image, {}),
         ("b.jpg", image, {"progressive": True, "exif": b"Exif\0\0" + bytes(99)}),
         ("c.jpg", image.convert("CMYK"), {}),
@@ -39,8 +40,8 @@ def seeds(folder) -> list[bytes]:
         ("b.webp", image, {"lossless": True}),
         ("c.webp", image.convert("RGBA"), {}),
     ):
-        made.save(folder / name, **options)
-        found.append((folder / name).read_bytes())
+        variant.save(folder / name, **options)
+        contents.append((folder / name).read_bytes())
     light = (noise / np.float32(255)).astype(np.float32)
     for compression in ("NO", "ZIP", "PIZ"):
         header = {
@@ -52,18 +53,18 @@ def seeds(folder) -> list[bytes]:
             header, {name: np.ascontiguousarray(plane) for name, plane in planes.items()}
         ) as file:
             file.write(str(folder / "seed.exr"))
-        found.append((folder / "seed.exr").read_bytes())
-    return found
+        contents.append((folder / "seed.exr").read_bytes())
+    return contents
 
 
 @pytest.mark.cases(short=150, weight=3)
 @given(data=st.data(), size=st.sampled_from([(40, 24), (20, 12), (13, 7), (1, 1)]))
-def test_images(folder, seeds, data, size):
-    content = data.draw(spoiled(seeds))
+def test_corrupt_images(folder, seeds, data, size):
+    content = data.draw(corrupted(seeds))
     path = folder / "tried"
     path.write_bytes(content)
-    found = attempt("image size", lambda: image_size(path), content)
-    assert found is None or 1 <= found[0] * found[1] <= MAX_PIXELS
+    dimensions = attempt("image size", lambda: image_size(path), content)
+    assert dimensions is None or 1 <= dimensions[0] * dimensions[1] <= MAX_PIXELS
     attempt("image", lambda: check_image(path), content)
     pixels = attempt("image", lambda: load_image(path, *size), content)
     if pixels is not None:
@@ -71,8 +72,8 @@ def test_images(folder, seeds, data, size):
 
 
 @given(data=st.data(), window=st.sampled_from([None, (3, 2, 10, 8)]))
-def test_depths(folder, seeds, data, window):
-    content = data.draw(spoiled(seeds[-3:]))
+def test_corrupt_mesh_depths(folder, seeds, data, window):
+    content = data.draw(corrupted(seeds[-3:]))
     path = folder / "depth.exr"
     path.write_bytes(content)
     depth = attempt("mesh depth", lambda: read_depth(path, 40, 24, window), content)

@@ -1,4 +1,4 @@
-"""The doors of jobs: files in TOML and JSON, regions, and what the command line sets."""
+"""Jobs: TOML and JSON files, regions, and parameters on the command line."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.fuzz.doors import attempt
-from tests.fuzz.mutations import ODD_VALUES, spoiled, spoiled_value
+from tests.fuzz.entry_points import attempt
+from tests.fuzz.mutations import UNUSUAL_VALUES, corrupted, corrupted_value
 from training.cli.job_options import add_options, job_from_options
 from training.methods import METHODS
 from training.runs.job import Job
@@ -31,7 +31,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def texts(folder) -> dict[str, list[bytes]]:
-    """Jobs as their two kinds of files have them."""
+    """Return jobs in both file formats."""
     toml = []
     for values in JOBS:
         Job.from_dict(values).write(folder / "good.toml")
@@ -39,25 +39,25 @@ def texts(folder) -> dict[str, list[bytes]]:
     return {".toml": toml, ".json": [json.dumps(values).encode() for values in JOBS]}
 
 
-def check(path, given: object) -> None:
-    """A job that is taken can be written, and says the same again."""
-    if job := attempt("job", lambda: Job.from_file(path).resolved(), given):
+def check(path, content: object) -> None:
+    """Check that an accepted job is unchanged after writing and reading it."""
+    if job := attempt("job", lambda: Job.from_file(path).resolved(), content):
         job.write(path.with_name("again.toml"))
         assert Job.from_file(path.with_name("again.toml")) == job
 
 
 @pytest.mark.cases(short=150, weight=2)
 @given(data=st.data(), suffix=st.sampled_from([".toml", ".json"]))
-def test_job_files(folder, texts, data, suffix):
-    text = data.draw(spoiled(texts[suffix]))
+def test_corrupt_job_files(folder, texts, data, suffix):
+    text = data.draw(corrupted(texts[suffix]))
     path = folder / f"job{suffix}"
     path.write_bytes(text)
     check(path, text)
 
 
 @pytest.mark.cases(short=150, weight=2)
-@given(values=st.sampled_from(JOBS).flatmap(spoiled_value))
-def test_jobs_with_odd_values(folder, values):
+@given(values=st.sampled_from(JOBS).flatmap(corrupted_value))
+def test_jobs_with_unusual_values(folder, values):
     path = folder / "values.json"
     path.write_text(json.dumps(values))
     check(path, values)
@@ -65,13 +65,13 @@ def test_jobs_with_odd_values(folder, values):
 
 @given(
     name=st.sampled_from(sorted(JOBS[0]["parameters"])),
-    value=st.one_of(ODD_VALUES.map(json.dumps), st.text(max_size=20)),
+    value=st.one_of(UNUSUAL_VALUES.map(json.dumps), st.text(max_size=20)),
 )
-def test_parameters_of_the_command_line(name, value):
+def test_command_line_parameters(name, value):
     parser = argparse.ArgumentParser()
     add_options(parser)
-    chosen = parser.parse_args(["--scene", "s", "--out", "o", "--set", f"{name}={value}"])
-    attempt("--set", lambda: job_from_options(chosen).resolved(), value)
+    options = parser.parse_args(["--scene", "s", "--out", "o", "--set", f"{name}={value}"])
+    attempt("--set", lambda: job_from_options(options).resolved(), value)
 
 
 REGION = {
@@ -80,21 +80,21 @@ REGION = {
 }  # fmt: skip
 
 
-def check_region(path, given: object) -> None:
-    """A region that is taken can be written, and asked for points."""
-    if region := attempt("region", lambda: Region.read(path), given):
+def check_region(path, content: object) -> None:
+    """Check that an accepted region can be written and used."""
+    if region := attempt("region", lambda: Region.read(path), content):
         region.write(path)
         region.near_border(np.zeros((3, 3), np.float32))
 
 
 @given(data=st.data())
-def test_regions(folder, data):
-    text = data.draw(spoiled([json.dumps(REGION).encode()]))
+def test_corrupt_regions(folder, data):
+    text = data.draw(corrupted([json.dumps(REGION).encode()]))
     (folder / "region.json").write_bytes(text)
     check_region(folder / "region.json", text)
 
 
-@given(values=spoiled_value(REGION))
-def test_regions_with_odd_values(folder, values):
+@given(values=corrupted_value(REGION))
+def test_regions_with_unusual_values(folder, values):
     (folder / "region.json").write_text(json.dumps(values))
     check_region(folder / "region.json", values)

@@ -1,4 +1,4 @@
-"""The doors of the render process: lines that ask for frames, and files of splats."""
+"""Render process: frame requests and splat files."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.fuzz.doors import attempt
-from tests.fuzz.mutations import spoiled, spoiled_value
+from tests.fuzz.entry_points import attempt
+from tests.fuzz.mutations import corrupted, corrupted_value
 from training.editing.look import Look, looks_as_dicts
 from training.lod.crop import Crop
 from training.render import wire
@@ -45,44 +45,46 @@ def splats() -> Splats:
     return Splats(means, quats, log_scales - 2, logits[:, 0], sh.reshape(20, 4, 3))
 
 
-def answer(request, splats: Splats) -> None:
-    """Draws what was asked for, where that is a small picture."""
+def render(request, splats: Splats) -> None:
+    """Render the requested frame if it is small."""
     if isinstance(request, FrameRequest):
         width, height = (
             request.window[2:] if request.window else (request.camera.width, request.camera.height)
         )
         assert 1 <= width * height <= MAX_PIXELS
         if width * height <= 10_000:
-            held = SplatSet(splats, backend="cpu")
-            instances = [Instance(held, one.matrix, one.level, looks=one.looks) for one in request.sets]
-            picture = draw(
+            splat_set = SplatSet(splats, backend="cpu")
+            instances = [
+                Instance(splat_set, entry.matrix, entry.level, looks=entry.looks) for entry in request.sets
+            ]
+            image = draw(
                 instances, request.camera, near=request.near, background=request.background,
                 depth=request.depth, levels=request.levels, window=request.window, backend="cpu",
             )  # fmt: skip
-            assert picture is not None and picture.alpha.shape == (height, width)
+            assert image is not None and image.alpha.shape == (height, width)
 
 
 @pytest.mark.cases(short=120, weight=2)
-@given(values=spoiled_value(REQUEST))
-def test_requests(splats, values):
+@given(values=corrupted_value(REQUEST))
+def test_requests_with_unusual_values(splats, values):
     line = json.dumps(values).encode()
-    attempt("render request", lambda: answer(parse_request(parse_line(line)), splats), values)
+    attempt("render request", lambda: render(parse_request(parse_line(line)), splats), values)
 
 
 @given(data=st.data())
-def test_lines(data):
-    line = data.draw(spoiled([json.dumps(REQUEST).encode(), b'{"cancel": 7}']))
+def test_corrupt_lines(data):
+    line = data.draw(corrupted([json.dumps(REQUEST).encode(), b'{"cancel": 7}']))
     attempt("render request", lambda: parse_request(parse_line(line)), line)
 
 
 @pytest.mark.cases(short=60, weight=1)
 @given(data=st.data(), count=st.sampled_from([20, 20, 20, 0, 1, 19, 21, 1 << 29]))
-def test_sets(folder, splats, data, count):
+def test_corrupt_sets(folder, splats, data, count):
     path = folder / "set-1"
     wire.write_set(path, wire.pack_set(splats, None))
-    content = data.draw(spoiled([path.read_bytes()]))
+    content = data.draw(corrupted([path.read_bytes()]))
     path.write_bytes(content)
     request = parse_request(REQUEST)
     attempt(
-        "render set", lambda: answer(request, drop_undrawable(wire.read_set(path, count)[0], path)), content
+        "render set", lambda: render(request, drop_undrawable(wire.read_set(path, count)[0], path)), content
     )

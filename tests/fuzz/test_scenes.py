@@ -1,4 +1,4 @@
-"""The doors of scenes: COLMAP models, binary and text, and cameras as JSON."""
+"""Scenes: binary and text COLMAP models, and cameras as JSON."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.fuzz.doors import attempt
-from tests.fuzz.mutations import spoiled, spoiled_value
+from tests.fuzz.entry_points import attempt
+from tests.fuzz.mutations import corrupted, corrupted_value
 from tests.training.scenes import synthetic
 from training.scenes.cameras import MAX_COORDINATE, Camera, camera_to_dict, read_camera
 from training.scenes.colmap import read_scene
@@ -21,7 +21,7 @@ CAMERA = camera_to_dict(Camera("a.png", 96, 72, 80.0, 82.0, 47.0, 37.0, np.eye(4
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    """Photographs, and beside them a folder for the model that is tried."""
+    """Write photos and valid models."""
     folder = tmp_path_factory.mktemp("scene")
     truth = synthetic.write_scene(folder, model="binary", points=40)
     (folder / "text").mkdir()
@@ -31,7 +31,7 @@ def scene(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def files(scene) -> dict[str, dict[str, bytes]]:
-    """The three files of the model by the kind and their names."""
+    """Return the three files of each model by suffix and name."""
     names = ("cameras", "images", "points3D")
     return {
         suffix: {f"{name}{suffix}": (scene / kind / f"{name}{suffix}").read_bytes() for name in names}
@@ -39,32 +39,32 @@ def files(scene) -> dict[str, dict[str, bytes]]:
     }
 
 
-def check(scene, model, given: object) -> None:
-    """What is read can be used: photographs are there, everything has a place, extents are numbers."""
-    found = attempt("COLMAP", lambda: read_scene(scene, model=model), given)
-    if found is not None:
-        assert found.cameras and all(camera.image.is_file() and not camera.flaw for camera in found.cameras)
+def check(scene, model, content: object) -> None:
+    """Check that an accepted scene is usable: photos exist, positions and extents are finite."""
+    result = attempt("COLMAP", lambda: read_scene(scene, model=model), content)
+    if result is not None:
+        assert result.cameras and all(camera.image.is_file() and not camera.flaw for camera in result.cameras)
         assert (
-            len(found.points) == len(found.point_colors)
-            and np.abs(found.points).max(initial=0) <= MAX_COORDINATE
+            len(result.points) == len(result.point_colors)
+            and np.abs(result.points).max(initial=0) <= MAX_COORDINATE
         )
-        assert np.isfinite(found.extent() if len(found.points) else found.center).all()
-        assert np.isfinite(found.up_rotation()).all()
-        assert "".join(found.warnings).encode() is not None  # can be printed
+        assert np.isfinite(result.extent() if len(result.points) else result.center).all()
+        assert np.isfinite(result.up_rotation()).all()
+        assert "".join(result.warnings).encode() is not None  # printable
 
 
 @pytest.mark.cases(short=150, weight=3)
 @given(data=st.data(), suffix=st.sampled_from([".bin", ".txt"]))
-def test_models(scene, files, data, suffix):
+def test_corrupt_models(scene, files, data, suffix):
     model = scene / "tried"
     shutil.rmtree(model, ignore_errors=True)
     model.mkdir()
-    whole = files[suffix]
-    chosen = data.draw(st.sampled_from(sorted(whole)))
-    spoilt = data.draw(spoiled([whole[chosen]]))
-    for name, content in (whole | {chosen: spoilt}).items():
+    valid = files[suffix]
+    target = data.draw(st.sampled_from(sorted(valid)))
+    replacement = data.draw(corrupted([valid[target]]))
+    for name, content in (valid | {target: replacement}).items():
         (model / name).write_bytes(content)
-    check(scene, model, (chosen, spoilt))
+    check(scene, model, (target, replacement))
 
 
 @pytest.mark.cases(short=80, weight=1)
@@ -75,7 +75,7 @@ def test_models(scene, files, data, suffix):
     pose=st.lists(st.floats(), min_size=7, max_size=7),
     lens=st.lists(st.floats(), min_size=4, max_size=4),
 )
-def test_names_and_numbers(scene, names, pose, lens):
+def test_unusual_names_and_numbers(scene, names, pose, lens):
     model = scene / "numbers"
     model.mkdir(exist_ok=True)
     (model / "cameras.txt").write_text(
@@ -89,8 +89,8 @@ def test_names_and_numbers(scene, names, pose, lens):
 
 
 @pytest.mark.cases(short=150, weight=2)
-@given(values=spoiled_value(CAMERA))
-def test_cameras(scene, values):
+@given(values=corrupted_value(CAMERA))
+def test_cameras_with_unusual_values(scene, values):
     path = scene / "camera.json"
     path.write_text(json.dumps(values))
     answer = attempt("camera", lambda: read_camera(path), values)
@@ -100,8 +100,8 @@ def test_cameras(scene, values):
 
 
 @given(data=st.data())
-def test_texts_of_cameras(scene, data):
-    text = data.draw(spoiled([json.dumps(CAMERA).encode()]))
+def test_corrupt_camera_files(scene, data):
+    text = data.draw(corrupted([json.dumps(CAMERA).encode()]))
     path = scene / "text.json"
     path.write_bytes(text)
     attempt("camera", lambda: read_camera(path), text)

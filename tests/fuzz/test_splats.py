@@ -1,4 +1,4 @@
-"""The doors of splats: PLYs of every dialect, bundles, folders of levels. What is taken can be drawn."""
+"""Splats: PLY files of all dialects, bundles, level folders. Accepted splats can be rendered."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.fuzz.doors import attempt
-from tests.fuzz.mutations import spoiled, spoiled_value
+from tests.fuzz.entry_points import attempt
+from tests.fuzz.mutations import corrupted, corrupted_value
 from training.cli.info import describe
 from training.splats.bundle import read_bundle, write_bundle
 from training.splats.gaussians import Splats
@@ -30,9 +30,9 @@ def splats(count: int, degree: int, **extras) -> Splats:
 
 
 def bundles() -> list[Bundle]:
-    """One of every form: levels apart with extras, levels that add up, a table, a single level."""
+    """Return bundles with separate levels and extras, cumulative levels, a single level and a table."""
     bands = [Level(number, splats(3 * number, 1), {"s_min": 0.5 / number}) for number in (1, 2, 4)]
-    bands[1].splats.extras["odd"] = np.arange(6, dtype="u1")
+    bands[1].splats.extras["unknown"] = np.arange(6, dtype="u1")
     octree = [Level(number, splats(4, 0, lod_bias=np.ones(4, "f4"))) for number in (1, 2)]
     facts = {"d_max": 9.0, "d_max_focal": 500.0}
     decay = [Level(1, splats(9, 2, sigma_d=np.ones(9, "f4")))]
@@ -51,44 +51,44 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def files(folder) -> list[bytes]:
-    """Good PLYs: bundles, plain ones, of other programs, in ASCII, with a mesh's faces."""
-    found = []
+    """Return valid PLY files: bundles, plain files, those of other programs, ASCII, and one with faces."""
+    contents = []
     for bundle in bundles():
         for order in ("finest_first", "stream"):
             write_bundle(folder / "good.ply", bundle, order)
-            found.append((folder / "good.ply").read_bytes())
+            contents.append((folder / "good.ply").read_bytes())
     write_ply(folder / "good.ply", splats(5, 3, filter_3D=np.ones(5, "f4"), id=np.arange(5, dtype="u4")))
-    found.append((folder / "good.ply").read_bytes())
-    head, rows = found[-1].split(b"end_header\n")
+    contents.append((folder / "good.ply").read_bytes())
+    head, rows = contents[-1].split(b"end_header\n")
     faces = b"element face 1\nproperty list uchar int vertex_indices\nend_header\n"
-    found.append(head + faces + rows + b"\3" + bytes(12))
+    contents.append(head + faces + rows + b"\3" + bytes(12))
     write_ply(folder / "good.ply", splats(4, 0))
     head, rows = (folder / "good.ply").read_bytes().split(b"end_header\n")
     table = np.frombuffer(rows, "f4").reshape(4, -1)
     text = "\n".join(" ".join(f"{value:.5g}" for value in row) for row in table)
-    found.append(head.replace(b"binary_little_endian", b"ascii") + b"end_header\n" + text.encode() + b"\n")
-    return found
+    contents.append(head.replace(b"binary_little_endian", b"ascii") + b"end_header\n" + text.encode() + b"\n")
+    return contents
 
 
 def use(bundle: Bundle, folder) -> Bundle:
-    """What follows a reading: every value is one that can be drawn, and the bundle can be written."""
+    """Check that all values can be rendered and that the bundle is unchanged after writing it."""
     for level in bundle.levels:
-        part = level.splats
-        columns = (part.means**2, part.quats**2, np.exp(part.log_scales) ** 2, part.sh**2)
+        data = level.splats
+        columns = (data.means**2, data.quats**2, np.exp(data.log_scales) ** 2, data.sh**2)
         assert all(np.isfinite(column).all() for column in columns)
-        assert not np.isnan(part.opacity_logits).any() and (part.quats**2).sum(axis=1).all()
+        assert not np.isnan(data.opacity_logits).any() and (data.quats**2).sum(axis=1).all()
     if len({level.splats.sh_degree for level in bundle.levels}) == 1:
-        write_bundle(folder / "again.ply", bundle)
-        again = read_bundle(folder / "again.ply")
-        assert [len(level.splats) for level in again.levels] == [len(level.splats) for level in bundle.levels]
-        assert (again.rule, again.facts, again.controls) == (bundle.rule, bundle.facts, bundle.controls)
+        write_bundle(folder / "copy.ply", bundle)
+        copy = read_bundle(folder / "copy.ply")
+        assert [len(level.splats) for level in copy.levels] == [len(level.splats) for level in bundle.levels]
+        assert (copy.rule, copy.facts, copy.controls) == (bundle.rule, bundle.facts, bundle.controls)
     return bundle
 
 
 @pytest.mark.cases(short=100, weight=6)
 @given(data=st.data())
-def test_plys_and_bundles(folder, files, data):
-    content = data.draw(spoiled(files))
+def test_corrupt_plys_and_bundles(folder, files, data):
+    content = data.draw(corrupted(files))
     path = folder / "a.ply"
     path.write_bytes(content)
     attempt("PLY", lambda: read_ply(path), content)
@@ -98,33 +98,33 @@ def test_plys_and_bundles(folder, files, data):
 
 @pytest.mark.cases(short=60, weight=2)
 @given(data=st.data())
-def test_what_bundles_say_of_themselves(folder, files, data):
+def test_corrupt_bundle_headers(folder, files, data):
     content = data.draw(st.sampled_from(files[:6]))
-    said = content[: content.index(b"end_header")].split(b"comment lodsplat ")
-    place = data.draw(st.integers(1, len(said) - 1))
-    comment, *rest = said[place].split(b"\n")
-    odd = json.dumps(data.draw(spoiled_value(json.loads(comment)))).encode()
-    said[place] = b"\n".join([odd, *rest])
-    content = b"comment lodsplat ".join(said) + content[content.index(b"end_header") :]
-    path = folder / "said.ply"
+    comments = content[: content.index(b"end_header")].split(b"comment lodsplat ")
+    index = data.draw(st.integers(1, len(comments) - 1))
+    comment, *lines = comments[index].split(b"\n")
+    replacement = json.dumps(data.draw(corrupted_value(json.loads(comment)))).encode()
+    comments[index] = b"\n".join([replacement, *lines])
+    content = b"comment lodsplat ".join(comments) + content[content.index(b"end_header") :]
+    path = folder / "header.ply"
     path.write_bytes(content)
     attempt("bundle", lambda: use(read_bundle(path), folder), content)
 
 
 @pytest.mark.cases(short=40, weight=2)
-@given(data=st.data(), which=st.sampled_from(bundles()))
-def test_folders_of_levels(folder, data, which):
-    there = folder / "levels"
-    shutil.rmtree(there, ignore_errors=True)
-    write_folder(there, which)
-    files = [file.name for file in sorted(there.glob("*.ply"))]  # tables.ply among them
-    spoil = data.draw(st.sampled_from(["manifest.json", "values", "gone", *files]))
-    manifest = there / "manifest.json"
-    if spoil == "values":
-        manifest.write_text(json.dumps(data.draw(spoiled_value(json.loads(manifest.read_text())))))
-    elif spoil == "gone":
+@given(data=st.data(), bundle=st.sampled_from(bundles()))
+def test_corrupt_level_folders(folder, data, bundle):
+    target = folder / "levels"
+    shutil.rmtree(target, ignore_errors=True)
+    write_folder(target, bundle)
+    files = [file.name for file in sorted(target.glob("*.ply"))]  # including tables.ply
+    change = data.draw(st.sampled_from(["manifest.json", "values", "no manifest", *files]))
+    manifest = target / "manifest.json"
+    if change == "values":
+        manifest.write_text(json.dumps(data.draw(corrupted_value(json.loads(manifest.read_text())))))
+    elif change == "no manifest":
         manifest.unlink()
-        (there / files[-1]).write_bytes(data.draw(spoiled([(there / "lod0.ply").read_bytes()])))
+        (target / files[-1]).write_bytes(data.draw(corrupted([(target / "lod0.ply").read_bytes()])))
     else:
-        (there / spoil).write_bytes(data.draw(spoiled([(there / spoil).read_bytes()])))
-    attempt("folder of levels", lambda: use(read_folder(there), folder), spoil)
+        (target / change).write_bytes(data.draw(corrupted([(target / change).read_bytes()])))
+    attempt("folder of levels", lambda: use(read_folder(target), folder), change)
