@@ -7,7 +7,7 @@ import json
 from textwrap import fill
 
 from ..methods import METHODS, PRESETS, method_info
-from ..optimize.parameters import possible
+from ..optimize.parameters import describe_values
 
 _WIDTH = 110
 
@@ -42,6 +42,6 @@ def describe_method(name: str) -> str:
         values = {preset: json.dumps(getattr(method.preset(preset), field.name)) for preset in PRESETS}
         equal = len(set(values.values())) == 1
         text = values["draft"] if equal else ", ".join(f"{key} {value}" for key, value in values.items())
-        lines += ["", f"{field.name}: {possible(field)}{unit}{per_level}", f"    {text}"]
+        lines += ["", f"{field.name}: {describe_values(field)}{unit}{per_level}", f"    {text}"]
         lines += [fill(field.metadata["about"], _WIDTH, initial_indent="    ", subsequent_indent="    ")]
     return "\n".join(lines)
