@@ -134,7 +134,7 @@ def two_levels(bpy, splats):
     camera = bpy.data.objects.new("eye", bpy.data.cameras.new("eye"))
     bpy.context.scene.collection.objects.link(camera)
     bpy.context.scene.camera = camera
-    with scenes._new_scene(bpy.context, "bench") as root:
+    with scenes.new_scene(bpy.context, "bench") as root:
         scenes.set_bundle_facts(root, bundle.Bundle("flod", [], "bands"))
         scenes.set_level(root, bundle.Level(1, splats, {"s_min": S_MIN}))
         scenes.set_level(root, bundle.Level(2, splats, {"s_min": 0.0}))
@@ -210,7 +210,7 @@ def clean_up(bpy, count: int) -> None:
     scenes, cleaning = load("blender_lodgs.data.scenes"), load("blender_lodgs.data.cleaning")
     bundle = load("training.splats.bundle")
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
-    with scenes._new_scene(bpy.context, "bench") as root:
+    with scenes.new_scene(bpy.context, "bench") as root:
         scenes.set_bundle_facts(root, bundle.Bundle("flod", [], "bands"))
         for number in range(1, 6):
             scenes.set_level(

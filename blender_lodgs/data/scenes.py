@@ -32,7 +32,7 @@ from ...training.scenes.views import placed as placed_views
 from ...training.splats.bundle import Bundle, Level, read_bundle, read_folder, read_head
 from ...training.splats.formats import STREAMED, as_ply, is_ply
 from ...training.splats.gaussians import Splats
-from .. import extension
+from .. import compat, extension
 from ..nodes import ellipsoids
 from . import cleaning, crops, looks, objects, painting, selection, streams, tables
 from .objects import root_of
@@ -131,7 +131,7 @@ def import_colmap(
     straight = already_undistorted(scene)
     shown = {camera.name: camera for camera in straight.cameras} if straight else {}
     extent, near = _extent(scene), _near(scene)
-    with _new_scene(context, scene.folder.name) as root:
+    with new_scene(context, scene.folder.name) as root:
         axes = axes_of(root)
         if upright:
             axes.rotation_quaternion = Matrix(scene.up_rotation().tolist()).to_quaternion()
@@ -276,7 +276,7 @@ def place_splats(
         for level in bundle.levels:
             made.append(objects.new_splats(f"{file.path.stem} {level.number}", level.splats))
             yield
-        with _new_scene(context, file.path.stem.removesuffix(".compressed")) as root:
+        with new_scene(context, file.path.stem.removesuffix(".compressed")) as root:
             if upright:
                 axes_of(root).rotation_quaternion = Matrix(bundle.upright.tolist()).to_quaternion()
             _fill(root, file, made)
@@ -302,7 +302,7 @@ def refill(root: bpy.types.Object, file: SplatsFile) -> None:
 def _fill(root: bpy.types.Object, file: SplatsFile, made: Sequence[bpy.types.Object | None]) -> None:
     """Puts a file's levels, of which there may be objects, and all that it says of them into a scene."""
     for level, obj in zip(file.bundle.levels, made, strict=True):
-        _put_level(root, level, obj)
+        put_level(root, level, obj)
     set_bundle_facts(root, file.bundle)
     set_tables(root, file.bundle.tables)
     root.lodgs.single_level = file.bundle.levels[-1].number
@@ -337,7 +337,7 @@ def set_bundle_facts(root: bpy.types.Object, bundle: Bundle) -> None:
             item.facts = json.dumps(facts[item.number])
     if "camera_center" in bundle.meta:
         settings.camera_center = bundle.meta["camera_center"]
-    _levels_changed(root)
+    levels_changed(root)
 
 
 def set_tables(root: bpy.types.Object, given: Tables) -> None:
@@ -358,8 +358,8 @@ def set_level(root: bpy.types.Object, level: Level) -> bpy.types.Object:
         The level's object.
     """
     first = not root.lodgs.levels
-    obj = _put_level(root, level)
-    _levels_changed(root)
+    obj = put_level(root, level)
+    levels_changed(root)
     if level.number == root.lodgs.levels[-1].number:
         root.lodgs.single_level = level.number
         root.lodgs.active_level = len(root.lodgs.levels) - 1
@@ -403,7 +403,7 @@ def make_room(root: bpy.types.Object, number: int) -> None:
         if kept.object.name == _level_name(root, kept.number):
             kept.object.name = _level_name(root, number)
         kept.number = number
-    _levels_changed(root)
+    levels_changed(root)
 
 
 def read_levels(root: bpy.types.Object, placed: bool = False, looked: bool = False) -> Bundle:
@@ -478,7 +478,7 @@ def delete_left_out(root: bpy.types.Object) -> int:
     before = sum(len(item.object.data.points) for item in root.lodgs.levels if item.exists)
     bundle = read_levels(root)
     for level in bundle.levels:
-        _put_level(root, level)
+        put_level(root, level)
     for item in root.lodgs.levels:
         item.lost = 0
     for obj in crops.cutting(root):
@@ -486,7 +486,7 @@ def delete_left_out(root: bpy.types.Object) -> int:
             obj.lodgs_crop.keep = "ALL"
         else:
             bpy.data.objects.remove(obj)
-    _levels_changed(root)
+    levels_changed(root)
     return before - sum(len(level.splats) for level in bundle.levels)
 
 
@@ -521,10 +521,13 @@ def shown_splats(
         LodgsError: nothing is visible, or the levels have spherical harmonics of different degrees; or of
             placed ones, the root is stretched.
     """
-    depsgraph = context.evaluated_depsgraph_get()
-    parts = [
-        objects.read_splats(item.object, depsgraph) for item in root.lodgs.levels if _visible(context, item)
-    ]
+    with _drawn_by_lodgs(context):
+        depsgraph = context.evaluated_depsgraph_get()
+        parts = [
+            objects.read_splats(item.object, depsgraph)
+            for item in root.lodgs.levels
+            if _visible(context, item)
+        ]
     if looked:
         parts = [look.looked(part, _looks(root)) for part in parts]
     if not any(len(part) for part in parts):
@@ -543,6 +546,22 @@ def shown_splats(
     if not placed:
         return splats
     return placement_of(root).splats(splats, *((rule.lengths, rule.places) if rule else ()))
+
+
+@contextmanager
+def _drawn_by_lodgs(context: bpy.types.Context) -> Iterator[None]:
+    """Evaluate objects without the modifiers that apply weights and looks for Blender's own drawing."""
+    settings = context.scene.lodgs_viewport
+    before = settings.splats, settings.drawn_by
+    if compat.NATIVE_SPLATS is None or not settings.points:
+        yield
+        return
+    settings.splats, settings.drawn_by = True, "LODGS"
+    try:
+        context.view_layer.update()
+        yield
+    finally:
+        settings.splats, settings.drawn_by = before
 
 
 def count_shown(context: bpy.types.Context, root: bpy.types.Object) -> tuple[int, int]:
@@ -581,7 +600,7 @@ def offer_ellipsoids(scene: bpy.types.Scene) -> None:
 
 
 @contextmanager
-def _new_scene(context: bpy.types.Context, name: str) -> Iterator[bpy.types.Object]:
+def new_scene(context: bpy.types.Context, name: str) -> Iterator[bpy.types.Object]:
     """A new root in a new collection; both, and all in them, vanish again if the block fails."""
     if context.mode != "OBJECT":
         bpy.ops.object.mode_set(mode="OBJECT")
@@ -707,9 +726,7 @@ def _short(value: float) -> float:
     return value if isinstance(value, int) else float(f"{value:.7g}")
 
 
-def _put_level(
-    root: bpy.types.Object, level: Level, made: bpy.types.Object | None = None
-) -> bpy.types.Object:
+def put_level(root: bpy.types.Object, level: Level, made: bpy.types.Object | None = None) -> bpy.types.Object:
     """The level's object in the scene and its entry in the list, without what depends on the whole list.
 
     Args:
@@ -750,7 +767,7 @@ def _level_name(root: bpy.types.Object, number: int) -> str:
     return f"{root.name} level {number}"
 
 
-def _levels_changed(root: bpy.types.Object) -> None:
+def levels_changed(root: bpy.types.Object) -> None:
     """Drops levels whose objects are gone, keeps the settings within the rest, and renews the drivers."""
     settings = root.lodgs
     for index in reversed(range(len(settings.levels))):
@@ -778,7 +795,7 @@ def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     if depsgraph.id_type_updated("COLLECTION"):
         for root in editable:
             if not all(item.exists for item in root.lodgs.levels):
-                _levels_changed(root)
+                levels_changed(root)
     if depsgraph.id_type_updated("OBJECT"):
         for root in editable:
             if crops.outdated(root) or looks.outdated(root):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from ..data import photographs, scenes
+from ..data import native, photographs, scenes
 from ..runs import preparing
 from .parts import Panel, say, split_column
 
@@ -15,6 +15,8 @@ class LODGS_PT_scene(Panel):
 
     def draw(self, context):
         layout, root = self.layout, scenes.active_root(context)
+        if native.loose_splats(context):
+            layout.operator("lodgs.add_to_scene", icon="ADD")
         _draw_import(layout, another=scenes.shows_splats(context.scene))
         if scenes.linked(context):
             say(layout, scenes.LINKED, "LINKED")

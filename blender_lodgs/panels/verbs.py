@@ -15,8 +15,8 @@ VERBS = (
      "lodgs.cancel_measuring"),
     ("lodgs.use_engine", "lodgs.render_quick", "lodgs.combine_with_meshes", "lodgs.separate_meshes",
      "lodgs.render_mesh_depth", "lodgs.export_camera"),
-    ("lodgs.capture_scene", "lodgs.import_capture", "lodgs.reset_look", "lodgs.remove_paint",
-     "lodgs.remove_scene"),
+    ("lodgs.add_to_scene", "lodgs.capture_scene", "lodgs.import_capture", "lodgs.reset_look",
+     "lodgs.remove_paint", "lodgs.remove_scene"),
 )  # fmt: skip
 """What the menu has, beside what other menus have: placing, cleaning, File's Import and Export."""
 

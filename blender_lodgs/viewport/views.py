@@ -25,7 +25,7 @@ import gpu
 import numpy as np
 from mathutils import Matrix
 
-from .. import extension
+from .. import compat, extension
 from ..data import changes, scenes, selection, shown
 from . import eye, resident, splats
 from .arranging import Arrangement, Placement, Request, arrange
@@ -120,7 +120,11 @@ def draw(context: bpy.types.Context) -> None:
     if region.as_pointer() not in _views:
         _forget_closed()
     view = _views.setdefault(region.as_pointer(), ViewState())
-    instances = shown.splat_instances(context.evaluated_depsgraph_get(), space)
+    instances = [
+        instance
+        for instance in shown.splat_instances(context.evaluated_depsgraph_get(), space)
+        if not compat.is_native(instance.evaluated.data)  # Blender draws it
+    ]
     now, matrix = time.monotonic(), region_data.window_matrix @ region_data.view_matrix
     if view.matrix is not None and view.matrix != matrix:
         view.moved = now

@@ -84,7 +84,7 @@ def test_blender_begins_with_what_the_trainer_measures(bpy, lodgs, some, tmp_pat
     lodgs("training.splats.bundle").write_bundle(tmp_path / "b.ply", bundle)
     assert in_use(scenes.import_splats(bpy.context, tmp_path / "b.ply")) == wanted
 
-    with scenes._new_scene(bpy.context, "trained") as root:
+    with scenes.new_scene(bpy.context, "trained") as root:
         for level in bundle.levels:
             scenes.set_level(root, level)
         scenes.set_bundle_facts(root, bundle)
@@ -96,7 +96,7 @@ def test_blender_begins_with_what_the_trainer_measures(bpy, lodgs, some, tmp_pat
 
 def test_levels_in_use_go_along_until_somebody_sets_them(bpy, lodgs, some):
     scenes, bundle = lodgs("data.scenes"), some(6, {})
-    with scenes._new_scene(bpy.context, "trained") as root:
+    with scenes.new_scene(bpy.context, "trained") as root:
         scenes.set_bundle_facts(root, lodgs("training.splats.bundle").Bundle("flod", [], "bands"))
         for level in bundle.levels[:4]:
             scenes.set_level(root, level)
@@ -109,7 +109,7 @@ def test_levels_in_use_go_along_until_somebody_sets_them(bpy, lodgs, some):
     root.lodgs.bands.first = 4
     for item in list(root.lodgs.levels)[3:]:
         bpy.data.objects.remove(item.object)
-    scenes._levels_changed(root)
+    scenes.levels_changed(root)
     assert in_use(root) == {"gamma": 1, "first": 1, "last": 3}  # which was the rule's own again
 
 

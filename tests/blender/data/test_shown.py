@@ -28,7 +28,7 @@ def two_levels(bpy, lodgs):
     bpy.context.scene.collection.objects.link(camera)
     bpy.context.scene.camera = camera
     splats = [make_splats(lodgs, seed) for seed in range(2)]
-    with lodgs("data.scenes")._new_scene(bpy.context, "scene") as root:
+    with lodgs("data.scenes").new_scene(bpy.context, "scene") as root:
         for number, s_min in ((2, 0.0), (1, 0.003)):
             lodgs("data.scenes").set_level(root, level(number, splats[number - 1], {"s_min": s_min}))
         bundle = lodgs("training.splats.bundle").Bundle("flod", [], "bands")

@@ -24,9 +24,9 @@ def weights(bpy, lodgs):
     levels = [Level(1, splats(~SETS), {"d_l": 20.0}), Level(2, fine, {"d_l": 0.0})]
     table = {name: np.float32(values) for name, values in CHUNKS.items()}
     bundle = Bundle("lodge", levels, "chunks", tables={"chunks": table})
-    with scenes._new_scene(bpy.context, "town") as root:
+    with scenes.new_scene(bpy.context, "town") as root:
         for one in levels:
-            scenes._put_level(root, one)
+            scenes.put_level(root, one)
         scenes.set_bundle_facts(root, bundle)
         scenes.set_tables(root, bundle.tables)
     root.location, root.rotation_euler, root.scale = (5, 6, 7), (1, 2, 3), (2, 3, 4)

@@ -142,9 +142,9 @@ def splat_scene(bpy, lodgs):
             levels.append(Level(number, splats, {fact: facts[fact] for fact in rule.level_facts}))
         scene = {fact: facts[fact] for fact in rule.scene_facts}
         bundle = Bundle("any", levels, name, scene, cumulative=rule.cumulative)
-        with scenes._new_scene(bpy.context, "any") as root:
+        with scenes.new_scene(bpy.context, "any") as root:
             for one in bundle.levels:
-                scenes._put_level(root, one)
+                scenes.put_level(root, one)
             scenes.set_bundle_facts(root, bundle)
         return root
 
@@ -154,7 +154,7 @@ def splat_scene(bpy, lodgs):
 @pytest.mark.parametrize("name", RULES)
 def test_an_older_group_is_renewed_and_whoever_used_it_gets_the_new_one(bpy, lodgs, splat_scene, name):
     groups, selection, root = lodgs("nodes.rules"), lodgs("data.selection"), splat_scene(name)
-    used = root.lodgs.levels[0].object.modifiers[-1].node_group
+    used = lodgs("data.selection").rule_modifier(root.lodgs.levels[0].object).node_group
     version = used["lodgs_version"]
     assert not selection.outdated(root)
     used["lodgs_version"] = 0
@@ -253,14 +253,18 @@ def test_a_group_that_an_artist_has_changed_is_followed_by_all(bpy, lodgs, half,
 @pytest.mark.parametrize("name", RULES)
 def test_a_changed_group_stays_in_use_and_is_kept_when_it_is_renewed(lodgs, splat_scene, change, name):
     selection, root = lodgs("data.selection"), splat_scene(name)
-    used = root.lodgs.levels[0].object.modifiers[-1].node_group
+    used = lodgs("data.selection").rule_modifier(root.lodgs.levels[0].object).node_group
     change(used)
     selection.attach(root)
     assert not selection.outdated(root)
-    assert {item.object.modifiers[-1].node_group for item in root.lodgs.levels} == {used}
+    assert {lodgs("data.selection").rule_modifier(item.object).node_group for item in root.lodgs.levels} == {
+        used
+    }
     used["lodgs_version"] = 0
     lodgs("data.older_files").bring_up_to_date(root)
-    assert used not in {item.object.modifiers[-1].node_group for item in root.lodgs.levels}
+    assert used not in {
+        lodgs("data.selection").rule_modifier(item.object).node_group for item in root.lodgs.levels
+    }
     assert used.name == f"LODGS {name.title()} (older)" and used.use_fake_user
 
 
@@ -279,7 +283,7 @@ def test_a_group_is_as_made_after_saving(bpy, lodgs, splat_scene, change, tmp_pa
 @pytest.mark.parametrize("name", RULES)
 def test_an_emptied_group_stops_nothing(bpy, lodgs, half, name, capfd):
     root = half(name)
-    group = root.lodgs.levels[0].object.modifiers[-1].node_group
+    group = lodgs("data.selection").rule_modifier(root.lodgs.levels[0].object).node_group
     group.interface.clear()
     group.nodes.clear()
     bpy.context.view_layer.update()

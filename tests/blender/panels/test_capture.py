@@ -77,7 +77,7 @@ def test_it_tells_how_far_a_capture_is_and_how_it_ended(bpy, lodgs, drawn, monke
 def test_it_is_there_where_no_splat_scene_is(bpy, lodgs, drawn):
     panel = lodgs("panels.capture").LODGS_PT_capture
     assert panel.poll(bpy.context)
-    with lodgs("data.scenes")._new_scene(bpy.context, "scene"):
+    with lodgs("data.scenes").new_scene(bpy.context, "scene"):
         pass
     assert not panel.poll(bpy.context)
 

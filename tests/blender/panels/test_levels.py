@@ -86,9 +86,9 @@ def town(bpy, lodgs):
     levels = [Level(1, splats.select(slice(0, 10)), {"d_l": 20.0}), Level(2, splats, {"d_l": 0.0})]
     table = {"x": [0, 10], "y": [0, 0], "z": [0, 0], "radius": [10, 10]}
     table = {name: np.float32(values) for name, values in table.items()}
-    with scenes._new_scene(bpy.context, "town") as root:
+    with scenes.new_scene(bpy.context, "town") as root:
         for one in levels:
-            scenes._put_level(root, one)
+            scenes.put_level(root, one)
         scenes.set_bundle_facts(root, Bundle("lodge", levels, "chunks"))
         scenes.set_tables(root, {"chunks": table})
     root.lodgs.mode, root.lodgs.eye = "SELECTIVE", "TRAINING"

@@ -18,7 +18,7 @@ def scene_of(bpy, lodgs):
         camera = bpy.data.objects.new("eye", bpy.data.cameras.new("eye"))
         bpy.context.scene.collection.objects.link(camera)
         bpy.context.scene.camera = camera
-        with lodgs("data.scenes")._new_scene(bpy.context, "scene") as root:
+        with lodgs("data.scenes").new_scene(bpy.context, "scene") as root:
             for number, s_min in enumerate(S_MIN, 1):
                 direction = rng.standard_normal((COUNT, 3))
                 direction /= np.linalg.norm(direction, axis=1, keepdims=True)

@@ -8,7 +8,7 @@ import pytest
 def root(bpy, lodgs):
     """Two cells side by side, and two views: the first cell's sees ahead, the other's is none of ours."""
     camera = lodgs("training.scenes.cameras").Camera
-    with lodgs("data.scenes")._new_scene(bpy.context, "scene") as root:
+    with lodgs("data.scenes").new_scene(bpy.context, "scene") as root:
         root.lodgs.cameras = bpy.data.collections.new("cameras")
         bpy.context.scene.collection.children.link(root.lodgs.cameras)
         for place in range(2):

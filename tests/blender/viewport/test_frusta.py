@@ -15,7 +15,7 @@ def root(bpy, lodgs):
         opacity_logits=np.float32(rng.choice([-3.0, 3.0], count)),
         sh=np.zeros((count, 1, 3), np.float32),
     )
-    with lodgs("data.scenes")._new_scene(bpy.context, "scene") as root:
+    with lodgs("data.scenes").new_scene(bpy.context, "scene") as root:
         lodgs("data.scenes").set_level(root, bundle.Level(1, splats))
     bpy.context.view_layer.update()
     return root, splats

@@ -13,7 +13,7 @@ COUNT = 1500
 def scene(bpy, lodgs):
     """The root of two levels by distance around the origin, of harmonics of degree 1."""
     rng, bundle = np.random.default_rng(4), lodgs("training.splats.bundle")
-    with lodgs("data.scenes")._new_scene(bpy.context, "scene") as root:
+    with lodgs("data.scenes").new_scene(bpy.context, "scene") as root:
         for number, s_min in ((1, 0.01), (2, 0.0)):
             splats = lodgs("training.splats.gaussians").Splats(
                 means=rng.uniform(-4, 4, (COUNT, 3)).astype(np.float32),

@@ -228,7 +228,7 @@ def test_antialiased_splats_beside_others(bpy, lodgs, picture, truth):
     scenes, bundle = lodgs("data.scenes"), lodgs("training.splats.bundle")
     sets = [(make_splats(lodgs, 6000, 1, seed, size=-5.5), np.eye(4)) for seed in range(2)]
     for (splats, _), meta in zip(sets, ({"antialias": True}, {}), strict=True):
-        with scenes._new_scene(bpy.context, "scene") as root:
+        with scenes.new_scene(bpy.context, "scene") as root:
             scenes.set_level(root, bundle.Level(1, splats))
             scenes.set_bundle_facts(root, bundle.Bundle("", [], meta=meta))
     bpy.context.view_layer.update()
@@ -242,7 +242,7 @@ def test_a_copy_and_an_instance_are_antialiased_too(bpy, lodgs, picture):
     from mathutils import Matrix
 
     scenes, bundle = lodgs("data.scenes"), lodgs("training.splats.bundle")
-    with scenes._new_scene(bpy.context, "scene") as root:
+    with scenes.new_scene(bpy.context, "scene") as root:
         level = scenes.set_level(root, bundle.Level(1, make_splats(lodgs, 20)))
         scenes.set_bundle_facts(root, bundle.Bundle("", []))
     copy, instance = level.copy(), bpy.data.objects.new("instance", None)
@@ -293,7 +293,7 @@ def fading(bpy, lodgs, camera, truth):
 
     scenes, bundle = lodgs("data.scenes"), lodgs("training.splats.bundle")
     levels = [make_splats(lodgs, 1500, 1, seed) for seed in range(2)]
-    with scenes._new_scene(bpy.context, "scene") as root:
+    with scenes.new_scene(bpy.context, "scene") as root:
         for number, splats in enumerate(levels, 1):
             scenes.set_level(root, bundle.Level(number, splats))
         facts = {"d_max": 6.0, "d_max_focal": 500.0}
@@ -430,7 +430,7 @@ def test_only_changed_splats_are_uploaded_again(bpy, lodgs, camera, picture, fra
     """Not for time, views, selection by distance, levels seen before or moved objects."""
     scenes, bundle, views = lodgs("data.scenes"), lodgs("training.splats.bundle"), lodgs("viewport.views")
     scene = bpy.context.scene
-    with scenes._new_scene(bpy.context, "scene") as root:
+    with scenes.new_scene(bpy.context, "scene") as root:
         for number, s_min in ((1, 0.003), (2, 0.0)):
             scenes.set_level(root, bundle.Level(number, make_splats(lodgs, 500, 3, number), {"s_min": s_min}))
         scenes.set_bundle_facts(root, bundle.Bundle("flod", [], "bands"))
