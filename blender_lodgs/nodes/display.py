@@ -61,6 +61,15 @@ def attach(obj: bpy.types.Object) -> None:
     keep_last(obj)
 
 
+def is_drawn_by_blender(evaluated: bpy.types.Object) -> bool:
+    """Return True if viewports show an evaluated object as Blender's own splats.
+
+    The type of its evaluated cloud does not tell: Blender drops it with the last point.
+    """
+    modifier = evaluated.modifiers.get(NAME)
+    return compat.is_native(evaluated.data) and not (modifier is not None and modifier.show_viewport)
+
+
 def keep_last(obj: bpy.types.Object) -> None:
     """Move the display modifiers behind those whose weights they apply, but before that of ellipsoids."""
     for name in (NAME, NATIVE):

@@ -25,8 +25,9 @@ import gpu
 import numpy as np
 from mathutils import Matrix
 
-from .. import compat, extension
+from .. import extension
 from ..data import changes, scenes, selection, shown
+from ..nodes import display
 from . import eye, resident, splats
 from .arranging import Arrangement, Placement, Request, arrange
 from .resident import Cloud, Reading, Resident, Store
@@ -123,7 +124,7 @@ def draw(context: bpy.types.Context) -> None:
     instances = [
         instance
         for instance in shown.splat_instances(context.evaluated_depsgraph_get(), space)
-        if not compat.is_native(instance.evaluated.data)  # Blender draws it
+        if not display.is_drawn_by_blender(instance.evaluated)
     ]
     now, matrix = time.monotonic(), region_data.window_matrix @ region_data.view_matrix
     if view.matrix is not None and view.matrix != matrix:

@@ -242,8 +242,10 @@ def test_blender_or_lodgs_draws_and_both_select_the_same_splats(bpy, lodgs, make
         bpy.context.view_layer.update()
         visible = lodgs("data.shown").splat_instances(bpy.context.evaluated_depsgraph_get())
         clouds = [instance.evaluated.data for instance in visible]
-        types[drawn_by] = {cloud.type for cloud in clouds}
+        types[drawn_by] = {cloud.type for cloud in clouds if len(cloud.points)}
         positions[drawn_by] = [lodgs("attributes").read_attribute(cloud, "position") for cloud in clouds]
+        by_blender = {lodgs("nodes.display").is_drawn_by_blender(each.evaluated) for each in visible}
+        assert by_blender == {drawn_by == "BLENDER"}
     assert types == {"LODGS": {"POINTS"}, "BLENDER": {"GAUSSIAN_SPLAT"}}
     counts = [0 if values is None else len(values) for values in positions["LODGS"]]
     assert 0 < sum(counts) < 300

@@ -108,7 +108,7 @@ def test_two_scenes_of_one_file_have_their_own(bpy, lodgs, root, file, tmp_path)
     scenes.set_tables(other, {"chunks": {name: values[::-1] for name, values in CHUNKS.items()}})
     assert exported(bpy, root, tmp_path / "out.ply") == file.read_bytes()
     for one in (root, other):
-        modifiers = lodgs("data.selection").rule_modifier([item.object) for item in one.lodgs.levels]
+        modifiers = [lodgs("data.selection").rule_modifier(item.object) for item in one.lodgs.levels]
         given = [lodgs("compat").get_input(modifier, "chunks_table") for modifier in modifiers]
         assert given == [one.lodgs.tables["chunks"].object] * 2
     assert other.lodgs.tables["chunks"].object != root.lodgs.tables["chunks"].object
