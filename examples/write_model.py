@@ -79,7 +79,9 @@ def write_model(rendered: Path, scene: Path, cameras: str, quality: int) -> pyco
     ]
 
     points = sample_points(positions)
-    seen = [visible_points(depths_of(p, view), view, points) for p, view in zip(positions, views, strict=True)]
+    seen = [
+        visible_points(depths_of(p, view), view, points) for p, view in zip(positions, views, strict=True)
+    ]
     pixels, visible = map(np.stack, zip(*seen, strict=True))  # (V, N, 2), (V, N)
     kept = visible.sum(axis=0) >= SHORTEST_TRACK
     points, pixels = points[kept], pixels[:, kept]

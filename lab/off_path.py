@@ -72,7 +72,9 @@ def pixels(
                           outputs=("median_depth",), backend=evaluation.backend)  # fmt: skip
         assert drawn.median_depth is not None
         difference = to_8_bit(drawn.image.cpu()) - evaluation.target(camera).image
-        views = np.sum([visible_points(depths, view, places.reshape(-1, 3))[1] for view, depths in train], axis=0)
+        views = np.sum(
+            [visible_points(depths, view, places.reshape(-1, 3))[1] for view, depths in train], axis=0
+        )
         depths = drawn.median_depth.cpu().numpy() / depths_of(places, camera)
         yield difference.square().mean(2).numpy().ravel(), views, depths.ravel()
 

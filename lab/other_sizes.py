@@ -66,9 +66,7 @@ def psnr_by_size(run: Path) -> Iterator[tuple[int, str, dict[int, float]]]:
                 who,
                 {
                     level.number: float(
-                        evaluation.compare_views(
-                            evaluation.cameras, full_detail_source(bundle, level)
-                        ).mean()
+                        evaluation.compare_views(evaluation.cameras, full_detail_source(bundle, level)).mean()
                     )
                     for level in standalone_levels(bundle)
                 },
