@@ -119,7 +119,7 @@ def test_files_with_the_old_names_open_with_blenders(bpy, lodgs, make, native, t
 def test_levels_of_another_blender_get_this_ones_modifiers(bpy, lodgs, make, tmp_path):
     """A file saved before Blender 5.3 has plain clouds, the points' material and one display modifier."""
     write_ply(tmp_path / "s.ply", make(40, 1))
-    root = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "s.ply")
+    root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "s.ply")
     obj, display = root.lodgs.levels[0].object, lodgs("nodes.display")
     expected = [modifier.name for modifier in obj.modifiers]
     if lodgs("compat").NATIVE_SPLATS:
@@ -224,7 +224,7 @@ def test_cycles_draws_a_level_as_blenders_own_import(bpy, lodgs, make, with_spla
 
     path = str(tmp_path / "s.ply")
     theirs = rendered(lambda: bpy.ops.wm.ply_import(filepath=path))
-    ours = rendered(lambda: lodgs("data.scenes").import_splats(bpy.context, path, upright=False))
+    ours = rendered(lambda: lodgs("data.importing").import_splats(bpy.context, path, upright=False))
     assert theirs[..., :3].std() > 0.1
     np.testing.assert_array_equal(ours, theirs)
 
@@ -234,7 +234,7 @@ def test_blender_or_lodgs_draws_and_both_select_the_same_splats(bpy, lodgs, make
     files = lodgs("training.splats.levels")
     levels = [files.Level(n, make(100 * n, 1, seed=n), {"s_min": s}) for n, s in ((1, 0.5), (2, 0.0))]
     bundles.write_bundle(tmp_path / "b.ply", files.Bundle("flod", levels, "bands", {}, {"gamma": 1.0}))
-    root = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "b.ply")
+    root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply")
     root.lodgs.mode, root.lodgs.eye, root.lodgs.camera_center = "SELECTIVE", "TRAINING", (0, 0, -1)
     settings = bpy.context.scene.lodgs_viewport
     positions, types = {}, {}
@@ -263,7 +263,7 @@ def test_blender_draws_looks_paint_and_weights(bpy, lodgs, make, with_splats, tm
     """What Blender draws from is the look of ``training.editing.look``, and export has it once."""
     splats = make(80, 3)
     write_ply(tmp_path / "s.ply", splats)
-    root = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "s.ply", upright=False)
+    root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "s.ply", upright=False)
     obj = root.lodgs.levels[0].object
     look = root.lodgs_look
     look.exposure, look.tint, look.saturation, look.opacity = -1.0, (1.0, 0.5, 0.7), 0.6, 0.5
