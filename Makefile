@@ -1,7 +1,7 @@
 # Entry point for all tasks. Each target installs its own dependencies (make setup).
 PYTHON ?= python3
 VENV := .venv/bin/python
-BLENDER_5_2 := .venv-blender-5.2/bin/python
+BLENDER_5_3 := .venv-blender-5.3/bin/python
 METHOD ?= flod
 INPUTS ?= 20000
 SCENES ?= examples/lantern_garden examples/lantern_walk
@@ -9,17 +9,18 @@ SCENES ?= examples/lantern_garden examples/lantern_walk
 LOCK := .venv/bin/uv pip compile --quiet --universal --generate-hashes --no-build --custom-compile-command "make pins"
 # One worker per core. Kernels are compiled once into the user's cache.
 PYTEST := -m pytest -n auto
-quick test test-5.0 nightly fuzz: export OMP_NUM_THREADS := 1  # the workers already use every core
+quick test test-5.0 test-5.2 nightly fuzz: export OMP_NUM_THREADS := 1  # the workers already use every core
 export LODGS_TRAINER_PYTHON := $(CURDIR)/$(VENV)
 
-.PHONY: help setup demo check quick test test-5.0 nightly fuzz attacks lint docs tables bench bench-quality bench-lod bench-tree bench-blocks extension pins \
+.PHONY: help setup demo check quick test test-5.0 test-5.2 nightly fuzz attacks lint docs tables bench bench-quality bench-lod bench-tree bench-blocks extension pins \
 	window interop clean
 
 help:
-	@echo "make setup      create the environments from pinned packages (Python 3.11; also 3.13 for Blender 5.2's tests)"
+	@echo "make setup      create the environments from pinned packages (Python 3.11; also 3.13 for Blender 5.3's tests)"
 	@echo "make demo       import, train, select, measure and export the example scene (METHOD=flod)"
 	@echo "make check      style, types and quick tests, about a minute; run it often"
-	@echo "make test       all tests except nightly ones, in Blender 4.5 and, with Python 3.13, in Blender 5.2"
+	@echo "make test       all tests except nightly ones, in Blender 4.5 and, with Python 3.13, in Blender 5.3"
+	@echo "make test-5.2   the Blender tests in Blender 5.2 (test-5.0: in 5.0)"
 	@echo "make nightly    long tests and those of laboratory tools"
 	@echo "make fuzz       20,000 corrupt inputs for every reader (INPUTS=20000, SEED=number), some minutes"
 	@echo "make lint       style and types"
@@ -52,16 +53,16 @@ quick: setup
 test: setup
 	$(VENV) $(PYTEST) -m "not nightly" tests/training tests/fuzz
 	$(VENV) $(PYTEST) -m "not nightly" tests/blender
-	@if [ -x $(BLENDER_5_2) ]; then set -x; $(BLENDER_5_2) $(PYTEST) -m "not nightly" tests/blender; fi
+	@if [ -x $(BLENDER_5_3) ]; then set -x; $(BLENDER_5_3) $(PYTEST) -m "not nightly" tests/blender; fi
 
-test-5.0: setup
-	@$(PYTHON) tools/setup.py 5.0
-	.venv-blender-5.0/bin/python $(PYTEST) tests/blender
+test-5.0 test-5.2: test-%: setup
+	@$(PYTHON) tools/setup.py $*
+	.venv-blender-$*/bin/python $(PYTEST) tests/blender
 
 nightly: setup
 	$(VENV) $(PYTEST) -m nightly tests/training tests/fuzz tests/lab
 	$(VENV) $(PYTEST) -m nightly tests/blender
-	@if [ -x $(BLENDER_5_2) ]; then set -x; $(BLENDER_5_2) $(PYTEST) -m nightly tests/blender; fi
+	@if [ -x $(BLENDER_5_3) ]; then set -x; $(BLENDER_5_3) $(PYTEST) -m nightly tests/blender; fi
 
 fuzz: setup
 	LODGS_FUZZ=$(INPUTS) $(VENV) $(PYTEST) tests/fuzz --timeout 0 $(if $(SEED),--hypothesis-seed $(SEED))
@@ -81,7 +82,7 @@ bench: setup
 	$(VENV) tools/bench.py $(if $(BASE),--base $(BASE))
 	$(VENV) tools/bench_gpu.py
 	$(VENV) tools/bench_blender.py
-	@if [ -x $(BLENDER_5_2) ]; then set -x; $(BLENDER_5_2) tools/bench_blender.py; fi
+	@if [ -x $(BLENDER_5_3) ]; then set -x; $(BLENDER_5_3) tools/bench_blender.py; fi
 
 bench-quality: setup
 	$(VENV) tools/bench_quality.py $(SCENES) $(if $(BASE),--report --base $(BASE)) $(if $(METHODS),--methods $(METHODS))
@@ -102,7 +103,9 @@ extension: setup
 pins: setup
 	for name in trainer cuda cluster develop blender-5.0; do $(LOCK) $(if $(UPGRADE),--upgrade) --python-version 3.11 \
 		requirements/$$name.in -o requirements/$$name.txt || exit 1; done
-	$(LOCK) $(if $(UPGRADE),--upgrade) --python-version 3.13 requirements/blender-5.2.in -o requirements/blender-5.2.txt
+	for name in blender-5.2 blender-5.3; do $(LOCK) $(if $(UPGRADE),--upgrade) --python-version 3.13 \
+		requirements/$$name.in -o requirements/$$name.txt || exit 1; done
+	$(VENV) tools/blender_versions.py
 
 window: setup
 	$(VENV) tools/window.py --method $(METHOD) $(if $(LONG),--long) $(if $(WALK),--walk)
@@ -116,4 +119,4 @@ attacks: setup
 	$(VENV) tools/attacks_blocks.py
 
 clean:
-	rm -rf build dist .venv .venv-blender-5.2 .venv-blender-5.0
+	rm -rf build dist .venv .venv-blender-*

@@ -1,8 +1,11 @@
 """The attributes of splats and points in Blender: their names, how they are read and how they are written.
 
-They follow Blender 5.3's native splats: ``position``, ``radiance:base`` (the three DC coefficients and the
-opacity), ``radiance:sh_1``.. (one vector a coefficient), ``scale`` (standard deviations) and ``rotation``
-(unit quaternion wxyz).
+They are those of Blender 5.3's native splats, in every Blender: ``position``, ``radiance:base`` (the three DC
+coefficients and the opacity), ``radiance:sh_0`` to ``radiance:sh_14`` (one vector per higher coefficient),
+``scale`` (standard deviations) and ``rotation`` (unit quaternion wxyz).
+
+Files saved before Blender 5.3 count the higher coefficients from 1. Readers take both names: a cloud with
+``radiance:sh_0`` counts from 0.
 """
 
 from __future__ import annotations
@@ -13,7 +16,8 @@ from typing import NamedTuple
 import bpy
 import numpy as np
 
-BASE, SH, SCALE, ROTATION = "radiance:base", "radiance:sh_{}", "scale", "rotation"
+BASE, SCALE, ROTATION = "radiance:base", "scale", "rotation"
+_SH = "radiance:sh_{}"
 LOG_SCALE, OPACITY_LOGIT, QUATERNION = "log_scale", "opacity_logit", "quaternion"
 COLOR, RADIUS, WEIGHT, HIDDEN = "display_color", "radius", "lod_weight", "hidden"
 SELECTION = ".selection"
@@ -22,6 +26,38 @@ LOOK_OPACITY = "look_opacity"
 """What a look makes of opacities, a factor, where Blender itself draws splats (``nodes.look``)."""
 COLUMN = "column:{}"
 """A file's column whose own name may mean something else to Blender; every column of a table."""
+
+
+MAX_HIGHER_SH = 24
+"""Number of coefficients above degree 0 at degree 4."""
+
+
+def sh_name(coefficient: int) -> str:
+    """Return the attribute name of SH coefficient ``coefficient`` (1 to 24; 0 is in ``radiance:base``)."""
+    return _SH.format(coefficient - 1)
+
+
+def sh_names(cloud: bpy.types.PointCloud) -> list[str]:
+    """Return the attribute names of a cloud's SH coefficients above degree 0, in the order of the basis.
+
+    The list covers complete degrees only, up to degree 4: 0, 3, 8, 15 or 24 names.
+    """
+    first = 0 if _SH.format(0) in cloud.attributes else 1
+    count = 0
+    while count < MAX_HIGHER_SH and _SH.format(first + count) in cloud.attributes:
+        count += 1
+    complete = int((count + 1) ** 0.5) ** 2 - 1
+    return [_SH.format(first + index) for index in range(complete)]
+
+
+def rename_sh(cloud: bpy.types.PointCloud) -> None:
+    """Rename coefficients counted from 1, as files before Blender 5.3 have them, to Blender's names."""
+    if _SH.format(0) in cloud.attributes:
+        return
+    index = 1
+    while (attribute := cloud.attributes.get(_SH.format(index))) is not None:
+        attribute.name = _SH.format(index - 1)
+        index += 1
 
 
 class Layout(NamedTuple):

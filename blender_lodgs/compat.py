@@ -32,14 +32,23 @@ def _native_splats() -> tuple[str, str] | None:
 
 
 NATIVE_SPLATS = _native_splats()
-"""The property of point clouds, and its value, that has Blender draw splats itself; None before 5.3."""
+"""Property of point clouds, and its value, with which Blender draws Gaussian splats; None before 5.3."""
+
+
+NATIVE_HIGHER_SH = 15
+"""SH coefficients above degree 0 that Blender's own splats have: up to degree 3."""
 
 
 def make_native(cloud: bpy.types.PointCloud) -> bool:
-    """Has Blender draw a point cloud as Gaussian splats where it can; whether it does."""
+    """Set a point cloud's type to Gaussian splats; return False where Blender has no such type."""
     if NATIVE_SPLATS:
         setattr(cloud, *NATIVE_SPLATS)
     return bool(NATIVE_SPLATS)
+
+
+def is_native(cloud: bpy.types.PointCloud) -> bool:
+    """Return True if Blender draws a point cloud as Gaussian splats."""
+    return NATIVE_SPLATS is not None and getattr(cloud, NATIVE_SPLATS[0]) == NATIVE_SPLATS[1]
 
 
 def new_point_cloud(name: str, count: int) -> bpy.types.PointCloud:

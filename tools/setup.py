@@ -1,8 +1,9 @@
 """Create the environments for `make`. Standard library only; runs on the system's Python.
 
 python3 tools/setup.py            .venv (Python 3.11: trainer, Blender 4.5 as a module, checks) and, if
-                                  Python 3.13 is installed, .venv-blender-5.2 (Blender 5.2 as a module)
+                                  Python 3.13 is installed, .venv-blender-5.3 (Blender 5.3 as a module)
 python3 tools/setup.py 5.0        .venv-blender-5.0 (Blender 5.0, Python 3.11)
+python3 tools/setup.py 5.2        .venv-blender-5.2 (Blender 5.2, Python 3.13)
 """
 
 from __future__ import annotations
@@ -103,12 +104,18 @@ def main() -> int:
         if sys.argv[1:] == ["5.0"]:
             make(".venv-blender-5.0", python, "blender-5.0.txt")
             return 0
-        make(".venv", python, "develop.txt")
         newer = find_python("3.13")
-        if newer is not None:
+        if sys.argv[1:] == ["5.2"]:
+            if newer is None:
+                print("setup: Blender 5.2 needs Python 3.13; install it.", file=sys.stderr)
+                return 1
             make(".venv-blender-5.2", newer, "blender-5.2.txt")
-        elif not (ROOT / ".venv-blender-5.2").exists():
-            print("setup: Python 3.13 not found; tests in Blender 5.2 will be skipped.", file=sys.stderr)
+            return 0
+        make(".venv", python, "develop.txt")
+        if newer is not None:
+            make(".venv-blender-5.3", newer, "blender-5.3.txt")
+        elif not (ROOT / ".venv-blender-5.3").exists():
+            print("setup: Python 3.13 not found; tests in Blender 5.3 will be skipped.", file=sys.stderr)
         if sys.platform.startswith("linux") and not ctypes.util.find_library("vulkan"):
             print(
                 "setup: Vulkan not found; tests of the gpu backend will be skipped. On Debian, install",

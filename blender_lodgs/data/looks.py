@@ -19,6 +19,7 @@ from ...training.editing.look import DAYLIGHT, NEUTRAL, RANGES, Look
 from ...training.editing.paint import COLUMNS as PAINT
 from ...training.lod.crop import Crop
 from .. import compat
+from ..attributes import sh_names
 from ..nodes import ellipsoids
 from ..nodes import look as groups
 from ..nodes.building import add_switched_modifier, find_modifier, remove_modifier, replace_driver
@@ -156,10 +157,14 @@ def modifier_of(obj: bpy.types.Object) -> bpy.types.NodesModifier | None:
 
 
 def outdated(root: bpy.types.Object) -> bool:
-    """Whether regions have come or gone since modifiers were last given them."""
+    """True if a level's modifier is another version's, or lacks a region that has come since, or has one
+    that has gone."""
     regions = regions_of(root)
-    return any(
-        crops.followed_by(item.object, groups.COUNT) != regions for item in root.lodgs.levels if item.exists
+    levels = [item.object for item in root.lodgs.levels if item.exists]
+    return any(crops.followed_by(obj, groups.COUNT) != regions for obj in levels) or not all(
+        groups.is_current(modifier.node_group, len(regions), len(sh_names(obj.data)))
+        for obj in levels
+        if (modifier := modifier_of(obj)) is not None
     )
 
 
@@ -181,13 +186,13 @@ def _attach(obj: bpy.types.Object, root: bpy.types.Object, regions: list[bpy.typ
     modifier = modifier_of(obj)
     if (
         modifier is not None
-        and groups.is_current(modifier.node_group, len(regions))
+        and groups.is_current(modifier.node_group, len(regions), len(sh_names(obj.data)))
         and crops.followed_by(obj, groups.COUNT) == regions
     ):
         return
     detach(obj)
     modifier = add_switched_modifier(
-        obj, groups.look_group(len(regions)),
+        obj, groups.look_group(len(regions), len(sh_names(obj.data))),
         show_viewport="lodgs_viewport.points", show_render="lodgs_render.draws_points",
     )  # fmt: skip
     last = obj.modifiers.find(ellipsoids.NAME)

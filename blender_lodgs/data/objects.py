@@ -31,9 +31,11 @@ from ..attributes import (
     RADIUS,
     ROTATION,
     SCALE,
-    SH,
     WEIGHT,
     read_attribute,
+    rename_sh,
+    sh_name,
+    sh_names,
     write_attribute,
 )
 from ..nodes import display
@@ -44,6 +46,8 @@ _OWN = {
 }  # fmt: skip
 _TYPE = "lodgs_type:"  # custom property that remembers a column's type
 _EXTRA = COLUMN.format("")
+_OPACITIES = 1e-12, 1 - 2.0**-24
+"""Range of opacities that have a finite logit: up to the float32 next to 1."""
 _MADE = ("scenes", "objects", "collections", "pointclouds", "meshes", "cameras", "images")
 
 
@@ -71,34 +75,51 @@ def new_points(name: str, positions: np.ndarray, colors: np.ndarray, radius: flo
     cloud = compat.new_point_cloud(name, len(positions))
     write_attribute(cloud, "position", "FLOAT_VECTOR", positions)
     write_attribute(cloud, RADIUS, "FLOAT", np.full(len(positions), radius))
-    return _in_colors(name, cloud, colors)
+    cloud.materials.append(display.points_material())
+    obj = bpy.data.objects.new(name, cloud)
+    _set_colors(obj, colors)
+    return obj
 
 
 @all_or_nothing()
 def new_splats(name: str, splats: Splats) -> bpy.types.Object:
     """Splats as an object that is in no collection yet; its local space is the splats' world."""
     cloud = compat.new_point_cloud(name, len(splats))
-    opacity, scale = _sigmoid(splats.opacity_logits), np.exp(splats.log_scales)
+    opacity = _sigmoid(splats.opacity_logits)
+    scale = _exp(splats.log_scales)
     base = np.empty((len(splats), 4), np.float32)
     base[:, :3], base[:, 3] = splats.sh[:, 0], opacity
     write_attribute(cloud, "position", "FLOAT_VECTOR", splats.means)
     write_attribute(cloud, BASE, compat.WIDE_TYPE, base)
     for k in range(1, splats.sh.shape[1]):
-        write_attribute(cloud, SH.format(k), "FLOAT_VECTOR", splats.sh[:, k])
+        write_attribute(cloud, sh_name(k), "FLOAT_VECTOR", splats.sh[:, k])
     write_attribute(cloud, SCALE, "FLOAT_VECTOR", scale)
     write_attribute(cloud, ROTATION, "QUATERNION", _unit(splats.quats))
-    write_attribute(cloud, LOG_SCALE, "FLOAT_VECTOR", splats.log_scales)
-    write_attribute(cloud, OPACITY_LOGIT, "FLOAT", splats.opacity_logits)
-    write_attribute(cloud, QUATERNION, compat.WIDE_TYPE, splats.quats)
     for column, values in splats.extras.items():
         taken = column in _OWN or column.startswith((".", _EXTRA, "radiance:"))
         write_column(cloud, _EXTRA + column if taken else column, values)
+    obj = bpy.data.objects.new(name, cloud)
+    complete_attributes(obj, splats)
+    return obj
+
+
+def complete_attributes(obj: bpy.types.Object, splats: Splats) -> None:
+    """Give a splat object the attributes and modifiers by which LODGS edits, draws and exports it.
+
+    Args:
+        splats: those of the object, as :func:`read_splats` returns them.
+    """
+    cloud = obj.data
+    rename_sh(cloud)
+    write_attribute(cloud, LOG_SCALE, "FLOAT_VECTOR", splats.log_scales)
+    write_attribute(cloud, OPACITY_LOGIT, "FLOAT", splats.opacity_logits)
+    write_attribute(cloud, QUATERNION, compat.WIDE_TYPE, splats.quats)
     # A sphere with the splat's mean size; a faint splat covers less, so that fog does not hide the scene.
+    opacity = _sigmoid(splats.opacity_logits)
     radius = np.exp(splats.log_scales @ np.full(3, 1 / 3, np.float32)) * np.sqrt(opacity)
     write_attribute(cloud, RADIUS, "FLOAT", radius)
-    obj = _in_colors(name, cloud, to_bytes(SH_C0 * splats.sh[:, 0] + np.float32(0.5)))
+    _set_colors(obj, to_bytes(SH_C0 * splats.sh[:, 0] + np.float32(0.5)))
     display.attach(obj)
-    return obj
 
 
 def root_of(obj: bpy.types.Object | None) -> bpy.types.Object | None:
@@ -150,18 +171,16 @@ def splats_of(cloud: bpy.types.PointCloud, weights: np.ndarray | None = None) ->
         return None
     if weights is not None:
         base[:, 3] *= weights
-    coefficients = [base[:, :3]]
-    while (vector := read_attribute(cloud, SH.format(len(coefficients)))) is not None:
-        coefficients.append(vector)
-    whole = int(np.sqrt(len(coefficients))) ** 2  # a band that has lost a coefficient is left out
+    sh = np.stack([base[:, :3], *(read_attribute(cloud, name) for name in sh_names(cloud))], axis=1)
     tiny = np.float32(1e-30)
-    opacity = np.clip(base[:, 3], np.float32(1e-6), np.float32(1 - 1e-6))
+    opacity = np.clip(base[:, 3].astype(np.float64), *_OPACITIES)
+    logits = np.log(opacity / (1 - opacity)).astype(np.float32)
     return Splats(
         means=means,
         quats=_kept(cloud, QUATERNION, _unit, rotation, rotation),
-        log_scales=_kept(cloud, LOG_SCALE, np.exp, scale, np.log(np.maximum(scale, tiny))),
-        opacity_logits=_kept(cloud, OPACITY_LOGIT, _sigmoid, base[:, 3], np.log(opacity / (1 - opacity))),
-        sh=np.stack(coefficients[:whole], axis=1),
+        log_scales=_kept(cloud, LOG_SCALE, _exp, scale, np.log(np.maximum(scale, tiny))),
+        opacity_logits=_kept(cloud, OPACITY_LOGIT, _sigmoid, base[:, 3], logits),
+        sh=sh,
     )
 
 
@@ -177,8 +196,7 @@ def megabytes(cloud: bpy.types.PointCloud) -> float:
 
 def sh_degree(cloud: bpy.types.PointCloud) -> int:
     """The degree of the spherical harmonics that a point cloud of splats carries."""
-    bands = sum(a.name.startswith(SH.format("")) for a in cloud.attributes)
-    return int(np.sqrt(bands + 1)) - 1
+    return int((len(sh_names(cloud)) + 1) ** 0.5) - 1
 
 
 def to_bytes(colors: np.ndarray) -> np.ndarray:
@@ -215,37 +233,14 @@ def read_column(
     return values if values is None or kind is None else values.astype(kind)
 
 
-def _in_colors(name: str, cloud: bpy.types.PointCloud, colors: np.ndarray) -> bpy.types.Object:
-    """An object of the cloud in its (N, 3) uint8 sRGB colours; Blender shades in linear light."""
+def _set_colors(obj: bpy.types.Object, colors: np.ndarray) -> None:
+    """Set the (N, 3) uint8 sRGB display colours of an object's points; Blender shades in linear light."""
     linear = linear_from_srgb(np.arange(256, dtype=np.float32) / 255).astype(np.float32)
     rgba = np.ones((len(colors), 4), np.float32)
     rgba[:, :3] = linear[colors]
-    write_attribute(cloud, COLOR, "FLOAT_COLOR", rgba)
-    cloud.materials.append(_material())
-    obj = bpy.data.objects.new(name, cloud)
+    write_attribute(obj.data, COLOR, "FLOAT_COLOR", rgba)
     if len(colors):
         obj.color = rgba.mean(axis=0)  # what Solid shading can show of a point cloud
-    return obj
-
-
-def _material() -> bpy.types.Material:
-    """The one material that shows every point in its display colour, unlit."""
-    name = "LODGS Points"
-    material = bpy.data.materials.get((name, None))
-    if material is None:
-        material = bpy.data.materials.new(name)
-        if material.node_tree is None:
-            material.use_nodes = True
-        nodes, links = material.node_tree.nodes, material.node_tree.links
-        nodes.clear()
-        color, emission = nodes.new("ShaderNodeAttribute"), nodes.new("ShaderNodeEmission")
-        output = nodes.new("ShaderNodeOutputMaterial")
-        color.attribute_name = COLOR
-        links.new(color.outputs["Color"], emission.inputs["Color"])
-        links.new(emission.outputs["Emission"], output.inputs["Surface"])
-        for x, node in enumerate((color, emission, output)):
-            node.location = (x * 200, 0)
-    return material
 
 
 def _kept(cloud, name: str, activate, visible: np.ndarray, inverse: np.ndarray) -> np.ndarray:
@@ -261,11 +256,22 @@ def _kept(cloud, name: str, activate, visible: np.ndarray, inverse: np.ndarray) 
     return stored if same.all() else np.where(same, stored, inverse)
 
 
+# The next three functions round as Blender's importers do, so that both give the same bits and Cycles, whose
+# noise depends on them, the same image.
+
+
+def _exp(values: np.ndarray) -> np.ndarray:
+    with np.errstate(over="ignore"):
+        return np.exp(values, dtype=np.float64).astype(np.float32)
+
+
 def _sigmoid(logits: np.ndarray) -> np.ndarray:
     with np.errstate(over="ignore"):
-        return 1 / (1 + np.exp(-logits))
+        return np.float32(1) / (np.float32(1) + _exp(-logits))
 
 
 def _unit(quats: np.ndarray) -> np.ndarray:
-    norm = np.sqrt(np.einsum("ij,ij->i", quats, quats))[:, None]
-    return np.where(norm > 0, quats / np.maximum(norm, np.float32(1e-30)), np.float32([1, 0, 0, 0]))
+    w, x, y, z = np.square(quats, dtype=np.float32).T
+    norm = np.sqrt(((w + x) + y) + z)[:, None]
+    unit = quats * (np.float32(1) / np.maximum(norm, np.float32(1e-30)))
+    return np.where(norm > 0, unit, np.float32([1, 0, 0, 0]))

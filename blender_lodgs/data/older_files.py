@@ -7,7 +7,9 @@ import json
 import bpy
 
 from ...training.lod.rule import find_rule
-from . import selection
+from ..attributes import BASE, LOG_SCALE, rename_sh
+from ..nodes import display
+from . import looks, selection
 
 
 def bring_up_to_date(root: bpy.types.Object) -> None:
@@ -18,13 +20,24 @@ def bring_up_to_date(root: bpy.types.Object) -> None:
     if rule is not None and levels and not root.lodgs.begun:  # as long as nobody had set it, it went along
         finest = {control.name: levels[-1] for control in rule.controls if control.follows == "finest"}
         root.lodgs.begun = json.dumps(finest)
-    if selection.outdated(root):
+    if selection.outdated(root) or looks.outdated(root):
         selection.attach(root)
 
 
 @bpy.app.handlers.persistent
 def _on_load(*_) -> None:
     """After opening a file, and after appending from one. What is linked stays as its own file has it."""
+    for cloud in bpy.data.pointclouds:
+        if cloud.is_editable and BASE in cloud.attributes:
+            rename_sh(cloud)
+    for obj in bpy.data.objects:
+        if (
+            obj.type == "POINTCLOUD"
+            and obj.is_editable
+            and obj.data.is_editable
+            and LOG_SCALE in obj.data.attributes
+        ):
+            display.attach(obj)
     for obj in bpy.data.objects:
         if obj.lodgs.is_root and obj.is_editable:
             bring_up_to_date(obj)

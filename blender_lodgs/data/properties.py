@@ -9,6 +9,7 @@ from typing import Any
 import bpy
 
 from ...training.lod.rule import Control, Rule, rules
+from .. import compat
 from .selection import read_json
 from .training import PARAMETERS, TrainingCell, TrainingSettings
 from .viewpoints import ViewsSettings
@@ -48,6 +49,14 @@ def _single_changed(self, context) -> None:
 
 def _became_root(self, context) -> None:
     self.itself = self.id_data if self.is_root else None
+
+
+def _is_native(self) -> bool:
+    return compat.NATIVE_SPLATS is not None and self.splats and self.drawn_by == "BLENDER"
+
+
+def _hides_blender(self) -> bool:
+    return self.splats if compat.NATIVE_SPLATS is None else not _is_native(self)
 
 
 def _antialias(self) -> bool:
@@ -404,9 +413,37 @@ class ViewportSettings(bpy.types.PropertyGroup):
         update=_changed,
         options=set(),
     )
+    drawn_by: bpy.props.EnumProperty(
+        name="Drawn By",
+        description="Program part that draws splats in the 3D viewport",
+        items=[
+            (
+                "LODGS", "LODGS",
+                "Levels of detail with a splat budget, streaming, level colours and the selection overlay",
+            ),
+            (
+                "BLENDER", "Blender",
+                "Blender's own splats with the same levels, without splat budget, streaming, level colours "
+                "and selection overlay",
+            ),
+        ],
+        default="LODGS",
+        update=_changed,
+        options=set(),
+    )  # fmt: skip
+    native: bpy.props.BoolProperty(
+        description="Blender draws splats in viewports itself",
+        get=_is_native,
+        options={"HIDDEN"},
+    )
     points: bpy.props.BoolProperty(
-        description="Whether Blender draws splats, as points",
-        get=lambda self: not self.splats,
+        description="Blender draws splat objects in viewports, as points or as splats of its own",
+        get=lambda self: not self.splats or self.native,
+        options={"HIDDEN"},
+    )
+    hides_blender: bpy.props.BoolProperty(
+        description="Blender's own drawing of splat objects is hidden or reduced to points in viewports",
+        get=_hides_blender,
         options={"HIDDEN"},
     )
     budget: bpy.props.IntProperty(

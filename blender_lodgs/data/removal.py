@@ -10,8 +10,8 @@ from __future__ import annotations
 import bpy
 
 from . import crops, photographs, tables
-from .placement import axes_of
 from .importing import ABOUT
+from .placement import axes_of
 
 
 def remove(root: bpy.types.Object) -> None:

@@ -8,6 +8,8 @@ operators call and what scripts may call.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import bpy
 import numpy as np
@@ -20,7 +22,7 @@ from ...training.scenes.view_tables import VIEWS, make_view_tables
 from ...training.scenes.view_tables import transform_views as placed_views
 from ...training.splats.gaussians import Splats
 from ...training.splats.levels import Bundle, Level
-from .. import extension
+from .. import compat, extension
 from ..nodes import ellipsoids
 from . import cleaning, crops, looks, objects, painting, selection, streams, tables
 from .controls import changed_controls, update_controls
@@ -55,7 +57,7 @@ def set_bundle_facts(root: bpy.types.Object, bundle: Bundle) -> None:
             item.facts = json.dumps(facts[item.number])
     if "camera_center" in bundle.meta:
         settings.camera_center = bundle.meta["camera_center"]
-    _levels_changed(root)
+    levels_changed(root)
 
 
 def set_tables(root: bpy.types.Object, given: Tables) -> None:
@@ -77,7 +79,7 @@ def set_level(root: bpy.types.Object, level: Level) -> bpy.types.Object:
     """
     first = not root.lodgs.levels
     obj = put_level(root, level)
-    _levels_changed(root)
+    levels_changed(root)
     if level.number == root.lodgs.levels[-1].number:
         root.lodgs.single_level = level.number
         root.lodgs.active_level = len(root.lodgs.levels) - 1
@@ -121,7 +123,7 @@ def make_room(root: bpy.types.Object, number: int) -> None:
         if kept.object.name == _level_name(root, kept.number):
             kept.object.name = _level_name(root, number)
         kept.number = number
-    _levels_changed(root)
+    levels_changed(root)
 
 
 def read_levels(root: bpy.types.Object, placed: bool = False, looked: bool = False) -> Bundle:
@@ -204,7 +206,7 @@ def delete_left_out(root: bpy.types.Object) -> int:
             obj.lodgs_crop.keep = "ALL"
         else:
             bpy.data.objects.remove(obj)
-    _levels_changed(root)
+    levels_changed(root)
     return before - sum(len(level.splats) for level in bundle.levels)
 
 
@@ -239,10 +241,13 @@ def shown_splats(
         LodgsError: nothing is visible, or the levels have spherical harmonics of different degrees; or of
             placed ones, the root is stretched.
     """
-    depsgraph = context.evaluated_depsgraph_get()
-    parts = [
-        objects.read_splats(item.object, depsgraph) for item in root.lodgs.levels if _visible(context, item)
-    ]
+    with _drawn_by_lodgs(context):
+        depsgraph = context.evaluated_depsgraph_get()
+        parts = [
+            objects.read_splats(item.object, depsgraph)
+            for item in root.lodgs.levels
+            if _visible(context, item)
+        ]
     if looked:
         parts = [look.apply_looks(part, _looks(root)) for part in parts]
     if not any(len(part) for part in parts):
@@ -261,6 +266,22 @@ def shown_splats(
     if not placed:
         return splats
     return placement_of(root).transform_splats(splats, *((rule.lengths, rule.places) if rule else ()))
+
+
+@contextmanager
+def _drawn_by_lodgs(context: bpy.types.Context) -> Iterator[None]:
+    """Evaluate objects without the modifiers that apply weights and looks for Blender's own drawing."""
+    settings = context.scene.lodgs_viewport
+    before = settings.splats, settings.drawn_by
+    if compat.NATIVE_SPLATS is None or not settings.points:
+        yield
+        return
+    settings.splats, settings.drawn_by = True, "LODGS"
+    try:
+        context.view_layer.update()
+        yield
+    finally:
+        settings.splats, settings.drawn_by = before
 
 
 def count_shown(context: bpy.types.Context, root: bpy.types.Object) -> tuple[int, int]:
@@ -356,7 +377,7 @@ def _level_name(root: bpy.types.Object, number: int) -> str:
     return f"{root.name} level {number}"
 
 
-def _levels_changed(root: bpy.types.Object) -> None:
+def levels_changed(root: bpy.types.Object) -> None:
     """Drops levels whose objects are gone, keeps the settings within the rest, and renews the drivers."""
     settings = root.lodgs
     for index in reversed(range(len(settings.levels))):
@@ -384,7 +405,7 @@ def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     if depsgraph.id_type_updated("COLLECTION"):
         for root in editable:
             if not all(item.exists for item in root.lodgs.levels):
-                _levels_changed(root)
+                levels_changed(root)
     if depsgraph.id_type_updated("OBJECT"):
         for root in editable:
             if crops.outdated(root) or looks.outdated(root):

@@ -20,10 +20,10 @@ from ...training.lod.query import LodQuery
 from ...training.lod.rule import Rule, collect_facts, fact_names, find_rule
 from .. import compat
 from ..nodes import crops as crop_groups
+from ..nodes import display
 from ..nodes import look as look_groups
 from ..nodes import rules as groups
 from ..nodes.building import remove_modifier, replace_driver
-from ..nodes.display import NAME as DISPLAY
 from . import crops, looks
 from .placement import axes_of
 from .tables import read_table
@@ -35,7 +35,7 @@ def choice(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> LodQu
     None where all is shown. A modifier whose group somebody has changed counts as none (:func:`only_chosen`).
     """
     cropped = crops.of_modifier(evaluated, depsgraph, lambda modifier: _is_on(modifier, depsgraph))
-    modifier = _modifier(evaluated)
+    modifier = rule_modifier(evaluated)
     rule = None if modifier is None else groups.rule_of_group(modifier.node_group)
     if modifier is None or rule is None or not _is_on(modifier, depsgraph):
         return None if cropped is None else LodQuery.from_crops(cropped)
@@ -73,7 +73,7 @@ def _frozen(obj: bpy.types.Object | None) -> tuple[tuple[str, str, bytes], ...]:
 def only_chosen(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bool:
     """Whether an evaluated object shows its own splats as they are, chosen by nothing but :func:`choice`."""
     return all(
-        modifier.type == "NODES" and (modifier.name == DISPLAY or _chooses(modifier.node_group))
+        modifier.type == "NODES" and (modifier.name == display.NAME or _chooses(modifier.node_group))
         for modifier in evaluated.modifiers
         if _is_on(modifier, depsgraph)
     )
@@ -170,11 +170,18 @@ def follow_crops(root: bpy.types.Object) -> None:
 
 
 def _order(root: bpy.types.Object) -> None:
-    """Crops come before a rule that asks how many splats there are; else after it, where fewer are left."""
+    """Put the modifiers of levels into the order in which they work.
+
+    Crops come before a rule that asks how many splats there are; else after it, where fewer are left. Weights
+    are applied last.
+    """
+    for item in root.lodgs.levels:
+        if item.exists:
+            display.keep_last(item.object)
     rule = find_rule(root.lodgs.rule)
     for item in root.lodgs.levels if rule else ():
         cropping, own = (
-            (crops.modifier_of(item.object), _modifier(item.object)) if item.exists else (None, None)
+            (crops.modifier_of(item.object), rule_modifier(item.object)) if item.exists else (None, None)
         )
         if cropping and own and rule:
             modifiers = item.object.modifiers
@@ -186,7 +193,7 @@ def _order(root: bpy.types.Object) -> None:
 def outdated(root: bpy.types.Object) -> bool:
     """Whether a level's modifier is not the one that this version makes: its file is an older one's."""
     rule = find_rule(root.lodgs.rule)
-    modifiers = [_modifier(item.object) for item in root.lodgs.levels if item.exists]
+    modifiers = [rule_modifier(item.object) for item in root.lodgs.levels if item.exists]
     if rule is None:
         return any(modifiers)
     return not all(modifier and groups.is_current(modifier.node_group, rule) for modifier in modifiers)
@@ -218,12 +225,14 @@ def _given(root: bpy.types.Object) -> Iterator[tuple[bpy.types.NodesModifier, st
         groups.table_socket(item.name): item.object if item.exists else None for item in root.lodgs.tables
     }
     for item in root.lodgs.levels:
-        modifier = _modifier(item.object) if item.exists else None
+        modifier = rule_modifier(item.object) if item.exists else None
         slots = item.object.material_slots if item.exists else ()
         material = {groups.MATERIAL: slots[0].material if slots else None}
         cropping = crops.modifier_of(item.object) if item.exists else None
         eye = {groups.CAMERA_OBJECT: root.lodgs.eye_object}
-        for each, given in ((modifier, eye | tables | material), (cropping, material)):
+        showing = item.object.modifiers.get(display.NAME) if item.exists else None
+        points = {display.MATERIAL: material[groups.MATERIAL] or display.points_material()}
+        for each, given in ((modifier, eye | tables | material), (cropping, material), (showing, points)):
             if each is not None:
                 yield from ((each, name, value) for name, value in given.items())
 
@@ -336,7 +345,7 @@ def _drive_level(root: bpy.types.Object, obj: bpy.types.Object, rule: Rule, fact
 
 def _modifier_of(obj: bpy.types.Object, rule: Rule) -> bpy.types.NodesModifier:
     """The modifier with a rule's group, made where there is none, in the place of one with another rule."""
-    modifier = _modifier(obj)
+    modifier = rule_modifier(obj)
     place = len(obj.modifiers)
     if modifier is not None and not groups.is_current(
         modifier.node_group, rule
@@ -355,12 +364,12 @@ def _modifier_of(obj: bpy.types.Object, rule: Rule) -> bpy.types.NodesModifier:
 
 def _detach(obj: bpy.types.Object) -> None:
     """Takes away the modifier that chooses by distance."""
-    modifier = _modifier(obj)
+    modifier = rule_modifier(obj)
     if modifier is not None:
         remove_modifier(obj, modifier)
 
 
-def _modifier(obj: bpy.types.Object) -> bpy.types.NodesModifier | None:
+def rule_modifier(obj: bpy.types.Object) -> bpy.types.NodesModifier | None:
     """The modifier that chooses by distance, whichever rule and version it is of."""
     for modifier in obj.modifiers:
         group = modifier.node_group if isinstance(modifier, bpy.types.NodesModifier) else None

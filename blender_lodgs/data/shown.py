@@ -169,14 +169,11 @@ def read(cloud: bpy.types.PointCloud) -> SplatArrays:
         return SplatArrays(
             nothing[:, :3], nothing, nothing[:, :3], nothing[:, 0], np.zeros((0, 1, 3), np.float32), None
         )
-    higher = 0
-    while higher < 24 and attributes.SH.format(higher + 1) in cloud.attributes:
-        higher += 1
-    coefficients = int(np.sqrt(higher + 1)) ** 2
-    sh = np.empty((coefficients, count, 3), np.float32)
+    names = attributes.sh_names(cloud)
+    sh = np.empty((1 + len(names), count, 3), np.float32)
     sh[0] = base[:, :3]
-    for k in range(1, coefficients):
-        cloud.attributes[attributes.SH.format(k)].data.foreach_get("vector", sh[k].reshape(-1))
+    for coefficients, name in zip(sh[1:], names, strict=True):
+        cloud.attributes[name].data.foreach_get("vector", coefficients.reshape(-1))
     return SplatArrays(
         means, quats, scales, base[:, 3].copy(), sh.transpose(1, 0, 2),
         attributes.read_attribute(cloud, attributes.WEIGHT),

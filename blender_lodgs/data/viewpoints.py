@@ -305,7 +305,9 @@ def dome_of(root: bpy.types.Object) -> tuple[list[Camera], tuple[float, float]]:
         LodgsError: there is no opaque splat to look at.
     """
     count = root.lodgs.training.views
-    views, near = _keep("dome", (*_cloud_of(root)[1:], count), lambda: dome_views_around(_sample_of(root), count))
+    views, near = _keep(
+        "dome", (*_cloud_of(root)[1:], count), lambda: dome_views_around(_sample_of(root), count)
+    )
     return views, (DOMES[0] * near / NEAR_SHARE, DOMES[1] * near / NEAR_SHARE)
 
 

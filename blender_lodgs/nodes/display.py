@@ -1,31 +1,170 @@
-"""The node group "LODGS Display": what Blender itself draws of splats where viewports draw them as such."""
+"""Node groups that switch between Blender's own drawing of splat objects and that of LODGS.
+
+"LODGS Display" hides Blender's drawing in viewports that LODGS draws, and turns splats into coloured points
+there. "LODGS Native Splats" applies the level-of-detail weights and the opacity of looks where Blender 5.3 or
+later draws the splats itself: its own drawing reads opacities from ``radiance:base`` only.
+
+Before Blender 5.3 splat clouds carry the material of points. From 5.3 on they carry none, since a material
+would replace the splats' own colours; the group sets it instead, or the artist's own material.
+"""
 
 from __future__ import annotations
 
 import bpy
 
 from .. import compat
-from .building import Nodes, add_switched_modifier, ensure_group
+from ..attributes import BASE, COLOR, LOOK_OPACITY, WEIGHT
+from . import ellipsoids
+from .building import (
+    Nodes,
+    add_switched_modifier,
+    ensure_group,
+    is_edited,
+    remove_modifier,
+    replace_driver,
+)
 
 NAME = "LODGS Display"
+NATIVE = "LODGS Native Splats"
+_POINTS = "LODGS Points"
+MATERIAL = "material"
+_HIDE_POINTS = "Hide Points"
 
 
 def display() -> bpy.types.GeometryNodeTree:
-    """The group: points of radius 0, so that Blender's own balls hide no splats."""
+    """Return the group that hides Blender's drawing: plain points, of radius 0 where LODGS draws splats."""
+    return ensure_group(NAME, 2 if compat.NATIVE_SPLATS else 1, _build_display)
 
-    def build(nodes: Nodes) -> None:
-        source, radius = nodes.add("NodeGroupInput"), nodes.add("GeometryNodeSetPointRadius")
-        radius.inputs["Radius"].default_value = 0.0
-        nodes.link(source.outputs[0], radius, "Points")
-        nodes.link(radius.outputs["Points"], nodes.add("NodeGroupOutput"), "Geometry")
 
-    return ensure_group(NAME, 1, build)
+def native() -> bpy.types.GeometryNodeTree:
+    """Return the group that multiplies opacities by level-of-detail weights and the look's opacity."""
+    return ensure_group(NATIVE, 1, _build_native)
 
 
 def attach(obj: bpy.types.Object) -> None:
-    """Gives an object of splats this modifier, which is on in viewports where splats are drawn as such.
+    """Give a splat object its display modifiers; those of another Blender version are replaced.
 
-    Where Blender draws them as such by itself, there is nothing to hide.
+    Drivers switch them: *LODGS Display* is on in viewports that Blender does not draw, *LODGS Native Splats*
+    where Blender draws the viewport or the render.
     """
-    if not compat.make_native(obj.data):
-        add_switched_modifier(obj, display(), show_viewport="lodgs_viewport.splats")
+    is_native = compat.make_native(obj.data)
+    _set_material(obj.data, is_native)
+    if _is_outdated(obj, NAME, display):
+        modifier = add_switched_modifier(obj, display(), show_viewport="lodgs_viewport.hides_blender")
+        if is_native:
+            compat.set_input(modifier, MATERIAL, points_material())
+            driver = replace_driver(obj, compat.input_path(modifier, _HIDE_POINTS), "on")
+            variable = driver.variables.new()
+            variable.name, variable.type = "on", "CONTEXT_PROP"
+            variable.targets[0].context_property = "ACTIVE_SCENE"
+            variable.targets[0].data_path = "lodgs_viewport.splats"
+            variable.targets[0].use_fallback_value = True
+    if is_native and _is_outdated(obj, NATIVE, native):
+        add_switched_modifier(
+            obj, native(), show_viewport="lodgs_viewport.native", show_render="lodgs_render.draws_points"
+        )
+    elif not is_native and (modifier := obj.modifiers.get(NATIVE)) is not None:
+        remove_modifier(obj, modifier)
+    keep_last(obj)
+
+
+def is_drawn_by_blender(evaluated: bpy.types.Object) -> bool:
+    """Return True if viewports show an evaluated object as Blender's own splats.
+
+    The type of its evaluated cloud does not tell: Blender drops it with the last point.
+    """
+    modifier = evaluated.modifiers.get(NAME)
+    return compat.is_native(evaluated.data) and not (modifier is not None and modifier.show_viewport)
+
+
+def keep_last(obj: bpy.types.Object) -> None:
+    """Move the display modifiers behind those whose weights they apply, but before that of ellipsoids."""
+    for name in (NAME, NATIVE):
+        index = obj.modifiers.find(name)
+        end = obj.modifiers.find(ellipsoids.NAME)
+        last = len(obj.modifiers) - 1 if end < 0 else end - (index < end)
+        if index >= 0 and index != last:
+            obj.modifiers.move(index, last)
+
+
+def points_material() -> bpy.types.Material:
+    """Return the material that shows every point in its display colour, unlit; one per file."""
+    material = bpy.data.materials.get((_POINTS, None))
+    if material is None:
+        material = bpy.data.materials.new(_POINTS)
+        if material.node_tree is None:
+            material.use_nodes = True
+        nodes, links = material.node_tree.nodes, material.node_tree.links
+        nodes.clear()
+        color, emission = nodes.new("ShaderNodeAttribute"), nodes.new("ShaderNodeEmission")
+        output = nodes.new("ShaderNodeOutputMaterial")
+        color.attribute_name = COLOR
+        links.new(color.outputs["Color"], emission.inputs["Color"])
+        links.new(emission.outputs["Emission"], output.inputs["Surface"])
+        for x, node in enumerate((color, emission, output)):
+            node.location = (x * 200, 0)
+    return material
+
+
+def _set_material(cloud: bpy.types.PointCloud, is_native: bool) -> None:
+    """Give a cloud the material of points, or take it away where Blender draws splats. Others stay."""
+    own = [material.name if material else "" for material in cloud.materials] == [_POINTS]
+    if is_native and own:
+        cloud.materials.clear()
+    elif not is_native and not cloud.materials:
+        cloud.materials.append(points_material())
+
+
+def _is_outdated(obj: bpy.types.Object, name: str, current) -> bool:
+    """Remove a modifier whose group is another version's; True if the object needs a new one."""
+    modifier = obj.modifiers.get(name)
+    if modifier is None:
+        return True
+    tree = modifier.node_group
+    if tree is not None and (is_edited(tree) or tree == current()):
+        return False
+    remove_modifier(obj, modifier)
+    return True
+
+
+def _build_display(nodes: Nodes) -> None:
+    if compat.NATIVE_SPLATS:
+        nodes.tree.interface.new_socket(_HIDE_POINTS, in_out="INPUT", socket_type="NodeSocketBool")
+        nodes.tree.interface.new_socket(MATERIAL, in_out="INPUT", socket_type="NodeSocketMaterial")
+    source = nodes.add("NodeGroupInput")
+    points = source.outputs[0]
+    radius = nodes.add("GeometryNodeSetPointRadius")
+    if compat.NATIVE_SPLATS:
+        kind = nodes.add("GeometryNodePointsSetType")
+        kind.inputs["Type"].default_value = "Points"
+        nodes.link(points, kind, "Points")
+        nodes.link(source.outputs[_HIDE_POINTS], radius, "Selection")
+        material = nodes.add("GeometryNodeSetMaterial")
+        nodes.link(kind.outputs[0], material, "Geometry")
+        nodes.link(source.outputs[MATERIAL], material, "Material")
+        points = material.outputs["Geometry"]
+    radius.inputs["Radius"].default_value = 0.0
+    nodes.link(points, radius, "Points")
+    nodes.link(radius.outputs["Points"], nodes.add("NodeGroupOutput"), "Geometry")
+
+
+def _build_native(nodes: Nodes) -> None:
+    base = nodes.add("GeometryNodeInputNamedAttribute", data_type="FLOAT_COLOR")
+    base.inputs["Name"].default_value = BASE
+    channels = nodes.add("FunctionNodeSeparateColor")
+    nodes.link(next(s for s in base.outputs if s.enabled), channels, "Color")
+    opacity = nodes.field(channels.outputs["Alpha"])
+    for name in (WEIGHT, LOOK_OPACITY):
+        factor = nodes.add("GeometryNodeInputNamedAttribute", data_type="FLOAT")
+        factor.inputs["Name"].default_value = name
+        value = nodes.field(next(s for s in factor.outputs if s.name == "Attribute" and s.enabled))
+        opacity = opacity * nodes.field(factor.outputs["Exists"]).where(value, 1.0)
+    color = nodes.add("FunctionNodeCombineColor")
+    for channel in ("Red", "Green", "Blue"):
+        nodes.link(channels.outputs[channel], color, channel)
+    nodes.link(opacity.socket, color, "Alpha")
+    store = nodes.add("GeometryNodeStoreNamedAttribute", data_type="FLOAT_COLOR", domain="POINT")
+    store.inputs["Name"].default_value = BASE
+    nodes.link(nodes.add("NodeGroupInput").outputs[0], store, "Geometry")
+    nodes.link(color.outputs["Color"], store, "Value")
+    nodes.link(store.outputs["Geometry"], nodes.add("NodeGroupOutput"), "Geometry")

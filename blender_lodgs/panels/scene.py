@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from ..data import photographs, roots
+from ..data import native, photographs, roots
 from ..runs import photo_preparation
 from .parts import Panel, say, split_column
 
@@ -15,6 +15,8 @@ class LODGS_PT_scene(Panel):
 
     def draw(self, context):
         layout, root = self.layout, roots.active_root(context)
+        if native.loose_splats(context):
+            layout.operator("lodgs.add_to_scene", icon="ADD")
         _draw_import(layout, another=roots.shows_splats(context.scene))
         if roots.linked(context):
             say(layout, roots.LINKED, "LINKED")

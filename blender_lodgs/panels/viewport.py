@@ -24,12 +24,20 @@ class LODGS_PT_viewport(Panel):
         layout, settings = self.layout, context.scene.lodgs_viewport
         root = roots.active_root(context)
         column = split_column(layout)
-        if not compat.NATIVE_SPLATS:
-            column.prop(settings, "splats")
-        if settings.splats and not compat.NATIVE_SPLATS:
+        column.prop(settings, "splats")
+        if settings.splats and compat.NATIVE_SPLATS:
+            column.row(align=True).prop(settings, "drawn_by", expand=True)
+        if settings.native:
+            say(
+                layout,
+                "Blender draws all splats of the levels shown: no splat budget, streaming, level colours "
+                "or selection overlay.",
+                "INFO",
+            )
+        elif settings.splats:
             column.prop(settings, "budget")
             column.prop(settings, "moving", slider=True)
-        if root is not None:
+        if root is not None and not settings.native:
             column = layout.column(align=True)
             column.active = len(root.lodgs.levels) != 1  # one level has one colour
             column.label(text="Colours")
@@ -49,7 +57,7 @@ class LODGS_PT_viewport(Panel):
             text = f"The viewport could not be drawn ({viewport.problem}). Untick Gaussian Splats for points."
             say(layout, text, "ERROR")
         left_out = views.left_out()
-        if settings.splats and left_out:
+        if settings.splats and not settings.native and left_out:
             layout.label(text=f"{left_out:,} splats left out to stay within that", icon="INFO")
 
 
@@ -67,8 +75,7 @@ def _overlays(self, context):
         return
     self.layout.label(text="LODGS")
     row = self.layout.row()
-    if not compat.NATIVE_SPLATS:
-        row.prop(context.scene.lodgs_viewport, "splats")
+    row.prop(context.scene.lodgs_viewport, "splats")
     root = roots.active_root(context)
     if root is not None and root.lodgs.cameras is not None:
         row.prop(

@@ -1,10 +1,13 @@
 """What 3D viewports draw of splat scenes: Gaussians as they are (``splats``), or points (``discs``).
 
-Splats are drawn in all shadings but Wireframe where ``Scene.lodgs_viewport.splats`` is on; otherwise they are
-points like those of COLMAP: discs in Solid shading, Blender's own points elsewhere. Where Blender draws
-splats by itself, it is left to it. ``arranging`` decides which are drawn in which order, ``views`` keeps what
-each viewport shows, ``eye`` follows a viewport's view, ``frusta`` shows where training or a capture will look
-from, ``coverage`` how well that covers a Blender scene, and ``cells`` what a large scene is divided into.
+Splats are drawn in every shading mode but Wireframe where ``Scene.lodgs_viewport.splats`` is on. Otherwise
+they are points like those of COLMAP: discs in Solid shading, Blender's own points elsewhere. Blender 5.3 and
+later draw splats themselves where the scene says so (``Scene.lodgs_viewport.drawn_by``).
+
+- ``arranging`` decides which splats are drawn in which order, ``views`` keeps what each viewport shows.
+- ``eye`` follows a viewport's view.
+- ``frusta`` shows the views of training or of a capture, ``coverage`` how well they cover a Blender scene.
+- ``cells`` shows the cells of a large scene.
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import bpy
 
 from ...training.lod.colors import level_color
-from .. import compat, extension
+from .. import extension
 from ..data import roots as scenes
 from . import cells, coverage, discs, eye, frusta, splats, views
 
@@ -31,8 +34,8 @@ problem = ""
 
 def draws_splats(scene: bpy.types.Scene, viewport: bpy.types.SpaceView3D) -> bool:
     """Whether a viewport draws a Blender scene's splats as Gaussians, by our own shaders."""
-    wanted = scene.lodgs_viewport.splats and viewport.shading.type != "WIREFRAME"
-    return wanted and not compat.NATIVE_SPLATS
+    settings = scene.lodgs_viewport
+    return settings.splats and not settings.native and viewport.shading.type != "WIREFRAME"
 
 
 def _draw() -> None:
@@ -59,7 +62,7 @@ def _draw_view(context: bpy.types.Context) -> None:
         points = [
             (obj, tint)
             for root in scenes.roots(context.scene)
-            for obj, tint in _points(root.lodgs, levels=not with_splats)
+            for obj, tint in _points(root.lodgs, not with_splats and not context.scene.lodgs_viewport.native)
             if obj is not None and obj.visible_get(view_layer=context.view_layer, viewport=space)
         ]
         if points:
@@ -78,7 +81,7 @@ def _points(
 ) -> Iterator[tuple[bpy.types.Object | None, tuple[float, float, float, float]]]:
     """What of a splat scene is drawn as points, and in which colour; alpha 0 is each point's own."""
     yield settings.points, (0, 0, 0, 0)
-    if levels and not compat.NATIVE_SPLATS:
+    if levels:
         for item in settings.levels:
             yield item.object, (*level_color(item.number), float(settings.tell in ("LEVELS", "BANDS")))
 

@@ -240,10 +240,7 @@ def higher_of(cloud: Cloud) -> int:
     """How many coefficients beyond the first a cloud has, of whole degrees up to 4."""
     if isinstance(cloud, Stream):
         return cloud.higher
-    count = 0
-    while count < splats.MOST_COEFFICIENTS and attributes.SH.format(count + 1) in cloud.attributes:
-        count += 1
-    return int((count + 1) ** 0.5) ** 2 - 1
+    return len(attributes.sh_names(cloud))
 
 
 class Reading:
@@ -328,9 +325,9 @@ def read_records(cloud: bpy.types.PointCloud, rows: np.ndarray, higher: int) -> 
     records[:, 4:8] = attributes.view_attribute(cloud, attributes.ROTATION)[rows]
     records[:, 8:11] = attributes.view_attribute(cloud, attributes.SCALE)[rows]
     records[:, 11:14] = base[:, :3]
-    for k in range(min(higher, higher_of(cloud))):
+    for k, name in enumerate(attributes.sh_names(cloud)[:higher]):
         place = 14 + 3 * k
-        records[:, place : place + 3] = attributes.view_attribute(cloud, attributes.SH.format(k + 1))[rows]
+        records[:, place : place + 3] = attributes.view_attribute(cloud, name)[rows]
     if (weights := attributes.view_attribute(cloud, attributes.WEIGHT)) is not None:
         records[:, 3] *= weights[rows]
     if (paint := painting.shown_paint(cloud, rows)) is not None:

@@ -8,7 +8,7 @@ linear, beneath overlays that are there already.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import gpu
@@ -419,13 +419,13 @@ def draw(
         shader.bind()
         # those that are not there yet are alike, or drivers would compile for other formats again and again
         alike = next(texture for texture in records if texture is not None)
+        textures = {
+            "instances": instances, "placements": placements, "looks": every_look, "palette": _palette(),
+        }  # fmt: skip
         for number in range(PARTS):
             texture = records[number] if number < len(records) else None
-            shader.uniform_sampler(f"records_{number}", texture or alike)
-        shader.uniform_sampler("instances", instances)
-        shader.uniform_sampler("placements", placements)
-        shader.uniform_sampler("looks", every_look)
-        shader.uniform_sampler("palette", _palette())
+            textures[f"records_{number}"] = texture or alike
+        bind_textures(shader, textures)
         shader.uniform_float("projection", projection)
         shader.uniform_float("size", size)
         shader.uniform_float("frame", frame)
@@ -438,10 +438,18 @@ def draw(
     gpu.state.blend_set("ALPHA_PREMULT")
     shader, quad = _program("composite")
     shader.bind()
-    shader.uniform_sampler("colors", canvas.colors)
-    shader.uniform_sampler("overlay", overlay)
+    bind_textures(shader, {"colors": canvas.colors, "overlay": overlay})
     quad.draw(shader)
     gpu.state.blend_set("NONE")
+
+
+def bind_textures(shader: gpu.types.GPUShader, textures: Mapping[str, gpu.types.GPUTexture]) -> None:
+    """Bind textures to samplers, given in the order of their slots.
+
+    Under OpenGL, Blender 5.3 also binds every texture to slot 0, so that one has to come last.
+    """
+    for name, texture in reversed(textures.items()):
+        shader.uniform_sampler(name, texture)
 
 
 def reset_state() -> None:

@@ -28,6 +28,7 @@ from mathutils import Matrix
 from .. import extension
 from ..data import changes, selection, shown
 from ..data import roots as scenes
+from ..nodes import display
 from . import eye, resident, splats
 from .arranging import Arrangement, Placement, Request, arrange
 from .resident import Cloud, Reading, Resident, Store
@@ -121,7 +122,11 @@ def draw(context: bpy.types.Context) -> None:
     if region.as_pointer() not in _views:
         _forget_closed()
     view = _views.setdefault(region.as_pointer(), ViewState())
-    instances = shown.splat_instances(context.evaluated_depsgraph_get(), space)
+    instances = [
+        instance
+        for instance in shown.splat_instances(context.evaluated_depsgraph_get(), space)
+        if not display.is_drawn_by_blender(instance.evaluated)
+    ]
     now, matrix = time.monotonic(), region_data.window_matrix @ region_data.view_matrix
     if view.matrix is not None and view.matrix != matrix:
         view.moved = now

@@ -12,6 +12,7 @@ from gpu_extras.batch import batch_for_shader
 
 from ..data import roots as scenes
 from . import eye
+from .splats import bind_textures
 
 _VERTEX = """
 void main()
@@ -85,8 +86,7 @@ def draw(pictures: Comparison, wipe: float, corners: list[tuple[float, float]], 
     )  # fmt: skip
     shader = _wipe_shader()
     shader.bind()
-    shader.uniform_sampler("photograph", pictures.textures[0])
-    shader.uniform_sampler("rendered", pictures.textures[1])
+    bind_textures(shader, {"photograph": pictures.textures[0], "rendered": pictures.textures[1]})
     shader.uniform_float("wipe", wipe)
     shader.uniform_float("line", line)
     batch.draw(shader)

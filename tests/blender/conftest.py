@@ -61,6 +61,8 @@ def frame(bpy):
         gpu.init()
     except Exception as error:
         pytest.skip(f"no graphics here: {error}")
+    if not _draws(gpu):
+        pytest.skip("no graphics here: a cleared framebuffer stays empty; install mesa-vulkan-drivers")
 
     def drawn(size, draw, before=None):
         kind, data = "RGBA32F", np.zeros((size, size, 4), np.float32)
@@ -86,6 +88,16 @@ def frame(bpy):
         return seen
 
     return drawn
+
+
+def _draws(gpu):
+    """Return True if this Blender's graphics draw at all. Blender 5.3 starts without a working driver too."""
+    texture = gpu.types.GPUTexture((1, 1), format="RGBA32F")
+    frame = gpu.types.GPUFrameBuffer(color_slots=texture)
+    with frame.bind():
+        frame.clear(color=(0.25, 0.5, 0.75, 1.0))
+        seen = frame.read_color(0, 0, 1, 1, 4, 0, "FLOAT")
+    return np.allclose(np.ravel(seen.to_list()), (0.25, 0.5, 0.75, 1.0))
 
 
 @pytest.fixture

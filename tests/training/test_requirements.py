@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from tools import extension, setup
+from tools import blender_versions, extension, setup
 
 ROOT = Path(__file__).resolve().parents[2]
 REQUIREMENTS = ROOT / "requirements"
-LOCKS = ["trainer", "cuda", "cluster", "develop", "blender-5.0", "blender-5.2"]
+LOCKS = ["trainer", "cuda", "cluster", "develop", "blender-5.0", "blender-5.2", "blender-5.3"]
 
 PIN = r"(?P<name>[A-Za-z0-9._-]+)==(?P<version>[^\s;]+)(?P<marker> ; [^\\]+?)?"
 
@@ -91,3 +91,10 @@ def test_setup_installs_a_lock_once_per_change(tmp_path, monkeypatch):
         lock.write_text(text)
         setup.make(".venv", str(python), "some.txt")
         assert log.read_text().count(f"--require-hashes --only-binary=:all: -r {lock}\n") == times
+
+
+def test_newer_blenders_than_those_tested_are_named():
+    tested = {(4, 5, 15), (5, 2, 3), (5, 3, 0)}
+    assert blender_versions.newer({"5.1.2", "5.2.3", "4.5.1"}, tested) == []
+    assert blender_versions.newer({"5.2.10", "5.4.0", "5.3.0"}, tested) == ["5.2.10", "5.4.0"]
+    assert (5, 3, 0) in blender_versions.pinned()

@@ -109,7 +109,7 @@ def test_levels_in_use_go_along_until_somebody_sets_them(bpy, lodgs, some):
     root.lodgs.bands.first = 4
     for item in list(root.lodgs.levels)[3:]:
         bpy.data.objects.remove(item.object)
-    scenes._levels_changed(root)
+    scenes.levels_changed(root)
     assert in_use(root) == {"gamma": 1, "first": 1, "last": 3}  # which was the rule's own again
 
 

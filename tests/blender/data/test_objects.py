@@ -66,8 +66,8 @@ def test_attributes_are_those_of_native_splats(lodgs, make):
     assert np.array_equal(base[:, :3], splats.sh[:, 0])
     assert base[:, 3] == pytest.approx(1 / (1 + np.exp(-splats.opacity_logits.astype(float))), abs=1e-6)
     for k in range(1, 9):
-        assert np.array_equal(attributes.read_attribute(cloud, f"radiance:sh_{k}"), splats.sh[:, k])
-    assert "radiance:sh_9" not in cloud.attributes
+        assert np.array_equal(attributes.read_attribute(cloud, f"radiance:sh_{k - 1}"), splats.sh[:, k])
+    assert "radiance:sh_8" not in cloud.attributes
     scale = attributes.read_attribute(cloud, "scale")
     assert scale == pytest.approx(np.exp(splats.log_scales.astype(float)), rel=1e-6)
     rotation = attributes.read_attribute(cloud, "rotation")

@@ -110,7 +110,7 @@ def test_two_scenes_of_one_file_have_their_own(bpy, lodgs, root, file, tmp_path)
     scenes.set_tables(other, {"chunks": {name: values[::-1] for name, values in CHUNKS.items()}})
     assert exported(bpy, root, tmp_path / "out.ply") == file.read_bytes()
     for one in (root, other):
-        modifiers = [item.object.modifiers[-1] for item in one.lodgs.levels]
+        modifiers = [lodgs("data.selection").rule_modifier(item.object) for item in one.lodgs.levels]
         given = [lodgs("compat").get_input(modifier, "chunks_table") for modifier in modifiers]
         assert given == [one.lodgs.tables["chunks"].object] * 2
     assert other.lodgs.tables["chunks"].object != root.lodgs.tables["chunks"].object
@@ -179,7 +179,7 @@ def test_what_earlier_versions_saved_goes_on(bpy, lodgs, tmp_path):
     root.lodgs.begun = json.dumps({"distance_scale": 2.0})
     root.lodgs.mode, root.lodgs.eye, root.lodgs.camera_center = "SELECTIVE", "TRAINING", (0, 0, 0)
     for item in root.lodgs.levels:
-        item.object.modifiers[-1].node_group["lodgs_version"] = 101
+        lodgs("data.selection").rule_modifier(item.object).node_group["lodgs_version"] = 101
     lodgs("data.older_files").bring_up_to_date(root)
     depsgraph = bpy.context.evaluated_depsgraph_get()
     for item, wanted in zip(root.lodgs.levels, (lambda d: d >= 0.75, lambda d: d < 0.75), strict=True):

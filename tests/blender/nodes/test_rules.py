@@ -159,7 +159,7 @@ def splat_scene(bpy, lodgs):
 @pytest.mark.parametrize("name", RULES)
 def test_older_group_is_replaced_for_all_users(bpy, lodgs, splat_scene, name):
     groups, selection, root = lodgs("nodes.rules"), lodgs("data.selection"), splat_scene(name)
-    used = root.lodgs.levels[0].object.modifiers[-1].node_group
+    used = lodgs("data.selection").rule_modifier(root.lodgs.levels[0].object).node_group
     version = used["lodgs_version"]
     assert not selection.outdated(root)
     used["lodgs_version"] = 0
@@ -257,14 +257,18 @@ def test_edited_group_is_used_everywhere(bpy, lodgs, half, change, frame, name):
 @pytest.mark.parametrize("name", RULES)
 def test_edited_group_stays_in_use_and_is_kept_when_replaced(lodgs, splat_scene, change, name):
     selection, root = lodgs("data.selection"), splat_scene(name)
-    used = root.lodgs.levels[0].object.modifiers[-1].node_group
+    used = lodgs("data.selection").rule_modifier(root.lodgs.levels[0].object).node_group
     change(used)
     selection.attach(root)
     assert not selection.outdated(root)
-    assert {item.object.modifiers[-1].node_group for item in root.lodgs.levels} == {used}
+    assert {lodgs("data.selection").rule_modifier(item.object).node_group for item in root.lodgs.levels} == {
+        used
+    }
     used["lodgs_version"] = 0
     lodgs("data.older_files").bring_up_to_date(root)
-    assert used not in {item.object.modifiers[-1].node_group for item in root.lodgs.levels}
+    assert used not in {
+        lodgs("data.selection").rule_modifier(item.object).node_group for item in root.lodgs.levels
+    }
     assert used.name == f"LODGS {name.title()} (older)" and used.use_fake_user
 
 
@@ -283,7 +287,7 @@ def test_edits_are_recognized_after_saving(bpy, lodgs, splat_scene, change, tmp_
 @pytest.mark.parametrize("name", RULES)
 def test_empty_group_causes_no_errors(bpy, lodgs, half, name, capfd):
     root = half(name)
-    group = root.lodgs.levels[0].object.modifiers[-1].node_group
+    group = lodgs("data.selection").rule_modifier(root.lodgs.levels[0].object).node_group
     group.interface.clear()
     group.nodes.clear()
     bpy.context.view_layer.update()

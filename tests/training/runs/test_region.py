@@ -19,7 +19,9 @@ from training.scenes.colmap import read_scene
 from training.splats.bundle import read_bundle
 
 HALF = "box -9 -9 -1.5 0 9 9"  # the half with x < 0 of the points near the origin of the tiny scene
-TURNED = Crop.from_matrix("BOX", np.array([[0.6, -0.8, 0, 0.1], [0.8, 0.6, 0, 2], [0, 0, 3, 1], [0, 0, 0, 1.0]]))
+TURNED = Crop.from_matrix(
+    "BOX", np.array([[0.6, -0.8, 0, 0.1], [0.8, 0.6, 0, 2], [0, 0, 3, 1], [0, 0, 0, 1.0]])
+)
 
 
 @pytest.mark.parametrize("crop", [TURNED, Crop.box((0, 0, 0), (1, 2, 3)), Crop.sphere((1, 0, -2), 0.3)])
