@@ -33,7 +33,7 @@ from training.methods.tree.build import GrowingForest
 from training.methods.tree.store import layout_of
 from training.methods.tree.train import Method, SeenRecords
 from training.optimize.memory import keep_freed_memory
-from training.optimize.out_of_core.cut_cache import BESIDE, LARGE
+from training.optimize.out_of_core.cut_cache import MMAP_BYTES, SLOT_BYTES
 from training.optimize.parameters import override
 from training.optimize.training_data import TrainingData
 from training.rasterize import Gaussians, rasterize
@@ -146,7 +146,7 @@ def train(options: argparse.Namespace) -> dict:
     def timed_take(*arguments) -> np.ndarray:
         start = time.perf_counter()
         if "no cache" in options.way:
-            store.cache.clear()  # writes changes
+            store.cache.evict_all()  # writes changes
         rows = take(*arguments)
         cut_times.append(1000 * (time.perf_counter() - start))
         counts.append(len(rows))
@@ -177,7 +177,7 @@ def train(options: argparse.Namespace) -> dict:
     torch.save(method.state_dict(), options.folder / "checkpoint.pt")
     timed = slice(WARM, -AFTER)
     share = store.cache.reused / max(store.cache.reused + store.cache.loaded, 1)
-    cache_mb = (store.cache.capacity * (4 * store.layout.width + BESIDE) + store.cache.tables) / 1e6
+    cache_mb = (store.cache.capacity * (4 * store.layout.width + SLOT_BYTES) + store.cache.tables) / 1e6
     return {
         "splats": len(store), "cache_mb": cache_mb, "reused": share,
         "step_s": float(np.mean(times[timed])), "cut_ms": float(np.mean(cut_times[timed])),
@@ -188,7 +188,7 @@ def train(options: argparse.Namespace) -> dict:
 
 def draw(options: argparse.Namespace) -> dict:
     """Render the largest cut of a run several times with loss and gradients, without a tree."""
-    keep_freed_memory(LARGE)  # as in a run
+    keep_freed_memory(MMAP_BYTES)  # as in a run
     method = method_in(options.folder, options)
     names = [field.name for field in fields(Gaussians)]
     arrays = {name: np.load(options.folder / f"largest_{name}.npy") for name in names}

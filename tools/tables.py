@@ -92,7 +92,7 @@ def _about(method: MethodInfo) -> str:
     return (
         f"`{method.name}`: {method.about}. Training starts from {start}. "
         f"{rule if method.rule else 'It has no levels of detail.'} "
-        f"Parameters in Blender's panel: {', '.join(f'`{name}`' for name in method.offered)}."
+        f"Parameters in Blender's panel: {', '.join(f'`{name}`' for name in method.panel_parameters)}."
     )
 
 

@@ -227,7 +227,9 @@ def place_splats(
                 _add_views(context, root, cameras, camera_extent(cameras) or 1.0, near)
                 for facts in (view.data.lodgs for view in views(root)):
                     facts.held_out = cameras[facts.place].name in unseen
-            root.lodgs.training.method = next(info.name for info in METHODS.values() if info.for_splats)
+            root.lodgs.training.method = next(
+                info.name for info in METHODS.values() if info.suggested_for_base
+            )
     except BaseException:
         bpy.data.batch_remove([obj.data for obj in made])  # which takes the objects along
         raise

@@ -39,7 +39,7 @@ def offered(method: str) -> list[Field]:
     ALL_OFFER."""
     info = method_info(method)
     known = {f.name: f for f in fields(info.parameters)}
-    names = (*info.offered, *ALL_OFFER)
+    names = (*info.panel_parameters, *ALL_OFFER)
     return [known[name] for name in names if not isinstance(known[name].default, tuple)]
 
 

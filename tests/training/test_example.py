@@ -12,7 +12,7 @@ from PIL import Image
 
 from examples import rig
 from training.evaluate.offset_views import VEIL_DEPTH
-from training.optimize.support import halfway
+from training.optimize.support import midpoint_views
 from training.scenes.colmap import read_scene
 from training.scenes.offset_views import read_offset_views
 
@@ -129,7 +129,7 @@ def test_walk_has_nearby_objects_but_none_in_front_of_the_whole_view():
     quarters = [{tuple(side) for side in row[near]} for row, near in zip(sides, distances < 2.5, strict=True)]
     assert np.mean([len(quarter) == 4 for quarter in quarters]) > 0.5
     limit = VEIL_DEPTH * scene.median_depth()
-    for place in halfway(scene.cameras):  # so that what an evaluation calls a veil is one
+    for place in midpoint_views(scene.cameras):  # so that what an evaluation calls a veil is one
         visible = place.sees(scene.points)
         assert (place.view_space(scene.points)[visible, 2] > limit).mean() > 0.99
 

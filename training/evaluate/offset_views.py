@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import expit
 
-from ..optimize.support import halfway
+from ..optimize.support import midpoint_views
 from ..optimize.training_data import TrainingData
 from ..scenes.cameras import pick_evenly
 from .views import Evaluation, SplatSource
@@ -37,7 +37,7 @@ def measure_veil(evaluation: Evaluation, source: SplatSource) -> dict[str, float
         ``MAX_POSITIONS`` evenly chosen ones.
     """
     shares = []
-    for camera in pick_evenly(halfway(evaluation.data.train), MAX_POSITIONS):
+    for camera in pick_evenly(midpoint_views(evaluation.data.train), MAX_POSITIONS):
         splats, weights = source(camera)
         near = camera.view_space(splats.means)[:, 2] < VEIL_DEPTH * evaluation.data.median_depth
         # near splats alone determine whether half of the light is stopped in front of the limit

@@ -88,7 +88,7 @@ class Evaluation:
 
     def target(self, camera: Camera) -> Target:
         """Return the photo of a view, with transparent parts black, and its mask."""
-        return self.data.photographs.target(camera)
+        return self.data.images.target(camera)
 
     def load(self, splats: Splats | Gaussians) -> Gaussians:
         """Copy splats to the rasterizer's device, for repeated drawing."""

@@ -73,7 +73,7 @@ def create(
         name: a key of METHODS.
         backend: the rasterizer's; the tensors live where it draws (``rasterize.tensor_device``).
         base: splats to begin with instead of the scene's points, where the method can (``from_base``); in
-            memory, but for methods that take them in parts (``base_in_parts``).
+            memory, but for methods that take them in parts (``streams_base``).
 
     Raises:
         LodgsError: the scene has too few points, or no view sees any.

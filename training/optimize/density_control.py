@@ -11,19 +11,19 @@ import torch
 
 from ..errors import LodgsError
 from ..rasterize.features import rotation_matrices
-from .model import PEAKS, Model
+from .model import PEAK_STATS, Model
 
 RESET_OPACITY = 0.01
 """What an opacity reset leaves at most."""
 
 
-SHORTER = 0.45
+AXIS_SHRINK = 0.45
 """What a split along the longest axis takes from that axis (Improved-GS, arXiv 2508.12313)."""
-APART = 3 * SHORTER
+CHILD_OFFSET = 3 * AXIS_SHRINK
 """How far from the parent's mean its children lie on that axis, in its standard deviations there."""
-NARROWER = sqrt(1 - SHORTER**2)
+SIDE_SCALE = sqrt(1 - AXIS_SHRINK**2)
 """The children's share of the parent's other two."""
-FAINTER = 0.6
+CHILD_OPACITY = 0.6
 """The children's share of its opacity."""
 
 
@@ -32,7 +32,7 @@ def peak_scores(model: Model) -> torch.Tensor:
 
     LODGE, Eq. 6, after H3DGS: gradients in 3DGS units, radii of three standard deviations in pixels.
     """
-    gradient, radius, logits = (model.look(name) for name in (*PEAKS, "opacity_logits"))
+    gradient, radius, logits = (model.read(name) for name in (*PEAK_STATS, "opacity_logits"))
     return gradient * radius * logits.sigmoid() ** 0.2
 
 
@@ -71,18 +71,18 @@ def densify(
         chosen = chosen[order[:room]].sort().values
     if len(chosen) == 0:
         return 0
-    rows = model.rows(chosen)
+    rows = model.read_rows(chosen)
     scales = rows["log_scales"].exp() + min_scale
     cloned = scales.amax(1) <= (-torch.inf if clone_below is None else clone_below)
     clones = {name: row[cloned] for name, row in rows.items()}
     parents, scales = chosen[~cloned], scales[~cloned]
     children = {name: torch.cat([row[~cloned]] * 2) for name, row in rows.items()}
     if clone_below is None:
-        children, scales = along_longest_axis(children, scales)
+        children, scales = split_longest_axis(children, scales)
     else:
-        children["means"] += sample_inside(children["quats"], scales.repeat(2, 1), rng)
+        children["means"] += sample_gaussians(children["quats"], scales.repeat(2, 1), rng)
         scales = (scales / 1.6).repeat(2, 1)
-    children["log_scales"] = constrained_log(scales, min_scale)
+    children["log_scales"] = constrained_log_scales(scales, min_scale)
     alive = torch.ones(len(model), dtype=torch.bool, device=parents.device)
     alive[parents] = False
     model.keep(alive)
@@ -90,7 +90,7 @@ def densify(
     return len(chosen)
 
 
-def along_longest_axis(
+def split_longest_axis(
     children: dict[str, torch.Tensor], scales: torch.Tensor
 ) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
     """Two children on either side of each parent, which together look much as it did.
@@ -104,23 +104,23 @@ def along_longest_axis(
     """
     count, longest = len(scales), scales.argmax(1)
     axes = rotation_matrices(children["quats"][:count])[torch.arange(count), :, longest]
-    offset = APART * scales.amax(1, keepdim=True) * axes
+    offset = CHILD_OFFSET * scales.amax(1, keepdim=True) * axes
     children["means"] += torch.cat([offset, -offset])
-    children["opacity_logits"] = (FAINTER * children["opacity_logits"].sigmoid()).logit()
-    shares = torch.full_like(scales, NARROWER)
-    shares[torch.arange(count), longest] = 1 - SHORTER
+    children["opacity_logits"] = (CHILD_OPACITY * children["opacity_logits"].sigmoid()).logit()
+    shares = torch.full_like(scales, SIDE_SCALE)
+    shares[torch.arange(count), longest] = 1 - AXIS_SHRINK
     return children, (scales * shares).repeat(2, 1)
 
 
 def prune(model: Model, min_opacity: float) -> None:
     """Removes splats below an opacity."""
-    model.keep(model.look("opacity_logits").sigmoid() >= min_opacity)
+    model.keep(model.read("opacity_logits").sigmoid() >= min_opacity)
 
 
 def reset_opacities(model: Model) -> None:
     """Opacities fall to RESET_OPACITY at most, from where only splats that are needed rise again."""
     most = float(np.log(RESET_OPACITY / (1 - RESET_OPACITY)))
-    model.assign("opacity_logits", model.look("opacity_logits").clamp_max(most))
+    model.assign("opacity_logits", model.read("opacity_logits").clamp_max(most))
 
 
 def require_rows(model: Model, step: int, limit: str) -> None:
@@ -131,7 +131,7 @@ def require_rows(model: Model, step: int, limit: str) -> None:
         )
 
 
-def sample_inside(quats: torch.Tensor, scales: torch.Tensor, rng: np.random.Generator) -> torch.Tensor:
+def sample_gaussians(quats: torch.Tensor, scales: torch.Tensor, rng: np.random.Generator) -> torch.Tensor:
     """For each of N Gaussians a place drawn from it, (N, 3) from its mean.
 
     Args:
@@ -141,7 +141,7 @@ def sample_inside(quats: torch.Tensor, scales: torch.Tensor, rng: np.random.Gene
     return torch.einsum("nij,nj->ni", rotation_matrices(quats), local * scales)
 
 
-def constrained_log(scales: torch.Tensor, min_scale: float, floor: float = 0.05) -> torch.Tensor:
+def constrained_log_scales(scales: torch.Tensor, min_scale: float, floor: float = 0.05) -> torch.Tensor:
     """s_opt with exp(s_opt) + min_scale = scales (FLoD, Eq. 5), where that is possible.
 
     The published code clamps the difference at 1e-7, from which a splat hardly ever grows again (its

@@ -9,7 +9,7 @@ import torch
 from ..rasterize import Adam
 from .schedules import log_linear
 
-FALL = 0.1
+FINAL_RATE = 0.1
 """What is left of the learning rate at the end."""
 
 
@@ -46,7 +46,7 @@ class Exposure:
         """What makes a step, if anything, after a share of the run's steps: its rate falls to a tenth."""
         if not self._lr:
             return ()
-        rate = log_linear(self._lr, FALL * self._lr, share)
+        rate = log_linear(self._lr, FINAL_RATE * self._lr, share)
         self._adam.lr.update(dict.fromkeys(self._names, rate))
         return (self._adam,)
 

@@ -11,16 +11,16 @@ from pathlib import Path
 
 from ..rasterize import Target
 from ..scenes.cameras import Camera
-from .memory import MOST_BYTES, TARGET_BYTES, free_memory
+from .memory import MAX_BYTES, TARGET_BYTES, free_memory
 
 READERS = 2
 """Threads that read: a step has its own."""
-AHEAD = 8
+READ_AHEAD = 8
 """Photographs of so many steps are read ahead."""
 WINDOW = 4096
 """It is known of so many coming steps what they need."""
 
-Plan = Callable[[int], Camera | None]
+CameraPlan = Callable[[int], Camera | None]
 """The view of a step, as far as is known before it, at its size; None: it needs none, or there is no step."""
 
 _Key = tuple[Path, int, int]
@@ -28,10 +28,10 @@ _Key = tuple[Path, int, int]
 
 def default_budget() -> int:
     """Bytes that are kept if nothing is said: a quarter of the free memory, MOST_BYTES at most."""
-    return min(MOST_BYTES, free_memory() // 4)
+    return min(MAX_BYTES, free_memory() // 4)
 
 
-class Targets:
+class ImageCache:
     """Photographs by their views: those that are needed soonest stay, and are read before they are needed.
 
     What is kept, and when it is read, changes how long a step takes and nothing else: a plan may be wrong.
@@ -48,10 +48,10 @@ class Targets:
     """
 
     def __init__(self, read: Callable[[Camera], Target], budget: int) -> None:
-        self._read, self._budget, self.held = read, budget, 0
+        self._read, self._budget, self.held_bytes = read, budget, 0
         self._kept: dict[_Key, Future[Target]] = {}  # least recently used first
         self._readers: ThreadPoolExecutor | None = None
-        self._plan: Plan | None = None
+        self._plan: CameraPlan | None = None
         self._begin = 0  # the step that the window begins with
         self._window: deque[_Key | None] = deque()
         self._uses: dict[_Key, deque[int]] = {}  # the steps in the window that need a photograph
@@ -73,22 +73,22 @@ class Targets:
                 self._kept[key] = reading
                 return target
         if reading is not None:
-            self.held -= _bytes(key)
+            self.held_bytes -= _bytes(key)
         target = self._read(camera)
         if self._make_room(_bytes(key), self._next_use(key)):
             self._kept[key] = done = Future()
             done.set_result(target)
-            self.held += _bytes(key)
+            self.held_bytes += _bytes(key)
         return target
 
-    def follow(self, step: int, plan: Plan) -> None:
+    def prefetch(self, step: int, plan: CameraPlan) -> None:
         """Tells that a step begins; what it and the next ones need is read, while there is room.
 
         Args:
             plan: what steps need; it may be asked about steps that never come, and say something else later.
         """
         self._advance(step, plan)
-        for use, key in enumerate(islice(self._window, AHEAD), step):
+        for use, key in enumerate(islice(self._window, READ_AHEAD), step):
             if key is None or key in self._kept:
                 continue
             camera = plan(use)
@@ -97,7 +97,7 @@ class Targets:
             if self._readers is None:
                 self._readers = ThreadPoolExecutor(READERS, "lodgs-photographs")
             self._kept[key] = self._readers.submit(self._read, camera)
-            self.held += _bytes(key)
+            self.held_bytes += _bytes(key)
 
     def _make_room(self, size: int, use: float) -> bool:
         """Drops what is needed last, and later than at the step ``use``, until so many bytes are free.
@@ -106,7 +106,7 @@ class Targets:
         """
         if size > self._budget:
             return False
-        while self.held + size > self._budget:
+        while self.held_bytes + size > self._budget:
             key = max(
                 (key for key, reading in self._kept.items() if not reading.running()),
                 key=self._next_use,
@@ -116,14 +116,14 @@ class Targets:
                 return False
             if self._kept[key].cancel() or self._kept[key].done():
                 del self._kept[key]
-                self.held -= _bytes(key)
+                self.held_bytes -= _bytes(key)
         return True
 
     def _next_use(self, key: _Key) -> float:
         """The step that needs a photograph next, as far as is known."""
         return self._uses[key][0] if key in self._uses else inf
 
-    def _advance(self, step: int, plan: Plan) -> None:
+    def _advance(self, step: int, plan: CameraPlan) -> None:
         """Moves the window to begin with a step."""
         while self._window and self._begin < step:
             key = self._window.popleft()

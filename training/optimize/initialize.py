@@ -8,11 +8,11 @@ from scipy.spatial import KDTree
 
 from ..errors import LodgsError
 from ..splats.gaussians import SH_C0, Splats
-from .density_control import constrained_log
+from .density_control import constrained_log_scales
 from .model import NAMES
 
 
-def distinct(points: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def drop_duplicates(points: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Points without exact repetitions, which have no distance to take a scale from.
 
     Raises:
@@ -27,7 +27,9 @@ def distinct(points: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, np.nda
     return points, colors[index]
 
 
-def sampled(points: np.ndarray, colors: np.ndarray, most: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def sample_points(
+    points: np.ndarray, colors: np.ndarray, most: int, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
     """At most so many of the points, a random sample in their order."""
     if len(points) > most:
         some = np.sort(np.random.default_rng(seed).choice(len(points), most, replace=False))
@@ -82,7 +84,7 @@ def from_points(
     tensors = {
         "means": torch.tensor(points, dtype=torch.float32),
         "quats": torch.from_numpy(quats),
-        "log_scales": constrained_log(log_scales.exp(), min_scale),
+        "log_scales": constrained_log_scales(log_scales.exp(), min_scale),
         "opacity_logits": torch.full((count,), float(np.log(0.1 / 0.9))),
         "sh": torch.from_numpy(sh),
     }

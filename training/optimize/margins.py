@@ -17,24 +17,24 @@ from ..rasterize import Gaussians, rasterize
 from ..scenes.cameras import Camera, pick_evenly
 from ..splats.gaussians import SH_C0
 
-VIEWS = 32
+MAX_VIEWS = 32
 """Most views that are continued, evenly chosen."""
 CELLS = 32
 """Splats along a photograph's longer side where it is continued, if there may be so many."""
-FEWEST_CELLS = 10
+MIN_CELLS = 10
 """No fewer: then photographs are not continued, as so large splats would reach into them."""
-SIZE = 0.7
+SPLAT_SIZE = 0.7
 """Their standard deviation, in the distance between two."""
-KNOWN = 64
+DEPTH_PIXELS = 64
 """Pixels along that side of what is known of each view."""
 OPACITY = 0.95
-BEHIND = 1.1
+DEPTH_FACTOR = 1.1
 """They lie so many times as deep as what they continue, so that photographs stay as they are."""
-FARTHER = (1.0, 1.3, 1.7, 2.5, 4.0, 8.0)
+DEPTH_STEPS = (1.0, 1.3, 1.7, 2.5, 4.0, 8.0)
 """Where one would stand before what a photograph shows, it is tried so many times as deep."""
-BLURS = (1, 2, 4, 8, 16, 32)
+BLUR_SIGMAS = (1, 2, 4, 8, 16, 32)
 """Standard deviations, in cells, of what one continues: of the first that reaches enough that is known."""
-REACHED = 0.02
+MIN_BLUR_WEIGHT = 0.02
 """The share of a blur's weight that is enough."""
 
 
@@ -49,10 +49,10 @@ class Margins:
     """
 
     def __init__(self, cameras: Sequence[Camera], share: float, near: float, backend: str) -> None:
-        self._cameras = pick_evenly(cameras, VIEWS)
+        self._cameras = pick_evenly(cameras, MAX_VIEWS)
         self._share, self._near, self._backend = share, near, backend
 
-    def continued(self, gaussians: Gaussians, most: int) -> Gaussians:
+    def extend(self, gaussians: Gaussians, most: int) -> Gaussians:
         """Splats where the wider views show next to nothing; none before what a view itself shows.
 
         Args:
@@ -64,7 +64,7 @@ class Margins:
         """
         gaussians, cells = gaussians.detach(), CELLS
         known = [self._known(gaussians, camera) for camera in self._cameras]
-        while cells >= FEWEST_CELLS:
+        while cells >= MIN_CELLS:
             total = gaussians
             for camera in self._cameras:
                 if added := self._beyond(total, camera, cells, known):
@@ -78,7 +78,7 @@ class Margins:
 
     def _known(self, gaussians: Gaussians, camera: Camera) -> tuple[Camera, np.ndarray]:
         """A view made small, and the depth (H, W) before which it says what there is."""
-        small = camera.scaled(KNOWN / max(camera.width, camera.height))
+        small = camera.scaled(DEPTH_PIXELS / max(camera.width, camera.height))
         _, alpha, depth = self._draw(gaussians, small)
         thin = maximum_filter(1 - alpha, 3) > 0.5
         return small, np.where(thin, np.inf, maximum_filter(depth, 3))
@@ -97,7 +97,7 @@ class Margins:
         covered = (alpha > 0.5) & (depth > 0)
         inverse = 1 / np.where(covered, depth, 1)
         shown = np.concatenate([image / np.maximum(alpha, 0.5)[..., None], inverse[..., None]], 2)
-        shown, reached = blurred(shown, covered)
+        shown, reached = blur_outward(shown, covered)
         across, down = (wide.width - small.width) // 2, (wide.height - small.height) // 2
         row, column = np.nonzero(~covered & reached)
         edge_row = row.clip(down, down + small.height - 1)
@@ -110,16 +110,16 @@ class Margins:
 
         rays = np.stack([(column + 0.5 - wide.cx) / wide.fx, (row + 0.5 - wide.cy) / wide.fy], 1)
         rays = np.concatenate([rays, np.ones((len(rays), 1))], 1) @ wide.world_to_camera[:3, :3]
-        start = BEHIND / shown[row, column, 3]
+        start = DEPTH_FACTOR / shown[row, column, 3]
         depths = np.full(len(rays), np.nan)
-        for times in FARTHER:
+        for times in DEPTH_STEPS:
             places = wide.center + rays * (start * times)[:, None]
             open_ = np.flatnonzero(np.isnan(depths))
             free = open_[~_before(places[open_], known)]
             depths[free] = times * start[free]
         kept = ~np.isnan(depths)
         away = rays[kept] * depths[kept, None]
-        size = SIZE * np.linalg.norm(away, axis=1) / wide.focal
+        size = SPLAT_SIZE * np.linalg.norm(away, axis=1) / wide.focal
         colors = shown[row[kept], column[kept], :3]
         return _round(wide.center + away, size, colors, like=gaussians)
 
@@ -138,7 +138,7 @@ class Margins:
         return drawn.image.cpu().numpy(), drawn.alpha.cpu().numpy(), drawn.median_depth.cpu().numpy()
 
 
-def blurred(values: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def blur_outward(values: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Values (H, W, C) continued from where they are known (H, W), the blurrier the farther away.
 
     Returns:
@@ -146,10 +146,10 @@ def blurred(values: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarr
     """
     found, open_ = np.zeros_like(values), np.ones_like(known)
     masked = np.where(known[..., None], values, 0)
-    for blur in BLURS:
+    for blur in BLUR_SIGMAS:
         sigma = (blur, blur)
         weight = gaussian_filter(known.astype(np.float64), sigma, mode="constant")
-        here = open_ & (weight > REACHED)
+        here = open_ & (weight > MIN_BLUR_WEIGHT)
         summed = gaussian_filter(masked, (*sigma, 0), mode="constant")
         found[here] = summed[here] / weight[here, None]
         open_ &= ~here

@@ -9,11 +9,11 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-MOST_BYTES = 2 << 30
+MAX_BYTES = 2 << 30
 """Bytes of photographs that are kept, if nothing is said and the computer has four times as much free."""
 TARGET_BYTES = 36
 """Bytes a pixel: the photograph and its two local moments, float32."""
-UNKNOWN = 4 << 30
+FALLBACK_BYTES = 4 << 30
 """Bytes that a computer is taken to have where it does not say."""
 
 
@@ -31,7 +31,7 @@ def free_memory() -> int:
             return min(int(found[1]) << 10, _in_container())  # type: ignore[index]
     with suppress(OSError, ValueError, AttributeError):
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
-    return UNKNOWN
+    return FALLBACK_BYTES
 
 
 def keep_freed_memory(largest: int | None = None) -> None:
@@ -69,4 +69,4 @@ def _on_windows() -> int:
 
     status = Status(length=ctypes.sizeof(Status))
     known = ctypes.windll.kernel32.GlobalMemoryStatusEx(ctypes.byref(status))  # type: ignore[attr-defined]
-    return int(status.free) if known else UNKNOWN
+    return int(status.free) if known else FALLBACK_BYTES

@@ -18,17 +18,17 @@ from ..splats.ply import Columns
 from .density_control import require_rows
 from .exposure import Exposure
 from .margins import Margins
-from .model import OUTSIDE, PEAKS, Model
+from .model import OUTSIDE, PEAK_STATS, Model
 from .parameters import Parameters
 from .schedules import due, log_linear
 from .support import INTERVAL
 from .training_data import TrainingData, TrainingView
 
-DEPTH_FALL = 0.01
+FINAL_DEPTH_WEIGHT = 0.01
 """What is left of the weight of depths at the end."""
-MANY_VIEWS = 40
+DROPOUT_VIEWS = 40
 """With so many training views no splats are left out of steps."""
-ALL_FROM = 7 / 8
+DROPOUT_END = 7 / 8
 """From this share of the steps on none are, however few views there are."""
 
 
@@ -49,7 +49,7 @@ class Optimizer(Protocol):
         """Forgets these gradients."""
 
 
-class Made(NamedTuple):
+class StepResult(NamedTuple):
     """What a step tells of itself, until the next one.
 
     Attributes:
@@ -141,7 +141,7 @@ class Method(ABC, Generic[P, D]):
     def meta(self) -> dict:
         """What a bundle records of this run. Methods add to it."""
         data = self.data
-        middle = min(data.whole_train, key=lambda camera: np.linalg.norm(camera.center - data.mean_camera))
+        middle = min(data.full_train, key=lambda camera: np.linalg.norm(camera.center - data.mean_camera))
         ahead = middle.center + data.median_depth * middle.world_to_camera[2, :3]
         return {
             "camera_center": data.mean_camera.tolist(),
@@ -154,44 +154,44 @@ class Method(ABC, Generic[P, D]):
 
     # -- a step ----------------------------------------------------------------------------------------
 
-    def train_step(self, step: int) -> Made:
+    def train_step(self, step: int) -> StepResult:
         """Makes one step; the first has number 0."""
         view = self.choose_view(step)
-        made = self.step_there(view, step) or self.step_here(view, step)
+        made = self.step_on_device(view, step) or self.step_with_autograd(view, step)
         self.control_density(step)
-        if self.parameters.margin and not self.data.transparent and self.continues_margins(step):
-            self.continue_margins(step)
+        if self.parameters.margin and not self.data.transparent and self.adds_margins(step):
+            self.extend_margins(step)
         if due(INTERVAL, step + 1) or self.ends_level(step):
             self.exposure.center()
-            self.keep_supported(step)
+            self.prune_unsupported(step)
         return made
 
-    def step_here(self, view: TrainingView, step: int) -> Made:
+    def step_with_autograd(self, view: TrainingView, step: int) -> StepResult:
         """Draws, and moves what is trained by its gradients."""
         drawings = self.draw(view, step)
         loss = self.loss(drawings, view, step)
         loss.backward()
-        self.model.hold_still()
+        self.model.freeze_gradients()
         self.accumulate_stats(drawings, view, step)
-        self.grow_inside(step)
+        self.limit_growth(step)
         self.set_learning_rates(step)
         for optimizer in (*self.optimizers(), *self.exposure.optimizers(step / self.steps)):
             optimizer.step()
             optimizer.zero_grad()
         seen = drawings[0].rendering
-        picture = self.over_black(seen.image, seen.alpha, step)
-        return Made(float(loss.detach()), lambda: picture, view.target)
+        picture = self.composite_over_black(seen.image, seen.alpha, step)
+        return StepResult(float(loss.detach()), lambda: picture, view.target)
 
-    def step_there(self, view: TrainingView, step: int) -> Made | None:
+    def step_on_device(self, view: TrainingView, step: int) -> StepResult | None:
         """The same where the backend can make the whole step by itself; None where it cannot."""
         p, target = self.parameters, view.target
-        plain = self.is_plain(step) and not (p.lr_exposure or self.outputs or self.data.region)
+        plain = self.allows_device_step(step) and not (p.lr_exposure or self.outputs or self.data.region)
         if not plain or target.mask is not None or target.alpha is not None:
             return None
-        twin = self.model.twin(self.backend, p.antialias)
+        twin = self.model.device_model(self.backend, p.antialias)
         if twin is None:
             return None
-        weights, min_scale = self.shown(view, step)
+        weights, min_scale = self.render_weights(view, step)
         self.set_learning_rates(step)
         loss = twin.step(
             view.camera,
@@ -202,22 +202,22 @@ class Method(ABC, Generic[P, D]):
             ssim_weight=p.ssim_weight,
             weights=weights,
             min_scale=min_scale,
-            shrink=view.shrink if self.counts(view, step) else None,
+            shrink=view.shrink if self.collects_stats(view, step) else None,
         )
-        return Made(loss, lambda: self.over_black(*twin.last_image(), step), target)
+        return StepResult(loss, lambda: self.composite_over_black(*twin.last_image(), step), target)
 
-    def is_plain(self, step: int) -> bool:
+    def allows_device_step(self, step: int) -> bool:
         """Whether a step has one picture, of all the model's splats as :meth:`shown`, and this class's loss.
 
         Such a step may be made without ``draw`` and all that follows until ``control_density``.
         """
         return False
 
-    def shown(self, view: TrainingView, step: int) -> tuple[torch.Tensor | None, float]:
+    def render_weights(self, view: TrainingView, step: int) -> tuple[torch.Tensor | None, float]:
         """Weights (N,) and smallest standard deviation with which a plain step draws; see ``rasterize``."""
         return None, 0.0
 
-    def left_out(self, step: int, share: float) -> torch.Tensor | None:
+    def dropout_weights(self, step: int, share: float) -> torch.Tensor | None:
         """Weights (N,) that leave some splats out of a step, at random; None: it draws all.
 
         The others become as much more opaque (DropGaussian, Park et al. 2025). The fewer photographs see a
@@ -227,17 +227,17 @@ class Method(ABC, Generic[P, D]):
         Args:
             share: of the schedule's steps that were made before.
         """
-        rate = self.parameters.dropout * (1 - len(self.data.train) / MANY_VIEWS)
-        if rate <= 0 or share >= ALL_FROM:
+        rate = self.parameters.dropout * (1 - len(self.data.train) / DROPOUT_VIEWS)
+        if rate <= 0 or share >= DROPOUT_END:
             return None
         draws = np.random.default_rng([self.seed, step, 13]).random(len(self.model), np.float32)
         return torch.from_numpy((draws >= rate) / np.float32(1 - rate)).to(self.device)
 
     def choose_view(self, step: int) -> TrainingView:
         """The photograph of a step."""
-        return self.data.view_at(step, self.planned)
+        return self.data.view_at(step, self.planned_view)
 
-    def planned(self, step: int) -> tuple[int, float] | None:
+    def planned_view(self, step: int) -> tuple[int, float] | None:
         """Which view :meth:`choose_view` takes at a step, and its ``shrink``; None: it is not asked.
 
         It is asked ahead, so that photographs are read before they are needed, and may say something else
@@ -283,7 +283,7 @@ class Method(ABC, Generic[P, D]):
         p, truth = self.parameters, truth.to(drawn)
         known = truth.isfinite()
         apart = torch.where(known, drawn - truth, 0).abs().sum() / known.sum().clamp_min(1)
-        weight = log_linear(p.depth_weight, DEPTH_FALL * p.depth_weight, step / self.steps)
+        weight = log_linear(p.depth_weight, FINAL_DEPTH_WEIGHT * p.depth_weight, step / self.steps)
         return weight * self.data.median_depth * apart
 
     @property
@@ -291,16 +291,16 @@ class Method(ABC, Generic[P, D]):
         """What pictures of steps show besides colours, as ``rasterize`` takes it."""
         return ("inverse_depth",) if self.data.depths and self.parameters.depth_weight else ()
 
-    def counts(self, view: TrainingView, step: int) -> bool:
+    def collects_stats(self, view: TrainingView, step: int) -> bool:
         """Whether :meth:`control_density` decides by what a step sees."""
         return True
 
     def accumulate_stats(self, drawings: Sequence[D], view: TrainingView, step: int) -> None:
         """After ``backward``: what :meth:`control_density` decides by is added up (``model.stats``)."""
-        if self.counts(view, step):
+        if self.collects_stats(view, step):
             self.model.accumulate_stats(drawings[0].rendering, view.shrink)
 
-    def grow_inside(self, step: int) -> None:
+    def limit_growth(self, step: int) -> None:
         """After :meth:`accumulate_stats`: outside of a job's region nothing asks for more splats."""
         region, model = self.data.region, self.model
         if region is None:
@@ -308,7 +308,7 @@ class Method(ABC, Generic[P, D]):
         if OUTSIDE not in model.columns or due(INTERVAL, step):
             outside = ~region.contains(model["means"].detach().cpu().numpy())
             model.columns[OUTSIDE] = torch.from_numpy(outside).to(model["means"])
-        for name in ("gradient_sum", PEAKS[0]):
+        for name in ("gradient_sum", PEAK_STATS[0]):
             if name in model.stats:
                 model.stats[name][model.columns[OUTSIDE] > 0] = 0
 
@@ -332,15 +332,15 @@ class Method(ABC, Generic[P, D]):
         """Whether a level, or the run, is finished after a step."""
         return step + 1 == self.steps or self.level_at(step + 1) > self.level_at(step)
 
-    def continues_margins(self, step: int) -> bool:
+    def adds_margins(self, step: int) -> bool:
         """Whether photographs are continued after a step: best when splats are no longer added."""
         return False
 
     @torch.no_grad()
-    def continue_margins(self, step: int) -> None:
+    def extend_margins(self, step: int) -> None:
         """Adds what continues the photographs beyond their edges."""
         room = self.parameters.margin_room(self.budget_at(step))
-        self.append_margins(vars(self.margins().continued(self.gaussians_at(step), room)), step)
+        self.append_margins(vars(self.margins().extend(self.gaussians_at(step), room)), step)
 
     def budget_at(self, step: int) -> int:
         """Most splats that the model may have after a step."""
@@ -363,7 +363,7 @@ class Method(ABC, Generic[P, D]):
         self.model.append(rows)
 
     @torch.no_grad()
-    def keep_supported(self, step: int) -> None:
+    def prune_unsupported(self, step: int) -> None:
         """Removes what stands in the way of the training views, and bounds how large splats are.
 
         Raises:
@@ -374,13 +374,13 @@ class Method(ABC, Generic[P, D]):
             return
         support = self.data.support
         means = model["means"].detach().cpu().numpy()
-        distances, places = support.nearest_places(means)
+        distances, places = support.nearest_positions(means)
         if p.largest:
             sizes = np.maximum(p.largest * distances, np.finfo(np.float32).tiny)
             most = torch.from_numpy(np.log(sizes)).to(model["log_scales"])
             model["log_scales"].clamp_max_(most[:, None])
         if p.free_depth:
-            model.keep(torch.from_numpy(~support.intruding(means, distances, places, p.free_depth)))
+            model.keep(torch.from_numpy(~support.find_intruding(means, distances, places, p.free_depth)))
             require_rows(model, step, "free_depth")
 
     # -- what methods draw with ------------------------------------------------------------------------
@@ -423,7 +423,7 @@ class Method(ABC, Generic[P, D]):
         return red, green, blue
 
     @torch.no_grad()
-    def over_black(self, image: torch.Tensor, alpha: torch.Tensor, step: int) -> torch.Tensor:
+    def composite_over_black(self, image: torch.Tensor, alpha: torch.Tensor, step: int) -> torch.Tensor:
         """A step's picture (H, W, 3) as it is over black, which pictures have behind them."""
         background = torch.tensor(self.background(step)).to(image)
         return image - (1 - alpha[..., None]) * background
@@ -442,7 +442,7 @@ class Method(ABC, Generic[P, D]):
         """
         raise NotImplementedError("the levels hold all")
 
-    def picture(self, camera: Camera) -> torch.Tensor:
+    def render_image(self, camera: Camera) -> torch.Tensor:
         """What the model itself shows a camera, (H, W, 3); asked only where ``arrays`` gives some."""
         raise NotImplementedError("the levels hold all")
 

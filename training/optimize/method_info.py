@@ -18,7 +18,7 @@ PRESETS = {
 """The presets that every method has, each with what it is for."""
 
 
-def undivided(parameters: Parameters) -> None:
+def no_split(parameters: Parameters) -> None:
     """Of methods whose cells make all levels by themselves."""
     return None
 
@@ -56,13 +56,13 @@ class MethodInfo:
     parameters: type[Parameters]
     presets: Mapping[str, Parameters]
     rule: str = ""
-    offered: tuple[str, ...] = ()
+    panel_parameters: tuple[str, ...] = ()
     from_base: bool = False
-    base_in_parts: bool = False
-    for_splats: bool = False
-    in_cells: str = ""
-    divided: Callable[[Any], tuple[Parameters, Parameters] | None] = undivided
-    captured: Mapping[str, Any] = field(default_factory=dict)
+    streams_base: bool = False
+    suggested_for_base: bool = False
+    cell_method: str = ""
+    split_parameters: Callable[[Any], tuple[Parameters, Parameters] | None] = no_split
+    capture_values: Mapping[str, Any] = field(default_factory=dict)
     unused: tuple[str, ...] = ()
     package: str = ""
 

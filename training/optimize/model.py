@@ -17,13 +17,13 @@ from .parameters import Parameters
 
 NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh")
 """The tensors that every splat has; a model of splats may train further ones, (N,), under other names."""
-PEAKS = ("gradient_max", "radius_max")
+PEAK_STATS = ("gradient_max", "radius_max")
 """Stats that densification by maxima needs: as ``gradient_sum``, and in pixels, since the last reset."""
 
 
 OUTSIDE = "outside"
 """Column of the rows beside which none are added, 1, where only a region is trained in detail."""
-HELD = "held"
+FROZEN = "held"
 """Column of the rows that stay as they are, 1, where there are such: what they are beside is trained."""
 
 
@@ -63,7 +63,7 @@ class Model:
         blank = self["means"].detach().new_zeros(len(self))
         self.stats = {"gradient_sum": blank, "seen": blank.clone(), **(stats or {})}
         if peaks:
-            self.stats |= {name: blank.clone() for name in PEAKS}
+            self.stats |= {name: blank.clone() for name in PEAK_STATS}
 
     def __len__(self) -> int:
         return len(self._adam.tensors["means"] if self._twin is None else self._twin)
@@ -97,13 +97,13 @@ class Model:
     def lr(self, rates: dict[str, LearningRate]) -> None:
         self._adam.lr = rates
 
-    def twin(self, backend: str, antialias: bool) -> DeviceModel | None:
+    def device_model(self, backend: str, antialias: bool) -> DeviceModel | None:
         """What a backend trains in the model's place, until somebody asks for what it is; see ``make_device_model``."""
-        if self._twin is None and HELD not in self.columns:
+        if self._twin is None and FROZEN not in self.columns:
             self._twin = make_device_model(backend, self._adam, self._stats, antialias=antialias)
         return self._twin
 
-    def look(self, name: str) -> torch.Tensor:
+    def read(self, name: str) -> torch.Tensor:
         """A trained tensor's or a statistic's values, to read only: what is trained elsewhere stays there."""
         if self._twin is not None and (name in NAMES or name in self._stats):
             return self._twin.read(name)
@@ -129,7 +129,7 @@ class Model:
         """The tensors as the rasterizer takes them, of a model of splats."""
         return Gaussians(*(self[name] for name in NAMES))
 
-    def rows(self, index: torch.Tensor) -> dict[str, torch.Tensor]:
+    def read_rows(self, index: torch.Tensor) -> dict[str, torch.Tensor]:
         """A copy of the trained tensors at indices (M,), by name."""
         here = {name: self._adam.tensors[name].detach()[index] for name in self._here}
         return here if self._twin is None else here | self._twin.read_rows(index)
@@ -177,21 +177,21 @@ class Model:
             self._replace(name, values, torch.zeros_like(values), torch.zeros_like(values))
 
     @torch.no_grad()
-    def keep_above(self, least: torch.Tensor) -> None:
+    def raise_log_scales(self, least: torch.Tensor) -> None:
         """No log-scale of a splat is below its least one (N,) from here."""
         if self._twin is None:
             self["log_scales"].copy_(torch.maximum(self["log_scales"], least[:, None]))
         else:
             self._twin.raise_log_scales(least)
 
-    def hold(self, rows: torch.Tensor) -> None:
+    def freeze_rows(self, rows: torch.Tensor) -> None:
         """From now on these rows, (N,) bool, stay as they are."""
-        self.columns[HELD] = rows.to(self["means"])
+        self.columns[FROZEN] = rows.to(self["means"])
 
-    def hold_still(self) -> None:
+    def freeze_gradients(self) -> None:
         """After ``backward``: rows that are held have no part in the step."""
-        if HELD in self.columns:
-            held = self.columns[HELD] > 0
+        if FROZEN in self.columns:
+            held = self.columns[FROZEN] > 0
             for tensor in self.adam.tensors.values():
                 if tensor.grad is not None:
                     tensor.grad[held] = 0
@@ -208,7 +208,7 @@ class Model:
         gradient = rendering.grad2d.norm(dim=1) / shrink
         self.stats["gradient_sum"] += gradient
         self.stats["seen"] += rendering.radii > 0
-        for name, now in zip(PEAKS, (gradient, rendering.radii), strict=True):
+        for name, now in zip(PEAK_STATS, (gradient, rendering.radii), strict=True):
             if name in self.stats:
                 self.stats[name] = torch.maximum(self.stats[name], now)
 
@@ -222,7 +222,7 @@ class Model:
 
     def mean_gradient(self) -> torch.Tensor:
         """Mean norm of the image-plane gradient over the views that drew each splat; as ``gradient_sum``."""
-        return self.look("gradient_sum") / self.look("seen").clamp_min(1)
+        return self.read("gradient_sum") / self.read("seen").clamp_min(1)
 
     def _replace(self, name: str, tensor: torch.Tensor, first: torch.Tensor, second: torch.Tensor) -> None:
         self._adam.replace(name, tensor.requires_grad_(True), first, second)

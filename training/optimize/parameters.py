@@ -11,9 +11,9 @@ from ..documents import quote
 from ..errors import LodgsError
 from ..scenes.depths import DEPTH_KINDS
 
-MARGIN_SHARE, MARGIN_SPLATS = 0.1, 4000
+MAX_MARGIN_SHARE, MAX_MARGIN_SPLATS = 0.1, 4000
 """The most of all splats that may continue photographs beyond their edges, and the most at all."""
-MOST_WHOLE, MOST_NUMBER = 2**31 - 1, 1e9
+MAX_INTEGER, MAX_NUMBER = 2**31 - 1, 1e9
 """The largest whole number, and the largest other one, that any parameter takes."""
 
 
@@ -155,18 +155,18 @@ class Parameters:
         return self.total_steps
 
     @property
-    def goes_on(self) -> bool:
+    def continues_levels(self) -> bool:
         """Whether training goes on from coarser levels, which a base has."""
         return False
 
     @property
-    def most_at_once(self) -> int:
+    def max_trained_splats(self) -> int:
         """Most splats that are trained at a time."""
         return self.max_splats
 
     def margin_room(self, budget: int) -> int:
         """How many of at most so many splats may continue photographs."""
-        return min(int(MARGIN_SHARE * budget), MARGIN_SPLATS) if self.margin else 0
+        return min(int(MAX_MARGIN_SHARE * budget), MAX_MARGIN_SPLATS) if self.margin else 0
 
     def check(self) -> None:
         """What values must be beside each other; a method's class says it of its own.
@@ -269,7 +269,7 @@ def override(parameters: Parameters, values: dict) -> Parameters:
     return made
 
 
-def possible(f: Field) -> str:
+def describe_values(f: Field) -> str:
     """What a parameter (or each entry of a tuple) can be: "a number above 0 and at most 1"."""
     about, default = f.metadata, f.default[0] if isinstance(f.default, tuple) else f.default
     if isinstance(default, bool):
@@ -293,13 +293,13 @@ def _valid(f: Field, value: Any) -> Any:
         whole = isinstance(value, int) and not isinstance(value, bool)
         valid = whole or (isinstance(default, float) and isinstance(value, float) and isfinite(value))
         valid = valid and value <= high and (value >= low if above is None else value > above)
-        most = MOST_WHOLE if isinstance(default, int) else MOST_NUMBER
+        most = MAX_INTEGER if isinstance(default, int) else MAX_NUMBER
         if valid and value > most:
             raise LodgsError(
                 f"{f.name} = {quote(value)} is more than any use of it.", f"Give at most {most:g}."
             )
     if not valid:
-        raise LodgsError(f"{f.name} = {quote(value)} is not possible.", f"Give {possible(f)}.")
+        raise LodgsError(f"{f.name} = {quote(value)} is not possible.", f"Give {describe_values(f)}.")
     return type(default)(value)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from ..lod.blocks import SIZE
 
 
-def least_importance(importance: np.ndarray, views: np.ndarray, most: float) -> float:
+def importance_threshold(importance: np.ndarray, views: np.ndarray, most: float) -> float:
     """The importance from which on splats stay, so that no more are drawn than may be.
 
     Args:
@@ -23,7 +23,7 @@ def least_importance(importance: np.ndarray, views: np.ndarray, most: float) -> 
     return float(importance[descending[within - 1]]) if 0 < within < len(importance) else 0.0
 
 
-def room_taken_over(log_scales: np.ndarray, shares: np.ndarray, kept: np.ndarray) -> np.ndarray:
+def log_scale_gain(log_scales: np.ndarray, shares: np.ndarray, kept: np.ndarray) -> np.ndarray:
     """What is to be added to log-scales (N, 3), (N,), so that those that are kept cover what all did.
 
     In each block, areas weighted by the splats' shares of a pixel add up to what they were. At most doubles

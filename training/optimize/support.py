@@ -14,17 +14,17 @@ NEIGHBOURS = (1, 2, 4)
 """Which of a camera's nearest other cameras a place lies halfway to."""
 INTERVAL = 50
 """Steps between two looks at what is supported."""
-NEAREST = 0.01
+NEAREST_QUANTILE = 0.01
 """Quantile of the depths of the points in a view that counts as the nearest, as some points are astray."""
 MARGIN = 0.1
 """What a view is widened by on every side, as a share of its image."""
-POINTS = 20_000
+MAX_POINTS = 20_000
 """Most points that are looked at."""
-SEEN = 2
+MIN_PHOTOS = 2
 """So many photographs have to see what is near to a place but not before it."""
 
 
-def halfway(cameras: Sequence[Camera]) -> list[Camera]:
+def midpoint_views(cameras: Sequence[Camera]) -> list[Camera]:
     """Views from halfway between each camera and its 1st, 2nd and 4th nearest, looking as the camera does.
 
     Places that need more cameras than there are do not exist.
@@ -53,17 +53,19 @@ class Support:
     """
 
     def __init__(self, cameras: Sequence[Camera], points: np.ndarray) -> None:
-        points = points[:: -(-len(points) // POINTS)].astype(np.float64)
+        points = points[:: -(-len(points) // MAX_POINTS)].astype(np.float64)
         self._cameras = cameras
-        self._views = [*cameras, *halfway(cameras)]
+        self._views = [*cameras, *midpoint_views(cameras)]
         depths = (view.view_space(points)[view.sees(points), 2] for view in self._views)
-        self._nearest = np.array([np.quantile(seen, NEAREST) if len(seen) else 0.0 for seen in depths])
+        self._nearest = np.array(
+            [np.quantile(seen, NEAREST_QUANTILE) if len(seen) else 0.0 for seen in depths]
+        )
         self._eyes = KDTree(np.array([view.center for view in self._views]))
         sides = [max(view.width / view.fx, view.height / view.fy) for view in self._views]
         self._slant = float(np.sqrt(1 + 2 * ((1 + MARGIN) * max(sides)) ** 2))
         """A point in a view lies at most this many times as far as it is deep, wherever its center is."""
 
-    def nearest_places(self, means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def nearest_positions(self, means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The nearest of the places to each of the points (N, 3): how far it is, in scene units, and which.
 
         Returns:
@@ -72,13 +74,13 @@ class Support:
         distances, places = self._eyes.query(means, workers=-1)
         return np.asarray(distances), np.asarray(places)
 
-    def intruding(
+    def find_intruding(
         self, means: np.ndarray, distances: np.ndarray, places: np.ndarray, share: float
     ) -> np.ndarray:
         """Which points (N, 3) stand in the way: nearer than a share of what is nearest in a place's view.
 
         Args:
-            distances, places: as :meth:`nearest_places` gives them.
+            distances, places: as :meth:`nearest_positions` gives them.
 
         Returns:
             (N,) bool.
@@ -94,5 +96,5 @@ class Support:
         seen = np.zeros(int(beside.sum()), np.int64)
         for camera in self._cameras:
             seen += camera.sees(points[beside])
-        found[near[beside]] |= seen < SEEN
+        found[near[beside]] |= seen < MIN_PHOTOS
         return found

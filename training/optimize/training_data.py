@@ -20,20 +20,20 @@ from ..scenes.colmap import Scene
 from ..scenes.depths import DepthPriors
 from ..scenes.exposures import remove_gain
 from ..scenes.images import load_image, load_mask
-from .image_cache import Targets, default_budget
+from .image_cache import ImageCache, default_budget
 from .memory import TARGET_BYTES
 from .support import Support
 
-TRIED = 3
+ALPHA_SAMPLES = 3
 """Photographs that are looked at for whether they are transparent."""
-SMALLEST = 11
+MIN_SIDE = 11
 """Pixels of a photograph's shorter side: SSIM compares windows of so many."""
 DEPTH_BYTES = 4
 """Bytes a pixel that depth takes beside a photograph."""
-OPAQUE = 0.99
+OPAQUE_ALPHA = 0.99
 """Alpha from here on is no transparency, but rounding."""
 
-Planned = Callable[[int], tuple[int, float] | None]
+ViewPlan = Callable[[int], tuple[int, float] | None]
 """Of a step: the index of its training view, and how many times smaller that is; None: it needs none."""
 
 
@@ -86,7 +86,7 @@ class TrainingData:
         photo_memory: int | None = None,
         splat_memory: int | None = None,
         scratch: Path | None = None,
-        whole: Scene | None = None,
+        full_scene: Scene | None = None,
         depths: DepthPriors | None = None,
         region: Crop | None = None,
         gains: Mapping[str, np.ndarray] | None = None,
@@ -96,8 +96,8 @@ class TrainingData:
                 f"The COLMAP model in {scene.model} has no 3D points, so there is nothing to train from.",
                 "Triangulate the model's points in COLMAP, or choose another model.",
             )
-        self.whole = scene if whole is None else whole
-        all_train, all_test = self.whole.split(test_every, validation)
+        self.full_scene = scene if full_scene is None else full_scene
+        all_train, all_test = self.full_scene.split(test_every, validation)
         train, test = (_among(scene.cameras, each) for each in (all_train, all_test))
         if len(scene.cameras) < 2:
             raise LodgsError(
@@ -112,28 +112,28 @@ class TrainingData:
             )
         if validation and not all_test:
             raise LodgsError(
-                f"Of the {len(self.whole.cameras)} usable views in {scene.folder} validation leaves some out "
+                f"Of the {len(self.full_scene.cameras)} usable views in {scene.folder} validation leaves some out "
                 f"and measures none, with one of every {test_every} held out.",
                 "Give a smaller test_every, or train without validation.",
             )
         self.scene, self.exposure, self.depths, self.region = scene, exposure, depths, region
         self._trained, self._gains = {camera.name for camera in train}, gains or {}
-        self.whole_train = [camera.scaled(image_scale) for camera in all_train]
+        self.full_train = [camera.scaled(image_scale) for camera in all_train]
         self.train = [camera.scaled(image_scale) for camera in train]
         self.test = [camera.scaled(image_scale) for camera in test]
         for camera in (*self.train, *self.test):
-            if min(camera.width, camera.height) < SMALLEST:
+            if min(camera.width, camera.height) < MIN_SIDE:
                 raise LodgsError(
                     f"{camera.name} would be trained on at {camera.width} x {camera.height} pixels; "
-                    f"{SMALLEST} are needed.",
+                    f"{MIN_SIDE} are needed.",
                     "Give a larger image_scale.",
                 )
         budget = default_budget() if photo_memory is None else photo_memory
         if depths:
             budget = budget * TARGET_BYTES // (TARGET_BYTES + DEPTH_BYTES)
-        self.photographs = Targets(self._read, budget)
+        self.images = ImageCache(self._read, budget)
         self.splat_memory, self._scratch = splat_memory, scratch
-        self._planned: Planned | None = None
+        self._planned: ViewPlan | None = None
 
     @cached_property
     def scratch(self) -> Path:
@@ -146,22 +146,22 @@ class TrainingData:
     @cached_property
     def extent(self) -> float:
         """Scene extent in scene units: 1.1 x the largest distance of a camera from their mean."""
-        return self.whole.extent()
+        return self.full_scene.extent()
 
     @cached_property
     def median_depth(self) -> float:
         """Median depth of the points in the views, in scene units."""
-        return self.whole.median_depth()
+        return self.full_scene.median_depth()
 
     @cached_property
     def mean_camera(self) -> np.ndarray:
         """Mean position of the training cameras, (3,)."""
-        return np.mean([camera.center for camera in self.whole_train], axis=0)
+        return np.mean([camera.center for camera in self.full_train], axis=0)
 
     @cached_property
     def focal(self) -> float:
         """Focal length in pixels: the training views' median."""
-        return float(np.median([camera.focal for camera in self.whole_train]))
+        return float(np.median([camera.focal for camera in self.full_train]))
 
     @cached_property
     def support(self) -> Support:
@@ -171,7 +171,7 @@ class TrainingData:
     @cached_property
     def near(self) -> float:
         """Depth before which nothing is drawn, in scene units."""
-        return self.whole.near()
+        return self.full_scene.near()
 
     @cached_property
     def threshold_scale(self) -> float:
@@ -180,17 +180,17 @@ class TrainingData:
         The loss is a mean over pixels, and the gradient counts half image widths: for a splat of given
         size in pixels it grows as the image shrinks, with the inverse of the image's side.
         """
-        pixels = np.median([camera.width * camera.height for camera in self.whole_train])
+        pixels = np.median([camera.width * camera.height for camera in self.full_train])
         return float(np.sqrt(1e6 / pixels))
 
     @cached_property
     def transparent(self) -> bool:
         """Whether photographs have alpha that counts: one of TRIED training views is not opaque."""
-        for camera in pick_evenly(self.train, TRIED):
+        for camera in pick_evenly(self.train, ALPHA_SAMPLES):
             if camera.image is not None:
                 with suppress(LodgsError):  # which the step that needs it tells
                     pixels = load_image(camera.image, camera.width, camera.height, alpha=True)
-                    if pixels[..., 3].min() < OPAQUE:
+                    if pixels[..., 3].min() < OPAQUE_ALPHA:
                         return True
         return False
 
@@ -199,7 +199,7 @@ class TrainingData:
         epoch, place = divmod(step, len(self.train))
         return int(_shuffled(len(self.train), seed, epoch)[place])
 
-    def view_at(self, step: int, planned: Planned) -> TrainingView:
+    def view_at(self, step: int, planned: ViewPlan) -> TrainingView:
         """The view of a step; those that the next steps need are read meanwhile.
 
         Args:
@@ -208,7 +208,7 @@ class TrainingData:
         if planned != self._planned:
             self._planned = planned
             self._plan = lambda step: None if (view := planned(step)) is None else self.camera(*view)
-        self.photographs.follow(step, self._plan)
+        self.images.prefetch(step, self._plan)
         view = planned(step)
         assert view is not None
         return self.view(*view)
@@ -223,7 +223,7 @@ class TrainingData:
 
     def target(self, view: int, shrink: float = 1) -> Target:
         """The ground truth of a training view, ``shrink`` times smaller, ready for the loss."""
-        return self.photographs.target(self.camera(view, shrink))
+        return self.images.target(self.camera(view, shrink))
 
     def _read(self, camera: Camera) -> Target:
         """The photograph at the camera's size, its planes one after the other as losses take them."""

@@ -92,7 +92,7 @@ def training_data(
         photo_memory=job.photo_memory * 10**6 or None,
         splat_memory=job.splat_memory * 10**6 or None,
         scratch=folder.checkpoints,
-        whole=full_scene,
+        full_scene=full_scene,
         depths=depths,
         region=job.crop,
         gains=gains,

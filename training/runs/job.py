@@ -172,7 +172,7 @@ class Job:
             raise LodgsError(
                 f"Unknown backend: {quote(self.backend)}.", f"Use one of: {', '.join(BACKENDS)}."
             )
-        continues = self.resolved_parameters().goes_on
+        continues = self.resolved_parameters().continues_levels
         if continues and not self.base:
             raise LodgsError(
                 "Cannot continue with finer levels: the job has no base.", "Add 'base', or start at level 1."
@@ -210,7 +210,7 @@ class Job:
         for key in ("base", "capture", "region"):
             if getattr(self, key):
                 raise LodgsError(f"The job has both 'cells' and '{key}'.", "Remove one of them.")
-        if not method_info(self.method).in_cells:
+        if not method_info(self.method).cell_method:
             raise LodgsError(
                 f"The method '{self.method}' cannot train a scene in cells.",
                 "Choose another method, or remove 'cells'.",
@@ -248,7 +248,7 @@ class Job:
 
     @cached_property
     def _parameters(self) -> Parameters:
-        captured = method_info(self.method).captured if self.capture else {}
+        captured = method_info(self.method).capture_values if self.capture else {}
         return parameters_of(self.method, self.preset, {**captured, **self.parameters})
 
     def resolved(self) -> Job:

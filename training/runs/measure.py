@@ -177,7 +177,7 @@ def _measure_networks(job: Job, folder: RunFolder, evaluation: Evaluation) -> di
         method.load_arrays(arrays)
     except (KeyError, ValueError) as error:
         raise array_error(folder.model, error) from error
-    return evaluation.measure_images(method.picture)
+    return evaluation.measure_images(method.render_image)
 
 
 def _finite(value):

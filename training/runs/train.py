@@ -130,7 +130,7 @@ def _train(
         scene=job.scene, out=str(folder.path), pid=os.getpid(),
     )  # fmt: skip
     with _interrupt_on_cancel(folder):
-        merged_is_result = bool(job.cells) and METHODS[job.method].in_cells == job.method
+        merged_is_result = bool(job.cells) and METHODS[job.method].cell_method == job.method
         if job.cells:
             merged = folder.bundle if merged_is_result else folder.merged
             division = write_plan(job, folder)
@@ -224,7 +224,7 @@ class _TrainingRun:
         region = None
         if job.base:
             base, antialias = open_base(job.base, self._warn)
-            if not METHODS[job.method].base_in_parts:
+            if not METHODS[job.method].streams_base:
                 base = base.select(slice(None))
             if antialias != parameters.antialias:
                 self._warn(f"Antialiasing is {'on' if antialias else 'off'} for this run, as in its base.")
@@ -240,7 +240,7 @@ class _TrainingRun:
         method = create(job.method, data, parameters, job.seed, self._backend, base)
         method.warn = self._warn
         if region is not None and region.seam:
-            method.model.hold(
+            method.model.freeze_rows(
                 torch.from_numpy(~region.near_border(method.model["means"].detach().cpu().numpy()))
             )
         return method
@@ -294,7 +294,7 @@ class _TrainingRun:
         """Write the levels, as stored after their training, into one bundle."""
         self.folder.require_lock()
         levels = [self._read_level(record) for record in self.levels]
-        up = up_rotation(self.data.whole.cameras).round(6)
+        up = up_rotation(self.data.full_scene.cameras).round(6)
         meta = {**self.method.meta(), "up_rotation": up, "seed": self.job.seed}
         if self.job.test_every:
             middle = [self.job.test_every // 2] if self.job.validation else []
@@ -306,7 +306,7 @@ class _TrainingRun:
             with atomic_write(self.folder.model) as temporary, open(temporary, "wb") as file:
                 np.savez(file, **arrays)
             if self.data.test:
-                neural_psnr = self.evaluation.measure_images(self.method.picture)["psnr"]
+                neural_psnr = self.evaluation.measure_images(self.method.render_image)["psnr"]
                 resident = ResidentBundle(bundle, self.evaluation.backend)
                 baked_psnr = self.evaluation.measure_by_distance(resident, resolve_controls(bundle, {}))[
                     "psnr"
@@ -321,8 +321,8 @@ class _TrainingRun:
 
     def _view_tables(self) -> dict[str, Columns]:
         """Return the scene's cameras as bundle tables."""
-        cameras = self.data.whole.cameras
-        excluded = {camera.name for camera in cameras} - {camera.name for camera in self.data.whole_train}
+        cameras = self.data.full_scene.cameras
+        excluded = {camera.name for camera in cameras} - {camera.name for camera in self.data.full_train}
         return make_view_tables(cameras, self.data.near, excluded)
 
     def _read_level(self, record: dict) -> Level:

@@ -8,7 +8,7 @@ import pytest
 
 from training.evaluate.offset_views import MAX_POSITIONS, VEIL_DEPTH, count_oversized, measure_veil
 from training.evaluate.views import Evaluation
-from training.optimize.support import halfway
+from training.optimize.support import midpoint_views
 from training.rasterize import Gaussians, rasterize
 from training.scenes.cameras import Camera, pick_evenly
 from training.splats.gaussians import Splats
@@ -50,7 +50,7 @@ def evaluation(*cameras: Camera) -> Evaluation:
 
 def test_positions_are_halfway_to_the_first_second_and_fourth_nearest():
     cameras = [camera(x, turn) for x, turn in ((0, 0.1), (1, 0.2), (3, 0.3), (7, 0.4), (15, 0.5))]
-    offset_cameras = halfway(cameras)
+    offset_cameras = midpoint_views(cameras)
     assert [round(float(offset.center[0]), 6) for offset in offset_cameras] == [
         0.5, 1.5, 7.5,  # from 0: to 1, 3 and 15
         0.5, 2.0, 8.0,  # from 1: to 0, 3 and 15
@@ -66,7 +66,7 @@ def test_positions_are_halfway_to_the_first_second_and_fourth_nearest():
 
 
 def test_two_cameras_share_their_midpoint():
-    assert [offset.center[0] for offset in halfway([camera(-1), camera(1)])] == [0, 0]
+    assert [offset.center[0] for offset in midpoint_views([camera(-1), camera(1)])] == [0, 0]
 
 
 def test_positions_are_limited_evenly():

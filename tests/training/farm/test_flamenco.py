@@ -88,7 +88,7 @@ def test_extra_options_apply_to_the_plan(tmp_path):
 @needs_node
 def test_settings_match_methods_and_presets(tmp_path):
     settings = {setting["key"]: setting for setting in compiled(tmp_path)["type"]["settings"]}
-    assert set(settings["method"]["choices"]) == {name for name, info in METHODS.items() if info.in_cells}
+    assert set(settings["method"]["choices"]) == {name for name, info in METHODS.items() if info.cell_method}
     assert settings["preset"]["choices"] == list(PRESETS)
     assert settings["polish"]["default"] == POLISH_STEPS
     for setting in settings.values():

@@ -82,7 +82,7 @@ def test_the_loss_by_hand(data):
 
 def test_masked_out_and_held_out_depths_do_not_count(scene, data, tmp_path):
     camera = data.test[0]
-    assert data.photographs.target(camera).inverse_depth is None
+    assert data.images.target(camera).inverse_depth is None
     assert data.target(0).inverse_depth is not None
     shutil.copytree(scene.folder, tmp_path / "scene")
     (tmp_path / "scene" / "masks").mkdir()

@@ -5,7 +5,7 @@ import torch
 
 from training.methods import METHODS, create
 from training.methods.flod import finish
-from training.optimize.method import ALL_FROM, MANY_VIEWS
+from training.optimize.method import DROPOUT_END, DROPOUT_VIEWS
 from training.optimize.parameters import override
 
 PLAIN = ("3dgs", "flod", "octree", "clod", "lodge", "tree")
@@ -17,9 +17,9 @@ def make(data, name="3dgs", **values):
 
 def test_the_share_by_hand(data):
     """Of six training views: 0.4 (1 - 6 / 40) = 0.34 are left out, the others 1 / 0.66 times as opaque."""
-    assert len(data.train) == 6 and MANY_VIEWS == 40
+    assert len(data.train) == 6 and DROPOUT_VIEWS == 40
     method = make(data, dropout=0.4)
-    found = torch.cat([method.left_out(step, 0.0) for step in range(200)])
+    found = torch.cat([method.dropout_weights(step, 0.0) for step in range(200)])
     assert sorted(found.unique().tolist()) == pytest.approx([0, 1 / 0.66])
     assert float((found == 0).double().mean()) == pytest.approx(0.34, abs=0.015)
     assert float(found.mean()) == pytest.approx(1, abs=0.03)
@@ -27,18 +27,21 @@ def test_the_share_by_hand(data):
 
 def test_every_step_leaves_out_others_and_the_same_when_it_is_made_again(data):
     one, again, other = make(data), make(data), create("3dgs", data, make(data).parameters, 1, "cpu")
-    assert torch.equal(one.left_out(3, 0.0), again.left_out(3, 0.0))
-    assert not torch.equal(one.left_out(3, 0.0), one.left_out(4, 0.0))
-    assert not torch.equal(one.left_out(3, 0.0), other.left_out(3, 0.0))
+    assert torch.equal(one.dropout_weights(3, 0.0), again.dropout_weights(3, 0.0))
+    assert not torch.equal(one.dropout_weights(3, 0.0), one.dropout_weights(4, 0.0))
+    assert not torch.equal(one.dropout_weights(3, 0.0), other.dropout_weights(3, 0.0))
 
 
 def test_none_is_left_out_of_many_views_nor_at_the_end_nor_where_it_is_off(data, monkeypatch):
     method = make(data)
-    assert method.left_out(0, ALL_FROM - 0.01) is not None and method.left_out(0, ALL_FROM) is None
-    assert make(data, dropout=0.0).left_out(0, 0.0) is None
+    assert (
+        method.dropout_weights(0, DROPOUT_END - 0.01) is not None
+        and method.dropout_weights(0, DROPOUT_END) is None
+    )
+    assert make(data, dropout=0.0).dropout_weights(0, 0.0) is None
     for count, some in ((39, True), (40, False), (400, False)):
         monkeypatch.setattr(data, "train", [data.train[0]] * count)
-        assert (method.left_out(0, 0.0) is not None) == some
+        assert (method.dropout_weights(0, 0.0) is not None) == some
 
 
 @pytest.mark.parametrize("name", METHODS)
@@ -53,7 +56,7 @@ def test_what_is_left_out_learns_nothing_in_a_step(data, name):
     """And a part of the rest does: it is drawn."""
     method = make(data, name, dropout=0.5, margin=0.0)
     before = method.model["means"].detach().clone()
-    left = method.left_out(0, 0.0)
+    left = method.dropout_weights(0, 0.0)
     method.train_step(0)
     moved = (method.model["means"].detach() != before).any(1)
     assert not moved[left == 0].any() and moved[left > 0].any()
@@ -63,11 +66,11 @@ def test_finishing_draws_all(data):
     """Which begins before the last eighth of the steps: levels are to meet as they are shown."""
     flod = make(data, "flod", levels=2, steps=[4, 4], finish_share=1.0, dropout=0.5)
     view = flod.data.view(0)
-    assert (flod.shown(view, 0)[0] == 0).any()
+    assert (flod.render_weights(view, 0)[0] == 0).any()
     for step in range(8):
         flod.train_step(step)
         flod.levels_after(step)
-    assert ALL_FROM > 8 / 16
+    assert DROPOUT_END > 8 / 16
     for step in range(8, 12):
         chosen = finish.weights(flod.model, flod.s_min, view.camera, flod._finishing_values(step))
-        assert torch.equal(flod.shown(view, step)[0], chosen)
+        assert torch.equal(flod.render_weights(view, step)[0], chosen)

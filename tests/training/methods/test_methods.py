@@ -284,7 +284,7 @@ def test_a_step_has_its_own_background_and_its_picture_has_none(data, name):
     black = create(name, data, override(presets["draft"], {"random_background": False}), 0, "cpu")
     expected = black.draw(view, 3)[0].rendering
     torch.testing.assert_close(drawn.image - expected.image, (1 - drawn.alpha[..., None]) * behind)
-    torch.testing.assert_close(method.over_black(drawn.image, drawn.alpha, 3), expected.image)
+    torch.testing.assert_close(method.composite_over_black(drawn.image, drawn.alpha, 3), expected.image)
     assert (drawn.alpha < 0.5).any()
     colors = {method.background(step) for step in range(9)}
     assert len(colors) == 9 and black.background(3) == (0, 0, 0) == tuple(

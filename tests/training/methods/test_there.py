@@ -44,14 +44,14 @@ def steps(method, begin: int, end: int) -> list[float]:
 @pytest.fixture
 def there(graphics, monkeypatch) -> list:
     """Grows by one with each step that a device makes."""
-    found, twin = [], Model.twin
+    found, twin = [], Model.device_model
 
     def noted(model, *arguments):
         made = twin(model, *arguments)
         found.append(made is not None)
         return made
 
-    monkeypatch.setattr(Model, "twin", noted)
+    monkeypatch.setattr(Model, "device_model", noted)
     return found
 
 
@@ -74,7 +74,7 @@ def trained(count: int) -> Model:
     tensors["opacity_logits"] = torch.linspace(-8, 4, count)
     rates = dict.fromkeys(tensors, 1e-3)
     model = Model(tensors, rates, columns={"level": torch.arange(float(count))}, peaks=True)
-    twin, camera = model.twin("gpu", False), Camera("", 75, 50, 60.0, 60.0, 37.5, 25.0, np.eye(4))
+    twin, camera = model.device_model("gpu", False), Camera("", 75, 50, 60.0, 60.0, 37.5, 25.0, np.eye(4))
     assert twin is not None
     target = Target(rng.integers(0, 256, (50, 75, 3)) / np.float32(255))
     for _ in range(2):
@@ -100,10 +100,10 @@ def test_splats_come_and_go_there_as_they_do_here(graphics, monkeypatch, most):
     other.adam.zero_grad()  # which brings it home
     for model in (one, other):
         control_density(model)
-        model.append({name: row[:0] for name, row in model.rows(torch.arange(3)).items()})
-        model.append(model.rows(torch.tensor([7, 7, 3])) | {"level": torch.ones(3)})
+        model.append({name: row[:0] for name, row in model.read_rows(torch.arange(3)).items()})
+        model.append(model.read_rows(torch.tensor([7, 7, 3])) | {"level": torch.ones(3)})
         model.keep(torch.arange(len(model)) != 5)
-        model.assign("sh", 2 * model.look("sh"))
+        model.assign("sh", 2 * model.read("sh"))
     assert one._twin is not None and other._twin is None
     for part, theirs in zip(_flat(one.state_dict()), _flat(other.state_dict()), strict=True):
         assert torch.equal(part, theirs)
@@ -115,7 +115,7 @@ def test_density_control_moves_a_few_numbers_of_a_splat(graphics):
     """Of which there are 750 bytes: those that it decides by, and the rows that come."""
     model, before = trained(4000), graphics.transferred
     control_density(model)
-    assert model.twin("gpu", False) is not None and graphics.transferred - before < 100 * 4000
+    assert model.device_model("gpu", False) is not None and graphics.transferred - before < 100 * 4000
 
 
 def _flat(state) -> list[torch.Tensor]:

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from training.optimize.density_control import constrained_log, densify, peak_scores, prune, reset_opacities
+from training.optimize.density_control import (
+    constrained_log_scales,
+    densify,
+    peak_scores,
+    prune,
+    reset_opacities,
+)
 from training.optimize.model import NAMES, Model
 
 ALL = (*NAMES, "decay")
@@ -125,8 +131,8 @@ def test_maxima_decide_by_the_papers_equation_6():
 
 def test_constrained_log_undoes_the_constraint_and_stays_free_below_it():
     scales = torch.tensor([0.5, 0.2])
-    torch.testing.assert_close(constrained_log(scales, 0.1).exp() + 0.1, scales)
-    assert constrained_log(torch.tensor([0.05]), 0.1).exp().item() == pytest.approx(0.005)
+    torch.testing.assert_close(constrained_log_scales(scales, 0.1).exp() + 0.1, scales)
+    assert constrained_log_scales(torch.tensor([0.05]), 0.1).exp().item() == pytest.approx(0.005)
 
 
 def test_pruning_takes_what_is_more_transparent_than_asked_for(model):

@@ -16,7 +16,7 @@ from training.errors import LodgsError
 from training.methods import METHODS, create
 from training.optimize import image_cache as targets_module
 from training.optimize import memory as memory_module
-from training.optimize.image_cache import TARGET_BYTES, Targets, default_budget
+from training.optimize.image_cache import TARGET_BYTES, ImageCache, default_budget
 from training.optimize.parameters import override
 from training.optimize.training_data import TrainingData
 from training.rasterize import Target, photometric_loss
@@ -50,28 +50,28 @@ def shuffles(views: int, epochs: int) -> list[int]:
     return np.concatenate([np.random.default_rng(e).permutation(views) for e in range(epochs)]).tolist()
 
 
-def run(targets: Targets, order: list[int], plan=None) -> None:
+def run(targets: ImageCache, order: list[int], plan=None) -> None:
     plan = plan or (lambda step: view(order[step]) if step < len(order) else None)
     for step, index in enumerate(order):
-        targets.follow(step, plan)
+        targets.prefetch(step, plan)
         assert (targets.target(view(index)).image == index).all()
 
 
 @pytest.mark.parametrize("room", [0, 1, 2, 5, 19, 20, 1000])
 def test_never_more_than_the_budget_is_held(room):
     disk, order = Disk(0.002), shuffles(20, 5)
-    targets = Targets(disk, room * ONE + 7)
-    most, follow = 0, targets.follow
+    targets = ImageCache(disk, room * ONE + 7)
+    most, follow = 0, targets.prefetch
 
     def watched(step, plan):
         nonlocal most
         follow(step, plan)
-        most = max(most, targets.held)
+        most = max(most, targets.held_bytes)
 
-    targets.follow = watched  # type: ignore[method-assign]
+    targets.prefetch = watched  # type: ignore[method-assign]
     run(targets, order)
     kept = sum(len(reading.result().image) for reading in targets._kept.values()) // SIDE
-    assert targets.held == kept * ONE <= max(most, targets.held) <= room * ONE + 7
+    assert targets.held_bytes == kept * ONE <= max(most, targets.held_bytes) <= room * ONE + 7
     assert sum(disk.reads.values()) >= 20
     if room >= 20:
         assert set(disk.reads.values()) == {1}
@@ -83,7 +83,7 @@ def test_what_is_needed_soonest_stays():
     """No way to keep them reads fewer: each epoch shows as many as have no room when it begins."""
     views, room, epochs = 40, 20, 10
     disk = Disk()
-    run(Targets(disk, room * ONE), shuffles(views, epochs))
+    run(ImageCache(disk, room * ONE), shuffles(views, epochs))
     fewest = views + (epochs - 1) * (views - room)
     assert fewest <= sum(disk.reads.values()) <= 1.05 * fewest  # one that is being read cannot be dropped
 
@@ -91,13 +91,13 @@ def test_what_is_needed_soonest_stays():
 def test_photographs_are_there_before_they_are_needed():
     """While a step goes on, those of the next ones are read, in their order."""
     disk, order = Disk(), list(range(30))
-    targets = Targets(disk, 5 * ONE)
+    targets = ImageCache(disk, 5 * ONE)
 
     def plan(step: int) -> Camera | None:
         return view(order[step]) if step < len(order) else None
 
     for step, index in enumerate(order):
-        targets.follow(step, plan)
+        targets.prefetch(step, plan)
         targets.target(view(index))
         for reading in list(targets._kept.values()):
             reading.result()
@@ -108,16 +108,16 @@ def test_photographs_are_there_before_they_are_needed():
 
 def test_a_plan_may_be_wrong_change_and_end():
     disk, order = Disk(0.001), shuffles(12, 4)
-    run(Targets(disk, 4 * ONE), order, plan=lambda step: view((7 * step) % 12))
-    run(Targets(disk, 4 * ONE), order, plan=lambda step: None)
-    targets = Targets(disk, 4 * ONE)
+    run(ImageCache(disk, 4 * ONE), order, plan=lambda step: view((7 * step) % 12))
+    run(ImageCache(disk, 4 * ONE), order, plan=lambda step: None)
+    targets = ImageCache(disk, 4 * ONE)
     plans = [lambda step, side=side: view(order[step % 48], side) for side in (SIDE // 2, SIDE)]
     for half, plan in enumerate(plans):  # smaller ones at first, which then are of no more use
         for step in range(24 * half, 24 * half + 24):
             side = plan(step).width
-            targets.follow(step, plan)
+            targets.prefetch(step, plan)
             assert targets.target(view(order[step], side)).image.shape == (side, side, 3)
-            assert targets.held <= 4 * ONE
+            assert targets.held_bytes <= 4 * ONE
     for reading in targets._kept.values():
         assert len(reading.result().image) == SIDE
 
@@ -125,7 +125,7 @@ def test_a_plan_may_be_wrong_change_and_end():
 def test_steps_that_need_what_is_kept_are_not_robbed_by_pictures_between_them():
     """Evaluation in the middle of a run reads what has no room, and does not keep it."""
     disk = Disk()
-    targets = Targets(disk, 10 * ONE)
+    targets = ImageCache(disk, 10 * ONE)
 
     def plan(step: int) -> Camera:
         return view(step % 10)
@@ -133,9 +133,9 @@ def test_steps_that_need_what_is_kept_are_not_robbed_by_pictures_between_them():
     run(targets, list(range(10)), plan)
     for index in range(100, 130):
         targets.target(view(index))
-    assert targets.held == 10 * ONE
+    assert targets.held_bytes == 10 * ONE
     for step in range(10, 30):
-        targets.follow(step, plan)
+        targets.prefetch(step, plan)
         targets.target(view(step % 10))
     assert all(disk.reads[f"{index}"] == 1 for index in range(10))
 
@@ -154,12 +154,12 @@ def test_an_unreadable_photograph_is_told_by_the_step_that_needs_it(tmp_path):
 
     for step in range(4):
         data.view_at(step, planned)
-    for reading in list(data.photographs._kept.values()):
+    for reading in list(data.images._kept.values()):
         reading.exception()  # by now 4 and 6 were tried
     places[4].write_bytes(whole)  # type: ignore[union-attr]
     assert data.view_at(4, planned).index == 4, "what is there again when it is needed is no error"
     data.view_at(5, planned)
-    with pytest.raises(LodgsError, match="cannot be read as an image"):
+    with pytest.raises(LodgsError, match="as an image"):
         data.view_at(6, planned)
 
 
@@ -212,10 +212,10 @@ def test_every_method_plans_what_it_then_sees(scene, name):
     """At least as far ahead as its state stays as it is; and no photograph is read twice for it."""
     data = TrainingData(scene, 1.0, 4)
     method = create(name, data, METHODS[name].presets["draft"], 0, "cpu")
-    ahead = [method.planned(step) for step in range(3, 9)]
+    ahead = [method.planned_view(step) for step in range(3, 9)]
     seen = [method.choose_view(step) for step in range(3, 9)]
     assert ahead == [(view.index, view.shrink) for view in seen]
-    assert method.planned(method.steps) is None
+    assert method.planned_view(method.steps) is None
 
 
 def test_memory_stays_within_the_budget(tmp_path):
@@ -233,10 +233,10 @@ def test_memory_stays_within_the_budget(tmp_path):
     def peak(budget: int) -> int:
         data = TrainingData.__new__(TrainingData)
         data.exposure, data.transparent, data.depths, data._gains = 0.0, False, None, {}
-        targets = Targets(data._read, budget)
+        targets = ImageCache(data._read, budget)
         tracemalloc.start()
         for step in range(2 * views):
-            targets.follow(step, lambda step: cameras[step % views] if step < 2 * views else None)
+            targets.prefetch(step, lambda step: cameras[step % views] if step < 2 * views else None)
             target = targets.target(cameras[step % views])
             photometric_loss(picture, target, 0.2, backend="cpu")
             del target

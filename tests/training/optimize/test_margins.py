@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from training.methods import METHODS, create
-from training.optimize.margins import BEHIND, Margins, blurred
+from training.optimize.margins import DEPTH_FACTOR, Margins, blur_outward
 from training.optimize.parameters import override
 from training.rasterize import Gaussians, rasterize
 from training.scenes.cameras import Camera
@@ -44,11 +44,11 @@ def margins(*cameras: Camera, share: float = 0.5) -> Margins:
 
 def test_a_wall_goes_on_beyond_the_photograph():
     seen, shown = wall(4, -4, 4), camera()
-    added = margins(shown).continued(seen, 10_000)
+    added = margins(shown).extend(seen, 10_000)
     u, depth = shown.project(added.means.numpy().astype(np.float64))
     outside = (u < 0).any(1) | (u[:, 0] > 96) | (u[:, 1] > 72)
     assert len(added) > 500 and outside.all()
-    assert depth == pytest.approx(BEHIND * 4, rel=1e-3)
+    assert depth == pytest.approx(DEPTH_FACTOR * 4, rel=1e-3)
     colors = 0.5 + SH_C0 * added.sh[:, 0].numpy()
     assert np.abs(colors - ORANGE).max() < 0.05 and not added.sh[:, 1:].any()
     wide, everything = shown.widened(0.45), Gaussians.concatenated([seen, added])
@@ -66,57 +66,57 @@ def test_nothing_stands_before_what_another_photograph_shows():
     first, second = camera(), camera(x=12)
     both = Gaussians.concatenated([near, far])
     for cameras, seen, stands in (((first,), near, True), ((first, second), both, False)):
-        means = margins(*cameras).continued(seen, 10_000).means.numpy().astype(np.float64)
+        means = margins(*cameras).extend(seen, 10_000).means.numpy().astype(np.float64)
         assert (second.sees(means) & (means[:, 2] < 12)).any() == stands
 
 
 def test_what_is_shown_everywhere_is_not_continued():
-    assert len(margins(camera()).continued(wall(4, -12, 12), 10_000)) < len(
-        margins(camera()).continued(wall(4, -4, 4), 10_000)
+    assert len(margins(camera()).extend(wall(4, -12, 12), 10_000)) < len(
+        margins(camera()).extend(wall(4, -4, 4), 10_000)
     )
     enclosed = replace(wall(4, -12, 12), log_scales=wall(4, -12, 12).log_scales + 4)
-    assert len(margins(camera()).continued(enclosed, 10_000)) == 0
+    assert len(margins(camera()).extend(enclosed, 10_000)) == 0
 
 
 def test_where_nothing_is_shown_nothing_is_continued():
     behind = wall(4, -4, 4)
     behind = replace(behind, means=-behind.means)
-    assert len(margins(camera()).continued(behind, 10_000)) == 0
+    assert len(margins(camera()).extend(behind, 10_000)) == 0
 
 
 def test_a_photograph_that_ends_in_nothing_is_not_continued():
     """Something in the middle before nothing."""
     low = wall(4, -1, 1)
     low = low.select(low.means[:, 1].abs() < 1)
-    assert len(margins(camera(), camera(x=1)).continued(low, 10_000)) == 0
+    assert len(margins(camera(), camera(x=1)).extend(low, 10_000)) == 0
 
 
 def test_the_scenes_unit_does_not_matter():
-    small = margins(camera(), camera(x=1)).continued(wall(4, -4, 4), 10_000)
+    small = margins(camera(), camera(x=1)).extend(wall(4, -4, 4), 10_000)
     scale = 1000.0
     seen = wall(4, -4, 4)
     large = replace(seen, means=scale * seen.means, log_scales=seen.log_scales + np.log(scale))
-    there = Margins([camera(), camera(x=scale)], 0.5, scale * NEAR, "cpu").continued(large, 10_000)
+    there = Margins([camera(), camera(x=scale)], 0.5, scale * NEAR, "cpu").extend(large, 10_000)
     assert there.means.numpy() / scale == pytest.approx(small.means.numpy(), rel=1e-3, abs=1e-3)
     assert there.log_scales.numpy() - np.log(scale) == pytest.approx(small.log_scales.numpy(), abs=1e-3)
 
 
 def test_fewer_are_larger():
-    many, few = (margins(camera()).continued(wall(4, -4, 4), most) for most in (10_000, 300))
+    many, few = (margins(camera()).extend(wall(4, -4, 4), most) for most in (10_000, 300))
     assert len(many) > 500 and 100 < len(few) <= 300
     assert few.log_scales.min() > many.log_scales.max()
     wide = camera().widened(0.45)
     assert draw(Gaussians.concatenated([wall(4, -4, 4), few]), wide).alpha.min() > 0.5
-    assert len(margins(camera()).continued(wall(4, -4, 4), 30)) == 0
+    assert len(margins(camera()).extend(wall(4, -4, 4), 30)) == 0
 
 
 def test_blurring_gives_what_is_known_its_own_value_and_stops_where_nothing_is_near():
     values, known = np.full((9, 400, 1), 7.0), np.zeros((9, 400), bool)
-    found, reached = blurred(values, known)
+    found, reached = blur_outward(values, known)
     assert not reached.any() and not found.any()
     known[:, :10] = True
     values[:, 10:] = np.nan  # is not looked at
-    found, reached = blurred(values, known)
+    found, reached = blur_outward(values, known)
     assert reached[:, :20].all() and not reached[:, 200:].any()
     assert found[reached] == pytest.approx(7.0)
 

@@ -25,7 +25,7 @@ def test_keep_drops_rows_and_their_moments(model, moments):
 
 
 def test_append_brings_all_that_is_trained_and_zeros_for_columns_without_values(model, moments):
-    rows = model.rows(torch.tensor([3, 3, 7]))
+    rows = model.read_rows(torch.tensor([3, 3, 7]))
     model.stats["seen"] += 5
     model.append(rows | {"level": torch.tensor([9.0, 9.0, 9.0])})
     assert model["decay"].tolist()[50:] == [13, 13, 17]
@@ -38,9 +38,9 @@ def test_append_brings_all_that_is_trained_and_zeros_for_columns_without_values(
 
 def test_every_column_learns_at_its_own_rate(model):
     """Adam's first step is the rate itself, whatever the gradient's size."""
-    fresh = Model(model.rows(torch.arange(50)), model.adam.lr)
+    fresh = Model(model.read_rows(torch.arange(50)), model.adam.lr)
     (fresh["decay"].sum() * 7 + fresh["means"].sum()).backward()
-    before = fresh.rows(torch.arange(50))
+    before = fresh.read_rows(torch.arange(50))
     fresh.adam.step()
     torch.testing.assert_close(before["decay"] - fresh["decay"], torch.full((50,), 0.5))
     torch.testing.assert_close(before["means"] - fresh["means"], torch.full((50, 3), 1e-3), rtol=1e-3, atol=0)

@@ -22,7 +22,7 @@ class Made(Parameters):
 def test_every_parameter_says_what_it_is_and_every_preset_is_possible(method):
     names = [f.name for f in fields(method.parameters)]
     assert all(f.metadata["about"].endswith(".") for f in fields(method.parameters))
-    assert set(method.offered) <= set(names)
+    assert set(method.panel_parameters) <= set(names)
     assert list(method.presets) == list(PRESETS)
     for values in method.presets.values():
         assert type(values) is method.parameters

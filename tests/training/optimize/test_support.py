@@ -25,7 +25,7 @@ def from_the_side(y: float, z: float) -> Camera:
 
 def intruding(support: Support, means, share: float = 0.5) -> list[bool]:
     means = np.array(means, np.float32)
-    return support.intruding(means, *support.nearest_places(means), share).tolist()
+    return support.find_intruding(means, *support.nearest_positions(means), share).tolist()
 
 
 @pytest.fixture
@@ -74,7 +74,7 @@ def test_a_view_without_points_forbids_nothing():
 
 def test_the_nearest_place_of_a_point(support):
     means = np.array([(1, 0, 2), (0, 0, 3), (-4, 4, 0)], np.float32)
-    distances, places = support.nearest_places(means)
+    distances, places = support.nearest_positions(means)
     assert distances == pytest.approx([2, 3, 5])
     assert places[[0, 2]].tolist() == [1, 0] and places[1] >= 2  # cameras come first, then what lies between
 
@@ -87,12 +87,12 @@ def test_training_leaves_nothing_in_the_way_and_nothing_too_large(data):
     p, before = method.parameters, len(method.model)
     eye = data.train[0]
     ahead = torch.tensor(eye.center + 0.02 * eye.world_to_camera[2, :3], dtype=torch.float32)
-    rows = method.model.rows(torch.tensor([0, 0]))
+    rows = method.model.read_rows(torch.tensor([0, 0]))
     rows["means"][0] = ahead
     rows["log_scales"][1] = 9.0
     method.model.append(rows)
-    method.keep_supported(0)
+    method.prune_unsupported(0)
     assert len(method.model) == before + 1
     largest = method.model["log_scales"].detach().exp().amax(1).numpy()
-    allowed = p.largest * data.support.nearest_places(method.model["means"].detach().numpy())[0]
+    allowed = p.largest * data.support.nearest_positions(method.model["means"].detach().numpy())[0]
     assert (largest <= allowed * 1.0001).all() and largest[-1] == pytest.approx(allowed[-1], rel=1e-4)

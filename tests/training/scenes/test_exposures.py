@@ -116,5 +116,5 @@ def test_only_training_photos_are_corrected():
         data.target(3).image, remove_gain(plain.target(3).image.numpy(), np.array([2, 1, 0.5]))
     )
     for camera in data.test:
-        assert (data.photographs.target(camera).image == plain.photographs.target(camera).image).all()
+        assert (data.images.target(camera).image == plain.images.target(camera).image).all()
     assert (data.target(4).image == plain.target(4).image).all()

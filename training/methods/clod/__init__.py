@@ -93,7 +93,7 @@ METHOD = MethodInfo(
     parameters=ClodParameters,
     presets={"draft": _DRAFT, "standard": _STANDARD, "paper": _PAPER},
     rule="decay",
-    offered=("max_splats", "keep_share", "s_v_most"),
+    panel_parameters=("max_splats", "keep_share", "s_v_most"),
     from_base=True,
-    in_cells="clod",
+    cell_method="clod",
 )

@@ -137,7 +137,7 @@ class Method(threedgs_train.Method):
             drawings.append(ClodDrawing(rendering, s_v, opacities, shown, inside))
         return drawings
 
-    def is_plain(self, step: int) -> bool:
+    def allows_device_step(self, step: int) -> bool:
         return step < self.begins
 
     def random_scale(self, step: int) -> float:
@@ -174,7 +174,7 @@ class Method(threedgs_train.Method):
             self.model.keep(self.seen_somewhere())
             require_rows(self.model, step, "tau")
 
-    def continues_margins(self, step: int) -> bool:
+    def adds_margins(self, step: int) -> bool:
         """Right after the decay has begun, which removes what photographs show little of."""
         return step == self.begins > 0
 
@@ -259,10 +259,10 @@ class Method(threedgs_train.Method):
 
     def _far_distance(self, quantile: float) -> float:
         """A quantile of the distances between training views and the scene's points that they see."""
-        points = self.data.whole.points
+        points = self.data.full_scene.points
         points = points[:: max(1, len(points) // POINTS)]
         seen = [
             np.linalg.norm(points[camera.sees(points, near=self.data.near)] - camera.center, axis=1)
-            for camera in self.data.whole_train
+            for camera in self.data.full_train
         ]
         return float(np.quantile(np.concatenate(seen), quantile))

@@ -108,11 +108,11 @@ class FlodParameters(DensityParameters):
         return self.all_steps - sum(self.steps) if self.end == self.levels else 0
 
     @property
-    def goes_on(self) -> bool:
+    def continues_levels(self) -> bool:
         return self.first_level > 1
 
     @property
-    def most_at_once(self) -> int:
+    def max_trained_splats(self) -> int:
         shares = (self.budget_ratio**n for n in range(min(TOGETHER, self.levels)))
         at_end = self.max_splats * self.budget_ratio ** (self.levels - self.end)
         return round(self.max_splats * sum(shares) if self.finish_steps else at_end)
@@ -161,7 +161,7 @@ METHOD = MethodInfo(
     parameters=FlodParameters,
     presets={"draft": _DRAFT, "standard": _STANDARD, "paper": _PAPER},
     rule="bands",
-    offered=("levels", "footprint", "max_splats"),
-    in_cells="flod",
-    divided=divided,
+    panel_parameters=("levels", "footprint", "max_splats"),
+    cell_method="flod",
+    split_parameters=divided,
 )

@@ -20,7 +20,7 @@ from ...lod.blocks import spatial_order
 from ...lod.rule import Values, collect_facts
 from ...lod.rules.bands import RULE
 from ...optimize.model import Model, splat_rates
-from ...optimize.pruning import least_importance, room_taken_over
+from ...optimize.pruning import importance_threshold, log_scale_gain
 from ...optimize.schedules import log_linear
 from ...optimize.training_data import TrainingData
 from ...rasterize import Gaussians, contributions
@@ -109,12 +109,12 @@ def begun_anew(
     own = np.concatenate([views[number] for number in numbers])
     others = sum(int(each.sum()) for number, each in views.items() if number not in numbers)
     most = max(p.drawn * alone.sum() - others, LEAST_SHARE * own.sum())
-    least = least_importance(np.concatenate(list(first.values())), own, most)
+    least = importance_threshold(np.concatenate(list(first.values())), own, most)
 
     anew = {}
     for number in numbers:
         kept = first[number] >= least
-        wider = log_scales + room_taken_over(log_scales, shares, kept)[:, None]
+        wider = log_scales + log_scale_gain(log_scales, shares, kept)[:, None]
         sizes = np.maximum(wider, np.float32(np.log(s_min[number - 1])))
         level = tensors | {"log_scales": torch.from_numpy(sizes).to(tensors["log_scales"])}
         if p.antialias:
@@ -159,7 +159,7 @@ def weights(model: Model, s_min: Sequence[float], camera: Camera, values: Values
     Args:
         s_min: of every level of the run, coarse to fine.
     """
-    means = model.look("means").cpu().numpy()
+    means = model.read("means").cpu().numpy()
     found = [_weights(means[rows], number, s_min, camera, values) for number, rows in _rows(model).items()]
     return torch.from_numpy(np.concatenate(found)).to(model.columns[LEVEL].device)
 
@@ -168,7 +168,7 @@ def keep_sizes(model: Model, s_min: Sequence[float]) -> None:
     """No splat becomes smaller than its level allows."""
     with np.errstate(divide="ignore"):
         least = torch.from_numpy(np.log(np.asarray(s_min, np.float64))).to(model.columns[LEVEL].device)
-    model.keep_above(least.float()[model.columns[LEVEL].long() - 1])
+    model.raise_log_scales(least.float()[model.columns[LEVEL].long() - 1])
 
 
 def levels_of(model: Model, s_min: Sequence[float]) -> list[Level]:

@@ -15,8 +15,14 @@ from ...errors import LodgsError
 from ...lod.rule import Values, all_controls
 from ...lod.rules.bands import min_scales
 from ...optimize import method
-from ...optimize.density_control import constrained_log, densify, prune, reset_opacities
-from ...optimize.initialize import distinct, from_points, from_splats, neighbour_distances, sampled
+from ...optimize.density_control import constrained_log_scales, densify, prune, reset_opacities
+from ...optimize.initialize import (
+    drop_duplicates,
+    from_points,
+    from_splats,
+    neighbour_distances,
+    sample_points,
+)
 from ...optimize.method import Drawing
 from ...optimize.model import Model, splat_rates
 from ...optimize.schedules import due, log_linear, shrink_at
@@ -42,8 +48,8 @@ class Method(method.Method[FlodParameters, Drawing]):
         self.s_min = min_scales(s_min_1, p.rho, p.levels)
         self._before = sum(p.steps[: p.first_level - 1])
         self._ends = list(accumulate(p.steps[p.first_level - 1 : p.end]))
-        points, colors = distinct(data.scene.points, data.scene.point_colors)
-        self.points, self.colors = sampled(points, colors, p.max_splats, self.seed)
+        points, colors = drop_duplicates(data.scene.points, data.scene.point_colors)
+        self.points, self.colors = sample_points(points, colors, p.max_splats, self.seed)
         self.kept: dict[int, dict[str, torch.Tensor]] = {}
         if base is None:
             self.model = self._new_model(self._from_points(1))
@@ -109,18 +115,18 @@ class Method(method.Method[FlodParameters, Drawing]):
         return super().sh_degree(self._before + step)
 
     def draw(self, view: TrainingView, step: int) -> list[Drawing]:
-        return [Drawing(self.rasterize_model(view.camera, step, *self.shown(view, step)))]
+        return [Drawing(self.rasterize_model(view.camera, step, *self.render_weights(view, step)))]
 
-    def is_plain(self, step: int) -> bool:
+    def allows_device_step(self, step: int) -> bool:
         return True
 
-    def shown(self, view: TrainingView, step: int) -> tuple[torch.Tensor | None, float]:
+    def render_weights(self, view: TrainingView, step: int) -> tuple[torch.Tensor | None, float]:
         if self.finishing(step):
             values = self._finishing_values(step)
             return finish.weights(self.model, self.s_min, view.camera, values), 0.0
-        return self.left_out(step, self._share(step)), self.s_min[self.level_at(step) - 1]
+        return self.dropout_weights(step, self._share(step)), self.s_min[self.level_at(step) - 1]
 
-    def counts(self, view: TrainingView, step: int) -> bool:
+    def collects_stats(self, view: TrainingView, step: int) -> bool:
         return not self.finishing(step) and self._local(step) < self._densify_until(step)
 
     def set_learning_rates(self, step: int) -> None:
@@ -155,7 +161,7 @@ class Method(method.Method[FlodParameters, Drawing]):
         if due(p.prune_interval, local):
             prune(model, p.min_opacity)
         if due(p.overlap_interval, local) and level < p.levels:
-            model.keep(apart(model.look("means").cpu(), s_min / 2))
+            model.keep(apart(model.read("means").cpu(), s_min / 2))
         if due(p.opacity_reset_interval, local):
             reset_opacities(model)
         if before and not len(model):
@@ -164,7 +170,7 @@ class Method(method.Method[FlodParameters, Drawing]):
                 "Lower 'footprint' (or 's_min_1'), so that coarse levels keep more splats.",
             )
 
-    def continues_margins(self, step: int) -> bool:
+    def adds_margins(self, step: int) -> bool:
         local = self._local(step)
         return not self.finishing(step) and local < self._densify_until(step) <= local + 1
 
@@ -176,7 +182,7 @@ class Method(method.Method[FlodParameters, Drawing]):
         return replace(self.model.gaussians, log_scales=scales.log())
 
     def append_margins(self, rows: Mapping[str, torch.Tensor], step: int) -> None:
-        scales = constrained_log(rows["log_scales"].exp(), self.s_min[self.level_at(step) - 1])
+        scales = constrained_log_scales(rows["log_scales"].exp(), self.s_min[self.level_at(step) - 1])
         super().append_margins({**rows, "log_scales": scales}, step)
 
     def _finishing_values(self, step: int) -> Values:
@@ -198,8 +204,8 @@ class Method(method.Method[FlodParameters, Drawing]):
         p, level = self.parameters, self.level_at(step)
         return p.densify_until[level - 1] * p.steps[level - 1]
 
-    def keep_supported(self, step: int) -> None:
-        super().keep_supported(step)
+    def prune_unsupported(self, step: int) -> None:
+        super().prune_unsupported(step)
         if self.finishing(step):  # what a level allows comes first
             finish.keep_sizes(self.model, self.s_min)
 
@@ -218,7 +224,10 @@ class Method(method.Method[FlodParameters, Drawing]):
     def _risen(self, tensors: dict[str, torch.Tensor], before: float, level: int) -> dict[str, torch.Tensor]:
         """What a level begins with: the one before it, to whose scales a constraint is added, and points."""
         after = self.s_min[level - 1]
-        tensors = {**tensors, "log_scales": constrained_log(tensors["log_scales"].exp() + before, after)}
+        tensors = {
+            **tensors,
+            "log_scales": constrained_log_scales(tensors["log_scales"].exp() + before, after),
+        }
         if self.parameters.rejoin_points:
             # What overlap pruning counts as too close is now half of a smaller size.
             distances, _ = KDTree(tensors["means"].cpu().numpy()).query(self.points)

@@ -122,8 +122,8 @@ METHOD = MethodInfo(
     parameters=LodgeParameters,
     presets={"draft": _DRAFT, "standard": _STANDARD, "paper": _PAPER},
     rule="chunks",
-    offered=("levels", "max_splats", "drawn", "keep", "chunks"),
+    panel_parameters=("levels", "max_splats", "drawn", "keep", "chunks"),
     from_base=True,
-    for_splats=True,
-    in_cells="3dgs",
+    suggested_for_base=True,
+    cell_method="3dgs",
 )

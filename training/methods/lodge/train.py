@@ -15,9 +15,9 @@ from ...lod.blocks import Blocks, block_quantiles, spatial_order
 from ...lod.partial_read import BLOCKS, block_table
 from ...lod.rules.chunks import RULE, TABLE, member_columns
 from ...optimize.density_control import require_rows
-from ...optimize.method import Drawing, Made
+from ...optimize.method import Drawing, StepResult
 from ...optimize.model import NAMES
-from ...optimize.pruning import least_importance, room_taken_over
+from ...optimize.pruning import importance_threshold, log_scale_gain
 from ...optimize.training_data import TrainingView
 from ...rasterize import Gaussians, photometric_loss
 from ...scenes.cameras import pick_evenly
@@ -137,10 +137,10 @@ class Method(Refining):
             self.begin_round(step)
         return super().choose_view(step)
 
-    def planned(self, step: int) -> tuple[int, float] | None:
-        return super().planned(step) if step < self.tuned_steps else None
+    def planned_view(self, step: int) -> tuple[int, float] | None:
+        return super().planned_view(step) if step < self.tuned_steps else None
 
-    def train_step(self, step: int) -> Made:
+    def train_step(self, step: int) -> StepResult:
         return super().train_step(step) if step < self.tuned_steps else self._chunk_step(step)
 
     def draw(self, view: TrainingView, step: int) -> list[Drawing]:
@@ -181,7 +181,7 @@ class Method(Refining):
         thinned = least > weight
         kept = found >= least.clamp_min(weight)
         with torch.no_grad():
-            wider = room_taken_over(self.model["log_scales"].cpu().numpy(), found.numpy(), kept.numpy())
+            wider = log_scale_gain(self.model["log_scales"].cpu().numpy(), found.numpy(), kept.numpy())
             self.model["log_scales"].add_((torch.from_numpy(wider) * thinned).to(self.device)[:, None])
         self.model.keep(kept)
         require_rows(self.model, step, "prune_weight")
@@ -208,7 +208,7 @@ class Method(Refining):
                 else:
                     others += seen.sum()
         most = max(share * finest - others, views.sum() / 4)
-        return least_importance(importance.numpy(), views, most)
+        return importance_threshold(importance.numpy(), views, most)
 
     def _most_distance(self, number: int) -> float:
         """The largest distance, in scene units, that leaves room for further levels before the next coarser
@@ -291,7 +291,7 @@ class Method(Refining):
             self.centres, self.radii = chunks.place_chunks(centers, wanted, self.seed)
 
     @torch.no_grad()
-    def _chunk_step(self, step: int) -> Made:
+    def _chunk_step(self, step: int) -> StepResult:
         """One chunk's set; what is told of the step is how a photograph in it looks by the set alone."""
         p, data, number = self.parameters, self.data, step - self.tuned_steps
         if number == 0:
@@ -311,7 +311,7 @@ class Method(Refining):
         view = data.view(data.train.index(nearest))
         drawn = self.rasterize_model(view.camera, step, gaussians=together(levels, rows))
         loss = photometric_loss(drawn.image, view.target, p.ssim_weight, backend=self.backend)
-        return Made(float(loss), lambda: drawn.image, view.target)
+        return StepResult(float(loss), lambda: drawn.image, view.target)
 
     # -- levels ----------------------------------------------------------------------------------------
 

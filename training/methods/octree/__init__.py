@@ -147,6 +147,6 @@ METHOD = MethodInfo(
     parameters=OctreeParameters,
     presets={"draft": _DRAFT, "standard": _STANDARD, "paper": _PAPER},
     rule="octree",
-    offered=("levels", "max_splats"),
-    in_cells="octree",
+    panel_parameters=("levels", "max_splats"),
+    cell_method="octree",
 )

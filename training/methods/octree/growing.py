@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from ...lod.rules.octree import fade_weights, target_level
-from ...optimize.initialize import distinct, neighbour_scale
+from ...optimize.initialize import drop_duplicates, neighbour_scale
 from ...optimize.model import Model
 from ...optimize.training_data import TrainingData
 from ...scenes.cameras import Camera
@@ -35,10 +35,10 @@ def plant(
         The schedule with its tree; points (N, 3), their colours (N, 3) uint8, and their levels (N,).
     """
     p = parameters
-    everywhere, _ = distinct(data.whole.points, data.whole.point_colors)
-    points, colors = distinct(data.scene.points, data.scene.point_colors)
+    everywhere, _ = drop_duplicates(data.full_scene.points, data.full_scene.point_colors)
+    points, colors = drop_duplicates(data.scene.points, data.scene.point_colors)
     octree = tree.build(
-        everywhere, data.whole_train, focal_px=data.focal, footprint=p.footprint,
+        everywhere, data.full_train, focal_px=data.focal, footprint=p.footprint,
         quantiles=(p.nearest, p.farthest), levels=p.levels, coarser=p.coarser_levels,
     )  # fmt: skip
     schedule = Schedule(data, p, seed, octree)
@@ -115,7 +115,7 @@ def _free(schedule: Schedule, model: Model, means: torch.Tensor, level: torch.Te
         return schedule.tree.keys(means.detach().double().cpu().numpy(), level.long().cpu().numpy())
 
     proposed = keys(means, level)
-    taken = keys(model.look("means"), model.columns["level"])
+    taken = keys(model.read("means"), model.columns["level"])
     _, first = np.unique(proposed, return_index=True)
     free = np.sort(first[~np.isin(proposed[first], taken)])
     wanted = wanted_by_views(schedule, means[free].double().cpu().numpy(), level[free].cpu().numpy())
@@ -138,7 +138,7 @@ def unseen(
     Returns:
         Booleans in the shape of ``seen``.
     """
-    largest = torch.zeros_like(model.look("seen"))
+    largest = torch.zeros_like(model.read("seen"))
     for view in range(len(schedule.data.train)):
         for shrink in schedule.shrinks():
             camera = schedule.data.camera(view, shrink)

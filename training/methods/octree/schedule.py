@@ -78,7 +78,7 @@ class Schedule:
 
     def wanted(self, camera: Camera, model: Model) -> torch.Tensor:
         """The level (N,) that a view wants at every anchor, not rounded."""
-        means = model.look("means")
+        means = model.read("means")
         distances = (means - torch.as_tensor(camera.center).to(means)).norm(dim=1)
         distances *= self.tree.focal_px / camera.focal
         return target_level(distances, model.columns["bias"], self.tree.d_max, self.tree.levels)
@@ -96,7 +96,7 @@ class Schedule:
         """Whether anchors are still added."""
         return step < self.parameters.grow_until * self.parameters.steps
 
-    def counts(self, view: TrainingView, step: int) -> bool:
+    def collects_stats(self, view: TrainingView, step: int) -> bool:
         """Whether anchors may grow for what a step sees."""
         return self.growing(step) and (view.shrink == 1 or step < self.joins[-1])
 

@@ -14,7 +14,7 @@ import torch
 
 from ...lod.rules.octree import BIAS
 from ...optimize import method
-from ...optimize.density_control import require_rows, sample_inside
+from ...optimize.density_control import require_rows, sample_gaussians
 from ...optimize.initialize import from_points
 from ...optimize.method import Drawing
 from ...optimize.model import Model, splat_rates
@@ -77,18 +77,18 @@ class Method(method.Method[OctreeParameters, Drawing]):
         return self.schedule.shrink(step)
 
     def draw(self, view: TrainingView, step: int) -> list[Drawing]:
-        return [Drawing(self.rasterize_model(view.camera, step, *self.shown(view, step)))]
+        return [Drawing(self.rasterize_model(view.camera, step, *self.render_weights(view, step)))]
 
-    def shown(self, view: TrainingView, step: int) -> tuple[torch.Tensor | None, float]:
+    def render_weights(self, view: TrainingView, step: int) -> tuple[torch.Tensor | None, float]:
         weights = self.schedule.weights(view.camera, self.model, step, full=view.shrink == 1)
-        left = self.left_out(step, step / self.parameters.steps)
+        left = self.dropout_weights(step, step / self.parameters.steps)
         return (weights if left is None else weights * left), 0.0
 
-    def is_plain(self, step: int) -> bool:
+    def allows_device_step(self, step: int) -> bool:
         return not self.parameters.volume_weight
 
-    def counts(self, view: TrainingView, step: int) -> bool:
-        return self.schedule.counts(view, step)
+    def collects_stats(self, view: TrainingView, step: int) -> bool:
+        return self.schedule.collects_stats(view, step)
 
     def loss(self, drawings: Sequence[Drawing], view: TrainingView, step: int) -> torch.Tensor:
         """With the volume of what is drawn (Octree-GS, Sec. 7.1)."""
@@ -101,7 +101,7 @@ class Method(method.Method[OctreeParameters, Drawing]):
 
     def accumulate_stats(self, drawings: Sequence[Drawing], view: TrainingView, step: int) -> None:
         super().accumulate_stats(drawings, view, step)
-        if self.counts(view, step):
+        if self.collects_stats(view, step):
             opacity = self.model["opacity_logits"].detach().sigmoid()
             drawn = drawings[0].rendering.radii > 0
             self.model.stats["opacity_sum"] += torch.where(drawn, opacity, 0)
@@ -119,7 +119,7 @@ class Method(method.Method[OctreeParameters, Drawing]):
         if self.schedule.reassigns_after(step):
             self.reassign_levels(step)
 
-    def continues_margins(self, step: int) -> bool:
+    def adds_margins(self, step: int) -> bool:
         return self.schedule.growing(step) and not self.schedule.growing(step + 1)
 
     def append_margins(self, rows: Mapping[str, torch.Tensor], step: int) -> None:
@@ -139,16 +139,16 @@ class Method(method.Method[OctreeParameters, Drawing]):
         p, model = self.parameters, self.model
         source, _, level = growing.steep(self.schedule, model, step)
         source, level = (column.repeat_interleave(p.candidates) for column in (source, level))
-        rows = model.rows(source)
+        rows = model.read_rows(source)
         rng = np.random.default_rng([self.seed, step, 1])
-        rows["means"] += sample_inside(rows["quats"], rows["log_scales"].exp(), rng)
+        rows["means"] += sample_gaussians(rows["quats"], rows["log_scales"].exp(), rng)
         rows["log_scales"] -= float(np.log(1.6))
         rows["opacity_logits"].clamp_max_(growing.FAINT)
         rows |= {"level": level, "bias": model.columns["bias"][source]}
         rows = growing.with_room(self.schedule, model, rows, step, self.growth_limit(step))
 
-        opacity = model.look("opacity_logits").sigmoid()
-        faint = model.look("opacity_sum") < p.min_opacity * model.look("seen")
+        opacity = model.read("opacity_logits").sigmoid()
+        faint = model.read("opacity_sum") < p.min_opacity * model.read("seen")
         model.keep(~(faint | (opacity < min(p.min_opacity, ALPHA_MIN))))
         model.append(rows)
         model.reset_stats()
@@ -169,5 +169,5 @@ class Method(method.Method[OctreeParameters, Drawing]):
     def reassign_levels(self, step: int) -> None:
         """Splats that have become too wide or too narrow for their level move to one that they fit."""
         columns, newest = self.model.columns, self.level_at(step)
-        means, log_scales = self.model.look("means"), self.model.look("log_scales")
+        means, log_scales = self.model.read("means"), self.model.read("log_scales")
         columns["level"] = growing.fitting_levels(self.schedule, columns["level"], means, log_scales, newest)

@@ -105,7 +105,7 @@ METHOD = MethodInfo(
     parameters=NeuralOctreeParameters,
     presets={"draft": _DRAFT, "standard": _STANDARD, "paper": _PAPER},
     rule="octree",
-    offered=("levels", "max_splats"),
+    panel_parameters=("levels", "max_splats"),
     unused=(
         "candidates",
         "sh_interval",

@@ -223,7 +223,7 @@ class Method(method.Method[NeuralOctreeParameters, Drawing]):
         return super().loss(drawings, view, step) + volume
 
     def accumulate_stats(self, drawings: Sequence[Drawing], view: TrainingView, step: int) -> None:
-        if not self.schedule.counts(view, step):
+        if not self.schedule.collects_stats(view, step):
             return
         stats, rendering, decoded = self.model.stats, drawings[0].rendering, drawings[0].decoded
         rendering.grad2d /= view.shrink  # as TrainingData.threshold_scale has it for smaller photographs
@@ -293,7 +293,7 @@ class Method(method.Method[NeuralOctreeParameters, Drawing]):
             colors=colors,
         )
 
-    def picture(self, camera: Camera) -> torch.Tensor:
+    def render_image(self, camera: Camera) -> torch.Tensor:
         """What the networks show a camera, (H, W, 3), levels fading as the distance asks."""
         with torch.no_grad():
             weights = fade_weights(self.schedule.wanted(camera, self.model), self.model.columns["level"])

@@ -45,7 +45,7 @@ METHOD = MethodInfo(
     about="one level, for comparison",
     parameters=ThreedgsParameters,
     presets={"draft": _DRAFT, "standard": _STANDARD, "paper": _PAPER},
-    offered=("max_splats",),
+    panel_parameters=("max_splats",),
     from_base=True,
-    in_cells="3dgs",
+    cell_method="3dgs",
 )

@@ -64,7 +64,7 @@ class Refining(threedgs_train.Method):
 
     def take_rows(self, rows: torch.Tensor) -> Gaussians:
         """The splats (M,) of these rows, int64, to draw: they alone make the step."""
-        leaves = {name: tensor.requires_grad_() for name, tensor in self.model.rows(rows).items()}
+        leaves = {name: tensor.requires_grad_() for name, tensor in self.model.read_rows(rows).items()}
         self._optimizer = SeenRows(self.model.adam, rows, leaves)
         return Gaussians(**leaves)
 
@@ -77,11 +77,11 @@ class Refining(threedgs_train.Method):
     def sh_degree(self, step: int) -> int:
         return self.parameters.sh_degree if self.refines(step) else super().sh_degree(step)
 
-    def is_plain(self, step: int) -> bool:
+    def allows_device_step(self, step: int) -> bool:
         return not self.refines(step)
 
-    def counts(self, view: TrainingView, step: int) -> bool:
-        return not self.refines(step) and super().counts(view, step)
+    def collects_stats(self, view: TrainingView, step: int) -> bool:
+        return not self.refines(step) and super().collects_stats(view, step)
 
     def set_learning_rates(self, step: int) -> None:
         if self.refines(step):  # a finished model's
@@ -89,9 +89,9 @@ class Refining(threedgs_train.Method):
         else:
             super().set_learning_rates(step)
 
-    def keep_supported(self, step: int) -> None:
+    def prune_unsupported(self, step: int) -> None:
         if not self.refines(step):
-            super().keep_supported(step)
+            super().prune_unsupported(step)
 
     def control_density(self, step: int) -> None:
         if not self.refines(step):

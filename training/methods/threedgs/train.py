@@ -9,7 +9,7 @@ import torch
 
 from ...optimize import method
 from ...optimize.density_control import densify, peak_scores, prune, require_rows, reset_opacities
-from ...optimize.initialize import distinct, from_points, from_splats, sampled
+from ...optimize.initialize import drop_duplicates, from_points, from_splats, sample_points
 from ...optimize.method import Drawing
 from ...optimize.model import Model, splat_rates
 from ...optimize.schedules import due, log_linear, shrink_at
@@ -32,8 +32,8 @@ class Method(method.Method[ThreedgsParameters, Drawing]):
         if base is not None:
             tensors = from_splats(base, p.sh_degree, self.device)
         else:
-            points, colors = distinct(scene.points, scene.point_colors)
-            points, colors = sampled(points, colors, self.growth_limit(0), self.seed)
+            points, colors = drop_duplicates(scene.points, scene.point_colors)
+            points, colors = sample_points(points, colors, self.growth_limit(0), self.seed)
             tensors = from_points(points, colors, p.sh_degree, self.device)
         self.model = self.new_model(tensors)
         self._densify_until = p.densify_until * self.scheduled_steps
@@ -60,15 +60,15 @@ class Method(method.Method[ThreedgsParameters, Drawing]):
         return self.parameters.sh_degree if self._from_base else super().sh_degree(step)
 
     def draw(self, view: TrainingView, step: int) -> list[Drawing]:
-        return [Drawing(self.rasterize_model(view.camera, step, *self.shown(view, step)))]
+        return [Drawing(self.rasterize_model(view.camera, step, *self.render_weights(view, step)))]
 
-    def is_plain(self, step: int) -> bool:
+    def allows_device_step(self, step: int) -> bool:
         return True
 
-    def shown(self, view: TrainingView, step: int) -> tuple[torch.Tensor | None, float]:
-        return self.left_out(step, step / self.scheduled_steps), 0.0
+    def render_weights(self, view: TrainingView, step: int) -> tuple[torch.Tensor | None, float]:
+        return self.dropout_weights(step, step / self.scheduled_steps), 0.0
 
-    def counts(self, view: TrainingView, step: int) -> bool:
+    def collects_stats(self, view: TrainingView, step: int) -> bool:
         return step < self._densify_until
 
     def set_learning_rates(self, step: int) -> None:
@@ -113,5 +113,5 @@ class Method(method.Method[ThreedgsParameters, Drawing]):
         self.model.keep(found.largest >= p.least_weight)
         require_rows(self.model, step, "least_weight")
 
-    def continues_margins(self, step: int) -> bool:
+    def adds_margins(self, step: int) -> bool:
         return step < self._densify_until <= step + 1

@@ -101,10 +101,10 @@ METHOD = MethodInfo(
     parameters=TreeParameters,
     presets={"draft": _DRAFT, "standard": _STANDARD, "paper": _PAPER},
     rule="cut",
-    offered=("max_splats", "tune_steps", "pixels"),
+    panel_parameters=("max_splats", "tune_steps", "pixels"),
     from_base=True,
-    base_in_parts=True,
-    for_splats=True,
-    captured={"leaf_rate": 0.0, "random_background": False},  # leaves are right, and black is nothing
-    in_cells="3dgs",
+    streams_base=True,
+    suggested_for_base=True,
+    capture_values={"leaf_rate": 0.0, "random_background": False},  # leaves are right, and black is nothing
+    cell_method="3dgs",
 )

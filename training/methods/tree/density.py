@@ -16,7 +16,7 @@ from scipy.special import logit
 from ...lod.crop import Crop
 from ...lod.tree.forest import extract_subtrees, forest_shape, max_subtree_leaves, merge_trees
 from ...lod.tree.shape import Tree
-from ...optimize.density_control import along_longest_axis
+from ...optimize.density_control import split_longest_axis
 from .store import RecordPiece, Store
 
 GROWN = 2
@@ -164,7 +164,7 @@ class Growing:
             rows = torch.from_numpy(np.concatenate([born[0::2], born[1::2]]))
             values = {name: part.clone() for name, part in self._store.layout.split(records[rows]).items()}
             scales = values["log_scales"][: len(rows) // 2].exp()
-            values, scales = along_longest_axis(values, scales)
+            values, scales = split_longest_axis(values, scales)
             values["log_scales"] = scales.log()
             for name in ("first", "second", "steps"):
                 values[name].zero_()

@@ -22,8 +22,8 @@ from ...lod.tree.forest import Forest, ForestShape, Piece, combine_trees
 from ...lod.tree.shape import Tree
 from ...optimize.memory import free_memory
 from ...optimize.model import NAMES
-from ...optimize.out_of_core.cut_cache import CutCache, NoRoom
-from ...optimize.out_of_core.row_file import FileRows, Layout
+from ...optimize.out_of_core.cut_cache import CutCache, CutTooLarge
+from ...optimize.out_of_core.row_file import RowFile, RowLayout
 from ...rasterize import Gaussians
 from ...rasterize.records import gather_gaussians
 from ...rasterize.sequential_point_tree import (
@@ -43,7 +43,7 @@ MARK = 32
 """Of every so many entries of a list the size of the first is in memory."""
 LIST_BLOCK = 64
 """Entries that are read and written together: of a list always the first ones."""
-ENTRY = Layout({"node": (), "pair": (2,), "ranks": (2,), "ball": (4,)})
+ENTRY = RowLayout({"node": (), "pair": (2,), "ranks": (2,), "ball": (4,)})
 """Of a list: a node and its children, by their numbers in the subtree, and these by their ranks in the list;
 the node's mean and size."""
 
@@ -59,13 +59,13 @@ def default_budget(device: torch.device | str = "cpu") -> int:
     return free_memory() // 2
 
 
-def layout_of(sh_degree: int) -> Layout:
+def layout_of(sh_degree: int) -> RowLayout:
     """What a node's record holds, see ``rasterize.records``."""
     shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "opacity_logits": ()}
     values: dict[str, tuple[int, ...]] = shapes | {"sh": ((sh_degree + 1) ** 2, 3)}
     count = sum(map(prod, values.values()))
     moments: dict[str, tuple[int, ...]] = {"first": (count,), "second": (count,)}
-    return Layout({**values, **moments, "steps": (), "score": (), "seen": ()})
+    return RowLayout({**values, **moments, "steps": (), "score": (), "seen": ()})
 
 
 class Store:
@@ -92,8 +92,8 @@ class Store:
         self._terms = (sh_degree + 1) ** 2
         self.budget, self._device = budget, device
         self.coarsened, self.wanted = 1.0, 0
-        self.rows = FileRows(folder, self.layout)
-        self._lists = FileRows(folder, ENTRY, block=LIST_BLOCK, name="lists")
+        self.rows = RowFile(folder, self.layout)
+        self._lists = RowFile(folder, ENTRY, block=LIST_BLOCK, name="lists")
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -187,7 +187,7 @@ class Store:
         while True:
             try:
                 return self._take(camera, coarser * pixels, near)
-            except NoRoom as error:
+            except CutTooLarge as error:
                 if detail_of(camera.focal, coarser * pixels) == MIN_DETAIL:
                     raise
                 if coarser == 1:
@@ -220,7 +220,7 @@ class Store:
                 counts = np.append(counts, subtrees - 1)
             return rows, counts
 
-        places = self.cache.take(np.append(groups, subtrees), np.append(distances, 1.0), cut)
+        places = self.cache.acquire(np.append(groups, subtrees), np.append(distances, 1.0), cut)
         below, top = np.split(places, [len(places) - (subtrees - 1)])
         return np.append(below, top[np.sort(above)])
 
@@ -269,7 +269,7 @@ class Store:
     def resize(self) -> None:
         """Cuts are made by the nodes as they are now."""
         self.cache.write_back()
-        self.cache.forget()
+        self.cache.release_cuts()
         found = [self._resized(some) for some in _batches(2 * self.shape.counts - 1)]
         self._marks, roots, shapes, *bounds = (np.concatenate(each) for each in zip(*found, strict=True))
         upper = self.layout.split(self.rows.read(np.arange(self.shape.ends[-1], len(self))))
@@ -355,7 +355,7 @@ class Store:
     # -- what lasts ------------------------------------------------------------------------------------
 
     def supersede(self, other: Store) -> None:
-        """Takes the place of another store of the same run, see ``FileRows.supersede``."""
+        """Takes the place of another store of the same run, see ``RowFile.supersede``."""
         self.rows.supersede(other.rows)
         self._lists.supersede(other._lists)
 
@@ -365,7 +365,7 @@ class Store:
         self._lists.close()
 
     def state_dict(self) -> dict[str, Any]:
-        """A checkpoint, for the file that is then written, see ``FileRows.state_dict``."""
+        """A checkpoint, for the file that is then written, see ``RowFile.state_dict``."""
         arrays = {
             "counts": self.shape.counts, "upper": self.shape.upper.children, "marks": self._marks,
             "balls": self._top.balls, "boxes": self._top.boxes,

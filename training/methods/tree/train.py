@@ -20,8 +20,8 @@ from ...lod.partial_read import BLOCKS
 from ...lod.tree.forest import build_levels
 from ...lod.tree.shape import LEAVES, leaf_only_columns
 from ...optimize.initialize import from_splats
-from ...optimize.method import Drawing, Made
-from ...optimize.out_of_core.view_order import Walk
+from ...optimize.method import Drawing, StepResult
+from ...optimize.out_of_core.view_order import ViewOrder
 from ...optimize.schedules import due
 from ...optimize.training_data import TrainingView
 from ...rasterize import Gaussians, Rendering, records
@@ -83,7 +83,7 @@ class SeenRecords:
         cache = self._store.cache
         told = self.rendering, self._number, torch.cat(rates), self._shares
         records.adam_step(cache.records, self._places, gradients, *told)
-        cache.changed(self._places[(self.rendering.radii > 0).numpy(force=True)])
+        cache.mark_changed(self._places[(self.rendering.radii > 0).numpy(force=True)])
 
     def zero_grad(self) -> None:
         """The next picture has other records."""
@@ -162,8 +162,8 @@ class Method(Refining):
     # -- a step ----------------------------------------------------------------------------------------
 
     @cached_property
-    def _walk(self) -> Walk:
-        return Walk(np.array([camera.center for camera in self.data.train]), self.seed)
+    def _walk(self) -> ViewOrder:
+        return ViewOrder(np.array([camera.center for camera in self.data.train]), self.seed)
 
     def view_index(self, step: int) -> int:
         """The training view of a step; of those that draw cuts most are near the one before."""
@@ -171,7 +171,7 @@ class Method(Refining):
             return super().view_index(step)
         return self._walk(step - self.finest_steps)
 
-    def train_step(self, step: int) -> Made:
+    def train_step(self, step: int) -> StepResult:
         if step == self.finest_steps:
             return self._build_step(step)
         if step < self.finest_steps:
@@ -180,7 +180,7 @@ class Method(Refining):
         if due(self.parameters.resize_interval, step - self.finest_steps):
             self.store.resize()
         told = super().train_step(step)
-        self.store.cache.after(step - self.finest_steps)
+        self.store.cache.end_step(step - self.finest_steps)
         return told
 
     def set_learning_rates(self, step: int) -> None:
@@ -235,7 +235,7 @@ class Method(Refining):
         self.store = grown
 
     @torch.no_grad()
-    def _build_step(self, step: int) -> Made:
+    def _build_step(self, step: int) -> StepResult:
         """Builds the tree; what is told of the step is how a view looks by it."""
         self.store = self._new_store()
         if self._base is not None:
@@ -249,7 +249,9 @@ class Method(Refining):
         gaussians = self._take(view, step, self.parameters.pixels)
         seen = self.rasterize_model(view.camera, step, gaussians=gaussians)
         loss = self.loss([Drawing(seen)], view, step)
-        return Made(float(loss), partial(self.over_black, seen.image, seen.alpha, step), view.target)
+        return StepResult(
+            float(loss), partial(self.composite_over_black, seen.image, seen.alpha, step), view.target
+        )
 
     def _new_store(self, budget: int | None = None) -> Store:
         budget = self.data.splat_memory or budget or default_budget(self.device)

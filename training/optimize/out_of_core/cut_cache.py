@@ -11,23 +11,23 @@ import torch
 from ...errors import LodgsError
 from ..memory import keep_freed_memory
 from ..schedules import due
-from .row_file import STAGING, FileRows
+from .row_file import STAGING_BYTES, RowFile
 
 REUSE = 0.77, 2.0
 """A cut is used again where the distance over that of its making is in here ("A LoD of Gaussians", Eq. 7)."""
 FLUSH_INTERVAL = 1000
 """Steps after which everything goes back, so that no cut stays for good."""
-REDUCED = 0.8
+KEEP_SHARE = 0.8
 """Share of the room that is taken after the least recently used has gone."""
-BESIDE = 17
+SLOT_BYTES = 17
 """Bytes that are kept of each row here beside its numbers: which row, its group, whether changed, places."""
-PLACE = 4
+INDEX_BYTES = 4
 """Bytes that are kept of each row there is: where it is here."""
 
-AT_ONCE = 1 << 15
+BATCH_ROWS = 1 << 15
 """Rows that are read or written together."""
 
-LARGE = 1 << 20
+MMAP_BYTES = 1 << 20
 """Bytes from which on an array's memory is the system's again when it is freed, where not all rows have room:
 what is made of cuts has another size each step, and a heap would keep half as much again in pieces that fit
 nothing. It costs some 10 % of a step's time."""
@@ -36,7 +36,7 @@ FREE = -1
 """The group of a place without a row."""
 
 
-class NoRoom(LodgsError):
+class CutTooLarge(LodgsError):
     """What a view needs at once is more than the budget has room for.
 
     Attributes:
@@ -85,29 +85,29 @@ class CutCache:
 
     def __init__(
         self,
-        rows: FileRows,
+        rows: RowFile,
         groups: int,
         budget: int,
         device: torch.device | str = "cpu",
         reuse: tuple[float, float] = REUSE,
         flush_interval: int = FLUSH_INTERVAL,
-        reduced: float = REDUCED,
+        reduced: float = KEEP_SHARE,
     ) -> None:
         self.rows, self.layout, self._device = rows, rows.layout, torch.device(device)
         self._least, self._most = reuse
         self._flush_interval, self._reduced = flush_interval, reduced
         self._record, self.budget = 4 * self.layout.width, budget
         # on a device what is between it and the file has memory of its own
-        self._at_once = AT_ONCE if self._device.type == "cpu" else max(STAGING // self._record, 1)
+        self._at_once = BATCH_ROWS if self._device.type == "cpu" else max(STAGING_BYTES // self._record, 1)
         self.records = torch.zeros(0, self.layout.width, device=self._device)
         self.loaded = self.reused = 0
         self._forget(groups)
 
     def _forget(self, groups: int) -> None:
-        most = max(self.budget - self.tables, 0) // (self._record + BESIDE)
+        most = max(self.budget - self.tables, 0) // (self._record + SLOT_BYTES)
         self.capacity = min(most, len(self.rows))
         if self.capacity < len(self.rows):
-            keep_freed_memory(LARGE)
+            keep_freed_memory(MMAP_BYTES)
         if len(self.records) != self.capacity:
             self.records = self.records[:0].clone()
             self.records = torch.zeros(self.capacity, self.layout.width, device=self._device)
@@ -130,7 +130,7 @@ class CutCache:
     @property
     def tables(self) -> int:
         """Bytes of what is kept of all rows there are."""
-        return PLACE * len(self.rows) + self.rows.tables
+        return INDEX_BYTES * len(self.rows) + self.rows.tables
 
     # -- a step ----------------------------------------------------------------------------------------
 
@@ -140,7 +140,7 @@ class CutCache:
         with np.errstate(invalid="ignore"):
             return (distances >= self._least * made) & (distances <= self._most * made)
 
-    def take(self, groups: np.ndarray, distances: np.ndarray, cut: Cut) -> np.ndarray:
+    def acquire(self, groups: np.ndarray, distances: np.ndarray, cut: Cut) -> np.ndarray:
         """Where the records of groups are, brought in where no cut of theirs serves.
 
         Args:
@@ -164,8 +164,8 @@ class CutCache:
                 break  # otherwise cuts that are finer than they need be have no room
         if there + len(rows) > self.capacity:
             needed = there + len(rows)
-            budget = needed * (self._record + BESIDE) + self.tables
-            raise NoRoom(needed, self.capacity, budget)
+            budget = needed * (self._record + SLOT_BYTES) + self.tables
+            raise CutTooLarge(needed, self.capacity, budget)
         self._clock += 1
         self._used[groups] = self._clock
         self.reused += there
@@ -190,16 +190,16 @@ class CutCache:
     def put(self, places: np.ndarray, records: torch.Tensor) -> None:
         """Puts records (M, width) at places (M,), each named once."""
         self.records.index_copy_(0, torch.from_numpy(places).to(self._device), records)
-        self.changed(places)
+        self.mark_changed(places)
 
-    def changed(self, places: np.ndarray) -> None:
+    def mark_changed(self, places: np.ndarray) -> None:
         """The records at places (M,) are to be written back."""
         self._dirty[places] = True
 
-    def after(self, step: int) -> None:
+    def end_step(self, step: int) -> None:
         """To be called after every step: cuts are forgotten where that is due."""
         if due(self._flush_interval, step + 1):
-            self.forget()
+            self.release_cuts()
 
     # -- coming and going ------------------------------------------------------------------------------
 
@@ -207,15 +207,15 @@ class CutCache:
         """What has changed is written; all stays here."""
         self._write(np.flatnonzero(self._dirty))
 
-    def forget(self) -> None:
+    def release_cuts(self) -> None:
         """No cut serves any more; rows stay here."""
         self._leave(list(self._places.values()))
         self._places = {}
         self._distance[:] = np.nan
 
-    def clear(self) -> None:
+    def evict_all(self) -> None:
         """Writes back, and keeps nothing."""
-        self.forget()
+        self.release_cuts()
         self._drop(np.flatnonzero(self._group != FREE))
 
     def _bring(self, groups: np.ndarray, rows: np.ndarray, counts: np.ndarray) -> None:
@@ -303,7 +303,7 @@ class CutCache:
     # -- what lasts ------------------------------------------------------------------------------------
 
     def state_dict(self) -> dict[str, Any]:
-        """A checkpoint of the rows, see ``FileRows.state_dict``, and which of them are here."""
+        """A checkpoint of the rows, see ``RowFile.state_dict``, and which of them are here."""
         self.write_back()
         groups = sorted(self._places)
         places = [self._places[group] for group in groups]

@@ -32,17 +32,17 @@ from ...errors import LodgsError
 
 BLOCK = 16
 """Rows of a block. Of rows that a step brings half as many bytes are written as with 64: blocks are whole."""
-TABLES = 21
+TABLE_BYTES = 21
 """Bytes in memory for each block, at most: where it is, its checksum, and where checkpoints have it."""
-NEAR = 4
+MAX_GAP = 4
 """Blocks between two that are wanted, at most, which are read with them: it takes less time than a call."""
-STAGING = 3 << 18
+STAGING_BYTES = 3 << 18
 """Bytes of blocks that are between file and tensors at a time; in up to six copies, all told."""
-KEPT = 2
+OLD_CHECKPOINTS = 2
 """Checkpoints before the newest one whose blocks stay: a run has as many, the newest may not be whole yet."""
 
 
-class Layout:
+class RowLayout:
     """What a row holds: arrays by name, one after the other, float32.
 
     Attributes:
@@ -65,7 +65,7 @@ class Layout:
         return torch.cat([tensors[name].reshape(len(tensors[name]), -1) for name in self.shapes], 1)
 
 
-class FileRows:
+class RowFile:
     """Rows in a file of a folder; in memory are some numbers of each block of them, see TABLES.
 
     For one thread. Where a write fails, what it was to replace may be lost: nothing more is read or written
@@ -79,7 +79,12 @@ class FileRows:
     """
 
     def __init__(
-        self, folder: Path, layout: Layout, block: int = BLOCK, staging: int = STAGING, name: str = "rows"
+        self,
+        folder: Path,
+        layout: RowLayout,
+        block: int = BLOCK,
+        staging: int = STAGING_BYTES,
+        name: str = "rows",
     ) -> None:
         self.layout, self._folder, self._block, self._name = layout, folder, block, name
         self._blocks_at_once = max(staging // (4 * layout.width * block), 1)
@@ -95,7 +100,9 @@ class FileRows:
         self._free = np.zeros(0, np.int32)  # slots that nobody needs
         self._retiring: list[np.ndarray] = []  # slots of the last checkpoint that have been replaced since
         self._retired: deque[np.ndarray] = deque()  # the same of the checkpoints before it, oldest first
-        self._named: deque[str] = deque(maxlen=KEPT + 1)  # files that these and the last one tell of
+        self._named: deque[str] = deque(
+            maxlen=OLD_CHECKPOINTS + 1
+        )  # files that these and the last one tell of
 
     def __len__(self) -> int:
         return self._count
@@ -105,7 +112,7 @@ class FileRows:
     @property
     def tables(self) -> int:
         """Bytes in memory, at most."""
-        return TABLES * len(self._slots)
+        return TABLE_BYTES * len(self._slots)
 
     def read(
         self, rows: np.ndarray, records: torch.Tensor | None = None, at: np.ndarray | None = None
@@ -186,11 +193,11 @@ class FileRows:
                 os.fsync(self._file.fileno())
         self._retired.append(_joined(self._retiring))
         self._retiring = []
-        while len(self._retired) > KEPT:
+        while len(self._retired) > OLD_CHECKPOINTS:
             self._free = np.sort(np.append(self._free, self._retired.popleft()))
         self._fresh[:] = False
         self._named.append(self._file_name)
-        if len(self._named) > KEPT:
+        if len(self._named) > OLD_CHECKPOINTS:
             self._remove_others()
         return {
             "file": self._file_name,
@@ -237,7 +244,7 @@ class FileRows:
             self._file.close()
             self._file = None
 
-    def supersede(self, other: FileRows) -> None:
+    def supersede(self, other: RowFile) -> None:
         """Takes the place of other rows of the same folder, whose file goes once no checkpoint has it."""
         self._named.extend(other._named)
         other.discard()
@@ -326,7 +333,7 @@ class FileRows:
             order = np.argsort(places)
             places, to = places[order], to[order]
         most = self._blocks_at_once * self._block
-        runs = _runs(places // self._block, places // most, 1 + NEAR)
+        runs = _runs(places // self._block, places // most, 1 + MAX_GAP)
         gaps = np.append(0, np.cumsum((np.diff(places) != 1) | (np.diff(to) != 1)))[: len(places)]
         staged = np.empty((0, self.layout.width), np.float32)
         at, used, begin, end = np.empty_like(places), 0, 0, 0  # rows of ``staged``; runs that wait in it

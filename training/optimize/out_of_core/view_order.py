@@ -15,7 +15,7 @@ SPREAD = 1.0
 """W, as a multiple of the median distance of a view to those that may follow it."""
 
 
-class Walk:
+class ViewOrder:
     """A view for each step, most of them near the one before ("A LoD of Gaussians", Sec. 4.4).
 
     After view i comes one of its k nearest, j with P(j | i) proportional to 1 / (w_ij + W), where w_ij is the
@@ -56,8 +56,8 @@ class Walk:
         distances = distances[others].reshape(count, k)
         typical = float(np.median(distances)) if k else 0.0
         weights = 1 / (distances + spread * typical) if typical > 0 and spread > 0 else _limit(distances)
-        self.chances = weights / weights.sum(1, keepdims=True)
-        self._ends = np.cumsum(self.chances, 1)
+        self.probabilities = weights / weights.sum(1, keepdims=True)
+        self._ends = np.cumsum(self.probabilities, 1)
         self._views = lru_cache(8)(self._walked)
 
     def __call__(self, step: int) -> int:

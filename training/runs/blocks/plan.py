@@ -22,7 +22,7 @@ import numpy as np
 from ...errors import LodgsError
 from ...lod.rule import find_rule
 from ...methods import method_info
-from ...optimize.memory import MOST_BYTES, TARGET_BYTES
+from ...optimize.memory import MAX_BYTES, TARGET_BYTES
 from ...optimize.parameters import Parameters
 from ...scenes.colmap import Scene, read_scene
 from ...scenes.regions import Region, plan_cells
@@ -309,23 +309,23 @@ def _training_views(job: Job, scene: Scene) -> set[str]:
 
 def _divided(job: Job) -> tuple[Parameters, Parameters | None]:
     """Return the blocks' parameters for an undivided scene, and those of the coarse part or None."""
-    method = method_info(method_info(job.method).in_cells)
+    method = method_info(method_info(job.method).cell_method)
     values = asdict(job.resolved_parameters())
     names = {field.name for field in fields(method.parameters)}
     parameters = method.parameters(**{name: value for name, value in values.items() if name in names})
-    coarse, fine = method.divided(parameters) or (None, parameters)
+    coarse, fine = method.split_parameters(parameters) or (None, parameters)
     return fine, coarse
 
 
 def _part_job(job: Job, parameters: Parameters, method: str = "") -> Job:
     values = {name: list(v) if isinstance(v, tuple) else v for name, v in asdict(parameters).items()}
-    method = method or method_info(job.method).in_cells
+    method = method or method_info(job.method).cell_method
     return replace(job, method=method, cells="", polish=0, parameters=values)
 
 
 def _polishes(job: Job) -> bool:
     """Return whether borders of cells are fitted; the rule must not weight splats at full detail."""
-    rule = find_rule(method_info(method_info(job.method).in_cells).rule)
+    rule = find_rule(method_info(method_info(job.method).cell_method).rule)
     return job.polish > 0 and (rule is None or not rule.always_active)
 
 
@@ -370,8 +370,8 @@ def _grids(scene: Scene, min_cells: float) -> Iterator[str]:
 
 def _memory(parameters: Parameters, views: int, pixels: float, photo_memory: int) -> int:
     """Estimate a trainer's memory in bytes."""
-    photos = min(views * pixels * TARGET_BYTES, photo_memory * 1e6 or MOST_BYTES)
-    return round(PROGRAM_BYTES + SPLAT_BYTES * parameters.most_at_once + photos)
+    photos = min(views * pixels * TARGET_BYTES, photo_memory * 1e6 or MAX_BYTES)
+    return round(PROGRAM_BYTES + SPLAT_BYTES * parameters.max_trained_splats + photos)
 
 
 def _scaled(steps: int | tuple[int, ...], share: float) -> int | tuple[int, ...]:

@@ -211,7 +211,7 @@ def test_the_networks_come_back_from_their_arrays(data, tmp_path):
     arrays = read_arrays(tmp_path / "model.npz")
     other.load_arrays(arrays)
     camera = data.test[0]
-    assert torch.equal(other.picture(camera), method.picture(camera))
+    assert torch.equal(other.render_image(camera), method.render_image(camera))
     other.train_step(4)  # and training can go on
     network = next(name for name in arrays if name.startswith("network."))
     for name, odd in (

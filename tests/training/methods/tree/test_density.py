@@ -90,7 +90,7 @@ def store(tmp_path):
 
 def with_stats(store, **values):
     """Sets columns of all records."""
-    store.cache.clear()
+    store.cache.evict_all()
     records = store.rows.read(np.arange(len(store)))
     for name, column in values.items():
         store.layout.split(records)[name][:] = torch.as_tensor(column, dtype=torch.float32)

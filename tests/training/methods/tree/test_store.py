@@ -13,13 +13,13 @@ from training.lod.tree.forest import forest_shape, max_subtree_leaves, merge_for
 from training.methods.tree import store as store_module
 from training.methods.tree.build import build
 from training.methods.tree.store import Store, layout_of
-from training.optimize.out_of_core.cut_cache import BESIDE, PLACE
-from training.optimize.out_of_core.row_file import BLOCK, TABLES
+from training.optimize.out_of_core.cut_cache import INDEX_BYTES, SLOT_BYTES
+from training.optimize.out_of_core.row_file import BLOCK, TABLE_BYTES
 from training.rasterize.sequential_point_tree import SequentialPointTree
 
 NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh")
-RECORD = 4 * layout_of(1).width + BESIDE
-TABLE = PLACE * 16_000 + TABLES * 16_000 // BLOCK
+RECORD = 4 * layout_of(1).width + SLOT_BYTES
+TABLE = INDEX_BYTES * 16_000 + TABLE_BYTES * 16_000 // BLOCK
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +61,7 @@ def test_a_cut_made_anew_is_that_of_hspt_in_memory(town, tmp_path, longest, monk
     found = 0
     for camera in cameras(np.random.default_rng(longest)):
         for pixels in (0.2, 0.7, 1.8):
-            made.cache.forget()
+            made.cache.release_cuts()
             places = made.take(camera, pixels, 0.3)
             rows = made.cache.rows_at(places)
             assert (np.diff(rows) > 0).all(), "rows ascend, whatever was here before"
@@ -80,7 +80,7 @@ def moved(made, seed):
     records = made.rows.read(np.arange(len(made)))
     records[:, :3] += torch.from_numpy(rng.normal(0, 0.05, (len(made), 3)).astype(np.float32))
     records[:, 7:10] += torch.from_numpy(rng.normal(0, 0.3, (len(made), 3)).astype(np.float32))
-    made.cache.clear()
+    made.cache.evict_all()
     made.rows.write(np.arange(len(made)), records)
     return records
 
@@ -98,7 +98,7 @@ def test_sizes_follow_what_has_moved(town, tmp_path, monkeypatch):
         sizes = tree.sizes(nodes.means, nodes.log_scales)
         hspt = SequentialPointTree(tree, nodes.means, sizes, nodes.log_scales, longest)
         for camera in cameras(np.random.default_rng(5), 4):
-            made.cache.forget()
+            made.cache.release_cuts()
             rows = made.cache.rows_at(made.take(camera, 0.7, 0.3))
             np.testing.assert_array_equal(np.sort(order[rows]), np.sort(hspt.cut(camera, 0.7, 0.3)))
 
@@ -142,7 +142,7 @@ def steps(made, begin, end):
             made.resize()
         places = made.take(views[step], 1.0, 0.3)
         made.cache.put(places, made.cache.get(places) * 1.001)
-        made.cache.after(step)
+        made.cache.end_step(step)
     made.cache.write_back()
     return made.rows.read(np.arange(len(made)))
 
@@ -186,10 +186,10 @@ def test_a_view_without_room_is_coarsened_until_it_has(town, tmp_path):
     made, whole = stored(tmp_path / "some", town, budget=700 * RECORD + TABLE), stored(tmp_path, town)
     coarser = 0
     for camera in cameras(np.random.default_rng(0)):
-        made.cache.forget()
+        made.cache.release_cuts()
         made.coarsened, made.wanted = 1.0, 0
         rows = made.cache.rows_at(made.take(camera, 0.2, 0.3))
-        whole.cache.forget()
+        whole.cache.release_cuts()
         truth = whole.cache.rows_at(whole.take(camera, 0.2 * made.coarsened, 0.3))
         np.testing.assert_array_equal(rows, truth)
         assert len(rows) <= made.cache.capacity == 700

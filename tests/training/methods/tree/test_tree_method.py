@@ -14,7 +14,7 @@ from training.lod.tree.forest import merge_forest
 from training.lod.tree.shape import splat_size
 from training.methods import create, method_info
 from training.methods.tree.store import layout_of
-from training.optimize.out_of_core.cut_cache import BESIDE
+from training.optimize.out_of_core.cut_cache import SLOT_BYTES
 from training.optimize.parameters import override
 from training.rasterize import Gaussians, rasterize
 from training.splats.gaussians import Splats
@@ -39,7 +39,7 @@ def trained(tree, begin=0, until=None):
 
 def shown(tree, camera, pixels):
     """The rows of a view's cut, made anew."""
-    tree.store.cache.clear()
+    tree.store.cache.evict_all()
     return tree.store.cache.rows_at(tree.store.take(camera, pixels, tree.data.near))
 
 
@@ -109,7 +109,7 @@ def test_rates_go_on_falling_from_leaves_to_cuts_and_those_of_a_base_have_fallen
 def test_photographs_are_continued_while_there_are_leaves_alone(data):
     """However many steps come after them."""
     tree = make(data, tune_steps=40, densify_until=0.9)
-    assert [step for step in range(tree.steps) if tree.continues_margins(step)] == [11]
+    assert [step for step in range(tree.steps) if tree.adds_margins(step)] == [11]
 
 
 def test_without_tuning_the_leaves_are_the_base_to_the_bit(data, base):
@@ -165,7 +165,7 @@ def test_a_step_moves_the_cut_of_its_view_alone(data, base):
     tree = make(data, far, lod_noise=0.0)
     trained(tree, until=4)
     before = records(tree)
-    tree.store.cache.clear()
+    tree.store.cache.evict_all()
     tree.train_step(4)
     moved = (records(tree) != before).any(dim=1)
     rows = shown(tree, tree.choose_view(4).camera, tree.parameters.pixels)
@@ -294,7 +294,7 @@ def test_that_views_are_coarsened_for_the_budget_is_said_once(data, monkeypatch)
     leaves = surfaces(3_000, degree=0)
     leaves.means = (0.03 * leaves.means + data.scene.points.mean(axis=0)).astype(np.float32)
     leaves.log_scales = (leaves.log_scales + np.log(0.03)).astype(np.float32)
-    record = BESIDE + 4 * layout_of(0).width
+    record = SLOT_BYTES + 4 * layout_of(0).width
     for room, many in ((600, 1), (10_000, 0)):
         monkeypatch.setattr(data, "splat_memory", room * record + 4 * (2 * len(leaves) - 1))
         tree, told = make(data, leaves, sh_degree=0, pixels=0.1, lod_noise=0.0), []

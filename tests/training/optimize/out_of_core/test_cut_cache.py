@@ -5,14 +5,17 @@ import pytest
 import torch
 
 from training.errors import LodgsError
-from training.optimize.out_of_core.cut_cache import BESIDE, PLACE, CutCache
-from training.optimize.out_of_core.row_file import TABLES, FileRows, Layout
+from training.optimize.out_of_core.cut_cache import INDEX_BYTES, SLOT_BYTES, CutCache
+from training.optimize.out_of_core.row_file import TABLE_BYTES, RowFile, RowLayout
 
-LAYOUT = Layout({"values": (4,)})
+LAYOUT = RowLayout({"values": (4,)})
 GROUPS, SIZE = 20, 30
 """Group g is the rows from SIZE * g; those of a cut are the first few, more for nearer ones."""
 BLOCK = 7
-ROW, TABLE = 4 * LAYOUT.width + BESIDE, PLACE * GROUPS * SIZE + TABLES * -(-GROUPS * SIZE // BLOCK)
+ROW, TABLE = (
+    4 * LAYOUT.width + SLOT_BYTES,
+    INDEX_BYTES * GROUPS * SIZE + TABLE_BYTES * -(-GROUPS * SIZE // BLOCK),
+)
 
 
 def filled(rows):
@@ -36,7 +39,7 @@ def cut_for(groups: np.ndarray, distances: np.ndarray):
 
 @pytest.fixture
 def made(tmp_path):
-    return filled(FileRows(tmp_path, LAYOUT, block=BLOCK))
+    return filled(RowFile(tmp_path, LAYOUT, block=BLOCK))
 
 
 @pytest.mark.parametrize("room", [140, 200, 1000])
@@ -51,7 +54,7 @@ def test_what_is_taken_is_what_was_put_last(made, room):
         groups = rng.permutation(GROUPS)[: rng.integers(1, 5)]
         distances = rng.uniform(1, 8, len(groups))
         cut, asked = cut_for(groups, distances)
-        places = cache.take(groups, distances, cut)
+        places = cache.acquire(groups, distances, cut)
         expected = []
         for group, distance in zip(groups.tolist(), distances, strict=True):
             if group in here and 0.77 * here[group][0] <= distance <= 2 * here[group][0]:
@@ -70,7 +73,7 @@ def test_what_is_taken_is_what_was_put_last(made, room):
         changed = records[torch.from_numpy(some)] + 1
         cache.put(places[some], changed)
         truth[expected[some]] = changed
-        cache.after(step)
+        cache.end_step(step)
         if step % 17 == 16:
             here.clear()
             assert not cache._places
@@ -79,7 +82,7 @@ def test_what_is_taken_is_what_was_put_last(made, room):
         assert sum(len(each) for each in cache._places.values()) == cache._held <= len(cache)
     assert most > min(room, 250) * 0.7
     assert cache.loaded > GROUPS * SIZE if room < 1000 else cache.loaded <= GROUPS * SIZE
-    cache.clear()
+    cache.evict_all()
     np.testing.assert_array_equal(rows.read(np.arange(GROUPS * SIZE)), truth)
 
 
@@ -90,7 +93,7 @@ def test_the_least_recently_used_go_first_and_only_as_many_as_need_be(made):
     def take(*groups: int) -> list[int]:
         some = np.array(groups)
         cut, asked = cut_for(some, np.ones(len(some)))
-        cache.take(some, np.ones(len(some)), cut)
+        cache.acquire(some, np.ones(len(some)), cut)
         return asked
 
     for group in range(5):
@@ -116,7 +119,7 @@ def test_a_cut_for_another_distance_brings_only_what_is_new(made):
 
     def take(distance: float) -> tuple[np.ndarray, bool]:
         cut, asked = cut_for(one, np.array([distance]))
-        return cache.take(one, np.array([distance]), cut), bool(asked)
+        return cache.acquire(one, np.array([distance]), cut), bool(asked)
 
     places, _ = take(4.0)
     assert len(places) == 7 and cache.loaded == 7
@@ -127,7 +130,7 @@ def test_a_cut_for_another_distance_brings_only_what_is_new(made):
     places, _ = take(20.0)
     assert len(places) == 1 and len(cache) == 10, "what has left stays while there is room"
     np.testing.assert_array_equal(cache.get(places), 2 * truth[90:91])
-    cache.forget()
+    cache.release_cuts()
     places, again = take(4.0)
     assert again and cache.loaded == 10
     np.testing.assert_array_equal(cache.get(places), 2 * truth[90:97])
@@ -142,12 +145,12 @@ def test_groups_share_no_rows(made):
     wrong = [([1, 2, 3, 3], [2, 2]), ([1, 2, 1], [2, 1])]
     for chosen, counts in wrong:
         with pytest.raises(ValueError, match="two groups, or in one twice"):
-            cache.take(two, np.ones(2), lambda _, c=chosen, n=counts: (np.array(c), np.array(n)))
+            cache.acquire(two, np.ones(2), lambda _, c=chosen, n=counts: (np.array(c), np.array(n)))
     cache = CutCache(rows, GROUPS, 300 * ROW + TABLE)
-    cache.take(two[:1], np.ones(1), lambda _: (np.array([5, 6]), np.array([2])))
+    cache.acquire(two[:1], np.ones(1), lambda _: (np.array([5, 6]), np.array([2])))
     with pytest.raises(ValueError, match="two groups"):
-        cache.take(two[1:], np.ones(1), lambda _: (np.array([6]), np.array([1])))
-    assert len(cache.take(two[:0], np.ones(0), lambda _: (np.array([6]), np.array([1])))) == 0
+        cache.acquire(two[1:], np.ones(1), lambda _: (np.array([6]), np.array([1])))
+    assert len(cache.acquire(two[:0], np.ones(0), lambda _: (np.array([6]), np.array([1])))) == 0
 
 
 def test_a_resumed_run_has_the_same_bits(tmp_path):
@@ -159,15 +162,15 @@ def test_a_resumed_run_has_the_same_bits(tmp_path):
             rng = np.random.default_rng(step)
             groups = rng.permutation(GROUPS)[:3]
             distances = rng.uniform(1, 6, 3)
-            places = cache.take(groups, distances, cut_for(groups, distances)[0])
+            places = cache.acquire(groups, distances, cut_for(groups, distances)[0])
             seen.append(cache.get(places).numpy().copy())
             cache.put(places, cache.get(places) * 1.1 + step)
-            cache.after(step)
+            cache.end_step(step)
         return seen
 
     def fresh(name: str) -> CutCache:
         (tmp_path / name).mkdir(exist_ok=True)
-        rows, _ = filled(FileRows(tmp_path / name, LAYOUT, block=BLOCK))
+        rows, _ = filled(RowFile(tmp_path / name, LAYOUT, block=BLOCK))
         return CutCache(rows, GROUPS, 130 * ROW + TABLE, flush_interval=40)
 
     truth = steps(fresh("whole"), 0, 60)
@@ -180,7 +183,7 @@ def test_a_resumed_run_has_the_same_bits(tmp_path):
     cache.load_state_dict(state)
     seen += steps(cache, 23, 60)
     assert all(np.array_equal(a, b) for a, b in zip(truth, seen, strict=True))
-    small = CutCache(filled(FileRows(tmp_path, LAYOUT, block=BLOCK))[0], GROUPS, 5 * ROW)
+    small = CutCache(filled(RowFile(tmp_path, LAYOUT, block=BLOCK))[0], GROUPS, 5 * ROW)
     state["rows"] = small.rows.state_dict()
     small.load_state_dict(state)  # in which there is no room for what was here
     assert not len(small)
@@ -194,5 +197,5 @@ def test_where_finer_cuts_have_no_room_all_are_made_anew(made):
     for distance, most in ((1.0, 60), (1.9, 60), (1.9, 75)):
         groups = np.arange(2 if most == 60 else 5)
         distances = np.full(len(groups), distance)
-        places = cache.take(groups, distances, cut_for(groups, distances)[0])
+        places = cache.acquire(groups, distances, cut_for(groups, distances)[0])
         assert len(places) == most  # of 30 each at 1, of 15 each at 1.9

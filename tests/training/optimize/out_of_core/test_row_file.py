@@ -19,11 +19,11 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 
 from training.errors import LodgsError
 from training.optimize.out_of_core import row_file as rows_module
-from training.optimize.out_of_core.row_file import FileRows, Layout
+from training.optimize.out_of_core.row_file import RowFile, RowLayout
 from training.runs.checkpoints import read_newest, remove_checkpoints, write_checkpoint
 from training.runs.folder import RunFolder
 
-LAYOUT = Layout({"means": (3,), "opacity": (), "sh": (2, 3)})
+LAYOUT = RowLayout({"means": (3,), "opacity": (), "sh": (2, 3)})
 ROOT = Path(__file__).resolve().parents[3]
 
 
@@ -52,8 +52,8 @@ class AsInMemory(RuleBasedStateMachine):
         self.truth = np.zeros((0, LAYOUT.width), np.float32)
         self.taken: list[tuple[dict, np.ndarray]] = []
 
-    def opened(self) -> FileRows:
-        return FileRows(self.folder, LAYOUT, block=3, staging=3 * 3 * 4 * LAYOUT.width)
+    def opened(self) -> RowFile:
+        return RowFile(self.folder, LAYOUT, block=3, staging=3 * 3 * 4 * LAYOUT.width)
 
     def teardown(self) -> None:
         self.rows.close()
@@ -118,7 +118,7 @@ TestAsInMemory.settings = settings(max_examples=25, stateful_step_count=25, dead
 
 
 def test_rows_that_are_not_there_are_refused(tmp_path):
-    rows = FileRows(tmp_path, LAYOUT, block=4)
+    rows = RowFile(tmp_path, LAYOUT, block=4)
     rows.append(records(0, 32))
     with pytest.raises(IndexError):
         rows.read(np.array([32]))
@@ -129,7 +129,7 @@ def test_rows_that_are_not_there_are_refused(tmp_path):
 
 
 def test_a_checkpoint_costs_what_has_changed(tmp_path):
-    rows = FileRows(tmp_path, LAYOUT, block=8)
+    rows = RowFile(tmp_path, LAYOUT, block=8)
     rows.append(records(0, 8000))
     rows.state_dict()
     (path,) = tmp_path.iterdir()
@@ -143,15 +143,15 @@ def test_a_checkpoint_costs_what_has_changed(tmp_path):
 
 
 def test_damage_is_found_before_anything_is_taken(tmp_path):
-    rows = FileRows(tmp_path, LAYOUT, block=8)
+    rows = RowFile(tmp_path, LAYOUT, block=8)
     rows.append(records(0, 100))
     state = rows.state_dict()
     rows.close()
     (path,) = tmp_path.iterdir()
     whole = path.read_bytes()
 
-    def resumed() -> FileRows:
-        found = FileRows(tmp_path, LAYOUT, block=8)
+    def resumed() -> RowFile:
+        found = RowFile(tmp_path, LAYOUT, block=8)
         found.load_state_dict(state)
         return found
 
@@ -165,9 +165,9 @@ def test_damage_is_found_before_anything_is_taken(tmp_path):
         resumed()
     for name in ("../rows_00000000.bin", "/etc/passwd"):
         with pytest.raises(ValueError, match="impossible name"):
-            FileRows(tmp_path, LAYOUT, block=8).load_state_dict({**state, "file": name})
+            RowFile(tmp_path, LAYOUT, block=8).load_state_dict({**state, "file": name})
     with pytest.raises(ValueError, match="another kind"):
-        FileRows(tmp_path, LAYOUT, block=4).load_state_dict(state)
+        RowFile(tmp_path, LAYOUT, block=4).load_state_dict(state)
 
 
 # -- ends --------------------------------------------------------------------------------------------------
@@ -175,7 +175,7 @@ def test_damage_is_found_before_anything_is_taken(tmp_path):
 
 def life(folder: RunFolder, first: int, last: int, count: list[int] | None = None) -> None:
     """Goes on with a small run where its newest checkpoint is; every step changes rows, and adds some."""
-    rows = FileRows(folder.checkpoints, LAYOUT, block=4, staging=4 * 4 * 4 * LAYOUT.width)
+    rows = RowFile(folder.checkpoints, LAYOUT, block=4, staging=4 * 4 * 4 * LAYOUT.width)
     rows.append(records(99, 25))  # as a method begins before it takes up a checkpoint
     found = read_newest(folder, "cpu", lambda state: rows.load_state_dict(state["rows"]), print)
     for step in range(found[0] if found else first, last):
@@ -190,7 +190,7 @@ def life(folder: RunFolder, first: int, last: int, count: list[int] | None = Non
 
 def held(folder: RunFolder) -> tuple[int, np.ndarray]:
     """The newest checkpoint's step and rows."""
-    rows = FileRows(folder.checkpoints, LAYOUT, block=4)
+    rows = RowFile(folder.checkpoints, LAYOUT, block=4)
     warned: list[str] = []
     found = read_newest(folder, "cpu", lambda state: rows.load_state_dict(state["rows"]), warned.append)
     assert not warned
@@ -303,7 +303,7 @@ def test_an_older_checkpoint_serves_where_the_newest_is_spoilt(tmp_path, undistu
     folder.create()
     life(folder, 0, STEPS)
     (folder.checkpoints / f"step_{STEPS:07d}.pt").write_bytes(b"nothing")
-    rows, warned = FileRows(folder.checkpoints, LAYOUT, block=4), []
+    rows, warned = RowFile(folder.checkpoints, LAYOUT, block=4), []
     found = read_newest(folder, "cpu", lambda state: rows.load_state_dict(state["rows"]), warned.append)
     assert found is not None and found[0] == STEPS - 2 and len(warned) == 1
     np.testing.assert_array_equal(rows.read(np.arange(len(rows))), undisturbed[STEPS - 2])

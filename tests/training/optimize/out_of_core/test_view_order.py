@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from training.optimize.out_of_core.view_order import BLOCK, Walk
+from training.optimize.out_of_core.view_order import BLOCK, ViewOrder
 
 CENTERS = np.random.default_rng(0).random((30, 3)) * (4, 1, 2)
 
@@ -24,10 +24,10 @@ def by_the_formula(centers: np.ndarray, k: int, spread: float) -> np.ndarray:
 @pytest.mark.parametrize(("k", "spread"), [(5, 1.0), (100, 0.2), (29, 5.0)])
 def test_what_follows_is_drawn_by_the_formula(k, spread):
     """The chances themselves, and the walk's own counts by a chi-squared test at one in a thousand."""
-    walk = Walk(CENTERS, 3, neighbours=k, spread=spread)
+    walk = ViewOrder(CENTERS, 3, neighbours=k, spread=spread)
     truth = by_the_formula(CENTERS, min(k, 29), spread)
     dense = np.zeros_like(truth)
-    np.put_along_axis(dense, walk.neighbours, walk.chances, 1)
+    np.put_along_axis(dense, walk.neighbours, walk.probabilities, 1)
     np.testing.assert_allclose(dense, truth, atol=1e-12)
     views = np.array([walk(step) for step in range(200 * BLOCK)]).reshape(-1, BLOCK)
     counts = np.zeros_like(truth)
@@ -42,7 +42,7 @@ def test_what_follows_is_drawn_by_the_formula(k, spread):
 def test_it_stays_nearer_than_a_shuffle():
     rng = np.random.default_rng(1)
     centers = np.stack([np.linspace(0, 100, 400), rng.random(400), rng.random(400)], 1)
-    walk = Walk(centers, 0, neighbours=20)
+    walk = ViewOrder(centers, 0, neighbours=20)
     views = np.array([walk(step) for step in range(20 * BLOCK)])
     away = np.linalg.norm(np.diff(centers[views], axis=0), axis=1)
     within = np.arange(1, len(views)) % BLOCK != 0
@@ -50,7 +50,7 @@ def test_it_stays_nearer_than_a_shuffle():
 
 
 def test_every_view_is_seen_and_begins_a_block_as_often_as_any_other():
-    walk = Walk(CENTERS, 1, neighbours=3)
+    walk = ViewOrder(CENTERS, 1, neighbours=3)
     first = [walk(block * BLOCK) for block in range(3 * len(CENTERS))]
     for epoch in range(3):
         assert sorted(first[30 * epoch : 30 * epoch + 30]) == list(range(30))
@@ -59,29 +59,29 @@ def test_every_view_is_seen_and_begins_a_block_as_often_as_any_other():
 
 def test_a_step_depends_on_its_number_and_the_seed_alone():
     steps = np.random.default_rng(2).permutation(5 * BLOCK)
-    walk, again = Walk(CENTERS, 7), Walk(CENTERS, 7)
+    walk, again = ViewOrder(CENTERS, 7), ViewOrder(CENTERS, 7)
     views = [walk(step) for step in range(5 * BLOCK)]
     assert [again(step) for step in steps] == [views[step] for step in steps]
-    other = Walk(CENTERS, 8)
+    other = ViewOrder(CENTERS, 8)
     assert [other(step) for step in range(5 * BLOCK)] != views
 
 
 def test_lengths_do_not_matter():
-    small, large = Walk(CENTERS, 7), Walk(1000 * CENTERS + 5, 7)
-    np.testing.assert_allclose(small.chances, large.chances, rtol=1e-9)
+    small, large = ViewOrder(CENTERS, 7), ViewOrder(1000 * CENTERS + 5, 7)
+    np.testing.assert_allclose(small.probabilities, large.probabilities, rtol=1e-9)
     assert [small(step) for step in range(500)] == [large(step) for step in range(500)]
 
 
 @pytest.mark.parametrize("spread", [0.0, 1.0])
 def test_odd_places_of_cameras(spread):
     """One camera; two; all in one place; rigs of six in each of many places."""
-    assert {Walk(np.zeros((1, 3)), 0, spread=spread)(step) for step in range(300)} == {0}
-    two = Walk(np.eye(3)[:2], 0, spread=spread)
+    assert {ViewOrder(np.zeros((1, 3)), 0, spread=spread)(step) for step in range(300)} == {0}
+    two = ViewOrder(np.eye(3)[:2], 0, spread=spread)
     assert [two(step) for step in range(4)] in ([0, 1, 0, 1], [1, 0, 1, 0])
-    together = Walk(np.zeros((40, 3)), 0, neighbours=8, spread=spread)
-    np.testing.assert_allclose(together.chances, 1 / 8)
-    rigs = Walk(np.repeat(CENTERS, 6, axis=0), 0, neighbours=10, spread=spread)
+    together = ViewOrder(np.zeros((40, 3)), 0, neighbours=8, spread=spread)
+    np.testing.assert_allclose(together.probabilities, 1 / 8)
+    rigs = ViewOrder(np.repeat(CENTERS, 6, axis=0), 0, neighbours=10, spread=spread)
     for walk in (together, rigs):
         assert not (walk.neighbours == np.arange(len(walk.neighbours))[:, None]).any()
         assert all(len(set(row)) == len(row) for row in walk.neighbours.tolist())
-        assert np.isfinite(walk.chances).all() and len({walk(step) for step in range(2000)}) > 20
+        assert np.isfinite(walk.probabilities).all() and len({walk(step) for step in range(2000)}) > 20

@@ -88,7 +88,7 @@ def test_blocks_have_the_units_and_held_out_views_of_the_full_scene(tiny_scene, 
         trained |= {camera.name for camera in data.train}
         assert 0 < len(data.scene.points) <= len(undivided.scene.points)
     assert trained == {camera.name for camera in undivided.train}
-    assert {block.job.method for block in blocks} == {METHODS[method].in_cells}
+    assert {block.job.method for block in blocks} == {METHODS[method].cell_method}
 
 
 def test_corrupt_photo_does_not_change_the_held_out_views(tiny_scene, tmp_path):
@@ -113,7 +113,7 @@ def test_invalid_plan_writes_nothing(tiny_scene, tmp_path, capsys):
     assert main(command) == 2
     assert "cells" in capsys.readouterr().err
     assert main([*command, "--cells", "5x1"]) == 2
-    assert "too few" in capsys.readouterr().err
+    assert "each cell needs" in capsys.readouterr().err
     assert main([*command, "--cells", "2x1"]) == 0
     assert "blocks run" in capsys.readouterr().out
     assert main([*command, "--cells", "1x2"]) == 2, "the folder belongs to another plan"
@@ -243,7 +243,7 @@ def test_invalid_cells_are_rejected(tiny_scene, tmp_path):
         job_for(tiny_scene, tmp_path / "run", "octree_neural", parameters={})
     with pytest.raises(LodgsError, match="both 'cells' and 'region'"):
         job_for(tiny_scene, tmp_path / "run", region="region.json")
-    with pytest.raises(LodgsError, match="too few"):
+    with pytest.raises(LodgsError, match="each cell needs"):
         planned(job_for(tiny_scene, tmp_path / "run", cells="5x1"))
     assert not (tmp_path / "run" / "blocks").exists()
 

@@ -160,7 +160,7 @@ def test_seam_steps_change_only_colours_and_opacities_of_free_splats(tiny_scene)
     values = {**SEAM_PARAMETERS, "lr_exposure": 0.0, "steps": 8, "max_splats": 200, "sh_degree": 1}
     method = create("3dgs", data, override(create_parameters(), values), 0, "cpu", base)
     frozen = torch.from_numpy(rng.random(200) < 0.5)
-    method.model.hold(frozen)
+    method.model.freeze_rows(frozen)
     for step in range(8):
         assert method.sh_degree(step) == 1 and method.shrink(step) == 1
         method.train_step(step)
