@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -122,19 +123,9 @@ def draw(
         ]
         if not instances:
             return image
-        frame = _common_frame(instances, camera, near)
-        counts = torch.tensor(frame.counts, device=frame.gaussians.means.device)
-        features = _membership(instances, counts, image) if levels else None
-        for top, strip in rasterize_strips(
-            frame.gaussians, frame.camera, rows=frame.rows, weights=frame.weights, background=back_color,
-            near=frame.near, antialias=_antialias_flags(instances, counts),
-            outputs=("depth", "median_depth") if depth else (), features=features, window=window,
-            limit=None if limit is None else torch.from_numpy(limit / frame.unit).to(frame.gaussians.means),
-            strip=STRIP_PIXELS, backend=backend,
-        ):  # fmt: skip
-            _copy_strip(image, top, strip, frame.unit, has_limit=limit is not None)
-            if not progress((top + len(strip.alpha)) / height):
-                return None
+        options = {"background": back_color, "window": window, "backend": backend}
+        completed = _draw_strips(image, instances, camera, near, limit, progress, options)
+        return image if completed else None
     except Exception as error:
         if not is_out_of_memory(error):
             raise
@@ -143,7 +134,32 @@ def draw(
             "not enough memory.",
             "Render a coarser level or a smaller image.",
         ) from error
-    return image
+
+
+def _draw_strips(
+    image: RenderedImage,
+    instances: list[Instance],
+    camera: Camera,
+    near: float,
+    limit: np.ndarray | None,
+    progress: Callable[[float], bool],
+    options: dict[str, Any],
+) -> bool:
+    """Draw an image strip by strip. Return False if ``progress`` cancels it."""
+    frame = _common_frame(instances, camera, near)
+    counts = torch.tensor(frame.counts, device=frame.gaussians.means.device)
+    for top, strip in rasterize_strips(
+        frame.gaussians, frame.camera, rows=frame.rows, weights=frame.weights, near=frame.near,
+        antialias=_antialias_flags(instances, counts),
+        outputs=("depth", "median_depth") if image.depth.size else (),
+        features=_membership(instances, counts, image) if image.levels else None,
+        limit=None if limit is None else torch.from_numpy(limit / frame.unit).to(frame.gaussians.means),
+        strip=STRIP_PIXELS, **options,
+    ):  # fmt: skip
+        _copy_strip(image, top, strip, frame.unit, has_limit=limit is not None)
+        if not progress((top + len(strip.alpha)) / len(image.alpha)):
+            return False
+    return True
 
 
 def _check_transforms(instances: Sequence[Instance]) -> None:

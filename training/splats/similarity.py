@@ -136,14 +136,14 @@ class Similarity:
         return self.scale * np.asarray(points, np.float64) @ self.rotation.T + self.translation
 
     def transform_columns(
-        self, columns: Columns, lengths: Collection[str], places: Sequence[AxisNames]
+        self, columns: Columns, lengths: Collection[str], positions: Sequence[AxisNames]
     ) -> Columns:
         """Scale the columns of lengths, transform those of positions, and keep all others.
 
         Args:
             columns: columns (N,) by name.
             lengths: names of columns of lengths.
-            places: names of the x, y and z columns of each kind of position.
+            positions: names of the x, y and z columns of each kind of position.
         """
         transformed = dict(columns)
         for name in lengths:
@@ -151,11 +151,11 @@ class Similarity:
                 with np.errstate(over="ignore"):  # huge values stand for infinity
                     scaled = transformed[name] * np.float64(self.scale)
                     transformed[name] = scaled.astype(transformed[name].dtype)
-        for place in places:
-            if all(name in transformed for name in place):
-                axes = self.transform_axes(transformed[name] for name in place)
+        for names in positions:
+            if all(name in transformed for name in names):
+                axes = self.transform_axes(transformed[name] for name in names)
                 transformed |= {
-                    name: axis.astype(transformed[name].dtype) for name, axis in zip(place, axes, strict=True)
+                    name: axis.astype(transformed[name].dtype) for name, axis in zip(names, axes, strict=True)
                 }
         return transformed
 
@@ -187,15 +187,15 @@ class Similarity:
         return rotated
 
     def transform_splats(
-        self, splats: Splats, lengths: Collection[str] = (), places: Sequence[AxisNames] = ()
+        self, splats: Splats, lengths: Collection[str] = (), positions: Sequence[AxisNames] = ()
     ) -> Splats:
         """Transform means, rotations, scales, harmonics and normals into new arrays.
 
         Args:
             lengths: names of extra columns of lengths.
-            places: names of extra x, y and z columns of positions.
+            positions: names of extra x, y and z columns of positions.
         """
-        extras = self.transform_columns(splats.extras, lengths, places)
+        extras = self.transform_columns(splats.extras, lengths, positions)
         if all(name in extras for name in NORMALS):
             normals = self.transform_axes((extras[name] for name in NORMALS), translate=False)
             extras |= dict(zip(NORMALS, normals, strict=True))

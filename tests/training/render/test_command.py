@@ -244,7 +244,7 @@ def test_out_of_memory_raises_one_sentence(bundle, camera, tmp_path, capsys, mon
     torch_error = RuntimeError(
         "[enforce fail at alloc_cpu.cpp:117] DefaultCPUAllocator: can't allocate memory: 9"
     )
-    for place in (
+    for function in (
         "image.RenderedImage.empty",
         "image.RenderedImage.eight_bit",
         "scene.rasterize_strips",
@@ -256,7 +256,7 @@ def test_out_of_memory_raises_one_sentence(bundle, camera, tmp_path, capsys, mon
                 raise error
 
             with monkeypatch.context() as patched:
-                patched.setattr(f"training.render.{place}", fail)
+                patched.setattr(f"training.render.{function}", fail)
                 assert main(arguments) == 2
             assert "not enough memory" in capsys.readouterr().err.lower()
     assert not (tmp_path / "a.png").exists()

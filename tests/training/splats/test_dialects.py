@@ -203,7 +203,7 @@ def test_2dgs_comment_is_refused(write):
 
 
 def test_2d_filter_survives_every_export(tmp_path, make_splats):
-    """The comment tells it to other programs and to LODGS."""
+    """The comment stores it for other programs and LODGS."""
     comment = "SplatRenderMode: mip"
     levels = [Level(1, make_splats(2, 0)), Level(2, make_splats(5, 0))]
     bundle = Bundle("lodge", levels, meta={"antialias": True})
