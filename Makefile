@@ -71,6 +71,7 @@ lint: setup
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
 	.venv/bin/pyright
+	$(VENV) tools/prose.py
 
 docs: setup
 	$(VENV) -m pdoc --docformat google --output-directory build/api training
