@@ -11,7 +11,7 @@ import bpy
 import numpy as np
 
 from ...training.errors import LodgsError
-from ...training.methods import method_info, parameters_of
+from ...training.methods import method_info, resolve_parameters
 from ...training.optimize.parameters import Parameters
 from ...training.runs.folder import RunFolder
 from ...training.runs.job import DOME, Job
@@ -117,7 +117,7 @@ def current_parameters(settings: TrainingSettings) -> Parameters:
 
 @lru_cache
 def _parameters(method: str, preset: str, changes: tuple[tuple[str, Any], ...]) -> Parameters:
-    return parameters_of(method, preset, dict(changes))
+    return resolve_parameters(method, preset, dict(changes))
 
 
 def _as_typed(value):

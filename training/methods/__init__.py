@@ -1,8 +1,8 @@
-"""The papers' methods behind one interface, a folder each. Importing this package needs no torch; making a
-method does.
+"""Published level-of-detail methods behind one interface, one folder per method.
 
-A folder's ``__init__.py`` declares the method (``METHOD``, a `MethodInfo`; no torch), its ``train.py`` holds
-the class ``Method``, which derives from ``optimize.method.Method``. Folders are found, not listed.
+A folder's ``__init__.py`` declares the method (``METHOD``, a `MethodInfo`) and does not import torch. Its
+``train.py`` defines the class ``Method``, derived from ``optimize.method.Method``. New folders need no
+registration.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 from importlib import import_module
 from pkgutil import iter_modules
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ..documents import quote
 from ..errors import LodgsError
@@ -22,40 +22,40 @@ if TYPE_CHECKING:
     from ..optimize.training_data import TrainingData
     from ..splats.gaussians import SplatRows
 
-__all__ = ["METHODS", "PRESETS", "MethodInfo", "create", "found", "method_info", "parameters_of"]
+__all__ = ["METHODS", "PRESETS", "MethodInfo", "create", "discover", "method_info", "resolve_parameters"]
 
 
-def found() -> dict[str, MethodInfo]:
-    """The methods whose folders lie in this package, by name, in the order of their numbers."""
+def discover() -> dict[str, MethodInfo]:
+    """Return the methods in this package by name, ordered by number."""
     folders = [f"{__name__}.{module.name}" for module in iter_modules(__path__) if module.ispkg]
     methods = [replace(import_module(folder).METHOD, package=folder) for folder in folders]
     return {method.name: method for method in sorted(methods, key=lambda method: method.number)}
 
 
-METHODS = found()
-"""Every method, by name."""
+METHODS = discover()
+"""All methods by name."""
 
 
 def method_info(name: str) -> MethodInfo:
-    """What a method says of itself.
+    """Return the description of a method.
 
     Raises:
-        LodgsError: there is no such method.
+        LodgsError: the method is unknown.
     """
     if name not in METHODS:
-        raise LodgsError(f"There is no method {quote(name)}.", f"Choose one of: {', '.join(METHODS)}.")
+        raise LodgsError(f"Unknown method: {quote(name)}.", f"Choose one of: {', '.join(METHODS)}.")
     return METHODS[name]
 
 
-def parameters_of(method: str, preset: str, changes: dict) -> Parameters:
-    """The parameters that a method is trained with: a preset's, with changes by name.
+def resolve_parameters(method: str, preset: str, changes: dict[str, Any]) -> Parameters:
+    """Return the parameters of a preset, with changes by parameter name.
 
     Raises:
-        LodgsError: there is no such method or preset, or a change is not possible.
+        LodgsError: the method or preset is unknown, or a change is invalid.
     """
     info = method_info(method)
-    if idle := sorted(set(changes) & set(info.unused)):
-        raise LodgsError(f"{info.label} has no use for '{idle[0]}'.", "Leave it out.")
+    if unused := sorted(set(changes) & set(info.unused)):
+        raise LodgsError(f"{info.label} does not use the parameter '{unused[0]}'.", "Remove it.")
     return override(info.preset(preset), changes)
 
 
@@ -67,13 +67,13 @@ def create(
     backend: str,
     base: SplatRows | None = None,
 ) -> Method:
-    """The method of a job, ready for its first step.
+    """Create a method, ready for its first training step.
 
     Args:
-        name: a key of METHODS.
-        backend: the rasterizer's; the tensors live where it draws (``rasterize.tensor_device``).
-        base: splats to begin with instead of the scene's points, where the method can (``from_base``); in
-            memory, but for methods that take them in parts (``streams_base``).
+        name: key of METHODS.
+        backend: rasterizer backend; it decides the device of the tensors (``rasterize.tensor_device``).
+        base: initial splats instead of the scene's points, if the method supports them (``from_base``). Must
+            be in memory unless the method reads them in parts (``streams_base``).
 
     Raises:
         LodgsError: the scene has too few points, or no view sees any.

@@ -11,7 +11,7 @@ from ..documents import quote, read_json, read_toml
 from ..errors import LodgsError
 from ..files import atomic_write
 from ..lod.crop import Crop, is_crop_text
-from ..methods import method_info, parameters_of
+from ..methods import method_info, resolve_parameters
 from ..optimize.parameters import Parameters
 from .folder import RunFolder
 
@@ -249,7 +249,7 @@ class Job:
     @cached_property
     def _parameters(self) -> Parameters:
         captured = method_info(self.method).capture_values if self.capture else {}
-        return parameters_of(self.method, self.preset, {**captured, **self.parameters})
+        return resolve_parameters(self.method, self.preset, {**captured, **self.parameters})
 
     def resolved(self) -> Job:
         """Return the same job with all parameters explicit, so that later versions repeat it unchanged."""

@@ -95,7 +95,7 @@ def tiny(tmp_path, monkeypatch):
     (folder / "__init__.py").write_text(ABOUT)
     (folder / "train.py").write_text(TRAIN)
     monkeypatch.setattr(methods, "__path__", [*methods.__path__, str(folder.parent)])
-    found = methods.found()
+    found = methods.discover()
     monkeypatch.setitem(methods.METHODS, "tiny", found["tiny"])
     yield found["tiny"]
     for name in [name for name in sys.modules if name.startswith("training.methods.tiny_folder")]:
@@ -117,7 +117,7 @@ def job(scene: Path, out: Path, **keys) -> Job:
 
 
 def test_a_folder_is_found_and_every_folder_declares_its_name(tiny):
-    assert tiny.package == "training.methods.tiny_folder" and list(methods.found())[-1] == "tiny"
+    assert tiny.package == "training.methods.tiny_folder" and list(methods.discover())[-1] == "tiny"
     folders = {path.parent.name for path in Path(methods.__file__).parent.glob("*/train.py")}
     assert folders == {
         method.package.rsplit(".", 1)[1] for method in methods.METHODS.values() if method != tiny

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from training.lod.crop import Crop
-from training.methods import METHODS, create, parameters_of
+from training.methods import METHODS, create, resolve_parameters
 from training.optimize.training_data import TrainingData
 from training.scenes.colmap import read_scene
 
@@ -17,7 +17,7 @@ def test_outside_nothing_asks_for_more(name, tiny_scene):
     """Whatever the method counts, from the first step on; inside it does."""
     region = Crop.from_text(HALF)
     data = TrainingData(read_scene(tiny_scene), test_every=4, region=region)
-    method = create(name, data, parameters_of(name, "draft", {"free_depth": 0.0}), 0, "cpu")
+    method = create(name, data, resolve_parameters(name, "draft", {"free_depth": 0.0}), 0, "cpu")
     for step in range(30):
         method.train_step(step)
         asked = method.model.stats["gradient_sum"].reshape(len(method.model), -1).sum(1).numpy()
@@ -29,5 +29,5 @@ def test_outside_nothing_asks_for_more(name, tiny_scene):
 @pytest.mark.parametrize("name", ["3dgs", "octree"])
 def test_it_resumes_to_the_bit(name, tiny_scene, check_resumed):
     data = TrainingData(read_scene(tiny_scene), test_every=4, region=Crop.from_text(HALF))
-    parameters = parameters_of(name, "draft", {"steps": 120, "max_splats": 200})
+    parameters = resolve_parameters(name, "draft", {"steps": 120, "max_splats": 200})
     check_resumed(lambda: create(name, data, parameters, 0, "cpu"), 77)

@@ -1,4 +1,4 @@
-"""CLoD-GS (arXiv 2510.09997, 2025): one set of splats, of which each fades with distance at its own pace."""
+"""CLoD-GS (arXiv 2510.09997, 2025): one set of splats that fade with distance, each at its own rate."""
 
 from dataclasses import dataclass, replace
 
@@ -9,60 +9,64 @@ from ..threedgs import ThreedgsParameters
 
 @dataclass(frozen=True)
 class ClodParameters(ThreedgsParameters):
-    """Those of CLoD-GS; until the decay begins it is 3DGS."""
+    """Parameters of CLoD-GS, which is 3DGS until the decay begins."""
 
     begin: float = parameter(
-        0.5, "Share of the steps after which the decay begins; with a base it begins at once.", high=1
+        0.5, "Fraction of the steps before the decay begins; with a base it begins immediately.", high=1
     )
     keep_share: float = parameter(
         0.74,
-        "When the decay begins, the splats that give most to the pixels of a view stay, so many that views "
-        "draw this share of what they drew; 1 keeps all. Not in the paper.",
+        "When the decay begins, keep the splats that contribute most to the pixels of the views, so "
+        "that views draw this fraction of their splats. 1 keeps all. Not in the paper.",
         above=0,
         high=1,
         label="Keep Share",
     )
     by_importance: bool = parameter(
         True,
-        "Whether each splat begins with the decay that its share in the views' pixels asks for. Not in the "
-        "paper; in short schedules it is what teaches decays anything.",
+        "Initialize each splat's decay from its contribution to the views. Short schedules need it to "
+        "learn decays. Not in the paper.",
     )
-    sigma_init: float = parameter(10.0, "Decay that all splats begin with otherwise.", above=0)
+    sigma_init: float = parameter(10.0, "Initial decay of all splats, if 'by_importance' is off.", above=0)
     log_sigma: bool = parameter(
-        True, "Whether the decay is trained as its logarithm, so that steps are relative. Not in the paper."
+        True, "Train the logarithm of the decay, so that updates are relative. Not in the paper."
     )
     lr_sigma: float = parameter(1e-2, "Learning rate of the decay.")
     s_v_most: float = parameter(
         10.0,
-        "Largest virtual distance scale that a step may draw (CLoD-GS: 3, 5 or 10).",
+        "Maximum virtual distance scale in training (CLoD-GS: 3, 5 or 10).",
         low=1,
         label="Max Distance",
     )
     log_uniform: bool = parameter(
-        True, "Whether random scales are as likely between 1 and 2 as between 5 and 10; the paper's are not."
+        True, "Sample the virtual distance scale uniformly in the logarithm; the paper samples it linearly."
     )
     random_weight: float = parameter(
-        0.5, "Weight of the picture at a random scale against the one as it is (CLoD-GS: 1)."
+        0.5, "Loss weight of the image at the random scale, relative to the image at scale 1 (CLoD-GS: 1)."
     )
     exponent: float = parameter(
-        0.7, "The share of splats wanted at a scale is its inverse to this power (CLoD-GS: 1.5).", above=0
+        0.7,
+        "Exponent of the target splat count: at scale s the target fraction is s to the power of "
+        "minus this value (CLoD-GS: 1.5).",
+        above=0,
     )
-    onset: float = parameter(2.0, "The scale up to which all splats are wanted (CLoD-GS: 1).", low=1)
+    onset: float = parameter(2.0, "Scale up to which the target is all splats (CLoD-GS: 1).", low=1)
     count_weight: float = parameter(
-        1.0, "Weight of the count's regularisation, times (s_v - 1)² (CLoD-GS: λ_reg)."
+        1.0, "Weight of the splat count regularization, which is multiplied by (s_v - 1)² (CLoD-GS: λ_reg)."
     )
     count_softness: float = parameter(
         0.5,
-        "How near to the threshold, as a logarithm, a splat feels the count: its gradient is a sigmoid's.",
+        "Width of the sigmoid that gives the splat count a gradient, in log opacity relative to the "
+        "threshold.",
         above=0,
     )
     tau: float = parameter(
-        0.02, "Attenuated opacity under which a splat is not drawn (CLoD-GS: τ, without a number).", above=0
+        0.02, "Minimum attenuated opacity of a drawn splat (CLoD-GS: τ, value not published).", above=0
     )
     reference_quantile: float = parameter(
         0.99,
-        "Quantile of the distances between views and the points that they see that is the reference of all "
-        "distances; 0 takes the farthest splat of each view, as published.",
+        "Quantile of the distances between views and their visible points, used as the reference "
+        "distance. 0 uses the farthest splat of each view, as published.",
         high=1,
     )
 
@@ -89,7 +93,7 @@ METHOD = MethodInfo(
     name="clod",
     number=4,
     label="CLoD-GS",
-    about="one set of splats that fade with distance, each at its own pace",
+    about="one set of splats that fade with distance, each at its own rate",
     parameters=ClodParameters,
     presets={"draft": _DRAFT, "standard": _STANDARD, "paper": _PAPER},
     rule="decay",

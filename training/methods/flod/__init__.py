@@ -1,4 +1,4 @@
-"""FLoD (Seo et al. 2025): independent levels, each limited to a smallest size of detail."""
+"""FLoD (Seo et al. 2025): independent levels, each with a minimum splat size."""
 
 from dataclasses import dataclass, replace
 
@@ -8,89 +8,94 @@ from ...optimize.parameters import PAPER, STANDARD, DensityParameters, parameter
 from ...splats.levels import MAX_LEVELS
 
 PAPER_FOOTPRINT = 40.0
-"""Pixels that the paper's lambda, 0.2 COLMAP units, covers at the median depth of its scenes, about."""
-TOGETHER = 3
-"""So many levels are drawn together by default (``Bands.defaults``), and finished."""
+"""Approximate size in pixels of the paper's lambda, 0.2 COLMAP units, at the median depth of its scenes."""
+BLENDED_LEVELS = 3
+"""Number of finest levels that are blended by default (``Bands.defaults``) and that finishing steps train."""
 CELL_LEVELS = 2
-"""So many of the finest levels of a scene in cells are trained cell by cell."""
+"""Number of finest levels that are trained cell by cell in a divided scene."""
 PAPER_REACH = PAPER_FOOTPRINT / 4**3
-"""How far the paper's finest level of five reaches by distance (Eq. 8, gamma 1), in median depths: 5/8."""
+"""Reach of the paper's finest of five levels by distance (Eq. 8, gamma 1), in median depths: 5/8."""
 
 
 @dataclass(frozen=True)
 class FlodParameters(DensityParameters):
-    """A tuple has one entry for each level, coarse to fine. ``max_splats`` is the last level's."""
+    """Parameters of FLoD.
+
+    Tuples have one entry per level, coarse to fine. ``max_splats`` limits the last level.
+    """
 
     levels: int = parameter(5, "Number of levels (FLoD: L_max).", low=1, high=MAX_LEVELS)
     rho: float = parameter(
-        4.0, "Factor between the smallest sizes of two neighbouring levels (FLoD: rho).", above=1
+        4.0, "Ratio of the minimum splat sizes of two neighbouring levels (FLoD: rho).", above=1
     )
     footprint: float = parameter(
         16.0,
-        "Pixels that level 1's smallest size covers at the scene's median depth; sets lambda, and the screen "
-        "size (gamma) that levels are chosen with by distance.",
+        "Minimum splat size of level 1, in pixels at the scene's median depth. Sets lambda and the "
+        "screen size (gamma) that selects levels by distance.",
         label="Coarsest Detail",
         above=0,
         unit="px",
     )
     s_min_1: float = parameter(
-        0.0, "Level 1's smallest size in scene units (FLoD: lambda); 0 takes it from 'footprint'."
+        0.0, "Minimum splat size of level 1 in scene units (FLoD: lambda). 0 derives it from 'footprint'."
     )
     steps: tuple[int, ...] = parameter(
         (250, 400, 500, 750, 1250), "Training steps of each level.", above=0, unit="steps"
     )
     densify_until: tuple[float, ...] = parameter(
-        (0.5,) * 5, "Share of a level's steps after which splats are no longer added or removed.", high=1
+        (0.5,) * 5, "Fraction of a level's steps in which splats are added and removed.", high=1
     )
     densify_interval: tuple[int, ...] = parameter(
         (50,) * 5, "Steps between two densifications.", above=0, unit="steps"
     )
     budget_ratio: float = parameter(
         0.6,
-        "A level's share of the next finer level's budget of splats, so that every level adds some; about "
-        "what the paper's levels have by themselves.",
+        "Maximum splat count of a level, as a fraction of the next finer level's; below 1 every level "
+        "adds splats. The levels of the paper have about this ratio.",
         above=0,
         high=1,
     )
     overlap_interval: int = parameter(
         50,
-        "Steps between two overlap prunings; the last level has none (FLoD, Sec. 4.3). 0 never prunes.",
+        "Steps between two overlap prunings, in all levels but the finest (FLoD, Sec. 4.3). 0 disables.",
         unit="steps",
     )
     rejoin_points: bool = parameter(
         True,
-        "Whether structure-from-motion points that overlap pruning took join again at the level that has "
-        "room for them, all or a random sample. Not in the paper; in short schedules it lets finer levels "
-        "begin from exact positions.",
+        "Add points of the initial point cloud that overlap pruning removed again at the first level "
+        "with room for them. Gives finer levels exact start positions in short schedules. Not in the "
+        "paper.",
     )
 
     first_level: int = parameter(
-        1, "Level that training begins with; above 1 from a base, which is the level before it.", low=1
+        1, "First level to train. Above 1 it needs a base: the level before it.", low=1
     )
-    last_level: int = parameter(0, "Level that training ends with; 0 for the finest.")
+    last_level: int = parameter(0, "Last level to train. 0 means the finest.")
     finish_share: float = parameter(
         0.2,
-        "Further steps at the end, as a share of all levels', that fit the three finest levels to how they "
-        "are drawn together by distance; of the two coarser ones those of fine detail begin anew with the "
-        "finest level's most important splats. Not in the paper.",
+        "Additional steps at the end that train the three finest levels as blended by distance, as a "
+        "fraction of all levels' steps. Coarser levels with fine detail restart from the most "
+        "important splats of the finest level. Not in the paper.",
         high=1,
     )
     drawn: float = parameter(
         0.53,
-        "By distance the training views draw at most this share of the splats that they draw of the finest "
-        "level alone: so many splats do the levels have that finishing steps begin anew. Not in the paper.",
+        "Maximum number of splats drawn by distance in the training views, as a fraction of those of "
+        "the finest level. Sets the size of the levels that the finishing steps restart. Not in the "
+        "paper.",
         above=0,
         high=1,
     )
     finish_alone: float = parameter(
         0.5,
-        "Share of these steps that draw one of the three alone, so that it does not need the others.",
+        "Fraction of the finishing steps that render a single level, so that each level also works "
+        "without the others.",
         high=1,
     )
 
     @property
     def end(self) -> int:
-        """The level that training ends with."""
+        """The last level to train."""
         return self.last_level or self.levels
 
     @property
@@ -99,12 +104,15 @@ class FlodParameters(DensityParameters):
 
     @property
     def all_steps(self) -> int:
-        """Steps of a run of all levels, which schedules are shares of."""
+        """Steps of a run of all levels; schedules are fractions of them."""
         return sum(self.steps) + (round(self.finish_share * sum(self.steps)) if self.levels > 1 else 0)
 
     @property
     def finish_steps(self) -> int:
-        """Steps that train the finest levels together, if the finest is trained and not the only one."""
+        """Number of finishing steps, which train the finest levels blended.
+
+        Zero if the finest level is not trained, or is the only one.
+        """
         return self.all_steps - sum(self.steps) if self.end == self.levels else 0
 
     @property
@@ -113,20 +121,23 @@ class FlodParameters(DensityParameters):
 
     @property
     def max_trained_splats(self) -> int:
-        shares = (self.budget_ratio**n for n in range(min(TOGETHER, self.levels)))
+        shares = (self.budget_ratio**n for n in range(min(BLENDED_LEVELS, self.levels)))
         at_end = self.max_splats * self.budget_ratio ** (self.levels - self.end)
         return round(self.max_splats * sum(shares) if self.finish_steps else at_end)
 
     def check(self) -> None:
         if not self.first_level <= self.end <= self.levels:
             raise LodgsError(
-                f"Levels {self.first_level} to {self.end} of {self.levels} cannot be trained.",
+                f"Cannot train levels {self.first_level} to {self.end} of {self.levels}.",
                 "Correct first_level or last_level.",
             )
 
 
-def divided(parameters: FlodParameters) -> tuple[FlodParameters, FlodParameters] | None:
-    """For a scene in cells: all but the two finest levels of the whole, and these two of each cell."""
+def divide(parameters: FlodParameters) -> tuple[FlodParameters, FlodParameters] | None:
+    """Return the parameters of a divided scene: coarse levels of the whole scene, fine levels of each cell.
+
+    None if there are not enough levels to divide.
+    """
     coarse = parameters.levels - CELL_LEVELS
     if coarse < 1:
         return None
@@ -157,11 +168,11 @@ METHOD = MethodInfo(
     name="flod",
     number=0,
     label="FLoD",
-    about="independent levels, each limited to a smallest size of detail",
+    about="independent levels, each with a minimum splat size",
     parameters=FlodParameters,
     presets={"draft": _DRAFT, "standard": _STANDARD, "paper": _PAPER},
     rule="bands",
     panel_parameters=("levels", "footprint", "max_splats"),
     cell_method="flod",
-    split_parameters=divided,
+    split_parameters=divide,
 )

@@ -30,7 +30,7 @@ from ...optimize.training_data import TrainingView
 from ...rasterize import Gaussians
 from ...splats.gaussians import Splats
 from ...splats.levels import Level
-from . import PAPER_REACH, TOGETHER, FlodParameters, finish
+from . import BLENDED_LEVELS, PAPER_REACH, FlodParameters, finish
 
 
 class Method(method.Method[FlodParameters, Drawing]):
@@ -242,7 +242,7 @@ class Method(method.Method[FlodParameters, Drawing]):
 
     def _keep_to_finish(self, level: int, splats: Splats) -> None:
         p = self.parameters
-        if p.finish_steps and level > p.levels - TOGETHER:
+        if p.finish_steps and level > p.levels - BLENDED_LEVELS:
             self.kept[level] = from_splats(splats, p.sh_degree, self.device)
 
     def begin_finishing(self) -> None:

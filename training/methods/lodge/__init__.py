@@ -1,4 +1,4 @@
-"""LODGE (2025): coarser levels from a finished model, smoothed for a distance, pruned and tuned."""
+"""LODGE (2025): coarser levels of a trained model, smoothed for a distance, pruned and tuned."""
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -10,41 +10,41 @@ from ...splats.levels import MAX_LEVELS
 from ..threedgs import ThreedgsParameters
 
 ROUNDS = (0.2, 0.6, 1.0)
-"""A level is pruned and tuned so often, with these shares of the pruning threshold (LODGE, A.2)."""
+"""Fractions of the pruning threshold in the rounds that prune and tune a level (LODGE, A.2)."""
 
 
 @dataclass(frozen=True)
 class LodgeParameters(ThreedgsParameters):
-    """Those of LODGE; ``steps`` are the finest level's, which is 3DGS where there is no base.
+    """Parameters of LODGE.
 
-    A tuple has one entry for each level, coarse to fine.
+    Without a base, ``steps`` train the finest level by 3DGS. Tuples have one entry per level, coarse to fine.
     """
 
-    levels: int = parameter(3, "Number of levels, the finest among them.", low=1, high=MAX_LEVELS)
+    levels: int = parameter(3, "Number of levels, including the finest.", low=1, high=MAX_LEVELS)
     distances: tuple[float, ...] = parameter(
         (0.0,) * 3,
-        "Distance from which on each level is shown, in median depths of the scene, falling to 0 for the "
-        "finest (LODGE: d_l). 0 finds the one that leaves least to draw.",
+        "Distance from which each level is drawn, in median depths of the scene, falling to 0 for the "
+        "finest (LODGE: d_l). 0 for another level chooses the distance that draws the fewest splats.",
     )
     prune_weight: float = parameter(
         0.1,
-        "Splats of a coarser level that are nowhere more than this share of a pixel are removed (LODGE: γ, "
-        "without a number).",
+        "Minimum blending weight of a splat in any pixel; a coarser level drops splats below it "
+        "(LODGE: γ, value not published).",
         high=1,
     )
     drawn: float = parameter(
         0.59,
-        "By distance the training views draw at most this share of the splats that they draw of the finest "
-        "level alone; where it is more, prune_weight is raised for a level. 1 does not raise it. Not in the "
+        "Maximum number of splats drawn by distance in the training views, as a fraction of those of "
+        "the finest level; above it, 'prune_weight' increases for the level. 1 disables. Not in the "
         "paper.",
         above=0,
         high=1,
     )
     keep: float = parameter(
         1.0,
-        "At most about this share of the next finer level's splats stays, of those that stand together; "
-        "what stays takes over the room of what goes. For scenes of many small splats, of which each has a "
-        "fair share of some pixel: 0.3 to 0.4 there. Not in the paper.",
+        "Maximum splat count of a level, as a fraction of the next finer level's; remaining splats "
+        "grow to fill the gaps. Use 0.3 to 0.4 in scenes of many small splats that all matter to some "
+        "pixel. Not in the paper.",
         above=0,
         high=1,
     )
@@ -52,30 +52,30 @@ class LodgeParameters(ThreedgsParameters):
         400, "Steps after each of the three prunings of a level.", above=0, unit="steps"
     )
     tune_range: float = parameter(
-        0.3, "While a level is tuned, distances are random by this share of them, up or down.", high=0.9
+        0.3, "Random variation of distances while a level is tuned, as a fraction of the distance.", high=0.9
     )
     tune_alone: float = parameter(
         0.25,
-        "Share of these steps that draw the level alone, on photographs as small as they are from its "
-        "distance, so that it stands where no training view is as far away. Not in the paper.",
+        "Fraction of the tuning steps that render the level alone, on images downscaled for its "
+        "distance. Trains levels that no training view is far enough to show. Not in the paper.",
         high=1,
     )
     chunks: int = parameter(
         0,
-        "Number of chunks, whose fixed sets of splats fade into each other as the eye moves. 0: as many as "
-        "LODGE's Eq. 5 asks for, and none where that would be fewer than 8; 1: none.",
+        "Number of chunks: fixed splat sets that blend into each other as the camera moves. 0 uses "
+        "LODGE's Eq. 5, and none below 8 chunks; 1 disables chunks.",
         high=96,
     )
     visible_weight: float = parameter(
         0.01,
-        "Splats that no view in a chunk, turned anywhere, shows by so large a share of a pixel are not in "
-        "its set (LODGE: a fixed threshold, without a number). 0 keeps all.",
+        "Minimum blending weight in any view from inside a chunk; its set omits splats below it "
+        "(LODGE: a fixed threshold, value not published). 0 keeps all.",
         high=1,
     )
     filter_variance: float = parameter(
         0.2,
-        "Variance of the filter that smooths a level, in squared pixels at its distance (LODGE: s, without a "
-        "number; Mip-Splatting's).",
+        "Variance of the filter that smooths a level, in square pixels at its distance (LODGE: s, "
+        "value not published; this is Mip-Splatting's).",
     )
 
     @property
@@ -88,15 +88,15 @@ class LodgeParameters(ThreedgsParameters):
 
     @property
     def level_steps(self) -> int:
-        """Steps that tune one level."""
+        """Number of steps that tune one level."""
         return len(ROUNDS) * self.tune_steps
 
     def check(self) -> None:
-        given = [distance for distance in self.distances[:-1] if distance]
-        if self.distances[-1] or any(a <= b for a, b in pairwise(given)):
+        fixed = [distance for distance in self.distances[:-1] if distance]
+        if self.distances[-1] or any(a <= b for a, b in pairwise(fixed)):
             raise LodgsError(
-                f"distances = {list(self.distances)} is not possible.",
-                "Give falling numbers, coarse to fine, the last one 0.",
+                f"Invalid distances: {list(self.distances)}.",
+                "Give decreasing numbers, coarse to fine, the last one 0.",
             )
 
 
@@ -118,7 +118,7 @@ METHOD = MethodInfo(
     name="lodge",
     number=5,
     label="LODGE",
-    about="coarser levels from a finished model, each for what is farther away",
+    about="coarser levels of a trained model, each for a greater distance",
     parameters=LodgeParameters,
     presets={"draft": _DRAFT, "standard": _STANDARD, "paper": _PAPER},
     rule="chunks",

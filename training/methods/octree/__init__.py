@@ -1,4 +1,4 @@
-"""Octree-GS (Ren et al. 2024) with explicit anchors: levels of an octree that add up, faded in one by one."""
+"""Octree-GS (Ren et al. 2024) with explicit anchors: octree levels that add up and fade in one by one."""
 
 from dataclasses import dataclass, replace
 
@@ -10,11 +10,12 @@ from ...splats.levels import MAX_LEVELS
 
 @dataclass(frozen=True)
 class OctreeParameters(Parameters):
-    """Those of Octree-GS; explicit and neural anchors share them."""
+    """Parameters of Octree-GS, shared by explicit and neural anchors."""
 
     max_splats: int = parameter(
         90_000,
-        "Most splats of all levels together, which add up; FLoD's five levels are over 110,000.",
+        "Maximum number of splats of all levels together; levels add up. The five levels of FLoD have "
+        "over 110,000.",
         above=0,
     )
     grad_threshold: float = parameter(
@@ -22,99 +23,111 @@ class OctreeParameters(Parameters):
     )
     levels: int = parameter(
         0,
-        "Number of levels (Octree-GS: K); 0 takes it from the range of distances (Eq. 3).",
+        "Number of levels (Octree-GS: K). 0 derives it from the range of distances (Eq. 3).",
         high=MAX_LEVELS,
     )
     nearest: float = parameter(
         0.05,
-        "Quantile of the distances from views to points that counts as the smallest (Octree-GS: d_min).",
+        "Quantile of the distances between views and points used as the smallest distance (Octree-GS: "
+        "d_min).",
         high=1,
     )
     farthest: float = parameter(
         0.95,
-        "Quantile that counts as the largest (Octree-GS: d_max), from where on level 1 alone is drawn.",
+        "Quantile used as the largest distance (Octree-GS: d_max), beyond which only level 1 is drawn.",
         high=1,
     )
     coarser_levels: int = parameter(
-        3, "Levels before those of Eq. 3, for views from farther away than any photograph."
+        3, "Additional coarse levels before those of Eq. 3, for views from farther away than any photo."
     )
     footprint: float = parameter(
         1.0,
-        "Pixels that the voxel of a level covers where the level is just wanted; sets the voxels' size.",
+        "Voxel size in pixels, at the distance where the voxel's level appears.",
         above=0,
         unit="px",
     )
     narrowest: float = parameter(
         0.8,
-        "Pixels that a splat's largest standard deviation covers at least where its level is just wanted; "
-        "narrower splats move to a finer level, up to the first one after 'coarser_levels'.",
+        "Minimum standard deviation of a splat along its longest axis, in pixels at the distance "
+        "where its level appears. Narrower splats move to a finer level, up to the first one after "
+        "'coarser_levels'.",
         unit="px",
     )
     widest: float = parameter(
-        26.0, "Pixels that it covers at most; wider splats move to a coarser level.", above=0, unit="px"
+        26.0,
+        "Maximum standard deviation of a splat along its longest axis, in the same pixels. Wider "
+        "splats move to a coarser level.",
+        above=0,
+        unit="px",
     )
     visible_share: float = parameter(
         0.0,
-        "Anchors that fewer than this share of the views want are dropped; those that none wants always are.",
+        "Minimum fraction of the views that need an anchor; others are dropped. Anchors that no view "
+        "needs are always dropped.",
         high=1,
     )
     coarse_share: float = parameter(
         0.25,
-        "Share of the steps in which levels join one by one; then anchors also grow into the next level.",
+        "Fraction of the steps in which levels join one by one; in these steps anchors also grow into "
+        "the next level.",
         high=1,
     )
     coarse_factor: float = parameter(
-        1.5, "How many times longer a level trains alone than the next one (Octree-GS: 1/omega).", above=0
+        1.5,
+        "Ratio of the steps before a level joins to those before the next one joins (Octree-GS: 1/omega).",
+        above=0,
     )
-    grow_interval: int = parameter(50, "Steps between two growings.", above=0, unit="steps")
+    grow_interval: int = parameter(50, "Steps between two growth passes.", above=0, unit="steps")
     grow_until: float = parameter(
         0.55,
-        "Share of the steps after which anchors are no longer added, nor removed but at the end.",
+        "Fraction of the steps in which anchors are added and removed; after it they are only removed "
+        "at the end.",
         high=1,
     )
     least_weight: float = parameter(
         0.02,
-        "Splats whose largest blending weight in any training view is below this go when growing ends and "
-        "once more at the end; 0 keeps all. Not in the paper, but in RadSplat.",
+        "Minimum blending weight of a splat in any training view; splats below it are removed when "
+        "growth ends and at the end. 0 keeps all. Not in the paper; from RadSplat.",
         high=1,
     )
     candidates: int = parameter(
-        2, "Places that each splat with a large gradient proposes in a growing.", above=0
+        2, "New positions that each splat with a large gradient proposes in a growth pass.", above=0
     )
     grow_harder: float = parameter(
         0.2,
-        "The gradient's threshold is 2 to this power higher from level to level (Octree-GS: beta), counted "
-        "from the first level after 'coarser_levels'.",
+        "Exponent of the gradient threshold: it grows by 2 to this power from level to level, after "
+        "'coarser_levels' (Octree-GS: beta).",
     )
     bias_rate: float = parameter(
         0.0025,
-        "What a level's bias gains in a growing where the gradient is a quarter of the threshold or more.",
+        "Increase of a splat's level bias in each growth pass where its gradient is at least a "
+        "quarter of the threshold.",
     )
     far_share: float = parameter(
         0.05,
-        "Share of the steps that see a photograph made smaller, as from 2, 4, ... times the distance; if it "
-        "is not 0, so do all steps before the finest level has joined.",
+        "Fraction of the steps that use a downscaled photo, as if seen from 2, 4, ... times the "
+        "distance. If above 0, all steps before the finest level joins do so too.",
         high=1,
     )
     full_share: float = parameter(
         0.4,
-        "Share of the other steps that draw every level wherever it is, as a view at full detail does.",
+        "Fraction of the remaining steps that draw all levels at every distance, like a view at full detail.",
         high=1,
     )
     lr_end: float = parameter(
         0.1,
-        "What is left of the learning rates at the end: they fall from when growing ends; 1 leaves them, as "
-        "in the paper. Positions have a rule of their own.",
+        "Final learning rates, as a fraction of the initial ones; they fall once growth ends. 1 keeps "
+        "them constant, as in the paper. Positions have their own schedule.",
         high=1,
     )
     volume_weight: float = parameter(
-        0.0, "Weight of the mean of the splats' volumes in the loss, lengths in median depths."
+        0.0, "Loss weight of the mean splat volume, with lengths in median depths."
     )
 
     def check(self) -> None:
         if self.nearest >= self.farthest:
             raise LodgsError(
-                f"nearest = {self.nearest} is not possible with farthest = {self.farthest}.",
+                f"'nearest' is {self.nearest}, but must be less than 'farthest', {self.farthest}.",
                 "Give a smaller number.",
             )
 
@@ -143,7 +156,7 @@ METHOD = MethodInfo(
     name="octree",
     number=1,
     label="Octree-GS",
-    about="levels of an octree that add up, faded in one by one as the eye comes nearer",
+    about="octree levels that add up and fade in as the camera approaches",
     parameters=OctreeParameters,
     presets={"draft": _DRAFT, "standard": _STANDARD, "paper": _PAPER},
     rule="octree",

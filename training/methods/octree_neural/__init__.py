@@ -10,58 +10,61 @@ from ..octree import OctreeParameters
 
 @dataclass(frozen=True)
 class NeuralOctreeParameters(OctreeParameters):
-    """Harmonics are those of baking."""
+    """Parameters of Octree-GS with neural anchors. ``sh_degree`` applies to baking."""
 
-    max_splats: int = parameter(180_000, "Most Gaussians of all levels together, which add up.", above=0)
-    min_opacity: float = parameter(
-        0.005, "Anchors the sum of whose Gaussians' opacities is below this are removed.", high=1
+    max_splats: int = parameter(
+        180_000, "Maximum number of Gaussians of all levels together; levels add up.", above=0
     )
-    lr_scales: float = parameter(7e-3, "Learning rate of the logs of the anchors' extents.")
-    offsets: int = parameter(5, "Gaussians of an anchor (Octree-GS: 10).", above=0, high=100)
-    features: int = parameter(32, "Length of an anchor's feature.", high=1024)
+    min_opacity: float = parameter(
+        0.005, "Minimum summed opacity of an anchor's Gaussians; anchors below it are removed.", high=1
+    )
+    lr_scales: float = parameter(7e-3, "Learning rate of the anchors' log extents.")
+    offsets: int = parameter(5, "Gaussians per anchor (Octree-GS: 10).", above=0, high=100)
+    features: int = parameter(32, "Length of an anchor's feature vector.", high=1024)
     direct: bool = parameter(
         True,
-        "Whether each Gaussian has looks of its own too, which those of the networks are added to. Not in "
-        "the paper; short schedules need it.",
+        "Give each Gaussian its own shape, colour and opacity, to which the networks' output is "
+        "added. Short schedules need it. Not in the paper.",
     )
     view_shapes: bool = parameter(
         False,
-        "Whether opacity and covariance change with the direction of view, as in the paper. They then learn "
-        "the photographs by heart where these are few, and baking cannot carry it.",
+        "Let opacity and covariance depend on the view direction, as in the paper. Overfits if there "
+        "are few photos, and baking cannot represent it.",
     )
     appearance: int = parameter(
         0,
-        "Length of each view's appearance, for photographs in changing light; 0: all are alike.",
+        "Length of each view's appearance vector, for photos in changing light. 0 disables.",
         high=1024,
     )
-    lr_features: float = parameter(7.5e-3, "Learning rate of features.")
+    lr_features: float = parameter(7.5e-3, "Learning rate of the features.")
     lr_offsets: float = parameter(
         1e-2,
-        "Learning rate of the Gaussians' offsets, which are in units of their anchor's extent, at the start.",
+        "Initial learning rate of the Gaussians' offsets, which are in units of their anchor's extent.",
     )
-    lr_offsets_final: float = parameter(1e-4, "The same at the end.")
+    lr_offsets_final: float = parameter(1e-4, "Final learning rate of the offsets.")
     lr_looks: float = parameter(
         1e-2,
-        "Learning rate of Gaussians' own scales and colours; opacities take five times, quaternions a fifth "
-        "of it.",
+        "Learning rate of the Gaussians' own scales and colours; opacities use five times, "
+        "quaternions a fifth of it.",
     )
     lr_network: float = parameter(
         2e-3,
-        "Learning rate of the opacity's network; covariance has twice, colour four times as much.",
+        "Learning rate of the opacity network; the covariance network uses twice, the colour network "
+        "four times this value.",
     )
     lr_network_final: float = parameter(
         0.01,
-        "What is left of the rates of opacity, colour and appearance at the end, as a share.",
+        "Final learning rates of opacity, colour and appearance, as a fraction of the initial ones.",
         high=1,
     )
-    lr_appearance: float = parameter(5e-2, "Learning rate of the views' appearances.")
-    bake_ridge: float = parameter(0.001, "How firmly baking holds the higher harmonics to zero.", above=0)
+    lr_appearance: float = parameter(5e-2, "Learning rate of the appearance vectors.")
+    bake_ridge: float = parameter(0.001, "Ridge regularization of the higher harmonics in baking.", above=0)
 
     def check(self) -> None:
         super().check()
         if self.max_splats < self.offsets:
             raise LodgsError(
-                f"max_splats = {self.max_splats} is less than one anchor's {self.offsets} Gaussians.",
+                f"'max_splats' is {self.max_splats}, but one anchor needs {self.offsets} Gaussians.",
                 "Give a larger number.",
             )
 
@@ -101,7 +104,7 @@ METHOD = MethodInfo(
     name="octree_neural",
     number=2,
     label="Octree-GS, neural",
-    about="the same with small networks, as in the paper; baked for Blender",
+    about="octree anchors with small neural networks, as in the paper; baked for Blender",
     parameters=NeuralOctreeParameters,
     presets={"draft": _DRAFT, "standard": _STANDARD, "paper": _PAPER},
     rule="octree",

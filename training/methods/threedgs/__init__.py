@@ -1,4 +1,4 @@
-"""Plain 3D Gaussian splatting (Kerbl et al. 2023): one level, for comparison."""
+"""Plain 3D Gaussian splatting (Kerbl et al. 2023): a single level, for comparison."""
 
 from dataclasses import dataclass, replace
 
@@ -8,28 +8,29 @@ from ...optimize.parameters import PAPER, STANDARD, DensityParameters, parameter
 
 @dataclass(frozen=True)
 class ThreedgsParameters(DensityParameters):
-    """Those of 3DGS."""
+    """Parameters of 3DGS."""
 
     densify_until: float = parameter(
-        0.5, "Share of the steps after which splats are no longer added or removed.", high=1
+        0.5, "Fraction of the steps in which splats are added and removed.", high=1
     )
     densify_interval: int = parameter(50, "Steps between two densifications.", above=0, unit="steps")
-    densify_from: int = parameter(0, "Step before which nothing is densified.", unit="steps")
+    densify_from: int = parameter(0, "First step with densification.", unit="steps")
     densify_by: str = parameter(
         "mean",
-        "What decides where splats are added: the mean image-plane gradient over the views since the last "
-        "densification, or the largest one times the largest radius times opacity^(1/5) (LODGE, Eq. 6).",
+        "Criterion for adding splats: the mean image-plane gradient over the views since the last "
+        "densification (mean), or the maximum gradient times the maximum radius times opacity^(1/5) "
+        "(max; LODGE, Eq. 6).",
         choices=("mean", "max"),
     )
     max_threshold: float = parameter(
         0.015,
-        "With 'max', the product above which splats are added, at one megapixel: gradients in 3DGS units, "
-        "radii of three standard deviations in pixels (LODGE: 0.015 outdoors, 0.03 indoors).",
+        "Threshold of the criterion 'max' at one megapixel: gradients in 3DGS units, radii of three "
+        "standard deviations in pixels (LODGE: 0.015 outdoors, 0.03 indoors).",
     )
     least_weight: float = parameter(
         0.0,
-        "Splats whose largest blending weight in any training view is below this go at 8, 16 and 24 "
-        "thirtieths of the steps (LODGE, A.2: 0.02); 0 keeps all.",
+        "Minimum blending weight of a splat in any training view; splats below it are removed at 8, "
+        "16 and 24 thirtieths of the steps (LODGE, A.2: 0.02). 0 keeps all.",
         high=1,
     )
 
@@ -42,7 +43,7 @@ METHOD = MethodInfo(
     name="3dgs",
     number=3,
     label="Plain 3D Gaussian splatting",
-    about="one level, for comparison",
+    about="a single level, for comparison",
     parameters=ThreedgsParameters,
     presets={"draft": _DRAFT, "standard": _STANDARD, "paper": _PAPER},
     panel_parameters=("max_splats",),

@@ -1,4 +1,4 @@
-"""A LoD of Gaussians (Windisch et al. 2026): a tree over splats, whose cuts are trained and drawn."""
+"""A LoD of Gaussians (Windisch et al. 2026): a tree over splats; training and rendering use its cuts."""
 
 from dataclasses import dataclass, replace
 
@@ -9,56 +9,61 @@ from ..threedgs import ThreedgsParameters
 
 @dataclass(frozen=True)
 class TreeParameters(ThreedgsParameters):
-    """Those of A LoD of Gaussians; ``steps`` are the first ones, those of 3DGS, which makes the leaves where
-    there is no base; its schedules are of all steps."""
+    """Parameters of A LoD of Gaussians.
+
+    Without a base, the first ``steps`` train the leaves by 3DGS; the schedules of 3DGS span all steps.
+    """
 
     tune_steps: int = parameter(
-        600, "Steps that train the cut which each view sees of the tree; 0 leaves it as built.", unit="steps"
+        600,
+        "Training steps for cuts of the tree, one view per step. 0 keeps the tree as built.",
+        unit="steps",
     )
     pixels: float = parameter(
         0.5,
-        "Granularity of these cuts, in pixels of the training images; pictures begin with the same.",
+        "Granularity of the cuts in training, in pixels of the training images; also the initial "
+        "value for rendering.",
         low=0.1,
         high=100,
         unit="px",
     )
     lod_noise: float = parameter(
         10.0,
-        "Each step's granularity is larger by this times r⁴, r random from 0 to 1: most cuts are fine, some "
-        "are coarse.",
+        "Random coarsening in training: granularity is multiplied by 1 + this value times r⁴, with r "
+        "uniform from 0 to 1. Most cuts are fine, some coarse.",
         high=100,
     )
     node_rate: float = parameter(
         2.0,
-        "Learning rates of nodes above leaves, in multiples of those that 3DGS has by then, or, with a base, "
-        "ends with.",
+        "Learning rates of inner nodes, as multiples of the current 3DGS rates; with a base, of the "
+        "final ones.",
         high=100,
     )
     leaf_rate: float = parameter(
         0.5,
-        "The same of leaves, which falls to 0.03 of it, so that they come to rest; 0 leaves all as they are.",
+        "Learning rates of leaves, as multiples of the same rates; they fall to 0.03 of this value. 0 "
+        "freezes the leaves.",
         high=100,
     )
     resize_interval: int = parameter(
         1000,
-        "Steps after which cuts follow the sizes that nodes have by then; 0: those that the tree was built "
-        "with.",
+        "Steps between two updates of node sizes, which decide the cuts. 0 keeps the sizes of the "
+        "built tree.",
         unit="steps",
     )
 
     grow_interval: int = parameter(
         0,
-        "Steps between two density controls of the tree, after which leaves are split where the product of "
-        "'max_threshold' says so, as far as 'max_splats' leaves have room; 0: none.",
+        "Steps between two density controls of the tree: leaves above 'max_threshold' split while "
+        "'max_splats' allows. 0 disables.",
         unit="steps",
     )
     grow_until: float = parameter(
-        0.85, "Share of 'tune_steps' after which the tree no longer changes its shape.", high=1
+        0.85, "Fraction of 'tune_steps' after which the tree keeps its shape.", high=1
     )
     unseen_epochs: float = parameter(
         0.0,
-        "With density control, leaves go that were in no image for so many times as many steps as there are "
-        "photographs; 0: none does.",
+        "Epochs after which density control removes leaves that were in no training image. 0 disables.",
     )
 
     @property
@@ -78,7 +83,7 @@ _STANDARD = replace(
     densify_interval=100,
     tune_steps=10_000,
     grow_interval=1000,
-    leaf_rate=1.0,  # those that grow have to learn
+    leaf_rate=1.0,  # new leaves have to learn
 )
 _PAPER = replace(
     _STANDARD,
@@ -89,7 +94,7 @@ _PAPER = replace(
     sh_degree=1,
     tune_steps=150_000,
     max_threshold=0.0075,
-    densify_until=0.083,  # 15,000 steps, as in 3DGS; all are six times as many as 3DGS makes
+    densify_until=0.083,  # 15,000 steps, as in 3DGS, of six times as many steps in total
     unseen_epochs=2.0,
 )
 
@@ -97,7 +102,7 @@ METHOD = MethodInfo(
     name="tree",
     number=6,
     label="A LoD of Gaussians",
-    about="a tree over a finished model, drawn at the detail that each place needs",
+    about="a tree over a trained model, cut at the detail that each region needs",
     parameters=TreeParameters,
     presets={"draft": _DRAFT, "standard": _STANDARD, "paper": _PAPER},
     rule="cut",
@@ -105,6 +110,6 @@ METHOD = MethodInfo(
     from_base=True,
     streams_base=True,
     suggested_for_base=True,
-    capture_values={"leaf_rate": 0.0, "random_background": False},  # leaves are right, and black is nothing
+    capture_values={"leaf_rate": 0.0, "random_background": False},  # leaves are exact, and black means empty
     cell_method="3dgs",
 )

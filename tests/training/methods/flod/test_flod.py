@@ -411,7 +411,7 @@ def test_fine_levels_go_on_from_a_coarse_one_with_the_units_of_all(data):
 
 @pytest.mark.parametrize("first, last", [(3, 2), (1, 5), (5, 0)])
 def test_levels_that_there_are_not_are_refused(first, last):
-    with pytest.raises(LodgsError, match="cannot be trained"):
+    with pytest.raises(LodgsError, match="Cannot train levels"):
         override(METHOD.preset("draft"), {"levels": 4, "first_level": first, "last_level": last})
 
 
