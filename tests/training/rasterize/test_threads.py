@@ -149,6 +149,7 @@ def test_buffers_are_reused_after_their_owner_is_deleted():
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="processes are not forked elsewhere")
 def test_two_processes_compile_every_kernel_once(tmp_path):
     program = """
