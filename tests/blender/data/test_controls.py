@@ -97,7 +97,7 @@ def test_blender_begins_with_what_the_trainer_measures(bpy, lodgs, some, tmp_pat
 def test_levels_in_use_go_along_until_somebody_sets_them(bpy, lodgs, some):
     scenes, bundle = lodgs("data.scenes"), some(6, {})
     with lodgs("data.importing").new_scene(bpy.context, "trained") as root:
-        scenes.set_bundle_facts(root, lodgs("training.splats.bundle").Bundle("flod", [], "bands"))
+        scenes.set_bundle_facts(root, lodgs("training.splats.levels").Bundle("flod", [], "bands"))
         for level in bundle.levels[:4]:
             scenes.set_level(root, level)
     assert in_use(root) == {"gamma": 1, "first": 2, "last": 4}

@@ -124,7 +124,7 @@ def test_points_make_way_for_the_first_level(bpy, lodgs, mini):
     root = lodgs("data.importing").import_colmap(bpy.context, mini)
     points, cameras = root.lodgs.points, root.lodgs.cameras
     assert points.type == "POINTCLOUD" and len(cameras.objects) == 32
-    level = lodgs("training.splats.bundle").Level(
+    level = lodgs("training.splats.levels").Level(
         1,
         lodgs("training.splats.gaussians").Splats(
             *(np.zeros((4, n), np.float32) for n in (3, 4, 3)),
@@ -215,7 +215,7 @@ def test_another_program_s_export(bpy, lodgs, tmp_path):
     (tmp_path / "transforms.json").write_text(json.dumps({"camera_angle_x": 1.0, "frames": frames}))
     said = []
     root = lodgs("data.importing").import_colmap(bpy.context, tmp_path, upright=False, warn=said.append)
-    assert "at random" in said[0]
+    assert "random" in said[0]
     bpy.context.view_layer.update()
     for number, pose in enumerate(poses):
         camera = next(each for each in root.lodgs.cameras.objects if each.name == f"{number}.png")

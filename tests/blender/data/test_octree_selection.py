@@ -124,7 +124,7 @@ def names_of(obj):
 
 def test_another_method_leaves_no_driver_of_the_first(bpy, lodgs, root):
     """Trained again with FLoD and back: each level has one modifier, with the drivers of its rule only."""
-    Bundle = lodgs("training.splats.bundle").Bundle
+    Bundle = lodgs("training.splats.levels").Bundle
     for item in root.lodgs.levels:
         item.facts = '{"s_min": 0.5}'
     obj = root.lodgs.levels[0].object

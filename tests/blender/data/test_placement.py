@@ -149,7 +149,7 @@ def test_the_ground_through_points_that_are_selected_in_edit_mode(bpy, lodgs):
     select(bpy, cloud)
     bpy.ops.object.mode_set(mode="EDIT")
     bpy.ops.pointcloud.select_all(action="DESELECT")
-    with pytest.raises(RuntimeError, match="0 places are selected"):
+    with pytest.raises(RuntimeError, match="0 selected points"):
         bpy.ops.lodgs.set_ground()
     places = np.empty((len(cloud.data.points), 3), np.float32)
     cloud.data.attributes["position"].data.foreach_get("vector", places.reshape(-1))

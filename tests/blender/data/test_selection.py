@@ -285,7 +285,7 @@ def test_a_level_arrives_while_an_artist_works(bpy, lodgs, root):
     bpy.ops.object.mode_set(mode="EDIT")
     splats = lodgs("data.objects").read_splats(root.lodgs.levels[0].object)
     scenes = len(bpy.data.scenes)
-    lodgs("data.scenes").set_level(root, lodgs("training.splats.bundle").Level(6, splats, {"s_min": 0.0}))
+    lodgs("data.scenes").set_level(root, lodgs("training.splats.levels").Level(6, splats, {"s_min": 0.0}))
     assert bpy.context.mode == "EDIT_MESH" and bpy.context.object == cube
     assert bpy.context.selected_objects == [cube] and len(bpy.data.scenes) == scenes
     assert root.lodgs.bands.last == 6
@@ -295,7 +295,7 @@ def test_levels_that_are_gone_leave_no_gap(bpy, lodgs, root):
     """A shorter training after a longer one: its finest level reaches up to the eye."""
     for item in list(root.lodgs.levels)[3:]:
         bpy.data.objects.remove(item.object)
-    lodgs("data.scenes").set_bundle_facts(root, lodgs("training.splats.bundle").Bundle("flod", [], "bands"))
+    lodgs("data.scenes").set_bundle_facts(root, lodgs("training.splats.levels").Bundle("flod", [], "bands"))
     assert [item.number for item in root.lodgs.levels] == [1, 2, 3]
     assert (root.lodgs.bands.last, root.lodgs.single_level) == (3, 3)
     bpy.context.view_layer.update()

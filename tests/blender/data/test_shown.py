@@ -23,7 +23,7 @@ def make_splats(lodgs, seed=0, count=COUNT, degree=1, **extras):
 @pytest.fixture
 def two_levels(bpy, lodgs):
     """A splat scene of two levels, side by side: root and the two levels' splats."""
-    level = lodgs("training.splats.bundle").Level
+    level = lodgs("training.splats.levels").Level
     camera = bpy.data.objects.new("eye", bpy.data.cameras.new("eye"))
     bpy.context.scene.collection.objects.link(camera)
     bpy.context.scene.camera = camera
@@ -31,7 +31,7 @@ def two_levels(bpy, lodgs):
     with lodgs("data.importing").new_scene(bpy.context, "scene") as root:
         for number, s_min in ((2, 0.0), (1, 0.003)):
             lodgs("data.scenes").set_level(root, level(number, splats[number - 1], {"s_min": s_min}))
-        bundle = lodgs("training.splats.bundle").Bundle("flod", [], "bands")
+        bundle = lodgs("training.splats.levels").Bundle("flod", [], "bands")
         lodgs("data.scenes").set_bundle_facts(root, bundle)
     root.location, root.rotation_euler, root.scale = (1, 2, 3), (0.3, 0.2, 0.1), (2, 2, 2)
     bpy.context.view_layer.update()
@@ -79,7 +79,7 @@ def test_distance_bands_count(bpy, lodgs, two_levels):
 
 def test_octree_weights_are_beside_the_opacities(bpy, lodgs, two_levels):
     root, splats = two_levels
-    Bundle, facts = lodgs("training.splats.bundle").Bundle, {"d_max": 1.2, "d_max_focal": 1000.0}
+    Bundle, facts = lodgs("training.splats.levels").Bundle, {"d_max": 1.2, "d_max_focal": 1000.0}
     lodgs("data.scenes").set_bundle_facts(root, Bundle("", [], "octree", facts, cumulative=True))
     root.lodgs.mode = "SELECTIVE"
     bpy.context.view_layer.update()

@@ -22,7 +22,7 @@ def made_up(bpy, lodgs, monkeypatch):
 
     offered = ("decay", "width", "turns", "fast", "kind", "shares")
     presets = {"draft": Made(), "standard": Made(width=4.5, kind="near"), "paper": Made()}
-    info = methods.MethodInfo("made", 98, "Made", "up", Made, presets, offered=offered)
+    info = methods.MethodInfo("made", 98, "Made", "up", Made, presets, panel_parameters=offered)
     monkeypatch.setitem(methods.METHODS, "made", info)
     group = lodgs("data.training")._parameters_of(info)
     bpy.utils.register_class(group)
@@ -82,8 +82,8 @@ def test_every_method_has_a_group(bpy, lodgs):
         settings.method = name
         for preset in lodgs("training.methods").PRESETS:
             settings.preset = preset
-            shown = {name: getattr(settings.parameters, f"preset_{name}") for name in info.offered}
-            wanted = {name: getattr(info.preset(preset), name) for name in info.offered}
+            shown = {name: getattr(settings.parameters, f"preset_{name}") for name in info.panel_parameters}
+            wanted = {name: getattr(info.preset(preset), name) for name in info.panel_parameters}
             assert shown == pytest.approx(wanted)  # Blender's numbers are float32
 
 

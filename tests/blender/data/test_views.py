@@ -94,7 +94,7 @@ def test_a_trained_scene_takes_its_photographs_views_along(bpy, lodgs):
     names = ("means", "quats", "log_scales", "opacity_logits", "sh")
     made = {name: getattr(splats(9), name) for name in names}
     level = lodgs("training.splats.gaussians").Splats(**made)
-    scenes.set_level(root, lodgs("training.splats.bundle").Level(1, level))
+    scenes.set_level(root, lodgs("training.splats.levels").Level(1, level))
     cameras, near, _ = read_view_tables(scenes.read_levels(root).tables)
     scene = read_scene(GARDEN)
     check(cameras, scene.cameras)

@@ -63,8 +63,8 @@ def test_flamenco_is_offered_if_the_preferences_name_a_manager(lodgs, root, draw
 def test_splats_without_photos_need_settings_of_views(bpy, lodgs, root, draw, fake):
     root.lodgs.scene_folder = ""
     assert draw().operators == [] and any("No photos to train on" in text for text in draw().texts)
-    level = lodgs("training.splats.bundle").Level
-    lodgs("data.scenes").set_level(root, level(1, lodgs("training.splats.bundle").NO_SPLATS))
+    level = lodgs("training.splats.levels").Level
+    lodgs("data.scenes").set_level(root, level(1, lodgs("training.splats.levels").NO_SPLATS))
     assert any("FLoD needs photos" in text for text in draw().texts) and not draw().operators
     settings = root.lodgs.training
     settings.method = "lodge"

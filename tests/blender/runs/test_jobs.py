@@ -78,7 +78,7 @@ def test_controls_follow_the_run_until_the_user_sets_them(bpy, lodgs, jobs, fake
     assert root.lodgs.bands.gamma == 1.0
     bpy.ops.lodgs.train(folder=str(tmp_path / "first"))
     assert root.lodgs.bands.gamma == 2.0
-    scenes, Bundle = lodgs("data.scenes"), lodgs("training.splats.bundle").Bundle
+    scenes, Bundle = lodgs("data.scenes"), lodgs("training.splats.levels").Bundle
     scenes.set_bundle_facts(root, Bundle("flod", [], "bands", {}, {"gamma": 0.4}))
     assert root.lodgs.bands.gamma == pytest.approx(0.4), "not set by the user"
     assert scenes.read_levels(root).controls == {"gamma": 0.4}
@@ -536,7 +536,7 @@ def test_deleting_the_root_ends_only_the_watch(bpy, jobs, lodgs, fake, root, tmp
 
 
 def test_run_with_fewer_levels_removes_the_other_levels(bpy, lodgs, jobs, fake, root, tmp_path):
-    Level = lodgs("training.splats.bundle").Level
+    Level = lodgs("training.splats.levels").Level
     for number in (1, 2, 3):
         lodgs("data.scenes").set_level(root, Level(number, splats(3)))
     fake()
