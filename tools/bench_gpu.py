@@ -110,10 +110,10 @@ class Case:
 
     def on_device(self) -> Callable[[], object]:
         """Return a step that stays on the device."""
-        twin = make_device_model("gpu", self.adam, self.stats)
-        assert twin is not None
+        model = make_device_model("gpu", self.adam, self.stats)
+        assert model is not None
         options = {"near": 0.01, "sh_degree": 3, "background": (0.0, 0.0, 0.0), "ssim_weight": 0.2}
-        return lambda: twin.step(self.camera, self.target, shrink=1, **options)
+        return lambda: model.step(self.camera, self.target, shrink=1, **options)
 
 
 def transferred_bytes(device: Device, step: Callable[[], object]) -> int:

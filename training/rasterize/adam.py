@@ -125,7 +125,16 @@ class Adam:
         self.steps = dict(state["steps"])
 
 
-def update_in_torch(parameter, gradient, m, v, lr, betas, eps, step) -> None:
+def update_in_torch(
+    parameter: torch.Tensor,
+    gradient: torch.Tensor,
+    m: torch.Tensor,
+    v: torch.Tensor,
+    lr: LearningRate,
+    betas: tuple[float, float],
+    eps: float,
+    step: int | torch.Tensor,
+) -> None:
     """Make one Adam step in place on any device; same formula as ``cpu.adam.update``."""
     m.lerp_(gradient, 1 - betas[0])
     v.mul_(betas[1]).addcmul_(gradient, gradient, value=1 - betas[1])

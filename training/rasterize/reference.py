@@ -217,7 +217,7 @@ def intersects_tile(
     (x0, y0), (a, b, c) = offset, conic
     x1, y1 = x0 + 15, y0 + 15
 
-    def distance(x, y):
+    def distance(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
         return (a * x * x + 2 * b * x * y + c * y * y) / determinant
 
     # the form is convex, so its minimum on the rectangle is at the mean or on an edge

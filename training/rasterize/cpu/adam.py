@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .compile import STRICT, f32, inlined, kernel, run_parallel, serialised
 
@@ -55,7 +56,17 @@ def _update_rows(begin, end, parameter, rows, gradient, m, v, lr, keep_m, keep_v
 
 
 @serialised
-def update_rows(parameter, rows, gradient, m, v, lr, betas, eps, step) -> None:
+def update_rows(
+    parameter: np.ndarray,
+    rows: np.ndarray,
+    gradient: np.ndarray,
+    m: np.ndarray,
+    v: np.ndarray,
+    lr: ArrayLike,
+    betas: tuple[float, float],
+    eps: float,
+    step: int,
+) -> None:
     """Make one Adam step in place for ``rows`` (M,) int64; ``lr`` is a number or broadcasts against one
     row."""
     width = int(np.prod(parameter.shape[1:], dtype=int))
@@ -69,14 +80,23 @@ def update_rows(parameter, rows, gradient, m, v, lr, betas, eps, step) -> None:
 
 
 @serialised
-def update(parameter, gradient, m, v, lr, betas, eps, step) -> None:
+def update(
+    parameter: np.ndarray,
+    gradient: np.ndarray,
+    m: np.ndarray,
+    v: np.ndarray,
+    lr: ArrayLike,
+    betas: tuple[float, float],
+    eps: float,
+    step: int,
+) -> None:
     """Make one Adam step in place; ``lr`` is a number or broadcasts against one row of ``parameter``."""
     correction = 1 - betas[0] ** step
-    lr = np.asarray(lr, np.float32) / np.float32(correction)
-    if lr.size == 1:
-        lr_row = np.full(ROW, lr.item(), np.float32)
+    rate = np.asarray(lr, np.float32) / np.float32(correction)
+    if rate.size == 1:
+        lr_row = np.full(ROW, rate.item(), np.float32)
     else:
-        lr_row = np.ascontiguousarray(np.broadcast_to(lr, parameter.shape[1:])).reshape(-1)
+        lr_row = np.ascontiguousarray(np.broadcast_to(rate, parameter.shape[1:])).reshape(-1)
     run_parallel(
         _update, -(-parameter.size // len(lr_row)), -(-VALUES // len(lr_row)),
         parameter.reshape(-1), gradient.reshape(-1), m.reshape(-1), v.reshape(-1), lr_row,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -75,7 +76,7 @@ def _corrections(betas: tuple[float, float], count: int) -> tuple[np.ndarray, np
     return first.astype(np.float32), (1 / second).astype(np.float32)
 
 
-def gather(records, places, arrays) -> None:
+def gather(records: np.ndarray, places: np.ndarray, arrays: Sequence[np.ndarray]) -> None:
     """Copy the values of records (N, width) at ``places`` (M,) int64 to arrays (M, ...)."""
     *arrays, sh = arrays
     sh = sh.reshape(len(places), 3 * sh.shape[1])
@@ -83,7 +84,18 @@ def gather(records, places, arrays) -> None:
 
 
 @serialised
-def step(records, places, gradients, grad2d, radii, number, lr, shares, betas, eps) -> None:
+def step(
+    records: np.ndarray,
+    places: np.ndarray,
+    gradients: Sequence[np.ndarray],
+    grad2d: np.ndarray,
+    radii: np.ndarray,
+    number: int,
+    lr: np.ndarray,
+    shares: np.ndarray,
+    betas: tuple[float, float],
+    eps: float,
+) -> None:
     """Make one Adam step on arrays; see ``rasterize.records.adam_step``."""
     corrections = _corrections(betas, 1 << int(number + 1).bit_length())
     flat = (array.reshape(-1) for array in (*gradients, grad2d))
