@@ -83,7 +83,7 @@ def rasterize(
             (FLoD, Eq. 4).
         near: depth in world units. Splats whose mean lies at or in front of it are not drawn.
         antialias: replace 3DGS's dilation by the 2D Mip filter of variance
-            :data:`..lod.unfiltered.MIP_VARIANCE`, and scale opacity by sqrt(det before / det after)
+            :data:`..editing.bake_filter.MIP_VARIANCE`, and scale opacity by sqrt(det before / det after)
             (Mip-Splatting, Yu et al. 2024, Eq. 10). An (N,) bool tensor selects it per splat.
         outputs: names from :data:`OUTPUTS` of further differentiable outputs in :class:`Rendering`.
         features: (N, F) values per splat, blended like colours over zero.
