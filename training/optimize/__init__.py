@@ -1,1 +1,1 @@
-"""The optimiser that methods share: model, density control, training data, losses, regularisation."""
+"""Optimiser shared by all methods: model, density control, training data, losses and regularisation."""

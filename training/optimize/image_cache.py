@@ -1,4 +1,4 @@
-"""Photographs for the steps that need them: read ahead by threads, and kept within a number of bytes."""
+"""Cache of training images with a memory limit, read ahead by threads."""
 
 from __future__ import annotations
 
@@ -14,117 +14,118 @@ from ..scenes.cameras import Camera
 from .memory import MAX_BYTES, TARGET_BYTES, free_memory
 
 READERS = 2
-"""Threads that read: a step has its own."""
+"""Reader threads, besides the training thread."""
 READ_AHEAD = 8
-"""Photographs of so many steps are read ahead."""
+"""Number of steps whose images are read ahead."""
 WINDOW = 4096
-"""It is known of so many coming steps what they need."""
+"""Number of coming steps whose views are known."""
 
 CameraPlan = Callable[[int], Camera | None]
-"""The view of a step, as far as is known before it, at its size; None: it needs none, or there is no step."""
+"""Forecast of a step's view at its image size. None if the step needs no image, or does not exist."""
 
 _Key = tuple[Path, int, int]
 
 
 def default_budget() -> int:
-    """Bytes that are kept if nothing is said: a quarter of the free memory, MOST_BYTES at most."""
+    """Return the default size of the cache in bytes: a quarter of the free memory, at most ``MAX_BYTES``."""
     return min(MAX_BYTES, free_memory() // 4)
 
 
 class ImageCache:
-    """Photographs by their views: those that are needed soonest stay, and are read before they are needed.
+    """Training images by view. Keeps the images that are needed soonest and reads them ahead.
 
-    What is kept, and when it is read, changes how long a step takes and nothing else: a plan may be wrong.
-    Every photograph counts with the moments that losses keep beside it, but without its mask and its alpha,
-    which take 4 bytes a pixel each. No more than the budget is held, besides a
-    photograph that has no room in it and is in use. For one thread to ask; others only read.
+    The cache affects only the duration of steps, so a forecast may be wrong. An image counts with the moments
+    that losses keep with it, but without its mask and alpha, which take 4 bytes per pixel each. The budget is
+    exceeded only by an image that does not fit and is in use. One thread may call; reader threads only read.
 
     Args:
-        read: a view's photograph; called in threads, with one view by one thread at a time.
+        read: load a view's image. Called in threads, for each view by one thread at a time.
         budget: bytes.
 
     Attributes:
-        held: bytes of the photographs that are kept or being read.
+        held_bytes: size of the images that are cached or being read.
     """
 
     def __init__(self, read: Callable[[Camera], Target], budget: int) -> None:
-        self._read, self._budget, self.held_bytes = read, budget, 0
-        self._kept: dict[_Key, Future[Target]] = {}  # least recently used first
+        self._read = read
+        self._budget = budget
+        self.held_bytes = 0
+        self._cached: dict[_Key, Future[Target]] = {}  # least recently used first
         self._readers: ThreadPoolExecutor | None = None
         self._plan: CameraPlan | None = None
-        self._begin = 0  # the step that the window begins with
+        self._begin = 0  # first step of the window
         self._window: deque[_Key | None] = deque()
-        self._uses: dict[_Key, deque[int]] = {}  # the steps in the window that need a photograph
+        self._uses: dict[_Key, deque[int]] = {}  # steps of the window that need an image
 
     def target(self, camera: Camera) -> Target:
-        """The photograph of a view, at the view's size.
+        """Return the image of a view, at the view's size.
 
         Raises:
-            LodgsError: it cannot be read.
+            LodgsError: the image cannot be read.
         """
         key = _key(camera)
-        reading = self._kept.pop(key, None)
-        if reading is not None and not reading.cancel():  # it has begun to be read
+        reading = self._cached.pop(key, None)
+        if reading is not None and not reading.cancel():  # reading has started
             try:
                 target = reading.result()
-            except Exception:  # told by the step that needs it, and only if it is still so
+            except Exception:  # read again below, which raises the error if it persists
                 pass
             else:
-                self._kept[key] = reading
+                self._cached[key] = reading
                 return target
         if reading is not None:
             self.held_bytes -= _bytes(key)
         target = self._read(camera)
         if self._make_room(_bytes(key), self._next_use(key)):
-            self._kept[key] = done = Future()
+            self._cached[key] = done = Future()
             done.set_result(target)
             self.held_bytes += _bytes(key)
         return target
 
     def prefetch(self, step: int, plan: CameraPlan) -> None:
-        """Tells that a step begins; what it and the next ones need is read, while there is room.
+        """Start a step: read the images of this and the next steps ahead, as far as they fit.
 
         Args:
-            plan: what steps need; it may be asked about steps that never come, and say something else later.
+            plan: forecast of views. It may be called for steps that never come, and may change later.
         """
         self._advance(step, plan)
         for use, key in enumerate(islice(self._window, READ_AHEAD), step):
-            if key is None or key in self._kept:
+            if key is None or key in self._cached:
                 continue
             camera = plan(use)
             if camera is None or _key(camera) != key or not self._make_room(_bytes(key), use):
                 break
             if self._readers is None:
-                self._readers = ThreadPoolExecutor(READERS, "lodgs-photographs")
-            self._kept[key] = self._readers.submit(self._read, camera)
+                self._readers = ThreadPoolExecutor(READERS, "lodgs-images")
+            self._cached[key] = self._readers.submit(self._read, camera)
             self.held_bytes += _bytes(key)
 
     def _make_room(self, size: int, use: float) -> bool:
-        """Drops what is needed last, and later than at the step ``use``, until so many bytes are free.
+        """Evict images that are needed later than step ``use``, latest first, until ``size`` bytes are free.
 
-        Of what is not known to be needed the least recently used goes first.
+        Images without a known use are evicted first, least recently used first.
         """
         if size > self._budget:
             return False
         while self.held_bytes + size > self._budget:
             key = max(
-                (key for key, reading in self._kept.items() if not reading.running()),
+                (key for key, reading in self._cached.items() if not reading.running()),
                 key=self._next_use,
                 default=None,
             )
             if key is None or (self._next_use(key) <= use and self._next_use(key) < inf):
                 return False
-            if self._kept[key].cancel() or self._kept[key].done():
-                del self._kept[key]
+            if self._cached[key].cancel() or self._cached[key].done():
+                del self._cached[key]
                 self.held_bytes -= _bytes(key)
         return True
 
     def _next_use(self, key: _Key) -> float:
-        """The step that needs a photograph next, as far as is known."""
+        """Return the next known step that needs an image, or infinity."""
         return self._uses[key][0] if key in self._uses else inf
 
     def _advance(self, step: int, plan: CameraPlan) -> None:
-        """Moves the window to begin with a step."""
+        """Move the window to begin with a step."""
         while self._window and self._begin < step:
             key = self._window.popleft()
             if key is not None:
@@ -136,12 +137,14 @@ class ImageCache:
             plan != self._plan
             or self._begin != step
             or not self._window
-            or self._window[0] != _of(plan(step))
+            or self._window[0] != _optional_key(plan(step))
         ):
-            self._plan, self._begin = plan, step
-            self._window, self._uses = deque(), {}
+            self._plan = plan
+            self._begin = step
+            self._window = deque()
+            self._uses = {}
         while len(self._window) < WINDOW:
-            key = _of(plan(step + len(self._window)))
+            key = _optional_key(plan(step + len(self._window)))
             if key is not None:
                 self._uses.setdefault(key, deque()).append(step + len(self._window))
             self._window.append(key)
@@ -152,7 +155,7 @@ def _key(camera: Camera) -> _Key:
     return camera.image, camera.width, camera.height
 
 
-def _of(camera: Camera | None) -> _Key | None:
+def _optional_key(camera: Camera | None) -> _Key | None:
     return None if camera is None else _key(camera)
 
 

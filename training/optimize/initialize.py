@@ -1,4 +1,4 @@
-"""What training begins with: splats at the scene's points, or a base's."""
+"""Initial splats, from the scene's points or from a base."""
 
 from __future__ import annotations
 
@@ -11,43 +11,47 @@ from ..splats.gaussians import SH_C0, Splats
 from .density_control import constrained_log_scales
 from .model import NAMES
 
+MIN_POINTS = 4
+"""Minimum number of distinct points to start from."""
+
 
 def drop_duplicates(points: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points without exact repetitions, which have no distance to take a scale from.
+    """Drop repeated points. Their neighbour distance is 0, which gives no scale.
 
     Raises:
-        LodgsError: fewer than 4 are left.
+        LodgsError: fewer than 4 points remain.
     """
     points, index = np.unique(points, axis=0, return_index=True)
-    if len(points) < 4:
+    if len(points) < MIN_POINTS:
         raise LodgsError(
-            f"The scene has {len(points)} distinct 3D points; training needs at least 4 to begin with.",
+            f"Cannot start training: the scene has {len(points)} distinct 3D points "
+            f"and needs at least {MIN_POINTS}.",
             "Run COLMAP's triangulation again, or choose another model.",
         )
     return points, colors[index]
 
 
 def sample_points(
-    points: np.ndarray, colors: np.ndarray, most: int, seed: int
+    points: np.ndarray, colors: np.ndarray, count: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """At most so many of the points, a random sample in their order."""
-    if len(points) > most:
-        some = np.sort(np.random.default_rng(seed).choice(len(points), most, replace=False))
-        points, colors = points[some], colors[some]
+    """Draw at most ``count`` random points, keeping their order."""
+    if len(points) > count:
+        index = np.sort(np.random.default_rng(seed).choice(len(points), count, replace=False))
+        points, colors = points[index], colors[index]
     return points, colors
 
 
 def neighbour_distances(means: np.ndarray, neighbours: int = 3) -> np.ndarray:
-    """Distances to the nearest other points, (N, neighbours), in the unit of ``means``.
+    """Return the distances to the nearest other points, (N, neighbours), in the unit of ``means``.
 
-    With fewer points than neighbours, the missing ones are infinitely far.
+    With fewer points than neighbours, the missing distances are infinite.
     """
     distances, _ = KDTree(means).query(means, k=neighbours + 1, workers=-1)
     return distances[:, 1:]
 
 
 def neighbour_scale(points: np.ndarray) -> np.ndarray:
-    """Root mean square distance (N,) of the three nearest neighbours, above 0."""
+    """Return the root mean square distance (N,) of the three nearest neighbours, above 0."""
     distances = neighbour_distances(points)
     finite = np.isfinite(distances)
     squared = np.where(finite, distances, 0) ** 2
@@ -62,17 +66,17 @@ def from_points(
     device: torch.device | str = "cpu",
     min_scale: float = 0.0,
 ) -> dict[str, torch.Tensor]:
-    """Splats from structure-from-motion points, as 3DGS begins: round, nearly transparent, coloured.
+    """Create splats from structure-from-motion points, as in 3DGS: round, nearly transparent, coloured.
 
     Args:
         points: (N, 3) world coordinates, at least two distinct ones.
         colors: (N, 3) uint8, display-coded.
-        sh_degree: the degree for which coefficients are made; those above 0 start at zero.
-        device: where the tensors are made.
+        sh_degree: degree of the harmonics; coefficients above degree 0 are zero.
+        device: device of the tensors.
         min_scale: FLoD's s_min, which the rasterizer adds to the scales.
 
     Returns:
-        Tensors by name; scales are the root mean square distance of the three nearest neighbours.
+        Tensors by name. Scales are the root mean square distance of the three nearest neighbours.
     """
     scale = neighbour_scale(points)
     count = len(points)
@@ -94,7 +98,7 @@ def from_points(
 def from_splats(
     splats: Splats, sh_degree: int, device: torch.device | str = "cpu"
 ) -> dict[str, torch.Tensor]:
-    """A base's splats as tensors by name, a copy; harmonics above ``sh_degree`` go, missing ones are zero."""
+    """Copy a base's splats to tensors by name, truncating or zero-padding harmonics to ``sh_degree``."""
     terms = (sh_degree + 1) ** 2
     sh = np.zeros((len(splats), terms, 3), np.float32)
     sh[:, : splats.sh.shape[1]] = splats.sh[:, :terms]

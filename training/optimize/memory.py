@@ -1,4 +1,4 @@
-"""How much memory this process may still take, and what it does with what it has freed. No torch."""
+"""Estimate the free memory and configure the allocator. Does not import torch."""
 
 from __future__ import annotations
 
@@ -10,57 +10,57 @@ from contextlib import suppress
 from pathlib import Path
 
 MAX_BYTES = 2 << 30
-"""Bytes of photographs that are kept, if nothing is said and the computer has four times as much free."""
+"""Upper limit of the default image cache."""
 TARGET_BYTES = 36
-"""Bytes a pixel: the photograph and its two local moments, float32."""
+"""Bytes per pixel of a training image: float32 colours and two local moments."""
 FALLBACK_BYTES = 4 << 30
-"""Bytes that a computer is taken to have where it does not say."""
+"""Memory to assume if the system reports none."""
 
 
 def free_memory() -> int:
-    """Bytes that programs can be given without others being written to the disk, about.
+    """Estimate the bytes available to programs without swapping.
 
-    On Linux the system's own estimate, or what its container leaves where that is less; on Windows what is
-    free; on macOS, which does not tell without a program of its own, half of what there is.
+    Linux reports an estimate, limited here by the container's memory limit. Windows reports the free memory.
+    macOS reports it only through a separate program, so half of the physical memory is assumed there.
     """
     if sys.platform == "win32":
-        return _on_windows()
+        return _windows_memory()
     if sys.platform == "linux":
         with suppress(OSError, AttributeError, ValueError):
-            found = re.search(r"^MemAvailable:\s+(\d+) kB", Path("/proc/meminfo").read_text(), re.MULTILINE)
-            return min(int(found[1]) << 10, _in_container())  # type: ignore[index]
+            match = re.search(r"^MemAvailable:\s+(\d+) kB", Path("/proc/meminfo").read_text(), re.MULTILINE)
+            return min(int(match[1]) << 10, _container_memory())  # type: ignore[index]
     with suppress(OSError, ValueError, AttributeError):
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
     return FALLBACK_BYTES
 
 
 def keep_freed_memory(largest: int | None = None) -> None:
-    """Keeps freed arrays for the next ones; glibc would fetch fresh pages, some 6 % of a step's time.
+    """Let glibc reuse the memory of freed arrays. Requesting new pages takes about 6 % of a step.
 
     Args:
-        largest: those of so many bytes and more go back to the system at once, 32 MB at most; None: none do.
+        largest: return arrays of at least this many bytes (up to 32 MB) to the system; None returns none.
     """
     if sys.platform == "linux":
         with suppress(OSError, AttributeError):  # another C library
             mallopt = ctypes.CDLL(None).mallopt
-            mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD: the heap stays,
-            mallopt(-4, 1 << 16 if largest else 0)  # M_MMAP_MAX: and large arrays come from it, too,
+            mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD: keep the heap
+            mallopt(-4, 1 << 16 if largest else 0)  # M_MMAP_MAX: allocate large arrays from the heap
             if largest:
-                mallopt(-3, largest)  # M_MMAP_THRESHOLD: up to here
+                mallopt(-3, largest)  # M_MMAP_THRESHOLD: except arrays above this size
 
 
-def _in_container(folder: Path = Path("/sys/fs/cgroup")) -> int:
-    """What the limit of this process's control group (version 2) leaves; what files hold can be given up."""
+def _container_memory(folder: Path = Path("/sys/fs/cgroup")) -> int:
+    """Return the bytes left by the control group's limit (version 2), including reclaimable file cache."""
     try:
         limit = int((folder / "memory.max").read_text())
         used = int((folder / "memory.current").read_text())
         files = re.search(r"^inactive_file (\d+)", (folder / "memory.stat").read_text(), re.MULTILINE)
-    except (OSError, ValueError):  # none, or "max"
+    except (OSError, ValueError):  # no control group, or the limit "max"
         return sys.maxsize
     return max(limit - used + (int(files[1]) if files else 0), 0)
 
 
-def _on_windows() -> int:
+def _windows_memory() -> int:
     class Status(ctypes.Structure):
         _fields_ = [("length", ctypes.c_ulong), ("load", ctypes.c_ulong)] + [
             (name, ctypes.c_ulonglong)
@@ -68,5 +68,5 @@ def _on_windows() -> int:
         ]
 
     status = Status(length=ctypes.sizeof(Status))
-    known = ctypes.windll.kernel32.GlobalMemoryStatusEx(ctypes.byref(status))  # type: ignore[attr-defined]
-    return int(status.free) if known else FALLBACK_BYTES
+    success = ctypes.windll.kernel32.GlobalMemoryStatusEx(ctypes.byref(status))  # type: ignore[attr-defined]
+    return int(status.free) if success else FALLBACK_BYTES

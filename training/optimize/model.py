@@ -1,6 +1,6 @@
-"""Trainable rows (splats, or anchors of splats) that come and go, with Adam's state in step.
+"""Trainable rows (splats or anchors of splats) with Adam's state.
 
-The parametrisation of splats is that of 3DGS files (``training.splats.gaussians``), as torch tensors.
+Splats are parametrised as in 3DGS files (``training.splats.gaussians``), as torch tensors.
 """
 
 from __future__ import annotations
@@ -16,37 +16,36 @@ from ..splats.gaussians import Splats
 from .parameters import Parameters
 
 NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh")
-"""The tensors that every splat has; a model of splats may train further ones, (N,), under other names."""
+"""Tensors of every splat. A model of splats may train further tensors, (N,), under other names."""
 PEAK_STATS = ("gradient_max", "radius_max")
-"""Stats that densification by maxima needs: as ``gradient_sum``, and in pixels, since the last reset."""
+"""Stats of densification by maxima since the last reset: gradient as in ``gradient_sum``, radius in pixels."""
 
 
 OUTSIDE = "outside"
-"""Column of the rows beside which none are added, 1, where only a region is trained in detail."""
+"""Column that marks rows outside the job's region with 1: no splats are added there."""
 FROZEN = "held"
-"""Column of the rows that stay as they are, 1, where there are such: what they are beside is trained."""
+"""Column that marks rows excluded from training with 1. Only present if there are any."""
 
 
 class Model:
     """N splats (or anchors of splats) under optimisation.
 
-    Plain splats may be trained by the backend itself (:meth:`twin`). Whoever asks for the optimizer, a tensor
-    or ``stats`` has them brought home before; all else (:meth:`look`, :meth:`rows`, :meth:`keep`, ...) leaves
-    them there.
+    The backend can train plain splats on its device (:meth:`device_model`). Access to the optimizer, a tensor
+    or ``stats`` copies them to the host first. All other methods (:meth:`read`, :meth:`read_rows`,
+    :meth:`keep`, ...) leave them on the device.
 
     Attributes:
-        adam: the optimizer, which holds the trained tensors by name and their moments; ``means`` is one.
-        lr: its learning rates by name.
-        columns: what else is kept of every row and not trained, by name: zero for rows that come without it.
-        stats: what is added up of every row between two resets, by name. ``gradient_sum`` and ``seen`` are
-            always there.
+        adam: optimizer with the trained tensors and their moments by name, among them ``means``.
+        lr: learning rates by name.
+        columns: further values of each row by name, not trained; zero for new rows that lack them.
+        stats: sums of each row since the last reset, by name, always with ``gradient_sum`` and ``seen``.
 
     Args:
-        tensors: the tensors to train, N rows each.
-        lr: the learning rate of each.
-        columns: as the attribute.
-        stats: further ones than ``gradient_sum`` and ``seen``, or these in another shape than (N,); zeros.
-        peaks: keep the stats ``gradient_max`` and ``radius_max`` as well.
+        tensors: tensors to train, N rows each.
+        lr: learning rate of each tensor.
+        columns: see the attribute.
+        stats: initial stats besides ``gradient_sum`` and ``seen``, or these two in a shape other than (N,).
+        peaks: also keep the stats ``gradient_max`` and ``radius_max``.
     """
 
     def __init__(
@@ -57,40 +56,40 @@ class Model:
         stats: Mapping[str, torch.Tensor] | None = None,
         peaks: bool = False,
     ) -> None:
-        self._twin: DeviceModel | None = None
+        self._device_model: DeviceModel | None = None
         self._adam = Adam({name: tensor.requires_grad_(True) for name, tensor in tensors.items()}, lr=lr)
         self.columns = dict(columns or {})
-        blank = self["means"].detach().new_zeros(len(self))
-        self.stats = {"gradient_sum": blank, "seen": blank.clone(), **(stats or {})}
+        zeros = self["means"].detach().new_zeros(len(self))
+        self.stats = {"gradient_sum": zeros, "seen": zeros.clone(), **(stats or {})}
         if peaks:
-            self.stats |= {name: blank.clone() for name in PEAK_STATS}
+            self.stats |= {name: zeros.clone() for name in PEAK_STATS}
 
     def __len__(self) -> int:
-        return len(self._adam.tensors["means"] if self._twin is None else self._twin)
+        return len(self._adam.tensors["means"] if self._device_model is None else self._device_model)
 
     def __getitem__(self, name: str) -> torch.Tensor:
         return self.adam.tensors[name]
 
     @property
     def adam(self) -> Adam:
-        """The optimizer, with what is trained at home."""
-        self._come_home()
+        """Optimizer, after copying the trained tensors to the host."""
+        self._copy_to_host()
         return self._adam
 
     @property
     def stats(self) -> dict[str, torch.Tensor]:
-        """What is added up, by name, at home."""
-        self._come_home()
+        """Stats by name, after copying them to the host."""
+        self._copy_to_host()
         return self._stats
 
     @stats.setter
     def stats(self, stats: dict[str, torch.Tensor]) -> None:
-        self._come_home()
+        self._copy_to_host()
         self._stats = stats
 
     @property
     def lr(self) -> dict[str, LearningRate]:
-        """The optimizer's learning rates; what is trained stays where it is."""
+        """Learning rates of the optimizer. Does not copy tensors."""
         return self._adam.lr
 
     @lr.setter
@@ -98,137 +97,140 @@ class Model:
         self._adam.lr = rates
 
     def device_model(self, backend: str, antialias: bool) -> DeviceModel | None:
-        """What a backend trains in the model's place, until somebody asks for what it is; see ``make_device_model``."""
-        if self._twin is None and FROZEN not in self.columns:
-            self._twin = make_device_model(backend, self._adam, self._stats, antialias=antialias)
-        return self._twin
+        """Return the model on the backend's device, or None if it cannot train there.
+
+        See ``make_device_model``. It is in use until :attr:`adam`, :attr:`stats` or a tensor is accessed.
+        """
+        if self._device_model is None and FROZEN not in self.columns:
+            self._device_model = make_device_model(backend, self._adam, self._stats, antialias=antialias)
+        return self._device_model
 
     def read(self, name: str) -> torch.Tensor:
-        """A trained tensor's or a statistic's values, to read only: what is trained elsewhere stays there."""
-        if self._twin is not None and (name in NAMES or name in self._stats):
-            return self._twin.read(name)
+        """Return a read-only copy or view of a trained tensor or a stat. The model stays on its device."""
+        if self._device_model is not None and (name in NAMES or name in self._stats):
+            return self._device_model.read(name)
         return self._stats[name] if name in self._stats else self._adam.tensors[name].detach()
 
     @property
-    def _here(self) -> list[str]:
-        """The trained tensors that are at home."""
-        return [name for name in self._adam.tensors if self._twin is None or name not in NAMES]
+    def _host_tensors(self) -> list[str]:
+        """Names of the trained tensors on the host."""
+        return [name for name in self._adam.tensors if self._device_model is None or name not in NAMES]
 
     @property
-    def _columns_here(self) -> list[dict[str, torch.Tensor]]:
-        """What is kept of every row at home beside them."""
-        return [self.columns, self._stats] if self._twin is None else [self.columns]
+    def _host_columns(self) -> list[dict[str, torch.Tensor]]:
+        """Tables of untrained values on the host: columns, and stats unless they are on the device."""
+        return [self.columns, self._stats] if self._device_model is None else [self.columns]
 
-    def _come_home(self) -> None:
-        twin, self._twin = self._twin, None
-        if twin is not None:
-            twin.copy_to_host()
+    def _copy_to_host(self) -> None:
+        device_model, self._device_model = self._device_model, None
+        if device_model is not None:
+            device_model.copy_to_host()
 
     @property
     def gaussians(self) -> Gaussians:
-        """The tensors as the rasterizer takes them, of a model of splats."""
+        """Tensors of a model of splats as rasterizer input."""
         return Gaussians(*(self[name] for name in NAMES))
 
     def read_rows(self, index: torch.Tensor) -> dict[str, torch.Tensor]:
-        """A copy of the trained tensors at indices (M,), by name."""
-        here = {name: self._adam.tensors[name].detach()[index] for name in self._here}
-        return here if self._twin is None else here | self._twin.read_rows(index)
+        """Copy the trained tensors at indices (M,), by name."""
+        rows = {name: self._adam.tensors[name].detach()[index] for name in self._host_tensors}
+        return rows if self._device_model is None else rows | self._device_model.read_rows(index)
 
     @torch.no_grad()
     def keep(self, mask: torch.Tensor) -> None:
-        """Removes the rows where ``mask`` (N,), on any device, is False."""
+        """Remove the rows where ``mask`` (N,), on any device, is False."""
         mask = mask.to(self._adam.tensors["means"].device)
         if not mask.any():
-            self._come_home()
-        if self._twin is not None and not mask.all():
-            self._twin.select(torch.nonzero(mask).squeeze(1))
-        for name in self._here:
+            self._copy_to_host()
+        if self._device_model is not None and not mask.all():
+            self._device_model.select(torch.nonzero(mask).squeeze(1))
+        for name in self._host_tensors:
             first, second = self._adam.state[name]
             self._replace(name, self._adam.tensors[name][mask], first[mask], second[mask])
-        for kept in self._columns_here:
-            kept.update({name: column[mask] for name, column in kept.items()})
+        for table in self._host_columns:
+            table.update({name: column[mask] for name, column in table.items()})
 
     @torch.no_grad()
     def append(self, rows: Mapping[str, torch.Tensor]) -> None:
-        """Adds rows at the end: every trained tensor's, and columns. Moments start at zero, as in 3DGS."""
-        added = len(rows["means"])
-        if self._twin is not None and added:
-            self._twin.append({name: rows[name] for name in NAMES})
-        for kept in self._columns_here:
-            for name, column in kept.items():
-                blank = column.new_zeros(added, *column.shape[1:])
-                kept[name] = torch.cat([column, rows.get(name, blank)])
-        for name in self._here:
+        """Add rows of all trained tensors, and optionally columns, with zero moments as in 3DGS."""
+        count = len(rows["means"])
+        if self._device_model is not None and count:
+            self._device_model.append({name: rows[name] for name in NAMES})
+        for table in self._host_columns:
+            for name, column in table.items():
+                zeros = column.new_zeros(count, *column.shape[1:])
+                table[name] = torch.cat([column, rows.get(name, zeros)])
+        for name in self._host_tensors:
             first, second = self._adam.state[name]
-            blank = torch.zeros_like(rows[name])
+            zeros = torch.zeros_like(rows[name])
             self._replace(
                 name,
                 torch.cat([self._adam.tensors[name], rows[name]]),
-                torch.cat([first, blank]),
-                torch.cat([second, blank]),
+                torch.cat([first, zeros]),
+                torch.cat([second, zeros]),
             )
 
     @torch.no_grad()
     def assign(self, name: str, values: torch.Tensor) -> None:
-        """Gives a trained tensor new values and zero moments."""
-        if self._twin is not None and name in NAMES:
-            self._twin.assign(name, values)
+        """Replace a trained tensor's values and reset its moments to zero."""
+        if self._device_model is not None and name in NAMES:
+            self._device_model.assign(name, values)
         else:
             self._replace(name, values, torch.zeros_like(values), torch.zeros_like(values))
 
     @torch.no_grad()
-    def raise_log_scales(self, least: torch.Tensor) -> None:
-        """No log-scale of a splat is below its least one (N,) from here."""
-        if self._twin is None:
-            self["log_scales"].copy_(torch.maximum(self["log_scales"], least[:, None]))
+    def raise_log_scales(self, minimum: torch.Tensor) -> None:
+        """Raise each splat's log-scales to its minimum (N,)."""
+        if self._device_model is None:
+            self["log_scales"].copy_(torch.maximum(self["log_scales"], minimum[:, None]))
         else:
-            self._twin.raise_log_scales(least)
+            self._device_model.raise_log_scales(minimum)
 
     def freeze_rows(self, rows: torch.Tensor) -> None:
-        """From now on these rows, (N,) bool, stay as they are."""
+        """Exclude rows, (N,) bool, from training from now on."""
         self.columns[FROZEN] = rows.to(self["means"])
 
     def freeze_gradients(self) -> None:
-        """After ``backward``: rows that are held have no part in the step."""
+        """Zero the gradients of frozen rows, after ``backward``."""
         if FROZEN in self.columns:
-            held = self.columns[FROZEN] > 0
+            frozen = self.columns[FROZEN] > 0
             for tensor in self.adam.tensors.values():
                 if tensor.grad is not None:
-                    tensor.grad[held] = 0
+                    tensor.grad[frozen] = 0
 
     def accumulate_stats(self, rendering: Rendering, shrink: float = 1) -> None:
-        """After ``backward``: adds up image-plane gradients' norms, and how often each splat was drawn.
+        """Add image-plane gradient norms and draw counts to the stats, after ``backward``.
 
-        Where there are ``PEAKS``, these rise to the largest gradient and radius.
+        Raises ``PEAK_STATS``, if kept, to the largest gradient and radius.
 
         Args:
-            shrink: how many times smaller the photograph was, which made gradients as many times larger (see
+            shrink: factor by which the image was reduced, which enlarged gradients by the same factor (see
                 ``TrainingData.threshold_scale``).
         """
         gradient = rendering.grad2d.norm(dim=1) / shrink
         self.stats["gradient_sum"] += gradient
         self.stats["seen"] += rendering.radii > 0
-        for name, now in zip(PEAK_STATS, (gradient, rendering.radii), strict=True):
+        for name, values in zip(PEAK_STATS, (gradient, rendering.radii), strict=True):
             if name in self.stats:
-                self.stats[name] = torch.maximum(self.stats[name], now)
+                self.stats[name] = torch.maximum(self.stats[name], values)
 
     def reset_stats(self) -> None:
-        """Begins anew with what is added up."""
-        if self._twin is not None:
-            self._twin.reset_stats()
+        """Set all stats to zero."""
+        if self._device_model is not None:
+            self._device_model.reset_stats()
             return
         for name, column in self.stats.items():
             self.stats[name] = torch.zeros_like(column)
 
     def mean_gradient(self) -> torch.Tensor:
-        """Mean norm of the image-plane gradient over the views that drew each splat; as ``gradient_sum``."""
+        """Return the mean image-plane gradient norm over the views that drew each splat."""
         return self.read("gradient_sum") / self.read("seen").clamp_min(1)
 
     def _replace(self, name: str, tensor: torch.Tensor, first: torch.Tensor, second: torch.Tensor) -> None:
         self._adam.replace(name, tensor.requires_grad_(True), first, second)
 
     def state_dict(self) -> dict:
-        """Tensors and numbers, as ``torch.load(weights_only=True)`` reads them."""
+        """Return tensors and numbers, as read by ``torch.load(weights_only=True)``."""
         return {
             "tensors": {name: tensor.detach() for name, tensor in self.adam.tensors.items()},
             "columns": self.columns,
@@ -237,32 +239,33 @@ class Model:
         }
 
     def load_state_dict(self, state: dict) -> None:
-        """Becomes what ``state_dict`` gave, or stays as it is.
+        """Restore a state. An invalid state leaves the model unchanged.
 
         Raises:
-            ValueError: it is of another model, or its parts do not fit together.
+            ValueError: the state is of another model, or inconsistent.
         """
         tensors, columns, stats, adam = (state[name] for name in ("tensors", "columns", "stats", "adam"))
         count = len(tensors["means"])
-        for ours, theirs in (
+        for expected, loaded in (
             (self.adam.tensors, tensors),
             ({name: first for name, (first, _) in self.adam.state.items()}, adam["m"]),
             ({name: second for name, (_, second) in self.adam.state.items()}, adam["v"]),
             (self.columns, columns),
             (self.stats, stats),
         ):
-            _check_alike(ours, theirs, count)
+            _check_compatible(expected, loaded, count)
         if not tensors.keys() == adam["steps"].keys() == self.adam.steps.keys():
-            raise ValueError(f"there are steps of {sorted(adam['steps'])}, tensors {sorted(tensors)}")
+            raise ValueError(f"steps of {sorted(adam['steps'])} do not match tensors {sorted(tensors)}")
         for name, tensor in tensors.items():
             self.adam.replace(name, tensor.requires_grad_(True))
-        self.columns, self.stats = columns, stats
+        self.columns = columns
+        self.stats = stats
         self.adam.load_state_dict(adam)
 
     def splats(self, min_scale: float = 0.0) -> Splats:
-        """A copy as plain arrays, with ``min_scale`` (FLoD, Eq. 4) baked into the scales.
+        """Copy the splats to arrays, with ``min_scale`` (FLoD, Eq. 4) baked into the scales.
 
-        What is trained beside NAMES becomes ``extras``, float32.
+        Trained tensors besides NAMES become ``extras``, float32.
         """
         arrays = {name: tensor.detach().cpu().numpy().copy() for name, tensor in self.adam.tensors.items()}
         if min_scale > 0:
@@ -272,24 +275,26 @@ class Model:
 
 
 def splat_rates(parameters: Parameters, extent: float) -> dict[str, LearningRate]:
-    """The learning rates of NAMES by a method's parameters, positions' times the scene extent."""
+    """Return the learning rates of NAMES by a method's parameters, positions times the scene extent."""
     p = parameters
-    further = [[p.lr_sh / 20]] * ((p.sh_degree + 1) ** 2 - 1)
+    higher_degrees = [[p.lr_sh / 20]] * ((p.sh_degree + 1) ** 2 - 1)
     return {
         "means": p.lr_means * extent,
         "quats": p.lr_quats,
         "log_scales": p.lr_scales,
         "opacity_logits": p.lr_opacities,
-        "sh": torch.tensor([[p.lr_sh], *further]),
+        "sh": torch.tensor([[p.lr_sh], *higher_degrees]),
     }
 
 
-def _check_alike(ours: Mapping[str, torch.Tensor], theirs: Mapping[str, torch.Tensor], count: int) -> None:
-    """Raises ValueError unless tensors have ``count`` rows each, and those that others have are like them."""
-    if missing := ours.keys() - theirs.keys():
+def _check_compatible(
+    expected: Mapping[str, torch.Tensor], loaded: Mapping[str, torch.Tensor], count: int
+) -> None:
+    """Raise ValueError unless loaded tensors have ``count`` rows and match expected shapes and types."""
+    if missing := expected.keys() - loaded.keys():
         raise ValueError(f"{sorted(missing)} are missing")
-    for name, tensor in theirs.items():
-        like = ours.get(name, tensor)
+    for name, tensor in loaded.items():
+        like = expected.get(name, tensor)
         if tensor.shape != (count, *like.shape[1:]) or tensor.dtype != like.dtype:
             raise ValueError(f"{name} is {tuple(tensor.shape)} of {tensor.dtype}, for {count} rows")
         if not tensor.is_contiguous():

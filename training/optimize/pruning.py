@@ -1,4 +1,4 @@
-"""Which splats of a finished level a coarser one keeps, and how these cover for the others. No torch."""
+"""Selection of a coarser level's splats from a finished level. Does not import torch."""
 
 from __future__ import annotations
 
@@ -7,33 +7,42 @@ import numpy as np
 from ..lod.blocks import SIZE
 
 
-def importance_threshold(importance: np.ndarray, views: np.ndarray, most: float) -> float:
-    """The importance from which on splats stay, so that no more are drawn than may be.
+def importance_threshold(importance: np.ndarray, views: np.ndarray, budget: float) -> float:
+    """Return the importance above which splats are kept within a budget.
 
     Args:
-        importance: (N,) of each splat; the most important ones stay.
-        views: (N,) in how many views each is drawn.
-        most: over these views together so many may be.
+        importance: (N,) importance of each splat; the most important ones are kept.
+        views: (N,) number of views that draw each splat.
+        budget: maximum number of splats drawn, summed over all views.
 
     Returns:
-        A value of ``importance``; 0 where all may stay, or none.
+        A value of ``importance``, or 0 if all splats or none fit the budget.
     """
     descending = np.argsort(-importance, kind="stable")
-    within = int(np.searchsorted(views[descending].cumsum(), most, side="right"))
+    within = int(np.searchsorted(views[descending].cumsum(), budget, side="right"))
     return float(importance[descending[within - 1]]) if 0 < within < len(importance) else 0.0
 
 
 def log_scale_gain(log_scales: np.ndarray, shares: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    """What is to be added to log-scales (N, 3), (N,), so that those that are kept cover what all did.
+    """Compute the enlargement that lets the kept splats cover the area of all splats.
 
-    In each block, areas weighted by the splats' shares of a pixel add up to what they were. At most doubles
-    a splat's size: a block of which nearly nothing is kept is not one surface.
+    Areas are weighted by the splats' shares of a pixel and summed in each block. Splats at most double in
+    size, because a block that loses nearly all splats is not one surface.
+
+    Args:
+        log_scales: (N, 3).
+        shares: (N,) share of a pixel.
+        kept: (N,) bool.
+
+    Returns:
+        (N,) float32 offsets to add to the log-scales.
     """
     if not len(kept):
         return np.zeros(0, np.float32)
     begins = np.arange(0, len(kept), SIZE)
-    ordered = np.sort(log_scales, axis=1)
-    covered = shares * np.exp(ordered[:, 1] + ordered[:, 2]).astype(np.float64)
-    before, after = (np.add.reduceat(each, begins) for each in (covered, covered * kept))
-    wider = np.log(np.clip(before / np.maximum(after, 1e-30), 1, 4)) / 2
-    return np.repeat(wider, SIZE)[: len(kept)].astype(np.float32)
+    ascending = np.sort(log_scales, axis=1)
+    area = shares * np.exp(ascending[:, 1] + ascending[:, 2]).astype(np.float64)
+    total = np.add.reduceat(area, begins)
+    remaining = np.add.reduceat(area * kept, begins)
+    gain = np.log(np.clip(total / np.maximum(remaining, 1e-30), 1, 4)) / 2
+    return np.repeat(gain, SIZE)[: len(kept)].astype(np.float32)

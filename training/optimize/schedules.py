@@ -1,4 +1,4 @@
-"""When things happen in training, and how rates fall."""
+"""Schedules of training: intervals, learning rates and image sizes."""
 
 from __future__ import annotations
 
@@ -6,27 +6,27 @@ from math import ceil, sqrt
 
 
 def log_linear(first: float, last: float, share: float) -> float:
-    """From the first to the last value, in equal factors, after a share of the steps (all from 1 on)."""
+    """Interpolate geometrically between two values; a ``share`` above 1 gives the last value."""
     share = min(share, 1.0)
     return float(first ** (1 - share) * last**share)
 
 
 def due(interval: int, step: int) -> bool:
-    """Whether what happens every ``interval`` steps (0: never) happens after the ``step``-th, from 1."""
+    """Return True every ``interval`` steps, counting from step 1. The interval 0 disables."""
     return interval > 0 and step % interval == 0
 
 
 def shrink_at(share: float, first: float, full: float) -> float:
-    """How many times smaller photographs are after a share of the steps.
+    """Return the factor by which images are reduced after a share of the steps.
 
-    Their pixels grow evenly to all. What is coarse is learned sooner from fewer pixels, by fewer splats
-    (DashGaussian, Chen et al. 2025). Sides
-    are whole tenths, so that photographs of each size can be kept.
+    The number of pixels grows linearly up to full size: fewer pixels and splats suffice to learn coarse
+    structure first (DashGaussian, Chen et al. 2025). Sides are rounded up to tenths, so that images of each
+    size can be cached.
 
     Args:
-        first: what photographs' sides begin with, as a share of their own.
-        full: the share of the steps from which they have all their pixels.
+        first: side of the first images, as a share of the full side.
+        full: share of the steps after which images have full size.
     """
-    grown = min(share / full, 1.0) if full > 0 else 1.0
-    side = sqrt(first**2 + (1 - first**2) * grown)
+    progress = min(share / full, 1.0) if full > 0 else 1.0
+    side = sqrt(first**2 + (1 - first**2) * progress)
     return 10 / ceil(10 * side - 1e-9)

@@ -1,4 +1,4 @@
-"""What photographs support: splats neither right before a camera nor so large that they wrap it."""
+"""Free space around the training cameras, and the bounds on splats that follow from it."""
 
 from __future__ import annotations
 
@@ -11,45 +11,45 @@ from scipy.spatial import KDTree
 from ..scenes.cameras import Camera
 
 NEIGHBOURS = (1, 2, 4)
-"""Which of a camera's nearest other cameras a place lies halfway to."""
+"""Ranks of the neighbours of a camera to form midpoints with."""
 INTERVAL = 50
-"""Steps between two looks at what is supported."""
+"""Steps between two removals of unsupported splats."""
 NEAREST_QUANTILE = 0.01
-"""Quantile of the depths of the points in a view that counts as the nearest, as some points are astray."""
+"""Quantile of point depths used as a view's nearest depth, which ignores outliers."""
 MARGIN = 0.1
-"""What a view is widened by on every side, as a share of its image."""
+"""Widening of a view on every side, as a share of its image."""
 MAX_POINTS = 20_000
-"""Most points that are looked at."""
+"""Maximum number of scene points to test."""
 MIN_PHOTOS = 2
-"""So many photographs have to see what is near to a place but not before it."""
+"""Photos that have to see a splat near a camera outside its frame."""
 
 
 def midpoint_views(cameras: Sequence[Camera]) -> list[Camera]:
-    """Views from halfway between each camera and its 1st, 2nd and 4th nearest, looking as the camera does.
+    """Create views at the midpoints between each camera and its 1st, 2nd and 4th nearest neighbours.
 
-    Places that need more cameras than there are do not exist.
+    Views keep the camera's rotation. Ranks beyond the number of cameras are skipped.
     """
     centers = np.array([camera.center for camera in cameras])
-    found = []
-    order = np.asarray(KDTree(centers).query(centers, k=1 + max(NEIGHBOURS))[1])  # itself is the first
-    for camera, others in zip(cameras, order[:, list(NEIGHBOURS)], strict=True):
-        for other in others[others < len(cameras)]:  # those that do not exist are numbered beyond
+    views = []
+    order = np.asarray(KDTree(centers).query(centers, k=1 + max(NEIGHBOURS))[1])  # column 0: the camera
+    for camera, neighbours in zip(cameras, order[:, list(NEIGHBOURS)], strict=True):
+        for neighbour in neighbours[neighbours < len(cameras)]:  # scipy numbers missing ones beyond the end
             pose = camera.world_to_camera.copy()
-            pose[:3, 3] = -pose[:3, :3] @ (camera.center + centers[other]) / 2
-            found.append(replace(camera, world_to_camera=pose, image=None))
-    return found
+            pose[:3, 3] = -pose[:3, :3] @ (camera.center + centers[neighbour]) / 2
+            views.append(replace(camera, world_to_camera=pose, image=None))
+    return views
 
 
 class Support:
-    """The room that whoever took the photographs stood in and walked through.
+    """Free space that the photographer stood in and walked through.
 
-    Nothing is near before a camera, or before a place halfway between two, but what the scene's points show.
-    Nor is anything as near beside or behind one but what two photographs see: what only one of them sees may
-    be at any depth along its rays, and whoever turns around there has it before his eyes.
+    No splat may stand close in front of a camera, or of the midpoint of two, closer than the scene's points
+    allow. Within the same distance outside the frame, splats need to be seen by two photos: a splat seen by
+    one photo may lie at any depth along its rays, and would block the view of a camera that turns there.
 
     Args:
-        cameras: the training views.
-        points: (P, 3) the scene's; at most POINTS, evenly taken from their order, are looked at.
+        cameras: training views.
+        points: (P, 3) scene points; at most ``MAX_POINTS``, evenly spaced in their order, are tested.
     """
 
     def __init__(self, cameras: Sequence[Camera], points: np.ndarray) -> None:
@@ -58,43 +58,43 @@ class Support:
         self._views = [*cameras, *midpoint_views(cameras)]
         depths = (view.view_space(points)[view.sees(points), 2] for view in self._views)
         self._nearest = np.array(
-            [np.quantile(seen, NEAREST_QUANTILE) if len(seen) else 0.0 for seen in depths]
+            [np.quantile(depth, NEAREST_QUANTILE) if len(depth) else 0.0 for depth in depths]
         )
-        self._eyes = KDTree(np.array([view.center for view in self._views]))
+        self._positions = KDTree(np.array([view.center for view in self._views]))
         sides = [max(view.width / view.fx, view.height / view.fy) for view in self._views]
         self._slant = float(np.sqrt(1 + 2 * ((1 + MARGIN) * max(sides)) ** 2))
-        """A point in a view lies at most this many times as far as it is deep, wherever its center is."""
+        """Maximum ratio of distance to depth of a point in a view, wherever its principal point is."""
 
     def nearest_positions(self, means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The nearest of the places to each of the points (N, 3): how far it is, in scene units, and which.
+        """Find the nearest camera or midpoint of each point (N, 3).
 
         Returns:
-            (N,) float64 and (N,) int.
+            (N,) float64 distances in scene units, and (N,) int indices of the positions.
         """
-        distances, places = self._eyes.query(means, workers=-1)
-        return np.asarray(distances), np.asarray(places)
+        distances, positions = self._positions.query(means, workers=-1)
+        return np.asarray(distances), np.asarray(positions)
 
     def find_intruding(
-        self, means: np.ndarray, distances: np.ndarray, places: np.ndarray, share: float
+        self, means: np.ndarray, distances: np.ndarray, positions: np.ndarray, share: float
     ) -> np.ndarray:
-        """Which points (N, 3) stand in the way: nearer than a share of what is nearest in a place's view.
+        """Find points (N, 3) that are closer to a view than a share of its nearest depth.
 
         Args:
-            distances, places: as :meth:`nearest_positions` gives them.
+            distances, positions: result of :meth:`nearest_positions`.
 
         Returns:
             (N,) bool.
         """
-        found = np.zeros(len(means), bool)
+        intruding = np.zeros(len(means), bool)
         near = np.flatnonzero(distances < share * self._slant * self._nearest.max())
         points = means[near].astype(np.float64)
         for view, nearest in zip(self._views, self._nearest, strict=True):
-            before = view.view_space(points)[:, 2] < share * nearest
-            before[before] = view.sees(points[before], margin=MARGIN)
-            found[near] |= before
-        beside = distances[near] < share * self._nearest[places[near]]
-        seen = np.zeros(int(beside.sum()), np.int64)
+            in_front = view.view_space(points)[:, 2] < share * nearest
+            in_front[in_front] = view.sees(points[in_front], margin=MARGIN)
+            intruding[near] |= in_front
+        around = distances[near] < share * self._nearest[positions[near]]
+        photos = np.zeros(int(around.sum()), np.int64)
         for camera in self._cameras:
-            seen += camera.sees(points[beside])
-        found[near[beside]] |= seen < MIN_PHOTOS
-        return found
+            photos += camera.sees(points[around])
+        intruding[near[around]] |= photos < MIN_PHOTOS
+        return intruding

@@ -104,11 +104,11 @@ def test_splats_come_and_go_there_as_they_do_here(graphics, monkeypatch, most):
         model.append(model.read_rows(torch.tensor([7, 7, 3])) | {"level": torch.ones(3)})
         model.keep(torch.arange(len(model)) != 5)
         model.assign("sh", 2 * model.read("sh"))
-    assert one._twin is not None and other._twin is None
+    assert one._device_model is not None and other._device_model is None
     for part, theirs in zip(_flat(one.state_dict()), _flat(other.state_dict()), strict=True):
         assert torch.equal(part, theirs)
     one.keep(torch.zeros(len(one), dtype=torch.bool))
-    assert len(one) == 0 and one._twin is None
+    assert len(one) == 0 and one._device_model is None
 
 
 def test_density_control_moves_a_few_numbers_of_a_splat(graphics):

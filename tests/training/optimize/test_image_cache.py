@@ -70,7 +70,7 @@ def test_never_more_than_the_budget_is_held(room):
 
     targets.prefetch = watched  # type: ignore[method-assign]
     run(targets, order)
-    kept = sum(len(reading.result().image) for reading in targets._kept.values()) // SIDE
+    kept = sum(len(reading.result().image) for reading in targets._cached.values()) // SIDE
     assert targets.held_bytes == kept * ONE <= max(most, targets.held_bytes) <= room * ONE + 7
     assert sum(disk.reads.values()) >= 20
     if room >= 20:
@@ -99,7 +99,7 @@ def test_photographs_are_there_before_they_are_needed():
     for step, index in enumerate(order):
         targets.prefetch(step, plan)
         targets.target(view(index))
-        for reading in list(targets._kept.values()):
+        for reading in list(targets._cached.values()):
             reading.result()
         assert {f"{i}" for i in order[step : step + 5]} <= disk.reads.keys()
         assert len(disk.reads) <= step + 5
@@ -118,7 +118,7 @@ def test_a_plan_may_be_wrong_change_and_end():
             targets.prefetch(step, plan)
             assert targets.target(view(order[step], side)).image.shape == (side, side, 3)
             assert targets.held_bytes <= 4 * ONE
-    for reading in targets._kept.values():
+    for reading in targets._cached.values():
         assert len(reading.result().image) == SIDE
 
 
@@ -154,7 +154,7 @@ def test_an_unreadable_photograph_is_told_by_the_step_that_needs_it(tmp_path):
 
     for step in range(4):
         data.view_at(step, planned)
-    for reading in list(data.images._kept.values()):
+    for reading in list(data.images._cached.values()):
         reading.exception()  # by now 4 and 6 were tried
     places[4].write_bytes(whole)  # type: ignore[union-attr]
     assert data.view_at(4, planned).index == 4, "what is there again when it is needed is no error"
@@ -271,6 +271,6 @@ def test_if_nothing_is_said_a_quarter_of_what_is_free(monkeypatch, tmp_path):
     assert 1 << 24 < memory_module.free_memory() < 1 << 48
     for name, text in {"max": "1000", "current": "900", "stat": "anon 5\ninactive_file 300\n"}.items():
         (tmp_path / f"memory.{name}").write_text(text)
-    assert memory_module._in_container(tmp_path) == 400
+    assert memory_module._container_memory(tmp_path) == 400
     (tmp_path / "memory.max").write_text("max\n")
-    assert memory_module._in_container(tmp_path) > 1 << 60
+    assert memory_module._container_memory(tmp_path) > 1 << 60

@@ -484,7 +484,7 @@ class Method(method.Method[NeuralOctreeParameters, Drawing]):
         if not self.parameters.margin or self.data.transparent:
             return baked
         room = self.parameters.margin_room(self.parameters.max_splats)
-        margins = self.margins().continued(Gaussians.of(baked, self.device), room)
+        margins = self.margins().extend(Gaussians.of(baked, self.device), room)
         level, bias = np.ones(len(margins), np.uint8), np.zeros(len(margins), np.float32)
         arrays = {name: tensor.cpu().numpy() for name, tensor in vars(margins).items()}
         return Splats.concatenated([baked, Splats(**arrays, extras={"lod_level": level, BIAS: bias})])

@@ -209,7 +209,7 @@ def test_what_stays_faint_is_removed_and_what_was_not_seen_stays(data):
     octree.grow(20)
     assert torch.equal(octree.model["means"].detach(), torch.cat([kept[:5], kept[10:]]))
     octree.model.stats["seen"] += 1
-    with pytest.raises(LodgsError, match="No splat is left"):
+    with pytest.raises(LodgsError, match="no splats remain"):
         octree.grow(20)
 
 
@@ -254,7 +254,7 @@ def test_what_no_view_sees_much_of_goes(data, far_share, monkeypatch):
 
 
 def test_an_impossible_least_weight_says_so(data):
-    with pytest.raises(LodgsError, match=r"No splat is left at step 40.*'least_weight'"):
+    with pytest.raises(LodgsError, match=r"no splats remain at step 40.*'least_weight'"):
         make(data, least_weight=1.0).prune_unseen(39)
 
 

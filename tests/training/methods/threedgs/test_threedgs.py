@@ -111,7 +111,7 @@ def test_positions_rates_fall_in_equal_factors(data):
 
 def test_when_all_is_too_transparent_it_says_so(data):
     method = make(data, steps=10, prune_interval=1, min_opacity=1.0)
-    with pytest.raises(LodgsError, match=r"No splat is left at step 1.*'min_opacity'"):
+    with pytest.raises(LodgsError, match=r"no splats remain at step 1.*'min_opacity'"):
         method.train_step(0)
 
 
