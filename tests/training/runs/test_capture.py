@@ -89,7 +89,7 @@ def test_capture_overwrites_nothing_and_leaves_no_partial_scene(ball, tmp_path):
     with pytest.raises(LodgsError, match="already exists"):
         write_scene(tmp_path / "existing", ball, views, near)
     unseen = Splats(**{**vars(ball), "means": ball.means + np.float32(1e4)})
-    with pytest.raises(LodgsError, match="No two views"):
+    with pytest.raises(LodgsError, match="no two views"):
         write_scene(tmp_path / "new", unseen, views, near)
     assert [path.name for path in tmp_path.iterdir()] == ["existing"] and not any(
         (tmp_path / "existing").iterdir()
@@ -118,7 +118,7 @@ def test_views_along_a_path_are_level_and_look_in_all_directions(ball):
     turned = np.cross(ahead[-6], ahead[-5])  # views turn to the left first, with -y up
     assert turned[1] < 0 < near < 1
     for invalid in (path[:1], np.array([[0, 0, 0], [0, 5, 0]], float)):
-        with pytest.raises(LodgsError, match="no length, or leads straight up"):
+        with pytest.raises(LodgsError, match="no length or is vertical"):
             walk_views(ball, invalid, np.array([0.0, -1, 0]), 6)
 
 
@@ -234,7 +234,7 @@ def test_cancelled_capture_leaves_no_files_and_resumes_after_the_run_was_moved(
 
 @pytest.mark.parametrize(
     ("words", "message"),
-    [(["--cameras", "."], "no two camera files"), (["--views", "1"], "views = 1")],
+    [(["--cameras", "."], "camera files"), (["--views", "1"], "views = 1")],
 )
 def test_capture_reports_missing_views(ball, tmp_path, capsys, monkeypatch, words, message):
     monkeypatch.chdir(tmp_path)
