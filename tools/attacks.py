@@ -279,8 +279,9 @@ def base_splats() -> Splats:
     means = rng.normal(0, rng.choice([0.2, 0.8], (BASE_SPLATS, 1)), (BASE_SPLATS, 3))
     quats, log_scales = rng.normal(size=(BASE_SPLATS, 4)), rng.normal(-4.5, 0.4, (BASE_SPLATS, 3))
     logits, sh = rng.normal(0, 2, BASE_SPLATS), rng.normal(0, 0.3, (BASE_SPLATS, 16, 3))
-    arrays = (means, quats, log_scales, logits, sh)
-    return Splats(*(array.astype(np.float32) for array in arrays))
+    arrays = (array.astype(np.float32) for array in (means, quats, log_scales, logits, sh))
+    means, quats, log_scales, logits, sh = arrays
+    return Splats(means, quats, log_scales, logits, sh)
 
 
 def exit_code(process: Process) -> int | None:

@@ -75,7 +75,7 @@ def test_paths_inside_a_run_follow_the_moved_run(tmp_path):
         ('out = "b"\n', "has no key 'scene'"),
         ("scene = 3\nout = 'b'\n", "Invalid path scene = 3"),
         ('scene = "a"\nout = "b"\nmethod = "nerf"\n', "no method 'nerf'"),
-        ('scene = "a"\nout = "b"\npreset = "fast"\n', "no preset 'fast'"),
+        ('scene = "a"\nout = "b"\npreset = "fast"\n', "Unknown preset: 'fast'"),
         ('scene = "a"\nout = "b"\nbackend = "metal"\n', "Unknown backend: 'metal'"),
         ('scene = "a"\nout = "b"\nimage_scale = 0\n', "image_scale = 0"),
         ('scene = "a"\nout = "b"\nseed = -1\n', "seed = -1"),
@@ -112,7 +112,7 @@ def test_paths_inside_a_run_follow_the_moved_run(tmp_path):
         ('scene = "a"\nout = "b"\npreset = {}\n', "preset = {}"),
         ('scene = "a"\nout = "b"\nparameters = 3\n', "parameters = 3"),
         ('scene = "a\\u0000b"\nout = "b"\n', "scene contains invalid characters"),
-        ('scene = "a"\nout = "b"\n[parameters]\nlr_sh = 1e300\n', "lr_sh = 1e\\+300 is more than any use"),
+        ('scene = "a"\nout = "b"\n[parameters]\nlr_sh = 1e300\n', "lr_sh = 1e\\+300 is too large"),
         (
             'scene = "a"\nout = "b"\n[parameters]\nmax_splats = 2147483648\n',
             "max_splats = 2147483648 is more",

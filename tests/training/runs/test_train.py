@@ -499,10 +499,10 @@ def test_unexpected_error_is_an_event_with_details_in_the_log(uninterrupted, tmp
 @pytest.mark.parametrize(
     ("views", "keys", "message"),
     [
-        (2, {}, "Of the 2 usable views in .* 1 would be trained on"),
-        (4, {"test_every": 2, "validation": True}, "Of the 4 usable views in .* 0 would be"),
-        (4, {"validation": True}, "validation leaves some out and measures none"),
-        (4, {"test_every": 0, "image_scale": 0.15}, "at 9 x 7 pixels; 11 are needed"),
+        (2, {}, "of the 2 usable views in .* 1 remain"),
+        (4, {"test_every": 2, "validation": True}, "of the 4 usable views in .* 0 remain"),
+        (4, {"validation": True}, "for validation"),
+        (4, {"test_every": 0, "image_scale": 0.15}, "9 x 7 pixels, 11 per side"),
     ],
 )
 def test_scene_with_too_few_views_or_pixels_is_rejected(tiny_scene, tmp_path, views, keys, message):
