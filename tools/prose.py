@@ -14,7 +14,6 @@ import sys
 from collections import Counter, defaultdict
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TypeGuard
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("blender_lodgs", "training")
@@ -43,11 +42,11 @@ def texts(tree: ast.AST) -> Iterator[tuple[str, str]]:
                 yield "docstrings", doc
         elif isinstance(node, ast.Call):
             for keyword in node.keywords:
-                if keyword.arg in ("description", "help", "about") and _is_text(keyword.value):
-                    yield "interface", keyword.value.value
+                if keyword.arg in ("description", "help", "about") and _text(keyword.value) is not None:
+                    yield "interface", _text(keyword.value) or ""
             name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
             if name in ("parameter", "Control"):
-                yield from (("interface", arg.value) for arg in node.args if _is_text(arg))
+                yield from (("interface", text) for arg in node.args if (text := _text(arg)) is not None)
             elif name.endswith(("Error", "warn", "warning")):
                 yield from (("errors", _message(arg)) for arg in node.args if _message(arg))
 
@@ -95,14 +94,15 @@ def problems(sources: dict[str, str], listed: int = 0) -> list[str]:
     return report
 
 
-def _is_text(node: ast.expr) -> TypeGuard[ast.Constant]:
-    return isinstance(node, ast.Constant) and isinstance(node.value, str)
+def _text(node: ast.expr) -> str | None:
+    """Return the value of a string constant, else None."""
+    return node.value if isinstance(node, ast.Constant) and isinstance(node.value, str) else None
 
 
 def _message(node: ast.expr) -> str:
     """Return the constant parts of a string or f-string of at least three words, else an empty string."""
     parts = node.values if isinstance(node, ast.JoinedStr) else [node]
-    text = "".join(part.value if _is_text(part) else "X" for part in parts)
+    text = "".join("X" if (value := _text(part)) is None else value for part in parts)
     return text if len(_words(text)) > 2 else ""
 
 
