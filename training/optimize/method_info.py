@@ -1,4 +1,4 @@
-"""What a method says of itself without torch: its name, parameters and presets, for panels and job checks."""
+"""Description of methods for panels and job checks: name, parameters and presets. Does not import torch."""
 
 from __future__ import annotations
 
@@ -11,42 +11,43 @@ from ..errors import LodgsError
 from .parameters import Parameters
 
 PRESETS = {
-    "draft": "Minutes on two processor cores: a first look",
+    "draft": "First look: minutes on two CPU cores",
     "standard": "An evening on a laptop, minutes on a GPU",
-    "paper": "The paper's own schedule",
+    "paper": "Schedule of the paper",
 }
-"""The presets that every method has, each with what it is for."""
+"""Presets of every method and their purpose."""
 
 
 def no_split(parameters: Parameters) -> None:
-    """Of methods whose cells make all levels by themselves."""
+    """Return None: every cell trains all levels."""
     return None
 
 
 @dataclass(frozen=True)
 class MethodInfo:
-    """A method, as its folder declares it in ``METHOD``.
+    """Description of a method, declared as ``METHOD`` by its package.
 
     Attributes:
-        name: what jobs, command lines and bundles call it.
-        number: its place in lists, and what a .blend stores of it: the next free one, for good.
-        label: what a panel calls it.
-        about: what it makes, as the end of a sentence that begins with the label.
-        parameters: the class of its parameters.
-        presets: the parameters of each of PRESETS.
-        rule: the name of the rule that chooses its detail (``training.lod``); "" for none.
-        offered: the parameters that a panel shows, beside the presets.
-        from_base: whether training can begin with splats (a job's ``base``) instead of the scene's points.
-        base_in_parts: whether a base may stay in its file (``SplatRows``).
-        for_splats: whether it is what to offer first for splats that are there already.
-        captured: values of parameters that are others where the photographs are the base's own pictures, by
-            name, whatever the preset.
-        in_cells: the method that trains cells of a scene that is too large for one run: its own name, or one
-            whose splats, put together, are then its base; "" where cells cannot be put together.
-        divided: of the parameters of a scene in cells, those of a run of all of it that makes the coarser
-            levels once, and those of the cells' runs, which go on from them; None: cells make all levels.
+        name: name in jobs, command lines and bundles.
+        number: position in lists, also stored in .blend files: the next free number, never changed.
+        label: label in panels.
+        about: result of the method, as the end of a sentence that begins with the label.
+        parameters: class of its parameters.
+        presets: parameters of each of PRESETS.
+        rule: name of its level-of-detail rule (``training.lod``); "" if none.
+        panel_parameters: parameters shown in panels, in addition to presets.
+        from_base: True if training can start from splats (a job's ``base``) instead of the scene's points.
+        streams_base: True if a base may stay on disk (``SplatRows``).
+        suggested_for_base: True for the default method of imported splats.
+        capture_values: values of parameters, by name, that override the preset if the images are renders of
+            the base.
+        cell_method: method that trains the cells of a large scene: the method itself, or one whose merged
+            splats are its base. "" if cells cannot be merged.
+        split_parameters: split the parameters of a scene in cells into those of a run over the full scene,
+            which trains the coarser levels, and those of the cells, which continue them. Returns None if
+            every cell trains all levels.
         unused: names of inherited parameters that this method ignores.
-        package: the folder as a module, set where the method is found.
+        package: package of the method as a module name, set at discovery.
     """
 
     name: str
@@ -68,17 +69,15 @@ class MethodInfo:
 
     @property
     def fields(self) -> list[Field]:
-        """The parameters that can be set."""
-        return [each for each in fields(self.parameters) if each.name not in self.unused]
+        """Parameters that can be set."""
+        return [f for f in fields(self.parameters) if f.name not in self.unused]
 
     def preset(self, name: str) -> Parameters:
-        """The parameters of a preset.
+        """Return the parameters of a preset.
 
         Raises:
-            LodgsError: there is no such preset.
+            LodgsError: unknown preset.
         """
         if name not in self.presets:
-            raise LodgsError(
-                f"There is no preset {quote(name)}.", f"Choose one of: {', '.join(self.presets)}."
-            )
+            raise LodgsError(f"Unknown preset: {quote(name)}.", f"Choose one of: {', '.join(self.presets)}.")
         return self.presets[name]

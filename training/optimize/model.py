@@ -18,7 +18,7 @@ from .parameters import Parameters
 NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh")
 """Tensors of every splat. A model of splats may train further tensors, (N,), under other names."""
 PEAK_STATS = ("gradient_max", "radius_max")
-"""Stats of densification by maxima since the last reset: gradient as in ``gradient_sum``, radius in pixels."""
+"""Stats of densification by maxima: gradient as in ``gradient_sum``, and radius in pixels."""
 
 
 OUTSIDE = "outside"

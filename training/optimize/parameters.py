@@ -1,4 +1,4 @@
-"""What a job can set: parameters as dataclass fields that know their bounds, units and help. No torch."""
+"""Parameters of methods: dataclass fields with bounds, units and help. Does not import torch."""
 
 from __future__ import annotations
 
@@ -11,10 +11,14 @@ from ..documents import quote
 from ..errors import LodgsError
 from ..scenes.depths import DEPTH_KINDS
 
-MAX_MARGIN_SHARE, MAX_MARGIN_SPLATS = 0.1, 4000
-"""The most of all splats that may continue photographs beyond their edges, and the most at all."""
-MAX_INTEGER, MAX_NUMBER = 2**31 - 1, 1e9
-"""The largest whole number, and the largest other one, that any parameter takes."""
+MAX_MARGIN_SHARE = 0.1
+"""Maximum share of all splats for margins."""
+MAX_MARGIN_SPLATS = 4000
+"""Maximum number of splats for margins."""
+MAX_INTEGER = 2**31 - 1
+"""Maximum value of any integer parameter."""
+MAX_NUMBER = 1e9
+"""Maximum value of any other numeric parameter."""
 
 
 def parameter(
@@ -28,185 +32,183 @@ def parameter(
     unit: str = "",
     choices: Sequence[str] = (),
 ) -> Any:
-    """A field of a `Parameters` class. All that is said of it is in the field's ``metadata``, by these names.
+    """Create a field of a `Parameters` class. The arguments are in the field's ``metadata``, by name.
 
     Args:
-        default: a bool, int, float or str, or a tuple of one of these with an entry for each level; its type
-            is the parameter's.
-        about: help, one or two sentences.
-        label: what a panel calls it; "" for its name in words.
-        low, high: bounds of a number, inclusive; ``high`` is never above MOST_WHOLE or MOST_NUMBER.
-        above: the number that it has to exceed, in place of ``low``.
+        default: a bool, int, float or str, or a tuple of one of these with an entry per level. Determines the
+            type of values.
+        about: help text, one or two sentences.
+        label: label in panels; "" derives it from the name.
+        low, high: inclusive bounds of a number, further limited by MAX_INTEGER or MAX_NUMBER.
+        above: exclusive lower bound, in place of ``low``.
         unit: "px", "steps", ...; "" for a pure number.
-        choices: the texts that are possible.
+        choices: valid values of a str.
     """
-    described = {"about": about, "label": label, "low": low, "high": high, "above": above}
-    return field(default=default, metadata=described | {"unit": unit, "choices": tuple(choices)})
+    metadata = {"about": about, "label": label, "low": low, "high": high, "above": above}
+    return field(default=default, metadata=metadata | {"unit": unit, "choices": tuple(choices)})
 
 
 @dataclass(frozen=True)
 class Parameters:
-    """What every method has; a job begins with the values of a preset.
+    """Parameters of every method. Presets give the initial values of a job.
 
-    Sizes and thresholds do not depend on the scene's scale: they are in pixels of the training images or in
+    Sizes and thresholds are independent of the scene's scale: they are in pixels of the training images or
     multiples of the scene extent.
     """
 
     steps: int = parameter(3000, "Training steps.", above=0, unit="steps")
     max_splats: int = parameter(
         60_000,
-        "Most splats; those with the largest gradients are densified first. Of more structure-from-motion "
-        "points than this, training begins with a random sample.",
+        "Maximum number of splats. Those with the largest gradients are densified first. If the scene has "
+        "more points, training starts from a random sample.",
         above=0,
     )
     grad_threshold: float = parameter(
-        1e-4, "Mean image-plane gradient (3DGS units) above which splats are added, at one megapixel."
+        1e-4,
+        "Mean image-plane gradient (3DGS units, at one megapixel) above which splats are added.",
     )
-    min_opacity: float = parameter(0.005, "Splats below this opacity are removed.", high=1)
-    sh_degree: int = parameter(
-        3, "Degree of the spherical harmonics that carry view-dependent colour, 0 to 3.", high=3
-    )
-    sh_interval: int = parameter(250, "Steps after which the next degree joins in.", unit="steps")
-    ssim_weight: float = parameter(0.2, "Weight of D-SSIM against L1 in the loss.", high=1)
+    min_opacity: float = parameter(0.005, "Remove splats below this opacity.", high=1)
+    sh_degree: int = parameter(3, "Degree of spherical harmonics for view-dependent colour, 0 to 3.", high=3)
+    sh_interval: int = parameter(250, "Steps between increases of the harmonics' degree.", unit="steps")
+    ssim_weight: float = parameter(0.2, "Weight of D-SSIM relative to L1 in the loss.", high=1)
     free_depth: float = parameter(
         0.5,
-        "Nothing stands before a training view, or one halfway between two, that is nearer than this share "
-        "of the nearest points in it, nor as near beside or behind its eye what fewer than two photographs "
-        "see; 0 lets splats stand anywhere.",
+        "Remove splats closer to a training camera, or to the midpoint of two neighbouring cameras, than "
+        "this fraction of its nearest scene points. Within the same distance outside the frame, keep only "
+        "splats seen by two or more photos. 0 disables.",
         high=1,
     )
     largest: float = parameter(
         0.3,
-        "Largest standard deviation of a splat, as a share of its distance from the nearest training view; 0 "
-        "sets no bound.",
+        "Maximum standard deviation of a splat, as a fraction of its distance from the nearest training "
+        "camera. 0 disables.",
     )
     random_background: bool = parameter(
         True,
-        "Whether every step draws over another colour, so that no splat can use the black behind it as a "
-        "colour of the scene; not for photographs whose black is nothing.",
+        "Use a random background colour in every step, so that splats cannot use the black background as a "
+        "scene colour. Disable for photos with a black background.",
     )
     margin: float = parameter(
         0.5,
-        "How much photographs are continued on every side, as a share of their size, where none shows "
-        "anything: blurred colours at the depth of the edge instead of black. 0 leaves it empty.",
+        "Width of the margin around photos, as a fraction of their size. Areas outside all photos are filled "
+        "with blurred colours at the depth of the edge. 0 disables.",
         high=2,
     )
     antialias: bool = parameter(
         True,
-        "Whether splats are drawn through Mip-Splatting's 2D filter, which keeps the light of those that are "
-        "smaller than a pixel, instead of 3DGS's dilation. Where a run begins with a base, the base decides.",
+        "Use the 2D filter of Mip-Splatting, which preserves the brightness of splats smaller than a pixel, "
+        "instead of the dilation of 3DGS. Runs that start from a base use the base's setting.",
     )
     dropout: float = parameter(
         0.2,
-        "Where photographs are few, a step leaves out splats at random, so that none serves one photograph "
-        "alone: this share of them with one photograph, less with more, none from 40 on, nor in the last "
-        "eighth of the steps. Not in the papers.",
+        "Fraction of random splats to drop in each step, which reduces overfitting to few photos. It "
+        "decreases to 0 at 40 photos, and is 0 in the last eighth of the steps. Not in the papers.",
         high=0.5,
     )
     depth_weight: float = parameter(
         0.0,
-        "Weight in the loss, at the start, of how far off the depth of splats is where it is known (see "
-        "depth): L1 of inverse depth, in inverse median depths. It falls to a hundredth; 0 for none.",
+        "Initial weight of the depth loss where depth is known (see depth): L1 of inverse depth, in inverse "
+        "median depths. It decreases to a hundredth. 0 disables.",
         label="Depth Weight",
     )
     depth: str = parameter(
         "metric",
-        "What is known of depth: maps in the folder depths, in the scene's unit (metric); maps of depth "
-        "(relative) or of inverse depth (inverse) of which scale and shift are found by the scene's points, "
-        "view by view; or only these points themselves (points).",
-        label="Depth Is",
+        "Source of depth: maps in the folder depths in scene units (metric), maps of depth (relative) or of "
+        "inverse depth (inverse) with scale and shift fitted to the scene's points in each view, or only "
+        "these points (points).",
+        label="Depth Source",
         choices=DEPTH_KINDS,
     )
     match_exposure: bool = parameter(
         True,
-        "Whether photographs that are exposed or balanced otherwise than those beside them are evened first, "
-        "by the points that they share. What changes smoothly from one to the next stays.",
+        "Before training, correct photos whose exposure or white balance differs from their neighbours, by "
+        "shared scene points. Smooth changes along the sequence remain.",
     )
     lr_exposure: float = parameter(
         0.0,
-        "Learning rate of each photograph's own gain and offset of colours, which pictures do not have; for "
-        "photographs that differ in exposure or white balance. 0 learns none.",
+        "Learning rate of a colour gain and offset per photo, which renders do not use. For photos with "
+        "different exposure or white balance. 0 disables.",
     )
     lr_means: float = parameter(
         3e-4,
-        "Learning rate of positions, times the scene extent, at the start of a level (FLoD) or of the run.",
+        "Learning rate of positions, times the scene extent, at the start of a level (FLoD) or the run.",
     )
-    lr_means_final: float = parameter(3e-5, "The same at the end.")
+    lr_means_final: float = parameter(3e-5, "Learning rate of positions, times the scene extent, at the end.")
     lr_scales: float = parameter(1e-2, "Learning rate of log-scales.")
     lr_quats: float = parameter(1e-3, "Learning rate of quaternions.")
     lr_opacities: float = parameter(5e-2, "Learning rate of opacity logits.")
     lr_sh: float = parameter(
-        2.5e-3, "Learning rate of the base colour; the other harmonics take a twentieth."
+        2.5e-3, "Learning rate of the base colour. Higher harmonics use a twentieth of it."
     )
 
     @property
     def levels(self) -> int:
-        """Number of levels, a parameter where there can be several; 0 where the scene decides."""
+        """Number of levels, a parameter of methods with several; 0 if it depends on the scene."""
         return 1
 
     @property
     def total_steps(self) -> int:
-        """Training steps of a whole run."""
+        """Training steps of the run."""
         return self.steps
 
     @property
     def base_steps(self) -> int:
-        """Training steps of a run that begins with a base, where the method can."""
+        """Training steps of a run that starts from a base."""
         return self.total_steps
 
     @property
     def continues_levels(self) -> bool:
-        """Whether training goes on from coarser levels, which a base has."""
+        """True if training continues the coarser levels of a base."""
         return False
 
     @property
     def max_trained_splats(self) -> int:
-        """Most splats that are trained at a time."""
+        """Maximum number of splats trained at the same time."""
         return self.max_splats
 
     def margin_room(self, budget: int) -> int:
-        """How many of at most so many splats may continue photographs."""
+        """Return the share of a budget of splats that is reserved for margins."""
         return min(int(MAX_MARGIN_SHARE * budget), MAX_MARGIN_SPLATS) if self.margin else 0
 
     def check(self) -> None:
-        """What values must be beside each other; a method's class says it of its own.
+        """Check parameters against each other. Methods override this.
 
         Raises:
-            LodgsError: where they are not.
+            LodgsError: parameters are inconsistent.
         """
 
 
 @dataclass(frozen=True)
 class DensityParameters(Parameters):
-    """Those of methods that clone, split and prune as 3DGS does (``optimize.density_control``)."""
+    """Parameters of methods with the density control of 3DGS (``optimize.density_control``)."""
 
     first_resolution: float = parameter(
         0.35,
-        "Photographs begin this much smaller, as a share of their side; 1 trains on their size throughout.",
+        "Initial side of the training images, as a fraction of the full side. 1 always trains at full size.",
         above=0,
         high=1,
     )
     full_resolution: float = parameter(
-        0.5, "Share of the steps after which photographs have their size.", high=1
+        0.5, "Fraction of the steps after which training images have full size.", high=1
     )
     long_axis: bool = parameter(
         True,
-        "Whether splats are added by splitting one in two along its longest axis, so that the picture stays "
-        "much as it was; otherwise small ones are cloned and large ones split at random, as in 3DGS.",
+        "Densify by splitting splats in two along their longest axis, which changes the image little. "
+        "Otherwise clone small splats and split large ones at random, as in 3DGS.",
     )
     clone_extent: float = parameter(
         0.01,
-        "Splats larger than this multiple of the scene extent are split at random, smaller ones cloned, "
-        "where 'long_axis' is false.",
+        "Without 'long_axis', split splats larger than this multiple of the scene extent and clone smaller "
+        "ones.",
     )
     prune_interval: int = parameter(
-        100, "Steps between two removals of transparent splats; 0 never removes.", unit="steps"
+        100, "Steps between removals of transparent splats. 0 disables.", unit="steps"
     )
-    opacity_reset_interval: int = parameter(
-        0, "Steps between two opacity resets; 0 never resets.", unit="steps"
-    )
+    opacity_reset_interval: int = parameter(0, "Steps between opacity resets. 0 disables.", unit="steps")
     lr_means_steps: int = parameter(
-        0, "Steps over which the positions' rate decays; 0 takes all (FLoD: the level's own).", unit="steps"
+        0,
+        "Steps over which the learning rate of positions decays. 0 uses all steps (FLoD: of the level).",
+        unit="steps",
     )
 
 
@@ -217,7 +219,7 @@ STANDARD: dict[str, Any] = {
     "lr_means_final": 1.6e-6,
     "lr_scales": 5e-3,
 }
-"""What presets *standard* take from 3DGS as published, but for its number of splats."""
+"""Values of presets *standard*: 3DGS as published, with fewer splats."""
 AS_PUBLISHED: dict[str, Any] = {
     "free_depth": 0.0,
     "largest": 0.0,
@@ -227,7 +229,7 @@ AS_PUBLISHED: dict[str, Any] = {
     "match_exposure": False,
     "dropout": 0.0,
 }
-"""What presets *paper* leave out, whatever the method: it is in no paper, but for the filter, in LODGE's."""
+"""Values of presets *paper* that disable additions to the papers. LODGE alone uses the filter."""
 PAPER: dict[str, Any] = AS_PUBLISHED | {
     "first_resolution": 1.0,
     "long_axis": False,
@@ -236,53 +238,60 @@ PAPER: dict[str, Any] = AS_PUBLISHED | {
     "max_splats": 5_000_000,
     "lr_means_steps": 30_000,
 }
-"""What presets *paper* take from it besides, where density is controlled as in 3DGS."""
+"""Values of presets *paper* of methods with the density control of 3DGS."""
 
 
 def override(parameters: Parameters, values: dict) -> Parameters:
-    """``parameters`` with the named values changed, as a job file gives them; None leaves one as it is.
+    """Return ``parameters`` with the values of a job file. None keeps the current value.
 
-    A single number for a per-level parameter serves every level; a new number of ``levels`` keeps the
-    last entries of the per-level ones (the finest levels) or repeats the first. A list of one entry serves as
-    a number.
+    A single number for a per-level parameter applies to every level. A new number of ``levels`` keeps the
+    last entries of per-level parameters (the finest levels) or repeats the first. A list of one entry is
+    accepted as a number.
 
     Raises:
-        LodgsError: on an unknown name, a value of the wrong kind, or a wrong number of entries.
+        LodgsError: unknown name, invalid value, or wrong number of entries.
     """
-    known = {f.name: f for f in fields(parameters)}
-    if unknown := sorted(set(values) - set(known)):
+    all_fields = {f.name: f for f in fields(parameters)}
+    if unknown := sorted(set(values) - set(all_fields)):
         raise LodgsError(
-            f"The job sets the unknown parameter {quote(unknown[0])}.", f"Known are: {', '.join(known)}."
+            f"Cannot read the job: unknown parameter {quote(unknown[0])}.",
+            f"Choose from: {', '.join(all_fields)}.",
         )
-    given = {name: value for name, value in values.items() if value is not None}
-    changed: dict[str, Any] = {name: getattr(parameters, name) for name in known} | given
-    if "levels" in known:
-        changed["levels"] = _valid(known["levels"], changed["levels"])
-    for name, f in known.items():
-        value = changed[name]
+    overrides = {name: value for name, value in values.items() if value is not None}
+    result: dict[str, Any] = {name: getattr(parameters, name) for name in all_fields} | overrides
+    if "levels" in all_fields:
+        result["levels"] = _check_value(all_fields["levels"], result["levels"])
+    for name, f in all_fields.items():
+        value = result[name]
         if isinstance(f.default, tuple):
-            changed[name] = _per_level(f, value, changed["levels"], name in given)
+            result[name] = _per_level(f, value, result["levels"], name in overrides)
         else:
-            changed[name] = _valid(f, value[0] if isinstance(value, list) and len(value) == 1 else value)
-    made = replace(parameters, **changed)
-    made.check()
-    return made
+            value = value[0] if isinstance(value, list) and len(value) == 1 else value
+            result[name] = _check_value(f, value)
+    overridden = replace(parameters, **result)
+    overridden.check()
+    return overridden
 
 
 def describe_values(f: Field) -> str:
-    """What a parameter (or each entry of a tuple) can be: "a number above 0 and at most 1"."""
-    about, default = f.metadata, f.default[0] if isinstance(f.default, tuple) else f.default
+    """Describe the valid values of a parameter or tuple entry, as "a number above 0 and at most 1"."""
+    metadata = f.metadata
+    default = f.default[0] if isinstance(f.default, tuple) else f.default
     if isinstance(default, bool):
         return "true or false"
     if isinstance(default, str):
-        return f"one of: {', '.join(about['choices'])}"
+        return f"one of: {', '.join(metadata['choices'])}"
     kind = "a whole number" if isinstance(default, int) else "a number"
-    least = f"of at least {about['low']}" if about["above"] is None else f"above {about['above']}"
-    return f"{kind} {least}" + (f" and at most {about['high']}" if about["high"] < inf else "")
+    low = f"of at least {metadata['low']}" if metadata["above"] is None else f"above {metadata['above']}"
+    return f"{kind} {low}" + (f" and at most {metadata['high']}" if metadata["high"] < inf else "")
 
 
-def _valid(f: Field, value: Any) -> Any:
-    """A value of the field's kind and within its bounds, or a sentence that says what is possible."""
+def _check_value(f: Field, value: Any) -> Any:
+    """Convert a value to the field's type.
+
+    Raises:
+        LodgsError: wrong type, or out of bounds.
+    """
     default = f.default[0] if isinstance(f.default, tuple) else f.default
     low, high, above, choices = (f.metadata[name] for name in ("low", "high", "above", "choices"))
     if isinstance(default, bool):
@@ -290,25 +299,24 @@ def _valid(f: Field, value: Any) -> Any:
     elif isinstance(default, str):
         valid = value in choices
     else:
-        whole = isinstance(value, int) and not isinstance(value, bool)
-        valid = whole or (isinstance(default, float) and isinstance(value, float) and isfinite(value))
+        integer = isinstance(value, int) and not isinstance(value, bool)
+        valid = integer or (isinstance(default, float) and isinstance(value, float) and isfinite(value))
         valid = valid and value <= high and (value >= low if above is None else value > above)
-        most = MAX_INTEGER if isinstance(default, int) else MAX_NUMBER
-        if valid and value > most:
-            raise LodgsError(
-                f"{f.name} = {quote(value)} is more than any use of it.", f"Give at most {most:g}."
-            )
+        limit = MAX_INTEGER if isinstance(default, int) else MAX_NUMBER
+        if valid and value > limit:
+            raise LodgsError(f"{f.name} = {quote(value)} is too large.", f"Use at most {limit:g}.")
     if not valid:
-        raise LodgsError(f"{f.name} = {quote(value)} is not possible.", f"Give {describe_values(f)}.")
+        raise LodgsError(f"{f.name} = {quote(value)} is invalid.", f"Use {describe_values(f)}.")
     return type(default)(value)
 
 
-def _per_level(f: Field, value: Any, levels: int, given: bool) -> tuple:
+def _per_level(f: Field, value: Any, levels: int, explicit: bool) -> tuple:
+    """Return one entry per level. Only an explicit value must have the right number of entries."""
     entries = tuple(value) if isinstance(value, list | tuple) else (value,) * levels
-    if given and len(entries) != levels:
+    if explicit and len(entries) != levels:
         raise LodgsError(
             f"{f.name} has {len(entries)} entries for {levels} levels.",
-            "Give one for each level, coarse to fine, or a single number.",
+            "Use one entry per level, coarse to fine, or a single number.",
         )
     entries = entries[:1] * (levels - len(entries)) + entries[-levels:]
-    return tuple(_valid(f, entry) for entry in entries)
+    return tuple(_check_value(f, entry) for entry in entries)

@@ -1,4 +1,4 @@
-"""What methods train on: views at training size, held-out views, and the scene's own units."""
+"""Training data: views at training size, held-out views, images and the scene's units."""
 
 from __future__ import annotations
 
@@ -25,27 +25,27 @@ from .memory import TARGET_BYTES
 from .support import Support
 
 ALPHA_SAMPLES = 3
-"""Photographs that are looked at for whether they are transparent."""
+"""Number of images to check for transparency."""
 MIN_SIDE = 11
-"""Pixels of a photograph's shorter side: SSIM compares windows of so many."""
+"""Minimum side of an image in pixels: the window size of SSIM."""
 DEPTH_BYTES = 4
-"""Bytes a pixel that depth takes beside a photograph."""
+"""Bytes per pixel of a depth map."""
 OPAQUE_ALPHA = 0.99
-"""Alpha from here on is no transparency, but rounding."""
+"""Alpha that counts as opaque despite rounding."""
 
 ViewPlan = Callable[[int], tuple[int, float] | None]
-"""Of a step: the index of its training view, and how many times smaller that is; None: it needs none."""
+"""Forecast of a step: index of its training view and image reduction factor. None if it needs no view."""
 
 
 @dataclass(frozen=True)
 class TrainingView:
-    """What a step compares its picture with.
+    """Camera and image of a training step.
 
     Attributes:
-        index: of the training view.
-        camera: the view, at the size of the target.
-        target: the photograph, ready for the loss.
-        shrink: how many times smaller than training size it is.
+        index: index of the training view.
+        camera: camera at the size of the target.
+        target: image, ready for the loss.
+        shrink: reduction factor relative to training size.
     """
 
     index: int
@@ -55,25 +55,25 @@ class TrainingView:
 
 
 class TrainingData:
-    """A scene's views, resized, and their photographs, never more than fit.
+    """Views of a scene at training size, with a cache of their images.
 
     Args:
-        whole: the scene that this one is a part of, whose units, and whose held-out views, count; None: it is
-            no part.
-        photo_memory: bytes of photographs that are kept; None: ``targets.default_budget``. What is trained
-            does not depend on it.
-        splat_memory: bytes of splats that are kept by methods that have them in files; None: as they choose.
-        scratch: where such methods make files, which a checkpoint tells of; None: in a temporary folder.
-        depths: what is known of the depth in training views; None: nothing.
-        region: where splats are added, in the scene's coordinates; None: everywhere.
-        gains: of photographs by name what they are evened by, see ``scenes.exposures``; None: none is.
+        full_scene: scene of which ``scene`` is a cell, which determines units and held-out views. None if
+            ``scene`` is complete.
+        photo_memory: size of the image cache in bytes; None for ``image_cache.default_budget``. Does not
+            affect the result.
+        splat_memory: bytes of splats in memory, for methods with splats on disk; None for their default.
+        scratch: folder for files of such methods, to which checkpoints refer; None for a temporary folder.
+        depths: depth priors of training views, if any.
+        region: region in scene coordinates where splats are added; None for everywhere.
+        gains: exposure corrections by image name (see ``scenes.exposures``); None for no correction.
 
     Attributes:
-        scene: what is trained on.
-        whole: the scene that it is a part of, or the same.
-        whole_train: training cameras of the whole scene, at training size.
-        train, test: cameras at training size; test views are every n-th by name (see ``Scene.split``).
-        photographs: of any of these views.
+        scene: scene to train.
+        full_scene: scene of which it is a cell, or the same.
+        full_train: training cameras of the full scene, at training size.
+        train, test: cameras at training size. Test views are every n-th by name (see ``Scene.split``).
+        images: cache of the images of these views.
     """
 
     def __init__(
@@ -93,51 +93,56 @@ class TrainingData:
     ) -> None:
         if len(scene.points) == 0:
             raise LodgsError(
-                f"The COLMAP model in {scene.model} has no 3D points, so there is nothing to train from.",
-                "Triangulate the model's points in COLMAP, or choose another model.",
+                f"Cannot train: the COLMAP model in {scene.model} has no 3D points.",
+                "Triangulate points in COLMAP, or choose another model.",
             )
         self.full_scene = scene if full_scene is None else full_scene
         all_train, all_test = self.full_scene.split(test_every, validation)
-        train, test = (_among(scene.cameras, each) for each in (all_train, all_test))
+        train, test = (_intersection(scene.cameras, cameras) for cameras in (all_train, all_test))
         if len(scene.cameras) < 2:
             raise LodgsError(
-                f"The scene {scene.folder} has {len(scene.cameras)} usable view(s); 2 are needed.",
-                "Check that the image folder holds the photographs that the model names.",
+                f"Cannot train {scene.folder}: it has {len(scene.cameras)} usable view(s) and needs 2.",
+                "Check that the image folder contains the photos of the model.",
             )
         if len(train) < 2:
             raise LodgsError(
-                f"Of the {len(scene.cameras)} usable views in {scene.folder} {len(train)} would be trained "
-                "on and the others held out; 2 are needed.",
-                "Hold out none (test_every = 0), or one of more.",
+                f"Cannot train: of the {len(scene.cameras)} usable views in {scene.folder} {len(train)} "
+                "remain for training and the others are held out. 2 are needed.",
+                "Set test_every to 0 to hold out no views, or to a larger number.",
             )
         if validation and not all_test:
             raise LodgsError(
-                f"Of the {len(self.full_scene.cameras)} usable views in {scene.folder} validation leaves some out "
-                f"and measures none, with one of every {test_every} held out.",
-                "Give a smaller test_every, or train without validation.",
+                f"Cannot validate: test_every = {test_every} holds out none of the "
+                f"{len(self.full_scene.cameras)} usable views in {scene.folder} for validation.",
+                "Use a smaller test_every, or train without validation.",
             )
-        self.scene, self.exposure, self.depths, self.region = scene, exposure, depths, region
-        self._trained, self._gains = {camera.name for camera in train}, gains or {}
+        self.scene = scene
+        self.exposure = exposure
+        self.depths = depths
+        self.region = region
+        self._train_names = {camera.name for camera in train}
+        self._gains = gains or {}
         self.full_train = [camera.scaled(image_scale) for camera in all_train]
         self.train = [camera.scaled(image_scale) for camera in train]
         self.test = [camera.scaled(image_scale) for camera in test]
         for camera in (*self.train, *self.test):
             if min(camera.width, camera.height) < MIN_SIDE:
                 raise LodgsError(
-                    f"{camera.name} would be trained on at {camera.width} x {camera.height} pixels; "
-                    f"{MIN_SIDE} are needed.",
-                    "Give a larger image_scale.",
+                    f"Cannot train: the size of {camera.name} is {camera.width} x {camera.height} pixels, "
+                    f"{MIN_SIDE} per side are needed.",
+                    "Use a larger image_scale.",
                 )
         budget = default_budget() if photo_memory is None else photo_memory
         if depths:
             budget = budget * TARGET_BYTES // (TARGET_BYTES + DEPTH_BYTES)
         self.images = ImageCache(self._read, budget)
-        self.splat_memory, self._scratch = splat_memory, scratch
+        self.splat_memory = splat_memory
+        self._scratch = scratch
         self._planned: ViewPlan | None = None
 
     @cached_property
     def scratch(self) -> Path:
-        """A folder for files of the run that methods go on with after a checkpoint."""
+        """Folder for files of methods that store splats on disk."""
         if self._scratch is not None:
             return self._scratch
         self._temporary = tempfile.TemporaryDirectory(prefix="lodgs-")
@@ -145,7 +150,7 @@ class TrainingData:
 
     @cached_property
     def extent(self) -> float:
-        """Scene extent in scene units: 1.1 x the largest distance of a camera from their mean."""
+        """Scene extent in scene units: 1.1 x the largest distance of a camera from the mean position."""
         return self.full_scene.extent()
 
     @cached_property
@@ -160,50 +165,50 @@ class TrainingData:
 
     @cached_property
     def focal(self) -> float:
-        """Focal length in pixels: the training views' median."""
+        """Median focal length of the training views, in pixels."""
         return float(np.median([camera.focal for camera in self.full_train]))
 
     @cached_property
     def support(self) -> Support:
-        """Where the training views leave room for splats."""
+        """Free space around the training cameras."""
         return Support(self.train, self.scene.points)
 
     @cached_property
     def near(self) -> float:
-        """Depth before which nothing is drawn, in scene units."""
+        """Near plane, in scene units."""
         return self.full_scene.near()
 
     @cached_property
     def threshold_scale(self) -> float:
-        """Factor on 3DGS's gradient threshold for the size of these images.
+        """Factor on 3DGS's gradient threshold for the image size.
 
-        The loss is a mean over pixels, and the gradient counts half image widths: for a splat of given
-        size in pixels it grows as the image shrinks, with the inverse of the image's side.
+        The loss is a mean over pixels, and gradients are in half image widths. For a splat of constant size
+        in pixels, the gradient is therefore inversely proportional to the image's side.
         """
         pixels = np.median([camera.width * camera.height for camera in self.full_train])
         return float(np.sqrt(1e6 / pixels))
 
     @cached_property
     def transparent(self) -> bool:
-        """Whether photographs have alpha that counts: one of TRIED training views is not opaque."""
+        """True if any of ``ALPHA_SAMPLES`` training images has transparent pixels."""
         for camera in pick_evenly(self.train, ALPHA_SAMPLES):
             if camera.image is not None:
-                with suppress(LodgsError):  # which the step that needs it tells
+                with suppress(LodgsError):  # raised again by the step that needs the image
                     pixels = load_image(camera.image, camera.width, camera.height, alpha=True)
                     if pixels[..., 3].min() < OPAQUE_ALPHA:
                         return True
         return False
 
     def training_view(self, step: int, seed: int) -> int:
-        """The index of the view to train at a step: every epoch is a new shuffle, from (seed, epoch)."""
-        epoch, place = divmod(step, len(self.train))
-        return int(_shuffled(len(self.train), seed, epoch)[place])
+        """Return the index of a step's view. Each epoch is a new shuffle, from (seed, epoch)."""
+        epoch, position = divmod(step, len(self.train))
+        return int(_shuffled(len(self.train), seed, epoch)[position])
 
     def view_at(self, step: int, planned: ViewPlan) -> TrainingView:
-        """The view of a step; those that the next steps need are read meanwhile.
+        """Return the view of a step, and read the images of the next steps ahead.
 
         Args:
-            planned: what steps need, as far as is known now.
+            planned: forecast of views.
         """
         if planned != self._planned:
             self._planned = planned
@@ -214,34 +219,37 @@ class TrainingData:
         return self.view(*view)
 
     def view(self, index: int, shrink: float = 1) -> TrainingView:
-        """A training view by index, its image ``shrink`` times smaller."""
+        """Return a training view by index, reduced by ``shrink``."""
         return TrainingView(index, self.camera(index, shrink), self.target(index, shrink), shrink)
 
     def camera(self, view: int, shrink: float = 1) -> Camera:
-        """A training view, its image ``shrink`` times smaller: what one as far away would see."""
+        """Return the camera of a training view, with an image reduced by ``shrink``."""
         return self.train[view] if shrink == 1 else self.train[view].scaled(1 / shrink)
 
     def target(self, view: int, shrink: float = 1) -> Target:
-        """The ground truth of a training view, ``shrink`` times smaller, ready for the loss."""
+        """Return the image of a training view, reduced by ``shrink`` and ready for the loss."""
         return self.images.target(self.camera(view, shrink))
 
     def _read(self, camera: Camera) -> Target:
-        """The photograph at the camera's size, its planes one after the other as losses take them."""
+        """Load an image at the camera's size, in planar layout as needed by losses."""
         assert camera.image is not None
-        size, alpha = (camera.width, camera.height), self.transparent
+        size = (camera.width, camera.height)
+        alpha = self.transparent
         image = load_image(camera.image, *size, exposure=self.exposure, alpha=alpha)
         if camera.name in self._gains:
             image[..., :3] = remove_gain(image[..., :3], self._gains[camera.name])
         planes = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))
         mask = None if camera.mask is None else load_mask(camera.mask, *size)
-        known = self.depths.inverse(camera) if self.depths and camera.name in self._trained else None
-        if known is not None and mask is not None:
-            known[mask <= 0.5] = np.nan
-        return Target(planes[:3].permute(1, 2, 0), mask, planes[3] if alpha else None, known)
+        inverse_depth = (
+            self.depths.inverse(camera) if self.depths and camera.name in self._train_names else None
+        )
+        if inverse_depth is not None and mask is not None:
+            inverse_depth[mask <= 0.5] = np.nan
+        return Target(planes[:3].permute(1, 2, 0), mask, planes[3] if alpha else None, inverse_depth)
 
 
-def _among(cameras: Sequence[Camera], others: Sequence[Camera]) -> list[Camera]:
-    """Those of some cameras that are among others, by name."""
+def _intersection(cameras: Sequence[Camera], others: Sequence[Camera]) -> list[Camera]:
+    """Return the cameras that also occur in another list, by name."""
     names = {camera.name for camera in others}
     return [camera for camera in cameras if camera.name in names]
 

@@ -1,4 +1,4 @@
-"""A small trainable model, and its moments."""
+"""Fixtures: a small trainable model and its moments."""
 
 from collections.abc import Callable
 
@@ -14,19 +14,19 @@ RATES = {"means": 1e-3, "quats": 1e-3, "log_scales": 1e-2, "opacity_logits": 5e-
 
 @pytest.fixture
 def model() -> Model:
-    """50 splats that train a column of their own, ``decay``; row i is 10 + i there."""
+    """Return 50 splats with a trained tensor ``decay``, whose row i is 10 + i."""
     rng = np.random.default_rng(0)
     points = rng.normal(size=(50, 3))
     tensors = from_points(points, rng.integers(0, 255, (50, 3)), sh_degree=2)
-    made = Model(tensors | {"decay": 10 + torch.arange(50.0)}, RATES, columns={"level": torch.arange(50.0)})
-    for first, second in made.adam.state.values():  # moments that can be recognised: row i holds i + 1
+    model = Model(tensors | {"decay": 10 + torch.arange(50.0)}, RATES, columns={"level": torch.arange(50.0)})
+    for first, second in model.adam.state.values():  # recognisable moments: row i is i + 1
         rows = torch.arange(1.0, 51.0).view(-1, *(1,) * (first.dim() - 1))
         first += rows
         second += 10 * rows
-    return made
+    return model
 
 
 @pytest.fixture
 def moments() -> Callable[[Model, str, int], torch.Tensor]:
-    """The first number of every row of a tensor's first (0) or second (1) moments."""
-    return lambda model, name, which: model.adam.state[name][which].reshape(len(model), -1)[:, 0]
+    """Return a function for the first value in each row of a tensor's first (0) or second (1) moments."""
+    return lambda model, name, order: model.adam.state[name][order].reshape(len(model), -1)[:, 0]

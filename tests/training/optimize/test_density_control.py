@@ -1,4 +1,4 @@
-"""Splats that are cloned, split and pruned, whatever columns they have."""
+"""Tests of cloning, splitting and pruning splats with any columns."""
 
 from types import SimpleNamespace
 
@@ -34,7 +34,7 @@ def test_small_splats_are_cloned_in_place(model, moments):
         assert torch.equal(moments(model, name, 0)[:50], torch.arange(1.0, 51.0))
 
 
-def test_large_splats_are_split_into_two_smaller_ones_drawn_from_them(model):
+def test_large_splats_are_split_at_random_positions_inside(model):
     model.assign("log_scales", torch.log(torch.tensor([[0.5, 1.0, 2.0]])).repeat(50, 1))
     # a quarter turn about z: the splat's x axis lies along the world's y
     model.assign(
@@ -59,8 +59,8 @@ def test_large_splats_are_split_into_two_smaller_ones_drawn_from_them(model):
     np.testing.assert_allclose(spread, [1.1, 0.6, 2.1], rtol=0.05)
 
 
-def test_a_split_along_the_longest_axis_looks_much_like_its_parent(model, moments):
-    """Places, sizes and opacity by Improved-GS's formulas; what a camera sees stays nearly the same."""
+def test_split_along_the_longest_axis_preserves_appearance(model, moments):
+    """Positions, scales and opacity follow the formulas of Improved-GS."""
     model.assign("log_scales", torch.log(torch.tensor([[0.05, 0.4, 0.1]])).repeat(50, 1))
     # a quarter turn about z: the splat's y axis lies along the world's -x
     turn = torch.tensor([[np.sqrt(0.5), 0, 0, np.sqrt(0.5)]], dtype=torch.float32)
@@ -85,7 +85,7 @@ def test_a_split_along_the_longest_axis_looks_much_like_its_parent(model, moment
     assert moments(model, "means", 0)[49:].tolist() == [0, 0]
 
 
-def test_a_split_along_the_longest_axis_keeps_flods_constraint(model):
+def test_split_along_the_longest_axis_keeps_the_constraint_of_flod(model):
     model.assign("log_scales", torch.log(torch.tensor([[0.5, 1.0, 2.0]])).repeat(50, 1))
     densify(
         model, torch.ones(50), threshold=0.5, clone_below=None, max_splats=1000, min_scale=0.1,
@@ -96,7 +96,7 @@ def test_a_split_along_the_longest_axis_keeps_flods_constraint(model):
     torch.testing.assert_close(model["log_scales"].exp() + 0.1, expected.repeat(100, 1))
 
 
-def test_the_budget_goes_to_the_largest_gradients(model):
+def test_largest_gradients_are_densified_first(model):
     gradients = torch.linspace(0, 1, 50)
     before = model["means"].detach().clone()
     added = densify(
@@ -107,8 +107,8 @@ def test_the_budget_goes_to_the_largest_gradients(model):
     assert torch.equal(model["means"][50:], before[[47, 48, 49]])
 
 
-def test_maxima_decide_by_the_papers_equation_6():
-    """Two views by hand: the largest gradient and the largest radius count, be they of different views."""
+def test_peak_scores_match_equation_6():
+    """Two views computed by hand, with the largest gradient and radius in different views."""
     tensors = {"means": torch.zeros(3, 3), "opacity_logits": torch.tensor([0.0, 0.0, -10.0])}
     model = Model(tensors, dict.fromkeys(tensors, 0.0), peaks=True)
     views = (
@@ -116,12 +116,12 @@ def test_maxima_decide_by_the_papers_equation_6():
         ([[0.0, -1e-4], [0.0, 0.0], [0.0, 0.0]], [20.0, 15.0, 0.0]),
     )
     for gradients, radii in views:
-        seen = SimpleNamespace(grad2d=torch.tensor(gradients), radii=torch.tensor(radii))
-        model.accumulate_stats(seen)  # pyright: ignore[reportArgumentType]
+        rendering = SimpleNamespace(grad2d=torch.tensor(gradients), radii=torch.tensor(radii))
+        model.accumulate_stats(rendering)  # pyright: ignore[reportArgumentType]
     faint = 1 / (1 + np.exp(10.0))
     expected = [5e-4 * 20 * 0.5**0.2, 1e-3 * 15 * 0.5**0.2, 5e-4 * 40 * faint**0.2]
     np.testing.assert_allclose(peak_scores(model), expected, rtol=1e-6)
-    # a photograph of half the side has gradients twice as large, which count as those of the whole one
+    # an image of half the side has gradients twice as large, which are scaled down
     shrunk = SimpleNamespace(grad2d=torch.tensor([[0.0, 2e-3]] * 3), radii=torch.tensor([1.0] * 3))
     model.accumulate_stats(shrunk, shrink=2)  # pyright: ignore[reportArgumentType]
     np.testing.assert_allclose(model.stats["gradient_max"], [1e-3] * 3, rtol=1e-6)
@@ -129,19 +129,19 @@ def test_maxima_decide_by_the_papers_equation_6():
     assert not peak_scores(model).any()
 
 
-def test_constrained_log_undoes_the_constraint_and_stays_free_below_it():
+def test_constrained_log_scales_invert_the_constraint_above_a_floor():
     scales = torch.tensor([0.5, 0.2])
     torch.testing.assert_close(constrained_log_scales(scales, 0.1).exp() + 0.1, scales)
     assert constrained_log_scales(torch.tensor([0.05]), 0.1).exp().item() == pytest.approx(0.005)
 
 
-def test_pruning_takes_what_is_more_transparent_than_asked_for(model):
+def test_pruning_removes_splats_below_the_opacity(model):
     model.assign("opacity_logits", torch.logit(torch.linspace(0.01, 0.99, 50)))
     prune(model, 0.5)
     assert model["decay"].tolist() == [*range(35, 60)]
 
 
-def test_an_opacity_reset_leaves_a_hundredth_at_most_and_no_moments(model, moments):
+def test_opacity_reset_limits_opacity_and_clears_moments(model, moments):
     model.assign("opacity_logits", torch.logit(torch.linspace(0.001, 0.9, 50)))
     model.adam.state["opacity_logits"][0][:] = 1
     reset_opacities(model)

@@ -1,4 +1,4 @@
-"""What training begins with."""
+"""Tests of initial splats."""
 
 import numpy as np
 import pytest
@@ -14,18 +14,18 @@ def test_neighbour_distances_equal_brute_force():
     np.testing.assert_allclose(neighbour_distances(points), expected, rtol=1e-12)
 
 
-def test_initial_scale_is_the_rms_distance_of_three_neighbours_and_colour_shows_as_given():
+def test_initial_scale_is_the_rms_neighbour_distance_and_colours_are_preserved():
     points = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3], [50, 50, 50]], float)
     colors = np.array([[255, 0, 51]] * 5, np.uint8)
     tensors = from_points(points, colors, sh_degree=1)
     assert tensors["log_scales"][0].exp().tolist() == pytest.approx([np.sqrt((1 + 4 + 9) / 3)] * 3)
-    shown = 0.5 + 0.28209479177387814 * tensors["sh"][0, 0]
-    assert shown.tolist() == pytest.approx([1, 0, 0.2], abs=1e-6)
+    color = 0.5 + 0.28209479177387814 * tensors["sh"][0, 0]
+    assert color.tolist() == pytest.approx([1, 0, 0.2], abs=1e-6)
     assert torch.sigmoid(tensors["opacity_logits"]).tolist() == pytest.approx([0.1] * 5)
     assert not tensors["sh"][:, 1:].any()
 
 
-def test_training_does_not_move_the_points_it_began_with():
+def test_training_does_not_change_the_scene_points():
     points = np.random.default_rng(0).normal(size=(10, 3)).astype(np.float32)
     before = points.copy()
     tensors = from_points(points, np.zeros((10, 3), np.uint8), sh_degree=0)

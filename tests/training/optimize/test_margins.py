@@ -1,4 +1,4 @@
-"""Photographs continued beyond their edges, on walls whose places and colours are known."""
+"""Tests of margins, on walls with known positions and colours."""
 
 from dataclasses import replace
 
@@ -18,14 +18,14 @@ ORANGE = (0.9, 0.5, 0.1)
 
 
 def camera(x: float = 0.0, z: float = 0.0) -> Camera:
-    """At (x, 0, z), looking along +z, 90 degrees wide and 74 high."""
+    """Return a camera at (x, 0, z) that looks along +z, 90 degrees wide and 74 high."""
     pose = np.eye(4)
     pose[:3, 3] = -x, 0, -z
     return Camera(f"{x:g}", 96, 72, 48.0, 48.0, 48.0, 36.0, pose)
 
 
 def wall(depth: float, left: float, right: float, color=ORANGE) -> Gaussians:
-    """Opaque splats at a depth, as high as a camera at the origin sees there."""
+    """Return opaque splats at a depth, as high as the view of a camera at the origin."""
     x, y = np.meshgrid(np.arange(left, right, 0.1), np.arange(-0.75 * depth, 0.75 * depth, 0.1))
     means = torch.tensor(np.stack([x, y, np.full_like(x, depth)], -1).reshape(-1, 3)).float()
     sh = torch.zeros(len(means), 4, 3)
@@ -42,35 +42,35 @@ def margins(*cameras: Camera, share: float = 0.5) -> Margins:
     return Margins(cameras, share, NEAR, "cpu")
 
 
-def test_a_wall_goes_on_beyond_the_photograph():
-    seen, shown = wall(4, -4, 4), camera()
-    added = margins(shown).extend(seen, 10_000)
-    u, depth = shown.project(added.means.numpy().astype(np.float64))
+def test_margins_continue_a_wall_beyond_the_photo():
+    visible, view = wall(4, -4, 4), camera()
+    added = margins(view).extend(visible, 10_000)
+    u, depth = view.project(added.means.numpy().astype(np.float64))
     outside = (u < 0).any(1) | (u[:, 0] > 96) | (u[:, 1] > 72)
     assert len(added) > 500 and outside.all()
     assert depth == pytest.approx(DEPTH_FACTOR * 4, rel=1e-3)
     colors = 0.5 + SH_C0 * added.sh[:, 0].numpy()
     assert np.abs(colors - ORANGE).max() < 0.05 and not added.sh[:, 1:].any()
-    wide, everything = shown.widened(0.45), Gaussians.concatenated([seen, added])
-    before, after = draw(seen, wide).alpha, draw(everything, wide).alpha
+    wide, total = view.widened(0.45), Gaussians.concatenated([visible, added])
+    before, after = draw(visible, wide).alpha, draw(total, wide).alpha
     assert (before < 0.5).float().mean() > 0.5 and after.min() > 0.5
     inner = (slice(6, -6), slice(6, -6))
     torch.testing.assert_close(
-        draw(everything, shown).image[inner], draw(seen, shown).image[inner], atol=0.02, rtol=0
+        draw(total, view).image[inner], draw(visible, view).image[inner], atol=0.02, rtol=0
     )
 
 
-def test_nothing_stands_before_what_another_photograph_shows():
-    """The second camera looks past the end of the near wall at one that is far."""
+def test_margins_do_not_cover_surfaces_of_other_photos():
+    """The second camera looks past the end of the near wall at a far wall."""
     near, far = wall(4, -4, 4), wall(12, 4, 30, color=(0.1, 0.2, 0.9))
     first, second = camera(), camera(x=12)
     both = Gaussians.concatenated([near, far])
-    for cameras, seen, stands in (((first,), near, True), ((first, second), both, False)):
-        means = margins(*cameras).extend(seen, 10_000).means.numpy().astype(np.float64)
-        assert (second.sees(means) & (means[:, 2] < 12)).any() == stands
+    for cameras, visible, covered in (((first,), near, True), ((first, second), both, False)):
+        means = margins(*cameras).extend(visible, 10_000).means.numpy().astype(np.float64)
+        assert (second.sees(means) & (means[:, 2] < 12)).any() == covered
 
 
-def test_what_is_shown_everywhere_is_not_continued():
+def test_covered_surroundings_get_no_margins():
     assert len(margins(camera()).extend(wall(4, -12, 12), 10_000)) < len(
         margins(camera()).extend(wall(4, -4, 4), 10_000)
     )
@@ -78,31 +78,31 @@ def test_what_is_shown_everywhere_is_not_continued():
     assert len(margins(camera()).extend(enclosed, 10_000)) == 0
 
 
-def test_where_nothing_is_shown_nothing_is_continued():
+def test_empty_photos_get_no_margins():
     behind = wall(4, -4, 4)
     behind = replace(behind, means=-behind.means)
     assert len(margins(camera()).extend(behind, 10_000)) == 0
 
 
-def test_a_photograph_that_ends_in_nothing_is_not_continued():
-    """Something in the middle before nothing."""
+def test_photos_with_empty_edges_get_no_margins():
+    """Only the middle of the image is covered."""
     low = wall(4, -1, 1)
     low = low.select(low.means[:, 1].abs() < 1)
     assert len(margins(camera(), camera(x=1)).extend(low, 10_000)) == 0
 
 
-def test_the_scenes_unit_does_not_matter():
+def test_margins_scale_with_the_scene():
     small = margins(camera(), camera(x=1)).extend(wall(4, -4, 4), 10_000)
     scale = 1000.0
-    seen = wall(4, -4, 4)
-    large = replace(seen, means=scale * seen.means, log_scales=seen.log_scales + np.log(scale))
-    there = Margins([camera(), camera(x=scale)], 0.5, scale * NEAR, "cpu").extend(large, 10_000)
-    assert there.means.numpy() / scale == pytest.approx(small.means.numpy(), rel=1e-3, abs=1e-3)
-    assert there.log_scales.numpy() - np.log(scale) == pytest.approx(small.log_scales.numpy(), abs=1e-3)
+    splats = wall(4, -4, 4)
+    large = replace(splats, means=scale * splats.means, log_scales=splats.log_scales + np.log(scale))
+    scaled = Margins([camera(), camera(x=scale)], 0.5, scale * NEAR, "cpu").extend(large, 10_000)
+    assert scaled.means.numpy() / scale == pytest.approx(small.means.numpy(), rel=1e-3, abs=1e-3)
+    assert scaled.log_scales.numpy() - np.log(scale) == pytest.approx(small.log_scales.numpy(), abs=1e-3)
 
 
-def test_fewer_are_larger():
-    many, few = (margins(camera()).extend(wall(4, -4, 4), most) for most in (10_000, 300))
+def test_smaller_budget_gives_larger_splats():
+    many, few = (margins(camera()).extend(wall(4, -4, 4), budget) for budget in (10_000, 300))
     assert len(many) > 500 and 100 < len(few) <= 300
     assert few.log_scales.min() > many.log_scales.max()
     wide = camera().widened(0.45)
@@ -110,22 +110,22 @@ def test_fewer_are_larger():
     assert len(margins(camera()).extend(wall(4, -4, 4), 30)) == 0
 
 
-def test_blurring_gives_what_is_known_its_own_value_and_stops_where_nothing_is_near():
+def test_blur_preserves_known_values_and_has_limited_reach():
     values, known = np.full((9, 400, 1), 7.0), np.zeros((9, 400), bool)
-    found, reached = blur_outward(values, known)
-    assert not reached.any() and not found.any()
+    blurred, reached = blur_outward(values, known)
+    assert not reached.any() and not blurred.any()
     known[:, :10] = True
-    values[:, 10:] = np.nan  # is not looked at
-    found, reached = blur_outward(values, known)
+    values[:, 10:] = np.nan  # unknown values are ignored
+    blurred, reached = blur_outward(values, known)
     assert reached[:, :20].all() and not reached[:, 200:].any()
-    assert found[reached] == pytest.approx(7.0)
+    assert blurred[reached] == pytest.approx(7.0)
 
 
 @pytest.mark.parametrize("name", sorted(METHODS))
-def test_every_method_continues_its_photographs(data, name):
-    """What is added lies beyond the photographs, is there at the end, and has all that its rule reads."""
+def test_every_method_adds_margins(data, name):
+    """Margins are outside the photos, in the final levels, and have the columns of the rule."""
     steps = {"steps": [6, 6], "levels": 2, "finish_share": 0.0} if name == "flod" else {"steps": 12}
-    made = {}
+    results = {}
     for margin in (0.0, 0.5):
         preset = METHODS[name].preset("draft")
         tuning = {"tune_steps": 6} if hasattr(preset, "tune_steps") else {}
@@ -134,11 +134,11 @@ def test_every_method_continues_its_photographs(data, name):
         for step in range(method.steps):
             method.train_step(step)
             levels |= {level.number: level.rows.select(slice(None)) for level in method.levels_after(step)}
-        made[margin] = levels
-    for number, without in made[0.0].items():
-        splats = made[0.5][number]
-        assert set(splats.extras) == set(without.extras)
+        results[margin] = levels
+    for number, plain in results[0.0].items():
+        splats = results[0.5][number]
+        assert set(splats.extras) == set(plain.extras)
         means = splats.means.astype(np.float64)
         outside = ~np.any([view.sees(means) for view in data.train], axis=0)
         if number == 1 or name == "flod":
-            assert outside.sum() > (~np.any([v.sees(without.means) for v in data.train], axis=0)).sum()
+            assert outside.sum() > (~np.any([v.sees(plain.means) for v in data.train], axis=0)).sum()

@@ -1,4 +1,4 @@
-"""Rows that come and go, with Adam's state in step, whatever their columns are."""
+"""Tests of models whose rows are added and removed with Adam's state."""
 
 import io
 
@@ -24,7 +24,7 @@ def test_keep_drops_rows_and_their_moments(model, moments):
         assert model[name].requires_grad and model[name].is_leaf
 
 
-def test_append_brings_all_that_is_trained_and_zeros_for_columns_without_values(model, moments):
+def test_append_adds_trained_tensors_and_zeros_for_missing_columns(model, moments):
     rows = model.read_rows(torch.tensor([3, 3, 7]))
     model.stats["seen"] += 5
     model.append(rows | {"level": torch.tensor([9.0, 9.0, 9.0])})
@@ -36,8 +36,8 @@ def test_append_brings_all_that_is_trained_and_zeros_for_columns_without_values(
         assert moments(model, name, 0).tolist() == [*range(1, 51), 0, 0, 0]
 
 
-def test_every_column_learns_at_its_own_rate(model):
-    """Adam's first step is the rate itself, whatever the gradient's size."""
+def test_tensors_have_separate_learning_rates(model):
+    """Adam's first step equals the rate for any gradient."""
     fresh = Model(model.read_rows(torch.arange(50)), model.adam.lr)
     (fresh["decay"].sum() * 7 + fresh["means"].sum()).backward()
     before = fresh.read_rows(torch.arange(50))
@@ -46,7 +46,7 @@ def test_every_column_learns_at_its_own_rate(model):
     torch.testing.assert_close(before["means"] - fresh["means"], torch.full((50, 3), 1e-3), rtol=1e-3, atol=0)
 
 
-def test_a_checkpoint_holds_every_column(model):
+def test_checkpoint_restores_all_columns(model):
     model.stats["seen"] += 2
     file = io.BytesIO()
     torch.save(model.state_dict(), file)
@@ -60,7 +60,7 @@ def test_a_checkpoint_holds_every_column(model):
     assert torch.equal(other.stats["seen"], model.stats["seen"])
 
 
-def test_splats_have_further_columns_as_extras_and_are_a_copy(model):
+def test_splats_are_a_copy_with_extras(model):
     splats = model.splats(min_scale=0.5)
     assert list(splats.extras) == ["decay"]
     np.testing.assert_array_equal(splats.extras["decay"], np.arange(10, 60, dtype=np.float32))
@@ -73,7 +73,7 @@ def test_splats_have_further_columns_as_extras_and_are_a_copy(model):
     assert model["decay"][0] == 10 and not np.array_equal(splats.means, model["means"].detach().numpy())
 
 
-def test_statistics_begin_anew_in_the_shape_they_had():
+def test_reset_stats_keeps_shapes():
     stats = {"seen": torch.ones(2, 4), "opacity_sum": torch.ones(2)}
     model = Model({"means": torch.zeros(2, 3)}, {"means": 0.0}, stats=stats)
     model.reset_stats()
@@ -83,13 +83,13 @@ def test_statistics_begin_anew_in_the_shape_they_had():
     assert not any(stat.any() for stat in model.stats.values())
 
 
-def test_a_state_without_a_column_is_refused_and_changes_nothing(model):
+def test_state_without_a_column_is_rejected_and_changes_nothing(model):
     state, before = model.state_dict(), model["means"].detach().clone()
-    lacking = {
+    incomplete = {
         **state,
         "columns": {},
         "tensors": {name: tensor + 1 for name, tensor in state["tensors"].items()},
     }
     with pytest.raises(ValueError, match=r"\['level'\] are missing"):
-        model.load_state_dict(lacking)
+        model.load_state_dict(incomplete)
     assert torch.equal(model["means"], before)

@@ -1,4 +1,4 @@
-"""What a coarser level keeps of a finer one, and how much it is enlarged, by hand."""
+"""Tests of pruning and enlargement of coarser levels, computed by hand."""
 
 import numpy as np
 import pytest
@@ -7,24 +7,24 @@ from training.lod.blocks import SIZE
 from training.optimize.pruning import importance_threshold, log_scale_gain
 
 
-@pytest.mark.parametrize("most, kept", [(100, "abcd"), (11, "abcd"), (10.9, "abd"), (4, "ab"), (3, "b")])
-def test_the_most_important_stay_as_long_as_views_draw_no_more_than_they_may(most, kept):
+@pytest.mark.parametrize("budget, kept", [(100, "abcd"), (11, "abcd"), (10.9, "abd"), (4, "ab"), (3, "b")])
+def test_most_important_splats_are_kept_within_the_budget(budget, kept):
     importance, views = np.array([0.5, 0.9, 0.1, 0.2]), np.array([1, 3, 4, 3])
-    least = importance_threshold(importance, views, most)
-    assert "".join(np.array(list("abcd"))[importance >= least]) == kept
+    threshold = importance_threshold(importance, views, budget)
+    assert "".join(np.array(list("abcd"))[importance >= threshold]) == kept
 
 
-def test_where_not_even_one_may_stay_nothing_is_said():
+def test_threshold_is_zero_if_no_splat_fits():
     assert importance_threshold(np.array([0.5, 0.9]), np.array([2, 3]), 1) == 0
 
 
-def test_what_stays_takes_over_the_room_of_what_goes():
-    """Discs of the area e^-3 in two blocks: of the first a quarter stays, of the second all."""
+def test_kept_splats_cover_the_area_of_removed_ones():
+    """Discs of area e^-3 in two blocks: a quarter of the first and all of the second are kept."""
     log_scales = np.tile(np.float32([-9, -1, -2]), (2 * SIZE, 1))
     kept, shares = np.ones(2 * SIZE, bool), np.ones(2 * SIZE, np.float32)
     kept[: 3 * SIZE // 4] = False
-    wider = log_scale_gain(log_scales, shares, kept)
-    np.testing.assert_allclose(wider[:SIZE], np.log(2), rtol=1e-5)  # four times the area is twice the size
-    np.testing.assert_allclose(wider[SIZE:], 0, atol=1e-7)
-    shares[: 3 * SIZE // 4] = 0  # what nobody saw leaves no room
+    gain = log_scale_gain(log_scales, shares, kept)
+    np.testing.assert_allclose(gain[:SIZE], np.log(2), rtol=1e-5)  # four times the area, twice the size
+    np.testing.assert_allclose(gain[SIZE:], 0, atol=1e-7)
+    shares[: 3 * SIZE // 4] = 0  # invisible splats have no area
     np.testing.assert_allclose(log_scale_gain(log_scales, shares, kept), 0, atol=1e-7)

@@ -1,4 +1,4 @@
-"""Where splats may stand and how large they may be, on cameras whose free room is worked out by hand."""
+"""Tests of the free space around cameras and the size limit of splats, computed by hand."""
 
 import numpy as np
 import pytest
@@ -9,14 +9,14 @@ from training.scenes.cameras import Camera
 
 
 def camera(x: float, width: int = 100) -> Camera:
-    """A camera at (x, 0, 0) that looks along +z, 90 degrees wide."""
+    """Return a camera at (x, 0, 0) that looks along +z, 90 degrees wide."""
     pose = np.eye(4)
     pose[0, 3] = -x
     return Camera(f"{x:g}", width, width, width / 2, width / 2, width / 2, width / 2, pose)
 
 
-def from_the_side(y: float, z: float) -> Camera:
-    """A camera at (3, y, z) that looks along -x, 90 degrees wide."""
+def side_camera(y: float, z: float) -> Camera:
+    """Return a camera at (3, y, z) that looks along -x, 90 degrees wide."""
     pose = np.eye(4)
     pose[:3, :3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]
     pose[:3, 3] = -pose[:3, :3] @ [3, y, z]
@@ -30,65 +30,65 @@ def intruding(support: Support, means, share: float = 0.5) -> list[bool]:
 
 @pytest.fixture
 def support() -> Support:
-    """Two cameras 2 apart before a wall at depth 10, with one stray point in 200 at depth 1."""
+    """Two cameras at distance 2 face a wall at depth 10; one of 200 points is an outlier at depth 1."""
     x, y = np.meshgrid(np.linspace(-5, 5, 20), np.linspace(-5, 5, 10))
     wall = np.stack([x, y, np.full_like(x, 10.0)], -1).reshape(-1, 3)
     wall[0] = (0, 0, 1)
     return Support([camera(-1), camera(1)], wall.astype(np.float32))
 
 
-def test_what_stands_nearer_than_a_share_of_the_nearest_points_intrudes(support):
+def test_points_closer_than_a_share_of_the_nearest_depth_intrude(support):
     means = [(-1, 0, depth) for depth in (0.05, 1.0, 4.9, 5.1, 9.0)]
     assert intruding(support, means) == [True, True, True, False, False]  # half of 10, not of 1
     assert not any(intruding(support, means, share=0.0))
 
 
-def test_what_is_farther_away_intrudes_only_in_a_view(support):
-    # 5.1 away at least; the image ends where |y| = z, a tenth of its height wider on either side at 1.2 z
+def test_more_distant_points_intrude_only_inside_a_view(support):
+    # at distances above 5.1; the image ends at |y| = z, with the margin at |y| = 1.2 z
     beside, at_the_edge, in_the_image = (-1, 5, 4), (-1, 4.7, 4), (-1, 3.9, 4)
     assert intruding(support, [beside, at_the_edge, in_the_image]) == [False, True, True]
 
 
-def test_what_is_beside_or_behind_a_camera_intrudes_unless_two_photographs_see_it():
-    far, thing = (0, 0, 10.0), (0, 0, -2.0)
-    beside, behind, away = (0, -4, 0), thing, (0, 0, -5.1)  # half of 10 around the eye has to be free
-    for others, stays in (((), False), ((0,), False), ((0, 1), True)):
-        cameras = [camera(0), camera(0.001), *(from_the_side(y, -2.0) for y in others)]
-        alone = Support(cameras, np.array([far, thing], np.float32))
-        assert intruding(alone, [beside, behind, away]) == [True, not stays, False]
+def test_points_outside_the_frame_intrude_unless_two_photos_see_them():
+    far, point = (0, 0, 10.0), (0, 0, -2.0)
+    beside, behind, away = (0, -4, 0), point, (0, 0, -5.1)  # half of 10 around the camera is free space
+    for heights, supported in (((), False), ((0,), False), ((0, 1), True)):
+        cameras = [camera(0), camera(0.001), *(side_camera(y, -2.0) for y in heights)]
+        support = Support(cameras, np.array([far, point], np.float32))
+        assert intruding(support, [beside, behind, away]) == [True, not supported, False]
 
 
-def test_places_between_cameras_are_kept_free():
-    # 90 degrees wide, the two cameras see x = 0 from z = 1 on: a share of 0.1 leaves 1 of 10 free
-    around, before = (0, 0, 0.5), (0, 0.9, 0.8)  # 0.5 and 1.2 from between the two, 1.1 and 1.6 from them
+def test_points_between_cameras_intrude():
+    # the two cameras see x = 0 from z = 1; a share of 0.1 keeps 1 of 10 free
+    around, in_front = (0, 0, 0.5), (0, 0.9, 0.8)  # 0.5 and 1.2 from the midpoint, 1.1 and 1.6 from cameras
     support = Support([camera(-1), camera(1)], np.array([[0, 0, 10.0]], np.float32))
-    assert intruding(support, [around, before], 0.1) == [True, True]
-    alone = Support([camera(-1)], np.array([[0, 0, 10.0]], np.float32))
-    assert intruding(alone, [around, before], 0.1) == [False, False]
+    assert intruding(support, [around, in_front], 0.1) == [True, True]
+    single = Support([camera(-1)], np.array([[0, 0, 10.0]], np.float32))
+    assert intruding(single, [around, in_front], 0.1) == [False, False]
 
 
-def test_a_view_without_points_forbids_nothing():
+def test_views_without_points_have_no_free_space():
     empty = Support([camera(-1), camera(1)], np.array([[0, 0, -10.0]], np.float32))
     assert intruding(empty, [(0, 0, 0.01), (-1, 0, -0.01)]) == [False, False]
 
 
-def test_the_nearest_place_of_a_point(support):
+def test_nearest_positions_are_cameras_or_midpoints(support):
     means = np.array([(1, 0, 2), (0, 0, 3), (-4, 4, 0)], np.float32)
-    distances, places = support.nearest_positions(means)
+    distances, positions = support.nearest_positions(means)
     assert distances == pytest.approx([2, 3, 5])
-    assert places[[0, 2]].tolist() == [1, 0] and places[1] >= 2  # cameras come first, then what lies between
+    assert positions[[0, 2]].tolist() == [1, 0] and positions[1] >= 2  # cameras first, then midpoints
 
 
-def test_training_leaves_nothing_in_the_way_and_nothing_too_large(data):
-    """A splat before the camera goes, one that wraps the scene shrinks, the others stay as they are."""
+def test_training_removes_intruding_splats_and_limits_sizes(data):
+    """A splat in front of a camera is removed, a huge one shrinks, the others do not change."""
     from training.methods import METHODS, create
 
     method = create("3dgs", data, METHODS["3dgs"].presets["draft"], 0, "cpu")
     p, before = method.parameters, len(method.model)
-    eye = data.train[0]
-    ahead = torch.tensor(eye.center + 0.02 * eye.world_to_camera[2, :3], dtype=torch.float32)
+    camera = data.train[0]
+    in_front = torch.tensor(camera.center + 0.02 * camera.world_to_camera[2, :3], dtype=torch.float32)
     rows = method.model.read_rows(torch.tensor([0, 0]))
-    rows["means"][0] = ahead
+    rows["means"][0] = in_front
     rows["log_scales"][1] = 9.0
     method.model.append(rows)
     method.prune_unsupported(0)

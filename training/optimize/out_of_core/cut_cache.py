@@ -1,4 +1,4 @@
-"""Cuts of point trees in fast memory: what a view needs of rows that lie elsewhere, kept while it is near."""
+"""Cuts of point trees in memory: rows on disk that a view needs, cached while the camera is near."""
 
 from __future__ import annotations
 
@@ -14,73 +14,75 @@ from ..schedules import due
 from .row_file import STAGING_BYTES, RowFile
 
 REUSE = 0.77, 2.0
-"""A cut is used again where the distance over that of its making is in here ("A LoD of Gaussians", Eq. 7)."""
+"""Range of the current distance over a cut's original distance for reuse ("A LoD of Gaussians", Eq. 7)."""
 FLUSH_INTERVAL = 1000
-"""Steps after which everything goes back, so that no cut stays for good."""
+"""Steps after which all cuts are released, so that none stays forever."""
 KEEP_SHARE = 0.8
-"""Share of the room that is taken after the least recently used has gone."""
+"""Share of the capacity in use after an eviction."""
 SLOT_BYTES = 17
-"""Bytes that are kept of each row here beside its numbers: which row, its group, whether changed, places."""
+"""Bytes per cached row besides its record: row, group, changed flag and slots."""
 INDEX_BYTES = 4
-"""Bytes that are kept of each row there is: where it is here."""
+"""Bytes per row on disk: its slot."""
 
 BATCH_ROWS = 1 << 15
-"""Rows that are read or written together."""
+"""Rows to read or write together."""
 
 MMAP_BYTES = 1 << 20
-"""Bytes from which on an array's memory is the system's again when it is freed, where not all rows have room:
-what is made of cuts has another size each step, and a heap would keep half as much again in pieces that fit
-nothing. It costs some 10 % of a step's time."""
+"""Arrays from this size on are returned to the system if the cache holds only a part of the rows. Arrays that
+depend on cuts change size in every step, and fragments of the heap would take half as much memory again. It
+takes about 10 % of a step."""
 
 FREE = -1
-"""The group of a place without a row."""
+"""Group of a free slot."""
 
 
 class CutTooLarge(LodgsError):
-    """What a view needs at once is more than the budget has room for.
+    """A view needs more rows than the memory budget holds.
 
     Attributes:
-        needed, room: rows.
-        budget: bytes that would do.
+        needed: rows of the view.
+        room: rows of the budget.
+        budget: sufficient budget in bytes.
     """
 
     def __init__(self, needed: int, room: int, budget: int) -> None:
         super().__init__(
-            f"A view needs {needed:,} splats at once; the memory budget has room for {room:,}.",
-            f"Give at least {-(-budget // 10**6):,} MB as splat_memory, or ask for coarser detail.",
+            f"Cannot render the view: it needs {needed:,} splats, the memory budget holds {room:,}.",
+            f"Set splat_memory to at least {-(-budget // 10**6):,} MB, or use coarser detail.",
         )
-        self.needed, self.room, self.budget = needed, room, budget
+        self.needed = needed
+        self.room = room
+        self.budget = budget
 
 
 Cut = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""Told which (K,) of the groups asked for have to be cut, says the rows of each, one group's after the
-other's, (M,) int64, and how many each has, (K,)."""
+"""Compute the cuts of groups. Gets indices (K,) into the requested groups, and returns the rows (M,) int64,
+group after group, and the number of rows of each (K,)."""
 
 
 class CutCache:
-    """Rows in fast memory, in groups that come and go together: a group's is a cut of one point tree.
+    """Cached rows in groups that are loaded together: the rows of a group are a cut of one point tree.
 
-    Rows that leave a cut stay here, and their changes with them, as long as there is room: what has been in
-    no cut for longest goes first, and where cuts themselves have no room, those least recently used. Memory
-    is the budget, in which are the tables of all rows there are. A group's rows are no other group's.
+    Rows that leave a cut stay cached with their changes as long as there is room. Rows that left their cut
+    first are evicted first. If cuts themselves do not fit, the least recently used ones are released. The
+    budget includes the tables of all rows. Groups have no rows in common.
 
-    What a step sees depends on which cuts are here, so ``state_dict`` tells that, too; it does not depend on
-    which other rows are.
+    Steps depend on the cached cuts, so ``state_dict`` includes them. They do not depend on other cached rows.
 
     Args:
-        rows: where rows are otherwise; only this object may change them.
-        groups: how many groups there are.
+        rows: rows on disk; only this object may change them.
+        groups: number of groups.
         budget: bytes.
-        device: where records live.
-        reuse: smallest and largest distance, over that of its making, for which a cut is used again.
-        flush_interval: steps, see :meth:`after`.
-        reduced: see REDUCED.
+        device: device of the records.
+        reuse: minimum and maximum distance, over a cut's original distance, for reuse.
+        flush_interval: steps, see :meth:`end_step`.
+        keep_share: see KEEP_SHARE.
 
     Attributes:
-        capacity: rows for which there is room.
-        records: (capacity, width) on the device; who changes some in place says so by :meth:`changed`.
-        loaded: rows that have been brought in so far.
-        reused: rows that were there when they were asked for.
+        capacity: maximum number of cached rows.
+        records: (capacity, width) on the device; call :meth:`mark_changed` after changes in place.
+        loaded: number of rows loaded so far.
+        reused: number of requested rows that were cached.
     """
 
     def __init__(
@@ -91,227 +93,238 @@ class CutCache:
         device: torch.device | str = "cpu",
         reuse: tuple[float, float] = REUSE,
         flush_interval: int = FLUSH_INTERVAL,
-        reduced: float = KEEP_SHARE,
+        keep_share: float = KEEP_SHARE,
     ) -> None:
-        self.rows, self.layout, self._device = rows, rows.layout, torch.device(device)
-        self._least, self._most = reuse
-        self._flush_interval, self._reduced = flush_interval, reduced
-        self._record, self.budget = 4 * self.layout.width, budget
-        # on a device what is between it and the file has memory of its own
-        self._at_once = BATCH_ROWS if self._device.type == "cpu" else max(STAGING_BYTES // self._record, 1)
+        self.rows = rows
+        self.layout = rows.layout
+        self.budget = budget
+        self._device = torch.device(device)
+        self._min_ratio, self._max_ratio = reuse
+        self._flush_interval = flush_interval
+        self._keep_share = keep_share
+        self._record_bytes = 4 * self.layout.width
+        # Transfers to a device need staging memory in addition.
+        on_host = self._device.type == "cpu"
+        self._batch_rows = BATCH_ROWS if on_host else max(STAGING_BYTES // self._record_bytes, 1)
         self.records = torch.zeros(0, self.layout.width, device=self._device)
         self.loaded = self.reused = 0
-        self._forget(groups)
+        self._reset(groups)
 
-    def _forget(self, groups: int) -> None:
-        most = max(self.budget - self.tables, 0) // (self._record + SLOT_BYTES)
-        self.capacity = min(most, len(self.rows))
+    def _reset(self, groups: int) -> None:
+        limit = max(self.budget - self.tables, 0) // (self._record_bytes + SLOT_BYTES)
+        self.capacity = min(limit, len(self.rows))
         if self.capacity < len(self.rows):
             keep_freed_memory(MMAP_BYTES)
         if len(self.records) != self.capacity:
             self.records = self.records[:0].clone()
             self.records = torch.zeros(self.capacity, self.layout.width, device=self._device)
-        self._place = np.full(len(self.rows), -1, np.int32)  # of each row, where its record is; -1: not here
-        self._row = np.zeros(self.capacity, np.int32)  # of each record, which row it is
-        self._group = np.full(self.capacity, FREE, np.int32)  # or FREE - 1 - the clock when it left one
+        self._slot = np.full(len(self.rows), -1, np.int32)  # slot of each row, -1 if it is not cached
+        self._row = np.zeros(self.capacity, np.int32)  # row of each slot
+        self._group = np.full(self.capacity, FREE, np.int32)  # of each slot; FREE - 1 - clock after its cut
         self._dirty = np.zeros(self.capacity, bool)
-        self._free = np.arange(self.capacity, dtype=np.int32)[::-1].copy()  # a stack of places
-        self._room = self.capacity  # of these so many are left
-        self._places: dict[int, np.ndarray] = {}  # of each group whose cut is here, int32
-        self._held = 0  # rows of all these
+        self._free = np.arange(self.capacity, dtype=np.int32)[::-1].copy()  # stack of free slots
+        self._room = self.capacity  # number of free slots
+        self._cuts: dict[int, np.ndarray] = {}  # int32 slots of each group whose cut is cached
+        self._cut_rows = 0  # total number of rows of these cuts
         self._distance = np.full(groups, np.nan)
         self._used = np.full(groups, -1)
         self._clock = 0
 
     def __len__(self) -> int:
-        """Rows that are here."""
+        """Return the number of cached rows."""
         return self.capacity - self._room
 
     @property
     def tables(self) -> int:
-        """Bytes of what is kept of all rows there are."""
+        """Bytes of the tables of all rows."""
         return INDEX_BYTES * len(self.rows) + self.rows.tables
 
     # -- a step ----------------------------------------------------------------------------------------
 
     def reusable(self, groups: np.ndarray, distances: np.ndarray) -> np.ndarray:
-        """Which of some groups (G,) have a cut here that serves for these distances (G,)."""
-        made = self._distance[groups]
+        """Find groups (G,) whose cached cut is valid at these distances (G,), as (G,) bool."""
+        original = self._distance[groups]
         with np.errstate(invalid="ignore"):
-            return (distances >= self._least * made) & (distances <= self._most * made)
+            return (distances >= self._min_ratio * original) & (distances <= self._max_ratio * original)
 
     def acquire(self, groups: np.ndarray, distances: np.ndarray, cut: Cut) -> np.ndarray:
-        """Where the records of groups are, brought in where no cut of theirs serves.
+        """Return the slots of the cuts of groups, and load cuts that are not cached or not valid.
 
         Args:
-            groups: (G,) int64, each once.
-            distances: (G,) from the eye to the root of each.
-            cut: asked for the rows of those that are not here, or for another distance.
+            groups: (G,) int64, distinct.
+            distances: (G,) from the camera to the root of each.
+            cut: compute cuts that have to be loaded.
 
         Returns:
-            (M,) int64 places, for :meth:`get` and :meth:`put`: group after group, each in its cut's order.
+            (M,) int64 slots for :meth:`get` and :meth:`put`: group after group, each in its cut's order.
 
         Raises:
-            NoRoom: there is none for them all; nothing has changed.
-            ValueError: a row is in two groups, or in one twice.
+            CutTooLarge: the cuts exceed the capacity; nothing has changed.
+            ValueError: duplicate row, in a group or in two.
         """
-        groups, distances = np.asarray(groups, np.int64), np.asarray(distances, np.float64)
-        for known in (self.reusable(groups, distances), np.zeros(len(groups), bool)):
-            anew = np.flatnonzero(~known)
-            rows, counts = cut(anew) if len(anew) else (np.zeros(0, np.int64), np.zeros(0, np.int64))
-            there = sum(len(self._places[group]) for group in groups[known].tolist())
-            if there + len(rows) <= self.capacity or not known.any():
-                break  # otherwise cuts that are finer than they need be have no room
-        if there + len(rows) > self.capacity:
-            needed = there + len(rows)
-            budget = needed * (self._record + SLOT_BYTES) + self.tables
+        groups = np.asarray(groups, np.int64)
+        distances = np.asarray(distances, np.float64)
+        for valid in (self.reusable(groups, distances), np.zeros(len(groups), bool)):
+            missing = np.flatnonzero(~valid)
+            rows, counts = cut(missing) if len(missing) else (np.zeros(0, np.int64), np.zeros(0, np.int64))
+            cached = sum(len(self._cuts[group]) for group in groups[valid].tolist())
+            if cached + len(rows) <= self.capacity or not valid.any():
+                break  # otherwise compute all cuts again, as cached ones may be finer than necessary
+        if cached + len(rows) > self.capacity:
+            needed = cached + len(rows)
+            budget = needed * (self._record_bytes + SLOT_BYTES) + self.tables
             raise CutTooLarge(needed, self.capacity, budget)
         self._clock += 1
         self._used[groups] = self._clock
-        self.reused += there
-        if len(anew):
-            self._bring(groups[anew], np.asarray(rows, np.int64), np.asarray(counts, np.int64))
-        self._distance[groups[anew]] = distances[anew]
-        places = [self._places[group] for group in groups.tolist()]
-        return np.concatenate(places, dtype=np.int64) if places else np.zeros(0, np.int64)
+        self.reused += cached
+        if len(missing):
+            self._load(groups[missing], np.asarray(rows, np.int64), np.asarray(counts, np.int64))
+        self._distance[groups[missing]] = distances[missing]
+        slots = [self._cuts[group] for group in groups.tolist()]
+        return np.concatenate(slots, dtype=np.int64) if slots else np.zeros(0, np.int64)
 
-    def rows_at(self, places: np.ndarray) -> np.ndarray:
-        """Which rows (M,) are at places (M,)."""
-        return self._row[places]
+    def rows_at(self, slots: np.ndarray) -> np.ndarray:
+        """Return the rows (M,) in slots (M,)."""
+        return self._row[slots]
 
-    def groups_at(self, places: np.ndarray) -> np.ndarray:
-        """Which groups (M,) these are of."""
-        return self._group[places]
+    def groups_at(self, slots: np.ndarray) -> np.ndarray:
+        """Return the groups (M,) of slots (M,)."""
+        return self._group[slots]
 
-    def get(self, places: np.ndarray) -> torch.Tensor:
-        """A copy of the records (M, width) at places (M,), on the device."""
-        return self.records.index_select(0, torch.from_numpy(places).to(self._device))
+    def get(self, slots: np.ndarray) -> torch.Tensor:
+        """Copy the records (M, width) in slots (M,), on the device."""
+        return self.records.index_select(0, torch.from_numpy(slots).to(self._device))
 
-    def put(self, places: np.ndarray, records: torch.Tensor) -> None:
-        """Puts records (M, width) at places (M,), each named once."""
-        self.records.index_copy_(0, torch.from_numpy(places).to(self._device), records)
-        self.mark_changed(places)
+    def put(self, slots: np.ndarray, records: torch.Tensor) -> None:
+        """Store records (M, width) in distinct slots (M,)."""
+        self.records.index_copy_(0, torch.from_numpy(slots).to(self._device), records)
+        self.mark_changed(slots)
 
-    def mark_changed(self, places: np.ndarray) -> None:
-        """The records at places (M,) are to be written back."""
-        self._dirty[places] = True
+    def mark_changed(self, slots: np.ndarray) -> None:
+        """Mark the records in slots (M,) to be written to disk."""
+        self._dirty[slots] = True
 
     def end_step(self, step: int) -> None:
-        """To be called after every step: cuts are forgotten where that is due."""
+        """Release all cuts if due. Call after every step."""
         if due(self._flush_interval, step + 1):
             self.release_cuts()
 
-    # -- coming and going ------------------------------------------------------------------------------
+    # -- loading and eviction --------------------------------------------------------------------------
 
     def write_back(self) -> None:
-        """What has changed is written; all stays here."""
+        """Write changed records to disk. All rows stay cached."""
         self._write(np.flatnonzero(self._dirty))
 
     def release_cuts(self) -> None:
-        """No cut serves any more; rows stay here."""
-        self._leave(list(self._places.values()))
-        self._places = {}
+        """Invalidate all cuts. Their rows stay cached."""
+        self._leave(list(self._cuts.values()))
+        self._cuts = {}
         self._distance[:] = np.nan
 
     def evict_all(self) -> None:
-        """Writes back, and keeps nothing."""
+        """Write changed records to disk and empty the cache."""
         self.release_cuts()
-        self._drop(np.flatnonzero(self._group != FREE))
+        self._evict(np.flatnonzero(self._group != FREE))
 
-    def _bring(self, groups: np.ndarray, rows: np.ndarray, counts: np.ndarray) -> None:
-        """Makes some groups consist of these rows; what they have in common with before stays."""
-        owners, places = np.repeat(groups, counts), self._place[rows]
-        here = places >= 0
-        coming, stays = rows[~here], places[here]
-        self._place[coming] = np.arange(len(coming), dtype=np.int32)
-        twice = not np.array_equal(self._place[coming], np.arange(len(coming)))
-        self._place[coming] = -1
-        others = self._group[stays]
-        if twice or ((others >= 0) & (others != owners[here])).any() or len(np.unique(stays)) < len(stays):
-            raise ValueError("a row is in two groups, or in one twice")
-        self._leave([self._places.pop(group) for group in groups.tolist() if group in self._places])
-        self._group[stays] = owners[here]
-        over = self._held + len(rows) - self.capacity
-        if over > 0:
-            self._leave(self._least_used(over))
-        short = len(coming) - self._room
-        if short > 0:
-            self._drop(self._longest_left(short))
-        self._held += len(rows)
-        self._room -= len(coming)
-        room = self._free[self._room : self._room + len(coming)].astype(np.int64)
-        for first in range(0, len(coming), self._at_once):
-            some = slice(first, first + self._at_once)
+    def _load(self, groups: np.ndarray, rows: np.ndarray, counts: np.ndarray) -> None:
+        """Set the rows of groups. Rows that are cached stay in their slots."""
+        owners = np.repeat(groups, counts)
+        slots = self._slot[rows]
+        cached = slots >= 0
+        new_rows = rows[~cached]
+        cached_slots = slots[cached]
+        self._slot[new_rows] = np.arange(len(new_rows), dtype=np.int32)
+        duplicate = not np.array_equal(self._slot[new_rows], np.arange(len(new_rows)))
+        self._slot[new_rows] = -1
+        previous = self._group[cached_slots]
+        conflict = ((previous >= 0) & (previous != owners[cached])).any()
+        if duplicate or conflict or len(np.unique(cached_slots)) < len(cached_slots):
+            raise ValueError("duplicate row, in a group or in two")
+        self._leave([self._cuts.pop(group) for group in groups.tolist() if group in self._cuts])
+        self._group[cached_slots] = owners[cached]
+        excess = self._cut_rows + len(rows) - self.capacity
+        if excess > 0:
+            self._leave(self._pop_least_used(excess))
+        shortage = len(new_rows) - self._room
+        if shortage > 0:
+            self._evict(self._oldest_slots(shortage))
+        self._cut_rows += len(rows)
+        self._room -= len(new_rows)
+        new_slots = self._free[self._room : self._room + len(new_rows)].astype(np.int64)
+        for first in range(0, len(new_rows), self._batch_rows):
+            batch = slice(first, first + self._batch_rows)
             if self._device.type == "cpu":
-                self.rows.read(coming[some], self.records, room[some])
+                self.rows.read(new_rows[batch], self.records, new_slots[batch])
                 continue
-            records = self.rows.read(coming[some]).pin_memory().to(self._device, non_blocking=True)
-            self.records.index_copy_(0, torch.from_numpy(room[some]).to(self._device), records)
-        self._place[coming], self._row[room] = room, coming
-        places[~here] = room
-        self._group[places] = owners
+            records = self.rows.read(new_rows[batch]).pin_memory().to(self._device, non_blocking=True)
+            self.records.index_copy_(0, torch.from_numpy(new_slots[batch]).to(self._device), records)
+        self._slot[new_rows] = new_slots
+        self._row[new_slots] = new_rows
+        slots[~cached] = new_slots
+        self._group[slots] = owners
         ends = np.cumsum(counts)
-        parts = (part.copy() for part in np.split(places, ends[:-1]))  # each leaves by itself
-        self._places |= zip(groups.tolist(), parts, strict=True)
-        self.loaded += len(coming)
-        self.reused += len(stays)
+        cuts = (part.copy() for part in np.split(slots, ends[:-1]))  # copies, which are freed separately
+        self._cuts |= zip(groups.tolist(), cuts, strict=True)
+        self.loaded += len(new_rows)
+        self.reused += len(cached_slots)
 
-    def _least_used(self, short: int) -> list[np.ndarray]:
-        """The cuts of groups that go, so that so many rows fit, and some more; none that are in use now."""
-        others = np.array([g for g in self._places if self._used[g] < self._clock], np.int64)
-        others = others[np.lexsort((others, self._used[others]))]
-        sizes = np.cumsum([len(self._places[group]) for group in others.tolist()])
-        enough = short + int((1 - self._reduced) * self.capacity)
-        many = min(int(np.searchsorted(sizes, enough)) + 1, len(others))
-        self._distance[others[:many]] = np.nan
-        return [self._places.pop(group) for group in others[:many].tolist()]
+    def _pop_least_used(self, excess: int) -> list[np.ndarray]:
+        """Remove cuts with at least ``excess`` rows, least recently used first, but none of this step."""
+        unused = np.array([group for group in self._cuts if self._used[group] < self._clock], np.int64)
+        unused = unused[np.lexsort((unused, self._used[unused]))]
+        sizes = np.cumsum([len(self._cuts[group]) for group in unused.tolist()])
+        target = excess + int((1 - self._keep_share) * self.capacity)
+        count = min(int(np.searchsorted(sizes, target)) + 1, len(unused))
+        self._distance[unused[:count]] = np.nan
+        return [self._cuts.pop(group) for group in unused[:count].tolist()]
 
     def _leave(self, cuts: list[np.ndarray]) -> None:
-        """The rows at these places are in no cut from now on."""
-        for places in cuts:
-            self._group[places] = FREE - 1 - self._clock
-            self._held -= len(places)
+        """Mark the rows in the slots of cuts as being in no cut."""
+        for slots in cuts:
+            self._group[slots] = FREE - 1 - self._clock
+            self._cut_rows -= len(slots)
 
-    def _longest_left(self, short: int) -> np.ndarray:
-        """The places of rows in no cut that go, so that so many are free, and some more."""
-        left = self._group[self._group < FREE]
-        enough = min(max(short, int((1 - self._reduced) * self.capacity)), len(left))
-        if not enough:
+    def _oldest_slots(self, shortage: int) -> np.ndarray:
+        """Return at least ``shortage`` slots of rows in no cut, those that left their cut first."""
+        ages = self._group[self._group < FREE]
+        count = min(max(shortage, int((1 - self._keep_share) * self.capacity)), len(ages))
+        if not count:
             return np.zeros(0, np.int64)
-        left.partition(len(left) - enough)  # sorting all would take five times the memory
-        border = left[len(left) - enough]
-        del left
-        before = np.flatnonzero((self._group > border) & (self._group < FREE))
-        return np.append(before, np.flatnonzero(self._group == border)[: enough - len(before)])
+        ages.partition(len(ages) - count)  # a full sort would take five times the memory
+        border = ages[len(ages) - count]
+        del ages
+        older = np.flatnonzero((self._group > border) & (self._group < FREE))
+        return np.append(older, np.flatnonzero(self._group == border)[: count - len(older)])
 
-    def _drop(self, places: np.ndarray) -> None:
-        self._write(places[self._dirty[places]])
-        self._place[self._row[places]] = -1
-        self._group[places] = FREE
-        self._free[self._room : self._room + len(places)] = places
-        self._room += len(places)
+    def _evict(self, slots: np.ndarray) -> None:
+        self._write(slots[self._dirty[slots]])
+        self._slot[self._row[slots]] = -1
+        self._group[slots] = FREE
+        self._free[self._room : self._room + len(slots)] = slots
+        self._room += len(slots)
 
-    def _write(self, places: np.ndarray) -> None:
-        """Writes back the records at places, in the order of their rows."""
-        places = places[np.argsort(self._row[places])]
-        for first in range(0, len(places), self._at_once):
-            some = places[first : first + self._at_once]
-            here = (self.records, some) if self._device.type == "cpu" else (self.get(some).cpu(), None)
-            self.rows.write(self._row[some], *here)
-            self._dirty[some] = False
+    def _write(self, slots: np.ndarray) -> None:
+        """Write the records in slots to disk, in the order of their rows."""
+        slots = slots[np.argsort(self._row[slots])]
+        for first in range(0, len(slots), self._batch_rows):
+            batch = slots[first : first + self._batch_rows]
+            on_host = self._device.type == "cpu"
+            source = (self.records, batch) if on_host else (self.get(batch).cpu(), None)
+            self.rows.write(self._row[batch], *source)
+            self._dirty[batch] = False
 
-    # -- what lasts ------------------------------------------------------------------------------------
+    # -- checkpoints -----------------------------------------------------------------------------------
 
     def state_dict(self) -> dict[str, Any]:
-        """A checkpoint of the rows, see ``RowFile.state_dict``, and which of them are here."""
+        """Return a checkpoint of the rows (see ``RowFile.state_dict``) and of the cached cuts."""
         self.write_back()
-        groups = sorted(self._places)
-        places = [self._places[group] for group in groups]
+        groups = sorted(self._cuts)
+        slots = [self._cuts[group] for group in groups]
         return {
             "rows": self.rows.state_dict(),
             "groups": torch.tensor(groups, dtype=torch.int64),
-            "counts": torch.tensor([len(each) for each in places], dtype=torch.int64),
-            "here": torch.from_numpy(self._row[np.concatenate(places)] if places else self._row[:0].copy()),
+            "counts": torch.tensor([len(cut) for cut in slots], dtype=torch.int64),
+            "here": torch.from_numpy(self._row[np.concatenate(slots)] if slots else self._row[:0].copy()),
             "distance": torch.from_numpy(self._distance.copy()),
             "used": torch.from_numpy(self._used.copy()),
             "clock": self._clock,
@@ -319,18 +332,20 @@ class CutCache:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Goes on from what ``state_dict`` gave, with a budget that may be another one.
+        """Restore a checkpoint. The budget may differ.
 
         Raises:
             ValueError: the rows cannot be read.
         """
         self.rows.load_state_dict(state["rows"])
-        groups, counts, here, distance, used = (
+        groups, counts, rows, distance, used = (
             state[name].cpu().numpy().copy() for name in ("groups", "counts", "here", "distance", "used")
         )
-        self._forget(len(used))
-        if len(here) > self.capacity:
+        self._reset(len(used))
+        if len(rows) > self.capacity:
             return
         if len(groups):
-            self._bring(groups, here, counts)
-        self._distance, self._used, self._clock = distance, used, state["clock"]
+            self._load(groups, rows, counts)
+        self._distance = distance
+        self._used = used
+        self._clock = state["clock"]

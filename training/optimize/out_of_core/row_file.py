@@ -1,13 +1,12 @@
-"""Rows of numbers outside memory: splats with their moments in one file of a run, read and written in parts.
+"""Rows of numbers on disk: splats with their moments in one file of a run, read and written in blocks.
 
-The file consists of slots that hold a block of rows each, and a table says which slot each block is in. What
-a checkpoint has is never overwritten: the first time that a block is written after one, it goes to another
-slot, and a checkpoint is the table alone, with a checksum of each block, kept in what ``checkpoints`` writes
-by rename. So it costs what has changed since the last one, and whatever ends a trainer, a full disk too,
-leaves every checkpoint as it was.
+The file consists of slots of one block of rows each, and a table maps blocks to slots. Slots of a checkpoint
+are never overwritten: the first write to a block after a checkpoint goes to another slot. A checkpoint is the
+table with a checksum of each block, in the file that ``checkpoints`` writes by rename. Its cost is therefore
+proportional to the changes since the last one, and a crash or a full disk leaves every checkpoint intact.
 
-The file is read and written by explicit calls, not mapped: a mapped page counts as the process's own memory
-for as long as the system leaves it there, and a failing disk would end the process by a signal.
+The file is read and written by explicit calls, not mapped: the system counts mapped pages as memory of the
+process, and a disk error would end the process by a signal.
 """
 
 from __future__ import annotations
@@ -31,23 +30,23 @@ import torch
 from ...errors import LodgsError
 
 BLOCK = 16
-"""Rows of a block. Of rows that a step brings half as many bytes are written as with 64: blocks are whole."""
+"""Rows per block. Blocks are written whole; 16 halve the bytes written per step compared with 64."""
 TABLE_BYTES = 21
-"""Bytes in memory for each block, at most: where it is, its checksum, and where checkpoints have it."""
+"""Maximum memory per block in bytes: its slot, its checksum and its slots in checkpoints."""
 MAX_GAP = 4
-"""Blocks between two that are wanted, at most, which are read with them: it takes less time than a call."""
+"""Maximum gap in blocks to read along, as one larger read is faster than two."""
 STAGING_BYTES = 3 << 18
-"""Bytes of blocks that are between file and tensors at a time; in up to six copies, all told."""
+"""Bytes per transfer between file and tensors; up to six copies are in memory."""
 OLD_CHECKPOINTS = 2
-"""Checkpoints before the newest one whose blocks stay: a run has as many, the newest may not be whole yet."""
+"""Older checkpoints whose blocks are preserved, as many as a run keeps, in case the newest is incomplete."""
 
 
 class RowLayout:
-    """What a row holds: arrays by name, one after the other, float32.
+    """Layout of a row: consecutive float32 arrays by name.
 
     Attributes:
-        shapes: of each array of a row; () for a number.
-        width: numbers of a row.
+        shapes: shape of each array; () for a number.
+        width: number of values in a row.
     """
 
     def __init__(self, shapes: Mapping[str, tuple[int, ...]]) -> None:
@@ -55,27 +54,27 @@ class RowLayout:
         self.width = sum(map(prod, self.shapes.values()))
 
     def split(self, records: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Views of records (M, width), by name: (M, ...)."""
+        """Return views of records (M, width) by name, (M, ...)."""
         parts = records.split([prod(shape) for shape in self.shapes.values()], dim=1)
         shapes = zip(self.shapes.items(), parts, strict=True)
         return {name: part.unflatten(1, shape) if shape else part[:, 0] for (name, shape), part in shapes}
 
     def join(self, tensors: Mapping[str, torch.Tensor]) -> torch.Tensor:
-        """Records (M, width) of tensors (M, ...) by name."""
+        """Join tensors (M, ...) by name to records (M, width)."""
         return torch.cat([tensors[name].reshape(len(tensors[name]), -1) for name in self.shapes], 1)
 
 
 class RowFile:
-    """Rows in a file of a folder; in memory are some numbers of each block of them, see TABLES.
+    """Rows in a file, with a table of ``TABLE_BYTES`` per block in memory. Not thread-safe.
 
-    For one thread. Where a write fails, what it was to replace may be lost: nothing more is read or written
-    then, and a run goes on from its last checkpoint.
+    A failed write may lose the previous rows. All later reads and writes fail, and the run has to resume from
+    its last checkpoint.
 
     Args:
-        folder: where the file is made, when first written to, under a name of its own.
-        block: rows that are read and written together at least.
-        staging: bytes, see STAGING.
-        name: what the file's name begins with; others in the same folder have other ones.
+        folder: folder of the file, which is created at the first write under a unique name.
+        block: rows per block.
+        staging: bytes, see ``STAGING_BYTES``.
+        name: start of the file's name, unique in the folder.
     """
 
     def __init__(
@@ -86,23 +85,25 @@ class RowFile:
         staging: int = STAGING_BYTES,
         name: str = "rows",
     ) -> None:
-        self.layout, self._folder, self._block, self._name = layout, folder, block, name
-        self._blocks_at_once = max(staging // (4 * layout.width * block), 1)
+        self.layout = layout
+        self._folder = folder
+        self._block = block
+        self._name = name
+        self._batch_blocks = max(staging // (4 * layout.width * block), 1)
         self._file: FileIO | None = None
         self._broken: LodgsError | None = None
-        self._begin_anew()
+        self._clear()
 
-    def _begin_anew(self) -> None:
-        self._count, self._size = 0, 0  # rows, and slots that the file has
-        self._slots = np.zeros(0, np.int32)  # of each block; -1: all zeros, in none
+    def _clear(self) -> None:
+        self._count = 0  # rows
+        self._size = 0  # slots of the file
+        self._slots = np.zeros(0, np.int32)  # slot of each block, -1 for zeros without a slot
         self._checks = np.zeros(0, np.int32)  # CRC-32 of each block
-        self._fresh = np.zeros(0, bool)  # whether it has been written since the last checkpoint
-        self._free = np.zeros(0, np.int32)  # slots that nobody needs
-        self._retiring: list[np.ndarray] = []  # slots of the last checkpoint that have been replaced since
-        self._retired: deque[np.ndarray] = deque()  # the same of the checkpoints before it, oldest first
-        self._named: deque[str] = deque(
-            maxlen=OLD_CHECKPOINTS + 1
-        )  # files that these and the last one tell of
+        self._fresh = np.zeros(0, bool)  # blocks written since the last checkpoint
+        self._free = np.zeros(0, np.int32)  # unused slots
+        self._retiring: list[np.ndarray] = []  # slots of the last checkpoint replaced since
+        self._retired: deque[np.ndarray] = deque()  # the same for older checkpoints, oldest first
+        self._named: deque[str] = deque(maxlen=OLD_CHECKPOINTS + 1)  # files of these checkpoints
 
     def __len__(self) -> int:
         return self._count
@@ -111,64 +112,68 @@ class RowFile:
 
     @property
     def tables(self) -> int:
-        """Bytes in memory, at most."""
+        """Maximum memory of the tables in bytes."""
         return TABLE_BYTES * len(self._slots)
 
     def read(
         self, rows: np.ndarray, records: torch.Tensor | None = None, at: np.ndarray | None = None
     ) -> torch.Tensor:
-        """Records (M, width) at rows (M,) int64, in any order, on the CPU.
+        """Read the records (M, width) of rows (M,) int64, in any order, to the CPU.
 
         Args:
-            records: where they are put, (N, width) on the CPU, and come back; None: they alone.
-            at: (M,) int64 in these, each once; None: all.
+            records: output (N, width) on the CPU; None for a new tensor.
+            at: (M,) int64 distinct rows of the output; None for all.
+
+        Returns:
+            The output.
 
         Raises:
             LodgsError: the file cannot be read.
         """
-        self._require_whole()
-        rows = _checked(rows, self._count)
+        self._require_intact()
+        rows = _check_rows(rows, self._count)
         records = torch.empty(len(rows), self.layout.width) if records is None else records
-        found, slots = records.numpy(), self._slots[rows // self._block].astype(np.int64)
-        there = np.flatnonzero(slots >= 0)
-        to = there if at is None else at[there]
-        if len(there) < len(rows):
-            nowhere = np.flatnonzero(slots < 0)
-            found[nowhere if at is None else at[nowhere]] = 0
-        self._read_places(slots[there] * self._block + rows[there] % self._block, to, found)
+        output = records.numpy()
+        slots = self._slots[rows // self._block].astype(np.int64)
+        stored = np.flatnonzero(slots >= 0)
+        to = stored if at is None else at[stored]
+        if len(stored) < len(rows):
+            zero = np.flatnonzero(slots < 0)
+            output[zero if at is None else at[zero]] = 0
+        self._read_positions(slots[stored] * self._block + rows[stored] % self._block, to, output)
         return records
 
     def write(self, rows: np.ndarray, records: torch.Tensor, at: np.ndarray | None = None) -> None:
-        """Puts records (M, width) at rows (M,) int64, each named once, in any order.
+        """Write records (M, width) to distinct rows (M,) int64, in any order.
 
         Args:
-            at: (M,) int64: these of records (N, width); None: all.
+            at: (M,) int64 indices into records (N, width); None for all.
 
         Raises:
             LodgsError: the disk is full, or the file cannot be written.
-            ValueError: a row is named twice.
+            ValueError: duplicate row.
         """
-        self._require_whole()
-        rows = _checked(rows, self._count)
+        self._require_intact()
+        rows = _check_rows(rows, self._count)
         values = records.detach().numpy()
         if (np.diff(rows) < 0).any():
             order = np.argsort(rows)
             rows, at = rows[order], order if at is None else at[order]
         if (np.diff(rows) == 0).any():
-            raise ValueError("a row is written twice")
-        begins = _begins(rows // self._block)
+            raise ValueError("duplicate row")
+        begins = _run_starts(rows // self._block)
         ends = np.append(begins[1:], len(rows))
-        for first in range(0, len(begins), self._blocks_at_once):
-            some = slice(first, first + self._blocks_at_once)
-            part = slice(begins[some][0], ends[some][-1])
-            given = values[part] if at is None else values[at[part]]
-            self._write_blocks((ends - begins)[some], rows[part], given)
+        for first in range(0, len(begins), self._batch_blocks):
+            batch = slice(first, first + self._batch_blocks)
+            part = slice(begins[batch][0], ends[batch][-1])
+            source = values[part] if at is None else values[at[part]]
+            self._write_blocks((ends - begins)[batch], rows[part], source)
 
     def append(self, records: torch.Tensor) -> None:
-        """Adds rows (M, width) at the end.
+        """Add rows (M, width) at the end.
 
         Raises:
-            LodgsError: as :meth:`write`.
+            LodgsError: see :meth:`write`.
         """
         begin, self._count = self._count, self._count + len(records)
         more = -(-self._count // self._block) - len(self._slots)
@@ -180,25 +185,25 @@ class RowFile:
     # -- checkpoints -----------------------------------------------------------------------------------
 
     def state_dict(self) -> dict[str, Any]:
-        """A checkpoint, for the file that is then written; what it tells of is on the disk.
+        """Return a checkpoint, after flushing the rows to disk.
 
-        Call it for nothing else: after three further calls slots of this one are used again.
+        Only call this to write a checkpoint: after three further calls, its slots are reused.
 
         Raises:
-            LodgsError: the disk does not take it.
+            LodgsError: the file cannot be written.
         """
-        self._require_whole()
-        with self._telling():
+        self._require_intact()
+        with self._convert_errors():
             if self._file is not None:
                 os.fsync(self._file.fileno())
-        self._retired.append(_joined(self._retiring))
+        self._retired.append(_concatenate(self._retiring))
         self._retiring = []
         while len(self._retired) > OLD_CHECKPOINTS:
             self._free = np.sort(np.append(self._free, self._retired.popleft()))
         self._fresh[:] = False
         self._named.append(self._file_name)
         if len(self._named) > OLD_CHECKPOINTS:
-            self._remove_others()
+            self._remove_old_files()
         return {
             "file": self._file_name,
             "named": list(self._named),
@@ -211,25 +216,25 @@ class RowFile:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Goes on from a checkpoint, all of which is read once to be sure of it.
+        """Restore a checkpoint and verify all of its rows.
 
         Raises:
-            ValueError: the file is not there, is damaged, or is not of such rows.
+            ValueError: the file is missing, corrupt, or has other rows.
         """
         self.discard()
         shapes = {name: tuple(shape) for name, shape in state["shapes"].items()}
         if shapes != self.layout.shapes or state["block"] != self._block:
-            raise ValueError("its rows are of another kind")
+            raise ValueError("its rows have another layout")
         self._count = state["count"]
         self._slots, self._checks = (state[name].cpu().numpy().copy() for name in ("slots", "checks"))
         self._retired = deque(slots.cpu().numpy().copy() for slots in state["retired"])
-        self._named.extend(state.get("named", ()))  # older checkpoints do not have it
+        self._named.extend(state.get("named", ()))  # missing in older checkpoints
         self._fresh = np.zeros(len(self._slots), bool)
         if not (0 <= self._count <= len(self._slots) * self._block and len(self._slots) == len(self._checks)):
-            raise ValueError("its table of rows is damaged")
+            raise ValueError("its row table is corrupt")
         if state["file"]:
-            if not self._may_be(state["file"]):
-                raise ValueError("its file of rows has an impossible name")
+            if not self._is_row_file(state["file"]):
+                raise ValueError("its row file has an invalid name")
             path = self._folder / state["file"]
             if path.is_symlink() or not path.is_file():
                 raise ValueError(f"{path.name} is missing")
@@ -239,123 +244,127 @@ class RowFile:
         self._free = np.setdiff1d(np.arange(self._size, dtype=np.int32), taken)
 
     def close(self) -> None:
-        """Closes the file."""
+        """Close the file."""
         if self._file is not None:
             self._file.close()
             self._file = None
 
     def supersede(self, other: RowFile) -> None:
-        """Takes the place of other rows of the same folder, whose file goes once no checkpoint has it."""
+        """Replace other rows in the same folder. Their file is deleted when no checkpoint uses it."""
         self._named.extend(other._named)
         other.discard()
 
     def discard(self) -> None:
-        """Forgets all rows; a file that no checkpoint tells of is removed."""
+        """Drop all rows, and delete the file if no checkpoint uses it."""
         if self._file is not None:
-            path, unknown = Path(str(self._file.name)), self._file_name not in self._named
+            path = Path(str(self._file.name))
+            unused = self._file_name not in self._named
             self.close()
-            if unknown:
+            if unused:
                 path.unlink(missing_ok=True)
         self._broken = None
-        self._begin_anew()
+        self._clear()
 
     def _verify(self) -> None:
         if (self._slots >= self._size).any() or (self._slots < -1).any():
-            raise ValueError("its file of rows is cut short")
-        there = np.flatnonzero(self._slots >= 0)
-        there = there[np.argsort(self._slots[there])]
-        for first in range(0, len(there), self._blocks_at_once):
-            some = there[first : first + self._blocks_at_once]
-            found = np.empty((len(some), self._block, self.layout.width), np.float32)
-            self._read_slots(self._slots[some], np.arange(len(some)), found)
-            if (_checksums(found) != self._checks[some]).any():
-                raise ValueError("its file of rows is damaged")
+            raise ValueError("its row file is truncated")
+        stored = np.flatnonzero(self._slots >= 0)
+        stored = stored[np.argsort(self._slots[stored])]
+        for first in range(0, len(stored), self._batch_blocks):
+            batch = stored[first : first + self._batch_blocks]
+            blocks = np.empty((len(batch), self._block, self.layout.width), np.float32)
+            self._read_slots(self._slots[batch], np.arange(len(batch)), blocks)
+            if (_checksums(blocks) != self._checks[batch]).any():
+                raise ValueError("its row file is corrupt")
 
-    def _remove_others(self) -> None:
-        """Removes files that no checkpoint tells of any more, of earlier lives of the run as well."""
+    def _remove_old_files(self) -> None:
+        """Delete files that no checkpoint uses, also those of earlier processes of the run."""
         for path in self._folder.glob(f"{self._name}_*.bin"):
-            if self._may_be(path.name) and path.name not in self._named:
+            if self._is_row_file(path.name) and path.name not in self._named:
                 with suppress(OSError):
                     path.unlink()
 
-    def _may_be(self, name: str) -> bool:
+    def _is_row_file(self, name: str) -> bool:
         return re.fullmatch(rf"{self._name}_[0-9a-f]{{8}}\.bin", name) is not None
 
     # -- blocks ----------------------------------------------------------------------------------------
 
-    def _write_blocks(self, given: np.ndarray, rows: np.ndarray, values: np.ndarray) -> None:
-        """Writes the blocks (B,) of rows (M,), ascending, of which each has so many: ``given`` (B,)."""
-        blocks = rows[np.cumsum(given) - given] // self._block
-        before, fresh = self._slots[blocks], self._fresh[blocks]
-        held = np.minimum(self._count - blocks * self._block, self._block)
-        slots = before.copy()
+    def _write_blocks(self, counts: np.ndarray, rows: np.ndarray, values: np.ndarray) -> None:
+        """Write ascending rows (M,) that lie in B blocks, with ``counts`` (B,) rows in each."""
+        blocks = rows[np.cumsum(counts) - counts] // self._block
+        previous = self._slots[blocks]
+        fresh = self._fresh[blocks]
+        sizes = np.minimum(self._count - blocks * self._block, self._block)
+        slots = previous.copy()
         slots[~fresh] = self._new_slots(int((~fresh).sum()))
-        place = np.empty_like(slots)  # of each block in the buffer, which is in the order of the file
-        place[np.argsort(slots)] = np.arange(len(slots))
+        position = np.empty_like(slots)  # of each block in the buffer, which is in the order of the file
+        position[np.argsort(slots)] = np.arange(len(slots))
         buffer = np.zeros((len(slots), self._block, self.layout.width), np.float32)
-        old = np.flatnonzero((given < held) & (before >= 0))
-        self._read_slots(before[old], place[old], buffer)
-        buffer[np.repeat(place, given), rows % self._block] = values
-        with self._telling():
+        partial = np.flatnonzero((counts < sizes) & (previous >= 0))
+        self._read_slots(previous[partial], position[partial], buffer)
+        buffer[np.repeat(position, counts), rows % self._block] = values
+        with self._convert_errors():
             file = self._file or self._open(self._folder / f"{self._name}_{uuid4().hex[:8]}.bin", new=True)
             in_order = np.sort(slots)
             for run in _runs(in_order):
                 file.seek(int(in_order[run.start]) * self._block_bytes)
                 _write(file, buffer[run])
-        self._slots[blocks], self._checks[blocks], self._fresh[blocks] = (
-            slots,
-            _checksums(buffer)[place],
-            True,
-        )
-        self._retiring.append(before[~fresh & (before >= 0)])
+        self._slots[blocks] = slots
+        self._checks[blocks] = _checksums(buffer)[position]
+        self._fresh[blocks] = True
+        self._retiring.append(previous[~fresh & (previous >= 0)])
 
     def _new_slots(self, count: int) -> np.ndarray:
-        """Slots that nobody needs, ascending; at the end of the file where there are no others."""
-        found, self._free = self._free[:count], self._free[count:]
-        end = np.arange(self._size, self._size + count - len(found), dtype=np.int32)
-        self._size += len(end)
-        return np.append(found, end)
+        """Return unused slots, ascending, extending the file if necessary."""
+        reused, self._free = self._free[:count], self._free[count:]
+        added = np.arange(self._size, self._size + count - len(reused), dtype=np.int32)
+        self._size += len(added)
+        return np.append(reused, added)
 
-    def _read_slots(self, slots: np.ndarray, to: np.ndarray, found: np.ndarray) -> None:
-        """Reads the blocks in slots (B,) to places ``to`` (B,) among blocks ``found`` (., block, width)."""
-        inside = np.arange(self._block)
-        places, to = ((each[:, None].astype(np.int64) * self._block + inside).ravel() for each in (slots, to))
-        self._read_places(places, to, found.reshape(-1, self.layout.width))
+    def _read_slots(self, slots: np.ndarray, to: np.ndarray, output: np.ndarray) -> None:
+        """Read the blocks in slots (B,) to blocks ``to`` (B,) of the output (., block, width)."""
+        offsets = np.arange(self._block)
+        positions, to = (
+            (blocks[:, None].astype(np.int64) * self._block + offsets).ravel() for blocks in (slots, to)
+        )
+        self._read_positions(positions, to, output.reshape(-1, self.layout.width))
 
-    def _read_places(self, places: np.ndarray, to: np.ndarray, found: np.ndarray) -> None:
-        """Reads the rows at places (M,), counted through all slots, to rows ``to`` (M,) of ``found``.
+    def _read_positions(self, positions: np.ndarray, to: np.ndarray, output: np.ndarray) -> None:
+        """Read the rows at positions (M,) of the file to rows ``to`` (M,) of the output.
 
-        Blocks that follow each other, or nearly, are read at once, with what is between. What does not go
-        where it belongs as it lies there is put in its places afterwards, as much of it together as STAGING
-        has.
+        Adjacent and nearly adjacent blocks are read with one call. Contiguous rows are read directly to the
+        output, others by way of a staging buffer.
         """
-        if (np.diff(places) < 0).any():
-            order = np.argsort(places)
-            places, to = places[order], to[order]
-        most = self._blocks_at_once * self._block
-        runs = _runs(places // self._block, places // most, 1 + MAX_GAP)
-        gaps = np.append(0, np.cumsum((np.diff(places) != 1) | (np.diff(to) != 1)))[: len(places)]
+        if (np.diff(positions) < 0).any():
+            order = np.argsort(positions)
+            positions, to = positions[order], to[order]
+        limit = self._batch_blocks * self._block
+        runs = _runs(positions // self._block, positions // limit, 1 + MAX_GAP)
+        gaps = np.append(0, np.cumsum((np.diff(positions) != 1) | (np.diff(to) != 1)))[: len(positions)]
         staged = np.empty((0, self.layout.width), np.float32)
-        at, used, begin, end = np.empty_like(places), 0, 0, 0  # rows of ``staged``; runs that wait in it
-        with self._telling():
+        at = np.empty_like(positions)  # rows of ``staged``
+        used = begin = end = 0  # used rows of ``staged``, and the range of positions in it
+        with self._convert_errors():
             for run in runs:
-                first, last = int(places[run.start]), int(places[run.stop - 1])
-                as_they_lie = gaps[run.start] == gaps[run.stop - 1] and last - first >= self._block
-                count = 0 if as_they_lie else last - first + 1
-                if begin < end and (as_they_lie or used + count > most):
-                    found[to[begin:end]] = staged[at[begin:end]]
+                first, last = int(positions[run.start]), int(positions[run.stop - 1])
+                contiguous = gaps[run.start] == gaps[run.stop - 1] and last - first >= self._block
+                count = 0 if contiguous else last - first + 1
+                if begin < end and (contiguous or used + count > limit):
+                    output[to[begin:end]] = staged[at[begin:end]]
                     used = begin = end = 0
-                assert self._file is not None, "where a block has a slot there is a file"
+                assert self._file is not None, "blocks with a slot are in a file"
                 self._file.seek(first * 4 * self.layout.width)
-                if as_they_lie:
-                    _read(self._file, found[to[run.start] : to[run.stop - 1] + 1])
+                if contiguous:
+                    _read(self._file, output[to[run.start] : to[run.stop - 1] + 1])
                     continue
                 if not len(staged):
-                    staged = np.empty((most, self.layout.width), np.float32)
+                    staged = np.empty((limit, self.layout.width), np.float32)
                 _read(self._file, staged[used : used + count])
-                np.add(places[run], used - first, out=at[run])
-                used, begin, end = used + count, begin if used else run.start, run.stop
-            found[to[begin:end]] = staged[at[begin:end]]
+                np.add(positions[run], used - first, out=at[run])
+                begin = begin if used else run.start
+                end = run.stop
+                used += count
+            output[to[begin:end]] = staged[at[begin:end]]
 
     # -- the file --------------------------------------------------------------------------------------
 
@@ -372,66 +381,67 @@ class RowFile:
     def _block_bytes(self) -> int:
         return 4 * self.layout.width * self._block
 
-    def _require_whole(self) -> None:
+    def _require_intact(self) -> None:
+        """Raise the error of an earlier failed write or read."""
         if self._broken is not None:
             raise self._broken
 
     @contextmanager
-    def _telling(self) -> Iterator[None]:
-        """What goes wrong with the file is a LodgsError, then and later."""
+    def _convert_errors(self) -> Iterator[None]:
+        """Convert OSError to LodgsError, and keep it for later calls."""
         try:
             yield
         except OSError as error:
             place = self._folder if self._file is None else self._file.name
             self._broken = LodgsError(
-                f"{place} could not be read or written: {error.strerror or error}.",
-                "Free some space there or choose another folder, then resume the run.",
+                f"Cannot read or write {place}: {error.strerror or error}.",
+                "Free disk space or choose another folder, then resume the run.",
             )
             raise self._broken from error
 
 
-def _checked(rows: np.ndarray, count: int) -> np.ndarray:
+def _check_rows(rows: np.ndarray, count: int) -> np.ndarray:
     rows = np.asarray(rows, np.int64)
     if len(rows) and (rows.min() < 0 or rows.max() >= count):
-        raise IndexError(f"rows from {rows.min()} to {rows.max()}, there are {count}")
+        raise IndexError(f"rows {rows.min()} to {rows.max()} are out of range for {count} rows")
     return rows
 
 
-def _joined(arrays: list[np.ndarray]) -> np.ndarray:
+def _concatenate(arrays: list[np.ndarray]) -> np.ndarray:
     return np.concatenate(arrays) if arrays else np.zeros(0, np.int32)
 
 
-def _runs(numbers: np.ndarray, cells: np.ndarray | None = None, apart: int = 1) -> list[slice]:
-    """Where ascending numbers (M,) are at most so far apart, without leaving a cell."""
+def _runs(numbers: np.ndarray, cells: np.ndarray | None = None, max_step: int = 1) -> list[slice]:
+    """Split ascending numbers (M,) into runs with steps of at most ``max_step`` in one cell each."""
     if not len(numbers):
         return []
-    breaks = np.diff(numbers) > apart
+    breaks = np.diff(numbers) > max_step
     if cells is not None:
         breaks |= np.diff(cells) > 0
     borders = [0, *(np.flatnonzero(breaks) + 1).tolist(), len(numbers)]
     return [slice(*ends) for ends in pairwise(borders)]
 
 
-def _begins(numbers: np.ndarray) -> np.ndarray:
-    """Where each of ascending numbers (M,) is the first time."""
+def _run_starts(numbers: np.ndarray) -> np.ndarray:
+    """Return the index of the first occurrence of each of ascending numbers (M,)."""
     return np.flatnonzero(np.append(True, np.diff(numbers) > 0)[: len(numbers)])
 
 
 def _checksums(blocks: np.ndarray) -> np.ndarray:
-    """CRC-32 of each block."""
+    """Return the CRC-32 of each block."""
     return np.array([zlib.crc32(block) for block in blocks], np.uint32).view(np.int32)
 
 
 def _read(file: FileIO, array: np.ndarray) -> None:
-    left = array.data.cast("B")
-    while left:
-        got = file.readinto(left)
-        if not got:
-            raise OSError("it is cut short")
-        left = left[got:]
+    remaining = array.data.cast("B")
+    while remaining:
+        count = file.readinto(remaining)
+        if not count:
+            raise OSError("it is truncated")
+        remaining = remaining[count:]
 
 
 def _write(file: FileIO, array: np.ndarray) -> None:
-    left = np.ascontiguousarray(array).data.cast("B")
-    while left:
-        left = left[file.write(left) :]
+    remaining = np.ascontiguousarray(array).data.cast("B")
+    while remaining:
+        remaining = remaining[file.write(remaining) :]

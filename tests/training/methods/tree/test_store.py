@@ -149,7 +149,7 @@ def steps(made, begin, end):
 
 def exactly(made):
     """Cuts serve for the same distance alone."""
-    made.cache._least = made.cache._most = 1.0
+    made.cache._min_ratio = made.cache._max_ratio = 1.0
     return made
 
 

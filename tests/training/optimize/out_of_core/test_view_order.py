@@ -1,4 +1,4 @@
-"""Views that stay near: chances by the formula, every view seen, the same from any step on."""
+"""Tests of the view order: probabilities, coverage of all views, reproducibility."""
 
 import numpy as np
 import pytest
@@ -9,23 +9,23 @@ from training.optimize.out_of_core.view_order import BLOCK, ViewOrder
 CENTERS = np.random.default_rng(0).random((30, 3)) * (4, 1, 2)
 
 
-def by_the_formula(centers: np.ndarray, k: int, spread: float) -> np.ndarray:
-    """P(j | i) as a dense matrix, by sorting all distances."""
+def expected_probabilities(centers: np.ndarray, k: int, spread: float) -> np.ndarray:
+    """Return P(j | i) as a dense matrix, by sorting all distances."""
     count = len(centers)
     w = np.linalg.norm(centers[:, None] - centers, axis=2)
     np.fill_diagonal(w, np.inf)
     near = np.argsort(w, axis=1)[:, :k]
-    typical = np.median(np.take_along_axis(w, near, 1))
-    chances = np.zeros((count, count))
-    np.put_along_axis(chances, near, 1 / (np.take_along_axis(w, near, 1) + spread * typical), 1)
-    return chances / chances.sum(1, keepdims=True)
+    median = np.median(np.take_along_axis(w, near, 1))
+    probabilities = np.zeros((count, count))
+    np.put_along_axis(probabilities, near, 1 / (np.take_along_axis(w, near, 1) + spread * median), 1)
+    return probabilities / probabilities.sum(1, keepdims=True)
 
 
 @pytest.mark.parametrize(("k", "spread"), [(5, 1.0), (100, 0.2), (29, 5.0)])
-def test_what_follows_is_drawn_by_the_formula(k, spread):
-    """The chances themselves, and the walk's own counts by a chi-squared test at one in a thousand."""
+def test_successors_follow_the_formula(k, spread):
+    """Compare the probabilities, and test the counts of a walk by a chi-squared test at 0.001."""
     walk = ViewOrder(CENTERS, 3, neighbours=k, spread=spread)
-    truth = by_the_formula(CENTERS, min(k, 29), spread)
+    truth = expected_probabilities(CENTERS, min(k, 29), spread)
     dense = np.zeros_like(truth)
     np.put_along_axis(dense, walk.neighbours, walk.probabilities, 1)
     np.testing.assert_allclose(dense, truth, atol=1e-12)
@@ -39,17 +39,17 @@ def test_what_follows_is_drawn_by_the_formula(k, spread):
     assert statistic < chi2.ppf(0.999, possible.sum() - len(CENTERS))
 
 
-def test_it_stays_nearer_than_a_shuffle():
+def test_consecutive_views_are_nearer_than_in_a_shuffle():
     rng = np.random.default_rng(1)
     centers = np.stack([np.linspace(0, 100, 400), rng.random(400), rng.random(400)], 1)
     walk = ViewOrder(centers, 0, neighbours=20)
     views = np.array([walk(step) for step in range(20 * BLOCK)])
-    away = np.linalg.norm(np.diff(centers[views], axis=0), axis=1)
+    distances = np.linalg.norm(np.diff(centers[views], axis=0), axis=1)
     within = np.arange(1, len(views)) % BLOCK != 0
-    assert away[within].max() < 7 < np.mean(away[~within])
+    assert distances[within].max() < 7 < np.mean(distances[~within])
 
 
-def test_every_view_is_seen_and_begins_a_block_as_often_as_any_other():
+def test_every_view_begins_equally_many_blocks():
     walk = ViewOrder(CENTERS, 1, neighbours=3)
     first = [walk(block * BLOCK) for block in range(3 * len(CENTERS))]
     for epoch in range(3):
@@ -57,31 +57,31 @@ def test_every_view_is_seen_and_begins_a_block_as_often_as_any_other():
     assert first[:30] != first[30:60]
 
 
-def test_a_step_depends_on_its_number_and_the_seed_alone():
+def test_view_depends_only_on_step_and_seed():
     steps = np.random.default_rng(2).permutation(5 * BLOCK)
-    walk, again = ViewOrder(CENTERS, 7), ViewOrder(CENTERS, 7)
+    walk, copy = ViewOrder(CENTERS, 7), ViewOrder(CENTERS, 7)
     views = [walk(step) for step in range(5 * BLOCK)]
-    assert [again(step) for step in steps] == [views[step] for step in steps]
+    assert [copy(step) for step in steps] == [views[step] for step in steps]
     other = ViewOrder(CENTERS, 8)
     assert [other(step) for step in range(5 * BLOCK)] != views
 
 
-def test_lengths_do_not_matter():
+def test_order_is_independent_of_scale():
     small, large = ViewOrder(CENTERS, 7), ViewOrder(1000 * CENTERS + 5, 7)
     np.testing.assert_allclose(small.probabilities, large.probabilities, rtol=1e-9)
     assert [small(step) for step in range(500)] == [large(step) for step in range(500)]
 
 
 @pytest.mark.parametrize("spread", [0.0, 1.0])
-def test_odd_places_of_cameras(spread):
-    """One camera; two; all in one place; rigs of six in each of many places."""
+def test_coincident_and_few_cameras(spread):
+    """One camera, two cameras, all cameras in one position, and rigs of six."""
     assert {ViewOrder(np.zeros((1, 3)), 0, spread=spread)(step) for step in range(300)} == {0}
     two = ViewOrder(np.eye(3)[:2], 0, spread=spread)
     assert [two(step) for step in range(4)] in ([0, 1, 0, 1], [1, 0, 1, 0])
-    together = ViewOrder(np.zeros((40, 3)), 0, neighbours=8, spread=spread)
-    np.testing.assert_allclose(together.probabilities, 1 / 8)
+    coincident = ViewOrder(np.zeros((40, 3)), 0, neighbours=8, spread=spread)
+    np.testing.assert_allclose(coincident.probabilities, 1 / 8)
     rigs = ViewOrder(np.repeat(CENTERS, 6, axis=0), 0, neighbours=10, spread=spread)
-    for walk in (together, rigs):
+    for walk in (coincident, rigs):
         assert not (walk.neighbours == np.arange(len(walk.neighbours))[:, None]).any()
         assert all(len(set(row)) == len(row) for row in walk.neighbours.tolist())
         assert np.isfinite(walk.probabilities).all() and len({walk(step) for step in range(2000)}) > 20
