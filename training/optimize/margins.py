@@ -146,18 +146,18 @@ class Margins:
         )
 
 
-def blur_outward(values: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def blur_outward(values: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Extend values (H, W, C) from a known area (H, W), with a blur that increases with distance.
 
     Returns:
         The values, and the area (H, W) within reach of known values.
     """
     result = np.zeros_like(values)
-    pending = np.ones_like(known)
-    masked = np.where(known[..., None], values, 0)
+    pending = np.ones_like(valid)
+    masked = np.where(valid[..., None], values, 0)
     for blur in BLUR_SIGMAS:
         sigma = (blur, blur)
-        weight = gaussian_filter(known.astype(np.float64), sigma, mode="constant")
+        weight = gaussian_filter(valid.astype(np.float64), sigma, mode="constant")
         reached = pending & (weight > MIN_BLUR_WEIGHT)
         total = gaussian_filter(masked, (*sigma, 0), mode="constant")
         result[reached] = total[reached] / weight[reached, None]

@@ -267,13 +267,13 @@ class Method(ABC, Generic[P, D]):
         """
         weight = self.parameters.ssim_weight
         target = view.target.over(self.background(step))
-        first, *rest = (
+        first, *additional = (
             photometric_loss(
                 self.exposure(drawing.rendering.image, view.index), target, weight, backend=self.backend
             )
             for drawing in drawings
         )
-        return sum(rest, first) + self.depth_loss(drawings[0].rendering, view, step)
+        return sum(additional, first) + self.depth_loss(drawings[0].rendering, view, step)
 
     def depth_loss(self, rendering: Rendering, view: TrainingView, step: int) -> torch.Tensor | float:
         """Return the weighted mean |Σ w / z − 1 / depth| over pixels with known depth.

@@ -23,7 +23,7 @@ def importance_threshold(importance: np.ndarray, views: np.ndarray, budget: floa
     return float(importance[descending[within - 1]]) if 0 < within < len(importance) else 0.0
 
 
-def log_scale_gain(log_scales: np.ndarray, shares: np.ndarray, kept: np.ndarray) -> np.ndarray:
+def log_scale_gain(log_scales: np.ndarray, shares: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """Compute the enlargement that lets the kept splats cover the area of all splats.
 
     Areas are weighted by the splats' shares of a pixel and summed in each block. Splats at most double in
@@ -32,17 +32,17 @@ def log_scale_gain(log_scales: np.ndarray, shares: np.ndarray, kept: np.ndarray)
     Args:
         log_scales: (N, 3).
         shares: (N,) share of a pixel.
-        kept: (N,) bool.
+        mask: (N,) bool, the kept splats.
 
     Returns:
         (N,) float32 offsets to add to the log-scales.
     """
-    if not len(kept):
+    if not len(mask):
         return np.zeros(0, np.float32)
-    begins = np.arange(0, len(kept), SIZE)
+    begins = np.arange(0, len(mask), SIZE)
     ascending = np.sort(log_scales, axis=1)
     area = shares * np.exp(ascending[:, 1] + ascending[:, 2]).astype(np.float64)
     total = np.add.reduceat(area, begins)
-    remaining = np.add.reduceat(area * kept, begins)
+    remaining = np.add.reduceat(area * mask, begins)
     gain = np.log(np.clip(total / np.maximum(remaining, 1e-30), 1, 4)) / 2
-    return np.repeat(gain, SIZE)[: len(kept)].astype(np.float32)
+    return np.repeat(gain, SIZE)[: len(mask)].astype(np.float32)

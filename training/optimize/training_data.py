@@ -248,9 +248,9 @@ class TrainingData:
         return Target(planes[:3].permute(1, 2, 0), mask, planes[3] if alpha else None, inverse_depth)
 
 
-def _intersection(cameras: Sequence[Camera], others: Sequence[Camera]) -> list[Camera]:
+def _intersection(cameras: Sequence[Camera], selection: Sequence[Camera]) -> list[Camera]:
     """Return the cameras that also occur in another list, by name."""
-    names = {camera.name for camera in others}
+    names = {camera.name for camera in selection}
     return [camera for camera in cameras if camera.name in names]
 
 

@@ -19,7 +19,7 @@ ALL = (*NAMES, "decay")
 
 
 def test_small_splats_are_cloned_in_place(model, moments):
-    before = {name: model[name].detach().clone() for name in ALL}
+    parents = {name: model[name].detach().clone() for name in ALL}
     gradients = torch.zeros(50)
     gradients[[4, 7]] = 1.0
     added = densify(
@@ -28,8 +28,8 @@ def test_small_splats_are_cloned_in_place(model, moments):
     )  # fmt: skip
     assert added == 2 and len(model) == 52
     for name in ALL:
-        assert torch.equal(model[name][:50], before[name])
-        assert torch.equal(model[name][50:], before[name][[4, 7]])
+        assert torch.equal(model[name][:50], parents[name])
+        assert torch.equal(model[name][50:], parents[name][[4, 7]])
         assert moments(model, name, 0)[50:].tolist() == [0, 0]
         assert torch.equal(moments(model, name, 0)[:50], torch.arange(1.0, 51.0))
 
@@ -98,13 +98,13 @@ def test_split_along_the_longest_axis_keeps_the_constraint_of_flod(model):
 
 def test_largest_gradients_are_densified_first(model):
     gradients = torch.linspace(0, 1, 50)
-    before = model["means"].detach().clone()
+    means = model["means"].detach().clone()
     added = densify(
         model, gradients, threshold=0.1, clone_below=1e9, max_splats=53, min_scale=0.0,
         rng=np.random.default_rng(0),
     )  # fmt: skip
     assert added == 3
-    assert torch.equal(model["means"][50:], before[[47, 48, 49]])
+    assert torch.equal(model["means"][50:], means[[47, 48, 49]])
 
 
 def test_peak_scores_match_equation_6():

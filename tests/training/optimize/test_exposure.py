@@ -49,16 +49,16 @@ def test_training_recovers_gains_and_offsets_with_constant_mean():
 
 
 def test_state_is_restored_by_photo_name():
-    before, after = Exposure("abc", 0.1), Exposure("xcb", 0.1)
+    saved, restored = Exposure("abc", 0.1), Exposure("xcb", 0.1)
     for view in range(3):
-        before(torch.rand(2, 2, 3), view).sum().backward()
-    [adam] = before.optimizers(0.0)
+        saved(torch.rand(2, 2, 3), view).sum().backward()
+    [adam] = saved.optimizers(0.0)
     adam.step()
-    set_exposure(before, 1, [[2.0] * 3, [0.1] * 3])
-    after.load_state_dict(deepcopy(before.state_dict()))
+    set_exposure(saved, 1, [[2.0] * 3, [0.1] * 3])
+    restored.load_state_dict(deepcopy(saved.state_dict()))
     new = torch.tensor([[1.0] * 3, [0.0] * 3])
-    torch.testing.assert_close(after.table, torch.stack([new, before.table[2], before.table[1]]))
-    assert after.state_dict()["adam"]["steps"] == {"x": 0, "c": 1, "b": 1}
+    torch.testing.assert_close(restored.table, torch.stack([new, saved.table[2], saved.table[1]]))
+    assert restored.state_dict()["adam"]["steps"] == {"x": 0, "c": 1, "b": 1}
 
 
 @pytest.mark.parametrize("name", ["3dgs", "flod", "octree", "octree_neural", "clod"])

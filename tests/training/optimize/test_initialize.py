@@ -27,7 +27,7 @@ def test_initial_scale_is_the_rms_neighbour_distance_and_colours_are_preserved()
 
 def test_training_does_not_change_the_scene_points():
     points = np.random.default_rng(0).normal(size=(10, 3)).astype(np.float32)
-    before = points.copy()
+    original = points.copy()
     tensors = from_points(points, np.zeros((10, 3), np.uint8), sh_degree=0)
     tensors["means"] += 1
-    np.testing.assert_array_equal(points, before)
+    np.testing.assert_array_equal(points, original)

@@ -24,9 +24,9 @@ def camera(x: float = 0.0, z: float = 0.0) -> Camera:
     return Camera(f"{x:g}", 96, 72, 48.0, 48.0, 48.0, 36.0, pose)
 
 
-def wall(depth: float, left: float, right: float, color=ORANGE) -> Gaussians:
+def wall(depth: float, x_min: float, x_max: float, color=ORANGE) -> Gaussians:
     """Return opaque splats at a depth, as high as the view of a camera at the origin."""
-    x, y = np.meshgrid(np.arange(left, right, 0.1), np.arange(-0.75 * depth, 0.75 * depth, 0.1))
+    x, y = np.meshgrid(np.arange(x_min, x_max, 0.1), np.arange(-0.75 * depth, 0.75 * depth, 0.1))
     means = torch.tensor(np.stack([x, y, np.full_like(x, depth)], -1).reshape(-1, 3)).float()
     sh = torch.zeros(len(means), 4, 3)
     sh[:, 0] = (torch.tensor(color) - 0.5) / SH_C0
@@ -52,8 +52,8 @@ def test_margins_continue_a_wall_beyond_the_photo():
     colors = 0.5 + SH_C0 * added.sh[:, 0].numpy()
     assert np.abs(colors - ORANGE).max() < 0.05 and not added.sh[:, 1:].any()
     wide, total = view.widened(0.45), Gaussians.concatenated([visible, added])
-    before, after = draw(visible, wide).alpha, draw(total, wide).alpha
-    assert (before < 0.5).float().mean() > 0.5 and after.min() > 0.5
+    plain_alpha, total_alpha = draw(visible, wide).alpha, draw(total, wide).alpha
+    assert (plain_alpha < 0.5).float().mean() > 0.5 and total_alpha.min() > 0.5
     inner = (slice(6, -6), slice(6, -6))
     torch.testing.assert_close(
         draw(total, view).image[inner], draw(visible, view).image[inner], atol=0.02, rtol=0
@@ -64,8 +64,8 @@ def test_margins_do_not_cover_surfaces_of_other_photos():
     """The second camera looks past the end of the near wall at a far wall."""
     near, far = wall(4, -4, 4), wall(12, 4, 30, color=(0.1, 0.2, 0.9))
     first, second = camera(), camera(x=12)
-    both = Gaussians.concatenated([near, far])
-    for cameras, visible, covered in (((first,), near, True), ((first, second), both, False)):
+    combined = Gaussians.concatenated([near, far])
+    for cameras, visible, covered in (((first,), near, True), ((first, second), combined, False)):
         means = margins(*cameras).extend(visible, 10_000).means.numpy().astype(np.float64)
         assert (second.sees(means) & (means[:, 2] < 12)).any() == covered
 
@@ -79,9 +79,9 @@ def test_covered_surroundings_get_no_margins():
 
 
 def test_empty_photos_get_no_margins():
-    behind = wall(4, -4, 4)
-    behind = replace(behind, means=-behind.means)
-    assert len(margins(camera()).extend(behind, 10_000)) == 0
+    invisible = wall(4, -4, 4)
+    invisible = replace(invisible, means=-invisible.means)
+    assert len(margins(camera()).extend(invisible, 10_000)) == 0
 
 
 def test_photos_with_empty_edges_get_no_margins():
@@ -102,21 +102,21 @@ def test_margins_scale_with_the_scene():
 
 
 def test_smaller_budget_gives_larger_splats():
-    many, few = (margins(camera()).extend(wall(4, -4, 4), budget) for budget in (10_000, 300))
-    assert len(many) > 500 and 100 < len(few) <= 300
-    assert few.log_scales.min() > many.log_scales.max()
+    small, large = (margins(camera()).extend(wall(4, -4, 4), budget) for budget in (10_000, 300))
+    assert len(small) > 500 and 100 < len(large) <= 300
+    assert large.log_scales.min() > small.log_scales.max()
     wide = camera().widened(0.45)
-    assert draw(Gaussians.concatenated([wall(4, -4, 4), few]), wide).alpha.min() > 0.5
+    assert draw(Gaussians.concatenated([wall(4, -4, 4), large]), wide).alpha.min() > 0.5
     assert len(margins(camera()).extend(wall(4, -4, 4), 30)) == 0
 
 
 def test_blur_preserves_known_values_and_has_limited_reach():
-    values, known = np.full((9, 400, 1), 7.0), np.zeros((9, 400), bool)
-    blurred, reached = blur_outward(values, known)
+    values, valid = np.full((9, 400, 1), 7.0), np.zeros((9, 400), bool)
+    blurred, reached = blur_outward(values, valid)
     assert not reached.any() and not blurred.any()
-    known[:, :10] = True
+    valid[:, :10] = True
     values[:, 10:] = np.nan  # unknown values are ignored
-    blurred, reached = blur_outward(values, known)
+    blurred, reached = blur_outward(values, valid)
     assert reached[:, :20].all() and not reached[:, 200:].any()
     assert blurred[reached] == pytest.approx(7.0)
 

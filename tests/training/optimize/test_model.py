@@ -40,10 +40,12 @@ def test_tensors_have_separate_learning_rates(model):
     """Adam's first step equals the rate for any gradient."""
     fresh = Model(model.read_rows(torch.arange(50)), model.adam.lr)
     (fresh["decay"].sum() * 7 + fresh["means"].sum()).backward()
-    before = fresh.read_rows(torch.arange(50))
+    initial = fresh.read_rows(torch.arange(50))
     fresh.adam.step()
-    torch.testing.assert_close(before["decay"] - fresh["decay"], torch.full((50,), 0.5))
-    torch.testing.assert_close(before["means"] - fresh["means"], torch.full((50, 3), 1e-3), rtol=1e-3, atol=0)
+    torch.testing.assert_close(initial["decay"] - fresh["decay"], torch.full((50,), 0.5))
+    torch.testing.assert_close(
+        initial["means"] - fresh["means"], torch.full((50, 3), 1e-3), rtol=1e-3, atol=0
+    )
 
 
 def test_checkpoint_restores_all_columns(model):
@@ -51,13 +53,13 @@ def test_checkpoint_restores_all_columns(model):
     file = io.BytesIO()
     torch.save(model.state_dict(), file)
     file.seek(0)
-    other = Model({name: torch.zeros_like(model[name]) for name in ALL}, model.adam.lr)
-    other.load_state_dict(torch.load(file, weights_only=True))
+    restored = Model({name: torch.zeros_like(model[name]) for name in ALL}, model.adam.lr)
+    restored.load_state_dict(torch.load(file, weights_only=True))
     for name in ALL:
-        assert torch.equal(other[name], model[name])
-        assert all(map(torch.equal, other.adam.state[name], model.adam.state[name]))
-    assert torch.equal(other.columns["level"], model.columns["level"])
-    assert torch.equal(other.stats["seen"], model.stats["seen"])
+        assert torch.equal(restored[name], model[name])
+        assert all(map(torch.equal, restored.adam.state[name], model.adam.state[name]))
+    assert torch.equal(restored.columns["level"], model.columns["level"])
+    assert torch.equal(restored.stats["seen"], model.stats["seen"])
 
 
 def test_splats_are_a_copy_with_extras(model):
@@ -84,7 +86,7 @@ def test_reset_stats_keeps_shapes():
 
 
 def test_state_without_a_column_is_rejected_and_changes_nothing(model):
-    state, before = model.state_dict(), model["means"].detach().clone()
+    state, means = model.state_dict(), model["means"].detach().clone()
     incomplete = {
         **state,
         "columns": {},
@@ -92,4 +94,4 @@ def test_state_without_a_column_is_rejected_and_changes_nothing(model):
     }
     with pytest.raises(ValueError, match=r"\['level'\] are missing"):
         model.load_state_dict(incomplete)
-    assert torch.equal(model["means"], before)
+    assert torch.equal(model["means"], means)

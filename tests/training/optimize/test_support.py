@@ -45,17 +45,17 @@ def test_points_closer_than_a_share_of_the_nearest_depth_intrude(support):
 
 def test_more_distant_points_intrude_only_inside_a_view(support):
     # at distances above 5.1; the image ends at |y| = z, with the margin at |y| = 1.2 z
-    beside, at_the_edge, in_the_image = (-1, 5, 4), (-1, 4.7, 4), (-1, 3.9, 4)
-    assert intruding(support, [beside, at_the_edge, in_the_image]) == [False, True, True]
+    outside, at_the_edge, in_the_image = (-1, 5, 4), (-1, 4.7, 4), (-1, 3.9, 4)
+    assert intruding(support, [outside, at_the_edge, in_the_image]) == [False, True, True]
 
 
 def test_points_outside_the_frame_intrude_unless_two_photos_see_them():
     far, point = (0, 0, 10.0), (0, 0, -2.0)
-    beside, behind, away = (0, -4, 0), point, (0, 0, -5.1)  # half of 10 around the camera is free space
+    lateral, rear, distant = (0, -4, 0), point, (0, 0, -5.1)  # half of 10 around the camera is free space
     for heights, supported in (((), False), ((0,), False), ((0, 1), True)):
         cameras = [camera(0), camera(0.001), *(side_camera(y, -2.0) for y in heights)]
         support = Support(cameras, np.array([far, point], np.float32))
-        assert intruding(support, [beside, behind, away]) == [True, not supported, False]
+        assert intruding(support, [lateral, rear, distant]) == [True, not supported, False]
 
 
 def test_points_between_cameras_intrude():
@@ -84,7 +84,7 @@ def test_training_removes_intruding_splats_and_limits_sizes(data):
     from training.methods import METHODS, create
 
     method = create("3dgs", data, METHODS["3dgs"].presets["draft"], 0, "cpu")
-    p, before = method.parameters, len(method.model)
+    p, count = method.parameters, len(method.model)
     camera = data.train[0]
     in_front = torch.tensor(camera.center + 0.02 * camera.world_to_camera[2, :3], dtype=torch.float32)
     rows = method.model.read_rows(torch.tensor([0, 0]))
@@ -92,7 +92,7 @@ def test_training_removes_intruding_splats_and_limits_sizes(data):
     rows["log_scales"][1] = 9.0
     method.model.append(rows)
     method.prune_unsupported(0)
-    assert len(method.model) == before + 1
+    assert len(method.model) == count + 1
     largest = method.model["log_scales"].detach().exp().amax(1).numpy()
     allowed = p.largest * data.support.nearest_positions(method.model["means"].detach().numpy())[0]
     assert (largest <= allowed * 1.0001).all() and largest[-1] == pytest.approx(allowed[-1], rel=1e-4)

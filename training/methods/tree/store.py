@@ -181,7 +181,7 @@ class Store:
         Where there is no room for it, it is made coarser until there is.
 
         Raises:
-            NoRoom: there is none for the coarsest.
+            CutTooLarge: the budget is too small even for the coarsest cut.
         """
         coarser = 1.0
         while True:

@@ -240,8 +240,8 @@ class RowFile:
                 raise ValueError(f"{path.name} is missing")
             self._open(path)
         self._verify()
-        taken = np.concatenate([self._slots[self._slots >= 0], *self._retired])
-        self._free = np.setdiff1d(np.arange(self._size, dtype=np.int32), taken)
+        used = np.concatenate([self._slots[self._slots >= 0], *self._retired])
+        self._free = np.setdiff1d(np.arange(self._size, dtype=np.int32), used)
 
     def close(self) -> None:
         """Close the file."""
@@ -249,10 +249,10 @@ class RowFile:
             self._file.close()
             self._file = None
 
-    def supersede(self, other: RowFile) -> None:
+    def supersede(self, previous: RowFile) -> None:
         """Replace other rows in the same folder. Their file is deleted when no checkpoint uses it."""
-        self._named.extend(other._named)
-        other.discard()
+        self._named.extend(previous._named)
+        previous.discard()
 
     def discard(self) -> None:
         """Drop all rows, and delete the file if no checkpoint uses it."""

@@ -115,11 +115,11 @@ def test_least_recently_used_cuts_are_released_first(stored):
 def test_cut_at_another_distance_loads_only_new_rows(stored):
     rows, truth = stored
     cache = CutCache(rows, GROUPS, 300 * ROW + TABLE)
-    one = np.array([3])
+    group = np.array([3])
 
     def acquire(distance: float) -> tuple[np.ndarray, bool]:
-        cut, requested = cut_for(one, np.array([distance]))
-        return cache.acquire(one, np.array([distance]), cut), bool(requested)
+        cut, requested = cut_for(group, np.array([distance]))
+        return cache.acquire(group, np.array([distance]), cut), bool(requested)
 
     slots, _ = acquire(4.0)
     assert len(slots) == 7 and cache.loaded == 7
@@ -141,16 +141,16 @@ def test_cut_at_another_distance_loads_only_new_rows(stored):
 def test_duplicate_rows_are_rejected(stored):
     rows, _ = stored
     cache = CutCache(rows, GROUPS, 300 * ROW + TABLE)
-    two = np.array([0, 1])
+    groups = np.array([0, 1])
     invalid = [([1, 2, 3, 3], [2, 2]), ([1, 2, 1], [2, 1])]
     for chosen, counts in invalid:
         with pytest.raises(ValueError, match="duplicate row"):
-            cache.acquire(two, np.ones(2), lambda _, c=chosen, n=counts: (np.array(c), np.array(n)))
+            cache.acquire(groups, np.ones(2), lambda _, c=chosen, n=counts: (np.array(c), np.array(n)))
     cache = CutCache(rows, GROUPS, 300 * ROW + TABLE)
-    cache.acquire(two[:1], np.ones(1), lambda _: (np.array([5, 6]), np.array([2])))
+    cache.acquire(groups[:1], np.ones(1), lambda _: (np.array([5, 6]), np.array([2])))
     with pytest.raises(ValueError, match="duplicate row"):
-        cache.acquire(two[1:], np.ones(1), lambda _: (np.array([6]), np.array([1])))
-    assert len(cache.acquire(two[:0], np.ones(0), lambda _: (np.array([6]), np.array([1])))) == 0
+        cache.acquire(groups[1:], np.ones(1), lambda _: (np.array([6]), np.array([1])))
+    assert len(cache.acquire(groups[:0], np.ones(0), lambda _: (np.array([6]), np.array([1])))) == 0
 
 
 def test_resumed_run_is_bit_identical(tmp_path):

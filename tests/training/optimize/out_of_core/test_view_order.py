@@ -62,8 +62,8 @@ def test_view_depends_only_on_step_and_seed():
     walk, copy = ViewOrder(CENTERS, 7), ViewOrder(CENTERS, 7)
     views = [walk(step) for step in range(5 * BLOCK)]
     assert [copy(step) for step in steps] == [views[step] for step in steps]
-    other = ViewOrder(CENTERS, 8)
-    assert [other(step) for step in range(5 * BLOCK)] != views
+    reseeded = ViewOrder(CENTERS, 8)
+    assert [reseeded(step) for step in range(5 * BLOCK)] != views
 
 
 def test_order_is_independent_of_scale():
@@ -76,8 +76,8 @@ def test_order_is_independent_of_scale():
 def test_coincident_and_few_cameras(spread):
     """One camera, two cameras, all cameras in one position, and rigs of six."""
     assert {ViewOrder(np.zeros((1, 3)), 0, spread=spread)(step) for step in range(300)} == {0}
-    two = ViewOrder(np.eye(3)[:2], 0, spread=spread)
-    assert [two(step) for step in range(4)] in ([0, 1, 0, 1], [1, 0, 1, 0])
+    pair = ViewOrder(np.eye(3)[:2], 0, spread=spread)
+    assert [pair(step) for step in range(4)] in ([0, 1, 0, 1], [1, 0, 1, 0])
     coincident = ViewOrder(np.zeros((40, 3)), 0, neighbours=8, spread=spread)
     np.testing.assert_allclose(coincident.probabilities, 1 / 8)
     rigs = ViewOrder(np.repeat(CENTERS, 6, axis=0), 0, neighbours=10, spread=spread)
