@@ -106,8 +106,8 @@ class TrainingData:
             )
         if len(train) < 2:
             raise LodgsError(
-                f"Cannot train: of the {len(scene.cameras)} usable views in {scene.folder} {len(train)} "
-                "remain for training and the others are held out. 2 are needed.",
+                f"Cannot train: {len(train)} of {len(scene.cameras)} usable views in {scene.folder} remain "
+                "for training after holding out views, 2 are needed.",
                 "Set test_every to 0 to hold out no views, or to a larger number.",
             )
         if validation and not all_test:

@@ -39,7 +39,7 @@ def test_method_numbers_are_unique_and_stable():
 
 
 def test_unknown_methods_and_presets_are_rejected():
-    with pytest.raises(LodgsError, match=r"no method 'nerf'.*flod, octree"):
+    with pytest.raises(LodgsError, match=r"Unknown method: 'nerf'.*flod, octree"):
         method_info("nerf")
     with pytest.raises(LodgsError, match=r"Unknown preset: 'fast'.*draft, standard, paper"):
         method_info("flod").preset("fast")
