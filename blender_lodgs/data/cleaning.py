@@ -1,4 +1,4 @@
-"""Clutter in a splat scene: found by the tests of ``training.editing.cleaning``, hidden, shown again, deleted.
+"""Clean-up of a splat scene: hide, show and delete the splats that ``training.editing.cleaning`` finds.
 
 Hidden splats are a boolean attribute of their level's points; one modifier drops them (``crops``). A level
 that is trained anew has other points, of which none is hidden: the panel says how many were. Crops act on

@@ -1,9 +1,9 @@
-"""How a splat scene looks: exposure, white balance, tint, saturation and opacity, on its root and its crops.
+"""Looks of a splat scene: exposure, white balance, tint, saturation and opacity, on its root and its crops.
 
-``Object.lodgs_look`` of a root counts everywhere in the scene, that of a crop in the crop, upon the root's
-(``training.editing.look``). Splats stay what they are: what LODGS draws, in viewports, F12 and comparisons, gets
-:func:`looks_of`, and exports what that makes of them. For points and ellipsoids, which Blender draws, every
-level has a modifier (``nodes.look``) as soon as somebody has set something.
+The look of a root (``Object.lodgs_look``) applies to the entire scene, that of a crop inside the crop, on top
+of the root's (``training.editing.look``). The splats stay unchanged. Viewports, F12, comparisons and exports
+of LODGS apply :func:`looks_of`. For Blender's own drawing, every level gets a modifier (``nodes.look``) once
+a look is set.
 """
 
 from __future__ import annotations
@@ -59,43 +59,43 @@ class LookSettings(bpy.types.PropertyGroup):
 
     exposure: bpy.props.FloatProperty(
         name="Exposure",
-        description="How much lighter the splats are, in stops: one more is twice the light",
+        description="Brightness of the splats in stops. Each stop doubles the light",
         default=NEUTRAL.exposure, min=RANGES["exposure"][0], max=RANGES["exposure"][1],
         soft_min=-4.0, soft_max=4.0, step=10, precision=2, update=_changed,
     )  # fmt: skip
     temperature: bpy.props.FloatProperty(
         name="Temperature",
-        description="White balance: the colour temperature of the light that is to look white. Below "
-        f"{DAYLIGHT:.0f} K colours get colder, above it warmer",
+        description="White balance: colour temperature of the light that appears white. Values below "
+        f"{DAYLIGHT:.0f} K make colours colder, above it warmer",
         default=NEUTRAL.temperature, min=RANGES["temperature"][0], max=RANGES["temperature"][1],
         soft_max=12_000.0, step=10_000, precision=0, subtype="COLOR_TEMPERATURE", update=_changed,
     )  # fmt: skip
     tint: bpy.props.FloatVectorProperty(
         name="Tint",
-        description="The colour that white gets, as the display shows it; all others are multiplied by it",
+        description="Display colour that multiplies all splat colours",
         default=NEUTRAL.tint, min=RANGES["tint"][0], max=RANGES["tint"][1], size=3,
         subtype="COLOR_GAMMA", update=_changed,
     )  # fmt: skip
     saturation: bpy.props.FloatProperty(
         name="Saturation",
-        description="How colourful the splats are: 0 is grey, 1 as they were trained",
+        description="Saturation of the splats. 0 is grey, 1 is as trained",
         default=NEUTRAL.saturation, min=RANGES["saturation"][0], max=RANGES["saturation"][1],
         soft_max=2.0, precision=3, subtype="FACTOR", update=_changed,
     )  # fmt: skip
     opacity: bpy.props.FloatProperty(
         name="Opacity",
-        description="Factor on the opacity of every splat",
+        description="Factor for the opacity of every splat",
         default=NEUTRAL.opacity, min=RANGES["opacity"][0], max=RANGES["opacity"][1], precision=3,
         subtype="FACTOR", update=_changed,
     )  # fmt: skip
     outside: bpy.props.BoolProperty(
         name="Outside",
-        description="Have the look of the region count outside of it, to leave what lies in it as it is",
+        description="Apply the look outside the region instead of inside",
         update=_changed,
     )
     matrix: bpy.props.FloatVectorProperty(
         name="Matrix",
-        description="What the look makes of display-coded colours, row by row, for node groups",
+        description="Colour matrix of the look, row by row, for node groups",
         size=9, get=_matrix, options={"HIDDEN"},
     )  # fmt: skip
 

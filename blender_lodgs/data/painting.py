@@ -1,4 +1,4 @@
-"""Paint on a splat scene: columns of its levels' splats, beside their own colours (``training.editing.paint``).
+"""Paint on a splat scene, stored in columns of its levels (``training.editing.paint``).
 
 What LODGS draws has it mixed in where splats are read; for points and ellipsoids the modifier of the look has
 it (``looks``). Files that keep the splats as trained keep their paint beside, and give it back.
@@ -49,7 +49,7 @@ def read(root: bpy.types.Object) -> dict[int, np.ndarray]:
     if file is not None:
         raise LodgsError(
             f"Most of these splats are in {file.name}, which is not painted.",
-            "Import it with Splats at Most 0, so that all are here.",
+            "Import it with Memory Budget 0, so that all are here.",
         )
     found = {}
     for item in levels(root):

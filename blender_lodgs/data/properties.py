@@ -1,4 +1,4 @@
-"""What LODGS keeps in a .blend file: on each scene root (``Object.lodgs``) and on each of its cameras."""
+"""Properties that LODGS stores in a .blend file: on scene roots (``Object.lodgs``), cameras and scenes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .training import PARAMETERS, TrainingCell, TrainingSettings
 from .viewpoints import ViewsSettings
 
 ON_CHANGE: dict[str, Callable[[Any, bpy.types.Context], None]] = {}
-"""What is done when a property has changed, with its owner, by name; ``updates`` says what."""
+"""Update callbacks by name, called with the property's owner; ``updates`` fills the table."""
 
 
 def _look_up(name: str) -> Callable[[Any, bpy.types.Context], None]:
@@ -31,12 +31,12 @@ _ellipsoids_changed = _look_up("ellipsoids")
 
 
 def _changed(self, context) -> None:
-    """Properties set from scripts do not evaluate the scene anew by themselves."""
+    """Tag the owner: properties set from scripts do not trigger an evaluation by themselves."""
     self.id_data.update_tag()
 
 
 def _finest(self) -> int:
-    """The finest level that there is; without levels there is no limit yet."""
+    """Return the number of the finest level, or no limit if there are no levels yet."""
     return max((item.number for item in self.levels), default=2**31 - 1)
 
 
@@ -64,7 +64,7 @@ def _antialias(self) -> bool:
 
 
 def _set_antialias(self, value: bool) -> None:
-    meta = {name: each for name, each in read_json(self.meta).items() if name != "antialias"}
+    meta = {name: entry for name, entry in read_json(self.meta).items() if name != "antialias"}
     self.meta = json.dumps(meta | ({"antialias": True} if value else {}))
     _changed(self, bpy.context)
 
@@ -78,64 +78,63 @@ class SplatLevel(bpy.types.PropertyGroup):
 
     number: bpy.props.IntProperty(name="Level", description="Number of the level; 1 is the coarsest", min=1)
     object: bpy.props.PointerProperty(
-        name="Object", description="The point cloud that holds the level's splats", type=bpy.types.Object
+        name="Object", description="Point cloud with the splats of the level", type=bpy.types.Object
     )
     show: bpy.props.BoolProperty(
         name="Show",
-        description="Show the level where the detail settings call for it",
+        description="Show the level if the detail settings select it",
         default=True,
         update=_changed,
         options=set(),
     )
     facts: bpy.props.StringProperty(
-        name="Facts", description="What the rule needs to know of the level, as JSON", options={"HIDDEN"}
+        name="Facts", description="Facts of the level for the rule, as JSON", options={"HIDDEN"}
     )
 
     lost: bpy.props.IntProperty(
         name="No Longer Hidden",
-        description="How many splats were hidden of the level whose place this one has taken",
+        description="Number of hidden splats of the level that this one replaced",
         options={"HIDDEN"},
     )
 
     @property
     def exists(self) -> bool:
-        """False once an artist has deleted the level's object, which the list still remembers, or changed
-        its type."""
+        """False if the artist deleted the level's object or changed its type; the list keeps the entry."""
         obj = self.object
         return obj is not None and obj.type == "POINTCLOUD" and bool(obj.users_collection)
 
 
 class SplatTable(bpy.types.PropertyGroup):
-    """A table that came with a splat scene, by its name; see ``tables``."""
+    """A named table of a splat scene's bundle; see ``tables``."""
 
     object: bpy.props.PointerProperty(
-        name="Object", description="The mesh that holds the table's rows", type=bpy.types.Object
+        name="Object", description="Mesh with the rows of the table", type=bpy.types.Object
     )
     collection: bpy.props.PointerProperty(
-        name="Collection", description="What is to be seen of the table", type=bpy.types.Collection
+        name="Collection", description="Visible objects of the table", type=bpy.types.Collection
     )
 
     @property
     def exists(self) -> bool:
-        """False once an artist has deleted the table's object."""
+        """False if the artist deleted the table's object."""
         obj = self.object
         return obj is not None and obj.type == "MESH" and bool(obj.users_collection)
 
 
 class SplatStream(bpy.types.PropertyGroup):
-    """The file of a tree of which a splat scene holds the top; see ``streams``."""
+    """File of a tree whose top levels are in the splat scene; see ``streams``."""
 
     file: bpy.props.StringProperty(
         name="File",
-        description="The bundle from which finer splats are read as the eye comes near",
+        description="Bundle from which finer splats are streamed as the camera approaches",
         subtype="FILE_PATH",
         update=_changed,
         options={"PATH_SUPPORTS_BLEND_RELATIVE"},
     )
     budget: bpy.props.IntProperty(
-        name="Splats at Most",
-        description="How many splats of a tree are in memory at most: those that the scene holds, and those "
-        "that are read from the file. Where the view needs more, they are coarser everywhere",
+        name="Memory Budget",
+        description="Maximum number of splats of the tree in memory, in the scene and streamed. If the view "
+        "needs more, all of it becomes coarser",
         default=1_000_000,
         min=1024,
         soft_max=16_000_000,
@@ -144,13 +143,20 @@ class SplatStream(bpy.types.PropertyGroup):
         update=_changed,
         options=set(),
     )
-    total: bpy.props.IntProperty(name="Splats", description="How many splats the file has")
-    here: bpy.props.IntProperty(name="Splats Here", description="How many of them the scene's levels hold")
-    begun: bpy.props.IntProperty(name="Begun", description="How often a file has taken the place of another")
+    total: bpy.props.IntProperty(name="Splats", description="Number of splats in the file")
+    here: bpy.props.IntProperty(
+        name="Splats in Scene", description="Number of splats of the file in the scene's levels"
+    )
+    begun: bpy.props.IntProperty(
+        name="File Changes", description="Number of times that the file was replaced"
+    )
 
 
 def _level_set(rule: Rule, control: Control):
-    """For a control that names a level: it stays among those that there are, and takes the other along."""
+    """Return the update callback of a control that names a level.
+
+    It keeps the control within the existing levels and moves the opposite limit along.
+    """
 
     def update(self, context) -> None:
         value, finest = getattr(self, control.name), _finest(self.id_data.lodgs)
@@ -158,9 +164,9 @@ def _level_set(rule: Rule, control: Control):
             setattr(self, control.name, finest)
             return
         for other in rule.controls:
-            there = getattr(self, other.name)
-            if (other.follows == "finest" and there < value) or (
-                other.follows == "coarsest" and there > value
+            limit = getattr(self, other.name)
+            if (other.follows == "finest" and limit < value) or (
+                other.follows == "coarsest" and limit > value
             ):
                 setattr(self, other.name, value)
         _changed(self, context)
@@ -169,7 +175,7 @@ def _level_set(rule: Rule, control: Control):
 
 
 def _controls_of(rule: Rule) -> type[bpy.types.PropertyGroup]:
-    """A group with a property for each control of a rule."""
+    """Return a property group with a property for each control of a rule."""
 
     def property_of(control: Control):
         update = _level_set(rule, control) if control.follows else _changed
@@ -190,65 +196,64 @@ def _controls_of(rule: Rule) -> type[bpy.types.PropertyGroup]:
 
 
 CONTROLS = {rule.name: _controls_of(rule) for rule in rules().values()}
-"""The groups of all rules by name; each is a property of ``SplatScene`` of that name."""
+"""Property groups of all rules by name; ``SplatScene`` has a property of each name."""
 
 
 class SplatScene(bpy.types.PropertyGroup):
-    """A splat scene, kept on its scene root: the empty that all its objects are children of.
+    """Settings of a splat scene, stored on its scene root: the empty that is parent of all its objects.
 
-    Children keep COLMAP coordinates; the root's transform stands it upright, scales and places it.
+    Children keep COLMAP coordinates; the root's transform orients, scales and places the scene.
     """
 
     is_root: bpy.props.BoolProperty(update=_became_root, options={"HIDDEN"})
     itself: bpy.props.PointerProperty(
         name="Itself",
-        description="The root, which so outlives its deletion until all that belongs to it is removed",
+        description="Keeps the deleted root alive until its objects are removed",
         type=bpy.types.Object,
         options={"HIDDEN"},
     )
     flight_of: bpy.props.PointerProperty(
-        name="Flight of",
-        description="The root of the scene that this object carries a moving camera along or around, and "
-        "with which it is removed",
+        name="Path of",
+        description="Root of the scene that this camera path or turntable belongs to",
         type=bpy.types.Object,
         options={"HIDDEN"},
     )
     scene_folder: bpy.props.StringProperty(
-        name="Scene", description="Folder of the COLMAP scene", subtype="DIR_PATH"
+        name="Scene", description="Folder of the COLMAP scene on disk", subtype="DIR_PATH"
     )
     method: bpy.props.StringProperty(
-        name="Method", description="Name of the method that made the levels; empty for a plain splat file"
+        name="Method", description="Method that trained the levels. Empty for a plain splat file"
     )
     rule: bpy.props.StringProperty(
         name="Rule",
-        description="What chooses the levels by distance; empty where they are not made for distances",
+        description="Rule that selects levels by camera distance. Empty if the method has none",
     )
     facts: bpy.props.StringProperty(
-        name="Facts", description="What the rule needs to know of the scene, as JSON", options={"HIDDEN"}
+        name="Facts", description="Facts of the scene for the rule, as JSON", options={"HIDDEN"}
     )
     meta: bpy.props.StringProperty(
-        name="Further Facts", description="What else is known of the levels, as JSON", options={"HIDDEN"}
+        name="Metadata", description="Metadata of the levels, as JSON", options={"HIDDEN"}
     )
     recorded: bpy.props.StringProperty(
         name="Recorded",
-        description="What the file or the run records of the rule's controls, as JSON",
+        description="Values of the rule's controls that the file or run recorded, as JSON",
         options={"HIDDEN"},
     )
     begun: bpy.props.StringProperty(
-        name="Begun With",
-        description="What the rule's controls began with, recorded or by the levels, as JSON",
+        name="Initial Controls",
+        description="Initial values of the rule's controls, as JSON",
         options={"HIDDEN"},
     )
     cumulative: bpy.props.BoolProperty(
         name="Cumulative",
-        description="Each level only holds what it adds to the coarser ones",
+        description="Each level adds its splats to those of the coarser levels",
         update=_changed,
         options=set(),
     )
     antialias: bpy.props.BoolProperty(
         name="Antialiased",
-        description="Draw the splats through Mip-Splatting's 2D filter, as those need it that were trained "
-        "with it: what is smaller than a pixel then grows no thicker than it is",
+        description="Draw splats with Mip-Splatting's 2D filter. Enable it for splats that were trained with "
+        "this filter",
         get=_antialias,
         set=_set_antialias,
         options=set(),
@@ -264,90 +269,89 @@ class SplatScene(bpy.types.PropertyGroup):
 
     axes: bpy.props.PointerProperty(
         name="Axes",
-        description="The empty in whose space the coordinates of the scene's files are",
+        description="Empty whose local space has the coordinates of the scene's files",
         type=bpy.types.Object,
     )
     points: bpy.props.PointerProperty(
-        name="Points", description="The points of the COLMAP scene", type=bpy.types.Object
+        name="Points", description="Points of the COLMAP scene", type=bpy.types.Object
     )
     cameras: bpy.props.PointerProperty(
-        name="Cameras", description="The cameras of the COLMAP scene", type=bpy.types.Collection
+        name="Cameras", description="Cameras of the COLMAP scene", type=bpy.types.Collection
     )
     active_view: bpy.props.IntProperty(
-        name="Chosen View", description="Line of the list of views", options=set(), update=_view_chosen
+        name="Active View", description="Active row of the list of views", options=set(), update=_view_chosen
     )
     levels: bpy.props.CollectionProperty(type=SplatLevel)
     active_level: bpy.props.IntProperty(
-        name="Chosen Level", description="Line of the list of levels", options=set()
+        name="Active Level", description="Active row of the list of levels", options=set()
     )
     tables: bpy.props.CollectionProperty(
-        type=SplatTable, name="Tables", description="What the rule knows besides the splats"
+        type=SplatTable, name="Tables", description="Scene facts of the rule in tables, such as chunks"
     )
 
     painted: bpy.props.PointerProperty(
         name="Paint",
-        description="The finest level's places and paint, from before all levels were replaced",
+        description="Positions and paint of the finest level before all levels were replaced",
         type=bpy.types.PointCloud,
         options={"HIDDEN"},
     )
     stream: bpy.props.PointerProperty(
-        name="Streaming", description="The file of which the levels are the top", type=SplatStream
+        name="Streaming", description="File with the finer levels of the tree", type=SplatStream
     )
 
     mode: bpy.props.EnumProperty(
         name="Detail",
-        description="Which levels are shown",
+        description="Levels to show",
         items=[
             ("SINGLE", "One Level", "Show one level everywhere"),
-            ("SELECTIVE", "By Distance", "Near the eye show fine levels, far from it coarse ones"),
+            ("SELECTIVE", "By Distance", "Show fine levels near the camera and coarse levels far away"),
         ],
         update=_changed,
     )
     single_level: bpy.props.IntProperty(
         name="Level",
-        description="The level that is shown; 1 is the coarsest. Where levels add up, all coarser ones are "
+        description="Level to show; 1 is the coarsest. If levels are cumulative, all coarser levels are "
         "shown with it",
         default=1,
         min=1,
         update=_single_changed,
     )
     eye: bpy.props.EnumProperty(
-        name="Eye",
-        description="From where distances are measured",
+        name="Camera",
+        description="Camera from which distances are measured",
         items=[
-            ("CAMERA", "Scene Camera", "The scene's active camera, wherever it moves"),
-            ("OBJECT", "Object", "An object of your choice"),
+            ("CAMERA", "Scene Camera", "Active camera of the scene"),
+            ("OBJECT", "Object", "Origin of an object"),
             (
                 "TRAINING",
                 "Training Cameras",
-                "The mean position of the training cameras: the choice stays put",
+                "Mean position of the training cameras, which never moves",
             ),
             (
                 "VIEW",
                 "Viewport",
-                "Your own view, of the 3D viewport that moved last. Renders keep what it saw: choose the "
-                "scene camera for them. Of a scene that is read from its file they show what their camera "
-                "needs",
+                "View of the 3D viewport that moved last. Renders keep its selection: choose Scene Camera "
+                "before rendering",
             ),
         ],
         update=_whose_eye_changed,
     )
     freeze: bpy.props.BoolProperty(
         name="Freeze",
-        description="Keep the choice of detail as it is now, to look at it from elsewhere",
+        description="Keep the current selection of detail while the camera moves",
         update=_freeze_changed,
         options=set(),
     )
     held_eye: bpy.props.FloatVectorProperty(
-        name="Held Eye",
-        description="Where the eye is held, or the viewport's was last, in the scene's own units",
+        name="Frozen Position",
+        description="Frozen camera position, or the last one of the viewport, in the scene's own units",
         size=3,
         subtype="XYZ",
         update=_eye_changed,
         options={"HIDDEN"},
     )
     held_focal: bpy.props.FloatProperty(
-        name="Held Focal Length", default=1000.0, subtype="PIXEL", update=_changed, options={"HIDDEN"}
+        name="Frozen Focal Length", default=1000.0, subtype="PIXEL", update=_changed, options={"HIDDEN"}
     )
     eye_object: bpy.props.PointerProperty(
         name="Object",
@@ -358,29 +362,28 @@ class SplatScene(bpy.types.PropertyGroup):
     )
     focal_px: bpy.props.FloatProperty(
         name="Focal Length",
-        description="Focal length of the scene camera in pixels of the render; follows the camera by itself",
+        description="Focal length of the scene camera in render pixels. Updates with the camera",
         subtype="PIXEL",
         options={"ANIMATABLE"},
     )
 
     tell: bpy.props.EnumProperty(
         name="Colours",
-        description="What the colours tell in the viewport",
+        description="Meaning of the splat colours in the viewport",
         items=[
             ("OWN", "Own", "The splats' own colours"),
             (
                 "LEVELS",
                 "Levels",
-                "Which level is where: violet (coarse), blue, teal, yellow, red and on. In a tree of splats, "
-                "how large what a splat stands for is: each colour is half the size of the one before, white "
-                "the finest level",
+                "Level of each splat: violet (coarse), blue, teal, yellow, red and on. For a tree, node "
+                "size: each colour is half the size of the previous one, white is the finest level",
             ),
             (
                 "BANDS",
                 "Bands",
-                "Which level is wanted at which distance from the eye, in the same colours",
+                "Level that the rule requests at each distance from the camera, in the same colours",
             ),
-            ("CHUNKS", "Chunks", "Which chunk is the nearest where, in colours that repeat"),
+            ("CHUNKS", "Chunks", "Nearest chunk at each position, in repeating colours"),
         ],
         options=set(),
     )
@@ -389,26 +392,26 @@ class SplatScene(bpy.types.PropertyGroup):
 
     @property
     def by_distance(self) -> bool:
-        """Whether the levels say at which distances they are to be shown, in a way that is known here."""
+        """True if the scene has a known rule that selects levels by distance."""
         return self.rule in rules()
 
     @property
     def complete(self) -> bool:
-        """Whether each level is a scene by itself, see ``Rule.complete``; else only the finest is."""
+        """True if every level is a complete scene (``Rule.complete``); otherwise only the finest is."""
         return not self.by_distance or rules()[self.rule].complete
 
     @property
     def controls(self) -> bpy.types.PropertyGroup | None:
-        """What an eye may turn: the properties of the scene's rule."""
+        """The properties of the rule's controls, or None without a rule."""
         return getattr(self, self.rule) if self.by_distance else None
 
 
 class ViewportSettings(bpy.types.PropertyGroup):
-    """How 3D viewports draw splats, on the Blender scene (``Scene.lodgs_viewport``)."""
+    """Drawing of splats in 3D viewports, on the Blender scene (``Scene.lodgs_viewport``)."""
 
     splats: bpy.props.BoolProperty(
         name="Gaussian Splats",
-        description="Draw splats as the photographs show them, not as points. Wireframe shading has none",
+        description="Draw Gaussian splats instead of points. Wireframe shading always shows points",
         default=True,
         update=_changed,
         options=set(),
@@ -447,9 +450,9 @@ class ViewportSettings(bpy.types.PropertyGroup):
         options={"HIDDEN"},
     )
     budget: bpy.props.IntProperty(
-        name="Splats at Most",
-        description="How many splats a viewport draws at most. Where there are more, coarser levels stand "
-        "in for the finest, and of a single level the most visible splats are drawn",
+        name="Splat Budget",
+        description="Maximum number of splats that a viewport draws. Beyond it, coarser levels replace finer "
+        "ones, and a single level shows its most visible splats",
         default=2_000_000,
         min=1000,
         max=16_000_000,
@@ -458,7 +461,7 @@ class ViewportSettings(bpy.types.PropertyGroup):
     )
     moving: bpy.props.FloatProperty(
         name="While Moving",
-        description="Resolution of the splats while the view moves",
+        description="Resolution of splats while the view moves. Lower it for smoother navigation",
         default=50.0,
         min=10.0,
         max=100.0,
@@ -469,74 +472,70 @@ class ViewportSettings(bpy.types.PropertyGroup):
 
 
 class CaptureSettings(ViewsSettings, bpy.types.PropertyGroup):
-    """How a Blender scene becomes photographs to train from, on the scene (``Scene.lodgs_capture``)."""
+    """Capture of training images from a Blender scene (``Scene.lodgs_capture``)."""
 
     folder: bpy.props.StringProperty(
         name="Folder",
-        description="Folder that receives the pictures and becomes a COLMAP scene; empty: lodgs_capture "
-        "beside the .blend file. What is there already is not rendered again",
+        description="Folder for the images and the COLMAP model. If empty, lodgs_capture next to the .blend "
+        "file. Existing images are not rendered again",
         subtype="DIR_PATH",
         options={"PATH_SUPPORTS_BLEND_RELATIVE"},
     )
 
 
 class ViewSettings(bpy.types.PropertyGroup):
-    """What an imported camera knows of its photograph, on its data (``Camera.lodgs``); all 0 on others."""
+    """Photo of an imported camera, on its data (``Camera.lodgs``); all 0 for other cameras."""
 
-    width: bpy.props.IntProperty(name="Width", description="Width of the photograph", subtype="PIXEL")
-    height: bpy.props.IntProperty(name="Height", description="Height of the photograph", subtype="PIXEL")
-    fx: bpy.props.FloatProperty(name="Focal Length X", description="In pixels", subtype="PIXEL")
-    fy: bpy.props.FloatProperty(name="Focal Length Y", description="In pixels", subtype="PIXEL")
+    width: bpy.props.IntProperty(name="Width", description="Width of the photo", subtype="PIXEL")
+    height: bpy.props.IntProperty(name="Height", description="Height of the photo", subtype="PIXEL")
+    fx: bpy.props.FloatProperty(name="Focal Length X", description="Horizontal focal length", subtype="PIXEL")
+    fy: bpy.props.FloatProperty(name="Focal Length Y", description="Vertical focal length", subtype="PIXEL")
     photograph: bpy.props.StringProperty(
-        name="Photograph", description="File of the photograph", subtype="FILE_PATH"
+        name="Photo", description="Image file of the photo", subtype="FILE_PATH"
     )
     mask: bpy.props.StringProperty(
         name="Mask",
-        description="File of a picture that is black where the photograph does not count; empty for none",
+        description="Image that is black where training ignores the photo. Empty for none",
         subtype="FILE_PATH",
     )
     distorted: bpy.props.BoolProperty(
-        name="Distorted", description="The lens bends lines in the photograph, which the camera does not show"
+        name="Distorted", description="The photo has lens distortion, which the camera does not show"
     )
     place: bpy.props.IntProperty(
-        name="Place", description="Place by name among the views of the COLMAP model, from 0", default=-1
+        name="Index", description="Index of the view in the COLMAP model, sorted by name, from 0", default=-1
     )
-    held_out: bpy.props.BoolProperty(
-        name="Held Out", description="The splats that it came with were not trained on it"
-    )
+    held_out: bpy.props.BoolProperty(name="Held Out", description="Training did not use this photo")
     psnr: bpy.props.FloatProperty(
         name="PSNR",
-        description="How alike the splats and the photograph were when last measured, in dB; 0 before",
+        description="Similarity of splats and photo at the last measurement, in dB. 0 before the first",
     )
 
 
 class CropSettings(bpy.types.PropertyGroup):
-    """What an empty under a scene root crops (``Object.lodgs_crop``); see ``crops``."""
+    """Crop of splats by an empty below the scene root (``Object.lodgs_crop``); see ``crops``."""
 
     is_crop: bpy.props.BoolProperty(
-        name="Crop", description="Whether the empty crops the splats of its scene", options={"HIDDEN"}
+        name="Crop", description="The empty crops the splats of its scene", options={"HIDDEN"}
     )
     keep: bpy.props.EnumProperty(
         name="Keep",
-        description="What is left of the splats, at every level",
+        description="Splats to keep, at every level",
         items=[
-            ("INSIDE", "Keep Inside", "Splats in this crop stay, and those in others that keep theirs"),
-            ("OUTSIDE", "Cut Out", "Splats in this crop go"),
-            ("ALL", "Keep All", "None go: only the look of the splats in it is its own"),
+            ("INSIDE", "Keep Inside", "Keep splats inside this crop and inside other crops of this kind"),
+            ("OUTSIDE", "Cut Out", "Remove splats inside this crop"),
+            ("ALL", "Keep All", "Keep all splats; the crop only has a look of its own"),
         ],
         update=_changed,
     )
-    use: bpy.props.BoolProperty(
-        name="Use", description="Whether the crop has an effect", default=True, update=_changed
-    )
+    use: bpy.props.BoolProperty(name="Use", description="Enable the crop", default=True, update=_changed)
 
 
 class BrushSettings(bpy.types.PropertyGroup):
-    """How strokes select and paint splats, on the Blender scene (``Scene.lodgs_brush``)."""
+    """Brush that selects and paints splats, on the Blender scene (``Scene.lodgs_brush``)."""
 
     radius: bpy.props.IntProperty(
         name="Radius",
-        description="Of the brush, in pixels of the viewport; press F over it to change it there",
+        description="Radius of the brush in the viewport. Press F in the viewport to change it",
         default=40,
         min=1,
         max=2000,
@@ -546,12 +545,12 @@ class BrushSettings(bpy.types.PropertyGroup):
     )
     through: bpy.props.BoolProperty(
         name="Through",
-        description="Select and paint what other splats hide from the view as well, to any depth",
+        description="Select and paint hidden splats as well, at any depth",
         options=set(),
     )
     color: bpy.props.FloatVectorProperty(
         name="Colour",
-        description="What is painted, as the display shows it before the look",
+        description="Colour of the paint on the display, before the look",
         default=(0.8, 0.1, 0.1),
         min=0,
         max=1,
@@ -561,7 +560,7 @@ class BrushSettings(bpy.types.PropertyGroup):
     )
     strength: bpy.props.FloatProperty(
         name="Strength",
-        description="How much of the colour one stroke puts over the splats' own; press Shift F to change it",
+        description="Opacity of the paint in one stroke. Press Shift F to change it",
         default=1.0,
         min=0,
         max=1,
@@ -570,7 +569,7 @@ class BrushSettings(bpy.types.PropertyGroup):
     )
     hardness: bpy.props.FloatProperty(
         name="Hardness",
-        description="Share of the radius in which the brush has its full strength; beyond it falls off",
+        description="Fraction of the radius with full strength. The brush falls off beyond it",
         default=0.5,
         min=0,
         max=1,
@@ -580,12 +579,11 @@ class BrushSettings(bpy.types.PropertyGroup):
 
 
 class RenderSettings(bpy.types.PropertyGroup):
-    """How the engine LODGS renders a Blender scene (``Scene.lodgs_render``)."""
+    """Settings of the render engine LODGS (``Scene.lodgs_render``)."""
 
     background: bpy.props.FloatVectorProperty(
         name="Background",
-        description="Colour behind the splats, as the display shows it. Splats of photographs are trained "
-        "over black",
+        description="Display colour behind the splats. Splats are trained over black",
         size=3,
         min=0.0,
         max=1.0,
@@ -593,40 +591,40 @@ class RenderSettings(bpy.types.PropertyGroup):
     )
     use_pass_levels: bpy.props.BoolProperty(
         name="Levels",
-        description="Passes that tell which level each pixel shows, and how much of it every level fills",
+        description="Passes with the main level of each pixel and the coverage of every level",
     )
     ellipsoids: bpy.props.BoolProperty(
         name="Splats as Ellipsoids",
-        description="Let Cycles and EEVEE render splats as ellipsoids that fade outwards, for shadows and "
-        "reflections. Fine up to some hundred thousand splats",
+        description="Render splats as soft ellipsoids in Cycles and EEVEE, for shadows and reflections. Suits "
+        "up to some hundred thousand splats",
         update=_ellipsoids_changed,
     )
     draws_points: bpy.props.BoolProperty(
-        description="Whether renders of this scene are Blender's, which show points or ellipsoids",
+        description="Blender renders this scene, with points, ellipsoids or splats of its own",
         get=lambda self: self.id_data.render.engine != "LODGS",
         options={"HIDDEN"},
     )
     draws_ellipsoids: bpy.props.BoolProperty(
-        description="Whether renders of this scene show ellipsoids: LODGS draws true splats instead",
+        description="Renders of this scene show ellipsoids. LODGS draws splats instead",
         get=lambda self: self.ellipsoids and self.draws_points,
         options={"HIDDEN"},
     )
     holdout: bpy.props.StringProperty(
         name="Hold Out",
-        description="OpenEXR files with the Depth pass of the meshes, #### for the frame's number: splats "
-        "behind that depth are left out, and the film is transparent there",
+        description="OpenEXR files with the Depth pass of the meshes, #### for the frame number. Splats "
+        "behind that depth are not rendered, and the film is transparent there",
         subtype="FILE_PATH",
         options={"PATH_SUPPORTS_BLEND_RELATIVE"},
     )
     show_comparison: bpy.props.BoolProperty(
         name="Wipe",
-        description="Show the photograph over the rendered picture of the view that was compared",
+        description="Show the photo over the render of the compared view",
         update=_redraw,
         options=set(),
     )
     wipe: bpy.props.FloatProperty(
-        name="Photograph",
-        description="How much of the width shows the photograph, from the left; the rest is rendered",
+        name="Photo",
+        description="Fraction of the width that shows the photo, from the left",
         default=0.5,
         min=0.0,
         max=1.0,
@@ -636,19 +634,19 @@ class RenderSettings(bpy.types.PropertyGroup):
     )
     meshes: bpy.props.PointerProperty(
         name="Meshes",
-        description="Scene that renders the meshes, joined with the splats by depth in the compositor",
+        description="Scene that renders the meshes. The compositor combines them with the splats by depth",
         type=bpy.types.Scene,
     )
     before_meshes: bpy.props.StringProperty(
         name="Before Meshes",
-        description="What combining with meshes has switched on, to be switched off again, as JSON",
+        description="Settings that Combine With Meshes changed and Remove restores, as JSON",
         options={"HIDDEN"},
     )
 
 
 SplatScene.__annotations__ |= {
     name: bpy.props.PointerProperty(
-        name=name.title(), description="How much detail an eye asks for", type=controls
+        name=name.title(), description="Level of detail that a camera requests", type=controls
     )
     for name, controls in CONTROLS.items()
 }

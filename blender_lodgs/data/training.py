@@ -96,19 +96,19 @@ def _use(name: str, label: str, description: str) -> Any:
 
 
 def _properties_of(f: Field, method: str) -> dict[str, Any]:
-    """Three properties: the artist's value, whether there is one, and the preset's, to show until then."""
+    """Return three properties: the artist's value, its switch, and the preset's value to show until then."""
     name, label = f.name, f.metadata["label"] or f.name.replace("_", " ").title()
     about = f.metadata["about"].removesuffix(".")  # Blender adds one
-    tooltip = f"{about}. This is the preset's; tick the box to give another"
+    tooltip = f"{about}. Value of the preset; tick the box to change it"
     return {
         name: _property(f, label, description=about, default=f.default),
-        f"use_{name}": _use(name, label, "Take a value of your own instead of the preset's"),
+        f"use_{name}": _use(name, label, "Use your own value instead of the preset's"),
         f"preset_{name}": _property(f, label, description=tooltip, get=_preset_value(f, method)),
     }
 
 
 def _parameters_of(method: MethodInfo) -> type[bpy.types.PropertyGroup]:
-    """A group with the parameters that a method offers; one counts when it is set (``is_property_set``)."""
+    """Return a group with a method's parameters; those with ``is_property_set`` override the preset."""
     annotations = {}
     for f in offered(method.name):
         annotations |= _properties_of(f, method.name)
@@ -118,69 +118,71 @@ def _parameters_of(method: MethodInfo) -> type[bpy.types.PropertyGroup]:
 
 
 PARAMETERS = {method: _parameters_of(info) for method, info in METHODS.items()}
-"""The groups of all methods by name; each is a property ``parameters_<name>`` of ``TrainingSettings``."""
+"""Property groups of all methods by name; ``TrainingSettings`` has them as ``parameters_<name>``."""
 
 
 class TrainingCell(bpy.types.PropertyGroup):
-    """A cell of a scene that is trained in cells, as its plan has it."""
+    """A planned cell of a scene that is trained in cells."""
 
-    views: bpy.props.IntProperty(name="Views", description="How many views it is trained and measured on")
-    points: bpy.props.IntProperty(name="Points", description="With how many points its training begins")
-    splats: bpy.props.IntProperty(name="Splats at Most", description="How many splats it has at most")
-    steps: bpy.props.IntProperty(name="Steps", description="How many steps it is trained for")
-    megabytes: bpy.props.FloatProperty(name="Memory", description="About how much its training takes, in MB")
+    views: bpy.props.IntProperty(name="Views", description="Number of views for training and measuring")
+    points: bpy.props.IntProperty(name="Points", description="Number of initial points")
+    splats: bpy.props.IntProperty(name="Max Splats", description="Maximum number of splats")
+    steps: bpy.props.IntProperty(name="Steps", description="Number of training steps")
+    megabytes: bpy.props.FloatProperty(name="Memory", description="Estimated memory of its training, in MB")
     outline: bpy.props.FloatVectorProperty(
-        name="Outline", description="Its corners on the ground, in the scene's own units", size=12
+        name="Outline", description="Corners of the cell on the ground, in the scene's own units", size=12
     )
     enlarged: bpy.props.FloatVectorProperty(
-        name="Enlarged", description="The corners of what it is trained on, in the same units", size=12
+        name="Training Area",
+        description="Corners of the area that its training covers, in the scene's own units",
+        size=12,
     )
     places: bpy.props.StringProperty(
-        name="Places", description="The places by name of its views, as JSON", options={"HIDDEN"}
+        name="View Indices", description="Indices of its views, sorted by name, as JSON", options={"HIDDEN"}
     )
 
 
 class TrainingSettings(viewpoints.ViewsSettings, bpy.types.PropertyGroup):
-    """Choices of the training panel, and the scene root's newest run (``root.lodgs.training``).
+    """Settings of the Training panel and the newest run of a scene root (``root.lodgs.training``).
 
-    ``run`` is the folder of that run, relative to the .blend where possible; all else about it is read from
-    there.
+    ``run`` is the folder of that run, relative to the .blend file if possible. Everything else about the run
+    is read from the folder.
     """
 
     method: bpy.props.EnumProperty(
         name="Method",
-        description="What is trained",
+        description="Training method, which determines the kind of levels",
         items=[(m.name, m.label, f"{m.label}: {m.about}", m.number) for m in METHODS.values()],
     )
     preset: bpy.props.EnumProperty(
         name="Preset",
-        description="How long the training takes",
+        description="Duration and quality of the training",
         items=[(name, name.title(), text) for name, text in PRESETS.items()],
     )
     start_from: bpy.props.EnumProperty(
         name="Start From",
-        description="What the training begins with",
+        description="Initial splats of the training",
         items=[
-            ("POINTS", "Points", "The points of the COLMAP scene"),
-            ("RUN", "This Run", "The finest level of this scene's newest run, which has to be finished"),
+            ("POINTS", "Points", "Points of the COLMAP scene"),
+            ("RUN", "This Run", "Finest level of the newest run of this scene, which must be finished"),
             (
                 "FILE",
                 "Splat File",
-                "The finest level of a finished run, of a bundle or of any splat PLY",
+                "Finest level of a finished run, a bundle or any splat PLY",
             ),
-            ("SCENE", "These Splats", "The finest level of this scene, with all that was changed in it"),
+            ("SCENE", "These Splats", "Finest level of this scene, with all edits"),
         ],
     )
     find_distances: bpy.props.BoolProperty(
         name="Find Distances",
-        description="Training finds from where on each level is shown: where the least is left to draw. "
-        "Without it these distances are yours",
+        description="Let training choose the level distances that leave the fewest splats to draw. Disable "
+        "it to set them yourself",
         default=True,
     )
     distances: bpy.props.FloatVectorProperty(
         name="Level Distances",
-        description="From how far away a level is shown, in median depths: half of all that photographs show "
-        "is nearer than 1. The coarser a level, the farther away; 0 has training find it",
+        description="Distance from which each level is shown, in multiples of the scene's median depth. "
+        "Increase it for coarser levels. 0 lets training choose",
         size=MAX_LEVELS - 1,
         default=[3.0 * 2.0**place for place in range(MAX_LEVELS - 1)],
         min=0.0,
@@ -190,18 +192,18 @@ class TrainingSettings(viewpoints.ViewsSettings, bpy.types.PropertyGroup):
     )
     median_depth: bpy.props.FloatProperty(
         name="Median Depth",
-        description="How far away what photographs show is, in the scene's own units; 0 where nobody knows",
+        description="Median depth of the photos, in the scene's own units. 0 if unknown",
         options={"HIDDEN"},
     )
     base: bpy.props.StringProperty(
         name="Splats",
-        description="PLY of splats, or folder of a finished run, that the training begins with",
+        description="Splat PLY or folder of a finished run to start from",
         subtype="FILE_PATH",
         options={"PATH_SUPPORTS_BLEND_RELATIVE"},
     )
     image_scale: bpy.props.FloatProperty(
         name="Image Scale",
-        description="Size of the training images over the size of the photographs",
+        description="Scale of the photos for training. Increase it for finer detail and longer training",
         default=0.5,
         min=0.01,
         soft_min=0.1,
@@ -211,43 +213,43 @@ class TrainingSettings(viewpoints.ViewsSettings, bpy.types.PropertyGroup):
     region: bpy.props.PointerProperty(
         type=bpy.types.Object,
         name="Region",
-        description="A box or sphere of this scene: what lies in it is trained in detail, all else coarsely. "
-        "Empty: everything",
+        description="Box or sphere of this scene to train in detail; the rest is trained coarsely. If empty, "
+        "everything is trained in detail",
         poll=lambda settings, obj: obj in crops.crops_of(settings.id_data),
     )
     test_every: bpy.props.IntProperty(
         name="Hold Out Every",
-        description="Every n-th view by name is kept out of training to measure quality; 0 trains on all",
+        description="Hold out every n-th view by name to measure quality. 0 trains on all views",
         default=Job.test_every,
         min=0,
         soft_max=16,
     )
     use_test_every: _use(
-        "test_every", "Hold Out Every", "Take a number of your own instead of the one for so many photographs"
+        "test_every", "Hold Out Every", "Use your own number instead of the default for this number of photos"
     )
     preset_test_every: bpy.props.IntProperty(
         name="Hold Out Every",
-        description=f"Every {Job.test_every}th view is kept out of training to measure quality, or none (0) "
-        f"where there are fewer than {FEW} photographs; tick the box to give another number",
+        description=f"Default: hold out every {Job.test_every}th view to measure quality, or none (0) with "
+        f"fewer than {FEW} photos. Tick the box to change it",
         get=_affordable,
         options=set(),
     )
     seed: bpy.props.IntProperty(
-        name="Seed", description="Two runs with the same seed are equal", default=0, min=0
+        name="Seed", description="Seed of random choices. Runs with the same seed are equal", default=0, min=0
     )
     divide_by: bpy.props.EnumProperty(
         name="Divide By",
-        description="How many cells the ground is divided into, each of which is trained by itself",
+        description="Rule that divides the ground into cells, which are trained separately",
         items=[
-            ("GRID", "By Number", "So many columns of so many cells; 1 by 1 trains the scene as a whole"),
-            ("SPLATS", "By Splats", "As few cells as have so many splats at most; Plan finds them"),
-            ("MEMORY", "By Memory", "As few cells as take so much memory at most; Plan finds them"),
+            ("GRID", "By Number", "Number of columns and rows. 1 by 1 trains the scene as a whole"),
+            ("SPLATS", "By Splats", "Fewest cells within a number of splats each. Plan Cells computes them"),
+            ("MEMORY", "By Memory", "Fewest cells within a memory limit each. Plan Cells computes them"),
         ],
         options=set(),
     )
     cell_splats: bpy.props.IntProperty(
-        name="Splats at Most",
-        description="How many splats a cell has at most",
+        name="Max Splats",
+        description="Maximum number of splats per cell",
         default=1_000_000,
         min=1000,
         soft_max=16_000_000,
@@ -255,8 +257,8 @@ class TrainingSettings(viewpoints.ViewsSettings, bpy.types.PropertyGroup):
         options=set(),
     )
     cell_memory: bpy.props.FloatProperty(
-        name="GB at Most",
-        description="How many gigabytes of memory the training of a cell takes at most, estimated",
+        name="Max Memory (GB)",
+        description="Maximum memory for training one cell, estimated, in gigabytes",
         default=8.0,
         min=0.5,
         soft_max=64.0,
@@ -266,7 +268,7 @@ class TrainingSettings(viewpoints.ViewsSettings, bpy.types.PropertyGroup):
     )
     columns: bpy.props.IntProperty(
         name="Columns",
-        description="How many columns of cells there are, across the longer side of the ground",
+        description="Number of columns along the longer side of the ground",
         default=1,
         min=1,
         soft_max=8,
@@ -275,7 +277,7 @@ class TrainingSettings(viewpoints.ViewsSettings, bpy.types.PropertyGroup):
     )
     rows: bpy.props.IntProperty(
         name="Rows",
-        description="How many cells each column has",
+        description="Number of cells per column",
         default=1,
         min=1,
         soft_max=8,
@@ -284,8 +286,8 @@ class TrainingSettings(viewpoints.ViewsSettings, bpy.types.PropertyGroup):
     )
     polish: bpy.props.IntProperty(
         name="Border Steps",
-        description="Steps that fit each cell's borders to the cells beside it, once all are trained; "
-        "0 leaves them as they are",
+        description="Training steps that match the borders of neighbouring cells after all are trained. 0 "
+        "disables them",
         default=Job.polish,
         min=0,
         soft_max=2000,
@@ -293,8 +295,8 @@ class TrainingSettings(viewpoints.ViewsSettings, bpy.types.PropertyGroup):
     )
     at_once: bpy.props.IntProperty(
         name="Cells at Once",
-        description="How many cells are trained at a time on this computer. Each takes its own memory, and "
-        "they share the processor. Above 1 the trainer needs Dask",
+        description="Number of cells that train at the same time on this computer. Each needs its own "
+        "memory. More than 1 requires Dask",
         default=1,
         min=1,
         soft_max=8,
@@ -303,47 +305,46 @@ class TrainingSettings(viewpoints.ViewsSettings, bpy.types.PropertyGroup):
     )
     show_cells: bpy.props.BoolProperty(
         name="Show Cells",
-        description="Show the cells on the ground: what each is trained on fainter, and the cameras of the "
-        "chosen one",
+        description="Show cells on the ground, their training areas, and the cameras of the active cell",
         default=True,
         options=set(),
     )
-    planned_cells: bpy.props.CollectionProperty(
-        type=TrainingCell, name="Cells", description="What the plan says of each cell"
-    )
+    planned_cells: bpy.props.CollectionProperty(type=TrainingCell, name="Cells", description="Planned cells")
     active_cell: bpy.props.IntProperty(
-        name="Chosen Cell", description="Line of the list of cells", options=set()
+        name="Active Cell", description="Active row of the list of cells", options=set()
     )
     planned_for: bpy.props.StringProperty(
-        name="Planned For", description="What the cells were planned for, as JSON", options={"HIDDEN"}
+        name="Plan Inputs",
+        description="Settings for which the cells were planned, as JSON",
+        options={"HIDDEN"},
     )
     output: bpy.props.StringProperty(
-        name="Run Folders In",
-        description="Folder that receives the folders of the runs; empty: lodgs_runs beside the .blend file",
+        name="Runs Folder",
+        description="Folder for new runs. If empty, lodgs_runs next to the .blend file",
         subtype="DIR_PATH",
         options={"PATH_SUPPORTS_BLEND_RELATIVE"},
     )
     model: bpy.props.StringProperty(
         name="Model",
-        description="Folder of the COLMAP model; empty: the scene's largest",
+        description="Folder of the COLMAP model. If empty, the largest model of the scene",
         subtype="DIR_PATH",
         options={"PATH_SUPPORTS_BLEND_RELATIVE"},
     )
     images: bpy.props.StringProperty(
-        name="Photographs",
-        description="Folder of the photographs; empty: found beside the model",
+        name="Photos",
+        description="Folder of the photos. If empty, the folder next to the model",
         subtype="DIR_PATH",
         options={"PATH_SUPPORTS_BLEND_RELATIVE"},
     )
     run: bpy.props.StringProperty(
         name="Run Folder",
-        description="Folder of this scene's newest run",
+        description="Folder of the newest run of this scene",
         subtype="DIR_PATH",
         options={"PATH_SUPPORTS_BLEND_RELATIVE"},
     )
     read: bpy.props.IntProperty(
         name="Events Read",
-        description="Bytes of the run's events that this file has taken in",
+        description="Number of bytes of the run's event log that this file has read",
         options={"HIDDEN"},
     )
 
@@ -357,18 +358,18 @@ class TrainingSettings(viewpoints.ViewsSettings, bpy.types.PropertyGroup):
 
     @property
     def grid(self) -> str:
-        """The cells as a job has them; "" for the scene as a whole."""
+        """The grid as a job key, "COLUMNSxROWS"; "" for the scene as a whole."""
         return f"{self.columns}x{self.rows}" if self.columns * self.rows > 1 else ""
 
     @property
     def parameters(self) -> bpy.types.PropertyGroup:
-        """The parameters that the chosen method offers."""
+        """The parameters of the selected method."""
         return getattr(self, f"parameters_{self.method}")
 
 
 TrainingSettings.__annotations__ |= {
     f"parameters_{name}": bpy.props.PointerProperty(
-        name=METHODS[name].label, description="What is changed from the preset", type=parameters
+        name=METHODS[name].label, description="Parameters that differ from the preset", type=parameters
     )
     for name, parameters in PARAMETERS.items()
 }

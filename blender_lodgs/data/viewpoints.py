@@ -53,41 +53,40 @@ def _is_curve(settings: bpy.types.PropertyGroup, obj: bpy.types.Object) -> bool:
 
 
 class ViewsSettings:
-    """Choices of views, of splats without photographs and of a Blender scene."""
+    """Settings of views for rendering training images, of splats or of a Blender scene."""
 
     views_from: bpy.props.EnumProperty(
         name="Views From",
-        description="From where pictures are drawn that take the place of photographs",
+        description="Placement of the cameras that render training images",
         items=[
             (
                 "DOME",
                 "All Around",
-                "A dome of views around the splats, or around what is selected of a Blender scene: for a "
-                "thing that is seen from outside",
+                "Dome of cameras around the splats or the selected objects, for an object seen from outside",
             ),
             (
                 "GRID",
                 "Above",
-                "A grid of views above the splats, or above what is selected of a Blender scene, that look "
-                "straight down and from four sides in turn, as a drone does: for grounds and towns",
+                "Grid of cameras above the splats or the selected objects that look down and to four sides, "
+                "as a drone does, for terrain and towns",
             ),
-            ("CAMERAS", "Cameras", "Every camera of the Blender scene"),
-            ("ANIMATION", "Animation", "The scene's camera in frames that are evenly chosen from its range"),
-            ("CURVE", "Along Curve", "A walk along a curve that looks ahead, to both sides and back in turn"),
+            ("CAMERAS", "Cameras", "All cameras of the Blender scene"),
+            ("ANIMATION", "Animation", "Scene camera at frames spread evenly over the frame range"),
+            ("CURVE", "Along Curve", "Cameras along a curve that look ahead, to both sides and back in turn"),
         ],
     )
     views: bpy.props.IntProperty(
-        name="Views", description="How many views there are", default=Job.views, min=VIEWS[0], max=VIEWS[1]
+        name="Views", description="Number of views", default=Job.views, min=VIEWS[0], max=VIEWS[1]
     )
     show_views: bpy.props.BoolProperty(
         name="Show Views",
-        description="Show in the viewport from where the pictures will be drawn",
+        description="Show the views in the viewport",
         default=False,
         options=set(),
     )
     view_width: bpy.props.IntProperty(
         name="View Width",
-        description="How wide their pictures are; training makes them smaller by Image Scale",
+        description="Width of the rendered images. Training scales them by Image Scale",
         default=Job.view_width,
         min=VIEW_WIDTHS[0],
         max=VIEW_WIDTHS[1],
@@ -95,7 +94,7 @@ class ViewsSettings:
     )
     height: bpy.props.FloatProperty(
         name="Height",
-        description="How far views are above the top of what they show; at 0, twice as far as they are apart",
+        description="Height of the views above the top of the subject. 0 uses twice their spacing",
         default=0.0,
         min=0.0,
         soft_max=1000.0,
@@ -103,19 +102,19 @@ class ViewsSettings:
     )
     curve: bpy.props.PointerProperty(
         name="Curve",
-        description="What to walk along, at the height of the eyes",
+        description="Curve for the cameras to follow, at eye level",
         type=bpy.types.Object,
         poll=_is_curve,
     )
 
 
 def alone(root: bpy.types.Object) -> bool:
-    """Whether a splat scene has splats but no photographs."""
+    """Return True if a splat scene has splats but no photos."""
     return not root.lodgs.scene_folder and any(item.exists for item in root.lodgs.levels)
 
 
 def count(settings: bpy.types.PropertyGroup) -> int:
-    """How many views the settings ask for."""
+    """Return the number of views of the settings."""
     return len(_cameras(bpy.context.scene)) if settings.views_from == "CAMERAS" else settings.views
 
 

@@ -40,7 +40,7 @@ class LODGS_OT_import_splats(BackgroundOperator, bpy.types.Operator):
     )
 
     budget: bpy.props.IntProperty(
-        name="Splats at Most",
+        name="Memory Budget",
         description="Maximum number of splats of a tree in memory; finer splats are streamed from the file "
         "when the camera comes near. 0 imports the whole tree, as for other files",
         default=0,

@@ -165,7 +165,7 @@ def prepare(root: bpy.types.Object, folder: str = "") -> Submission:
     if not (folder or root.lodgs.training.output or bpy.data.is_saved):
         raise LodgsError(
             "Cannot choose a run folder: the .blend file is not saved.",
-            "Save it in a folder that all workers see, or set Run Folders In.",
+            "Save it in a folder that all workers see, or set Runs Folder.",
         )
     out = Path(bpy.path.abspath(folder)).resolve() if folder else run_folders.new_run_folder(root)
     if RunFolder(out).state() != "empty":
