@@ -138,9 +138,9 @@ def test_level_distances_can_be_set(bpy, lodgs, root, draw, fake):
     assert draw(panel).texts[-1].endswith("median depth of the photos (1.5 m)")
     assert lodgs("runs.job_settings").current_parameters(settings).distances == (12.0, 6.0, 2.6, 0.0)
     settings.distances[1] = 30.0
-    assert any("Give falling numbers" in text for text in draw().texts)
+    assert any("Give decreasing numbers" in text for text in draw().texts)
     settings.distances[1] = 0.0  # found by training
-    assert not any("Give falling numbers" in text for text in draw().texts)
+    assert not any("Give decreasing numbers" in text for text in draw().texts)
 
 
 def test_start_from_is_offered_if_the_method_can_start_from_splats(root, draw, fake):
