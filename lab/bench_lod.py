@@ -30,7 +30,7 @@ from training.evaluate.metrics import psnr
 from training.lod.partial_read import BLOCKS, block_table, read_part
 from training.lod.rules.chunks import RULE, TABLE, member_columns
 from training.lod.selection import resolve_controls
-from training.methods.lodge.chunks import members
+from training.methods.lodge.chunks import chunk_rows
 from training.methods.lodge.composite import IndexedLevel
 from training.rasterize import Gaussians, Rendering
 from training.rasterize.resident import ResidentBundle
@@ -135,7 +135,7 @@ def without_visibility(file: Path) -> Path:
     table, sets = bundle.tables[TABLE], {number: [] for number in levels}
     centres = np.stack([table[axis] for axis in "xyz"], axis=1)
     for centre, radius in zip(centres, table["radius"], strict=True):
-        for number, rows in members(levels, d_l, centre, float(radius)).items():
+        for number, rows in chunk_rows(levels, d_l, centre, float(radius)).items():
             inside = np.zeros(len(levels[number]), bool)
             inside[rows] = True
             sets[number].append(inside)

@@ -29,9 +29,9 @@ from examples import town
 from training.lod.rules.cut import detail_of
 from training.methods import method_info
 from training.methods.tree import TreeParameters
-from training.methods.tree.build import GrowingForest
-from training.methods.tree.store import layout_of
-from training.methods.tree.train import Method, SeenRecords
+from training.methods.tree.build import ForestBuilder
+from training.methods.tree.store import record_layout
+from training.methods.tree.train import Method, RecordOptimizer
 from training.optimize.memory import keep_freed_memory
 from training.optimize.out_of_core.cut_cache import MMAP_BYTES, SLOT_BYTES
 from training.optimize.parameters import override
@@ -93,11 +93,11 @@ def build_store(options: argparse.Namespace) -> dict:
     method.model.keep(torch.zeros(len(method.model), dtype=torch.bool))
     start = time.perf_counter()
     method.store = store = method._new_store()
-    store.fill(GrowingForest(leaves, folder))
+    store.fill(ForestBuilder(leaves, folder))
     seconds = time.perf_counter() - start
     for camera in method.data.train:
         assert camera.image is not None
-        gaussians = store.gaussians_at(store.take(camera, options.pixels, town.NEAR))
+        gaussians = store.gaussians_at(store.load_cut(camera, options.pixels, town.NEAR))
         image = rasterize(gaussians, camera, near=town.NEAR, backend="cpu").image
         write_png(camera.image, (image.numpy().clip(0, 1) * 255).round().astype(np.uint8))
     torch.save(method.state_dict(), folder / "state.pt.part")
@@ -123,7 +123,7 @@ def level(options: argparse.Namespace) -> dict:
         for camera in method.data.train:
             center, k = camera.center, detail_of(camera.focal, pixels)
             nodes, lists, bands = store._top.traverse(center, k, image_borders(camera, town.NEAR))
-            counts.append(len(nodes) + len(store.cut(lists.astype(np.int64), bands, center, k)[0]))
+            counts.append(len(nodes) + len(store.find_cut(lists.astype(np.int64), bands, center, k)[0]))
         return float(np.mean(counts))
 
     low, high = 0.1, 100.0
@@ -139,7 +139,7 @@ def train(options: argparse.Namespace) -> dict:
     store = method.store
     cut_times, counts, times = [], [], []
     assert store is not None
-    take = store.take
+    take = store.load_cut
     if not WAYS[options.way]:
         method.view_index = lambda step: method.data.training_view(step, 0)
 
@@ -152,8 +152,8 @@ def train(options: argparse.Namespace) -> dict:
         counts.append(len(rows))
         return rows
 
-    store.take = timed_take  # pyright: ignore
-    resize = store.resize
+    store.load_cut = timed_take  # pyright: ignore
+    resize = store.update_sizes
     resize_times = []
 
     def timed_resize() -> None:
@@ -161,14 +161,14 @@ def train(options: argparse.Namespace) -> dict:
         resize()
         resize_times.append(time.perf_counter() - start)
 
-    store.resize = timed_resize
+    store.update_sizes = timed_resize
     largest = 0
     for step in range(1, options.steps + 1):
         start, resizing = time.perf_counter(), sum(resize_times)
         method.train_step(step)
         times.append(time.perf_counter() - start - (sum(resize_times) - resizing))
         if counts[-1] > largest:
-            assert isinstance(method._optimizer, SeenRecords)
+            assert isinstance(method._optimizer, RecordOptimizer)
             largest, splats = counts[-1], method._optimizer.gaussians
             for name, tensor in vars(splats).items():  # no copy, which would count as memory
                 np.save(options.folder / f"largest_{name}.npy", tensor.detach().numpy())
@@ -276,14 +276,14 @@ def main() -> None:
         vars(options).update(TINY)
     options.out.parent.mkdir(parents=True, exist_ok=True)
     run("build", options.small, options)
-    half = options.small * 4e-6 * layout_of(0).width  # MB of the small tree's nodes
+    half = options.small * 4e-6 * record_layout(0).width  # MB of the small tree's nodes
     program = [run("train", options.small, options, budget=half) for _ in range(2)][
         1
     ]  # the first one may compile
     program, small = program["peak_mb"] - program["cache_mb"], run("draw", options.small, options)["peak_mb"]
     print(f"memory besides 110 % of the budget: program {program:.0f} MB, and drawing")
     for times in options.times:
-        leaves = round(options.budget * 1e6 * times / (4 * layout_of(0).width) / 2)
+        leaves = round(options.budget * 1e6 * times / (4 * record_layout(0).width) / 2)
         built = run("build", leaves, options)
         if built:
             print(

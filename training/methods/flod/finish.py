@@ -1,12 +1,12 @@
-"""Finishing: the levels before the finest become its most important splats, and all learn to stand together.
+"""Finishing steps of FLoD: restart the levels before the finest and train all of them for blended rendering.
 
-Not in the paper (FLoD, Sec. 5.2), which trains each level as if it were alone, before the finer ones: no step
-has ever drawn two of them, nor the places where one takes over from the next. Here they are rows of one
-model. Those whose smallest size hardly limits what they can show begin anew: as copies of the finest level's
-splats that have the largest share of some pixel, so many that views by distance draw no more than they may.
-Each step then draws what the rule chooses at a random screen size, or a level alone, so that it does not come
-to need the others. Rates fall meanwhile, for the finest level as well: without that the one before it, which
-has fewer splats and more steps, comes to be the better one.
+Not in the paper (FLoD, Sec. 5.2), which trains each level on its own, before the finer ones; no step
+renders two levels, nor the transitions between them. Here the finest levels are rows of one model. Levels
+whose minimum size hardly limits their detail restart as copies of the most important splats of the finest
+level, few enough to meet the budget of views by distance. Each step then renders the selection of the
+rule at a random screen size, or a single level, so that each level also works without the others.
+Learning rates fall meanwhile, for the finest level as well; otherwise the level before it, which has
+fewer splats and more steps, becomes the better one.
 """
 
 from __future__ import annotations
@@ -30,32 +30,32 @@ from ...splats.levels import Level
 from . import FlodParameters
 
 LEVEL = "level"
-"""Column of the number of each row's level; levels follow each other, coarse to fine."""
+"""Column with the level number of each row; levels are consecutive, coarse to fine."""
 FINE_PIXELS = 1.5
-"""A level begins anew where its smallest size covers at most so many pixels at the median depth. What is
-coarser was trained with fewer and larger splats than the finest level's, and keeps them."""
-VIEWS_COUNTED = 24
-"""In so many training views it is counted what they draw."""
-COARSER = 0.8
-"""Of two neighbouring levels that begin anew the coarser one has so many times the other's splats."""
-LEAST_SHARE = 0.25
-"""At least this share of what views draw of a level stays, whatever the others have drawn."""
-SPREAD = 1.3
-"""The largest factor on the run's screen size, up or down."""
+"""A level restarts if its minimum size is at most this many pixels at the median depth. Coarser levels were
+trained with fewer and larger splats than the finest level has, and keep them."""
+COUNTED_VIEWS = 24
+"""Number of training views in which drawn splats are counted."""
+COUNT_RATIO = 0.8
+"""Splat count of a restarted level relative to the next finer restarted level."""
+MIN_SHARE = 0.25
+"""Minimum fraction of the drawn splats of restarted levels that remain, regardless of other levels."""
+MAX_GAMMA_FACTOR = 1.3
+"""Maximum random factor on the screen size, up or down."""
 FINEST_WEIGHT = 2.0
-"""The finest level is drawn alone so many times as often as each other one."""
-MEANS = 3.0
-"""Positions begin with so many times the rate that a level ends with."""
-FALL = 0.1
-"""What is left of all learning rates at the end."""
+"""Relative frequency of the finest level in steps that render a single level."""
+MEANS_RATE = 3.0
+"""Initial learning rate of positions, relative to the final one of a level."""
+FINAL_RATE = 0.1
+"""Final learning rates as a fraction of the initial ones."""
 
 
-def joined(levels: Mapping[int, Mapping[str, torch.Tensor]], lr: Mapping[str, LearningRate]) -> Model:
-    """One model of the splats of several levels.
+def join_levels(levels: Mapping[int, Mapping[str, torch.Tensor]], lr: Mapping[str, LearningRate]) -> Model:
+    """Combine the splats of several levels in one model.
 
     Args:
-        levels: tensors by name for each number, coarse to fine, smallest sizes baked in.
-        lr: the learning rates to begin with.
+        levels: tensors by name for each level number, coarse to fine, with minimum sizes applied.
+        lr: initial learning rates.
     """
     names = next(iter(levels.values()))
     tensors = {name: torch.cat([level[name] for level in levels.values()]) for name in names}
@@ -64,7 +64,7 @@ def joined(levels: Mapping[int, Mapping[str, torch.Tensor]], lr: Mapping[str, Le
 
 
 @torch.no_grad()
-def begun_anew(
+def restart_levels(
     levels: Mapping[int, Mapping[str, torch.Tensor]],
     numbers: Sequence[int],
     s_min: Sequence[float],
@@ -73,127 +73,136 @@ def begun_anew(
     gamma: float,
     backend: str,
 ) -> dict[int, dict[str, torch.Tensor]]:
-    """Levels of the finest one's splats, so many that views by distance draw no more than ``drawn`` of it.
+    """Restart levels with the most important splats of the finest level.
 
-    Each has the ones with the largest share of some pixel. Views are as wide as photographs are continued, so
-    that what continues them counts.
+    Importance is a splat's maximum share of a pixel. The levels get as many splats as views by distance
+    may draw, ``drawn`` of those of the finest level. Views include the margins, so that margin splats
+    count.
 
     Args:
-        levels: as of :func:`joined`.
-        numbers: those that begin anew, coarse to fine, the last one before the finest.
-        gamma: the screen size that levels are chosen with.
+        levels: see :func:`join_levels`.
+        numbers: levels to restart, coarse to fine, the last one before the finest.
+        gamma: screen size for the selection of levels.
 
     Returns:
-        Their splats, in spatial order, none smaller than its level allows. With Mip-Splatting's filter, which
-        shows of splats smaller than a pixel as little as they are, those that are raised to that size become
-        as much fainter as they cover more.
+        Tensors of the restarted levels, in spatial order, with minimum sizes applied. With
+            Mip-Splatting's filter, which fades splats below a pixel, enlarged splats become fainter in
+            proportion to their area.
     """
     p, (coarsest, *_, finest) = parameters, levels
     order = torch.from_numpy(spatial_order(levels[finest]["means"].cpu().numpy()))
     tensors = {name: tensor[order.to(tensor.device)] for name, tensor in levels[finest].items()}
     wide = (camera.widened(p.margin) for camera in data.train)
-    found = contributions(Gaussians(**tensors), wide, near=data.near, antialias=p.antialias, backend=backend)
-    shares, log_scales = found.largest.cpu().numpy(), tensors["log_scales"].cpu().numpy()
-    rank = np.empty(len(shares))
-    rank[np.argsort(-shares, kind="stable")] = np.arange(1, len(shares) + 1)
-    first = {number: COARSER ** (numbers[-1] - number) / rank for number in numbers}
+    contribution = contributions(
+        Gaussians(**tensors), wide, near=data.near, antialias=p.antialias, backend=backend
+    )
+    importance, log_scales = contribution.largest.cpu().numpy(), tensors["log_scales"].cpu().numpy()
+    rank = np.empty(len(importance))
+    rank[np.argsort(-importance, kind="stable")] = np.arange(1, len(importance) + 1)
+    first = {number: COUNT_RATIO ** (numbers[-1] - number) / rank for number in numbers}
 
     values = {"gamma": gamma, "first": coarsest, "last": finest}
     views = {
-        number: _views_drawing(
-            (tensors if number in numbers else level)["means"], number, s_min, data, values
-        )
+        number: _count_views((tensors if number in numbers else level)["means"], number, s_min, data, values)
         for number, level in levels.items()
     }
-    alone = _views_drawing(tensors["means"], finest, s_min, data, {**values, "first": finest})
-    own = np.concatenate([views[number] for number in numbers])
-    others = sum(int(each.sum()) for number, each in views.items() if number not in numbers)
-    most = max(p.drawn * alone.sum() - others, LEAST_SHARE * own.sum())
-    least = importance_threshold(np.concatenate(list(first.values())), own, most)
+    finest_views = _count_views(tensors["means"], finest, s_min, data, {**values, "first": finest})
+    own_views = np.concatenate([views[number] for number in numbers])
+    other_splats = sum(int(counts.sum()) for number, counts in views.items() if number not in numbers)
+    max_views = max(p.drawn * finest_views.sum() - other_splats, MIN_SHARE * own_views.sum())
+    threshold = importance_threshold(np.concatenate(list(first.values())), own_views, max_views)
 
-    anew = {}
+    restarted = {}
     for number in numbers:
-        kept = first[number] >= least
-        wider = log_scales + log_scale_gain(log_scales, shares, kept)[:, None]
-        sizes = np.maximum(wider, np.float32(np.log(s_min[number - 1])))
+        keep = first[number] >= threshold
+        grown_scales = log_scales + log_scale_gain(log_scales, importance, keep)[:, None]
+        sizes = np.maximum(grown_scales, np.float32(np.log(s_min[number - 1])))
         level = tensors | {"log_scales": torch.from_numpy(sizes).to(tensors["log_scales"])}
         if p.antialias:
-            share = torch.from_numpy(np.exp(covered_log(wider) - covered_log(sizes)))
-            level["opacity_logits"] = fainter(tensors["opacity_logits"], share)
-        rows = torch.from_numpy(kept)
-        anew[number] = {name: tensor[rows.to(tensor.device)] for name, tensor in level.items()}
-    return anew
+            fraction = torch.from_numpy(np.exp(log_covered_area(grown_scales) - log_covered_area(sizes)))
+            level["opacity_logits"] = scale_opacities(tensors["opacity_logits"], fraction)
+        rows = torch.from_numpy(keep)
+        restarted[number] = {name: tensor[rows.to(tensor.device)] for name, tensor in level.items()}
+    return restarted
 
 
-def covered_log(log_scales: np.ndarray) -> np.ndarray:
-    """Logarithm of the areas (N,) that ellipsoids (N, 3) cover, but for a factor: root mean square over all
-    sides to see them from."""
+def log_covered_area(log_scales: np.ndarray) -> np.ndarray:
+    """Return the log of the areas (N,) of ellipsoids (N, 3), up to a constant: root mean square over
+    directions.
+    """
     squares = np.exp(2 * log_scales.astype(np.float64))
     return np.log((squares * np.roll(squares, 1, axis=1)).sum(1)) / 2
 
 
-def fainter(logits: torch.Tensor, share: torch.Tensor) -> torch.Tensor:
-    """Opacities (N,), as logits, times shares (N,) in (0, 1]."""
-    share = share.to(logits)
-    return torch.where(share < 1, torch.logit((logits.sigmoid() * share).clamp_min(1e-6)), logits)
+def scale_opacities(logits: torch.Tensor, fraction: torch.Tensor) -> torch.Tensor:
+    """Multiply opacities (N,), given as logits, by factors (N,) in (0, 1]."""
+    fraction = fraction.to(logits)
+    return torch.where(fraction < 1, torch.logit((logits.sigmoid() * fraction).clamp_min(1e-6)), logits)
 
 
-def rates(parameters: FlodParameters, extent: float, share: float) -> dict[str, LearningRate]:
-    """The learning rates after a share of the steps."""
-    lr = splat_rates(parameters, extent) | {"means": MEANS * parameters.lr_means_final * extent}
-    return {name: rate * log_linear(1.0, FALL, share) for name, rate in lr.items()}
+def learning_rates(parameters: FlodParameters, extent: float, fraction: float) -> dict[str, LearningRate]:
+    """Return the learning rates after a fraction of the finishing steps."""
+    lr = splat_rates(parameters, extent) | {"means": MEANS_RATE * parameters.lr_means_final * extent}
+    return {name: rate * log_linear(1.0, FINAL_RATE, fraction) for name, rate in lr.items()}
 
 
-def random_values(rng: np.random.Generator, gamma: float, model: Model, alone: float) -> Values:
-    """Controls of the rule for a step: a level alone with a chance of ``alone``, else all levels."""
+def random_values(rng: np.random.Generator, gamma: float, model: Model, single_share: float) -> Values:
+    """Draw the rule's controls for a step: a single level with probability ``finest_views``, otherwise all
+    levels.
+    """
     numbers = list(_rows(model))
-    often = np.array([1.0] * (len(numbers) - 1) + [FINEST_WEIGHT])
-    factor, level = SPREAD ** rng.uniform(-1, 1), int(rng.choice(numbers, p=often / often.sum()))
-    first, last = (level, level) if rng.uniform() < alone else (numbers[0], numbers[-1])
+    frequencies = np.array([1.0] * (len(numbers) - 1) + [FINEST_WEIGHT])
+    factor, level = (
+        MAX_GAMMA_FACTOR ** rng.uniform(-1, 1),
+        int(rng.choice(numbers, p=frequencies / frequencies.sum())),
+    )
+    first, last = (level, level) if rng.uniform() < single_share else (numbers[0], numbers[-1])
     return {"gamma": gamma * factor, "first": first, "last": last}
 
 
 def weights(model: Model, s_min: Sequence[float], camera: Camera, values: Values) -> torch.Tensor:
-    """The rule's weights (N,) of all rows.
+    """Return the rule's weights (N,) of all rows.
 
     Args:
-        s_min: of every level of the run, coarse to fine.
+        s_min: minimum size of every level of the run, coarse to fine.
     """
     means = model.read("means").cpu().numpy()
-    found = [_weights(means[rows], number, s_min, camera, values) for number, rows in _rows(model).items()]
-    return torch.from_numpy(np.concatenate(found)).to(model.columns[LEVEL].device)
+    level_weights = [
+        _weights(means[rows], number, s_min, camera, values) for number, rows in _rows(model).items()
+    ]
+    return torch.from_numpy(np.concatenate(level_weights)).to(model.columns[LEVEL].device)
 
 
-def keep_sizes(model: Model, s_min: Sequence[float]) -> None:
-    """No splat becomes smaller than its level allows."""
+def raise_to_min_sizes(model: Model, s_min: Sequence[float]) -> None:
+    """Raise the scales of splats to the minimum of their level."""
     with np.errstate(divide="ignore"):
-        least = torch.from_numpy(np.log(np.asarray(s_min, np.float64))).to(model.columns[LEVEL].device)
-    model.raise_log_scales(least.float()[model.columns[LEVEL].long() - 1])
+        threshold = torch.from_numpy(np.log(np.asarray(s_min, np.float64))).to(model.columns[LEVEL].device)
+    model.raise_log_scales(threshold.float()[model.columns[LEVEL].long() - 1])
 
 
-def levels_of(model: Model, s_min: Sequence[float]) -> list[Level]:
-    """The levels that were trained, coarse to fine."""
+def split_levels(model: Model, s_min: Sequence[float]) -> list[Level]:
+    """Split the model into its levels, coarse to fine."""
     splats, facts = model.splats(), dict(_facts(s_min))
-    return [Level(number, splats.select(some), facts[number]) for number, some in _rows(model).items()]
+    return [Level(number, splats.select(rows), facts[number]) for number, rows in _rows(model).items()]
 
 
 def _weights(
     means: np.ndarray, number: int, s_min: Sequence[float], camera: Camera, values: Values
 ) -> np.ndarray:
-    """The rule's weights (N,) of a level's splats."""
-    eye, facts = np.asarray(camera.center, np.float32), collect_facts(RULE, {}, _facts(s_min), number)
-    return RULE.weights(means, eye, camera.focal, {}, facts, values)
+    """Return the rule's weights (N,) of a level's splats."""
+    position, facts = np.asarray(camera.center, np.float32), collect_facts(RULE, {}, _facts(s_min), number)
+    return RULE.weights(means, position, camera.focal, {}, facts, values)
 
 
-def _views_drawing(
+def _count_views(
     means: torch.Tensor, number: int, s_min: Sequence[float], data: TrainingData, values: Values
 ) -> np.ndarray:
-    """In how many of VIEWS_COUNTED training views each of a level's splats (N,) is drawn."""
-    places = means.cpu().numpy()
-    views = np.zeros(len(places), np.int64)
-    for camera in pick_evenly(data.train, VIEWS_COUNTED):
-        shown = _weights(places, number, s_min, camera, values) > 0
-        views += shown & camera.sees(places, data.near)
+    """Count for each splat of a level (N,) in how many of COUNTED_VIEWS training views it is drawn."""
+    positions = means.cpu().numpy()
+    views = np.zeros(len(positions), np.int64)
+    for camera in pick_evenly(data.train, COUNTED_VIEWS):
+        drawn = _weights(positions, number, s_min, camera, values) > 0
+        views += drawn & camera.sees(positions, data.near)
     return views
 
 
@@ -202,7 +211,7 @@ def _facts(s_min: Sequence[float]) -> list[tuple[int, dict[str, float]]]:
 
 
 def _rows(model: Model) -> dict[int, slice]:
-    """The rows of each level, by its number."""
+    """Return the rows of each level by number."""
     numbers, counts = model.columns[LEVEL].unique_consecutive(return_counts=True)
     ends = counts.cumsum(0)
     return {

@@ -1,4 +1,4 @@
-"""FLoD (Seo et al. 2025): levels trained one after another under a shrinking 3D scale constraint."""
+"""FLoD (Seo et al. 2025): train levels one after another under a decreasing 3D scale constraint."""
 
 from __future__ import annotations
 
@@ -34,29 +34,29 @@ from . import BLENDED_LEVELS, PAPER_REACH, FlodParameters, finish
 
 
 class Method(method.Method[FlodParameters, Drawing]):
-    """One run of FLoD.
+    """Training of FLoD levels.
 
     Attributes:
-        s_min: the smallest standard deviation of each level, coarse to fine, in scene units.
-        points, colors: the scene's points to begin with, (P, 3) both.
-        kept: the finished ones of the levels that finishing steps train, as tensors by name.
+        s_min: minimum standard deviation of each level, coarse to fine, in scene units.
+        points, colors: initial points of the scene, (P, 3) both.
+        completed: completed levels for the finishing steps, as tensors by name.
     """
 
     def setup(self, base: Splats | None) -> None:
         p, data = self.parameters, self.data
         s_min_1 = p.s_min_1 or p.footprint * data.median_depth / data.focal
         self.s_min = min_scales(s_min_1, p.rho, p.levels)
-        self._before = sum(p.steps[: p.first_level - 1])
+        self._skipped_steps = sum(p.steps[: p.first_level - 1])
         self._ends = list(accumulate(p.steps[p.first_level - 1 : p.end]))
         points, colors = drop_duplicates(data.scene.points, data.scene.point_colors)
         self.points, self.colors = sample_points(points, colors, p.max_splats, self.seed)
-        self.kept: dict[int, dict[str, torch.Tensor]] = {}
+        self.completed: dict[int, dict[str, torch.Tensor]] = {}
         if base is None:
             self.model = self._new_model(self._from_points(1))
         else:
-            self._keep_to_finish(p.first_level - 1, base)
+            self._store_for_finishing(p.first_level - 1, base)
             tensors = from_splats(base, p.sh_degree, self.device)
-            self.model = self._new_model(self._risen(tensors, 0.0, p.first_level))
+            self.model = self._new_model(self._next_level_tensors(tensors, 0.0, p.first_level))
 
     @property
     def levels(self) -> int:
@@ -68,51 +68,53 @@ class Method(method.Method[FlodParameters, Drawing]):
     def ends_level(self, step: int) -> bool:
         return step + 1 in self._ends or super().ends_level(step)
 
-    def finishing(self, step: int) -> bool:
-        """Whether a step is one of those that train the finest levels together."""
+    def is_finishing(self, step: int) -> bool:
+        """Return whether a step is a finishing step, which trains the finest levels blended."""
         return step >= self._ends[-1]
 
     def levels_after(self, step: int) -> list[Level]:
-        """The level that the step completed, the next one is then prepared; at the end the refined ones."""
-        if self.finishing(step) and step + 1 == self.steps:
-            return finish.levels_of(self.model, self.s_min)
+        """Return the level that the step completes, and start the next one; at the end, the finished
+        levels.
+        """
+        if self.is_finishing(step) and step + 1 == self.steps:
+            return finish.split_levels(self.model, self.s_min)
         if step + 1 not in self._ends:
             return []
         number = self.level_at(step)
         s_min = self.s_min[number - 1]
         finished = Level(number, self.model.splats(s_min), {"s_min": s_min})
-        self._keep_to_finish(number, finished.splats)
+        self._store_for_finishing(number, finished.splats)
         if number < self.parameters.end:
-            self.rise_to(number + 1)
-        elif self.kept:
-            self.begin_finishing()
+            self.start_level(number + 1)
+        elif self.completed:
+            self.start_finishing()
         return [finished]
 
     def controls(self) -> dict[str, float]:
-        """The gamma with which the finest level reaches as far as the paper's, in median depths.
+        """Return the gamma at which the finest level reaches as far as the paper's, in median depths.
 
-        d_proj(l) = s_min(l) / gamma * f (Eq. 8) falls with s_min: a gamma that did not follow it would leave
-        the finest level of a smaller footprint, or of more levels, nothing to draw. It is never more than the
-        paper's one pixel, so that few levels with coarse detail are not shown nearer than that is seen.
+        d_proj(l) = s_min(l) / gamma * f (Eq. 8) falls with s_min. With a fixed gamma, the finest level of
+        a smaller footprint, or of more levels, would never be drawn. The maximum is the paper's value,
+        one pixel, so that coarse levels do not appear at distances where their lack of detail is visible.
         """
         if self.levels == 1:
             return {}
         pixels = self.s_min[-2] * self.data.focal / self.data.median_depth
         value = max(min(pixels / PAPER_REACH, 1.0), all_controls()["gamma"].low)
-        return {"gamma": float(f"{value:.6g}")}  # as many digits as Blender keeps
+        return {"gamma": float(f"{value:.6g}")}  # Blender stores as many digits
 
     def meta(self) -> dict:
         footprint = self.s_min[0] * self.data.focal / self.data.median_depth
         return {"rho": self.parameters.rho, **super().meta(), "footprint_px": footprint}
 
-    # -- a step ----------------------------------------------------------------------------------------
+    # -- steps -----------------------------------------------------------------------------------------
 
     def shrink(self, step: int) -> float:
         p = self.parameters
-        return shrink_at(self._share(step), p.first_resolution, p.full_resolution)
+        return shrink_at(self._progress(step), p.first_resolution, p.full_resolution)
 
     def sh_degree(self, step: int) -> int:
-        return super().sh_degree(self._before + step)
+        return super().sh_degree(self._skipped_steps + step)
 
     def draw(self, view: TrainingView, step: int) -> list[Drawing]:
         return [Drawing(self.rasterize_model(view.camera, step, *self.render_weights(view, step)))]
@@ -121,32 +123,32 @@ class Method(method.Method[FlodParameters, Drawing]):
         return True
 
     def render_weights(self, view: TrainingView, step: int) -> tuple[torch.Tensor | None, float]:
-        if self.finishing(step):
+        if self.is_finishing(step):
             values = self._finishing_values(step)
             return finish.weights(self.model, self.s_min, view.camera, values), 0.0
-        return self.dropout_weights(step, self._share(step)), self.s_min[self.level_at(step) - 1]
+        return self.dropout_weights(step, self._progress(step)), self.s_min[self.level_at(step) - 1]
 
     def collects_stats(self, view: TrainingView, step: int) -> bool:
-        return not self.finishing(step) and self._local(step) < self._densify_until(step)
+        return not self.is_finishing(step) and self._level_step(step) < self._densify_until(step)
 
     def set_learning_rates(self, step: int) -> None:
         p = self.parameters
-        if self.finishing(step):
+        if self.is_finishing(step):
             share = (step - self._ends[-1]) / p.finish_steps
-            self.model.lr = finish.rates(p, self.data.extent, share)
+            self.model.lr = finish.learning_rates(p, self.data.extent, share)
             return
-        share = self._local(step) / (p.lr_means_steps or p.steps[self.level_at(step) - 1])
+        share = self._level_step(step) / (p.lr_means_steps or p.steps[self.level_at(step) - 1])
         rate = log_linear(p.lr_means, p.lr_means_final, share) * self.data.extent
         self.model.lr["means"] = rate
 
     def control_density(self, step: int) -> None:
-        if self.finishing(step):
-            finish.keep_sizes(self.model, self.s_min)
+        if self.is_finishing(step):
+            finish.raise_to_min_sizes(self.model, self.s_min)
             return
-        p, model, level, local = self.parameters, self.model, self.level_at(step), self._local(step) + 1
+        p, model, level, local = self.parameters, self.model, self.level_at(step), self._level_step(step) + 1
         if local > self._densify_until(step):
             return
-        before, s_min = len(model), self.s_min[level - 1]
+        old_count, s_min = len(model), self.s_min[level - 1]
         if due(p.densify_interval[level - 1], local):
             densify(
                 model,
@@ -161,18 +163,18 @@ class Method(method.Method[FlodParameters, Drawing]):
         if due(p.prune_interval, local):
             prune(model, p.min_opacity)
         if due(p.overlap_interval, local) and level < p.levels:
-            model.keep(apart(model.read("means").cpu(), s_min / 2))
+            model.keep(well_separated(model.read("means").cpu(), s_min / 2))
         if due(p.opacity_reset_interval, local):
             reset_opacities(model)
-        if before and not len(model):
+        if old_count and not len(model):
             raise LodgsError(
-                f"Level {level} lost all its splats at step {step + 1}.",
+                f"Training removed all splats of level {level} at step {step + 1}.",
                 "Lower 'footprint' (or 's_min_1'), so that coarse levels keep more splats.",
             )
 
     def adds_margins(self, step: int) -> bool:
-        local = self._local(step)
-        return not self.finishing(step) and local < self._densify_until(step) <= local + 1
+        local = self._level_step(step)
+        return not self.is_finishing(step) and local < self._densify_until(step) <= local + 1
 
     def budget_at(self, step: int) -> int:
         return self.budget(self.level_at(step))
@@ -186,52 +188,58 @@ class Method(method.Method[FlodParameters, Drawing]):
         super().append_margins({**rows, "log_scales": scales}, step)
 
     def _finishing_values(self, step: int) -> Values:
-        """What a finishing step draws."""
+        """Return the rule's controls for a finishing step."""
         rng = np.random.default_rng([self.seed, step, 3])
         return finish.random_values(rng, self.controls()["gamma"], self.model, self.parameters.finish_alone)
 
-    def _share(self, step: int) -> float:
-        """What share of a run of all levels a step comes after."""
-        return (self._before + step) / self.parameters.all_steps
+    def _progress(self, step: int) -> float:
+        """Return the fraction of a run of all levels that is complete before a step."""
+        return (self._skipped_steps + step) / self.parameters.all_steps
 
-    def _local(self, step: int) -> int:
-        """Steps that the level of a step has seen before it."""
-        place = self.level_at(step) - self.parameters.first_level
-        return step - (self._ends[place - 1] if place else 0)
+    def _level_step(self, step: int) -> int:
+        """Return the number of completed steps of the current level."""
+        index = self.level_at(step) - self.parameters.first_level
+        return step - (self._ends[index - 1] if index else 0)
 
     def _densify_until(self, step: int) -> float:
-        """Steps of the level of a step in which splats are added and removed."""
+        """Return the number of steps of the current level with density control."""
         p, level = self.parameters, self.level_at(step)
         return p.densify_until[level - 1] * p.steps[level - 1]
 
     def prune_unsupported(self, step: int) -> None:
         super().prune_unsupported(step)
-        if self.finishing(step):  # what a level allows comes first
-            finish.keep_sizes(self.model, self.s_min)
+        if self.is_finishing(step):  # minimum sizes take precedence
+            finish.raise_to_min_sizes(self.model, self.s_min)
 
     # -- levels ----------------------------------------------------------------------------------------
 
     def budget(self, level: int) -> int:
-        """Most splats that a level may have."""
+        """Return the maximum splat count of a level."""
         p = self.parameters
         return int(p.max_splats * p.budget_ratio ** (p.levels - level))
 
-    def rise_to(self, level: int) -> None:
-        """The next level starts from this one: same scales, a smaller constraint, Adam anew (Eq. 5)."""
+    def start_level(self, level: int) -> None:
+        """Start the next level from the current one: same scales, a smaller constraint, new Adam state (Eq.
+        5).
+        """
         tensors = {name: tensor.detach() for name, tensor in self.model.adam.tensors.items()}
-        self.model = self._new_model(self._risen(tensors, self.s_min[level - 2], level))
+        self.model = self._new_model(self._next_level_tensors(tensors, self.s_min[level - 2], level))
 
-    def _risen(self, tensors: dict[str, torch.Tensor], before: float, level: int) -> dict[str, torch.Tensor]:
-        """What a level begins with: the one before it, to whose scales a constraint is added, and points."""
-        after = self.s_min[level - 1]
+    def _next_level_tensors(
+        self, tensors: dict[str, torch.Tensor], old_min: float, level: int
+    ) -> dict[str, torch.Tensor]:
+        """Return the initial tensors of a level: those of the level before, with its constraint added to
+        their scales, and points.
+        """
+        new_min = self.s_min[level - 1]
         tensors = {
             **tensors,
-            "log_scales": constrained_log_scales(tensors["log_scales"].exp() + before, after),
+            "log_scales": constrained_log_scales(tensors["log_scales"].exp() + old_min, new_min),
         }
         if self.parameters.rejoin_points:
-            # What overlap pruning counts as too close is now half of a smaller size.
+            # overlap pruning now allows half of a smaller size
             distances, _ = KDTree(tensors["means"].cpu().numpy()).query(self.points)
-            free = np.flatnonzero(distances >= after / 2)
+            free = np.flatnonzero(distances >= new_min / 2)
             room = max(self.budget(level) - len(tensors["means"]), 0)
             if len(free) > room:
                 rng = np.random.default_rng([self.seed, level, 2])
@@ -240,21 +248,23 @@ class Method(method.Method[FlodParameters, Drawing]):
             tensors = {name: torch.cat([tensor, points[name][free]]) for name, tensor in tensors.items()}
         return tensors
 
-    def _keep_to_finish(self, level: int, splats: Splats) -> None:
+    def _store_for_finishing(self, level: int, splats: Splats) -> None:
         p = self.parameters
         if p.finish_steps and level > p.levels - BLENDED_LEVELS:
-            self.kept[level] = from_splats(splats, p.sh_degree, self.device)
+            self.completed[level] = from_splats(splats, p.sh_degree, self.device)
 
-    def begin_finishing(self) -> None:
-        """The levels that finishing steps train, as one model; those of fine detail begin anew."""
-        p, data, levels = self.parameters, self.data, self.kept
-        most = finish.FINE_PIXELS * data.median_depth / data.focal
-        fine = [number for number in levels if 0 < self.s_min[number - 1] <= most]
+    def start_finishing(self) -> None:
+        """Combine the completed levels into one model for the finishing steps; restart those of fine
+        detail.
+        """
+        p, data, levels = self.parameters, self.data, self.completed
+        max_size = finish.FINE_PIXELS * data.median_depth / data.focal
+        fine = [number for number in levels if 0 < self.s_min[number - 1] <= max_size]
         if fine:
             gamma = self.controls()["gamma"]
-            levels |= finish.begun_anew(levels, fine, self.s_min, data, p, gamma, self.backend)
-        self.model = finish.joined(levels, finish.rates(p, data.extent, 0.0))
-        self.kept = {}
+            levels |= finish.restart_levels(levels, fine, self.s_min, data, p, gamma, self.backend)
+        self.model = finish.join_levels(levels, finish.learning_rates(p, data.extent, 0.0))
+        self.completed = {}
 
     def _from_points(self, level: int) -> dict[str, torch.Tensor]:
         s_min = self.s_min[level - 1]
@@ -263,20 +273,22 @@ class Method(method.Method[FlodParameters, Drawing]):
     def _new_model(self, tensors: dict[str, torch.Tensor]) -> Model:
         return Model(tensors, splat_rates(self.parameters, self.data.extent))
 
-    # -- what lasts ------------------------------------------------------------------------------------
+    # -- checkpoints -----------------------------------------------------------------------------------
 
     def state_dict(self) -> dict:
-        return {**super().state_dict(), "kept": self.kept}
+        return {**super().state_dict(), "kept": self.completed}
 
     def load_state_dict(self, state: dict) -> None:
         super().load_state_dict(state)
-        self.kept = state.get("kept", {})
+        self.completed = state.get("kept", {})
 
 
-def apart(means: torch.Tensor, distance: float) -> torch.Tensor:
-    """Overlap pruning (FLoD, Eq. 6): where the mean distance to the 3 nearest neighbours is at least this.
+def well_separated(means: torch.Tensor, distance: float) -> torch.Tensor:
+    """Return which splats overlap pruning keeps (FLoD, Eq. 6): mean distance to 3 nearest neighbours of at
+    least ``distance``.
 
-    As in the published code all splats are judged at once, so that both of a close pair go.
+    As in the published code, all splats are tested at once, so that both splats of a close pair are
+    removed.
     """
     if len(means) <= 3:
         return torch.ones(len(means), dtype=torch.bool)

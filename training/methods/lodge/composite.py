@@ -1,4 +1,4 @@
-"""Levels as a camera sees them together, and what each splat gives to a picture."""
+"""Render several levels together, and measure each splat's contribution to images."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from ...rasterize.filter3d import apply_filter3d
 from ...scenes.cameras import Camera
 
 Rows = Mapping[int, np.ndarray]
-"""Of levels by number, finest first, the rows (M,) int32 that are meant."""
+"""Selected rows (M,) int32 of levels by number, finest first."""
 
 
-def filtered(gaussians: Gaussians, std: float) -> Gaussians:
-    """Splats with LODGE's filter of that standard deviation, in scene units (Eq. 3)."""
+def smooth(gaussians: Gaussians, std: float) -> Gaussians:
+    """Apply LODGE's filter of a standard deviation in scene units (Eq. 3)."""
     scales, opacities = apply_filter3d(gaussians.log_scales, gaussians.opacity_logits, std)
     return replace(gaussians, log_scales=scales, opacity_logits=opacities)
 
 
 @dataclass(frozen=True)
 class IndexedLevel:
-    """A level's splats in blocks: work goes to those alone that a camera may see.
+    """Splats of a level in blocks, which limits work to the blocks in view.
 
     Attributes:
-        gaussians: in spatial order; not differentiated.
-        means: theirs, (N, 3) float32.
-        blocks: theirs.
+        gaussians: splats in spatial order, detached from gradients.
+        means: their positions, (N, 3) float32.
+        blocks: their blocks.
     """
 
     gaussians: Gaussians
@@ -41,7 +41,7 @@ class IndexedLevel:
 
     @classmethod
     def of(cls, gaussians: Gaussians, blocks: Blocks | None = None) -> IndexedLevel:
-        """A level; ``blocks`` where they are known."""
+        """Create a level, computing ``blocks`` if they are not given."""
         gaussians = gaussians.detach()
         means = gaussians.means.cpu().numpy()
         return cls(gaussians, means, blocks or Blocks.of(means, gaussians.log_scales.cpu().numpy()))
@@ -50,24 +50,24 @@ class IndexedLevel:
         return len(self.gaussians)
 
     def in_view(self, camera: Camera, near: float) -> np.ndarray:
-        """The rows (M,) int32 that may be in a camera's image."""
+        """Return the rows (M,) int32 that may be in a camera's image."""
         return self.blocks.rows(self.blocks.in_view(camera, near))
 
 
-def rows_seen(
+def visible_rows(
     levels: Mapping[int, IndexedLevel],
     d_l: Mapping[int, float],
     camera: Camera,
     near: float,
     distance_scale: float = 1.0,
 ) -> Rows:
-    """What a camera sees of levels by the rule (Eq. 2), from its own eye.
+    """Return the rows of each level that the rule draws for a camera (Eq. 2), by distance from the camera.
 
     Args:
-        levels: by number.
-        d_l: the distance from which on each of them is shown, in scene units, by number.
-        near: depth at which drawing begins.
-        distance_scale: the rule's control.
+        levels: levels by number.
+        d_l: distance from which each level is drawn, in scene units, by number.
+        near: near clipping depth.
+        distance_scale: control of the rule.
     """
     views = {number: level.blocks.in_view(camera, near) for number, level in levels.items()}
     return rows_at_distances(levels, d_l, camera.center, views, distance_scale)
@@ -76,74 +76,85 @@ def rows_seen(
 def rows_at_distances(
     levels: Mapping[int, IndexedLevel],
     d_l: Mapping[int, float],
-    eye: np.ndarray,
+    position: np.ndarray,
     blocks: Mapping[int, np.ndarray] | None = None,
     distance_scale: float = 1.0,
 ) -> Rows:
-    """The rows of levels that the rule shows an eye (3,), of all blocks or of those that are True, (B,)."""
+    """Return the rows that the rule draws for a camera position (3,), in all blocks or in those marked True,
+    (B,).
+    """
     facts = [(number, {"d_l": d_l[number]}) for number in sorted(levels)]
     values = RULE.defaults(sorted(levels)) | {"distance_scale": distance_scale, "chunks": 0}
-    eye, found = np.asarray(eye, np.float32), {}
+    position, selected = np.asarray(position, np.float32), {}
     for number, level in levels.items():
         of_level = collect_facts(RULE, {}, facts, number)
-        some = level.blocks.in_band(eye, *RULE.distance_band(1.0, of_level, values))[0]
-        rows = level.blocks.rows(some if blocks is None else some & blocks[number])
-        found[number] = rows[RULE.weights(level.means[rows], eye, 1.0, {}, of_level, values) > 0]
-    return found
+        level_rows = level.blocks.in_band(position, *RULE.distance_band(1.0, of_level, values))[0]
+        rows = level.blocks.rows(level_rows if blocks is None else level_rows & blocks[number])
+        selected[number] = rows[RULE.weights(level.means[rows], position, 1.0, {}, of_level, values) > 0]
+    return selected
 
 
-def together(levels: Mapping[int, IndexedLevel], rows: Rows) -> Gaussians:
-    """These rows of levels as one set, in the order of ``rows``."""
+def gather_rows(levels: Mapping[int, IndexedLevel], rows: Rows) -> Gaussians:
+    """Concatenate these rows of levels, in the order of ``rows``."""
     return Gaussians.concatenated(
-        [levels[number].gaussians.select(torch.from_numpy(some).long()) for number, some in rows.items()]
+        [
+            levels[number].gaussians.select(torch.from_numpy(level_rows).long())
+            for number, level_rows in rows.items()
+        ]
     )
 
 
-class Stack:
-    """All splats of some levels in one set, of which rows are drawn without copies.
+class LevelStack:
+    """All splats of several levels in one set, whose rows can be rendered without copies.
 
     Args:
-        antialias: how they are drawn, as of ``rasterize``.
+        antialias: see ``rasterize``.
 
     Attributes:
-        gaussians: level after level.
-        part: where each level's rows are, by number.
+        gaussians: splats, level after level.
+        slices: slice of each level by number.
     """
 
     def __init__(self, levels: Mapping[int, IndexedLevel], antialias: bool = False) -> None:
         self.antialias = antialias
         self.gaussians = Gaussians.concatenated([level.gaussians for level in levels.values()])
         ends = np.cumsum([len(level) for level in levels.values()])
-        self.part = {
+        self.slices = {
             number: slice(int(end) - len(level), int(end))
             for (number, level), end in zip(levels.items(), ends, strict=True)
         }
 
     def rows(self, rows: Rows) -> torch.Tensor:
-        """Rows of levels as rows of all, (M,) int32."""
-        found = [some + np.int32(self.part[number].start) for number, some in rows.items()]
-        return torch.from_numpy(np.concatenate(found)).to(self.gaussians.means.device)
+        """Convert rows of levels to rows of the set, (M,) int32."""
+        selected = [level_rows + np.int32(self.slices[number].start) for number, level_rows in rows.items()]
+        return torch.from_numpy(np.concatenate(selected)).to(self.gaussians.means.device)
 
-    def importance(self, pictures: Iterable[tuple[Camera, Rows]], near: float, backend: str) -> torch.Tensor:
-        """The largest share (N,) of a pixel that each splat has in pictures of rows."""
+    def importance(self, views: Iterable[tuple[Camera, Rows]], near: float, backend: str) -> torch.Tensor:
+        """Return each splat's maximum share (N,) of a pixel in images of the given rows."""
         largest = torch.zeros(len(self.gaussians))
-        for camera, rows in pictures:
-            some = self.rows(rows)
-            found = contributions(
-                self.gaussians, [camera], near=near, antialias=self.antialias, rows=some, backend=backend
+        for camera, rows in views:
+            measured = contributions(
+                self.gaussians,
+                [camera],
+                near=near,
+                antialias=self.antialias,
+                rows=self.rows(rows),
+                backend=backend,
             )
-            largest = torch.maximum(largest, found.largest.to(largest))
+            largest = torch.maximum(largest, measured.largest.to(largest))
         return largest
 
 
-def seen_from_afar(
+def seen_from_distance(
     level: IndexedLevel, cameras: Sequence[Camera], near: float, distance: float, views: int
 ) -> np.ndarray:
-    """(N,) bool, which splats so many cameras have in their images from that distance or farther."""
+    """Return which splats are in the images of at least ``views`` cameras at this distance or farther, (N,)
+    bool.
+    """
     counts = np.zeros(len(level), np.int32)
     for camera in cameras:
-        _, most = level.blocks.distances(camera.center)
-        rows = level.blocks.rows(level.blocks.in_view(camera, near) & (most >= distance))
+        _, max_distances = level.blocks.distances(camera.center)
+        rows = level.blocks.rows(level.blocks.in_view(camera, near) & (max_distances >= distance))
         means = level.means[rows]
         far = np.linalg.norm(means - camera.center, axis=1) >= distance
         counts[rows[far & camera.sees(means, near)]] += 1

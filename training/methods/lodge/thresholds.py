@@ -1,4 +1,4 @@
-"""From which distance on a coarser level is shown: what leaves least to draw (LODGE, Sec. 3, Fig. 4)."""
+"""Choose the distance of a coarser level by the least number of splats to draw (LODGE, Sec. 3, Fig. 4)."""
 
 from __future__ import annotations
 
@@ -10,29 +10,30 @@ import torch
 
 from ...rasterize import rasterize
 from ...scenes.cameras import Camera, pick_evenly
-from .composite import IndexedLevel, Rows, Stack, filtered, rows_seen
+from .composite import IndexedLevel, LevelStack, Rows, smooth, visible_rows
 
-MOST_CURVES = 5
-"""Of more levels than this, a bundle's head has no room for what was tried."""
+MAX_CURVES = 5
+"""Maximum number of levels for which the bundle header stores the measured costs."""
 VIEWS = 8
-"""So many training views tell the cost."""
-TRIED, NEAREST, FARTHEST = 9, 0.05, 0.9
-"""So many distances are tried, in equal ratios: from that which this share of the splats of some view are
-nearer than, to that which this share of the splats of all views are nearer than."""
-STANDING_APART = 2.0
-"""A level begins at least this many times farther away than the next finer one."""
+"""Number of training views for measuring the cost."""
+CANDIDATES, NEAR_QUANTILE, FAR_QUANTILE = 9, 0.05, 0.9
+"""Number of candidate distances, in equal ratios, and quantiles of the distances of visible splats that
+bound them: the first in any view, the second over all views."""
+MIN_RATIO = 2.0
+"""Minimum ratio between the distances of neighbouring levels."""
 
 
 class Thresholds:
-    """Finds distances one after the other, finest first (the paper's greedy strategy).
+    """Greedy choice of the levels' distances, finest level first, as in the paper.
 
     Args:
-        cameras: the training views.
-        near: depth at which drawing begins, in scene units.
-        backend: the rasterizer's.
-        prune_weight: the least share of a pixel that keeps a splat of the coarser level.
-        std: the smoothing filter's standard deviation for a distance, both in scene units.
-        antialias: as of ``rasterize``.
+        cameras: training views.
+        near: near clipping depth in scene units.
+        backend: rasterizer backend.
+        prune_weight: minimum share of a pixel of a splat in the coarser level.
+        std: function that returns the smoothing filter's standard deviation for a distance, both in scene
+            units.
+        antialias: see ``rasterize``.
     """
 
     def __init__(
@@ -49,65 +50,67 @@ class Thresholds:
         self._antialias = antialias
 
     @torch.no_grad()
-    def next(
-        self, levels: Mapping[int, IndexedLevel], d_l: Mapping[int, float], most: float = np.inf
+    def choose(
+        self, levels: Mapping[int, IndexedLevel], d_l: Mapping[int, float], max_distance: float = np.inf
     ) -> tuple[float, dict[str, Any]]:
-        """The distance of the next coarser level.
+        """Choose the distance of the next coarser level.
 
         Args:
-            levels: the levels that there are, by number, finest first.
-            d_l: their distances, in scene units.
-            most: none beyond this is tried.
+            levels: existing levels by number, finest first.
+            d_l: their distances in scene units.
+            most: maximum distance.
 
         Returns:
-            The distance; and for a report the ``distances`` that were tried with the ``costs`` of each, and
-            the cost ``before``, without the level; in few digits, because the bundle's head has little room.
+            The distance, and a report: the tried ``distances``, the ``costs`` of each, and the cost
+                ``before``, without the level. Numbers are rounded to keep the bundle header small.
         """
-        tried = self._candidates(next(iter(levels.values())), STANDING_APART * max(d_l.values()), most)
-        costs = [_short(self.cost(levels, d_l, distance)) for distance in tried]
-        alone = [(camera, rows_seen(levels, d_l, camera, self._near)) for camera in self._cameras]
-        before = _short(self._mean_in_tiles(Stack(levels, self._antialias), alone))
-        return tried[int(np.argmin(costs))], {"distances": tried, "costs": costs, "before": before}
+        min_distance = MIN_RATIO * max(d_l.values())
+        candidates = self._candidates(next(iter(levels.values())), min_distance, max_distance)
+        costs = [_round(self.cost(levels, d_l, distance)) for distance in candidates]
+        views = [(camera, visible_rows(levels, d_l, camera, self._near)) for camera in self._cameras]
+        before = _round(self._mean_tile_count(LevelStack(levels, self._antialias), views))
+        return candidates[int(np.argmin(costs))], {"distances": candidates, "costs": costs, "before": before}
 
     def cost(self, levels: Mapping[int, IndexedLevel], d_l: Mapping[int, float], distance: float) -> float:
-        """How many splats a tile of 16x16 pixels has to look at, on average, with one more level.
+        """Return the mean number of splats per tile of 16x16 pixels with an additional level.
 
-        The level is the finest one smoothed and pruned, without the steps that tune it.
+        The level is the finest one after smoothing and pruning, without tuning.
         """
         finest, number = next(iter(levels.values())), min(levels) - 1
-        coarser = IndexedLevel.of(filtered(finest.gaussians, self._std(distance)))
+        coarser = IndexedLevel.of(smooth(finest.gaussians, self._std(distance)))
         levels, d_l = {**levels, number: coarser}, {**d_l, number: distance}
-        stack = Stack(levels, self._antialias)
-        pictures = [(camera, rows_seen(levels, d_l, camera, self._near)) for camera in self._cameras]
-        found = stack.importance(pictures, self._near, self._backend)[stack.part[number]].numpy()
-        kept = found >= self._prune_weight
-        pruned = [(camera, {**rows, number: rows[number][kept[rows[number]]]}) for camera, rows in pictures]
-        return self._mean_in_tiles(stack, pruned)
+        stack = LevelStack(levels, self._antialias)
+        views = [(camera, visible_rows(levels, d_l, camera, self._near)) for camera in self._cameras]
+        importance = stack.importance(views, self._near, self._backend)[stack.slices[number]].numpy()
+        keep = importance >= self._prune_weight
+        pruned = [(camera, {**rows, number: rows[number][keep[rows[number]]]}) for camera, rows in views]
+        return self._mean_tile_count(stack, pruned)
 
-    def _mean_in_tiles(self, stack: Stack, pictures: Iterable[tuple[Camera, Rows]]) -> float:
-        """How many splats a tile has to look at, on average over pictures."""
+    def _mean_tile_count(self, stack: LevelStack, views: Iterable[tuple[Camera, Rows]]) -> float:
+        """Return the mean number of splats per tile over the images of the given rows."""
         tiles = []
-        for camera, rows in pictures:
-            some = stack.rows(rows)
-            drawn = rasterize(
-                stack.gaussians, camera, near=self._near, antialias=self._antialias, rows=some,
+        for camera, rows in views:
+            selected = stack.rows(rows)
+            rendering = rasterize(
+                stack.gaussians, camera, near=self._near, antialias=self._antialias, rows=selected,
                 backend=self._backend,
             )  # fmt: skip
-            tiles.append(drawn.tile_counts.double().mean())
+            tiles.append(rendering.tile_counts.double().mean())
         return float(torch.stack(tiles).mean())
 
-    def _candidates(self, finest: IndexedLevel, least: float, most: float) -> list[float]:
-        """Distances to try, of at least ``least`` where ``most`` leaves room for that, in scene units."""
-        seen = []
+    def _candidates(self, finest: IndexedLevel, min_distance: float, max_distance: float) -> list[float]:
+        """Return candidate distances in scene units; ``max_distance`` takes precedence over the minimum."""
+        visible = []
         for camera in self._cameras:
             means = finest.means[finest.in_view(camera, self._near)]
-            seen.append(np.linalg.norm(means[camera.sees(means, self._near)] - camera.center, axis=1))
-        seen = [distances for distances in seen if len(distances)] or [np.array([least])]
-        near = min(max(min(float(np.quantile(distances, NEAREST)) for distances in seen), least), most)
-        far = min(float(np.quantile(np.concatenate(seen), FARTHEST)), most)
-        return [_short(d) for d in np.geomspace(near, max(far, near), TRIED)]
+            visible.append(np.linalg.norm(means[camera.sees(means, self._near)] - camera.center, axis=1))
+        visible = [distances for distances in visible if len(distances)] or [np.array([min_distance])]
+        nearest = min(float(np.quantile(distances, NEAR_QUANTILE)) for distances in visible)
+        near = min(max(nearest, min_distance), max_distance)
+        far = min(float(np.quantile(np.concatenate(visible), FAR_QUANTILE)), max_distance)
+        return [_round(d) for d in np.geomspace(near, max(far, near), CANDIDATES)]
 
 
-def _short(number: float) -> float:
-    """The number in four digits."""
+def _round(number: float) -> float:
+    """Round to four digits."""
     return float(f"{number:.4g}")

@@ -1,8 +1,8 @@
-"""LODGE (2025): levels, finest first, each a copy of the finest for a distance; then chunks.
+"""LODGE (2025): train levels, finest first, each from a copy of the finest; then compute chunks.
 
-A level is smoothed as its distance allows, pruned of what hardly shows, and tuned beside the finer ones,
-which stay as they are (Sec. 3, A.2). The finest is a base, or 3DGS in the first steps. The last steps make
-the sets of chunks, one a step.
+A level is smoothed for its distance, pruned of unimportant splats, and tuned while blended with the finer
+levels, which are frozen (Sec. 3, A.2). The finest level is a base, or the result of 3DGS in the first
+steps. The last steps compute the splat sets of chunks, one per step.
 """
 
 from __future__ import annotations
@@ -24,33 +24,34 @@ from ...scenes.cameras import pick_evenly
 from ...splats.gaussians import Splats
 from ...splats.levels import Level
 from ...splats.ply import Columns
-from ..threedgs.refining import Refining
+from ..threedgs.refining import RefiningMethod
 from . import ROUNDS, LodgeParameters, chunks
 from .composite import (
     IndexedLevel,
-    Stack,
-    filtered,
-    rows_seen,
-    seen_from_afar,
-    together,
+    LevelStack,
+    gather_rows,
+    seen_from_distance,
+    smooth,
+    visible_rows,
 )  # fmt: skip
-from .thresholds import MOST_CURVES, STANDING_APART, Thresholds
+from .thresholds import MAX_CURVES, MIN_RATIO, Thresholds
 
-VIEWS_COUNTED = 24
-"""In so many training views it is counted what they draw."""
+COUNTED_VIEWS = 24
+"""Number of training views in which drawn splats are counted."""
 FAR_VIEWS = 2
-"""A place that so many training views have from a level's distance or farther is tuned and pruned by them."""
+"""Number of training views at a level's distance or farther that suffice to tune and prune a splat."""
 
 
-class Method(Refining):
-    """One run of LODGE.
+class Method(RefiningMethod):
+    """Training of LODGE levels.
 
     Attributes:
-        d_l: the distance from which on each level is shown, in scene units, by number; those known so far.
-        finished: the levels that no step changes any more, as they are drawn, by number, finest first.
-        costs: what finding the distances has told, see ``Thresholds``.
-        centres, radii: of the chunks, (K, 3) and (K,) float32, as soon as their number is known.
-        sets: which splats of each level (N,) are in the set of each of the chunks so far, by number.
+        d_l: distance from which each level is drawn, in scene units, by number; entries are added during
+            training.
+        finished: frozen levels as rendered, by number, finest first.
+        costs: reports of the choice of distances, see ``Thresholds``.
+        centres, radii: chunks, (K, 3) and (K,) float32, once their number is known.
+        sets: which splats of each level (N,) belong to each computed chunk, by level number.
     """
 
     parameters: LodgeParameters
@@ -58,15 +59,17 @@ class Method(Refining):
     def setup(self, base: Splats | None) -> None:
         p = self.parameters
         if base is not None and p.levels == 1:
-            raise LodgsError("A base is the one level itself: there is nothing to train.", "Give levels = 2.")
+            raise LodgsError(
+                "Cannot train a single level: the base already is that level.", "Set levels to 2 or more."
+            )
         super().setup(base)
         self.d_l = {p.levels: 0.0}
         self.finished: dict[int, IndexedLevel] = {}
         self.costs: list[dict] = []
         self.centres, self.radii = np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
         self.sets: dict[int, list[np.ndarray]] = {}
-        self._blocks: Blocks | None = None  # of the level in training, as it was at its last pruning
-        self._alone_share = p.tune_alone
+        self._blocks: Blocks | None = None  # blocks of the level in training, as of its last pruning
+        self._single_share = p.tune_alone
 
     @property
     def steps(self) -> int:
@@ -74,7 +77,7 @@ class Method(Refining):
 
     @property
     def tuned_steps(self) -> int:
-        """So many steps come before the chunks."""
+        """Number of steps before the chunks."""
         return self.finest_steps + self.parameters.base_steps
 
     @property
@@ -92,7 +95,7 @@ class Method(Refining):
         done = step + 1
         if done > self.tuned_steps:
             return done == self.steps
-        return done == self.finest_steps or (done > self.finest_steps and self._local(done) == 0)
+        return done == self.finest_steps or (done > self.finest_steps and self._level_step(done) == 0)
 
     def stage(self, step: int) -> str:
         if step < self.tuned_steps:
@@ -100,40 +103,43 @@ class Method(Refining):
         return f"chunk {step - self.tuned_steps + 1} of {len(self.centres)}"
 
     def levels_after(self, step: int) -> list[Level]:
-        """The finest as soon as it is there, each coarser one when it is tuned; all with the last chunk."""
-        done, found = step + 1, []
+        """Return the finest level once it is trained, each coarser level after tuning, and all after the
+        last chunk.
+        """
+        done, levels = step + 1, []
         if done > self.tuned_steps:
-            return [self._level(number) for number in sorted(self.finished)] if done == self.steps else []
+            numbers = sorted(self.finished) if done == self.steps else []
+            return [self._make_level(number) for number in numbers]
         if done == max(self.finest_steps, 1):
             self._finish(self.levels)
-            found.append(self._level(self.levels))
-        if step >= self.finest_steps and self._local(done) == 0:
-            found.insert(0, self._level(self.level_at(step)))
-        return found
+            levels.append(self._make_level(self.levels))
+        if step >= self.finest_steps and self._level_step(done) == 0:
+            levels.insert(0, self._make_level(self.level_at(step)))
+        return levels
 
     def tables(self) -> dict[str, Columns]:
-        """The chunks, where there are any, and which blocks of rows have splats of them."""
+        """Return the table of chunks, if any, and the block table."""
         if not len(self.centres):
             return {}
         x, y, z = self.centres.T
-        splats = {number: self._level(number).splats for number in sorted(self.sets)}
+        splats = {number: self._make_level(number).splats for number in sorted(self.sets)}
         return {
             TABLE: {"x": x, "y": y, "z": z, "radius": self.radii},
             BLOCKS: block_table(RULE, splats),
         }
 
     def meta(self) -> dict:
-        found = {"costs": self.costs} if self.levels <= MOST_CURVES else {}
+        found = {"costs": self.costs} if self.levels <= MAX_CURVES else {}
         return {**super().meta(), "filter_variance": self.parameters.filter_variance, **found}
 
-    # -- a step ----------------------------------------------------------------------------------------
+    # -- steps -----------------------------------------------------------------------------------------
 
     def shrink(self, step: int) -> float:
-        alone = self.refines(step) and self._alone(step)
-        return self._farther(self.level_at(step)) if alone else super().shrink(step)
+        single = self.refines(step) and self._renders_single(step)
+        return self._distance_ratio(self.level_at(step)) if single else super().shrink(step)
 
     def choose_view(self, step: int) -> TrainingView:
-        if step >= self.finest_steps and self._local(step) % self.parameters.tune_steps == 0:
+        if step >= self.finest_steps and self._level_step(step) % self.parameters.tune_steps == 0:
             self.begin_round(step)
         return super().choose_view(step)
 
@@ -148,204 +154,214 @@ class Method(Refining):
             return super().draw(view, step)
         number, near = self.level_at(step), self.data.near
         level = IndexedLevel.of(self.model.gaussians, self._blocks)
-        if self._alone(step):
+        if self._renders_single(step):
             rows = {number: level.in_view(view.camera, near)}
         else:
             rng, spread = np.random.default_rng([self.seed, step, 8]), self.parameters.tune_range
             scale = 1 / rng.uniform(1 - spread, 1 + spread)
-            rows = rows_seen({**self.finished, number: level}, self.d_l, view.camera, near, scale)
-        own = torch.from_numpy(rows[number]).long().to(self.device)
-        shown = [filtered(self.take_rows(own), self._std(self.d_l[number]))]
+            rows = visible_rows({**self.finished, number: level}, self.d_l, view.camera, near, scale)
+        trained_rows = torch.from_numpy(rows[number]).long().to(self.device)
+        parts = [smooth(self.select_rows(trained_rows), self._std(self.d_l[number]))]
         if len(rows) > 1:
-            shown.insert(0, together(self.finished, {n: some for n, some in rows.items() if n != number}))
-        drawn = self.rasterize_model(view.camera, step, gaussians=Gaussians.concatenated(shown))
-        return [Drawing(drawn)]
+            parts.insert(0, gather_rows(self.finished, {n: some for n, some in rows.items() if n != number}))
+        rendering = self.rasterize_model(view.camera, step, gaussians=Gaussians.concatenated(parts))
+        return [Drawing(rendering)]
 
     def background(self, step: int) -> tuple[float, float, float]:
-        """Black for the coarser levels, which the finest covers for: what is nothing may be black."""
+        """Return black for coarser levels; the finest level already prevents a fit to the background."""
         return super().background(step) if step < self.finest_steps else (0.0, 0.0, 0.0)
 
     # -- levels ----------------------------------------------------------------------------------------
 
     def begin_round(self, step: int) -> None:
-        """Before a step: what hardly shows leaves the level; a new level begins as a copy of the finest."""
-        p, number, local = self.parameters, self.level_at(step), self._local(step)
+        """Prune the level before a step; a new level starts as a copy of the finest."""
+        p, number, local = self.parameters, self.level_at(step), self._level_step(step)
         if local == 0:
             self._begin_level(number)
-        found, before = self.importance(number), (0.0, *ROUNDS)[local // p.tune_steps]
+        importance, before = self.importance(number), (0.0, *ROUNDS)[local // p.tune_steps]
         part = ROUNDS[local // p.tune_steps]
-        # of what stands together, so that the rounds come to the level's share of the finest one's splats
+        # per spatial block; all rounds together reach the level's fraction of the finest level's splats
         share = p.keep ** ((self.levels - number) * (part - before))
-        least = torch.from_numpy(block_quantiles(found.numpy(), 1 - share))
-        weight = max(p.prune_weight * part, self._affordable(number, found, part))
-        thinned = least > weight
-        kept = found >= least.clamp_min(weight)
+        threshold = torch.from_numpy(block_quantiles(importance.numpy(), 1 - share))
+        weight = max(p.prune_weight * part, self._budget_threshold(number, importance, part))
+        thinned = threshold > weight
+        keep = importance >= threshold.clamp_min(weight)
         with torch.no_grad():
-            wider = log_scale_gain(self.model["log_scales"].cpu().numpy(), found.numpy(), kept.numpy())
-            self.model["log_scales"].add_((torch.from_numpy(wider) * thinned).to(self.device)[:, None])
-        self.model.keep(kept)
+            log_scales = self.model["log_scales"].cpu().numpy()
+            gain = log_scale_gain(log_scales, importance.numpy(), keep.numpy())
+            self.model["log_scales"].add_((torch.from_numpy(gain) * thinned).to(self.device)[:, None])
+        self.model.keep(keep)
         require_rows(self.model, step, "prune_weight")
-        self._blocks = self._smoothed(number).blocks
+        self._blocks = self._smoothed_level(number).blocks
 
-    def _affordable(self, number: int, importance: torch.Tensor, part: float) -> float:
-        """The least importance of those splats of a level that come to what the views may draw (``drawn``).
+    def _budget_threshold(self, number: int, importance: torch.Tensor, part: float) -> float:
+        """Return the importance threshold of a level that meets the limit ``drawn`` for the training views.
 
-        A share ``part`` of the way from all of them; at least a quarter of those that the views would draw.
+        ``part`` interpolates from all splats to the limit. At least a quarter of the splats drawn in the
+        views remain.
         """
         share = 1 - (1 - self.parameters.drawn) * part
         if share == 1:
             return 0.0
-        level, near = self._smoothed(number), self.data.near
+        level, near = self._smoothed_level(number), self.data.near
         levels = {**self.finished, number: level}
-        views, finest, others = np.zeros(len(level), np.int64), 0, 0
-        for camera in pick_evenly(self.data.train, VIEWS_COUNTED):
-            alone = self.finished[self.levels]
-            finest += camera.sees(alone.means[alone.in_view(camera, near)], near).sum()
-            for each, rows in rows_seen(levels, self.d_l, camera, near).items():
-                seen = camera.sees(levels[each].means[rows], near)
-                if each == number:
-                    views[rows[seen]] += 1
+        views = np.zeros(len(level), np.int64)
+        finest_splats = other_splats = 0
+        for camera in pick_evenly(self.data.train, COUNTED_VIEWS):
+            single = self.finished[self.levels]
+            finest_splats += camera.sees(single.means[single.in_view(camera, near)], near).sum()
+            for drawn, rows in visible_rows(levels, self.d_l, camera, near).items():
+                in_image = camera.sees(levels[drawn].means[rows], near)
+                if drawn == number:
+                    views[rows[in_image]] += 1
                 else:
-                    others += seen.sum()
-        most = max(share * finest - others, views.sum() / 4)
-        return importance_threshold(importance.numpy(), views, most)
+                    other_splats += in_image.sum()
+        max_views = max(share * finest_splats - other_splats, views.sum() / 4)
+        return importance_threshold(importance.numpy(), views, max_views)
 
-    def _most_distance(self, number: int) -> float:
-        """The largest distance, in scene units, that leaves room for further levels before the next coarser
-        one that was given a distance."""
+    def _max_distance(self, number: int) -> float:
+        """Return the maximum distance, in scene units, that leaves room for further levels before the next
+        coarser level of fixed distance.
+        """
         coarser = self.parameters.distances[number - 1 :: -1]
         steps = next((steps for steps, distance in enumerate(coarser) if distance), None)
         if steps is None:
             return np.inf
         end, begin = coarser[steps] * self.data.median_depth, max(self.d_l.values())
-        return max(end / STANDING_APART**steps, (begin * end) ** 0.5)
+        return max(end / MIN_RATIO**steps, (begin * end) ** 0.5)
 
     def _begin_level(self, number: int) -> None:
         p, data = self.parameters, self.data
         self._finish(number + 1)
         finest = self.finished[self.levels]
-        given = p.distances[number - 1] * data.median_depth
-        if given:
-            self.d_l[number] = given
+        fixed = p.distances[number - 1] * data.median_depth
+        if fixed:
+            self.d_l[number] = fixed
         else:
             thresholds = Thresholds(
                 data.train, data.near, self.backend, p.prune_weight, self._std, p.antialias
             )
-            most = self._most_distance(number)
-            self.d_l[number], costs = thresholds.next(self.finished, self.d_l, most)
+            max_distance = self._max_distance(number)
+            self.d_l[number], costs = thresholds.choose(self.finished, self.d_l, max_distance)
             self.costs.append({"level": number, **costs})
         if number == self.levels - 1:
             self._place_chunks()
-        known = seen_from_afar(finest, data.train, data.near, self.d_l[number], FAR_VIEWS)
-        self._alone_share = p.tune_alone * float((~known).mean())
+        well_seen = seen_from_distance(finest, data.train, data.near, self.d_l[number], FAR_VIEWS)
+        self._single_share = p.tune_alone * float((~well_seen).mean())
         tensors = {name: getattr(finest.gaussians, name).clone() for name in NAMES}
         self.model = self.new_model(tensors)
 
     def _finish(self, number: int) -> None:
-        """The level in training is what it is from now on."""
+        """Freeze the level in training."""
         if number in self.finished:
             return
-        level = self._smoothed(number)
+        level = self._smoothed_level(number)
         if number == self.levels and self.finest_steps:
             order = torch.from_numpy(spatial_order(level.means))
             level = IndexedLevel.of(level.gaussians.select(order))
         self.finished[number] = level
 
     @torch.no_grad()
-    def _smoothed(self, number: int) -> IndexedLevel:
-        """The model as a level: with the filter of its distance (Eq. 3), which no step can undo."""
+    def _smoothed_level(self, number: int) -> IndexedLevel:
+        """Return the model as a level, with the filter for its distance (Eq. 3), which training cannot
+        undo.
+        """
         gaussians, d_l = self.model.gaussians.detach(), self.d_l[number]
-        return IndexedLevel.of(filtered(gaussians, self._std(d_l)) if d_l else gaussians)
+        return IndexedLevel.of(smooth(gaussians, self._std(d_l)) if d_l else gaussians)
 
     @torch.no_grad()
     def importance(self, number: int) -> torch.Tensor:
-        """The largest share (N,) of a pixel that each splat of the level in training has.
+        """Return the maximum share (N,) of a pixel of each splat of the level in training.
 
-        In the training views, beside the finer levels. Those of its splats that too few training views see
-        from its distance are also asked for in views from as far away, of the level alone, which see what
-        continues the photographs, too.
+        Images are the training views, blended with the finer levels. Splats that too few training views
+        see from the level's distance are also measured in views of the level alone from that distance,
+        which include the margins.
         """
         data, backend = self.data, self.backend
-        level, farther, near = self._smoothed(number), self._farther(number), data.near
+        level, ratio, near = self._smoothed_level(number), self._distance_ratio(number), data.near
         levels = {**self.finished, number: level}
-        stack = Stack(levels, self.parameters.antialias)
-        beside = ((camera, rows_seen(levels, self.d_l, camera, near)) for camera in data.train)
-        found = stack.importance(beside, near, backend)[stack.part[number]]
+        stack = LevelStack(levels, self.parameters.antialias)
+        blended = ((camera, visible_rows(levels, self.d_l, camera, near)) for camera in data.train)
+        importance = stack.importance(blended, near, backend)[stack.slices[number]]
         if not self.parameters.tune_alone:
-            return found
-        known = seen_from_afar(level, data.train, near, self.d_l[number], FAR_VIEWS)
-        if known.all():
-            return found
-        views = (camera.widened(self.parameters.margin).scaled(1 / farther) for camera in data.train)
-        away = ((view, {number: level.in_view(view, near)}) for view in views)
-        alone = Stack({number: level}, self.parameters.antialias).importance(away, near, backend)
-        return torch.where(torch.from_numpy(known), found, torch.maximum(found, alone))
+            return importance
+        well_seen = seen_from_distance(level, data.train, near, self.d_l[number], FAR_VIEWS)
+        if well_seen.all():
+            return importance
+        views = (camera.widened(self.parameters.margin).scaled(1 / ratio) for camera in data.train)
+        far_views = ((view, {number: level.in_view(view, near)}) for view in views)
+        single = LevelStack({number: level}, self.parameters.antialias).importance(far_views, near, backend)
+        return torch.where(torch.from_numpy(well_seen), importance, torch.maximum(importance, single))
 
     # -- chunks ----------------------------------------------------------------------------------------
 
     def _place_chunks(self) -> None:
-        """Where chunks are, as soon as it is known where the finest level ends (Eq. 5)."""
+        """Place the chunks once the end of the finest level is known (Eq. 5)."""
         centers = np.array([camera.center for camera in self.data.train])
-        wanted = self.parameters.chunks or chunks.chunk_count(centers, self.d_l[self.levels - 1])
-        if wanted >= (2 if self.parameters.chunks else chunks.FEWEST):
-            self.centres, self.radii = chunks.place_chunks(centers, wanted, self.seed)
+        count = self.parameters.chunks or chunks.chunk_count(centers, self.d_l[self.levels - 1])
+        if count >= (2 if self.parameters.chunks else chunks.MIN_CHUNKS):
+            self.centres, self.radii = chunks.place_chunks(centers, count, self.seed)
 
     @torch.no_grad()
     def _chunk_step(self, step: int) -> StepResult:
-        """One chunk's set; what is told of the step is how a photograph in it looks by the set alone."""
+        """Compute the set of one chunk; the result of the step is an image of a photo's view by this set."""
         p, data, number = self.parameters, self.data, step - self.tuned_steps
         if number == 0:
             self._finish(1)
         levels, centre, radius = self.finished, self.centres[number], float(self.radii[number])
-        rows = chunks.members(levels, self.d_l, centre, radius)
+        rows = chunks.chunk_rows(levels, self.d_l, centre, radius)
         near = chunks.cameras_near(data.train, self.centres, number)
         if p.visible_weight:
             rng = np.random.default_rng([self.seed, number, 11])
-            views = [*near, *chunks.turned(near, rng)]
-            rows = chunks.visible(levels, rows, views, p.visible_weight, data.near, self.backend, p.antialias)
-        for level, some in rows.items():
-            members = np.zeros(len(levels[level]), bool)
-            members[some] = True
-            self.sets.setdefault(level, []).append(members)
+            views = [*near, *chunks.turn_cameras(near, rng)]
+            rows = chunks.prune_invisible(
+                levels, rows, views, p.visible_weight, data.near, self.backend, p.antialias
+            )
+        for level, rows_of_level in rows.items():
+            in_set = np.zeros(len(levels[level]), bool)
+            in_set[rows_of_level] = True
+            self.sets.setdefault(level, []).append(in_set)
         nearest = min(near or data.train, key=lambda camera: np.linalg.norm(camera.center - centre))
         view = data.view(data.train.index(nearest))
-        drawn = self.rasterize_model(view.camera, step, gaussians=together(levels, rows))
-        loss = photometric_loss(drawn.image, view.target, p.ssim_weight, backend=self.backend)
-        return StepResult(float(loss), lambda: drawn.image, view.target)
+        rendering = self.rasterize_model(view.camera, step, gaussians=gather_rows(levels, rows))
+        loss = photometric_loss(rendering.image, view.target, p.ssim_weight, backend=self.backend)
+        return StepResult(float(loss), lambda: rendering.image, view.target)
 
     # -- levels ----------------------------------------------------------------------------------------
 
-    def _level(self, number: int) -> Level:
-        level = self.finished[number] if number in self.finished else self._smoothed(number)
+    def _make_level(self, number: int) -> Level:
+        level = self.finished[number] if number in self.finished else self._smoothed_level(number)
         splats = Splats(*(tensor.cpu().numpy().copy() for tensor in vars(level.gaussians).values()))
         if number in self.sets:
             splats.extras = member_columns(np.stack(self.sets[number]))
         return Level(number, splats, {"d_l": self.d_l[number]})
 
-    def _local(self, step: int) -> int:
-        """Steps that the level in training has seen before a step."""
+    def _level_step(self, step: int) -> int:
+        """Return the number of completed steps of the level in training."""
         return (step - self.finest_steps) % self.parameters.level_steps
 
     def _std(self, distance: float) -> float:
-        """The filter's standard deviation for a distance, in scene units (Eq. 3, as Mip-Splatting has it)."""
+        """Return the filter's standard deviation for a distance, in scene units (Eq. 3, as in
+        Mip-Splatting).
+        """
         return self.parameters.filter_variance**0.5 * distance / self.data.focal
 
-    def _farther(self, number: int) -> float:
-        """How many times farther away than the median depth a level begins; at least 1."""
+    def _distance_ratio(self, number: int) -> float:
+        """Return the distance of a level as a multiple of the median depth; at least 1."""
         return max(self.d_l.get(number, 0.0) / self.data.median_depth, 1.0)
 
-    def _alone(self, step: int) -> bool:
+    def _renders_single(self, step: int) -> bool:
         draw = np.random.default_rng([self.seed, step, 9]).random()
-        return draw < self._alone_share
+        return draw < self._single_share
 
-    # -- what lasts ------------------------------------------------------------------------------------
+    # -- checkpoints -----------------------------------------------------------------------------------
 
     def state_dict(self) -> dict:
         finished = {number: dict(vars(level.gaussians)) for number, level in self.finished.items()}
         blocks = self._blocks
         return {
             **super().state_dict(),
-            "d_l": self.d_l, "finished": finished, "costs": self.costs, "alone": self._alone_share,
+            "d_l": self.d_l, "finished": finished, "costs": self.costs, "alone": self._single_share,
             "blocks": {} if blocks is None else {
                 "count": blocks.count, "low": torch.from_numpy(blocks.low),
                 "high": torch.from_numpy(blocks.high), "reach": torch.from_numpy(blocks.reach),
@@ -359,7 +375,7 @@ class Method(Refining):
 
     def load_state_dict(self, state: dict) -> None:
         super().load_state_dict(state)
-        self.d_l, self.costs, self._alone_share = state["d_l"], state["costs"], state["alone"]
+        self.d_l, self.costs, self._single_share = state["d_l"], state["costs"], state["alone"]
         self.finished = {
             number: IndexedLevel.of(Gaussians(**tensors)) for number, tensors in state["finished"].items()
         }

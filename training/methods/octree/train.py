@@ -1,8 +1,8 @@
-"""Octree-GS (Ren et al. 2024) with explicit anchors: levels of an octree that add up, chosen by distance.
+"""Octree-GS (Ren et al. 2024) with explicit anchors: octree levels that add up and are selected by distance.
 
-An anchor is one Gaussian with parameters of its own and no network. It belongs to a level, and began in a
-voxel of that level in which no other anchor was. What a view draws follows ``lod.rules.octree``,
-rounded while training.
+An anchor is a single Gaussian with its own parameters and without networks. It belongs to a level, and
+starts in a voxel of that level without other anchors. Views select anchors by ``lod.rules.octree``,
+rounded in training.
 """
 
 from __future__ import annotations
@@ -28,19 +28,21 @@ from ...splats.levels import Level
 from . import OctreeParameters, growing
 
 MARGIN = "margin"
-"""Column: whether a splat continues a photograph beyond its edge."""
+"""Column that marks margin splats."""
 
 
 class Method(method.Method[OctreeParameters, Drawing]):
-    """One run of Octree-GS.
+    """Training of Octree-GS.
 
     Attributes:
-        schedule: which levels a step draws, with the octree.
+        schedule: schedule of levels, with the octree.
     """
 
     def setup(self, base: Splats | None) -> None:
         p = self.parameters
-        self.schedule, points, colors, level = growing.plant(self.data, p, self.seed, self.growth_limit(0))
+        self.schedule, points, colors, level = growing.create_anchors(
+            self.data, p, self.seed, self.growth_limit(0)
+        )
         tensors = from_points(points, colors, p.sh_degree, self.device)
         tensors["log_scales"] = growing.log_spacing(points, level, columns=3).to(self.device)
         zeros = torch.zeros(len(points), device=self.device)
@@ -57,8 +59,8 @@ class Method(method.Method[OctreeParameters, Drawing]):
         return self.schedule.level_at(step)
 
     def levels_after(self, step: int) -> list[Level]:
-        """All levels, when the last one has joined and at the end."""
-        if not self.schedule.hands_over(step):
+        """Return all levels when the last one has joined and at the end."""
+        if not self.schedule.completes_levels(step):
             return []
         splats, level = self.model.splats(), self.model.columns["level"].cpu().numpy()
         splats.extras |= {"lod_level": level.astype(np.uint8), BIAS: self.model.columns["bias"].cpu().numpy()}
@@ -71,7 +73,7 @@ class Method(method.Method[OctreeParameters, Drawing]):
         tree = self.schedule.tree
         return {"voxel": tree.voxel, **super().meta()}
 
-    # -- a step ----------------------------------------------------------------------------------------
+    # -- steps -----------------------------------------------------------------------------------------
 
     def shrink(self, step: int) -> float:
         return self.schedule.shrink(step)
@@ -81,8 +83,8 @@ class Method(method.Method[OctreeParameters, Drawing]):
 
     def render_weights(self, view: TrainingView, step: int) -> tuple[torch.Tensor | None, float]:
         weights = self.schedule.weights(view.camera, self.model, step, full=view.shrink == 1)
-        left = self.dropout_weights(step, step / self.parameters.steps)
-        return (weights if left is None else weights * left), 0.0
+        dropout = self.dropout_weights(step, step / self.parameters.steps)
+        return (weights if dropout is None else weights * dropout), 0.0
 
     def allows_device_step(self, step: int) -> bool:
         return not self.parameters.volume_weight
@@ -91,7 +93,7 @@ class Method(method.Method[OctreeParameters, Drawing]):
         return self.schedule.collects_stats(view, step)
 
     def loss(self, drawings: Sequence[Drawing], view: TrainingView, step: int) -> torch.Tensor:
-        """With the volume of what is drawn (Octree-GS, Sec. 7.1)."""
+        """Return the loss with volume regularization (Octree-GS, Sec. 7.1)."""
         loss = super().loss(drawings, view, step)
         if not self.parameters.volume_weight:
             return loss
@@ -120,10 +122,10 @@ class Method(method.Method[OctreeParameters, Drawing]):
             self.reassign_levels(step)
 
     def adds_margins(self, step: int) -> bool:
-        return self.schedule.growing(step) and not self.schedule.growing(step + 1)
+        return self.schedule.is_growing(step) and not self.schedule.is_growing(step + 1)
 
     def append_margins(self, rows: Mapping[str, torch.Tensor], step: int) -> None:
-        """They are of the coarsest level, for every distance, whatever photographs show of them."""
+        """Add margin splats to the coarsest level, for all distances."""
         ones = torch.ones_like(rows["opacity_logits"])
         super().append_margins({**rows, "level": ones, MARGIN: ones.bool()}, step)
 
@@ -131,21 +133,21 @@ class Method(method.Method[OctreeParameters, Drawing]):
 
     @torch.no_grad()
     def grow(self, step: int) -> None:
-        """New anchors in free voxels where gradients are large (Octree-GS, Sec. 4.2); faint ones go.
+        """Add anchors in free voxels with large gradients (Octree-GS, Sec. 4.2), and remove faint ones.
 
-        A splat proposes its likeness, smaller and faint, at places drawn from itself. Faint are those whose
-        opacity was too low on average in the views that drew them, or is for any.
+        A splat proposes smaller, faint copies of itself at positions sampled from it. A splat is faint if
+        its mean opacity over the views that drew it is too low, or too low to be visible.
         """
         p, model = self.parameters, self.model
-        source, _, level = growing.steep(self.schedule, model, step)
+        source, _, level = growing.select_growth(self.schedule, model, step)
         source, level = (column.repeat_interleave(p.candidates) for column in (source, level))
         rows = model.read_rows(source)
         rng = np.random.default_rng([self.seed, step, 1])
         rows["means"] += sample_gaussians(rows["quats"], rows["log_scales"].exp(), rng)
         rows["log_scales"] -= float(np.log(1.6))
-        rows["opacity_logits"].clamp_max_(growing.FAINT)
+        rows["opacity_logits"].clamp_max_(growing.MAX_NEW_LOGIT)
         rows |= {"level": level, "bias": model.columns["bias"][source]}
-        rows = growing.with_room(self.schedule, model, rows, step, self.growth_limit(step))
+        rows = growing.limit_growth(self.schedule, model, rows, step, self.growth_limit(step))
 
         opacity = model.read("opacity_logits").sigmoid()
         faint = model.read("opacity_sum") < p.min_opacity * model.read("seen")
@@ -155,9 +157,9 @@ class Method(method.Method[OctreeParameters, Drawing]):
         require_rows(model, step, "min_opacity")
 
     def prune_unseen(self, step: int) -> None:
-        """Splats go of which no view, near or far, sees much, by their largest blending weight (RadSplat)."""
-        unseen = growing.unseen(self.schedule, self.model, step, self._largest_weights)
-        self.model.keep(~unseen | self.model.columns[MARGIN])
+        """Remove splats of low blending weight in all views, near or far (RadSplat)."""
+        low_weight = growing.find_unseen(self.schedule, self.model, step, self._largest_weights)
+        self.model.keep(~low_weight | self.model.columns[MARGIN])
         require_rows(self.model, step, "least_weight")
 
     def _largest_weights(self, camera: Camera, view: int, weights: torch.Tensor) -> torch.Tensor:
@@ -167,7 +169,7 @@ class Method(method.Method[OctreeParameters, Drawing]):
         ).largest  # fmt: skip
 
     def reassign_levels(self, step: int) -> None:
-        """Splats that have become too wide or too narrow for their level move to one that they fit."""
+        """Move splats that are too wide or too narrow for their level to a matching one."""
         columns, newest = self.model.columns, self.level_at(step)
         means, log_scales = self.model.read("means"), self.model.read("log_scales")
-        columns["level"] = growing.fitting_levels(self.schedule, columns["level"], means, log_scales, newest)
+        columns["level"] = growing.matching_levels(self.schedule, columns["level"], means, log_scales, newest)

@@ -1,4 +1,4 @@
-"""What methods have in common that begin with a finished model, or make it by 3DGS, and then refine it."""
+"""Base class of methods that refine a trained model: a base, or the result of 3DGS steps."""
 
 from __future__ import annotations
 
@@ -16,34 +16,35 @@ from ...splats.gaussians import Splats
 from . import train as threedgs_train
 
 
-class SeenRows:
-    """Adam's step for the rows alone that a picture was made of.
+class RowOptimizer:
+    """Apply Adam to the rows that one image was rendered from.
 
     Args:
-        adam: of all rows.
-        rows: (M,) int64 of them.
-        leaves: these rows of each tensor, from which the picture was made.
+        adam: optimizer of all rows.
+        rows: (M,) int64 indices of the rows.
+        leaves: their values by name, the leaves of the image's gradient graph.
     """
 
     def __init__(self, adam: Adam, rows: torch.Tensor, leaves: dict[str, torch.Tensor]) -> None:
         self._adam, self._rows, self._leaves = adam, rows, leaves
 
     def step(self) -> None:
-        """One step of these rows."""
+        """Update these rows by one step."""
         self._adam.step_rows(self._rows, {name: leaf.grad for name, leaf in self._leaves.items()})
 
     def zero_grad(self) -> None:
-        """The rows go with their gradients: the next picture has others."""
+        """Drop the rows with their gradients; the next image has other rows."""
         self._leaves = {}
 
 
-class Refining(threedgs_train.Method):
-    """Steps of 3DGS, none with a base, and then steps that move what a picture was made of.
+class RefiningMethod(threedgs_train.Method):
+    """3DGS steps, none with a base, followed by steps that refine only the rendered rows.
 
-    Of the latter a method says what they draw; splats come and go as it says, and not as in 3DGS.
+    Subclasses define the images of the refining steps and control density in them; the rules of 3DGS do not
+    apply there.
 
     Attributes:
-        finest_steps: so many steps are 3DGS.
+        finest_steps: number of 3DGS steps.
     """
 
     def setup(self, base: Splats | None) -> None:
@@ -53,19 +54,19 @@ class Refining(threedgs_train.Method):
         if base is None:
             super().setup(None)
             return
-        p = self.parameters = replace(p, sh_degree=min(p.sh_degree, base.sh_degree))  # as they come
+        p = self.parameters = replace(p, sh_degree=min(p.sh_degree, base.sh_degree))  # the base has no more
         tensors = from_splats(base.select(spatial_order(base.means)), p.sh_degree, self.device)
         self.model = self.new_model(tensors)
         self._densify_until = 0
 
     def refines(self, step: int) -> bool:
-        """Whether a step comes after those of 3DGS."""
+        """Return whether a step follows the 3DGS steps."""
         return step >= self.finest_steps
 
-    def take_rows(self, rows: torch.Tensor) -> Gaussians:
-        """The splats (M,) of these rows, int64, to draw: they alone make the step."""
+    def select_rows(self, rows: torch.Tensor) -> Gaussians:
+        """Select (M,) int64 rows for rendering; only they take part in the next update."""
         leaves = {name: tensor.requires_grad_() for name, tensor in self.model.read_rows(rows).items()}
-        self._optimizer = SeenRows(self.model.adam, rows, leaves)
+        self._optimizer = RowOptimizer(self.model.adam, rows, leaves)
         return Gaussians(**leaves)
 
     def optimizers(self) -> Sequence[Optimizer]:
@@ -84,7 +85,7 @@ class Refining(threedgs_train.Method):
         return not self.refines(step) and super().collects_stats(view, step)
 
     def set_learning_rates(self, step: int) -> None:
-        if self.refines(step):  # a finished model's
+        if self.refines(step):  # the model is already trained
             self.model.lr["means"] = self.parameters.lr_means_final * self.data.extent
         else:
             super().set_learning_rates(step)

@@ -19,12 +19,12 @@ from ...splats.gaussians import Splats
 from ...splats.levels import Level
 from . import ThreedgsParameters
 
-WEIGHED_AT = (8 / 30, 16 / 30, 24 / 30)
-"""Shares of the steps after which splats that hardly show are removed, where that is wanted."""
+PRUNE_AT = (8 / 30, 16 / 30, 24 / 30)
+"""Fractions of the steps after which splats of low weight are pruned, if enabled."""
 
 
 class Method(method.Method[ThreedgsParameters, Drawing]):
-    """One run of 3DGS."""
+    """Training of a 3DGS model."""
 
     def setup(self, base: Splats | None) -> None:
         p, scene = self.parameters, self.data.scene
@@ -40,16 +40,16 @@ class Method(method.Method[ThreedgsParameters, Drawing]):
 
     @property
     def scheduled_steps(self) -> int:
-        """Over how many steps rates fall and photographs grow, of which shares are."""
+        """Number of steps over which learning rates fall and image resolution grows."""
         return self.parameters.steps
 
     def new_model(self, tensors: Mapping[str, torch.Tensor]) -> Model:
-        """A model of splats with what densification by the job's rule has to know of them."""
+        """Create a model with the statistics that the densification criterion needs."""
         p = self.parameters
         return Model(tensors, splat_rates(p, self.data.extent), peaks=p.densify_by == "max")
 
     def levels_after(self, step: int) -> list[Level]:
-        """The one level, at the end."""
+        """Return the single level after the last step."""
         return [Level(1, self.model.splats())] if step + 1 == self.steps else []
 
     def shrink(self, step: int) -> float:
@@ -77,12 +77,12 @@ class Method(method.Method[ThreedgsParameters, Drawing]):
         self.model.lr["means"] = rate * self.data.extent
 
     def control_density(self, step: int) -> None:
-        p, model, done = self.parameters, self.model, step + 1
-        if p.least_weight and done in (round(share * p.steps) for share in WEIGHED_AT):
+        p, model, completed = self.parameters, self.model, step + 1
+        if p.least_weight and completed in (round(share * p.steps) for share in PRUNE_AT):
             self.prune_unimportant(step)
-        if done > self._densify_until:
+        if completed > self._densify_until:
             return
-        if due(p.densify_interval, done) and done >= p.densify_from:
+        if due(p.densify_interval, completed) and completed >= p.densify_from:
             peaks = p.densify_by == "max"
             densify(
                 model,
@@ -93,24 +93,24 @@ class Method(method.Method[ThreedgsParameters, Drawing]):
                 rng=np.random.default_rng([self.seed, step, 1]),
             )
             model.reset_stats()
-        if due(p.prune_interval, done):
+        if due(p.prune_interval, completed):
             prune(model, p.min_opacity)
             require_rows(model, step, "min_opacity")
-        if due(p.opacity_reset_interval, done):
+        if due(p.opacity_reset_interval, completed):
             reset_opacities(model)
 
     @torch.no_grad()
     def prune_unimportant(self, step: int) -> None:
-        """Splats go of which no training view, with what continues its photograph, shows much (RadSplat)."""
+        """Remove splats of low weight in all training views, which include the margins (RadSplat)."""
         p, data = self.parameters, self.data
-        found = contributions(
+        contribution = contributions(
             self.model.gaussians,
             (camera.widened(p.margin) for camera in data.train),
             near=data.near,
             antialias=p.antialias,
             backend=self.backend,
         )
-        self.model.keep(found.largest >= p.least_weight)
+        self.model.keep(contribution.largest >= p.least_weight)
         require_rows(self.model, step, "least_weight")
 
     def adds_margins(self, step: int) -> bool:

@@ -1,8 +1,8 @@
-"""Density control on a tree (A LoD of Gaussians, Sec. 4.2 and A.6): leaves that grow, and dead ones.
+"""Density control of a tree (A LoD of Gaussians, Sec. 4.2 and A.6): split leaves and remove dead ones.
 
-A leaf that is to be densified becomes a node, with its values, over two new leaves. A dead leaf goes with its
-parent, whose place its sibling takes, with all that is below it; the two are free to be somebody's children
-elsewhere, so that a tree whose number of leaves is bounded follows where detail is needed.
+A split leaf becomes an inner node with the same values over two new leaves. A dead leaf is removed with its
+parent, and its sibling subtree takes the parent's place. The freed nodes allow splits elsewhere, so that a
+tree with a limited number of leaves follows the detail of the scene.
 """
 
 from __future__ import annotations
@@ -19,74 +19,75 @@ from ...lod.tree.shape import Tree
 from ...optimize.density_control import split_longest_axis
 from .store import RecordPiece, Store
 
-GROWN = 2
-"""A subtree of more than so many times the leaves that one should have is divided."""
+MAX_GROWTH = 2
+"""A subtree is divided if it exceeds its target number of leaves by this factor."""
 
 
-def edited(tree: Tree, split: np.ndarray, dead: np.ndarray) -> tuple[Tree, np.ndarray]:
-    """A tree without its dead leaves, in which others have become nodes over two leaves.
+def edit_tree(tree: Tree, split: np.ndarray, dead: np.ndarray) -> tuple[Tree, np.ndarray]:
+    """Remove dead leaves from a tree and split others.
 
-    Of two dead siblings the right one goes; the left one is dead still, and goes the next time (A.6). A tree
-    always keeps one leaf. Dead leaves are not split. As in ``build``'s trees every node must have a higher
-    number than those below it, and has one then.
+    Of two dead siblings only the right one is removed; the left one remains dead until the next call (A.6).
+    The tree keeps at least one leaf. Dead leaves are not split. Inner nodes have higher numbers than the
+    nodes below them, before and after, as in the trees of ``build``.
 
     Args:
-        tree: of N leaves.
-        split, dead: (N,) bool of leaves.
+        tree: tree of N leaves.
+        split, dead: (N,) bool, for the leaves.
 
     Returns:
-        The tree of M leaves, in the order of those that they come from, and (2M - 1,) int64 of its nodes the
-        old ones. Where a leaf was split three have it: the new node, whose values they are, and two children,
-        one after the other.
+        The tree of M leaves in their original order, and the source node of each new node, (2M - 1,) int64.
+            Three new nodes have a split leaf as source: the inner node with its values, and its two
+            children, which are consecutive.
     """
     count, rows = tree.leaves, tree.children
     split = split & ~dead
-    gone = _losses(tree, dead)
-    # the node that stands where each one stood: itself, or, of one that lost a child, what is in the other's
-    stands = np.arange(len(tree))
-    loses = gone.any(axis=1)
-    stands[count:][loses] = np.where(gone[loses, 0], rows[loses, 1], rows[loses, 0])
-    while not np.array_equal(further := stands[stands], stands):
-        stands = further
-    dies = np.zeros(len(tree), bool)
-    dies[rows[gone]] = True
-    # new numbers: leaves, in place of one that is split its two children; it itself and the other nodes
-    many = np.where(dies[:count], 0, 1 + split)
-    firsts = np.cumsum(many) - many
-    splits, kept = np.flatnonzero(split), np.flatnonzero(~loses)
-    leaves = int(many.sum())
-    place = np.concatenate([firsts, np.zeros(len(rows), np.int64)])
-    place[splits] = leaves + np.arange(len(splits))
-    place[count + kept] = leaves + len(splits) + np.arange(len(kept))
-    children = np.concatenate([firsts[splits, None] + np.arange(2), place[stands[rows[kept]]]])
-    source = np.concatenate([np.repeat(np.arange(count), many), splits, count + kept])
+    lost = _lost_children(tree, dead)
+    # the node in each one's place: itself, or, if it lost a child, the replacement of its other child
+    place = np.arange(len(tree))
+    loses_child = lost.any(axis=1)
+    place[count:][loses_child] = np.where(lost[loses_child, 0], rows[loses_child, 1], rows[loses_child, 0])
+    while not np.array_equal(next_place := place[place], place):
+        place = next_place
+    removed = np.zeros(len(tree), bool)
+    removed[rows[lost]] = True
+    # new numbers: leaves (two for a split one), then split leaves and the other inner nodes
+    counts = np.where(removed[:count], 0, 1 + split)
+    firsts = np.cumsum(counts) - counts
+    splits, kept = np.flatnonzero(split), np.flatnonzero(~loses_child)
+    leaves = int(counts.sum())
+    new_number = np.concatenate([firsts, np.zeros(len(rows), np.int64)])
+    new_number[splits] = leaves + np.arange(len(splits))
+    new_number[count + kept] = leaves + len(splits) + np.arange(len(kept))
+    children = np.concatenate([firsts[splits, None] + np.arange(2), new_number[place[rows[kept]]]])
+    source = np.concatenate([np.repeat(np.arange(count), counts), splits, count + kept])
     return Tree(children.astype(np.int32)), source
 
 
-def _losses(tree: Tree, dead: np.ndarray) -> np.ndarray:
-    """(N - 1, 2) bool: which child goes of each node above leaves; at most one."""
-    gone = np.append(dead, np.zeros(len(tree.children), bool))[tree.children]
-    gone[gone.all(axis=1), 0] = False
-    return gone
+def _lost_children(tree: Tree, dead: np.ndarray) -> np.ndarray:
+    """Return which child each inner node loses, (N - 1, 2) bool; at most one each."""
+    lost = np.append(dead, np.zeros(len(tree.children), bool))[tree.children]
+    lost[lost.all(axis=1), 0] = False
+    return lost
 
 
-class Growing:
-    """The records of a store after density control, made while its pieces are asked for, which is once.
+class TreeDensityControl:
+    """Records of a store after density control, computed during iteration over its pieces.
 
-    Leaves are split along their longest axis (``optimize.density_control``). In 3DGS-MCMC, which the paper
-    follows, both children are copies that only noise separates. All scores are reset.
+    It can be iterated once. Leaves are split along their longest axis (``optimize.density_control``); in
+    3DGS-MCMC, which the paper follows, both children are copies that only noise separates. All scores are
+    reset.
 
     Args:
-        store: stays as it is, with nothing of it in memory.
-        threshold: leaves of a higher score (of its records) are split, the highest first.
-        min_opacity: leaves of a lower one are dead,
-        unseen_since: and those that no step from this one on has had in its image, counted from 1.
-        now: how many steps have been made.
-        most: leaves that the tree may have.
-        region: leaves outside of it are not split; None: all may be.
+        store: input, unchanged; its cache must be empty.
+        threshold: minimum score of a leaf to split; the highest scores are split first.
+        min_opacity: minimum opacity of a leaf; leaves below it are dead.
+        unseen_since: leaves that were in no image since this step, counted from 1, are dead.
+        now: number of completed steps.
+        most: maximum number of leaves of the tree.
+        region: only leaves inside it are split; None for all.
 
     Attributes:
-        removed, added: leaves.
+        removed, added: numbers of leaves.
     """
 
     def __init__(
@@ -96,78 +97,80 @@ class Growing:
         threshold: float,
         min_opacity: float,
         unseen_since: int,
-        now: int,
-        most: int,
+        step: int,
+        max_leaves: int,
         region: Crop | None = None,
     ) -> None:
-        self._store, self._now = store, now
-        self._longest = max_subtree_leaves(int(store.shape.counts.sum()))
+        self._store, self._step = store, step
+        self._subtree_leaves = max_subtree_leaves(int(store.shape.counts.sum()))
         self._least_logit = float(logit(min_opacity))
         self._unseen_since = unseen_since
         self._upper: RecordPiece | None = None
-        store.rest()
-        scores, wanted, count, self.removed = [], [], 0, 0
+        store.release_cache()
+        scores, candidates, count, self.removed = [], [], 0, 0
         for records, tree in store.records():
-            dead = self._dead(records[: tree.leaves])
+            dead = self._find_dead(records[: tree.leaves])
             leaves = store.layout.split(records[: tree.leaves])
             score = leaves["score"].numpy()
-            grows = (score > threshold) & ~dead
+            split = (score > threshold) & ~dead
             if region is not None:
-                grows &= region.contains(leaves["means"].numpy())
-            chosen = np.flatnonzero(grows)
-            scores.append(score[chosen])
-            wanted.append(count + chosen)
+                split &= region.contains(leaves["means"].numpy())
+            rows = np.flatnonzero(split)
+            scores.append(score[rows])
+            candidates.append(count + rows)
             count += tree.leaves
-            self.removed += int(_losses(tree, dead).sum())
-        score, found = np.concatenate(scores), np.concatenate(wanted)
-        room = max(most - (count - self.removed), 0)
-        self._split = np.sort(found[np.argsort(-score, kind="stable")[:room]])
+            self.removed += int(_lost_children(tree, dead).sum())
+        max_splits = max(max_leaves - (count - self.removed), 0)
+        order = np.argsort(-np.concatenate(scores), kind="stable")
+        self._split = np.sort(np.concatenate(candidates)[order[:max_splits]])
         self.added = len(self._split)
 
     def __iter__(self) -> Iterator[RecordPiece]:
-        """The new subtrees, as ``Store.fill_records`` takes them."""
-        count, uppers, above = 0, [], []
+        """Yield the new subtrees for ``Store.fill_records``."""
+        count, uppers, upper_records = 0, [], []
         for records, tree in self._store.records():
             begin, end = np.searchsorted(self._split, (count, count + tree.leaves))
             split = np.zeros(tree.leaves, bool)
             split[self._split[begin:end] - count] = True
             count += tree.leaves
-            tree, source = edited(tree, split, self._dead(records[: tree.leaves]))
-            born = np.flatnonzero(split[source[: tree.leaves]])
-            records = self._with_children(records[torch.from_numpy(source)], born)
-            grown = tree.leaves > GROWN * self._longest
-            order, shape = forest_shape(tree, self._longest if grown else tree.leaves)
+            tree, source = edit_tree(tree, split, self._find_dead(records[: tree.leaves]))
+            children_rows = np.flatnonzero(split[source[: tree.leaves]])
+            records = self._create_children(records[torch.from_numpy(source)], children_rows)
+            too_large = tree.leaves > MAX_GROWTH * self._subtree_leaves
+            order, shape = forest_shape(tree, self._subtree_leaves if too_large else tree.leaves)
             records = records[torch.from_numpy(order).long()]
             for (first, last), part in zip(shape.ranges, extract_subtrees(tree, order, shape), strict=True):
                 yield records[first:last], part
             uppers.append(shape.upper)
-            above.append(records[shape.ends[-1] :].clone())  # the subtree's need not stay for it
+            upper_records.append(
+                records[shape.ends[-1] :].clone()
+            )  # a copy, so that the subtree's records can be freed
         records, upper = self._store.upper_records()
-        self._upper = torch.cat([*above, records]), merge_trees(uppers, upper)
+        self._upper = torch.cat([*upper_records, records]), merge_trees(uppers, upper)
 
     @property
     def upper(self) -> RecordPiece:
-        """The upper tree, as soon as all subtrees have been asked for."""
-        assert self._upper is not None, "the subtrees come first"
+        """The upper tree, available after iteration."""
+        assert self._upper is not None, "iterate over the subtrees first"
         return self._upper
 
-    def _dead(self, leaves: torch.Tensor) -> np.ndarray:
+    def _find_dead(self, leaves: torch.Tensor) -> np.ndarray:
         values = self._store.layout.split(leaves)
         return (
             (values["opacity_logits"] < self._least_logit) | (values["seen"] < self._unseen_since)
         ).numpy()
 
-    def _with_children(self, records: torch.Tensor, born: np.ndarray) -> torch.Tensor:
-        """Records of which some rows (2P,), pairs of copies of P leaves, become their children."""
+    def _create_children(self, records: torch.Tensor, children_rows: np.ndarray) -> torch.Tensor:
+        """Turn rows (2P,), P pairs of copied leaves, into the children of these leaves."""
         self._store.layout.split(records)["score"].zero_()
-        if len(born):
-            rows = torch.from_numpy(np.concatenate([born[0::2], born[1::2]]))
+        if len(children_rows):
+            rows = torch.from_numpy(np.concatenate([children_rows[0::2], children_rows[1::2]]))
             values = {name: part.clone() for name, part in self._store.layout.split(records[rows]).items()}
             scales = values["log_scales"][: len(rows) // 2].exp()
             values, scales = split_longest_axis(values, scales)
             values["log_scales"] = scales.log()
             for name in ("first", "second", "steps"):
                 values[name].zero_()
-            values["seen"].fill_(self._now)
+            values["seen"].fill_(self._step)
             records[rows] = self._store.layout.join(values)
         return records

@@ -1,11 +1,11 @@
-"""A LoD of Gaussians (Windisch et al. 2026): a tree over a finished model, whose cuts are then trained.
+"""A LoD of Gaussians (Windisch et al. 2026): build a tree over a trained model, then train its cuts.
 
-The leaves are a base, or 3DGS in the first steps. One step builds the tree; in those after it every view
-draws its cut, a little coarser at random (A.6, "Varying level of detail"), and moves the nodes of this cut
-alone, as if they were a scene of their own.
+The leaves come from a base, or from 3DGS in the first steps. One step builds the tree. Each step after it
+renders one view's cut, randomly coarsened (A.6, "Varying level of detail"), and updates only the nodes of
+this cut.
 
-From then on the nodes are outside memory (``store``), and views come in an order that stays near (Sec. 4.4).
-Density control (Sec. 4.2) makes a new store of the old one (``density``).
+From then on nodes are stored on disk (``store``), and consecutive views are close to each other (Sec. 4.4).
+Density control (Sec. 4.2) rewrites the store (``density``).
 """
 
 from __future__ import annotations
@@ -30,29 +30,29 @@ from ...splats.gaussians import SplatRows
 from ...splats.levels import Level
 from ...splats.ply import Columns
 from ..threedgs import train as threedgs_train
-from ..threedgs.refining import Refining
+from ..threedgs.refining import RefiningMethod
 from . import TreeParameters
-from .build import GrowingForest
-from .density import Growing
+from .build import ForestBuilder
+from .density import TreeDensityControl
 from .store import Store, default_budget
 
-LEAF_REST = 0.03
-"""The rate at which leaves move at the end of training, as a share of that at its beginning."""
+FINAL_LEAF_RATE = 0.03
+"""Learning rate of leaves at the end, as a fraction of the initial one."""
 
 
-class SeenRecords:
-    """Adam's step for the records alone that are in a picture; of a cut, a half to three quarters are not.
+class RecordOptimizer:
+    """Apply Adam to the records that are visible in one image, a quarter to a half of a cut.
 
     Args:
-        store: of all records.
-        places: (M,) int64 of them in its cache.
-        lr: learning rates by name, as ``Adam`` has them when the step is made.
-        shares: (M,) of these rates, which each moves with.
-        number: of the step, from 1.
+        store: storage of all records.
+        places: (M,) int64 cache indices of the cut.
+        lr: learning rates by name, as of ``Adam`` at the time of the step.
+        shares: (M,) factors on these rates.
+        number: number of the step, from 1.
 
     Attributes:
-        gaussians: these splats, to make the picture from.
-        rendering: of them, once it has been made.
+        gaussians: splats of the cut, for rendering.
+        rendering: rendering of them, set after rendering.
     """
 
     rendering: Rendering
@@ -60,56 +60,60 @@ class SeenRecords:
     def __init__(
         self,
         store: Store,
-        places: np.ndarray,
+        indices: np.ndarray,
         lr: Mapping[str, LearningRate],
-        shares: torch.Tensor,
+        rate_factors: torch.Tensor,
         number: int,
     ) -> None:
-        self._store, self._places, self._lr, self._shares, self._number = store, places, lr, shares, number
-        self.gaussians = store.gaussians_at(places)
+        self._store = store
+        self._indices = indices
+        self._lr = lr
+        self._rate_factors = rate_factors
+        self._number = number
+        self.gaussians = store.gaussians_at(indices)
         for values in vars(self.gaussians).values():
             values.requires_grad_()
 
     def step(self) -> None:
-        """One step of these records."""
+        """Update the visible records by one step."""
         leaves = vars(self.gaussians)
         gradients = [leaf.grad for leaf in leaves.values() if leaf.grad is not None]
-        if len(gradients) < len(leaves):  # nothing of them is in the picture
+        if len(gradients) < len(leaves):  # none is visible
             return
         rates = [
             torch.as_tensor(self._lr[name]).float().expand(leaf.shape[1:]).reshape(-1)
             for name, leaf in leaves.items()
         ]
         cache = self._store.cache
-        told = self.rendering, self._number, torch.cat(rates), self._shares
-        records.adam_step(cache.records, self._places, gradients, *told)
-        cache.mark_changed(self._places[(self.rendering.radii > 0).numpy(force=True)])
+        arguments = self.rendering, self._number, torch.cat(rates), self._rate_factors
+        records.adam_step(cache.records, self._indices, gradients, *arguments)
+        cache.mark_changed(self._indices[(self.rendering.radii > 0).numpy(force=True)])
 
     def zero_grad(self) -> None:
-        """The next picture has other records."""
+        """Do nothing; the next image has other records."""
 
 
-class Method(Refining):
-    """One run of A LoD of Gaussians.
+class Method(RefiningMethod):
+    """Training of A LoD of Gaussians.
 
     Attributes:
-        store: all nodes, as soon as the tree is built.
+        store: all nodes, once the tree is built.
     """
 
     parameters: TreeParameters
 
     def setup(self, base: SplatRows | None) -> None:
         super().setup(None if base is None else base.select(slice(0, 0)))
-        # leaves that are grown on need their own steps, and what continues photographs a model
+        # density control and margins belong to the 3DGS steps only
         self._densify_until = min(self._densify_until, self.finest_steps)
         self.store: Store | None = None
         self._base = base
         self._table: Columns = {}
-        self._told = 0  # bytes of splat_memory that somebody was told of
+        self._reported_budget = 0  # bytes of splat_memory in the last warning
 
     @property
     def scheduled_steps(self) -> int:
-        """Cuts go on with 3DGS where its steps for the leaves end."""
+        """Total steps: training cuts continues the schedules of 3DGS."""
         return self.steps
 
     @property
@@ -138,7 +142,7 @@ class Method(Refining):
         return step + 1 in (self.finest_steps, self.steps)
 
     def levels_after(self, step: int) -> list[Level]:
-        """The leaves as soon as they are there, for whoever waits; all nodes at the end."""
+        """Return the leaves after the 3DGS steps, as a preview, and all nodes at the end."""
         if step + 1 == self.steps:
             assert self.store is not None
             levels, self._table = build_levels(self.store, self.data.scratch)
@@ -150,26 +154,26 @@ class Method(Refining):
         return []
 
     def tables(self) -> dict[str, Columns]:
-        """Which blocks of rows an eye needs, by which a part of the file can be read."""
+        """Return the block table, which allows partial reads of the file."""
         if self.store is None:
             return {}
         return {BLOCKS: self._table or build_levels(self.store, self.data.scratch)[1]}
 
     def controls(self) -> dict[str, float]:
-        """Pictures begin with the granularity that was trained."""
+        """Initialize the granularity in rendering to that of training."""
         return {"pixels": self.parameters.pixels}
 
-    # -- a step ----------------------------------------------------------------------------------------
+    # -- steps -----------------------------------------------------------------------------------------
 
     @cached_property
-    def _walk(self) -> ViewOrder:
+    def _view_order(self) -> ViewOrder:
         return ViewOrder(np.array([camera.center for camera in self.data.train]), self.seed)
 
     def view_index(self, step: int) -> int:
-        """The training view of a step; of those that draw cuts most are near the one before."""
+        """Choose a training view; in steps on cuts, consecutive views are mostly close to each other."""
         if not self.refines(step):
             return super().view_index(step)
-        return self._walk(step - self.finest_steps)
+        return self._view_order(step - self.finest_steps)
 
     def train_step(self, step: int) -> StepResult:
         if step == self.finest_steps:
@@ -178,41 +182,41 @@ class Method(Refining):
             return super().train_step(step)
         assert self.store is not None
         if due(self.parameters.resize_interval, step - self.finest_steps):
-            self.store.resize()
-        told = super().train_step(step)
+            self.store.update_sizes()
+        arguments = super().train_step(step)
         self.store.cache.end_step(step - self.finest_steps)
-        return told
+        return arguments
 
     def set_learning_rates(self, step: int) -> None:
         if self._base is None:
-            threedgs_train.Method.set_learning_rates(self, step)  # which go on falling
+            threedgs_train.Method.set_learning_rates(self, step)  # the schedule continues
         else:
             super().set_learning_rates(step)
 
     def draw(self, view: TrainingView, step: int) -> list[Drawing]:
         if not self.refines(step):
             return super().draw(view, step)
-        gaussians = self._take(view, step, self._pixels(step))
+        gaussians = self._load_cut(view, step, self._pixels(step))
         return [Drawing(self.rasterize_model(view.camera, step, gaussians=gaussians))]
 
-    def _take(self, view: TrainingView, step: int, pixels: float) -> Gaussians:
-        """The splats of a view's cut, to draw: they alone make the step."""
+    def _load_cut(self, view: TrainingView, step: int, pixels: float) -> Gaussians:
+        """Load the cut of a view for rendering; only its splats take part in the next update."""
         assert self.store is not None
-        places = self.store.take(view.camera, pixels, self.data.near)
-        if self.store.wanted > 2 * self._told:  # once, as a rule
-            self._told = self.store.wanted
+        indices = self.store.load_cut(view.camera, pixels, self.data.near)
+        if self.store.needed_budget > 2 * self._reported_budget:  # usually once
+            self._reported_budget = self.store.needed_budget
             self.warn(
-                "The memory budget has no room for what some views show: they are trained coarser, up to "
-                f"{self.store.coarsened:.1f} times so far. {-(-self._told // 10**6):,} MB as splat_memory "
-                "would have room for these."
+                "The memory budget is too small for some views: they are trained with detail up to "
+                f"{self.store.max_coarsening:.1f} times coarser. Set splat_memory to at least "
+                f"{-(-self._reported_budget // 10**6):,} MB."
             )
-        shares, number = self._shares(places, step), step + 1 - self.finest_steps
-        self._optimizer = SeenRecords(self.store, places, self.model.lr, shares, number)
+        rate_factors, number = self._rate_factors(indices, step), step + 1 - self.finest_steps
+        self._optimizer = RecordOptimizer(self.store, indices, self.model.lr, rate_factors, number)
         return self._optimizer.gaussians
 
     def accumulate_stats(self, drawings: Sequence[Drawing], view: TrainingView, step: int) -> None:
         super().accumulate_stats(drawings, view, step)
-        if isinstance(self._optimizer, SeenRecords):
+        if isinstance(self._optimizer, RecordOptimizer):
             self._optimizer.rendering = drawings[0].rendering
 
     def control_density(self, step: int) -> None:
@@ -220,37 +224,39 @@ class Method(Refining):
         p, done = self.parameters, step - self.finest_steps
         if self.store is None or done > p.grow_until * p.tune_steps or not due(p.grow_interval, done):
             return
-        growing = Growing(
+        control = TreeDensityControl(
             self.store,
             threshold=p.max_threshold * self.data.threshold_scale,
             min_opacity=p.min_opacity,
             unseen_since=done + 1 - round(p.unseen_epochs * len(self.data.train)) if p.unseen_epochs else 0,
-            now=done + 1,
-            most=p.max_splats,
+            step=done + 1,
+            max_leaves=p.max_splats,
             region=self.data.region,
         )
-        grown = self._new_store(self.store.budget)
-        grown.fill_records(growing, lambda: growing.upper)
-        grown.supersede(self.store)
-        self.store = grown
+        updated = self._new_store(self.store.budget)
+        updated.fill_records(control, lambda: control.upper)
+        updated.supersede(self.store)
+        self.store = updated
 
     @torch.no_grad()
     def _build_step(self, step: int) -> StepResult:
-        """Builds the tree; what is told of the step is how a view looks by it."""
+        """Build the tree; the result of the step is an image rendered from it."""
         self.store = self._new_store()
         if self._base is not None:
-            self.store.fill(GrowingForest(self._base, self.data.scratch, self.parameters.sh_degree))
+            self.store.fill(ForestBuilder(self._base, self.data.scratch, self.parameters.sh_degree))
         else:
             leaves = self.model.splats()
-            none = from_splats(leaves.select(slice(0)), self.parameters.sh_degree, self.device)
-            self.model = self.new_model(none)
-            self.store.fill(GrowingForest(leaves))
+            no_splats = from_splats(leaves.select(slice(0)), self.parameters.sh_degree, self.device)
+            self.model = self.new_model(no_splats)
+            self.store.fill(ForestBuilder(leaves))
         view = self.choose_view(step)
-        gaussians = self._take(view, step, self.parameters.pixels)
-        seen = self.rasterize_model(view.camera, step, gaussians=gaussians)
-        loss = self.loss([Drawing(seen)], view, step)
+        gaussians = self._load_cut(view, step, self.parameters.pixels)
+        rendering = self.rasterize_model(view.camera, step, gaussians=gaussians)
+        loss = self.loss([Drawing(rendering)], view, step)
         return StepResult(
-            float(loss), partial(self.composite_over_black, seen.image, seen.alpha, step), view.target
+            float(loss),
+            partial(self.composite_over_black, rendering.image, rendering.alpha, step),
+            view.target,
         )
 
     def _new_store(self, budget: int | None = None) -> Store:
@@ -258,18 +264,18 @@ class Method(Refining):
         return Store(self.data.scratch, self.parameters.sh_degree, budget, self.device)
 
     def _pixels(self, step: int) -> float:
-        """A step's granularity (A.6: distances times 1 + 5 r⁴)."""
+        """Return the granularity of a step (A.6: distances times 1 + 5 r⁴)."""
         r = np.random.default_rng([self.seed, step, 12]).random()
         return self.parameters.pixels * (1 + self.parameters.lod_noise * r**4)
 
-    def _shares(self, places: np.ndarray, step: int) -> torch.Tensor:
-        """The shares (M,) of the learning rates that records (M,) move with: leaves come to rest."""
+    def _rate_factors(self, indices: np.ndarray, step: int) -> torch.Tensor:
+        """Return factors (M,) on the learning rates of records (M,); those of leaves decrease."""
         assert self.store is not None
         done = (step - self.finest_steps) / max(self.parameters.tune_steps, 1)
-        slow = self.parameters.leaf_rate * LEAF_REST**done
-        return torch.where(torch.from_numpy(self.store.are_leaves(places)), slow, self.parameters.node_rate)
+        slow = self.parameters.leaf_rate * FINAL_LEAF_RATE**done
+        return torch.where(torch.from_numpy(self.store.is_leaf(indices)), slow, self.parameters.node_rate)
 
-    # -- what lasts ------------------------------------------------------------------------------------
+    # -- checkpoints -----------------------------------------------------------------------------------
 
     def close(self) -> None:
         if self.store is not None:
@@ -280,6 +286,6 @@ class Method(Refining):
 
     def load_state_dict(self, state: dict) -> None:
         super().load_state_dict(state)
-        if (kept := state["store"]) is not None:
-            self.store = self._new_store(kept["cache"]["budget"])
-            self.store.load_state_dict(kept)
+        if (saved := state["store"]) is not None:
+            self.store = self._new_store(saved["cache"]["budget"])
+            self.store.load_state_dict(saved)

@@ -52,15 +52,15 @@ def test_training_draws_by_the_rule(data):
     [level] = trained(clod)
     camera, rule = data.train[1], rules()["decay"]
     for s_v in (1.0, 2.5):
-        falloff, _, shown = clod.attenuated(camera, s_v)
+        falloff, _, drawn = clod.attenuate(camera, s_v)
         opacity = clod.model["opacity_logits"].sigmoid()
         columns = {"sigma_d": clod.sigma.detach().numpy(), "opacity": opacity.detach().numpy()}
         facts = collect_facts(rule, clod.facts(), [(1, {})], 1)
         means = clod.model["means"].detach().numpy()
         values = {"s_v": s_v, "at_most": 0}
         wanted = rule.weights(means, camera.center, camera.focal, columns, facts, values)
-        found = (falloff * shown).detach().numpy()
-        assert (np.abs(found - wanted) > 1e-5).sum() <= 1
+        contribution = (falloff * drawn).detach().numpy()
+        assert (np.abs(contribution - wanted) > 1e-5).sum() <= 1
     assert level.splats.extras["sigma_d"].shape == (len(level.splats),)
 
 
@@ -68,13 +68,13 @@ def test_the_counts_gradient_goes_straight_through(data):
     clod = make(data)
     trained(clod, 13)
     camera, p = data.train[0], clod.parameters
-    inside = torch.from_numpy(camera.sees(clod.model["means"].detach().numpy(), near=data.near))
-    assert 3 < inside.sum() < len(inside)
-    opacities = torch.rand(len(inside), dtype=torch.float64, requires_grad=True)
+    in_view = torch.from_numpy(camera.sees(clod.model["means"].detach().numpy(), near=data.near))
+    assert 3 < in_view.sum() < len(in_view)
+    opacities = torch.rand(len(in_view), dtype=torch.float64, requires_grad=True)
     s_v = 4.0
-    shown = opacities.detach() > p.tau * s_v
-    excess = clod.count_excess(ClodDrawing(None, s_v, opacities, shown, inside))
-    share = shown[inside].double().mean()
+    drawn = opacities.detach() > p.tau * s_v
+    excess = clod.count_excess(ClodDrawing(None, s_v, opacities, drawn, in_view))
+    share = drawn[in_view].double().mean()
     target = (s_v / p.onset) ** -p.exponent
     assert share > target
     assert excess.item() == pytest.approx(9 * (share - target).item() ** 2)
@@ -82,10 +82,10 @@ def test_the_counts_gradient_goes_straight_through(data):
     # d excess / d share times the mean's, times the sigmoid's of the logarithm, by hand
     margin = (opacities.detach() / (p.tau * s_v)).log() / p.count_softness
     slope = margin.sigmoid() * (1 - margin.sigmoid()) / p.count_softness / opacities.detach()
-    expected = 18 * (share - target) / inside.sum() * slope * inside
+    expected = 18 * (share - target) / in_view.sum() * slope * in_view
     torch.testing.assert_close(opacities.grad, expected)
-    few = clod.count_excess(ClodDrawing(None, s_v, opacities, torch.zeros_like(shown), inside))
-    near = clod.count_excess(ClodDrawing(None, 1.9, opacities, torch.ones_like(shown), inside))
+    few = clod.count_excess(ClodDrawing(None, s_v, opacities, torch.zeros_like(drawn), in_view))
+    near = clod.count_excess(ClodDrawing(None, 1.9, opacities, torch.ones_like(drawn), in_view))
     assert few.item() == near.item() == 0
 
 
@@ -93,22 +93,22 @@ def test_decays_begin_by_importance(data):
     clod = make(data, tau=0.004)
     trained(clod, 12)
     before, p = clod.model["opacity_logits"].detach().sigmoid(), clod.parameters
-    found = contributions(
+    contribution = contributions(
         clod.model.gaussians.detach(), data.train, near=data.near, antialias=True, backend="cpu"
     )
     means = clod.model["means"].detach().numpy().copy()
     clod.begin_decay()
     # those that give most to the pixels of a view stay, as many as views draw 74 % of what they drew
     kept = torch.from_numpy((means[:, None] == clod.model["means"].detach().numpy()[None]).all(2).any(1))
-    views, importance = found.views.double(), found.total / found.views.clamp_min(1)
+    views, importance = contribution.views.double(), contribution.total / contribution.views.clamp_min(1)
     assert importance[kept].min() >= importance[~kept].max()
     assert 0.6 < views[kept].sum() / views.sum() <= 0.74
 
     distances = np.stack([np.linalg.norm(means[kept] - camera.center, axis=1) for camera in data.train], 1)
-    inside = np.stack([camera.sees(means[kept], near=data.near) for camera in data.train], 1)
-    some = torch.from_numpy(inside.any(1))
-    mean = torch.from_numpy((distances * inside).sum(1) / inside.sum(1).clip(1) / clod.reference)
-    nearest = torch.from_numpy(np.where(inside, distances, np.inf).min(1) / clod.reference)
+    in_view = np.stack([camera.sees(means[kept], near=data.near) for camera in data.train], 1)
+    some = torch.from_numpy(in_view.any(1))
+    mean = torch.from_numpy((distances * in_view).sum(1) / in_view.sum(1).clip(1) / clod.reference)
+    nearest = torch.from_numpy(np.where(in_view, distances, np.inf).min(1) / clod.reference)
     alpha, sigma = clod.model["opacity_logits"].detach().sigmoid(), clod.sigma.detach()
     some &= (sigma > 2e-3) & (sigma < 49) & (alpha < 0.989) & (alpha > 2e-4)
     # from its nearest view a splat looks as before ...
@@ -136,7 +136,7 @@ def test_the_reference_is_a_quantile_of_what_views_see_or_each_views_farthest(da
     assert clod.reference == pytest.approx(np.quantile(np.concatenate(seen), 0.9), rel=1e-5)
     published = make(data, reference_quantile=0.0)
     assert published.facts()["reference"] == 0
-    assert published.normalized(data.train[0]).max() == pytest.approx(1)
+    assert published.normalized_distances(data.train[0]).max() == pytest.approx(1)
 
 
 def test_any_prefix_is_a_coarser_scene_and_counts_fall_with_the_scale(data):
@@ -165,7 +165,7 @@ def test_what_no_view_draws_goes(data):
     some = torch.arange(5)
     with torch.no_grad():
         clod.model["opacity_logits"][some] = -6.0  # far below tau
-    seen = clod.seen_somewhere()
+    seen = clod.drawn_anywhere()
     assert not seen[some].any() and seen.sum() > 5
 
 

@@ -11,7 +11,7 @@ from training.lod.blocks import SIZE, spatial_order
 from training.lod.rule import all_controls
 from training.lod.selection import resolve_controls, select
 from training.methods.flod import METHOD, finish
-from training.methods.flod.train import Method, apart
+from training.methods.flod.train import Method, well_separated
 from training.optimize.initialize import from_splats
 from training.optimize.model import NAMES
 from training.optimize.parameters import override
@@ -92,11 +92,11 @@ def test_the_picture_does_not_jump_when_the_level_rises(data):
 
     for step in range(6):
         flod.train_step(step)
-    before = picture(1)
+    old_min = picture(1)
     assert len(flod.levels_after(5)) == 1
-    torch.testing.assert_close(picture(2), before, atol=2e-5, rtol=0)
+    torch.testing.assert_close(picture(2), old_min, atol=2e-5, rtol=0)
     # and it is the new constraint that is in force: the old one would draw larger splats
-    assert (picture(1) - before).abs().max() > 0.01
+    assert (picture(1) - old_min).abs().max() > 0.01
 
 
 def test_points_that_have_room_at_the_next_level_join_again(data):
@@ -104,7 +104,7 @@ def test_points_that_have_room_at_the_next_level_join_again(data):
     points = torch.from_numpy(np.unique(data.scene.points, axis=0))
     flod.model.keep(torch.arange(len(points)) % 2 == 0)  # as if pruned
     stayed = flod.model["means"].detach().clone()
-    flod.rise_to(2)
+    flod.start_level(2)
     distances = torch.cdist(points, stayed).min(1).values
     expected = points[distances >= flod.s_min[1] / 2]
     assert 0 < len(expected) < len(points)
@@ -118,13 +118,13 @@ def test_of_more_points_than_there_is_room_for_some_join(data):
         flod = make(data, min_opacity=0.0, densify_interval=100, max_splats=50, budget_ratio=0.8)
         points = flod.points
         flod.model.keep(torch.arange(len(points)) < 10)
-        flod.rise_to(2)
+        flod.start_level(2)
         assert len(flod.model) == flod.budget(2) == 40
         models.append(flod.model["means"].detach())
     assert torch.equal(*models)
-    joined = {tuple(mean) for mean in models[0][10:].tolist()}
-    assert len(joined) == 30 and joined <= {tuple(point) for point in np.float32(points).tolist()}
-    assert {tuple(point) for point in np.float32(points[10:40]).tolist()} != joined
+    join_levels = {tuple(mean) for mean in models[0][10:].tolist()}
+    assert len(join_levels) == 30 and join_levels <= {tuple(point) for point in np.float32(points).tolist()}
+    assert {tuple(point) for point in np.float32(points[10:40]).tolist()} != join_levels
 
 
 def test_training_begins_with_no_more_points_than_splats_may_be(data):
@@ -138,8 +138,8 @@ def test_overlap_pruning_equals_brute_force():
     means = torch.from_numpy(np.random.default_rng(3).normal(size=(300, 3)).astype(np.float32))
     distances = torch.cdist(means.double(), means.double())
     mean_of_three = distances.sort(1).values[:, 1:4].mean(1)
-    assert torch.equal(apart(means, 0.35), mean_of_three >= 0.35)
-    assert 0 < apart(means, 0.35).sum() < 300
+    assert torch.equal(well_separated(means, 0.35), mean_of_three >= 0.35)
+    assert 0 < well_separated(means, 0.35).sum() < 300
 
 
 def test_overlap_pruning_spares_the_last_level(data):
@@ -147,9 +147,9 @@ def test_overlap_pruning_spares_the_last_level(data):
     with pytest.raises(LodgsError, match="footprint"):  # nothing is a million apart: level 1 loses all
         flod.train_step(0)
     last = make(data, overlap_interval=1, levels=1, steps=[4], densify_until=1.0)
-    before = len(last.model)
+    old_min = len(last.model)
     last.train_step(0)
-    assert len(last.model) == before
+    assert len(last.model) == old_min
 
 
 @pytest.mark.parametrize("margin", [0.0, 0.5])
@@ -201,7 +201,7 @@ def test_points_that_repeat_are_no_trouble_and_too_few_are_said(data, tiny_scene
         make(TrainingData(few))
 
 
-def finishing(data, **values) -> tuple[Method, list[Level]]:
+def is_finishing(data, **values) -> tuple[Method, list[Level]]:
     """A run just before its first finishing step, and what it has handed over."""
     values = {"finish_share": 0.5, "footprint": 40.0, "random_background": False, **values}
     flod, handed = make(data, **values), []
@@ -212,14 +212,14 @@ def finishing(data, **values) -> tuple[Method, list[Level]]:
 
 
 def test_finishing_begins_with_the_levels_as_they_were_handed_over(data):
-    flod, handed = finishing(data, levels=4, steps=[3, 5, 5, 5])
+    flod, handed = is_finishing(data, levels=4, steps=[3, 5, 5, 5])
     assert flod.steps == 27 and [level.number for level in handed] == [1, 2, 3, 4]
-    again = finish.levels_of(flod.model, flod.s_min)
+    again = finish.split_levels(flod.model, flod.s_min)
     assert [level.number for level in again] == [2, 3, 4], "the finest and the two before it"
-    for before, after in zip(handed[1:], again, strict=True):
-        assert before.facts == after.facts
+    for old_min, new_min in zip(handed[1:], again, strict=True):
+        assert old_min.facts == new_min.facts
         for name in NAMES:
-            np.testing.assert_array_equal(getattr(before.splats, name), getattr(after.splats, name))
+            np.testing.assert_array_equal(getattr(old_min.splats, name), getattr(new_min.splats, name))
 
 
 def seen_area(scales: np.ndarray) -> np.ndarray:
@@ -231,8 +231,8 @@ def seen_area(scales: np.ndarray) -> np.ndarray:
 
 def test_levels_of_fine_detail_begin_anew_as_what_shows_most_of_the_finest(data):
     """Blending weights by the reference; in views as wide as photographs are continued."""
-    flod, handed = finishing(data, footprint=1.0, drawn=0.6, margin=0.25)
-    finest, (*coarser, last) = handed[-1].splats, finish.levels_of(flod.model, flod.s_min)
+    flod, handed = is_finishing(data, footprint=1.0, drawn=0.6, margin=0.25)
+    finest, (*coarser, last) = handed[-1].splats, finish.split_levels(flod.model, flod.s_min)
     assert_same(last.splats, finest)
     wide = [camera.widened(0.25) for camera in data.train]
     shares = contributions(
@@ -259,13 +259,13 @@ def test_levels_of_fine_detail_begin_anew_as_what_shows_most_of_the_finest(data)
 
 def test_what_is_raised_to_a_levels_size_is_as_much_fainter_as_it_covers_more(data):
     """With the filter; without it splats smaller than a pixel were drawn nearly as large before."""
-    flod, handed = finishing(data, footprint=1.0, drawn=0.6)
+    flod, handed = is_finishing(data, footprint=1.0, drawn=0.6)
     levels = {level.number: from_splats(level.splats, 3, torch.device("cpu")) for level in handed}
     finest = levels[3]
     finest["log_scales"] -= torch.tensor([6.0, 5.0, 7.0])
     for antialias in (True, False):
         p = replace(flod.parameters, antialias=antialias)
-        anew = finish.begun_anew(levels, [1, 2], flod.s_min, data, p, flod.controls()["gamma"], "cpu")[2]
+        anew = finish.restart_levels(levels, [1, 2], flod.s_min, data, p, flod.controls()["gamma"], "cpu")[2]
         places = {tuple(mean): row for row, mean in enumerate(finest["means"].tolist())}
         rows = [places[tuple(mean)] for mean in anew["means"].tolist()]
         own, raised = finest["log_scales"][rows].exp().numpy(), anew["log_scales"].exp().numpy()
@@ -283,8 +283,8 @@ def test_what_is_raised_to_a_levels_size_is_as_much_fainter_as_it_covers_more(da
 
 @pytest.mark.parametrize("drawn", [0.5, 0.8])
 def test_views_by_distance_draw_at_most_a_share_of_the_finest_level(data, drawn):
-    flod, handed = finishing(data, footprint=1.0, drawn=drawn)
-    levels = finish.levels_of(flod.model, flod.s_min)
+    flod, handed = is_finishing(data, footprint=1.0, drawn=drawn)
+    levels = finish.split_levels(flod.model, flod.s_min)
     bundle, by_distance, finest = Bundle("flod", levels, "bands"), 0, 0
     for camera in data.train:
         values = resolve_controls(bundle, flod.controls())
@@ -296,7 +296,7 @@ def test_views_by_distance_draw_at_most_a_share_of_the_finest_level(data, drawn)
 
 @pytest.mark.parametrize("alone", [0.0, 1.0])
 def test_finishing_steps_draw_what_the_rule_chooses(data, alone):
-    flod, handed = finishing(data, finish_alone=alone)
+    flod, handed = is_finishing(data, finish_alone=alone)
     bundle, seen = Bundle("flod", handed, "bands"), set()
     for step in range(18, 27):
         view, values = flod.choose_view(step), flod._finishing_values(step)
@@ -317,7 +317,7 @@ def test_finishing_steps_draw_what_the_rule_chooses(data, alone):
 
 
 def test_alone_the_finest_level_is_drawn_twice_as_often_as_each_other(data):
-    flod, _ = finishing(data)
+    flod, _ = is_finishing(data)
     rng = np.random.default_rng(0)
     values = [finish.random_values(rng, 1.0, flod.model, 0.5) for _ in range(8000)]
     alone = [each["last"] for each in values if each["first"] == each["last"]]
@@ -328,19 +328,19 @@ def test_alone_the_finest_level_is_drawn_twice_as_often_as_each_other(data):
 
 
 def test_finished_levels_keep_their_sizes_and_their_number_of_splats(data):
-    flod, handed = finishing(data, finish_alone=1.0, finish_share=1.0)
+    flod, handed = is_finishing(data, finish_alone=1.0, finish_share=1.0)
     for step in range(18, 36):
         flod.train_step(step)
         final = flod.levels_after(step)
         assert bool(final) == (step == 35) and flod.level_at(step) == 3
-    for before, after in zip(handed, final, strict=True):
-        assert (before.number, len(before.splats), before.facts) == (
-            after.number,
-            len(after.splats),
-            after.facts,
+    for old_min, new_min in zip(handed, final, strict=True):
+        assert (old_min.number, len(old_min.splats), old_min.facts) == (
+            new_min.number,
+            len(new_min.splats),
+            new_min.facts,
         )
-        assert not np.array_equal(before.splats.sh, after.splats.sh)
-        assert np.exp(after.splats.log_scales).min() >= after.facts["s_min"] * (1 - 1e-6)
+        assert not np.array_equal(old_min.splats.sh, new_min.splats.sh)
+        assert np.exp(new_min.splats.log_scales).min() >= new_min.facts["s_min"] * (1 - 1e-6)
 
 
 def test_one_level_has_nothing_to_meet(data):

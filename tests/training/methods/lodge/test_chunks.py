@@ -53,7 +53,7 @@ def test_where_chunks_are_and_how_far_they_reach():
 def test_a_set_is_chosen_from_farther_away_by_the_radius():
     """Splats every unit along a line from the centre; d_l of 4 and 8, and a radius of 3."""
     line = level_of([[x, 0, 0] for x in range(20)])
-    found = chunks.members({3: line, 2: line, 1: line}, {3: 0.0, 2: 4.0, 1: 8.0}, np.zeros(3), 3.0)
+    found = chunks.chunk_rows({3: line, 2: line, 1: line}, {3: 0.0, 2: 4.0, 1: 8.0}, np.zeros(3), 3.0)
     assert [found[n].tolist() for n in (3, 2, 1)] == [[*range(7)], [*range(7, 11)], [*range(11, 20)]]
 
 
@@ -65,13 +65,13 @@ def test_what_no_view_shows_is_not_in_a_set():
     level = level_of(np.concatenate([wall, hidden, seen]), log_scale=np.log(0.12))
     ahead = Camera("", 64, 64, 60.0, 60.0, 32.0, 32.0, look_at(np.zeros(3), np.array([1.0, 0, 0]), (0, 0, 1)))
     rows = {1: np.arange(len(wall) + 4, dtype=np.int32)}
-    found = chunks.visible({1: level}, rows, [ahead], 0.005, 0.1, "cpu")[1]
+    found = chunks.prune_invisible({1: level}, rows, [ahead], 0.005, 0.1, "cpu")[1]
     count = len(wall)
     assert not {count, count + 1} & set(found) and count + 2 in found
     assert count + 3 not in found  # behind the eye
-    around = chunks.turned([ahead] * 8, np.random.default_rng(0))
+    around = chunks.turn_cameras([ahead] * 8, np.random.default_rng(0))
     assert len(around) == 32 and all(np.allclose(view.center, 0) for view in around)
-    found = chunks.visible({1: level}, rows, [ahead, *around], 0.005, 0.1, "cpu")[1]
+    found = chunks.prune_invisible({1: level}, rows, [ahead, *around], 0.005, 0.1, "cpu")[1]
     assert not {count, count + 1} & set(found) and {count + 2, count + 3} <= set(found)
 
 

@@ -12,9 +12,9 @@ from training.lod.blocks import spatial_order
 from training.lod.selection import resolve_controls, select
 from training.methods import create, method_info
 from training.methods.lodge import LodgeParameters
-from training.methods.lodge.composite import IndexedLevel, Stack, rows_seen, together
-from training.methods.lodge.thresholds import MOST_CURVES, TRIED, Thresholds
-from training.methods.threedgs.train import WEIGHED_AT
+from training.methods.lodge.composite import IndexedLevel, LevelStack, gather_rows, visible_rows
+from training.methods.lodge.thresholds import CANDIDATES, MAX_CURVES, Thresholds
+from training.methods.threedgs.train import PRUNE_AT
 from training.optimize.parameters import override
 from training.rasterize import Gaussians, contributions, rasterize
 from training.scenes.cameras import Camera
@@ -128,9 +128,9 @@ def test_training_draws_what_the_bundle_shows(data, base):
             bundle, camera.center, camera.focal, resolve_controls(bundle, {"distance_scale": scale})
         )
         assert weights is None
-        rows = rows_seen(drawn, lodge.d_l, camera, 0.01, scale)
+        rows = visible_rows(drawn, lodge.d_l, camera, 0.01, scale)
         assert sum(map(len, rows.values())) <= len(splats)
-        one = rasterize(together(drawn, rows), camera, backend="reference").image
+        one = rasterize(gather_rows(drawn, rows), camera, backend="reference").image
         other = rasterize(Gaussians.of(splats), camera, backend="reference").image
         torch.testing.assert_close(one, other)
 
@@ -151,8 +151,8 @@ def test_importance_is_the_largest_weight_of_the_reference(data, base):
     few = base.select(slice(0, 12))
     gaussians, camera = Gaussians.of(few), data.train[0]
     level = IndexedLevel.of(gaussians)
-    stack = Stack({2: level, 1: level})
-    assert stack.part == {2: slice(0, 12), 1: slice(12, 24)}
+    stack = LevelStack({2: level, 1: level})
+    assert stack.slices == {2: slice(0, 12), 1: slice(12, 24)}
     rows = {2: np.zeros(0, np.int32), 1: np.arange(12, dtype=np.int32)}
     found = stack.importance([(camera, rows)], data.near, "cpu")
     assert (found[:12] == 0).all()
@@ -172,7 +172,7 @@ def test_the_papers_preset_trains_as_its_appendix_says():
     assert isinstance(p, LodgeParameters)
     assert (p.antialias, p.densify_by, p.max_threshold, p.least_weight) == (True, "max", 0.015, 0.02)
     assert (p.steps, p.densify_interval, p.densify_from, p.densify_until) == (30_000, 300, 600, 0.5)
-    assert p.opacity_reset_interval == 3000 and round(WEIGHED_AT[0] * p.steps) == 8000
+    assert p.opacity_reset_interval == 3000 and round(PRUNE_AT[0] * p.steps) == 8000
 
 
 def test_levels_of_an_antialiased_base_are_found_and_drawn_so(data, base):
@@ -181,13 +181,13 @@ def test_levels_of_an_antialiased_base_are_found_and_drawn_so(data, base):
     given = {"distances": [1.2, 0.8, 0.0], "prune_weight": 0.0, "tune_alone": 0.0}
     lodge = make(data, small, antialias=True, **given)
     trained(lodge, until=1)
-    found, levels = lodge.importance(2), {**lodge.finished, 2: lodge._smoothed(2)}
+    found, levels = lodge.importance(2), {**lodge.finished, 2: lodge._smoothed_level(2)}
     for flag in (True, False):
         largest = torch.zeros(len(found))
         for camera in data.train:
-            rows = rows_seen(levels, lodge.d_l, camera, data.near)
+            rows = visible_rows(levels, lodge.d_l, camera, data.near)
             of_picture = contributions(
-                together(levels, rows), [camera], near=data.near, antialias=flag, backend="reference"
+                gather_rows(levels, rows), [camera], near=data.near, antialias=flag, backend="reference"
             ).largest
             own = torch.from_numpy(rows[2]).long()
             largest[own] = torch.maximum(largest[own], of_picture[len(of_picture) - len(own) :])
@@ -242,7 +242,7 @@ def test_the_cost_of_distances_by_hand():
     # smoothed by 8 px the far one reaches the corners of the picture
     wide = Thresholds([camera], 0.01, "cpu", prune_weight=0.0, std=lambda d: d / 5)
     assert wide.cost(levels, d_l, 5.0) == pytest.approx((4 + 16) / 16)
-    assert thresholds.next(levels, d_l)[1]["before"] == pytest.approx((4 + 4) / 16)
+    assert thresholds.choose(levels, d_l)[1]["before"] == pytest.approx((4 + 4) / 16)
     # and where nothing of it is left, it costs nothing
     gone = Thresholds([camera], 0.01, "cpu", prune_weight=0.9, std=lambda d: d / 5)
     assert gone.cost(levels, d_l, 5.0) == pytest.approx(4 / 16)
@@ -257,10 +257,10 @@ def test_the_distance_found_is_the_cheapest_that_was_tried(data, base):
         assert lodge.d_l[cost["level"]] == cost["distances"][int(np.argmin(cost["costs"]))]
 
 
-@pytest.mark.parametrize("count", [MOST_CURVES, MAX_LEVELS])
+@pytest.mark.parametrize("count", [MAX_CURVES, MAX_LEVELS])
 def test_the_head_of_a_bundle_has_room_for_what_was_tried(data, base, tmp_path, count):
     lodge = make(data, base, levels=count)
-    odd = [123.4] * TRIED
+    odd = [123.4] * CANDIDATES
     lodge.costs = [
         {"level": number, "distances": odd, "costs": odd, "before": 123.4} for number in range(1, count)
     ]
@@ -270,7 +270,7 @@ def test_the_head_of_a_bundle_has_room_for_what_was_tried(data, base, tmp_path, 
     tables = {"chunks": {"x": np.zeros(1, np.float32)}}
     write_bundle(tmp_path / "bundle.ply", Bundle("lodge", levels, "chunks", meta=meta, tables=tables))
     read = read_bundle(tmp_path / "bundle.ply").meta
-    assert read.get("costs", []) == (lodge.costs if count == MOST_CURVES else [])
+    assert read.get("costs", []) == (lodge.costs if count == MAX_CURVES else [])
 
 
 @pytest.mark.parametrize("stop", [11, 12, 14, 15, 21])

@@ -23,7 +23,7 @@ def make(data, **values) -> Method:
 def test_levels_join_one_by_one_each_after_a_shorter_time(data):
     octree = make(data, levels=6, steps=1000, coarse_share=0.5, coarse_factor=2.0)
     # half of the levels at once; then intervals of 8, 4, 2, 1 fifteenths of the first 500 steps
-    assert octree.schedule.joins == [0, 0, 0, 267, 400, 467]
+    assert octree.schedule.join_steps == [0, 0, 0, 267, 400, 467]
     assert [octree.level_at(step) for step in (0, 266, 267, 466, 467, 999)] == [3, 3, 4, 5, 6, 6]
 
 
@@ -51,12 +51,12 @@ def test_a_picture_half_as_large_wants_one_level_less(data):
 
 
 def test_levels_that_are_there_see_what_they_are_wanted_for(data, monkeypatch):
-    monkeypatch.setattr("training.methods.octree.schedule.SMALLEST", 4)
+    monkeypatch.setattr("training.methods.octree.schedule.MIN_SIDE", 4)
     octree = make(data, levels=4, steps=400, coarse_share=0.5, far_share=1e-9)
     schedule = octree.schedule
-    assert [schedule.joins[2:], schedule.shrink(0)] == [[95, 158], 4]  # two of four levels: two halvings
+    assert [schedule.join_steps[2:], schedule.shrink(0)] == [[95, 158], 4]  # two of four levels: two halvings
     assert [schedule.shrink(step) for step in (94, 95, 157, 158, 399)] == [4, 2, 2, 1, 1]
-    monkeypatch.setattr("training.methods.octree.schedule.SMALLEST", 20)  # of 48 pixels: one halving at most
+    monkeypatch.setattr("training.methods.octree.schedule.MIN_SIDE", 20)  # of 48 pixels: one halving at most
     assert schedule.shrink(0) == 2
     assert make(data, levels=4, steps=400, coarse_share=0.5, far_share=0.0).schedule.shrink(0) == 1
 
@@ -77,7 +77,7 @@ def test_gradients_of_smaller_pictures_count_for_as_much(data, monkeypatch):
         only = torch.zeros(len(octree.model))
         only[0] = 1
         monkeypatch.setattr(octree.schedule, "weights", lambda *_, only=only, **__: only)
-        octree.schedule.joins = [0, 39]
+        octree.schedule.join_steps = [0, 39]
         octree.model["means"].data[0] = torch.from_numpy(middle)
         octree.model["log_scales"].data[0] = float(np.log(1.5 * shrink * data.median_depth / camera.fx))
         octree.train_step(0)
@@ -89,11 +89,11 @@ def test_gradients_of_smaller_pictures_count_for_as_much(data, monkeypatch):
 def test_some_steps_see_smaller_pictures_and_some_everything(data, monkeypatch):
     octree = make(data, far_share=0.5, full_share=0.5, steps=400, coarse_share=0.0)
     assert {octree.schedule.shrink(step) for step in range(400)} == {1}  # half of 48 pixels would be too few
-    monkeypatch.setattr("training.methods.octree.schedule.SMALLEST", 12)
-    shrinks = np.array([octree.schedule.shrink(step) for step in range(400)])
-    assert set(shrinks) == {1, 2, 4}
-    assert 0.4 < (shrinks == 1).mean() < 0.6
-    assert 0.4 < (shrinks[shrinks > 1] == 2).mean() < 0.6
+    monkeypatch.setattr("training.methods.octree.schedule.MIN_SIDE", 12)
+    shrink_factors = np.array([octree.schedule.shrink(step) for step in range(400)])
+    assert set(shrink_factors) == {1, 2, 4}
+    assert 0.4 < (shrink_factors == 1).mean() < 0.6
+    assert 0.4 < (shrink_factors[shrink_factors > 1] == 2).mean() < 0.6
     drawn = [octree.schedule.weights(data.train[0], octree.model, step, full=True) for step in range(200)]
     assert 60 < sum(weights.mean() == 1 for weights in drawn) < 140
     drawn = [octree.schedule.weights(data.train[0], octree.model, step) for step in range(20)]
@@ -228,7 +228,7 @@ def test_what_is_too_faint_to_be_drawn_is_removed(data):
 def test_what_no_view_sees_much_of_goes(data, far_share, monkeypatch):
     """Blending weights by another way: drawn as features, one column a splat. Coarse splats, which finer ones
     hide from near, count for what they give from afar."""
-    monkeypatch.setattr("training.methods.octree.schedule.SMALLEST", 12)
+    monkeypatch.setattr("training.methods.octree.schedule.MIN_SIDE", 12)
     octree = make(data, far_share=far_share, least_weight=0.3)
     octree.model["opacity_logits"].data.fill_(2.0)
     model, level, largest = octree.model, octree.model.columns["level"], torch.zeros(len(octree.model))
@@ -269,7 +269,7 @@ def test_what_is_too_narrow_moves_finer_up_to_the_first_level_that_photographs_w
     octree.model["log_scales"].detach()[:4] = (pixel * widths).log()[:, None] - torch.tensor(
         [1.0, 0.001, 3.0]  # only the widest counts
     )
-    for step, newest in ((octree.schedule.joins[-1] - 1, 3), (octree.schedule.joins[-1], 4)):
+    for step, newest in ((octree.schedule.join_steps[-1] - 1, 3), (octree.schedule.join_steps[-1], 4)):
         octree.reassign_levels(step)
         fitting = [min(3, finest), min(newest, finest), 1, 4]
         assert octree.model.columns["level"][:4].tolist() == fitting
@@ -281,7 +281,7 @@ def test_what_is_too_narrow_stays_where_no_photograph_wants_a_finer_level(data):
     level[:2] = 1
     octree.model["log_scales"].data[:2] = -20.0
     means[0] = torch.from_numpy(data.train[0].center) + 3 * octree.schedule.tree.d_max
-    octree.reassign_levels(octree.schedule.joins[-1])
+    octree.reassign_levels(octree.schedule.join_steps[-1])
     assert octree.model.columns["level"][:2].tolist() == [1, 4]
 
 
@@ -316,7 +316,7 @@ def test_levels_add_up_to_all_splats_with_their_bias(data):
         octree.train_step(step)
         if levels := octree.levels_after(step):
             handed_over[step + 1] = levels
-    assert list(handed_over) == [octree.schedule.joins[-1], 8]
+    assert list(handed_over) == [octree.schedule.join_steps[-1], 8]
     levels = handed_over[8]
     assert [level.number for level in levels] == [1, 2, 3, 4]
     assert sum(len(level.splats) for level in levels) == len(octree.model)

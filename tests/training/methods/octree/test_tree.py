@@ -17,7 +17,7 @@ def camera(z: float, focal: float = 100.0) -> Camera:
 
 def test_distances_are_of_what_a_view_sees_and_in_one_focal_length():
     points = np.array([[0, 0, 4.0], [0, 3.0, 4.0], [0, 0, -1.0], [30.0, 0, 4.0]])
-    near, long = octree.view_distances(points, [camera(0.0), camera(0.0, focal=200.0)], 100.0)
+    near, long = octree.visible_distances(points, [camera(0.0), camera(0.0, focal=200.0)], 100.0)
     assert near.tolist() == [4.0, 5.0]  # behind, and outside the image, count for nothing
     assert long.tolist() == [2.0]  # twice the focal length, half as far; the second point is outside
 

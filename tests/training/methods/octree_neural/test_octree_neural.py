@@ -68,7 +68,7 @@ def test_decoding_is_the_papers(data, changes):
     logit = network(method.networks.opacity) + own[:, 0]
     opacity = 1 / (1 + np.exp(-logit)) if direct else np.tanh(logit)
     shown = np.flatnonzero(opacity > (1 / 255 if direct else 0))
-    assert len(shown) == 2 and g.which.tolist() == shown.tolist()
+    assert len(shown) == 2 and g.offset_index.tolist() == shown.tolist()
     looks = (network(method.networks.covariance).reshape(4, 7) + own[:, 1:8])[shown]
     colors = (network(method.networks.color, inputs).reshape(4, 3) + own[:, 8:])[shown]
     extents = np.exp(model["log_scales"])
@@ -89,7 +89,7 @@ def test_anchors_beside_the_image_whose_gaussians_reach_into_it_are_drawn(data):
     beside = 0
     for camera in data.train:
         camera = replace(camera, fx=8 * camera.fx, fy=8 * camera.fy)  # a narrow view
-        visible = method.visible(camera, torch.ones(len(method.model)))
+        visible = method.visible_anchors(camera, torch.ones(len(method.model)))
         with torch.no_grad():
             all_of_it = method.rasterize_decoded(method.decode(camera, everything), camera).image
             drawn = method.rasterize_decoded(method.decode(camera, visible), camera).image
@@ -104,12 +104,12 @@ def test_anchors_beside_the_image_whose_gaussians_reach_into_it_are_drawn(data):
 def test_a_gaussian_that_no_view_sees_much_of_is_never_drawn_again(data):
     """Against the largest blending weights of another rasterizer, the reference."""
     method = make(data, least_weight=0.1)
-    method.schedule.joins = [0] * len(method.schedule.joins)
+    method.schedule.join_steps = [0] * len(method.schedule.join_steps)
     largest = torch.zeros_like(method.model.stats["seen"])
     for view, camera in enumerate(data.train):
-        g = method.decode(camera, method.drawn_by(camera), view)
+        g = method.decode(camera, method.drawn_anchors(camera), view)
         found = contributions(g.gaussians(), [camera], near=data.near, backend="reference").largest
-        largest[g.anchor, g.which] = torch.maximum(largest[g.anchor, g.which], found)
+        largest[g.anchor, g.offset_index] = torch.maximum(largest[g.anchor, g.offset_index], found)
     stay = (largest >= 0.1).any(1)
     assert 0 < stay.sum() < len(stay)
     method.prune_unseen(39)
@@ -139,7 +139,7 @@ def draw(splats, camera, data):
 
 def ever_drawn(method: Method) -> torch.Tensor:
     """Anchors (indices) that a training view draws; others are not baked."""
-    return torch.cat([method.drawn_by(camera) for camera in method.data.train]).unique()
+    return torch.cat([method.drawn_anchors(camera) for camera in method.data.train]).unique()
 
 
 def blind(method: Method, *names: str) -> None:
@@ -168,7 +168,7 @@ def test_opacity_and_covariance_are_those_of_the_median_view(data):
     baked = method.bake()
     means, anchors = method.model["means"].detach(), []
     for anchor in range(len(method.model)):
-        seen = [camera for camera in data.train if anchor in method.drawn_by(camera)]
+        seen = [camera for camera in data.train if anchor in method.drawn_anchors(camera)]
         if not seen:
             continue
         far = [float((means[anchor] - torch.as_tensor(c.center).float()).norm()) for c in seen]

@@ -1,4 +1,4 @@
-"""The tree as it is built: moments of the leaves, nothing that is fog or a hole, no order that breaks it."""
+"""Tests of building trees: moments of the leaves, opacity without holes, termination for extreme input."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from scipy.special import expit, logit
 
 from training.errors import LodgsError
 from training.lod.tree.shape import splat_area
-from training.methods.tree.build import OPAQUE, SPREAD, build, optical_depth
+from training.methods.tree.build import MAX_OPACITY, MAX_SPREAD, build, optical_depth
 from training.rasterize import Gaussians, rasterize
 from training.scenes.cameras import Camera
 from training.splats.gaussians import Splats
@@ -33,33 +33,33 @@ def covariances(splats):
     return np.einsum("nij,nj,nkj->nik", turns, scales**2, turns)
 
 
-def below(tree, node):
-    """The leaves below a node, one by one."""
+def leaves_below(tree, node):
+    """Yield the leaves below a node."""
     if node < tree.leaves:
         return [node]
-    return [leaf for child in tree.children[node - tree.leaves] for leaf in below(tree, child)]
+    return [leaf for child in tree.children[node - tree.leaves] for leaf in leaves_below(tree, child)]
 
 
 @pytest.mark.parametrize("count", [2, 3, 17, 600])
-def test_every_node_has_the_moments_of_its_leaves(count):
+def test_nodes_have_moments_of_their_leaves(count):
     nodes, tree = build(scene(count))
     assert len(nodes) == len(tree) == 2 * count - 1 and tree.leaves == count
-    assert sorted(below(tree, len(tree) - 1)) == list(range(count))
+    assert sorted(leaves_below(tree, len(tree) - 1)) == list(range(count))
     means, spreads = nodes.means.astype(float), covariances(nodes)
     weights = optical_depth(expit(nodes.opacity_logits.astype(float))) * splat_area(nodes.log_scales)
     for node in range(count, len(tree), 1 + count // 40):
-        leaves = below(tree, node)
-        shares = weights[leaves] / weights[leaves].sum()
-        mean = shares @ means[leaves]
+        leaves = leaves_below(tree, node)
+        rate_factors = weights[leaves] / weights[leaves].sum()
+        mean = rate_factors @ means[leaves]
         np.testing.assert_allclose(means[node], mean, atol=1e-4)
         apart = means[leaves] - mean
-        expected = np.einsum("n,nij->ij", shares, spreads[leaves] + apart[:, :, None] * apart[:, None])
+        expected = np.einsum("n,nij->ij", rate_factors, spreads[leaves] + apart[:, :, None] * apart[:, None])
         ratio = np.trace(spreads[node]) / np.trace(expected)
-        assert 0.999 < ratio < SPREAD * 1.001
+        assert 0.999 < ratio < MAX_SPREAD * 1.001
         np.testing.assert_allclose(spreads[node] / ratio, expected, atol=1e-3 * np.trace(expected))
-        color = np.einsum("n,nkc->kc", shares, nodes.sh[leaves])
+        color = np.einsum("n,nkc->kc", rate_factors, nodes.sh[leaves])
         np.testing.assert_allclose(nodes.sh[node], color, atol=1e-4)
-        if expit(nodes.opacity_logits[node]) < OPAQUE * 0.999:  # what is hidden stays as much
+        if expit(nodes.opacity_logits[node]) < MAX_OPACITY * 0.999:  # what is hidden stays as much
             assert weights[node] == pytest.approx(weights[leaves].sum(), rel=1e-3) and ratio < 1.001
 
 
@@ -68,16 +68,16 @@ def test_opacities_stay_below_one():
     stacked.means[:] *= np.float32(0.01)
     nodes, tree = build(stacked)
     opacities = expit(nodes.opacity_logits.astype(float))
-    assert opacities.max() <= OPAQUE * 1.00001 and opacities[tree.leaves :].min() > 0.9
+    assert opacities.max() <= MAX_OPACITY * 1.00001 and opacities[tree.leaves :].min() > 0.9
 
 
 @pytest.mark.parametrize("opacity", [0.02, 0.5, 0.9, 0.99])
-def test_optical_depth_is_what_a_splat_hides(opacity):
+def test_optical_depth_is_integral_of_absorption(opacity):
     hidden, _ = quad(lambda r: -np.log(1 - opacity * np.exp(-r * r / 2)) * r, 0, 12)
     assert optical_depth(np.array([opacity]))[0] == pytest.approx(hidden, rel=1e-5)
 
 
-def test_two_splats_in_one_place_hide_what_they_hid():
+def test_merged_coincident_splats_keep_optical_depth():
     two = scene(2, opacity=0.3)
     for column in (two.means, two.quats, two.log_scales):
         column[1] = column[0]
@@ -87,8 +87,8 @@ def test_two_splats_in_one_place_hide_what_they_hid():
     np.testing.assert_allclose(covariances(nodes)[2], covariances(nodes)[0], rtol=1e-4)
 
 
-def test_a_wall_is_a_wall_at_every_size_without_holes():
-    """Discs on a grid, seen from before: whatever the cut, the picture is as opaque, and has its colour."""
+def test_wall_has_no_holes_at_any_cut():
+    """Discs on a grid keep opacity and colour in the image for every cut."""
     side = 64
     grid = np.stack(np.meshgrid(*[np.linspace(-1, 1, side)] * 2), axis=-1).reshape(-1, 2)
     step = 2 / (side - 1)
@@ -116,8 +116,8 @@ def test_a_wall_is_a_wall_at_every_size_without_holes():
         )
 
 
-def test_repetitions_and_chains_end_soon():
-    """Equal splats, and a row in which each is nearer to the next one than to the one before."""
+def test_equal_splats_and_chains_give_flat_trees():
+    """Test equal splats, and a row with shrinking gaps, in which each splat prefers the next one."""
     equal = scene(1000)
     for column in (equal.means, equal.quats, equal.log_scales, equal.sh):
         column[:] = column[0]
@@ -131,7 +131,7 @@ def test_repetitions_and_chains_end_soon():
         assert all(np.isfinite(getattr(nodes, name)).all() for name in ("means", "quats", "log_scales", "sh"))
 
 
-def test_odd_splats_make_a_tree():
+def test_extreme_splats_build_a_tree():
     odd = scene(40)
     odd.log_scales[0], odd.log_scales[1], odd.log_scales[2, 0] = -80, 25, -80
     odd.opacity_logits[3], odd.opacity_logits[4] = -100, 100
@@ -141,12 +141,12 @@ def test_odd_splats_make_a_tree():
         assert np.isfinite(getattr(nodes, name)[40:]).all()
 
 
-def test_one_splat_is_a_sentence():
-    with pytest.raises(LodgsError, match="One splat makes no tree"):
+def test_single_splat_raises():
+    with pytest.raises(LodgsError, match="Cannot build a tree"):
         build(scene(1))
 
 
-def test_a_tree_is_the_same_on_any_number_of_threads():
+def test_tree_is_independent_of_thread_count():
     from training.rasterize.cpu import compile
 
     before, found = compile.thread_count(), []

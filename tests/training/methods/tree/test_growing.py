@@ -1,4 +1,4 @@
-"""A tree that is built cell by cell: proper, with all leaves, and hardly another one than in one piece."""
+"""Tests of trees built cell by cell, against trees built in one piece."""
 
 from itertools import pairwise
 
@@ -7,86 +7,86 @@ import pytest
 
 from training.lod.selection import resolve_controls, select_levels
 from training.lod.tree.forest import build_levels, merge_forest
-from training.methods.tree.build import GrowingForest, _cells
+from training.methods.tree.build import ForestBuilder, _cell_bounds
 from training.splats.bundle import read_bundle, write_bundle
 from training.splats.file_rows import open_ply
 from training.splats.levels import Bundle
 from training.splats.ply import write_ply
 
-from .test_build import below, covariances, scene
+from .test_build import covariances, leaves_below, scene
 
 
-def test_cells_are_boxes_of_space_with_few_enough():
-    """Every cell is all places with one beginning of their bits, and its half before it had too many."""
+def test_cells_are_boxes_within_limit():
+    """Every cell is the set of positions with a common bit prefix, and its parent exceeds the limit."""
     rng = np.random.default_rng(0)
-    places = np.sort(
+    indices = np.sort(
         np.concatenate([rng.integers(0, 1 << 63, 3000), np.full(90, 12345), rng.integers(0, 4000, 500)])
     ).astype(np.uint64)
-    borders = _cells(places, 40)
-    assert borders[0] == 0 and borders[-1] == len(places) and (np.diff(borders) > 0).all()
+    borders = _cell_bounds(indices, 40)
+    assert borders[0] == 0 and borders[-1] == len(indices) and (np.diff(borders) > 0).all()
     assert np.diff(borders).max() <= 40
     for begin, end in pairwise(borders):
-        shared = 63 - int(places[begin] ^ places[end - 1]).bit_length()
-        prefix = places >> np.uint64(63 - shared) if shared else places * 0
+        shared = 63 - int(indices[begin] ^ indices[end - 1]).bit_length()
+        prefix = indices >> np.uint64(63 - shared) if shared else indices * 0
         inside = prefix == prefix[begin]
-        assert inside.sum() == end - begin or (places[inside] == 12345).sum() > 40
-    assert _cells(places, len(places)) == [0, len(places)]
-    assert len(_cells(np.zeros(100, np.uint64), 30)) == 5
+        assert inside.sum() == end - begin or (indices[inside] == 12345).sum() > 40
+    assert _cell_bounds(indices, len(indices)) == [0, len(indices)]
+    assert len(_cell_bounds(np.zeros(100, np.uint64), 30)) == 5
 
 
 @pytest.mark.parametrize("cell", [1, 2, 50, 5000])
-def test_every_node_stands_for_its_leaves(cell):
+def test_nodes_represent_their_leaves(cell):
     leaves = scene(600)
-    forest = GrowingForest(leaves, longest=8, cell=cell)
+    forest = ForestBuilder(leaves, subtree_leaves=8, cell=cell)
     nodes, tree = merge_forest(forest)
     assert len(nodes) == len(tree) == 1199 and tree.leaves == 600
-    assert sorted(below(tree, len(tree) - 1)) == list(range(600))
+    assert sorted(leaves_below(tree, len(tree) - 1)) == list(range(600))
     order = np.lexsort(nodes.means[:600].T)
     expected = leaves.select(np.lexsort(leaves.means.T))
     for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):  # leaves are untouched
         np.testing.assert_array_equal(getattr(nodes, name)[:600][order], getattr(expected, name))
-    one, _ = merge_forest(GrowingForest(leaves))
+    one, _ = merge_forest(ForestBuilder(leaves))
     np.testing.assert_allclose(nodes.means[-1], one.means[-1], atol=1e-4)  # the root's, of all leaves
     np.testing.assert_allclose(covariances(nodes)[-1], covariances(one)[-1], rtol=1e-3)
     np.testing.assert_allclose(nodes.sh[-1], one.sh[-1], atol=1e-4)
     assert nodes.opacity_logits[-1] == pytest.approx(one.opacity_logits[-1], abs=1e-3)
 
 
-def test_leaves_in_a_file_make_the_same_tree(tmp_path, monkeypatch):
+def test_leaves_on_disk_give_the_same_tree(tmp_path, monkeypatch):
     from training.methods.tree import build
 
-    monkeypatch.setattr(build, "_ROWS", 700)
+    monkeypatch.setattr(build, "_BATCH_ROWS", 700)
     leaves = scene(5000)
     write_ply(tmp_path / "a.ply", leaves)
     (tmp_path / "scratch").mkdir()
-    of_file = GrowingForest(open_ply(tmp_path / "a.ply"), tmp_path / "scratch", cell=300)
-    for (one, tree), (other, same) in zip(GrowingForest(leaves, cell=300), of_file, strict=True):
+    of_file = ForestBuilder(open_ply(tmp_path / "a.ply"), tmp_path / "scratch", cell=300)
+    for (one, tree), (other, same) in zip(ForestBuilder(leaves, cell=300), of_file, strict=True):
         np.testing.assert_array_equal(tree.children, same.children)
         np.testing.assert_array_equal(one.sh, other.sh)
         np.testing.assert_array_equal(one.quats, other.quats)
     assert not list((tmp_path / "scratch").iterdir())
 
 
-def test_cells_leave_no_seam():
-    """Nearly all nodes are those of a tree in one piece; the others are as large as cells."""
+def test_cells_have_no_seams():
+    """Nearly all nodes equal those of a tree in one piece; the others are as large as cells."""
     leaves = scene(30_000)
 
-    def found(cell):
-        nodes, tree = merge_forest(GrowingForest(leaves, cell=cell))
+    def nodes_of(cell):
+        nodes, tree = merge_forest(ForestBuilder(leaves, cell=cell))
         rows = np.concatenate([nodes.means, nodes.log_scales], axis=1)[tree.leaves :]
         return {
             row.tobytes(): int(count)
             for row, count in zip(rows, tree.leaves_below[tree.leaves :], strict=True)
         }
 
-    whole, pieces = found(1 << 20), found(2000)
+    whole, pieces = nodes_of(1 << 20), nodes_of(2000)
     others = [count for row, count in pieces.items() if row not in whole]
     assert 0 < len(others) < 0.02 * len(whole) and np.median(others) > 100
 
 
-def test_levels_of_what_grows_are_all_nodes(tmp_path):
+def test_levels_contain_all_nodes(tmp_path):
     leaves = scene(3000)
-    levels, table = build_levels(GrowingForest(leaves, cell=500), tmp_path)
+    levels, table = build_levels(ForestBuilder(leaves, cell=500), tmp_path)
     assert [len(level.rows) for level in levels] == [2999, 3000] and table["level"].tolist() == [1] * 6 + [
         2
     ] * 6
@@ -94,14 +94,14 @@ def test_levels_of_what_grows_are_all_nodes(tmp_path):
     assert (sizes["parent_size"] > sizes["node_size"]).all() and (sizes["node_size"] > 0).all()
 
 
-@pytest.mark.parametrize(("cell", "longest"), [(1, 1), (7, 3), (60, 200)])
-def test_cuts_of_what_grew_in_cells_are_proper(tmp_path, cell, longest):
-    """One node on each path from a leaf to the root, for any eye: sizes fit where cells and pieces meet."""
+@pytest.mark.parametrize(("cell", "subtree_leaves"), [(1, 1), (7, 3), (60, 200)])
+def test_cuts_of_cells_are_proper(tmp_path, cell, subtree_leaves):
+    """Every path from a leaf to the root has one node of the cut, for any camera."""
     leaves = scene(500)
-    levels, _ = build_levels(GrowingForest(leaves, longest=longest, cell=cell), tmp_path)
+    levels, _ = build_levels(ForestBuilder(leaves, subtree_leaves=subtree_leaves, cell=cell), tmp_path)
     write_bundle(tmp_path / "a.ply", Bundle("tree", levels, "cut"))
     bundle, drawn = read_bundle(tmp_path / "a.ply"), []
-    nodes, tree = merge_forest(GrowingForest(leaves, longest=longest, cell=cell))
+    nodes, tree = merge_forest(ForestBuilder(leaves, subtree_leaves=subtree_leaves, cell=cell))
 
     def keys(splats):
         return [row.tobytes() for row in np.concatenate([splats.means, splats.quats, splats.log_scales], 1)]
@@ -116,8 +116,8 @@ def test_cuts_of_what_grew_in_cells_are_proper(tmp_path, cell, longest):
             above = np.zeros(len(tree), int)  # how many of a node and those above it are drawn
             above[-1] = seen[-1]
             for layer in tree.layers:
-                below = tree.children[layer - tree.leaves]
-                above[below] = above[layer][:, None] + seen[below]
+                leaves_below = tree.children[layer - tree.leaves]
+                above[leaves_below] = above[layer][:, None] + seen[leaves_below]
             assert (above[: tree.leaves] == 1).all()
             drawn.append(seen.sum())
     assert min(drawn) < 20 and max(drawn) == 500

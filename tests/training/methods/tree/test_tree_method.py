@@ -1,4 +1,4 @@
-"""A LoD of Gaussians as a method: leaves, tree, cuts that train what they show, runs that go on."""
+"""Tests of A LoD of Gaussians as a method: leaves, tree, training of cuts, resuming."""
 
 import io
 from dataclasses import replace
@@ -13,7 +13,7 @@ from training.lod.selection import BundleSelector, resolve_controls
 from training.lod.tree.forest import merge_forest
 from training.lod.tree.shape import splat_size
 from training.methods import create, method_info
-from training.methods.tree.store import layout_of
+from training.methods.tree.store import record_layout
 from training.optimize.out_of_core.cut_cache import SLOT_BYTES
 from training.optimize.parameters import override
 from training.rasterize import Gaussians, rasterize
@@ -37,14 +37,14 @@ def trained(tree, begin=0, until=None):
     return levels
 
 
-def shown(tree, camera, pixels):
-    """The rows of a view's cut, made anew."""
+def cut_rows(tree, camera, pixels):
+    """Return the rows of a view's cut."""
     tree.store.cache.evict_all()
-    return tree.store.cache.rows_at(tree.store.take(camera, pixels, tree.data.near))
+    return tree.store.cache.rows_at(tree.store.load_cut(camera, pixels, tree.data.near))
 
 
-def above_leaves(tree):
-    """Which rows are of nodes above leaves."""
+def inner_rows(tree):
+    """Return which rows are inner nodes."""
     forest = tree.store.shape
     place = np.concatenate([np.arange(2 * count - 1) - count for count in forest.counts.tolist()])
     return np.append(place, np.zeros(len(forest.counts) - 1)) >= 0
@@ -70,7 +70,7 @@ def base(data) -> Splats:
     return trained(plain)[-1].splats
 
 
-def test_leaves_come_first_and_all_nodes_last(data):
+def test_run_returns_leaves_then_all_nodes(data):
     tree = make(data)
     assert tree.steps == tree.parameters.total_steps == 12 + 1 + 8 and tree.levels == 2
     first, above, leaves = trained(tree)
@@ -85,7 +85,7 @@ def test_leaves_come_first_and_all_nodes_last(data):
     assert weights.all()
 
 
-def test_until_the_tree_is_built_it_is_3dgs_of_as_many_steps_in_all(data):
+def test_first_steps_are_3dgs(data):
     values = {"steps": 12 + 1 + 8, "densify_until": 0.4, "prune_interval": 6, "margin": 0.0}
     plain = create("3dgs", data, override(method_info("3dgs").preset("draft"), values), 0, "cpu")
     tree = make(data)
@@ -95,7 +95,7 @@ def test_until_the_tree_is_built_it_is_3dgs_of_as_many_steps_in_all(data):
     torch.testing.assert_close(tree.model["means"], plain.model["means"])
 
 
-def test_rates_go_on_falling_from_leaves_to_cuts_and_those_of_a_base_have_fallen(data, base):
+def test_learning_rates_continue_and_start_low_with_base(data, base):
     tree, based = make(data), make(data, base)
     p = tree.parameters
     for step in (0, 11, 13, 20):
@@ -106,13 +106,13 @@ def test_rates_go_on_falling_from_leaves_to_cuts_and_those_of_a_base_have_fallen
     assert based.model.adam.lr["means"] == pytest.approx(p.lr_means_final * data.extent)
 
 
-def test_photographs_are_continued_while_there_are_leaves_alone(data):
-    """However many steps come after them."""
+def test_margins_are_added_before_the_tree_is_built(data):
+    """The number of later steps has no influence."""
     tree = make(data, tune_steps=40, densify_until=0.9)
     assert [step for step in range(tree.steps) if tree.adds_margins(step)] == [11]
 
 
-def test_without_tuning_the_leaves_are_the_base_to_the_bit(data, base):
+def test_without_tuning_leaves_equal_the_base(data, base):
     tree = make(data, base, tune_steps=0)
     assert tree.steps == tree.parameters.base_steps == 1
     above, leaves = trained(tree)
@@ -121,26 +121,26 @@ def test_without_tuning_the_leaves_are_the_base_to_the_bit(data, base):
     assert same(one, other) and above.number == 1
 
 
-def test_leaves_of_rate_0_stay_to_the_bit_while_nodes_learn(data, base):
+def test_leaf_rate_zero_freezes_leaves(data, base):
     tree = make(data, base, leaf_rate=0.0, pixels=16.0)
     trained(tree, until=1)
-    built, above = records(tree), above_leaves(tree)
+    built, above = records(tree), inner_rows(tree)
     trained(tree, begin=1)
     values = slice(11 + 3 * 16)
     assert torch.equal(records(tree)[~above, values], built[~above, values])
     assert (records(tree)[above, values] != built[above, values]).any()
 
 
-def test_leaves_come_to_rest(data, base):
-    """Their rate falls to 0.03 of what it was, the nodes' does not."""
+def test_leaf_rate_decreases(data, base):
+    """The rate of leaves falls to 0.03 of its initial value; the rate of nodes is constant."""
     tree = make(data, base, leaf_rate=0.2, node_rate=3.0, tune_steps=400)
     trained(tree, until=1)
     camera = data.train[0]
-    places = tree.store.take(camera, 16.0, data.near)
-    above = above_leaves(tree)[tree.store.cache.rows_at(places)]
+    indices = tree.store.load_cut(camera, 16.0, data.near)
+    above = inner_rows(tree)[tree.store.cache.rows_at(indices)]
     assert above.any() and not above.all()
     for step, share in ((1, 0.2), (201, 0.2 * 0.03**0.5), (401, 0.2 * 0.03)):
-        found = tree._shares(places, step).numpy()
+        found = tree._rate_factors(indices, step).numpy()
         np.testing.assert_allclose(found, np.where(above, 3, share), rtol=0.01)
 
 
@@ -159,7 +159,7 @@ def test_sizes_are_saturated_after_training(data, base):
     )  # fmt: skip
 
 
-def test_a_step_moves_the_cut_of_its_view_alone(data, base):
+def test_step_updates_only_the_cut_of_its_view(data, base):
     middle = base.means.mean(axis=0)
     far = replace(base, means=middle + (base.means - middle) / 30, log_scales=base.log_scales - np.float32(3))
     tree = make(data, far, lod_noise=0.0)
@@ -168,21 +168,21 @@ def test_a_step_moves_the_cut_of_its_view_alone(data, base):
     tree.store.cache.evict_all()
     tree.train_step(4)
     moved = (records(tree) != before).any(dim=1)
-    rows = shown(tree, tree.choose_view(4).camera, tree.parameters.pixels)
+    rows = cut_rows(tree, tree.choose_view(4).camera, tree.parameters.pixels)
     cut = torch.zeros_like(moved)
     cut[rows] = True
     assert moved.sum() > 0 and not (moved & ~cut).any()
-    assert moved[above_leaves(tree)].any()  # which are trained, too
+    assert moved[inner_rows(tree)].any()  # which are trained, too
 
 
-def test_training_draws_what_the_bundle_shows(data, base):
+def test_training_cut_equals_bundle_cut(data, base):
     tree = make(data, base, tune_steps=0)
     bundle = Bundle("tree", trained(tree), "cut")
     choice = BundleSelector(bundle)
     for pixels in (0.5, 3.0, 11.0):
         for camera in data.train[:3]:
-            rows = shown(tree, camera, pixels)
-            gaussians = tree.store.gaussians_at(tree.store.take(camera, pixels, data.near))
+            rows = cut_rows(tree, camera, pixels)
+            gaussians = tree.store.gaussians_at(tree.store.load_cut(camera, pixels, data.near))
             one = tree.rasterize_model(camera, 0, gaussians=gaussians).image
             weights = choice.weights(
                 camera.center, camera.focal, resolve_controls(bundle, {"pixels": pixels})
@@ -203,7 +203,7 @@ def test_training_draws_what_the_bundle_shows(data, base):
             assert off.sum() <= 2 and (one.detach() - reference).abs().max() < 1 / 255
 
 
-def test_a_bundle_tells_which_blocks_an_eye_needs(data, base):
+def test_bundle_has_block_table(data, base):
     tree = make(data, base, tune_steps=0)
     assert tree.tables() == {}
     levels = trained(tree)
@@ -213,13 +213,13 @@ def test_a_bundle_tells_which_blocks_an_eye_needs(data, base):
         assert table["parent_size"][row] == level.splats.extras["parent_size"].max()
 
 
-def test_pictures_begin_with_the_granularity_that_was_trained(data, base):
+def test_rendering_uses_trained_granularity(data, base):
     tree = make(data, base, tune_steps=0, pixels=3.0)
     bundle = Bundle("tree", trained(tree), "cut", controls=tree.controls())
     assert resolve_controls(bundle, {})["pixels"] == 3
 
 
-def test_noise_is_coarser_most_at_its_end(data, base):
+def test_lod_noise_follows_fourth_power(data, base):
     tree = make(data, base, pixels=2.0, lod_noise=5.0)
     found = np.array([tree._pixels(step) for step in range(4000)])
     assert found.min() >= 2 and found.max() <= 12
@@ -227,8 +227,8 @@ def test_noise_is_coarser_most_at_its_end(data, base):
     assert (found < 4).mean() == pytest.approx(0.669, abs=0.02)
 
 
-def test_a_view_of_nothing_makes_its_step(data, base):
-    """All splats behind one camera, which every step may meet."""
+def test_view_of_nothing_completes_its_step(data, base):
+    """All splats are behind one camera."""
     camera = data.train[0]
     behind = replace(base, means=(base.means - camera.center + 0).astype(np.float32))
     behind.means = (camera.center - 50 * camera.world_to_camera[2, :3] + 0.01 * behind.means).astype(
@@ -237,14 +237,14 @@ def test_a_view_of_nothing_makes_its_step(data, base):
     tree = make(data, behind)
     trained(tree, until=1)
     view = replace(tree.choose_view(1), camera=camera)
-    assert len(shown(tree, camera, 1.0)) == 0
+    assert len(cut_rows(tree, camera, 1.0)) == 0
     tree.choose_view = lambda step: view
     assert np.isfinite(tree.train_step(1)[0])
 
 
 @pytest.mark.parametrize("stop", [11, 12, 13, 16])
-def test_a_run_goes_on_to_the_bit(data, stop):
-    """Stopped among the leaves' steps, at their end, before the tree's first step, between two resizings."""
+def test_resume_is_bit_identical(data, stop):
+    """Stops in the 3DGS steps, at their end, before the first step of the tree, and between size updates."""
     values = {"resize_interval": 3, "lr_scales": 0.1}
     whole, first = make(data, **values), make(data, **values)
     levels = trained(whole)
@@ -259,8 +259,8 @@ def test_a_run_goes_on_to_the_bit(data, stop):
     assert all(same(one.splats, other.splats) for one, other in zip(levels, after, strict=True))
 
 
-def test_a_tree_grows_where_photographs_ask_for_it(data, base):
-    """As far as there is room; and it goes on to the bit from before and after."""
+def test_density_control_grows_the_tree(data, base):
+    """It grows up to its limit, and resuming before and after growth is bit-identical."""
     values = {
         "tune_steps": 24,
         "grow_interval": 6,
@@ -290,21 +290,21 @@ def test_a_tree_grows_where_photographs_ask_for_it(data, base):
         assert torch.equal(records(again), records(tree))
 
 
-def test_that_views_are_coarsened_for_the_budget_is_said_once(data, monkeypatch):
+def test_coarsening_for_budget_warns_once(data, monkeypatch):
     leaves = surfaces(3_000, degree=0)
     leaves.means = (0.03 * leaves.means + data.scene.points.mean(axis=0)).astype(np.float32)
     leaves.log_scales = (leaves.log_scales + np.log(0.03)).astype(np.float32)
-    record = SLOT_BYTES + 4 * layout_of(0).width
+    record = SLOT_BYTES + 4 * record_layout(0).width
     for room, many in ((600, 1), (10_000, 0)):
         monkeypatch.setattr(data, "splat_memory", room * record + 4 * (2 * len(leaves) - 1))
         tree, told = make(data, leaves, sh_degree=0, pixels=0.1, lod_noise=0.0), []
         tree.warn = told.append
         trained(tree)
-        assert len(told) == many and all("coarser" in each and "MB as splat_memory" in each for each in told)
-        assert (tree.store.coarsened > 1) == bool(many)
+        assert len(told) == many and all("coarser" in each and "splat_memory" in each for each in told)
+        assert (tree.store.max_coarsening > 1) == bool(many)
 
 
-def test_leaves_that_hardly_show_go_while_leaves_are_trained(data, monkeypatch):
+def test_unimportant_leaves_are_pruned_in_first_steps(data, monkeypatch):
     tree, gone = make(data, steps=30, tune_steps=60, least_weight=0.1), []
     monkeypatch.setattr(tree, "prune_unimportant", gone.append)
     for step in range(tree.finest_steps):
