@@ -33,7 +33,7 @@ def bundle_of(clod, levels) -> Bundle:
     return Bundle("clod", levels, "decay", clod.facts())
 
 
-def test_until_the_decay_begins_it_is_3dgs(data):
+def test_steps_before_decay_equal_3dgs(data):
     values = {"steps": 24, "densify_until": 0.4, "prune_interval": 6, "margin": 0.0}
     plain = create("3dgs", data, override(method_info("3dgs").preset("draft"), values), 0, "cpu")
     clod = make(data, margin=0.0)
@@ -46,7 +46,7 @@ def test_until_the_decay_begins_it_is_3dgs(data):
     assert len(clod.model) < before and len(clod.sigma.detach().unique()) > before / 4
 
 
-def test_training_draws_by_the_rule(data):
+def test_training_weights_equal_rule(data):
     """Attenuations and masks of a step are what the rule says of the splats that it hands over."""
     clod = make(data, keep_share=1.0)
     [level] = trained(clod)
@@ -64,7 +64,7 @@ def test_training_draws_by_the_rule(data):
     assert level.splats.extras["sigma_d"].shape == (len(level.splats),)
 
 
-def test_the_counts_gradient_goes_straight_through(data):
+def test_count_uses_straight_through_gradient(data):
     clod = make(data)
     trained(clod, 13)
     camera, p = data.train[0], clod.parameters
@@ -89,7 +89,7 @@ def test_the_counts_gradient_goes_straight_through(data):
     assert few.item() == near.item() == 0
 
 
-def test_decays_begin_by_importance(data):
+def test_initial_decays_follow_importance(data):
     clod = make(data, tau=0.004)
     trained(clod, 12)
     before, p = clod.model["opacity_logits"].detach().sigmoid(), clod.parameters
@@ -126,7 +126,7 @@ def test_decays_begin_by_importance(data):
     torch.testing.assert_close(edge[close], (p.tau * vanishes[close]).double(), rtol=2e-2, atol=0)
 
 
-def test_the_reference_is_a_quantile_of_what_views_see_or_each_views_farthest(data):
+def test_reference_distance(data):
     points = data.scene.points
     seen = [
         np.linalg.norm(points[camera.sees(points, near=data.near)] - camera.center, axis=1)
@@ -139,7 +139,7 @@ def test_the_reference_is_a_quantile_of_what_views_see_or_each_views_farthest(da
     assert published.normalized_distances(data.train[0]).max() == pytest.approx(1)
 
 
-def test_any_prefix_is_a_coarser_scene_and_counts_fall_with_the_scale(data):
+def test_prefixes_are_coarser_and_counts_fall_with_scale(data):
     clod = make(data)
     [level] = trained(clod)
     bundle, camera = bundle_of(clod, [level]), data.train[0]
@@ -159,7 +159,7 @@ def test_any_prefix_is_a_coarser_scene_and_counts_fall_with_the_scale(data):
     assert (np.diff(mean) <= 1e-4).all()
 
 
-def test_what_no_view_draws_goes(data):
+def test_undrawn_splats_are_removed(data):
     clod = make(data, keep_share=1.0)
     trained(clod, 13)
     some = torch.arange(5)
@@ -170,7 +170,7 @@ def test_what_no_view_draws_goes(data):
 
 
 @pytest.mark.parametrize("preset", ["draft", "paper"])
-def test_a_base_begins_at_once_and_without_new_splats(data, preset):
+def test_base_starts_decay_without_new_splats(data, preset):
     first = make(data, steps=12, begin=1.0)
     [level] = trained(first)
     clod = make(data, base=level.splats, preset=preset, steps=4, prune_interval=0, opacity_reset_interval=0)
@@ -180,7 +180,7 @@ def test_a_base_begins_at_once_and_without_new_splats(data, preset):
     assert len(clod.model) == len(level.splats) if preset == "paper" else len(clod.model) < len(level.splats)
 
 
-def test_a_resumed_run_goes_on_with_the_same_decay(data):
+def test_resume_keeps_decay(data):
     clod = make(data)
     trained(clod, 15)
     again = make(data)
@@ -188,7 +188,7 @@ def test_a_resumed_run_goes_on_with_the_same_decay(data):
     assert clod.train_step(15)[0] == again.train_step(15)[0]
 
 
-def test_impossible_values_are_sentences():
+def test_invalid_values_raise():
     draft = method_info("clod").preset("draft")
     for name, value in (("s_v_most", 0.5), ("exponent", 0), ("keep_share", 0), ("tau", 0), ("begin", 1.5)):
         with pytest.raises(LodgsError, match=name):

@@ -39,7 +39,7 @@ def test_footprint_is_in_pixels_at_the_median_depth(data):
     assert flod.s_min == pytest.approx([flod.s_min[0], flod.s_min[0] / 4, 0])
 
 
-def test_an_absolute_constraint_is_taken_as_it_is(data):
+def test_absolute_minimum_size_is_used(data):
     assert make(data, s_min_1=0.125).s_min == pytest.approx([0.125, 0.03125, 0])
 
 
@@ -47,7 +47,7 @@ def test_an_absolute_constraint_is_taken_as_it_is(data):
     "values",
     [{}, {"footprint": 40.0}, {"s_min_1": 0.125}, {"levels": 7, "rho": 3.0}, {"footprint": 4.0, "levels": 4}],
 )
-def test_the_finest_level_reaches_as_far_as_the_papers_whatever_the_footprint(data, values):
+def test_finest_level_reach_is_independent_of_footprint(data, values):
     """The paper's: 40 pixels at the median depth, a quarter from level to level, gamma 1 (Eq. 3, 8)."""
     flod = make(data, **({"levels": 5, "steps": 6, "footprint": 16.0} | values))
     (gamma,) = flod.controls().values()
@@ -55,21 +55,21 @@ def test_the_finest_level_reaches_as_far_as_the_papers_whatever_the_footprint(da
     assert reach == pytest.approx(40 / 4**3, rel=1e-5)
 
 
-def test_a_draft_is_chosen_at_two_fifths_of_a_pixel_and_the_paper_at_one(data):
+def test_gamma_of_presets(data):
     for preset, gamma in (("draft", 0.4), ("standard", 0.4), ("paper", 1.0)):
         flod = Method(data, METHOD.preset(preset), seed=0, backend="cpu")
         assert flod.controls() == {"gamma": pytest.approx(gamma, rel=1e-5)}
 
 
 @pytest.mark.parametrize("s_min_1, expected", [(1e-9, 0.01), (1e9, 1)])
-def test_gamma_stays_possible_and_within_a_pixel(data, s_min_1, expected):
+def test_gamma_is_clamped(data, s_min_1, expected):
     assert make(data, s_min_1=s_min_1).controls() == {"gamma": expected}
     assert all_controls()["gamma"].validate(expected) == expected
     assert make(data, levels=1, steps=[4]).controls() == {}
 
 
 @pytest.mark.slow
-def test_no_splat_is_ever_smaller_than_its_level_allows_and_levels_come_in_order(data):
+def test_splats_respect_minimum_size_of_ordered_levels(data):
     flod, finished = make(data, footprint=40.0), []  # larger than the points' distances: it binds
     for step in range(flod.steps):
         assert flod.level_at(step) == step // 6 + 1
@@ -81,10 +81,10 @@ def test_no_splat_is_ever_smaller_than_its_level_allows_and_levels_come_in_order
     assert np.exp(finished[0].splats.log_scales).min() < finished[0].facts["s_min"] * 1.2
 
 
-def test_the_picture_does_not_jump_when_the_level_rises(data):
+def test_image_is_continuous_between_levels(data):
     flod = make(data, rejoin_points=False)
 
-    def picture(level):
+    def render_level(level):
         with torch.no_grad():
             return rasterize(
                 flod.model.gaussians, data.train[0], min_scale=flod.s_min[level - 1], near=data.near
@@ -92,14 +92,14 @@ def test_the_picture_does_not_jump_when_the_level_rises(data):
 
     for step in range(6):
         flod.train_step(step)
-    old_min = picture(1)
+    old_min = render_level(1)
     assert len(flod.levels_after(5)) == 1
-    torch.testing.assert_close(picture(2), old_min, atol=2e-5, rtol=0)
+    torch.testing.assert_close(render_level(2), old_min, atol=2e-5, rtol=0)
     # and it is the new constraint that is in force: the old one would draw larger splats
-    assert (picture(1) - old_min).abs().max() > 0.01
+    assert (render_level(1) - old_min).abs().max() > 0.01
 
 
-def test_points_that_have_room_at_the_next_level_join_again(data):
+def test_points_rejoin_at_next_level(data):
     flod = make(data, min_opacity=0.0, densify_interval=100)
     points = torch.from_numpy(np.unique(data.scene.points, axis=0))
     flod.model.keep(torch.arange(len(points)) % 2 == 0)  # as if pruned
@@ -111,7 +111,7 @@ def test_points_that_have_room_at_the_next_level_join_again(data):
     assert torch.equal(flod.model["means"].detach(), torch.cat([stayed, expected]))
 
 
-def test_of_more_points_than_there_is_room_for_some_join(data):
+def test_rejoining_points_are_sampled_to_budget(data):
     """As many as there is room for, from all over, the same ones in every run of a seed."""
     models = []
     for _ in range(2):
@@ -127,7 +127,7 @@ def test_of_more_points_than_there_is_room_for_some_join(data):
     assert {tuple(point) for point in np.float32(points[10:40]).tolist()} != join_levels
 
 
-def test_training_begins_with_no_more_points_than_splats_may_be(data):
+def test_initial_points_are_limited_to_max_splats(data):
     flod = make(data, max_splats=20)
     assert len(flod.model) == len(flod.points) == 20
     everything = {tuple(point) for point in data.scene.points.tolist()}
@@ -142,7 +142,7 @@ def test_overlap_pruning_equals_brute_force():
     assert 0 < well_separated(means, 0.35).sum() < 300
 
 
-def test_overlap_pruning_spares_the_last_level(data):
+def test_overlap_pruning_skips_last_level(data):
     flod = make(data, overlap_interval=1, s_min_1=1e6, steps=[1, 1, 4], densify_until=1.0)
     with pytest.raises(LodgsError, match="footprint"):  # nothing is a million apart: level 1 loses all
         flod.train_step(0)
@@ -153,7 +153,7 @@ def test_overlap_pruning_spares_the_last_level(data):
 
 
 @pytest.mark.parametrize("margin", [0.0, 0.5])
-def test_every_level_keeps_to_its_share_of_the_budget(data, margin):
+def test_levels_respect_their_budgets(data, margin):
     flod = make(
         data, margin=margin, s_min_1=1e-3, steps=[12, 12, 12], densify_interval=2, densify_until=1.0,
         grad_threshold=0.0, max_splats=200, budget_ratio=0.5, min_opacity=0.0, rejoin_points=False,
@@ -169,7 +169,7 @@ def test_every_level_keeps_to_its_share_of_the_budget(data, margin):
     assert counts[0] <= 65 and 90 <= counts[1] <= 100 and 180 <= counts[2] <= 200
 
 
-def test_gradients_are_averaged_over_the_views_that_saw_a_splat(data):
+def test_gradients_are_averaged_over_visible_views(data):
     flod = make(data, densify_interval=100, prune_interval=100)
     for step in range(3):
         flod.train_step(step)
@@ -179,7 +179,7 @@ def test_gradients_are_averaged_over_the_views_that_saw_a_splat(data):
     assert torch.equal(flod.model.mean_gradient(), gradient_sum / seen.clamp_min(1))
 
 
-def test_a_preset_of_the_paper_is_the_papers():
+def test_paper_preset_matches_paper():
     paper = METHOD.preset("paper")
     assert paper.steps == (10_000, 15_000, 20_000, 25_000, 30_000)
     until = [share * steps for share, steps in zip(paper.densify_until, paper.steps, strict=True)]
@@ -188,7 +188,7 @@ def test_a_preset_of_the_paper_is_the_papers():
     assert (paper.rho, paper.levels, paper.overlap_interval, paper.finish_steps) == (4, 5, 1000, 0)
 
 
-def test_points_that_repeat_are_no_trouble_and_too_few_are_said(data, tiny_scene, tmp_path):
+def test_duplicate_points_train_and_too_few_raise(data, tiny_scene, tmp_path):
     from dataclasses import replace
 
     scene = read_scene(tiny_scene)
@@ -211,7 +211,7 @@ def is_finishing(data, **values) -> tuple[Method, list[Level]]:
     return flod, handed
 
 
-def test_finishing_begins_with_the_levels_as_they_were_handed_over(data):
+def test_finishing_starts_from_completed_levels(data):
     flod, handed = is_finishing(data, levels=4, steps=[3, 5, 5, 5])
     assert flod.steps == 27 and [level.number for level in handed] == [1, 2, 3, 4]
     again = finish.split_levels(flod.model, flod.s_min)
@@ -222,14 +222,14 @@ def test_finishing_begins_with_the_levels_as_they_were_handed_over(data):
             np.testing.assert_array_equal(getattr(old_min.splats, name), getattr(new_min.splats, name))
 
 
-def seen_area(scales: np.ndarray) -> np.ndarray:
+def projected_area(scales: np.ndarray) -> np.ndarray:
     """Root mean square area (N,) of ellipsoids (N, 3) on planes of all directions, by projecting them."""
     bases, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(1000, 3, 2)))
     squares = [np.linalg.det(np.einsum("mki,k,mkj->mij", bases, one**2, bases)).mean() for one in scales]
     return np.sqrt(squares)
 
 
-def test_levels_of_fine_detail_begin_anew_as_what_shows_most_of_the_finest(data):
+def test_fine_levels_restart_from_important_splats(data):
     """Blending weights by the reference; in views as wide as photographs are continued."""
     flod, handed = is_finishing(data, footprint=1.0, drawn=0.6, margin=0.25)
     finest, (*coarser, last) = handed[-1].splats, finish.split_levels(flod.model, flod.s_min)
@@ -257,7 +257,7 @@ def test_levels_of_fine_detail_begin_anew_as_what_shows_most_of_the_finest(data)
     assert one == pytest.approx(0.8 * two, abs=1)
 
 
-def test_what_is_raised_to_a_levels_size_is_as_much_fainter_as_it_covers_more(data):
+def test_enlarged_splats_become_fainter(data):
     """With the filter; without it splats smaller than a pixel were drawn nearly as large before."""
     flod, handed = is_finishing(data, footprint=1.0, drawn=0.6)
     levels = {level.number: from_splats(level.splats, 3, torch.device("cpu")) for level in handed}
@@ -273,7 +273,7 @@ def test_what_is_raised_to_a_levels_size_is_as_much_fainter_as_it_covers_more(da
         if not antialias:
             np.testing.assert_array_equal(ratio, 1)
             continue
-        expected = seen_area(own) / seen_area(raised)
+        expected = projected_area(own) / projected_area(raised)
         assert np.median(expected) < 0.1
         # but for what a block takes over of the room of those that went, at most four times the area
         taken, block = ratio / expected, np.argsort(spatial_order(finest["means"].numpy()))[rows] // SIZE
@@ -282,7 +282,7 @@ def test_what_is_raised_to_a_levels_size_is_as_much_fainter_as_it_covers_more(da
 
 
 @pytest.mark.parametrize("drawn", [0.5, 0.8])
-def test_views_by_distance_draw_at_most_a_share_of_the_finest_level(data, drawn):
+def test_views_by_distance_respect_drawn_limit(data, drawn):
     flod, handed = is_finishing(data, footprint=1.0, drawn=drawn)
     levels = finish.split_levels(flod.model, flod.s_min)
     bundle, by_distance, finest = Bundle("flod", levels, "bands"), 0, 0
@@ -295,7 +295,7 @@ def test_views_by_distance_draw_at_most_a_share_of_the_finest_level(data, drawn)
 
 
 @pytest.mark.parametrize("alone", [0.0, 1.0])
-def test_finishing_steps_draw_what_the_rule_chooses(data, alone):
+def test_finishing_steps_render_rule_selection(data, alone):
     flod, handed = is_finishing(data, finish_alone=alone)
     bundle, seen = Bundle("flod", handed, "bands"), set()
     for step in range(18, 27):
@@ -316,7 +316,7 @@ def test_finishing_steps_draw_what_the_rule_chooses(data, alone):
     assert len(seen) == 9 and nearest == ({1, 2, 3} if alone else {3})
 
 
-def test_alone_the_finest_level_is_drawn_twice_as_often_as_each_other(data):
+def test_finest_level_is_rendered_alone_twice_as_often(data):
     flod, _ = is_finishing(data)
     rng = np.random.default_rng(0)
     values = [finish.random_values(rng, 1.0, flod.model, 0.5) for _ in range(8000)]
@@ -327,7 +327,7 @@ def test_alone_the_finest_level_is_drawn_twice_as_often_as_each_other(data):
     assert [alone.count(n) / len(alone) for n in (1, 2, 3)] == pytest.approx([0.25, 0.25, 0.5], abs=0.03)
 
 
-def test_finished_levels_keep_their_sizes_and_their_number_of_splats(data):
+def test_finishing_keeps_minimum_sizes_and_counts(data):
     flod, handed = is_finishing(data, finish_alone=1.0, finish_share=1.0)
     for step in range(18, 36):
         flod.train_step(step)
@@ -343,13 +343,13 @@ def test_finished_levels_keep_their_sizes_and_their_number_of_splats(data):
         assert np.exp(new_min.splats.log_scales).min() >= new_min.facts["s_min"] * (1 - 1e-6)
 
 
-def test_one_level_has_nothing_to_meet(data):
+def test_single_level_has_no_finishing(data):
     flod = make(data, levels=1, steps=[4], finish_share=1.0)
     assert flod.steps == 4
 
 
 @pytest.mark.parametrize("stop", [8, 18, 21])
-def test_what_is_resumed_ends_where_an_unbroken_run_ends(data, stop, check_resumed):
+def test_resume_is_bit_identical(data, stop, check_resumed):
     """Before the last level, when it is finished, and amid the finishing steps."""
     check_resumed(lambda: make(data, finish_share=0.5, footprint=1.0), stop)
 
@@ -370,7 +370,7 @@ def assert_same(one, other):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
 
 
-def test_coarse_levels_alone_are_those_of_all_to_the_bit(data):
+def test_coarse_levels_alone_equal_full_run(data):
     """The same constraint, budgets and schedules, though the finest level is trained elsewhere."""
     values = {"levels": 4, "steps": [4, 5, 6, 7], "sh_interval": 3, "finish_share": 0.2, "max_splats": 90}
     whole, coarse = make(data, **values), make(data, **values, last_level=2)
@@ -385,7 +385,7 @@ def test_coarse_levels_alone_are_those_of_all_to_the_bit(data):
     assert not levels and coarse.controls() == whole.controls()
 
 
-def test_fine_levels_go_on_from_a_coarse_one_with_the_units_of_all(data):
+def test_fine_levels_continue_from_coarse_level(data):
     values = {
         "levels": 4,
         "steps": [4, 5, 6, 7],
@@ -410,7 +410,7 @@ def test_fine_levels_go_on_from_a_coarse_one_with_the_units_of_all(data):
 
 
 @pytest.mark.parametrize("first, last", [(3, 2), (1, 5), (5, 0)])
-def test_levels_that_there_are_not_are_refused(first, last):
+def test_invalid_level_range_raises(first, last):
     with pytest.raises(LodgsError, match="Cannot train levels"):
         override(METHOD.preset("draft"), {"levels": 4, "first_level": first, "last_level": last})
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from training.lod.blocks import spatial_order
-from training.lod.rules.chunks import in_chunk as members_of
+from training.lod.rules.chunks import in_chunk as in_chunk
 from training.methods import create, method_info
 from training.methods.lodge import chunks
 from training.methods.lodge.composite import IndexedLevel
@@ -16,7 +16,7 @@ from training.splats.gaussians import Splats
 NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh")
 
 
-def level_of(means, log_scale=-3.0) -> IndexedLevel:
+def create_level(means, log_scale=-3.0) -> IndexedLevel:
     count = len(means)
     return IndexedLevel.of(
         Gaussians.of(
@@ -29,7 +29,7 @@ def level_of(means, log_scale=-3.0) -> IndexedLevel:
     )  # fmt: skip
 
 
-def test_how_many_chunks():
+def test_chunk_count():
     """The farthest camera is 6 from the mean, so 4 / d_1 * 6 (Eq. 5), but no more than there are."""
     centers = np.array([[x, 0, 0] for x in np.linspace(-6, 6, 31)])
     assert chunks.chunk_count(centers, 2.0) == 12
@@ -38,7 +38,7 @@ def test_how_many_chunks():
     assert chunks.chunk_count(np.tile(centers, (20, 1)), 0.01) == 96
 
 
-def test_where_chunks_are_and_how_far_they_reach():
+def test_chunk_centres_and_radii():
     """Two clusters and one camera apart: centres are their means, radii as far as the next centre."""
     places = np.array([[0, 0, 0], [2, 0, 0], [10, 0, 0], [12, 0, 0], [40, 0, 0]], float)
     centres, radii = chunks.place_chunks(places, 3, 0)
@@ -50,19 +50,19 @@ def test_where_chunks_are_and_how_far_they_reach():
     np.testing.assert_allclose(reach, [27.2])  # to the farthest camera
 
 
-def test_a_set_is_chosen_from_farther_away_by_the_radius():
+def test_chunk_radius_increases_distances():
     """Splats every unit along a line from the centre; d_l of 4 and 8, and a radius of 3."""
-    line = level_of([[x, 0, 0] for x in range(20)])
+    line = create_level([[x, 0, 0] for x in range(20)])
     found = chunks.chunk_rows({3: line, 2: line, 1: line}, {3: 0.0, 2: 4.0, 1: 8.0}, np.zeros(3), 3.0)
     assert [found[n].tolist() for n in (3, 2, 1)] == [[*range(7)], [*range(7, 11)], [*range(11, 20)]]
 
 
-def test_what_no_view_shows_is_not_in_a_set():
+def test_hidden_splats_are_not_in_a_set():
     """A wall of opaque splats before others; a camera turned anywhere sees no more of what is behind it."""
     y, z = (each.reshape(-1) for each in np.meshgrid(np.linspace(-3, 3, 61), np.linspace(-3, 3, 61)))
     wall = np.stack([0 * y + 2, y, z], axis=1)
     hidden, seen = [[2.5, 0, 0], [2.4, 0.3, 0.1]], [[1.5, 0, 0], [-2, 0, 0]]
-    level = level_of(np.concatenate([wall, hidden, seen]), log_scale=np.log(0.12))
+    level = create_level(np.concatenate([wall, hidden, seen]), log_scale=np.log(0.12))
     ahead = Camera("", 64, 64, 60.0, 60.0, 32.0, 32.0, look_at(np.zeros(3), np.array([1.0, 0, 0]), (0, 0, 1)))
     rows = {1: np.arange(len(wall) + 4, dtype=np.int32)}
     found = chunks.prune_invisible({1: level}, rows, [ahead], 0.005, 0.1, "cpu")[1]
@@ -76,11 +76,11 @@ def test_what_no_view_shows_is_not_in_a_set():
 
 
 def make(data, **values):
-    given = {
+    distances = {
         "steps": 8, "densify_until": 0.4, "prune_interval": 6, "tune_steps": 2, "margin": 0.0, "chunks": 3,
         "distances": [1.6, 0.8, 0.0], **values,
     }  # fmt: skip
-    return create("lodge", data, override(method_info("lodge").preset("draft"), given), 0, "cpu")
+    return create("lodge", data, override(method_info("lodge").preset("draft"), distances), 0, "cpu")
 
 
 def trained(lodge, begin=0, until=None):
@@ -92,7 +92,7 @@ def trained(lodge, begin=0, until=None):
     return levels
 
 
-def test_the_last_steps_make_chunks_and_all_levels_come_again(data):
+def test_last_steps_compute_chunks_and_return_all_levels(data):
     lodge = make(data)
     assert lodge.steps == 8 + 2 * 3 * 2  # until it is known where the chunks are
     levels = trained(lodge)
@@ -105,11 +105,11 @@ def test_the_last_steps_make_chunks_and_all_levels_come_again(data):
         assert all(np.array_equal(getattr(before.splats, n), getattr(after.splats, n)) for n in NAMES)
     finest = levels[0].splats.means
     np.testing.assert_array_equal(spatial_order(finest), np.arange(len(finest)))
-    shown = [members_of(level.splats.extras, 1) for level in levels[3:]]
+    shown = [in_chunk(level.splats.extras, 1) for level in levels[3:]]
     assert 0 < sum(each.sum() for each in shown) < sum(map(len, shown))
 
 
-def test_sets_without_visibility_are_those_of_distances(data):
+def test_sets_without_visibility_follow_distances(data):
     lodge = make(data, visible_weight=0.0)
     levels = trained(lodge)[3:]
     table = lodge.tables()["chunks"]
@@ -118,15 +118,15 @@ def test_sets_without_visibility_are_those_of_distances(data):
     for level in levels:
         near, far = (end * data.median_depth + (radius if end else 0) for end in ends[level.number])
         away = np.linalg.norm(level.splats.means - centre, axis=1)
-        np.testing.assert_array_equal(members_of(level.splats.extras, 2), (away >= near) & (away < far))
+        np.testing.assert_array_equal(in_chunk(level.splats.extras, 2), (away >= near) & (away < far))
 
 
-def test_small_scenes_have_no_chunks_unless_they_are_asked_for(data):
+def test_small_scenes_have_no_chunks_by_default(data):
     lodge = make(data, chunks=0)
     assert [level.number for level in trained(lodge)] == [3, 2, 1] and lodge.tables() == {}
     assert trained(make(data, chunks=1))[-1].splats.extras == {}
 
 
 @pytest.mark.parametrize("stop", [19, 20, 21, 22])
-def test_a_run_goes_on_to_the_bit_within_its_chunks(data, stop, check_resumed):
+def test_resume_in_chunks_is_bit_identical(data, stop, check_resumed):
     check_resumed(lambda: make(data), stop)

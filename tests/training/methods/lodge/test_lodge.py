@@ -56,7 +56,7 @@ def base(data) -> Splats:
     return trained(plain)[-1].splats
 
 
-def test_levels_come_finest_first_and_each_keeps_its_distance(data):
+def test_levels_are_trained_finest_first(data):
     lodge = make(data, levels=3)
     assert lodge.steps == lodge.parameters.total_steps == 12 + 2 * 3 * 3
     levels = trained(lodge)
@@ -69,7 +69,7 @@ def test_levels_come_finest_first_and_each_keeps_its_distance(data):
         assert 0 < len(level.splats) <= len(levels[0].splats)
 
 
-def test_a_base_is_the_finest_level_to_the_bit(data, base):
+def test_base_is_the_finest_level(data, base):
     lodge = make(data, base)
     finest, *_ = levels = trained(lodge)
     ordered = base.select(spatial_order(base.means))
@@ -77,7 +77,7 @@ def test_a_base_is_the_finest_level_to_the_bit(data, base):
     assert [level.number for level in levels] == [3, 2, 1] and lodge.steps == 18
 
 
-def test_until_the_coarser_levels_begin_it_is_3dgs(data):
+def test_first_steps_are_3dgs(data):
     values = {"steps": 12, "densify_until": 0.4, "prune_interval": 6, "margin": 0.0}
     plain = create("3dgs", data, override(method_info("3dgs").preset("draft"), values), 0, "cpu")
     lodge = make(data, tune_steps=1)  # levels of three steps, whose ends would come within these
@@ -88,12 +88,12 @@ def test_until_the_coarser_levels_begin_it_is_3dgs(data):
     torch.testing.assert_close(lodge.model["means"], plain.model["means"])
 
 
-def test_one_level_of_a_base_is_refused(data, base):
+def test_single_level_of_a_base_raises(data, base):
     with pytest.raises(LodgsError, match="nothing to train"):
         make(data, base, levels=1)
 
 
-def test_one_level_is_the_base_alone(data, base):
+def test_single_level_without_base_is_3dgs(data, base):
     lodge = make(data, levels=1)
     [level] = trained(lodge)
     assert (level.number, level.facts) == (1, {"d_l": 0.0})
@@ -101,23 +101,23 @@ def test_one_level_is_the_base_alone(data, base):
         make(data, levels=2, distances=[1.0, 2.0])
 
 
-def test_distances_that_are_given_are_taken(data, base):
+def test_fixed_distances_are_used(data, base):
     lodge = make(data, base, distances=[3.0, 0.5, 0.0])
     d_l = {level.number: level.facts["d_l"] for level in trained(lodge)}
     assert d_l == pytest.approx({3: 0.0, 2: 0.5 * data.median_depth, 1: 3.0 * data.median_depth})
     assert lodge.costs == []
 
 
-@pytest.mark.parametrize("given", [[0.7, 0.0, 0.0], [0.7, 0.0, 0.0, 0.0], [0.7, 0.0, 0.6, 0.0]])
-def test_what_training_finds_is_nearer_than_what_is_given_for_a_coarser_level(data, base, given):
-    lodge = make(data, base, levels=len(given), distances=given)
+@pytest.mark.parametrize("distances", [[0.7, 0.0, 0.0], [0.7, 0.0, 0.0, 0.0], [0.7, 0.0, 0.6, 0.0]])
+def test_chosen_distances_stay_below_fixed_ones(data, base, distances):
+    lodge = make(data, base, levels=len(distances), distances=distances)
     trained(lodge)
-    found = [lodge.d_l[number] / data.median_depth for number in range(1, len(given) + 1)]
+    found = [lodge.d_l[number] / data.median_depth for number in range(1, len(distances) + 1)]
     assert found[0] == pytest.approx(0.7) and found[-1] == 0
     assert all(coarser > finer for coarser, finer in pairwise(found))
 
 
-def test_training_draws_what_the_bundle_shows(data, base):
+def test_training_selection_equals_bundle_selection(data, base):
     """The composite of a step against the selection of the bundle that was written, picture by picture."""
     lodge = make(data, base, distances=[1.3, 0.8, 0.0])
     levels = sorted(trained(lodge), key=lambda level: level.number)
@@ -135,7 +135,7 @@ def test_training_draws_what_the_bundle_shows(data, base):
         torch.testing.assert_close(one, other)
 
 
-def test_tuning_moves_its_level_alone(data, base):
+def test_tuning_updates_only_its_level(data, base):
     lodge = make(data, base)
     trained(lodge, until=10)  # in the coarsest level
     before = {n: [t.clone() for t in vars(level.gaussians).values()] for n, level in lodge.finished.items()}
@@ -146,7 +146,7 @@ def test_tuning_moves_its_level_alone(data, base):
         assert all(map(torch.equal, tensors, vars(lodge.finished[number].gaussians).values()))
 
 
-def test_importance_is_the_largest_weight_of_the_reference(data, base):
+def test_importance_equals_reference(data, base):
     """Blending weights by the derivative of a picture of ones with respect to each splat's own colour."""
     few = base.select(slice(0, 12))
     gaussians, camera = Gaussians.of(few), data.train[0]
@@ -167,7 +167,7 @@ def test_importance_is_the_largest_weight_of_the_reference(data, base):
         assert found[row - 7] == pytest.approx(float(picture.max()), abs=2e-5)
 
 
-def test_the_papers_preset_trains_as_its_appendix_says():
+def test_paper_preset_matches_paper():
     p = method_info("lodge").preset("paper")
     assert isinstance(p, LodgeParameters)
     assert (p.antialias, p.densify_by, p.max_threshold, p.least_weight) == (True, "max", 0.015, 0.02)
@@ -175,11 +175,11 @@ def test_the_papers_preset_trains_as_its_appendix_says():
     assert p.opacity_reset_interval == 3000 and round(PRUNE_AT[0] * p.steps) == 8000
 
 
-def test_levels_of_an_antialiased_base_are_found_and_drawn_so(data, base):
+def test_antialiased_base_gives_antialiased_levels(data, base):
     """Its importance and its pictures are of Mip-Splatting's filter, of splats smaller than a pixel."""
     small = replace(base, log_scales=base.log_scales - np.float32(2))
-    given = {"distances": [1.2, 0.8, 0.0], "prune_weight": 0.0, "tune_alone": 0.0}
-    lodge = make(data, small, antialias=True, **given)
+    distances = {"distances": [1.2, 0.8, 0.0], "prune_weight": 0.0, "tune_alone": 0.0}
+    lodge = make(data, small, antialias=True, **distances)
     trained(lodge, until=1)
     found, levels = lodge.importance(2), {**lodge.finished, 2: lodge._smoothed_level(2)}
     for flag in (True, False):
@@ -195,7 +195,7 @@ def test_levels_of_an_antialiased_base_are_found_and_drawn_so(data, base):
     assert lodge.meta()["antialias"] is True
 
 
-def test_what_hardly_shows_goes_and_what_shows_stays(data, base):
+def test_pruning_removes_unimportant_splats(data, base):
     all_of_it = make(data, base, prune_weight=0.0, drawn=1.0, distances=[1.2, 0.8, 0.0])
     some = make(data, base, prune_weight=0.3, drawn=1.0, distances=[1.2, 0.8, 0.0])
     for lodge in (all_of_it, some):
@@ -208,7 +208,7 @@ def test_what_hardly_shows_goes_and_what_shows_stays(data, base):
 
 
 @pytest.mark.parametrize("drawn", [0.5, 0.8])
-def test_views_by_distance_draw_at_most_a_share_of_the_finest_level(data, base, drawn):
+def test_views_by_distance_respect_drawn_limit(data, base, drawn):
     lodge = make(data, base, prune_weight=0.0, drawn=drawn, distances=[1.2, 0.6, 0.0])
     bundle = Bundle("lodge", sorted(trained(lodge), key=lambda level: level.number), "chunks")
     by_distance = finest = 0
@@ -219,13 +219,13 @@ def test_views_by_distance_draw_at_most_a_share_of_the_finest_level(data, base, 
     assert 0.8 * drawn < by_distance / finest <= drawn * 1.001
 
 
-def test_levels_keep_their_share_at_most(data, base):
+def test_levels_respect_keep_share(data, base):
     levels = trained(make(data, base, prune_weight=0.0, drawn=1.0, keep=0.4, distances=[1.2, 0.8, 0.0]))
     shares = {level.number: len(level.splats) / len(base) for level in levels}
     assert shares[2] == pytest.approx(0.4, abs=0.06) and shares[1] == pytest.approx(0.16, abs=0.06)
 
 
-def test_the_cost_of_distances_by_hand():
+def test_cost_of_distances():
     """Two splats before a camera: with a distance between them the farther one is drawn smoothed."""
     pose = np.eye(4)
     camera = Camera("v", 64, 64, 64.0, 64.0, 32.0, 32.0, pose)
@@ -248,7 +248,7 @@ def test_the_cost_of_distances_by_hand():
     assert gone.cost(levels, d_l, 5.0) == pytest.approx(4 / 16)
 
 
-def test_the_distance_found_is_the_cheapest_that_was_tried(data, base):
+def test_chosen_distance_has_least_cost(data, base):
     lodge = make(data, base)
     trained(lodge)
     assert [cost["level"] for cost in lodge.costs] == [2, 1]
@@ -258,7 +258,7 @@ def test_the_distance_found_is_the_cheapest_that_was_tried(data, base):
 
 
 @pytest.mark.parametrize("count", [MAX_CURVES, MAX_LEVELS])
-def test_the_head_of_a_bundle_has_room_for_what_was_tried(data, base, tmp_path, count):
+def test_costs_fit_in_bundle_header(data, base, tmp_path, count):
     lodge = make(data, base, levels=count)
     odd = [123.4] * CANDIDATES
     lodge.costs = [
@@ -274,6 +274,6 @@ def test_the_head_of_a_bundle_has_room_for_what_was_tried(data, base, tmp_path, 
 
 
 @pytest.mark.parametrize("stop", [11, 12, 14, 15, 21])
-def test_a_run_goes_on_to_the_bit(data, stop, check_resumed):
+def test_resume_is_bit_identical(data, stop, check_resumed):
     """Stopped in the finest level, at its end, within a round, at a round's and at a level's end."""
     check_resumed(lambda: make(data), stop)
