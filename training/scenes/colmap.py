@@ -25,19 +25,15 @@ from .colmap_model import (
     read_poses,
 )
 from .image_files import ImageFiles, SidecarFiles, find_image_folder
-from .images import image_size, quarter_turns
 from .orientation import up_rotation
+from .view_selection import OUTLIER_FACTOR, ViewCollector, exclusion_messages, find_outliers, quote_name
 
-OUTLIER_FACTOR = 1000
-"""Points and cameras farther from the camera centre than this multiple of the median distance are dropped."""
 MASKS, DEPTHS = "masks", "depths"
 """Folders next to the image folder, or in the scene folder if the photos are there."""
 DEPTH_SUFFIXES = ".exr", ".png", ".npy"
 """File name suffixes of depth maps."""
 MAX_DEPTH_CAMERAS = 500
 """Maximum number of cameras used to compute the median depth."""
-MAX_NAMED = 5
-"""Maximum number of views named by warnings of one kind; the remaining ones are counted."""
 MAX_FOLDERS = 20_000
 """Maximum number of folders searched for models."""
 
@@ -227,7 +223,7 @@ def read_scene(
             f"Cannot read scene: image folder {images} does not exist.", "Choose the folder of the photos."
         )
     base = folder if images == folder else images.parent
-    views = _ViewCollector(
+    views = ViewCollector(
         ImageFiles(images, folder),
         SidecarFiles(base / MASKS, ".png"),
         SidecarFiles(base / DEPTHS, *DEPTH_SUFFIXES),
@@ -239,22 +235,12 @@ def read_scene(
     if not views.cameras:
         raise LodgsError(
             f"Cannot read scene: none of the {len(poses)} views of {model} has a usable photo in {images}."
-            + "".join(f" {_quote(name)}: {reason}" for name, reason in views.excluded[:1]),
+            + "".join(f" {quote_name(name)}: {reason}" for name, reason in views.excluded[:1]),
             "Choose the folder that holds the images under the names used by the model.",
         )
 
-    points, colors, ids = read_points(model)
-    if not len(points):
-        warnings.append(f"The scene has no points: {model} has no points3D{model_suffix(model)} with points.")
-    valid = (np.abs(points) <= MAX_COORDINATE).all(axis=1)
-    outliers, inlier_cameras = _find_outliers(points[valid], views.cameras)
-    valid[valid] = ~outliers
-    if not valid.all():
-        warnings.append(
-            f"Skipped {np.sum(~valid):,} points of {model}: their position is not finite, or more than "
-            f"{OUTLIER_FACTOR:,} times the median distance from the cameras."
-        )
-    views.drop_outliers(inlier_cameras)
+    points, colors, ids, inliers = _read_inlier_points(model, views.cameras, warnings)
+    views.drop_outliers(inliers)
     if progress:
         progress(1.0)
     return Scene(
@@ -262,13 +248,31 @@ def read_scene(
         model=model,
         images_folder=images,
         cameras=views.cameras,
-        points=points[valid],
-        point_colors=colors[valid],
-        point_ids=ids[valid],
+        points=points,
+        point_colors=colors,
+        point_ids=ids,
         names=list(dict.fromkeys(pose.name.replace("\\", "/") for pose in poses)),
         distorted=views.distorted,
         warnings=[*warnings, *views.warnings(images)],
     )
+
+
+def _read_inlier_points(
+    model: Path, cameras: Sequence[Camera], warnings: list[str]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return positions, colours and ids of the points without outliers, and a mask (V,) of inlier cameras."""
+    points, colors, ids = read_points(model)
+    if not len(points):
+        warnings.append(f"The scene has no points: {model} has no points3D{model_suffix(model)} with points.")
+    valid = (np.abs(points) <= MAX_COORDINATE).all(axis=1)
+    outliers, inlier_cameras = find_outliers(points[valid], cameras)
+    valid[valid] = ~outliers
+    if not valid.all():
+        warnings.append(
+            f"Skipped {np.sum(~valid):,} points of {model}: their position is not finite, or more than "
+            f"{OUTLIER_FACTOR:,} times the median distance from the cameras."
+        )
+    return points[valid], colors[valid], ids[valid], inlier_cameras
 
 
 def _read_registered(model: Path) -> tuple[dict[int, Intrinsics], list[Pose]]:
@@ -294,7 +298,7 @@ def _read_registered(model: Path) -> tuple[dict[int, Intrinsics], list[Pose]]:
         if pose.camera_id not in intrinsics:
             raise LodgsError(
                 f"Cannot read COLMAP model: {model / f'cameras{suffix}'} lacks camera {pose.camera_id} "
-                f"of image {_quote(pose.name)}.",
+                f"of image {quote_name(pose.name)}.",
                 DAMAGED_REMEDY,
             )
     return intrinsics, poses
@@ -315,7 +319,7 @@ def exclude_views(scene: Scene, reasons: dict[str, str]) -> Scene:
     if not remaining:
         name, reason = next(iter(reasons.items()))
         raise LodgsError(
-            f"Cannot use any view of {scene.folder}. {_quote(name)}: {reason}", "Check the photos."
+            f"Cannot use any view of {scene.folder}. {quote_name(name)}: {reason}", "Check the photos."
         )
     return replace(
         scene,
@@ -382,113 +386,3 @@ def _largest_model(folder: Path, warnings: list[str]) -> Path:
         if count < counts[0]:
             warnings.append(f"Skipped {model}: a smaller model of {count} views.")
     return models[0]
-
-
-class _ViewCollector:
-    """Collects the usable views of a model and the reasons for skipping the other views.
-
-    Attributes:
-        excluded: (name, sentence) for each skipped view.
-    """
-
-    def __init__(self, files: ImageFiles, masks: SidecarFiles, depths: SidecarFiles) -> None:
-        self._files = files
-        self._masks = masks
-        self._depths = depths
-        self._missing: list[str] = []
-        self._reshaped: list[str] = []
-        self.cameras: list[Camera] = []
-        self.distorted: list[str] = []
-        self.excluded: list[tuple[str, str]] = []
-
-    def add(self, pose: Pose, lens: Intrinsics) -> None:
-        """Add a view at the size of its photo, or record the reason for skipping it."""
-        name = pose.name.replace("\\", "/")
-        try:
-            if not lens.lens.focals:
-                raise LodgsError(f"camera model {lens.lens.name} is a panorama, not a perspective view.")
-            if self.cameras and self.cameras[-1].name == name:
-                raise LodgsError("the model has another view of the same name.")
-            image = self._files.find(pose.name)
-            if image is None:
-                self._missing.append(name)
-                return
-            width, height = image_size(image)
-            sidecars = self._masks.find(name), self._depths.find(name)
-            camera = Camera(
-                name, lens.width, lens.height, *lens.pinhole, pose.world_to_camera, image, *sidecars,
-                turns=quarter_turns(image),
-            )  # fmt: skip
-            if (width, height) != (lens.width, lens.height):
-                camera = camera.resized(width, height)
-            if flaw := camera.flaw:
-                raise LodgsError(f"{flaw}.")
-        except LodgsError as error:
-            self.excluded.append((name, error.what))
-            return
-        self.cameras.append(camera)
-        if lens.distorted:
-            self.distorted.append(name)
-        stretch = np.log(width) + np.log(lens.height) - np.log(height) - np.log(lens.width)
-        if abs(stretch) > 0.01 + 1 / min(width, height):  # more than rounding to whole pixels explains
-            self._reshaped.append(
-                f"{_quote(name)} is {width}x{height}, but its camera in the model is "
-                f"{lens.width}x{lens.height}: check that the photo is neither rotated nor cropped."
-            )
-
-    def drop_outliers(self, inliers: np.ndarray) -> None:
-        """Drop the cameras outside the mask ``inliers`` (V,)."""
-        outliers = [camera.name for camera, inlier in zip(self.cameras, inliers, strict=True) if not inlier]
-        self.excluded += [
-            (name, f"its position exceeds {OUTLIER_FACTOR:,} times the median distance from the cameras.")
-            for name in outliers
-        ]
-        self.cameras = [camera for camera in self.cameras if camera.name not in outliers]
-        self.distorted = [name for name in self.distorted if name not in outliers]
-
-    def warnings(self, folder: Path) -> list[str]:
-        """Return a limited number of warnings, whatever the number of views."""
-        messages = exclusion_messages(self.excluded)
-        match self._missing:
-            case []:
-                pass
-            case [name]:
-                messages.append(f"Skipped {_quote(name)}: {folder} has no such file.")
-            case names:
-                more = ", ..." if len(names) > MAX_NAMED else ""
-                messages.append(
-                    f"Skipped {len(names):,} views without a file in {folder}: "
-                    f"{', '.join(map(_quote, names[:MAX_NAMED]))}{more}."
-                )
-        for attribute, sidecars in ("mask", self._masks), ("depth", self._depths):
-            if all(getattr(camera, attribute) is None for camera in self.cameras):
-                messages += filter(None, [sidecars.mismatch_warning(_quote(self.cameras[0].name))])
-        messages += self._reshaped[:MAX_NAMED]
-        if len(self._reshaped) > MAX_NAMED:
-            messages.append(f"{len(self._reshaped) - MAX_NAMED:,} more photos have another aspect ratio.")
-        return messages
-
-
-def exclusion_messages(excluded: Sequence[tuple[str, str]]) -> list[str]:
-    """Return sentences for (name, reason) pairs; pairs after the first MAX_NAMED are summarised."""
-    messages = [f"Skipped {_quote(name)}: {reason}" for name, reason in excluded[:MAX_NAMED]]
-    if len(excluded) > MAX_NAMED:
-        messages.append(f"Skipped {len(excluded) - MAX_NAMED:,} more views for similar reasons.")
-    return messages
-
-
-def _quote(name: str) -> str:
-    """Return a view's name in printable form, with at most 200 characters."""
-    return printable(name if len(name) <= 200 else f"{name[:200]}...")
-
-
-def _find_outliers(points: np.ndarray, cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray]:
-    """Return a mask (P,) of outlier points and a mask (V,) of inlier cameras."""
-    positions = np.array([camera.center for camera in cameras])
-    middle = np.median(positions, axis=0)
-    point_distances = np.linalg.norm(points - middle, axis=1)
-    camera_distances = np.linalg.norm(positions - middle, axis=1)
-    scale = max(np.median(camera_distances), np.median(point_distances) if len(point_distances) else 0.0)
-    if scale == 0:
-        return np.zeros(len(points), bool), np.ones(len(cameras), bool)
-    return point_distances > OUTLIER_FACTOR * scale, camera_distances <= OUTLIER_FACTOR * scale

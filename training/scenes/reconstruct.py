@@ -24,9 +24,10 @@ import numpy as np
 from ..errors import LodgsError
 from ..files import atomic_write, check_folder, link_or_copy
 from . import pycolmap_process
-from .colmap import MASKS, exclusion_messages, find_models
+from .colmap import MASKS, find_models
 from .image_files import SidecarFiles
 from .images import IMAGE_SUFFIXES, check_mask, image_size, load_image, write_png
+from .view_selection import exclusion_messages
 
 PRESETS = {"draft": (1000, 2048), "standard": (1600, 4096)}
 """Longer side in pixels for feature extraction, and maximum number of features per photo."""
@@ -116,12 +117,7 @@ def reconstruct(
     if not photos.is_relative_to(out):
         outputs.append(out / "images")
     names, excluded, sizes = _list_photos(photos, [*outputs, *([masks] if masks else [])])
-    if len(names) < MIN_PHOTOS:
-        raise LodgsError(
-            f"Cannot reconstruct {photos}: found {len(names)} readable photos, need at least {MIN_PHOTOS}."
-            + "".join(f" {message}" for message in exclusion_messages(excluded)[:1]),
-            "Choose the folder of the photos.",
-        )
+    _check_photos(photos, names, excluded)
     _check_output(out, work)
     size, features = PRESETS[preset]
     settings = {
@@ -140,15 +136,10 @@ def reconstruct(
             "masks": masks_folder,
         }  # fmt: skip
         result = _run_colmap(request, work, report)
-        with atomic_write(work / "pairs.png") as temporary:
-            write_png(temporary, draw_pairs(image_names, result["pairs"], result["placed"]))
         if len(result["placed"]) < MIN_PHOTOS:
             what, remedy = _explain_failure(image_names, result, work)
             raise LodgsError(" ".join([what, *exclusion_messages(excluded)]), remedy)
-        (out / "sparse").mkdir(exist_ok=True)
-        shutil.rmtree(out / "sparse" / "0", ignore_errors=True)
-        os.replace(work / "model", out / "sparse" / "0")
-        shutil.rmtree(work / "models", ignore_errors=True)
+        _install_model(work, out)
     except OSError as error:
         raise LodgsError(
             f"Cannot write scene {out}: {error.strerror or error}.",
@@ -262,6 +253,16 @@ def _list_photos(
     return names, excluded, sizes
 
 
+def _check_photos(photos: Path, names: Sequence[str], excluded: Sequence[tuple[str, str]]) -> None:
+    """Raise LodgsError if there are too few readable photos."""
+    if len(names) < MIN_PHOTOS:
+        raise LodgsError(
+            f"Cannot reconstruct {photos}: found {len(names)} readable photos, need at least {MIN_PHOTOS}."
+            + "".join(f" {message}" for message in exclusion_messages(excluded)[:1]),
+            "Choose the folder of the photos.",
+        )
+
+
 def _check_output(out: Path, work: Path) -> None:
     """Raise LodgsError if the scene's folder contains a scene or files of another program."""
     if (work / SETTINGS).is_file():
@@ -322,7 +323,7 @@ def _link_masks(masks: Path, photos: Path, image_names: Mapping[str, str], out: 
 
 
 def _run_colmap(request: dict, work: Path, report: Report) -> dict:
-    """Run structure from motion in a separate process and return its result."""
+    """Run structure from motion in a separate process, draw pairs.png and return the result."""
     result: dict = {}
     progress = _Progress(work / "database.db", report)
 
@@ -336,7 +337,17 @@ def _run_colmap(request: dict, work: Path, report: Report) -> dict:
         problem = pycolmap_process.run_program("sfm", request, work, on_message)
     if problem:
         raise LodgsError(f"Cannot reconstruct the photos: COLMAP stopped: {problem}", "Try again to resume.")
+    with atomic_write(work / "pairs.png") as temporary:
+        write_png(temporary, draw_pairs(request["names"], result["pairs"], result["placed"]))
     return result
+
+
+def _install_model(work: Path, out: Path) -> None:
+    """Replace the scene's model by the new one."""
+    (out / "sparse").mkdir(exist_ok=True)
+    shutil.rmtree(out / "sparse" / "0", ignore_errors=True)
+    os.replace(work / "model", out / "sparse" / "0")
+    shutil.rmtree(work / "models", ignore_errors=True)
 
 
 def _summarize(names: Sequence[str], result: Mapping) -> str:
