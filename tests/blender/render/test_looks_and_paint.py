@@ -206,7 +206,7 @@ def test_streamed_tree_has_its_look(bpy, lodgs, image, tmp_path):
         root = lodgs("data.importing").import_splats(
             bpy.context, tmp_path / "tree.ply", budget=budget, upright=False
         )
-        assert bool(lodgs("data.streams").write_splats(root)) == bool(budget)
+        assert bool(lodgs("data.streams").file_of(root)) == bool(budget)
         root.lodgs.controls.pixels = 0.1  # leaves
         original = image()
         with_looks(bpy, root)
