@@ -1,4 +1,4 @@
-"""Check that a resumed method gives the same bits as an unbroken one."""
+"""Fixture that compares resumed and uninterrupted training."""
 
 import io
 from collections.abc import Callable
@@ -14,8 +14,9 @@ from training.splats.ply import extra_columns, splat_columns
 
 @pytest.fixture
 def check_resumed() -> Callable[[Callable[[], Method], int], None]:
-    """check_resumed(make, stop): a method that goes on with the state of one that was stopped after ``stop``
-    steps, as it stands in a file, hands over the same levels to the bit as one that was not."""
+    """Return check_resumed(make, stop): resume a method after ``stop`` steps from a state file, and require
+    the same bits as from an uninterrupted run.
+    """
 
     def check(make: Callable[[], Method], stop: int) -> None:
         whole, first, second, file = make(), make(), make(), io.BytesIO()

@@ -1,4 +1,4 @@
-"""Depth in the loss of every method: its value by hand, its effect, and points where a scene has none."""
+"""Tests of the depth loss in all methods, and of start points from depth."""
 
 from __future__ import annotations
 
@@ -44,21 +44,21 @@ def data(scene):
     return TrainingData(scene, image_scale=0.25, test_every=3, depths=DepthPriors(scene, "metric"))
 
 
-def made(name: str, data: TrainingData, weight: float):
+def create_method(name: str, data: TrainingData, weight: float):
     parameters = replace(METHODS[name].preset("draft"), depth_weight=weight, dropout=0.0)
     return create(name, data, parameters, 0, "cpu")
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_every_method_has_it_in_its_loss(name, data):
-    none, half, whole = (made(name, data, weight).train_step(0)[0] for weight in (0.0, 0.5, 1.0))
+def test_every_method_uses_depth_loss(name, data):
+    none, half, whole = (create_method(name, data, weight).train_step(0)[0] for weight in (0.0, 0.5, 1.0))
     assert whole - none > 0.01
     assert half - none == pytest.approx((whole - none) / 2, rel=1e-3)
 
 
-def test_the_loss_by_hand(data):
-    """In float64, from another backend's picture."""
-    method = made("3dgs", data, 0.7)
+def test_depth_loss_matches_reference(data):
+    """Computed in float64 from another backend's image."""
+    method = create_method("3dgs", data, 0.7)
     view = method.choose_view(0)
     drawings = method.draw(view, 0)
     found = float(method.depth_loss(drawings[0].rendering, view, 0).detach())
@@ -80,7 +80,7 @@ def test_the_loss_by_hand(data):
     assert later == pytest.approx(found / 100, rel=1e-3)
 
 
-def test_masked_out_and_held_out_depths_do_not_count(scene, data, tmp_path):
+def test_masked_and_held_out_depths_are_ignored(scene, data, tmp_path):
     camera = data.test[0]
     assert data.images.target(camera).inverse_depth is None
     assert data.target(0).inverse_depth is not None
@@ -96,8 +96,8 @@ def test_masked_out_and_held_out_depths_do_not_count(scene, data, tmp_path):
     assert known[:, :40].isnan().all() and known[:, 40:].isfinite().all()
 
 
-def without_points(scene: Path) -> None:
-    """Its own copy of the model, without points."""
+def copy_without_points(scene: Path) -> None:
+    """Replace the model by a copy without points."""
     model = scene / "sparse" / "0"
     there = model.resolve()
     (scene / "sparse").unlink()
@@ -106,7 +106,7 @@ def without_points(scene: Path) -> None:
 
 
 def depth_error(run: Path) -> float:
-    """Median relative error of the held-out views' depth, where something is drawn."""
+    """Return the median relative depth error of held-out views at drawn pixels."""
     splats, errors = read_bundle(run / "bundle.ply").levels[-1].splats, []
     for number in (0, 3):
         camera = make_view(number).scaled(0.25)
@@ -118,10 +118,10 @@ def depth_error(run: Path) -> float:
 
 
 @pytest.mark.slow
-def test_depth_is_better_with_it_and_it_can_begin_without_points(walls, tmp_path, capsys):
-    """On a floor of random squares, from maps whose scale nobody knows; and from maps alone.
+def test_depth_loss_improves_depth_and_replaces_points(walls, tmp_path, capsys):
+    """Train on a floor of random squares, from depth maps of unknown scale, and from maps without points.
 
-    Of all splats in every step: 150 steps are too few to make up for what is left out of four views' steps.
+    Dropout is off, because 150 steps with four views are too few to compensate for it.
     """
     found = {}
     for name, kind, weight in (("off", "inverse", 0.0), ("on", "inverse", 0.3), ("bare", "metric", 0.3)):
@@ -129,7 +129,7 @@ def test_depth_is_better_with_it_and_it_can_begin_without_points(walls, tmp_path
         folder.mkdir()
         write_depth_scene(walls, folder, FITTED["inverse"] if kind == "inverse" else METRIC["one layer"])
         if name == "bare":
-            without_points(folder)
+            copy_without_points(folder)
         keys = {
             "scene": str(folder), "out": str(tmp_path / f"{name}_run"), "method": "3dgs", "backend": "cpu",
             "test_every": 3, "image_scale": 0.25,

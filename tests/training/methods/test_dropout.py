@@ -1,4 +1,4 @@
-"""Splats that steps leave out where photographs are few (DropGaussian), whatever the method."""
+"""Tests of splat dropout for few photos (DropGaussian) in all methods."""
 
 import pytest
 import torch
@@ -15,8 +15,8 @@ def make(data, name="3dgs", **values):
     return create(name, data, override(METHODS[name].preset("draft"), values), 0, "cpu")
 
 
-def test_the_share_by_hand(data):
-    """Of six training views: 0.4 (1 - 6 / 40) = 0.34 are left out, the others 1 / 0.66 times as opaque."""
+def test_dropout_rate(data):
+    """Six training views: 0.4 (1 - 6 / 40) = 0.34 are dropped, the others are 1 / 0.66 times as opaque."""
     assert len(data.train) == 6 and DROPOUT_VIEWS == 40
     method = make(data, dropout=0.4)
     found = torch.cat([method.dropout_weights(step, 0.0) for step in range(200)])
@@ -25,14 +25,14 @@ def test_the_share_by_hand(data):
     assert float(found.mean()) == pytest.approx(1, abs=0.03)
 
 
-def test_every_step_leaves_out_others_and_the_same_when_it_is_made_again(data):
+def test_dropout_is_random_per_step_and_repeatable(data):
     one, again, other = make(data), make(data), create("3dgs", data, make(data).parameters, 1, "cpu")
     assert torch.equal(one.dropout_weights(3, 0.0), again.dropout_weights(3, 0.0))
     assert not torch.equal(one.dropout_weights(3, 0.0), one.dropout_weights(4, 0.0))
     assert not torch.equal(one.dropout_weights(3, 0.0), other.dropout_weights(3, 0.0))
 
 
-def test_none_is_left_out_of_many_views_nor_at_the_end_nor_where_it_is_off(data, monkeypatch):
+def test_dropout_is_off_with_many_views_and_at_the_end(data, monkeypatch):
     method = make(data)
     assert (
         method.dropout_weights(0, DROPOUT_END - 0.01) is not None
@@ -45,15 +45,15 @@ def test_none_is_left_out_of_many_views_nor_at_the_end_nor_where_it_is_off(data,
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_presets_leave_out_a_fifth_but_those_of_the_papers(name):
+def test_dropout_of_presets(name):
     for preset in ("draft", "standard", "paper"):
         expected = 0.2 if name in PLAIN and preset != "paper" else 0.0
         assert METHODS[name].preset(preset).dropout == expected
 
 
 @pytest.mark.parametrize("name", PLAIN)
-def test_what_is_left_out_learns_nothing_in_a_step(data, name):
-    """And a part of the rest does: it is drawn."""
+def test_dropped_splats_get_no_update(data, name):
+    """Some of the remaining splats are updated."""
     method = make(data, name, dropout=0.5, margin=0.0)
     before = method.model["means"].detach().clone()
     left = method.dropout_weights(0, 0.0)
@@ -62,8 +62,8 @@ def test_what_is_left_out_learns_nothing_in_a_step(data, name):
     assert not moved[left == 0].any() and moved[left > 0].any()
 
 
-def test_finishing_draws_all(data):
-    """Which begins before the last eighth of the steps: levels are to meet as they are shown."""
+def test_finishing_has_no_dropout(data):
+    """Finishing starts before the last eighth of the steps; levels have to match their rendering."""
     flod = make(data, "flod", levels=2, steps=[4, 4], finish_share=1.0, dropout=0.5)
     view = flod.data.view(0)
     assert (flod.render_weights(view, 0)[0] == 0).any()

@@ -1,4 +1,4 @@
-"""A method is a folder: one that nobody knew is found, trains a column of its own and begins with a base."""
+"""Tests of method folders: a new folder is discovered, trains its own column and starts from a base."""
 
 import inspect
 import sys
@@ -89,7 +89,7 @@ class Method(method.Method):
 
 @pytest.fixture
 def tiny(tmp_path, monkeypatch):
-    """What a folder called ``tiny_folder`` beside the methods' own declares."""
+    """Return the description of a method in a new folder ``tiny_folder``."""
     folder = tmp_path / "methods" / "tiny_folder"
     folder.mkdir(parents=True)
     (folder / "__init__.py").write_text(ABOUT)
@@ -116,7 +116,7 @@ def job(scene: Path, out: Path, **keys) -> Job:
     return Job.from_dict(values | keys)
 
 
-def test_a_folder_is_found_and_every_folder_declares_its_name(tiny):
+def test_method_folders_are_discovered(tiny):
     assert tiny.package == "training.methods.tiny_folder" and list(methods.discover())[-1] == "tiny"
     folders = {path.parent.name for path in Path(methods.__file__).parent.glob("*/train.py")}
     assert folders == {
@@ -124,8 +124,8 @@ def test_a_folder_is_found_and_every_folder_declares_its_name(tiny):
     }
 
 
-def test_no_other_room_of_the_trainer_names_a_methods_folder():
-    """What a new method would have to be added to."""
+def test_no_other_package_names_a_method():
+    """New methods need no changes in other packages."""
     root = Path(methods.__file__).parents[1]
     for path in root.rglob("*.py"):
         inside = path.relative_to(root).parts
@@ -135,7 +135,7 @@ def test_no_other_room_of_the_trainer_names_a_methods_folder():
             assert not any(f"from .{name} " in text for name in ("flod", "octree", "threedgs")), path
 
 
-def test_a_step_of_two_drawings_trains_weights_and_keeps_a_column_of_ones_own(tiny, data):
+def test_two_drawings_train_extra_weights_and_columns(tiny, data):
     method = methods.create("tiny", data, tiny.preset("draft"), seed=0, backend="cpu")
     before, count = method.model["decay"].detach().clone(), len(method.model)
     loss, image, target = method.train_step(0)
@@ -152,7 +152,7 @@ def test_a_step_of_two_drawings_trains_weights_and_keeps_a_column_of_ones_own(ti
     assert list(level.splats.extras) == ["decay"]
 
 
-def test_the_loss_of_two_drawings_is_the_sum_and_one_is_the_loss_itself(tiny, data):
+def test_loss_sums_over_drawings(tiny, data):
     method = methods.create("tiny", data, tiny.preset("draft"), seed=0, backend="cpu")
     view = method.choose_view(0)
     both = method.draw(view, 0)
@@ -161,7 +161,7 @@ def test_the_loss_of_two_drawings_is_the_sum_and_one_is_the_loss_itself(tiny, da
     assert float(method.loss(both, view, 0).detach()) == pytest.approx(sum(losses))
 
 
-def test_a_run_begins_with_a_base_and_ends_with_its_column_in_the_bundle(tiny, tiny_scene, tmp_path):
+def test_run_with_base_writes_its_column(tiny, tiny_scene, tmp_path):
     write_ply(tmp_path / "base.ply", base())
     made = job(tiny_scene, tmp_path / "run", base=str(tmp_path / "base.ply"))
     assert training_loop.train(made) == 0
@@ -176,8 +176,8 @@ def test_a_run_begins_with_a_base_and_ends_with_its_column_in_the_bundle(tiny, t
 
 
 @pytest.mark.parametrize("antialias", [False, True])
-def test_a_run_is_antialiased_where_its_base_is(tiny, tiny_scene, tmp_path, antialias):
-    """Whatever its job says, which it tells; its bundle, its levels and its measures are what it drew."""
+def test_run_uses_antialiasing_of_its_base(tiny, tiny_scene, tmp_path, antialias):
+    """The base overrides the job, with a warning, for the bundle, its levels and its measurements."""
     small = replace(base(), log_scales=base().log_scales - np.float32(2))
     write_ply(tmp_path / "base.ply", small, ["SplatRenderMode: mip"] * antialias)
     made = job(
@@ -206,9 +206,7 @@ def test_a_run_is_antialiased_where_its_base_is(tiny, tiny_scene, tmp_path, anti
             assert (abs(row["psnr"] - np.mean(drawn)) < 5e-3) == (flag == antialias)
 
 
-def test_a_base_is_refused_where_a_method_cannot_begin_with_one_and_where_there_is_none(
-    tiny, tiny_scene, tmp_path
-):
+def test_unusable_base_raises(tiny, tiny_scene, tmp_path):
     with pytest.raises(LodgsError, match=r"'flod' cannot begin.*Leave out 'base'"):
         job(tiny_scene, tmp_path / "run", method="flod", base=str(tmp_path / "base.ply"))
     made = job(tiny_scene, tmp_path / "run", base=str(tmp_path / "absent.ply"))
@@ -217,7 +215,7 @@ def test_a_base_is_refused_where_a_method_cannot_begin_with_one_and_where_there_
     assert event["event"] == "error" and "absent.ply" in event["what"] and event["remedy"]
 
 
-def test_a_jobs_base_is_relative_to_its_file(tiny, tmp_path):
+def test_base_path_is_relative_to_the_job(tiny, tmp_path):
     (tmp_path / "job.toml").write_text('scene = "s"\nout = "run"\nmethod = "tiny"\nbase = "before/run"\n')
     made = Job.from_file(tmp_path / "job.toml")
     assert made.base == str(tmp_path / "before" / "run")
@@ -225,7 +223,7 @@ def test_a_jobs_base_is_relative_to_its_file(tiny, tmp_path):
     assert Job.from_file(tmp_path / "again.toml").base == made.base
 
 
-def test_a_base_is_the_finest_complete_level_of_a_run_a_bundle_or_a_ply(tmp_path):
+def test_base_is_finest_complete_level(tmp_path):
     coarse, fine = base(10), base(30)
     run = RunFolder(tmp_path / "run")
     with pytest.raises(LodgsError, match="There is no"):
@@ -246,7 +244,7 @@ def test_a_base_is_the_finest_complete_level_of_a_run_a_bundle_or_a_ply(tmp_path
         read_base(tmp_path / "empty.ply")
 
 
-def test_a_method_that_forgets_something_cannot_be_made(data, tiny):
+def test_incomplete_method_cannot_be_created(data, tiny):
     class Forgetful(Method):
         def setup(self, base):
             pass
@@ -256,7 +254,7 @@ def test_a_method_that_forgets_something_cannot_be_made(data, tiny):
         Forgetful(data, tiny.preset("draft"), 0, "cpu")  # pyright: ignore[reportAbstractUsage]
 
 
-def test_what_all_methods_record_of_a_scene(data, tiny):
+def test_scene_metadata(data, tiny):
     method = methods.create("tiny", data, tiny.preset("draft"), seed=0, backend="cpu")
     meta = method.meta()
     assert meta["focal_px"] == 60
@@ -272,7 +270,7 @@ def test_what_all_methods_record_of_a_scene(data, tiny):
 
 
 @pytest.mark.parametrize("name", sorted(methods.METHODS))
-def test_a_step_has_its_own_background_and_its_picture_has_none(data, name):
+def test_step_has_random_background_and_image_has_none(data, name):
     from training.methods import create
     from training.optimize.parameters import override
 

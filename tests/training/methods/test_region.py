@@ -1,4 +1,4 @@
-"""A region that is trained in detail: what it does to every method."""
+"""Tests of training a region in detail, for all methods."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ HALF = "box -9 -9 -1.5 0 9 9"  # of what stands around the origin in the tiny sc
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_outside_nothing_asks_for_more(name, tiny_scene):
-    """Whatever the method counts, from the first step on; inside it does."""
+def test_no_growth_outside_region(name, tiny_scene):
+    """Statistics outside are zero from the first step on; inside they are not."""
     region = Crop.from_text(HALF)
     data = TrainingData(read_scene(tiny_scene), test_every=4, region=region)
     method = create(name, data, resolve_parameters(name, "draft", {"free_depth": 0.0}), 0, "cpu")
@@ -27,7 +27,7 @@ def test_outside_nothing_asks_for_more(name, tiny_scene):
 
 
 @pytest.mark.parametrize("name", ["3dgs", "octree"])
-def test_it_resumes_to_the_bit(name, tiny_scene, check_resumed):
+def test_resume_is_bit_identical(name, tiny_scene, check_resumed):
     data = TrainingData(read_scene(tiny_scene), test_every=4, region=Crop.from_text(HALF))
     parameters = resolve_parameters(name, "draft", {"steps": 120, "max_splats": 200})
     check_resumed(lambda: create(name, data, parameters, 0, "cpu"), 77)

@@ -1,4 +1,4 @@
-"""An object alone on transparent ground: what is trained is as transparent, without a halo."""
+"""Tests of training an object on transparent ground: same transparency, no halo."""
 
 import sys
 
@@ -21,7 +21,7 @@ SIDE = 64
 
 
 def ring() -> list[Camera]:
-    """Sixteen views from around, at two heights."""
+    """Return sixteen cameras around the object, at two heights."""
     found = []
     for number in range(16):
         angle = 2 * np.pi * number / 16
@@ -32,7 +32,7 @@ def ring() -> list[Camera]:
 
 
 def ball(random: np.random.Generator) -> Gaussians:
-    """Splats on a sphere of radius a half, light ones."""
+    """Return bright splats on a sphere of radius 0.5."""
     means = random.normal(size=(500, 3))
     means *= 0.5 / np.linalg.norm(means, axis=1, keepdims=True)
     return Gaussians(
@@ -46,7 +46,7 @@ def ball(random: np.random.Generator) -> Gaussians:
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    """Photographs with alpha, as a renderer writes them: colours not multiplied by it."""
+    """Write photos with straight alpha, as a renderer does."""
     folder, truth = tmp_path_factory.mktemp("ball"), ball(np.random.default_rng(0))
     for camera in ring():
         drawn = rasterize(truth, camera, near=0.1, backend="cpu")
@@ -61,7 +61,7 @@ def scene(tmp_path_factory):
     return folder
 
 
-def test_photographs_are_over_black_with_their_alpha(scene):
+def test_photos_are_composited_over_black(scene):
     data = TrainingData(read_scene(scene), test_every=8)
     assert data.transparent
     target, truth = data.target(0), ball(np.random.default_rng(0))
@@ -78,7 +78,7 @@ def test_photographs_are_over_black_with_their_alpha(scene):
 
 @pytest.mark.parametrize("method", ["3dgs", "octree"])
 @pytest.mark.slow
-def test_what_is_trained_is_as_transparent(scene, tmp_path, method, capsys):
+def test_trained_object_is_as_transparent(scene, tmp_path, method, capsys):
     parameters = {"steps": 400, "max_splats": 1500}
     keys = {
         "scene": str(scene), "out": str(tmp_path / "run"), "method": method, "backend": "cpu",

@@ -1,4 +1,4 @@
-"""CLoD-GS: its formulas by hand and by autograd in float64, how decays begin, and whole runs."""
+"""Tests of CLoD-GS: formulas against float64 references, initial decays, and whole runs."""
 
 from copy import deepcopy
 
@@ -47,7 +47,7 @@ def test_steps_before_decay_equal_3dgs(data):
 
 
 def test_training_weights_equal_rule(data):
-    """Attenuations and masks of a step are what the rule says of the splats that it hands over."""
+    """Attenuations and masks of a step equal the rule's results for the returned splats."""
     clod = make(data, keep_share=1.0)
     [level] = trained(clod)
     camera, rule = data.train[1], rules()["decay"]

@@ -1,4 +1,4 @@
-"""FLoD as published: constraint, level rise, overlap pruning, schedule."""
+"""Tests of FLoD: scale constraint, level changes, overlap pruning, schedules and finishing steps."""
 
 from dataclasses import replace
 
@@ -48,7 +48,7 @@ def test_absolute_minimum_size_is_used(data):
     [{}, {"footprint": 40.0}, {"s_min_1": 0.125}, {"levels": 7, "rho": 3.0}, {"footprint": 4.0, "levels": 4}],
 )
 def test_finest_level_reach_is_independent_of_footprint(data, values):
-    """The paper's: 40 pixels at the median depth, a quarter from level to level, gamma 1 (Eq. 3, 8)."""
+    """In the paper: 40 pixels at the median depth, a ratio of 4 between levels, gamma 1 (Eq. 3, 8)."""
     flod = make(data, **({"levels": 5, "steps": 6, "footprint": 16.0} | values))
     (gamma,) = flod.controls().values()
     reach = flod.s_min[-2] / gamma * data.focal / data.median_depth
@@ -112,7 +112,7 @@ def test_points_rejoin_at_next_level(data):
 
 
 def test_rejoining_points_are_sampled_to_budget(data):
-    """As many as there is room for, from all over, the same ones in every run of a seed."""
+    """The sample fills the budget, spreads over the scene and depends on the seed only."""
     models = []
     for _ in range(2):
         flod = make(data, min_opacity=0.0, densify_interval=100, max_splats=50, budget_ratio=0.8)
@@ -202,7 +202,7 @@ def test_duplicate_points_train_and_too_few_raise(data, tiny_scene, tmp_path):
 
 
 def is_finishing(data, **values) -> tuple[Method, list[Level]]:
-    """A run just before its first finishing step, and what it has handed over."""
+    """Return a run before its first finishing step, and its completed levels."""
     values = {"finish_share": 0.5, "footprint": 40.0, "random_background": False, **values}
     flod, handed = make(data, **values), []
     for step in range(18):
@@ -223,14 +223,14 @@ def test_finishing_starts_from_completed_levels(data):
 
 
 def projected_area(scales: np.ndarray) -> np.ndarray:
-    """Root mean square area (N,) of ellipsoids (N, 3) on planes of all directions, by projecting them."""
+    """Return the root mean square area (N,) of projections of ellipsoids (N, 3) in all directions."""
     bases, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(1000, 3, 2)))
     squares = [np.linalg.det(np.einsum("mki,k,mkj->mij", bases, one**2, bases)).mean() for one in scales]
     return np.sqrt(squares)
 
 
 def test_fine_levels_restart_from_important_splats(data):
-    """Blending weights by the reference; in views as wide as photographs are continued."""
+    """The reference rasterizer gives the weights; views include the margins."""
     flod, handed = is_finishing(data, footprint=1.0, drawn=0.6, margin=0.25)
     finest, (*coarser, last) = handed[-1].splats, finish.split_levels(flod.model, flod.s_min)
     assert_same(last.splats, finest)
@@ -258,7 +258,7 @@ def test_fine_levels_restart_from_important_splats(data):
 
 
 def test_enlarged_splats_become_fainter(data):
-    """With the filter; without it splats smaller than a pixel were drawn nearly as large before."""
+    """Applies to the antialiasing filter; without it small splats are already drawn enlarged."""
     flod, handed = is_finishing(data, footprint=1.0, drawn=0.6)
     levels = {level.number: from_splats(level.splats, 3, torch.device("cpu")) for level in handed}
     finest = levels[3]
@@ -350,7 +350,7 @@ def test_single_level_has_no_finishing(data):
 
 @pytest.mark.parametrize("stop", [8, 18, 21])
 def test_resume_is_bit_identical(data, stop, check_resumed):
-    """Before the last level, when it is finished, and amid the finishing steps."""
+    """Stops before the last level, after it, and in the finishing steps."""
     check_resumed(lambda: make(data, finish_share=0.5, footprint=1.0), stop)
 
 
@@ -371,7 +371,7 @@ def assert_same(one, other):
 
 
 def test_coarse_levels_alone_equal_full_run(data):
-    """The same constraint, budgets and schedules, though the finest level is trained elsewhere."""
+    """Constraint, budgets and schedules stay the same if the finest level is trained separately."""
     values = {"levels": 4, "steps": [4, 5, 6, 7], "sh_interval": 3, "finish_share": 0.2, "max_splats": 90}
     whole, coarse = make(data, **values), make(data, **values, last_level=2)
     assert coarse.steps == 9 and whole.steps == 26

@@ -1,10 +1,10 @@
-"""LODGE's chunks: Eq. 5 and the sets by hand, and a run that makes them."""
+"""Tests of LODGE's chunks: Eq. 5, sets against references, and a run with chunks."""
 
 import numpy as np
 import pytest
 
 from training.lod.blocks import spatial_order
-from training.lod.rules.chunks import in_chunk as in_chunk
+from training.lod.rules.chunks import in_chunk
 from training.methods import create, method_info
 from training.methods.lodge import chunks
 from training.methods.lodge.composite import IndexedLevel
@@ -30,7 +30,9 @@ def create_level(means, log_scale=-3.0) -> IndexedLevel:
 
 
 def test_chunk_count():
-    """The farthest camera is 6 from the mean, so 4 / d_1 * 6 (Eq. 5), but no more than there are."""
+    """The farthest camera is at distance 6 from the mean: 4 / d_1 * 6 (Eq. 5), limited to the number of
+    cameras.
+    """
     centers = np.array([[x, 0, 0] for x in np.linspace(-6, 6, 31)])
     assert chunks.chunk_count(centers, 2.0) == 12
     assert chunks.chunk_count(centers, 2.1) == 12  # 11.4
@@ -39,7 +41,7 @@ def test_chunk_count():
 
 
 def test_chunk_centres_and_radii():
-    """Two clusters and one camera apart: centres are their means, radii as far as the next centre."""
+    """Two clusters and a distant camera: centres are means, radii reach the next centre."""
     places = np.array([[0, 0, 0], [2, 0, 0], [10, 0, 0], [12, 0, 0], [40, 0, 0]], float)
     centres, radii = chunks.place_chunks(places, 3, 0)
     order = np.argsort(centres[:, 0])
@@ -51,14 +53,14 @@ def test_chunk_centres_and_radii():
 
 
 def test_chunk_radius_increases_distances():
-    """Splats every unit along a line from the centre; d_l of 4 and 8, and a radius of 3."""
+    """Splats at unit intervals along a line from the centre; d_l of 4 and 8, and a radius of 3."""
     line = create_level([[x, 0, 0] for x in range(20)])
     found = chunks.chunk_rows({3: line, 2: line, 1: line}, {3: 0.0, 2: 4.0, 1: 8.0}, np.zeros(3), 3.0)
     assert [found[n].tolist() for n in (3, 2, 1)] == [[*range(7)], [*range(7, 11)], [*range(11, 20)]]
 
 
 def test_hidden_splats_are_not_in_a_set():
-    """A wall of opaque splats before others; a camera turned anywhere sees no more of what is behind it."""
+    """An opaque wall hides splats from cameras of every orientation."""
     y, z = (each.reshape(-1) for each in np.meshgrid(np.linspace(-3, 3, 61), np.linspace(-3, 3, 61)))
     wall = np.stack([0 * y + 2, y, z], axis=1)
     hidden, seen = [[2.5, 0, 0], [2.4, 0.3, 0.1]], [[1.5, 0, 0], [-2, 0, 0]]

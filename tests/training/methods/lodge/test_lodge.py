@@ -1,4 +1,4 @@
-"""LODGE: levels are the rule's and no finer than their filter, the finest stays, runs go on to the bit."""
+"""Tests of LODGE: levels follow the rule and their filter, the finest level is frozen, runs resume."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -89,7 +89,7 @@ def test_first_steps_are_3dgs(data):
 
 
 def test_single_level_of_a_base_raises(data, base):
-    with pytest.raises(LodgsError, match="nothing to train"):
+    with pytest.raises(LodgsError, match="single level"):
         make(data, base, levels=1)
 
 
@@ -118,7 +118,7 @@ def test_chosen_distances_stay_below_fixed_ones(data, base, distances):
 
 
 def test_training_selection_equals_bundle_selection(data, base):
-    """The composite of a step against the selection of the bundle that was written, picture by picture."""
+    """Compares the blended levels of a step with the selection from the written bundle, image by image."""
     lodge = make(data, base, distances=[1.3, 0.8, 0.0])
     levels = sorted(trained(lodge), key=lambda level: level.number)
     bundle, camera = Bundle("lodge", levels, "chunks"), data.train[2]
@@ -147,7 +147,7 @@ def test_tuning_updates_only_its_level(data, base):
 
 
 def test_importance_equals_reference(data, base):
-    """Blending weights by the derivative of a picture of ones with respect to each splat's own colour."""
+    """The reference weights are derivatives of an image of ones by each splat's own colour."""
     few = base.select(slice(0, 12))
     gaussians, camera = Gaussians.of(few), data.train[0]
     level = IndexedLevel.of(gaussians)
@@ -176,7 +176,7 @@ def test_paper_preset_matches_paper():
 
 
 def test_antialiased_base_gives_antialiased_levels(data, base):
-    """Its importance and its pictures are of Mip-Splatting's filter, of splats smaller than a pixel."""
+    """Importance and images use Mip-Splatting's filter for splats smaller than a pixel."""
     small = replace(base, log_scales=base.log_scales - np.float32(2))
     distances = {"distances": [1.2, 0.8, 0.0], "prune_weight": 0.0, "tune_alone": 0.0}
     lodge = make(data, small, antialias=True, **distances)
@@ -226,7 +226,7 @@ def test_levels_respect_keep_share(data, base):
 
 
 def test_cost_of_distances():
-    """Two splats before a camera: with a distance between them the farther one is drawn smoothed."""
+    """Two splats in front of a camera: a distance between them smooths the farther one."""
     pose = np.eye(4)
     camera = Camera("v", 64, 64, 64.0, 64.0, 32.0, 32.0, pose)
     means = np.float32([[0, 0, 2], [0, 0, 8]])
@@ -275,5 +275,5 @@ def test_costs_fit_in_bundle_header(data, base, tmp_path, count):
 
 @pytest.mark.parametrize("stop", [11, 12, 14, 15, 21])
 def test_resume_is_bit_identical(data, stop, check_resumed):
-    """Stopped in the finest level, at its end, within a round, at a round's and at a level's end."""
+    """Stops in the finest level, at its end, within a round, and at the ends of a round and a level."""
     check_resumed(lambda: make(data), stop)

@@ -1,4 +1,4 @@
-"""Octree-GS with explicit anchors: what a step draws, how levels join, where anchors grow."""
+"""Tests of Octree-GS with explicit anchors: drawn levels, join steps, growth and pruning."""
 
 import numpy as np
 import pytest
@@ -20,14 +20,14 @@ def make(data, **values) -> Method:
     return Method(data, override(METHOD.preset("draft"), values), seed=0, backend="cpu")
 
 
-def test_levels_join_one_by_one_each_after_a_shorter_time(data):
+def test_levels_join_at_decreasing_intervals(data):
     octree = make(data, levels=6, steps=1000, coarse_share=0.5, coarse_factor=2.0)
     # half of the levels at once; then intervals of 8, 4, 2, 1 fifteenths of the first 500 steps
     assert octree.schedule.join_steps == [0, 0, 0, 267, 400, 467]
     assert [octree.level_at(step) for step in (0, 266, 267, 466, 467, 999)] == [3, 3, 4, 5, 6, 6]
 
 
-def test_a_step_draws_what_is_wanted_of_the_levels_that_have_joined(data):
+def test_step_draws_needed_joined_levels(data):
     octree = make(data, steps=400, coarse_share=0.5)
     camera = data.train[0]
     distance = np.linalg.norm(octree.model["means"].detach().numpy() - camera.center, axis=1)
@@ -41,7 +41,7 @@ def test_a_step_draws_what_is_wanted_of_the_levels_that_have_joined(data):
         assert 0 < expected.sum() < len(expected)
 
 
-def test_a_picture_half_as_large_wants_one_level_less(data):
+def test_half_size_image_needs_one_level_less(data):
     octree = make(data, far_share=1.0)
     near = octree.schedule.weights(data.train[0], octree.model, 39, full=False)
     half = octree.schedule.weights(data.camera(0, 2), octree.model, 39, full=False)
@@ -50,7 +50,7 @@ def test_a_picture_half_as_large_wants_one_level_less(data):
     assert 0 < half.mean() < near.mean() < 1
 
 
-def test_levels_that_are_there_see_what_they_are_wanted_for(data, monkeypatch):
+def test_image_size_matches_joined_levels(data, monkeypatch):
     monkeypatch.setattr("training.methods.octree.schedule.MIN_SIDE", 4)
     octree = make(data, levels=4, steps=400, coarse_share=0.5, far_share=1e-9)
     schedule = octree.schedule
@@ -61,8 +61,8 @@ def test_levels_that_are_there_see_what_they_are_wanted_for(data, monkeypatch):
     assert make(data, levels=4, steps=400, coarse_share=0.5, far_share=0.0).schedule.shrink(0) == 1
 
 
-def test_gradients_of_smaller_pictures_count_for_as_much(data, monkeypatch):
-    """A splat as large in pixels, at an edge, in a picture half as large: there is as much to grow for."""
+def test_gradients_are_independent_of_image_size(data, monkeypatch):
+    """A splat of equal size in pixels, at an edge in a half-size image, has the same growth score."""
     camera, sums = data.train[data.training_view(0, 0)], []
     x, y = (camera.width / 2 - camera.cx) / camera.fx, (camera.height / 2 - camera.cy) / camera.fy
     pose = np.linalg.inv(camera.world_to_camera)
@@ -86,7 +86,7 @@ def test_gradients_of_smaller_pictures_count_for_as_much(data, monkeypatch):
     assert sums[1] == pytest.approx(sums[0], rel=0.02)
 
 
-def test_some_steps_see_smaller_pictures_and_some_everything(data, monkeypatch):
+def test_random_far_and_full_steps(data, monkeypatch):
     octree = make(data, far_share=0.5, full_share=0.5, steps=400, coarse_share=0.0)
     assert {octree.schedule.shrink(step) for step in range(400)} == {1}  # half of 48 pixels would be too few
     monkeypatch.setattr("training.methods.octree.schedule.MIN_SIDE", 12)
@@ -100,7 +100,7 @@ def test_some_steps_see_smaller_pictures_and_some_everything(data, monkeypatch):
     assert not any(weights.mean() == 1 for weights in drawn)
 
 
-def test_new_anchors_lie_in_free_voxels_of_their_own_or_the_next_level(data):
+def test_new_anchors_are_in_free_voxels(data):
     octree = make(data, steps=400, footprint=6.0, max_splats=10_000, coarse_share=0.0, min_opacity=0.0)
     before = octree.schedule.tree.keys(
         octree.model["means"].detach().double().numpy(), octree.model.columns["level"].long().numpy()
@@ -120,7 +120,7 @@ def test_new_anchors_lie_in_free_voxels_of_their_own_or_the_next_level(data):
     assert (octree.model.columns["bias"][:count] == octree.parameters.bias_rate).all()
 
 
-def test_steep_splats_of_the_finest_level_grow_in_it(data):
+def test_finest_level_grows_in_itself(data):
     octree = make(data, steps=400, coarse_share=0.0, max_splats=10_000, min_opacity=0.0)
     octree.model.columns["level"][:] = 4
     count = len(octree.model)
@@ -131,7 +131,7 @@ def test_steep_splats_of_the_finest_level_grow_in_it(data):
     assert (octree.model.columns["level"][count:] == 4).all()
 
 
-def test_new_anchors_begin_faint_so_that_pictures_hardly_change(data):
+def test_new_anchors_hardly_change_images(data):
     octree = make(data, steps=400, footprint=6.0, max_splats=10_000, min_opacity=0.0)
     octree.model["opacity_logits"].data[::2] = 3.0
     octree.model["opacity_logits"].data[1::2] = -4.0
@@ -145,10 +145,11 @@ def test_new_anchors_begin_faint_so_that_pictures_hardly_change(data):
 
 
 @pytest.mark.parametrize(("coarser", "times"), [(0, 4), (1, 2), (2, 1)])
-def test_the_thresholds_rise_from_level_to_level(data, coarser, times):
-    """tau 2^(beta (l - 1)), Sec. 4.2: below a level's nothing grows, below the next one's it stays.
+def test_growth_threshold_increases_with_level(data, coarser, times):
+    """tau 2^(beta (l - 1)), Sec. 4.2: below a level's threshold nothing grows, below the next one's growth
+    stays in the level.
 
-    Levels for views from farther away than any photograph do not count.
+    Levels for views from farther away than any photo do not count.
     """
     for factor, expected in ((0.99, None), (1.01, 0), (2.01, 1)):
         octree = make(
@@ -165,7 +166,7 @@ def test_the_thresholds_rise_from_level_to_level(data, coarser, times):
         assert set(grown.tolist()) == (set() if expected is None else {3.0 + expected})
 
 
-def test_learning_rates_fall_once_growing_has_ended(data):
+def test_learning_rates_fall_after_growth(data):
     octree = make(data, steps=100, grow_until=0.6, lr_end=0.01, coarse_share=0.0)
     for step, share in ((0, 1.0), (60, 1.0), (80, 0.1), (100, 0.01)):  # of 40 steps, in equal factors
         octree.set_learning_rates(step)
@@ -174,13 +175,13 @@ def test_learning_rates_fall_once_growing_has_ended(data):
         torch.testing.assert_close(lr["sh"][:2, 0], torch.tensor([p.lr_sh, p.lr_sh / 20]) * share)
 
 
-def test_learning_rates_stay_where_growing_lasts_to_the_end(data):
+def test_learning_rates_are_constant_during_growth(data):
     octree = make(data, steps=100, grow_until=1.0, lr_end=0.01)
     octree.set_learning_rates(99)
     assert octree.model.adam.lr["log_scales"] == octree.parameters.lr_scales
 
 
-def test_what_no_view_sees_is_looked_for_when_growing_ends_and_at_the_end(data, monkeypatch):
+def test_unseen_splats_are_pruned_after_growth_and_at_the_end(data, monkeypatch):
     octree, reviewed = make(data, steps=12, grow_until=0.5, grow_interval=3), []
     monkeypatch.setattr(octree, "prune_unseen", reviewed.append)
     for step in range(12):
@@ -188,7 +189,7 @@ def test_what_no_view_sees_is_looked_for_when_growing_ends_and_at_the_end(data, 
     assert reviewed == [5, 11]
 
 
-def test_no_level_grows_into_the_next_before_all_have_joined(data):
+def test_growth_into_next_level_waits_for_all_levels(data):
     octree = make(data, steps=400, footprint=6.0, coarse_share=0.9, max_splats=10_000, min_opacity=0.0)
     count, levels = len(octree.model), octree.model.columns["level"].clone()
     octree.model.stats["seen"][levels == 1] += 1
@@ -199,7 +200,7 @@ def test_no_level_grows_into_the_next_before_all_have_joined(data):
     assert (octree.model.columns["bias"] == 0).all()
 
 
-def test_what_stays_faint_is_removed_and_what_was_not_seen_stays(data):
+def test_faint_anchors_are_removed_unless_unseen(data):
     octree = make(data, grad_threshold=1e9, min_opacity=0.01)
     stats = octree.model.stats
     stats["seen"][:10] = 4
@@ -213,8 +214,8 @@ def test_what_stays_faint_is_removed_and_what_was_not_seen_stays(data):
         octree.grow(20)
 
 
-def test_what_is_too_faint_to_be_drawn_is_removed(data):
-    """No view counts as having drawn it."""
+def test_invisible_anchors_are_removed(data):
+    """No view counts as having drawn them."""
     octree = make(data, grad_threshold=1e9)
     octree.model["opacity_logits"].data[:5] = -5.55  # 1/258
     kept = octree.model["means"].detach()[5:].clone()
@@ -225,9 +226,10 @@ def test_what_is_too_faint_to_be_drawn_is_removed(data):
 
 
 @pytest.mark.parametrize("far_share", [0.0, 0.1])
-def test_what_no_view_sees_much_of_goes(data, far_share, monkeypatch):
-    """Blending weights by another way: drawn as features, one column a splat. Coarse splats, which finer ones
-    hide from near, count for what they give from afar."""
+def test_splats_of_low_weight_are_pruned(data, far_share, monkeypatch):
+    """The reference renders weights as features, one column per splat. Coarse splats hidden by finer ones
+    count for distant views.
+    """
     monkeypatch.setattr("training.methods.octree.schedule.MIN_SIDE", 12)
     octree = make(data, far_share=far_share, least_weight=0.3)
     octree.model["opacity_logits"].data.fill_(2.0)
@@ -253,13 +255,13 @@ def test_what_no_view_sees_much_of_goes(data, far_share, monkeypatch):
     assert 0.1 < stayed.float().mean() < 0.9
 
 
-def test_an_impossible_least_weight_says_so(data):
+def test_invalid_least_weight_raises(data):
     with pytest.raises(LodgsError, match=r"no splats remain at step 40.*'least_weight'"):
         make(data, least_weight=1.0).prune_unseen(39)
 
 
 @pytest.mark.parametrize(("coarser", "finest"), [(3, 4), (1, 2)])
-def test_what_is_too_narrow_moves_finer_up_to_the_first_level_that_photographs_want(data, coarser, finest):
+def test_narrow_splats_move_to_finer_level(data, coarser, finest):
     octree = make(data, narrowest=0.5, widest=8.0, coarse_share=0.5, coarser_levels=coarser)
     level = octree.model.columns["level"]
     level[:], level[1], level[3] = 1, 2, 4
@@ -275,7 +277,7 @@ def test_what_is_too_narrow_moves_finer_up_to_the_first_level_that_photographs_w
         assert octree.model.columns["level"][:4].tolist() == fitting
 
 
-def test_what_is_too_narrow_stays_where_no_photograph_wants_a_finer_level(data):
+def test_narrow_splats_stay_if_no_photo_needs_finer_level(data):
     octree = make(data, narrowest=0.5, coarse_share=0.0, coarser_levels=3)
     level, means = octree.model.columns["level"], octree.model["means"].data
     level[:2] = 1
@@ -285,7 +287,7 @@ def test_what_is_too_narrow_stays_where_no_photograph_wants_a_finer_level(data):
     assert octree.model.columns["level"][:2].tolist() == [1, 4]
 
 
-def test_what_is_too_wide_for_its_level_moves_to_the_coarser_one_that_it_fits(data):
+def test_wide_splats_move_to_coarser_level(data):
     octree = make(data, narrowest=0.0, widest=2.0)
     octree.model.columns["level"][:] = 4
     octree.model.columns["level"][3] = 2
@@ -299,7 +301,7 @@ def test_what_is_too_wide_for_its_level_moves_to_the_coarser_one_that_it_fits(da
     assert octree.model.columns["level"][:4].tolist() == [4, 2, 1, 2]
 
 
-def test_the_volume_is_measured_in_median_depths(data):
+def test_volume_uses_median_depths(data):
     octree = make(data, volume_weight=2.0)
     rendering, view = octree.rasterize_model(data.train[0], 0), data.view(0)
     drawn = rendering.radii > 0

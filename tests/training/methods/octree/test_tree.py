@@ -1,4 +1,4 @@
-"""The octree of Octree-GS: distances, levels, voxels and anchors, worked by hand."""
+"""Tests of the octree of Octree-GS: distances, levels, voxels and anchors."""
 
 import numpy as np
 import pytest
@@ -9,31 +9,31 @@ from training.scenes.cameras import Camera
 
 
 def camera(z: float, focal: float = 100.0) -> Camera:
-    """Looks along +z from (0, 0, z)."""
+    """Return a camera at (0, 0, z) that looks along +z."""
     matrix = np.eye(4)
     matrix[2, 3] = -z
     return Camera("", 200, 200, focal, focal, 100.0, 100.0, matrix)
 
 
-def test_distances_are_of_what_a_view_sees_and_in_one_focal_length():
+def test_distances_use_visible_points_and_one_focal_length():
     points = np.array([[0, 0, 4.0], [0, 3.0, 4.0], [0, 0, -1.0], [30.0, 0, 4.0]])
     near, long = octree.visible_distances(points, [camera(0.0), camera(0.0, focal=200.0)], 100.0)
     assert near.tolist() == [4.0, 5.0]  # behind, and outside the image, count for nothing
     assert long.tolist() == [2.0]  # twice the focal length, half as far; the second point is outside
 
 
-def test_a_view_in_the_midst_of_points_does_not_make_levels_without_end():
+def test_camera_among_points_gives_few_levels():
     points = np.array([[0, 0, 1e-6], [0, 0, 9.0]])
     tree = octree.build(points, [camera(0.0)], focal_px=100.0, footprint=2.0, quantiles=(0, 1), coarser=3)
     assert (tree.levels, tree.d_max) == (12, 8 * 9.0)  # log2 has room for 23; the coarse stay
 
 
-def test_views_that_see_no_point_are_told():
-    with pytest.raises(LodgsError, match="No training view sees"):
+def test_views_without_points_raise():
+    with pytest.raises(LodgsError, match="no training view sees"):
         octree.build(np.array([[0, 0, -1.0]]), [camera(0.0)], focal_px=100.0, footprint=2.0)
 
 
-def test_levels_follow_from_the_range_of_distances():
+def test_level_count_from_distance_range():
     points = np.array([[0, 0, z] for z in (1.0, 2.0, 4.0, 8.0, 9.0)])
     tree = octree.build(points, [camera(0.0)], focal_px=100.0, footprint=2.0, quantiles=(0, 1))
     assert (tree.levels, tree.d_max) == (4, 9.0)  # floor(log2 9) + 1
@@ -45,7 +45,7 @@ def test_levels_follow_from_the_range_of_distances():
     assert further.size(3) == pytest.approx(tree.size(1))
 
 
-def test_every_voxel_of_every_level_has_exactly_one_point_of_that_or_a_coarser_level():
+def test_every_voxel_has_one_point():
     points = np.random.default_rng(3).uniform(-1, 1, (3000, 3))
     tree = octree.Octree(4, 1.0, 100.0, 0.7, points.min(0))
     level = octree.anchors(points, tree)
@@ -55,7 +55,7 @@ def test_every_voxel_of_every_level_has_exactly_one_point_of_that_or_a_coarser_l
         assert sorted(standing) == occupied.tolist()
 
 
-def test_voxels_of_different_levels_and_places_have_different_names():
+def test_voxel_keys_are_unique():
     points = np.array([[x, y, z] for x in range(6) for y in range(6) for z in range(6)]) + 0.5
     tree = octree.Octree(12, 1.0, 1.0, 2048.0, np.zeros(3))
     fine = tree.keys(points, 12)  # voxels of edge 1

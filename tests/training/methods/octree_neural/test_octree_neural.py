@@ -1,4 +1,4 @@
-"""Octree-GS with neural anchors: decoding as the papers say, baking against the networks themselves."""
+"""Tests of Octree-GS with neural anchors: decoding against the papers, baking against the networks."""
 
 from dataclasses import replace
 
@@ -26,23 +26,23 @@ def make(data, **values) -> Method:
     return method
 
 
-def test_an_anchor_stands_in_the_middle_of_its_voxel(data):
+def test_anchors_are_at_voxel_centres(data):
     method = make(data)
     means, level = method.model["means"].detach().double().numpy(), method.model.columns["level"].numpy()
     cells = (means - method.schedule.tree.origin) / method.schedule.tree.size(level)[:, None]
     np.testing.assert_allclose(cells % 1, 0.5, atol=1e-4)
 
 
-def test_there_are_no_more_gaussians_than_asked_for_from_the_start(data):
+def test_initial_gaussians_respect_max_splats(data):
     assert len(make(data).model) > 10
     assert len(make(data, max_splats=43, offsets=4, margin=0.0).model) == 10
 
 
 @pytest.mark.parametrize("changes", [{"direct": False}, {}, {"view_shapes": False}])
-def test_decoding_is_the_papers(data, changes):
-    """One anchor by hand in float64: Scaffold-GS, Sec. 3.2, Gaussian by Gaussian.
+def test_decoding_matches_papers(data, changes):
+    """Decode one anchor in float64: Scaffold-GS, Sec. 3.2, Gaussian by Gaussian.
 
-    Its own looks are added, and then opacity is a sigmoid; shapes that do not change with the view see no
+    With own looks, these are added and opacity is a sigmoid. Shapes without view dependence ignore the
     direction.
     """
     method, camera = make(data, **changes), data.train[2]
@@ -82,7 +82,7 @@ def test_decoding_is_the_papers(data, changes):
         np.testing.assert_allclose(getattr(g, name).detach().numpy(), expected, rtol=1e-5, atol=1e-6)
 
 
-def test_anchors_beside_the_image_whose_gaussians_reach_into_it_are_drawn(data):
+def test_anchors_reaching_into_the_image_are_visible(data):
     method = make(data)
     method.model["log_scales"].data -= 2
     everything = torch.arange(len(method.model))
@@ -101,8 +101,8 @@ def test_anchors_beside_the_image_whose_gaussians_reach_into_it_are_drawn(data):
     assert beside > 0
 
 
-def test_a_gaussian_that_no_view_sees_much_of_is_never_drawn_again(data):
-    """Against the largest blending weights of another rasterizer, the reference."""
+def test_gaussians_of_low_weight_are_disabled(data):
+    """The reference rasterizer gives the maximum blending weights."""
     method = make(data, least_weight=0.1)
     method.schedule.join_steps = [0] * len(method.schedule.join_steps)
     largest = torch.zeros_like(method.model.stats["seen"])
@@ -118,7 +118,7 @@ def test_a_gaussian_that_no_view_sees_much_of_is_never_drawn_again(data):
     assert method.splats == alive.sum()
 
 
-def test_anchors_of_which_nothing_is_drawn_are_removed(data, monkeypatch):
+def test_anchors_without_gaussians_are_removed(data, monkeypatch):
     method = make(data, grad_threshold=1e9)
     method.model["looks"].data[:5, :, 0] = -30
     monkeypatch.setattr(method.schedule, "weights", lambda *_, **__: torch.ones(len(method.model)))
@@ -137,33 +137,35 @@ def draw(splats, camera, data):
     return rasterize(Gaussians.of(splats), camera, near=data.near).image
 
 
-def ever_drawn(method: Method) -> torch.Tensor:
-    """Anchors (indices) that a training view draws; others are not baked."""
+def drawn_in_training(method: Method) -> torch.Tensor:
+    """Return the anchors (indices) that a training view draws; others are not baked."""
     return torch.cat([method.drawn_anchors(camera) for camera in method.data.train]).unique()
 
 
-def blind(method: Method, *names: str) -> None:
-    """Networks that do not look at the direction."""
+def ignore_direction(method: Method, *names: str) -> None:
+    """Make networks independent of the view direction."""
     for name in names:
         features = method.parameters.features
         getattr(method.networks, name)[0].weight.data[:, features : features + 3] = 0
 
 
 @pytest.mark.parametrize("appearance", [0, 2])
-def test_baking_loses_nothing_where_nothing_depends_on_the_view(data, appearance):
-    """Nor is the light of single photographs taken for what the direction does."""
+def test_baking_is_exact_without_view_dependence(data, appearance):
+    """Appearance vectors of single photos do not count as view dependence."""
     method = make(data, appearance=appearance)
     method.networks.appearance.data.normal_(generator=torch.Generator().manual_seed(2))
-    blind(method, "opacity", "covariance", "color")
+    ignore_direction(method, "opacity", "covariance", "color")
     baked = method.bake()
     for camera in (data.train[0], data.test[0]):
         with torch.no_grad():
-            everything = method.rasterize_decoded(method.decode(camera, ever_drawn(method)), camera).image
+            everything = method.rasterize_decoded(
+                method.decode(camera, drawn_in_training(method)), camera
+            ).image
         assert everything.max() > 0.2
         assert (draw(baked, camera, data) - everything).abs().max() < 1e-3
 
 
-def test_opacity_and_covariance_are_those_of_the_median_view(data):
+def test_baking_uses_the_median_view(data):
     method = make(data)
     baked = method.bake()
     means, anchors = method.model["means"].detach(), []
@@ -180,10 +182,10 @@ def test_opacity_and_covariance_are_those_of_the_median_view(data):
     np.testing.assert_allclose(np.exp(baked.log_scales), scales, rtol=1e-4)
 
 
-def test_harmonics_fit_colours_that_are_harmonics(data):
-    """Colours that change linearly with the direction are found again between the training views."""
+def test_baking_fits_harmonics(data):
+    """Colours linear in the direction are reproduced between the training views."""
     method = make(data, bake_ridge=1e-5)
-    blind(method, "opacity", "covariance")
+    ignore_direction(method, "opacity", "covariance")
     # sigmoid(x) is x/4 + 1/2 near 0: a first layer of directions that stay positive, a faint second one
     first, last = method.networks.color[0], method.networks.color[2]
     first.weight.data.zero_()
@@ -193,7 +195,7 @@ def test_harmonics_fit_colours_that_are_harmonics(data):
     baked = method.bake()
     camera = data.test[1]
     with torch.no_grad():
-        g = method.decode(camera, ever_drawn(method))
+        g = method.decode(camera, drawn_in_training(method))
         shown = method.rasterize_decoded(g, camera).image
         flat = np.array(baked.sh)
         flat[:, 1:] = 0
@@ -202,7 +204,7 @@ def test_harmonics_fit_colours_that_are_harmonics(data):
     assert error < 0.3 * (draw(baked, camera, data) - shown).abs().mean()
 
 
-def test_the_networks_come_back_from_their_arrays(data, tmp_path):
+def test_arrays_restore_the_networks(data, tmp_path):
     method = make(data, appearance=2)
     for step in range(4):
         method.train_step(step)
@@ -226,7 +228,7 @@ def test_the_networks_come_back_from_their_arrays(data, tmp_path):
         other.load_arrays({})
 
 
-def test_new_anchors_come_where_steep_gaussians_are(data):
+def test_growth_at_large_gradients(data):
     method = make(data, steps=400, coarse_share=0.0, min_opacity=0.0, max_splats=10_000)
     count, columns = len(method.model), method.model.columns
     method.model.stats["seen"] += 1

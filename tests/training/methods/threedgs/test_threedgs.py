@@ -1,4 +1,4 @@
-"""Plain 3DGS: one level, its schedule, and that it is FLoD with one level."""
+"""Tests of plain 3DGS: its level, its schedule, and equality with one-level FLoD."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ def make(data, name="3dgs", **values):
     return create(name, data, override(method_info(name).preset("draft"), values), seed=0, backend="cpu")
 
 
-def test_its_one_level_is_there_at_the_end_alone(data):
+def test_single_level_is_returned_at_the_end(data):
     method = make(data, steps=4)
     handed_over = []
     for step in range(method.steps):
@@ -25,8 +25,8 @@ def test_its_one_level_is_there_at_the_end_alone(data):
     assert handed_over == [[], [], [], [1]] and method.levels == 1
 
 
-def test_it_is_flod_with_one_level_to_the_bit(data):
-    """FLoD's last level has no constraint (Sec. 4.1): the paper's own baseline."""
+def test_equals_flod_with_one_level(data):
+    """FLoD's last level has no constraint (Sec. 4.1), which makes it the paper's baseline."""
     values = {
         "steps": 24, "densify_interval": 4, "densify_until": 0.75, "prune_interval": 6, "max_splats": 90,
         "opacity_reset_interval": 10, "grad_threshold": 0.0,
@@ -41,7 +41,7 @@ def test_it_is_flod_with_one_level_to_the_bit(data):
         np.testing.assert_array_equal(*(getattr(splats, name) for splats in models))
 
 
-def test_splats_are_only_added_before_densification_ends(data):
+def test_no_splats_are_added_after_densification(data):
     density = {"densify_interval": 2, "densify_until": 0.5, "grad_threshold": 0.0, "min_opacity": 0.0}
     method = make(data, steps=20, free_depth=0.0, **density)
     counts = []
@@ -52,8 +52,8 @@ def test_splats_are_only_added_before_densification_ends(data):
 
 
 @pytest.mark.parametrize("threshold", [0.003, 0.01])
-def test_what_decides_by_maxima_is_added_from_the_step_on_that_is_given(data, threshold):
-    """As many as have a product above the threshold, which is of images of a megapixel."""
+def test_max_criterion_starts_at_densify_from(data, threshold):
+    """Splats with a product above the threshold are added, normalized to one megapixel."""
     method = make(
         data, steps=40, densify_interval=4, densify_from=7, densify_by="max", max_threshold=threshold,
         margin=0.0, free_depth=0.0, largest=0.0, prune_interval=0, first_resolution=1.0,
@@ -68,7 +68,7 @@ def test_what_decides_by_maxima_is_added_from_the_step_on_that_is_given(data, th
     assert above > 3
 
 
-def test_what_hardly_shows_goes_at_three_steps(data):
+def test_unimportant_splats_are_pruned_three_times(data):
     method = make(
         data, steps=30, least_weight=0.08, densify_until=0.0, prune_interval=0, free_depth=0.0, margin=0.0
     )
@@ -85,8 +85,8 @@ def test_what_hardly_shows_goes_at_three_steps(data):
     assert 8 in gone and set(gone) <= {8, 16, 24}
 
 
-def test_the_light_of_small_splats_is_trained_as_it_is_drawn(data):
-    """A step's picture is the rasterizer's with that filter, and the bundle says which."""
+def test_antialiasing_is_used_in_training(data):
+    """A step renders with the antialiasing filter, and the bundle records it."""
     for antialias in (False, True):
         method = make(data, steps=10, antialias=antialias, random_background=False, dropout=0.0)
         with torch.no_grad():
@@ -102,20 +102,20 @@ def test_the_light_of_small_splats_is_trained_as_it_is_drawn(data):
         assert method.meta().get("antialias", False) is antialias
 
 
-def test_positions_rates_fall_in_equal_factors(data):
+def test_position_rate_decays_exponentially(data):
     method = make(data, steps=100, lr_means=1e-2, lr_means_final=1e-4)
     for step, rate in ((0, 1e-2), (50, 1e-3), (100, 1e-4)):
         method.set_learning_rates(step)
         assert method.model.adam.lr["means"] == pytest.approx(rate * data.extent)
 
 
-def test_when_all_is_too_transparent_it_says_so(data):
+def test_transparent_model_raises(data):
     method = make(data, steps=10, prune_interval=1, min_opacity=1.0)
     with pytest.raises(LodgsError, match=r"no splats remain at step 1.*'min_opacity'"):
         method.train_step(0)
 
 
-def test_harmonics_join_one_degree_after_the_other(data):
+def test_harmonics_degrees_join_one_by_one(data):
     method = make(data, steps=10, sh_interval=3)
     assert [method.sh_degree(step) for step in (0, 2, 3, 8, 9, 50)] == [0, 0, 1, 2, 3, 3]
     method.train_step(0)

@@ -1,4 +1,4 @@
-"""Steps that a graphics device makes by itself are those that go through torch, whatever the method."""
+"""Tests that training steps on a graphics device equal steps through autograd, for all methods."""
 
 import io
 
@@ -23,8 +23,8 @@ CASES = {
     "lodge": {"steps": 8, "tune_steps": 2},
     "tree": {"steps": 8, "tune_steps": 4},
 }
-THERE = {"3dgs": 14, "flod": 15, "octree": 14, "clod": 6, "lodge": 8, "tree": 8}
-"""How many steps of each are plain."""
+DEVICE_STEPS = {"3dgs": 14, "flod": 15, "octree": 14, "clod": 6, "lodge": 8, "tree": 8}
+"""Number of steps on the device for each method."""
 
 
 def make(name, data, backend="gpu"):
@@ -33,7 +33,7 @@ def make(name, data, backend="gpu"):
 
 
 def steps(method, begin: int, end: int) -> list[float]:
-    """The losses of these steps."""
+    """Return the losses of these steps."""
     losses = []
     for step in range(begin, end):
         losses.append(method.train_step(step).loss)
@@ -42,32 +42,32 @@ def steps(method, begin: int, end: int) -> list[float]:
 
 
 @pytest.fixture
-def there(graphics, monkeypatch) -> list:
-    """Grows by one with each step that a device makes."""
+def device_steps(graphics, monkeypatch) -> list:
+    """Return a list that gains an entry for each step on the device."""
     found, twin = [], Model.device_model
 
-    def noted(model, *arguments):
+    def count_step(model, *arguments):
         made = twin(model, *arguments)
         found.append(made is not None)
         return made
 
-    monkeypatch.setattr(Model, "device_model", noted)
+    monkeypatch.setattr(Model, "device_model", count_step)
     return found
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_methods_do_there_what_they_do_here(name, data, there):
+def test_device_steps_equal_autograd_steps(name, data, device_steps):
     method, other = make(name, data), make(name, data, "cpu")
-    count = THERE[name]
+    count = DEVICE_STEPS[name]
     losses, expected = steps(method, 0, count), steps(other, 0, count)
-    assert there == [True] * count + [False] * count
+    assert device_steps == [True] * count + [False] * count
     assert losses == pytest.approx(expected, rel=2e-2)
     assert losses[0] == pytest.approx(expected[0], rel=5e-4)  # photographs there have eight bits
     assert len(method.model) == pytest.approx(len(other.model), rel=0.05)
 
 
 def trained(count: int) -> Model:
-    """Splats after two steps on the device, which have columns here, one of them trained."""
+    """Return splats after two steps on the device, with host columns, one of them trained."""
     rng = np.random.default_rng(0)
     points, colors = rng.uniform((-1, -1, 2), (1, 1, 4), (count, 3)), rng.integers(0, 255, (count, 3))
     tensors = from_points(points, colors, sh_degree=3) | {"decay": torch.arange(float(count))}
@@ -83,7 +83,7 @@ def trained(count: int) -> Model:
 
 
 def control_density(model: Model) -> None:
-    """As 3DGS does: a tenth of the splats become two, faint ones go, opacities fall."""
+    """Imitate 3DGS: split a tenth of the splats, remove faint ones, lower opacities."""
     gradients, rng = model.mean_gradient(), np.random.default_rng(0)
     threshold = float(gradients.quantile(0.9))
     assert densify(model, gradients, threshold=threshold, clone_below=0.1, max_splats=10**6, rng=rng) > 50
@@ -92,10 +92,10 @@ def control_density(model: Model) -> None:
     reset_opacities(model)
 
 
-@pytest.mark.parametrize("most", [1 << 27, 200 << 10])
-def test_splats_come_and_go_there_as_they_do_here(graphics, monkeypatch, most):
-    """To the bit, also on a device that takes the moments of 512 at a time."""
-    monkeypatch.setattr(graphics, "binding_bytes", most)
+@pytest.mark.parametrize("max_bytes", [1 << 27, 200 << 10])
+def test_density_control_on_device_equals_host(graphics, monkeypatch, max_bytes):
+    """Bit-identical, also on a device that processes the moments of 512 splats at a time."""
+    monkeypatch.setattr(graphics, "binding_bytes", max_bytes)
     one, other = trained(1000), trained(1000)
     other.adam.zero_grad()  # which brings it home
     for model in (one, other):
@@ -111,8 +111,8 @@ def test_splats_come_and_go_there_as_they_do_here(graphics, monkeypatch, most):
     assert len(one) == 0 and one._device_model is None
 
 
-def test_density_control_moves_a_few_numbers_of_a_splat(graphics):
-    """Of which there are 750 bytes: those that it decides by, and the rows that come."""
+def test_density_control_transfers_little(graphics):
+    """Of 750 bytes per splat only the criteria and the new rows are transferred."""
     model, before = trained(4000), graphics.transferred
     control_density(model)
     assert model.device_model("gpu", False) is not None and graphics.transferred - before < 100 * 4000
@@ -124,8 +124,8 @@ def _flat(state) -> list[torch.Tensor]:
     return [part for name in sorted(state) for part in _flat(state[name])]
 
 
-def test_a_run_goes_on_elsewhere(data, there):
-    """From here to there and back, by checkpoints: what was there is in them."""
+def test_checkpoint_moves_between_host_and_device(data, device_steps):
+    """Checkpoints contain the state on the device, in both directions."""
     whole, parts, at = make("flod", data, "cpu"), [], 0
     expected = steps(whole, 0, 15)
     file = io.BytesIO()
@@ -138,14 +138,14 @@ def test_a_run_goes_on_elsewhere(data, there):
         file, at = io.BytesIO(), end
         torch.save(method.state_dict(), file)
     assert parts == pytest.approx(expected, rel=2e-2)
-    assert there.count(True) == 5
+    assert device_steps.count(True) == 5
 
 
-def test_a_run_there_resumes_to_the_bit(data, graphics, check_resumed):
+def test_resume_on_device_is_bit_identical(data, graphics, check_resumed):
     check_resumed(lambda: make("flod", data), 7)
 
 
-def test_a_picture_there_is_read_when_it_is_asked_for(data, graphics):
+def test_device_image_is_read_lazily(data, graphics):
     method, other = make("3dgs", data), make("3dgs", data, "cpu")
     made, expected = method.train_step(0), other.train_step(0)
     torch.testing.assert_close(made.image(), expected.image(), atol=2e-3, rtol=0)
