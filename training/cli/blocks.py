@@ -13,6 +13,7 @@ from .train import train_job
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     plan = actions.add_parser(
         "plan", help="divide a job into blocks, each a run of its own, and estimate the work for each"
@@ -44,6 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    """Run the command and return its exit code."""
     return _plan(options) if options.action == "plan" else _train(options)
 
 

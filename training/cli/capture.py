@@ -9,6 +9,7 @@ from .options import BACKEND_HELP, SOURCE_HELP, warn
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
     parser.add_argument("source", type=Path, help=SOURCE_HELP)
     parser.add_argument("--out", type=Path, required=True, help="new folder for the scene")
     parser.add_argument(
@@ -21,6 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    """Run the command and return its exit code."""
     from ..runs.capture import capture
     from ..runs.job import DOME, check_views
 

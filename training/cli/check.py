@@ -21,10 +21,12 @@ INSTALL = "Install the packages of requirements/trainer.txt."
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
     parser.description = "Exit code: 0 if this Python can train, else 2."
 
 
 def run(options: argparse.Namespace | None = None) -> int:
+    """Run the command and return its exit code."""
     report = environment()
     print(json.dumps(report))
     return 0 if report["ok"] else 2

@@ -7,6 +7,7 @@ import json
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
     parser.add_argument("--time", action="store_true", help="also time a training step on each device")
     parser.add_argument(
         "--json", action="store_true", help="print only the drivers' answers, as JSON, without tests"
@@ -14,6 +15,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    """Run the command and return its exit code."""
     from ..rasterize.devices import Devices, describe
 
     print(json.dumps(Devices.detect().as_json()) if options.json else describe(options.time))

@@ -18,6 +18,7 @@ _LIMITS = "max_size", "min_opacity", "max_distance", "min_views", "gap", "share"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
     parser.description = (
         "Edits every level in the same way; levels can still be selected by distance. Positions and "
         "lengths of crops and limits are in the splats' units before the edit (lodgs info prints the "
@@ -108,6 +109,7 @@ def _add_look(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    """Run the command and return its exit code."""
     from ..editing.cleaning import Cleaning
     from ..editing.edit import edit
     from ..runs.folder import RunFolder

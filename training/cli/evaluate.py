@@ -9,6 +9,7 @@ from .options import add_controls, control_values, warn
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
     parser.add_argument("run", type=Path, help="run folder")
     add_controls(parser)
     parser.add_argument("--picture", type=Path, help="PNG to write: the levels side by side from one view")
@@ -18,6 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    """Run the command and return its exit code."""
     from ..runs.measure import evaluate_run, format_report
 
     report = evaluate_run(options.run, control_values(options), options.picture, options.far, warn)

@@ -16,10 +16,12 @@ from ..splats.ply import Element, all_columns
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
     parser.add_argument("file", type=Path, help="bundle, folder of levels, or any 3DGS PLY")
 
 
 def run(options: argparse.Namespace) -> int:
+    """Run the command and return its exit code."""
     from ..splats.formats import open_as_ply
 
     with open_as_ply(options.file) as path:

@@ -13,10 +13,12 @@ _WIDTH = 110
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
     parser.add_argument("name", nargs="?", metavar="NAME", help="method whose parameters to list")
 
 
 def run(options: argparse.Namespace) -> int:
+    """Run the command and return its exit code."""
     print(describe_method(options.name) if options.name else describe_methods())
     return 0
 

@@ -10,6 +10,7 @@ from .options import BACKEND_HELP, SOURCE_HELP, add_controls, control_values, pa
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
     parser.add_argument("source", type=Path, help=SOURCE_HELP)
     camera = parser.add_mutually_exclusive_group(required=True)
     camera.add_argument("--camera", type=Path, help="JSON file of a camera, as Blender's LODGS tab writes it")
@@ -34,6 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    """Run the command and return its exit code."""
     from ..lod.rule import find_rule
     from ..lod.selection import unknown_rule_error
     from ..render.command import RenderSource, render

@@ -12,6 +12,7 @@ from .options import warn
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
     parser.description = "Repeat the command to resume an interrupted reconstruction."
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument(
@@ -47,6 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    """Run the command and return its exit code."""
     return _reconstruct(options) if options.photos else _convert(options)
 
 

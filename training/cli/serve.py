@@ -10,6 +10,7 @@ from .options import BACKEND_HELP
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
     parser.add_argument(
         "folder", type=Path, help="new or empty folder for arrays, removed when the server ends"
     )
@@ -17,6 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    """Run the command and return its exit code."""
     from ..render.serve import serve
 
     return serve(options.folder, options.backend, sys.stdin.buffer, sys.stdout)

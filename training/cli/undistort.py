@@ -9,12 +9,14 @@ from .options import warn
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
     parser.add_argument("scene", type=Path, help="COLMAP folder")
     parser.add_argument("--model", type=Path, metavar="DIR", help="folder of its model")
     parser.add_argument("--images", type=Path, metavar="DIR", help="folder of its photos")
 
 
 def run(options: argparse.Namespace) -> int:
+    """Run the command and return its exit code."""
     from ..scenes.colmap import read_scene
     from ..scenes.undistort import CACHE_FOLDER, undistort_scene
 
