@@ -386,7 +386,7 @@ def selection_ms(splats: Gaussians, camera: Camera, seconds: float) -> tuple[flo
         for facts in (collect_facts(BANDS, {}, levels, number) for number, _ in levels)
     ]
     return (
-        fastest(lambda: [chooser.chosen(choice, camera, 0.01) for choice in choices], seconds),
+        fastest(lambda: [chooser.select(choice, camera, 0.01) for choice in choices], seconds),
         fastest(lambda: [np.flatnonzero(choice.weights(means, {})) for choice in choices], seconds),
     )
 

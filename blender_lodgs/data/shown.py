@@ -13,8 +13,7 @@ import bpy
 import numpy as np
 
 from .. import attributes
-from . import looks, selection, streams
-from . import roots as scenes
+from . import looks, roots, selection, streams
 from .placement import axes_of
 
 
@@ -81,7 +80,7 @@ def splat_instances(
         return []
     levels = {
         item.object: (item.number, root)
-        for root in scenes.roots(depsgraph.scene)
+        for root in roots.roots(depsgraph.scene)
         for item in root.lodgs.levels
         if item.object is not None
     }
@@ -96,7 +95,7 @@ def splat_instances(
         matrix = np.array(instance.matrix_world, np.float64)
         original = obj.original
         evaluated = original.evaluated_get(depsgraph)
-        level, root = levels.get(original) or (0, scenes.root_of(original))
+        level, root = levels.get(original) or (0, roots.root_of(original))
         antialias = root is not None and root.lodgs.antialias
         together = root, evaluated.matrix_world.copy().freeze()  # levels mostly are, and have one look
         if root is not None and together not in own_looks:
@@ -119,7 +118,7 @@ def choice_of_picture(instance: SplatInstance, depsgraph: bpy.types.Depsgraph) -
     that has seen: the camera asks for itself.
     """
     choice = selection.choice(instance.evaluated, depsgraph)
-    root, camera = scenes.root_of(instance.object), depsgraph.scene.camera
+    root, camera = roots.root_of(instance.object), depsgraph.scene.camera
     if choice is None or not choice.rule or instance.source is None or root is None or camera is None:
         return choice
     settings = root.lodgs
@@ -132,7 +131,7 @@ def choice_of_picture(instance: SplatInstance, depsgraph: bpy.types.Depsgraph) -
 
 def _with_sources(found: list[SplatInstance], depsgraph: bpy.types.Depsgraph) -> list[SplatInstance]:
     """The same, with sources where all levels stand together, chosen by nothing but their rule."""
-    sources = {root: source for root in scenes.roots(depsgraph.scene) if (source := streams.source_of(root))}
+    sources = {root: source for root in roots.roots(depsgraph.scene) if (source := streams.source_of(root))}
     if not sources:
         return found
     of = {item.object: root for root in sources for item in root.lodgs.levels if item.exists}

@@ -20,7 +20,7 @@ import bpy
 
 from ...training.lod.colors import level_color
 from .. import extension
-from ..data import roots as scenes
+from ..data import roots
 from . import cells, coverage, discs, eye, frusta, splats, views
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ def _draw_view(context: bpy.types.Context) -> None:
     if space.shading.type == "SOLID" and space.shading.color_type not in {"OBJECT", "RANDOM", "SINGLE"}:
         points = [
             (obj, tint)
-            for root in scenes.roots(context.scene)
+            for root in roots.roots(context.scene)
             for obj, tint in _points(root.lodgs, not with_splats and not context.scene.lodgs_viewport.native)
             if obj is not None and obj.visible_get(view_layer=context.view_layer, viewport=space)
         ]

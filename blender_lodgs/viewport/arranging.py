@@ -16,8 +16,7 @@ from typing import Protocol
 import numpy as np
 
 from ...training.editing.look import Looks
-from ...training.lod.query import LodQuery as Choice
-from ...training.lod.query import SplatSelector as Chooser
+from ...training.lod.query import LodQuery, SplatSelector
 from ...training.lod.rule import OPACITY
 
 SAMPLE, LEAST_SAMPLE = 16, 10_000
@@ -64,31 +63,31 @@ class Pool:
     serial: int = field(default_factory=lambda: next(_serials))
     changed: list[np.ndarray] = field(default_factory=list)
     _seen: dict[int, int] = field(default_factory=dict)
-    _choosers: dict[tuple[int, int], Chooser] = field(default_factory=dict, compare=False)
+    _choosers: dict[tuple[int, int], SplatSelector] = field(default_factory=dict, compare=False)
     _drawn: list[Drawn] = field(default_factory=list, compare=False)
 
-    def chooser(self, placement: Placement) -> Chooser:
+    def chooser(self, placement: Placement) -> SplatSelector:
         """What chooses from a placement's splats."""
         key = placement.first, placement.count
         if key not in self._choosers:
             part = slice(placement.first, placement.first + placement.count)
             columns = {name: column[part] for name, column in self.columns.items()}
             columns[OPACITY] = self.opacities[part]
-            self._choosers[key] = Chooser(self.means[part], columns)
+            self._choosers[key] = SplatSelector(self.means[part], columns)
         return self._choosers[key]
 
     def about(self, placement: Placement) -> int:
         """About how many splats of a placement have a weight: of many splats a few are asked."""
         few = placement.count // SAMPLE
-        if placement.choice is None or not placement.choice.how.apart or few < LEAST_SAMPLE:
+        if placement.choice is None or not placement.choice.resolved_rule.independent or few < LEAST_SAMPLE:
             return len(_choose(self, placement)[0])
         key = placement.first, -few
         if key not in self._choosers:
             rows = placement.first + np.random.default_rng(0).integers(0, placement.count, few)
             columns = {name: column[rows] for name, column in self.columns.items()}
             columns[OPACITY] = self.opacities[rows]
-            self._choosers[key] = Chooser(self.means[rows, :3], columns)
-        return len(self._choosers[key].chosen(placement.choice)[0]) * SAMPLE
+            self._choosers[key] = SplatSelector(self.means[rows, :3], columns)
+        return len(self._choosers[key].select(placement.choice)[0]) * SAMPLE
 
     def drawn(self, request: Request) -> Drawn:
         """What a request draws, in no order; the last one is kept."""
@@ -153,7 +152,7 @@ class Placement:
     count: int
     matrix: bytes
     level: int
-    choice: Choice | None
+    choice: LodQuery | None
     scene: int
     tell: str
     antialias: bool = False
@@ -317,7 +316,7 @@ def _choose(pool: Pool, placement: Placement) -> tuple[np.ndarray, np.ndarray]:
     """The splats of a placement that have a weight, and their weights."""
     if placement.choice is None:
         return np.arange(placement.count, dtype=np.int32), np.ones(placement.count, np.float32)
-    return pool.chooser(placement).chosen(placement.choice)
+    return pool.chooser(placement).select(placement.choice)
 
 
 def _thin(pool: Pool, placements, chosen, which: Sequence[int], keep: int) -> None:
@@ -345,10 +344,10 @@ def _color_levels(
     choice = placement.choice
     if choice is not None and choice.rule:
         if placement.tell == "LEVELS":
-            own, place = choice.how.columns, index + placement.first
-            return choice.told_level({n: pool.columns[n][place] for n in own if n in pool.columns})
+            own, place = choice.resolved_rule.columns, index + placement.first
+            return choice.splat_level({n: pool.columns[n][place] for n in own if n in pool.columns})
         if placement.tell == "BANDS":
-            return choice.wanted_level(means)
+            return choice.target_level(means)
         if placement.tell == "CHUNKS":
-            return choice.parts(means)
+            return choice.part_numbers(means)
     return placement.level if placement.tell in ("LEVELS", "BANDS") else 0

@@ -8,8 +8,7 @@ import numpy as np
 from gpu_extras.batch import batch_for_shader
 
 from ...training.lod.colors import level_color
-from ..data import cells
-from ..data import roots as scenes
+from ..data import cells, roots
 from ..data.placement import axes_of
 from . import frusta
 
@@ -21,7 +20,7 @@ FAINT, FILLED = 0.5, 0.08
 
 def draw(scene: bpy.types.Scene) -> None:
     """Draws the cells that are to be shown into the active framebuffer, over everything."""
-    for root in scenes.roots(scene):
+    for root in roots.roots(scene):
         settings = root.lodgs.training
         if not settings.show_cells or not settings.planned_cells:
             continue

@@ -14,8 +14,7 @@ import bpy
 import numpy as np
 from mathutils import Matrix, Vector
 
-from ..data import roots as scenes
-from ..data import selection
+from ..data import roots, selection
 from ..data.placement import axes_of
 
 Place = tuple[float, float, float]
@@ -83,7 +82,7 @@ def on_draw(
         splats: whether it draws splats as such.
     """
     global _newest, _due
-    if not any(_follows(root) for root in scenes.roots(scene)):
+    if not any(_follows(root) for root in roots.roots(scene)):
         _last.clear()
         return
     matrix = view.window_matrix @ view.view_matrix
@@ -115,7 +114,7 @@ def moved(scene: bpy.types.Scene, root: bpy.types.Object) -> tuple[Place, float]
 
 def follow(scene: bpy.types.Scene, eye: Place, focal_px: float) -> None:
     """Has all splat scenes whose eye is the viewport measure distances from a place in the world."""
-    for root in scenes.roots(scene):
+    for root in roots.roots(scene):
         if _follows(root):
             selection.hold(root, tuple(axes_of(root).matrix_world.inverted_safe() @ Vector(eye)), focal_px)
 

@@ -12,8 +12,7 @@ from mathutils import Matrix
 
 from ...training.errors import LodgsError
 from ...training.scenes.cameras import Camera
-from ..data import roots as scenes
-from ..data import viewpoints
+from ..data import roots, viewpoints
 from ..data.placement import axes_of
 
 COLOR = (1.0, 0.75, 0.2, 1.0)
@@ -23,7 +22,7 @@ LENGTH = 0.2
 
 def draw(context: bpy.types.Context) -> None:
     """Draws the views that are to be shown into the active framebuffer, over everything."""
-    for root in scenes.roots(context.scene):
+    for root in roots.roots(context.scene):
         if root.lodgs.training.show_views and viewpoints.alone(root):
             with suppress(LodgsError):  # which the panel says
                 _draw(viewpoints.placed_of(root), axes_of(root).matrix_world)

@@ -17,8 +17,8 @@ import bpy
 import gpu
 import numpy as np
 
-from ...training.editing.paint import mix_paint as mixed
-from ...training.lod.rule import all_rule_columns as every_column
+from ...training.editing.paint import mix_paint
+from ...training.lod.rule import all_rule_columns
 from .. import attributes
 from ..data import changes, cleaning, painting
 from . import splats
@@ -256,7 +256,7 @@ class Reading:
         total = sum(counts)
         means, areas = np.zeros((total, 3), np.float32), np.zeros(total, np.float32)
         opacities = np.zeros(total, np.float32)
-        columns = {name: np.zeros(total, np.float32) for name in every_column()}
+        columns = {name: np.zeros(total, np.float32) for name in all_rule_columns()}
         paged = [
             (start, each) for start, each in zip(starts, clouds, strict=True) if isinstance(each, Stream)
         ]
@@ -332,7 +332,7 @@ def read_records(cloud: bpy.types.PointCloud, rows: np.ndarray, higher: int) -> 
         records[:, 3] *= weights[rows]
     if (paint := painting.shown_paint(cloud, rows)) is not None:
         colors = records[:, 11 : 14 + 3 * higher].reshape(len(records), -1, 3)  # a view
-        colors[:] = mixed(colors, paint)
+        colors[:] = mix_paint(colors, paint)
     return records
 
 

@@ -17,7 +17,7 @@ from mathutils import Matrix
 
 from ...training.editing.look import Looks
 from ...training.lod.colors import LEVEL_COLORS
-from ...training.lod.crop import FACE_SQUARED as FACE
+from ...training.lod.crop import FACE_SQUARED
 from .arranging import WIDTH, Arrangement
 
 MOST_COEFFICIENTS = 24
@@ -555,7 +555,7 @@ def _splat_shader() -> gpu.types.GPUShader:
         info.sampler(slot, "FLOAT_2D", name)
     info.define("WIDTH", str(WIDTH))
     info.define("PALETTE", str(len(LEVEL_COLORS)))
-    info.define("FACE", repr(FACE))
+    info.define("FACE", repr(FACE_SQUARED))
     info.define("SELECTED", f"vec3{SELECTED}")
     info.push_constant("MAT4", "projection")
     info.push_constant("VEC4", "frame")

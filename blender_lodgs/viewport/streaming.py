@@ -12,7 +12,7 @@ import time
 import numpy as np
 
 from ...training.errors import LodgsError
-from ...training.lod.query import LodQuery as Choice
+from ...training.lod.query import LodQuery
 from ...training.lod.rules.cut import NODE_SIZE, PARENT, PARENT_SIZE, detail_of
 from ...training.lod.tree.paging import SIZE, Pager
 from ...training.splats.gaussians import Splats
@@ -41,7 +41,7 @@ class Stream:
         self.source, self.ready, self.problem = source, False, ""
         self.records, self.columns, self.higher, self.taken = np.zeros((0, 0), np.float32), {}, 0, 0
         self._pager: Pager | None = None
-        self._asked: tuple[Choice, Direction | None] | None = None
+        self._asked: tuple[LodQuery, Direction | None] | None = None
         self._stopping = False
         threading.Thread(target=self._open, name="lodgs-stream", daemon=True).start()
 
@@ -67,7 +67,7 @@ class Stream:
             return self.arrived != self.taken
         return self._pager is None or not self.ready or not self._pager.idle
 
-    def ask(self, choice: Choice, direction: Direction | None) -> None:
+    def ask(self, choice: LodQuery, direction: Direction | None) -> None:
         """Says by what splats are chosen from now on. Returns at once.
 
         Args:

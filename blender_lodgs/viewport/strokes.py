@@ -5,12 +5,9 @@ from __future__ import annotations
 import bpy
 import numpy as np
 
-from ...training.editing.brush import OcclusionDepth as Front
-from ...training.editing.brush import Projection
-from ...training.editing.brush import hit_strength as hits
-from ...training.editing.brush import middle_scale as middle
-from ...training.lod.crop import crop_mask as kept
-from ...training.lod.query import SplatSelector as Chooser
+from ...training.editing.brush import OcclusionDepth, Projection, hit_strength, middle_scale
+from ...training.lod.crop import crop_mask
+from ...training.lod.query import SplatSelector
 from ...training.lod.rule import HIDDEN, OPACITY
 from .. import attributes
 from ..data import cleaning, crops, shown
@@ -50,12 +47,12 @@ class Picture:
             obj, cloud = item.object, item.object.data
             means, scales = (cleaning.view_of(cloud, name) for name in ("position", attributes.SCALE))
             placed = projected.place(means)
-            there = kept(cropped, means) & ~cleaning.hidden(cloud)
-            self._levels[item.number] = placed, 2 * scales.max(axis=1, initial=0), there, middle(scales)
+            there = crop_mask(cropped, means) & ~cleaning.hidden(cloud)
+            self._levels[item.number] = placed, 2 * scales.max(axis=1, initial=0), there, middle_scale(scales)
             if (instance := instances.get(obj)) is not None:
                 choice = views.choice_of_view(instance, depsgraph)
                 parts.append((placed, scales, _drawn(cloud, means, choice)))
-        self._front = Front(parts)
+        self._front = OcclusionDepth(parts)
 
     def hits(
         self, covered: np.ndarray, through: bool = False, footprints: bool = False
@@ -69,7 +66,7 @@ class Picture:
         """
         front = None if through else self._front
         return {
-            number: hits(covered, placed, reach, front, sigma if footprints else None) * there
+            number: hit_strength(covered, placed, reach, front, sigma if footprints else None) * there
             for number, (placed, reach, there, sigma) in self._levels.items()
         }
 
@@ -82,7 +79,7 @@ def _drawn(cloud: bpy.types.PointCloud, means: np.ndarray, choice) -> np.ndarray
     names = {name for name in choice.columns if name in cloud.attributes}
     columns = {name: attributes.view_attribute(cloud, name) for name in names - {HIDDEN}}
     columns |= {OPACITY: opacities, HIDDEN: cleaning.hidden(cloud)}
-    rows, weights = Chooser(means, columns).chosen(choice)
+    rows, weights = SplatSelector(means, columns).select(choice)
     drawn = np.zeros(len(means), np.float32)
     drawn[rows] = weights * opacities[rows]
     return drawn

@@ -26,8 +26,7 @@ import numpy as np
 from mathutils import Matrix
 
 from .. import extension
-from ..data import changes, selection, shown
-from ..data import roots as scenes
+from ..data import changes, roots, selection, shown
 from ..nodes import display
 from . import eye, resident, splats
 from .arranging import Arrangement, Placement, Request, arrange
@@ -311,7 +310,7 @@ def _direction(
 def _stood_for(instances: list[shown.SplatInstance]) -> Iterator[bpy.types.PointCloud]:
     """The levels in whose place what is read from a file is drawn."""
     for instance in instances:
-        root = scenes.root_of(instance.object) if instance.source is not None else None
+        root = roots.root_of(instance.object) if instance.source is not None else None
         for item in root.lodgs.levels if root is not None else ():
             if item.exists:
                 yield item.object.data
@@ -388,11 +387,11 @@ def _placements(
     moving: bool,
     take_over: bool,
 ) -> tuple[Placement, ...]:
-    roots = {item.object: root for root in scenes.roots(depsgraph.scene) for item in root.lodgs.levels}
+    root_of_level = {item.object: root for root in roots.roots(depsgraph.scene) for item in root.lodgs.levels}
     numbers, found = {key: number for number, key in enumerate(_keys)}, []
     for instance in instances:
         number = numbers[_key(instance, depsgraph)]
-        root, paged = roots.get(instance.object), instance.source and _streams[instance.source.scene]
+        root, paged = root_of_level.get(instance.object), instance.source and _streams[instance.source.scene]
         found.append(
             Placement(
                 first=of.starts[number],
@@ -422,7 +421,7 @@ def choice_of_view(
         return None
     if not moving:
         return shown.choice_of_picture(instance, depsgraph)
-    choice, root = selection.choice(instance.evaluated, depsgraph), scenes.root_of(instance.object)
+    choice, root = selection.choice(instance.evaluated, depsgraph), roots.root_of(instance.object)
     seen = eye.moved(depsgraph.scene, root) if root is not None else None
     return (
         choice

@@ -10,7 +10,7 @@ import gpu
 import numpy as np
 from gpu_extras.batch import batch_for_shader
 
-from ..data import roots as scenes
+from ..data import roots
 from . import eye
 from .splats import bind_textures
 
@@ -136,7 +136,7 @@ def _draw() -> None:
 
 def shown(context: bpy.types.Context) -> bool:
     """Whether there is a comparison of the scene's camera, and the panel that can switch it off again."""
-    camera, root = context.scene.camera, scenes.active_root(context)
+    camera, root = context.scene.camera, roots.active_root(context)
     if comparison is None or camera is None or root is None or root.lodgs.cameras is None:
         return False
     return (

@@ -33,7 +33,7 @@ _MAX_SURPLUS = 2
 def supports_culled_reads(rule: str) -> bool:
     """Return whether levels of a rule can be drawn from only the splats that a camera can see."""
     resolved = find_rule(rule)
-    return resolved is not None and resolved.apart and not resolved.tables
+    return resolved is not None and resolved.independent and not resolved.tables
 
 
 def open_if_large(path: str | Path, limit: int = 0) -> Bundle | None:
@@ -111,7 +111,7 @@ class CulledReader:
             query: skip blocks whose splats have no weight by this query.
         """
         visible = self._blocks.in_view(camera, 0.0)
-        if query is not None and self._rule is not None and self._rule.apart and query.region() is None:
+        if query is not None and self._rule is not None and self._rule.independent and query.region() is None:
             band = query.distance_band(self._highest)
             visible &= self._blocks.in_band(np.array(query.eye, np.float32), *band)[0]
         limit = max(_MAX_SURPLUS * np.count_nonzero(visible), _BATCH // SIZE)

@@ -43,14 +43,14 @@ class LodQuery:
         return cls(NO_RULE.name, (0.0, 0.0, 0.0), 1.0, (), (), crops=crops)
 
     @property
-    def how(self) -> Rule:
+    def resolved_rule(self) -> Rule:
         """The rule."""
         return rules()[self.rule] if self.rule else NO_RULE
 
     @property
     def columns(self) -> tuple[str, ...]:
         """Names of the columns that :meth:`weights` needs."""
-        return self.how.columns if self.crops is None else (*self.how.columns, HIDDEN)
+        return self.resolved_rule.columns if self.crops is None else (*self.resolved_rule.columns, HIDDEN)
 
     def weights(self, means: np.ndarray, columns: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return weights (N,) of splats at means (N, 3) with columns (N,) by name.
@@ -61,7 +61,7 @@ class LodQuery:
         values = dict(self.values)
 
         def weigh(means: np.ndarray, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-            return self.how.weights(
+            return self.resolved_rule.weights(
                 means, self._position, self.focal_px, columns, facts, values, self._tables()
             )
 
@@ -74,47 +74,47 @@ class LodQuery:
             return weigh(means, columns)
         weights = np.zeros(len(means), np.float32)
         rows = np.flatnonzero(visible)
-        weights[rows] = weigh(means[rows], {name: columns[name][rows] for name in self.how.columns})
+        weights[rows] = weigh(means[rows], {name: columns[name][rows] for name in self.resolved_rule.columns})
         return weights
 
     def distance_band(self, highest: Mapping[str, np.ndarray]) -> tuple[float, float | np.ndarray]:
         """Return the distance band, see ``Rule.distance_band``."""
-        return self.how.distance_band(self.focal_px, dict(self.facts), dict(self.values), highest)
+        return self.resolved_rule.distance_band(self.focal_px, dict(self.facts), dict(self.values), highest)
 
     def region(self) -> Region | None:
         """Return the camera's region, see ``Rule.region``."""
-        return self.how.region(self._position, dict(self.values), self._tables())
+        return self.resolved_rule.region(self._position, dict(self.values), self._tables())
 
     def visible_in_region(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return (N,) bool, see ``Rule.visible_in_region``; the camera must be in a region."""
         region = self.region()
         assert region is not None
-        return self.how.visible_in_region(columns, region)
+        return self.resolved_rule.visible_in_region(columns, region)
 
     def region_label(self) -> str:
         """Return a description of the region, see ``Rule.region_label``."""
-        return self.how.region_label(self._position, dict(self.values), self._tables())
+        return self.resolved_rule.region_label(self._position, dict(self.values), self._tables())
 
     def inactive_controls(self) -> Mapping[str, str]:
         """Return controls without effect, see ``Rule.inactive_controls``."""
-        return self.how.inactive_controls(self._position, dict(self.values), self._tables())
+        return self.resolved_rule.inactive_controls(self._position, dict(self.values), self._tables())
 
-    def parts(self, means: np.ndarray) -> np.ndarray:
-        """Return (N,) numbers of parts of space, see ``Rule.parts``."""
-        return self.how.parts(means, self._tables())
+    def part_numbers(self, means: np.ndarray) -> np.ndarray:
+        """Return (N,) numbers of parts of space, see ``Rule.part_numbers``."""
+        return self.resolved_rule.part_numbers(means, self._tables())
 
-    def told_level(self, columns: Mapping[str, np.ndarray]) -> np.ndarray | float:
-        """Return the level (N,) of splats with columns (N,), see ``Rule.told_level``."""
-        return self.how.told_level(columns, dict(self.facts))
+    def splat_level(self, columns: Mapping[str, np.ndarray]) -> np.ndarray | float:
+        """Return the level (N,) of splats with columns (N,), see ``Rule.splat_level``."""
+        return self.resolved_rule.splat_level(columns, dict(self.facts))
 
-    def wanted_level(self, means: np.ndarray) -> np.ndarray:
-        """Return the level (N,) that the rule aims at, see ``Rule.wanted_level``."""
+    def target_level(self, means: np.ndarray) -> np.ndarray:
+        """Return the level (N,) that the rule aims at, see ``Rule.target_level``."""
         facts = dict(self.facts)
-        return self.how.wanted_level(means, self._position, self.focal_px, facts, dict(self.values))
+        return self.resolved_rule.target_level(means, self._position, self.focal_px, facts, dict(self.values))
 
     def coarser(self, levels: Sequence[int]) -> LodQuery | None:
         """Return the query for the next coarser detail; None if there is none."""
-        values = self.how.coarser(dict(self.values), levels)
+        values = self.resolved_rule.coarser(dict(self.values), levels)
         return None if values is None else replace(self, values=tuple(values.items()))
 
     @property
@@ -163,22 +163,22 @@ class SplatSelector:
         self._region: tuple[str, Region, _Subset] | None = None
         self._last: tuple[LodQuery | None, tuple[np.ndarray, np.ndarray]] | None = None
 
-    def chosen(
-        self, choice: LodQuery | None, camera: Camera | None = None, near: float = 0.0
+    def select(
+        self, query: LodQuery | None, camera: Camera | None = None, near: float = 0.0
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the rows of splats with a weight, (M,) int32 ascending, and their weights (M,) float32.
 
         Without a camera, the result of the last query is cached.
 
         Args:
-            choice: None: all splats have weight 1.
+            query: None: all splats have weight 1.
             camera: skip blocks outside its image; None: keep them.
             near: depth where the camera's image begins.
         """
         if camera is not None:
-            return self._select(choice, camera, near)
-        if self._last is None or self._last[0] != choice:
-            self._last = choice, self._select(choice, None, 0.0)
+            return self._select(query, camera, near)
+        if self._last is None or self._last[0] != query:
+            self._last = query, self._select(query, None, 0.0)
         return self._last[1]
 
     def _subset(self, query: LodQuery) -> tuple[_Subset, bool]:
@@ -190,7 +190,9 @@ class SplatSelector:
         if self._region is None or self._region[:2] != (query.rule, region):
             rows = np.flatnonzero(query.visible_in_region(subset.columns)).astype(np.int32)
             if len(rows) < len(subset.means):
-                columns = {name: subset.columns[name][rows] for name in (*query.how.columns, HIDDEN)}
+                columns = {
+                    name: subset.columns[name][rows] for name in (*query.resolved_rule.columns, HIDDEN)
+                }
                 log_scales = None if self._log_scales is None else self._log_scales[rows]
                 subset = _Subset.of(rows, subset.means[rows], columns, log_scales)
             self._region = query.rule, region, subset
@@ -211,7 +213,7 @@ class SplatSelector:
         if not visible.any():
             return np.zeros(0, np.int32), np.zeros(0, np.float32)
         rows = blocks.rows(visible) if subset.rows is None else blocks.of_rows(visible, subset.rows)
-        if query is not None and not query.how.apart:
+        if query is not None and not query.resolved_rule.independent:
             return _with_weight(rows, blocks.of_rows(visible, _weigh(query, subset.means, columns)))
         evaluated = visible & ~full
         if not evaluated.any():
@@ -233,10 +235,10 @@ class SplatSelector:
         count = len(subset.blocks.low)
         visible = np.ones(count, bool)
         full = np.full(count, query is None)
-        if query is not None and query.how.apart and not in_region:
-            band = query.distance_band(subset.highest(query.how))
+        if query is not None and query.resolved_rule.independent and not in_region:
+            band = query.distance_band(subset.highest(query.resolved_rule))
             visible, inside = subset.blocks.in_band(np.array(query.eye, np.float32), *band)
-            if query.how.binary and query.crops is None:
+            if query.resolved_rule.binary and query.crops is None:
                 full = inside
         return visible, full
 

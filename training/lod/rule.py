@@ -112,7 +112,7 @@ class Rule(ABC):
         places: the columns and table columns that are positions, as names of x, y and z.
         linked_columns: columns of a splat must agree with those of others, see :meth:`reconcile`.
         always_active: weights apply at full detail, too: without them a level is not as trained.
-        apart: the weight of a splat does not depend on other splats, so a subset can be evaluated.
+        independent: weights do not depend on other splats, so that subsets can be evaluated.
         binary: every splat inside its level's :meth:`distance_band` has weight 1.
         complete: each level, with the coarser ones if levels add up, is a complete scene; otherwise only the
             finest is.
@@ -130,7 +130,7 @@ class Rule(ABC):
     places: ClassVar[tuple[AxisNames, ...]] = ()
     linked_columns: ClassVar[bool] = False
     always_active: ClassVar[bool] = False
-    apart: ClassVar[bool] = True
+    independent: ClassVar[bool] = True
     binary: ClassVar[bool] = False
     complete: ClassVar[bool] = True
     sweep: ClassVar[tuple[str, tuple[float, ...]] | None] = None
@@ -211,7 +211,7 @@ class Rule(ABC):
         """Return the controls without effect at a camera position, by name, each with a reason."""
         return {}
 
-    def parts(self, means: np.ndarray, tables: Tables) -> np.ndarray:
+    def part_numbers(self, means: np.ndarray, tables: Tables) -> np.ndarray:
         """Return the number (N,), from 1 on, of the part of space at each position, for coloured overlays.
 
         0 if the rule has no such parts.
@@ -226,11 +226,13 @@ class Rule(ABC):
         """
         return levels if self.complete else levels[-1:]
 
-    def told_level(self, columns: Mapping[str, np.ndarray], facts: Mapping[str, float]) -> np.ndarray | float:
+    def splat_level(
+        self, columns: Mapping[str, np.ndarray], facts: Mapping[str, float]
+    ) -> np.ndarray | float:
         """Return the level (N,) of splats, or one for all, for overlays that colour splats by level."""
         return facts["level"]
 
-    def wanted_level(
+    def target_level(
         self,
         means: np.ndarray,
         position: np.ndarray,

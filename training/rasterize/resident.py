@@ -95,7 +95,7 @@ class SplatSet:
         """
         if self._selector is None:
             self._selector = self._make_selector()
-        rows, weights = self._selector.chosen(query, camera, near)
+        rows, weights = self._selector.select(query, camera, near)
         if self._weights is None:
             return rows, weights
         weights = weights * self._weights[rows]

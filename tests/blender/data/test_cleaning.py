@@ -343,9 +343,9 @@ def test_nothing_left_is_said_and_half_a_tree_is_not_deleted(bpy, lodgs, scene_o
     crops = lodgs("data.crops")
     crops.new_crop(root, "BOX", blender(placed((900, 0, 0), (0, 0, 0), (1, 1, 1))))
     bpy.context.view_layer.update()
-    with pytest.raises(RuntimeError, match="Nothing is left"):
+    with pytest.raises(RuntimeError, match="No splats remain"):
         bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "out.ply"))
-    with pytest.raises(RuntimeError, match="Nothing is left"):
+    with pytest.raises(RuntimeError, match="No splats remain"):
         bpy.ops.lodgs.delete_left_out()
     assert not (tmp_path / "out.ply").exists() and len(root.lodgs.levels[0].object.data.points) == 700
 

@@ -134,9 +134,9 @@ def test_the_top_of_a_tree_can_be_imported(bpy, lodgs, tree, root, tmp_path):
 def test_colours_tell_sizes(bpy, lodgs):
     """Each colour is an octave of what a splat stands for, leaves have the last."""
     rule = lodgs("training.lod.rule").rules()["cut"]
-    told = partial(rule.told_level, facts={"level": 1.0})
+    told = partial(rule.splat_level, facts={"level": 1.0})
     sizes = np.float32([0, 1, 1.9, 2, 4, 0.5, 0.3, 2.0**10, 2.0**11])
     assert told({"node_size": sizes}).tolist() == [12, 1, 1, 11, 10, 2, 3, 2, 1]
     means = np.float32([[0, 0, d] for d in (31.9, 32, 64, 128)])
-    wanted = rule.wanted_level(means, np.zeros(3, np.float32), 64.0, {"level": 1.0}, {"pixels": 2.0})
+    wanted = rule.target_level(means, np.zeros(3, np.float32), 64.0, {"level": 1.0}, {"pixels": 2.0})
     assert wanted.tolist() == [2, 1, 11, 10]

@@ -239,7 +239,7 @@ def test_edited_group_is_used_everywhere(bpy, lodgs, half, change, frame, name):
         if placed.choice is None:
             return len(splats)
         columns = splats.extras | {"opacity": 1 / (1 + np.exp(-splats.opacity_logits))}
-        return len(lodgs("training.lod.query").SplatSelector(splats.means, columns).chosen(placed.choice)[0])
+        return len(lodgs("training.lod.query").SplatSelector(splats.means, columns).select(placed.choice)[0])
 
     def everything():
         return sum(len(item.object.data.points) for item in root.lodgs.levels if item.object.visible_get())

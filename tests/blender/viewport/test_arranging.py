@@ -294,7 +294,7 @@ def test_a_budget_finds_its_choice_by_asking_a_few(bpy, lodgs, monkeypatch):
     )  # fmt: skip
     by = choice(lodgs, "cut", 1000.0, {"level": 2.0, "levels": 2.0}, {"pixels": 1.0})
     truth, budget = by, 100_000
-    while len(pool.chooser(placed(lodgs, 0, count, level=2)).chosen(truth)[0]) > budget:
+    while len(pool.chooser(placed(lodgs, 0, count, level=2)).select(truth)[0]) > budget:
         truth = truth.coarser([1, 2])
     assert dict(truth.values)["pixels"] > 2
     choose = arranging._choose
@@ -302,7 +302,7 @@ def test_a_budget_finds_its_choice_by_asking_a_few(bpy, lodgs, monkeypatch):
     ((index, _),), left_out = arranging.within_budget(
         pool, [placed(lodgs, 0, count, level=2, choice=by)], budget
     )
-    assert np.array_equal(index, pool.chooser(placed(lodgs, 0, count, level=2)).chosen(truth)[0])
+    assert np.array_equal(index, pool.chooser(placed(lodgs, 0, count, level=2)).select(truth)[0])
     assert len({placement.choice for _, placement in asked}) <= 3 and left_out > budget
 
 

@@ -214,10 +214,10 @@ def test_query_with_crops_equals_rule_on_cropped_splats(name):
             dict(choice.facts),
             dict(choice.values),
         )
-        rows, weights = SplatSelector(splats.means, columns, splats.log_scales).chosen(choice)
+        rows, weights = SplatSelector(splats.means, columns, splats.log_scales).select(choice)
         np.testing.assert_array_equal(rows, np.flatnonzero(stays)[expected > 0])
         np.testing.assert_array_equal(weights, expected[expected > 0])
-    single, _ = SplatSelector(splats.means, columns).chosen(LodQuery.from_crops(crops))
+    single, _ = SplatSelector(splats.means, columns).select(LodQuery.from_crops(crops))
     np.testing.assert_array_equal(single, np.flatnonzero(stays))
 
 

@@ -182,8 +182,8 @@ def test_positions_belong_to_the_nearest_chunk():
     means = np.random.default_rng(0).normal(10, 15, (40_000, 3)).astype(np.float32)
     centres = np.stack([TABLES["chunks"][axis] for axis in "xyz"], axis=1)
     nearest = np.linalg.norm(means[:, None] - centres, axis=2).argmin(axis=1)
-    assert (CHUNKS.parts(means, TABLES) == nearest + 1).mean() > 0.9999  # halfway, a bit decides
-    assert not CHUNKS.parts(means, NO_TABLES).any()
+    assert (CHUNKS.part_numbers(means, TABLES) == nearest + 1).mean() > 0.9999  # halfway, a bit decides
+    assert not CHUNKS.part_numbers(means, NO_TABLES).any()
 
 
 @pytest.mark.parametrize(

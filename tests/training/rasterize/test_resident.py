@@ -263,14 +263,14 @@ def test_blocks_inside_a_band_skip_the_rule(monkeypatch):
         query = LodQuery("bands", (0.0, 0.0, 0.0), 60.0, tuple(facts.items()), tuple(values.items()))
         expected = np.flatnonzero((away >= np.float32(60 * s_min)) & (away < np.float32(60 * coarser)))
         evaluated.clear()
-        rows, weights = selector.chosen(query)
+        rows, weights = selector.select(query)
         np.testing.assert_array_equal(rows, expected)
         assert rows.dtype == np.int32 and (weights == 1).all() and weights.dtype == np.float32
         counts.append((sum(evaluated), len(expected)))
         hidden = SplatSelector(
             splats.means, {HIDDEN: (splats.means[:, 0] > 0).astype(np.float32)}, splats.log_scales
         )
-        rows, _ = hidden.chosen(replace(query, crops=()))
+        rows, _ = hidden.select(replace(query, crops=()))
         np.testing.assert_array_equal(rows, expected[splats.means[expected, 0] <= 0])
     assert counts[0] == (0, len(splats)) and 0 < counts[1][0] < 0.8 * counts[1][1] and counts[3] == (0, 0)
 

@@ -123,9 +123,9 @@ class Chunks(Rule):
             return {}
         return {"distance_scale": "The sets of chunks are fixed. The distance scale applies outside of them."}
 
-    def parts(self, means, tables: Tables) -> np.ndarray:
+    def part_numbers(self, means, tables: Tables) -> np.ndarray:
         if not _rows(tables):
-            return super().parts(means, tables)
+            return super().part_numbers(means, tables)
         centres = np.stack([tables[TABLE][axis] for axis in "xyz"]).astype(np.float32)
         squares = (centres * centres).sum(axis=0)
         numbers = np.empty(len(means), np.float32)

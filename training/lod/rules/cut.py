@@ -167,11 +167,11 @@ class Cut(Rule):
         parent_sizes[inside] = key_sizes[key_of_child]
         return {NODE_SIZE: sizes, PARENT_SIZE: parent_sizes}
 
-    def told_level(self, columns, facts) -> np.ndarray:
+    def splat_level(self, columns, facts) -> np.ndarray:
         """Return a colour number: the octave of a node's size, OCTAVES + 1 for leaves."""
         return _octave(columns[NODE_SIZE])
 
-    def wanted_level(self, means, position, focal_px, facts, values) -> np.ndarray:
+    def target_level(self, means, position, focal_px, facts, values) -> np.ndarray:
         """Return the colour number of the largest size that is fine enough at each splat."""
         return _octave(distances(means, position) / np.float32(detail_of(focal_px, values["pixels"])))
 

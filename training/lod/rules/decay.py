@@ -73,7 +73,7 @@ class Decay(Rule):
         ),
     )  # fmt: skip
     always_active = True
-    apart = False
+    independent = False
     sweep = ("s_v", (1.0, 1.5, 2.0, 3.0, 5.0))
 
     def normalized(self, means: np.ndarray, position: np.ndarray, facts: Mapping[str, float]) -> np.ndarray:

@@ -83,7 +83,7 @@ class Octree(Rule):
         weight = fade_weights(target, np.float32(facts["level"])).astype(np.float32)
         return weight if values["fade"] else (weight >= 0.5).astype(np.float32)
 
-    def wanted_level(self, means, position, focal_px, facts, values) -> np.ndarray:
+    def target_level(self, means, position, focal_px, facts, values) -> np.ndarray:
         return np.floor(self._target(means, position, focal_px, np.float32(0), facts, values))
 
     def coarser(self, values: Values, levels: Sequence[int]) -> Values | None:
