@@ -19,19 +19,19 @@ def check_resumed() -> Callable[[Callable[[], Method], int], None]:
     """
 
     def check(make: Callable[[], Method], stop: int) -> None:
-        whole, first, second, file = make(), make(), make(), io.BytesIO()
-        levels, before = _train(whole, 0), _train(first, 0, stop)
+        full_run, first, second, file = make(), make(), make(), io.BytesIO()
+        levels, initial = _train(full_run, 0), _train(first, 0, stop)
         torch.save(first.state_dict(), file)
         file.seek(0)
         second.load_state_dict(torch.load(file, weights_only=True))
-        after = before + _train(second, stop)
-        assert [level.number for level in after] == [level.number for level in levels] != []
-        for one, other in zip(levels, after, strict=True):
+        final = initial + _train(second, stop)
+        assert [level.number for level in final] == [level.number for level in levels] != []
+        for one, other in zip(levels, final, strict=True):
             columns, theirs = (splat_columns(x.splats) | extra_columns(x.splats) for x in (one, other))
             assert one.facts == other.facts and columns.keys() == theirs.keys()
             for name, column in columns.items():
                 np.testing.assert_array_equal(column, theirs[name])
-        assert second.meta() == whole.meta()
+        assert second.meta() == full_run.meta()
 
     return check
 

@@ -51,9 +51,9 @@ def create_method(name: str, data: TrainingData, weight: float):
 
 @pytest.mark.parametrize("name", METHODS)
 def test_every_method_uses_depth_loss(name, data):
-    none, half, whole = (create_method(name, data, weight).train_step(0)[0] for weight in (0.0, 0.5, 1.0))
-    assert whole - none > 0.01
-    assert half - none == pytest.approx((whole - none) / 2, rel=1e-3)
+    none, half, full_run = (create_method(name, data, weight).train_step(0)[0] for weight in (0.0, 0.5, 1.0))
+    assert full_run - none > 0.01
+    assert half - none == pytest.approx((full_run - none) / 2, rel=1e-3)
 
 
 def test_depth_loss_matches_reference(data):
@@ -61,7 +61,7 @@ def test_depth_loss_matches_reference(data):
     method = create_method("3dgs", data, 0.7)
     view = method.choose_view(0)
     drawings = method.draw(view, 0)
-    found = float(method.depth_loss(drawings[0].rendering, view, 0).detach())
+    actual = float(method.depth_loss(drawings[0].rendering, view, 0).detach())
     gaussians = Gaussians(*(tensor.detach().double() for tensor in vars(method.model.gaussians).values()))
     drawn = rasterize(
         gaussians,
@@ -71,13 +71,13 @@ def test_depth_loss_matches_reference(data):
         outputs=("inverse_depth",),
         backend="reference",
     ).inverse_depth
-    camera = data.scene.cameras[[each.name for each in data.scene.cameras].index(view.camera.name)]
+    camera = data.scene.cameras[[item.name for item in data.scene.cameras].index(view.camera.name)]
     small = (1 / depth_of(camera.scaled(0.25 / view.shrink))).astype(np.float64)
     assert drawn is not None and drawn.shape == small.shape
     expected = 0.7 * data.median_depth * np.abs(drawn.numpy() - small).mean()
-    assert found == pytest.approx(expected, rel=0.02)  # a corner between floor and wall is no plane
+    assert actual == pytest.approx(expected, rel=0.02)  # a corner between floor and wall is no plane
     later = float(method.depth_loss(drawings[0].rendering, view, method.steps).detach())
-    assert later == pytest.approx(found / 100, rel=1e-3)
+    assert later == pytest.approx(actual / 100, rel=1e-3)
 
 
 def test_masked_and_held_out_depths_are_ignored(scene, data, tmp_path):
@@ -91,9 +91,9 @@ def test_masked_and_held_out_depths_are_ignored(scene, data, tmp_path):
     for number in range(6):
         write_png(tmp_path / "scene" / "masks" / f"{number}.png", half)
     masked = read_scene(tmp_path / "scene")
-    known = TrainingData(masked, 0.25, 3, depths=DepthPriors(masked, "metric")).target(0).inverse_depth
-    assert known is not None
-    assert known[:, :40].isnan().all() and known[:, 40:].isfinite().all()
+    valid = TrainingData(masked, 0.25, 3, depths=DepthPriors(masked, "metric")).target(0).inverse_depth
+    assert valid is not None
+    assert valid[:, :40].isnan().all() and valid[:, 40:].isfinite().all()
 
 
 def copy_without_points(scene: Path) -> None:
@@ -123,7 +123,7 @@ def test_depth_loss_improves_depth_and_replaces_points(walls, tmp_path, capsys):
 
     Dropout is off, because 150 steps with four views are too few to compensate for it.
     """
-    found = {}
+    actual = {}
     for name, kind, weight in (("off", "inverse", 0.0), ("on", "inverse", 0.3), ("bare", "metric", 0.3)):
         folder = tmp_path / name
         folder.mkdir()
@@ -138,5 +138,5 @@ def test_depth_loss_improves_depth_and_replaces_points(walls, tmp_path, capsys):
             },
         }  # fmt: skip
         assert train(Job.from_dict(keys), sys.stdout) == 0
-        found[name] = depth_error(tmp_path / f"{name}_run")
-    assert found["on"] < 0.7 * found["off"] and found["bare"] < 0.7 * found["off"]
+        actual[name] = depth_error(tmp_path / f"{name}_run")
+    assert actual["on"] < 0.7 * actual["off"] and actual["bare"] < 0.7 * actual["off"]

@@ -44,26 +44,26 @@ def steps(method, begin: int, end: int) -> list[float]:
 @pytest.fixture
 def device_steps(graphics, monkeypatch) -> list:
     """Return a list that gains an entry for each step on the device."""
-    found, twin = [], Model.device_model
+    actual, twin = [], Model.device_model
 
     def count_step(model, *arguments):
-        made = twin(model, *arguments)
-        found.append(made is not None)
-        return made
+        created = twin(model, *arguments)
+        actual.append(created is not None)
+        return created
 
     monkeypatch.setattr(Model, "device_model", count_step)
-    return found
+    return actual
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_device_steps_equal_autograd_steps(name, data, device_steps):
-    method, other = make(name, data), make(name, data, "cpu")
+    method, second = make(name, data), make(name, data, "cpu")
     count = DEVICE_STEPS[name]
-    losses, expected = steps(method, 0, count), steps(other, 0, count)
+    losses, expected = steps(method, 0, count), steps(second, 0, count)
     assert device_steps == [True] * count + [False] * count
     assert losses == pytest.approx(expected, rel=2e-2)
     assert losses[0] == pytest.approx(expected[0], rel=5e-4)  # photographs there have eight bits
-    assert len(method.model) == pytest.approx(len(other.model), rel=0.05)
+    assert len(method.model) == pytest.approx(len(second.model), rel=0.05)
 
 
 def trained(count: int) -> Model:
@@ -96,26 +96,26 @@ def control_density(model: Model) -> None:
 def test_density_control_on_device_equals_host(graphics, monkeypatch, max_bytes):
     """Bit-identical, also on a device that processes the moments of 512 splats at a time."""
     monkeypatch.setattr(graphics, "binding_bytes", max_bytes)
-    one, other = trained(1000), trained(1000)
-    other.adam.zero_grad()  # which brings it home
-    for model in (one, other):
+    first, second = trained(1000), trained(1000)
+    second.adam.zero_grad()  # which brings it home
+    for model in (first, second):
         control_density(model)
         model.append({name: row[:0] for name, row in model.read_rows(torch.arange(3)).items()})
         model.append(model.read_rows(torch.tensor([7, 7, 3])) | {"level": torch.ones(3)})
         model.keep(torch.arange(len(model)) != 5)
         model.assign("sh", 2 * model.read("sh"))
-    assert one._device_model is not None and other._device_model is None
-    for part, theirs in zip(_flat(one.state_dict()), _flat(other.state_dict()), strict=True):
+    assert first._device_model is not None and second._device_model is None
+    for part, theirs in zip(_flat(first.state_dict()), _flat(second.state_dict()), strict=True):
         assert torch.equal(part, theirs)
-    one.keep(torch.zeros(len(one), dtype=torch.bool))
-    assert len(one) == 0 and one._device_model is None
+    first.keep(torch.zeros(len(first), dtype=torch.bool))
+    assert len(first) == 0 and first._device_model is None
 
 
 def test_density_control_transfers_little(graphics):
     """Of 750 bytes per splat only the criteria and the new rows are transferred."""
-    model, before = trained(4000), graphics.transferred
+    model, initial = trained(4000), graphics.transferred
     control_density(model)
-    assert model.device_model("gpu", False) is not None and graphics.transferred - before < 100 * 4000
+    assert model.device_model("gpu", False) is not None and graphics.transferred - initial < 100 * 4000
 
 
 def _flat(state) -> list[torch.Tensor]:
@@ -126,8 +126,8 @@ def _flat(state) -> list[torch.Tensor]:
 
 def test_checkpoint_moves_between_host_and_device(data, device_steps):
     """Checkpoints contain the state on the device, in both directions."""
-    whole, parts, at = make("flod", data, "cpu"), [], 0
-    expected = steps(whole, 0, 15)
+    full_run, parts, at = make("flod", data, "cpu"), [], 0
+    expected = steps(full_run, 0, 15)
     file = io.BytesIO()
     for backend, end in (("cpu", 4), ("gpu", 9), ("cpu", 15)):
         method = make("flod", data, backend)
@@ -146,9 +146,11 @@ def test_resume_on_device_is_bit_identical(data, graphics, check_resumed):
 
 
 def test_device_image_is_read_lazily(data, graphics):
-    method, other = make("3dgs", data), make("3dgs", data, "cpu")
-    made, expected = method.train_step(0), other.train_step(0)
-    torch.testing.assert_close(made.image(), expected.image(), atol=2e-3, rtol=0)
-    before = graphics.transferred
-    made.image()
-    assert graphics.transferred - before == 16 * made.target.image.shape[0] * made.target.image.shape[1]
+    method, second = make("3dgs", data), make("3dgs", data, "cpu")
+    created, expected = method.train_step(0), second.train_step(0)
+    torch.testing.assert_close(created.image(), expected.image(), atol=2e-3, rtol=0)
+    initial = graphics.transferred
+    created.image()
+    assert (
+        graphics.transferred - initial == 16 * created.target.image.shape[0] * created.target.image.shape[1]
+    )

@@ -19,17 +19,17 @@ def test_dropout_rate(data):
     """Six training views: 0.4 (1 - 6 / 40) = 0.34 are dropped, the others are 1 / 0.66 times as opaque."""
     assert len(data.train) == 6 and DROPOUT_VIEWS == 40
     method = make(data, dropout=0.4)
-    found = torch.cat([method.dropout_weights(step, 0.0) for step in range(200)])
-    assert sorted(found.unique().tolist()) == pytest.approx([0, 1 / 0.66])
-    assert float((found == 0).double().mean()) == pytest.approx(0.34, abs=0.015)
-    assert float(found.mean()) == pytest.approx(1, abs=0.03)
+    actual = torch.cat([method.dropout_weights(step, 0.0) for step in range(200)])
+    assert sorted(actual.unique().tolist()) == pytest.approx([0, 1 / 0.66])
+    assert float((actual == 0).double().mean()) == pytest.approx(0.34, abs=0.015)
+    assert float(actual.mean()) == pytest.approx(1, abs=0.03)
 
 
 def test_dropout_is_random_per_step_and_repeatable(data):
-    one, again, other = make(data), make(data), create("3dgs", data, make(data).parameters, 1, "cpu")
-    assert torch.equal(one.dropout_weights(3, 0.0), again.dropout_weights(3, 0.0))
-    assert not torch.equal(one.dropout_weights(3, 0.0), one.dropout_weights(4, 0.0))
-    assert not torch.equal(one.dropout_weights(3, 0.0), other.dropout_weights(3, 0.0))
+    first, again, second = make(data), make(data), create("3dgs", data, make(data).parameters, 1, "cpu")
+    assert torch.equal(first.dropout_weights(3, 0.0), again.dropout_weights(3, 0.0))
+    assert not torch.equal(first.dropout_weights(3, 0.0), first.dropout_weights(4, 0.0))
+    assert not torch.equal(first.dropout_weights(3, 0.0), second.dropout_weights(3, 0.0))
 
 
 def test_dropout_is_off_with_many_views_and_at_the_end(data, monkeypatch):
@@ -39,9 +39,9 @@ def test_dropout_is_off_with_many_views_and_at_the_end(data, monkeypatch):
         and method.dropout_weights(0, DROPOUT_END) is None
     )
     assert make(data, dropout=0.0).dropout_weights(0, 0.0) is None
-    for count, some in ((39, True), (40, False), (400, False)):
+    for count, subset in ((39, True), (40, False), (400, False)):
         monkeypatch.setattr(data, "train", [data.train[0]] * count)
-        assert (method.dropout_weights(0, 0.0) is not None) == some
+        assert (method.dropout_weights(0, 0.0) is not None) == subset
 
 
 @pytest.mark.parametrize("name", METHODS)
@@ -55,10 +55,10 @@ def test_dropout_of_presets(name):
 def test_dropped_splats_get_no_update(data, name):
     """Some of the remaining splats are updated."""
     method = make(data, name, dropout=0.5, margin=0.0)
-    before = method.model["means"].detach().clone()
+    initial = method.model["means"].detach().clone()
     left = method.dropout_weights(0, 0.0)
     method.train_step(0)
-    moved = (method.model["means"].detach() != before).any(1)
+    moved = (method.model["means"].detach() != initial).any(1)
     assert not moved[left == 0].any() and moved[left > 0].any()
 
 

@@ -95,9 +95,9 @@ def tiny(tmp_path, monkeypatch):
     (folder / "__init__.py").write_text(ABOUT)
     (folder / "train.py").write_text(TRAIN)
     monkeypatch.setattr(methods, "__path__", [*methods.__path__, str(folder.parent)])
-    found = methods.discover()
-    monkeypatch.setitem(methods.METHODS, "tiny", found["tiny"])
-    yield found["tiny"]
+    actual = methods.discover()
+    monkeypatch.setitem(methods.METHODS, "tiny", actual["tiny"])
+    yield actual["tiny"]
     for name in [name for name in sys.modules if name.startswith("training.methods.tiny_folder")]:
         del sys.modules[name]
 
@@ -137,10 +137,10 @@ def test_no_other_package_names_a_method():
 
 def test_two_drawings_train_extra_weights_and_columns(tiny, data):
     method = methods.create("tiny", data, tiny.preset("draft"), seed=0, backend="cpu")
-    before, count = method.model["decay"].detach().clone(), len(method.model)
+    initial, count = method.model["decay"].detach().clone(), len(method.model)
     loss, image, target = method.train_step(0)
     assert loss > 0 and image().shape == target.image.shape
-    learned = (method.model["decay"].detach() - before).abs()
+    learned = (method.model["decay"].detach() - initial).abs()
     assert (learned > 0).sum() > count / 2
     assert learned.max() == pytest.approx(0.1, rel=1e-3)  # Adam's first step is the rate
     for step in range(1, 8):
@@ -163,16 +163,16 @@ def test_loss_sums_over_drawings(tiny, data):
 
 def test_run_with_base_writes_its_column(tiny, tiny_scene, tmp_path):
     write_ply(tmp_path / "base.ply", base())
-    made = job(tiny_scene, tmp_path / "run", base=str(tmp_path / "base.ply"))
-    assert training_loop.train(made) == 0
-    folder = RunFolder(made.out)
+    created = job(tiny_scene, tmp_path / "run", base=str(tmp_path / "base.ply"))
+    assert training_loop.train(created) == 0
+    folder = RunFolder(created.out)
     splats = read_bundle(folder.bundle).levels[0].splats
     assert "decay" in splats.extras and splats.extras["decay"].dtype == np.float32
     assert splats.sh_degree == 3
     # what began as the base's first splats hardly moved in eight steps
     near = np.linalg.norm(splats.means[:, None] - base().means, axis=2).min(1)
     assert np.median(near) < 0.05
-    assert training_loop.train(made) == 0, "started again with the same job, it is resumed"
+    assert training_loop.train(created) == 0, "started again with the same job, it is resumed"
 
 
 @pytest.mark.parametrize("antialias", [False, True])
@@ -180,11 +180,11 @@ def test_run_uses_antialiasing_of_its_base(tiny, tiny_scene, tmp_path, antialias
     """The base overrides the job, with a warning, for the bundle, its levels and its measurements."""
     small = replace(base(), log_scales=base().log_scales - np.float32(2))
     write_ply(tmp_path / "base.ply", small, ["SplatRenderMode: mip"] * antialias)
-    made = job(
+    created = job(
         tiny_scene, tmp_path / "run", base=str(tmp_path / "base.ply"), parameters={"antialias": not antialias}
     )
-    assert training_loop.train(made) == 0
-    folder = RunFolder(made.out)
+    assert training_loop.train(created) == 0
+    folder = RunFolder(created.out)
     events, _ = folder.events()
     said = [event["message"] for event in events if event["event"] == "warning"]
     assert said == [f"The base is {'' if antialias else 'not '}antialiased, and so is this run."]
@@ -209,18 +209,18 @@ def test_run_uses_antialiasing_of_its_base(tiny, tiny_scene, tmp_path, antialias
 def test_unusable_base_raises(tiny, tiny_scene, tmp_path):
     with pytest.raises(LodgsError, match=r"'flod' cannot begin.*Leave out 'base'"):
         job(tiny_scene, tmp_path / "run", method="flod", base=str(tmp_path / "base.ply"))
-    made = job(tiny_scene, tmp_path / "run", base=str(tmp_path / "absent.ply"))
-    assert training_loop.train(made) == BAD_INPUT
-    event = RunFolder(made.out).events()[0][-1]
+    created = job(tiny_scene, tmp_path / "run", base=str(tmp_path / "absent.ply"))
+    assert training_loop.train(created) == BAD_INPUT
+    event = RunFolder(created.out).events()[0][-1]
     assert event["event"] == "error" and "absent.ply" in event["what"] and event["remedy"]
 
 
 def test_base_path_is_relative_to_the_job(tiny, tmp_path):
     (tmp_path / "job.toml").write_text('scene = "s"\nout = "run"\nmethod = "tiny"\nbase = "before/run"\n')
-    made = Job.from_file(tmp_path / "job.toml")
-    assert made.base == str(tmp_path / "before" / "run")
-    made.resolved().write(tmp_path / "again.toml")
-    assert Job.from_file(tmp_path / "again.toml").base == made.base
+    created = Job.from_file(tmp_path / "job.toml")
+    assert created.base == str(tmp_path / "before" / "run")
+    created.resolved().write(tmp_path / "again.toml")
+    assert Job.from_file(tmp_path / "again.toml").base == created.base
 
 
 def test_base_is_finest_complete_level(tmp_path):

@@ -22,13 +22,13 @@ SIDE = 64
 
 def ring() -> list[Camera]:
     """Return sixteen cameras around the object, at two heights."""
-    found = []
+    actual = []
     for number in range(16):
         angle = 2 * np.pi * number / 16
         eye = np.array([3 * np.cos(angle), 3 * np.sin(angle), 0.8 if number % 2 else -0.4])
         pose = look_at(eye, np.zeros(3), (0, 0, 1))
-        found.append(Camera(f"{number:02d}.png", SIDE, SIDE, 90.0, 90.0, SIDE / 2, SIDE / 2, pose))
-    return found
+        actual.append(Camera(f"{number:02d}.png", SIDE, SIDE, 90.0, 90.0, SIDE / 2, SIDE / 2, pose))
+    return actual
 
 
 def ball(random: np.random.Generator) -> Gaussians:

@@ -188,10 +188,10 @@ class Method(threedgs_train.Method):
     @torch.no_grad()
     def drawn_anywhere(self) -> torch.Tensor:
         """Return the splats (N,) that are drawn at s_v = 1 from any training camera."""
-        seen = torch.zeros(len(self.model), dtype=torch.bool, device=self.device)
+        visible = torch.zeros(len(self.model), dtype=torch.bool, device=self.device)
         for camera in self.data.train:
-            seen |= self.attenuate(camera, 1.0)[2]
-        return seen
+            visible |= self.attenuate(camera, 1.0)[2]
+        return visible
 
     # -- initial decay ---------------------------------------------------------------------------------
 
@@ -257,15 +257,17 @@ class Method(threedgs_train.Method):
             total, views = total + distances * in_view, views + in_view
             nearest = torch.where(in_view, torch.minimum(nearest, distances), nearest)
             closest = torch.minimum(closest, distances)
-        seen = views > 0
-        return torch.where(seen, total / views.clamp_min(1), closest), torch.where(seen, nearest, closest)
+        visible = views > 0
+        return torch.where(visible, total / views.clamp_min(1), closest), torch.where(
+            visible, nearest, closest
+        )
 
     def _far_distance(self, quantile: float) -> float:
         """Return a quantile of the distances between training views and their visible scene points."""
         points = self.data.full_scene.points
         points = points[:: max(1, len(points) // MAX_POINTS)]
-        seen = [
+        visible = [
             np.linalg.norm(points[camera.sees(points, near=self.data.near)] - camera.center, axis=1)
             for camera in self.data.full_train
         ]
-        return float(np.quantile(np.concatenate(seen), quantile))
+        return float(np.quantile(np.concatenate(visible), quantile))

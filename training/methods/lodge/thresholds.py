@@ -68,8 +68,8 @@ class Thresholds:
         candidates = self._candidates(next(iter(levels.values())), min_distance, max_distance)
         costs = [_round(self.cost(levels, d_l, distance)) for distance in candidates]
         views = [(camera, visible_rows(levels, d_l, camera, self._near)) for camera in self._cameras]
-        before = _round(self._mean_tile_count(LevelStack(levels, self._antialias), views))
-        return candidates[int(np.argmin(costs))], {"distances": candidates, "costs": costs, "before": before}
+        current = _round(self._mean_tile_count(LevelStack(levels, self._antialias), views))
+        return candidates[int(np.argmin(costs))], {"distances": candidates, "costs": costs, "before": current}
 
     def cost(self, levels: Mapping[int, IndexedLevel], d_l: Mapping[int, float], distance: float) -> float:
         """Return the mean number of splats per tile of 16x16 pixels with an additional level.

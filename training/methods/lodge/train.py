@@ -129,8 +129,8 @@ class Method(RefiningMethod):
         }
 
     def meta(self) -> dict:
-        found = {"costs": self.costs} if self.levels <= MAX_CURVES else {}
-        return {**super().meta(), "filter_variance": self.parameters.filter_variance, **found}
+        report = {"costs": self.costs} if self.levels <= MAX_CURVES else {}
+        return {**super().meta(), "filter_variance": self.parameters.filter_variance, **report}
 
     # -- steps -----------------------------------------------------------------------------------------
 
@@ -163,7 +163,10 @@ class Method(RefiningMethod):
         trained_rows = torch.from_numpy(rows[number]).long().to(self.device)
         parts = [smooth(self.select_rows(trained_rows), self._std(self.d_l[number]))]
         if len(rows) > 1:
-            parts.insert(0, gather_rows(self.finished, {n: some for n, some in rows.items() if n != number}))
+            parts.insert(
+                0,
+                gather_rows(self.finished, {n: level_rows for n, level_rows in rows.items() if n != number}),
+            )
         rendering = self.rasterize_model(view.camera, step, gaussians=Gaussians.concatenated(parts))
         return [Drawing(rendering)]
 
@@ -178,10 +181,10 @@ class Method(RefiningMethod):
         p, number, local = self.parameters, self.level_at(step), self._level_step(step)
         if local == 0:
             self._begin_level(number)
-        importance, before = self.importance(number), (0.0, *ROUNDS)[local // p.tune_steps]
+        importance, previous = self.importance(number), (0.0, *ROUNDS)[local // p.tune_steps]
         part = ROUNDS[local // p.tune_steps]
         # per spatial block; all rounds together reach the level's fraction of the finest level's splats
-        share = p.keep ** ((self.levels - number) * (part - before))
+        share = p.keep ** ((self.levels - number) * (part - previous))
         threshold = torch.from_numpy(block_quantiles(importance.numpy(), 1 - share))
         weight = max(p.prune_weight * part, self._budget_threshold(number, importance, part))
         thinned = threshold > weight
@@ -385,8 +388,8 @@ class Method(RefiningMethod):
         self.centres, self.radii = state["centres"].numpy(), state["radii"].numpy()
         self.sets = {
             number: [
-                one.astype(bool)
-                for one in np.unpackbits(bits.numpy(), axis=1, count=len(self.finished[number]))
+                members.astype(bool)
+                for members in np.unpackbits(bits.numpy(), axis=1, count=len(self.finished[number]))
             ]
             for number, bits in state["sets"].items()
         }

@@ -125,6 +125,6 @@ class Schedule:
     def learning_rates(self, rates: Mapping[str, LearningRate], step: int) -> dict[str, LearningRate]:
         """Return learning rates of a step by name; they fall once growth ends. Not in the paper."""
         p = self.parameters
-        after = step / p.steps - p.grow_until
-        fall = p.lr_end ** (after / (1 - p.grow_until)) if after > 0 else 1.0
+        progress = step / p.steps - p.grow_until
+        fall = p.lr_end ** (progress / (1 - p.grow_until)) if progress > 0 else 1.0
         return {name: rate * fall for name, rate in rates.items()}

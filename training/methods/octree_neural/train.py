@@ -136,7 +136,7 @@ class Method(method.Method[NeuralOctreeParameters, NeuralDrawing]):
         """Create a model of anchors; gradient statistics are per Gaussian."""
         count, device = len(level), self.device
         single = {name: torch.zeros(count, device=device) for name in ("opacity_sum", "anchor_seen")}
-        each = {
+        per_gaussian = {
             name: torch.zeros(count, self.parameters.offsets, device=device)
             for name in ("gradient_sum", "seen")
         }
@@ -144,7 +144,7 @@ class Method(method.Method[NeuralOctreeParameters, NeuralDrawing]):
             {name: row.to(device) for name, row in rows.items()},
             self._rates,
             columns={"level": level.to(device), "bias": bias.to(device)},
-            stats=single | each,
+            stats=single | per_gaussian,
         )
 
     @property
@@ -281,8 +281,8 @@ class Method(method.Method[NeuralOctreeParameters, NeuralDrawing]):
         own_looks = model["looks"][anchors] if p.direct else inputs.new_zeros(1, 1, LOOK_CHANNELS)
         opacity = self.networks.opacity(static_inputs) + own_looks[..., 0]
         # tanh as in the paper: Gaussians below 0 are not drawn and get no gradients
-        opacity, least = (opacity.sigmoid(), ALPHA_MIN) if p.direct else (opacity.tanh(), 0.0)
-        index, offset_index = torch.nonzero(opacity.detach() > least).unbind(1)
+        opacity, min_opacity = (opacity.sigmoid(), ALPHA_MIN) if p.direct else (opacity.tanh(), 0.0)
+        index, offset_index = torch.nonzero(opacity.detach() > min_opacity).unbind(1)
 
         looks = (self.networks.covariance(static_inputs).view(-1, p.offsets, 7) + own_looks[..., 1:8])[
             index, offset_index

@@ -118,16 +118,16 @@ class ForestBuilder:
         self._upper = splats, merge_trees([tree for _, tree in uppers], top)
 
 
-def _read_cells(leaves: SplatRows, scratch: Path | None, most: int) -> Iterator[Splats]:
+def _read_cells(leaves: SplatRows, scratch: Path | None, max_leaves: int) -> Iterator[Splats]:
     """Yield the leaves in spatial order, one cell of limited size at a time."""
     means = np.empty((len(leaves), 3), np.float32)
     for part in _row_batches(len(leaves)):
         means[part] = leaves.select(part).means
-    indices = morton_codes(means)
+    codes = morton_codes(means)
     del means
-    order = np.argsort(indices, kind="stable")
-    borders = _cell_bounds(indices[order], most)
-    del indices
+    order = np.argsort(codes, kind="stable")
+    borders = _cell_bounds(codes[order], max_leaves)
+    del codes
     if scratch is None:
         assert isinstance(leaves, Splats)
         for cell in pairwise(borders):
@@ -141,8 +141,8 @@ def _read_cells(leaves: SplatRows, scratch: Path | None, most: int) -> Iterator[
         for part in _row_batches(len(leaves)):
             splats, cells = _drop_extras(leaves.select(part)), cell_of[part]
             by_cell = np.argsort(cells, kind="stable")
-            found, begins = np.unique(cells[by_cell], return_index=True)
-            for number, rows in zip(found.tolist(), np.split(by_cell, begins[1:]), strict=True):
+            cell_numbers, begins = np.unique(cells[by_cell], return_index=True)
+            for number, rows in zip(cell_numbers.tolist(), np.split(by_cell, begins[1:]), strict=True):
                 file.write(int(filled[number]), splats.select(rows))
                 filled[number] += len(rows)
         for cell in pairwise(borders):  # its leaves are in the order of reading
@@ -150,22 +150,23 @@ def _read_cells(leaves: SplatRows, scratch: Path | None, most: int) -> Iterator[
             yield file.select(slice(*cell)).select(ranks)
 
 
-def _cell_bounds(indices: np.ndarray, most: int) -> list[int]:
+def _cell_bounds(codes: np.ndarray, max_leaves: int) -> list[int]:
     """Return the cell boundaries in ascending curve positions (N,), from 0 to N.
 
-    Cells are halved until none has more than ``most`` leaves. Leaves at equal positions are divided by row.
+    Cells are halved until none has more than ``max_leaves`` leaves. Leaves at equal positions are divided by
+    row.
     """
-    borders, ahead = [0], [(0, len(indices), 3 * AXIS_BITS)]
+    borders, ahead = [0], [(0, len(codes), 3 * AXIS_BITS)]
     while ahead:
         begin, end, bit = ahead.pop()
-        if end - begin <= most:
+        if end - begin <= max_leaves:
             borders.append(end)
             continue
-        middle = begin + most
+        middle = begin + max_leaves
         if bit:
             bit -= 1
-            half = (indices[begin] >> np.uint64(bit) | np.uint64(1)) << np.uint64(bit)
-            middle = begin + int(np.searchsorted(indices[begin:end], half))
+            half = (codes[begin] >> np.uint64(bit) | np.uint64(1)) << np.uint64(bit)
+            middle = begin + int(np.searchsorted(codes[begin:end], half))
         ahead += [part for part in ((middle, end, bit), (begin, middle, bit)) if part[0] < part[1]]
     return borders
 
@@ -208,12 +209,12 @@ def _merge_to_root(moments: np.ndarray) -> tuple[np.ndarray, Tree]:
         first, second = _mutual_pairs(best[:count])
         merged = _merge_pairs(moments[first], moments[second])
         children.append(np.stack([numbers[first], numbers[second]], axis=1))
-        kept = np.ones(count, bool)
-        kept[second] = False
+        remaining = np.ones(count, bool)
+        remaining[second] = False
         numbers[first] = leaves + sum(map(len, nodes)) + np.arange(len(first))
         nodes.append(merged)
         moments[first] = merged
-        moments, numbers = moments[kept], numbers[kept]
+        moments, numbers = moments[remaining], numbers[remaining]
     return np.concatenate(nodes), Tree(np.concatenate(children))
 
 
@@ -241,17 +242,17 @@ def _splat_moments(splats: Splats) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 @inlined(STRICT)
-def _merged_area(one, other):
+def _merged_area(first, second):
     """Return the square root of the merged covariance's second invariant; s1 s2 for a flat splat."""
-    share = one[9] / (one[9] + other[9])
+    share = first[9] / (first[9] + second[9])
     rest, both = 1 - share, share * (1 - share)
-    x, y, z = one[0] - other[0], one[1] - other[1], one[2] - other[2]
-    xx = share * one[3] + rest * other[3] + both * x * x
-    xy = share * one[4] + rest * other[4] + both * x * y
-    xz = share * one[5] + rest * other[5] + both * x * z
-    yy = share * one[6] + rest * other[6] + both * y * y
-    yz = share * one[7] + rest * other[7] + both * y * z
-    zz = share * one[8] + rest * other[8] + both * z * z
+    x, y, z = first[0] - second[0], first[1] - second[1], first[2] - second[2]
+    xx = share * first[3] + rest * second[3] + both * x * x
+    xy = share * first[4] + rest * second[4] + both * x * y
+    xz = share * first[5] + rest * second[5] + both * x * z
+    yy = share * first[6] + rest * second[6] + both * y * y
+    yz = share * first[7] + rest * second[7] + both * y * z
+    zz = share * first[8] + rest * second[8] + both * z * z
     return np.sqrt(max(xx * yy - xy * xy + xx * zz - xz * xz + yy * zz - yz * yz, 0.0))
 
 
@@ -259,15 +260,15 @@ def _merged_area(one, other):
 def _choose_partners(begin, end, moments, radius, color, best):
     """Choose the partner of least cost for each row; ties go to the least exclusive or."""
     for i in range(begin, end):
-        least, chosen = np.inf, -1
+        min_cost, chosen = np.inf, -1
         for j in range(max(i - radius, 0), min(i + radius + 1, len(moments))):
             if j != i:
-                one, other = moments[min(i, j)], moments[max(i, j)]  # the same result from either side
-                red, green, blue = one[10] - other[10], one[11] - other[11], one[12] - other[12]
+                first, second = moments[min(i, j)], moments[max(i, j)]  # the same result from either side
+                red, green, blue = first[10] - second[10], first[11] - second[11], first[12] - second[12]
                 unlike = red * red + green * green + blue * blue
-                cost = _merged_area(one, other) * (1 + color * unlike)
-                if cost < least or chosen < 0 or (cost == least and (i ^ j) < (i ^ chosen)):
-                    least, chosen = cost, j
+                cost = _merged_area(first, second) * (1 + color * unlike)
+                if cost < min_cost or chosen < 0 or (cost == min_cost and (i ^ j) < (i ^ chosen)):
+                    min_cost, chosen = cost, j
         best[i] = chosen
 
 
@@ -284,12 +285,12 @@ def _mutual_pairs(best: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return first, best[first]
 
 
-def _merge_pairs(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+def _merge_pairs(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Merge pairs of moments (M, 13): joint means and covariances, weighted by optical depth."""
-    depth = one[:, 9] + other[:, 9]
-    share = (one[:, 9] / depth)[:, None]
-    merged = share * one + (1 - share) * other
-    apart = one[:, :3] - other[:, :3]
+    depth = first[:, 9] + second[:, 9]
+    share = (first[:, 9] / depth)[:, None]
+    merged = share * first + (1 - share) * second
+    apart = first[:, :3] - second[:, :3]
     between = apart[:, (0, 0, 0, 1, 1, 2)] * apart[:, (0, 1, 2, 1, 2, 2)]
     merged[:, 3:9] += share * (1 - share) * between
     merged[:, 9] = depth
@@ -309,8 +310,8 @@ def _node_splats(moments: np.ndarray, tree: Tree, sh: np.ndarray, depths: np.nda
         axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
         quats[part] = Rotation.from_matrix(axes).as_quat()[:, [3, 0, 1, 2]]
     hidden = moments[:, 9] / splat_area(log_scales)  # optical depth before enlarging
-    known = np.linspace(1e-4, MAX_OPACITY, 4096)
-    opacities = np.interp(hidden, optical_depth(known), known)
+    samples = np.linspace(1e-4, MAX_OPACITY, 4096)
+    opacities = np.interp(hidden, optical_depth(samples), samples)
     wider = np.clip(hidden / optical_depth(opacities), 1, MAX_SPREAD)
     log_scales += (np.log(wider) / 2).astype(np.float32)[:, None]
     harmonics = np.empty((count, *sh.shape[1:]), np.float32)

@@ -53,13 +53,13 @@ def edit_tree(tree: Tree, split: np.ndarray, dead: np.ndarray) -> tuple[Tree, np
     # new numbers: leaves (two for a split one), then split leaves and the other inner nodes
     counts = np.where(removed[:count], 0, 1 + split)
     firsts = np.cumsum(counts) - counts
-    splits, kept = np.flatnonzero(split), np.flatnonzero(~loses_child)
+    splits, remaining = np.flatnonzero(split), np.flatnonzero(~loses_child)
     leaves = int(counts.sum())
     new_number = np.concatenate([firsts, np.zeros(len(rows), np.int64)])
     new_number[splits] = leaves + np.arange(len(splits))
-    new_number[count + kept] = leaves + len(splits) + np.arange(len(kept))
-    children = np.concatenate([firsts[splits, None] + np.arange(2), new_number[place[rows[kept]]]])
-    source = np.concatenate([np.repeat(np.arange(count), counts), splits, count + kept])
+    new_number[count + remaining] = leaves + len(splits) + np.arange(len(remaining))
+    children = np.concatenate([firsts[splits, None] + np.arange(2), new_number[place[rows[remaining]]]])
+    source = np.concatenate([np.repeat(np.arange(count), counts), splits, count + remaining])
     return Tree(children.astype(np.int32)), source
 
 

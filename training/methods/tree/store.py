@@ -372,10 +372,10 @@ class Store:
 
     # -- checkpoints -----------------------------------------------------------------------------------
 
-    def supersede(self, other: Store) -> None:
+    def supersede(self, previous: Store) -> None:
         """Replace another store of the same run, see ``RowFile.supersede``."""
-        self.rows.supersede(other.rows)
-        self._lists.supersede(other._lists)
+        self.rows.supersede(previous.rows)
+        self._lists.supersede(previous._lists)
 
     def close(self) -> None:
         """Close the files."""

@@ -41,9 +41,9 @@ def test_steps_before_decay_equal_3dgs(data):
         assert clod.train_step(step)[0] == plain.train_step(step)[0]
     assert torch.equal(clod.model["means"], plain.model["means"])
     assert clod.sigma.detach().unique().tolist() == pytest.approx([10.0])
-    before = len(clod.model)
+    initial = len(clod.model)
     clod.train_step(12)
-    assert len(clod.model) < before and len(clod.sigma.detach().unique()) > before / 4
+    assert len(clod.model) < initial and len(clod.sigma.detach().unique()) > initial / 4
 
 
 def test_training_weights_equal_rule(data):
@@ -58,9 +58,9 @@ def test_training_weights_equal_rule(data):
         facts = collect_facts(rule, clod.facts(), [(1, {})], 1)
         means = clod.model["means"].detach().numpy()
         values = {"s_v": s_v, "at_most": 0}
-        wanted = rule.weights(means, camera.center, camera.focal, columns, facts, values)
+        expected = rule.weights(means, camera.center, camera.focal, columns, facts, values)
         contribution = (falloff * drawn).detach().numpy()
-        assert (np.abs(contribution - wanted) > 1e-5).sum() <= 1
+        assert (np.abs(contribution - expected) > 1e-5).sum() <= 1
     assert level.splats.extras["sigma_d"].shape == (len(level.splats),)
 
 
@@ -92,48 +92,50 @@ def test_count_uses_straight_through_gradient(data):
 def test_initial_decays_follow_importance(data):
     clod = make(data, tau=0.004)
     trained(clod, 12)
-    before, p = clod.model["opacity_logits"].detach().sigmoid(), clod.parameters
+    initial, p = clod.model["opacity_logits"].detach().sigmoid(), clod.parameters
     contribution = contributions(
         clod.model.gaussians.detach(), data.train, near=data.near, antialias=True, backend="cpu"
     )
     means = clod.model["means"].detach().numpy().copy()
     clod.begin_decay()
     # those that give most to the pixels of a view stay, as many as views draw 74 % of what they drew
-    kept = torch.from_numpy((means[:, None] == clod.model["means"].detach().numpy()[None]).all(2).any(1))
+    remaining = torch.from_numpy((means[:, None] == clod.model["means"].detach().numpy()[None]).all(2).any(1))
     views, importance = contribution.views.double(), contribution.total / contribution.views.clamp_min(1)
-    assert importance[kept].min() >= importance[~kept].max()
-    assert 0.6 < views[kept].sum() / views.sum() <= 0.74
+    assert importance[remaining].min() >= importance[~remaining].max()
+    assert 0.6 < views[remaining].sum() / views.sum() <= 0.74
 
-    distances = np.stack([np.linalg.norm(means[kept] - camera.center, axis=1) for camera in data.train], 1)
-    in_view = np.stack([camera.sees(means[kept], near=data.near) for camera in data.train], 1)
-    some = torch.from_numpy(in_view.any(1))
+    distances = np.stack(
+        [np.linalg.norm(means[remaining] - camera.center, axis=1) for camera in data.train], 1
+    )
+    in_view = np.stack([camera.sees(means[remaining], near=data.near) for camera in data.train], 1)
+    subset = torch.from_numpy(in_view.any(1))
     mean = torch.from_numpy((distances * in_view).sum(1) / in_view.sum(1).clip(1) / clod.reference)
     nearest = torch.from_numpy(np.where(in_view, distances, np.inf).min(1) / clod.reference)
     alpha, sigma = clod.model["opacity_logits"].detach().sigmoid(), clod.sigma.detach()
-    some &= (sigma > 2e-3) & (sigma < 49) & (alpha < 0.989) & (alpha > 2e-4)
+    subset &= (sigma > 2e-3) & (sigma < 49) & (alpha < 0.989) & (alpha > 2e-4)
     # from its nearest view a splat looks as before ...
-    seen = alpha * torch.exp(-(nearest**2) / (2 * sigma**2))
-    assert some.sum() > 5
-    torch.testing.assert_close(seen[some], before[kept].double()[some], rtol=2e-3, atol=1e-5)
+    visible = alpha * torch.exp(-(nearest**2) / (2 * sigma**2))
+    assert subset.sum() > 5
+    torch.testing.assert_close(visible[subset], initial[remaining].double()[subset], rtol=2e-3, atol=1e-5)
     # ... and from its mean one it is gone at the scale of its rank
-    rank = (torch.argsort(torch.argsort(importance[kept], descending=True, stable=True)) + 0.5) / int(
-        kept.sum()
+    rank = (torch.argsort(torch.argsort(importance[remaining], descending=True, stable=True)) + 0.5) / int(
+        remaining.sum()
     )
     vanishes = (p.onset * rank ** (-1 / p.exponent)).clamp(1.1, 50)
     edge = alpha * torch.exp(-((mean * vanishes) ** 2) / (2 * sigma**2))
-    close = some & (before[kept] > 1.06 * p.tau * vanishes)
+    close = subset & (initial[remaining] > 1.06 * p.tau * vanishes)
     assert close.sum() > 5
     torch.testing.assert_close(edge[close], (p.tau * vanishes[close]).double(), rtol=2e-2, atol=0)
 
 
 def test_reference_distance(data):
     points = data.scene.points
-    seen = [
+    visible = [
         np.linalg.norm(points[camera.sees(points, near=data.near)] - camera.center, axis=1)
         for camera in data.train
     ]
     clod = make(data, reference_quantile=0.9)
-    assert clod.reference == pytest.approx(np.quantile(np.concatenate(seen), 0.9), rel=1e-5)
+    assert clod.reference == pytest.approx(np.quantile(np.concatenate(visible), 0.9), rel=1e-5)
     published = make(data, reference_quantile=0.0)
     assert published.facts()["reference"] == 0
     assert published.normalized_distances(data.train[0]).max() == pytest.approx(1)
@@ -162,11 +164,11 @@ def test_prefixes_are_coarser_and_counts_fall_with_scale(data):
 def test_undrawn_splats_are_removed(data):
     clod = make(data, keep_share=1.0)
     trained(clod, 13)
-    some = torch.arange(5)
+    subset = torch.arange(5)
     with torch.no_grad():
-        clod.model["opacity_logits"][some] = -6.0  # far below tau
-    seen = clod.drawn_anywhere()
-    assert not seen[some].any() and seen.sum() > 5
+        clod.model["opacity_logits"][subset] = -6.0  # far below tau
+    visible = clod.drawn_anywhere()
+    assert not visible[subset].any() and visible.sum() > 5
 
 
 @pytest.mark.parametrize("preset", ["draft", "paper"])

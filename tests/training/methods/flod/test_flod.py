@@ -173,10 +173,10 @@ def test_gradients_are_averaged_over_visible_views(data):
     flod = make(data, densify_interval=100, prune_interval=100)
     for step in range(3):
         flod.train_step(step)
-    seen, gradient_sum = flod.model.stats["seen"], flod.model.stats["gradient_sum"]
-    assert 0 < seen.max() <= 3
-    assert (gradient_sum[seen == 0] == 0).all()
-    assert torch.equal(flod.model.mean_gradient(), gradient_sum / seen.clamp_min(1))
+    visible, gradient_sum = flod.model.stats["seen"], flod.model.stats["gradient_sum"]
+    assert 0 < visible.max() <= 3
+    assert (gradient_sum[visible == 0] == 0).all()
+    assert torch.equal(flod.model.mean_gradient(), gradient_sum / visible.clamp_min(1))
 
 
 def test_paper_preset_matches_paper():
@@ -225,7 +225,7 @@ def test_finishing_starts_from_completed_levels(data):
 def projected_area(scales: np.ndarray) -> np.ndarray:
     """Return the root mean square area (N,) of projections of ellipsoids (N, 3) in all directions."""
     bases, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(1000, 3, 2)))
-    squares = [np.linalg.det(np.einsum("mki,k,mkj->mij", bases, one**2, bases)).mean() for one in scales]
+    squares = [np.linalg.det(np.einsum("mki,k,mkj->mij", bases, first**2, bases)).mean() for first in scales]
     return np.sqrt(squares)
 
 
@@ -253,8 +253,8 @@ def test_fine_levels_restart_from_important_splats(data):
         ]  # a block takes over the room of what it lost
         assert larger.min() >= 1 - 1e-6 and 1.02 < larger.max() <= 2 + 1e-6
         assert len(np.unique(larger.round(3))) <= -(-len(finest) // SIZE)
-    one, two = (len(level.splats) for level in coarser)
-    assert one == pytest.approx(0.8 * two, abs=1)
+    first, two = (len(level.splats) for level in coarser)
+    assert first == pytest.approx(0.8 * two, abs=1)
 
 
 def test_enlarged_splats_become_fainter(data):
@@ -297,11 +297,11 @@ def test_views_by_distance_respect_drawn_limit(data, drawn):
 @pytest.mark.parametrize("alone", [0.0, 1.0])
 def test_finishing_steps_render_rule_selection(data, alone):
     flod, handed = is_finishing(data, finish_alone=alone)
-    bundle, seen = Bundle("flod", handed, "bands"), set()
+    bundle, visible = Bundle("flod", handed, "bands"), set()
     for step in range(18, 27):
         view, values = flod.choose_view(step), flod._finishing_values(step)
         assert (values["first"] == values["last"]) == bool(alone)
-        seen.add(values["gamma"])
+        visible.add(values["gamma"])
         assert 1 / 1.3 <= values["gamma"] / flod.controls()["gamma"] <= 1.3
         splats, weights = select(bundle, view.camera.center, view.camera.focal, values)
         with torch.no_grad():
@@ -313,15 +313,15 @@ def test_finishing_steps_render_rule_selection(data, alone):
         assert weights is None and 0 < len(splats) < sum(len(level.splats) for level in handed)
         torch.testing.assert_close(drawn, expected.image)
     nearest = {flod._finishing_values(step)["last"] for step in range(18, 60)}
-    assert len(seen) == 9 and nearest == ({1, 2, 3} if alone else {3})
+    assert len(visible) == 9 and nearest == ({1, 2, 3} if alone else {3})
 
 
 def test_finest_level_is_rendered_alone_twice_as_often(data):
     flod, _ = is_finishing(data)
     rng = np.random.default_rng(0)
     values = [finish.random_values(rng, 1.0, flod.model, 0.5) for _ in range(8000)]
-    alone = [each["last"] for each in values if each["first"] == each["last"]]
-    together = {(each["first"], each["last"]) for each in values if each["first"] != each["last"]}
+    alone = [item["last"] for item in values if item["first"] == item["last"]]
+    together = {(item["first"], item["last"]) for item in values if item["first"] != item["last"]}
     assert together == {(1, 3)}
     assert len(alone) / 8000 == pytest.approx(0.5, abs=0.03)
     assert [alone.count(n) / len(alone) for n in (1, 2, 3)] == pytest.approx([0.25, 0.25, 0.5], abs=0.03)
@@ -365,24 +365,24 @@ def trained(flod) -> list[Level]:
     return finished
 
 
-def assert_same(one, other):
+def assert_same(first, second):
     for name in NAMES:
-        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
 
 
 def test_coarse_levels_alone_equal_full_run(data):
     """Constraint, budgets and schedules stay the same if the finest level is trained separately."""
     values = {"levels": 4, "steps": [4, 5, 6, 7], "sh_interval": 3, "finish_share": 0.2, "max_splats": 90}
-    whole, coarse = make(data, **values), make(data, **values, last_level=2)
-    assert coarse.steps == 9 and whole.steps == 26
+    full_run, coarse = make(data, **values), make(data, **values, last_level=2)
+    assert coarse.steps == 9 and full_run.steps == 26
     levels = trained(coarse)
     for step in range(9):
-        whole.train_step(step)
-        for level in whole.levels_after(step):
+        full_run.train_step(step)
+        for level in full_run.levels_after(step):
             alone = levels.pop(0)
             assert (alone.number, alone.facts) == (level.number, level.facts)
             assert_same(alone.splats, level.splats)
-    assert not levels and coarse.controls() == whole.controls()
+    assert not levels and coarse.controls() == full_run.controls()
 
 
 def test_fine_levels_continue_from_coarse_level(data):
@@ -402,11 +402,11 @@ def test_fine_levels_continue_from_coarse_level(data):
     np.testing.assert_allclose(drawn, allowed, rtol=1e-5)
     assert [fine.level_at(step) for step in (0, 5, 6, 12)] == [3, 3, 4, 4]
     assert fine.sh_degree(0) == 9 // 3, "harmonics that have joined stay"
-    whole = make(data, **values, finish_share=0.2)
-    assert [fine.shrink(step) for step in range(13)] == [whole.shrink(step) for step in range(9, 22)]
+    full_run = make(data, **values, finish_share=0.2)
+    assert [fine.shrink(step) for step in range(13)] == [full_run.shrink(step) for step in range(9, 22)]
     levels = trained(fine)
     assert [level.number for level in levels] == [3, 4, 2, 3, 4], "the one before them is finished with them"
-    assert [level.facts["s_min"] for level in levels[:2]] == whole.s_min[2:]
+    assert [level.facts["s_min"] for level in levels[:2]] == full_run.s_min[2:]
 
 
 @pytest.mark.parametrize("first, last", [(3, 2), (1, 5), (5, 0)])

@@ -47,34 +47,34 @@ def test_chunk_centres_and_radii():
     order = np.argsort(centres[:, 0])
     np.testing.assert_allclose(centres[order, 0], [1, 11, 40])
     np.testing.assert_allclose(radii[order], [10, 10, 29])
-    one, reach = chunks.place_chunks(places, 1, 0)
-    np.testing.assert_allclose(one, [[12.8, 0, 0]])
+    first, reach = chunks.place_chunks(places, 1, 0)
+    np.testing.assert_allclose(first, [[12.8, 0, 0]])
     np.testing.assert_allclose(reach, [27.2])  # to the farthest camera
 
 
 def test_chunk_radius_increases_distances():
     """Splats at unit intervals along a line from the centre; d_l of 4 and 8, and a radius of 3."""
     line = create_level([[x, 0, 0] for x in range(20)])
-    found = chunks.chunk_rows({3: line, 2: line, 1: line}, {3: 0.0, 2: 4.0, 1: 8.0}, np.zeros(3), 3.0)
-    assert [found[n].tolist() for n in (3, 2, 1)] == [[*range(7)], [*range(7, 11)], [*range(11, 20)]]
+    actual = chunks.chunk_rows({3: line, 2: line, 1: line}, {3: 0.0, 2: 4.0, 1: 8.0}, np.zeros(3), 3.0)
+    assert [actual[n].tolist() for n in (3, 2, 1)] == [[*range(7)], [*range(7, 11)], [*range(11, 20)]]
 
 
 def test_hidden_splats_are_not_in_a_set():
     """An opaque wall hides splats from cameras of every orientation."""
-    y, z = (each.reshape(-1) for each in np.meshgrid(np.linspace(-3, 3, 61), np.linspace(-3, 3, 61)))
+    y, z = (item.reshape(-1) for item in np.meshgrid(np.linspace(-3, 3, 61), np.linspace(-3, 3, 61)))
     wall = np.stack([0 * y + 2, y, z], axis=1)
-    hidden, seen = [[2.5, 0, 0], [2.4, 0.3, 0.1]], [[1.5, 0, 0], [-2, 0, 0]]
-    level = create_level(np.concatenate([wall, hidden, seen]), log_scale=np.log(0.12))
+    hidden, visible = [[2.5, 0, 0], [2.4, 0.3, 0.1]], [[1.5, 0, 0], [-2, 0, 0]]
+    level = create_level(np.concatenate([wall, hidden, visible]), log_scale=np.log(0.12))
     ahead = Camera("", 64, 64, 60.0, 60.0, 32.0, 32.0, look_at(np.zeros(3), np.array([1.0, 0, 0]), (0, 0, 1)))
     rows = {1: np.arange(len(wall) + 4, dtype=np.int32)}
-    found = chunks.prune_invisible({1: level}, rows, [ahead], 0.005, 0.1, "cpu")[1]
+    actual = chunks.prune_invisible({1: level}, rows, [ahead], 0.005, 0.1, "cpu")[1]
     count = len(wall)
-    assert not {count, count + 1} & set(found) and count + 2 in found
-    assert count + 3 not in found  # behind the eye
+    assert not {count, count + 1} & set(actual) and count + 2 in actual
+    assert count + 3 not in actual  # behind the eye
     around = chunks.turn_cameras([ahead] * 8, np.random.default_rng(0))
     assert len(around) == 32 and all(np.allclose(view.center, 0) for view in around)
-    found = chunks.prune_invisible({1: level}, rows, [ahead, *around], 0.005, 0.1, "cpu")[1]
-    assert not {count, count + 1} & set(found) and {count + 2, count + 3} <= set(found)
+    actual = chunks.prune_invisible({1: level}, rows, [ahead, *around], 0.005, 0.1, "cpu")[1]
+    assert not {count, count + 1} & set(actual) and {count + 2, count + 3} <= set(actual)
 
 
 def make(data, **values):
@@ -102,13 +102,13 @@ def test_last_steps_compute_chunks_and_return_all_levels(data):
     assert [level.number for level in levels] == [3, 2, 1, 1, 2, 3]
     table = lodge.tables()["chunks"]
     assert {len(column) for column in table.values()} == {3} and list(table) == ["x", "y", "z", "radius"]
-    for before, after in zip(levels[:3], levels[:2:-1], strict=True):
-        assert before.number == after.number and list(after.splats.extras) == ["chunks_0"]
-        assert all(np.array_equal(getattr(before.splats, n), getattr(after.splats, n)) for n in NAMES)
+    for initial, final in zip(levels[:3], levels[:2:-1], strict=True):
+        assert initial.number == final.number and list(final.splats.extras) == ["chunks_0"]
+        assert all(np.array_equal(getattr(initial.splats, n), getattr(final.splats, n)) for n in NAMES)
     finest = levels[0].splats.means
     np.testing.assert_array_equal(spatial_order(finest), np.arange(len(finest)))
-    shown = [in_chunk(level.splats.extras, 1) for level in levels[3:]]
-    assert 0 < sum(each.sum() for each in shown) < sum(map(len, shown))
+    drawn = [in_chunk(level.splats.extras, 1) for level in levels[3:]]
+    assert 0 < sum(item.sum() for item in drawn) < sum(map(len, drawn))
 
 
 def test_sets_without_visibility_follow_distances(data):

@@ -43,9 +43,9 @@ def trained(lodge, begin=0, until=None):
     return levels
 
 
-def same(one: Splats, other: Splats) -> bool:
+def same(first: Splats, second: Splats) -> bool:
     names = ("means", "quats", "log_scales", "opacity_logits", "sh")
-    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in names)
+    return all(np.array_equal(getattr(first, name), getattr(second, name)) for name in names)
 
 
 @pytest.fixture(scope="module")
@@ -64,8 +64,8 @@ def test_levels_are_trained_finest_first(data):
     d_l = [level.facts["d_l"] for level in levels]
     assert d_l[0] == 0 < d_l[1] < d_l[2]
     for level in levels[1:]:
-        least = np.sqrt(0.2) * level.facts["d_l"] / data.focal
-        assert np.exp(level.splats.log_scales).min() >= 0.9999 * least
+        minimum = np.sqrt(0.2) * level.facts["d_l"] / data.focal
+        assert np.exp(level.splats.log_scales).min() >= 0.9999 * minimum
         assert 0 < len(level.splats) <= len(levels[0].splats)
 
 
@@ -112,9 +112,9 @@ def test_fixed_distances_are_used(data, base):
 def test_chosen_distances_stay_below_fixed_ones(data, base, distances):
     lodge = make(data, base, levels=len(distances), distances=distances)
     trained(lodge)
-    found = [lodge.d_l[number] / data.median_depth for number in range(1, len(distances) + 1)]
-    assert found[0] == pytest.approx(0.7) and found[-1] == 0
-    assert all(coarser > finer for coarser, finer in pairwise(found))
+    actual = [lodge.d_l[number] / data.median_depth for number in range(1, len(distances) + 1)]
+    assert actual[0] == pytest.approx(0.7) and actual[-1] == 0
+    assert all(coarser > finer for coarser, finer in pairwise(actual))
 
 
 def test_training_selection_equals_bundle_selection(data, base):
@@ -130,19 +130,19 @@ def test_training_selection_equals_bundle_selection(data, base):
         assert weights is None
         rows = visible_rows(drawn, lodge.d_l, camera, 0.01, scale)
         assert sum(map(len, rows.values())) <= len(splats)
-        one = rasterize(gather_rows(drawn, rows), camera, backend="reference").image
-        other = rasterize(Gaussians.of(splats), camera, backend="reference").image
-        torch.testing.assert_close(one, other)
+        first = rasterize(gather_rows(drawn, rows), camera, backend="reference").image
+        second = rasterize(Gaussians.of(splats), camera, backend="reference").image
+        torch.testing.assert_close(first, second)
 
 
 def test_tuning_updates_only_its_level(data, base):
     lodge = make(data, base)
     trained(lodge, until=10)  # in the coarsest level
-    before = {n: [t.clone() for t in vars(level.gaussians).values()] for n, level in lodge.finished.items()}
+    initial = {n: [t.clone() for t in vars(level.gaussians).values()] for n, level in lodge.finished.items()}
     row = lodge.model["sh"].detach().clone()
     trained(lodge, 10, 12)
-    assert sorted(before) == [2, 3] and not torch.equal(row, lodge.model["sh"].detach())
-    for number, tensors in before.items():
+    assert sorted(initial) == [2, 3] and not torch.equal(row, lodge.model["sh"].detach())
+    for number, tensors in initial.items():
         assert all(map(torch.equal, tensors, vars(lodge.finished[number].gaussians).values()))
 
 
@@ -154,9 +154,9 @@ def test_importance_equals_reference(data, base):
     stack = LevelStack({2: level, 1: level})
     assert stack.slices == {2: slice(0, 12), 1: slice(12, 24)}
     rows = {2: np.zeros(0, np.int32), 1: np.arange(12, dtype=np.int32)}
-    found = stack.importance([(camera, rows)], data.near, "cpu")
-    assert (found[:12] == 0).all()
-    found = found[12 + 7 :]
+    actual = stack.importance([(camera, rows)], data.near, "cpu")
+    assert (actual[:12] == 0).all()
+    actual = actual[12 + 7 :]
     for row in range(7, 12):
         lit = torch.zeros(12, 3)
         lit[row] = 1.0
@@ -164,7 +164,7 @@ def test_importance_equals_reference(data, base):
             gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.opacity_logits, lit
         )
         picture = rasterize(only, camera, near=data.near, backend="reference").image
-        assert found[row - 7] == pytest.approx(float(picture.max()), abs=2e-5)
+        assert actual[row - 7] == pytest.approx(float(picture.max()), abs=2e-5)
 
 
 def test_paper_preset_matches_paper():
@@ -181,9 +181,9 @@ def test_antialiased_base_gives_antialiased_levels(data, base):
     distances = {"distances": [1.2, 0.8, 0.0], "prune_weight": 0.0, "tune_alone": 0.0}
     lodge = make(data, small, antialias=True, **distances)
     trained(lodge, until=1)
-    found, levels = lodge.importance(2), {**lodge.finished, 2: lodge._smoothed_level(2)}
+    actual, levels = lodge.importance(2), {**lodge.finished, 2: lodge._smoothed_level(2)}
     for flag in (True, False):
-        largest = torch.zeros(len(found))
+        largest = torch.zeros(len(actual))
         for camera in data.train:
             rows = visible_rows(levels, lodge.d_l, camera, data.near)
             of_picture = contributions(
@@ -191,20 +191,20 @@ def test_antialiased_base_gives_antialiased_levels(data, base):
             ).largest
             own = torch.from_numpy(rows[2]).long()
             largest[own] = torch.maximum(largest[own], of_picture[len(of_picture) - len(own) :])
-        assert ((found - largest).abs().max() < 1e-4) == flag
+        assert ((actual - largest).abs().max() < 1e-4) == flag
     assert lodge.meta()["antialias"] is True
 
 
 def test_pruning_removes_unimportant_splats(data, base):
     all_of_it = make(data, base, prune_weight=0.0, drawn=1.0, distances=[1.2, 0.8, 0.0])
-    some = make(data, base, prune_weight=0.3, drawn=1.0, distances=[1.2, 0.8, 0.0])
-    for lodge in (all_of_it, some):
+    subset = make(data, base, prune_weight=0.3, drawn=1.0, distances=[1.2, 0.8, 0.0])
+    for lodge in (all_of_it, subset):
         trained(lodge, until=1)
     assert len(all_of_it.model) == len(base)
     weights = all_of_it.importance(2)
-    assert len(some.model) < len(base)
+    assert len(subset.model) < len(base)
     # the first of three prunings takes a fifth of the threshold; the step in between changes little
-    assert len(some.model) == pytest.approx(int((weights >= 0.06).sum()), abs=2)
+    assert len(subset.model) == pytest.approx(int((weights >= 0.06).sum()), abs=2)
 
 
 @pytest.mark.parametrize("drawn", [0.5, 0.8])

@@ -102,7 +102,7 @@ def test_random_far_and_full_steps(data, monkeypatch):
 
 def test_new_anchors_are_in_free_voxels(data):
     octree = make(data, steps=400, footprint=6.0, max_splats=10_000, coarse_share=0.0, min_opacity=0.0)
-    before = octree.schedule.tree.keys(
+    initial = octree.schedule.tree.keys(
         octree.model["means"].detach().double().numpy(), octree.model.columns["level"].long().numpy()
     )
     count = len(octree.model)
@@ -113,7 +113,7 @@ def test_new_anchors_are_in_free_voxels(data):
     added, level = octree.model["means"][count:], octree.model.columns["level"][count:]
     assert len(added) > 0
     keys = octree.schedule.tree.keys(added.detach().double().numpy(), level.long().numpy())
-    assert len(set(keys)) == len(keys) and not set(keys) & set(before)
+    assert len(set(keys)) == len(keys) and not set(keys) & set(initial)
     assert level.min() == 2 and set(level.tolist()) <= set((levels + 1).tolist())
     scales = octree.model["log_scales"].detach().exp()[:, 0]
     assert torch.isclose(scales[count:, None] * 1.6, scales[None, :count]).any(1).all()
@@ -157,10 +157,10 @@ def test_growth_threshold_increases_with_level(data, coarser, times):
             max_splats=999, levels=4, coarser_levels=coarser,
         )  # fmt: skip
         count, level = len(octree.model), octree.model.columns["level"]
-        some = level == 3
+        subset = level == 3
         threshold = octree.parameters.grad_threshold * data.threshold_scale * times
         octree.model.stats["seen"] += 1
-        octree.model.stats["gradient_sum"] += threshold * factor * some
+        octree.model.stats["gradient_sum"] += threshold * factor * subset
         octree.grow(200)
         grown = octree.model.columns["level"][count:]
         assert set(grown.tolist()) == (set() if expected is None else {3.0 + expected})
@@ -206,9 +206,9 @@ def test_faint_anchors_are_removed_unless_unseen(data):
     stats["seen"][:10] = 4
     stats["opacity_sum"][:5] = 4 * 0.02
     stats["opacity_sum"][5:10] = 4 * 0.005
-    kept = octree.model["means"].detach().clone()
+    remaining = octree.model["means"].detach().clone()
     octree.grow(20)
-    assert torch.equal(octree.model["means"].detach(), torch.cat([kept[:5], kept[10:]]))
+    assert torch.equal(octree.model["means"].detach(), torch.cat([remaining[:5], remaining[10:]]))
     octree.model.stats["seen"] += 1
     with pytest.raises(LodgsError, match="no splats remain"):
         octree.grow(20)
@@ -218,11 +218,11 @@ def test_invisible_anchors_are_removed(data):
     """No view counts as having drawn them."""
     octree = make(data, grad_threshold=1e9)
     octree.model["opacity_logits"].data[:5] = -5.55  # 1/258
-    kept = octree.model["means"].detach()[5:].clone()
+    remaining = octree.model["means"].detach()[5:].clone()
     rendering = octree.rasterize_model(data.train[0], 0)
     assert (rendering.radii[:5] == 0).all()
     octree.grow(20)
-    assert torch.equal(octree.model["means"].detach(), kept)
+    assert torch.equal(octree.model["means"].detach(), remaining)
 
 
 @pytest.mark.parametrize("far_share", [0.0, 0.1])
@@ -239,12 +239,12 @@ def test_splats_of_low_weight_are_pruned(data, far_share, monkeypatch):
             camera = data.camera(view, shrink)
             distances = (model["means"].detach() - torch.as_tensor(camera.center)).norm(dim=1)
             distances *= octree.schedule.tree.focal_px / camera.fx
-            wanted = (octree.schedule.tree.d_max / distances).log2().clip(0, 3) + 1
-            drawn = (level <= (wanted + 0.5)).float()
+            expected = (octree.schedule.tree.d_max / distances).log2().clip(0, 3) + 1
+            drawn = (level <= (expected + 0.5)).float()
             splats = model.gaussians.detach()
             for column in range(0, len(model), 100):
-                one = torch.eye(len(model))[:, column : column + 100].contiguous()
-                blended = rasterize(splats, camera, weights=drawn, near=data.near, features=one).features
+                first = torch.eye(len(model))[:, column : column + 100].contiguous()
+                blended = rasterize(splats, camera, weights=drawn, near=data.near, features=first).features
                 here = largest[column : column + 100]
                 torch.maximum(here, blended.amax((0, 1)), out=here)
     clear = (largest - 0.3).abs() > 1e-3

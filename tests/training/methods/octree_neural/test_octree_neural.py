@@ -67,15 +67,15 @@ def test_decoding_matches_papers(data, changes):
     own = model.get("looks", np.zeros((4, 11)))
     logit = network(method.networks.opacity) + own[:, 0]
     opacity = 1 / (1 + np.exp(-logit)) if direct else np.tanh(logit)
-    shown = np.flatnonzero(opacity > (1 / 255 if direct else 0))
-    assert len(shown) == 2 and g.offset_index.tolist() == shown.tolist()
-    looks = (network(method.networks.covariance).reshape(4, 7) + own[:, 1:8])[shown]
-    colors = (network(method.networks.color, inputs).reshape(4, 3) + own[:, 8:])[shown]
+    drawn = np.flatnonzero(opacity > (1 / 255 if direct else 0))
+    assert len(drawn) == 2 and g.offset_index.tolist() == drawn.tolist()
+    looks = (network(method.networks.covariance).reshape(4, 7) + own[:, 1:8])[drawn]
+    colors = (network(method.networks.color, inputs).reshape(4, 3) + own[:, 8:])[drawn]
     extents = np.exp(model["log_scales"])
     for name, expected in {
-        "opacities": opacity[shown],
+        "opacities": opacity[drawn],
         "colors": 1 / (1 + np.exp(-colors)),
-        "means": model["means"] + model["offsets"][shown] * extents[:3],
+        "means": model["means"] + model["offsets"][drawn] * extents[:3],
         "scales": extents[3:] / (1 + np.exp(-looks[:, :3])),
         "quats": looks[:, 3:],
     }.items():
@@ -108,8 +108,8 @@ def test_gaussians_of_low_weight_are_disabled(data):
     largest = torch.zeros_like(method.model.stats["seen"])
     for view, camera in enumerate(data.train):
         g = method.decode(camera, method.drawn_anchors(camera), view)
-        found = contributions(g.gaussians(), [camera], near=data.near, backend="reference").largest
-        largest[g.anchor, g.offset_index] = torch.maximum(largest[g.anchor, g.offset_index], found)
+        actual = contributions(g.gaussians(), [camera], near=data.near, backend="reference").largest
+        largest[g.anchor, g.offset_index] = torch.maximum(largest[g.anchor, g.offset_index], actual)
     stay = (largest >= 0.1).any(1)
     assert 0 < stay.sum() < len(stay)
     method.prune_unseen(39)
@@ -126,11 +126,11 @@ def test_anchors_without_gaussians_are_removed(data, monkeypatch):
     drawings = method.draw(view, 0)
     drawings[0].rendering.grad2d = torch.zeros(len(drawings[0].rendering.radii), 2)
     unseen = 5 - int((drawings[0].anchors < 5).sum())
-    before = len(method.model)
+    initial = len(method.model)
     method.accumulate_stats(drawings, view, 0)
     method.grow(20)
     assert unseen < 5
-    assert len(method.model) == before - 5 + unseen
+    assert len(method.model) == initial - 5 + unseen
 
 
 def draw(splats, camera, data):
@@ -170,11 +170,11 @@ def test_baking_uses_the_median_view(data):
     baked = method.bake()
     means, anchors = method.model["means"].detach(), []
     for anchor in range(len(method.model)):
-        seen = [camera for camera in data.train if anchor in method.drawn_anchors(camera)]
-        if not seen:
+        visible = [camera for camera in data.train if anchor in method.drawn_anchors(camera)]
+        if not visible:
             continue
-        far = [float((means[anchor] - torch.as_tensor(c.center).float()).norm()) for c in seen]
-        camera = seen[int(np.argsort(far)[(len(far) - 1) // 2])]
+        far = [float((means[anchor] - torch.as_tensor(c.center).float()).norm()) for c in visible]
+        camera = visible[int(np.argsort(far)[(len(far) - 1) // 2])]
         anchors.append(method.decode(camera, torch.tensor([anchor])))
     opacity = torch.cat([g.opacities for g in anchors]).detach()
     scales = torch.cat([g.scales for g in anchors]).detach()
@@ -196,12 +196,12 @@ def test_baking_fits_harmonics(data):
     camera = data.test[1]
     with torch.no_grad():
         g = method.decode(camera, drawn_in_training(method))
-        shown = method.rasterize_decoded(g, camera).image
+        drawn = method.rasterize_decoded(g, camera).image
         flat = np.array(baked.sh)
         flat[:, 1:] = 0
-    error = (draw(baked, camera, data) - shown).abs().mean()
+    error = (draw(baked, camera, data) - drawn).abs().mean()
     baked.sh = flat
-    assert error < 0.3 * (draw(baked, camera, data) - shown).abs().mean()
+    assert error < 0.3 * (draw(baked, camera, data) - drawn).abs().mean()
 
 
 def test_arrays_restore_the_networks(data, tmp_path):
@@ -209,12 +209,12 @@ def test_arrays_restore_the_networks(data, tmp_path):
     for step in range(4):
         method.train_step(step)
     np.savez(tmp_path / "model.npz", **method.arrays())  # pyright: ignore[reportArgumentType]
-    other = make(data, appearance=2)
+    second = make(data, appearance=2)
     arrays = read_arrays(tmp_path / "model.npz")
-    other.load_arrays(arrays)
+    second.load_arrays(arrays)
     camera = data.test[0]
-    assert torch.equal(other.render_image(camera), method.render_image(camera))
-    other.train_step(4)  # and training can go on
+    assert torch.equal(second.render_image(camera), method.render_image(camera))
+    second.train_step(4)  # and training can go on
     network = next(name for name in arrays if name.startswith("network."))
     for name, odd in (
         ("means", arrays["means"][:-1]),
@@ -223,9 +223,9 @@ def test_arrays_restore_the_networks(data, tmp_path):
         (network, arrays[network][:-1]),
     ):
         with pytest.raises(ValueError, match=r" is \(.* not \("):
-            other.load_arrays(arrays | {name: odd})
+            second.load_arrays(arrays | {name: odd})
     with pytest.raises(KeyError, match="means"):
-        other.load_arrays({})
+        second.load_arrays({})
 
 
 def test_growth_at_large_gradients(data):

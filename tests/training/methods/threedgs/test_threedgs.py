@@ -75,8 +75,8 @@ def test_unimportant_splats_are_pruned_three_times(data):
     counts = [method.splats]
     for step in range(30):
         if step + 1 in (8, 16, 24):  # the step before decides nearly alike
-            found = contributions(method.model.gaussians, data.train, near=data.near, backend="reference")
-            expected = int((found.largest >= 0.08).sum())
+            actual = contributions(method.model.gaussians, data.train, near=data.near, backend="reference")
+            expected = int((actual.largest >= 0.08).sum())
         method.train_step(step)
         counts.append(method.splats)
         if step + 1 == 8:

@@ -149,13 +149,13 @@ def test_single_splat_raises():
 def test_tree_is_independent_of_thread_count():
     from training.rasterize.cpu import compile
 
-    before, found = compile.thread_count(), []
+    initial, actual = compile.thread_count(), []
     try:
         for count in (1, 3):
             compile.set_thread_count(count)
-            found.append(build(scene(20_000)))
+            actual.append(build(scene(20_000)))
     finally:
-        compile.set_thread_count(before)
-    (one, tree), (other, same) = found
+        compile.set_thread_count(initial)
+    (first, tree), (second, same) = actual
     np.testing.assert_array_equal(tree.children, same.children)
-    np.testing.assert_array_equal(one.sh, other.sh)
+    np.testing.assert_array_equal(first.sh, second.sh)

@@ -59,7 +59,7 @@ def test_edge_cases_of_the_paper():
     tree = Tree(np.array([[2, 3], [0, 1], [5, 4]], np.int32))
 
     def after(split=(), dead=()):
-        flags = (np.isin(np.arange(4), each) for each in (split, dead))
+        flags = (np.isin(np.arange(4), item) for item in (split, dead))
         new, source = edit_tree(tree, *flags)
         return nested(new, source.tolist())
 
@@ -106,36 +106,38 @@ def is_leaf(store):
 
 
 def control_density(store, **values):
-    wanted = {"threshold": np.inf, "min_opacity": 0.005, "unseen_since": 0, "step": 9, "max_leaves": 10**6}
-    growing = TreeDensityControl(store, **(wanted | values))
-    other = Store(store.rows._folder, 1, store.budget)
-    other.fill_records(growing, lambda: growing.upper)
-    return growing, other
+    expected = {"threshold": np.inf, "min_opacity": 0.005, "unseen_since": 0, "step": 9, "max_leaves": 10**6}
+    control = TreeDensityControl(store, **(expected | values))
+    second = Store(store.rows._folder, 1, store.budget)
+    second.fill_records(control, lambda: control.upper)
+    return control, second
 
 
 def test_no_candidates_change_nothing(store):
-    before = merge_forest(store)
-    growing, after = control_density(store)
-    assert growing.added == growing.removed == 0
-    splats, tree = merge_forest(after)
-    assert np.array_equal(tree.children, before[1].children) and np.array_equal(splats.means, before[0].means)
+    initial = merge_forest(store)
+    control, final = control_density(store)
+    assert control.added == control.removed == 0
+    splats, tree = merge_forest(final)
+    assert np.array_equal(tree.children, initial[1].children) and np.array_equal(
+        splats.means, initial[0].means
+    )
 
 
 def test_highest_scores_are_split_up_to_limit(store):
     rng = np.random.default_rng(0)
     scores = rng.random(len(store)) * is_leaf(store)
     set_columns(store, score=scores, steps=3)
-    growing, after = control_density(store, threshold=0.5, max_leaves=450)
-    splats, new = merge_forest(after)
-    assert growing.added == 50 and new.leaves == 450 and len(splats) == len(new) == 899
+    control, final = control_density(store, threshold=0.5, max_leaves=450)
+    splats, new = merge_forest(final)
+    assert control.added == 50 and new.leaves == 450 and len(splats) == len(new) == 899
     # those that are nodes now are the leaves of the highest scores, as they were
-    least = np.sort(scores)[-50]
+    minimum = np.sort(scores)[-50]
     records = store.rows.read(np.arange(len(store)))
-    chosen = {row.tobytes() for row in records[scores >= least][:, :3].numpy()}
-    kept = {row.tobytes() for row in splats.means[: new.leaves]}
+    chosen = {row.tobytes() for row in records[scores >= minimum][:, :3].numpy()}
+    remaining = {row.tobytes() for row in splats.means[: new.leaves]}
     above = {row.tobytes() for row in splats.means[new.leaves :]}
-    assert len(chosen) == 50 and chosen <= above and not chosen & kept
-    columns = after.layout.split(after.rows.read(np.arange(len(after))))
+    assert len(chosen) == 50 and chosen <= above and not chosen & remaining
+    columns = final.layout.split(final.rows.read(np.arange(len(final))))
     assert not columns["score"].any()
     fresh = columns["steps"] == 0
     assert fresh.sum() == 100 and not columns["first"][fresh].any() and (columns["seen"][fresh] == 9).all()
@@ -143,37 +145,37 @@ def test_highest_scores_are_split_up_to_limit(store):
     place = {row.tobytes(): node for node, row in enumerate(splats.means)}
     for row in chosen:
         node = place[row]
-        one, other = new.children[node - new.leaves]
-        middle = (splats.means[one].astype(float) + splats.means[other]) / 2
+        first, second = new.children[node - new.leaves]
+        middle = (splats.means[first].astype(float) + splats.means[second]) / 2
         np.testing.assert_allclose(middle, splats.means[node], atol=1e-5)
-        assert splats.opacity_logits[one] == splats.opacity_logits[other] < splats.opacity_logits[node]
+        assert splats.opacity_logits[first] == splats.opacity_logits[second] < splats.opacity_logits[node]
 
 
 def test_faint_and_unseen_leaves_are_removed(store):
     leaves = is_leaf(store)
-    seen = np.full(len(store), 7.0)
+    visible = np.full(len(store), 7.0)
     gone = np.flatnonzero(leaves)[[3, 50, 200]]
-    seen[gone] = 2
-    set_columns(store, seen=seen)
+    visible[gone] = 2
+    set_columns(store, seen=visible)
     removed = store.rows.read(gone)[:, :3].numpy()
-    growing, after = control_density(store, unseen_since=3)
-    splats, tree = merge_forest(after)
-    assert growing.removed == 3 and tree.leaves == 397
+    control, final = control_density(store, unseen_since=3)
+    splats, tree = merge_forest(final)
+    assert control.removed == 3 and tree.leaves == 397
     assert not (removed[:, None] == splats.means).all(2).any()
-    faint = np.zeros(len(after))
-    faint[np.flatnonzero(is_leaf(after))[:5]] = -9
-    set_columns(after, opacity_logits=faint)
-    growing, last = control_density(after)
-    assert 0 < growing.removed <= 5 and merge_forest(last)[1].leaves == 397 - growing.removed
+    faint = np.zeros(len(final))
+    faint[np.flatnonzero(is_leaf(final))[:5]] = -9
+    set_columns(final, opacity_logits=faint)
+    control, last = control_density(final)
+    assert 0 < control.removed <= 5 and merge_forest(last)[1].leaves == 397 - control.removed
 
 
 def test_large_subtree_is_divided(store):
     for _ in range(4):
         set_columns(store, score=is_leaf(store))
-        before = merge_forest(store)[1].leaves
+        initial = merge_forest(store)[1].leaves
         _, store = control_density(store, threshold=0.5)
         splats, tree = merge_forest(store)
-        assert tree.leaves == 2 * before == int(store.shape.counts.sum())
+        assert tree.leaves == 2 * initial == int(store.shape.counts.sum())
         assert store.shape.counts.max() <= MAX_GROWTH * max_subtree_leaves(tree.leaves)
         assert sorted(leaves_below(tree, len(tree) - 1)) == list(range(tree.leaves))
         sizes = tree.sizes(splats.means, splats.log_scales)
@@ -181,5 +183,5 @@ def test_large_subtree_is_divided(store):
 
 
 def test_faint_pairs_keep_one_leaf(store):
-    growing, after = control_density(store, min_opacity=1.0)
-    assert growing.removed == len(merge_forest(store)[1].children) - len(merge_forest(after)[1].children) > 0
+    control, final = control_density(store, min_opacity=1.0)
+    assert control.removed == len(merge_forest(store)[1].children) - len(merge_forest(final)[1].children) > 0

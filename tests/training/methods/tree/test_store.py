@@ -108,7 +108,7 @@ def test_store_returns_its_input(town, tmp_path):
     nodes, tree = town
     forest = split_tree(nodes, tree, max_subtree_leaves(tree.leaves))
     store = create_store(tmp_path, town)
-    for (ours, shape), (theirs, other) in zip([*store, store.upper], [*forest, forest.upper], strict=True):
+    for (ours, shape), (theirs, second) in zip([*store, store.upper], [*forest, forest.upper], strict=True):
         if not len(ours):
             continue
         names = match_rows(ours.means, theirs.means)
@@ -116,22 +116,22 @@ def test_store_returns_its_input(town, tmp_path):
             np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name)[names])
         if len(ours) < len(shape):  # the upper tree, whose leaves are elsewhere
             np.testing.assert_array_equal(names, np.arange(len(names)))
-            np.testing.assert_array_equal(shape.children, other.children)
+            np.testing.assert_array_equal(shape.children, second.children)
             continue
         assert (names[: shape.leaves] < shape.leaves).all() and names[-1] == len(shape) - 1
         np.testing.assert_array_equal(
-            names[shape.children], other.children[names[shape.leaves :] - shape.leaves]
+            names[shape.children], second.children[names[shape.leaves :] - shape.leaves]
         )
 
 
 def test_nodes_are_sorted_by_parent_size(town, tmp_path):
-    store, many = create_store(tmp_path, town), 0
+    store, count = create_store(tmp_path, town), 0
     for splats, tree in store:
         sizes, parents = tree.sizes(splats.means, splats.log_scales), tree.parents
         for part in (slice(0, tree.leaves), slice(tree.leaves, -1)):
             assert (np.diff(sizes[parents[part]]) >= 0).all()
-        many += len(tree) > 10
-    assert many > 50
+        count += len(tree) > 10
+    assert count > 50
 
 
 def steps(store, begin, end):

@@ -55,12 +55,12 @@ def records(tree):
     return tree.store.rows.read(np.arange(len(tree.store)))
 
 
-def same(one: Splats, other: Splats) -> bool:
+def same(first: Splats, second: Splats) -> bool:
     names = ("means", "quats", "log_scales", "opacity_logits", "sh")
-    columns = one.extras.keys() == other.extras.keys() and all(
-        np.array_equal(one.extras[name], other.extras[name]) for name in one.extras
+    columns = first.extras.keys() == second.extras.keys() and all(
+        np.array_equal(first.extras[name], second.extras[name]) for name in first.extras
     )
-    return columns and all(np.array_equal(getattr(one, name), getattr(other, name)) for name in names)
+    return columns and all(np.array_equal(getattr(first, name), getattr(second, name)) for name in names)
 
 
 @pytest.fixture(scope="module")
@@ -117,8 +117,8 @@ def test_without_tuning_leaves_equal_the_base(data, base):
     assert tree.steps == tree.parameters.base_steps == 1
     above, leaves = trained(tree)
     leaves.splats.extras = {}
-    one, other = (splats.select(np.lexsort(splats.means.T)) for splats in (leaves.splats, base))
-    assert same(one, other) and above.number == 1
+    first, second = (splats.select(np.lexsort(splats.means.T)) for splats in (leaves.splats, base))
+    assert same(first, second) and above.number == 1
 
 
 def test_leaf_rate_zero_freezes_leaves(data, base):
@@ -140,8 +140,8 @@ def test_leaf_rate_decreases(data, base):
     above = inner_rows(tree)[tree.store.cache.rows_at(indices)]
     assert above.any() and not above.all()
     for step, share in ((1, 0.2), (201, 0.2 * 0.03**0.5), (401, 0.2 * 0.03)):
-        found = tree._rate_factors(indices, step).numpy()
-        np.testing.assert_allclose(found, np.where(above, 3, share), rtol=0.01)
+        actual = tree._rate_factors(indices, step).numpy()
+        np.testing.assert_allclose(actual, np.where(above, 3, share), rtol=0.01)
 
 
 def test_sizes_are_saturated_after_training(data, base):
@@ -164,10 +164,10 @@ def test_step_updates_only_the_cut_of_its_view(data, base):
     far = replace(base, means=middle + (base.means - middle) / 30, log_scales=base.log_scales - np.float32(3))
     tree = make(data, far, lod_noise=0.0)
     trained(tree, until=4)
-    before = records(tree)
+    initial = records(tree)
     tree.store.cache.evict_all()
     tree.train_step(4)
-    moved = (records(tree) != before).any(dim=1)
+    moved = (records(tree) != initial).any(dim=1)
     rows = cut_rows(tree, tree.choose_view(4).camera, tree.parameters.pixels)
     cut = torch.zeros_like(moved)
     cut[rows] = True
@@ -183,7 +183,7 @@ def test_training_cut_equals_bundle_cut(data, base):
         for camera in data.train[:3]:
             rows = cut_rows(tree, camera, pixels)
             gaussians = tree.store.gaussians_at(tree.store.load_cut(camera, pixels, data.near))
-            one = tree.rasterize_model(camera, 0, gaussians=gaussians).image
+            first = tree.rasterize_model(camera, 0, gaussians=gaussians).image
             weights = choice.weights(
                 camera.center, camera.focal, resolve_controls(bundle, {"pixels": pixels})
             )
@@ -197,10 +197,10 @@ def test_training_cut_equals_bundle_cut(data, base):
                 for backend in ("cpu", "reference")
             )  # fmt: skip
             assert len(rows) <= (weights > 0).sum()
-            torch.testing.assert_close(one.detach(), own, atol=2e-5, rtol=1e-4)
+            torch.testing.assert_close(first.detach(), own, atol=2e-5, rtol=1e-4)
             # two backends may round a splat's alpha across its threshold in a pixel, which is worth a 255th
-            off = ~torch.isclose(one.detach(), reference, atol=2e-5, rtol=1e-4).all(-1)
-            assert off.sum() <= 2 and (one.detach() - reference).abs().max() < 1 / 255
+            off = ~torch.isclose(first.detach(), reference, atol=2e-5, rtol=1e-4).all(-1)
+            assert off.sum() <= 2 and (first.detach() - reference).abs().max() < 1 / 255
 
 
 def test_bundle_has_block_table(data, base):
@@ -221,10 +221,10 @@ def test_rendering_uses_trained_granularity(data, base):
 
 def test_lod_noise_follows_fourth_power(data, base):
     tree = make(data, base, pixels=2.0, lod_noise=5.0)
-    found = np.array([tree._pixels(step) for step in range(4000)])
-    assert found.min() >= 2 and found.max() <= 12
+    actual = np.array([tree._pixels(step) for step in range(4000)])
+    assert actual.min() >= 2 and actual.max() <= 12
     # A.6: 1 + 5 r⁴ is below 2 for r < (1/5)^(1/4) = 0.669
-    assert (found < 4).mean() == pytest.approx(0.669, abs=0.02)
+    assert (actual < 4).mean() == pytest.approx(0.669, abs=0.02)
 
 
 def test_view_of_nothing_completes_its_step(data, base):
@@ -246,17 +246,17 @@ def test_view_of_nothing_completes_its_step(data, base):
 def test_resume_is_bit_identical(data, stop):
     """Stops in the 3DGS steps, at their end, before the first step of the tree, and between size updates."""
     values = {"resize_interval": 3, "lr_scales": 0.1}
-    whole, first = make(data, **values), make(data, **values)
-    levels = trained(whole)
-    before = trained(first, until=stop)
+    full_run, first = make(data, **values), make(data, **values)
+    levels = trained(full_run)
+    initial = trained(first, until=stop)
     file = io.BytesIO()
     torch.save(first.state_dict(), file)
     file.seek(0)
     second = make(data, **values)
     second.load_state_dict(torch.load(file, weights_only=True))
-    after = before + trained(second, stop)
-    assert [level.number for level in after] == [level.number for level in levels]
-    assert all(same(one.splats, other.splats) for one, other in zip(levels, after, strict=True))
+    final = initial + trained(second, stop)
+    assert [level.number for level in final] == [level.number for level in levels]
+    assert all(same(one.splats, other.splats) for one, other in zip(levels, final, strict=True))
 
 
 def test_density_control_grows_the_tree(data, base):
@@ -279,13 +279,13 @@ def test_density_control_grows_the_tree(data, base):
     (above, leaves), *_ = [tree.levels_after(tree.steps - 1)]
     assert len(leaves.rows) == counts[-1] == len(above.rows) + 1
     for pause in (4, 9, 14):
-        other = make(data, base, **values)
-        trained(other, until=pause)
-        kept = io.BytesIO()
-        torch.save(other.state_dict(), kept)
-        kept.seek(0)
+        second = make(data, base, **values)
+        trained(second, until=pause)
+        remaining = io.BytesIO()
+        torch.save(second.state_dict(), remaining)
+        remaining.seek(0)
         again = make(data, base, **values)
-        again.load_state_dict(torch.load(kept, weights_only=True))
+        again.load_state_dict(torch.load(remaining, weights_only=True))
         trained(again, begin=pause)
         assert torch.equal(records(again), records(tree))
 
@@ -295,13 +295,15 @@ def test_coarsening_for_budget_warns_once(data, monkeypatch):
     leaves.means = (0.03 * leaves.means + data.scene.points.mean(axis=0)).astype(np.float32)
     leaves.log_scales = (leaves.log_scales + np.log(0.03)).astype(np.float32)
     record = SLOT_BYTES + 4 * record_layout(0).width
-    for room, many in ((600, 1), (10_000, 0)):
+    for room, count in ((600, 1), (10_000, 0)):
         monkeypatch.setattr(data, "splat_memory", room * record + 4 * (2 * len(leaves) - 1))
-        tree, told = make(data, leaves, sh_degree=0, pixels=0.1, lod_noise=0.0), []
-        tree.warn = told.append
+        tree, messages = make(data, leaves, sh_degree=0, pixels=0.1, lod_noise=0.0), []
+        tree.warn = messages.append
         trained(tree)
-        assert len(told) == many and all("coarser" in each and "splat_memory" in each for each in told)
-        assert (tree.store.max_coarsening > 1) == bool(many)
+        assert len(messages) == count and all(
+            "coarser" in item and "splat_memory" in item for item in messages
+        )
+        assert (tree.store.max_coarsening > 1) == bool(count)
 
 
 def test_unimportant_leaves_are_pruned_in_first_steps(data, monkeypatch):
