@@ -91,25 +91,10 @@ class TrainingData:
         region: Crop | None = None,
         gains: Mapping[str, np.ndarray] | None = None,
     ) -> None:
-        if len(scene.points) == 0:
-            raise LodgsError(
-                f"Cannot train: the COLMAP model in {scene.model} has no 3D points.",
-                "Triangulate points in COLMAP, or choose another model.",
-            )
         self.full_scene = scene if full_scene is None else full_scene
         all_train, all_test = self.full_scene.split(test_every, validation)
         train, test = (_intersection(scene.cameras, cameras) for cameras in (all_train, all_test))
-        if len(scene.cameras) < 2:
-            raise LodgsError(
-                f"Cannot train {scene.folder}: it has {len(scene.cameras)} usable view(s) and needs 2.",
-                "Check that the image folder contains the photos of the model.",
-            )
-        if len(train) < 2:
-            raise LodgsError(
-                f"Cannot train: {len(train)} of {len(scene.cameras)} usable views in {scene.folder} remain "
-                "for training after holding out views, 2 are needed.",
-                "Set test_every to 0 to hold out no views, or to a larger number.",
-            )
+        _check_scene(scene, train)
         if validation and not all_test:
             raise LodgsError(
                 f"Cannot validate: test_every = {test_every} holds out none of the "
@@ -246,6 +231,26 @@ class TrainingData:
         if inverse_depth is not None and mask is not None:
             inverse_depth[mask <= 0.5] = np.nan
         return Target(planes[:3].permute(1, 2, 0), mask, planes[3] if alpha else None, inverse_depth)
+
+
+def _check_scene(scene: Scene, train: Sequence[Camera]) -> None:
+    """Raise LodgsError unless a scene has points and enough views to train."""
+    if len(scene.points) == 0:
+        raise LodgsError(
+            f"Cannot train: the COLMAP model in {scene.model} has no 3D points.",
+            "Triangulate points in COLMAP, or choose another model.",
+        )
+    if len(scene.cameras) < 2:
+        raise LodgsError(
+            f"Cannot train {scene.folder}: it has {len(scene.cameras)} usable view(s) and needs 2.",
+            "Check that the image folder contains the photos of the model.",
+        )
+    if len(train) < 2:
+        raise LodgsError(
+            f"Cannot train: {len(train)} of {len(scene.cameras)} usable views in {scene.folder} remain "
+            "for training after holding out views, 2 are needed.",
+            "Set test_every to 0 to hold out no views, or to a larger number.",
+        )
 
 
 def _intersection(cameras: Sequence[Camera], selection: Sequence[Camera]) -> list[Camera]:
