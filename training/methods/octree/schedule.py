@@ -16,7 +16,7 @@ from ...optimize.training_data import TrainingData, TrainingView
 from ...rasterize.adam import LearningRate
 from ...scenes.cameras import Camera
 from . import OctreeParameters
-from .tree import Octree
+from .tree import AnchorOctree
 
 MIN_SIDE = 32
 """Minimum length of the shorter side of a downscaled photo, in pixels."""
@@ -34,7 +34,7 @@ class Schedule:
     data: TrainingData
     parameters: OctreeParameters
     seed: int
-    tree: Octree
+    tree: AnchorOctree
     join_steps: list[int] = field(init=False)
 
     def __post_init__(self) -> None:

@@ -21,7 +21,7 @@ POINTS, VIEWS = 50_000, 500
 
 
 @dataclass(frozen=True)
-class Octree:
+class AnchorOctree:
     """Levels over a scene.
 
     Attributes:
@@ -75,7 +75,7 @@ def build(
     quantiles: tuple[float, float] = (0.05, 0.95),
     levels: int = 0,
     coarser: int = 0,
-) -> Octree:
+) -> AnchorOctree:
     """Build the octree for a scene's points (P, 3) and views, of which samples of about POINTS and VIEWS are
     used.
 
@@ -101,10 +101,10 @@ def build(
     levels = levels or min(floor(log2(d_max / d_min)) + 1 + coarser, MAX_LEVELS)
     coarser = min(coarser, levels - 1)
     d_max = float(d_max) * 2**coarser
-    return Octree(levels, d_max, focal_px, footprint * d_max / focal_px, points.min(axis=0) - 1e-6)
+    return AnchorOctree(levels, d_max, focal_px, footprint * d_max / focal_px, points.min(axis=0) - 1e-6)
 
 
-def anchors(points: np.ndarray, octree: Octree) -> np.ndarray:
+def anchors(points: np.ndarray, octree: AnchorOctree) -> np.ndarray:
     """Return the level (P,) of each point that represents a voxel, 0 for other points.
 
     A point represents the voxel of the coarsest level that no other point represents yet: the first one

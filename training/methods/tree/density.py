@@ -17,7 +17,7 @@ from ...lod.crop import Crop
 from ...lod.tree.forest import extract_subtrees, forest_shape, max_subtree_leaves, merge_trees
 from ...lod.tree.shape import Tree
 from ...optimize.density_control import split_longest_axis
-from .store import RecordPiece, Store
+from .store import NodeStore, RecordPiece
 
 MAX_GROWTH = 2
 """A subtree is divided if it exceeds its target number of leaves by this factor."""
@@ -92,7 +92,7 @@ class TreeDensityControl:
 
     def __init__(
         self,
-        store: Store,
+        store: NodeStore,
         *,
         threshold: float,
         min_opacity: float,
@@ -126,7 +126,7 @@ class TreeDensityControl:
         self.added = len(self._split)
 
     def __iter__(self) -> Iterator[RecordPiece]:
-        """Yield the new subtrees for ``Store.fill_records``."""
+        """Yield the new subtrees for ``NodeStore.fill_records``."""
         count, uppers, upper_records = 0, [], []
         for records, tree in self._store.records():
             begin, end = np.searchsorted(self._split, (count, count + tree.leaves))

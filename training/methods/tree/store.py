@@ -67,7 +67,7 @@ def record_layout(sh_degree: int) -> RowLayout:
     return RowLayout({**values, **moments, "steps": (), "score": (), "seen": ()})
 
 
-class Store:
+class NodeStore:
     """Nodes of one tree on disk, with a cache in memory.
 
     Args:
@@ -372,7 +372,7 @@ class Store:
 
     # -- checkpoints -----------------------------------------------------------------------------------
 
-    def supersede(self, previous: Store) -> None:
+    def supersede(self, previous: NodeStore) -> None:
         """Replace another store of the same run, see ``RowFile.supersede``."""
         self.rows.supersede(previous.rows)
         self._lists.supersede(previous._lists)

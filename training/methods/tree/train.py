@@ -34,7 +34,7 @@ from ..threedgs.refining import RefiningMethod
 from . import TreeParameters
 from .build import ForestBuilder
 from .density import TreeDensityControl
-from .store import Store, default_budget
+from .store import NodeStore, default_budget
 
 FINAL_LEAF_RATE = 0.03
 """Learning rate of leaves at the end, as a fraction of the initial one."""
@@ -59,7 +59,7 @@ class RecordOptimizer:
 
     def __init__(
         self,
-        store: Store,
+        store: NodeStore,
         indices: np.ndarray,
         lr: Mapping[str, LearningRate],
         rate_factors: torch.Tensor,
@@ -106,7 +106,7 @@ class Method(RefiningMethod):
         super().setup(None if base is None else base.select(slice(0, 0)))
         # density control and margins belong to the 3DGS steps only
         self._densify_until = min(self._densify_until, self.finest_steps)
-        self.store: Store | None = None
+        self.store: NodeStore | None = None
         self._base = base
         self._table: Columns = {}
         self._reported_budget = 0  # bytes of splat_memory in the last warning
@@ -259,9 +259,9 @@ class Method(RefiningMethod):
             view.target,
         )
 
-    def _new_store(self, budget: int | None = None) -> Store:
+    def _new_store(self, budget: int | None = None) -> NodeStore:
         budget = self.data.splat_memory or budget or default_budget(self.device)
-        return Store(self.data.scratch, self.parameters.sh_degree, budget, self.device)
+        return NodeStore(self.data.scratch, self.parameters.sh_degree, budget, self.device)
 
     def _pixels(self, step: int) -> float:
         """Return the granularity of a step (A.6: distances times 1 + 5 r⁴)."""

@@ -47,7 +47,7 @@ def test_level_count_from_distance_range():
 
 def test_every_voxel_has_one_point():
     points = np.random.default_rng(3).uniform(-1, 1, (3000, 3))
-    tree = octree.Octree(4, 1.0, 100.0, 0.7, points.min(0))
+    tree = octree.AnchorOctree(4, 1.0, 100.0, 0.7, points.min(0))
     level = octree.anchors(points, tree)
     for number in range(1, 5):
         occupied = np.unique(tree.keys(points, number))
@@ -57,7 +57,7 @@ def test_every_voxel_has_one_point():
 
 def test_voxel_keys_are_unique():
     points = np.array([[x, y, z] for x in range(6) for y in range(6) for z in range(6)]) + 0.5
-    tree = octree.Octree(12, 1.0, 1.0, 2048.0, np.zeros(3))
+    tree = octree.AnchorOctree(12, 1.0, 1.0, 2048.0, np.zeros(3))
     fine = tree.keys(points, 12)  # voxels of edge 1
     assert len(set(fine)) == len(points)
     assert not set(fine) & set(tree.keys(points, 11))

@@ -9,7 +9,7 @@ from training.lod.tree.forest import max_subtree_leaves, merge_forest
 from training.lod.tree.shape import Tree
 from training.methods.tree.build import ForestBuilder
 from training.methods.tree.density import MAX_GROWTH, TreeDensityControl, edit_tree
-from training.methods.tree.store import Store
+from training.methods.tree.store import NodeStore
 
 from .test_build import leaves_below, scene
 
@@ -85,7 +85,7 @@ def test_single_leaf_remains():
 
 @pytest.fixture
 def store(tmp_path):
-    store = Store(tmp_path, 1, 1 << 24)
+    store = NodeStore(tmp_path, 1, 1 << 24)
     store.fill(ForestBuilder(scene(400), subtree_leaves=16))
     return store
 
@@ -108,7 +108,7 @@ def is_leaf(store):
 def control_density(store, **values):
     expected = {"threshold": np.inf, "min_opacity": 0.005, "unseen_since": 0, "step": 9, "max_leaves": 10**6}
     control = TreeDensityControl(store, **(expected | values))
-    second = Store(store.rows._folder, 1, store.budget)
+    second = NodeStore(store.rows._folder, 1, store.budget)
     second.fill_records(control, lambda: control.upper)
     return control, second
 

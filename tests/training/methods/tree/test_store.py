@@ -12,7 +12,7 @@ from training.errors import LodgsError
 from training.lod.tree.forest import forest_shape, max_subtree_leaves, merge_forest, split_tree
 from training.methods.tree import store as store_module
 from training.methods.tree.build import build
-from training.methods.tree.store import Store, record_layout
+from training.methods.tree.store import NodeStore, record_layout
 from training.optimize.out_of_core.cut_cache import INDEX_BYTES, SLOT_BYTES
 from training.optimize.out_of_core.row_file import BLOCK, TABLE_BYTES
 from training.rasterize.sequential_point_tree import SequentialPointTree
@@ -31,7 +31,7 @@ def town():
 def create_store(folder, town, budget=1 << 30, subtree_leaves=0):
     nodes, tree = town
     folder.mkdir(parents=True, exist_ok=True)
-    store = Store(folder, 1, budget)
+    store = NodeStore(folder, 1, budget)
     store.fill(split_tree(nodes, tree, subtree_leaves or max_subtree_leaves(tree.leaves)))
     return store
 
@@ -181,7 +181,7 @@ def test_resume_is_bit_identical(town, tmp_path, stop):
     steps(first, stop, min(stop + 9, 40))  # which is lost
     first.close()
     file.seek(0)
-    second = Store(tmp_path / "parts", 1, budget)
+    second = NodeStore(tmp_path / "parts", 1, budget)
     second.load_state_dict(torch.load(file, weights_only=True))
     torch.testing.assert_close(steps(second, stop, 40), truth, rtol=0, atol=0)
 
