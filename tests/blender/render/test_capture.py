@@ -345,7 +345,7 @@ def test_transparent_film_gives_images_with_alpha(bpy, scene, capture, tmp_path)
         (lambda bpy: [new_camera(bpy, (0, -9, 3), (75, 0, 0), type=kind) for kind in ("PANO", "PERSP")],
          ["--cameras"], "is pano"),
         (lambda bpy: [bpy.data.objects.remove(obj) for obj in list(bpy.data.objects)], ["--around"],
-         "nothing to look at"),
+         "the Blender scene is empty"),
         (lambda bpy: setattr(bpy.context.scene.render, "engine", "LODGS"), ["--around"], "only splats"),
         (lambda bpy: setattr(bpy.context.view_layer, "use", False), ["--around"], "none of its view layers"),
         (lambda bpy: None, ["--around", "--views", "1"], "Invalid views = 1"),
