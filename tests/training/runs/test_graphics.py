@@ -116,6 +116,7 @@ def test_cpu_replaces_a_device_that_renders_incorrectly(graphics, keys, monkeypa
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_levels_on_a_device_are_as_good_as_on_the_cpu(graphics, keys, tmp_path):
     """Each level has the same PSNR within 0.25 dB, and about the same number of splats.
 

@@ -1,6 +1,7 @@
 """Training runs as processes: events, files, resuming and failures."""
 
 import errno
+import io
 import json
 import os
 import shutil
@@ -76,6 +77,14 @@ TINY = {
 """Parameters by method for 70 steps and 3 levels on the tiny scene, which has a black background."""
 
 
+one_method_by_default = pytest.mark.parametrize(
+    "uninterrupted",
+    ["flod", *(pytest.param(name, marks=pytest.mark.nightly) for name in TINY if name != "flod")],
+    indirect=True,
+)
+"""Run a test that starts processes with one method, with the others only nightly."""
+
+
 @pytest.fixture(scope="module", params=TINY)
 def uninterrupted(request, tiny_scene, tmp_path_factory) -> dict:
     """Keys, output lines and bundle of an uninterrupted run of the tiny job."""
@@ -84,13 +93,11 @@ def uninterrupted(request, tiny_scene, tmp_path_factory) -> dict:
         "scene": str(tiny_scene), "out": str(out / "run"), "image_scale": 1.0, "test_every": 4,
         "method": request.param, "parameters": TINY[request.param],
     }  # fmt: skip
-    process = subprocess.run(
-        command(out / "job.json", keys), cwd=ROOT, capture_output=True, text=True, timeout=240
-    )
-    assert process.returncode == 0, process.stderr
+    stream = io.StringIO()
+    assert training_loop.train(Job.from_dict(keys), stream) == 0
     return {
         "keys": keys,
-        "lines": process.stdout.splitlines(),
+        "lines": stream.getvalue().splitlines(),
         "bundle": (out / "run" / "bundle.ply").read_bytes(),
     }
 
@@ -169,6 +176,7 @@ def test_training_improves_the_images(uninterrupted):
 
 
 @pytest.mark.slow
+@one_method_by_default
 @pytest.mark.parametrize("step", [*(pytest.param(n, marks=pytest.mark.nightly) for n in (3, 44, 61)), 23])
 def test_killed_run_resumes_to_the_same_bits(uninterrupted, tmp_path, step):
     keys = {**uninterrupted["keys"], "out": str(tmp_path / "run")}
@@ -263,7 +271,8 @@ def test_unused_gpu_is_reported(uninterrupted, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="Windows cancels with a file")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@one_method_by_default
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.nightly), signal.SIGTERM])
 def test_stop_signal_saves_a_checkpoint(uninterrupted, tmp_path, number):
     keys = {**uninterrupted["keys"], "out": str(tmp_path / "run")}
     keys = with_steps(keys, 30000)

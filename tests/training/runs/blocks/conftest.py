@@ -12,12 +12,17 @@ from training.runs.folder import RunFolder
 from training.runs.job import Job
 
 
-@pytest.fixture
-def blocks_in_process(monkeypatch) -> None:
-    """Train blocks in this process, which saves the start of a process for each."""
+def train_in_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Train blocks in this process, which saves starting a process for each."""
 
     def train_block(folder: str) -> int:
         run = RunFolder(Path(folder))
         return training_loop.train(Job.from_file(run.job))
 
     monkeypatch.setattr(workers_module, "train_block", train_block)
+
+
+@pytest.fixture
+def blocks_in_process(monkeypatch) -> None:
+    """Train blocks in this process during a test."""
+    train_in_process(monkeypatch)

@@ -18,6 +18,7 @@ from training.runs.events import event_line
 from training.runs.folder import RunFolder
 from training.runs.train import train
 
+from .conftest import train_in_process
 from .test_blocks import TINY, job_for
 
 
@@ -81,18 +82,26 @@ def test_cancelled_block_does_not_start(block):
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_dask_workers_give_the_same_bundle_as_this_process(tiny_scene, tmp_path):
-    """Coarse part, blocks and seams, two at a time."""
+@pytest.mark.parametrize(
+    ("method", "kinds"),
+    [
+        ("3dgs", ["block", "block"]),
+        pytest.param("flod", ["coarse", "block", "block", "seam", "seam"], marks=pytest.mark.nightly),
+    ],
+)
+def test_dask_workers_give_the_same_bundle_as_this_process(tiny_scene, tmp_path, monkeypatch, method, kinds):
+    """Two parts at a time."""
     pytest.importorskip("distributed")
-    levels = {"levels": 3, "steps": [15, 15, 15], "footprint": 6.0}
-    local, cluster = (
-        job_for(tiny_scene, tmp_path / name, "flod", test_every=0, polish=4, parameters={**TINY, **levels})
-        for name in ("local", "cluster")
-    )
-    assert train(local) == 0 and train(cluster, on="local:2", resources={"GPU": 1}) == 0
+    levels = {"levels": 3, "steps": [15, 15, 15], "footprint": 6.0} if method == "flod" else {}
+    keys = {"test_every": 0, "polish": 4 if "seam" in kinds else 0, "parameters": {**TINY, **levels}}
+    local, cluster = (job_for(tiny_scene, tmp_path / name, method, **keys) for name in ("local", "cluster"))
+    with monkeypatch.context() as patch:
+        train_in_process(patch)
+        assert train(local) == 0
+    assert train(cluster, on="local:2", resources={"GPU": 1}) == 0
     division = read_plan(RunFolder(cluster.out))
     parts = [part for stage in division.stages for part in stage]
-    assert [part.kind for part in parts] == ["coarse", "block", "block", "seam", "seam"]
+    assert [part.kind for part in parts] == kinds
     assert all(part.folder.state() == "done" and part.folder.log.exists() for part in parts)
     assert RunFolder(cluster.out).bundle.read_bytes() == RunFolder(local.out).bundle.read_bytes()
 
@@ -153,6 +162,7 @@ def test_computer_without_cards(monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.timeout(600)
 def test_external_scheduler_trains_a_block_and_its_loss_is_reported(block, tmp_path, monkeypatch):
     pytest.importorskip("distributed")
