@@ -1,6 +1,7 @@
 """Level-of-detail rules: a weight for each splat of a level, depending on the camera.
 
-Each module of ``lod.rules`` defines a rule and is discovered automatically. A rule declares its inputs (facts
+Each module of ``lod.rules`` defines a rule and is discovered automatically. Other packages add rules as entry
+points (``plugins.RULES_GROUP``). A rule declares its inputs (facts
 of the scene and of each level, columns of the splats), its user controls, and the weights. The command line,
 Blender's panels and node groups, evaluation and both renderers use these declarations.
 """
@@ -8,17 +9,19 @@ Blender's panels and node groups, evaluation and both renderers use these declar
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from math import inf
 from pkgutil import iter_modules
+from types import ModuleType
 from typing import Any, ClassVar
 
 import numpy as np
 
 from ..errors import LodgsError
+from ..plugins import RULES_GROUP, load_plugins
 from ..splats.ply import Columns
 from ..splats.similarity import AxisNames
 
@@ -286,11 +289,27 @@ class Rule(ABC):
 
 @cache
 def rules() -> dict[str, Rule]:
-    """Return every rule by name: ``RULE`` of each module of ``lod.rules``."""
+    """Return every rule by name: ``RULE`` of each module of ``lod.rules`` and of plug-ins."""
     from . import rules as package
 
     modules = (import_module(f"{package.__name__}.{info.name}") for info in iter_modules(package.__path__))
-    return {module.RULE.name: module.RULE for module in modules}
+    by_name: dict[str, Rule] = {module.RULE.name: module.RULE for module in modules}
+
+    def add(module: ModuleType) -> None:
+        if not isinstance(module.RULE, Rule):
+            raise ValueError("RULE is not a Rule")
+        if module.RULE.name in ("", *by_name):
+            raise ValueError(f"another rule has the name {module.RULE.name!r}")
+        by_name[module.RULE.name] = module.RULE
+
+    load_plugins(RULES_GROUP, add)
+    return by_name
+
+
+def restrict_rules(names: Collection[str]) -> None:
+    """Forget all other rules, which a host program cannot evaluate. They count as unknown afterwards."""
+    for name in rules().keys() - set(names):
+        del rules()[name]
 
 
 class NoRule(Rule):

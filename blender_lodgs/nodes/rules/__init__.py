@@ -1,6 +1,7 @@
 """Node groups of the level-of-detail rules: ``training.lod.rules`` in geometry nodes.
 
-Each rule has a module of the same name in this package, which is imported automatically. It defines:
+Each rule has a module of the same name in this package, which is imported automatically. Rules without one,
+of third-party packages, count as unknown in Blender: levels are shown one at a time. A module defines:
 
 - ``VERSION``: integer that must be raised whenever the nodes change.
 - ``FADES``: whether weights between 0 and 1 occur.
@@ -21,7 +22,7 @@ from types import ModuleType
 
 import bpy
 
-from ....training.lod.rule import Rule, fact_names, rules
+from ....training.lod.rule import Rule, fact_names, restrict_rules, rules
 from ...attributes import COLUMN, OPACITY_LOGIT, WEIGHT
 from ..building import VERSION, Field, Nodes, ensure_group, is_edited
 
@@ -49,6 +50,8 @@ _SHARED = {
     MATERIAL: "NodeSocketMaterial",
 }
 _SHARED_VERSION = 2
+
+restrict_rules([module.name for module in iter_modules(__path__)])
 
 
 class RuleInputs:
