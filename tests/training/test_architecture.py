@@ -29,7 +29,7 @@ FLOORS = {
     ),
     "training": (
         ("__main__",),
-        ("cli",),
+        ("cli", "api"),
         ("render",),
         ("runs",),
         ("evaluate",),
@@ -42,7 +42,7 @@ FLOORS = {
         ("splats",),
         ("documents",),
         ("files",),
-        ("errors", "__init__"),
+        ("errors", "plugins", "__init__"),
     ),
 }
 """The rooms of both packages, from the top: each may import those on the floors below it, and itself."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from ..errors import LodgsError
 from ..lod.rule import Values, find_rule
@@ -21,7 +22,7 @@ from ..splats.bundle import read_header, read_tables
 from ..splats.dialects import Warn, ignore
 from ..splats.level_folder import read_folder
 from ..splats.levels import Bundle
-from .image import check_suffix, read_depth, write_image
+from .image import RenderedImage, check_suffix, read_depth, write_image
 from .scene import Instance, draw
 
 
@@ -145,7 +146,34 @@ def render(
     if problem := cpu_fallback_reason(backend):
         warn(problem)
     resident = ResidentBundle(source.levels, backend, warn)
-    bundle, rule = resident.bundle, find_rule(source.rule)
+    all_passes = out.suffix.lower() == ".exr"
+    image = draw_bundle(
+        resident, camera, level, controls, near=near, background=background, depth=all_passes,
+        levels=all_passes, limit=limit, backend=backend,
+    )  # fmt: skip
+    write_image(out, image)
+    return resident
+
+
+def draw_bundle(
+    resident: ResidentBundle,
+    camera: Camera,
+    level: int = 0,
+    controls: Values | None = None,
+    **options: Any,
+) -> RenderedImage:
+    """Draw one level, or the levels that the rule selects; arguments as for :func:`render`.
+
+    Rules that always apply also weight the finest level.
+
+    Args:
+        options: of :func:`.scene.draw`.
+
+    Raises:
+        LodgsError: the level or a control does not exist, or as :func:`.scene.draw`.
+    """
+    bundle = resident.bundle
+    rule = find_rule(bundle.rule)
     if controls is not None or (rule is not None and rule.always_active and not level):
         sets = resident.select_by_rule(camera, resolve_controls(bundle, controls or {}))
     else:
@@ -154,11 +182,6 @@ def render(
         Instance(weighted.splats, level=number, antialias=bundle.antialias, query=weighted.query)
         for number, weighted in sets.items()
     ]
-    all_passes = out.suffix.lower() == ".exr"
-    image = draw(
-        instances, camera, near=near, background=background, depth=all_passes, levels=all_passes, limit=limit,
-        backend=backend,
-    )  # fmt: skip
-    assert image is not None
-    write_image(out, image)
-    return resident
+    image = draw(instances, camera, **options)
+    assert image is not None  # nothing cancels it
+    return image

@@ -81,7 +81,7 @@ class RenderedImage:
         """Convert to (H, W, 3) uint8, or (H, W, 4) with straight alpha if a pixel is transparent."""
         codes = np.empty((*self.alpha.shape, 3 if (self.alpha == 1).all() else 4), np.uint8)
         for rows in self._strips():
-            values = np.concatenate([self._straight(rows), self.alpha[rows, :, None]], 2).astype(np.float64)
+            values = np.concatenate([self.straight(rows), self.alpha[rows, :, None]], 2).astype(np.float64)
             codes[rows] = np.floor(values.clip(0, 1) * 255 + 0.5)[..., : codes.shape[2]]
         return codes
 
@@ -95,7 +95,7 @@ class RenderedImage:
         linear = np.empty((*self.alpha.shape, 4), np.float32)
         for rows in self._strips():
             alpha = _avoid_thresholds(self.alpha[rows, :, None].astype(np.float64)).clip(0, 1)
-            colours = _avoid_thresholds(self._straight(rows).astype(np.float64)).clip(0)
+            colours = _avoid_thresholds(self.straight(rows).astype(np.float64)).clip(0)
             linear[rows, :, :3], linear[rows, :, 3:] = linear_from_srgb(colours) * alpha, alpha
         return linear
 
@@ -110,8 +110,8 @@ class RenderedImage:
             planes |= {f"Level {n}.X": mask for n, mask in zip(self.levels, self.masks, strict=True) if n}
         return planes
 
-    def _straight(self, rows: slice) -> np.ndarray:
-        """Return straight colours (H, W, 3) of a range of rows, float32."""
+    def straight(self, rows: slice = slice(None)) -> np.ndarray:
+        """Return straight colours (H, W, 3) of a range of rows, float32: not multiplied by alpha."""
         image, alpha = self.image[rows], self.alpha[rows, :, None]
         return np.divide(image, alpha, out=np.zeros_like(image), where=alpha > 0)
 
