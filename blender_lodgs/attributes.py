@@ -1,11 +1,11 @@
-"""The attributes of splats and points in Blender: their names, how they are read and how they are written.
+"""Attributes of splats and points in Blender: names, reading and writing.
 
-They are those of Blender 5.3's native splats, in every Blender: ``position``, ``radiance:base`` (the three DC
-coefficients and the opacity), ``radiance:sh_0`` to ``radiance:sh_14`` (one vector per higher coefficient),
-``scale`` (standard deviations) and ``rotation`` (unit quaternion wxyz).
+The names are those of Blender 5.3's native splats, in every Blender version: ``position``, ``radiance:base``
+(three DC coefficients and the opacity), ``radiance:sh_0`` to ``radiance:sh_14`` (one vector per higher
+coefficient), ``scale`` (standard deviations) and ``rotation`` (unit quaternion wxyz).
 
-Files saved before Blender 5.3 count the higher coefficients from 1. Readers take both names: a cloud with
-``radiance:sh_0`` counts from 0.
+Files saved before Blender 5.3 number the higher coefficients from 1. Readers accept both: a cloud with
+``radiance:sh_0`` starts at 0.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ _SH = "radiance:sh_{}"
 LOG_SCALE, OPACITY_LOGIT, QUATERNION = "log_scale", "opacity_logit", "quaternion"
 COLOR, RADIUS, WEIGHT, HIDDEN = "display_color", "radius", "lod_weight", "hidden"
 SELECTION = ".selection"
-"""Blender's own of the points that are selected in Edit Mode."""
+"""Blender's attribute of points that are selected in Edit Mode."""
 LOOK_OPACITY = "look_opacity"
-"""What a look makes of opacities, a factor, where Blender itself draws splats (``nodes.look``)."""
+"""Opacity factor of a look, for Blender's own drawing of splats (``nodes.look``)."""
 COLUMN = "column:{}"
-"""A file's column whose own name may mean something else to Blender; every column of a table."""
+"""Prefix for columns of tables, and for file columns whose names Blender uses otherwise."""
 
 
 MAX_HIGHER_SH = 24
@@ -51,7 +51,7 @@ def sh_names(cloud: bpy.types.PointCloud) -> list[str]:
 
 
 def rename_sh(cloud: bpy.types.PointCloud) -> None:
-    """Rename coefficients counted from 1, as files before Blender 5.3 have them, to Blender's names."""
+    """Rename coefficients numbered from 1, as in files before Blender 5.3, to Blender's names."""
     if _SH.format(0) in cloud.attributes:
         return
     index = 1
@@ -61,7 +61,7 @@ def rename_sh(cloud: bpy.types.PointCloud) -> None:
 
 
 class Layout(NamedTuple):
-    """How an attribute type travels through ``foreach_get`` and ``foreach_set``."""
+    """Data layout of an attribute type for ``foreach_get`` and ``foreach_set``."""
 
     key: str
     dtype: type
@@ -83,14 +83,14 @@ LAYOUTS = {
 def write_attribute(
     cloud: bpy.types.PointCloud | bpy.types.Mesh, name: str, kind: str, values: np.ndarray
 ) -> None:
-    """Sets a point attribute of type ``kind`` (a key of LAYOUTS) from (N,) or (N, width) values."""
+    """Set a point attribute of type ``kind`` (a key of LAYOUTS) from (N,) or (N, width) values."""
     layout = LAYOUTS[kind]
     attribute = cloud.attributes.get(name) or cloud.attributes.new(name, kind, "POINT")
     attribute.data.foreach_set(layout.key, np.ascontiguousarray(values, layout.dtype).reshape(-1))
 
 
 def read_attribute(cloud: bpy.types.PointCloud | bpy.types.Mesh, name: str) -> np.ndarray | None:
-    """A point attribute as (N,) or (N, width), or None if there is none of that name and a known type."""
+    """Return a point attribute as (N,) or (N, width); None if it is missing or of an unknown type."""
     attribute = cloud.attributes.get(name)
     if attribute is None or attribute.data_type not in LAYOUTS or attribute.domain != "POINT":
         return None
@@ -101,10 +101,10 @@ def read_attribute(cloud: bpy.types.PointCloud | bpy.types.Mesh, name: str) -> n
 
 
 def view_attribute(cloud: bpy.types.PointCloud | bpy.types.Mesh, name: str) -> np.ndarray | None:
-    """As :func:`read_attribute`, without copying: to read some rows of many, at once.
+    """Return a point attribute as :func:`read_attribute`, but without a copy, read-only.
 
-    It is Blender's own memory, which is another as soon as Blender goes on: never keep it, nor hand it to
-    another thread.
+    The result is Blender's own memory, which becomes invalid as soon as Blender continues: do not store it or
+    pass it to another thread.
     """
     attribute = cloud.attributes.get(name)
     if attribute is None or attribute.data_type not in LAYOUTS or attribute.domain != "POINT":
@@ -112,7 +112,7 @@ def view_attribute(cloud: bpy.types.PointCloud | bpy.types.Mesh, name: str) -> n
     layout, data = LAYOUTS[attribute.data_type], attribute.data
     size, last = np.dtype(layout.dtype).itemsize * layout.width, len(data) - 1
     start = data[0].as_pointer() if len(data) else 0
-    if not len(data) or data[last].as_pointer() - start != size * last:  # no such array
+    if not len(data) or data[last].as_pointer() - start != size * last:  # not contiguous
         return read_attribute(cloud, name)
     memory = (ctypes.c_byte * (size * len(data))).from_address(start)
     values = np.ctypeslib.as_array(memory).view(layout.dtype)

@@ -263,7 +263,7 @@ def _capture(args: argparse.Namespace) -> int:
             raise LodgsError(
                 f"Cannot capture: {args.blend} has no curve '{args.curve}'.", "Name a curve of the file."
             )
-    width, height = args.size or viewpoints.size(scene, settings)
+    width, height = args.size or viewpoints.image_size(scene, settings)
     views = settings.views if args.views is None else args.views
     check_views(views, width)
     settings.views = views

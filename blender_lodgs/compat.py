@@ -1,4 +1,4 @@
-"""What differs between Blender versions, each found by asking for the feature, never for the version."""
+"""Differences between Blender versions, detected by feature, never by version number."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ def _denoises() -> bool:
     return getattr(_cycles, "with_openimagedenoise", True)
 
 
-DENOISES = _denoises()
-"""Whether Cycles was built with Open Image Denoise: that of some Linux distributions was not."""
+HAS_DENOISER = _denoises()
+"""True if Cycles was built with Open Image Denoise; some Linux distributions omit it."""
 
 
 def _native_splats() -> tuple[str, str] | None:
@@ -32,11 +32,11 @@ def _native_splats() -> tuple[str, str] | None:
 
 
 NATIVE_SPLATS = _native_splats()
-"""Property of point clouds, and its value, with which Blender draws Gaussian splats; None before 5.3."""
+"""Property of point clouds and its value for Gaussian splats; None before Blender 5.3."""
 
 
 NATIVE_HIGHER_SH = 15
-"""SH coefficients above degree 0 that Blender's own splats have: up to degree 3."""
+"""Number of SH coefficients above degree 0 of Blender's own splats (degree 3)."""
 
 
 def make_native(cloud: bpy.types.PointCloud) -> bool:
@@ -52,13 +52,12 @@ def is_native(cloud: bpy.types.PointCloud) -> bool:
 
 
 def new_point_cloud(name: str, count: int) -> bpy.types.PointCloud:
-    """A point-cloud datablock of ``count`` points, all at the origin, without users."""
+    """Create a point-cloud datablock of ``count`` points at the origin, without users."""
     cloud = bpy.data.pointclouds.new(name)
     if hasattr(cloud, "resize"):
         cloud.resize(count)
         return cloud
-    # Before PointCloud.resize, only a conversion makes points. In a scene of its own it meets no mode and
-    # leaves the user's selection alone.
+    # Without PointCloud.resize, only a conversion creates points. A separate scene keeps mode and selection.
     bpy.data.pointclouds.remove(cloud)
     mesh = bpy.data.meshes.new(name)
     mesh.vertices.add(count)
@@ -87,7 +86,7 @@ def _identifier(modifier: bpy.types.NodesModifier, name: str) -> str:
 
 
 def has_input(modifier: bpy.types.NodesModifier, name: str) -> bool:
-    """Whether there is a group input called ``name``."""
+    """Return True if a modifier's node group has an input called ``name``."""
     return any(
         item.item_type == "SOCKET" and item.in_out == "INPUT" and item.name == name
         for item in modifier.node_group.interface.items_tree
@@ -95,7 +94,7 @@ def has_input(modifier: bpy.types.NodesModifier, name: str) -> bool:
 
 
 def input_path(modifier: bpy.types.NodesModifier, name: str) -> str:
-    """The data path, from the modifier's object, of the group input called ``name``."""
+    """Return the data path, from the modifier's object, of the group input called ``name``."""
     identifier, owner = _identifier(modifier, name), f'modifiers["{modifier.name}"]'
     if hasattr(modifier, "properties"):
         return f"{owner}.properties.inputs.{identifier}.value"
@@ -103,7 +102,7 @@ def input_path(modifier: bpy.types.NodesModifier, name: str) -> str:
 
 
 def get_input(modifier: bpy.types.NodesModifier, name: str):
-    """The value of the group input called ``name``."""
+    """Return the value of the group input called ``name``."""
     identifier = _identifier(modifier, name)
     if hasattr(modifier, "properties"):
         return getattr(modifier.properties.inputs, identifier).value
@@ -111,7 +110,7 @@ def get_input(modifier: bpy.types.NodesModifier, name: str):
 
 
 def set_input(modifier: bpy.types.NodesModifier, name: str, value) -> None:
-    """Sets the group input called ``name``; the object is evaluated anew."""
+    """Set the group input called ``name`` and tag the object for evaluation."""
     identifier = _identifier(modifier, name)
     if hasattr(modifier, "properties"):
         getattr(modifier.properties.inputs, identifier).value = value
@@ -120,22 +119,22 @@ def set_input(modifier: bpy.types.NodesModifier, name: str, value) -> None:
     modifier.id_data.update_tag()
 
 
-def strips(scene: bpy.types.Scene):
-    """The strips of a scene's sequencer, which Blender 4.3 and before call sequences."""
+def sequencer_strips(scene: bpy.types.Scene):
+    """Return the strips of a scene's sequencer; Blender 4.3 and earlier call them sequences."""
     editor = scene.sequence_editor_create()
     return editor.strips if hasattr(editor, "strips") else editor.sequences
 
 
-def png(settings: bpy.types.ImageFormatSettings, alpha: bool) -> None:
-    """Has pictures saved as PNGs of 8 bits."""
+def set_png(settings: bpy.types.ImageFormatSettings, alpha: bool) -> None:
+    """Set the image format to PNG with 8 bits."""
     if hasattr(settings, "media_type"):
         settings.media_type = "IMAGE"
     settings.file_format, settings.color_mode = "PNG", "RGBA" if alpha else "RGB"
     settings.color_depth = "8"
 
 
-def multilayer_exr(settings: bpy.types.ImageFormatSettings) -> None:
-    """Has pictures saved as multilayer EXRs, in whole floats."""
+def set_multilayer_exr(settings: bpy.types.ImageFormatSettings) -> None:
+    """Set the image format to multilayer EXR with 32-bit floats."""
     if hasattr(settings, "media_type"):
         settings.media_type = "MULTI_LAYER_IMAGE"
     settings.file_format, settings.color_depth = "OPEN_EXR_MULTILAYER", "32"
@@ -145,11 +144,11 @@ COMPOSITOR_START = (
     "CompositorNodeRLayers", "CompositorNodeComposite", "CompositorNodeViewer", "NodeGroupOutput",
     "NodeReroute",
 )  # fmt: skip
-"""Nodes of a compositor tree that nobody has worked on."""
+"""Nodes of an unedited compositor tree."""
 
 
 def compositor_tree(scene: bpy.types.Scene) -> bpy.types.NodeTree:
-    """The scene's compositor tree, made where there is none, and in use."""
+    """Return the scene's compositor tree, created if necessary, and enable compositing."""
     if hasattr(scene, "compositing_node_group"):
         if scene.compositing_node_group is None:
             scene.compositing_node_group = bpy.data.node_groups.new(scene.name, "CompositorNodeTree")
@@ -162,15 +161,15 @@ def compositor_tree(scene: bpy.types.Scene) -> bpy.types.NodeTree:
     return tree
 
 
-def composites(scene: bpy.types.Scene) -> bool:
-    """Whether a render's picture is what a compositor makes of it."""
+def uses_compositor(scene: bpy.types.Scene) -> bool:
+    """Return True if renders of a scene are composited."""
     if hasattr(scene, "compositing_node_group"):
         return scene.render.use_compositing and scene.compositing_node_group is not None
     return scene.render.use_compositing and scene.use_nodes and scene.node_tree is not None
 
 
 def reset_compositor(scene: bpy.types.Scene) -> None:
-    """Makes the compositor of a scene what it is before anybody has worked on it."""
+    """Reset the compositor of a scene to its default."""
     if hasattr(scene, "compositing_node_group"):
         tree, scene.compositing_node_group = scene.compositing_node_group, None
         if tree is not None and not tree.users:
@@ -185,7 +184,7 @@ def reset_compositor(scene: bpy.types.Scene) -> None:
 
 
 def to_straight(tree: bpy.types.NodeTree) -> bpy.types.Node:
-    """A new node that divides colours by their alpha."""
+    """Add a node that converts premultiplied to straight alpha."""
     node = tree.nodes.new("CompositorNodePremulKey")
     if hasattr(node, "mapping"):
         node.mapping = "PREMUL_TO_STRAIGHT"
@@ -195,7 +194,7 @@ def to_straight(tree: bpy.types.NodeTree) -> bpy.types.Node:
 
 
 def compositor_output(tree: bpy.types.NodeTree) -> bpy.types.NodeSocket:
-    """The socket that takes the finished picture, of a node made for it."""
+    """Add an output node and return its image socket."""
     if hasattr(bpy.types, "CompositorNodeComposite"):
         output = tree.nodes.new("CompositorNodeComposite")
     else:
@@ -204,12 +203,3 @@ def compositor_output(tree: bpy.types.NodeTree) -> bpy.types.NodeSocket:
         output = tree.nodes.new("NodeGroupOutput")
     output.location = (600, 0)
     return output.inputs[0]
-
-
-def stored_properties(owner: bpy.types.ID, name: str):
-    """What a file stores of a property group of an ID, like a dict (also what no property of today reads);
-    None where that is nothing."""
-    if hasattr(owner, "bl_system_properties_get"):  # from 5.0 on they are no custom properties
-        properties = owner.bl_system_properties_get()
-        return None if properties is None else properties.get(name)
-    return owner.get(name)

@@ -1,1 +1,1 @@
-"""What a .blend file holds of splat scenes: settings, levels, cameras, and which splats are shown."""
+"""Splat-scene data in .blend files: properties, levels, cameras and the displayed splats."""

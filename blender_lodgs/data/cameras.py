@@ -1,4 +1,4 @@
-"""Blender's cameras as the trainer sees them: pinholes in pixels, OpenCV axes."""
+"""Conversion of Blender cameras to trainer cameras: pinholes in pixels, OpenCV axes."""
 
 from __future__ import annotations
 
@@ -11,13 +11,15 @@ from .placement import matrix_of
 
 
 def scene_camera(scene: bpy.types.Scene) -> bpy.types.Object:
-    """The camera object that a scene is rendered through.
+    """Return the active camera object of a scene.
 
     Raises:
-        LodgsError: there is none.
+        LodgsError: The scene has no camera.
     """
     if scene.camera is None:
-        raise LodgsError("The scene has no camera.", "Add one, or look through one of the views.")
+        raise LodgsError(
+            "Cannot render: the scene has no camera.", "Add a camera, or look through one of the views."
+        )
     return scene.camera
 
 
@@ -27,19 +29,22 @@ def view_of(
     width: int,
     height: int,
 ) -> tuple[Camera, float]:
-    """What a camera object sees in a render of this size, and the depth at which it begins to see.
+    """Convert a camera object to a camera in Blender's world.
 
-    Blender ignores a camera's scale, and so does this. The world is Blender's.
+    The object's scale is ignored, as in Blender.
+
+    Returns:
+        The camera for an image of this size, and its clip start.
 
     Raises:
-        LodgsError: the camera is no perspective one.
+        LodgsError: The object is not a perspective camera.
     """
     camera = obj.data
     if obj.type != "CAMERA" or camera.type != "PERSP":
-        kind = "no camera" if obj.type != "CAMERA" else f"{camera.type.lower()}"
+        kind = "not a camera" if obj.type != "CAMERA" else camera.type.lower()
         raise LodgsError(
-            f"LODGS renders through perspective cameras, and '{obj.name}' is {kind}.",
-            "Change its lens type to Perspective.",
+            f"Cannot render with LODGS: '{obj.name}' is {kind}, but a perspective camera is needed.",
+            "Set its lens type to Perspective.",
         )
     render = depsgraph.scene.render
     p = obj.calc_matrix_camera(
@@ -58,15 +63,19 @@ def view_of(
 
 
 def _world_to_camera(obj: bpy.types.Object) -> np.ndarray:
-    """(4, 4) float64 of an object's pose without its scale; Blender's cameras look along -z with y up."""
+    """Return the (4, 4) float64 inverse of an object's pose without scale, in OpenCV axes.
+
+    Blender's cameras look along -z with y up.
+    """
     pose = np.array(obj.matrix_world, np.float64)
     axes = pose[:3, :3] / np.linalg.norm(pose[:3, :3], axis=0)
-    # orthogonal to the last bit of float64, where Blender's float32 are so to about 1e-7
-    left, _, right = np.linalg.svd(axes * (1.0, -1.0, -1.0))
-    rotation = (left @ right).T
-    found = np.eye(4)
-    found[:3, :3], found[:3, 3] = rotation, -rotation @ pose[:3, 3]
-    return found
+    # Blender's float32 axes are orthogonal to about 1e-7 only; make them so in float64.
+    u, _, vh = np.linalg.svd(axes * (1.0, -1.0, -1.0))
+    rotation = (u @ vh).T
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation
+    matrix[:3, 3] = -rotation @ pose[:3, 3]
+    return matrix
 
 
 def view_from(
@@ -76,15 +85,18 @@ def view_from(
     height: int,
     obj: bpy.types.Object | None = None,
 ) -> tuple[Camera, float]:
-    """What a camera sees, in the coordinates of a splat scene, which are those of its files.
+    """Convert a camera object to a camera in the coordinates of a splat scene's files.
 
     Args:
-        obj: a camera; None for the one that the scene is rendered through.
+        obj: Camera object; None for the active camera of the scene.
+
+    Returns:
+        The camera and its clip start, in units of the files.
 
     Raises:
-        LodgsError: there is no camera to render through, or the root is stretched.
+        LodgsError: The scene has no camera, or the root is scaled differently along its axes.
     """
     obj = obj or scene_camera(depsgraph.scene)
     camera, near = view_of(obj.evaluated_get(depsgraph), depsgraph, width, height)
-    inside, unit = camera.in_object_space(matrix_of(root, depsgraph))
-    return inside, near / unit
+    local, unit = camera.in_object_space(matrix_of(root, depsgraph))
+    return local, near / unit

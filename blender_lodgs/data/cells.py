@@ -1,4 +1,4 @@
-"""The cells that a large scene is trained in: what their plan says, kept on its root (``training``)."""
+"""Plan of the cells of a large scene, stored on its root (``training``)."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from . import photographs
 if TYPE_CHECKING:
     from .training import TrainingCell, TrainingSettings
 
-GROUND = 0.01
-"""The quantile of the points' heights at which cells are shown."""
-BEYOND = 0.05
-"""Share of the cameras' longer side by which cells without end are shown to reach beyond them."""
-_DECIDES = (
+GROUND_QUANTILE = 0.01
+"""Quantile of the point heights at which cells are drawn."""
+MARGIN = 0.05
+"""Margin of unbounded cells beyond the cameras, as a fraction of the cameras' longer side."""
+_PLAN_KEYS = (
     "scene",
     "model",
     "images",
@@ -33,18 +33,18 @@ _DECIDES = (
     "cells",
     "parameters",
 )
-"""What of a job its plan depends on."""
+"""Job keys that determine the plan."""
 
 
 @dataclass(frozen=True)
 class CellPlan:
-    """What a plan says of the cells of a job.
+    """Plan of a job's cells.
 
     Attributes:
-        job: whose ``cells`` say how many there are; "" for one.
-        planned: each of them.
-        outlines: of each, see :func:`outlines`.
-        places: of each, the places by name of its views.
+        job: Job with the planned grid in ``cells``; "" for a single cell.
+        planned: Planned cells.
+        outlines: Corners of each cell; see :func:`outlines`.
+        places: Indices of each cell's views, sorted by name.
     """
 
     job: Job
@@ -54,14 +54,14 @@ class CellPlan:
 
 
 def plan_cells(job: Job, splats: int = 0, memory: int = 0) -> CellPlan:
-    """Plans the cells of a job. No bpy: it may take a while, in a thread.
+    """Plan the cells of a job. Takes a while; needs no bpy and may run in a thread.
 
     Args:
-        splats, memory: of how many splats, or bytes, each cell has at most; the job then has as few cells as
-            do. 0: as many as the job says.
+        splats: Maximum number of splats per cell; the job gets the fewest cells within it. 0 for no limit.
+        memory: Maximum number of bytes per cell, in the same way. Without both, the job's own grid is used.
 
     Raises:
-        LodgsError: the scene cannot be read, or divided so.
+        LodgsError: The scene cannot be read or divided into these cells.
     """
     scene = read_planned_scene(job)
     if splats or memory:
@@ -69,74 +69,78 @@ def plan_cells(job: Job, splats: int = 0, memory: int = 0) -> CellPlan:
     planned = plan(job, scene)
     if len(planned) == 1:
         job = replace(job, cells="")
-    regions = [each.region for each in planned]
-    place_of = {name: place for place, name in enumerate(scene.names)}
-    places = [[place_of[name] for name in region.views] for region in regions]
+    regions = [cell.region for cell in planned]
+    index_of = {name: index for index, name in enumerate(scene.names)}
+    places = [[index_of[name] for name in region.views] for region in regions]
     return CellPlan(job, planned, outlines(scene, regions), places)
 
 
 def outlines(scene: Scene, regions: list[Region]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """The corners (4, 3) on the ground of each cell and of the same enlarged, in COLMAP's world.
+    """Return the corners on the ground of each cell and of its enlarged area, in COLMAP's world.
 
-    What has no end does not reach far beyond the cameras here.
+    Unbounded sides end shortly beyond the cameras.
+
+    Returns:
+        Pairs of (4, 3) arrays.
     """
     ground = regions[0].ground
-    stand = np.array([camera.center for camera in scene.cameras]) @ ground.T
-    low, high = stand[:, :2].min(axis=0), stand[:, :2].max(axis=0)
-    reach = BEYOND * (high - low).max()
-    height = np.quantile(scene.points.astype(np.float64) @ ground[2], GROUND)
+    centers = np.array([camera.center for camera in scene.cameras]) @ ground.T
+    low, high = centers[:, :2].min(axis=0), centers[:, :2].max(axis=0)
+    margin = MARGIN * (high - low).max()
+    height = np.quantile(scene.points.astype(np.float64) @ ground[2], GROUND_QUANTILE)
 
     def corners(bounds: np.ndarray) -> np.ndarray:
-        a, b, c, d = np.clip(bounds, (low - reach)[:, None], (high + reach)[:, None]).ravel()
+        a, b, c, d = np.clip(bounds, (low - margin)[:, None], (high + margin)[:, None]).ravel()
         return np.array([(a, c, height), (b, c, height), (b, d, height), (a, d, height)]) @ ground
 
     return [(corners(region.cell), corners(region.area)) for region in regions]
 
 
-def show(settings: TrainingSettings, found: CellPlan) -> None:
-    """Keeps a plan, for the panel and for viewports."""
-    settings.columns, settings.rows = found.job.grid if found.job.cells else (1, 1)
-    require(settings, len(found.planned))
-    each = zip(settings.planned_cells, found.planned, found.outlines, found.places, strict=True)
-    for cell, planned, (outline, enlarged), places in each:
+def store_plan(settings: TrainingSettings, cell_plan: CellPlan) -> None:
+    """Store a plan for the panel and the viewports."""
+    settings.columns, settings.rows = cell_plan.job.grid if cell_plan.job.cells else (1, 1)
+    resize_cells(settings, len(cell_plan.planned))
+    entries = zip(
+        settings.planned_cells, cell_plan.planned, cell_plan.outlines, cell_plan.places, strict=True
+    )
+    for cell, planned, (outline, enlarged), places in entries:
         cell.views, cell.points = planned.views, planned.points
         cell.splats, cell.steps, cell.megabytes = planned.splats, planned.steps, planned.memory / 1e6
         cell.outline, cell.enlarged, cell.places = outline.ravel(), enlarged.ravel(), json.dumps(places)
-    settings.planned_for = _decides(settings, found.job)
+    settings.planned_for = _plan_key(settings, cell_plan.job)
 
 
-def require(settings: TrainingSettings, count: int) -> None:
-    """Makes sure that there are so many cells; those of another plan are forgotten."""
+def resize_cells(settings: TrainingSettings, count: int) -> None:
+    """Set the number of cells; another number clears the stored plan."""
     if len(settings.planned_cells) != count:
-        forget(settings)
+        clear_plan(settings)
         for _ in range(count):
             settings.planned_cells.add()
 
 
-def forget(settings: TrainingSettings) -> None:
-    """Forgets the plan."""
+def clear_plan(settings: TrainingSettings) -> None:
+    """Clear the stored plan."""
     settings.planned_cells.clear()
     settings.active_cell, settings.planned_for = 0, ""
 
 
 def is_planned(settings: TrainingSettings, job: Job) -> bool:
-    """Whether the plan that is kept is that of a job, and of how the settings divide it."""
-    return settings.planned_for == _decides(settings, job)
+    """Return True if the stored plan belongs to a job and to the current division settings."""
+    return settings.planned_for == _plan_key(settings, job)
 
 
-def _decides(settings: TrainingSettings, job: Job) -> str:
+def _plan_key(settings: TrainingSettings, job: Job) -> str:
     values = asdict(job)
-    return json.dumps([*(values[name] for name in _DECIDES), *settings.limits])
+    return json.dumps([*(values[name] for name in _PLAN_KEYS), *settings.limits])
 
 
-def eyes(root: bpy.types.Object, cell: TrainingCell) -> tuple[np.ndarray, np.ndarray]:
-    """Where the cameras of a cell stand (V, 3), and the corners (V, 4, 3) of their frames in the viewport, in
-    the scene's own units; of those that are still there."""
+def cell_cameras(root: bpy.types.Object, cell: TrainingCell) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions (V, 3) and frame corners (V, 4, 3) of a cell's existing cameras, in scene units."""
     places = set(json.loads(cell.places or "[]"))
-    found = [view for view in photographs.views(root) if view.data.lodgs.place in places]
-    poses = np.array([view.matrix_basis for view in found], np.float64).reshape(-1, 4, 4)
-    halves = [(v.width / v.fx / 2, v.height / v.fy / 2) for v in (view.data.lodgs for view in found)]
-    frames = [[(-x, y, -1), (x, y, -1), (x, -y, -1), (-x, -y, -1)] for x, y in halves]
-    sizes = np.array([view.data.display_size for view in found])
+    cameras = [view for view in photographs.views(root) if view.data.lodgs.place in places]
+    poses = np.array([view.matrix_basis for view in cameras], np.float64).reshape(-1, 4, 4)
+    half_sizes = [(v.width / v.fx / 2, v.height / v.fy / 2) for v in (view.data.lodgs for view in cameras)]
+    frames = [[(-x, y, -1), (x, y, -1), (x, -y, -1), (-x, -y, -1)] for x, y in half_sizes]
+    sizes = np.array([view.data.display_size for view in cameras])
     corners = sizes[:, None, None] * np.reshape(frames, (-1, 4, 3)) @ poses[:, :3, :3].swapaxes(1, 2)
     return poses[:, :3, 3], poses[:, None, :3, 3] + corners

@@ -1,7 +1,7 @@
-"""Which datablocks' points have changed: for all who keep what they have made of them.
+"""Change counters of point data, for caches derived from it.
 
-Blender reports what has been tagged when it evaluates a view layer, and every operator has it do so first. It
-reports nothing of what no view layer of a window shows.
+Blender reports tagged datablocks when it evaluates a view layer; every operator triggers an evaluation first.
+Datablocks outside the view layers of all windows are not reported.
 """
 
 from __future__ import annotations
@@ -18,77 +18,81 @@ _reported: Counter[int] = Counter()
 _painted: Counter[int] = Counter()
 _files = 0
 _selections = 0
-_only = ""
+_change_kind = ""
 
 
 def version(datablock: bpy.types.ID) -> Version:
-    """Another one after the points of a datablock, or of an object as modifiers leave it, have changed in
-    anything but their paint."""
+    """Return a value that changes with a datablock's points, except for their paint.
+
+    For an object, it also changes with the result of its modifiers.
+    """
     return _files, _reported[datablock.session_uid]
 
 
-def paint(cloud: bpy.types.PointCloud) -> Version:
-    """Another one after points have been painted (``painting``)."""
+def paint_version(cloud: bpy.types.PointCloud) -> Version:
+    """Return a value that changes when points are painted (``painting``)."""
     return _files, _painted[cloud.session_uid]
 
 
 @contextmanager
 def selecting() -> Iterator[None]:
-    """In the block only selections change. To Blender that is a change of points, to :func:`version` none:
-    what was made of them stays."""
+    """Mark the changes in the block as changes of selection.
+
+    Blender treats them as changes of points; :func:`version` ignores them, so that caches stay valid.
+    """
     try:
-        with _nothing_but("selection"):
+        with _limit_reports("selection"):
             yield
     finally:
-        others_selected()
+        report_selected()
 
 
 def painting() -> AbstractContextManager[None]:
-    """In the block points are painted, which :func:`version` tells of what modifiers make of them alone."""
-    return _nothing_but("paint")
+    """Mark the changes in the block as paint: :func:`version` changes only for modified objects."""
+    return _limit_reports("paint")
 
 
 @contextmanager
-def _nothing_but(what: str) -> Iterator[None]:
-    global _only
-    bpy.context.view_layer.update()  # what has changed before is more
-    _only = what
+def _limit_reports(kind: str) -> Iterator[None]:
+    global _change_kind
+    bpy.context.view_layer.update()  # report earlier changes as such first
+    _change_kind = kind
     try:
         yield
         bpy.context.view_layer.update()
     finally:
-        _only = ""
+        _change_kind = ""
 
 
-def others_painted(cloud: bpy.types.PointCloud) -> None:
-    """Says that points have been painted."""
+def report_painted(cloud: bpy.types.PointCloud) -> None:
+    """Report that points were painted."""
     _painted[cloud.session_uid] += 1
 
 
-def others_selected() -> None:
-    """Says that viewports are to show other points as selected."""
+def report_selected() -> None:
+    """Report that viewports have to update the displayed selection."""
     global _selections
     _selections += 1
 
 
-def selection() -> Version:
-    """Another one after other points are to be shown as selected."""
+def selection_version() -> Version:
+    """Return a value that changes with the displayed selection."""
     return _files, _selections
 
 
 @bpy.app.handlers.persistent
 def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-    if _only == "selection" or depsgraph.mode == "RENDER":  # where at first everything counts as new
+    if _change_kind == "selection" or depsgraph.mode == "RENDER":  # a new render depsgraph reports everything
         return
     changed = [update.id.original for update in depsgraph.updates if update.is_updated_geometry]
-    if _only == "paint":
-        changed = [each for each in changed if isinstance(each, bpy.types.Object)]
-    _reported.update(each.session_uid for each in changed)
+    if _change_kind == "paint":
+        changed = [datablock for datablock in changed if isinstance(datablock, bpy.types.Object)]
+    _reported.update(datablock.session_uid for datablock in changed)
 
 
 @bpy.app.handlers.persistent
 def _on_load(*_) -> None:
-    """Another file, or another state of it: nothing is known of anything."""
+    """Invalidate all versions when a file is loaded, or its state changes by undo or redo."""
     global _files
     _files += 1
     _reported.clear()
@@ -97,15 +101,15 @@ def _on_load(*_) -> None:
 
 def register() -> None:
     handlers = bpy.app.handlers
-    for changes in (handlers.depsgraph_update_post, handlers.frame_change_post):
-        changes.append(_on_update)
-    for changes in (handlers.load_post, handlers.undo_post, handlers.redo_post):
-        changes.append(_on_load)
+    for callbacks in (handlers.depsgraph_update_post, handlers.frame_change_post):
+        callbacks.append(_on_update)
+    for callbacks in (handlers.load_post, handlers.undo_post, handlers.redo_post):
+        callbacks.append(_on_load)
 
 
 def unregister() -> None:
     handlers = bpy.app.handlers
-    for changes in (handlers.depsgraph_update_post, handlers.frame_change_post):
-        changes.remove(_on_update)
-    for changes in (handlers.load_post, handlers.undo_post, handlers.redo_post):
-        changes.remove(_on_load)
+    for callbacks in (handlers.depsgraph_update_post, handlers.frame_change_post):
+        callbacks.remove(_on_update)
+    for callbacks in (handlers.load_post, handlers.undo_post, handlers.redo_post):
+        callbacks.remove(_on_load)

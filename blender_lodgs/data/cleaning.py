@@ -1,8 +1,8 @@
-"""Clean-up of a splat scene: hide, show and delete the splats that ``training.editing.cleaning`` finds.
+"""Clean-up of a splat scene: hide, show, select and delete splats (``training.editing.cleaning``).
 
-Hidden splats are a boolean attribute of their level's points; one modifier drops them (``crops``). A level
-that is trained anew has other points, of which none is hidden: the panel says how many were. Crops act on
-whatever comes.
+Hidden splats are marked in a boolean attribute of their level's points; a modifier drops them (``crops``). A
+level that is trained again has new points, none of them hidden; the panel reports how many were hidden
+before. Crops also apply to new points.
 """
 
 from __future__ import annotations
@@ -23,98 +23,113 @@ from ..attributes import BASE, HIDDEN, SCALE, SELECTION, read_attribute, view_at
 from . import changes, crops, photographs, selection
 from .cameras import view_from
 from .placement import axes_of
-from .properties import SplatLevel
+from .scene_properties import SplatLevel
 
 TESTS = [
-    ("LARGE", "Large", "Splats larger than a length: fog, and what stands in the way"),
-    ("FAINT", "Faint", "Splats of little opacity"),
-    ("FAR", "Far", "Splats far from every camera of the photographs"),
-    ("UNSEEN", "Seen by Few", "Splats in the frames of few cameras, whether or not something hides them"),
-    ("FLOATERS", "Floaters", "Clusters of few splats with nothing near them"),
-    ("SELECTED", "Selected", "Splats that are selected, with the brush, the lasso or in Edit Mode"),
+    ("LARGE", "Large", "Splats larger than a length, such as fog"),
+    ("FAINT", "Faint", "Splats of low opacity"),
+    ("FAR", "Far", "Splats far from every camera of the photos"),
+    ("UNSEEN", "Few Views", "Splats in the frames of few cameras, occluded or not"),
+    ("FLOATERS", "Floaters", "Small clusters of splats that are far from others"),
+    ("SELECTED", "Selected", "Splats selected with the brush, the lasso or in Edit Mode"),
 ]
-"""What can be found, as Blender lists it."""
+"""Items of the enum property of tests."""
 
 Test = Callable[[bpy.types.PointCloud], np.ndarray]
-"""Which splats of a level it finds, (N,) bool."""
+"""Function from a level's point cloud to a mask (N,) bool."""
 
 _in_stroke: dict[int, np.ndarray] = {}
-"""What a stroke that is not over would have selected of point clouds, by ``session_uid``."""
+"""Selection masks of the current stroke, by ``session_uid`` of the point cloud."""
 _counts: dict[int, tuple[tuple, int]] = {}
-"""How many splats of a point cloud are left, by ``session_uid``, and what that depends on."""
+"""Cache keys and numbers of remaining splats, by ``session_uid`` of the point cloud."""
 
 
-def large(root: bpy.types.Object, most: float) -> Test:
-    """Finds splats whose largest standard deviation is above a length of the world."""
-    most /= unit_of(root)
-    return lambda cloud: cleaning.find_large(view_of(cloud, SCALE), most)
+def size_test(root: bpy.types.Object, max_size: float) -> Test:
+    """Return a test for splats whose largest standard deviation exceeds a length in the world."""
+    max_size /= unit_length(root)
+    return lambda cloud: cleaning.find_large(splat_attribute(cloud, SCALE), max_size)
 
 
-def faint(least: float) -> Test:
-    """Finds splats of less opacity."""
-    return lambda cloud: cleaning.find_faint(view_of(cloud, BASE)[:, 3], least)
+def opacity_test(min_opacity: float) -> Test:
+    """Return a test for splats below an opacity."""
+    return lambda cloud: cleaning.find_faint(splat_attribute(cloud, BASE)[:, 3], min_opacity)
 
 
-def far(context: bpy.types.Context, root: bpy.types.Object, most: float) -> Test:
-    """Finds splats that are farther than a length of the world from every camera.
+def distance_test(context: bpy.types.Context, root: bpy.types.Object, max_distance: float) -> Test:
+    """Return a test for splats farther than a length in the world from every camera.
 
     Raises:
-        LodgsError: as :func:`cameras`.
+        LodgsError: As :func:`cameras`.
     """
-    eyes = np.array([camera.center for camera in cameras(context, root)])
-    most /= unit_of(root)
-    return lambda cloud: cleaning.find_far(view_of(cloud, "position"), eyes, most)
+    positions = np.array([camera.center for camera in cameras(context, root)])
+    max_distance /= unit_length(root)
+    return lambda cloud: cleaning.find_far(splat_attribute(cloud, "position"), positions, max_distance)
 
 
-def unseen(context: bpy.types.Context, root: bpy.types.Object, least: int) -> Test:
-    """Finds splats in the frames of fewer cameras than that.
+def views_test(context: bpy.types.Context, root: bpy.types.Object, min_views: int) -> Test:
+    """Return a test for splats in the frames of fewer than ``least`` cameras.
 
     Raises:
-        LodgsError: as :func:`cameras`.
+        LodgsError: As :func:`cameras`.
     """
     views = cameras(context, root)
-    return lambda cloud: cleaning.find_unseen(view_of(cloud, "position"), views, least)
+    return lambda cloud: cleaning.find_unseen(splat_attribute(cloud, "position"), views, min_views)
 
 
-def selected(cloud: bpy.types.PointCloud) -> np.ndarray:
-    """Finds splats that are selected, by a stroke or in Edit Mode."""
-    found = read_attribute(cloud, SELECTION)
-    return np.zeros(len(cloud.points), bool) if found is None else found.astype(bool)
+def selected_mask(cloud: bpy.types.PointCloud) -> np.ndarray:
+    """Return the (N,) bool mask of splats selected by a stroke or in Edit Mode."""
+    values = read_attribute(cloud, SELECTION)
+    return np.zeros(len(cloud.points), bool) if values is None else values.astype(bool)
 
 
 def find(root: bpy.types.Object, test: Test) -> dict[int, np.ndarray]:
-    """What a test finds of each level, (N,) bool by its number, but for splats that are hidden already; of a
-    tree among the leaves, with the nodes that stand for nothing else."""
-    found = {item.number: test(item.object.data) & ~hidden(item.object.data) for item in levels(root)}
-    return _with_nodes(root, found)
+    """Apply a test to the visible splats of each level.
+
+    In a tree, the test applies to leaves; nodes without remaining leaves are added.
+
+    Returns:
+        Masks (N,) bool by level number.
+    """
+    masks = {item.number: test(item.object.data) & ~hidden_mask(item.object.data) for item in levels(root)}
+    return _with_nodes(root, masks)
 
 
 def find_floaters(
     context: bpy.types.Context, root: bpy.types.Object, gap: float, share: float
 ) -> dict[int, np.ndarray]:
-    """The floaters among what hiding and crops leave: see ``cleaning.find_floaters``.
+    """Find floaters among the splats that are neither hidden nor cropped; see ``cleaning.find_floaters``.
 
     Args:
-        gap: a length of the world; 0: ``cleaning.default_gap``.
+        gap: Length in the world; 0 for ``cleaning.default_gap``.
+
+    Returns:
+        Masks (N,) bool by level number.
     """
-    cropped = crops.as_objects_stand(root, context.evaluated_depsgraph_get())
-    means = {item.number: view_of(item.object.data, "position") for item in levels(root)}
-    left = {
-        item.number: ~hidden(item.object.data) & crop_mask(cropped, means[item.number])
+    cropped = crops.evaluated_crops(root, context.evaluated_depsgraph_get())
+    means = {item.number: splat_attribute(item.object.data, "position") for item in levels(root)}
+    visible = {
+        item.number: ~hidden_mask(item.object.data) & crop_mask(cropped, means[item.number])
         for item in levels(root)
     }
-    stays = {number: mask.copy() for number, mask in left.items()}
-    cleaning.exclude_floaters(stays, means, gap / unit_of(root), share, _family(root))
-    return _with_nodes(root, {number: left[number] & ~mask for number, mask in stays.items()})
+    remaining_masks = {number: mask.copy() for number, mask in visible.items()}
+    cleaning.exclude_floaters(remaining_masks, means, gap / unit_length(root), share, _tree_relations(root))
+    return _with_nodes(root, {number: visible[number] & ~mask for number, mask in remaining_masks.items()})
 
 
-def hide(root: bpy.types.Object, found: Mapping[int, np.ndarray]) -> int:
-    """Hides splats, (N,) bool of each level by its number; how many."""
+def hide(root: bpy.types.Object, masks: Mapping[int, np.ndarray]) -> int:
+    """Hide splats.
+
+    Args:
+        masks: (N,) bool by level number.
+
+    Returns:
+        The number of splats that were hidden.
+    """
     count = 0
     for item in levels(root):
-        cloud, mask = item.object.data, found[item.number]
+        cloud, mask = item.object.data, masks[item.number]
         if mask.any():
-            write_attribute(cloud, HIDDEN, "BOOLEAN", hidden(cloud) | mask)
+            write_attribute(cloud, HIDDEN, "BOOLEAN", hidden_mask(cloud) | mask)
             cloud.update_tag()
             count += int(mask.sum())
         item.lost = 0
@@ -122,61 +137,78 @@ def hide(root: bpy.types.Object, found: Mapping[int, np.ndarray]) -> int:
     return count
 
 
-def select(root: bpy.types.Object, found: Mapping[int, np.ndarray]) -> int:
-    """Selects splats, in place of those that are, as Edit Mode does; how many."""
-    with changes.selecting():
-        for item in levels(root):
-            write_attribute(item.object.data, SELECTION, "BOOLEAN", found[item.number])
-            item.object.data.update_tag()
-    return sum(int(mask.sum()) for mask in found.values())
+def select(root: bpy.types.Object, masks: Mapping[int, np.ndarray]) -> int:
+    """Replace the selection, as Edit Mode does.
 
-
-def select_also(root: bpy.types.Object, found: Mapping[int, np.ndarray], remove: bool = False) -> int:
-    """Selects splats, (N,) of each level by its number and not 0 where it is found, beside those that are, or
-    no longer.
-
-    Hidden ones are not; of a tree leaves are, with the nodes that stand for nothing else.
+    Args:
+        masks: (N,) bool by level number.
 
     Returns:
-        How many are.
+        The number of selected splats.
     """
-    both = {}
+    with changes.selecting():
+        for item in levels(root):
+            write_attribute(item.object.data, SELECTION, "BOOLEAN", masks[item.number])
+            item.object.data.update_tag()
+    return sum(int(mask.sum()) for mask in masks.values())
+
+
+def extend_selection(
+    root: bpy.types.Object, strengths: Mapping[int, np.ndarray], remove: bool = False
+) -> int:
+    """Add splats to the selection, or remove them from it.
+
+    Hidden splats are never selected. In a tree, the selection covers leaves, and nodes without remaining
+    leaves.
+
+    Args:
+        strengths: (N,) by level number; splats with values other than 0 are selected.
+        remove: Remove these splats from the selection instead.
+
+    Returns:
+        The number of selected splats.
+    """
+    masks = {}
     for item in levels(root):
-        both[item.number] = mask = selected(item.object.data)
-        mask[found[item.number] > 0] = not remove
-        mask &= ~hidden(item.object.data)
-    return select(root, _with_nodes(root, both))
+        masks[item.number] = mask = selected_mask(item.object.data)
+        mask[strengths[item.number] > 0] = not remove
+        mask &= ~hidden_mask(item.object.data)
+    return select(root, _with_nodes(root, masks))
 
 
-def show_selected(root: bpy.types.Object | None, found: Mapping[int, np.ndarray]) -> None:
-    """Has viewports show splats as selected while a stroke lasts; without any level those that are."""
+def preview_selection(root: bpy.types.Object | None, masks: Mapping[int, np.ndarray]) -> None:
+    """Display a selection in the viewports during a stroke; an empty mapping ends the preview."""
     _in_stroke.clear()
-    for item in levels(root) if root is not None and found else ():
-        _in_stroke[item.object.data.session_uid] = found[item.number]
-    changes.others_selected()
+    for item in levels(root) if root is not None and masks else ():
+        _in_stroke[item.object.data.session_uid] = masks[item.number]
+    changes.report_selected()
 
 
-def shown_selected(cloud: bpy.types.PointCloud) -> np.ndarray:
-    """(N,) bool, which splats viewports show as selected."""
-    found = _in_stroke.get(cloud.session_uid)
-    return selected(cloud) if found is None or len(found) != len(cloud.points) else found
+def displayed_selection(cloud: bpy.types.PointCloud) -> np.ndarray:
+    """Return the (N,) bool mask of splats that viewports display as selected."""
+    preview = _in_stroke.get(cloud.session_uid)
+    return selected_mask(cloud) if preview is None or len(preview) != len(cloud.points) else preview
 
 
 def count_selected(root: bpy.types.Object) -> dict[int, int]:
-    """How many splats of each level are selected, and not hidden, by its number."""
+    """Return the number of selected, visible splats by level number."""
     return {
-        item.number: int(np.count_nonzero(selected(item.object.data) & ~hidden(item.object.data)))
+        item.number: int(np.count_nonzero(selected_mask(item.object.data) & ~hidden_mask(item.object.data)))
         for item in levels(root)
     }
 
 
 def show_all(root: bpy.types.Object) -> int:
-    """Shows hidden splats again; how many."""
+    """Show hidden splats again.
+
+    Returns:
+        The number of splats that were hidden.
+    """
     count = 0
     for item in levels(root):
         cloud = item.object.data
         if HIDDEN in cloud.attributes:
-            count += int(hidden(cloud).sum())
+            count += int(hidden_mask(cloud).sum())
             cloud.attributes.remove(cloud.attributes[HIDDEN])
             cloud.update_tag()
         item.lost = 0
@@ -184,143 +216,157 @@ def show_all(root: bpy.types.Object) -> int:
     return count
 
 
-def left(root: bpy.types.Object, bundle: Bundle, depsgraph: bpy.types.Depsgraph) -> Bundle:
-    """The levels of a scene without what is hidden and what crops leave out; see ``cleaning.keep_splats``.
+def remaining(root: bpy.types.Object, bundle: Bundle, depsgraph: bpy.types.Depsgraph) -> Bundle:
+    """Return the levels of a scene without hidden and cropped splats; see ``cleaning.keep_splats``.
 
     Raises:
-        LodgsError: nothing is left.
+        LodgsError: No splat remains.
     """
-    cropped, clouds = crops.as_objects_stand(root, depsgraph), {item.number: item for item in levels(root)}
+    cropped, clouds = crops.evaluated_crops(root, depsgraph), {item.number: item for item in levels(root)}
     masks = {
-        level.number: crop_mask(cropped, level.splats.means) & ~hidden(clouds[level.number].object.data)
+        level.number: crop_mask(cropped, level.splats.means) & ~hidden_mask(clouds[level.number].object.data)
         for level in bundle.levels
     }
     return bundle if all(mask.all() for mask in masks.values()) else cleaning.keep_splats(bundle, masks)
 
 
-def count_left(root: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> dict[int, tuple[int, int]]:
-    """By the level's number how many splats hiding and crops leave, and how many there are."""
-    cropped, found = crops.as_objects_stand(root, depsgraph), {}
+def count_remaining(root: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> dict[int, tuple[int, int]]:
+    """Return the number of remaining splats and of all splats by level number.
+
+    Hidden and cropped splats do not remain.
+    """
+    cropped, counts = crops.evaluated_crops(root, depsgraph), {}
     for item in levels(root):
         cloud = item.object.data
-        there = changes.version(cloud), len(cloud.points), cropped
-        if _counts.get(cloud.session_uid, (None, 0))[0] != there:
-            mask = crop_mask(cropped, view_of(cloud, "position")) & ~hidden(cloud)
-            _counts[cloud.session_uid] = there, int(np.count_nonzero(mask))
-        found[item.number] = _counts[cloud.session_uid][1], len(cloud.points)
-    return found
+        key = changes.version(cloud), len(cloud.points), cropped
+        if _counts.get(cloud.session_uid, (None, 0))[0] != key:
+            mask = crop_mask(cropped, splat_attribute(cloud, "position")) & ~hidden_mask(cloud)
+            _counts[cloud.session_uid] = key, int(np.count_nonzero(mask))
+        counts[item.number] = _counts[cloud.session_uid][1], len(cloud.points)
+    return counts
 
 
-def hidden(cloud: bpy.types.PointCloud) -> np.ndarray:
-    """(N,) bool, which splats are hidden."""
-    found = read_attribute(cloud, HIDDEN)
-    return np.zeros(len(cloud.points), bool) if found is None else found.astype(bool)
+def hidden_mask(cloud: bpy.types.PointCloud) -> np.ndarray:
+    """Return the (N,) bool mask of hidden splats."""
+    values = read_attribute(cloud, HIDDEN)
+    return np.zeros(len(cloud.points), bool) if values is None else values.astype(bool)
 
 
 def cameras(context: bpy.types.Context, root: bpy.types.Object) -> list[Camera]:
-    """The cameras of a scene's photographs, or where it has none those of the Blender scene, in the splats'
-    space.
+    """Return the cameras of a scene, or of the Blender scene if it has none, in the splats' space.
 
     Raises:
-        LodgsError: there are none, or the root is stretched.
+        LodgsError: There are no cameras, or the root is scaled differently along its axes.
     """
     views = photographs.views(root)
     width, height = (context.scene.render.resolution_x, context.scene.render.resolution_y)
     depsgraph = context.evaluated_depsgraph_get()
-    found = [
-        # where views are hidden, Blender does not know where they stand
+    result = [
+        # Blender does not evaluate hidden views; their own pose is always valid.
         photographs.camera_of(view)
         if view.data.lodgs.width
         else view_from(root, depsgraph, width, height, view)[0]
         for view in views or [obj for obj in context.scene.objects if obj.type == "CAMERA"]
     ]
-    if not found:
+    if not result:
         raise LodgsError(
-            f"'{root.name}' has no cameras.",
-            "Import its photographs, or add cameras to the Blender scene.",
+            f"Cannot find splats by camera: '{root.name}' has no cameras.",
+            "Import its photos, or add cameras to the Blender scene.",
         )
-    return found
+    return result
 
 
-def unit_of(root: bpy.types.Object) -> float:
-    """How long a unit of the splats is in the world."""
+def unit_length(root: bpy.types.Object) -> float:
+    """Return the length of one splat unit in the world."""
     return max(axes_of(root).matrix_world.to_scale()) or 1.0
 
 
-def suggestions(context: bpy.types.Context, root: bpy.types.Object) -> dict[str, float]:
-    """Limits to begin with, by name, lengths in the world: such that of the finest level about one splat in a
-    hundred is larger, and one in twenty is farther off."""
-    cloud, unit = levels(root)[-1].object.data, unit_of(root)
-    means, scales = view_of(cloud, "position"), view_of(cloud, SCALE)
-    some = slice(None, None, max(len(means) // 100_000, 1))
-    found = {
-        "size": float(np.quantile(scales[some].max(axis=1), 0.99)) * unit,
+def suggest_limits(context: bpy.types.Context, root: bpy.types.Object) -> dict[str, float]:
+    """Suggest limits by name, as lengths in the world.
+
+    About one splat in a hundred of the finest level is larger than ``size``, and one in twenty is farther
+    from the cameras than ``distance``.
+    """
+    cloud, unit = levels(root)[-1].object.data, unit_length(root)
+    means, scales = splat_attribute(cloud, "position"), splat_attribute(cloud, SCALE)
+    sample = slice(None, None, max(len(means) // 100_000, 1))
+    limits = {
+        "size": float(np.quantile(scales[sample].max(axis=1), 0.99)) * unit,
         "gap": cleaning.default_gap(means) * unit,
     }
     try:
-        eyes = np.array([camera.center for camera in cameras(context, root)], np.float32)
+        positions = np.array([camera.center for camera in cameras(context, root)], np.float32)
     except LodgsError:
-        return found
-    away = np.full(len(means[some]), np.inf, np.float32)
-    for eye in eyes:
-        np.minimum(away, np.linalg.norm(means[some] - eye, axis=1), out=away)
-    return found | {"distance": float(np.quantile(away, 0.95)) * unit}
+        return limits
+    distances = np.full(len(means[sample]), np.inf, np.float32)
+    for position in positions:
+        np.minimum(distances, np.linalg.norm(means[sample] - position, axis=1), out=distances)
+    return limits | {"distance": float(np.quantile(distances, 0.95)) * unit}
 
 
 def bounds(root: bpy.types.Object) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (3,), along the world's axes, of a box with some room around nine tenths of the finest level on
-    each, or of the points where there is none: flat ground often lies in its outermost layer.
+    """Return the corners (3,) of a box around most of the scene, along the world's axes.
+
+    The box encloses nine tenths of the finest level along each axis, or of the points if there are no levels,
+    with a margin: flat ground often lies in the outermost layer.
 
     Raises:
-        LodgsError: there are neither.
+        LodgsError: The scene has neither splats nor points.
     """
     objects = [item.object for item in levels(root)] or [root.lodgs.points]
     if objects[-1] is None:
-        raise LodgsError(f"'{root.name}' has neither splats nor points.", "Import them, or train.")
-    means = view_of(objects[-1].data, "position")
+        raise LodgsError(
+            f"Cannot measure '{root.name}': it has neither splats nor points.",
+            "Import or train splats first.",
+        )
+    means = splat_attribute(objects[-1].data, "position")
     matrix = np.array(axes_of(root).matrix_world, np.float64)
-    placed = means[:: max(len(means) // 100_000, 1)] @ matrix[:3, :3].T + matrix[:3, 3]
-    low, high = np.quantile(placed, (0.05, 0.95), axis=0)
-    room = 0.05 * np.maximum(high - low, 0.1 * max((high - low).max(), 1e-6))
-    return low - room, high + room
+    positions = means[:: max(len(means) // 100_000, 1)] @ matrix[:3, :3].T + matrix[:3, 3]
+    low, high = np.quantile(positions, (0.05, 0.95), axis=0)
+    margin = 0.05 * np.maximum(high - low, 0.1 * max((high - low).max(), 1e-6))
+    return low - margin, high + margin
 
 
 def levels(root: bpy.types.Object) -> list[SplatLevel]:
-    """The levels that are there, coarse to fine."""
+    """Return the existing levels, coarse to fine."""
     return [item for item in root.lodgs.levels if item.exists]
 
 
-def _with_nodes(root: bpy.types.Object, found: dict[int, np.ndarray]) -> dict[int, np.ndarray]:
-    """The same; of a tree what is found of leaves, and the nodes of which then nothing else is left."""
-    family = _family(root)
-    if family is None:
-        return found
-    gone = {item.number: found[item.number] | hidden(item.object.data) for item in levels(root)}
-    stays = family.with_ancestors({number: ~mask for number, mask in gone.items()})
-    return {item.number: ~stays[item.number] & ~hidden(item.object.data) for item in levels(root)}
+def _with_nodes(root: bpy.types.Object, masks: dict[int, np.ndarray]) -> dict[int, np.ndarray]:
+    """Add the tree nodes without remaining leaves to masks of leaves; other scenes keep their masks."""
+    tree = _tree_relations(root)
+    if tree is None:
+        return masks
+    removed = {item.number: masks[item.number] | hidden_mask(item.object.data) for item in levels(root)}
+    remaining_masks = tree.with_ancestors({number: ~mask for number, mask in removed.items()})
+    return {
+        item.number: ~remaining_masks[item.number] & ~hidden_mask(item.object.data) for item in levels(root)
+    }
 
 
-def _family(root: bpy.types.Object) -> cleaning.TreeRelations | None:
-    """Who stands for whom, where the levels are a tree."""
+def _tree_relations(root: bpy.types.Object) -> cleaning.TreeRelations | None:
+    """Return the parent relations of the levels' splats, or None if they are not a tree."""
     if root.lodgs.rule != CUT.name:
         return None
     columns, means = {}, {}
     for item in levels(root):
         cloud = item.object.data
         means[item.number] = read_attribute(cloud, "position")
-        nothing = np.zeros(len(cloud.points), np.float32)
-        found = {name: read_attribute(cloud, name) for name in COLUMNS}
-        columns[item.number] = {name: nothing if x is None else x for name, x in found.items()}
+        zeros = np.zeros(len(cloud.points), np.float32)
+        values = {name: read_attribute(cloud, name) for name in COLUMNS}
+        columns[item.number] = {name: zeros if x is None else x for name, x in values.items()}
     return cleaning.TreeRelations(columns, means)
 
 
-def view_of(cloud: bpy.types.PointCloud, name: str) -> np.ndarray:
-    """An attribute of splats, see ``attributes.view_attribute``.
+def splat_attribute(cloud: bpy.types.PointCloud, name: str) -> np.ndarray:
+    """Return a splat attribute without a copy; see ``attributes.view_attribute``.
 
     Raises:
-        LodgsError: the cloud has it no more.
+        LodgsError: The point cloud no longer has the attribute.
     """
-    found = view_attribute(cloud, name)
-    if found is None:
-        raise LodgsError(f"{cloud.name} carries no splats.", "Undo what took its attributes away.")
-    return found
+    values = view_attribute(cloud, name)
+    if values is None:
+        raise LodgsError(
+            f"Cannot read '{cloud.name}': it has no splats.", "Undo the step that removed its attributes."
+        )
+    return values

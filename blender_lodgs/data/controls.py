@@ -1,4 +1,4 @@
-"""Values of the controls of a scene's rule: the user's, else recorded ones, else defaults."""
+"""Values of the controls of a scene's rule: set by the user, recorded, or default."""
 
 from __future__ import annotations
 
@@ -11,51 +11,51 @@ from . import selection
 
 
 def changed_controls(root: bpy.types.Object) -> dict[str, float]:
-    """The values of the rule's controls that are not the rule's own, by name."""
+    """Return the values of the rule's controls that differ from the rule's defaults, by name."""
     rule = find_rule(root.lodgs.rule)
     if rule is None:
         return {}
-    own = rule.defaults([item.number for item in root.lodgs.levels if item.exists])
+    defaults = rule.defaults([item.number for item in root.lodgs.levels if item.exists])
     values = {control.name: control.validate(_value(root, control)) for control in rule.controls}
-    return {name: value for name, value in values.items() if value != own[name]}
+    return {name: value for name, value in values.items() if value != defaults[name]}
 
 
 def update_controls(root: bpy.types.Object, recorded: dict[str, float] | None = None) -> None:
-    """Controls that nobody has set take what a bundle or a run records, else the rule's own for these levels.
+    """Set controls that the user has not set to recorded values, or to the rule's defaults for the levels.
 
     Args:
-        recorded: values by name; None: those of before.
+        recorded: Values by name from a bundle or run; None keeps the previous ones.
 
     Raises:
-        LodgsError: a value is not possible.
+        LodgsError: A value is invalid.
     """
     settings, rule = root.lodgs, find_rule(root.lodgs.rule)
-    before = selection.read_facts(settings.recorded)
-    recorded = before if recorded is None else recorded
+    previous = selection.read_facts(settings.recorded)
+    recorded = previous if recorded is None else recorded
     if rule is not None:
         numbers = [item.number for item in settings.levels if item.exists]
-        own = {control.name: control.default for control in rule.controls}
-        begun = own | before | selection.read_facts(settings.begun)
-        begins = (rule.defaults(numbers) if numbers else own) | recorded
-        begins = {control.name: control.validate(begins[control.name]) for control in rule.controls}
+        defaults = {control.name: control.default for control in rule.controls}
+        old_values = defaults | previous | selection.read_facts(settings.begun)
+        new_values = (rule.defaults(numbers) if numbers else defaults) | recorded
+        new_values = {control.name: control.validate(new_values[control.name]) for control in rule.controls}
         unset = [
             control
             for control in rule.controls
-            if begins[control.name] != begun[control.name]
-            and _value(root, control) == _short(begun[control.name])
+            if new_values[control.name] != old_values[control.name]
+            and _value(root, control) == _short(old_values[control.name])
         ]
-        unset.sort(key=lambda control: control.follows != "finest")  # which takes the coarsest along
+        unset.sort(key=lambda control: control.follows != "finest")  # setting it moves the coarsest along
         for control in unset:
-            setattr(settings.controls, control.name, begins[control.name])
-        settings.begun = json.dumps(begins)
+            setattr(settings.controls, control.name, new_values[control.name])
+        settings.begun = json.dumps(new_values)
     settings.recorded = json.dumps(recorded)
 
 
 def _value(root: bpy.types.Object, control: Control) -> float:
-    """What a control is set to."""
+    """Return the current value of a control."""
     return _short(getattr(root.lodgs.controls, control.name))
 
 
 def _short(value: float) -> float:
-    """A number to as many digits as Blender's floats have, which are shorter than the files'."""
+    """Round a number to the digits of Blender's floats, which have fewer than those of the files."""
     return value if isinstance(value, int) else float(f"{value:.7g}")

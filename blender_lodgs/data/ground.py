@@ -1,4 +1,4 @@
-"""What an artist says of a splat scene's place: where its ground is, and how long something in it is."""
+"""Alignment of a splat scene with its ground, and its scale."""
 
 from __future__ import annotations
 
@@ -18,41 +18,43 @@ from .photographs import views
 from .placement import axes_of, move, placement_of
 from .selection import read_json
 
-APART = 1e-6
-"""Of two places, over the size of the scene: nearer ones are one."""
+MIN_DISTANCE = 1e-6
+"""Minimum distance of two positions, as a fraction of their largest coordinate."""
 
 
-def lay_on_ground(root: bpy.types.Object, places: np.ndarray | None = None, flip: bool = False) -> float:
-    """Has z = 0 of Blender's world where a splat scene's ground is, its normal up.
+def align_to_ground(root: bpy.types.Object, positions: np.ndarray | None = None, flip: bool = False) -> float:
+    """Move a splat scene so that its ground is z = 0 of Blender's world, with the normal up.
 
     Args:
-        places: (P, 3) of the ground, in Blender's world: three or more; None finds the plane that lies under
-            the scene.
-        flip: the other side of the ground is up.
+        places: (P, 3) three or more points of the ground in Blender's world; None detects the plane below the
+            scene.
+        flip: Turn the other side of the ground up.
 
     Returns:
-        By how many degrees the scene was turned.
+        The rotation of the scene in degrees.
 
     Raises:
-        LodgsError: the places make no plane, or none is found; the root is stretched.
+        LodgsError: The points define no plane, no ground is detected, or the root is scaled differently along
+            its axes.
     """
-    there, up = placement_of(root), np.array([0.0, 0.0, 1.0])
-    if places is None:
-        normal, middle = find_ground(there.transform_points(_places(root)), up)
+    placement, up = placement_of(root), np.array([0.0, 0.0, 1.0])
+    if positions is None:
+        normal, center = find_ground(placement.transform_points(_ground_points(root)), up)
     else:
-        normal, middle = fit_plane(places, up)
+        normal, center = fit_plane(positions, up)
     _leave_edit_mode()
     up = -normal if flip else normal
-    move(root, ground_placement(up, middle))
+    move(root, ground_placement(up, center))
     return float(np.degrees(np.arccos(np.clip(up[2], -1, 1))))
 
 
 def scale(root: bpy.types.Object, factor: float) -> None:
-    """Makes a splat scene so many times as large, about where its root stands on z = 0. Its cameras see as
-    far as they did.
+    """Scale a splat scene about the projection of its root on z = 0.
+
+    The clip distances of its cameras are scaled along.
 
     Raises:
-        LodgsError: the root is stretched.
+        LodgsError: The root is scaled differently along its axes.
     """
     _leave_edit_mode()
     x, y, _ = root.matrix_world.translation
@@ -63,67 +65,76 @@ def scale(root: bpy.types.Object, factor: float) -> None:
                 setattr(view.data, name, factor * getattr(view.data, name))
 
 
-def picked(context: bpy.types.Context) -> np.ndarray:
-    """(P, 3) float64, where in Blender's world an artist has picked something: the points that are selected
-    in Edit Mode, or in Object Mode the origins of selected empties and meshes that are no splat scene's."""
+def picked_positions(context: bpy.types.Context) -> np.ndarray:
+    """Return the positions (P, 3) float64 of the selection in Blender's world.
+
+    In Edit Mode these are the selected points; in Object Mode the origins of selected empties and meshes that
+    do not belong to a splat scene.
+    """
     if context.mode == "OBJECT":
         axes = {axes_of(obj) for obj in bpy.data.objects if obj.lodgs.is_root}
-        places = [
+        positions = [
             np.array(obj.matrix_world.translation, np.float64)
             for obj in context.selected_objects
             if obj.type in ("EMPTY", "MESH") and not obj.lodgs.is_root and obj not in axes
         ]
-        return np.array(places).reshape(-1, 3)
-    found = [np.zeros((0, 3))]
+        return np.array(positions).reshape(-1, 3)
+    selection = [np.zeros((0, 3))]
     for obj in context.objects_in_mode:
-        if obj.type == "POINTCLOUD" and (places := read_attribute(obj.data, "position")) is not None:
+        if obj.type == "POINTCLOUD" and (positions := read_attribute(obj.data, "position")) is not None:
             matrix = np.array(obj.matrix_world, np.float64)
-            found.append(places[_selected(obj.data)] @ matrix[:3, :3].T + matrix[:3, 3])
-    return np.concatenate(found)
+            selection.append(positions[_selected(obj.data)] @ matrix[:3, :3].T + matrix[:3, 3])
+    return np.concatenate(selection)
 
 
 def _leave_edit_mode() -> None:
-    """Blender undoes what is done to objects from Object Mode alone."""
+    """Switch to Object Mode: Blender undoes changes of objects only there."""
     if bpy.context.mode != "OBJECT":
         bpy.ops.object.mode_set(mode="OBJECT")
 
 
 def _selected(cloud: bpy.types.PointCloud) -> np.ndarray:
-    """(N,) bool, which points are selected in Edit Mode."""
+    """Return the (N,) bool mask of points selected in Edit Mode."""
     selected = np.ones(len(cloud.points), bool)
-    if attribute := cloud.attributes.get(".selection"):  # without it all are
+    if attribute := cloud.attributes.get(".selection"):  # without the attribute, all points are selected
         attribute.data.foreach_get("value", selected)
     return selected
 
 
-def measured(places: np.ndarray) -> float:
-    """The distance between two places that were picked.
+def measure_distance(positions: np.ndarray) -> float:
+    """Return the distance between two selected positions.
 
     Raises:
-        LodgsError: there are not two, or they are one.
+        LodgsError: The number of positions is not two, or they coincide.
     """
-    if len(places) != 2:
+    if len(positions) != 2:
         raise LodgsError(
-            f"{len(places):,} places are selected, and a length is between two.",
-            "Select two points in Edit Mode, or two empties that mark them.",
+            f"Cannot measure a length: {len(positions):,} points are selected, but two are needed.",
+            "Select two points in Edit Mode, or two empties.",
         )
-    distance = float(np.linalg.norm(places[1] - places[0]))
-    if distance <= APART * float(np.abs(places).max()):
-        raise LodgsError("The two places that are selected are one.", "Select two that are apart.")
+    distance = float(np.linalg.norm(positions[1] - positions[0]))
+    if distance <= MIN_DISTANCE * float(np.abs(positions).max()):
+        raise LodgsError(
+            "Cannot measure a length: both selected points have the same position.",
+            "Select two other points.",
+        )
     return distance
 
 
-def _places(root: bpy.types.Object) -> np.ndarray:
-    """(P, 3) in the scene's own space: COLMAP's points, else where the finest level's opaque splats are;
-    those about the cameras alone, where it is known how deep these look."""
-    found = [item.object for item in root.lodgs.levels if item.exists][-1:]
-    obj = root.lodgs.points or (found[0] if found else None)
-    places = None if obj is None else read_attribute(obj.data, "position")
-    if places is None:
+def _ground_points(root: bpy.types.Object) -> np.ndarray:
+    """Return the points (P, 3) for ground detection, in the scene's own space.
+
+    These are COLMAP's points, or the means of the finest level's opaque splats. If the median depth is known,
+    only points near the cameras are returned.
+    """
+    levels = [item.object for item in root.lodgs.levels if item.exists][-1:]
+    obj = root.lodgs.points or (levels[0] if levels else None)
+    positions = None if obj is None else read_attribute(obj.data, "position")
+    if positions is None:
         return np.zeros((0, 3))
     base = read_attribute(obj.data, BASE)
-    places = places if base is None else places[base[:, 3] > 0.5]
+    positions = positions if base is None else positions[base[:, 3] > 0.5]
     depth = root.lodgs.training.median_depth or read_json(root.lodgs.meta).get("median_depth", 0)
     return points_near_cameras(
-        places, np.array(root.lodgs.camera_center), depth if isinstance(depth, int | float) else 0
+        positions, np.array(root.lodgs.camera_center), depth if isinstance(depth, int | float) else 0
     )

@@ -28,7 +28,7 @@ from .placement import axes_of, new_axes
 from .roots import collection_of
 
 ABOUT = "About these splats"
-"""The name of the text that tells of LODGS where it is not installed."""
+"""Name of the text that explains splat scenes to users without LODGS."""
 
 
 def import_colmap(
@@ -41,24 +41,24 @@ def import_colmap(
     photographs: bool = True,
     warn: Callable[[str], object] = print,
 ) -> bpy.types.Object:
-    """A COLMAP scene as a new splat scene: cameras, their photographs and the coloured points.
+    """Import a COLMAP scene as a new splat scene with cameras, photos and coloured points.
 
-    Where the Blender scene has no camera, the first view becomes its camera and gives the render its size.
+    If the Blender scene has no camera, the first view becomes its camera and sets the render size.
 
     Args:
-        folder: the scene's folder, or that of a model in it; or another program's export, which is then made
-            a COLMAP scene (``formats.colmap_scene``).
-        model: folder of the model; by default the largest one. Training takes the same one.
-        images: folder of the photographs; by default found beside the model. Training takes the same one.
-        upright: turn the root so that the cameras' mean up direction is +z; otherwise leave COLMAP's axes.
-        photographs: show each camera's photograph behind its view.
-        warn: receives one sentence for each thing that was left out or is odd.
+        folder: Folder of the scene or of a model in it, or another program's export, which is converted
+            (``formats.ensure_colmap_scene``).
+        model: Folder of the model; by default the largest one. Training uses the same one.
+        images: Folder of the photos; by default the one next to the model. Training uses the same one.
+        upright: Rotate the scene so that the cameras' mean up direction is +z; otherwise keep COLMAP's axes.
+        photographs: Show the photo of each view behind it.
+        warn: Function that receives a sentence for each omission or irregularity.
 
     Returns:
         The scene root.
 
     Raises:
-        LodgsError: the folder holds no scene that can be read. Nothing is left behind in that case.
+        LodgsError: The folder has no readable scene. The file is unchanged in that case.
     """
     manager = context.window_manager
     manager.progress_begin(0, 1)  # at the mouse pointer
@@ -70,8 +70,8 @@ def import_colmap(
         manager.progress_end()
     for message in scene.warnings:
         warn(message)
-    straight = cached_undistorted_scene(scene)
-    shown = {camera.name: camera for camera in straight.cameras} if straight else {}
+    undistorted = cached_undistorted_scene(scene)
+    undistorted_cameras = {camera.name: camera for camera in undistorted.cameras} if undistorted else {}
     extent = scene.extent(default=1.0)
     near = scene.near(default=extent / 1000)
     with new_scene(context, scene.folder.name) as root:
@@ -85,9 +85,9 @@ def import_colmap(
         root.lodgs.training.model = str(scene.model) if model else ""
         root.lodgs.training.images = str(scene.images_folder) if images else ""
 
-        seen = [shown.get(camera.name, camera) for camera in scene.cameras]
-        distorted = set(scene.distorted) - shown.keys()
-        _add_views(context, root, seen, extent, near, photographs, distorted, scene.names)
+        cameras = [undistorted_cameras.get(camera.name, camera) for camera in scene.cameras]
+        distorted = set(scene.distorted) - undistorted_cameras.keys()
+        _add_views(context, root, cameras, extent, near, photographs, distorted, scene.names)
         if len(scene.points):
             points = objects.new_points(
                 f"{root.name} points", scene.points, scene.point_colors, radius=extent / 400
@@ -108,17 +108,17 @@ def _add_views(
     distorted: Collection[str] = (),
     names: Sequence[str] = (),
 ) -> None:
-    """Gives a scene a camera object for each view; see :func:`new_camera`.
+    """Add a camera object to a scene for each view; see :func:`new_camera`.
 
     Args:
-        names: of all views of the model, in order; none: there are no others.
+        names: Names of all views of the model, in order; if empty, those of ``cameras``.
     """
     root.lodgs.cameras = bpy.data.collections.new(f"{root.name} cameras")
     collection_of(root).children.link(root.lodgs.cameras)
-    place_of = {name: place for place, name in enumerate(names or [camera.name for camera in cameras])}
+    index_of = {name: index for index, name in enumerate(names or [camera.name for camera in cameras])}
     for camera in cameras:
         view = new_camera(camera, extent, near, photograph=photographs, distorted=camera.name in distorted)
-        view.parent, view.data.lodgs.place = axes_of(root), place_of[camera.name]
+        view.parent, view.data.lodgs.place = axes_of(root), index_of[camera.name]
         root.lodgs.cameras.objects.link(view)
     if context.scene.camera is None and cameras:
         context.scene.camera = root.lodgs.cameras.objects[0]
@@ -133,37 +133,37 @@ def import_splats(
     budget: int = 0,
     warn: Callable[[str], object] = print,
 ) -> bpy.types.Object:
-    """A bundle, a folder of levels, or any 3DGS PLY as a single level, as a new splat scene.
+    """Import a bundle, a folder of levels, or a 3DGS PLY as a single level, as a new splat scene.
 
     Args:
-        budget: see :func:`read_splats_file`.
-        upright: turn the scene as the bundle says, or without that so that -y, which is up in most splat
-            files, is up; otherwise leave the axes.
-        warn: receives a sentence for each thing that is shown otherwise than the file's maker shows it.
+        budget: See :func:`read_splats_file`.
+        upright: Rotate the scene as the bundle records, or so that -y is up, as in most splat files;
+            otherwise keep the axes.
+        warn: Function that receives a sentence for each difference from the display of the original program.
 
     Returns:
         The scene root.
 
     Raises:
-        LodgsError: the file cannot be read, or what it says is not possible. Nothing is left behind then.
+        LodgsError: The file cannot be read or has invalid values. The file is unchanged in that case.
     """
-    pieces = place_splats(context, read_splats_file(path, budget), upright, warn)
+    steps = place_splats(context, read_splats_file(path, budget), upright, warn)
     while True:
         try:
-            next(pieces)
-        except StopIteration as end:
-            return end.value
+            next(steps)
+        except StopIteration as stop:
+            return stop.value
 
 
 @dataclass(frozen=True)
 class SplatsFile:
-    """What a file of splats holds.
+    """Contents of a splat file.
 
     Attributes:
-        bundle: its levels; the coarsest splats of a tree that stays in its file.
-        total: splats of such a tree; 0 where all are in the bundle.
-        budget: most splats of such a tree in memory.
-        warnings: a sentence for each thing that is shown otherwise than the file's maker shows it.
+        bundle: Levels; for a tree that stays in its file, its coarsest splats.
+        total: Number of splats of such a tree; 0 if the bundle has all splats.
+        budget: Maximum number of splats of such a tree in memory.
+        warnings: Sentences about differences from the display of the original program.
     """
 
     path: Path
@@ -174,64 +174,65 @@ class SplatsFile:
 
 
 def read_splats_file(path: Path | str, budget: int = 0) -> SplatsFile:
-    """What :func:`place_splats` places: a bundle, a folder of levels, or any other file of splats (see
-    ``training.splats.formats``) as a single level.
+    """Read a bundle, a folder of levels, or another splat file (``training.splats.formats``) as a single
+    level.
 
-    Nothing of Blender is touched, so that a thread may do it.
+    Does not access Blender's data and may run in a thread.
 
     Args:
-        budget: most splats of a tree of splats in memory; 0: all. Of a larger one the coarsest are imported,
-            which stand for the others; where LODGS itself draws, others are read from the file as the eye
-            comes near (``streams``).
+        budget: Maximum number of splats of a tree in memory; 0 for all. Of a larger tree, only the coarsest
+            splats are read; LODGS streams finer ones from the file as the camera approaches (``streams``).
 
     Raises:
-        LodgsError: the file cannot be read.
+        LodgsError: The file cannot be read.
     """
     path, warnings, total = Path(path), [], 0
     if path.name == STREAMED_FILE:
         path = path.resolve().parent
     if budget and not path.is_dir() and is_plain_ply(path) and is_tree(read_header(path)):
         total = TreeFile(path).total
-        bundle, _ = read_budgeted(path, budget if total <= budget else streams.held_of(budget))
-        here = sum(len(level.splats) for level in bundle.levels)
-        if here < total:
+        bundle, _ = read_budgeted(path, budget if total <= budget else streams.resident_count(budget))
+        count = sum(len(level.splats) for level in bundle.levels)
+        if count < total:
             warnings.append(
-                f"{here:,} of {total:,} splats are here: coarser ones stand for the others, which are read "
-                f"from {path.name} where viewports and renders of LODGS need them."
+                f"Imported the coarsest {count:,} of {total:,} splats. Viewports and renders of LODGS "
+                f"stream finer ones from {path.name}."
             )
-        total = total if here < total else 0
+        total = total if count < total else 0
     else:
-        with open_as_ply(path) as there:
-            bundle = (read_folder if there.is_dir() else read_bundle)(there, warnings.append)
+        with open_as_ply(path) as file:
+            bundle = (read_folder if file.is_dir() else read_bundle)(file, warnings.append)
     return SplatsFile(path, bundle, total, budget, warnings)
 
 
 def place_splats(
     context: bpy.types.Context, file: SplatsFile, upright: bool, warn: Callable[[str], object]
 ) -> Generator[None, None, bpy.types.Object]:
-    """Makes a new splat scene of what a file holds, level by level, and yields between two; see
-    :func:`import_splats`. Ended early, it leaves nothing behind."""
+    """Create a new splat scene from a file's contents; yields after each level.
+
+    See :func:`import_splats`. If the generator is closed early, the file is unchanged.
+    """
     for message in file.warnings:
         warn(message)
-    bundle, made = file.bundle, []
-    cameras, near, unseen = read_view_tables(bundle.tables)
+    bundle, level_objects = file.bundle, []
+    cameras, near, held_out = read_view_tables(bundle.tables)
     try:
         for level in bundle.levels:
-            made.append(objects.new_splats(f"{file.path.stem} {level.number}", level.splats))
+            level_objects.append(objects.new_splats(f"{file.path.stem} {level.number}", level.splats))
             yield
         with new_scene(context, file.path.stem.removesuffix(".compressed")) as root:
             if upright:
                 axes_of(root).rotation_quaternion = Matrix(bundle.up_rotation.tolist()).to_quaternion()
-            _fill(root, file, made)
+            _fill(root, file, level_objects)
             if cameras:
                 _add_views(context, root, cameras, camera_extent(cameras) or 1.0, near)
-                for facts in (view.data.lodgs for view in views(root)):
-                    facts.held_out = cameras[facts.place].name in unseen
+                for settings in (view.data.lodgs for view in views(root)):
+                    settings.held_out = cameras[settings.place].name in held_out
             root.lodgs.training.method = next(
                 info.name for info in METHODS.values() if info.suggested_for_base
             )
     except BaseException:
-        bpy.data.batch_remove([obj.data for obj in made])  # which takes the objects along
+        bpy.data.batch_remove([obj.data for obj in level_objects])  # also removes the objects
         raise
     if bundle.rule and not root.lodgs.by_distance:
         warn(" ".join(unknown_rule_error(bundle.rule)))
@@ -239,26 +240,30 @@ def place_splats(
 
 
 def refill(root: bpy.types.Object, file: SplatsFile) -> None:
-    """Gives a splat scene what a file holds, in place of the levels that it has."""
-    scenes.make_room(root, file.bundle.levels[-1].number)
+    """Replace the levels of a splat scene by those of a file."""
+    scenes.prepare_refill(root, file.bundle.levels[-1].number)
     _fill(root, file, [None] * len(file.bundle.levels))
 
 
-def _fill(root: bpy.types.Object, file: SplatsFile, made: Sequence[bpy.types.Object | None]) -> None:
-    """Puts a file's levels, of which there may be objects, and all that it says of them into a scene."""
-    for level, obj in zip(file.bundle.levels, made, strict=True):
+def _fill(root: bpy.types.Object, file: SplatsFile, level_objects: Sequence[bpy.types.Object | None]) -> None:
+    """Add a file's levels and metadata to a scene.
+
+    Args:
+        level_objects: Object of each level, or None to create one.
+    """
+    for level, obj in zip(file.bundle.levels, level_objects, strict=True):
         scenes.put_level(root, level, obj)
     scenes.set_bundle_facts(root, file.bundle)
     scenes.set_tables(root, file.bundle.tables)
     root.lodgs.single_level = file.bundle.levels[-1].number
     if file.total:
-        streams.begin(root, file.path, file.budget, file.total)
-        root.lodgs.eye = "VIEW"  # so that what is looked at comes
+        streams.start_streaming(root, file.path, file.budget, file.total)
+        root.lodgs.eye = "VIEW"  # stream for the viewport
 
 
 @contextmanager
 def new_scene(context: bpy.types.Context, name: str) -> Iterator[bpy.types.Object]:
-    """A new root in a new collection; both, and all in them, vanish again if the block fails."""
+    """Create a root in a new collection; both are removed with their contents if the block fails."""
     if context.mode != "OBJECT":
         bpy.ops.object.mode_set(mode="OBJECT")
     with objects.all_or_nothing():
@@ -277,11 +282,11 @@ def new_scene(context: bpy.types.Context, name: str) -> Iterator[bpy.types.Objec
 
 
 def _write_note() -> None:
-    """Leaves a text in the file for whoever opens it without LODGS, and sees points."""
+    """Add a text to the file for users without LODGS."""
     if ABOUT not in bpy.data.texts:
         bpy.data.texts.new(ABOUT).write(
             "The point clouds in this file are Gaussian splats. Without the extension LODGS, Blender shows "
-            "the finest level of each scene as points.\n\nWith it they are drawn as splats, in viewports and "
-            "in renders, with detail by distance, and can be cleaned, placed and exported: Edit, "
-            "Preferences, Get Extensions, Install from Disk. Nothing is lost without it.\n"
+            "the finest level of each scene as points.\n\nLODGS draws them as splats in viewports and "
+            "renders, with detail by distance, and can clean, place and export them. To install it: Edit, "
+            "Preferences, Get Extensions, Install from Disk. The file keeps all data without it.\n"
         )

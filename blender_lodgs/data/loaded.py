@@ -1,4 +1,4 @@
-"""Where the eye of a splat scene is, and what has to be at hand for it, for panels."""
+"""Current camera of a splat scene and the number of splats in its region, for panels."""
 
 from __future__ import annotations
 
@@ -10,41 +10,45 @@ from ..attributes import read_attribute
 from . import objects, selection
 
 _counts: dict[tuple[int, Region], int] = {}
-"""Splats of a point cloud, by ``session_uid``, for a region: counting takes long where there are many."""
+"""Number of splats by point cloud (``session_uid``) and region; counting large clouds is slow."""
 
 
-def chosen(context: bpy.types.Context, root: bpy.types.Object) -> selection.LodQuery | None:
-    """What a scene's levels are chosen by as of the last evaluation; None where none is shown by distance."""
+def current_query(context: bpy.types.Context, root: bpy.types.Object) -> selection.LodQuery | None:
+    """Return the rule arguments of a scene's levels as of the last evaluation.
+
+    Returns:
+        None if no visible level is selected by a rule.
+    """
     depsgraph = context.view_layer.depsgraph
     for item in root.lodgs.levels if depsgraph is not None else ():
         if item.exists and item.object.visible_get(view_layer=context.view_layer):
-            choice = selection.choice(item.object.evaluated_get(depsgraph), depsgraph)
-            return choice if choice is not None and choice.rule else None
+            query = selection.evaluated_query(item.object.evaluated_get(depsgraph), depsgraph)
+            return query if query is not None and query.rule else None
     return None
 
 
-def count_loaded(root: bpy.types.Object, choice: selection.LodQuery) -> tuple[int, float]:
-    """How many splats an eye may be shown while it stays in its region, and their size in 10^6 bytes.
+def count_loaded(root: bpy.types.Object, query: selection.LodQuery) -> tuple[int, float]:
+    """Return the number and size (10^6 bytes) of splats that may be visible within the camera's region.
 
-    All that there are where the rule, or the place, has no regions.
+    If the rule has no regions, all splats of the scene count.
     """
-    splats, megabytes, region = 0, 0.0, choice.region()
+    splats, megabytes, region = 0, 0.0, query.region()
     for item in root.lodgs.levels:
         if item.exists and item.show:
             cloud = item.object.data
-            count = len(cloud.points) if region is None else _count(cloud, choice, region)
+            count = len(cloud.points) if region is None else _count(cloud, query, region)
             splats += count
             megabytes += objects.megabytes(cloud) * count / max(len(cloud.points), 1)
     return splats, megabytes
 
 
-def _count(cloud: bpy.types.PointCloud, choice: selection.LodQuery, region: Region) -> int:
+def _count(cloud: bpy.types.PointCloud, query: selection.LodQuery, region: Region) -> int:
     key = cloud.session_uid, region
     if key not in _counts:
-        nothing = np.broadcast_to(np.float32(0), len(cloud.points))
-        found = {name: read_attribute(cloud, name) for name in choice.columns}
-        columns = {name: nothing if values is None else values for name, values in found.items()}
-        _counts[key] = int(np.count_nonzero(choice.visible_in_region(columns)))
+        zeros = np.broadcast_to(np.float32(0), len(cloud.points))
+        attributes = {name: read_attribute(cloud, name) for name in query.columns}
+        columns = {name: zeros if values is None else values for name, values in attributes.items()}
+        _counts[key] = int(np.count_nonzero(query.visible_in_region(columns)))
     return _counts[key]
 
 

@@ -31,8 +31,7 @@ PARTS = tuple(RANGES)
 
 
 class PlacedLook(NamedTuple):
-    """A look, and the crop in which it counts, or outside of which, in the splats' own space; None:
-    everywhere."""
+    """A look and the crop that limits it, in the splats' own space; None for the entire scene."""
 
     crop: Crop | None
     look: Look
@@ -51,7 +50,7 @@ def _rows(look: Look) -> list[float]:
 
 
 def _matrix(self) -> list[float]:
-    return _rows(_as_set(self))  # which every driver of every level asks for
+    return _rows(_read_look(self))  # cached: every driver of every level reads it
 
 
 class LookSettings(bpy.types.PropertyGroup):
@@ -103,35 +102,35 @@ class LookSettings(bpy.types.PropertyGroup):
 def looks_of(
     root: bpy.types.Object, depsgraph: bpy.types.Depsgraph, to_own: Matrix
 ) -> tuple[PlacedLook, ...]:
-    """The looks of a scene that change anything, as of the depsgraph, the one everywhere first.
+    """Return the looks of a scene that change anything, as evaluated in the depsgraph, the root's first.
 
     Args:
-        to_own: leads from the world to the splats' own space.
+        to_own: Matrix from the world to the splats' own space.
     """
-    everywhere, found = _as_set(root.evaluated_get(depsgraph).lodgs_look), []
-    if everywhere != NEUTRAL:
-        found.append(PlacedLook(None, everywhere))
+    root_look, placed_looks = _read_look(root.evaluated_get(depsgraph).lodgs_look), []
+    if root_look != NEUTRAL:
+        placed_looks.append(PlacedLook(None, root_look))
     for obj in regions_of(root):
         settings = obj.evaluated_get(depsgraph).lodgs_look
-        look = _as_set(settings)
+        look = _read_look(settings)
         if obj.lodgs_crop.use and look != NEUTRAL:
-            crop = crops.as_it_stands(obj, to_own, depsgraph)
-            found.append(PlacedLook(replace(crop, outside=settings.outside), look))
-    return tuple(found)
+            crop = crops.evaluated_crop(obj, to_own, depsgraph)
+            placed_looks.append(PlacedLook(replace(crop, outside=settings.outside), look))
+    return tuple(placed_looks)
 
 
 def regions_of(root: bpy.types.Object) -> list[bpy.types.Object]:
-    """The crops in which a look of their own may count."""
+    """Return the crops that can have a look of their own."""
     return [obj for obj in crops.crops_of(root) if obj.lodgs_crop.keep == "ALL" or is_set(obj)]
 
 
 def is_set(obj: bpy.types.Object) -> bool:
-    """Whether somebody has set something of a root's or a crop's look."""
+    """Return True if a property of the look of a root or a crop is set."""
     return any(obj.lodgs_look.is_property_set(name) for name in PARTS)
 
 
 def reset(root: bpy.types.Object, obj: bpy.types.Object) -> None:
-    """Gives the root, or one of its crops, the look that changes nothing; it may still be animated."""
+    """Reset the look of the root or of one of its crops; its animation stays."""
     for name in (*PARTS, "outside"):
         obj.lodgs_look.property_unset(name)
     attach(root)
@@ -139,26 +138,24 @@ def reset(root: bpy.types.Object, obj: bpy.types.Object) -> None:
 
 
 def attach(root: bpy.types.Object) -> None:
-    """Gives every level the modifier for paint and the looks that there are, anew where there are other
-    regions now; takes it away where nobody has painted, nor set any."""
+    """Give every level the modifier for paint and the current looks; remove it without paint and looks."""
     regions = regions_of(root)
     painted = any(PAINT[-1] in item.object.data.attributes for item in root.lodgs.levels if item.exists)
-    wanted = bool(regions) or is_set(root) or painted
+    needs_modifier = bool(regions) or is_set(root) or painted
     for item in root.lodgs.levels:
-        if item.exists and wanted:
+        if item.exists and needs_modifier:
             _attach(item.object, root, regions)
         elif item.exists:
             detach(item.object)
 
 
 def modifier_of(obj: bpy.types.Object) -> bpy.types.NodesModifier | None:
-    """The modifier of a level that shows looks, of any version."""
+    """Return the look modifier of a level, of any version."""
     return find_modifier(obj, groups.COUNT)
 
 
 def outdated(root: bpy.types.Object) -> bool:
-    """True if a level's modifier is another version's, or lacks a region that has come since, or has one
-    that has gone."""
+    """Return True if a level's modifier is of another version or does not match the current regions."""
     regions = regions_of(root)
     levels = [item.object for item in root.lodgs.levels if item.exists]
     return any(crops.followed_by(obj, groups.COUNT) != regions for obj in levels) or not all(
@@ -168,16 +165,16 @@ def outdated(root: bpy.types.Object) -> bool:
     )
 
 
-def _as_set(settings: LookSettings) -> Look:
-    """A look as its properties have it; animation may lead them anywhere."""
+def _read_look(settings: LookSettings) -> Look:
+    """Return the look of properties, clamped: animation can exceed their ranges."""
 
-    def held(name: str, value: float) -> float:
+    def clamp(name: str, value: float) -> float:
         low, high = RANGES[name]
         return min(max(value, low), high)
 
-    red, green, blue = (held("tint", each) for each in settings.tint)
+    red, green, blue = (clamp("tint", channel) for channel in settings.tint)
     exposure, temperature, saturation, opacity = (
-        held(name, getattr(settings, name)) for name in PARTS if name != "tint"
+        clamp(name, getattr(settings, name)) for name in PARTS if name != "tint"
     )
     return Look(exposure, temperature, (red, green, blue), saturation, opacity)
 
@@ -213,7 +210,7 @@ def _attach(obj: bpy.types.Object, root: bpy.types.Object, regions: list[bpy.typ
 
 
 def detach(obj: bpy.types.Object) -> None:
-    """Takes the modifier that shows looks off a level."""
+    """Remove the look modifier of a level."""
     modifier = modifier_of(obj)
     if modifier is not None:
         remove_modifier(obj, modifier)

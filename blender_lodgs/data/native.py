@@ -45,21 +45,21 @@ def add_to_scene(
         LodgsError: An object is linked, has no splats, or is scaled differently along its axes; or levels of
             one scene differ in position. Nothing is changed then.
     """
-    splats = [_checked(obj) for obj in clouds]
+    splats = [_read_movable(obj) for obj in clouds]
     groups = [list(clouds)] if as_levels else [[obj] for obj in clouds]
     for group in groups:
         for obj in group[1:]:
             if not _is_close(obj.matrix_world, group[0].matrix_world):
                 raise LodgsError(
-                    f"Cannot make levels of one scene: '{obj.name}' and '{group[0].name}' stand at different "
-                    "places.",
+                    f"Cannot make levels of one scene: '{obj.name}' and '{group[0].name}' have different "
+                    "transforms.",
                     "Give both the same transform, or add them as separate scenes.",
                 )
     read = dict(zip(clouds, splats, strict=True))
     return [_new_scene(context, group, [read[obj] for obj in group]) for group in groups]
 
 
-def _checked(obj: bpy.types.Object) -> Splats:
+def _read_movable(obj: bpy.types.Object) -> Splats:
     if not obj.is_editable or not obj.data.is_editable:
         raise LodgsError(f"Cannot add '{obj.name}': it is linked from another file.", "Make it local first.")
     scale = obj.matrix_world.to_scale()
@@ -86,14 +86,14 @@ def _new_scene(
             objects.complete_attributes(obj, values)
             scenes.put_level(root, Level(number, values, {}), obj)
         root.lodgs.single_level = len(group)
-        root.lodgs.training.method = next(info.name for info in METHODS.values() if info.for_splats)
+        root.lodgs.training.method = next(info.name for info in METHODS.values() if info.suggested_for_base)
         scenes.levels_changed(root)
     return root
 
 
-def _is_close(one, other) -> bool:
+def _is_close(first, second) -> bool:
     return all(
         abs(a - b) <= 1e-5 * (1 + abs(a))
-        for x, y in zip(one, other, strict=True)
+        for x, y in zip(first, second, strict=True)
         for a, b in zip(x, y, strict=True)
     )

@@ -1,9 +1,9 @@
-"""Splats and points as Blender point clouds, and back. One datablock, one set of splats.
+"""Conversion of splats and points to Blender point clouds and back; one datablock per set of splats.
 
-Attributes are those of ``attributes``, and every further column has its own name. Files hold logarithms,
-logits and quaternions of any length, which float32 cannot give back to the bit from activated values; they
-are therefore kept beside as ``log_scale``, ``opacity_logit`` and ``quaternion``. On the way back such a
-stored value counts where it still stands for the visible one: whatever an artist has changed, wins.
+Attributes have the names in ``attributes``; additional columns keep their own names. Files store logarithms,
+logits and unnormalised quaternions, which cannot be recovered bit by bit from activated float32 values. They
+are therefore stored as well, as ``log_scale``, ``opacity_logit`` and ``quaternion``. A stored value is used
+only while it matches the activated one, so that artists' edits take precedence.
 """
 
 from __future__ import annotations
@@ -48,29 +48,29 @@ _TYPE = "lodgs_type:"  # custom property that remembers a column's type
 _EXTRA = COLUMN.format("")
 _OPACITIES = 1e-12, 1 - 2.0**-24
 """Range of opacities that have a finite logit: up to the float32 next to 1."""
-_MADE = ("scenes", "objects", "collections", "pointclouds", "meshes", "cameras", "images")
+_KINDS = ("scenes", "objects", "collections", "pointclouds", "meshes", "cameras", "images")
 
 
 @contextmanager
 def all_or_nothing() -> Iterator[None]:
-    """What the block has made in the file vanishes again if it fails."""
-    before = {kind: set(getattr(bpy.data, kind)) for kind in _MADE}
+    """Remove all datablocks created in the block if it fails."""
+    existing = {kind: set(getattr(bpy.data, kind)) for kind in _KINDS}
     try:
         yield
     except BaseException:
-        for kind, there in before.items():
-            bpy.data.batch_remove(list(set(getattr(bpy.data, kind)) - there))
+        for kind, previous in existing.items():
+            bpy.data.batch_remove(list(set(getattr(bpy.data, kind)) - previous))
         raise
 
 
 @all_or_nothing()
 def new_points(name: str, positions: np.ndarray, colors: np.ndarray, radius: float) -> bpy.types.Object:
-    """Coloured points as an object that is in no collection yet.
+    """Create an object of coloured points, not yet in a collection.
 
     Args:
         positions: (P, 3), in the object's own space.
         colors: (P, 3) uint8, sRGB.
-        radius: display radius in the object's units.
+        radius: Display radius in the object's units.
     """
     cloud = compat.new_point_cloud(name, len(positions))
     write_attribute(cloud, "position", "FLOAT_VECTOR", positions)
@@ -83,7 +83,7 @@ def new_points(name: str, positions: np.ndarray, colors: np.ndarray, radius: flo
 
 @all_or_nothing()
 def new_splats(name: str, splats: Splats) -> bpy.types.Object:
-    """Splats as an object that is in no collection yet; its local space is the splats' world."""
+    """Create an object of splats, not yet in a collection; its local space is the splats' world."""
     cloud = compat.new_point_cloud(name, len(splats))
     opacity = _sigmoid(splats.opacity_logits)
     scale = _exp(splats.log_scales)
@@ -96,8 +96,8 @@ def new_splats(name: str, splats: Splats) -> bpy.types.Object:
     write_attribute(cloud, SCALE, "FLOAT_VECTOR", scale)
     write_attribute(cloud, ROTATION, "QUATERNION", _unit(splats.quats))
     for column, values in splats.extras.items():
-        taken = column in _OWN or column.startswith((".", _EXTRA, "radiance:"))
-        write_column(cloud, _EXTRA + column if taken else column, values)
+        reserved = column in _OWN or column.startswith((".", _EXTRA, "radiance:"))
+        write_column(cloud, _EXTRA + column if reserved else column, values)
     obj = bpy.data.objects.new(name, cloud)
     complete_attributes(obj, splats)
     return obj
@@ -107,14 +107,14 @@ def complete_attributes(obj: bpy.types.Object, splats: Splats) -> None:
     """Give a splat object the attributes and modifiers by which LODGS edits, draws and exports it.
 
     Args:
-        splats: those of the object, as :func:`read_splats` returns them.
+        splats: Splats of the object, as :func:`read_splats` returns them.
     """
     cloud = obj.data
     rename_sh(cloud)
     write_attribute(cloud, LOG_SCALE, "FLOAT_VECTOR", splats.log_scales)
     write_attribute(cloud, OPACITY_LOGIT, "FLOAT", splats.opacity_logits)
     write_attribute(cloud, QUATERNION, compat.WIDE_TYPE, splats.quats)
-    # A sphere with the splat's mean size; a faint splat covers less, so that fog does not hide the scene.
+    # Mean size of the splat, smaller for faint splats: fog would otherwise hide the scene.
     opacity = _sigmoid(splats.opacity_logits)
     radius = np.exp(splats.log_scales @ np.full(3, 1 / 3, np.float32)) * np.sqrt(opacity)
     write_attribute(cloud, RADIUS, "FLOAT", radius)
@@ -123,20 +123,21 @@ def complete_attributes(obj: bpy.types.Object, splats: Splats) -> None:
 
 
 def root_of(obj: bpy.types.Object | None) -> bpy.types.Object | None:
-    """The root of the splat scene that an object is in: itself, or what it is a child of; None outside."""
+    """Return the root of the splat scene of an object: itself or an ancestor; None outside splat scenes."""
     while obj is not None and not obj.lodgs.is_root:
         obj = obj.parent
     return obj
 
 
 def read_splats(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = None) -> Splats:
-    """The splats of an object, with all that artists have changed: its data, or what its modifiers leave.
+    """Return the splats of an object with all edits.
 
     Args:
-        depsgraph: where given, the modifiers are applied as it shows them, their weights to the opacities.
+        depsgraph: Apply modifiers as evaluated in it, and multiply opacities by their weights; None reads the
+            object's data.
 
     Raises:
-        LodgsError: if the object carries no splat attributes.
+        LodgsError: The object has no splat attributes.
     """
     types = obj.data  # evaluated data keeps no custom properties
     cloud = obj.evaluated_get(depsgraph).data if depsgraph else types
@@ -144,12 +145,14 @@ def read_splats(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = N
         return read_splats(obj).select(slice(0))
     splats = splats_of(cloud, read_attribute(cloud, WEIGHT))
     if splats is None:
-        raise LodgsError(f"{obj.name} carries no splats.", "Undo what took its attributes away.")
-    known = {a.name for a in cloud.attributes if a.name.startswith("radiance:")} | _OWN
+        raise LodgsError(
+            f"Cannot read '{obj.name}': it has no splats.", "Undo the step that removed its attributes."
+        )
+    own_names = {a.name for a in cloud.attributes if a.name.startswith("radiance:")} | _OWN
     splats.extras |= {
         a.name.removeprefix(_EXTRA): column
         for a in cloud.attributes
-        if a.name not in known
+        if a.name not in own_names
         and a.name[0] != "."
         and (column := read_column(cloud, a.name, types)) is not None
     }
@@ -157,13 +160,13 @@ def read_splats(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = N
 
 
 def splats_of(cloud: bpy.types.PointCloud, weights: np.ndarray | None = None) -> Splats | None:
-    """The splats of a point cloud in the form that files have, without further columns.
+    """Return the splats of a point cloud in the form of files, without additional columns.
 
     Args:
-        weights: (N,) factors on the opacities; None leaves them as they are.
+        weights: (N,) factors of the opacities; None for no factors.
 
     Returns:
-        None where the cloud lacks an attribute of splats.
+        None if the cloud lacks an attribute of splats.
     """
     means, base = read_attribute(cloud, "position"), read_attribute(cloud, BASE)
     scale, rotation = read_attribute(cloud, SCALE), read_attribute(cloud, ROTATION)
@@ -177,37 +180,37 @@ def splats_of(cloud: bpy.types.PointCloud, weights: np.ndarray | None = None) ->
     logits = np.log(opacity / (1 - opacity)).astype(np.float32)
     return Splats(
         means=means,
-        quats=_kept(cloud, QUATERNION, _unit, rotation, rotation),
-        log_scales=_kept(cloud, LOG_SCALE, _exp, scale, np.log(np.maximum(scale, tiny))),
-        opacity_logits=_kept(cloud, OPACITY_LOGIT, _sigmoid, base[:, 3], logits),
+        quats=_stored_or_inverse(cloud, QUATERNION, _unit, rotation, rotation),
+        log_scales=_stored_or_inverse(cloud, LOG_SCALE, _exp, scale, np.log(np.maximum(scale, tiny))),
+        opacity_logits=_stored_or_inverse(cloud, OPACITY_LOGIT, _sigmoid, base[:, 3], logits),
         sh=sh,
     )
 
 
 def megabytes(cloud: bpy.types.PointCloud) -> float:
-    """Size of the splats as a 3DGS file, in 10^6 bytes."""
-    columns = LAYOUTS.keys() - {"BOOLEAN"}  # which no file has: Blender's own
+    """Return the size of the splats as a 3DGS file, in 10^6 bytes."""
+    columns = LAYOUTS.keys() - {"BOOLEAN"}  # files have no booleans
     names = [a.name for a in cloud.attributes if a.data_type in columns and a.domain == "POINT"]
-    own = _OWN - {"position", BASE, SCALE, ROTATION}
-    widths = [LAYOUTS[cloud.attributes[name].data_type].width for name in names if name not in own]
+    derived = _OWN - {"position", BASE, SCALE, ROTATION}
+    widths = [LAYOUTS[cloud.attributes[name].data_type].width for name in names if name not in derived]
     normals = 3
     return len(cloud.points) * 4e-6 * (sum(widths) + normals)
 
 
 def sh_degree(cloud: bpy.types.PointCloud) -> int:
-    """The degree of the spherical harmonics that a point cloud of splats carries."""
+    """Return the degree of the spherical harmonics of a point cloud of splats."""
     return int((len(sh_names(cloud)) + 1) ** 0.5) - 1
 
 
 def to_bytes(colors: np.ndarray) -> np.ndarray:
-    """Display colours in [0, 1], clipped and rounded to uint8."""
+    """Convert display colours in [0, 1] to uint8, clipped and rounded."""
     return (np.clip(colors, 0, 1) * np.float32(255) + np.float32(0.5)).astype(np.uint8)
 
 
 def write_column(data: bpy.types.PointCloud | bpy.types.Mesh, name: str, values: np.ndarray) -> None:
-    """Sets an attribute to a file's own column, (N,) of any type that PLY has.
+    """Store a file column (N,) of any PLY type as an attribute.
 
-    What Blender has no type for is remembered.
+    Types that Blender lacks are recorded in a custom property.
     """
     if values.dtype == np.float32:
         write_attribute(data, name, "FLOAT", values)
@@ -222,15 +225,15 @@ def write_column(data: bpy.types.PointCloud | bpy.types.Mesh, name: str, values:
 def read_column(
     data: bpy.types.PointCloud | bpy.types.Mesh, name: str, types: bpy.types.PointCloud | bpy.types.Mesh
 ) -> np.ndarray | None:
-    """The column (N,) of an attribute that :func:`write_column` has set; None where it holds no such.
+    """Return the column (N,) stored by :func:`write_column`, or None if the attribute is not such a column.
 
     Args:
-        types: the original, where the data are evaluated: only that remembers types.
+        types: Original datablock with the recorded types; evaluated data have none.
     """
-    values, kind = read_attribute(data, name), types.get(_TYPE + name)
+    values, dtype = read_attribute(data, name), types.get(_TYPE + name)
     if values is not None and values.ndim == 2:
-        return values.reshape(-1).view(np.float64) if kind else None
-    return values if values is None or kind is None else values.astype(kind)
+        return values.reshape(-1).view(np.float64) if dtype else None
+    return values if values is None or dtype is None else values.astype(dtype)
 
 
 def _set_colors(obj: bpy.types.Object, colors: np.ndarray) -> None:
@@ -240,24 +243,23 @@ def _set_colors(obj: bpy.types.Object, colors: np.ndarray) -> None:
     rgba[:, :3] = linear[colors]
     write_attribute(obj.data, COLOR, "FLOAT_COLOR", rgba)
     if len(colors):
-        obj.color = rgba.mean(axis=0)  # what Solid shading can show of a point cloud
+        obj.color = rgba.mean(axis=0)  # Solid shading shows one colour per point cloud
 
 
-def _kept(cloud, name: str, activate, visible: np.ndarray, inverse: np.ndarray) -> np.ndarray:
-    """The stored values where they still activate to the visible ones, the inverse elsewhere."""
+def _stored_or_inverse(cloud, name: str, activate, visible: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+    """Return stored values that still activate to the visible ones, and inverse values elsewhere."""
     stored = read_attribute(cloud, name)
     if stored is None:
         return inverse
     with np.errstate(all="ignore"):
-        # Machines differ in the last bits of exp; an edit that small is none.
+        # Machines differ in the last bits of exp; smaller differences are not edits.
         same = np.isclose(activate(stored), visible, rtol=1e-5, atol=1e-7)
     if same.ndim == 2:
         same = same.all(axis=1, keepdims=True)
     return stored if same.all() else np.where(same, stored, inverse)
 
 
-# The next three functions round as Blender's importers do, so that both give the same bits and Cycles, whose
-# noise depends on them, the same image.
+# The next three functions round as Blender's importers do: Cycles noise depends on the exact bits.
 
 
 def _exp(values: np.ndarray) -> np.ndarray:

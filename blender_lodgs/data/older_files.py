@@ -1,4 +1,4 @@
-"""Files that older versions saved: they open, and choose their levels as before."""
+"""Upgrade of files saved by older versions."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from ..nodes import display
 from . import looks, selection
 
 
-def bring_up_to_date(root: bpy.types.Object) -> None:
-    """Renews a splat scene that an older version saved; one of this version stays as it is."""
+def upgrade_scene(root: bpy.types.Object) -> None:
+    """Upgrade a splat scene of an older version; scenes of this version stay unchanged."""
     if root.lodgs.itself is None:
         root.lodgs.itself = root
     rule, levels = find_rule(root.lodgs.rule), [item.number for item in root.lodgs.levels if item.exists]
-    if rule is not None and levels and not root.lodgs.begun:  # as long as nobody had set it, it went along
+    if rule is not None and levels and not root.lodgs.begun:  # older versions moved the unset control along
         finest = {control.name: levels[-1] for control in rule.controls if control.follows == "finest"}
         root.lodgs.begun = json.dumps(finest)
     if selection.outdated(root) or looks.outdated(root):
@@ -26,7 +26,7 @@ def bring_up_to_date(root: bpy.types.Object) -> None:
 
 @bpy.app.handlers.persistent
 def _on_load(*_) -> None:
-    """After opening a file, and after appending from one. What is linked stays as its own file has it."""
+    """Upgrade editable data after a file is opened or appended from; linked data stay unchanged."""
     for cloud in bpy.data.pointclouds:
         if cloud.is_editable and BASE in cloud.attributes:
             rename_sh(cloud)
@@ -40,7 +40,7 @@ def _on_load(*_) -> None:
             display.attach(obj)
     for obj in bpy.data.objects:
         if obj.lodgs.is_root and obj.is_editable:
-            bring_up_to_date(obj)
+            upgrade_scene(obj)
 
 
 _HANDLERS = (bpy.app.handlers.load_post, bpy.app.handlers.blend_import_post)

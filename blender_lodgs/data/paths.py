@@ -1,7 +1,6 @@
-"""Paths of scenes lead where they led where a file is saved in another folder, as images' do.
+"""Relative paths of splat scenes stay valid when the file is saved in another folder.
 
-Blender does not know what paths an extension keeps: relative to the file ("//") they would then mean
-something else.
+Blender remaps its own relative paths ("//"), but not those of extensions.
 """
 
 from __future__ import annotations
@@ -12,14 +11,14 @@ from contextlib import suppress
 
 import bpy
 
-_before: list[tuple[bpy.types.bpy_struct, str, str]] = []
-"""What paths were before the file is saved elsewhere: where, which property, its value."""
-_file = ""
-"""The file that was open then."""
+_previous: list[tuple[bpy.types.bpy_struct, str, str]] = []
+"""Owners, property names and values of paths before the file is saved in another folder."""
+_open_file = ""
+"""File that was open then."""
 
 
 def relative_paths() -> Iterator[tuple[bpy.types.bpy_struct, str, str]]:
-    """The paths of scenes of this file that are relative to it: where, which property, its value."""
+    """Return the relative paths of this file's scenes as tuples of owner, property name and value."""
     owners: list[bpy.types.bpy_struct] = []
     for obj in bpy.data.objects:
         if obj.is_editable and obj.lodgs.is_root:
@@ -30,37 +29,37 @@ def relative_paths() -> Iterator[tuple[bpy.types.bpy_struct, str, str]]:
         if scene.is_editable:
             owners += [scene.lodgs_render, scene.lodgs_capture]
     for owner in owners:
-        for each in owner.bl_rna.properties:
-            if each.type == "STRING" and each.subtype in ("FILE_PATH", "DIR_PATH"):
-                value = getattr(owner, each.identifier)
+        for prop in owner.bl_rna.properties:
+            if prop.type == "STRING" and prop.subtype in ("FILE_PATH", "DIR_PATH"):
+                value = getattr(owner, prop.identifier)
                 if value.startswith("//"):
-                    yield owner, each.identifier, value
+                    yield owner, prop.identifier, value
 
 
 @bpy.app.handlers.persistent
 def _on_save(path: str = "", *_) -> None:
-    """Writes paths as they are from where the file will be."""
-    global _file
-    _before.clear()
-    _file = bpy.data.filepath
-    here, there = (os.path.dirname(os.path.abspath(each)) for each in (_file, path))
-    if not (_file and path) or here == there:
+    """Make paths relative to the folder where the file will be saved."""
+    global _open_file
+    _previous.clear()
+    _open_file = bpy.data.filepath
+    old_folder, new_folder = (os.path.dirname(os.path.abspath(file)) for file in (_open_file, path))
+    if not (_open_file and path) or old_folder == new_folder:
         return
     for owner, name, value in list(relative_paths()):
-        moved = bpy.path.abspath(value)
+        remapped = bpy.path.abspath(value)
         with suppress(ValueError):  # on another drive
-            moved = bpy.path.relpath(moved, start=there)
-        setattr(owner, name, moved)
-        _before.append((owner, name, value))
+            remapped = bpy.path.relpath(remapped, start=new_folder)
+        setattr(owner, name, remapped)
+        _previous.append((owner, name, value))
 
 
 @bpy.app.handlers.persistent
 def _on_saved(*_) -> None:
-    """Where a copy was saved, or nothing, the file that is open has not moved."""
-    if bpy.data.filepath == _file:
-        for owner, name, value in _before:
+    """Restore the paths if the open file has not moved: after saving a copy or a failed save."""
+    if bpy.data.filepath == _open_file:
+        for owner, name, value in _previous:
             setattr(owner, name, value)
-    _before.clear()
+    _previous.clear()
 
 
 def register() -> None:

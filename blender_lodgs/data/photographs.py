@@ -1,4 +1,4 @@
-"""The views of a splat scene in Blender: camera objects that stand where its photographs were taken."""
+"""Views of a splat scene: camera objects at the poses of its photos."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from ...training.splats.dialects import Warn, ignore
 from ..attributes import HIDDEN, read_attribute
 from . import crops, selection
 from .objects import root_of
-from .placement import in_parent
+from .placement import matrix_in_parent
 
 SENSOR = 36.0
-"""Longer side of every imported camera's sensor in millimetres: lenses read as on a full-frame camera."""
+"""Longer side of imported cameras' sensors in millimetres, as on a full-frame camera."""
 
 
 class View(Protocol):
-    """What the render takes over of a view: of a ``Camera``, or of the data of an imported camera object."""
+    """Size and focal lengths of a view: a ``Camera``, or the data of an imported camera object."""
 
     @property
     def width(self) -> int: ...
@@ -39,23 +39,23 @@ class View(Protocol):
 def new_camera(
     camera: Camera, extent: float, near: float, *, photograph: bool, distorted: bool = False
 ) -> bpy.types.Object:
-    """A view as a camera object that is in no collection yet, placed in COLMAP's world.
+    """Create a camera object of a view in COLMAP's world, not yet in a collection.
 
     Args:
-        extent: the scene's, in its own units; sizes the object's display.
-        near: depth from which on splats are trained and measured, in the same units.
-        photograph: show the view's photograph behind it.
-        distorted: the lens bends lines in the photograph.
+        extent: Extent of the scene in its own units; sets the display size of the object.
+        near: Depth where splats begin in training and evaluation, in the same units.
+        photograph: Show the view's photo behind it.
+        distorted: The photo has lens distortion.
     """
     data = bpy.data.cameras.new(camera.name)
     _fit(data, camera, distorted)
     data.display_size = extent / 20
     data.clip_start, data.clip_end = near, extent * 1000
     if photograph and camera.image is not None:
-        picture = data.background_images.new()
-        picture.image = bpy.data.images.load(str(camera.image), check_existing=True)
-        picture.alpha = 1.0
-        picture.frame_method = "STRETCH"
+        background = data.background_images.new()
+        background.image = bpy.data.images.load(str(camera.image), check_existing=True)
+        background.alpha = 1.0
+        background.frame_method = "STRETCH"
         data.show_background_images = True
     obj = bpy.data.objects.new(camera.name, data)
     obj.matrix_basis = Matrix((np.linalg.inv(camera.world_to_camera) @ np.diag([1, -1, -1, 1])).tolist())
@@ -65,36 +65,36 @@ def new_camera(
 def show_undistorted(
     context: bpy.types.Context, root: bpy.types.Object, names: Sequence[str], scene: Scene
 ) -> None:
-    """Gives a scene's views the photographs without their lens's distortion, and cameras that fit these.
+    """Replace the photos of a scene's views by undistorted ones, and adjust the cameras.
 
     Args:
-        names: of all views of the model, in order.
-        scene: see ``undistort.undistorted``.
+        names: Names of all views of the model, in order.
+        scene: Undistorted scene; see ``undistort.undistort_scene``.
     """
-    found = {camera.name: camera for camera in scene.cameras}
+    undistorted = {camera.name: camera for camera in scene.cameras}
     for view in views(root):
-        facts = view.data.lodgs
-        camera = found.get(names[facts.place]) if 0 <= facts.place < len(names) else None
-        if camera is None or not facts.distorted:
+        settings = view.data.lodgs
+        camera = undistorted.get(names[settings.place]) if 0 <= settings.place < len(names) else None
+        if camera is None or not settings.distorted:
             continue
         _fit(view.data, camera, distorted=False)
-        for picture in view.data.background_images:
-            before = picture.image
-            picture.image = bpy.data.images.load(str(camera.image), check_existing=True)
-            if before is not None and not before.users:
-                bpy.data.images.remove(before)
+        for background in view.data.background_images:
+            old_image = background.image
+            background.image = bpy.data.images.load(str(camera.image), check_existing=True)
+            if old_image is not None and not old_image.users:
+                bpy.data.images.remove(old_image)
         if context.scene.camera == view:
             match_render(context.scene, camera, context.scene.render.resolution_percentage)
 
 
 def _fit(data: bpy.types.Camera, camera: Camera, distorted: bool) -> None:
-    """Has a camera see what a view's photograph shows."""
+    """Set lens, sensor and shift of a camera to those of a view."""
     long = max(camera.width, camera.height)
     wide = camera.width >= camera.height
     data.sensor_fit = "HORIZONTAL" if wide else "VERTICAL"
     data.sensor_width, data.sensor_height = SENSOR * camera.width / long, SENSOR * camera.height / long
     data.lens = (camera.fx if wide else camera.fy) * SENSOR / long
-    # Blender's shift moves the frame, in parts of the fitted side; the principal point moves the other way.
+    # Blender's shift moves the frame, as a fraction of the fitted side, against the principal point.
     pixel = camera.fy / camera.fx
     data.shift_x = (camera.width / 2 - camera.cx) / long * (1 if wide else pixel)
     data.shift_y = (camera.cy - camera.height / 2) / long / (pixel if wide else 1)
@@ -105,200 +105,227 @@ def _fit(data: bpy.types.Camera, camera: Camera, distorted: bool) -> None:
 
 
 def camera_of(view: bpy.types.Object) -> Camera:
-    """The view that :func:`new_camera` has made a camera object of, as far as Blender's float32 hold it."""
-    data, own = view.data, view.data.lodgs
-    long, wide, pixel = max(own.width, own.height), own.width >= own.height, own.fy / own.fx
+    """Return the view of a camera object from :func:`new_camera`, to the precision of Blender's float32."""
+    data, settings = view.data, view.data.lodgs
+    long, wide, pixel = (
+        max(settings.width, settings.height),
+        settings.width >= settings.height,
+        settings.fy / settings.fx,
+    )
     pose = np.array(view.matrix_basis, np.float64) @ np.diag([1.0, -1.0, -1.0, 1.0])
     return Camera(
-        view.name, own.width, own.height, own.fx, own.fy,
-        own.width / 2 - data.shift_x * long / (1 if wide else pixel),
-        own.height / 2 + data.shift_y * long * (pixel if wide else 1),
+        view.name, settings.width, settings.height, settings.fx, settings.fy,
+        settings.width / 2 - data.shift_x * long / (1 if wide else pixel),
+        settings.height / 2 + data.shift_y * long * (pixel if wide else 1),
         np.linalg.inv(pose),
     )  # fmt: skip
 
 
 def views(root: bpy.types.Object) -> list[bpy.types.Object]:
-    """The camera objects of a scene that are still there, by name."""
+    """Return the existing camera objects of a scene, sorted by name."""
     cameras = root.lodgs.cameras
-    found = [obj for obj in cameras.objects if obj.type == "CAMERA"] if cameras else []
-    return sorted(found, key=lambda obj: obj.name)
+    objects = [obj for obj in cameras.objects if obj.type == "CAMERA"] if cameras else []
+    return sorted(objects, key=lambda obj: obj.name)
 
 
-def photographed(root: bpy.types.Object) -> list[bpy.types.Object]:
-    """The views that have a photograph: those of an imported file of splats have none."""
+def views_with_photo(root: bpy.types.Object) -> list[bpy.types.Object]:
+    """Return the views with a photo; those of imported splat files have none."""
     return [view for view in views(root) if view.data.lodgs.photograph]
 
 
 def held_out(root: bpy.types.Object) -> list[bpy.types.Object]:
-    """The views that the run of the scene's levels did not train on, as far as it says so."""
+    """Return the held-out views of the scene's run, if recorded."""
     return [view for view in views(root) if is_held_out(root, view)]
 
 
 def is_held_out(root: bpy.types.Object, view: bpy.types.Object) -> bool:
-    """Whether the run of the scene's levels did not train on a view; False where it does not say so."""
-    facts = view.data.lodgs
-    if facts.is_property_set("held_out"):
-        return facts.held_out
+    """Return True if the scene's run held out a view; False if that is not recorded."""
+    settings = view.data.lodgs
+    if settings.is_property_set("held_out"):
+        return settings.held_out
     match selection.read_json(root.lodgs.meta).get("held_out"):
         case [*rests, int(every)] if every > 0:
-            return facts.place % every in rests
+            return settings.place % every in rests
     return False
 
 
 def look_through(context: bpy.types.Context, root: bpy.types.Object, step: int = 0) -> bpy.types.Object:
-    """Makes one of the views the scene's camera, and gives the render its size.
+    """Make one of the views the active camera and set the render size.
 
     Args:
-        step: how many views to go on by name from the scene's camera; 0 takes the active object, where that
-            is a view.
+        step: Number of views to advance by name from the active camera; 0 takes the active object if it is a
+            view.
 
     Returns:
         The camera object.
 
     Raises:
-        LodgsError: the scene has no cameras.
+        LodgsError: The scene has no cameras.
     """
     cameras = views(root)
     if not cameras:
-        raise LodgsError(f"'{root.name}' has no cameras.", "Import a COLMAP folder.")
+        raise LodgsError(
+            f"Cannot look through a view: '{root.name}' has no cameras.", "Import a COLMAP folder."
+        )
     current = context.scene.camera
     if step == 0 and context.active_object in cameras:
         current = context.active_object
     index = cameras.index(current) if current in cameras else min(-step, 0)
-    return through(context, cameras[(index + step) % len(cameras)])
+    return use_view(context, cameras[(index + step) % len(cameras)])
 
 
 def look_at_scene(context: bpy.types.Context, root: bpy.types.Object, warn: Warn = ignore) -> None:
-    """Turns the window's viewports to a splat scene, to orbit there: as it was photographed, where that is
-    known, else from where they look already, with most of it in sight. They see as far as its sky.
+    """Show a splat scene in the window's viewports and extend their clip range to its sky.
+
+    The viewports take the pose of the photos if it is known; otherwise they keep their direction and frame
+    the scene.
 
     Args:
-        warn: told of meshes that stand between where it was photographed from and what was seen there, such
-            as a new file's cube: they are hidden, or there would be nothing else to see.
+        warn: Function that receives a sentence for each mesh that is hidden because it blocks the view from
+            the photos, such as the cube of a new file.
     """
-    photographed = photographed_from(root)
-    for obj in _in_the_way(context, *photographed) if photographed is not None else ():
+    viewpoint = photo_viewpoint(root)
+    for obj in _blocking_meshes(context, *viewpoint) if viewpoint is not None else ():
         obj.hide_set(True)
-        warn(f"'{obj.name}' stands before the cameras and is hidden; Alt+H shows it.")
-    if photographed is None:
-        frame(context, root)
+        warn(f"Hid '{obj.name}', which blocks the view of the splats. Press Alt+H to show it.")
+    if viewpoint is None:
+        frame_scene(context, root)
         return
-    eye, target = photographed
-    for looks in _viewports(context, root):
-        looks.view_rotation = (eye - target).to_track_quat("Z", "Y")
-        looks.view_location, looks.view_distance = target, (eye - target).length
+    position, target = viewpoint
+    for region in _viewports(context, root):
+        region.view_rotation = (position - target).to_track_quat("Z", "Y")
+        region.view_location, region.view_distance = target, (position - target).length
 
 
-def frame(context: bpy.types.Context, root: bpy.types.Object) -> None:
-    """Has most of what is left of a splat scene in sight of the window's viewports, from the side that they
-    look from: far outliers do not count."""
-    if (bounds := bounds_of_most(root)) is not None:
-        for looks in _viewports(context, root):
-            looks.view_location, size = bounds
-            looks.view_distance = 1.5 * size
+def frame_scene(context: bpy.types.Context, root: bpy.types.Object) -> None:
+    """Frame most of a splat scene in the window's viewports without rotating them; outliers are ignored."""
+    if (bounds := central_bounds(root)) is not None:
+        for region in _viewports(context, root):
+            region.view_location, size = bounds
+            region.view_distance = 1.5 * size
 
 
 def _viewports(context: bpy.types.Context, root: bpy.types.Object) -> list[bpy.types.RegionView3D]:
-    """The window's viewports, out of cameras, and with all of a splat scene before their far end."""
-    found, reach = [], _reach(root)
+    """Return the window's viewports, set to free perspective and a clip range that covers a splat scene."""
+    regions, reach = [], _reach(root)
     for area in context.screen.areas if context.screen is not None else ():
         if area.type == "VIEW_3D":
             space = area.spaces.active
             space.clip_end = max(space.clip_end, reach)
             space.region_3d.view_perspective = "PERSP"
-            found.append(space.region_3d)
-    return found
+            regions.append(space.region_3d)
+    return regions
 
 
-def _in_the_way(context: bpy.types.Context, eye: Vector, target: Vector) -> list[bpy.types.Object]:
-    """The meshes that can be seen, through whose box the way from an eye to a target leads."""
-    found = []
+def _blocking_meshes(context: bpy.types.Context, position: Vector, target: Vector) -> list[bpy.types.Object]:
+    """Return the visible meshes whose bounding box intersects the segment from a position to a target."""
+    blocking = []
     for obj in context.view_layer.objects:
         if obj.type == "MESH" and obj.visible_get():
             to_local = obj.matrix_world.inverted_safe()
-            begin, end = np.array(to_local @ eye), np.array(to_local @ target)
-            corners, way = np.array(obj.bound_box), end - begin
-            way[way == 0] = 1e-30
-            enters, leaves = np.sort([(corners.min(0) - begin) / way, (corners.max(0) - begin) / way], axis=0)
-            if max(enters.max(), 0) <= min(leaves.min(), 1):
-                found.append(obj)
-    return found
+            start, end = np.array(to_local @ position), np.array(to_local @ target)
+            corners, direction = np.array(obj.bound_box), end - start
+            direction[direction == 0] = 1e-30
+            entry, exit = np.sort(
+                [(corners.min(0) - start) / direction, (corners.max(0) - start) / direction], axis=0
+            )
+            if max(entry.max(), 0) <= min(exit.min(), 1):
+                blocking.append(obj)
+    return blocking
 
 
-def photographed_from(root: bpy.types.Object) -> tuple[Vector, Vector] | None:
-    """An eye and what it looks at, in the root's parent: what a bundle records, or else of the view in the
-    middle of all views, at the median depth of the points. None where neither is there."""
+def photo_viewpoint(root: bpy.types.Object) -> tuple[Vector, Vector] | None:
+    """Return a camera position and its target, in the space of the root's parent.
+
+    They come from the bundle, or from the most central view and the median depth of the points. None without
+    both.
+    """
     meta = selection.read_json(root.lodgs.meta)
     if "view" in meta:
-        eye, target = (in_parent(root) @ Vector(place) for place in meta["view"])
-        return eye, target
-    poses, places = np.array([view.matrix_basis for view in views(root)]), _positions(root.lodgs.points)
-    if not len(poses) or not len(places):
+        position, target = (matrix_in_parent(root) @ Vector(point) for point in meta["view"])
+        return position, target
+    poses, points = np.array([view.matrix_basis for view in views(root)]), _positions(root.lodgs.points)
+    if not len(poses) or not len(points):
         return None
-    eyes = poses[:, :3, 3]
-    pose = poses[np.linalg.norm(eyes - eyes.mean(0), axis=1).argmin()]
-    eye, ahead = pose[:3, 3], -pose[:3, 2]
-    depths = (places - eye) @ ahead
+    positions = poses[:, :3, 3]
+    pose = poses[np.linalg.norm(positions - positions.mean(0), axis=1).argmin()]
+    position, direction = pose[:3, 3], -pose[:3, 2]
+    depths = (points - position) @ direction
     depth = np.median(depths[depths > 0]) if (depths > 0).any() else 1.0
-    return in_parent(root) @ Vector(eye), in_parent(root) @ Vector(eye + depth * ahead)
+    return matrix_in_parent(root) @ Vector(position), matrix_in_parent(root) @ Vector(
+        position + depth * direction
+    )
 
 
-def bounds_of_most(root: bpy.types.Object) -> tuple[Vector, float] | None:
-    """Middle and diagonal, in the root's parent, of a box around nine tenths of what is left of the finest
-    level along each axis, or of the points without splats: far outliers, which both always have, are not
-    in it. None without either."""
-    places = _most_places(root)
-    if not len(places):
+def central_bounds(root: bpy.types.Object) -> tuple[Vector, float] | None:
+    """Return center and diagonal of a box around most of a scene, in the space of the root's parent.
+
+    The box encloses nine tenths of the remaining finest level along each axis, or of the points, without
+    outliers. None if the scene has neither.
+    """
+    points = _central_points(root)
+    if not len(points):
         return None
-    low, high = np.percentile(places, (5, 95), axis=0)
-    size = float(np.linalg.norm(high - low)) * max(in_parent(root).to_scale())
-    return in_parent(root) @ Vector((low + high) / 2), size
+    low, high = np.percentile(points, (5, 95), axis=0)
+    size = float(np.linalg.norm(high - low)) * max(matrix_in_parent(root).to_scale())
+    return matrix_in_parent(root) @ Vector((low + high) / 2), size
 
 
 def _reach(root: bpy.types.Object) -> float:
-    """How far a viewport has to see: across all splats of the finest level, or a hundred times most of them
-    where some are lost in space; 0 without splats."""
-    bounds = bounds_of_most(root)
+    """Return the clip distance for viewports: the extent of all splats, up to a hundred times
+    :func:`central_bounds`.
+
+    0 without splats.
+    """
+    bounds = central_bounds(root)
     if bounds is None:
         return 0.0
-    across = float(np.linalg.norm(np.ptp(_most_places(root), axis=0))) * max(in_parent(root).to_scale())
+    across = float(np.linalg.norm(np.ptp(_central_points(root), axis=0))) * max(
+        matrix_in_parent(root).to_scale()
+    )
     return min(across, 100 * bounds[1])
 
 
-def _most_places(root: bpy.types.Object) -> np.ndarray:
-    """(N, 3) places of the finest level, or without levels of the points, in the scene's own space; those
-    that crops and hiding leave, if they leave some."""
+def _central_points(root: bpy.types.Object) -> np.ndarray:
+    """Return positions (N, 3) of the finest level or of the points, in the scene's own space.
+
+    Cropped and hidden splats are excluded unless none would remain.
+    """
     levels = [item.object for item in root.lodgs.levels if item.exists]
     if not levels:
         return _positions(root.lodgs.points)
-    places, hidden = _positions(levels[-1]), read_attribute(levels[-1].data, HIDDEN)
-    left = crop_mask(crops.as_objects_stand(root, bpy.context.evaluated_depsgraph_get()), places)
+    points, hidden = _positions(levels[-1]), read_attribute(levels[-1].data, HIDDEN)
+    remaining = crop_mask(crops.evaluated_crops(root, bpy.context.evaluated_depsgraph_get()), points)
     if hidden is not None:
-        left &= ~hidden.astype(bool)
-    return places[left] if left.any() else places
+        remaining &= ~hidden.astype(bool)
+    return points[remaining] if remaining.any() else points
 
 
 def _positions(obj: bpy.types.Object | None) -> np.ndarray:
-    """(N, 3) places of an object's points, in its own space."""
-    found = None if obj is None else read_attribute(obj.data, "position")
-    return np.zeros((0, 3), np.float32) if found is None else found
+    """Return the positions (N, 3) of an object's points, in its own space."""
+    values = None if obj is None else read_attribute(obj.data, "position")
+    return np.zeros((0, 3), np.float32) if values is None else values
 
 
-def through(context: bpy.types.Context, view: bpy.types.Object) -> bpy.types.Object:
-    """Makes a view the scene's camera, and gives the render its size. Returns the view."""
+def use_view(context: bpy.types.Context, view: bpy.types.Object) -> bpy.types.Object:
+    """Make a view the active camera and set the render size.
+
+    Returns:
+        The view.
+    """
     context.scene.camera = view
     if view.data.lodgs.width:
         match_render(context.scene, view.data.lodgs, context.scene.render.resolution_percentage)
     root = root_of(view)
     if root is not None and root.lodgs.cameras is not None:
-        line = root.lodgs.cameras.objects.find(view.name)
-        if line >= 0 and line != root.lodgs.active_view:  # the list of views goes along
-            root.lodgs.active_view = line
+        row = root.lodgs.cameras.objects.find(view.name)
+        if row >= 0 and row != root.lodgs.active_view:  # keep the list of views in sync
+            root.lodgs.active_view = row
     return view
 
 
 def match_render(scene: bpy.types.Scene, view: View, percentage: int = 100) -> None:
-    """Gives the render the size and the pixel shape of a view."""
+    """Set the render size and pixel aspect to those of a view."""
     render = scene.render
     render.resolution_x, render.resolution_y = view.width, view.height
     render.resolution_percentage = percentage

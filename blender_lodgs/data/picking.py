@@ -1,4 +1,4 @@
-"""Which splat scene is seen at a pixel of a viewport."""
+"""Picking of splat scenes in a viewport."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from ..attributes import BASE, SCALE, WEIGHT, read_attribute
 from .objects import root_of
 from .shown import SplatInstance, splat_instances
 
-DIM = 0.5
-"""Share of the light that the picked splats and those before them let through at most: fog is not picked."""
-FAINTEST = 1 / 255
-"""Splats of less opacity at the pixel do not count."""
+MAX_TRANSMITTANCE = 0.5
+"""Maximum transmittance at the picked splat; fog is not picked."""
+MIN_ALPHA = 1 / 255
+"""Minimum opacity of a splat at the pixel."""
 
 
 def scene_at(
@@ -26,29 +26,30 @@ def scene_at(
     at: tuple[float, float],
     before: float = np.inf,
 ) -> bpy.types.Object | None:
-    """The root of the splats that are seen at a pixel, or their object where they are in no scene.
+    """Return the root of the splats at a pixel, or their object if they are in no scene.
 
-    Splats count as round there, of their mean width; which one comes first is told by their means.
+    Splats are treated as round, with their mean width, and sorted by their means.
 
     Args:
-        viewport: see ``shown.splat_instances``.
-        view, projection: from the world to the camera's space, and on to clip space.
-        size: the viewport's (W, H) in pixels.
-        at: the pixel, x from the left and y from below.
-        before: depth in the world of what hides the splats behind it there.
+        viewport: See ``shown.splat_instances``.
+        view: Matrix from the world to the camera's space.
+        projection: Matrix from the camera's space to clip space.
+        size: Size (W, H) of the viewport in pixels.
+        at: Pixel, x from the left and y from below.
+        before: Depth in the world beyond which splats are occluded at the pixel.
 
     Returns:
-        None where no splats are, or not enough of them to hide half of what is behind.
+        None if the splats at the pixel hide less than half of the background.
     """
     instances = splat_instances(depsgraph, viewport)
-    found = [_at_pixel(each, np.array(view), np.array(projection), size, at) for each in instances]
-    if not found:
+    samples = [_at_pixel(item, np.array(view), np.array(projection), size, at) for item in instances]
+    if not samples:
         return None
-    depths, alphas = (np.concatenate(each) for each in zip(*found, strict=True))
-    owners = np.repeat(np.arange(len(found)), [len(each) for each, _ in found])
+    depths, alphas = (np.concatenate(values) for values in zip(*samples, strict=True))
+    owners = np.repeat(np.arange(len(samples)), [len(values) for values, _ in samples])
     order = np.argsort(depths)
     order = order[depths[order] < before]
-    hidden = np.cumprod(1 - alphas[order]) <= DIM
+    hidden = np.cumprod(1 - alphas[order]) <= MAX_TRANSMITTANCE
     if not hidden.any():
         return None
     obj = instances[owners[order[hidden.argmax()]]].object
@@ -62,18 +63,18 @@ def _at_pixel(
     size: tuple[int, int],
     at: tuple[float, float],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Depths (M,) in the world and opacities (M,) of the splats of an instance that cover a pixel."""
+    """Return depths (M,) in the world and opacities (M,) of an instance's splats that cover a pixel."""
     cloud = instance.evaluated.data
     means, scales, base = (read_attribute(cloud, name) for name in ("position", SCALE, BASE))
     if means is None or scales is None or base is None or not len(means):
         return np.zeros(0), np.zeros(0)
-    placed = Projection.of(view @ instance.matrix_world, projection, size).place(means)
-    away = np.square(placed.x - at[0]) + np.square(placed.y - at[1])
+    projected = Projection.of(view @ instance.matrix_world, projection, size).place(means)
+    squared_distances = np.square(projected.x - at[0]) + np.square(projected.y - at[1])
     with np.errstate(divide="ignore"):
-        sigma = scales.mean(1) / placed.pixel
-    alphas = base[:, 3] * np.exp(-away / 2 / (sigma**2 + 0.3))  # 3DGS's dilation
+        sigma = scales.mean(1) / projected.pixel
+    alphas = base[:, 3] * np.exp(-squared_distances / 2 / (sigma**2 + 0.3))  # 3DGS's dilation
     weights = read_attribute(cloud, WEIGHT)
     alphas = np.minimum(alphas if weights is None else alphas * weights, 0.99)
-    covers = alphas > FAINTEST
-    unit = np.cbrt(abs(np.linalg.det(instance.matrix_world[:3, :3])))  # what is compared stands in the world
-    return placed.depth[covers] * unit, alphas[covers]
+    visible = alphas > MIN_ALPHA
+    scale = np.cbrt(abs(np.linalg.det(instance.matrix_world[:3, :3])))  # instances are compared in the world
+    return projected.depth[visible] * scale, alphas[visible]

@@ -1,10 +1,10 @@
-"""Where a splat scene stands: its root, which is the artist's, and below that its axes.
+"""Placement of a splat scene by its root and its axes.
 
-The axes are an empty in whose space the files' coordinates are: all parts of the scene hang on it. What turns
-a scene upright, lays it on the ground and gives it its size is the transform of the axes, so that the root
-begins without one: artists move, turn and scale the root, by Euler angles, and Alt+R takes away no more than
-that. The axes are locked against Alt+R themselves. In files of older versions they are missing, and the root
-is in their place.
+The axes are an empty below the root; its local space has the coordinates of the files, and all parts of the
+scene are its children. The transform of the axes turns a scene upright, aligns it with the ground and scales
+it. The root starts without a transform, so that artists can move, rotate (Euler angles) and scale it, and
+Alt+R resets only their changes. The axes are locked against Alt+R. In files of older versions the axes are
+missing and the root takes their place.
 """
 
 from __future__ import annotations
@@ -16,21 +16,23 @@ from mathutils import Matrix
 from ...training.errors import LodgsError
 from ...training.splats.similarity import Similarity, is_similarity
 
-SMALL = 1e-4
-"""How large axes are drawn: nobody is to click them in place of the root."""
+DISPLAY_SIZE = 1e-4
+"""Display size of axes, too small to be clicked instead of the root."""
 
 
 def axes_of(root: bpy.types.Object) -> bpy.types.Object:
-    """The empty in whose space the coordinates of a splat scene's files are: the root itself, in older files
-    and where a root has been copied alone."""
+    """Return the empty whose local space has the coordinates of a scene's files.
+
+    This is the root itself in older files and for a copy of a root without its children.
+    """
     axes = root.lodgs.axes
     return axes if axes is not None and axes.parent == root else root
 
 
 def new_axes(root: bpy.types.Object) -> bpy.types.Object:
-    """Axes for a new root, in its collection."""
+    """Create the axes of a new root, in its collection."""
     axes = bpy.data.objects.new(f"{root.name} axes", None)
-    axes.parent, axes.rotation_mode, axes.empty_display_size = root, "QUATERNION", SMALL
+    axes.parent, axes.rotation_mode, axes.empty_display_size = root, "QUATERNION", DISPLAY_SIZE
     axes.lock_location = axes.lock_rotation = axes.lock_scale = (True, True, True)
     axes.lock_rotation_w = axes.lock_rotations_4d = True
     root.users_collection[0].objects.link(axes)
@@ -38,58 +40,64 @@ def new_axes(root: bpy.types.Object) -> bpy.types.Object:
     return axes
 
 
-def in_parent(root: bpy.types.Object) -> Matrix:
-    """From the coordinates of a splat scene to those of the root's parent, also before Blender has evaluated
-    them: mostly the world."""
+def matrix_in_parent(root: bpy.types.Object) -> Matrix:
+    """Return the matrix from a splat scene's coordinates to the space of the root's parent.
+
+    It is valid before Blender evaluates the objects. The parent's space is usually the world.
+    """
     axes = axes_of(root)
-    own = root.matrix_basis
-    return own.copy() if axes == root else own @ axes.matrix_parent_inverse @ axes.matrix_basis
+    root_matrix = root.matrix_basis
+    return (
+        root_matrix.copy() if axes == root else root_matrix @ axes.matrix_parent_inverse @ axes.matrix_basis
+    )
 
 
 def matrix_of(root: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = None) -> np.ndarray:
-    """(4, 4) float64 from a splat scene's coordinates to Blender's world, with the bits that Blender has.
+    """Return the (4, 4) float64 matrix from a splat scene's coordinates to Blender's world, unrounded.
 
     Args:
-        depsgraph: as it shows them; None: as they are.
+        depsgraph: Use the evaluated transform; None for the original one.
 
     Raises:
-        LodgsError: the root is stretched.
+        LodgsError: The root is scaled differently along its axes.
     """
     axes = axes_of(root)
-    own = axes.evaluated_get(depsgraph) if depsgraph else axes
-    matrix = np.array(own.matrix_world, np.float64)
+    evaluated = axes.evaluated_get(depsgraph) if depsgraph else axes
+    matrix = np.array(evaluated.matrix_world, np.float64)
     if not is_similarity(_orthogonal(matrix)):
         raise LodgsError(
-            f"'{root.name}' is stretched, which no camera of its files can show.",
-            "Give it one scale for all axes.",
+            f"Cannot use the transform of '{root.name}': its scale is stretched or mirrored.",
+            "Give it one positive scale for all axes.",
         )
     return matrix
 
 
 def placement_of(root: bpy.types.Object) -> Similarity:
-    """The same as it is meant: at right angles to the last bit of float64.
+    """Return the transform of :func:`matrix_of` with exactly orthogonal axes.
 
     Raises:
-        LodgsError: the root is stretched.
+        LodgsError: The root is scaled differently along its axes.
     """
     return Similarity.from_matrix(_orthogonal(matrix_of(root)))
 
 
 def move(root: bpy.types.Object, further: Similarity) -> None:
-    """Places a splat scene elsewhere in Blender's world; the root stays what it is.
+    """Apply a transform in Blender's world to a splat scene; the root stays unchanged.
 
     Raises:
-        LodgsError: the root is stretched.
+        LodgsError: The root is scaled differently along its axes.
     """
-    there = further.compose(placement_of(root))
-    axes_of(root).matrix_world = Matrix(there.matrix.tolist())
+    placement = further.compose(placement_of(root))
+    axes_of(root).matrix_world = Matrix(placement.matrix.tolist())
 
 
 def _orthogonal(matrix: np.ndarray) -> np.ndarray:
-    """A matrix (4, 4) whose columns are at right angles as well as float64 can say, where they were so as
-    well as Blender's float32 can; others stay as they are."""
-    left, scales, right = np.linalg.svd(matrix[:3, :3])
+    """Return a matrix (4, 4) with orthogonal columns in float64 if they are orthogonal in float32.
+
+    Other matrices are returned unchanged.
+    """
+    u, scales, vh = np.linalg.svd(matrix[:3, :3])
     if scales[2] > 0 and scales[0] < 1.0001 * scales[2]:
         matrix = matrix.copy()
-        matrix[:3, :3] = left @ right * scales.mean()
+        matrix[:3, :3] = u @ vh * scales.mean()
     return matrix

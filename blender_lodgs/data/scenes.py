@@ -1,8 +1,7 @@
-"""Splat scenes in Blender: a root, a collection, and in it cameras, points and levels.
+"""Levels and contents of splat scenes: API for operators and scripts.
 
-The scene root is an empty; ``root.lodgs`` holds what belongs to the scene (see ``properties.SplatScene``).
-Everything else hangs on its axes in COLMAP coordinates (see ``placement``). These functions are what
-operators call and what scripts may call.
+The scene root is an empty; ``root.lodgs`` stores the scene's settings (see ``scene_properties.SplatScene``).
+All other objects are children of its axes, in COLMAP coordinates (see ``placement``).
 """
 
 from __future__ import annotations
@@ -18,28 +17,26 @@ from ...training.editing import look, placement
 from ...training.errors import LodgsError
 from ...training.lod.rule import Tables, find_rule
 from ...training.lod.selection import check_rule, complete_splats, standalone_error
-from ...training.scenes.view_tables import VIEWS, make_view_tables
-from ...training.scenes.view_tables import transform_views as placed_views
+from ...training.scenes.view_tables import VIEWS, make_view_tables, transform_views
 from ...training.splats.gaussians import Splats
 from ...training.splats.levels import Bundle, Level
 from .. import compat, extension
 from ..nodes import ellipsoids
 from . import cleaning, crops, looks, objects, painting, selection, streams, tables
 from .controls import changed_controls, update_controls
-from .photographs import camera_of, is_held_out, photographed, views
+from .photographs import camera_of, is_held_out, views, views_with_photo
 from .placement import axes_of, placement_of
 from .roots import collection_of, roots
 
 
 def set_bundle_facts(root: bpy.types.Object, bundle: Bundle) -> None:
-    """Takes over what a bundle says beside its splats. Levels whose objects are gone leave the list.
+    """Store a bundle's metadata. Levels whose objects were deleted leave the list.
 
-    Controls take the values that it records, but for those that somebody has set. The bundle may have levels
-    without splats, or none at all while they are on their way.
+    Controls that the user has not set take the recorded values. During training, the bundle may have no
+    levels or levels without splats.
 
     Raises:
-        LodgsError: a value that it records is not possible, or it contradicts its rule. Nothing is taken over
-            in that case.
+        LodgsError: A recorded value is invalid or contradicts the rule. Nothing is changed in that case.
     """
     settings, rule = root.lodgs, check_rule(bundle)
     for control in rule.controls if rule else ():
@@ -60,17 +57,17 @@ def set_bundle_facts(root: bpy.types.Object, bundle: Bundle) -> None:
     levels_changed(root)
 
 
-def set_tables(root: bpy.types.Object, given: Tables) -> None:
-    """Gives a splat scene the tables of its bundle, in place of those that it has.
+def set_tables(root: bpy.types.Object, new_tables: Tables) -> None:
+    """Replace the tables of a splat scene by those of its bundle.
 
-    Apart from :func:`set_bundle_facts`: while levels are on their way, there are none yet.
+    Separate from :func:`set_bundle_facts` because tables arrive after the levels.
     """
-    tables.set_tables(root, given)
+    tables.set_tables(root, new_tables)
     selection.update_inputs(root)
 
 
 def set_level(root: bpy.types.Object, level: Level) -> bpy.types.Object:
-    """Adds a level to a splat scene, or replaces the one of its number; a new finest one is shown.
+    """Add a level to a splat scene, or replace the level of the same number; a new finest one is shown.
 
     COLMAP's points are hidden when the first level arrives.
 
@@ -89,57 +86,54 @@ def set_level(root: bpy.types.Object, level: Level) -> bpy.types.Object:
 
 
 def contents(root: bpy.types.Object) -> str:
-    """What a splat scene holds, in a few words: photographs, points, levels and their splats."""
+    """Describe the contents of a splat scene briefly: photos, views, points, levels and splats."""
     levels = [item.object for item in root.lodgs.levels if item.exists]
     counts = (
-        (len(photographed(root)), "photograph"),
-        (len(views(root)) - len(photographed(root)), "view"),
+        (len(views_with_photo(root)), "photo"),
+        (len(views(root)) - len(views_with_photo(root)), "view"),
         (len(root.lodgs.points.data.points) if root.lodgs.points else 0, "point"),
         (len(levels), "level"),
         (sum(len(obj.data.points) for obj in levels), "splat"),
     )
-    return ", ".join(f"{count:,} {what}{'s' * (count != 1)}" for count, what in counts if count)
+    return ", ".join(f"{count:,} {noun}{'s' * (count != 1)}" for count, noun in counts if count)
 
 
-def make_room(root: bpy.types.Object, number: int) -> None:
-    """Removes tables and all levels but one, whose object the next set's first level takes over, and ends
-    reading from a file.
+def prepare_refill(root: bpy.types.Object, number: int) -> None:
+    """Remove tables, streaming and all levels but one, whose object the first new level reuses.
 
     Args:
-        number: of that level. Where there is none of this number, the finest of those here takes it.
+        number: Number of that level. If there is none of this number, the finest level takes it.
     """
     tables.remove_tables(root)
-    streams.end(root)
-    painting.keep(root)
-    there = [item for item in root.lodgs.levels if item.exists]
-    kept = next((item for item in there if item.number == number), there[-1] if there else None)
-    for item in there:
-        if item != kept:
+    streams.stop_streaming(root)
+    painting.save_paint(root)
+    existing = [item for item in root.lodgs.levels if item.exists]
+    reused = next((item for item in existing if item.number == number), existing[-1] if existing else None)
+    for item in existing:
+        if item != reused:
             cloud = item.object.data
             bpy.data.objects.remove(item.object)
             if not cloud.users:
                 bpy.data.pointclouds.remove(cloud)
-    if kept is not None:
-        if kept.object.name == _level_name(root, kept.number):
-            kept.object.name = _level_name(root, number)
-        kept.number = number
+    if reused is not None:
+        if reused.object.name == _level_name(root, reused.number):
+            reused.object.name = _level_name(root, number)
+        reused.number = number
     levels_changed(root)
 
 
 def read_levels(root: bpy.types.Object, placed: bool = False, looked: bool = False) -> Bundle:
-    """The levels of a splat scene with all that artists have changed in them, modifiers not applied.
-
-    What is hidden, and what crops leave out, is not among them.
+    """Return the edited levels of a splat scene, without modifiers, hidden splats and cropped splats.
 
     Args:
-        placed: where the scene stands in Blender, upright there; otherwise in the splats' own world. What of
-            its objects has been moved by itself counts in neither.
-        looked: as paint and the scene's look have them (``looks``); otherwise as they were trained, with
-            their paint beside.
+        placed: Apply the scene's placement in Blender, so that the result is upright; otherwise use the
+            splats' own world. Transforms of single level objects are ignored.
+        looked: Apply paint and looks (``looks``); otherwise return trained colours, with paint in separate
+            columns.
 
     Raises:
-        LodgsError: there are none, or crops leave nothing; or of a placed one, its root is stretched or its
-            rule unknown.
+        LodgsError: There are no levels, or crops remove all splats; for a placed bundle also if the root is
+            scaled differently along its axes or the rule is unknown.
     """
     levels = [
         Level(item.number, objects.read_splats(item.object), selection.read_facts(item.facts))
@@ -147,14 +141,16 @@ def read_levels(root: bpy.types.Object, placed: bool = False, looked: bool = Fal
         if item.exists
     ]
     if not levels:
-        raise LodgsError(f"{root.name} has no levels yet.", "Train it or import splats first.")
+        raise LodgsError(
+            f"Cannot read the levels of '{root.name}': it has no levels.", "Train it or import splats first."
+        )
     settings = root.lodgs
     facts, meta = selection.read_facts(settings.facts), selection.read_json(settings.meta)
     bundle = Bundle(
         settings.method, levels, settings.rule, facts, changed_controls(root), settings.cumulative, meta,
         tables.read_tables(root) | view_tables(root),
     )  # fmt: skip
-    bundle = cleaning.left(root, bundle, bpy.context.evaluated_depsgraph_get())
+    bundle = cleaning.remaining(root, bundle, bpy.context.evaluated_depsgraph_get())
     if looked:
         bundle = look.apply_looks_to_levels(bundle, _looks(root))
     if placed:
@@ -164,84 +160,90 @@ def read_levels(root: bpy.types.Object, placed: bool = False, looked: bool = Fal
 
 
 def view_tables(root: bpy.types.Object, placed: bool = False) -> dict[str, dict[str, np.ndarray]]:
-    """A scene's views as tables of its bundle, in the order in which they came.
+    """Return a scene's views as tables of its bundle, in their original order.
 
     Args:
-        placed: see :func:`read_levels`.
+        placed: See :func:`read_levels`.
     """
-    found = sorted(
+    cameras = sorted(
         (view for view in views(root) if view.data.lodgs.width), key=lambda view: view.data.lodgs.place
     )
-    near = min((view.data.clip_start for view in found), default=0.0)
+    near = min((view.data.clip_start for view in cameras), default=0.0)
     axes = axes_of(root)
-    unit = 1.0 if axes == root else axes.matrix_basis.to_scale().x  # ``ground.scale`` takes clips along
-    unseen = {view.name for view in found if is_held_out(root, view)}
-    made = make_view_tables([camera_of(view) for view in found], near / unit, unseen)
-    if placed and VIEWS in made:
-        made[VIEWS] = placed_views(made[VIEWS], placement_of(root))
-    return made
+    unit = 1.0 if axes == root else axes.matrix_basis.to_scale().x  # ``ground.scale`` scales clip distances
+    held_out = {view.name for view in cameras if is_held_out(root, view)}
+    result = make_view_tables([camera_of(view) for view in cameras], near / unit, held_out)
+    if placed and VIEWS in result:
+        result[VIEWS] = transform_views(result[VIEWS], placement_of(root))
+    return result
 
 
-def delete_left_out(root: bpy.types.Object) -> int:
-    """Deletes what is hidden and what crops leave out, of every level, and the crops, but for their looks;
-    how many splats.
+def delete_excluded(root: bpy.types.Object) -> int:
+    """Delete the hidden and cropped splats of every level, and the crops; crops with a look stay as regions.
+
+    Returns:
+        The number of deleted splats.
 
     Raises:
-        LodgsError: as :func:`read_levels`, or the levels are only the top of a tree in a file.
+        LodgsError: As :func:`read_levels`, or the levels are only the top of a tree in a file.
     """
     file = streams.file_of(root)
     if file is not None:
         raise LodgsError(
-            f"Most of these splats are in {file.name}, which stays as it is.",
-            "Keep the crops; or edit the file with the command lodgs edit, and import what that writes.",
+            f"Cannot delete splats of '{root.name}': most of them are in {file.name}.",
+            "Keep the crops, or edit the file with the command lodgs edit and import the result.",
         )
-    before = sum(len(item.object.data.points) for item in root.lodgs.levels if item.exists)
+    count_before = sum(len(item.object.data.points) for item in root.lodgs.levels if item.exists)
     bundle = read_levels(root)
     for level in bundle.levels:
         put_level(root, level)
     for item in root.lodgs.levels:
         item.lost = 0
-    for obj in crops.cutting(root):
-        if looks.is_set(obj):  # which stays with what is left there
+    for obj in crops.removing_crops(root):
+        if looks.is_set(obj):  # keep the look as a region
             obj.lodgs_crop.keep = "ALL"
         else:
             bpy.data.objects.remove(obj)
     levels_changed(root)
-    return before - sum(len(level.splats) for level in bundle.levels)
+    return count_before - sum(len(level.splats) for level in bundle.levels)
 
 
 def read_level(root: bpy.types.Object, number: int, placed: bool = False, looked: bool = False) -> Splats:
-    """One level with all that artists have changed in it; where levels add up, with all coarser ones.
+    """Return one edited level; if levels are cumulative, with all coarser ones.
 
     Args:
-        placed, looked: see :func:`read_levels`.
+        placed: See :func:`read_levels`.
+        looked: See :func:`read_levels`.
 
     Raises:
-        LodgsError: there is no such level, or it is no scene by itself; or as :func:`read_levels`.
+        LodgsError: The level does not exist or is not a complete scene; or as :func:`read_levels`.
     """
     bundle = read_levels(root, placed, looked)
     for level in bundle.levels:
         if level.number == number:
-            _require_alone(root, number)
+            _require_complete(root, number)
             return complete_splats(bundle, level)
-    raise LodgsError(f"{root.name} has no level {number}.", "Choose one from the list of levels.")
+    raise LodgsError(
+        f"Cannot read level {number}: '{root.name}' has no level {number}.", "Choose a level from the list."
+    )
 
 
-def shown_splats(
+def visible_splats(
     context: bpy.types.Context, root: bpy.types.Object, placed: bool = False, looked: bool = False
 ) -> Splats:
-    """The splats that the detail settings, and artists' own modifiers, leave visible in the view layer.
+    """Return the splats that detail settings and modifiers leave visible in the view layer.
 
-    Columns that not every visible level has are left out.
+    Columns that some visible levels lack are dropped.
 
     Args:
-        placed, looked: see :func:`read_levels`.
+        placed: See :func:`read_levels`.
+        looked: See :func:`read_levels`.
 
     Raises:
-        LodgsError: nothing is visible, or the levels have spherical harmonics of different degrees; or of
-            placed ones, the root is stretched.
+        LodgsError: No splats are visible, or the levels differ in their degree of spherical harmonics; for
+            placed splats also if the root is scaled differently along its axes.
     """
-    with _drawn_by_lodgs(context):
+    with _without_native_drawing(context):
         depsgraph = context.evaluated_depsgraph_get()
         parts = [
             objects.read_splats(item.object, depsgraph)
@@ -251,10 +253,13 @@ def shown_splats(
     if looked:
         parts = [look.apply_looks(part, _looks(root)) for part in parts]
     if not any(len(part) for part in parts):
-        raise LodgsError(f"No splats of {root.name} are shown.", "Look at the detail settings.")
+        raise LodgsError(
+            f"Cannot read visible splats: no splats of '{root.name}' are shown.", "Check the detail settings."
+        )
     if len({part.sh_degree for part in parts}) > 1:
         raise LodgsError(
-            f"The levels of {root.name} have spherical harmonics of different degrees.", "Export one level."
+            f"Cannot combine the levels of '{root.name}': their degrees of spherical harmonics differ.",
+            "Export a single level.",
         )
     shared = [name for name in parts[0].extras if all(name in part.extras for part in parts)]
     arrays = ("means", "quats", "log_scales", "opacity_logits", "sh")
@@ -269,10 +274,10 @@ def shown_splats(
 
 
 @contextmanager
-def _drawn_by_lodgs(context: bpy.types.Context) -> Iterator[None]:
+def _without_native_drawing(context: bpy.types.Context) -> Iterator[None]:
     """Evaluate objects without the modifiers that apply weights and looks for Blender's own drawing."""
     settings = context.scene.lodgs_viewport
-    before = settings.splats, settings.drawn_by
+    previous = settings.splats, settings.drawn_by
     if compat.NATIVE_SPLATS is None or not settings.points:
         yield
         return
@@ -281,35 +286,35 @@ def _drawn_by_lodgs(context: bpy.types.Context) -> Iterator[None]:
         context.view_layer.update()
         yield
     finally:
-        settings.splats, settings.drawn_by = before
+        settings.splats, settings.drawn_by = previous
 
 
-def count_shown(context: bpy.types.Context, root: bpy.types.Object) -> tuple[int, int]:
-    """How many splats are visible as of the last evaluation, and how many there are in all levels."""
-    depsgraph, shown, everything = context.view_layer.depsgraph, 0, 0
+def count_visible(context: bpy.types.Context, root: bpy.types.Object) -> tuple[int, int]:
+    """Return the number of visible splats as of the last evaluation, and of all splats."""
+    depsgraph, visible, total = context.view_layer.depsgraph, 0, 0
     for item in root.lodgs.levels:
         if item.exists:
-            everything += len(item.object.data.points)
+            total += len(item.object.data.points)
             if depsgraph is not None and _visible(context, item):
-                shown += len(item.object.evaluated_get(depsgraph).data.points)
-    return shown, everything
+                visible += len(item.object.evaluated_get(depsgraph).data.points)
+    return visible, total
 
 
 def show_only(root: bpy.types.Object, number: int) -> None:
-    """Shows one level everywhere; where levels add up, with all coarser ones.
+    """Show one level everywhere; if levels are cumulative, with all coarser ones.
 
     Raises:
-        LodgsError: it is no scene by itself.
+        LodgsError: The level is not a complete scene.
     """
-    _require_alone(root, number)
+    _require_complete(root, number)
     root.lodgs.mode, root.lodgs.single_level = "SINGLE", number
     for item in root.lodgs.levels:
         if item.number == number or (root.lodgs.cumulative and item.number < number):
             item.show = True
 
 
-def offer_ellipsoids(scene: bpy.types.Scene) -> None:
-    """Gives every level of a scene's splats the modifier that makes ellipsoids where they are wanted."""
+def attach_ellipsoids(scene: bpy.types.Scene) -> None:
+    """Give every level of a Blender scene the ellipsoid modifier, and raise Cycles' transparent bounces."""
     for root in roots(scene):
         for item in root.lodgs.levels:
             if item.exists:
@@ -320,13 +325,13 @@ def offer_ellipsoids(scene: bpy.types.Scene) -> None:
 
 
 def _looks(root: bpy.types.Object) -> look.Looks:
-    """The looks of a scene as it stands now."""
+    """Return the current looks of a scene."""
     depsgraph = bpy.context.evaluated_depsgraph_get()
     to_own = axes_of(root).evaluated_get(depsgraph).matrix_world.inverted_safe()
     return looks.looks_of(root, depsgraph, to_own)
 
 
-def _require_alone(root: bpy.types.Object, number: int) -> None:
+def _require_complete(root: bpy.types.Object, number: int) -> None:
     finest = max((item.number for item in root.lodgs.levels if item.exists), default=number)
     if number < finest and not root.lodgs.complete:
         raise LodgsError(*standalone_error(number, finest))
@@ -336,15 +341,17 @@ def _visible(context: bpy.types.Context, item) -> bool:
     return item.exists and item.object.visible_get(view_layer=context.view_layer)
 
 
-def put_level(root: bpy.types.Object, level: Level, made: bpy.types.Object | None = None) -> bpy.types.Object:
-    """The level's object in the scene and its entry in the list, without what depends on the whole list.
+def put_level(
+    root: bpy.types.Object, level: Level, level_object: bpy.types.Object | None = None
+) -> bpy.types.Object:
+    """Add or replace a level's object and list entry, without updating list-wide settings and drivers.
 
     Args:
-        made: an object of the level's splats that is in no collection; None: there is none yet.
+        level_object: New object with the level's splats, in no collection; None to create it.
     """
     settings = root.lodgs
-    fresh = made or objects.new_splats("", painting.carried(root, level).splats)
-    fresh.name = fresh.data.name = _level_name(root, level.number)
+    new_object = level_object or objects.new_splats("", painting.transfer(root, level).splats)
+    new_object.name = new_object.data.name = _level_name(root, level.number)
     item = next((entry for entry in settings.levels if entry.number == level.number), None)
     if item is None:
         item = settings.levels.add()
@@ -353,24 +360,24 @@ def put_level(root: bpy.types.Object, level: Level, made: bpy.types.Object | Non
         settings.levels.move(len(settings.levels) - 1, position)
         item = settings.levels[position]
     elif item.exists:
-        # The object stays, with all that artists have hung on it; only its splats change.
-        old, obj = item.object.data, item.object
-        if obj.mode != "OBJECT":  # where Blender gives it no other splats
+        # Keep the object with its children and modifiers; replace only its splats.
+        old_cloud, obj = item.object.data, item.object
+        if obj.mode != "OBJECT":  # Blender cannot exchange data in other modes
             with extension.in_window():
                 bpy.ops.object.mode_set(mode="OBJECT")
-        item.lost = int(cleaning.hidden(old).sum())
-        obj.data, obj.color = fresh.data, fresh.color
-        bpy.data.objects.remove(fresh)
-        name = old.name
-        bpy.data.pointclouds.remove(old)
+        item.lost = int(cleaning.hidden_mask(old_cloud).sum())
+        obj.data, obj.color = new_object.data, new_object.color
+        bpy.data.objects.remove(new_object)
+        name = old_cloud.name
+        bpy.data.pointclouds.remove(old_cloud)
         obj.data.name = name
-        fresh = obj
-    if fresh.parent is None:
-        fresh.parent = axes_of(root)
-        collection_of(root).objects.link(fresh)
-    item.object = fresh
+        new_object = obj
+    if new_object.parent is None:
+        new_object.parent = axes_of(root)
+        collection_of(root).objects.link(new_object)
+    item.object = new_object
     item.facts = json.dumps(level.facts)
-    return fresh
+    return new_object
 
 
 def _level_name(root: bpy.types.Object, number: int) -> str:
@@ -378,7 +385,7 @@ def _level_name(root: bpy.types.Object, number: int) -> str:
 
 
 def levels_changed(root: bpy.types.Object) -> None:
-    """Drops levels whose objects are gone, keeps the settings within the rest, and renews the drivers."""
+    """Update the list of levels: drop deleted ones, clamp settings and renew drivers."""
     settings = root.lodgs
     for index in reversed(range(len(settings.levels))):
         if not settings.levels[index].exists:
@@ -395,13 +402,13 @@ def levels_changed(root: bpy.types.Object) -> None:
     selection.attach(root)
     for scene in root.users_scene:
         if scene.lodgs_render.ellipsoids:
-            offer_ellipsoids(scene)
+            attach_ellipsoids(scene)
 
 
 @bpy.app.handlers.persistent
 def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-    """Follows artists: a deleted level leaves no gap in the distances, a new material is shown."""
-    editable = [root for root in roots(scene) if root.is_editable]  # others are linked from their own file
+    """React to artists' edits: deleted levels, changed crops and looks, new materials."""
+    editable = [root for root in roots(scene) if root.is_editable]
     if depsgraph.id_type_updated("COLLECTION"):
         for root in editable:
             if not all(item.exists for item in root.lodgs.levels):
@@ -418,7 +425,7 @@ def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
 @bpy.app.handlers.persistent
 def _before_undo(*_) -> None:
     for root in _all_editable():
-        selection.let_go(root)
+        selection.detach_references(root)
 
 
 @bpy.app.handlers.persistent
@@ -432,20 +439,20 @@ def _all_editable() -> list[bpy.types.Object]:
 
 
 def _handlers():
-    """Lists of Blender's handlers, and ours for each."""
+    """Return pairs of Blender's handler lists and our handlers."""
     handlers = bpy.app.handlers
     yield handlers.depsgraph_update_post, _on_update
-    for before in (handlers.undo_pre, handlers.redo_pre):
-        yield before, _before_undo
-    for after in (handlers.undo_post, handlers.redo_post):
-        yield after, _after_undo
+    for callbacks in (handlers.undo_pre, handlers.redo_pre):
+        yield callbacks, _before_undo
+    for callbacks in (handlers.undo_post, handlers.redo_post):
+        yield callbacks, _after_undo
 
 
 def register() -> None:
-    for handlers, ours in _handlers():
-        handlers.append(ours)
+    for handlers, callback in _handlers():
+        handlers.append(callback)
 
 
 def unregister() -> None:
-    for handlers, ours in _handlers():
-        handlers.remove(ours)
+    for handlers, callback in _handlers():
+        handlers.remove(callback)

@@ -1,9 +1,9 @@
-"""What is shown of a splat scene: its rule's node groups on every level, driven by the scene's settings.
+"""Selection of visible splats: node groups of a scene's rule on every level, driven by the scene's settings.
 
-Every level has one modifier that is on where levels are chosen by distance: the group of the scene's rule
-(``nodes.rules``). Its facts are set, its controls and the eye are driven by bare names, so that Blender
-evaluates them even where it may not run scripts, and without any handler. Reading the sockets of an evaluated
-modifier gives the rule's arguments back: :func:`choice`.
+Every level has a modifier with the node group of the scene's rule (``nodes.rules``), enabled in the mode By
+Distance. Scene facts are plain inputs. Controls and camera are driven by expressions of bare names, which
+Blender evaluates without handlers and even without permission to run scripts. :func:`evaluated_query`
+converts the sockets of an evaluated modifier back to the rule's arguments.
 """
 
 from __future__ import annotations
@@ -29,12 +29,14 @@ from .placement import axes_of
 from .tables import read_table
 
 
-def choice(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> LodQuery | None:
-    """What the modifiers of an evaluated level choose by, as of the depsgraph: its crops, then its rule.
+def evaluated_query(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> LodQuery | None:
+    """Return the arguments of the crops and the rule of an evaluated level, as of the depsgraph.
 
-    None where all is shown. A modifier whose group somebody has changed counts as none (:func:`only_chosen`).
+    Returns:
+        None if all splats are shown. Modifiers with edited node groups are ignored; see
+        :func:`only_lodgs_modifiers`.
     """
-    cropped = crops.of_modifier(evaluated, depsgraph, lambda modifier: _is_on(modifier, depsgraph))
+    cropped = crops.modifier_crops(evaluated, depsgraph, lambda modifier: _is_on(modifier, depsgraph))
     modifier = rule_modifier(evaluated)
     rule = None if modifier is None else groups.rule_of_group(modifier.node_group)
     if modifier is None or rule is None or not _is_on(modifier, depsgraph):
@@ -43,44 +45,44 @@ def choice(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> LodQu
     def value(name: str):
         return compat.get_input(modifier, name)
 
-    held = value(groups.FREEZE) or value(groups.CAMERA_SOURCE) >= groups.VIEW_SOURCE
-    whose = groups.CAMERA_SOURCES[min(max(value(groups.CAMERA_SOURCE), 0), groups.VIEW_SOURCE)]
-    if held or whose == "TRAINING":
-        eye = tuple(value(groups.CAMERA_POSITION))
+    is_frozen = value(groups.FREEZE) or value(groups.CAMERA_SOURCE) >= groups.VIEW_SOURCE
+    source = groups.CAMERA_SOURCES[min(max(value(groups.CAMERA_SOURCE), 0), groups.VIEW_SOURCE)]
+    if is_frozen or source == "TRAINING":
+        position = tuple(value(groups.CAMERA_POSITION))
     else:
-        obj = depsgraph.scene.camera if whose == "CAMERA" else value(groups.CAMERA_OBJECT)
-        eye = (0.0, 0.0, 0.0)  # as geometry nodes have it without an object
+        obj = depsgraph.scene.camera if source == "CAMERA" else value(groups.CAMERA_OBJECT)
+        position = (0.0, 0.0, 0.0)  # the default of geometry nodes without an object
         if obj is not None:
-            place = obj.evaluated_get(depsgraph).matrix_world.translation
-            eye = tuple(evaluated.matrix_world.inverted_safe() @ place)
+            location = obj.evaluated_get(depsgraph).matrix_world.translation
+            position = tuple(evaluated.matrix_world.inverted_safe() @ location)
     return LodQuery(
         rule.name,
-        eye,
-        value(groups.STORED_FOCAL if held else groups.FOCAL),
+        position,
+        value(groups.STORED_FOCAL if is_frozen else groups.FOCAL),
         tuple((name, value(name)) for name in fact_names(rule)),
         tuple((control.name, value(control.name)) for control in rule.controls),
-        tuple((name, _frozen(value(groups.table_socket(name)))) for name in rule.tables),
+        tuple((name, _table_columns(value(groups.table_socket(name)))) for name in rule.tables),
         cropped,
     )
 
 
-def _frozen(obj: bpy.types.Object | None) -> tuple[tuple[str, str, bytes], ...]:
-    """A table's columns as :class:`LodQuery` keeps them."""
+def _table_columns(obj: bpy.types.Object | None) -> tuple[tuple[str, str, bytes], ...]:
+    """Return a table's columns in the form of :class:`LodQuery`."""
     columns = read_table(obj.original) if obj is not None else {}
     return tuple((name, values.dtype.str, values.tobytes()) for name, values in columns.items())
 
 
-def only_chosen(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bool:
-    """Whether an evaluated object shows its own splats as they are, chosen by nothing but :func:`choice`."""
+def only_lodgs_modifiers(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bool:
+    """Return True if no modifiers other than those of :func:`evaluated_query` act on an evaluated object."""
     return all(
-        modifier.type == "NODES" and (modifier.name == display.NAME or _chooses(modifier.node_group))
+        modifier.type == "NODES" and (modifier.name == display.NAME or _selects(modifier.node_group))
         for modifier in evaluated.modifiers
         if _is_on(modifier, depsgraph)
     )
 
 
-def _chooses(group: bpy.types.NodeTree | None) -> bool:
-    """Whether a modifier's group is a rule's, the crops' or the look's, and what they made it."""
+def _selects(group: bpy.types.NodeTree | None) -> bool:
+    """Return True for an unedited node group of a rule, of crops or of a look."""
     return (
         groups.rule_of_group(group) is not None
         or crop_groups.crop_count(group) is not None
@@ -93,48 +95,51 @@ def _is_on(modifier: bpy.types.Modifier, depsgraph: bpy.types.Depsgraph) -> bool
 
 
 def read_json(text: str) -> dict:
-    """What a property holds as JSON; nothing where somebody has made something else of it."""
+    """Parse a property with a JSON object; {} if the text is invalid."""
     try:
-        found = json.loads(text or "{}")
-        json.dumps(found, allow_nan=False)  # what files can hold
+        content = json.loads(text or "{}")
+        json.dumps(content, allow_nan=False)  # files allow no other numbers
     except (ValueError, RecursionError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return content if isinstance(content, dict) else {}
 
 
 def read_facts(text: str) -> dict[str, float]:
-    """The numbers of :func:`read_json`, by name."""
+    """Return the numbers of :func:`read_json`, by name."""
     return {name: value for name, value in read_json(text).items() if isinstance(value, int | float)}
 
 
-def eye_place(root: bpy.types.Object, scene: bpy.types.Scene) -> tuple[float, float, float]:
-    """Where the chosen eye is, in the splats' space, frozen or not. The viewport's starts at the camera's."""
+def camera_position(root: bpy.types.Object, scene: bpy.types.Scene) -> tuple[float, float, float]:
+    """Return the position of the selected camera in the splats' space, ignoring Freeze.
+
+    For the viewport this is the position of the scene camera.
+    """
     settings = root.lodgs
     if settings.eye == "TRAINING":
         return tuple(settings.camera_center)
     obj = settings.eye_object if settings.eye == "OBJECT" else scene.camera
     if obj is None:
-        return (0.0, 0.0, 0.0)  # as geometry nodes have it
+        return (0.0, 0.0, 0.0)  # as in geometry nodes
     return tuple(axes_of(root).matrix_world.inverted_safe() @ obj.matrix_world.translation)
 
 
-def hold(root: bpy.types.Object, eye: tuple[float, float, float], focal_px: float) -> None:
-    """Has distances measured from a place in the splats' own space, while they are frozen or the viewport's.
+def store_camera(root: bpy.types.Object, position: tuple[float, float, float], focal_px: float) -> None:
+    """Set the position, in the splats' own space, for Freeze and for the viewport as camera.
 
-    Nothing happens where that is the case already: setting evaluates the scene anew.
+    Equal values are not set: setting causes an evaluation.
     """
     settings = root.lodgs
-    if not np.array_equal(np.float32(eye), np.float32(settings.held_eye)):
-        settings.held_eye = eye
+    if not np.array_equal(np.float32(position), np.float32(settings.held_eye)):
+        settings.held_eye = position
     if np.float32(focal_px) != np.float32(settings.held_focal):
         settings.held_focal = focal_px
 
 
 def attach(root: bpy.types.Object) -> None:
-    """Gives every level of a splat scene its rule's modifier and its drivers, anew where they exist already.
+    """Give every level of a splat scene its rule's modifier and drivers, replacing existing ones.
 
-    Needed after the list of levels, the rule or its facts have changed. Levels whose rule is unknown, or
-    which have none, are shown one at a time.
+    Call it after changes of the levels, the rule or its facts. Without a known rule, levels are shown one at
+    a time.
     """
     settings = root.lodgs
     crops.attach(root)
@@ -153,7 +158,7 @@ def attach(root: bpy.types.Object) -> None:
                 continue
             try:
                 facts = collect_facts(rule, scene, levels, item.number)
-            except LodgsError:  # of a level that is still on its way
+            except LodgsError:  # training has not written the level's facts yet
                 _detach(item.object)
                 continue
             _drive_level(root, item.object, rule, facts)
@@ -162,7 +167,7 @@ def attach(root: bpy.types.Object) -> None:
 
 
 def follow_crops(root: bpy.types.Object) -> None:
-    """Has the levels' modifiers follow the crops, looks and hidden splats that there are now."""
+    """Update the levels' modifiers to the current crops, looks and hidden splats."""
     crops.attach(root)
     looks.attach(root)
     _order(root)
@@ -172,26 +177,26 @@ def follow_crops(root: bpy.types.Object) -> None:
 def _order(root: bpy.types.Object) -> None:
     """Put the modifiers of levels into the order in which they work.
 
-    Crops come before a rule that asks how many splats there are; else after it, where fewer are left. Weights
-    are applied last.
+    Crops come before a rule that depends on the number of splats, and otherwise after it, since fewer splats
+    remain there. Weights are applied last.
     """
     for item in root.lodgs.levels:
         if item.exists:
             display.keep_last(item.object)
     rule = find_rule(root.lodgs.rule)
     for item in root.lodgs.levels if rule else ():
-        cropping, own = (
+        cropping, rule_modifiers = (
             (crops.modifier_of(item.object), rule_modifier(item.object)) if item.exists else (None, None)
         )
-        if cropping and own and rule:
+        if cropping and rule_modifiers and rule:
             modifiers = item.object.modifiers
-            place, there = modifiers.find(cropping.name), modifiers.find(own.name)
-            if (place < there) == rule.apart:
-                modifiers.move(place, there)
+            crop_index, rule_index = modifiers.find(cropping.name), modifiers.find(rule_modifiers.name)
+            if (crop_index < rule_index) == rule.apart:
+                modifiers.move(crop_index, rule_index)
 
 
 def outdated(root: bpy.types.Object) -> bool:
-    """Whether a level's modifier is not the one that this version makes: its file is an older one's."""
+    """Return True if a level's modifier was made by an older version."""
     rule = find_rule(root.lodgs.rule)
     modifiers = [rule_modifier(item.object) for item in root.lodgs.levels if item.exists]
     if rule is None:
@@ -200,27 +205,29 @@ def outdated(root: bpy.types.Object) -> bool:
 
 
 def update_inputs(root: bpy.types.Object) -> None:
-    """Hands on to the modifiers what cannot be driven: the chosen eye, tables, a level's material."""
-    for modifier, name, value in _given(root):
-        _set(modifier, name, value, lambda there, value: there == value)
+    """Set the modifier inputs that cannot be driven: camera object, tables and materials."""
+    for modifier, name, value in _object_inputs(root):
+        _set(modifier, name, value, lambda current, value: current == value)
 
 
-def let_go(root: bpy.types.Object) -> None:
-    """Has the levels point at nothing of their scene, until :func:`follow_crops` gives it to them again.
+def detach_references(root: bpy.types.Object) -> None:
+    """Remove the levels' references to other objects until :func:`follow_crops` restores them.
 
-    Before an undo: Blender keeps in memory every object that its two steps hold alike. Levels are given crops
-    and all else after a step is made, so that such a one may point at an object that goes: a crash.
+    Call it before an undo. Blender keeps objects that are equal in both undo steps, and levels get crops
+    after a step is stored, so that a kept level could reference a deleted object and crash Blender.
     """
-    for modifier, name, _ in list(_given(root)):
-        _set(modifier, name, None, lambda there, _: there is None)
+    for modifier, name, _ in list(_object_inputs(root)):
+        _set(modifier, name, None, lambda current, _: current is None)
     for item in root.lodgs.levels:
         if item.exists:
             crops.detach(item.object)
             looks.detach(item.object)
 
 
-def _given(root: bpy.types.Object) -> Iterator[tuple[bpy.types.NodesModifier, str, bpy.types.ID | None]]:
-    """The inputs of the levels' modifiers that cannot be driven, by name, and what they are to be."""
+def _object_inputs(
+    root: bpy.types.Object,
+) -> Iterator[tuple[bpy.types.NodesModifier, str, bpy.types.ID | None]]:
+    """Return the modifier inputs that cannot be driven, as tuples of modifier, name and value."""
     tables = {
         groups.table_socket(item.name): item.object if item.exists else None for item in root.lodgs.tables
     }
@@ -229,26 +236,30 @@ def _given(root: bpy.types.Object) -> Iterator[tuple[bpy.types.NodesModifier, st
         slots = item.object.material_slots if item.exists else ()
         material = {groups.MATERIAL: slots[0].material if slots else None}
         cropping = crops.modifier_of(item.object) if item.exists else None
-        eye = {groups.CAMERA_OBJECT: root.lodgs.eye_object}
-        showing = item.object.modifiers.get(display.NAME) if item.exists else None
+        camera = {groups.CAMERA_OBJECT: root.lodgs.eye_object}
+        display_modifier = item.object.modifiers.get(display.NAME) if item.exists else None
         points = {display.MATERIAL: material[groups.MATERIAL] or display.points_material()}
-        for each, given in ((modifier, eye | tables | material), (cropping, material), (showing, points)):
-            if each is not None:
-                yield from ((each, name, value) for name, value in given.items())
+        for owner, inputs in (
+            (modifier, camera | tables | material),
+            (cropping, material),
+            (display_modifier, points),
+        ):
+            if owner is not None:
+                yield from ((owner, name, value) for name, value in inputs.items())
 
 
-def _set(modifier: bpy.types.NodesModifier, name: str, value, same: Callable[[Any, Any], bool]) -> None:
-    """Sets an input that is another: setting evaluates anew. A changed group may have lost it."""
-    if compat.has_input(modifier, name) and not same(compat.get_input(modifier, name), value):
+def _set(modifier: bpy.types.NodesModifier, name: str, value, is_equal: Callable[[Any, Any], bool]) -> None:
+    """Set an input if its value differs: setting causes an evaluation. Edited groups may lack the input."""
+    if compat.has_input(modifier, name) and not is_equal(compat.get_input(modifier, name), value):
         compat.set_input(modifier, name, value)
 
 
 def _drive_focal_length(root: bpy.types.Object) -> None:
-    """f = lens * fitted side in pixels / fitted side of the sensor, as Blender's render has it.
+    """Drive the focal length in pixels: lens * fitted side in pixels / fitted side of the sensor.
 
-    Blender fits the render's longer side to the sensor's width unless told otherwise; where pixels are not
-    square, the smaller of fx and fy counts, as in ``training.scenes.cameras.Camera.focal``. Without a camera,
-    Blender's standard one is assumed.
+    By default Blender fits the render's longer side to the sensor's width. For non-square pixels the smaller
+    of fx and fy is used, as in ``training.scenes.cameras.Camera.focal``. Without a camera, Blender's default
+    camera is assumed.
     """
     variables = {
         "lens": ("camera.data.lens", 50.0),
@@ -286,11 +297,13 @@ def _drive(
     index: int = -1,
     **sources: str,
 ) -> None:
-    """Drives a property by an expression of the root's properties: names, and their paths in ``lodgs``.
+    """Drive a property by an expression of the root's properties.
 
     Args:
-        index: of a vector's component.
-        without: values of names where this extension, and with it the properties, are missing; others are 0.
+        index: Component of a vector.
+        without: Fallback values by name if the extension, and with it the properties, is missing; 0 by
+            default.
+        sources: Paths in ``lodgs`` by variable name.
     """
     driver = replace_driver(obj, path, expression, index)
     for name, source in sources.items():
@@ -303,37 +316,37 @@ def _drive(
 
 
 def _drive_visibility(root: bpy.types.Object, index: int, item, rule: Rule | None) -> None:
-    """A level is there where its rule has use for it, or where it is the one shown or adds to that.
+    """Show a level where its rule uses it, or where it is the single level or adds to it.
 
-    Where this extension is missing, the finest one is there, so that nobody opens an empty file.
+    If the extension is missing, the finest level is shown, so that the file does not appear empty.
     """
     number, sources = item.number, {"show": f"levels[{index}].show"}
     sources |= {name: name for name in ("mode", "single_level", "cumulative")}
     in_use = "mode == 1"
     for control in rule.controls if rule else ():
-        if control.follows:  # what is not in use is not even evaluated
+        if control.follows:  # Blender does not evaluate hidden levels
             sources[control.name] = f"{rule.name}.{control.name}"
             in_use += f" and {control.name} {'<=' if control.follows == 'coarsest' else '>='} {number}"
-    alone = f"{number} == single_level or (cumulative and {number} <= single_level)"
-    finest = max(one.number for one in root.lodgs.levels if one.exists)
+    is_single = f"{number} == single_level or (cumulative and {number} <= single_level)"
+    finest = max(level.number for level in root.lodgs.levels if level.exists)
     without = {"show": 1, "single_level": finest, "cumulative": root.lodgs.cumulative}
     for path in ("hide_viewport", "hide_render"):
-        expression = f"0 if show and (({in_use}) or (mode == 0 and ({alone}))) else 1"
+        expression = f"0 if show and (({in_use}) or (mode == 0 and ({is_single}))) else 1"
         _drive(item.object, path, root, expression, without, **sources)
 
 
 def _drive_level(root: bpy.types.Object, obj: bpy.types.Object, rule: Rule, facts: Mapping) -> None:
-    modifier = _modifier_of(obj, rule)
+    modifier = _ensure_modifier(obj, rule)
     for name, value in facts.items():
-        _set(modifier, name, float(value), lambda there, value: there == np.float32(value))
+        _set(modifier, name, float(value), lambda current, value: current == np.float32(value))
     for path in ("show_viewport", "show_render"):
         _drive(obj, f'modifiers["{modifier.name}"].{path}', root, "mode", mode="mode")
-    driven = {name: name for name in (groups.CAMERA_SOURCE, groups.FREEZE, groups.FOCAL, groups.STORED_FOCAL)}
-    driven |= {control.name: f"{rule.name}.{control.name}" for control in rule.controls}
-    for name, source in driven.items():
+    paths = {name: name for name in (groups.CAMERA_SOURCE, groups.FREEZE, groups.FOCAL, groups.STORED_FOCAL)}
+    paths |= {control.name: f"{rule.name}.{control.name}" for control in rule.controls}
+    for name, source in paths.items():
         if compat.has_input(modifier, name):
             _drive(obj, compat.input_path(modifier, name), root, name, **{name: source})
-    # Setting it would tell Blender that the points have changed, at every step of the viewport's eye.
+    # Setting it would mark the points as changed at every move of the viewport.
     for axis in range(3) if compat.has_input(modifier, groups.CAMERA_POSITION) else ():
         sources = {"held": f"held_eye[{axis}]", "center": f"camera_center[{axis}]"}
         sources |= {name: name for name in (groups.CAMERA_SOURCE, groups.FREEZE)}
@@ -343,14 +356,14 @@ def _drive_level(root: bpy.types.Object, obj: bpy.types.Object, rule: Rule, fact
         )
 
 
-def _modifier_of(obj: bpy.types.Object, rule: Rule) -> bpy.types.NodesModifier:
-    """The modifier with a rule's group, made where there is none, in the place of one with another rule."""
+def _ensure_modifier(obj: bpy.types.Object, rule: Rule) -> bpy.types.NodesModifier:
+    """Return the modifier with a rule's group; create it, or replace one with another group."""
     modifier = rule_modifier(obj)
-    place = len(obj.modifiers)
+    index = len(obj.modifiers)
     if modifier is not None and not groups.is_current(
         modifier.node_group, rule
-    ):  # another method's, or older
-        place = obj.modifiers.find(modifier.name)
+    ):  # of another method or version
+        index = obj.modifiers.find(modifier.name)
         _detach(obj)
         modifier = None
     if modifier is None:
@@ -358,19 +371,19 @@ def _modifier_of(obj: bpy.types.Object, rule: Rule) -> bpy.types.NodesModifier:
         modifier = obj.modifiers.new(group.name, "NODES")
         assert isinstance(modifier, bpy.types.NodesModifier)
         modifier.node_group, modifier.show_expanded = group, False
-        obj.modifiers.move(len(obj.modifiers) - 1, min(place, len(obj.modifiers) - 1))
+        obj.modifiers.move(len(obj.modifiers) - 1, min(index, len(obj.modifiers) - 1))
     return modifier
 
 
 def _detach(obj: bpy.types.Object) -> None:
-    """Takes away the modifier that chooses by distance."""
+    """Remove the rule's modifier."""
     modifier = rule_modifier(obj)
     if modifier is not None:
         remove_modifier(obj, modifier)
 
 
 def rule_modifier(obj: bpy.types.Object) -> bpy.types.NodesModifier | None:
-    """The modifier that chooses by distance, whichever rule and version it is of."""
+    """Return the modifier of a rule, of any rule and version."""
     for modifier in obj.modifiers:
         group = modifier.node_group if isinstance(modifier, bpy.types.NodesModifier) else None
         if group and groups.RULE in group:

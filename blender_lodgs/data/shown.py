@@ -1,8 +1,8 @@
-"""Which splats a Blender scene shows, and how much of each: what viewports and renders draw.
+"""Visible splat instances of a Blender scene, for viewports and renders.
 
 A splat instance is an object of a splat point cloud (see ``objects``): a level of a splat scene, a copy of
-one, any other object that carries such attributes, or an instance of any of these. What is shown of it is
-what its modifiers leave, so that distances and fading count.
+one, any other object with these attributes, or an instance of any of them. Its modifiers are applied,
+including level-of-detail weights.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from .placement import axes_of
 
 @dataclass(frozen=True)
 class SplatInstance:
-    """A visible object, or instance of one, that holds splats.
+    """A visible object with splats, or an instance of one.
 
     Attributes:
-        object: the original, not the evaluated one.
-        evaluated: the same as its modifiers leave it; only valid as long as the depsgraph is not evaluated.
+        object: Original object.
+        evaluated: Evaluated object; valid until the depsgraph is evaluated again.
         matrix_world: (4, 4) float64, from the splats' space to Blender's world.
-        level: number of the level in its splat scene, 1 is the coarsest; 0 for splats that are no level.
-        antialias: see ``SplatScene.antialias``.
-        source: from where finer splats are to be read than the levels of its scene hold. All of them are
-            instances beside it then, and what is read stands for them all, in the place of the finest.
-        looks: see ``looks.looks_of``.
+        level: Number of the level in its splat scene, 1 is the coarsest; 0 for splats that are not a level.
+        antialias: See ``SplatScene.antialias``.
+        source: File with finer splats of the scene. All levels of the scene are then instances with this
+            source, and streamed splats replace them at the finest one.
+        looks: See ``looks.looks_of``.
     """
 
     object: bpy.types.Object
@@ -43,16 +43,16 @@ class SplatInstance:
 
 @dataclass(frozen=True)
 class SplatArrays:
-    """N splats in their object's space, float32, ready to be drawn: activated, and of unit rotations.
+    """N activated splats in their object's space, float32.
 
     Attributes:
         means: (N, 3).
-        quats: (N, 4) wxyz.
+        quats: (N, 4) wxyz, normalised.
         scales: (N, 3) standard deviations.
         opacities: (N,) in [0, 1].
         sh: (N, K, 3); colour = 0.5 + sum of coefficient * basis. A view of memory in the order (K, N, 3), as
-            Blender has it.
-        weights: (N,) in [0, 1], factors on the opacities by level of detail; None where all are 1.
+            in Blender.
+        weights: (N,) in [0, 1], level-of-detail factors of the opacities; None if all are 1.
     """
 
     means: np.ndarray
@@ -69,12 +69,13 @@ class SplatArrays:
 def splat_instances(
     depsgraph: bpy.types.Depsgraph, viewport: bpy.types.SpaceView3D | None = None
 ) -> list[SplatInstance]:
-    """The visible splat instances, coarse levels first.
+    """Return the visible splat instances, coarse levels first.
 
-    Visibility is the depsgraph's: that of its view layer, and by ``depsgraph.mode`` of renders or viewports.
+    Visibility is that of the depsgraph's view layer, for renders or viewports according to
+    ``depsgraph.mode``.
 
     Args:
-        viewport: leave out what this viewport hides by itself (its local view, its object types).
+        viewport: Exclude objects that this viewport hides by local view or object type.
     """
     if not any(is_splats(cloud) for cloud in bpy.data.pointclouds):
         return []
@@ -84,7 +85,7 @@ def splat_instances(
         for item in root.lodgs.levels
         if item.object is not None
     }
-    found, own_looks = [], {}
+    instances, own_looks = [], {}
     for instance in depsgraph.object_instances:  # visible ones only
         obj = instance.object
         if obj.type != "POINTCLOUD" or not is_splats(obj.original.data):
@@ -97,76 +98,85 @@ def splat_instances(
         evaluated = original.evaluated_get(depsgraph)
         level, root = levels.get(original) or (0, roots.root_of(original))
         antialias = root is not None and root.lodgs.antialias
-        together = root, evaluated.matrix_world.copy().freeze()  # levels mostly are, and have one look
-        if root is not None and together not in own_looks:
-            own_looks[together] = looks.looks_of(root, depsgraph, evaluated.matrix_world.inverted_safe())
-        look = own_looks.get(together, ())
-        found.append(SplatInstance(original, evaluated, matrix, level, antialias, looks=look))
-    found.sort(key=lambda instance: (instance.level, instance.object.name))
-    return _with_sources(found, depsgraph)
+        look_key = root, evaluated.matrix_world.copy().freeze()  # levels mostly share one look
+        if root is not None and look_key not in own_looks:
+            own_looks[look_key] = looks.looks_of(root, depsgraph, evaluated.matrix_world.inverted_safe())
+        look = own_looks.get(look_key, ())
+        instances.append(SplatInstance(original, evaluated, matrix, level, antialias, looks=look))
+    instances.sort(key=lambda instance: (instance.level, instance.object.name))
+    return _with_sources(instances, depsgraph)
 
 
-def without_coarser(instances: list[SplatInstance]) -> list[SplatInstance]:
-    """The same, where what is read from files stands for all levels of its scene."""
-    return [each for each in instances if each.source is None or each.level == each.source.level]
+def drop_streamed_levels(instances: list[SplatInstance]) -> list[SplatInstance]:
+    """Return the instances without coarser levels of streamed scenes, which streamed splats replace."""
+    return [
+        instance
+        for instance in instances
+        if instance.source is None or instance.level == instance.source.level
+    ]
 
 
-def choice_of_picture(instance: SplatInstance, depsgraph: bpy.types.Depsgraph) -> selection.LodQuery | None:
-    """By what a picture of the scene's camera chooses an instance's splats; None where all are shown.
+def camera_query(instance: SplatInstance, depsgraph: bpy.types.Depsgraph) -> selection.LodQuery | None:
+    """Return the rule arguments of an instance for an image of the scene camera; None if all are shown.
 
-    That is what modifiers choose by. Where the eye is the viewport's, there is more to be read of a file than
-    that has seen: the camera asks for itself.
+    These are the arguments of the modifiers, except for streamed scenes with the viewport as camera: finer
+    splats are then selected for the scene camera itself.
     """
-    choice = selection.choice(instance.evaluated, depsgraph)
+    query = selection.evaluated_query(instance.evaluated, depsgraph)
     root, camera = roots.root_of(instance.object), depsgraph.scene.camera
-    if choice is None or not choice.rule or instance.source is None or root is None or camera is None:
-        return choice
+    if query is None or not query.rule or instance.source is None or root is None or camera is None:
+        return query
     settings = root.lodgs
     if settings.eye != "VIEW" or settings.freeze:
-        return choice
-    place = camera.evaluated_get(depsgraph).matrix_world.translation
-    eye = tuple(axes_of(root).evaluated_get(depsgraph).matrix_world.inverted_safe() @ place)
-    return replace(choice, eye=eye, focal_px=root.evaluated_get(depsgraph).lodgs.focal_px)
+        return query
+    location = camera.evaluated_get(depsgraph).matrix_world.translation
+    position = tuple(axes_of(root).evaluated_get(depsgraph).matrix_world.inverted_safe() @ location)
+    return replace(query, eye=position, focal_px=root.evaluated_get(depsgraph).lodgs.focal_px)
 
 
-def _with_sources(found: list[SplatInstance], depsgraph: bpy.types.Depsgraph) -> list[SplatInstance]:
-    """The same, with sources where all levels stand together, chosen by nothing but their rule."""
+def _with_sources(instances: list[SplatInstance], depsgraph: bpy.types.Depsgraph) -> list[SplatInstance]:
+    """Add sources to instances whose levels share one transform and have no modifiers of artists."""
     sources = {root: source for root in roots.roots(depsgraph.scene) if (source := streams.source_of(root))}
     if not sources:
-        return found
-    of = {item.object: root for root in sources for item in root.lodgs.levels if item.exists}
-    together: dict[tuple, set[int]] = {}
-    for each in found:
-        if each.object in of and selection.only_chosen(each.evaluated, depsgraph):
-            together.setdefault((of[each.object], each.matrix_world.tobytes()), set()).add(each.level)
+        return instances
+    root_of_level = {item.object: root for root in sources for item in root.lodgs.levels if item.exists}
+    placed_levels: dict[tuple, set[int]] = {}
+    for instance in instances:
+        if instance.object in root_of_level and selection.only_lodgs_modifiers(instance.evaluated, depsgraph):
+            placed_levels.setdefault(
+                (root_of_level[instance.object], instance.matrix_world.tobytes()), set()
+            ).add(instance.level)
     numbers = {root: {item.number for item in root.lodgs.levels if item.exists} for root in sources}
     return [
-        replace(each, source=sources[root])
-        if (root := of.get(each.object)) in sources
-        and together.get((root, each.matrix_world.tobytes())) == numbers[root]
-        else each
-        for each in found
+        replace(instance, source=sources[root])
+        if (root := root_of_level.get(instance.object)) in sources
+        and placed_levels.get((root, instance.matrix_world.tobytes())) == numbers[root]
+        else instance
+        for instance in instances
     ]
 
 
 def is_splats(cloud: bpy.types.PointCloud) -> bool:
-    """Whether a point cloud carries the attributes of splats."""
+    """Return True if a point cloud has the attributes of splats."""
     return all(name in cloud.attributes for name in (attributes.BASE, attributes.SCALE, attributes.ROTATION))
 
 
 def read(cloud: bpy.types.PointCloud) -> SplatArrays:
-    """The splats of a point cloud: ``SplatInstance.evaluated.data`` for what is shown, or any object's data.
+    """Return the splats of a point cloud.
 
-    Attributes that modifiers have taken away leave no splats. A band of harmonics that has lost a coefficient
-    is left out.
+    The result is empty if modifiers removed an attribute. A band of harmonics without all coefficients is
+    dropped.
+
+    Args:
+        cloud: ``SplatInstance.evaluated.data`` for visible splats, or the data of any object.
     """
     count = len(cloud.points)
     base, scales = (attributes.read_attribute(cloud, name) for name in (attributes.BASE, attributes.SCALE))
     means, quats = (attributes.read_attribute(cloud, name) for name in ("position", attributes.ROTATION))
     if count == 0 or base is None or scales is None or means is None or quats is None:
-        nothing = np.zeros((0, 4), np.float32)
+        empty = np.zeros((0, 4), np.float32)
         return SplatArrays(
-            nothing[:, :3], nothing, nothing[:, :3], nothing[:, 0], np.zeros((0, 1, 3), np.float32), None
+            empty[:, :3], empty, empty[:, :3], empty[:, 0], np.zeros((0, 1, 3), np.float32), None
         )
     names = attributes.sh_names(cloud)
     sh = np.empty((1 + len(names), count, 3), np.float32)
@@ -182,6 +192,6 @@ def read(cloud: bpy.types.PointCloud) -> SplatArrays:
 def visible_splats(
     depsgraph: bpy.types.Depsgraph, viewport: bpy.types.SpaceView3D | None = None
 ) -> list[tuple[SplatInstance, SplatArrays]]:
-    """The visible splat instances that have splats left, each with them."""
-    found = [(instance, read(instance.evaluated.data)) for instance in splat_instances(depsgraph, viewport)]
-    return [(instance, splats) for instance, splats in found if len(splats)]
+    """Return the visible splat instances that are not empty, with their splats."""
+    pairs = [(instance, read(instance.evaluated.data)) for instance in splat_instances(depsgraph, viewport)]
+    return [(instance, splats) for instance, splats in pairs if len(splats)]

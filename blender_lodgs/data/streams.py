@@ -1,8 +1,7 @@
-"""Scenes that hold the top of a tree of splats, and read the rest from its file as it is needed.
+"""Streaming of large trees: the scene stores the top of a tree, LODGS reads finer splats from its file.
 
-The scene's objects hold the coarsest splats, as a tree complete by itself: modifiers, exports and saved files
-work with these. What LODGS itself draws is read from the file, wherever the eye comes near. There is a budget
-for both together.
+The scene's objects hold the coarsest splats as a complete tree: modifiers, exports and saved files use these.
+LODGS draws finer splats from the file as the camera approaches. One budget covers both.
 """
 
 from __future__ import annotations
@@ -15,23 +14,24 @@ import bpy
 
 from ..attributes import HIDDEN
 
-HELD, MOST_HELD = 0.25, 250_000
-"""Share of the budget that the scene's objects hold, and how many splats at most: Blender evaluates them anew
-whenever an eye rests, and all that is done with them holds its main thread."""
+RESIDENT_SHARE = 0.25
+"""Share of the budget for the scene's own objects."""
+MAX_RESIDENT = 250_000
+"""Maximum number of splats in the scene's own objects: Blender evaluates them in its main thread."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """Where a scene's finer splats are.
+    """File with a scene's finer splats.
 
     Attributes:
-        scene: its root's ``session_uid``.
-        path: the bundle.
-        total: its splats.
-        budget: how many of them may be in memory besides those that the scene's objects hold.
-        here: how many the scene's objects hold.
-        level: number of the finest level, in whose place all are drawn.
-        begun: another one where another file may be in the place of the last.
+        scene: ``session_uid`` of the root.
+        path: Bundle.
+        total: Number of splats in the bundle.
+        budget: Maximum number of streamed splats in memory, in addition to those of the scene's objects.
+        here: Number of splats in the scene's objects.
+        level: Number of the finest level; streamed splats replace it.
+        begun: Counter that changes when the file may have been replaced.
     """
 
     scene: int
@@ -43,39 +43,42 @@ class Source:
     begun: int
 
 
-def held_of(budget: int) -> int:
-    """How many splats of a larger tree the scene's objects may hold."""
-    return max(min(int(HELD * budget), MOST_HELD), 1)
+def resident_count(budget: int) -> int:
+    """Return the maximum number of splats of a larger tree in the scene's objects."""
+    return max(min(int(RESIDENT_SHARE * budget), MAX_RESIDENT), 1)
 
 
-def begin(root: bpy.types.Object, path: Path, budget: int, total: int) -> None:
-    """Has a scene that has just been given the top of a tree read the rest from its file from now on."""
+def start_streaming(root: bpy.types.Object, path: Path, budget: int, total: int) -> None:
+    """Start streaming for a scene that holds the top of a tree."""
     stream = root.lodgs.stream
     absolute = str(path.absolute())
     stream.file = absolute
     if bpy.data.filepath and bpy.context.preferences.filepaths.use_relative_paths:
         with suppress(ValueError):  # on another drive
             stream.file = bpy.path.relpath(absolute)
-    stream.budget, stream.total, stream.here = budget, total, _held(root)
+    stream.budget, stream.total, stream.here = budget, total, _count_splats(root)
     stream.begun += 1
 
 
-def end(root: bpy.types.Object) -> None:
-    """Has a scene show what it holds, and no file."""
+def stop_streaming(root: bpy.types.Object) -> None:
+    """Stop streaming; the scene shows only its own splats."""
     root.lodgs.stream.file = ""
 
 
 def file_of(root: bpy.types.Object) -> Path | None:
-    """The file of which a scene holds the top; None where it has none."""
+    """Return the file whose top a scene holds, or None."""
     file = root.lodgs.stream.file
     return Path(bpy.path.abspath(file, library=root.library)) if file else None
 
 
 def source_of(root: bpy.types.Object) -> Source | None:
-    """From where a scene's finer splats are to be read; None where it shows what it holds: all that there is,
-    one level, or what somebody has added or taken away."""
+    """Return the source of a scene's finer splats.
+
+    Returns:
+        None if the scene has all splats, shows a single level, or was edited.
+    """
     path, settings = file_of(root), root.lodgs
-    if path is None or settings.mode != "SELECTIVE" or changed(root):
+    if path is None or settings.mode != "SELECTIVE" or is_edited(root):
         return None
     stream = settings.stream
     finest = max(item.number for item in settings.levels if item.exists)
@@ -83,13 +86,13 @@ def source_of(root: bpy.types.Object) -> Source | None:
     return Source(root.session_uid, path, stream.total, budget, stream.here, finest, stream.begun)
 
 
-def changed(root: bpy.types.Object) -> bool:
-    """Whether the splats that a scene holds are other ones than came from its file, or some are hidden."""
+def is_edited(root: bpy.types.Object) -> bool:
+    """Return True if splats of a scene were added, removed or hidden since it was read from its file."""
     levels = [item.object.data for item in root.lodgs.levels if item.exists]
     if any(HIDDEN in cloud.attributes for cloud in levels):
         return True
-    return not levels or _held(root) != root.lodgs.stream.here
+    return not levels or _count_splats(root) != root.lodgs.stream.here
 
 
-def _held(root: bpy.types.Object) -> int:
+def _count_splats(root: bpy.types.Object) -> int:
     return sum(len(item.object.data.points) for item in root.lodgs.levels if item.exists)

@@ -1,7 +1,7 @@
-"""Tables of a bundle in Blender, such as LODGE's chunks: what rules know besides the splats themselves.
+"""Tables of a bundle in Blender: scene facts of rules, such as LODGE's chunks.
 
-A table is a mesh of a vertex a row and an attribute a column (``attributes.COLUMN``), where node groups read
-it. Nothing of it is ever drawn; rows that are places with a radius have spheres to look at, on request.
+A table is a mesh with a vertex per row and an attribute per column (``attributes.COLUMN``), for node groups.
+It is never drawn. Rows with a position and a radius get spheres that can be shown.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from .objects import read_column, write_column
 from .placement import axes_of
 
 _COLUMNS = "lodgs_columns"
-"""Custom property of a table's mesh: its columns in their order, as JSON."""
+"""Custom property of a table's mesh with its column names in order, as JSON."""
 
 
 def set_tables(root: bpy.types.Object, tables: Tables) -> None:
-    """Gives a splat scene tables in place of those that it has. Its rule is to be known before."""
+    """Replace the tables of a splat scene. The scene's rule must be set before."""
     remove_tables(root)
     rule = find_rule(root.lodgs.rule)
     for name, columns in tables.items():
-        if name in VIEWS:  # which are cameras
+        if name in VIEWS:  # views are camera objects
             continue
-        if name == BLOCKS:  # where rows are in a file: not true any more when somebody removes one
+        if name == BLOCKS:  # row ranges become invalid when splats are removed
             continue
         collection = bpy.data.collections.new(f"{root.name} {name}")
         collection.hide_viewport = collection.hide_render = True
@@ -47,7 +47,7 @@ def set_tables(root: bpy.types.Object, tables: Tables) -> None:
 
 
 def remove_tables(root: bpy.types.Object) -> None:
-    """Takes all tables off a splat scene."""
+    """Remove all tables of a splat scene."""
     objects = parts(root)
     meshes = {obj.data for obj in objects} - {None}
     collections = {item.collection for item in root.lodgs.tables} - {None}
@@ -58,19 +58,21 @@ def remove_tables(root: bpy.types.Object) -> None:
 
 
 def parts(root: bpy.types.Object) -> list[bpy.types.Object]:
-    """The objects of a splat scene's tables: their meshes, and the spheres. A copy of a root has none."""
+    """Return the objects of a splat scene's tables: meshes and spheres. A copy of a root has none."""
     collections = [item.collection for item in root.lodgs.tables if item.collection]
-    known = {item.object for item in root.lodgs.tables} | {obj for one in collections for obj in one.objects}
-    return [obj for obj in known if obj is not None and obj.parent == axes_of(root)]
+    objects = {item.object for item in root.lodgs.tables} | {
+        obj for collection in collections for obj in collection.objects
+    }
+    return [obj for obj in objects if obj is not None and obj.parent == axes_of(root)]
 
 
 def read_tables(root: bpy.types.Object) -> dict[str, dict[str, np.ndarray]]:
-    """The tables of a splat scene, of columns (rows,) by name."""
+    """Return the tables of a splat scene: columns (rows,) by name."""
     return {item.name: read_table(item.object) for item in root.lodgs.tables if item.exists}
 
 
 def read_table(obj: bpy.types.Object) -> dict[str, np.ndarray]:
-    """The columns (rows,) of a table's object by name."""
+    """Return the columns (rows,) of a table's object by name."""
     mesh = obj.data
     names = json.loads(mesh.get(_COLUMNS, "[]"))
     columns = {name: read_column(mesh, COLUMN.format(name), mesh) for name in names}
@@ -89,11 +91,11 @@ def _new_table(name: str, columns: dict[str, np.ndarray]) -> bpy.types.Object:
 
 
 def _new_spheres(name: str, columns: dict[str, np.ndarray]) -> list[bpy.types.Object]:
-    """An empty for each row, which shows where it is and how far it reaches, by its number."""
+    """Create a sphere empty with position and radius of each row, named by row number."""
     spheres = []
-    for number, (*place, radius) in enumerate(zip(*(columns[column] for column in SPHERE), strict=True)):
+    for number, (*center, radius) in enumerate(zip(*(columns[column] for column in SPHERE), strict=True)):
         sphere = bpy.data.objects.new(f"{name} {number:02}", None)
-        sphere.location, sphere.empty_display_size = place, radius
+        sphere.location, sphere.empty_display_size = center, radius
         sphere.empty_display_type, sphere.hide_select, sphere.show_name = "SPHERE", True, True
         spheres.append(sphere)
     return spheres

@@ -1,4 +1,4 @@
-"""What the training panel sets, kept on each scene root (``root.lodgs.training``)."""
+"""Settings of the training panel, stored on each scene root (``root.lodgs.training``)."""
 
 from __future__ import annotations
 
@@ -12,45 +12,51 @@ from ...training.runs.job import MAX_CELLS, Job
 from ...training.splats.levels import MAX_LEVELS
 from . import crops, photographs, viewpoints
 
-_WHOLE_MOST, _MOST = 2**31 - 1, 3.4e38
-_LEAST = 1e-6
-"""The smallest number above 0 that Blender shows."""
+_MAX_INTEGER = 2**31 - 1
+_MAX_FLOAT = 3.4e38
+_MIN_STEP = 1e-6
+"""Smallest number above 0 that Blender displays."""
 
-ALL_OFFER = "depth_weight", "depth"
-"""Parameters that the panel offers of every method."""
-FEW = 40
-"""Photographs, or views in their place, below which every one is needed to train on."""
+COMMON_PARAMETERS = "depth_weight", "depth"
+"""Parameters in the panel for every method."""
+MIN_HOLD_OUT = 40
+"""Minimum number of photos or views for a default hold-out; fewer are all trained on."""
 
 
-def hold_out(root: bpy.types.Object) -> int:
-    """Of how many photographs the root's next training holds one out: what is set, or affordable; 0: none."""
+def hold_out_interval(root: bpy.types.Object) -> int:
+    """Return the hold-out interval n of the root's next training (every n-th photo); 0 for none."""
     settings = root.lodgs.training
     return settings.test_every if settings.use_test_every else settings.preset_test_every
 
 
-def _affordable(settings: bpy.types.PropertyGroup) -> int:
+def _default_interval(settings: bpy.types.PropertyGroup) -> int:
     root = settings.id_data
-    views = viewpoints.count(settings) if viewpoints.alone(root) else len(photographs.views(root))
-    return 0 if views < FEW else Job.test_every
+    views = (
+        viewpoints.view_count(settings) if viewpoints.has_only_splats(root) else len(photographs.views(root))
+    )
+    return 0 if views < MIN_HOLD_OUT else Job.test_every
 
 
-def offered(method: str) -> list[Field]:
-    """The parameters of a method that the panel offers: those that it declares, but for per-level ones, and
-    ALL_OFFER."""
+def panel_parameters(method: str) -> list[Field]:
+    """Return the parameters of a method for the panel: its ``panel_parameters`` without per-level ones, and
+    COMMON_PARAMETERS."""
     info = method_info(method)
-    known = {f.name: f for f in fields(info.parameters)}
-    names = (*info.panel_parameters, *ALL_OFFER)
-    return [known[name] for name in names if not isinstance(known[name].default, tuple)]
+    fields_by_name = {f.name: f for f in fields(info.parameters)}
+    names = (*info.panel_parameters, *COMMON_PARAMETERS)
+    return [fields_by_name[name] for name in names if not isinstance(fields_by_name[name].default, tuple)]
 
 
-def chooses_distances(method: str) -> bool:
-    """Whether a method can be told from where on each level is shown."""
+def has_level_distances(method: str) -> bool:
+    """Return True if a method has level distances as a parameter."""
     return "distances" in {f.name for f in fields(method_info(method).parameters)}
 
 
 def level_distances(settings: bpy.types.PropertyGroup) -> list[tuple[int, int]]:
-    """The coarser levels whose distances can be set: their numbers, coarse to fine, and their places in
-    ``settings.distances``, where the one next to the finest comes first, however many there are."""
+    """Return the coarser levels with adjustable distances, coarse to fine.
+
+    Returns:
+        Pairs of level number and index in ``settings.distances``, where index 0 is next to the finest level.
+    """
     group = settings.parameters
     levels = group.levels if group.is_property_set("levels") else group.preset_levels
     return [(number, levels - 1 - number) for number in range(1, levels)]
@@ -61,12 +67,12 @@ def _preset_value(f: Field, method: str):
 
 
 def _property(f: Field, label: str, **options) -> Any:
-    """A property of the parameter's kind, within its bounds."""
+    """Create a Blender property of the parameter's type and range."""
     about = f.metadata
     options = {"name": label, "options": set(), **options}
     if isinstance(f.default, bool):
         return bpy.props.BoolProperty(**options)
-    if isinstance(f.default, str) and "get" in options:  # an enum's would have to give numbers
+    if isinstance(f.default, str) and "get" in options:  # a getter of an enum would have to return integers
         return bpy.props.StringProperty(**options)
     if isinstance(f.default, str):
         items = [(name, name.replace("_", " ").title(), "") for name in about["choices"]]
@@ -74,14 +80,14 @@ def _property(f: Field, label: str, **options) -> Any:
     low, high, above = about["low"], about["high"], about["above"]
     if isinstance(f.default, int):
         low = low if above is None else above + 1
-        return bpy.props.IntProperty(min=int(low), max=int(min(high, _WHOLE_MOST)), **options)
+        return bpy.props.IntProperty(min=int(low), max=int(min(high, _MAX_INTEGER)), **options)
     subtype = "PIXEL" if about["unit"] == "px" else "FACTOR" if (low, high) == (0, 1) else "NONE"
-    low = low if above is None else above + _LEAST
-    return bpy.props.FloatProperty(min=low, max=min(high, _MOST), subtype=subtype, **options)
+    low = low if above is None else above + _MIN_STEP
+    return bpy.props.FloatProperty(min=low, max=min(high, _MAX_FLOAT), subtype=subtype, **options)
 
 
 def _use(name: str, label: str, description: str) -> Any:
-    """A box to tick for a value of the artist's own: it begins as what was taken before, and is forgotten."""
+    """Create a checkbox that enables the user's own value; it starts as the previous default."""
 
     def set_use(group: bpy.types.PropertyGroup, use: bool) -> None:
         if not use:
@@ -110,7 +116,7 @@ def _properties_of(f: Field, method: str) -> dict[str, Any]:
 def _parameters_of(method: MethodInfo) -> type[bpy.types.PropertyGroup]:
     """Return a group with a method's parameters; those with ``is_property_set`` override the preset."""
     annotations = {}
-    for f in offered(method.name):
+    for f in panel_parameters(method.name):
         annotations |= _properties_of(f, method.name)
     return type(
         f"LODGS_parameters_{method.name}", (bpy.types.PropertyGroup,), {"__annotations__": annotations}
@@ -184,7 +190,7 @@ class TrainingSettings(viewpoints.ViewsSettings, bpy.types.PropertyGroup):
         description="Distance from which each level is shown, in multiples of the scene's median depth. "
         "Increase it for coarser levels. 0 lets training choose",
         size=MAX_LEVELS - 1,
-        default=[3.0 * 2.0**place for place in range(MAX_LEVELS - 1)],
+        default=[3.0 * 2.0**index for index in range(MAX_LEVELS - 1)],
         min=0.0,
         soft_max=100.0,
         step=50,
@@ -230,8 +236,8 @@ class TrainingSettings(viewpoints.ViewsSettings, bpy.types.PropertyGroup):
     preset_test_every: bpy.props.IntProperty(
         name="Hold Out Every",
         description=f"Default: hold out every {Job.test_every}th view to measure quality, or none (0) with "
-        f"fewer than {FEW} photos. Tick the box to change it",
-        get=_affordable,
+        f"fewer than {MIN_HOLD_OUT} photos. Tick the box to change it",
+        get=_default_interval,
         options=set(),
     )
     seed: bpy.props.IntProperty(
@@ -350,7 +356,7 @@ class TrainingSettings(viewpoints.ViewsSettings, bpy.types.PropertyGroup):
 
     @property
     def limits(self) -> tuple[int, int]:
-        """Splats and bytes that a cell has at most, where these decide how many cells there are; else 0."""
+        """Maximum numbers of splats and bytes per cell if they determine the grid; otherwise 0."""
         return (
             self.cell_splats if self.divide_by == "SPLATS" else 0,
             round(self.cell_memory * 1e9) if self.divide_by == "MEMORY" else 0,

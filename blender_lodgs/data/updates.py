@@ -1,6 +1,6 @@
-"""What follows when a property has changed: the functions that ``properties`` looks up by name.
+"""Update callbacks of properties, see ``property_callbacks``.
 
-Here, because they need what is built upon the properties.
+They are in a module of their own because they need modules that import the properties.
 """
 
 from __future__ import annotations
@@ -9,37 +9,39 @@ import bpy
 
 from .. import extension
 from . import photographs, scenes, selection
-from .properties import ON_CHANGE, RenderSettings, SplatScene
+from .properties import RenderSettings
+from .property_callbacks import ON_CHANGE
+from .scene_properties import SplatScene
 
 
 def _active_view(settings: SplatScene, context: bpy.types.Context) -> None:
     objects = settings.cameras.objects if settings.cameras else ()
     if settings.active_view < len(objects) and objects[settings.active_view].type == "CAMERA":
-        photographs.through(context, objects[settings.active_view])
+        photographs.use_view(context, objects[settings.active_view])
 
 
-def _eye(settings: SplatScene, context: bpy.types.Context) -> None:
-    if settings.eye == "VIEW" and not settings.freeze:  # until a viewport says where it is
-        _hold_eye(settings, context)
+def _camera_changed(settings: SplatScene, context: bpy.types.Context) -> None:
+    if settings.eye == "VIEW" and not settings.freeze:  # until a viewport reports its position
+        _store_camera(settings, context)
     selection.update_inputs(settings.id_data)
     settings.id_data.update_tag()
 
 
 def _freeze(settings: SplatScene, context: bpy.types.Context) -> None:
-    if settings.freeze and settings.eye != "VIEW":  # focal_px is still the moving eye's
-        _hold_eye(settings, context)
+    if settings.freeze and settings.eye != "VIEW":  # focal_px still belongs to the moving camera
+        _store_camera(settings, context)
     selection.update_inputs(settings.id_data)
     settings.id_data.update_tag()
 
 
-def _hold_eye(settings: SplatScene, context: bpy.types.Context) -> None:
+def _store_camera(settings: SplatScene, context: bpy.types.Context) -> None:
     root = settings.id_data
-    selection.hold(root, selection.eye_place(root, context.scene), settings.focal_px)
+    selection.store_camera(root, selection.camera_position(root, context.scene), settings.focal_px)
 
 
 def _ellipsoids(settings: RenderSettings, context: bpy.types.Context) -> None:
     if settings.ellipsoids:
-        scenes.offer_ellipsoids(settings.id_data)
+        scenes.attach_ellipsoids(settings.id_data)
     settings.id_data.update_tag()
 
 
@@ -48,7 +50,7 @@ def register() -> None:
         redraw=lambda settings, context: extension.redraw(),
         active_view=_active_view,
         eye_input=lambda settings, context: selection.update_inputs(settings.id_data),
-        eye=_eye,
+        eye=_camera_changed,
         freeze=_freeze,
         ellipsoids=_ellipsoids,
     )

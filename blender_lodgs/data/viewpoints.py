@@ -1,4 +1,4 @@
-"""From where splats without photographs, or a Blender scene, are looked at, so that there are photographs."""
+"""Placement of views for training images of splats without photos, or of a Blender scene."""
 
 from __future__ import annotations
 
@@ -30,22 +30,21 @@ from .objects import root_of
 from .placement import matrix_of
 
 SAMPLE = 100_000
-"""About so many splats say where a dome will be, before there is one."""
+"""Approximate number of splats for the preview of a dome."""
 
-UP, LOWEST = (0.0, 0.0, 1.0), 0.0
-"""What is up in a Blender scene, and the sine of the elevation at which a dome begins there: things stand on
-the ground."""
+UP = (0.0, 0.0, 1.0)
+"""Up axis of a Blender scene."""
+MIN_ELEVATION = 0.0
+"""Sine of a dome's lowest elevation: objects stand on the ground."""
 CLIP_START = 0.1
-"""Of cameras along a curve in a Blender scene, in its units: as Blender gives to new cameras; a quarter of
-how far they are apart where that is less."""
+"""Maximum clip start of cameras along a curve, as Blender's default; at most a quarter of their spacing."""
 _SOLID = {"MESH", "CURVE", "SURFACE", "FONT", "META", "VOLUME", "POINTCLOUD", "CURVES"}
 
 Shot = bpy.types.Object | int | tuple[Camera, float]
-"""From where a picture of a Blender scene is rendered: a camera of it, the frame in which its camera looks,
-or a view that is placed in its world, with its near depth."""
+"""Camera of an image: a camera object, a frame of the active camera, or a placed view and its near depth."""
 
-_kept: dict[str, tuple[tuple, Any]] = {}
-"""What viewports ask for at every redraw, with what it depends on: the last of each kind."""
+_cache: dict[str, tuple[tuple, Any]] = {}
+"""Last key and value of each kind, for redraws of viewports."""
 
 
 def _is_curve(settings: bpy.types.PropertyGroup, obj: bpy.types.Object) -> bool:
@@ -108,79 +107,82 @@ class ViewsSettings:
     )
 
 
-def alone(root: bpy.types.Object) -> bool:
+def has_only_splats(root: bpy.types.Object) -> bool:
     """Return True if a splat scene has splats but no photos."""
     return not root.lodgs.scene_folder and any(item.exists for item in root.lodgs.levels)
 
 
-def count(settings: bpy.types.PropertyGroup) -> int:
+def view_count(settings: bpy.types.PropertyGroup) -> int:
     """Return the number of views of the settings."""
     return len(_cameras(bpy.context.scene)) if settings.views_from == "CAMERAS" else settings.views
 
 
-def placed(context: bpy.types.Context, root: bpy.types.Object, splats: Splats) -> list[tuple[Camera, float]]:
-    """The views that a root's settings ask for, in its splats' coordinates, each with its near depth.
+def training_views(
+    context: bpy.types.Context, root: bpy.types.Object, splats: Splats
+) -> list[tuple[Camera, float]]:
+    """Return the views of a root's settings in its splats' coordinates, each with its near depth.
 
-    None of a dome, which the trainer places.
+    Empty for a dome, which the trainer places.
 
     Args:
-        splats: the root's finest level.
+        splats: Finest level of the root.
 
     Raises:
-        LodgsError: there are no two cameras, no curve, or one that leads nowhere; or the root is stretched.
+        LodgsError: There are fewer than two cameras, no curve or a curve of length 0; or the root is scaled
+            differently along its axes.
     """
     settings = root.lodgs.training
-    width, height = size(context.scene, settings)
+    width, height = image_size(context.scene, settings)
     match settings.views_from:
         case "CAMERAS":
-            cameras = _enough(_cameras(context.scene))
+            cameras = _require_two(_cameras(context.scene))
             depsgraph = context.evaluated_depsgraph_get()
             return [view_from(root, depsgraph, width, height, camera) for camera in cameras]
         case "ANIMATION":
             frames = _frames(context.scene, settings.views)
             return _animated(context, frames, lambda depsgraph: view_from(root, depsgraph, width, height))
         case "CURVE":
-            into = np.linalg.inv(matrix_of(root))
-            way = _way(settings.curve) @ into[:3, :3].T + into[:3, 3]
-            views, near = walk_views(splats, way, into[:3, 2], settings.views, width, height)
+            world_to_own = np.linalg.inv(matrix_of(root))
+            points = _curve_points(settings.curve) @ world_to_own[:3, :3].T + world_to_own[:3, 3]
+            views, near = walk_views(splats, points, world_to_own[:3, 2], settings.views, width, height)
             return [(view, near) for view in views]
         case "GRID":
-            views, near = _above(root, opaque_means(splats), settings, width, height)
+            views, near = _aerial_views(root, opaque_means(splats), settings, width, height)
             return [(view, near) for view in views]
     return []
 
 
-def of_scene(context: bpy.types.Context, width: int, height: int) -> list[Shot]:
-    """From where the settings of a Blender scene (``Scene.lodgs_capture``) have it captured.
+def capture_shots(context: bpy.types.Context, width: int, height: int) -> list[Shot]:
+    """Return the shots of a Blender scene according to its settings (``Scene.lodgs_capture``).
 
     Raises:
-        LodgsError: there are no two cameras, no curve, or one that leads nowhere; the camera stands still; a
-            camera is no perspective one; or nothing is there to look at.
+        LodgsError: There are fewer than two cameras, no curve or a curve of length 0; the camera does not
+            move or is not a perspective camera; or the scene is empty.
     """
     scene, settings = context.scene, context.scene.lodgs_capture
     match settings.views_from:
         case "CAMERAS":
-            cameras = _enough([obj for obj in _cameras(scene) if root_of(obj) is None])
-            _seen(context, cameras, width, height)
+            cameras = _require_two([obj for obj in _cameras(scene) if root_of(obj) is None])
+            _shot_views(context, cameras, width, height)
             return list(cameras)
         case "ANIMATION":
             frames = _frames(scene, settings.views)
-            _seen(context, [frames[0], frames[len(frames) // 2], frames[-1]], width, height)
+            _shot_views(context, [frames[0], frames[len(frames) // 2], frames[-1]], width, height)
             return list(frames)
-    views, near = placed_in_scene(context, width, height)
+    views, near = placed_capture_views(context, width, height)
     return [(view, near) for view in views]
 
 
-def seen_from(context: bpy.types.Context, width: int, height: int) -> list[tuple[Camera, float]]:
-    """What will be seen in each of the shots of :func:`of_scene`, in Blender's world, and its near depth.
+def capture_views(context: bpy.types.Context, width: int, height: int) -> list[tuple[Camera, float]]:
+    """Return the views and near depths of the shots of :func:`capture_shots`, in Blender's world.
 
     Raises:
-        LodgsError: as there.
+        LodgsError: As :func:`capture_shots`.
     """
-    return _seen(context, of_scene(context, width, height), width, height)
+    return _shot_views(context, capture_shots(context, width, height), width, height)
 
 
-def _seen(
+def _shot_views(
     context: bpy.types.Context, shots: Sequence[Shot], width: int, height: int
 ) -> list[tuple[Camera, float]]:
     def see(depsgraph: bpy.types.Depsgraph, camera: bpy.types.Object) -> tuple[Camera, float]:
@@ -193,31 +195,33 @@ def _seen(
     return [shot if isinstance(shot, tuple) else see(depsgraph, shot) for shot in shots]
 
 
-def placed_in_scene(
+def placed_capture_views(
     context: bpy.types.Context, width: int = 3, height: int = 2
 ) -> tuple[list[Camera], float]:
-    """The views that are placed in a Blender scene, and their near depth: all around or above what is
-    selected, or all of it, or along a curve. None where its own cameras are taken.
+    """Return the placed views of a Blender scene and their near depth.
+
+    They are around or above the selection or all objects, or along a curve. Empty if the scene's own cameras
+    are used.
 
     Raises:
-        LodgsError: there is nothing to look at, or no way to walk.
+        LodgsError: There is no object or no curve.
     """
     settings = context.scene.lodgs_capture
     match settings.views_from:
         case "DOME":
-            return dome_views_around(_corners(context), settings.views, width, height, UP, LOWEST)
+            return dome_views_around(_corners(context), settings.views, width, height, UP, MIN_ELEVATION)
         case "GRID":
             return aerial_views(_corners(context), settings.views, width, height, settings.height)
         case "CURVE":
-            way = _way(settings.curve)
-            apart = float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum()) / settings.views
-            views = views_along(way, np.array(UP), settings.views, width, height)
-            return views, min(CLIP_START, apart / 4)
+            points = _curve_points(settings.curve)
+            spacing = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum()) / settings.views
+            views = views_along(points, np.array(UP), settings.views, width, height)
+            return views, min(CLIP_START, spacing / 4)
     return [], 0.0
 
 
-def count_of_scene(scene: bpy.types.Scene) -> int:
-    """How many views the settings of a Blender scene ask for."""
+def capture_view_count(scene: bpy.types.Scene) -> int:
+    """Return the number of views of a Blender scene's capture settings."""
     match scene.lodgs_capture.views_from:
         case "CAMERAS":
             return sum(root_of(obj) is None for obj in _cameras(scene))
@@ -226,8 +230,8 @@ def count_of_scene(scene: bpy.types.Scene) -> int:
     return scene.lodgs_capture.views
 
 
-def chosen(context: bpy.types.Context) -> list[bpy.types.Object]:
-    """What is selected of a Blender scene, of that which views can be placed around."""
+def selected_subjects(context: bpy.types.Context) -> list[bpy.types.Object]:
+    """Return the selected objects of a Blender scene that views can be placed around."""
     return [
         obj
         for obj in context.view_layer.objects
@@ -239,114 +243,118 @@ def chosen(context: bpy.types.Context) -> list[bpy.types.Object]:
 
 
 def _corners(context: bpy.types.Context) -> np.ndarray:
-    """Corners (8 N, 3) of the boxes of what is selected of a Blender scene, or of all that renders of it.
+    """Return the corners (8 N, 3) of the bounding boxes of the selection, or of all rendered objects.
 
     Raises:
-        LodgsError: there is nothing.
+        LodgsError: There are no objects.
     """
     depsgraph = context.evaluated_depsgraph_get()
-    seen = [obj for obj in context.view_layer.objects if root_of(obj) is None]
-    corners = list(_boxes(chosen(context), depsgraph)) or list(_boxes(seen, depsgraph))
+    objects = [obj for obj in context.view_layer.objects if root_of(obj) is None]
+    corners = list(_boxes(selected_subjects(context), depsgraph)) or list(_boxes(objects, depsgraph))
     if not corners:
         raise LodgsError(
-            "The Blender scene holds nothing to look at.", "Add something, or choose other views."
+            "Cannot place views: the Blender scene is empty.", "Add objects, or choose other views."
         )
     return np.concatenate(corners)
 
 
 def _boxes(
-    objects: Iterable[bpy.types.Object], depsgraph: bpy.types.Depsgraph, placed: Matrix | None = None
+    objects: Iterable[bpy.types.Object], depsgraph: bpy.types.Depsgraph, transform: Matrix | None = None
 ) -> Iterator[np.ndarray]:
-    """Corners (8, 3) of each of some objects that render, and of what collections' instances show.
+    """Yield the bounding-box corners (8, 3) of each rendered object, also in collection instances.
 
     Args:
-        placed: how they are moved as a whole.
+        placed: Transform of the collection instance.
     """
     for obj in objects:
         if obj.hide_render:
             continue
-        shown = obj.evaluated_get(depsgraph)
-        matrix = placed @ shown.matrix_world if placed else shown.matrix_world
+        evaluated = obj.evaluated_get(depsgraph)
+        matrix = transform @ evaluated.matrix_world if transform else evaluated.matrix_world
         if obj.type in _SOLID:
-            turned = np.array(matrix)
-            yield np.array(shown.bound_box, np.float64) @ turned[:3, :3].T + turned[:3, 3]
+            world = np.array(matrix)
+            yield np.array(evaluated.bound_box, np.float64) @ world[:3, :3].T + world[:3, 3]
         if obj.instance_type == "COLLECTION" and obj.instance_collection is not None:
             collection = obj.instance_collection
-            moved = matrix @ Matrix.Translation(-collection.instance_offset)
-            yield from _boxes(collection.all_objects, depsgraph, moved)
+            instance_matrix = matrix @ Matrix.Translation(-collection.instance_offset)
+            yield from _boxes(collection.all_objects, depsgraph, instance_matrix)
 
 
-def placed_of(root: bpy.types.Object) -> list[Camera]:
-    """The views that training will place around or above a root's splats, or along a curve, in their world.
+def preview_views(root: bpy.types.Object) -> list[Camera]:
+    """Return the views that training will place around or above a root's splats, or along a curve.
+
+    They are in the splats' world.
 
     Raises:
-        LodgsError: there is no opaque splat to look at, or no way to walk.
+        LodgsError: There are no opaque splats or no curve.
     """
     settings = root.lodgs.training
     match settings.views_from:
         case "DOME":
-            return dome_of(root)[0]
+            return preview_dome(root)[0]
         case "GRID":
-            key = *_cloud_of(root)[1:], settings.views, settings.height, matrix_of(root).tobytes()
-            return _keep("above", key, lambda: _above(root, _sample_of(root), settings)[0])
+            key = *_finest_cloud(root)[1:], settings.views, settings.height, matrix_of(root).tobytes()
+            return _cached("above", key, lambda: _aerial_views(root, _sample_positions(root), settings)[0])
         case "CURVE":
-            into = np.linalg.inv(matrix_of(root))
-            way = _way(settings.curve) @ into[:3, :3].T + into[:3, 3]
-            return views_along(way, into[:3, 2], settings.views, 3, 2)
+            world_to_own = np.linalg.inv(matrix_of(root))
+            points = _curve_points(settings.curve) @ world_to_own[:3, :3].T + world_to_own[:3, 3]
+            return views_along(points, world_to_own[:3, 2], settings.views, 3, 2)
     return []
 
 
-def dome_of(root: bpy.types.Object) -> tuple[list[Camera], tuple[float, float]]:
-    """The dome that training will place around a root's splats, up to the few that it looks at more closely,
-    and how far its two shells are away from their middle; kept until something changes.
+def preview_dome(root: bpy.types.Object) -> tuple[list[Camera], tuple[float, float]]:
+    """Return the dome of a root's next training and the radii of its two shells; cached.
+
+    The dome is computed from a sample of the splats.
 
     Raises:
-        LodgsError: there is no opaque splat to look at.
+        LodgsError: There are no opaque splats.
     """
     count = root.lodgs.training.views
-    views, near = _keep(
-        "dome", (*_cloud_of(root)[1:], count), lambda: dome_views_around(_sample_of(root), count)
+    views, near = _cached(
+        "dome", (*_finest_cloud(root)[1:], count), lambda: dome_views_around(_sample_positions(root), count)
     )
     return views, (DOMES[0] * near / NEAR_SHARE, DOMES[1] * near / NEAR_SHARE)
 
 
-def _cloud_of(root: bpy.types.Object) -> tuple[bpy.types.PointCloud, int, changes.Version]:
-    """The finest splats of a root, and what is another one for others, or after they have changed."""
+def _finest_cloud(root: bpy.types.Object) -> tuple[bpy.types.PointCloud, int, changes.Version]:
+    """Return the finest point cloud of a root and two values that change with it and its points."""
     cloud = [item for item in root.lodgs.levels if item.exists][-1].object.data
     return cloud, cloud.session_uid, changes.version(cloud)
 
 
-def _sample_of(root: bpy.types.Object) -> np.ndarray:
-    """Where some of a root's opaque splats are, (N, 3) float64, in their coordinates."""
-    cloud = _cloud_of(root)[0]
+def _sample_positions(root: bpy.types.Object) -> np.ndarray:
+    """Return a sample of the root's opaque splats: positions (N, 3) float64."""
+    cloud = _finest_cloud(root)[0]
     step = max(len(cloud.points) // SAMPLE, 1)
     means, base = (attributes.view_attribute(cloud, name) for name in ("position", attributes.BASE))
-    if means is None or base is None:  # as Blender has no points
+    if means is None or base is None:  # empty clouds have no attributes
         return np.zeros((0, 3))
     return means[base[:, 3] > OPAQUE][::step].astype(np.float64)
 
 
-def _above(
-    root: bpy.types.Object, places: np.ndarray, settings: Any, width: int = 3, height: int = 2
+def _aerial_views(
+    root: bpy.types.Object, points: np.ndarray, settings: Any, width: int = 3, height: int = 2
 ) -> tuple[list[Camera], float]:
-    """Views above places (N, 3) of a root, by Blender's up, and their near depth: in the root's own world."""
+    """Return views above points (N, 3), along Blender's up axis, and their near depth; all in the root's
+    world."""
     matrix = matrix_of(root)
     views, near = aerial_views(
-        places @ matrix[:3, :3].T + matrix[:3, 3], settings.views, width, height, settings.height
+        points @ matrix[:3, :3].T + matrix[:3, 3], settings.views, width, height, settings.height
     )
-    inside, units = zip(*[view.in_object_space(matrix) for view in views], strict=True)
-    return list(inside), near / units[0]
+    local_views, units = zip(*[view.in_object_space(matrix) for view in views], strict=True)
+    return list(local_views), near / units[0]
 
 
-def _keep(kind: str, key: tuple, make: Callable[[], Any]) -> Any:
-    """What was made of a kind last, made anew where what it depends on is another."""
-    if kind not in _kept or _kept[kind][0] != key:
-        _kept[kind] = key, make()
-    return _kept[kind][1]
+def _cached(kind: str, key: tuple, create: Callable[[], Any]) -> Any:
+    """Return the cached value of a kind; create it again if its key differs."""
+    if kind not in _cache or _cache[kind][0] != key:
+        _cache[kind] = key, create()
+    return _cache[kind][1]
 
 
-def size(scene: bpy.types.Scene, settings: bpy.types.PropertyGroup) -> tuple[int, int]:
-    """Width and height of the pictures in pixels: of the shape that renders have."""
+def image_size(scene: bpy.types.Scene, settings: bpy.types.PropertyGroup) -> tuple[int, int]:
+    """Return width and height of the images in pixels, with the aspect ratio of renders."""
     render = scene.render
     return settings.view_width, max(round(settings.view_width * render.resolution_y / render.resolution_x), 1)
 
@@ -355,17 +363,22 @@ def _cameras(scene: bpy.types.Scene) -> list[bpy.types.Object]:
     return sorted((obj for obj in scene.objects if obj.type == "CAMERA"), key=lambda obj: obj.name)
 
 
-def _enough(cameras: list[bpy.types.Object]) -> list[bpy.types.Object]:
+def _require_two(cameras: list[bpy.types.Object]) -> list[bpy.types.Object]:
+    """Return the cameras.
+
+    Raises:
+        LodgsError: There are fewer than two.
+    """
     if len(cameras) < VIEWS[0]:
         raise LodgsError(
-            f"The Blender scene has {len(cameras)} camera(s), and training takes two views or more.",
+            f"Cannot train: the Blender scene has {len(cameras)} camera(s), but two views are needed.",
             "Add cameras, or choose other views.",
         )
     return cameras
 
 
 def _frames(scene: bpy.types.Scene, count: int) -> list[int]:
-    """So many frames, evenly chosen from the scene's range, or all that it has."""
+    """Return up to ``count`` frames, spread evenly over the scene's range."""
     frames = np.linspace(scene.frame_start, scene.frame_end, count).round().astype(int)
     return np.unique(frames).tolist()
 
@@ -375,48 +388,54 @@ def _animated(
     frames: Sequence[int],
     see: Callable[[bpy.types.Depsgraph], tuple[Camera, float]],
 ) -> list[tuple[Camera, float]]:
-    """What the scene's camera sees in some frames, as ``see`` has it in each."""
-    scene, frame, part = context.scene, context.scene.frame_current, context.scene.frame_subframe
-    found = []
-    try:
-        for each in frames:
-            scene.frame_set(each)
-            found.append(see(context.evaluated_depsgraph_get()))
-    finally:
-        scene.frame_set(frame, subframe=part)
-    if not np.ptp([view.world_to_camera for view, _ in found], axis=0).any():
-        raise LodgsError(
-            f"The camera '{scene_camera(scene).name}' does not move in the frames of the scene.",
-            "Animate it, or choose other views.",
-        )
-    return found
-
-
-def _way(curve: bpy.types.Object | None) -> np.ndarray:
-    """The corners (P, 3) of a curve in Blender's world, as fine as it is drawn.
+    """Return the results of ``see`` at some frames of the scene.
 
     Raises:
-        LodgsError: there is none, or it has not one spline.
+        LodgsError: The camera does not move.
+    """
+    scene, frame, subframe = context.scene, context.scene.frame_current, context.scene.frame_subframe
+    views = []
+    try:
+        for number in frames:
+            scene.frame_set(number)
+            views.append(see(context.evaluated_depsgraph_get()))
+    finally:
+        scene.frame_set(frame, subframe=subframe)
+    if not np.ptp([view.world_to_camera for view, _ in views], axis=0).any():
+        raise LodgsError(
+            f"Cannot place views: the camera '{scene_camera(scene).name}' does not move in the frame range.",
+            "Animate the camera, or choose other views.",
+        )
+    return views
+
+
+def _curve_points(curve: bpy.types.Object | None) -> np.ndarray:
+    """Return the points (P, 3) of a curve in Blender's world, at display resolution.
+
+    Raises:
+        LodgsError: There is no curve, or it does not have one spline.
     """
     if curve is None:
-        raise LodgsError("No curve is chosen to walk along.", "Choose one, or other views.")
+        raise LodgsError("Cannot place views: no curve is chosen.", "Choose a curve, or choose other views.")
     if len(curve.data.splines) != 1:
         raise LodgsError(
-            f"The curve '{curve.name}' has {len(curve.data.splines)} splines, and a walk takes one.",
+            f"Cannot place views: '{curve.name}' has {len(curve.data.splines)} splines instead of one.",
             "Choose another curve, or join its splines.",
         )
-    corners = _keep("way", (curve.data.session_uid, changes.version(curve.data)), lambda: _drawn(curve))
+    corners = _cached(
+        "way", (curve.data.session_uid, changes.version(curve.data)), lambda: _tessellate(curve)
+    )
     matrix = np.array(curve.matrix_world, np.float64)
     return corners @ matrix[:3, :3].T + matrix[:3, 3]
 
 
-def _drawn(curve: bpy.types.Object) -> np.ndarray:
-    """The corners (P, 3) of a curve in its own space, without what makes a pipe of it."""
-    plain = bpy.data.objects.new(curve.name, curve.data.copy())
+def _tessellate(curve: bpy.types.Object) -> np.ndarray:
+    """Return the points (P, 3) of a curve in its own space, without bevel and extrusion."""
+    copy = bpy.data.objects.new(curve.name, curve.data.copy())
     try:
-        plain.data.bevel_depth = plain.data.extrude = 0
-        plain.data.bevel_object = plain.data.taper_object = None
-        corners = np.array([vertex.co for vertex in plain.to_mesh().vertices], np.float64).reshape(-1, 3)
+        copy.data.bevel_depth = copy.data.extrude = 0
+        copy.data.bevel_object = copy.data.taper_object = None
+        corners = np.array([vertex.co for vertex in copy.to_mesh().vertices], np.float64).reshape(-1, 3)
     finally:
-        bpy.data.curves.remove(plain.data)
+        bpy.data.curves.remove(copy.data)
     return np.concatenate([corners, corners[:1]]) if curve.data.splines[0].use_cyclic_u else corners

@@ -42,7 +42,7 @@ def native() -> bpy.types.GeometryNodeTree:
 
 
 def attach(obj: bpy.types.Object) -> None:
-    """Give a splat object its display modifiers; those of another Blender version are replaced.
+    """Give a splat object its display modifiers; those of other Blender versions are replaced.
 
     Drivers switch them: *LODGS Display* is on in viewports that Blender does not draw, *LODGS Native Splats*
     where Blender draws the viewport or the render.
@@ -71,7 +71,7 @@ def attach(obj: bpy.types.Object) -> None:
 def is_drawn_by_blender(evaluated: bpy.types.Object) -> bool:
     """Return True if viewports show an evaluated object as Blender's own splats.
 
-    The type of its evaluated cloud does not tell: Blender drops it with the last point.
+    The type of an empty evaluated cloud is not reliable: Blender resets it.
     """
     modifier = evaluated.modifiers.get(NAME)
     return compat.is_native(evaluated.data) and not (modifier is not None and modifier.show_viewport)
@@ -107,7 +107,7 @@ def points_material() -> bpy.types.Material:
 
 
 def _set_material(cloud: bpy.types.PointCloud, is_native: bool) -> None:
-    """Give a cloud the material of points, or take it away where Blender draws splats. Others stay."""
+    """Add the points material to a cloud, or remove it if Blender draws splats; other materials stay."""
     own = [material.name if material else "" for material in cloud.materials] == [_POINTS]
     if is_native and own:
         cloud.materials.clear()
@@ -116,7 +116,7 @@ def _set_material(cloud: bpy.types.PointCloud, is_native: bool) -> None:
 
 
 def _is_outdated(obj: bpy.types.Object, name: str, current) -> bool:
-    """Remove a modifier whose group is another version's; True if the object needs a new one."""
+    """Remove a modifier with the group of another version; return True if the object needs a new one."""
     modifier = obj.modifiers.get(name)
     if modifier is None:
         return True

@@ -16,7 +16,7 @@ from ...training.editing.brush import brush_coverage, lasso_coverage
 from ...training.errors import LodgsError
 from .. import extension
 from ..data import cleaning, painting, roots
-from ..viewport.strokes import Picture
+from ..viewport.strokes import StrokeTarget
 from .base import EditLevelsOperator, report_errors
 
 _MIN_MOUSE_STEP = 2.0
@@ -67,8 +67,8 @@ class StrokeOperator(EditLevelsOperator):
         root = roots.active_root(context)
         self.prepare(root)
         path = np.array([point.loc for point in self.path])
-        picture = picture_of(context, root)
-        return self._finish(root, self._find_hits(picture, self._cover(picture, path)))
+        target = stroke_target(context, root)
+        return self._finish(root, self._find_hits(target, self._cover(target, path)))
 
     def invoke(self, context, event):
         return self._start(context, event)
@@ -90,11 +90,11 @@ class StrokeOperator(EditLevelsOperator):
                 setattr(self, name, getattr(settings, name))
         root = roots.active_root(context)
         self.path.clear()
-        self._picture = picture_of(context, root)
+        self._target = stroke_target(context, root)
         self.prepare(root)
         counts = {item.number: len(item.object.data.points) for item in cleaning.levels(root)}
         self._hits = {number: np.zeros(count, np.float32) for number, count in counts.items()}
-        self._stroke_cover = np.zeros(self._picture.size[::-1], np.float32)
+        self._stroke_cover = np.zeros(self._target.size[::-1], np.float32)
         self._lasso_handle = None
         if self.shape == "LASSO":
             self._lasso_handle = context.space_data.draw_handler_add(
@@ -112,7 +112,7 @@ class StrokeOperator(EditLevelsOperator):
             root = self._unchanged_root(context)
             if self.shape == "LASSO":
                 path = np.array([point.loc for point in self.path])
-                self._hits = self._find_hits(self._picture, self._cover(self._picture, path))
+                self._hits = self._find_hits(self._target, self._cover(self._target, path))
             return self._finish(root, self._hits)
         elif event.type in {"ESC", "RIGHTMOUSE"} and event.value == "PRESS":
             return {"CANCELLED"}
@@ -128,10 +128,10 @@ class StrokeOperator(EditLevelsOperator):
         context.region.tag_redraw()
         if self.shape == "BRUSH":
             root = self._unchanged_root(context)
-            cover = self._cover(self._picture, np.array([last, mouse]))
+            cover = self._cover(self._target, np.array([last, mouse]))
             if self.footprints:  # a footprint can reach beyond this segment of the stroke
                 cover = np.maximum(self._stroke_cover, cover, out=self._stroke_cover)
-            for number, hit in self._find_hits(self._picture, cover).items():
+            for number, hit in self._find_hits(self._target, cover).items():
                 np.maximum(self._hits[number], hit, out=self._hits[number])
             self.show(root, self._hits)
 
@@ -147,14 +147,14 @@ class StrokeOperator(EditLevelsOperator):
             raise LodgsError("Cannot finish the stroke: training replaced the levels.", "Draw it again.")
         return root
 
-    def _cover(self, picture: Picture, path: np.ndarray) -> np.ndarray:
+    def _cover(self, target: StrokeTarget, path: np.ndarray) -> np.ndarray:
         path = np.reshape(path, (-1, 2))
         if self.shape == "LASSO":
-            return lasso_coverage(path, picture.size)
-        return brush_coverage(path, self.radius, picture.size, self.hardness)
+            return lasso_coverage(path, target.size)
+        return brush_coverage(path, self.radius, target.size, self.hardness)
 
-    def _find_hits(self, picture: Picture, cover: np.ndarray) -> dict[int, np.ndarray]:
-        return picture.hits(cover, self.through, self.footprints)
+    def _find_hits(self, target: StrokeTarget, cover: np.ndarray) -> dict[int, np.ndarray]:
+        return target.hits(cover, self.through, self.footprints)
 
     def _finish(self, root, hits):
         self.report({"INFO"}, self.apply(root, hits))
@@ -203,26 +203,28 @@ class LODGS_OT_select_splats(StrokeOperator, bpy.types.Operator):
         layout.prop(self, "through")
 
     def prepare(self, root):
-        self._selected = {item.number: cleaning.selected(item.object.data) for item in cleaning.levels(root)}
+        self._selected = {
+            item.number: cleaning.selected_mask(item.object.data) for item in cleaning.levels(root)
+        }
 
     def show(self, root, hits):
         remove = self.action == "REMOVE"
-        cleaning.show_selected(root, {
+        cleaning.preview_selection(root, {
             number: mask & ~(hits[number] > 0) if remove else mask | (hits[number] > 0)
             for number, mask in self._selected.items()
         })  # fmt: skip
 
     def apply(self, root, hits):
-        cleaning.select_also(root, hits, self.action == "REMOVE")
+        cleaning.extend_selection(root, hits, self.action == "REMOVE")
         counts = cleaning.count_selected(root)
         by_level = ", ".join(f"level {number} {count:,}" for number, count in counts.items())
         return f"{sum(counts.values()):,} splats selected: {by_level}"
 
     def end_preview(self, root):
-        cleaning.show_selected(root, {})
+        cleaning.preview_selection(root, {})
 
 
-def picture_of(context: bpy.types.Context, root: bpy.types.Object) -> Picture:
+def stroke_target(context: bpy.types.Context, root: bpy.types.Object) -> StrokeTarget:
     """Return a splat scene's image in the viewport of a context.
 
     Raises:
@@ -236,7 +238,7 @@ def picture_of(context: bpy.types.Context, root: bpy.types.Object) -> Picture:
         view = area.spaces.active.region_3d
     if view is None:
         raise LodgsError("Cannot draw a stroke: no 3D viewport is active.", "Move the mouse into one.")
-    return Picture(
+    return StrokeTarget(
         root, context.evaluated_depsgraph_get(), np.array(view.view_matrix), np.array(view.window_matrix),
         (region.width, region.height), context.space_data,
     )  # fmt: skip
@@ -284,21 +286,21 @@ class LODGS_OT_paint_splats(StrokeOperator, bpy.types.Operator):
             layout.prop(self, name)
 
     def prepare(self, root):
-        self._paint = painting.read(root)
+        self._paint = painting.read_paint(root)
 
     def show(self, root, hits):
-        painting.show(root, self._blend(hits))
+        painting.preview_paint(root, self._blend(hits))
 
     def apply(self, root, hits):
-        count = painting.write(root, self._blend(hits))
+        count = painting.write_paint(root, self._blend(hits))
         return f"{count:,} painted splats in all levels"
 
     def end_preview(self, root):
-        painting.show(root, {})
+        painting.preview_paint(root, {})
 
     def _blend(self, hits):
         alpha = {number: self.strength * hit for number, hit in hits.items()}
-        return painting.over(self._paint, alpha, tuple(self.color) if self.action == "PAINT" else None)
+        return painting.blend(self._paint, alpha, tuple(self.color) if self.action == "PAINT" else None)
 
 
 class LODGS_OT_remove_paint(EditLevelsOperator, bpy.types.Operator):
@@ -320,7 +322,7 @@ class LODGS_OT_remove_paint(EditLevelsOperator, bpy.types.Operator):
     @report_errors
     def execute(self, context):
         root = roots.active_root(context)
-        painting.write(root, {number: 0 * paint for number, paint in painting.read(root).items()})
+        painting.write_paint(root, {number: 0 * paint for number, paint in painting.read_paint(root).items()})
         return {"FINISHED"}
 
 
@@ -346,7 +348,9 @@ class LODGS_OT_select_all_splats(EditLevelsOperator, bpy.types.Operator):
         invert = self.action == "INVERT"
         cleaning.select(
             root,
-            cleaning.find(root, lambda cloud: np.full(len(cloud.points), invert) & ~cleaning.selected(cloud)),
+            cleaning.find(
+                root, lambda cloud: np.full(len(cloud.points), invert) & ~cleaning.selected_mask(cloud)
+            ),
         )
         return {"FINISHED"}
 

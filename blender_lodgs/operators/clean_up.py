@@ -158,7 +158,7 @@ class LODGS_OT_hide_splats(EditLevelsOperator, bpy.types.Operator):
         layout.prop(self, "action")
 
     def invoke(self, context, event):
-        for name, value in cleaning.suggestions(context, roots.active_root(context)).items():
+        for name, value in cleaning.suggest_limits(context, roots.active_root(context)).items():
             if not self.properties.is_property_set(name):
                 setattr(self, name, value)
         return self.execute(context)
@@ -182,13 +182,13 @@ class LODGS_OT_hide_splats(EditLevelsOperator, bpy.types.Operator):
         if self.test == "FLOATERS":
             return cleaning.find_floaters(context, root, self.gap, self.share / 100)
         if self.test == "FAR":
-            test = cleaning.far(context, root, self.distance)
+            test = cleaning.distance_test(context, root, self.distance)
         elif self.test == "UNSEEN":
-            test = cleaning.unseen(context, root, self.views)
+            test = cleaning.views_test(context, root, self.views)
         elif self.test == "LARGE":
-            test = cleaning.large(root, self.size)
+            test = cleaning.size_test(root, self.size)
         else:
-            test = cleaning.faint(self.opacity) if self.test == "FAINT" else cleaning.selected
+            test = cleaning.opacity_test(self.opacity) if self.test == "FAINT" else cleaning.selected_mask
         return cleaning.find(root, test)
 
 
@@ -219,7 +219,7 @@ class LODGS_OT_delete_left_out(EditLevelsOperator, bpy.types.Operator):
             bpy.ops.object.mode_set(mode="OBJECT")
         if context.active_object in crops.crops_of(root):
             context.view_layer.objects.active = root
-        self.report({"INFO"}, f"{scenes.delete_left_out(root):,} splats deleted")
+        self.report({"INFO"}, f"{scenes.delete_excluded(root):,} splats deleted")
         return {"FINISHED"}
 
 

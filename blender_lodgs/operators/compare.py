@@ -17,7 +17,7 @@ class _ViewsOperator:
     @classmethod
     def poll(cls, context):
         root = roots.root_with_levels(context)
-        if root is None or not photographs.photographed(root):
+        if root is None or not photographs.views_with_photo(root):
             cls.poll_message_set("Select a splat scene with levels and photos first")
             return False
         return True

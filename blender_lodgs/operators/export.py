@@ -42,7 +42,7 @@ def _size(context: bpy.types.Context, kind: SplatFormat, level: int = 0) -> str:
     root = roots.active_root(context)
     items = [item for item in root.lodgs.levels if item.exists]
     if not level:
-        count = scenes.count_shown(context, root)[0]
+        count = scenes.count_visible(context, root)[0]
     else:
         items = [
             item
@@ -223,7 +223,7 @@ class LODGS_OT_export_plain(_ForeignExport, _FileExport, _ConvertingExport, bpy.
         if self.source == "LEVEL":
             splats = scenes.read_level(root, self.level, self.placed, self.looked)
         else:
-            splats = scenes.shown_splats(context, root, self.placed, self.looked)
+            splats = scenes.visible_splats(context, root, self.placed, self.looked)
         path = self._path()
         meta = selection.read_json(root.lodgs.meta)
         bundle = Bundle("", [Level(1, splats)], meta=meta, tables=scenes.view_tables(root, self.placed))

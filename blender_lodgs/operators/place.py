@@ -15,7 +15,7 @@ class LODGS_OT_frame_scene(SceneOperator, bpy.types.Operator):
     bl_label = "Frame Splat Scene"
 
     def execute(self, context):
-        photographs.frame(context, roots.active_root(context))
+        photographs.frame_scene(context, roots.active_root(context))
         return {"FINISHED"}
 
 
@@ -46,8 +46,8 @@ class LODGS_OT_set_ground(SceneOperator, bpy.types.Operator):
     @report_errors
     def execute(self, context):
         root = roots.active_root(context)
-        points = ground.picked(context) if self.by == "SELECTION" else None
-        degrees = ground.lay_on_ground(root, points, self.flip)
+        points = ground.picked_positions(context) if self.by == "SELECTION" else None
+        degrees = ground.align_to_ground(root, points, self.flip)
         self.report({"INFO"}, f"Ground set to Z = 0: '{root.name}' rotated by {degrees:.1f}°")
         return {"FINISHED"}
 
@@ -72,7 +72,7 @@ class LODGS_OT_set_scale(SceneOperator, bpy.types.Operator):
 
     @report_errors
     def _measure(self, context):
-        self.length = ground.measured(ground.picked(context))
+        self.length = ground.measure_distance(ground.picked_positions(context))
         return {"FINISHED"}
 
     def invoke(self, context, event):
@@ -83,7 +83,7 @@ class LODGS_OT_set_scale(SceneOperator, bpy.types.Operator):
     @report_errors
     def execute(self, context):
         root = roots.active_root(context)
-        factor = self.length / ground.measured(ground.picked(context))
+        factor = self.length / ground.measure_distance(ground.picked_positions(context))
         ground.scale(root, factor)
         unchanged = abs(factor - 1) < 1e-4
         self.report(
@@ -101,7 +101,7 @@ class LODGS_OT_camera_path(SceneOperator, bpy.types.Operator):
 
     @report_errors
     def execute(self, context):
-        camera = flights.path(context, roots.active_root(context))
+        camera = flights.add_path(context, roots.active_root(context))
         self.report({"INFO"}, f"'{camera.name}' is the active camera")
         return {"FINISHED"}
 
@@ -115,7 +115,7 @@ class LODGS_OT_turntable(SceneOperator, bpy.types.Operator):
 
     @report_errors
     def execute(self, context):
-        camera = flights.turntable(context, roots.active_root(context))
+        camera = flights.add_turntable(context, roots.active_root(context))
         self.report({"INFO"}, f"'{camera.name}' is the active camera")
         return {"FINISHED"}
 

@@ -88,7 +88,7 @@ class LODGS_OT_plan_cells(SceneOperator, SteppedOperator, bpy.types.Operator):
         self._plan = reading.result()
         root = root_by_uid(uid)
         if root is not None:  # undo may have replaced it
-            cells.show(root.lodgs.training, self._plan)
+            cells.store_plan(root.lodgs.training, self._plan)
 
     def status_text(self, context, count):
         return "Planning cells, Esc to stop"

@@ -51,14 +51,14 @@ class LODGS_PT_capture(Panel):
 def _draw_settings(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     settings = context.scene.lodgs_capture
     column = split_column(layout)
-    draw_views(column, settings, viewpoints.count_of_scene(context.scene))
+    draw_views(column, settings, viewpoints.capture_view_count(context.scene))
     if settings.views_from in ("DOME", "GRID"):
-        count = len(viewpoints.chosen(context))
+        count = len(viewpoints.selected_subjects(context))
         objects = f"{count} selected object{'' if count == 1 else 's'}" if count else "all objects"
         say(column, f"Views cover {objects}.", "INFO")
-    width, height = viewpoints.size(context.scene, settings)
+    width, height = viewpoints.image_size(context.scene, settings)
     measured = coverage.current(context.scene)
-    text = f"Coverage: {measured.enough:.0%}" if measured else "Show Coverage"
+    text = f"Coverage: {measured.covered:.0%}" if measured else "Show Coverage"
     column.operator(
         "lodgs.show_coverage", text=text, icon="HIDE_OFF" if measured else "HIDE_ON", depress=bool(measured)
     )

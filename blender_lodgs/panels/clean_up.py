@@ -46,7 +46,7 @@ class LODGS_PT_clean_up(LevelsPanel):
             grid.operator("lodgs.hide_splats", text=name).test = test
 
         column = layout.column(align=True)
-        for number, (visible, total) in cleaning.count_left(root, context.view_layer.depsgraph).items():
+        for number, (visible, total) in cleaning.count_remaining(root, context.view_layer.depsgraph).items():
             column.label(text=f"Level {number}: {visible:,} of {total:,} splats")
         lost = {item.number: item.lost for item in cleaning.levels(root) if item.lost}
         if lost:

@@ -57,7 +57,7 @@ class LODGS_PT_compare(Panel):
     @classmethod
     def poll(cls, context):
         root = roots.active_root(context)
-        return root is not None and bool(photographs.photographed(root))
+        return root is not None and bool(photographs.views_with_photo(root))
 
     def draw(self, context):
         layout, root = self.layout, roots.active_root(context)

@@ -95,7 +95,7 @@ class LODGS_PT_detail(LevelsPanel):
             row.enabled = settings.complete
             row.prop(settings, "single_level")
         else:
-            choice = loaded.chosen(context, root)
+            choice = loaded.current_query(context, root)
             idle = choice.inactive_controls() if choice else {}
             for control in rule.controls if rule else ():
                 row = column.row()
@@ -121,13 +121,13 @@ class LODGS_PT_detail(LevelsPanel):
 
 def _draw_counts(layout: bpy.types.UILayout, context: bpy.types.Context, root: bpy.types.Object) -> None:
     """Draw the camera's chunk and the numbers of visible and loaded splats."""
-    choice = loaded.chosen(context, root) if root.lodgs.mode == "SELECTIVE" else None
+    choice = loaded.current_query(context, root) if root.lodgs.mode == "SELECTIVE" else None
     column = layout.column(align=True)
     position = choice.region_label() if choice else ""
     if position:
         column.label(text=position)
     if not streams.file_of(root):  # when streaming, viewports draw more splats than the levels hold
-        visible, total = scenes.count_shown(context, root)
+        visible, total = scenes.count_visible(context, root)
         column.label(text=f"{visible:,} of {total:,} splats shown")
     if choice and position:
         splats, megabytes = loaded.count_loaded(root, choice)
@@ -149,7 +149,7 @@ class LODGS_PT_stream(LevelsPanel):
         settings = root.lodgs.stream
         resident = settings.here + (stream.splats if stream is not None and stream.ready else 0)
         layout.label(text=f"{_short(resident)} of {_short(settings.total)} splats in memory")
-        if streams.changed(root):
+        if streams.is_edited(root):
             say(layout, "These splats no longer match the file, so streaming is off.", "INFO")
         elif root.lodgs.mode != "SELECTIVE":
             say(layout, "Choose By Distance to stream finer splats.", "INFO")

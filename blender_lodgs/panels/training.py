@@ -10,7 +10,13 @@ from ...training.lod.rules.cut import RULE as CUT
 from ...training.methods import method_info
 from .. import extension
 from ..data import roots, viewpoints
-from ..data.training import ALL_OFFER, chooses_distances, hold_out, level_distances, offered
+from ..data.training import (
+    COMMON_PARAMETERS,
+    has_level_distances,
+    hold_out_interval,
+    level_distances,
+    panel_parameters,
+)
 from ..runs import environment, job_settings, run_folders
 from ..runs.messages import measured_on, progress_facts, short_level_line
 from ..runs.watch import Watch, watch_of
@@ -61,7 +67,7 @@ class LODGS_PT_training_advanced(Panel):
     def poll(cls, context: bpy.types.Context) -> bool:
         root = roots.active_root(context)
         watch = watch_of(root)
-        trains = root is not None and (root.lodgs.scene_folder or viewpoints.alone(root))
+        trains = root is not None and (root.lodgs.scene_folder or viewpoints.has_only_splats(root))
         return bool(trains) and not (watch and watch.running)
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -76,10 +82,10 @@ class LODGS_PT_training_advanced(Panel):
             row.operator("lodgs.add_region", text="", icon="ADD")
         layout.prop(settings, "seed")
         _draw_parameter(layout, settings, "test_every")
-        for f in offered(settings.method):
-            if f.name not in ALL_OFFER or root.lodgs.scene_folder:
+        for f in panel_parameters(settings.method):
+            if f.name not in COMMON_PARAMETERS or root.lodgs.scene_folder:
                 _draw_parameter(layout, settings.parameters, f.name)
-        if chooses_distances(settings.method):
+        if has_level_distances(settings.method):
             _draw_distances(layout, context, root)
         if root.lodgs.scene_folder:
             layout.prop(settings, "model")
@@ -94,7 +100,7 @@ def _draw_choices(
     layout: bpy.types.UILayout, context: bpy.types.Context, root: bpy.types.Object, resumable: bool
 ) -> None:
     settings = root.lodgs.training
-    without_photos = viewpoints.alone(root)
+    without_photos = viewpoints.has_only_splats(root)
     info = method_info(settings.method)
     if not root.lodgs.scene_folder and not without_photos:
         say(layout, "No photos to train on. Import photos or a COLMAP scene.", "INFO")
@@ -120,7 +126,7 @@ def _draw_choices(
         from_base = without_photos or (info.from_base and settings.start_from != "POINTS")
         steps = parameters.base_steps if from_base else parameters.total_steps
         column.label(text=f"{steps:,} steps{text}")
-        match hold_out(root):
+        match hold_out_interval(root):
             case 0 if not without_photos:
                 say(layout, "No views are held out, so quality is measured on training views.", "INFO")
             case 1:
@@ -147,10 +153,10 @@ def _draw_views(column: bpy.types.UILayout, context: bpy.types.Context, root: bp
     """Draw the settings of the views to render from splats without photos."""
     settings = root.lodgs.training
     column.separator()
-    draw_views(column, settings, viewpoints.count(settings))
+    draw_views(column, settings, viewpoints.view_count(settings))
     if settings.views_from == "DOME":
         try:
-            _, radii = viewpoints.dome_of(root)
+            _, radii = viewpoints.preview_dome(root)
         except LodgsError as error:
             say(column, str(error), "ERROR")
             return

@@ -74,7 +74,7 @@ class LODGS_PT_training_cells(Panel):
     @classmethod
     def poll(cls, context):
         root = roots.active_root(context)
-        return root is not None and bool(root.lodgs.scene_folder) and not viewpoints.alone(root)
+        return root is not None and bool(root.lodgs.scene_folder) and not viewpoints.has_only_splats(root)
 
     def draw(self, context):
         root = roots.active_root(context)

@@ -56,11 +56,11 @@ def render_views(
         Number of views of the capture.
 
     Raises:
-        LodgsError: see ``viewpoints.of_scene``, or the folder contains other views or is not writable.
+        LodgsError: see ``viewpoints.capture_shots``, or the folder contains other views or is not writable.
     """
     check_render_size(width, height)
     _check(context.scene)
-    shots = viewpoints.of_scene(context, width, height)
+    shots = viewpoints.capture_shots(context, width, height)
     names = [f"view_{number:04d}" for number in range(1, len(shots) + 1)]
     existing = {file.stem for file in (folder / CAMERAS).glob("*.json")}
     if existing - set(names):
@@ -98,7 +98,7 @@ def noise_warning(scene: bpy.types.Scene) -> str | None:
             f"Without a denoiser, {problem}. Enable Denoise in Render > Sampling, "
             f"or use {LOW_NOISE_SAMPLES} samples."
         )
-    if not compat.DENOISES and scene.cycles.denoiser != "OPTIX":
+    if not compat.HAS_DENOISER and scene.cycles.denoiser != "OPTIX":
         return (
             f"This Blender has no denoiser: {problem}. Use Blender from blender.org, "
             f"or {LOW_NOISE_SAMPLES} samples."
@@ -164,7 +164,7 @@ def _prepare(scene: bpy.types.Scene, width: int, height: int) -> None:
     for layer in used:
         layer.use_pass_z = True
         # without a compositor, image and depth must come from the same layer: the first one
-        layer.use = layer == used[0] or compat.composites(scene)
+        layer.use = layer == used[0] or compat.uses_compositor(scene)
     trees = [getattr(scene, "node_tree", None), *bpy.data.node_groups]
     for tree in filter(None, trees):
         for node in tree.nodes:
@@ -206,10 +206,10 @@ def _save(scene: bpy.types.Scene, folder: Path, name: str, size: tuple[int, int]
     settings.color_management = "FOLLOW_SCENE"
     for kind, suffix in ((DEPTHS, "exr"), (IMAGES, "png")):
         if kind == DEPTHS:
-            compat.multilayer_exr(settings)
+            compat.set_multilayer_exr(settings)
             settings.exr_codec = "ZIP"
         else:
-            compat.png(settings, alpha=scene.render.film_transparent)
+            compat.set_png(settings, alpha=scene.render.film_transparent)
         file = folder / kind / f"{name}.{suffix}"
         with atomic_write(file) as temporary:
             try:
@@ -218,7 +218,7 @@ def _save(scene: bpy.types.Scene, folder: Path, name: str, size: tuple[int, int]
             except RuntimeError:  # Blender gives no reason
                 complete = False
             if not complete:
-                hint = ", or connect the compositor's output" if compat.composites(scene) else ""
+                hint = ", or connect the compositor's output" if compat.uses_compositor(scene) else ""
                 raise LodgsError(
                     f"Cannot write {file}: the image is incomplete.",
                     f"Free some disk space{hint}, then start the capture again.",

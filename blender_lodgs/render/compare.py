@@ -116,7 +116,7 @@ def show_comparison(context: bpy.types.Context, root: bpy.types.Object, view: bp
     """
     comparison = compare_view(context, root, view)
     assert comparison is not None
-    photographs.through(context, view)
+    photographs.use_view(context, view)
     wipe.show(context, comparison)
     return comparison
 

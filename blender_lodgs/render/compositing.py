@@ -183,7 +183,7 @@ def _set_depth_only(scene: bpy.types.Scene) -> None:
     render, settings = scene.render, scene.cycles
     render.engine = "CYCLES"
     render.use_compositing = render.use_sequencer = render.use_motion_blur = False
-    compat.multilayer_exr(render.image_settings)
+    compat.set_multilayer_exr(render.image_settings)
     for layer in scene.view_layers:
         layer.use_pass_z, layer.use_pass_combined = True, False
     settings.samples, settings.max_bounces = 1, 0

@@ -164,11 +164,11 @@ def placed_splats(depsgraph: bpy.types.Depsgraph) -> list[renderer.PlacedSplats 
     the rule. Other objects give the splats that remain after their modifiers.
     """
     placed = []
-    for instance in shown.without_coarser(shown.splat_instances(depsgraph)):
+    for instance in shown.drop_streamed_levels(shown.splat_instances(depsgraph)):
         evaluated, matrix, level = instance.evaluated, instance.matrix_world, instance.level
         placement = (matrix, level, instance.antialias)
         is_empty = not len(evaluated.data.points)
-        if instance.source is not None and (choice := shown.choice_of_picture(instance, depsgraph)):
+        if instance.source is not None and (choice := shown.camera_query(instance, depsgraph)):
             tree = instance.source.path, matrix, instance.antialias, choice, instance.looks
             placed.append(renderer.PlacedTree(*tree))
             continue
@@ -180,8 +180,8 @@ def placed_splats(depsgraph: bpy.types.Depsgraph) -> list[renderer.PlacedSplats 
             continue
         cloud = instance.object.data
         read = partial(_read_splats, cloud.evaluated_get(depsgraph), all_rule_columns())
-        version = *changes.version(cloud), *changes.paint(cloud)
-        choice = selection.choice(evaluated, depsgraph)
+        version = *changes.version(cloud), *changes.paint_version(cloud)
+        choice = selection.evaluated_query(evaluated, depsgraph)
         placed.append(
             renderer.PlacedSplats(
                 cloud.session_uid, read, *placement, version, choice, is_empty, instance.looks
@@ -196,7 +196,7 @@ def _is_selected_by_rule(instance: shown.SplatInstance, depsgraph: bpy.types.Dep
     Objects that are hidden in the viewport do not count, because Blender does not report their changes.
     """
     return (
-        selection.only_chosen(instance.evaluated, depsgraph)
+        selection.only_lodgs_modifiers(instance.evaluated, depsgraph)
         and attributes.WEIGHT not in instance.object.data.attributes
         and instance.object.visible_get(view_layer=depsgraph.view_layer)
     )

@@ -102,7 +102,7 @@ def _open_video(video: Path) -> Iterator[tuple[bpy.types.Scene, int]]:
     """Yield a temporary scene that renders the frames of a video, and their number."""
     scene = bpy.data.scenes.new("video")
     try:
-        strip = compat.strips(scene).new_movie("video", str(video), channel=1, frame_start=1)
+        strip = compat.sequencer_strips(scene).new_movie("video", str(video), channel=1, frame_start=1)
         element = strip.elements[0] if strip.elements else None
         if element is None or not (element.orig_width and element.orig_height) or strip.frame_duration < 2:
             raise LodgsError(f"Cannot read {video} as a video.", "Choose another file.")
@@ -110,7 +110,7 @@ def _open_video(video: Path) -> Iterator[tuple[bpy.types.Scene, int]]:
         render.resolution_x, render.resolution_y = element.orig_width, element.orig_height
         render.resolution_percentage = 100
         scene.view_settings.view_transform = "Standard"
-        compat.png(render.image_settings, alpha=False)
+        compat.set_png(render.image_settings, alpha=False)
         yield scene, strip.frame_duration
     finally:
         bpy.data.scenes.remove(scene)

@@ -107,7 +107,9 @@ def start(context: bpy.types.Context) -> BackgroundCapture:
     if current is not None and current.running:
         raise LodgsError("A capture is already running.", "Wait for it or cancel it.")
     folder = capture_folder(context.scene)
-    count = len(viewpoints.of_scene(context, *viewpoints.size(context.scene, context.scene.lodgs_capture)))
+    count = len(
+        viewpoints.capture_shots(context, *viewpoints.image_size(context.scene, context.scene.lodgs_capture))
+    )
     environment.require(environment.trainer_python())
     copy, log = folder / "capture.blend", folder / "capture.log"
     try:

@@ -158,7 +158,7 @@ def prepare(root: bpy.types.Object, folder: str = "") -> Submission:
             "Cannot reach the Flamenco manager: Blender's online access is off.",
             "Turn on Allow Online Access in the preferences, under System.",
         )
-    if viewpoints.alone(root):
+    if viewpoints.has_only_splats(root):
         raise LodgsError(
             f"Cannot train '{root.name}' on a farm: it has no photos.", "Import a COLMAP folder."
         )

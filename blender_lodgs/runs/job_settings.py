@@ -17,7 +17,7 @@ from ...training.runs.folder import RunFolder
 from ...training.runs.job import DOME, Job
 from .. import extension
 from ..data import crops, viewpoints
-from ..data.training import chooses_distances, hold_out, level_distances, offered
+from ..data.training import has_level_distances, hold_out_interval, level_distances, panel_parameters
 from .run_folders import run_folder, run_state
 
 if TYPE_CHECKING:
@@ -37,17 +37,17 @@ def make_job(root: bpy.types.Object, out: Path, parameters: dict) -> Job:
     """
     settings = root.lodgs.training
     values = {
-        **(_capture_keys(root, out) if viewpoints.alone(root) else _photo_keys(root, out)),
+        **(_capture_keys(root, out) if viewpoints.has_only_splats(root) else _photo_keys(root, out)),
         "out": str(out),
         "method": settings.method,
         "preset": settings.preset,
         "seed": settings.seed,
-        "test_every": hold_out(root),
+        "test_every": hold_out_interval(root),
         "image_scale": _as_typed(settings.image_scale),
         "backend": extension.preferences().backend,
-        "cells": "" if viewpoints.alone(root) else settings.grid,
+        "cells": "" if viewpoints.has_only_splats(root) else settings.grid,
         "polish": settings.polish,
-        "region": crops.as_text(root, settings.region) if settings.region in crops.crops_of(root) else "",
+        "region": crops.crop_text(root, settings.region) if settings.region in crops.crops_of(root) else "",
         "parameters": changed_parameters(settings) | parameters,
     }
     return Job.from_dict(values)
@@ -97,10 +97,10 @@ def changed_parameters(settings: TrainingSettings) -> dict:
     group = settings.parameters
     values = {
         f.name: _as_typed(getattr(group, f.name))
-        for f in offered(settings.method)
+        for f in panel_parameters(settings.method)
         if group.is_property_set(f.name)
     }
-    if chooses_distances(settings.method) and not settings.find_distances:
+    if has_level_distances(settings.method) and not settings.find_distances:
         indices = [index for _, index in level_distances(settings)]
         values["distances"] = (*(_as_typed(settings.distances[index]) for index in indices), 0.0)
     return values
@@ -130,18 +130,18 @@ def apply_job(settings: TrainingSettings, job: Job) -> None:
     names = {field.name for field in fields(Job)} - {"region"}
     for name in names.intersection(settings.bl_rna.properties.keys()):
         setattr(settings, name, getattr(job, name))
-    settings.region = crops.as_object(settings.id_data, job.crop) if job.crop else None
+    settings.region = crops.region_object(settings.id_data, job.crop) if job.crop else None
     settings.start_from = "FILE" if job.base else "POINTS"
     settings.columns, settings.rows = job.grid if job.cells else (1, 1)
     preset = method_info(job.method).preset(job.preset)
     parameters = job.resolved_parameters()
-    for f in offered(job.method):
+    for f in panel_parameters(job.method):
         settings.parameters.property_unset(f.name)
         if getattr(parameters, f.name) != getattr(preset, f.name):
             setattr(settings.parameters, f.name, getattr(parameters, f.name))
     settings.property_unset("distances")
     settings.find_distances = not any(getattr(parameters, "distances", ()))
-    if chooses_distances(job.method) and not settings.find_distances:
+    if has_level_distances(job.method) and not settings.find_distances:
         for number, index in level_distances(settings):
             settings.distances[index] = parameters.distances[number - 1]
 

@@ -209,7 +209,7 @@ def attach(root: bpy.types.Object, folder: str, *, reload: bool = True) -> Watch
     link_run(root, run)
     watch = start_watching(Watch(run, root.session_uid, offset=root.lodgs.training.read))
     if watch.blocks and not root.lodgs.training.planned_for:
-        cells.require(root.lodgs.training, watch.cells)
+        cells.resize_cells(root.lodgs.training, watch.cells)
     return watch
 
 
@@ -243,7 +243,7 @@ def _export_inputs(root: bpy.types.Object, run: RunFolder, job: Job) -> None:
     bundle = scenes.read_levels(root)
     views = []
     if job.capture:
-        views = viewpoints.placed(bpy.context, root, complete_splats(bundle, bundle.levels[-1]))
+        views = viewpoints.training_views(bpy.context, root, complete_splats(bundle, bundle.levels[-1]))
     run.create()
     write_bundle(run.base, bundle)
     for number, (camera, near) in enumerate(views):

@@ -199,7 +199,7 @@ class Watch:
         self.stopping &= {
             (block["kind"], block["block"]) for block in blocks if block["state"] in ("waiting", "running")
         }
-        cells.require(root.lodgs.training, self.cells)
+        cells.resize_cells(root.lodgs.training, self.cells)
 
     def _add_level(self, root: bpy.types.Object, event: dict) -> None:
         if self._stays_in_file(root, event):
@@ -208,7 +208,7 @@ class Watch:
         level = self._read_level(event)
         with extension.in_window():
             if not root.lodgs.training.read:  # never mix levels of two runs
-                scenes.make_room(root, event["level"])
+                scenes.prepare_refill(root, event["level"])
             if "meta" in event:
                 scenes.set_bundle_facts(root, self._bundle_facts(event))
             scenes.set_level(root, level)

@@ -116,7 +116,7 @@ class Way:
 
     def fit_crop(self):
         """Move the crop to the photographed subject and scale it."""
-        camera, target = self.lodgs("data.photographs").photographed_from(self.root)
+        camera, target = self.lodgs("data.photographs").photo_viewpoint(self.root)
         to_own = np.linalg.inv(self.to_world())
         centre = to_own[:3, :3] @ target + to_own[:3, 3]
         radius = self.between_splats(centre, 0.5 * (camera - target).length)
@@ -288,7 +288,7 @@ class Way:
         remaining = {}
         for level, item in zip(trained.levels, self.root.lodgs.levels, strict=True):
             inside = np.linalg.norm(level.splats.means - self.sphere[0], axis=1) < self.sphere[1]
-            hidden = self.lodgs("data.cleaning").hidden(item.object.data)
+            hidden = self.lodgs("data.cleaning").hidden_mask(item.object.data)
             remaining[level.number] = level.splats.select(inside & ~hidden)
         files = {
             "out.ply": list(remaining),

@@ -49,7 +49,7 @@ def near(looks, size, means, place, radius):
 
 
 def selected(lodgs, root):
-    return {item.number: lodgs("data.cleaning").selected(item.object.data) for item in root.lodgs.levels}
+    return {item.number: lodgs("data.cleaning").selected_mask(item.object.data) for item in root.lodgs.levels}
 
 
 def stroke(bpy, *path, **options):
@@ -97,20 +97,20 @@ def test_a_lasso_selects_what_it_encloses_but_neither_hidden_nor_cropped_splats(
     corners = [tuple(low), (low[0], high[1]), tuple(high), (high[0], low[1])]
     assert stroke(bpy, *corners, shape="LASSO", through=True) == {"FINISHED"}
     cleaning, depsgraph = lodgs("data.cleaning"), bpy.context.evaluated_depsgraph_get()
-    crops = lodgs("data.crops").as_objects_stand(root, depsgraph)
+    crops = lodgs("data.crops").evaluated_crops(root, depsgraph)
     for level, item in zip(bundle.levels, root.lodgs.levels, strict=True):
         pixels, depth = pixels_of(looks, size, level.splats.means)
         wanted = ((pixels > low) & (pixels < high)).all(axis=1) & (depth > 0.1)
         clear = (np.abs(pixels - low) > 1.5).all(axis=1) & (np.abs(pixels - high) > 1.5).all(axis=1)
-        wanted &= ~cleaning.hidden(item.object.data) & crops[0].contains(level.splats.means)
-        np.testing.assert_array_equal(cleaning.selected(item.object.data)[clear], wanted[clear])
+        wanted &= ~cleaning.hidden_mask(item.object.data) & crops[0].contains(level.splats.means)
+        np.testing.assert_array_equal(cleaning.selected_mask(item.object.data)[clear], wanted[clear])
         assert 10 < wanted.sum() < len(wanted) / 2
 
     before = selected(lodgs, root)
     bpy.ops.lodgs.select_all_splats(action="INVERT")
     for item, was in zip(root.lodgs.levels, before.values(), strict=True):
-        mask = cleaning.selected(item.object.data)
-        np.testing.assert_array_equal(mask, ~was & ~cleaning.hidden(item.object.data))
+        mask = cleaning.selected_mask(item.object.data)
+        np.testing.assert_array_equal(mask, ~was & ~cleaning.hidden_mask(item.object.data))
     bpy.ops.lodgs.select_all_splats(action="DESELECT")
     assert not any(mask.any() for mask in selected(lodgs, root).values())
 
@@ -146,7 +146,7 @@ def test_of_a_tree_leaves_are_selected_and_nodes_that_stand_for_nothing_else(bpy
     looks, size = viewport
     middle, cleaning = (size[0] / 2, size[1] / 2), lodgs("data.cleaning")
     stroke(bpy, (0, 0), radius=1, through=True)
-    family = cleaning._family(root)
+    family = cleaning._tree_relations(root)
     stroke(bpy, middle, (middle[0] + 40, middle[1]), radius=150, through=True)
     stroke(bpy, (middle[0] - 80, middle[1]), radius=150, through=True)
     masks, leaves, some = selected(lodgs, root), family.leaves, 0
@@ -189,16 +189,18 @@ def test_selecting_is_no_change_of_the_splats_and_viewports_see_it(bpy, lodgs, s
     root, _ = scene_of(bundle_of("bands", np.random.default_rng(4)))
     clouds = [item.object.data for item in root.lodgs.levels]
     of, changes = lodgs("viewport.resident").read_pool(clouds), lodgs("data.changes")
-    of.see_selection(clouds)
+    of.update_selection(clouds)
     assert of.selected is None
     _, size = viewport
     stroke(bpy, (1, 1), radius=1)
     bpy.context.view_layer.update()
-    versions, selection = [changes.version(cloud) for cloud in clouds], changes.selection()
+    versions, selection = [changes.version(cloud) for cloud in clouds], changes.selection_version()
     stroke(bpy, (size[0] / 2, size[1] / 2), radius=100)
     bpy.context.view_layer.update()
-    assert versions == [changes.version(cloud) for cloud in clouds] and selection != changes.selection()
-    of.see_selection(clouds)
+    assert (
+        versions == [changes.version(cloud) for cloud in clouds] and selection != changes.selection_version()
+    )
+    of.update_selection(clouds)
     np.testing.assert_array_equal(of.selected, np.concatenate(list(selected(lodgs, root).values())))
 
 

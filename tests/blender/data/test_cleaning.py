@@ -113,10 +113,10 @@ def test_crops_leave_of_every_level_what_numpy_does(bpy, lodgs, cropped, name):
         np.testing.assert_array_equal(shown_rows(bpy, lodgs, item.object), np.sort(wanted))
         depsgraph = bpy.context.evaluated_depsgraph_get()
         evaluated = item.object.evaluated_get(depsgraph)
-        assert lodgs("data.selection").only_chosen(evaluated, depsgraph)
-        choice = lodgs("data.selection").choice(evaluated, depsgraph)
+        assert lodgs("data.selection").only_lodgs_modifiers(evaluated, depsgraph)
+        choice = lodgs("data.selection").evaluated_query(evaluated, depsgraph)
         np.testing.assert_array_equal(choice.weights(level.splats.means, {}) > 0, stay[item.number])
-    counts = lodgs("data.cleaning").count_left(root, depsgraph)
+    counts = lodgs("data.cleaning").count_remaining(root, depsgraph)
     assert counts == {number: (mask.sum(), len(mask)) for number, mask in stay.items()}
 
 
@@ -144,17 +144,17 @@ def test_what_is_shown_by_distance_is_what_the_export_shows(bpy, lodgs, cropped,
 def test_the_viewport_arranges_what_the_modifiers_leave(bpy, lodgs, cropped, name):
     root, _, _ = cropped(name)
     cleaning = lodgs("data.cleaning")
-    cleaning.hide(root, cleaning.find(root, cleaning.faint(0.3)))
+    cleaning.hide(root, cleaning.find(root, cleaning.opacity_test(0.3)))
     root.lodgs.mode, root.lodgs.eye = "SELECTIVE", "TRAINING"
     bpy.context.view_layer.update()
-    resident, arranging = lodgs("viewport.resident"), lodgs("viewport.arranging")
+    resident, arrangement = lodgs("viewport.resident"), lodgs("viewport.arrangement")
     selection, depsgraph = lodgs("data.selection"), bpy.context.evaluated_depsgraph_get()
     for item in root.lodgs.levels:
         pool = resident.read_pool([item.object.data]).pool
-        choice = selection.choice(item.object.evaluated_get(depsgraph), depsgraph)
+        choice = selection.evaluated_query(item.object.evaluated_get(depsgraph), depsgraph)
         count = len(item.object.data.points)
-        placement = arranging.Placement(0, count, np.eye(4).tobytes(), item.number, choice, 0, "LEVELS")
-        found = arranging.arrange(pool, arranging.Request((placement,), (0.0, 0.0, 1.0), 10**6))
+        placement = arrangement.Placement(0, count, np.eye(4).tobytes(), item.number, choice, 0, "LEVELS")
+        found = arrangement.arrange(pool, arrangement.Request((placement,), (0.0, 0.0, 1.0), 10**6))
         rows = lodgs("attributes").read_attribute(item.object.data, "row")[found.splats]
         np.testing.assert_array_equal(np.sort(rows), shown_rows(bpy, lodgs, item.object))
 
@@ -229,7 +229,9 @@ def test_each_test_hides_what_it_says(bpy, lodgs, scene_of):
     def hidden_by(**options):
         bpy.ops.lodgs.show_hidden_splats()
         assert bpy.ops.lodgs.hide_splats(**options) == {"FINISHED"}
-        return np.concatenate([lodgs("data.cleaning").hidden(item.object.data) for item in root.lodgs.levels])
+        return np.concatenate(
+            [lodgs("data.cleaning").hidden_mask(item.object.data) for item in root.lodgs.levels]
+        )
 
     log_scales = np.concatenate([level.splats.log_scales for level in bundle.levels])
     logits = np.concatenate([level.splats.opacity_logits for level in bundle.levels])
@@ -322,7 +324,7 @@ def test_a_tree_is_left_as_one(bpy, lodgs, scene_of, tmp_path):
     root, bundle = scene_of(tree)
     bpy.ops.lodgs.hide_splats(test="FAINT", opacity=0.6)
     stays = 1 / (1 + np.exp(-bundle.levels[1].splats.opacity_logits)) >= 0.6
-    hidden = [lodgs("data.cleaning").hidden(item.object.data) for item in root.lodgs.levels]
+    hidden = [lodgs("data.cleaning").hidden_mask(item.object.data) for item in root.lodgs.levels]
     np.testing.assert_array_equal(hidden[1], ~stays)
     assert 0 < hidden[0].sum() < hidden[1].sum()  # nodes stand as long as anything does below them
     bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "out.ply"))
@@ -362,12 +364,12 @@ def test_selected_splats_are_hidden_and_found_ones_selected(bpy, lodgs, scene_of
     bpy.ops.lodgs.hide_splats(test="LARGE", size=0.5 * UNIT, action="SELECT")
     for item, level in zip(root.lodgs.levels, bundle.levels, strict=True):
         wanted = np.exp(level.splats.log_scales).max(axis=1) > 0.5
-        np.testing.assert_array_equal(cleaning.selected(item.object.data), wanted)
-        assert not cleaning.hidden(item.object.data).any()
+        np.testing.assert_array_equal(cleaning.selected_mask(item.object.data), wanted)
+        assert not cleaning.hidden_mask(item.object.data).any()
     bpy.ops.lodgs.hide_splats(test="SELECTED")
     for item, level in zip(root.lodgs.levels, bundle.levels, strict=True):
         wanted = np.exp(level.splats.log_scales).max(axis=1) > 0.5
-        np.testing.assert_array_equal(cleaning.hidden(item.object.data), wanted)
+        np.testing.assert_array_equal(cleaning.hidden_mask(item.object.data), wanted)
 
 
 def test_views_of_photographs_are_the_cameras(bpy, lodgs):
@@ -397,7 +399,7 @@ def test_what_lies_on_a_crops_face_is_in_it_for_nodes_and_for_numpy(bpy, lodgs, 
     lodgs("data.crops").new_crop(root, shape, blender(matrix))
     lodgs("data.selection").follow_crops(root)
     depsgraph = bpy.context.evaluated_depsgraph_get()
-    crops = lodgs("data.crops").as_objects_stand(root, depsgraph)
+    crops = lodgs("data.crops").evaluated_crops(root, depsgraph)
     root.lodgs.mode = "SINGLE"
     for level, item in zip(bundle.levels, root.lodgs.levels, strict=True):
         root.lodgs.single_level = item.number

@@ -119,8 +119,8 @@ def test_the_top_of_a_tree_can_be_imported(bpy, lodgs, tree, root, tmp_path):
     counts = [len(item.object.data.points) for item in root.lodgs.levels]
     assert 400 < sum(counts) <= budget / 4 and counts[1] == counts[0] + 1  # a binary tree
     assert said == [
-        f"{sum(counts):,} of {2 * LEAVES - 1:,} splats are here: coarser ones stand for the others, which "
-        "are read from tree.ply where viewports and renders of LODGS need them."
+        f"Imported the coarsest {sum(counts):,} of {2 * LEAVES - 1:,} splats. Viewports and renders of LODGS "
+        "stream finer ones from tree.ply."
     ]
     root.lodgs.mode = "SINGLE"
     assert [len(rows) for rows in shown_rows(bpy, lodgs, root)] == [0, counts[1]]

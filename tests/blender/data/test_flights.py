@@ -37,7 +37,7 @@ def test_a_path_goes_from_the_first_photograph_to_the_last_beside_the_others(bpy
 
 
 def test_a_turntable_looks_at_the_middle_all_around_evenly(bpy, lodgs, root):
-    middle, size = lodgs("data.photographs").bounds_of_most(root)
+    middle, size = lodgs("data.photographs").central_bounds(root)
     assert bpy.ops.lodgs.turntable() == {"FINISHED"}
     poses = seen_from(bpy, bpy.context.scene.camera, range(1, 50))
     to = np.array(middle) - poses[:, :3, 3]
@@ -63,6 +63,6 @@ def test_it_stands_at_once_where_the_frame_has_it(bpy, lodgs, root, verb):
 def test_a_scene_of_nothing_is_refused_and_nothing_is_left(bpy, lodgs, root, verb):
     bpy.data.batch_remove([*root.lodgs.cameras.objects, root.lodgs.points])
     before = len(bpy.data.objects), len(bpy.data.cameras)
-    with pytest.raises(RuntimeError, match=r"0 camera|nothing to turn"):
+    with pytest.raises(RuntimeError, match=r"0 camera|neither splats nor points"):
         getattr(bpy.ops.lodgs, verb)()
     assert (len(bpy.data.objects), len(bpy.data.cameras)) == before

@@ -161,7 +161,7 @@ def test_one_level_and_what_is_shown(bpy, lodgs, bundle, file, tmp_path):
     vertex = plyfile.PlyData.read(out)["vertex"]
     assert np.array_equal(vertex["scale_2"], np.concatenate([part.log_scales[:, 2] for part in wanted]))
     assert np.array_equal(vertex["f_rest_44"], np.concatenate([part.sh[:, 15, 2] for part in wanted]))
-    assert lodgs("data.scenes").count_shown(bpy.context, root) == (sum(map(len, wanted)), 2200)
+    assert lodgs("data.scenes").count_visible(bpy.context, root) == (sum(map(len, wanted)), 2200)
 
     for item in root.lodgs.levels:
         item.show = False

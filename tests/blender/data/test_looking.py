@@ -32,12 +32,12 @@ def test_outliers_do_not_count_for_what_is_looked_at(bpy, lodgs, tmp_path):
     write_bundle(tmp_path / "b.ply", Bundle("", [Level(1, ball(2000, 40))]))
     root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply", upright=False)
     root.scale, root.location = (2, 2, 2), (0, 0, 5)
-    assert lodgs("data.photographs").photographed_from(root) is None
-    middle, size = lodgs("data.photographs").bounds_of_most(root)
+    assert lodgs("data.photographs").photo_viewpoint(root) is None
+    middle, size = lodgs("data.photographs").central_bounds(root)
     np.testing.assert_allclose(middle, (20, 40, 65), atol=0.3)
     assert size == pytest.approx(2 * 2 * 0.9 * 3**0.5, rel=0.1)
     empty = bpy.data.objects.new("nothing", None)
-    assert lodgs("data.photographs").bounds_of_most(empty) is None
+    assert lodgs("data.photographs").central_bounds(empty) is None
 
 
 def test_what_is_cropped_away_or_hidden_does_not_count_either(bpy, lodgs, tmp_path):
@@ -45,7 +45,7 @@ def test_what_is_cropped_away_or_hidden_does_not_count_either(bpy, lodgs, tmp_pa
 
     write_bundle(tmp_path / "b.ply", Bundle("", [Level(1, ball(2000, 40))]))
     root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply", upright=False)
-    bounds, cleaning = lodgs("data.photographs").bounds_of_most, lodgs("data.cleaning")
+    bounds, cleaning = lodgs("data.photographs").central_bounds, lodgs("data.cleaning")
     corner = Matrix.Translation((9.5, 19.5, 29.5)) @ Matrix.Diagonal((0.5, 0.5, 0.5, 1))
     crop = lodgs("data.crops").new_crop(root, "BOX", corner)
     bpy.context.view_layer.update()
@@ -64,7 +64,7 @@ def test_photographs_are_looked_at_from_the_view_in_the_middle(bpy, lodgs):
     root = lodgs("data.importing").import_colmap(bpy.context, GARDEN, photographs=False)
     root.location = (1, 2, 3)
     bpy.context.view_layer.update()
-    eye, target = lodgs("data.photographs").photographed_from(root)
+    eye, target = lodgs("data.photographs").photo_viewpoint(root)
     scene = read_scene(GARDEN)
     middle = min(scene.cameras, key=lambda camera: float(np.linalg.norm(camera.center - scene.center)))
     points = (middle.world_to_camera[:3, :3] @ scene.points.T).T + middle.world_to_camera[:3, 3]
@@ -77,7 +77,7 @@ def test_photographs_are_looked_at_from_the_view_in_the_middle(bpy, lodgs):
 
 def test_what_stands_before_the_cameras_is_hidden_and_that_is_said(bpy, lodgs):
     """A new file's cube, in which some scenes were photographed, and before which others."""
-    eye, target = lodgs("data.photographs").photographed_from(
+    eye, target = lodgs("data.photographs").photo_viewpoint(
         lodgs("data.importing").import_colmap(bpy.context, GARDEN, photographs=False)
     )
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
@@ -98,7 +98,7 @@ def test_what_stands_before_the_cameras_is_hidden_and_that_is_said(bpy, lodgs):
     cubes["about"].hide_set(False)
     root = lodgs("data.roots").roots(bpy.context.scene)[0]
     lodgs("data.photographs").look_at_scene(bpy.context, root, told.append)
-    assert told == ["'about' stands before the cameras and is hidden; Alt+H shows it."]
+    assert told == ["Hid 'about', which blocks the view of the splats. Press Alt+H to show it."]
 
 
 def test_an_impossible_control_changes_nothing(bpy, lodgs, tmp_path):

@@ -84,7 +84,7 @@ def test_node_groups_show_of_every_level_what_numpy_does(bpy, lodgs, looking, na
         bpy.context.view_layer.update()
         check(bpy, lodgs, item.object, level.splats)
         depsgraph = bpy.context.evaluated_depsgraph_get()
-        assert lodgs("data.selection").only_chosen(item.object.evaluated_get(depsgraph), depsgraph)
+        assert lodgs("data.selection").only_lodgs_modifiers(item.object.evaluated_get(depsgraph), depsgraph)
     bpy.context.scene.lodgs_viewport.splats = True  # what LODGS draws has its look without them
     bpy.context.view_layer.update()
     obj = root.lodgs.levels[2].object
@@ -216,11 +216,11 @@ def test_a_crop_that_cuts_has_a_look_too_which_outlives_it(bpy, lodgs, looking):
     crop.lodgs_look.exposure = 1.0
     bpy.context.view_layer.update()
     depsgraph, crops = bpy.context.evaluated_depsgraph_get(), lodgs("data.crops")
-    assert crops.cutting(root) == [crop] and len(crops.crops_of(root)) == 3
-    assert len(crops.as_objects_stand(root, depsgraph)) == 1
+    assert crops.removing_crops(root) == [crop] and len(crops.crops_of(root)) == 3
+    assert len(crops.evaluated_crops(root, depsgraph)) == 1
     assert len(lodgs("data.looks").looks_of(root, depsgraph, blender(np.eye(4)))) == 4
     bpy.ops.lodgs.delete_left_out()
-    assert crop.lodgs_crop.keep == "ALL" and not crops.cutting(root)
+    assert crop.lodgs_crop.keep == "ALL" and not crops.removing_crops(root)
     crop.lodgs_crop.use = False
     bpy.context.view_layer.update()
     depsgraph = bpy.context.evaluated_depsgraph_get()

@@ -151,7 +151,7 @@ def test_another_method_leaves_no_driver_of_the_first(bpy, lodgs, root):
 def test_what_is_shown_is_exported_as_it_fades(bpy, lodgs, root):
     bpy.context.scene.camera.location = (3, -2, 1)
     bpy.context.view_layer.update()
-    splats = lodgs("data.scenes").shown_splats(bpy.context, root)
+    splats = lodgs("data.scenes").visible_splats(bpy.context, root)
     eye = root.lodgs.axes.matrix_world.inverted() @ bpy.context.scene.camera.matrix_world.translation
     opacities = []
     for item, weights in zip(root.lodgs.levels, expected(root, eye, root.lodgs.focal_px), strict=True):

@@ -106,7 +106,7 @@ def test_a_stroke_paints_every_level_as_points_and_exports_show_it(bpy, lodgs, p
         wanted = linear_from_srgb((colors[item.number][some] @ matrix.T).clip(0, 1))
         found = attributes.read_attribute(evaluated.data, attributes.COLOR)[:, :3]
         check(found, wanted)
-        assert lodgs("data.selection").only_chosen(evaluated, depsgraph)
+        assert lodgs("data.selection").only_lodgs_modifiers(evaluated, depsgraph)
 
 
 def test_files_that_keep_the_splats_as_trained_keep_their_paint_beside(bpy, lodgs, painted, tmp_path):
@@ -162,10 +162,12 @@ def test_paint_is_no_other_splats_and_stays_with_those_that_are_left(bpy, lodgs,
     root, bundle, colors = painted(bundle_of("bands", np.random.default_rng(3)))
     clouds = [item.object.data for item in root.lodgs.levels]
     bpy.context.view_layer.update()
-    versions, paint = [list(map(each, clouds)) for each in (changes.version, changes.paint)]
+    versions, paint = [list(map(each, clouds)) for each in (changes.version, changes.paint_version)]
     stroke(bpy, (3, 3), radius=2, color=RED)
     bpy.context.view_layer.update()
-    assert versions == list(map(changes.version, clouds)) and paint != list(map(changes.paint, clouds))
+    assert versions == list(map(changes.version, clouds)) and paint != list(
+        map(changes.paint_version, clouds)
+    )
 
     bpy.ops.lodgs.hide_splats(test="FAINT", opacity=0.4)
     bpy.ops.lodgs.delete_left_out()
@@ -183,11 +185,11 @@ def test_levels_that_are_trained_anew_take_paint_over_by_position(bpy, lodgs, sc
     scenes, painting = lodgs("data.scenes"), lodgs("data.painting")
     root, bundle = scene_of(bundle_of("bands", np.random.default_rng(4)))
     half = {level.number: (level.splats.means[:, 0] > 0).astype(np.float32) for level in bundle.levels}
-    painting.write(root, painting.over(painting.read(root), half, RED))
+    painting.write_paint(root, painting.blend(painting.read_paint(root), half, RED))
     rng, fresh = np.random.default_rng(5), bundle_of("bands", np.random.default_rng(5)).levels
     finest = bundle.levels[2].splats.means
     if anew:
-        scenes.make_room(root, 1)
+        scenes.prepare_refill(root, 1)
     for level in fresh if anew else fresh[2:]:
         some = rng.integers(len(finest), size=len(level.splats))
         level.splats.means[:] = finest[some] + rng.normal(0, 0.001, (len(some), 3))
@@ -209,16 +211,16 @@ def test_paint_does_not_spread_from_run_to_run(bpy, lodgs, scene_of):  # noqa: F
     scenes, painting = lodgs("data.scenes"), lodgs("data.painting")
     root, bundle = scene_of(bundle_of("bands", np.random.default_rng(4)))
     half = {level.number: (level.splats.means[:, 0] > 0).astype(np.float32) for level in bundle.levels}
-    painting.write(root, painting.over(painting.read(root), half, RED))
-    before, some = painting.read(root)[3], bundle.levels[2].splats.select(slice(0, 5))
+    painting.write_paint(root, painting.blend(painting.read_paint(root), half, RED))
+    before, some = painting.read_paint(root)[3], bundle.levels[2].splats.select(slice(0, 5))
     for levels in ([Level(1, some)], bundle.levels):
-        scenes.make_room(root, 1)
+        scenes.prepare_refill(root, 1)
         for level in levels:
             level.splats.extras = {k: v for k, v in level.splats.extras.items() if k not in COLUMNS}
             scenes.set_level(root, level)
-    np.testing.assert_array_equal(painting.read(root)[3], before)
-    painting.write(root, painting.over(painting.read(root), half, BLUE))
-    scenes.make_room(root, 1)
+    np.testing.assert_array_equal(painting.read_paint(root)[3], before)
+    painting.write_paint(root, painting.blend(painting.read_paint(root), half, BLUE))
+    scenes.prepare_refill(root, 1)
     blue = painting.paint_of(root.lodgs.painted)[half[3] > 0, :3]
     np.testing.assert_allclose(blue, np.broadcast_to(BLUE, blue.shape), atol=1e-6)
 
@@ -229,7 +231,7 @@ def test_a_tree_is_painted_node_by_node_and_half_a_tree_is_not(bpy, lodgs, paint
         check(colors_of(level.splats), colors[level.number])
     write_in_pages(tmp_path / "paged.ply", tree_of(random_leaves(3000, np.random.default_rng(7))))
     lodgs("data.importing").import_splats(bpy.context, tmp_path / "paged.ply", budget=1500)
-    with pytest.raises(RuntimeError, match="Most of these splats are in paged"):
+    with pytest.raises(RuntimeError, match=r"most of its splats are in paged\.ply"):
         stroke(bpy, (100, 100), radius=50, color=RED)
 
 
@@ -240,7 +242,7 @@ def test_what_is_seen_is_painted_and_what_is_behind_is_not(bpy, lodgs, scene_of,
     for through in (False, True):
         path = [{"name": "", "loc": (size[0] / 2, size[1] / 2), "time": 0.0}]
         bpy.ops.lodgs.paint_splats(path=path, radius=200, color=RED, through=through)
-        painted = lodgs("data.painting").read(root)
+        painted = lodgs("data.painting").read_paint(root)
         counts.append(sum(int((paint[:, 3] > 0).sum()) for paint in painted.values()))
         bpy.ops.lodgs.remove_paint()
     assert 0 < counts[0] < counts[1]

@@ -198,7 +198,8 @@ def test_the_scale_by_a_length_between_two_empties(bpy, lodgs):
 
 
 @pytest.mark.parametrize(
-    "places,words", [([(0, 0, 0)], "1 places"), ([(1, 1, 1)] * 2, "are one"), ([(0, 0, 0)] * 3, "3 places")]
+    "places,words",
+    [([(0, 0, 0)], "1 points"), ([(1, 1, 1)] * 2, "same position"), ([(0, 0, 0)] * 3, "3 points")],
 )
 def test_a_selection_that_is_no_length_is_refused(bpy, root, places, words):
     empties(bpy, root, places)

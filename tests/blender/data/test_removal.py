@@ -135,7 +135,7 @@ def test_a_copy_of_a_scene_is_removed_for_itself(bpy, lodgs, root):
 
 def test_a_root_of_an_older_file_holds_on_to_itself(lodgs, root):
     root.lodgs.itself = None
-    lodgs("data.older_files").bring_up_to_date(root)
+    lodgs("data.older_files").upgrade_scene(root)
     assert root.lodgs.itself == root
 
 

@@ -370,7 +370,7 @@ def test_facts_that_somebody_changed_are_none(bpy, lodgs, root, text):
     """Other add-ons and scripts can write into any property."""
     root.lodgs.facts = root.lodgs.meta = root.lodgs.levels[1].facts = text
     lodgs("data.selection").attach(root)
-    lodgs("data.older_files").bring_up_to_date(root)
+    lodgs("data.older_files").upgrade_scene(root)
     bundle = lodgs("data.scenes").read_levels(root)
     assert bundle.facts.keys() <= {"s_min"} and "s_min" not in bundle.levels[1].facts
     rule = lodgs("nodes.rules").rule_of_group
@@ -388,4 +388,4 @@ def test_a_level_whose_object_is_none_of_splats_leaves_the_list(bpy, lodgs, root
     lodgs("data.selection").attach(root)
     scenes = lodgs("data.scenes")
     assert [level.number for level in scenes.read_levels(root).levels] == [2, 3, 4, 5]
-    assert scenes.count_shown(bpy.context, root)[1] == 4 * COUNT and not mesh.modifiers
+    assert scenes.count_visible(bpy.context, root)[1] == 4 * COUNT and not mesh.modifiers

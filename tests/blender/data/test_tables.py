@@ -166,7 +166,7 @@ def test_a_deleted_table_is_no_table(bpy, lodgs, root):
 
 
 def test_another_training_begins_without_them(lodgs, root):
-    lodgs("data.scenes").make_room(root, 1)
+    lodgs("data.scenes").prepare_refill(root, 1)
     assert not root.lodgs.tables and lodgs("data.scenes").read_levels(root).tables == {}
 
 
@@ -180,7 +180,7 @@ def test_what_earlier_versions_saved_goes_on(bpy, lodgs, tmp_path):
     root.lodgs.mode, root.lodgs.eye, root.lodgs.camera_center = "SELECTIVE", "TRAINING", (0, 0, 0)
     for item in root.lodgs.levels:
         lodgs("data.selection").rule_modifier(item.object).node_group["lodgs_version"] = 101
-    lodgs("data.older_files").bring_up_to_date(root)
+    lodgs("data.older_files").upgrade_scene(root)
     depsgraph = bpy.context.evaluated_depsgraph_get()
     for item, wanted in zip(root.lodgs.levels, (lambda d: d >= 0.75, lambda d: d < 0.75), strict=True):
         shown = len(item.object.evaluated_get(depsgraph).data.points)

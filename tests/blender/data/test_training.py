@@ -106,14 +106,17 @@ def photographed(bpy):
 def test_photographs_are_held_out_where_there_are_enough(lodgs, photographed, count, every):
     root, training = photographed(count), lodgs("data.training")
     settings = root.lodgs.training
-    assert training.hold_out(root) == settings.preset_test_every == every and not settings.use_test_every
+    assert (
+        training.hold_out_interval(root) == settings.preset_test_every == every
+        and not settings.use_test_every
+    )
     settings.use_test_every = True
-    assert training.hold_out(root) == settings.test_every == every
+    assert training.hold_out_interval(root) == settings.test_every == every
     for own in (5, 0):
         settings.test_every = own
-        assert training.hold_out(root) == own and settings.preset_test_every == every
+        assert training.hold_out_interval(root) == own and settings.preset_test_every == every
     settings.use_test_every = False
-    assert training.hold_out(root) == every
+    assert training.hold_out_interval(root) == every
 
 
 def test_what_is_held_out_is_the_jobs(lodgs, photographed, tmp_path):

@@ -60,7 +60,7 @@ def test_views_are_cameras_that_see_what_they_saw(bpy, lodgs, root):
     bpy.context.view_layer.update()
     depsgraph, seen = bpy.context.evaluated_depsgraph_get(), []
     for obj, view in zip(objects, views(), strict=True):  # as Blender itself projects
-        lodgs("data.photographs").through(bpy.context, obj)
+        lodgs("data.photographs").use_view(bpy.context, obj)
         bpy.context.view_layer.update()
         seen.append(lodgs("data.cameras").view_from(root, depsgraph, view.width, view.height, obj)[0])
     check(seen, views())

@@ -43,9 +43,9 @@ def weights(bpy, lodgs):
         if len(evaluated.data.points):
             read = lodgs("attributes").read_attribute
             weights[read(evaluated.data, "row")] = read(evaluated.data, "lod_weight")
-        choice = lodgs("data.selection").choice(evaluated, depsgraph)
+        choice = lodgs("data.selection").evaluated_query(evaluated, depsgraph)
         np.testing.assert_allclose(choice.weights(fine.means, fine.extras), weights, atol=1e-6)
-        repeated = lodgs("data.selection").choice(evaluated, depsgraph)
+        repeated = lodgs("data.selection").evaluated_query(evaluated, depsgraph)
         assert choice == repeated and hash(choice) == hash(repeated)
         region = choice.region()
         assert region is None or (choice.visible_in_region(fine.extras) >= (weights > 0)).all()

@@ -106,7 +106,7 @@ def test_node_group_gives_the_weights_of_the_rule(bpy, lodgs, level, name, count
         depsgraph = bpy.context.evaluated_depsgraph_get()
         evaluated = obj.evaluated_get(depsgraph)
 
-        query = selection.choice(evaluated, depsgraph)
+        query = selection.evaluated_query(evaluated, depsgraph)
         assert (query.rule, query.focal_px) == (name, focal)
         assert dict(query.values) == pytest.approx(values) and dict(query.facts) == pytest.approx(facts)
         columns = splats.extras | {"opacity": 1 / (1 + np.exp(-splats.opacity_logits))}
@@ -164,7 +164,7 @@ def test_older_group_is_replaced_for_all_users(bpy, lodgs, splat_scene, name):
     assert not selection.outdated(root)
     used["lodgs_version"] = 0
     assert selection.outdated(root)
-    lodgs("data.older_files").bring_up_to_date(root)
+    lodgs("data.older_files").upgrade_scene(root)
     assert not selection.outdated(root)
     for item in root.lodgs.levels:
         groups_of_rules = [m.node_group for m in item.object.modifiers if groups.rule_of_group(m.node_group)]
@@ -265,7 +265,7 @@ def test_edited_group_stays_in_use_and_is_kept_when_replaced(lodgs, splat_scene,
         used
     }
     used["lodgs_version"] = 0
-    lodgs("data.older_files").bring_up_to_date(root)
+    lodgs("data.older_files").upgrade_scene(root)
     assert used not in {
         lodgs("data.selection").rule_modifier(item.object).node_group for item in root.lodgs.levels
     }
@@ -297,7 +297,7 @@ def test_empty_group_causes_no_errors(bpy, lodgs, half, name, capfd):
     bpy.context.view_layer.update()
     depsgraph = bpy.context.evaluated_depsgraph_get()
     evaluated = root.lodgs.levels[0].object.evaluated_get(depsgraph)
-    assert lodgs("data.selection").choice(evaluated, depsgraph) is None
+    assert lodgs("data.selection").evaluated_query(evaluated, depsgraph) is None
     assert "Traceback" not in "".join(capfd.readouterr())
 
 

@@ -55,12 +55,12 @@ def test_noisy_render_settings_cause_a_warning(bpy, lodgs, draw, monkeypatch):
     scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", 16, False
     assert "16 samples leave noise" in " ".join(warnings())
     scene.cycles.use_denoising = True
-    monkeypatch.setattr(compat, "DENOISES", False)
+    monkeypatch.setattr(compat, "HAS_DENOISER", False)
     assert "This Blender has no denoiser" in " ".join(warnings())
     scene.cycles.samples = 256
     assert not warnings()
     scene.cycles.samples = 16
-    monkeypatch.setattr(compat, "DENOISES", True)
+    monkeypatch.setattr(compat, "HAS_DENOISER", True)
     assert not warnings()
     scene.render.engine, scene.cycles.use_denoising = "BLENDER_WORKBENCH", False
     assert not warnings()

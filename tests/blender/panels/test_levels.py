@@ -123,7 +123,7 @@ def test_chunk_of_the_camera_and_loaded_splats_are_shown(bpy, lodgs, town, draw)
 def test_loaded_splats_are_counted_again_when_splats_change(bpy, lodgs, town):
     loaded, cloud = lodgs("data.loaded"), town.lodgs.levels[1].object.data
     bpy.context.view_layer.update()
-    choice = loaded.chosen(bpy.context, town)
+    choice = loaded.current_query(bpy.context, town)
     assert loaded.count_loaded(town, choice)[0] == 110
     lodgs("attributes").write_attribute(cloud, "chunks_0", "FLOAT", np.ones(1000, np.float32))
     cloud.update_tag()

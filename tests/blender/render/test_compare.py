@@ -51,7 +51,7 @@ def read_photo(bpy, view) -> np.ndarray:
 
 def test_psnr_matches_a_render(bpy, lodgs, root, renderer, tmp_path):
     scene, view = bpy.context.scene, lodgs("data.photographs").views(root)[5]
-    lodgs("data.photographs").through(bpy.context, view)
+    lodgs("data.photographs").use_view(bpy.context, view)
     comparison = lodgs("render.compare").compare_view(bpy.context, root, view)
     lodgs("render.engine").use(scene)
     scene.render.dither_intensity = 0
@@ -67,7 +67,7 @@ def test_psnr_matches_a_render(bpy, lodgs, root, renderer, tmp_path):
     assert 5 < psnr < 20
     assert comparison.psnr == pytest.approx(psnr, abs=0.02)
     assert view.data.lodgs.psnr == pytest.approx(comparison.psnr)
-    np.testing.assert_allclose(comparison.photograph, truth, atol=2.5 / 255)
+    np.testing.assert_allclose(comparison.photo, truth, atol=2.5 / 255)
     np.testing.assert_allclose(comparison.rendered, rendered, atol=0.6 / 255)
 
 
@@ -142,8 +142,8 @@ def test_masks_and_transparency_count_as_in_evaluate(bpy, lodgs, measured, rende
     root, view, psnr = measured(2, 1.0, tmp_path)
     comparison = lodgs("render.compare").compare_view(bpy.context, root, view)
     over_black = pixels[..., :3] * (pixels[..., 3:] / 255)
-    np.testing.assert_allclose(255 * comparison.photograph, over_black, atol=1e-3)
-    rendered, truth = (np.rint(255 * np.clip(x, 0, 1)) for x in (comparison.rendered, comparison.photograph))
+    np.testing.assert_allclose(255 * comparison.photo, over_black, atol=1e-3)
+    rendered, truth = (np.rint(255 * np.clip(x, 0, 1)) for x in (comparison.rendered, comparison.photo))
     difference = (rendered - truth)[80:280, 120:360]
     assert comparison.psnr == pytest.approx(
         20 * np.log10(255) - 10 * np.log10((difference**2).mean()), abs=0.01
@@ -244,19 +244,19 @@ def test_wipe_is_hidden_with_its_panel(bpy, lodgs, root):
     black = np.zeros((2, 2, 3), np.float32)
     camera = bpy.context.scene.camera
     wipe.show(bpy.context, wipe.Comparison(camera.session_uid, black, black, 20.0))
-    assert wipe.shown(bpy.context) and panel.poll(bpy.context)
+    assert wipe.is_shown(bpy.context) and panel.poll(bpy.context)
     write_bundle(Path(bpy.app.tempdir) / "haze.ply", Bundle("flod", [Level(1, haze(0.4))]))
     second = lodgs("data.importing").import_splats(bpy.context, Path(bpy.app.tempdir) / "haze.ply")
     assert bpy.context.view_layer.objects.active == second and not panel.poll(bpy.context)
-    assert not wipe.shown(bpy.context)
+    assert not wipe.is_shown(bpy.context)
     bpy.context.view_layer.objects.active = root
-    assert wipe.shown(bpy.context)
+    assert wipe.is_shown(bpy.context)
     bpy.context.scene.lodgs_render.show_comparison = False
-    assert not wipe.shown(bpy.context)
+    assert not wipe.is_shown(bpy.context)
     bpy.context.scene.lodgs_render.show_comparison = True
     root.lodgs.cameras.objects.unlink(camera)
     bpy.context.scene.collection.objects.link(camera)
-    assert not wipe.shown(bpy.context)
+    assert not wipe.is_shown(bpy.context)
 
 
 @pytest.mark.parametrize(("validation", "remainders"), [(False, [0]), (True, [0, 4])])

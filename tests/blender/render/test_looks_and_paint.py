@@ -134,7 +134,7 @@ def half_painted(lodgs, root, share=0.7):
         item.number: share * (lodgs("data.objects").read_splats(item.object).means[:, 0] > 0)
         for item in root.lodgs.levels
     }
-    return painting.over(painting.read(root), half, (0.1, 0.8, 0.2))
+    return painting.blend(painting.read_paint(root), half, (0.1, 0.8, 0.2))
 
 
 @pytest.mark.usefixtures("renderer", "camera")
@@ -144,16 +144,16 @@ def test_frames_with_paint_equal_those_of_the_export(bpy, lodgs, image, tmp_path
     root = lodgs("data.importing").import_splats(bpy.context, write_splats(tmp_path), upright=False)
     root.lodgs.mode, root.lodgs.single_level = mode, 3
     original = image()
-    lodgs("data.painting").write(root, half_painted(lodgs, root))
+    lodgs("data.painting").write_paint(root, half_painted(lodgs, root))
     painted = image()
     assert np.abs(original - painted).max() > 0.05
-    copy = scenes.shown_splats(bpy.context, root, looked=True)
+    copy = scenes.visible_splats(bpy.context, root, looked=True)
     bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "out.ply"))
     lodgs("data.removal").remove(root)
     reimported = lodgs("data.importing").import_splats(bpy.context, tmp_path / "out.ply", upright=False)
     reimported.lodgs.mode, reimported.lodgs.single_level = mode, 3
     np.testing.assert_allclose(image(), painted, atol=1e-4)
-    np.testing.assert_allclose(scenes.shown_splats(bpy.context, reimported).sh, copy.sh, atol=1e-6)
+    np.testing.assert_allclose(scenes.visible_splats(bpy.context, reimported).sh, copy.sh, atol=1e-6)
 
 
 @pytest.mark.usefixtures("camera", "frame")
@@ -176,21 +176,23 @@ def test_viewports_show_paint_without_reading_splats_again(bpy, lodgs, image, tm
     painting = lodgs("data.painting")
     paint = half_painted(lodgs, root)
     read = views.reads
-    painting.show(root, paint)  # during a stroke
+    painting.preview_paint(root, paint)  # during a stroke
     during = image(viewport_quality)
-    painting.show(root, {})
+    painting.preview_paint(root, {})
     np.testing.assert_array_equal(image(viewport_quality), original)
-    painting.write(root, paint)
+    painting.write_paint(root, paint)
     painted = image(viewport_quality)
     assert np.abs(original - painted).max() > 0.05 and (views.reads == read) == (not modifier)
     np.testing.assert_array_equal(during, original if modifier else painted)
-    painting.write(root, painting.over(paint, {n: np.full(len(x), 0.5) for n, x in paint.items()}, None))
+    painting.write_paint(
+        root, painting.blend(paint, {n: np.full(len(x), 0.5) for n, x in paint.items()}, None)
+    )
     half = image(viewport_quality)
     assert np.abs(original - half).max() > 0.02 and np.abs(painted - half).max() > 0.02
-    painting.write(root, paint)
+    painting.write_paint(root, paint)
     np.testing.assert_array_equal(image(viewport_quality), painted)
     bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "out.ply"))
-    painting.write(root, {number: 0 * values for number, values in paint.items()})
+    painting.write_paint(root, {number: 0 * values for number, values in paint.items()})
     np.testing.assert_array_equal(image(viewport_quality), original)
     lodgs("data.removal").remove(root)
     reimported = importing.import_splats(bpy.context, tmp_path / "out.ply", upright=False)

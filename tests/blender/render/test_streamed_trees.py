@@ -47,7 +47,7 @@ def test_frames_of_a_streamed_tree_are_complete(bpy, lodgs, path, camera, frame)
     root = importing.import_splats(bpy.context, path, budget=BUDGET)
     assert sum(len(item.object.data.points) for item in root.lodgs.levels) <= BUDGET
     assert root.lodgs.eye == "VIEW"
-    lodgs("data.selection").hold(root, (500, 500, 500), 20.0)
+    lodgs("data.selection").store_camera(root, (500, 500, 500), 20.0)
     streamed = {pixels: frame(root, pixels) for pixels in (1.0, 8.0)}
     root.lodgs.stream.file = ""
     without_file = frame(root, 1.0)
@@ -66,7 +66,7 @@ def test_frozen_camera_selects_the_nodes(bpy, lodgs, path, camera, frame):
     for budget in (BUDGET, 0):
         root = importing.import_splats(bpy.context, path, budget=budget)
         root.lodgs.eye, root.lodgs.freeze = "CAMERA", True
-        lodgs("data.selection").hold(root, (9, 9, 1), 100.0)
+        lodgs("data.selection").store_camera(root, (9, 9, 1), 100.0)
         images.append(frame(root, 2.0))
         lodgs("data.removal").remove(root)
     np.testing.assert_allclose(*images, atol=1e-4)

@@ -37,7 +37,9 @@ def encode(bpy, lodgs, frames: list[np.ndarray], path: Path, kind: str, codec: s
         write_png(path.parent / f"{number:02d}.png", pixels)
     scene = bpy.data.scenes.new("encode")
     compat = lodgs("compat")
-    strip = compat.strips(scene).new_image("a", str(path.parent / "00.png"), channel=1, frame_start=1)
+    strip = compat.sequencer_strips(scene).new_image(
+        "a", str(path.parent / "00.png"), channel=1, frame_start=1
+    )
     for number in range(1, len(frames)):
         strip.elements.append(f"{number:02d}.png")
     strip.frame_final_duration = len(frames)

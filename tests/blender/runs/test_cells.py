@@ -66,7 +66,7 @@ def test_plan_matches_the_trainers(bpy, lodgs, job_settings, root):
         assert cell.points == region.start_points(scene).sum()
         assert cell.megabytes == pytest.approx(planned.memory / 1e6)
         assert [names[place] for place in json.loads(cell.places)] == list(region.views)
-        eyes, frames = lodgs("data.cells").eyes(root, cell)
+        eyes, frames = lodgs("data.cells").cell_cameras(root, cell)
         centers = [camera.center for camera in scene.cameras if camera.name in region.views]
         np.testing.assert_allclose(eyes, centers, atol=1e-4)
         assert frames.shape == (len(eyes), 4, 3)

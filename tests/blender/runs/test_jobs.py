@@ -655,10 +655,10 @@ def test_octree_levels_are_cumulative_and_follow_the_distance(bpy, lodgs, jobs, 
     assert settings.levels[-1].object == finest, "a newer version of a level keeps its object"
     settings.mode = "SELECTIVE"
     bpy.context.view_layer.update()
-    visible, total = lodgs("data.scenes").count_shown(bpy.context, root)
+    visible, total = lodgs("data.scenes").count_visible(bpy.context, root)
     settings.octree.offset = -16
     bpy.context.view_layer.update()
-    assert lodgs("data.scenes").count_shown(bpy.context, root)[0] == len(
+    assert lodgs("data.scenes").count_visible(bpy.context, root)[0] == len(
         settings.levels[0].object.data.points
     )
     assert 0 < visible <= total
