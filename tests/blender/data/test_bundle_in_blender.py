@@ -75,7 +75,7 @@ def check(bpy, lodgs, positions, values, splats):
     np.testing.assert_array_equal(values("opacity"), splats.opacity_logits)
 
 
-def test_a_level_that_comes_while_its_object_is_edited_takes_its_place(bpy, lodgs):
+def test_new_level_replaces_an_object_in_edit_mode(bpy, lodgs):
     scenes, bundles = lodgs("data.scenes"), lodgs("training.splats.bundle")
     root = lodgs("data.importing").import_colmap(bpy.context, "examples/lantern_walk", photographs=False)
 

@@ -66,7 +66,7 @@ def inside(matrix, means, sphere):
 
 
 def shown_rows(bpy, lodgs, obj):
-    """Which of a level's splats its modifiers leave, by their column of rows."""
+    """Return the rows of a level that its modifiers keep."""
     cloud = obj.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
     if not len(cloud.points):
         return np.zeros(0, np.int32)
@@ -102,7 +102,7 @@ def cropped(bpy, lodgs, scene_of):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_crops_leave_of_every_level_what_numpy_does(bpy, lodgs, cropped, name):
+def test_crops_match_numpy_at_every_level(bpy, lodgs, cropped, name):
     root, bundle, stay = cropped(name)
     root.lodgs.mode = "SINGLE"
     for item in root.lodgs.levels:
@@ -121,7 +121,7 @@ def test_crops_leave_of_every_level_what_numpy_does(bpy, lodgs, cropped, name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_what_is_shown_by_distance_is_what_the_export_shows(bpy, lodgs, cropped, tmp_path, name):
+def test_export_matches_selection_by_distance(bpy, lodgs, cropped, tmp_path, name):
     root, _, stay = cropped(name)
     root.lodgs.mode, root.lodgs.eye = "SELECTIVE", "TRAINING"
     root.lodgs.camera_center = (1.0, -2.0, 0.5)
@@ -141,7 +141,7 @@ def test_what_is_shown_by_distance_is_what_the_export_shows(bpy, lodgs, cropped,
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_viewport_arranges_what_the_modifiers_leave(bpy, lodgs, cropped, name):
+def test_viewport_draws_remaining_splats(bpy, lodgs, cropped, name):
     root, _, _ = cropped(name)
     cleaning = lodgs("data.cleaning")
     cleaning.hide(root, cleaning.find(root, cleaning.opacity_test(0.3)))
@@ -159,7 +159,7 @@ def test_the_viewport_arranges_what_the_modifiers_leave(bpy, lodgs, cropped, nam
         np.testing.assert_array_equal(np.sort(rows), shown_rows(bpy, lodgs, item.object))
 
 
-def test_crops_are_followed_while_they_move_change_and_go(bpy, lodgs, scene_of):
+def test_modifiers_follow_changed_and_deleted_crops(bpy, lodgs, scene_of):
     root, bundle = scene_of(bundle_of("bands", np.random.default_rng(2)))
     item, means = root.lodgs.levels[2], bundle.levels[2].splats.means
     root.lodgs.single_level = 3
@@ -214,7 +214,7 @@ def test_crops_are_followed_while_they_move_change_and_go(bpy, lodgs, scene_of):
     assert not [group for group in bpy.data.node_groups if group.name.startswith("LODGS Clean Up")]
 
 
-def test_each_test_hides_what_it_says(bpy, lodgs, scene_of):
+def test_each_test_hides_its_splats(bpy, lodgs, scene_of):
     bundle = bundle_of("bands", np.random.default_rng(3))
     planted = (np.float32([40, 0, 0]) + np.random.default_rng(0).normal(0, 0.01, (3, 3))).astype(np.float32)
     bundle.levels[1].splats.means[:3] = planted
@@ -306,7 +306,7 @@ def test_hidden_splats_are_saved_undone_exported_and_lost_with_their_level(bpy, 
     assert not any(cleaning.HIDDEN in item.object.data.attributes for item in root_now().lodgs.levels)
 
 
-def test_crops_act_on_levels_that_come(bpy, lodgs, scene_of):
+def test_crops_apply_to_new_levels(bpy, lodgs, scene_of):
     root, _ = scene_of(bundle_of("bands", np.random.default_rng(5)))
     root.lodgs.single_level = 3
     bpy.ops.lodgs.add_crop(shape="SPHERE")
@@ -319,7 +319,7 @@ def test_crops_act_on_levels_that_come(bpy, lodgs, scene_of):
     np.testing.assert_array_equal(shown_rows(bpy, lodgs, root.lodgs.levels[2].object), wanted)
 
 
-def test_a_tree_is_left_as_one(bpy, lodgs, scene_of, tmp_path):
+def test_cleaned_tree_stays_a_tree(bpy, lodgs, scene_of, tmp_path):
     tree = tree_of(random_leaves(600, np.random.default_rng(7)))
     root, bundle = scene_of(tree)
     bpy.ops.lodgs.hide_splats(test="FAINT", opacity=0.6)
@@ -340,7 +340,7 @@ def test_a_tree_is_left_as_one(bpy, lodgs, scene_of, tmp_path):
         )
 
 
-def test_nothing_left_is_said_and_half_a_tree_is_not_deleted(bpy, lodgs, scene_of, tmp_path):
+def test_empty_result_and_partial_tree_are_rejected(bpy, lodgs, scene_of, tmp_path):
     root, _ = scene_of(bundle_of("bands", np.random.default_rng(8)))
     crops = lodgs("data.crops")
     crops.new_crop(root, "BOX", blender(placed((900, 0, 0), (0, 0, 0), (1, 1, 1))))
@@ -358,7 +358,7 @@ def test_nothing_left_is_said_and_half_a_tree_is_not_deleted(bpy, lodgs, scene_o
         bpy.ops.lodgs.delete_left_out()
 
 
-def test_selected_splats_are_hidden_and_found_ones_selected(bpy, lodgs, scene_of):
+def test_selected_splats_are_hidden_and_matches_selected(bpy, lodgs, scene_of):
     root, bundle = scene_of(bundle_of("bands", np.random.default_rng(10)))
     cleaning = lodgs("data.cleaning")
     bpy.ops.lodgs.hide_splats(test="LARGE", size=0.5 * UNIT, action="SELECT")
@@ -385,7 +385,7 @@ def test_views_of_photographs_are_the_cameras(bpy, lodgs):
 
 
 @pytest.mark.parametrize("shape", ["BOX", "SPHERE"])
-def test_what_lies_on_a_crops_face_is_in_it_for_nodes_and_for_numpy(bpy, lodgs, scene_of, shape):
+def test_points_on_a_crop_face_are_inside(bpy, lodgs, scene_of, shape):
     """However the crop is turned: rounding puts such places on both sides of its face."""
     rng, bundle = np.random.default_rng(6), bundle_of("bands", np.random.default_rng(6))
     matrix = placed((3, -7, 11), (0.7, 0.4, -0.9), (2, 0.5, 3))
@@ -409,7 +409,7 @@ def test_what_lies_on_a_crops_face_is_in_it_for_nodes_and_for_numpy(bpy, lodgs, 
         np.testing.assert_array_equal(np.flatnonzero(crops[0].contains(level.splats.means)), on_face)
 
 
-def test_an_older_files_crops_are_given_this_versions_group(bpy, lodgs, scene_of):
+def test_crops_of_older_files_get_the_current_group(bpy, lodgs, scene_of):
     root, _ = scene_of(bundle_of("bands", np.random.default_rng(7)))
     bpy.ops.lodgs.add_crop(shape="BOX")
     crop, crops, version = bpy.context.active_object, lodgs("data.crops"), lodgs("nodes.building").VERSION
@@ -424,7 +424,7 @@ def test_an_older_files_crops_are_given_this_versions_group(bpy, lodgs, scene_of
     assert {crops.modifier_of(obj).node_group[version] for obj in levels} == {now}
 
 
-def test_levels_point_at_nothing_that_an_undo_may_take_away(bpy, lodgs, scene_of):
+def test_levels_drop_references_before_undo(bpy, lodgs, scene_of):
     """Blender keeps what two steps hold alike, with what it was given since, which may be gone."""
     root, _ = scene_of(bundle_of("bands", np.random.default_rng(1)))
     name, material, seen = root.name, bpy.data.materials.new("Mine"), []
@@ -465,7 +465,7 @@ def test_levels_point_at_nothing_that_an_undo_may_take_away(bpy, lodgs, scene_of
     assert pointed_at() == there
 
 
-def test_hidden_views_are_where_they_stand(bpy, lodgs):
+def test_hidden_views_keep_their_pose(bpy, lodgs):
     """Blender does not follow hidden objects: the scene was made larger meanwhile."""
     root = lodgs("data.importing").import_colmap(bpy.context, GARDEN, photographs=False)
     before = [camera.center for camera in lodgs("data.cleaning").cameras(bpy.context, root)]

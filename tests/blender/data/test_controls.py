@@ -1,4 +1,4 @@
-"""What an artist has set of a rule's controls comes back from a bundle."""
+"""Controls set by an artist survive a bundle round trip."""
 
 import json
 
@@ -40,7 +40,7 @@ def other_than_default(control):
     ("rule", "control"), [(rule, control) for rule in rules().values() for control in rule.controls],
     ids=lambda each: each.name,
 )  # fmt: skip
-def test_a_bundle_gives_back_what_was_set(lodgs, made, rule, control):
+def test_bundle_restores_controls(lodgs, made, rule, control):
     root = made(rule, {})
     setattr(root.lodgs.controls, control.name, other_than_default(control))
     set_ = lodgs("data.scenes").read_levels(root).controls
@@ -75,7 +75,7 @@ RECORDED = [{}, {"gamma": 2.0}, {"first": 1}, {"first": 2, "last": 3}]
 
 @pytest.mark.parametrize("count", [1, 3, 5])
 @pytest.mark.parametrize("controls", RECORDED, ids=str)
-def test_blender_begins_with_what_the_trainer_measures(bpy, lodgs, some, tmp_path, count, controls):
+def test_initial_controls_match_the_trainer(bpy, lodgs, some, tmp_path, count, controls):
     """Imported at once, or level by level as they are trained."""
     scenes, bundle = lodgs("data.scenes"), some(count, controls)
     if any(not bundle.levels[0].number <= controls.get(name, 2) <= count + 1 for name in ("first", "last")):
@@ -94,7 +94,7 @@ def test_blender_begins_with_what_the_trainer_measures(bpy, lodgs, some, tmp_pat
     assert scenes.read_levels(root).controls == said
 
 
-def test_levels_in_use_go_along_until_somebody_sets_them(bpy, lodgs, some):
+def test_level_controls_follow_until_set(bpy, lodgs, some):
     scenes, bundle = lodgs("data.scenes"), some(6, {})
     with lodgs("data.importing").new_scene(bpy.context, "trained") as root:
         scenes.set_bundle_facts(root, lodgs("training.splats.levels").Bundle("flod", [], "bands"))
@@ -114,7 +114,7 @@ def test_levels_in_use_go_along_until_somebody_sets_them(bpy, lodgs, some):
 
 
 @pytest.mark.parametrize("rule", rules().values(), ids=lambda rule: rule.name)
-def test_levels_that_contradict_their_rule_are_refused_and_leave_nothing(bpy, lodgs, made, rule, tmp_path):
+def test_levels_that_contradict_their_rule_are_rejected(bpy, lodgs, made, rule, tmp_path):
     files, made = lodgs("training.splats.bundle"), made(rule, {})
     bundle = files.read_bundle(tmp_path / "b.ply")
     bundle.cumulative = not rule.cumulative
@@ -125,7 +125,7 @@ def test_levels_that_contradict_their_rule_are_refused_and_leave_nothing(bpy, lo
     assert len(bpy.data.objects) == before
 
 
-def test_an_impossible_value_is_refused_and_leaves_nothing(bpy, lodgs, made):
+def test_invalid_value_is_rejected(bpy, lodgs, made):
     before = len(bpy.data.objects)
     with pytest.raises(lodgs("training.errors").LodgsError, match="offset = 99 is invalid"):
         made(rules()["octree"], {"offset": 99})

@@ -42,7 +42,7 @@ def wanted_rows(lodgs, tree, eye, focal, pixels):
     return [np.flatnonzero(w) for w in choice.level_weights(np.float32(eye), focal, {"pixels": pixels})]
 
 
-def test_it_is_shown_by_distance_from_the_scenes_own_space(bpy, lodgs, tree, root):
+def test_distances_are_measured_in_scene_space(bpy, lodgs, tree, root):
     """Wherever the root stands, and by the focal length of the camera in pixels of the render."""
     assert (root.lodgs.mode, root.lodgs.single_level) == ("SELECTIVE", 2)
     root.location, root.rotation_euler, root.scale = (5, 6, 7), (1, 2, 3), (3, 3, 3)
@@ -71,7 +71,7 @@ def test_it_is_shown_by_distance_from_the_scenes_own_space(bpy, lodgs, tree, roo
     assert counts[3][1] < counts[0][1] and all(0 < sum(each) < LEAVES for each in counts)
 
 
-def test_a_coarser_level_is_not_shown_alone_nor_exported(bpy, lodgs, root, tmp_path):
+def test_incomplete_level_is_neither_shown_nor_exported_alone(bpy, lodgs, root, tmp_path):
     scenes, LodgsError = lodgs("data.scenes"), lodgs("training.errors").LodgsError
     root.lodgs.single_level = 1
     assert root.lodgs.single_level == 2
@@ -91,7 +91,7 @@ def test_a_coarser_level_is_not_shown_alone_nor_exported(bpy, lodgs, root, tmp_p
     assert [path.name for path in tmp_path.iterdir()] == ["tree.ply"]
 
 
-def test_a_folder_gets_levels_that_are_scenes_by_themselves(bpy, lodgs, tree, root, tmp_path):
+def test_folder_has_complete_levels(bpy, lodgs, tree, root, tmp_path):
     assert bpy.ops.lodgs.export_folder(directory=str(tmp_path / "levels")) == {"FINISHED"}
     again = lodgs("training.splats.level_folder").read_folder(tmp_path / "levels")
     counts = [len(level.splats) for level in again.levels]
@@ -100,7 +100,7 @@ def test_a_folder_gets_levels_that_are_scenes_by_themselves(bpy, lodgs, tree, ro
     assert len(levels) == len(counts) == 2
 
 
-def test_a_bundle_comes_back_as_the_same_tree(bpy, lodgs, tree, root, tmp_path):
+def test_bundle_round_trip_keeps_the_tree(bpy, lodgs, tree, root, tmp_path):
     bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "again.ply"))
     again = lodgs("training.splats.bundle").read_bundle(tmp_path / "again.ply")
     assert (again.rule, again.method) == ("cut", "tree")
@@ -131,7 +131,7 @@ def test_the_top_of_a_tree_can_be_imported(bpy, lodgs, tree, root, tmp_path):
     assert [len(item.object.data.points) for item in everything.lodgs.levels] == [LEAVES - 1, LEAVES]
 
 
-def test_colours_tell_sizes(bpy, lodgs):
+def test_colours_show_node_sizes(bpy, lodgs):
     """Each colour is an octave of what a splat stands for, leaves have the last."""
     rule = lodgs("training.lod.rule").rules()["cut"]
     told = partial(rule.splat_level, facts={"level": 1.0})

@@ -22,7 +22,7 @@ def seen_from(bpy, camera, frames):
     return np.array(found)
 
 
-def test_a_path_goes_from_the_first_photograph_to_the_last_beside_the_others(bpy, lodgs, root):
+def test_path_runs_from_first_to_last_photo(bpy, lodgs, root):
     assert bpy.ops.lodgs.camera_path() == {"FINISHED"}
     camera, views = bpy.context.scene.camera, lodgs("data.photographs").views(root)
     poses = seen_from(bpy, camera, range(1, 49))
@@ -36,7 +36,7 @@ def test_a_path_goes_from_the_first_photograph_to_the_last_beside_the_others(bpy
     assert camera not in views and camera.parent == root.lodgs.axes
 
 
-def test_a_turntable_looks_at_the_middle_all_around_evenly(bpy, lodgs, root):
+def test_turntable_circles_the_center_evenly(bpy, lodgs, root):
     middle, size = lodgs("data.photographs").central_bounds(root)
     assert bpy.ops.lodgs.turntable() == {"FINISHED"}
     poses = seen_from(bpy, bpy.context.scene.camera, range(1, 50))
@@ -50,7 +50,7 @@ def test_a_turntable_looks_at_the_middle_all_around_evenly(bpy, lodgs, root):
 
 
 @pytest.mark.parametrize("verb", ["camera_path", "turntable"])
-def test_it_stands_at_once_where_the_frame_has_it(bpy, lodgs, root, verb):
+def test_new_path_is_evaluated_at_the_current_frame(bpy, lodgs, root, verb):
     bpy.context.scene.frame_set(20)
     getattr(bpy.ops.lodgs, verb)()
     camera = bpy.context.scene.camera
@@ -60,7 +60,7 @@ def test_it_stands_at_once_where_the_frame_has_it(bpy, lodgs, root, verb):
 
 
 @pytest.mark.parametrize("verb", ["camera_path", "turntable"])
-def test_a_scene_of_nothing_is_refused_and_nothing_is_left(bpy, lodgs, root, verb):
+def test_empty_scene_is_rejected(bpy, lodgs, root, verb):
     bpy.data.batch_remove([*root.lodgs.cameras.objects, root.lodgs.points])
     before = len(bpy.data.objects), len(bpy.data.cameras)
     with pytest.raises(RuntimeError, match=r"0 camera|neither splats nor points"):

@@ -43,7 +43,7 @@ def back(bpy, lodgs, path):
 
 
 @pytest.mark.parametrize("ending", [".splat", ".spz", ".compressed.ply"])
-def test_a_level_goes_out_and_comes_back(bpy, lodgs, root, tmp_path, request, ending):
+def test_level_round_trip(bpy, lodgs, root, tmp_path, request, ending):
     if ending != ".splat":
         request.getfixturevalue("theirs")
     path = tmp_path / f"out{ending}"
@@ -54,7 +54,7 @@ def test_a_level_goes_out_and_comes_back(bpy, lodgs, root, tmp_path, request, en
     assert obj.name.startswith("out level 1")
 
 
-def test_streamed_levels_go_out_and_come_back(bpy, lodgs, root, tmp_path, theirs):
+def test_streamed_levels_round_trip(bpy, lodgs, root, tmp_path, theirs):
     assert bpy.ops.lodgs.export_streamed(directory=str(tmp_path / "web")) == {"FINISHED"}
     for path in (tmp_path / "web", tmp_path / "web" / "lod-meta.json"):
         objects = back(bpy, lodgs, path)
@@ -62,7 +62,7 @@ def test_streamed_levels_go_out_and_come_back(bpy, lodgs, root, tmp_path, theirs
             np.testing.assert_allclose(means(obj), means(item.object), atol=0.01)
 
 
-def test_without_the_program_a_sentence_says_what_to_install(bpy, lodgs, root, tmp_path, monkeypatch):
+def test_missing_program_is_reported(bpy, lodgs, root, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setattr(lodgs("training.splats.formats"), "_FOLDERS", ())
     for export in (

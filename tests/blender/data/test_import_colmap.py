@@ -22,7 +22,7 @@ def _everything(bpy) -> dict[str, int]:
     return {name: len(getattr(bpy.data, name)) for name in names}
 
 
-def test_cameras_see_points_where_colmap_does(bpy, lodgs, mini):
+def test_cameras_project_points_as_colmap(bpy, lodgs, mini):
     from bpy_extras.object_utils import world_to_camera_view
     from mathutils import Vector
 
@@ -120,7 +120,7 @@ def test_looking_through_the_views(bpy, lodgs, shared_scenes):
     assert look(0) == names[0]
 
 
-def test_points_make_way_for_the_first_level(bpy, lodgs, mini):
+def test_first_level_hides_points(bpy, lodgs, mini):
     root = lodgs("data.importing").import_colmap(bpy.context, mini)
     points, cameras = root.lodgs.points, root.lodgs.cameras
     assert points.type == "POINTCLOUD" and len(cameras.objects) == 32
@@ -153,7 +153,7 @@ def test_training_takes_the_model_and_photographs_of_the_import(bpy, lodgs, mini
     assert (Path(job.model), Path(job.images)) == (found.model, found.images_folder)
 
 
-def test_a_camera_that_is_there_stays(bpy, lodgs, mini):
+def test_existing_camera_stays_active(bpy, lodgs, mini):
     mine = bpy.data.objects.new("mine", bpy.data.cameras.new("mine"))
     bpy.context.scene.collection.objects.link(mine)
     bpy.context.scene.camera = mine
@@ -168,7 +168,7 @@ def test_a_camera_that_is_there_stays(bpy, lodgs, mini):
     ["multicam_subfolders", "names_unicode_spaces", "missing_images", "empty_points3D", "flat_sparse",
      "distorted_simple_radial"],
 )  # fmt: skip
-def test_odd_scenes_import(bpy, lodgs, shared_scenes, name):
+def test_irregular_scenes_import(bpy, lodgs, shared_scenes, name):
     folder = shared_scenes / "variants" / name
     scene, told = read_scene(folder), []
     root = lodgs("data.importing").import_colmap(bpy.context, folder, warn=told.append)
@@ -179,7 +179,7 @@ def test_odd_scenes_import(bpy, lodgs, shared_scenes, name):
     assert bool(scene.distorted) == any(view.data.lodgs.distorted for view in views)
 
 
-def test_failures_are_said_and_leave_nothing(bpy, lodgs, tmp_path, mini, monkeypatch):
+def test_failed_import_leaves_no_data(bpy, lodgs, tmp_path, mini, monkeypatch):
     before = _everything(bpy)
     with pytest.raises(RuntimeError, match="no COLMAP model"):
         bpy.ops.lodgs.import_colmap(directory=str(tmp_path))
@@ -195,7 +195,7 @@ def test_failures_are_said_and_leave_nothing(bpy, lodgs, tmp_path, mini, monkeyp
     assert bpy.context.scene.camera is None
 
 
-def test_undo_leaves_nothing(bpy, mini):
+def test_undo_removes_the_import(bpy, mini):
     bpy.ops.ed.undo_push(message="before")
     before = _everything(bpy)
     bpy.ops.lodgs.import_colmap("EXEC_DEFAULT", True, directory=str(mini))  # True: one undo step, as by hand
@@ -224,7 +224,7 @@ def test_another_program_s_export(bpy, lodgs, tmp_path):
     assert len(read_scene(tmp_path).cameras) == 2
 
 
-def test_a_damaged_export_is_a_sentence_and_leaves_nothing(bpy, lodgs, tmp_path):
+def test_damaged_export_is_rejected(bpy, lodgs, tmp_path):
     (tmp_path / "transforms.json").write_text("{")
     before = _everything(bpy)
     with pytest.raises(RuntimeError, match=r"transforms\.json is not valid"):

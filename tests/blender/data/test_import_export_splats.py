@@ -41,7 +41,7 @@ def the_root(bpy):
     return root
 
 
-def test_bundle_in_and_out_is_the_same_file(bpy, bundle, file, tmp_path):
+def test_bundle_round_trip_is_identical(bpy, bundle, file, tmp_path):
     assert bpy.ops.lodgs.import_splats(filepath=str(file)) == {"FINISHED"}
     settings = the_root(bpy).lodgs
     assert [(i.number, len(i.object.data.points), json.loads(i.facts)) for i in settings.levels] == [
@@ -57,7 +57,7 @@ def test_bundle_in_and_out_is_the_same_file(bpy, bundle, file, tmp_path):
     assert out.read_bytes() == file.read_bytes()
 
 
-def test_the_first_bundle_turns_the_viewports_to_where_it_was_photographed_from(bpy, lodgs, bundle, tmp_path):
+def test_first_bundle_sets_the_viewports_to_its_view(bpy, lodgs, bundle, tmp_path):
     """An eye at (1, 0, -5) that looks along +z where -y is up: in Blender along +y from y = -5."""
     bundle.meta |= {"view": [[1, 0, -5], [1, 0, 3]], "up_rotation": [[1, 0, 0], [0, 0, 1], [0, -1, 0]]}
     path = tmp_path / "seen.ply"
@@ -76,7 +76,7 @@ def test_the_first_bundle_turns_the_viewports_to_where_it_was_photographed_from(
 
 
 @pytest.mark.parametrize("view", [[[0, 0, 0]], "far", [[0, 0, None], [0, 0, 1]]])
-def test_an_impossible_view_is_refused_in_a_sentence(bpy, lodgs, bundle, tmp_path, view):
+def test_invalid_view_is_rejected(bpy, lodgs, bundle, tmp_path, view):
     bundle.meta |= {"view": view}
     path = tmp_path / "seen.ply"
     lodgs("training.splats.bundle").write_bundle(path, bundle)
@@ -84,7 +84,7 @@ def test_an_impossible_view_is_refused_in_a_sentence(bpy, lodgs, bundle, tmp_pat
         bpy.ops.lodgs.import_splats(filepath=str(path))
 
 
-def test_saved_and_opened_still_the_same_file(bpy, file, tmp_path):
+def test_bundle_survives_saving(bpy, file, tmp_path):
     bpy.ops.lodgs.import_splats(filepath=str(file))
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
@@ -92,7 +92,7 @@ def test_saved_and_opened_still_the_same_file(bpy, file, tmp_path):
     assert (tmp_path / "out.ply").read_bytes() == file.read_bytes()
 
 
-def test_several_plain_files_at_once_as_dropped(bpy, lodgs, bundle, tmp_path):
+def test_several_dropped_files_import(bpy, lodgs, bundle, tmp_path):
     for level in bundle.levels[:2]:
         lodgs("training.splats.ply").write_ply(tmp_path / f"plain{level.number}.ply", level.splats)
     bpy.ops.lodgs.import_splats(
@@ -108,7 +108,7 @@ def test_several_plain_files_at_once_as_dropped(bpy, lodgs, bundle, tmp_path):
     assert (tmp_path / "out.ply").read_bytes() == (tmp_path / "plain2.ply").read_bytes()
 
 
-def test_a_foreign_2d_filter_is_known_and_named_again_on_export(bpy, lodgs, bundle, tmp_path):
+def test_foreign_2d_filter_round_trip(bpy, lodgs, bundle, tmp_path):
     splats = bundle.levels[0].splats
     lodgs("training.splats.ply").write_ply(tmp_path / "mip.ply", splats, ["SplatRenderMode: mip"])
     said = []
@@ -126,7 +126,7 @@ def test_upright_turns_minus_y_up(bpy, lodgs, file):
     assert np.array(root.lodgs.axes.matrix_world)[:3, :3] @ [0, -1, 0] == pytest.approx([0, 0, 1], abs=1e-6)
 
 
-def test_upright_is_as_the_bundle_says(bpy, lodgs, bundle, tmp_path):
+def test_upright_uses_the_bundles_rotation(bpy, lodgs, bundle, tmp_path):
     turned = np.array([[0, 0.6, 0.8], [1, 0, 0], [0, 0.8, -0.6]])  # a rotation
     bundle.meta["up_rotation"] = turned
     lodgs("training.splats.bundle").write_bundle(tmp_path / "b.ply", bundle)
@@ -135,7 +135,7 @@ def test_upright_is_as_the_bundle_says(bpy, lodgs, bundle, tmp_path):
     assert np.array(root.lodgs.axes.matrix_world)[:3, :3] == pytest.approx(turned, abs=1e-6)
 
 
-def test_one_level_and_what_is_shown(bpy, lodgs, bundle, file, tmp_path):
+def test_export_one_level_and_visible_splats(bpy, lodgs, bundle, file, tmp_path):
     bpy.ops.lodgs.import_splats(filepath=str(file))
     root, out = the_root(bpy), tmp_path / "out.ply"
     bpy.ops.lodgs.export_plain(filepath=str(out), source="LEVEL", level=2)
@@ -171,7 +171,7 @@ def test_one_level_and_what_is_shown(bpy, lodgs, bundle, file, tmp_path):
     assert not (tmp_path / "none.ply").exists()
 
 
-def test_as_shown_is_of_the_scene_itself_and_says_so(bpy, lodgs, file, tmp_path):
+def test_visible_export_covers_the_scene_only(bpy, lodgs, file, tmp_path):
     """A level that is moved and turned, and a copy of it, are drawn there; the export says that it is not."""
     bpy.ops.lodgs.import_splats(filepath=str(file))
     root, out = the_root(bpy), [tmp_path / "before.ply", tmp_path / "after.ply"]
@@ -187,7 +187,7 @@ def test_as_shown_is_of_the_scene_itself_and_says_so(bpy, lodgs, file, tmp_path)
     assert "COLMAP's coordinates" in placed.description and not placed.default
 
 
-def test_only_this_one(bpy, file):
+def test_export_only_the_active_level(bpy, file):
     bpy.ops.lodgs.import_splats(filepath=str(file))
     settings = the_root(bpy).lodgs
     settings.mode, settings.levels[0].show = "SELECTIVE", False
@@ -196,7 +196,7 @@ def test_only_this_one(bpy, file):
     assert [i.object.visible_get() for i in settings.levels] == [True, False, False]
 
 
-def test_deleted_level_is_left_out(bpy, bundle, file, tmp_path):
+def test_deleted_level_is_not_exported(bpy, bundle, file, tmp_path):
     bpy.ops.lodgs.import_splats(filepath=str(file))
     root = the_root(bpy)
     bpy.data.objects.remove(root.lodgs.levels[1].object)
@@ -220,7 +220,7 @@ def test_folder(bpy, bundle, file, tmp_path):
     assert bpy.ops.lodgs.export_folder(directory=str(folder), replace=True) == {"FINISHED"}
 
 
-def test_bad_files_are_said_and_leave_nothing(bpy, file, tmp_path):
+def test_invalid_files_are_rejected(bpy, file, tmp_path):
     short = tmp_path / "short.ply"
     short.write_bytes(file.read_bytes()[:-100])
     (tmp_path / "text.ply").write_text("hello")
@@ -231,7 +231,7 @@ def test_bad_files_are_said_and_leave_nothing(bpy, file, tmp_path):
     assert not bpy.ops.lodgs.export_bundle.poll()
 
 
-def test_nothing_is_written_where_nothing_can_be(bpy, file, tmp_path):
+def test_unwritable_path_is_rejected(bpy, file, tmp_path):
     bpy.ops.lodgs.import_splats(filepath=str(file))
     (tmp_path / "blocked").write_text("a file, not a folder")
     with pytest.raises(RuntimeError, match="Cannot write"):
@@ -246,13 +246,13 @@ def test_undo_of_an_import(bpy, file):
     assert not bpy.data.pointclouds and not bpy.data.objects and not bpy.data.node_groups
 
 
-def test_menus_offer_them(bpy):
+def test_menus_list_import_and_export(bpy):
     for menu in (bpy.types.TOPBAR_MT_file_import, bpy.types.TOPBAR_MT_file_export):
         assert any("lodgs" in f.__module__ for f in menu._dyn_ui_initialize())
     assert bpy.types.LODGS_FH_splats.bl_import_operator == "lodgs.import_splats"
 
 
-def test_everything_shown_has_a_tooltip(bpy):
+def test_all_properties_have_tooltips(bpy):
     """Operators, their options and the settings of a scene: short names, and a sentence each."""
     names = [n for n in dir(bpy.ops.lodgs) if not n.startswith("_")]
     shown = [getattr(bpy.ops.lodgs, name).get_rna_type() for name in names]
@@ -266,7 +266,7 @@ def test_everything_shown_has_a_tooltip(bpy):
                 assert len(prop.name) <= 24, (kind.identifier, prop.name)
 
 
-def test_imported_piece_by_piece_and_ended_early(bpy, lodgs, bundle, tmp_path):
+def test_stepwise_import_can_be_cancelled(bpy, lodgs, bundle, tmp_path):
     """As a window does it, which goes on between two pieces: the same scene, or nothing."""
     path, scenes, told = tmp_path / "b.ply", lodgs("data.scenes"), []
     lodgs("training.splats.bundle").write_bundle(path, bundle)

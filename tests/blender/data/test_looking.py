@@ -28,7 +28,7 @@ def ball(count: int, outliers: int) -> Splats:
     )
 
 
-def test_outliers_do_not_count_for_what_is_looked_at(bpy, lodgs, tmp_path):
+def test_framing_ignores_outliers(bpy, lodgs, tmp_path):
     write_bundle(tmp_path / "b.ply", Bundle("", [Level(1, ball(2000, 40))]))
     root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply", upright=False)
     root.scale, root.location = (2, 2, 2), (0, 0, 5)
@@ -40,7 +40,7 @@ def test_outliers_do_not_count_for_what_is_looked_at(bpy, lodgs, tmp_path):
     assert lodgs("data.photographs").central_bounds(empty) is None
 
 
-def test_what_is_cropped_away_or_hidden_does_not_count_either(bpy, lodgs, tmp_path):
+def test_framing_ignores_cropped_and_hidden_splats(bpy, lodgs, tmp_path):
     from mathutils import Matrix
 
     write_bundle(tmp_path / "b.ply", Bundle("", [Level(1, ball(2000, 40))]))
@@ -60,7 +60,7 @@ def test_what_is_cropped_away_or_hidden_does_not_count_either(bpy, lodgs, tmp_pa
     assert bounds(root)[1] == pytest.approx(2 * 0.9 * 3**0.5, rel=0.1), "of nothing left all counts"
 
 
-def test_photographs_are_looked_at_from_the_view_in_the_middle(bpy, lodgs):
+def test_viewports_take_the_central_view(bpy, lodgs):
     root = lodgs("data.importing").import_colmap(bpy.context, GARDEN, photographs=False)
     root.location = (1, 2, 3)
     bpy.context.view_layer.update()
@@ -75,7 +75,7 @@ def test_photographs_are_looked_at_from_the_view_in_the_middle(bpy, lodgs):
     np.testing.assert_allclose((target - eye).normalized(), ahead, atol=1e-4)
 
 
-def test_what_stands_before_the_cameras_is_hidden_and_that_is_said(bpy, lodgs):
+def test_blocking_meshes_are_hidden_and_reported(bpy, lodgs):
     """A new file's cube, in which some scenes were photographed, and before which others."""
     eye, target = lodgs("data.photographs").photo_viewpoint(
         lodgs("data.importing").import_colmap(bpy.context, GARDEN, photographs=False)
@@ -101,7 +101,7 @@ def test_what_stands_before_the_cameras_is_hidden_and_that_is_said(bpy, lodgs):
     assert told == ["Hid 'about', which blocks the view of the splats. Press Alt+H to show it."]
 
 
-def test_an_impossible_control_changes_nothing(bpy, lodgs, tmp_path):
+def test_invalid_control_changes_nothing(bpy, lodgs, tmp_path):
     write_bundle(tmp_path / "b.ply", Bundle("mine", [Level(1, ball(5, 0))]))
     root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply")
     odd = Bundle("flod", [], "bands", controls={"gamma": -1.0}, meta={"a": 1})
@@ -113,7 +113,7 @@ def test_an_impossible_control_changes_nothing(bpy, lodgs, tmp_path):
 
 @pytest.mark.parametrize("fails_at", [1, 4])
 @pytest.mark.parametrize("what", ["splats", "colmap", "level"])
-def test_too_little_memory_leaves_nothing(bpy, lodgs, monkeypatch, tmp_path, what, fails_at):
+def test_out_of_memory_leaves_no_data(bpy, lodgs, monkeypatch, tmp_path, what, fails_at):
     """One sentence, and no half of a scene or of a level, whichever array is one too many."""
     write_bundle(tmp_path / "b.ply", Bundle("", [Level(1, ball(5, 0))]))
     root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply")

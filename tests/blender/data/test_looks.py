@@ -75,7 +75,7 @@ def check(bpy, lodgs, obj, splats):
 
 
 @pytest.mark.parametrize("name", ["bands", "octree", "chunks", "decay"])
-def test_node_groups_show_of_every_level_what_numpy_does(bpy, lodgs, looking, name):
+def test_node_groups_match_numpy_at_every_level(bpy, lodgs, looking, name):
     root, bundle = looking(name)
     bpy.context.scene.lodgs_viewport.splats = False  # points, which Blender draws
     root.lodgs.mode = "SINGLE"
@@ -95,7 +95,7 @@ def test_node_groups_show_of_every_level_what_numpy_does(bpy, lodgs, looking, na
         assert lodgs("data.looks").modifier_of(obj).show_render == (engine == "CYCLES")
 
 
-def test_a_look_is_animated_and_levels_that_come_have_it(bpy, lodgs, looking):
+def test_look_is_animated_and_applies_to_new_levels(bpy, lodgs, looking):
     root, bundle = looking("bands")
     bpy.context.scene.lodgs_viewport.splats = False
     root.lodgs.single_level = 3
@@ -116,7 +116,7 @@ def test_a_look_is_animated_and_levels_that_come_have_it(bpy, lodgs, looking):
 
 
 @pytest.mark.parametrize("placed_too", [False, True])
-def test_an_export_has_the_look_and_comes_back_equal(bpy, lodgs, looking, tmp_path, placed_too):
+def test_exported_look_round_trip(bpy, lodgs, looking, tmp_path, placed_too):
     root, bundle = looking("bands")
     bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "out.ply"), placed=placed_too)
     found = read_bundle(tmp_path / "out.ply")
@@ -139,7 +139,7 @@ def test_an_export_has_the_look_and_comes_back_equal(bpy, lodgs, looking, tmp_pa
 
 
 @pytest.mark.parametrize("points", [False, True])
-def test_what_is_exported_as_shown_has_the_look_once(bpy, lodgs, looking, tmp_path, points):
+def test_visible_export_applies_the_look_once(bpy, lodgs, looking, tmp_path, points):
     root, bundle = looking("bands")
     bpy.context.scene.lodgs_viewport.splats = not points
     root.lodgs.single_level = 2
@@ -208,7 +208,7 @@ def test_a_look_is_undone_saved_duplicated_and_reset(bpy, lodgs, looking, tmp_pa
         bpy.ops.lodgs.reset_look(name="nobody")
 
 
-def test_a_crop_that_cuts_has_a_look_too_which_outlives_it(bpy, lodgs, looking):
+def test_look_of_a_crop_survives_deletion(bpy, lodgs, looking):
     root, _ = looking("bands")
     root.lodgs.single_level = 3
     bpy.ops.lodgs.add_crop(shape="BOX", keep="INSIDE")

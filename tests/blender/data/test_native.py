@@ -90,7 +90,7 @@ def test_coefficients_count_from_0_as_in_blender(lodgs, make, degree):
 
 @pytest.mark.parametrize("first", [0, 1])
 @pytest.mark.parametrize("degree", [0, 1, 3])
-def test_both_namings_are_read_alike(lodgs, make, native, first, degree):
+def test_both_coefficient_namings_are_read(lodgs, make, native, first, degree):
     splats = make(50, degree)
     obj = native(splats, first)
     read = lodgs("data.objects").read_splats(obj)
@@ -171,7 +171,7 @@ def test_several_clouds_become_levels_by_their_number_of_splats(bpy, lodgs, make
     assert root.lodgs.single_level == 2
 
 
-def test_a_cloud_that_cannot_be_added_is_left_alone(bpy, lodgs, make, native):
+def test_unsuitable_cloud_stays_unchanged(bpy, lodgs, make, native):
     good, bad = native(make(20), name="good"), native(make(30), name="bad")
     bad.scale = (1, 2, 1)
     good.select_set(True)
@@ -260,7 +260,7 @@ def test_blender_or_lodgs_draws_and_both_select_the_same_splats(bpy, lodgs, make
 
 
 def test_blender_draws_looks_paint_and_weights(bpy, lodgs, make, with_splats, tmp_path):
-    """What Blender draws from is the look of ``training.editing.look``, and export has it once."""
+    """Blender draws the look of ``training.editing.look``, and export has it once."""
     splats = make(80, 3)
     write_ply(tmp_path / "s.ply", splats)
     root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "s.ply", upright=False)

@@ -34,7 +34,7 @@ def same_bits(a, b) -> bool:
 
 
 @pytest.mark.parametrize("degree", range(5))
-def test_there_and_back_to_the_bit(lodgs, make, degree):
+def test_round_trip_is_bit_exact(lodgs, make, degree):
     objects = lodgs("data.objects")
     rng = np.random.default_rng(1)
     splats = make(
@@ -86,7 +86,7 @@ def test_display_colour(lodgs, make):
     assert tuple(obj.color[:3]) == pytest.approx(shown.mean(axis=0), abs=1e-5)
 
 
-def test_what_artists_change_wins(lodgs, make):
+def test_edits_take_precedence(lodgs, make):
     objects, attributes, splats = lodgs("data.objects"), lodgs("attributes"), make(40, 1)
     obj = objects.new_splats("s", splats)
     cloud = obj.data
@@ -130,7 +130,7 @@ def test_deleted_points_stay_away(bpy, lodgs, make):
     assert same_bits(splats.select(slice(25, None)), left)
 
 
-def test_not_splats(lodgs):
+def test_object_without_splats_is_rejected(lodgs):
     objects = lodgs("data.objects")
     obj = objects.new_points("p", np.zeros((3, 3)), np.zeros((3, 3), np.uint8), 0.1)
     with pytest.raises(lodgs("training.errors").LodgsError, match="no splats"):

@@ -98,14 +98,14 @@ def test_one_level_means_all_up_to_it(bpy, root):
     assert all(item.object.visible_get() for item in root.lodgs.levels)
 
 
-def test_the_star_shows_what_an_eye_had_hidden(bpy, lodgs, root):
+def test_solo_shows_a_hidden_level(bpy, lodgs, root):
     root.lodgs.levels[0].show = root.lodgs.levels[2].show = False
     bpy.ops.lodgs.show_only_level(level=2)
     bpy.context.view_layer.update()
     assert [item.object.visible_get() for item in root.lodgs.levels] == [True, True, False, False]
 
 
-def test_a_level_is_exported_with_all_that_it_adds_to(bpy, lodgs, root):
+def test_cumulative_level_is_exported_with_coarser_levels(bpy, lodgs, root):
     splats = lodgs("data.scenes").read_level(root, 3)
     assert len(splats) == 3 * COUNT
     means = np.empty(3 * COUNT, np.float32)
@@ -114,7 +114,7 @@ def test_a_level_is_exported_with_all_that_it_adds_to(bpy, lodgs, root):
 
 
 def is_display(name):
-    """Whether a modifier or a driver's path is one of those that every splat object has."""
+    """Return True for a modifier or driver path that every splat object has."""
     return "LODGS Display" in name or "LODGS Native Splats" in name
 
 
@@ -148,7 +148,7 @@ def test_another_method_leaves_no_driver_of_the_first(bpy, lodgs, root):
     assert sum(len(weights) for weights, _ in shown(bpy, root)) > COUNT
 
 
-def test_what_is_shown_is_exported_as_it_fades(bpy, lodgs, root):
+def test_visible_export_keeps_fading(bpy, lodgs, root):
     bpy.context.scene.camera.location = (3, -2, 1)
     bpy.context.view_layer.update()
     splats = lodgs("data.scenes").visible_splats(bpy.context, root)

@@ -109,7 +109,7 @@ def test_a_stroke_paints_every_level_as_points_and_exports_show_it(bpy, lodgs, p
         assert lodgs("data.selection").only_lodgs_modifiers(evaluated, depsgraph)
 
 
-def test_files_that_keep_the_splats_as_trained_keep_their_paint_beside(bpy, lodgs, painted, tmp_path):
+def test_exports_without_look_keep_paint_columns(bpy, lodgs, painted, tmp_path):
     root, bundle, colors = painted(bundle_of("bands", np.random.default_rng(1)))
     bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "trained.ply"), looked=False)
     for level, before in zip(read_bundle(tmp_path / "trained.ply").levels, bundle.levels, strict=True):
@@ -157,7 +157,7 @@ def test_strokes_are_undone_one_by_one_saved_and_removed(bpy, lodgs, scene_of, v
         assert lodgs("data.looks").modifier_of(item.object) is None
 
 
-def test_paint_is_no_other_splats_and_stays_with_those_that_are_left(bpy, lodgs, painted):
+def test_paint_stays_with_remaining_splats(bpy, lodgs, painted):
     changes = lodgs("data.changes")
     root, bundle, colors = painted(bundle_of("bands", np.random.default_rng(3)))
     clouds = [item.object.data for item in root.lodgs.levels]
@@ -180,7 +180,7 @@ def test_paint_is_no_other_splats_and_stays_with_those_that_are_left(bpy, lodgs,
 
 
 @pytest.mark.parametrize("anew", [False, True])
-def test_levels_that_are_trained_anew_take_paint_over_by_position(bpy, lodgs, scene_of, anew):  # noqa: F811
+def test_retrained_levels_take_over_paint_by_position(bpy, lodgs, scene_of, anew):  # noqa: F811
     """One level in the place of another, or all of another run: a painted half stays painted."""
     scenes, painting = lodgs("data.scenes"), lodgs("data.painting")
     root, bundle = scene_of(bundle_of("bands", np.random.default_rng(4)))
@@ -235,7 +235,7 @@ def test_a_tree_is_painted_node_by_node_and_half_a_tree_is_not(bpy, lodgs, paint
         stroke(bpy, (100, 100), radius=50, color=RED)
 
 
-def test_what_is_seen_is_painted_and_what_is_behind_is_not(bpy, lodgs, scene_of, viewport):  # noqa: F811
+def test_paint_reaches_visible_splats_only(bpy, lodgs, scene_of, viewport):  # noqa: F811
     root, _ = scene_of(bundle_of("bands", np.random.default_rng(8)))
     _, size = viewport
     counts = []

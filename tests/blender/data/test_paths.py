@@ -1,4 +1,4 @@
-"""What scenes know of files stays true when the .blend is saved in another folder."""
+"""File paths of scenes stay valid when the .blend is saved in another folder."""
 
 import os
 
@@ -21,7 +21,7 @@ def told(bpy, root):
     return [os.path.normpath(bpy.path.abspath(path)) for path in (run, holdout)]
 
 
-def test_saved_in_another_folder_paths_lead_where_they_led(bpy, saved, tmp_path):
+def test_paths_stay_valid_after_saving_in_another_folder(bpy, saved, tmp_path):
     before, name = told(bpy, saved), saved.name
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "b" / "file.blend"))
     assert told(bpy, saved) == before and saved.lodgs.training.run.startswith("//")
@@ -30,7 +30,7 @@ def test_saved_in_another_folder_paths_lead_where_they_led(bpy, saved, tmp_path)
     assert told(bpy, bpy.data.objects[name]) == before
 
 
-def test_a_copy_elsewhere_has_them_too_and_leaves_the_open_file_as_it_was(bpy, saved, tmp_path):
+def test_saved_copy_leaves_the_open_file_unchanged(bpy, saved, tmp_path):
     before, name, run = told(bpy, saved), saved.name, saved.lodgs.training.run
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "b" / "copy.blend"), copy=True)
     assert saved.lodgs.training.run == run and told(bpy, saved) == before

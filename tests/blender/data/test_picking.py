@@ -1,4 +1,4 @@
-"""Which splat scene is at a pixel, against where two scenes were put."""
+"""Picking of splat scenes, compared with the known positions of two scenes."""
 
 from types import SimpleNamespace
 
@@ -49,7 +49,7 @@ def at(bpy, lodgs):
     return found
 
 
-def test_the_nearest_that_hides_what_is_behind_is_picked(scene_of, at):
+def test_nearest_opaque_scene_is_picked(scene_of, at):
     near, far = scene_of("near", 0.9, (1, 0, 2)), scene_of("far", 0.9, (1, 0, -2))
     assert at(150, 50) == near
     assert at(50, 50) is None and at(150, 95) is None
@@ -59,7 +59,7 @@ def test_the_nearest_that_hides_what_is_behind_is_picked(scene_of, at):
     assert at(150, 50) == near
 
 
-def test_fog_is_looked_through(scene_of, at):
+def test_fog_is_not_picked(scene_of, at):
     scene_of("fog", 0.3, (0, 0, 2))
     assert at(100, 50) is None
     behind = scene_of("behind", 0.9, (0, 0, -2))
@@ -77,7 +77,7 @@ def window(bpy):
 
 
 @pytest.mark.parametrize("away", [0.4, 0.6])
-def test_a_mesh_is_chosen_where_no_splats_hide_it(bpy, lodgs, scene_of, window, away):
+def test_unobstructed_mesh_is_picked(bpy, lodgs, scene_of, window, away):
     """Blender's own click has selected it: a ball before the middle, and splats before or behind."""
     looks, region = window.region_3d, bpy.context.region
     eye = looks.view_matrix.inverted().translation

@@ -1,4 +1,4 @@
-"""Where scenes stand: the root is the artist's, the axes carry what turns, grounds and scales the scene."""
+"""Placement of scenes: the root is the artist's, the axes carry what turns, grounds and scales the scene."""
 
 import re
 from pathlib import Path

@@ -97,7 +97,7 @@ def test_the_operator_removes_and_undo_brings_back(bpy, root):
     assert not bpy.ops.lodgs.remove_scene.poll()
 
 
-def test_what_artists_have_hung_on_it_stays_where_it_is(bpy, root):
+def test_children_of_a_removed_scene_stay(bpy, root):
     mine = bpy.data.objects["the artist's"]
     mine.parent, mine.location = root, (1, 0, 0)
     root.users_collection[0].objects.link(mine)
@@ -139,7 +139,7 @@ def test_a_root_of_an_older_file_holds_on_to_itself(lodgs, root):
     assert root.lodgs.itself == root
 
 
-def test_cameras_that_move_go_with_their_scene(bpy, lodgs, root):
+def test_animated_cameras_are_removed_with_their_scene(bpy, lodgs, root):
     """The artist's own things stay, and so does what moves about another scene."""
     there = everything(bpy)["objects"]
     assert bpy.ops.lodgs.camera_path() == {"FINISHED"} and bpy.ops.lodgs.turntable() == {"FINISHED"}

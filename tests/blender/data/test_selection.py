@@ -1,4 +1,4 @@
-"""What the modifiers keep, against the rule in numpy, splat for splat, for cameras of every kind."""
+"""Splats kept by the modifiers, compared with the rule in numpy, splat for splat, for cameras of every kind."""
 
 from math import inf
 
@@ -157,7 +157,7 @@ def test_moving_turning_and_scaling_the_root_changes_nothing(bpy, root):
     assert np.abs(np.subtract(after, before)).max() <= 1
 
 
-def test_the_eye(bpy, root):
+def test_camera_sources(bpy, root):
     chosen = bpy.data.objects.new("chosen", None)
     bpy.context.scene.collection.objects.link(chosen)
     chosen.location = (10, 0, 0)
@@ -206,7 +206,7 @@ def test_animated_parented_constrained_and_switched_cameras(bpy, root):
     assert len(set(seen)) == len(seen)
 
 
-def test_one_level_alone(bpy, root):
+def test_single_level(bpy, root):
     root.lodgs.mode = "SINGLE"
     for number in (1, 4):
         root.lodgs.single_level = number
@@ -265,7 +265,7 @@ def test_selection_survives_saving(bpy, root, tmp_path):
     assert check(bpy, again) != before
 
 
-def test_a_level_arrives_anew(bpy, lodgs, root):
+def test_replaced_level(bpy, lodgs, root):
     """In the middle of the list, too: drivers know levels by their place in it."""
     settings = root.lodgs
     bundle, objects = lodgs("training.splats.bundle"), lodgs("data.objects")
@@ -291,7 +291,7 @@ def test_a_level_arrives_while_an_artist_works(bpy, lodgs, root):
     assert root.lodgs.bands.last == 6
 
 
-def test_levels_that_are_gone_leave_no_gap(bpy, lodgs, root):
+def test_removed_levels_leave_no_gap(bpy, lodgs, root):
     """A shorter training after a longer one: its finest level reaches up to the eye."""
     for item in list(root.lodgs.levels)[3:]:
         bpy.data.objects.remove(item.object)
@@ -366,7 +366,7 @@ def test_without_a_camera(bpy, root):
 
 
 @pytest.mark.parametrize("text", ["{", "[]", "null", '{"s_min": "a"}', '{"s_min": NaN}', "[" * 5000])
-def test_facts_that_somebody_changed_are_none(bpy, lodgs, root, text):
+def test_edited_facts_are_ignored(bpy, lodgs, root, text):
     """Other add-ons and scripts can write into any property."""
     root.lodgs.facts = root.lodgs.meta = root.lodgs.levels[1].facts = text
     lodgs("data.selection").attach(root)

@@ -147,7 +147,7 @@ def test_renders_and_viewports_hide_by_themselves(bpy, lodgs, two_levels):
     assert seen == ["b", "scene level 2"] and shown == ["a", "scene level 2"]
 
 
-def test_what_modifiers_take_away_is_gone(bpy, lodgs):
+def test_splats_removed_by_modifiers_are_not_read(bpy, lodgs):
     """Blender drops all attributes with the last point: nothing is shown, and nothing breaks."""
     obj = lodgs("data.objects").new_splats("obj", make_splats(lodgs))
     bpy.context.scene.collection.objects.link(obj)

@@ -63,7 +63,7 @@ def everything(bpy):
     return {kind: sorted(one.name for one in getattr(bpy.data, kind)) for kind in kinds}
 
 
-def test_a_bundle_comes_and_goes_to_the_bit_and_stays_so_in_a_file(bpy, root, file, tmp_path):
+def test_tables_round_trip_is_bit_exact(bpy, root, file, tmp_path):
     assert exported(bpy, root, tmp_path / "out.ply") == file.read_bytes()
     name = root.name
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
@@ -71,7 +71,7 @@ def test_a_bundle_comes_and_goes_to_the_bit_and_stays_so_in_a_file(bpy, root, fi
     assert exported(bpy, bpy.data.objects[name], tmp_path / "out.ply") == file.read_bytes()
 
 
-def test_a_folder_has_them_both_ways(bpy, bundle, root, tmp_path):
+def test_folder_keeps_tables(bpy, bundle, root, tmp_path):
     write_folder(tmp_path / "levels", bundle)
     assert bpy.ops.lodgs.import_splats(filepath=str(tmp_path / "levels")) == {"FINISHED"}
     bpy.context.view_layer.objects.active = root
@@ -118,7 +118,7 @@ def test_two_scenes_of_one_file_have_their_own(bpy, lodgs, root, file, tmp_path)
     assert len(lodgs("data.roots").roots(bpy.context.scene)) == 1
 
 
-def test_appended_they_come_along(bpy, root, file, tmp_path):
+def test_appended_scene_keeps_tables(bpy, root, file, tmp_path):
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     with bpy.data.libraries.load(str(tmp_path / "a.blend")) as (_, wanted):
@@ -128,7 +128,7 @@ def test_appended_they_come_along(bpy, root, file, tmp_path):
     assert exported(bpy, bpy.data.objects["town"], tmp_path / "out.ply") == file.read_bytes()
 
 
-def test_undo_and_redo_take_and_bring_them(bpy, file, tmp_path):
+def test_undo_and_redo_restore_tables(bpy, file, tmp_path):
     bpy.ops.ed.undo_push(message="before")
     assert bpy.ops.lodgs.import_splats("EXEC_DEFAULT", True, filepath=str(file)) == {"FINISHED"}
     there = everything(bpy)
@@ -139,7 +139,7 @@ def test_undo_and_redo_take_and_bring_them(bpy, file, tmp_path):
     assert exported(bpy, bpy.data.objects["town"], tmp_path / "out.ply") == file.read_bytes()
 
 
-def test_they_leave_with_their_scene(bpy, root):
+def test_tables_are_removed_with_their_scene(bpy, root):
     assert bpy.ops.lodgs.remove_scene() == {"FINISHED"}
     assert not any(everything(bpy).values())
 
@@ -165,12 +165,12 @@ def test_a_deleted_table_is_no_table(bpy, lodgs, root):
     assert not any("chunk" in name for names in everything(bpy).values() for name in names)
 
 
-def test_another_training_begins_without_them(lodgs, root):
+def test_new_training_has_no_tables(lodgs, root):
     lodgs("data.scenes").prepare_refill(root, 1)
     assert not root.lodgs.tables and lodgs("data.scenes").read_levels(root).tables == {}
 
 
-def test_what_earlier_versions_saved_goes_on(bpy, lodgs, tmp_path):
+def test_tables_of_earlier_versions_load(bpy, lodgs, tmp_path):
     """A scene of LODGE from before there were chunks: no tables, no columns, no controls but one."""
     levels = [Level(1, splats(30), {"d_l": 1.5}), Level(2, splats(90), {"d_l": 0.0})]
     bundle = Bundle("lodge", levels, "chunks", controls={"distance_scale": 2.0})

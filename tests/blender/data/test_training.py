@@ -119,7 +119,7 @@ def test_photographs_are_held_out_where_there_are_enough(lodgs, photographed, co
     assert training.hold_out_interval(root) == every
 
 
-def test_what_is_held_out_is_the_jobs(lodgs, photographed, tmp_path):
+def test_held_out_views_follow_the_job(lodgs, photographed, tmp_path):
     root = photographed(40)
     job_settings = lodgs("runs.job_settings")
     root.lodgs.scene_folder = str(tmp_path)

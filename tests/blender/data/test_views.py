@@ -52,7 +52,7 @@ def check(cameras, wanted):
         assert np.allclose(camera.project(places)[0], view.project(places)[0], atol=2e-3)
 
 
-def test_views_are_cameras_that_see_what_they_saw(bpy, lodgs, root):
+def test_views_keep_their_cameras(bpy, lodgs, root):
     objects = root.lodgs.cameras.objects
     assert [obj.name for obj in objects] == [view.name for view in views()]
     assert not any(obj.data.lodgs.photograph for obj in objects) and bpy.context.scene.camera == objects[0]

@@ -32,7 +32,7 @@ os._exit(0)
 
 
 @pytest.mark.parametrize("cumulative", [False, True])
-def test_the_finest_level_is_there_as_points(bpy, lodgs, tmp_path, cumulative):
+def test_finest_level_appears_as_points(bpy, lodgs, tmp_path, cumulative):
     s_min = {1: 0.1, 2: 0.05, 3: 0.0}
     levels = [Level(number, splats(count), {"s_min": s_min[number]}) for number, count in COUNTS.items()]
     rule, facts = ("octree", {"d_max": 9.0, "d_max_focal": 500.0}) if cumulative else ("bands", {})

@@ -127,7 +127,7 @@ def test_import_reports_the_imported_objects(bpy, lodgs, capfd, tmp_path):
     assert "'b': 2 levels, 1,235 splats" in capfd.readouterr().out
     assert bpy.ops.lodgs.import_colmap(directory=str(GARDEN)) == {"FINISHED"}
     scene = lodgs("training.scenes.colmap").read_scene(GARDEN)
-    counts = f"{len(scene.cameras)} photographs, {len(scene.points):,} points"
+    counts = f"{len(scene.cameras)} photos, {len(scene.points):,} points"
     assert f"'lantern_garden': {counts}" in capfd.readouterr().out
 
 
