@@ -20,6 +20,7 @@ def bench(*arguments) -> int:
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_each_run_gives_a_point_and_is_reused(tiny_scene, tmp_path, monkeypatch):
     monkeypatch.setattr(bench_quality, "_version", lambda checkout: "v")
     options = "--methods", "3dgs", "--shares", "0.001", "0.002", "--image-scale", "1", "--out", tmp_path

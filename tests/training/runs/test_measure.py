@@ -73,7 +73,7 @@ def test_large_tree_measured_in_parts_gives_the_same_report(finished, splats, tm
     run = finished(test_every=4)
     write_bundle(RunFolder(run).bundle, tree_of(splats))
     expected = evaluate_run(run, far=True)
-    monkeypatch.setattr(on_disk, "IN_MEMORY", 100)
+    monkeypatch.setattr(on_disk, "MAX_IN_MEMORY", 100)
     report = evaluate_run(run, image=tmp_path / "levels.png", far=True)
     assert (tmp_path / "levels.png").is_file()
     assert [row["set"] for row in report["selective"]] == ["per view"]

@@ -580,7 +580,7 @@ def test_levels_on_disk_give_the_same_bundle(tiny_scene, tmp_path, monkeypatch):
 
     monkeypatch.setattr(method, "levels_after", levels_on_disk)
     for module in (training_loop, on_disk):
-        monkeypatch.setattr(module, "IN_MEMORY", 20)
+        monkeypatch.setattr(module, "MAX_IN_MEMORY", 20)
     code, on_disk_events = run_in_process({**keys, "out": str(tmp_path / "on_disk")})
     assert code == 0
     bundles = [(tmp_path / name / "bundle.ply").read_bytes() for name in ("in_memory", "on_disk")]
