@@ -241,7 +241,7 @@ def clean_up(bpy, count: int) -> None:
         f" {1e3 * np.median(steps[:11]):.0f}, as points {1e3 * np.median(steps[11:]):.0f} (medians of 11)"
     )
     counts = fastest(
-        lambda: (cleaning._counts.clear(), cleaning.count_left(root, bpy.context.view_layer.depsgraph))
+        lambda: (cleaning._counts.clear(), cleaning.count_remaining(root, bpy.context.view_layer.depsgraph))
     )
     floaters = fastest(lambda: cleaning.find_floaters(bpy.context, root, 0.0, 0.001))
     crop.lodgs_crop.use = False
@@ -256,22 +256,22 @@ def clean_up(bpy, count: int) -> None:
     path = [(400, 400), (900, 400)]
 
     def begin():
-        return strokes.Picture(root, depsgraph, look, clip, size)
+        return strokes.StrokeTarget(root, depsgraph, look, clip, size)
 
     image = begin()
     begins, covers = fastest(begin), fastest(lambda: image.hits(brushed(path, 50, size)))
-    selects = fastest(lambda: cleaning.select_also(root, image.hits(brushed(path, 50, size))))
+    selects = fastest(lambda: cleaning.extend_selection(root, image.hits(brushed(path, 50, size))))
     painting, step = load("blender_lodgs.data.painting"), path[:1] * 2
-    previous_paint = painting.read(root)
+    previous_paint = painting.read_paint(root)
 
     def paint(along):
         hit = image.hits(brushed(along, 50, size, hardness=0.5), footprints=True)
-        return painting.over(previous_paint, hit, (0.8, 0.1, 0.1))
+        return painting.blend(previous_paint, hit, (0.8, 0.1, 0.1))
 
-    follows = fastest(lambda: painting.show(root, paint(step)))
-    painting.show(root, {})
-    painting.write(root, paint(path))  # adds the paint columns to all levels
-    paints = fastest(lambda: painting.write(root, paint(path)))
+    follows = fastest(lambda: painting.preview_paint(root, paint(step)))
+    painting.preview_paint(root, {})
+    painting.write_paint(root, paint(path))  # adds the paint columns to all levels
+    paints = fastest(lambda: painting.write_paint(root, paint(path)))
     hide = fastest(lambda: cleaning.hide(root, floater_rows), 1)
     print(
         f"clean up, {count:,} splats in five levels, ms of the main thread:\n"
@@ -295,8 +295,8 @@ def streaming(bpy, path: Path, budget: int, frames: int = 100) -> None:
         return
     gpu.init()
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
-    views, eye, visible = (
-        load(f"blender_lodgs.{name}") for name in ("viewport.views", "viewport.eye", "data.shown")
+    views, view_camera, visible = (
+        load(f"blender_lodgs.{name}") for name in ("viewport.views", "viewport.view_camera", "data.shown")
     )
     import_start = time.perf_counter()
     root = load("blender_lodgs.data.importing").import_splats(bpy.context, path, upright=False, budget=budget)
@@ -311,7 +311,7 @@ def streaming(bpy, path: Path, budget: int, frames: int = 100) -> None:
         depsgraph = bpy.context.evaluated_depsgraph_get()
         wall_start, cpu_start = time.perf_counter(), time.thread_time()
         looks = SimpleNamespace(view_matrix=look, window_matrix=projection @ look, view_distance=1.0)
-        eye.on_draw(region, bpy.context.scene, looks, splats=True)
+        view_camera.track(region, bpy.context.scene, looks, splats=True)
         views.prepare(view, visible.splat_instances(depsgraph), depsgraph, look, 2_000_000, moving=True)
         return time.perf_counter() - wall_start, time.thread_time() - cpu_start
 
@@ -332,9 +332,12 @@ def streaming(bpy, path: Path, budget: int, frames: int = 100) -> None:
         spent.append(redraw(position))
         time.sleep(1 / 60)
     settled = wait()
-    update = fastest(
-        lambda: (eye.follow(bpy.context.scene, tuple(low), 1000.0), bpy.context.view_layer.update()), 1
-    )
+
+    def store_and_evaluate() -> None:
+        view_camera.store_view(bpy.context.scene, tuple(low), 1000.0)
+        bpy.context.view_layer.update()
+
+    update = fastest(store_and_evaluate, 1)
     stream = views.stream(root)
     assert stream is not None and not stream.problem, stream and stream.problem
     wall, cpu = 1e3 * np.array(spent).T

@@ -48,7 +48,7 @@ def tour() -> Steps:
     yield 1.0
     region("UI").active_panel_category = "LODGS"
     press("lodgs.import_colmap", directory=PLAN["scene"], photographs=False)
-    root = module("data.scenes").active_root(bpy.context)
+    root = module("data.roots").active_root(bpy.context)
     _look_down(root)
     yield from plan(root)
     yield from train(root)
@@ -93,7 +93,7 @@ def train(root: bpy.types.Object) -> Steps:
     yield 1.0
     press("wm.open_mainfile", "EXEC_DEFAULT", filepath=blend)
     yield 2.0
-    root = module("data.scenes").active_root(bpy.context)
+    root = module("data.roots").active_root(bpy.context)
     watch = module("runs.watch").watch_of(root)
     assert watch is not None and watch.running and watch.process is None, (
         "The run is not found after reopening the file."

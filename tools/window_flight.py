@@ -102,7 +102,7 @@ class CallTimer:
             (module("viewport.discs"), "draw", PIXELS, True),
             (module("viewport"), "_draw_view", "redraw", False),
             (module("viewport.views"), "_wake", "polling for loaded data", False),
-            (module("viewport.eye"), "_hand_on", "updating the camera", False),
+            (module("viewport.view_camera"), "_store_pending", "updating the camera", False),
         ):
             setattr(owner, function, self.wrap(getattr(owner, function), name, separate=separate))
         for cls in [*_subclasses(bpy.types.Operator), *_subclasses(bpy.types.Panel)]:
@@ -197,7 +197,7 @@ def flight() -> Steps:
 
 def fly(timer: CallTimer, space: bpy.types.SpaceView3D) -> Steps:
     cameras = all_cameras()
-    roots = module("data.scenes").roots
+    roots = module("data.roots").roots
     opened = time.monotonic()
     press(
         "lodgs.import_splats",
@@ -280,7 +280,7 @@ def all_cameras() -> list:
 
 def loaded() -> Steps:
     """Wait until all data is loaded."""
-    views, (root,) = module("viewport.views"), module("data.scenes").roots(bpy.context.scene)
+    views, (root,) = module("viewport.views"), module("data.roots").roots(bpy.context.scene)
 
     def is_loaded() -> bool:
         stream = views.stream(root)

@@ -96,7 +96,7 @@ def preferences() -> Steps:
 
 def import_scene() -> Iterator[float]:
     press("lodgs.import_colmap", directory=PLAN["scene"])
-    root = module("data.scenes").active_root(bpy.context)
+    root = module("data.roots").active_root(bpy.context)
     views = module("data.photographs").views(root)
     photos = list(Path(PLAN["scene"], "images").iterdir())
     assert len(views) == len(photos), f"Imported {len(views)} of {len(photos)} cameras."
@@ -153,7 +153,7 @@ def levels(root: bpy.types.Object) -> Steps:
     for number in sorted({1, finest}):
         press("lodgs.show_only_level", level=number)
         yield from settle()
-        visible, _ = module("data.scenes").count_shown(bpy.context, root)
+        visible, _ = module("data.scenes").count_visible(bpy.context, root)
         assert visible == splat_counts(root)[number - 1], f"{visible} splats are visible."
         images[number] = screenshot(f"level-{number}", f"{visible:,} splats")
     if finest > 1:
@@ -170,13 +170,13 @@ def levels(root: bpy.types.Object) -> Steps:
 
 def distances(root: bpy.types.Object) -> Steps:
     """Use the rule's defaults, then coarser controls until a quarter fewer splats are visible."""
-    count_shown = module("data.scenes").count_shown
+    count_visible = module("data.scenes").count_visible
     controls, levels = root.lodgs.controls, [item.number for item in root.lodgs.levels]
     rule = training("lod.rule").find_rule(root.lodgs.rule)
     root.lodgs.mode = "SELECTIVE"
     scroll(20)
     yield from settle()
-    initial, total = count_shown(bpy.context, root)
+    initial, total = count_visible(bpy.context, root)
     assert 0 < initial <= total, f"{initial} of {total} splats are visible by distance."
     screenshot("by-distance", f"{initial:,} of {total:,} splats")
     visible = initial
@@ -188,7 +188,7 @@ def distances(root: bpy.types.Object) -> Steps:
         for name, value in values.items():
             setattr(controls, name, value)
         bpy.context.view_layer.update()
-        visible, _ = count_shown(bpy.context, root)
+        visible, _ = count_visible(bpy.context, root)
     yield from settle()
     assert visible, "No splats are visible with coarser controls."
     screenshot("by-distance-coarser", f"{visible:,} of {total:,} splats")
@@ -208,20 +208,20 @@ def orbit(root: bpy.types.Object) -> Steps:
         position = viewport()[1].view_matrix.inverted().translation
         distance = (root.lodgs.axes.matrix_world @ Vector(root.lodgs.held_eye) - position).length
         assert distance < 1e-3, f"The selection uses a position {distance:.3f} from the view's."
-        visible, _ = module("data.scenes").count_shown(bpy.context, root)
+        visible, _ = module("data.scenes").count_visible(bpy.context, root)
         screenshot("orbit", f"{visible:,} splats")
 
 
 def freeze(root: bpy.types.Object) -> Steps:
     root.lodgs.freeze, root.lodgs.tell = True, "BANDS"
     frozen = tuple(root.lodgs.held_eye)
-    visible = module("data.scenes").count_shown(bpy.context, root)
+    visible = module("data.scenes").count_visible(bpy.context, root)
     press("view3d.view_orbit", angle=math.radians(40), type="ORBITUP")
     viewport()[1].view_distance = 40
     yield from settle()
     yield from settle()
     assert tuple(root.lodgs.held_eye) == frozen, "A frozen camera position changed."
-    assert module("data.scenes").count_shown(bpy.context, root) == visible, "A frozen selection changed."
+    assert module("data.scenes").count_visible(bpy.context, root) == visible, "A frozen selection changed."
     screenshot("freeze", f"{visible[0]:,} splats")
     root.lodgs.freeze, root.lodgs.tell, root.lodgs.eye = False, "OWN", "CAMERA"
 

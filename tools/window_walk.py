@@ -76,7 +76,7 @@ def walk() -> Steps:
 
 def scene_root() -> bpy.types.Object:
     """Return the splat scene. Undo replaces the object, so do not keep it."""
-    (root,) = module("data.scenes").roots(bpy.context.scene)
+    (root,) = module("data.roots").roots(bpy.context.scene)
     return root
 
 
@@ -193,7 +193,7 @@ def state() -> tuple:
     """Return the state that editing changes."""
     bpy.context.view_layer.update()
     root = scene_root()
-    counts = module("data.cleaning").count_left(root, bpy.context.evaluated_depsgraph_get())
+    counts = module("data.cleaning").count_remaining(root, bpy.context.evaluated_depsgraph_get())
     names = sorted(obj.name for obj in bpy.data.objects)
     return counts, [*map(tuple, root.lodgs.axes.matrix_world)], names
 
