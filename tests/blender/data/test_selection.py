@@ -1,4 +1,4 @@
-"""Splats kept by the modifiers, compared with the rule in numpy, splat for splat, for cameras of every kind."""
+"""Splats kept by the modifiers, compared with the rule in numpy for all camera types."""
 
 from math import inf
 
