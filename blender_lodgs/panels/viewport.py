@@ -1,4 +1,4 @@
-"""How the 3D viewport draws splat scenes: in the LODGS tab, and among the viewport's overlays."""
+"""Viewport panel of the LODGS tab, and splat settings in the viewport's Overlays popover."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ class LODGS_PT_viewport(Panel):
         if settings.native:
             say(
                 layout,
-                "Blender draws all splats of the levels shown: no splat budget, streaming, level colours "
-                "or selection overlay.",
+                "Blender draws all splats of visible levels, without splat budget, streaming, level colours "
+                "and selection overlay.",
                 "INFO",
             )
         elif settings.splats:
@@ -39,7 +39,7 @@ class LODGS_PT_viewport(Panel):
             column.prop(settings, "moving", slider=True)
         if root is not None and not settings.native:
             column = layout.column(align=True)
-            column.active = len(root.lodgs.levels) != 1  # one level has one colour
+            column.active = len(root.lodgs.levels) != 1  # a single level has a single colour
             column.label(text="Colours")
             row = column.row(align=True)
             rule = find_rule(root.lodgs.rule)
@@ -48,21 +48,21 @@ class LODGS_PT_viewport(Panel):
             if root.lodgs.tell in ("LEVELS", "BANDS") and column.active and not root.lodgs.complete:
                 say(
                     layout,
-                    "Each colour is for sizes half as large as the one before; white: the finest level.",
+                    "Each colour stands for half the size of the previous one; white is the finest level.",
                     "COLOR",
                 )
             elif root.lodgs.tell in ("LEVELS", "BANDS") and column.active:
                 _legend(layout, [item.number for item in root.lodgs.levels if item.exists])
         if viewport.problem:
-            text = f"The viewport could not be drawn ({viewport.problem}). Untick Gaussian Splats for points."
+            text = f"Cannot draw splats: {viewport.problem}. Disable Gaussian Splats to draw points."
             say(layout, text, "ERROR")
-        left_out = views.left_out()
-        if settings.splats and not settings.native and left_out:
-            layout.label(text=f"{left_out:,} splats left out to stay within that", icon="INFO")
+        excluded = views.excluded_count()
+        if settings.splats and not settings.native and excluded:
+            layout.label(text=f"Budget excludes {excluded:,} splats", icon="INFO")
 
 
-def _legend(layout, numbers):
-    """Which colour is which level, coarse to fine."""
+def _legend(layout: bpy.types.UILayout, numbers: list[int]) -> None:
+    """Draw the colour of each level, coarse to fine."""
     grid = layout.grid_flow(row_major=True, columns=min(len(numbers), 6), align=True)
     for number in numbers:
         entry = grid.row(align=True)

@@ -1,13 +1,14 @@
-"""What 3D viewports draw of splat scenes: Gaussians as they are (``splats``), or points (``discs``).
+"""Drawing of splat scenes in 3D viewports, as Gaussians (``splats``) or points (``discs``).
 
-Splats are drawn in every shading mode but Wireframe where ``Scene.lodgs_viewport.splats`` is on. Otherwise
-they are points like those of COLMAP: discs in Solid shading, Blender's own points elsewhere. Blender 5.3 and
-later draw splats themselves where the scene says so (``Scene.lodgs_viewport.drawn_by``).
+If ``Scene.lodgs_viewport.splats`` is on, Gaussians are drawn in all shading modes except Wireframe. Otherwise
+splats are points like those of COLMAP: discs in Solid shading, Blender's point clouds elsewhere. Blender 5.3
+and later can draw splats natively (``Scene.lodgs_viewport.drawn_by``).
 
-- ``arranging`` decides which splats are drawn in which order, ``views`` keeps what each viewport shows.
-- ``eye`` follows a viewport's view.
-- ``frusta`` shows the views of training or of a capture, ``coverage`` how well they cover a Blender scene.
-- ``cells`` shows the cells of a large scene.
+- ``views`` draws a viewport, ``view_state`` loads its splats, ``arrangement`` selects and sorts them.
+- ``resident`` uploads splats, ``streaming`` reads them from disk, ``shaders`` draws them.
+- ``view_camera`` tracks the camera of a viewport's view.
+- ``frusta`` draws training and capture views, ``coverage`` the coverage of a Blender scene by capture views.
+- ``cells`` draws the training cells of a large scene.
 """
 
 from __future__ import annotations
@@ -21,43 +22,43 @@ import bpy
 from ...training.lod.colors import level_color
 from .. import extension
 from ..data import roots
-from . import cells, coverage, discs, eye, frusta, splats, views
+from . import cells, coverage, discs, frusta, shaders, splats, view_camera, views
 
 if TYPE_CHECKING:
-    from ..data.properties import SplatScene
+    from ..data.scene_properties import SplatScene
 
 _handle: Any = None
 
 problem = ""
-"""What went wrong when a viewport was drawn last; empty where nothing did."""
+"""Error of the last redraw; empty if there was none."""
 
 
 def draws_splats(scene: bpy.types.Scene, viewport: bpy.types.SpaceView3D) -> bool:
-    """Whether a viewport draws a Blender scene's splats as Gaussians, by our own shaders."""
+    """Return True if a viewport draws Gaussians with the shaders of LODGS."""
     settings = scene.lodgs_viewport
     return settings.splats and not settings.native and viewport.shading.type != "WIREFRAME"
 
 
 def _draw() -> None:
-    """One drawing of one viewport. What goes wrong ends it, and the panel tells it; the next tries anew."""
+    """Draw a viewport. Errors end the redraw and are displayed in the panel; the next redraw tries again."""
     global problem
     try:
         _draw_view(bpy.context)
-        failed = ""
+        message = ""
     except Exception as error:
-        failed = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-        if failed != problem:  # once, not at every redraw
+        message = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+        if message != problem:  # only once, not at every redraw
             traceback.print_exc()
         splats.reset_state()
-    if failed != problem:
-        problem = failed
-        bpy.app.timers.register(extension.redraw, first_interval=0)  # not while it is drawn
+    if message != problem:
+        problem = message
+        bpy.app.timers.register(extension.redraw, first_interval=0)  # not during a redraw
 
 
 def _draw_view(context: bpy.types.Context) -> None:
     space, region, view = context.space_data, context.region, context.region_data
     with_splats = draws_splats(context.scene, space)
-    eye.on_draw(region, context.scene, view, splats=with_splats)
+    view_camera.track(region, context.scene, view, splats=with_splats)
     if space.shading.type == "SOLID" and space.shading.color_type not in {"OBJECT", "RANDOM", "SINGLE"}:
         points = [
             (obj, tint)
@@ -79,7 +80,7 @@ def _draw_view(context: bpy.types.Context) -> None:
 def _points(
     settings: SplatScene, levels: bool
 ) -> Iterator[tuple[bpy.types.Object | None, tuple[float, float, float, float]]]:
-    """What of a splat scene is drawn as points, and in which colour; alpha 0 is each point's own."""
+    """Yield the objects of a splat scene that are drawn as points, with their tints; alpha 0 is no tint."""
     yield settings.points, (0, 0, 0, 0)
     if levels:
         for item in settings.levels:
@@ -88,7 +89,7 @@ def _points(
 
 @bpy.app.handlers.persistent
 def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-    if depsgraph.mode == "RENDER":  # a render's first evaluation: everything counts as new there
+    if depsgraph.mode == "RENDER":  # the first evaluation of a render reports everything
         return
     discs.on_update(depsgraph)
 
@@ -105,7 +106,7 @@ def _on_load(*_) -> None:
     coverage.clear()
     discs.clear()
     views.clear()
-    eye.clear()
+    view_camera.clear()
 
 
 def register() -> None:
@@ -131,6 +132,6 @@ def unregister() -> None:
         changes.remove(_on_load)
     handlers.load_pre.remove(_on_file)
     _on_load()
-    splats.clear()
+    shaders.clear()
     views.stop()
     _handle = None

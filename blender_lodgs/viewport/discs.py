@@ -1,8 +1,7 @@
-"""Splats and points in their own colours in Solid shading, where Blender draws every point cloud in one grey.
+"""Coloured points in Solid shading; Blender draws all point clouds in grey there.
 
-Each is a flat disc of its radius just in front of the ball that Blender draws, so that other objects hide it
-and are hidden by it as usual. Where the viewport colours by object, at random or in one colour, that is left
-as it is.
+Each point is a flat disc of its radius just in front of Blender's sphere, so that occlusion works as usual.
+The viewport's Object, Random and Single colour modes stay unchanged.
 """
 
 from __future__ import annotations
@@ -22,8 +21,8 @@ void main()
   vec4 clip = model_view_projection * vec4(position, 1.0);
   vec4 front = clip + color_radius.w * toward;
   gl_Position = vec4(clip.xy, front.z / max(front.w, 1e-6) * clip.w, clip.w);
-  gl_PointSize = color_radius.w * pixels / clip.w + 2.0; // a pixel around, for the ball's outline
-  // The level's colour (sRGB) in the lightness of the point's (linear), so that the scene stays readable.
+  gl_PointSize = color_radius.w * pixels / clip.w + 2.0; // one more pixel covers the sphere's outline
+  // The tint (sRGB) gets the lightness of the point's colour (linear) to keep the scene readable.
   float lightness = pow(dot(color_radius.rgb, vec3(1.0 / 3.0)), 1.0 / 2.2);
   color = mix(color_radius.rgb, pow((0.35 + 0.65 * lightness) * tint.rgb, vec3(2.2)), tint.a);
 }
@@ -31,17 +30,17 @@ void main()
 _FRAGMENT = """
 void main()
 {
-  vec2 place = 2.0 * gl_PointCoord - 1.0;
-  if (dot(place, place) > 1.0) {
+  vec2 disc_position = 2.0 * gl_PointCoord - 1.0;
+  if (dot(disc_position, disc_position) > 1.0) {
     discard;
   }
-  shown = vec4(color, 1.0);
+  result = vec4(color, 1.0);
 }
 """
 
 _shader: gpu.types.GPUShader | None = None
 _batches: dict[int, gpu.types.GPUBatch] = {}
-"""Points on the graphics card, by their object's ``session_uid``; they stay until the object changes."""
+"""Uploaded points by the ``session_uid`` of their object, valid until the object changes."""
 
 
 def draw(
@@ -51,12 +50,12 @@ def draw(
     projection: Matrix,
     height: int,
 ) -> None:
-    """Draws point clouds as their modifiers leave them into the active framebuffer, tested against its depth.
+    """Draw evaluated point clouds into the active framebuffer, tested against its depth.
 
     Args:
-        objects: point clouds, each with the colour (sRGB) in which to show it; alpha 0 is each point's own.
-        view, projection: from the world to the camera's space, and on to clip space.
-        height: of the framebuffer in pixels.
+        objects: point clouds with their tints (sRGB); alpha 0 keeps the points' own colours.
+        view, projection: from the world to camera space, and from there to clip space.
+        height: height of the framebuffer in pixels.
     """
     shader = _disc_shader()
     shader.bind()
@@ -79,13 +78,11 @@ def draw(
 
 
 def _upload(cloud: bpy.types.PointCloud) -> gpu.types.GPUBatch:
-    """A batch of positions, colours and radii, those of an evaluated point cloud."""
+    """Upload the positions, colours and radii of an evaluated point cloud."""
     count = len(cloud.points)
     color_radius = np.ones((count, 4), np.float32)
-    colors, radii = (
-        attributes.read_attribute(cloud, attributes.COLOR),
-        attributes.read_attribute(cloud, attributes.RADIUS),
-    )
+    colors = attributes.read_attribute(cloud, attributes.COLOR)
+    radii = attributes.read_attribute(cloud, attributes.RADIUS)
     if colors is not None:
         color_radius[:, :3] = colors[:, :3]
     if radii is not None:
@@ -103,8 +100,8 @@ def _upload(cloud: bpy.types.PointCloud) -> gpu.types.GPUBatch:
 def _disc_shader() -> gpu.types.GPUShader:
     global _shader
     if _shader is None:
-        between = gpu.types.GPUStageInterfaceInfo("lodgs_disc")
-        between.smooth("VEC3", "color")
+        interface = gpu.types.GPUStageInterfaceInfo("lodgs_disc")
+        interface.smooth("VEC3", "color")
         info = gpu.types.GPUShaderCreateInfo()
         info.push_constant("MAT4", "model_view_projection")
         info.push_constant("VEC4", "toward")
@@ -112,8 +109,8 @@ def _disc_shader() -> gpu.types.GPUShader:
         info.push_constant("FLOAT", "pixels")
         info.vertex_in(0, "VEC3", "position")
         info.vertex_in(1, "VEC4", "color_radius")
-        info.vertex_out(between)
-        info.fragment_out(0, "VEC4", "shown")
+        info.vertex_out(interface)
+        info.fragment_out(0, "VEC4", "result")
         info.vertex_source(_VERTEX)
         info.fragment_source(_FRAGMENT)
         _shader = gpu.shader.create_from_info(info)
@@ -121,7 +118,7 @@ def _disc_shader() -> gpu.types.GPUShader:
 
 
 def on_update(depsgraph: bpy.types.Depsgraph) -> None:
-    """Frees what has changed; what was deleted goes with all the rest."""
+    """Free the uploads of changed objects; all of them if a collection changed, as objects may be deleted."""
     if depsgraph.id_type_updated("COLLECTION"):
         _batches.clear()
     elif _batches:
@@ -131,7 +128,7 @@ def on_update(depsgraph: bpy.types.Depsgraph) -> None:
 
 
 def clear() -> None:
-    """Frees what is kept between drawings."""
+    """Free all uploads and the shader."""
     global _shader
     _batches.clear()
     _shader = None

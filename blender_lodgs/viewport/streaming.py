@@ -1,7 +1,8 @@
-"""Trees of splats larger than memory: what an eye needs of a file is read beside Blender's own thread.
+"""Streaming of splat trees larger than memory, in background threads.
 
-A thread reads pages of the file (``training.lod.tree.paging``), that of ``arranging`` takes them over, so that the
-thread that draws has nothing of it but the upload of splats that it is to draw. Nothing of Blender in here.
+One thread reads the pages that the camera needs (``training.lod.tree.paging``). The worker thread of
+``arrangement`` copies them, so that the drawing thread only uploads drawn splats. This module does not use
+bpy.
 """
 
 from __future__ import annotations
@@ -21,66 +22,72 @@ from ..data.streams import Source
 Direction = tuple[float, float, float]
 
 PAUSE = 0.02
-"""Seconds between two looks at what has come, until there is as much as the scene itself holds."""
+"""Seconds between two checks for new pages while the stream is not ready."""
 
 
 class Stream:
-    """Of a tree in a file what an eye needs, as ``resident`` brings it to the graphics card.
+    """The part of a tree on disk that the camera needs, in the record layout of ``resident``.
 
     Attributes:
-        source: see there.
-        ready: whether there is as much of it as the scene itself holds, which is drawn until then.
-        problem: why nothing comes any more; empty where it does.
-        records: (rows, 4 * texels) float32 of each place in memory, see ``resident.read_records``.
-        columns: (rows,) float32 by name, of the rule ``cut``; no eye is shown a place whose parent size is 0.
-        higher: how many coefficients beyond the first splats have.
-        taken: how many updates have been taken over.
+        source: the file.
+        ready: at least as many splats are in memory as the scene has; until then the scene's are drawn.
+        problem: error that ended streaming; empty if there is none.
+        records: (rows, 4 * texels) float32 of all slots in memory, see ``resident.read_records``.
+        columns: (rows,) float32 by name, of the rule ``cut``. Slots with parent size 0 are never selected.
+        higher: number of SH coefficients beyond the first.
+        taken: number of copied updates.
     """
 
     def __init__(self, source: Source) -> None:
-        self.source, self.ready, self.problem = source, False, ""
-        self.records, self.columns, self.higher, self.taken = np.zeros((0, 0), np.float32), {}, 0, 0
+        self.source = source
+        self.ready = False
+        self.problem = ""
+        self.records = np.zeros((0, 0), np.float32)
+        self.columns: dict[str, np.ndarray] = {}
+        self.higher = 0
+        self.taken = 0
         self._pager: Pager | None = None
-        self._asked: tuple[LodQuery, Direction | None] | None = None
+        self._request: tuple[LodQuery, Direction | None] | None = None
         self._stopping = False
         threading.Thread(target=self._open, name="lodgs-stream", daemon=True).start()
 
     @property
     def arrived(self) -> int:
-        """How many updates there have been to take over."""
+        """Number of available updates so far."""
         return 0 if self._pager is None else self._pager.arrived
 
     @property
     def splats(self) -> int:
-        """How many splats of the file are in memory."""
+        """Number of splats in memory."""
         return 0 if self._pager is None else self._pager.splats
 
     @property
     def short(self) -> bool:
-        """Whether the eye needs more of them than there is room for."""
+        """True if the camera needs more splats than the budget allows."""
         return self._pager is not None and self._pager.short
 
     @property
     def busy(self) -> bool:
-        """Whether something is on its way."""
+        """True while pages are being read or wait to be copied."""
         if self.problem:
             return self.arrived != self.taken
         return self._pager is None or not self.ready or not self._pager.idle
 
-    def ask(self, choice: LodQuery, direction: Direction | None) -> None:
-        """Says by what splats are chosen from now on. Returns at once.
+    def request(self, query: LodQuery, direction: Direction | None) -> None:
+        """Request the pages of a query. Returns at once.
 
         Args:
-            direction: in which the eye looks, in the splats' own space; None: everywhere.
+            direction: view direction in the splats' space; None: all directions.
         """
-        if (choice, direction) != self._asked:
-            self._asked = choice, direction
-            self._ask()
+        if (query, direction) != self._request:
+            self._request = query, direction
+            self._forward_request()
 
     def take(self) -> np.ndarray:
-        """Takes over what has come; the places (M,) int32 at which other splats are than before.
+        """Copy an update. Nobody may read the arrays meanwhile.
 
-        Nobody must be reading.
+        Returns:
+            Slots (M,) int32 with other splats than before.
         """
         update = None if self._pager is None else self._pager.take()
         if update is None:
@@ -97,26 +104,26 @@ class Stream:
         return (starts[:, None] + np.arange(SIZE)).reshape(-1).astype(np.int32)
 
     def stop(self) -> None:
-        """Ends reading."""
+        """Stop the threads."""
         self._stopping = True
         if self._pager is not None:
             self._pager.stop()
 
-    def _ask(self) -> None:
-        if self._pager is not None and self._asked is not None:
-            choice, direction = self._asked
-            k = detail_of(choice.focal_px, dict(choice.values)["pixels"])
-            self._pager.ask(np.array(choice.eye), k, None if direction is None else np.array(direction))
+    def _forward_request(self) -> None:
+        if self._pager is not None and self._request is not None:
+            query, direction = self._request
+            k = detail_of(query.focal_px, dict(query.values)["pixels"])
+            self._pager.ask(np.array(query.eye), k, None if direction is None else np.array(direction))
 
     def _open(self) -> None:
-        """In a thread of its own, which ends when there is something to show."""
+        """Open the file and wait in a separate thread until the stream is ready."""
         try:
             pager = Pager(self.source.path, self.source.budget)
             if pager.file.total != self.source.total:
                 raise LodgsError(
-                    f"{self.source.path.name} is not the file that was imported: it has "
-                    f"{pager.file.total:,} splats instead of {self.source.total:,}.",
-                    "Import it again.",
+                    f"Cannot stream {self.source.path.name}: it has {pager.file.total:,} splats instead of "
+                    f"{self.source.total:,} as the imported file.",
+                    "Import the file again.",
                 )
             self.higher = (pager.sh_degree + 1) ** 2 - 1
             self.records = np.zeros((pager.rows, 4 * record_texels(self.higher)), np.float32)
@@ -124,27 +131,29 @@ class Stream:
                 name: np.zeros(pager.rows, np.float32) for name in (NODE_SIZE, PARENT_SIZE, *PARENT)
             }
             self._pager = pager
-            self._ask()
+            self._forward_request()
             pager.start()
-            while not self._stopping and not pager.problem and not self._enough(pager):
+            while not self._stopping and not pager.problem and not self._is_ready(pager):
                 self.take()
                 time.sleep(PAUSE)
             self.problem = pager.problem
             self.ready = not self.problem
-        except Exception as error:  # what is shown then is what the scene holds
+        except Exception as error:  # the splats of the scene stay visible
             self.problem = str(error) or type(error).__name__
 
-    def _enough(self, pager: Pager) -> bool:
-        return self._asked is not None and self.taken > 0 and (pager.idle or pager.splats >= self.source.here)
+    def _is_ready(self, pager: Pager) -> bool:
+        return (
+            self._request is not None and self.taken > 0 and (pager.idle or pager.splats >= self.source.here)
+        )
 
 
 def record_texels(higher: int) -> int:
-    """How many texels of four floats a splat's record has: see ``resident.read_records``."""
+    """Return the number of texels (four floats) in a splat's record, see ``resident.read_records``."""
     return -(-(14 + 3 * higher) // 4)
 
 
 def records_of(splats: Splats) -> np.ndarray:
-    """The records of splats (M,), see ``resident.read_records``, (M, 4 * texels) float32."""
+    """Return the records (M, 4 * texels) float32 of splats (M,), see ``resident.read_records``."""
     higher = splats.sh.shape[1] - 1
     records = np.zeros((len(splats), 4 * record_texels(higher)), np.float32)
     records[:, 0:3] = splats.means

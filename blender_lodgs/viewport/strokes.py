@@ -1,4 +1,4 @@
-"""Splats of a scene that a stroke in a viewport hits, on every level (``training.editing.brush``)."""
+"""Hit tests of brush and lasso strokes in a viewport, for all levels of a splat scene."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class StrokeTarget:
         """Return the hit strengths (N,) of a stroke by level number, see ``brush.hit_strength``.
 
         Args:
-            covered: (H, W) stroke in the region's pixels (``brush.brush_coverage``, ``brush.lasso_coverage``).
+            covered: (H, W) stroke in the region's pixels, see ``brush.brush_coverage``.
             through: also hit splats behind others.
             footprints: hit splats by the covered part of their footprint instead of by their mean.
         """
@@ -72,9 +72,7 @@ class StrokeTarget:
         }
 
 
-def _visible_opacities(
-    cloud: bpy.types.PointCloud, means: np.ndarray, query: LodQuery | None
-) -> np.ndarray:
+def _visible_opacities(cloud: bpy.types.PointCloud, means: np.ndarray, query: LodQuery | None) -> np.ndarray:
     """Return the opacities (N,) of the splats that a query selects, and 0 for all others."""
     opacities = cleaning.splat_attribute(cloud, attributes.BASE)[:, 3]
     if query is None:

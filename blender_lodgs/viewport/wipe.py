@@ -1,4 +1,4 @@
-"""The wipe: in a viewport that looks through a view, its photograph over the rendered picture."""
+"""Wipe between the photo and the rendered image of a view, in viewports that look through its camera."""
 
 from __future__ import annotations
 
@@ -11,25 +11,26 @@ import numpy as np
 from gpu_extras.batch import batch_for_shader
 
 from ..data import roots
-from . import eye
-from .splats import bind_textures
+from . import view_camera
+from .shaders import bind_textures
 
 _VERTEX = """
 void main()
 {
-  place = across;
+  image_position = corner;
   gl_Position = vec4(position, 0.0, 1.0);
 }
 """
 _FRAGMENT = """
 void main()
 {
-  vec3 seen = place.x < wipe ? texture(photograph, place).rgb : texture(rendered, place).rgb;
-  if (abs(place.x - wipe) < line) {
-    seen = vec3(1.0);
+  vec3 code = image_position.x < wipe ? texture(photo, image_position).rgb
+                                      : texture(rendered, image_position).rgb;
+  if (abs(image_position.x - wipe) < line) {
+    code = vec3(1.0);
   }
-  vec3 above = pow((seen + 0.055) / 1.055, vec3(2.4));
-  shown = vec4(mix(seen / 12.92, above, step(vec3(0.04045), seen)), 1.0);
+  vec3 above = pow((code + 0.055) / 1.055, vec3(2.4));
+  result = vec4(mix(code / 12.92, above, step(vec3(0.04045), code)), 1.0);
 }
 """
 
@@ -39,63 +40,65 @@ _handle: Any = None
 
 @dataclass
 class Comparison:
-    """A view's two pictures.
+    """Photo and rendered image of a view.
 
     Attributes:
-        view: the camera object's ``session_uid``.
-        photograph, rendered: (H, W, 3) float32, display-coded, rows from the top.
+        view: ``session_uid`` of the camera object.
+        photo, rendered: (H, W, 3) float32, sRGB, top row first.
         psnr: in dB.
+        textures: both images on the graphics card once they are drawn.
     """
 
     view: int
-    photograph: np.ndarray
+    photo: np.ndarray
     rendered: np.ndarray
     psnr: float
-    textures: list = field(default_factory=list)
+    textures: list[gpu.types.GPUTexture] = field(default_factory=list)
 
 
 comparison: Comparison | None = None
-"""The comparison that viewports show."""
+"""Displayed comparison."""
 
 
-def show(context: bpy.types.Context, found: Comparison) -> None:
-    """Shows a comparison in the viewports that look through its view."""
+def show(context: bpy.types.Context, new_comparison: Comparison) -> None:
+    """Show a comparison in the viewports that look through its camera."""
     global comparison
-    comparison = found
+    comparison = new_comparison
     context.scene.lodgs_render.show_comparison = True
 
 
-def draw(pictures: Comparison, wipe: float, corners: list[tuple[float, float]], line: float) -> None:
-    """Draws the photograph left of the wipe and the rendered picture right of it, in linear light: the
-    framebuffer of a viewport's overlays codes it for the display.
+def draw(images: Comparison, wipe: float, corners: list[tuple[float, float]], line: float) -> None:
+    """Draw the photo left of the wipe and the rendered image right of it, in linear colours.
+
+    A viewport's overlay framebuffer converts them for the display.
 
     Args:
-        wipe: 0 to 1, from the left.
-        corners: of the picture, in clip space: below left and above right.
-        line: half the width of the line between both, in widths of the picture.
+        wipe: position from 0 (left) to 1 (right).
+        corners: lower left and upper right corner of the image in clip space.
+        line: half the width of the dividing line, as a fraction of the image width.
     """
-    if not pictures.textures:
-        pictures.textures += [_texture(pictures.photograph), _texture(pictures.rendered)]
+    if not images.textures:
+        images.textures += [_texture(images.photo), _texture(images.rendered)]
     (left, bottom), (right, top) = corners
     batch = batch_for_shader(
         _wipe_shader(), "TRI_STRIP",
         {
             "position": [(left, bottom), (right, bottom), (left, top), (right, top)],
-            "across": [(0, 1), (1, 1), (0, 0), (1, 0)],
+            "corner": [(0, 1), (1, 1), (0, 0), (1, 0)],
         },
     )  # fmt: skip
     shader = _wipe_shader()
     shader.bind()
-    bind_textures(shader, {"photograph": pictures.textures[0], "rendered": pictures.textures[1]})
+    bind_textures(shader, {"photo": images.textures[0], "rendered": images.textures[1]})
     shader.uniform_float("wipe", wipe)
     shader.uniform_float("line", line)
     batch.draw(shader)
 
 
-def _texture(picture: np.ndarray) -> gpu.types.GPUTexture:
-    height, width = picture.shape[:2]
+def _texture(image: np.ndarray) -> gpu.types.GPUTexture:
+    height, width = image.shape[:2]
     rgba = np.ones((height, width, 4), np.float32)
-    rgba[..., :3] = picture
+    rgba[..., :3] = image
     data = gpu.types.Buffer("FLOAT", rgba.size, rgba.reshape(-1))
     return gpu.types.GPUTexture((width, height), format="RGBA16F", data=data)
 
@@ -103,17 +106,17 @@ def _texture(picture: np.ndarray) -> gpu.types.GPUTexture:
 def _wipe_shader() -> gpu.types.GPUShader:
     global _shader
     if _shader is None:
-        between = gpu.types.GPUStageInterfaceInfo("lodgs_wipe")
-        between.smooth("VEC2", "place")
+        interface = gpu.types.GPUStageInterfaceInfo("lodgs_wipe")
+        interface.smooth("VEC2", "image_position")
         info = gpu.types.GPUShaderCreateInfo()
         info.push_constant("FLOAT", "wipe")
         info.push_constant("FLOAT", "line")
-        info.sampler(0, "FLOAT_2D", "photograph")
+        info.sampler(0, "FLOAT_2D", "photo")
         info.sampler(1, "FLOAT_2D", "rendered")
         info.vertex_in(0, "VEC2", "position")
-        info.vertex_in(1, "VEC2", "across")
-        info.vertex_out(between)
-        info.fragment_out(0, "VEC4", "shown")
+        info.vertex_in(1, "VEC2", "corner")
+        info.vertex_out(interface)
+        info.fragment_out(0, "VEC4", "result")
         info.vertex_source(_VERTEX)
         info.fragment_source(_FRAGMENT)
         _shader = gpu.shader.create_from_info(info)
@@ -124,18 +127,18 @@ def _draw() -> None:
     context = bpy.context
     scene, region, view = context.scene, context.region, context.region_data
     camera = scene.camera
-    if camera is None or eye.looked_through(context) != camera or not shown(context):
+    if camera is None or view_camera.active_camera(context) != camera or not is_shown(context):
         return
     assert comparison is not None
-    left, bottom, right, top = eye.frame(camera, scene, view.window_matrix @ view.view_matrix)
+    left, bottom, right, top = view_camera.camera_frame(camera, scene, view.window_matrix @ view.view_matrix)
     width = region.width * (right - left) / 2
     draw(
         comparison, scene.lodgs_render.wipe, [(left, bottom), (right, top)], 0.75 / max(width, 1)
     )  # fmt: skip
 
 
-def shown(context: bpy.types.Context) -> bool:
-    """Whether there is a comparison of the scene's camera, and the panel that can switch it off again."""
+def is_shown(context: bpy.types.Context) -> bool:
+    """Return True if a comparison of the scene camera is displayed and its panel is available."""
     camera, root = context.scene.camera, roots.active_root(context)
     if comparison is None or camera is None or root is None or root.lodgs.cameras is None:
         return False

@@ -1,4 +1,4 @@
-"""Blender's Python module with the checkout linked as an extension; each test gets an empty file."""
+"""Fixtures: Blender as a Python module with the checkout as an extension, and an empty file for each test."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(scope="session")
 def bpy():
-    """The module; tests that need it are skipped where it is not installed."""
+    """Start Blender's module; skip tests if it is not installed."""
     if importlib.util.find_spec("bpy") is None:
         pytest.skip("bpy is not installed in this environment")
     return start_blender()
@@ -31,27 +31,27 @@ def bpy():
 
 @pytest.fixture(autouse=True)
 def empty_file(bpy):
-    """An empty file with one empty scene; enabled extensions stay."""
+    """Open an empty file with one empty scene; extensions stay enabled."""
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
 
 
 @pytest.fixture
 def lodgs(bpy):
-    """``lodgs("data.scenes")``, ``lodgs("training.errors")``: modules of the extension's two packages."""
+    """``lodgs("data.scenes")``, ``lodgs("training.errors")``: import a module of the extension."""
 
     def load(name: str):
-        room = "" if name.startswith("training") else "blender_lodgs."
-        return importlib.import_module(f"{EXTENSION}.{room}{name}")
+        package = "" if name.startswith("training") else "blender_lodgs."
+        return importlib.import_module(f"{EXTENSION}.{package}{name}")
 
     return load
 
 
 @pytest.fixture
 def frame(bpy):
-    """``frame(size, draw)``: what ``draw()`` leaves in float colours, (size, size, 4) linear, row 0 low.
+    """``frame(size, draw)``: call ``draw()``, return the linear image (size, size, 4), bottom row first.
 
-    ``frame(size, draw, before)`` does so in 8 bits coded in sRGB, like a viewport's, that hold
-    ``before``. Tests that draw are skipped where this Blender has no graphics in background.
+    ``frame(size, draw, before)`` draws into an 8-bit sRGB framebuffer, as in viewports with ``before``.
+    Tests are skipped if this Blender has no graphics in background mode.
     """
     import gpu
 
@@ -64,7 +64,7 @@ def frame(bpy):
     if not _draws(gpu):
         pytest.skip("no graphics here: a cleared framebuffer stays empty; install mesa-vulkan-drivers")
 
-    def drawn(size, draw, before=None):
+    def draw_frame(size, draw, before=None):
         kind, data = "RGBA32F", np.zeros((size, size, 4), np.float32)
         if before is not None:
             kind, data = "SRGB8_A8", before.copy()
@@ -81,28 +81,28 @@ def frame(bpy):
             draw()
             buffer = frame.read_color(0, 0, size, size, 4, 0, "FLOAT")
         buffer.dimensions = size * size * 4
-        seen = np.array(buffer, np.float32).reshape(size, size, 4)
+        image = np.array(buffer, np.float32).reshape(size, size, 4)
         if before is not None:
-            code = seen[..., :3]
-            seen[..., :3] = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
-        return seen
+            code = image[..., :3]
+            image[..., :3] = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
+        return image
 
-    return drawn
+    return draw_frame
 
 
 def _draws(gpu):
-    """Return True if this Blender's graphics draw at all. Blender 5.3 starts without a working driver too."""
+    """Return True if drawing works. Blender 5.3 also starts without a working driver."""
     texture = gpu.types.GPUTexture((1, 1), format="RGBA32F")
     frame = gpu.types.GPUFrameBuffer(color_slots=texture)
     with frame.bind():
         frame.clear(color=(0.25, 0.5, 0.75, 1.0))
-        seen = frame.read_color(0, 0, 1, 1, 4, 0, "FLOAT")
-    return np.allclose(np.ravel(seen.to_list()), (0.25, 0.5, 0.75, 1.0))
+        image = frame.read_color(0, 0, 1, 1, 4, 0, "FLOAT")
+    return np.allclose(np.ravel(image.to_list()), (0.25, 0.5, 0.75, 1.0))
 
 
 @pytest.fixture
 def fake(tmp_path, monkeypatch):
-    """``fake("crash")`` sets how the trainer, played by ``fake_trainer.py``, behaves from now on."""
+    """``fake("crash")``: set the behaviour of the fake trainer, ``fake_trainer.py``."""
     program = tmp_path / "python with a space"
     program.write_text(
         f'#!/bin/sh\nexec "{sys.executable}" "{Path(__file__).with_name("fake_trainer.py")}" "$@"\n'
@@ -115,7 +115,7 @@ def fake(tmp_path, monkeypatch):
 
 @pytest.fixture
 def blender(bpy, tmp_path, monkeypatch):
-    """Blender as a program that panels start: ``as_blender.py`` plays it."""
+    """Replace Blender's executable by ``as_blender.py``."""
     program = tmp_path / "blender"
     program.write_text(
         f'#!/bin/sh\nexec "{sys.executable}" "{Path(__file__).with_name("as_blender.py")}" "$@"\n'
@@ -127,8 +127,8 @@ def blender(bpy, tmp_path, monkeypatch):
 
 
 @pytest.fixture(scope="session")
-def _one_renderer(bpy):
-    """Starting the renderer takes seconds: all tests share one, though each has a new file."""
+def _shared_renderer(bpy):
+    """Share one renderer between all tests, as it takes seconds to start."""
     renderer = importlib.import_module(f"{EXTENSION}.blender_lodgs.render.renderer")
     bpy.app.handlers.load_pre.remove(renderer._on_load)
     yield renderer
@@ -138,10 +138,10 @@ def _one_renderer(bpy):
 
 @pytest.fixture
 def renderer(request):
-    """The module that keeps the real renderer; skipped where $LODGS_TRAINER_PYTHON names none."""
+    """Return the module of the real renderer; skip if LODGS_TRAINER_PYTHON is not set."""
     if not os.environ.get("LODGS_TRAINER_PYTHON"):
         pytest.skip("no trainer; set LODGS_TRAINER_PYTHON")
-    return request.getfixturevalue("_one_renderer")
+    return request.getfixturevalue("_shared_renderer")
 
 
 def pytest_sessionfinish(session, exitstatus):
@@ -151,7 +151,7 @@ def pytest_sessionfinish(session, exitstatus):
 
 @pytest.hookimpl(trylast=True)
 def pytest_unconfigure(config):
-    """Blender 4.5 as a module can hang when Python ends, so a session that used it ends at once."""
+    """End the process at once: Blender 4.5 as a module can hang when Python ends."""
     if "bpy" in sys.modules and _exit_status is not None:
         sys.stdout.flush()
         sys.stderr.flush()

@@ -1,4 +1,4 @@
-"""Points in Solid shading, drawn into a picture of our own where this Blender has graphics in background."""
+"""Points in Solid shading, drawn offscreen."""
 
 import numpy as np
 import pytest
@@ -8,8 +8,8 @@ WHITE, RED, GREEN = (255, 255, 255), (255, 0, 0), (0, 255, 0)
 
 
 @pytest.fixture
-def picture(bpy, lodgs, frame):
-    """``picture(clouds)``: (SIZE, SIZE, 4) linear colours seen along -z, 2 units wide; row 0 is below."""
+def draw_points(bpy, lodgs, frame):
+    """``draw_points(clouds)``: linear colours (SIZE, SIZE, 4) along -z, 2 units wide, bottom row first."""
     from mathutils import Matrix
 
     view, projection = Matrix.Translation((0, 0, -5)), Matrix.Diagonal((1, 1, -0.1, 1))
@@ -26,31 +26,31 @@ def _points(bpy, lodgs, positions, colors, radius):
     return obj
 
 
-def test_discs_have_their_colour_place_and_size(bpy, lodgs, picture):
+def test_discs_match_colour_position_and_size(bpy, lodgs, draw_points):
     obj = _points(bpy, lodgs, [(-0.5, 0.5, 0), (0.5, -0.5, 0)], [RED, (0, 0, 188)], 0.25)
-    seen = picture([(obj, (0, 0, 0, 0))])
+    image = draw_points([(obj, (0, 0, 0, 0))])
     y, x = (np.mgrid[:SIZE, :SIZE] + 0.5) * 2 / SIZE - 1
     red, blue = (np.hypot(x - a, y - b) for a, b in ((-0.5, 0.5), (0.5, -0.5)))
     pixel = 2 / SIZE
-    assert (seen[red < 0.25] == (1, 0, 0, 1)).all()
-    assert np.allclose(seen[blue < 0.25], (0, 0, ((188 / 255 + 0.055) / 1.055) ** 2.4, 1), atol=1e-5)
-    assert (seen[np.minimum(red, blue) > 0.25 + 2 * pixel] == 0).all()
+    assert (image[red < 0.25] == (1, 0, 0, 1)).all()
+    assert np.allclose(image[blue < 0.25], (0, 0, ((188 / 255 + 0.055) / 1.055) ** 2.4, 1), atol=1e-5)
+    assert (image[np.minimum(red, blue) > 0.25 + 2 * pixel] == 0).all()
 
 
-def test_the_nearer_point_hides_and_changes_are_seen(bpy, lodgs, picture):
+def test_nearer_points_occlude_and_changes_are_drawn(bpy, lodgs, draw_points):
     obj = _points(bpy, lodgs, [(0, 0, 1), (0, 0, 0)], [RED, GREEN], 0.3)
     middle = SIZE // 2
-    assert tuple(picture([(obj, (0, 0, 0, 0))])[middle, middle]) == (1, 0, 0, 1)
+    assert tuple(draw_points([(obj, (0, 0, 0, 0))])[middle, middle]) == (1, 0, 0, 1)
     obj.data.attributes["position"].data.foreach_set("vector", np.float32([0, 0, 0, 0, 0, 1]))
     obj.data.update_tag()
     bpy.context.view_layer.update()
-    assert tuple(picture([(obj, (0, 0, 0, 0))])[middle, middle]) == (0, 1, 0, 1)
-    obj.location.x = 0.7  # moving needs no new upload, and is followed
+    assert tuple(draw_points([(obj, (0, 0, 0, 0))])[middle, middle]) == (0, 1, 0, 1)
+    obj.location.x = 0.7  # moves without a new upload
     bpy.context.view_layer.update()
-    assert picture([(obj, (0, 0, 0, 0))])[middle, middle, 3] == 0
+    assert draw_points([(obj, (0, 0, 0, 0))])[middle, middle, 3] == 0
 
 
-def test_level_colours(bpy, lodgs, picture):
+def test_tints_colour_points(bpy, lodgs, draw_points):
     obj = _points(bpy, lodgs, [(0, 0, 0)], [WHITE], 0.3)
-    seen = picture([(obj, (1, 0.5, 0, 1))])[SIZE // 2, SIZE // 2]
-    assert seen == pytest.approx((1, 0.5**2.2, 0, 1), abs=1e-4)
+    image = draw_points([(obj, (1, 0.5, 0, 1))])[SIZE // 2, SIZE // 2]
+    assert image == pytest.approx((1, 0.5**2.2, 0, 1), abs=1e-4)

@@ -1,4 +1,4 @@
-"""Where training will look from, as the viewport shows it."""
+"""Previews of training views in the viewport."""
 
 import numpy as np
 import pytest
@@ -21,11 +21,11 @@ def root(bpy, lodgs):
     return root, splats
 
 
-def test_it_is_the_dome_that_training_places(lodgs, root):
+def test_preview_matches_the_training_dome(lodgs, root):
     root, splats = root
     viewpoints, settings = lodgs("data.viewpoints"), root.lodgs.training
     settings.views = 10
-    views, shells = viewpoints.dome_of(root)
+    views, shells = viewpoints.preview_dome(root)
     placed, _ = lodgs("training.scenes.viewpoints").dome_views(splats, 10)
     assert len(views) == 10
     middle = np.median(splats.means[splats.opacity_logits > 0], axis=0)
@@ -33,29 +33,29 @@ def test_it_is_the_dome_that_training_places(lodgs, root):
         np.testing.assert_allclose(view.world_to_camera, truth.world_to_camera, atol=1e-6)
         assert np.isclose(np.linalg.norm(view.center - middle), shells, rtol=1e-5).any()
     settings.views = 12
-    assert len(viewpoints.dome_of(root)[0]) == 12
+    assert len(viewpoints.preview_dome(root)[0]) == 12
 
 
-def test_a_sample_of_many_splats_is_enough(lodgs, root, monkeypatch):
+def test_large_scenes_are_sampled(lodgs, root, monkeypatch):
     root, _ = root
     viewpoints = lodgs("data.viewpoints")
-    _, shells = viewpoints.dome_of(root)
+    _, shells = viewpoints.preview_dome(root)
     monkeypatch.setattr(viewpoints, "SAMPLE", 1000)
-    viewpoints._kept.clear()
-    assert np.allclose(viewpoints.dome_of(root)[1], shells, rtol=0.1)
+    viewpoints._cache.clear()
+    assert np.allclose(viewpoints.preview_dome(root)[1], shells, rtol=0.1)
 
 
-def test_pyramids_point_where_the_views_look(lodgs, root):
+def test_pyramids_match_the_views(lodgs, root):
     root, _ = root
-    views, _ = lodgs("data.viewpoints").dome_of(root)
+    views, _ = lodgs("data.viewpoints").preview_dome(root)
     ends = lodgs("viewport.frusta").lines(views, 0.5).reshape(len(views), 8, 2, 3)
     for view, edges in zip(views, ends, strict=True):
         np.testing.assert_allclose(edges[:4, 0], np.tile(view.center, (4, 1)), rtol=1e-6)
-        seen = edges[:4, 1] @ view.world_to_camera[:3, :3].T + view.world_to_camera[:3, 3]
-        pixels = seen[:, :2] / seen[:, 2:] * (view.fx, view.fy) + (view.cx, view.cy)
+        local = edges[:4, 1] @ view.world_to_camera[:3, :3].T + view.world_to_camera[:3, 3]
+        pixels = local[:, :2] / local[:, 2:] * (view.fx, view.fy) + (view.cx, view.cy)
         corners = [(0, 0), (view.width, 0), (view.width, view.height), (0, view.height)]
         np.testing.assert_allclose(pixels, corners, atol=0.01)
-        np.testing.assert_allclose(seen[:, 2], 0.5, rtol=1e-4)
+        np.testing.assert_allclose(local[:, 2], 0.5, rtol=1e-4)
         np.testing.assert_allclose(edges[4:, 0], edges[:4, 1])
         np.testing.assert_allclose(edges[4:, 1], np.roll(edges[:4, 1], -1, axis=0))
 
@@ -74,8 +74,8 @@ def test_they_are_drawn(bpy, lodgs, root, frame):
             lodgs("viewport.frusta").draw(bpy.context)
 
     assert (frame(64, draw)[..., 0] > 0).sum() > 50
-    for other in ("CAMERAS", "ANIMATION"):  # which Blender shows
-        root.lodgs.training.views_from = other
+    for source in ("CAMERAS", "ANIMATION"):  # Blender draws these cameras
+        root.lodgs.training.views_from = source
         assert not frame(64, draw).any()
     root.lodgs.training.views_from = "GRID"
     assert (frame(64, draw)[..., 0] > 0).sum() > 50
@@ -84,7 +84,7 @@ def test_they_are_drawn(bpy, lodgs, root, frame):
 
 
 @pytest.mark.parametrize("views_from", ["GRID", "CURVE"])
-def test_shown_are_those_that_training_takes(bpy, lodgs, root, views_from):
+def test_preview_matches_the_training_views(bpy, lodgs, root, views_from):
     root, splats = root
     viewpoints, settings = lodgs("data.viewpoints"), root.lodgs.training
     bpy.ops.curve.primitive_bezier_circle_add(radius=5, location=(0, 0, 1.7))
@@ -92,12 +92,12 @@ def test_shown_are_those_that_training_takes(bpy, lodgs, root, views_from):
     root.scale, root.location, root.rotation_euler = (2, 2, 2), (1, 2, 3), (0.3, 0.2, 0.1)
     bpy.context.view_layer.update()
     for _ in range(2):
-        shown, taken = viewpoints.placed_of(root), viewpoints.placed(bpy.context, root, splats)
-        assert len(shown) == len(taken) == 9
-        for view, (truth, near) in zip(shown, taken, strict=True):
+        previews, views = viewpoints.preview_views(root), viewpoints.training_views(bpy.context, root, splats)
+        assert len(previews) == len(views) == 9
+        for view, (truth, near) in zip(previews, views, strict=True):
             np.testing.assert_allclose(view.world_to_camera, truth.world_to_camera, atol=1e-3)
             assert near > 0
-        settings.curve.data.splines[0].bezier_points[0].co.x -= 3  # it is drawn anew
+        settings.curve.data.splines[0].bezier_points[0].co.x -= 3  # the preview follows
         settings.curve.data.update_tag()
         settings.height = 7
         bpy.context.view_layer.update()

@@ -1,4 +1,4 @@
-"""What is on the graphics card: what viewports draw, and no splat more."""
+"""Splats on the graphics card: exactly the drawn ones."""
 
 import time
 from types import SimpleNamespace
@@ -11,7 +11,7 @@ COUNT = 1500
 
 @pytest.fixture
 def scene(bpy, lodgs):
-    """The root of two levels by distance around the origin, of harmonics of degree 1."""
+    """Create a root with two levels by distance around the origin, SH degree 1."""
     rng, bundle = np.random.default_rng(4), lodgs("training.splats.bundle")
     with lodgs("data.importing").new_scene(bpy.context, "scene") as root:
         for number, s_min in ((1, 0.01), (2, 0.0)):
@@ -29,16 +29,16 @@ def scene(bpy, lodgs):
 
 
 @pytest.fixture
-def seen(bpy, lodgs, frame, scene):
-    """``seen(view, x, wait)``: the picture for the eye at a place on the x axis, as (96, 96, 4)."""
+def draw_from(bpy, lodgs, frame, scene):
+    """``draw_from(view, x, wait)``: image (96, 96, 4) from a camera at x."""
     from mathutils import Matrix
 
     views, selection = lodgs("viewport.views"), lodgs("data.selection")
     views.clear()
     projection = Matrix(((2, 0, 0, 0), (0, 2, 0, 0), (0, 0, -1, -0.1), (0, 0, -1, 0)))
 
-    def drawn(view, x, wait=True):
-        selection.hold(scene, (x, 0, 0), 600.0)
+    def draw(view, x, wait=True):
+        selection.store_camera(scene, (x, 0, 0), 600.0)
         bpy.context.view_layer.update()
         depsgraph = bpy.context.evaluated_depsgraph_get()
         instances = lodgs("data.shown").splat_instances(depsgraph)
@@ -47,23 +47,23 @@ def seen(bpy, lodgs, frame, scene):
             view, instances, depsgraph, look, projection, 10**6, wait=wait, under_overlays=False,
         ))  # fmt: skip
 
-    yield drawn
+    yield draw
     views.clear()
 
 
-def stored(store, width):
-    """What the graphics card has at each place, (room, width)."""
-    nothing = np.zeros((store.part, width), np.float32)
+def read_store(store, width):
+    """Return the contents (slots, width) of a store on the graphics card."""
+    empty = np.zeros((store.texture_slots, width), np.float32)
     parts = [
-        nothing
+        empty
         if texture is None
-        else np.array(texture.read(), np.float32).reshape(-1)[: nothing.size].reshape(nothing.shape)
+        else np.array(texture.read(), np.float32).reshape(-1)[: empty.size].reshape(empty.shape)
         for texture in store.textures
     ]
     return np.concatenate(parts)
 
 
-def test_a_viewed_attribute_is_the_read_one(bpy, lodgs, scene):
+def test_viewed_attributes_match_read_ones(bpy, lodgs, scene):
     attributes, cloud = lodgs("attributes"), scene.lodgs.levels[0].object.data
     kinds = set()
     for attribute in cloud.attributes:
@@ -79,135 +79,137 @@ def test_a_viewed_attribute_is_the_read_one(bpy, lodgs, scene):
     assert attributes.view_attribute(cloud, "no such") is None
 
 
-def test_only_what_is_drawn_is_uploaded_and_only_once(bpy, lodgs, seen):
+def test_drawn_splats_are_uploaded_once(bpy, lodgs, draw_from):
     views, resident = lodgs("viewport.views"), lodgs("viewport.resident")
     view, size, needed = views.ViewState(), 4 * 4 * resident.record_texels(3), set()
     uploaded = resident.bytes_uploaded
     for x in (0.0, 3.0, -3.0):
-        seen(view, x)
+        draw_from(view, x)
         needed |= set(view.arrangement.splats.tolist())
         assert resident.bytes_uploaded - uploaded == len(needed) * size
     assert view.arrangement.count < len(needed) < 2 * COUNT
-    seen(view, 0.0)
-    seen(views.ViewState(), 3.0)
+    draw_from(view, 0.0)
+    draw_from(views.ViewState(), 3.0)
     assert resident.bytes_uploaded - uploaded == len(needed) * size
 
 
-def test_places_change_hands(lodgs, frame):
-    """A store with room for few of many: held splats stay, to the bit, and the others that were last."""
+def test_slots_are_reused(lodgs, frame):
+    """A small store keeps requested splats and those of the last step, bit for bit."""
     resident, rng = lodgs("viewport.resident"), np.random.default_rng(2)
     records = rng.normal(size=(5000, 4 * resident.record_texels(8))).astype(np.float32)
 
     def steps():
         store, last = resident.Store(5000, 2500, 8), np.zeros(0, np.int32)
         for count in (900, 1200, 10, 1200, 1300, 1100):
-            wanted = rng.choice(5000, count, replace=False).astype(np.int32)
-            held = np.zeros(5000, bool)
-            held[wanted] = held[last] = True
-            store.hold(held)
-            stay = last[store.places[last] >= 0]
-            missing = store.missing(np.concatenate([wanted, wanted[:5]]))
-            assert set(missing.tolist()).isdisjoint(np.flatnonzero(store.places >= 0).tolist())
+            requested = rng.choice(5000, count, replace=False).astype(np.int32)
+            used = np.zeros(5000, bool)
+            used[requested] = used[last] = True
+            store.keep(used)
+            kept_splats = last[store.slots[last] >= 0]
+            missing = store.missing(np.concatenate([requested, requested[:5]]))
+            assert set(missing.tolist()).isdisjoint(np.flatnonzero(store.slots >= 0).tolist())
             for piece in np.array_split(missing, 3):
-                store.put(piece, records[piece])
-            assert (store.places[wanted] >= 0).all() and (store.places[stay] >= 0).all()
+                store.insert(piece, records[piece])
+            assert (store.slots[requested] >= 0).all() and (store.slots[kept_splats] >= 0).all()
             owned = np.flatnonzero(store.owners >= 0)
-            assert np.array_equal(store.places[store.owners[owned]], owned)
-            assert np.array_equal(stored(store, records.shape[1])[store.places[wanted]], records[wanted])
-            last = wanted
+            assert np.array_equal(store.slots[store.owners[owned]], owned)
+            assert np.array_equal(
+                read_store(store, records.shape[1])[store.slots[requested]], records[requested]
+            )
+            last = requested
 
     frame(8, steps)
 
 
-def test_viewports_share_the_store(lodgs, seen, monkeypatch):
-    """Each sees what it would see alone, whoever makes room; what nobody needs is given back."""
+def test_viewports_share_the_store(lodgs, draw_from, monkeypatch):
+    """Viewports draw as if alone; unused slots are freed."""
     views, resident = lodgs("viewport.views"), lodgs("viewport.resident")
-    monkeypatch.setattr(resident, "LEAST", 1)
-    places = (-9.0, -3.0, 0.0, 3.0, 9.0, -3.0, 0.0)
+    monkeypatch.setattr(resident, "MIN_SLOTS", 1)
+    positions = (-9.0, -3.0, 0.0, 3.0, 9.0, -3.0, 0.0)
     alone = []
-    for x in places:
+    for x in positions:
         views.clear()
-        alone.append(seen(views.ViewState(), x))
+        alone.append(draw_from(views.ViewState(), x))
     views.clear()
-    one, other, stores = views.ViewState(), views.ViewState(), set()
-    for x, expected in zip(places, alone, strict=True):
-        np.testing.assert_array_equal(seen(one, x), expected)
-        stores.add(one.resident.store)
-        np.testing.assert_array_equal(seen(other, 0.0), alone[2])
+    first, second, stores = views.ViewState(), views.ViewState(), set()
+    for x, expected in zip(positions, alone, strict=True):
+        np.testing.assert_array_equal(draw_from(first, x), expected)
+        stores.add(first.resident.store)
+        np.testing.assert_array_equal(draw_from(second, 0.0), alone[2])
     assert len(stores) > 1, "no store was too small"
-    assert len(one.resident.hold([np.arange(10)]).owners) < 100
+    assert len(first.resident.reserve([np.arange(10)]).owners) < 100
 
 
-def test_a_few_come_at_each_redraw(bpy, lodgs, seen, monkeypatch):
-    """Where there is nothing, what has come is drawn; where there is, it stays until all is there."""
+def test_each_redraw_uploads_a_batch(bpy, lodgs, draw_from, monkeypatch):
+    """Parts are drawn only at first; later arrangements are drawn when complete."""
     views, resident = lodgs("viewport.views"), lodgs("viewport.resident")
-    monkeypatch.setattr(resident, "PIECE", 100)
-    monkeypatch.setattr(views, "LOADING", (0.0, 0.0))
+    monkeypatch.setattr(resident, "UPLOAD_BATCH", 100)
+    monkeypatch.setattr(lodgs("viewport.view_state"), "LOADING", (0.0, 0.0))
 
     def settle(view, x):
-        counts, pictures = [], []
+        counts, images = [], []
         end = time.monotonic() + 30
         while time.monotonic() < end:
-            before = resident.bytes_uploaded
-            pictures.append(seen(view, x, wait=False))
-            assert resident.bytes_uploaded - before <= 100 * 16 * resident.record_texels(3)
+            previous = resident.bytes_uploaded
+            images.append(draw_from(view, x, wait=False))
+            assert resident.bytes_uploaded - previous <= 100 * 16 * resident.record_texels(3)
             counts.append(view.count)
             if view.arrangement is not None and view.pending is None and view.loading is None:
-                return counts, pictures
+                return counts, images
             time.sleep(0.01)
-        raise AssertionError("it never came")
+        raise AssertionError("uploads do not finish")
 
     view = views.ViewState()
     counts, _ = settle(view, 0.0)
     assert counts[-1] == view.arrangement.count and len(set(counts)) > 4 and counts == sorted(counts)
     first = view.arrangement
-    counts, pictures = settle(view, 3.0)
+    counts, images = settle(view, 3.0)
     assert set(counts[:-1]) == {first.count} and view.arrangement is not first
     views.clear()
-    np.testing.assert_array_equal(pictures[-1], seen(views.ViewState(), 3.0))
+    np.testing.assert_array_equal(images[-1], draw_from(views.ViewState(), 3.0))
 
 
-def test_splats_are_read_an_attribute_at_a_time(bpy, lodgs, seen, scene, monkeypatch):
-    """What is drawn stays until all that choosing needs has been read; and others begin anew."""
+def test_each_redraw_reads_an_attribute(bpy, lodgs, draw_from, scene, monkeypatch):
+    """The old image stays until the pool is complete; another change restarts reading."""
     views, view = lodgs("viewport.views"), lodgs("viewport.views").ViewState()
-    before, cloud = seen(view, 0.0), scene.lodgs.levels[1].object.data
+    before, cloud = draw_from(view, 0.0), scene.lodgs.levels[1].object.data
     positions = np.zeros(3 * COUNT, np.float32)
     cloud.attributes["position"].data.foreach_get("vector", positions)
 
-    def change(by):
-        cloud.attributes["position"].data.foreach_set("vector", positions + np.float32(by))
+    def change(offset):
+        cloud.attributes["position"].data.foreach_set("vector", positions + np.float32(offset))
         cloud.update_tag()
         bpy.context.view_layer.update()
 
-    def redraws(most=1000):
+    def redraws(limit=1000):
         reads, count = views.reads, 0
-        while views.reads == reads and count < most:
-            picture, count = seen(view, 0.0, wait=False), count + 1
+        while views.reads == reads and count < limit:
+            image, count = draw_from(view, 0.0, wait=False), count + 1
             assert views.reads > reads or views.wants_redraw(view)
-            np.testing.assert_array_equal(picture, before)
+            np.testing.assert_array_equal(image, before)
         return count
 
-    monkeypatch.setattr(views, "LOADING", (0.0, 0.0))
+    monkeypatch.setattr(lodgs("viewport.view_state"), "LOADING", (0.0, 0.0))
     change(0.1)
-    whole = redraws()
-    assert 6 < whole < 100
+    total = redraws()
+    assert 6 < total < 100
     change(0.2)
-    assert redraws(whole - 2) == whole - 2
+    assert redraws(total - 2) == total - 2
     change(0.3)
-    assert redraws() == whole, "it went on with what it had of others"
-    after = seen(view, 0.0)
+    assert redraws() == total, "reading did not restart"
+    after = draw_from(view, 0.0)
     views.clear()
-    np.testing.assert_array_equal(after, seen(views.ViewState(), 0.0))
+    np.testing.assert_array_equal(after, draw_from(views.ViewState(), 0.0))
     assert not np.array_equal(after, before)
 
 
-def test_splats_that_vanish_while_they_are_loaded(bpy, lodgs, seen, scene, monkeypatch):
+def test_splats_removed_during_loading(bpy, lodgs, draw_from, scene, monkeypatch):
     views, resident = lodgs("viewport.views"), lodgs("viewport.resident")
-    monkeypatch.setattr(resident, "PIECE", 10)
-    monkeypatch.setattr(views, "LOADING", (0.0, 0.0))
+    monkeypatch.setattr(resident, "UPLOAD_BATCH", 10)
+    monkeypatch.setattr(lodgs("viewport.view_state"), "LOADING", (0.0, 0.0))
     view = views.ViewState()
     for _ in range(200):
-        seen(view, 0.0, wait=False)
+        draw_from(view, 0.0, wait=False)
         if view.loading is not None:
             break
         time.sleep(0.01)
@@ -215,18 +217,18 @@ def test_splats_that_vanish_while_they_are_loaded(bpy, lodgs, seen, scene, monke
     bpy.data.objects.remove(scene.lodgs.levels[1].object)
     bpy.data.pointclouds.remove(bpy.data.pointclouds["scene level 2"])
     bpy.context.view_layer.update()
-    seen(view, 0.0)
+    draw_from(view, 0.0)
     assert view.loading is None and (view.arrangement.splats < COUNT).all()
 
 
-def test_the_viewports_own_eye_counts_before_the_modifiers_know_it(bpy, lodgs, seen, scene):
-    """So that nothing is evaluated while a view moves; and nothing changes when they do."""
+def test_a_moving_view_selects_before_modifiers_update(bpy, lodgs, draw_from, scene):
+    """Nothing is evaluated while a view moves, and nothing changes when it rests."""
     from mathutils import Matrix
 
-    views, eye = lodgs("viewport.views"), lodgs("viewport.eye")
+    views, view_camera = lodgs("viewport.views"), lodgs("viewport.view_camera")
     view, region = views.ViewState(), SimpleNamespace(as_pointer=lambda: 1, width=700)
     scene.location.x = 0.5
-    seen(view, 0.0)
+    draw_from(view, 0.0)
     version = lodgs("data.changes").version(scene.lodgs.levels[0].object.data)
 
     def request():
@@ -236,19 +238,21 @@ def test_the_viewports_own_eye_counts_before_the_modifiers_know_it(bpy, lodgs, s
 
     matrix = Matrix.Translation((-3.3, 1, -2))
     projection = Matrix(((2, 0, 0, 0), (0, 2, 0, 0), (0, 0, -1, -0.1), (0, 0, -1, 0)))
-    looks = SimpleNamespace(view_matrix=matrix, window_matrix=projection, view_distance=1.0)
-    eye.on_draw(region, bpy.context.scene, looks, splats=True)
+    region_view = SimpleNamespace(view_matrix=matrix, window_matrix=projection, view_distance=1.0)
+    view_camera.track(region, bpy.context.scene, region_view, splats=True)
     moved = request()
-    assert np.allclose(moved.placements[0].choice.eye, (2.8, -1, 2), atol=1e-6)
-    assert moved.placements[0].choice.focal_px == 700.0
+    assert np.allclose(moved.placements[0].query.eye, (2.8, -1, 2), atol=1e-6)
+    assert moved.placements[0].query.focal_px == 700.0
     assert tuple(scene.lodgs.held_eye) == (0.0, 0.0, 0.0)
-    assert eye._hand_on() > 0, "not while the view moves"
-    time.sleep(eye.REST)
-    assert eye._hand_on() is None and eye.moved(bpy.context.scene, scene) is None
+    assert view_camera._store_pending() > 0, "the view still moves"
+    time.sleep(view_camera.REST)
+    assert (
+        view_camera._store_pending() is None and view_camera.current_camera(bpy.context.scene, scene) is None
+    )
     bpy.context.view_layer.update()
     assert request() == moved
     assert lodgs("data.changes").version(scene.lodgs.levels[0].object.data) == version
     scene.lodgs.freeze = True
-    eye.on_draw(region, bpy.context.scene, looks, splats=True)
-    assert eye.moved(bpy.context.scene, scene) is None
-    eye.clear()
+    view_camera.track(region, bpy.context.scene, region_view, splats=True)
+    assert view_camera.current_camera(bpy.context.scene, scene) is None
+    view_camera.clear()

@@ -1,5 +1,5 @@
-"""Trees of splats that are read from their files as the eye moves: what is drawn is a complete cut at any
-time, and the whole file's where there is room."""
+"""Streaming of trees while the camera moves: the drawn splats are always a complete cut, and the cut of the
+whole file if the budget allows."""
 
 import shutil
 import time
@@ -7,12 +7,12 @@ import time
 import numpy as np
 import pytest
 
-from tests.blender.viewport.test_resident import stored
+from tests.blender.viewport.test_resident import read_store
 from tests.training.lod.tree.test_paging import Truth
 from tests.training.lod.tree.trees import random_leaves, tree_of, write_in_pages
 
 LEAVES, BUDGET, SIZE = 12_000, 23_500, 96
-EYES = [(0, 0, 30), (9, 9, 1), (-9, 8, 1), (8, -9, 2), (0, 0, 30)]
+POSITIONS = [(0, 0, 30), (9, 9, 1), (-9, 8, 1), (8, -9, 2), (0, 0, 30)]
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,7 @@ def path(tree, tmp_path):
 
 @pytest.fixture
 def root(bpy, lodgs, path, monkeypatch):
-    """A tree of which the top is here; pages come a few at a time."""
+    """Import the top of a tree; updates have a few pages each."""
     monkeypatch.setattr(lodgs("training.lod.tree.paging"), "PAGES_PER_UPDATE", 4)
     root = lodgs("data.importing").import_splats(bpy.context, path, upright=False, budget=BUDGET)
     yield root
@@ -37,75 +37,75 @@ def root(bpy, lodgs, path, monkeypatch):
 
 
 @pytest.fixture
-def look(bpy, lodgs, frame):
-    """``look(root, view, eye, pixels, wait)``: the picture from a place in the root's space, looking down."""
+def draw_from(bpy, lodgs, frame):
+    """``draw_from(root, view, position, pixels, wait)``: image from a position, looking down."""
     from mathutils import Matrix
 
     views = lodgs("viewport.views")
     views.clear()
     projection = Matrix(((2, 0, 0, 0), (0, 2, 0, 0), (0, 0, -1, -0.1), (0, 0, -1, 0)))
 
-    def looked(root, view, eye, pixels=20.0, wait=False, freeze=True):
+    def draw(root, view, position, pixels=20.0, wait=False, freeze=True):
         root.lodgs.controls.pixels = pixels
         root.lodgs.freeze = freeze
-        lodgs("data.selection").hold(root, eye, 1000.0)
+        lodgs("data.selection").store_camera(root, position, 1000.0)
         bpy.context.view_layer.update()
         depsgraph = bpy.context.evaluated_depsgraph_get()
         instances = lodgs("data.shown").splat_instances(depsgraph)
         return frame(SIZE, lambda: views.draw_splats(
-            view, instances, depsgraph, Matrix.Translation(-np.array(eye)), projection, 10**6, wait=wait,
+            view, instances, depsgraph, Matrix.Translation(-np.array(position)), projection, 10**6, wait=wait,
             under_overlays=False,
         ))  # fmt: skip
 
-    return looked
+    return draw
 
 
-def on_the_card(view):
-    """The means of the splats that a viewport draws, as the graphics card has them."""
+def drawn_means(view):
+    """Return the means of a viewport's drawn splats from the graphics card."""
     size = -(-(14 + 3 * view.store.higher) // 4)
     rows = np.array(view.instances.read(), np.float32).reshape(-1, 4)[: view.count]
-    return stored(view.store, 4 * size)[rows[:, 0].astype(int), :3]
+    return read_store(view.store, 4 * size)[rows[:, 0].astype(int), :3]
 
 
-def test_finer_ones_come_and_what_is_drawn_is_complete_at_any_time(bpy, lodgs, tree, path, root, look):
+def test_cuts_are_complete_while_finer_splats_are_loaded(bpy, lodgs, tree, path, root, draw_from):
     views, truth = lodgs("viewport.views"), Truth(tree)
     index = lodgs("training.lod.tree.paging").TreeFile(path).index()
-    view, streamed, numbers, begun = views.ViewState(), 0, [], False
-    held = sum(len(item.object.data.points) for item in root.lodgs.levels)
-    for eye in EYES:
+    view, streamed, numbers, complete = views.ViewState(), 0, [], False
+    base_count = sum(len(item.object.data.points) for item in root.lodgs.levels)
+    for position in POSITIONS:
         for pixels in (30.0, 8.0):
             until = time.monotonic() + 30
             while time.monotonic() < until:
-                before = views.stream(root)
-                settled = before is not None and before.ready and not before.busy
-                look(root, view, eye, pixels)
-                begun |= 0 < view.count == view.arrangement.count  # at first they come bit by bit
-                if begun:
-                    numbers.append(truth.nodes(on_the_card(view)))
+                previous = views.stream(root)
+                settled = previous is not None and previous.ready and not previous.busy
+                draw_from(root, view, position, pixels)
+                complete |= 0 < view.count == view.arrangement.count  # the first splats arrive in parts
+                if complete:
+                    numbers.append(truth.nodes(drawn_means(view)))
                     truth.require_complete(numbers[-1])
                 stream = views.stream(root)
                 if settled and not stream.busy and not view.pending and not view.loading:
                     break
                 time.sleep(0.005)
-            assert stream.ready and held + stream.splats <= BUDGET
-            if (index.detail(np.array(eye)) < 1001 / pixels).sum() <= (BUDGET - held) // 512:
+            assert stream.ready and base_count + stream.splats <= BUDGET
+            if (index.detail(np.array(position)) < 1001 / pixels).sum() <= (BUDGET - base_count) // 512:
                 streamed += 1
-                np.testing.assert_array_equal(np.sort(numbers[-1]), truth.cut(eye, pixels))
-    assert streamed == len(EYES)
-    assert len({len(each) for each in numbers}) > 12, "it came at once"
+                np.testing.assert_array_equal(np.sort(numbers[-1]), truth.cut(position, pixels))
+    assert streamed == len(POSITIONS)
+    assert len({len(nodes) for nodes in numbers}) > 12, "all pages arrived at once"
 
 
-def test_a_view_at_rest_is_redrawn_until_all_has_come(lodgs, root, look, monkeypatch):
-    """As in windows, which are drawn again only when that is asked for; what comes takes several redraws."""
-    views, eye = lodgs("viewport.views"), EYES[0]
+def test_a_resting_view_redraws_until_loading_ends(lodgs, root, draw_from, monkeypatch):
+    """Windows redraw only on request, and loading takes several redraws."""
+    views, position = lodgs("viewport.views"), POSITIONS[0]
     view, slices = views.ViewState(), 0
-    monkeypatch.setattr(views, "LOADING", (0.0, 0.0))
-    look(root, view, eye, 30.0)
+    monkeypatch.setattr(lodgs("viewport.view_state"), "LOADING", (0.0, 0.0))
+    draw_from(root, view, position, 30.0)
     until = time.monotonic() + 30
     while time.monotonic() < until:
         stream = views.stream(root)
         if views.wants_redraw(view):
-            look(root, view, eye, 30.0)
+            draw_from(root, view, position, 30.0)
             slices += view.loading is not None
         elif view.pending is None and stream.ready and not stream.busy:
             break
@@ -113,75 +113,74 @@ def test_a_view_at_rest_is_redrawn_until_all_has_come(lodgs, root, look, monkeyp
     assert not stream.busy and view.arrived == stream.ready + stream.taken and slices > 3
 
 
-def test_it_is_the_picture_of_the_whole_file(bpy, lodgs, path, root, look):
+def test_streamed_image_matches_the_whole_file(bpy, lodgs, path, root, draw_from):
     view = lodgs("viewport.views").ViewState()
-    pictures = [look(root, view, eye, 30.0, wait=True) for eye in EYES]
+    images = [draw_from(root, view, position, 30.0, wait=True) for position in POSITIONS]
     lodgs("viewport.views").clear()
     lodgs("data.removal").remove(root)
     whole = lodgs("data.importing").import_splats(bpy.context, path, upright=False)
     assert lodgs("data.streams").source_of(whole) is None
     view = lodgs("viewport.views").ViewState()
-    for eye, picture in zip(EYES, pictures, strict=True):
-        np.testing.assert_allclose(picture, look(whole, view, eye, 30.0, wait=True), atol=2e-3)
-        assert picture[..., 3].max() > 0.1
+    for position, image in zip(POSITIONS, images, strict=True):
+        np.testing.assert_allclose(image, draw_from(whole, view, position, 30.0, wait=True), atol=2e-3)
+        assert image[..., 3].max() > 0.1
 
 
-def test_two_viewports_draw_complete_cuts(bpy, lodgs, tree, root, look):
+def test_two_viewports_draw_complete_cuts(bpy, lodgs, tree, root, draw_from):
     views, truth = lodgs("viewport.views"), Truth(tree)
-    one, other, begun = views.ViewState(), views.ViewState(), set()
-    for eye in EYES:
+    first, second, complete = views.ViewState(), views.ViewState(), set()
+    for position in POSITIONS:
         for _ in range(25):
-            for view in (one, other):
-                look(root, view, eye, 12.0)
+            for view in (first, second):
+                draw_from(root, view, position, 12.0)
                 if 0 < view.count == view.arrangement.count:
-                    begun.add(view)
-                if view in begun:
-                    truth.require_complete(truth.nodes(on_the_card(view)))
+                    complete.add(view)
+                if view in complete:
+                    truth.require_complete(truth.nodes(drawn_means(view)))
             time.sleep(0.002)
-    assert len(begun) == 2
+    assert len(complete) == 2
 
 
-def test_a_file_that_is_gone_leaves_what_the_scene_holds(bpy, lodgs, path, tree, root, look, tmp_path):
+def test_missing_files_leave_the_splats_of_the_scene(bpy, lodgs, path, tree, root, draw_from, tmp_path):
     views, truth = lodgs("viewport.views"), Truth(tree)
-    path.rename(tmp_path / "elsewhere.ply")
+    path.rename(tmp_path / "moved.ply")
     view = views.ViewState()
 
-    def drawn():
+    def draw():
         until = time.monotonic() + 20
         while time.monotonic() < until:
-            before = views.stream(root)
-            settled = before is not None and not before.busy
-            look(root, view, EYES[1], 30.0)
+            previous = views.stream(root)
+            settled = previous is not None and not previous.busy
+            draw_from(root, view, POSITIONS[1], 30.0)
             if settled and not view.pending and not view.loading and not views.stream(root).busy:
                 break
             time.sleep(0.01)
-        return truth.nodes(on_the_card(view))
+        return truth.nodes(drawn_means(view))
 
-    found = drawn()
-    truth.require_complete(found)
+    truth.require_complete(draw())
     assert "town.ply" in views.stream(root).problem and not views.stream(root).ready
-    root.lodgs.stream.file = str(tmp_path / "elsewhere.ply")
-    again = drawn()
+    root.lodgs.stream.file = str(tmp_path / "moved.ply")
+    nodes = draw()
     assert not views.stream(root).problem
-    np.testing.assert_array_equal(np.sort(again), truth.cut(EYES[1], 30.0))
-    shutil.copy(path.with_name("elsewhere.ply"), path)
+    np.testing.assert_array_equal(np.sort(nodes), truth.cut(POSITIONS[1], 30.0))
+    shutil.copy(path.with_name("moved.ply"), path)
 
 
-def test_another_file_in_its_place_is_a_sentence(bpy, lodgs, path, root, look):
+def test_a_replaced_file_is_reported(bpy, lodgs, path, root, draw_from):
     bundle = lodgs("training.splats.bundle")
     bundle.write_bundle(path, tree_of(random_leaves(3000, np.random.default_rng(1), degree=1)))
     view = lodgs("viewport.views").ViewState()
-    look(root, view, EYES[0], wait=True)
-    assert "is not the file that was imported" in lodgs("viewport.views").stream(root).problem
+    draw_from(root, view, POSITIONS[0], wait=True)
+    assert "instead of 23,999" in lodgs("viewport.views").stream(root).problem
     assert view.count
 
 
-def test_what_somebody_has_changed_is_shown_as_it_is(bpy, lodgs, root):
+def test_edited_scenes_are_not_streamed(bpy, lodgs, root):
     streams, shown = lodgs("data.streams"), lodgs("data.shown")
 
     def sources():
         bpy.context.view_layer.update()
-        return [each.source for each in shown.splat_instances(bpy.context.evaluated_depsgraph_get())]
+        return [instance.source for instance in shown.splat_instances(bpy.context.evaluated_depsgraph_get())]
 
     assert len(set(sources())) == 1 and sources()[0] is not None
     coarse, fine = (item.object for item in root.lodgs.levels)
@@ -200,20 +199,19 @@ def test_what_somebody_has_changed_is_shown_as_it_is(bpy, lodgs, root):
     assert streams.source_of(root) is None
 
 
-def test_a_saved_file_goes_on(bpy, lodgs, root, path, tmp_path):
-    """By a path beside it, wherever both go."""
+def test_saved_scenes_keep_streaming(bpy, lodgs, root, path, tmp_path):
+    """Relative paths survive moving both files."""
     streams = lodgs("data.streams")
     assert streams.file_of(root) == path
     (tmp_path / "a").mkdir()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
-    again = lodgs("data.importing").import_splats(bpy.context, path, budget=BUDGET)
-    assert again.lodgs.stream.file == "//town.ply" and streams.file_of(again) == path
+    reimported = lodgs("data.importing").import_splats(bpy.context, path, budget=BUDGET)
+    assert reimported.lodgs.stream.file == "//town.ply" and streams.file_of(reimported) == path
     bpy.ops.wm.save_mainfile()
     for name in ("scene.blend", "town.ply"):
         shutil.move(tmp_path / name, tmp_path / "a" / name)
-    name = again.name
+    name = reimported.name
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a" / "scene.blend"))
-    found = bpy.data.objects[name]
-    source = streams.source_of(found)
+    source = streams.source_of(bpy.data.objects[name])
     assert source.path == tmp_path / "a" / "town.ply" and source.total == 2 * LEAVES - 1
     assert not lodgs("viewport.views")._streams

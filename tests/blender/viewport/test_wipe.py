@@ -1,11 +1,11 @@
-"""The wipe over a photograph and its rendered picture."""
+"""Wipe between a photo and its rendered image."""
 
 import numpy as np
 import pytest
 
 
-def test_the_wipe_draws_both_pictures(bpy, lodgs):
-    """Left of the wipe the photograph, right of it the rendering, rows the right way up, linear."""
+def test_wipe_draws_both_images(bpy, lodgs):
+    """The photo is on the left, the rendered image on the right, upright and linear."""
     import gpu
 
     from training.scenes.color import linear_from_srgb
@@ -26,8 +26,8 @@ def test_the_wipe_draws_both_pictures(bpy, lodgs):
         lodgs("viewport.wipe").draw(comparison, 1 / 3, [(-0.5, -0.5), (0.5, 0.5)], 0.001)
         buffer = frame.read_color(0, 0, 96, 64, 4, 0, "FLOAT")
     buffer.dimensions = 96 * 64 * 4
-    seen = np.array(buffer, np.float32).reshape(64, 96, 4)[::-1]
-    assert (seen[:16] == 0).all() and (seen[:, :24] == 0).all() and (seen[:, 72:] == 0).all()
-    inside = seen[16:48, 24:72, :3]
+    image = np.array(buffer, np.float32).reshape(64, 96, 4)[::-1]
+    assert (image[:16] == 0).all() and (image[:, :24] == 0).all() and (image[:, 72:] == 0).all()
+    inside = image[16:48, 24:72, :3]
     np.testing.assert_allclose(inside[:, :15], linear_from_srgb(photo[:, :15]), atol=3e-3)
     np.testing.assert_allclose(inside[:, 17:], linear_from_srgb(rendered[:, 17:]), atol=3e-3)
