@@ -191,7 +191,7 @@ def _order(root: bpy.types.Object) -> None:
         if cropping and rule_modifiers and rule:
             modifiers = item.object.modifiers
             crop_index, rule_index = modifiers.find(cropping.name), modifiers.find(rule_modifiers.name)
-            if (crop_index < rule_index) == rule.apart:
+            if (crop_index < rule_index) == rule.independent:
                 modifiers.move(crop_index, rule_index)
 
 

@@ -166,7 +166,7 @@ def test_export_one_level_and_visible_splats(bpy, lodgs, bundle, file, tmp_path)
     for item in root.lodgs.levels:
         item.show = False
     bpy.context.view_layer.update()
-    with pytest.raises(RuntimeError, match="No splats of scène 1 are shown"):
+    with pytest.raises(RuntimeError, match="no splats of 'scène 1' are shown"):
         bpy.ops.lodgs.export_plain(filepath=str(tmp_path / "none.ply"))
     assert not (tmp_path / "none.ply").exists()
 
