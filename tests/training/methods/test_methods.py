@@ -29,8 +29,8 @@ from training.splats.ply import write_ply
 
 ABOUT = """
 from dataclasses import dataclass
-from ..info import MethodInfo
-from ..parameters import Parameters, parameter
+from ...optimize.method_info import MethodInfo
+from ...optimize.parameters import Parameters, parameter
 
 @dataclass(frozen=True)
 class TinyParameters(Parameters):
@@ -45,11 +45,11 @@ TRAIN = '''
 import numpy as np
 import torch
 from ...splats.bundle import Level
-from .. import method
-from ..density import densify, prune
-from ..method import Drawing
-from ..model import Model, splat_rates
-from ..start import distinct, from_points, from_splats
+from ...optimize import method
+from ...optimize.density_control import densify, prune
+from ...optimize.method import Drawing
+from ...optimize.model import Model, splat_rates
+from ...optimize.initialize import drop_duplicates, from_points, from_splats
 
 class Method(method.Method):
     """Draws everything, and once more with weights that are trained; clones in step 4, prunes in step 6."""
@@ -57,7 +57,8 @@ class Method(method.Method):
     def setup(self, base):
         p, scene = self.parameters, self.data.scene
         if base is None:
-            tensors = from_points(*distinct(scene.points, scene.point_colors), p.sh_degree, self.device)
+            points = drop_duplicates(scene.points, scene.point_colors)
+            tensors = from_points(*points, p.sh_degree, self.device)
         else:
             tensors = from_splats(base, p.sh_degree, self.device)
         tensors["decay"] = torch.linspace(0.5, 1.5, len(tensors["means"]))
@@ -187,7 +188,7 @@ def test_run_uses_antialiasing_of_its_base(tiny, tiny_scene, tmp_path, antialias
     folder = RunFolder(created.out)
     events, _ = folder.events()
     said = [event["message"] for event in events if event["event"] == "warning"]
-    assert said == [f"The base is {'' if antialias else 'not '}antialiased, and so is this run."]
+    assert said == [f"Antialiasing is {'on' if antialias else 'off'} for this run, as in its base."]
     bundle = read_bundle(folder.bundle)
     assert bundle.antialias is antialias and bundle.meta.get("antialias", False) is antialias
     level = next(event for event in events if event["event"] == "level")
@@ -207,7 +208,7 @@ def test_run_uses_antialiasing_of_its_base(tiny, tiny_scene, tmp_path, antialias
 
 
 def test_unusable_base_raises(tiny, tiny_scene, tmp_path):
-    with pytest.raises(LodgsError, match=r"'flod' cannot begin.*Leave out 'base'"):
+    with pytest.raises(LodgsError, match=r"'flod' cannot start from a base.*Remove 'base'"):
         job(tiny_scene, tmp_path / "run", method="flod", base=str(tmp_path / "base.ply"))
     created = job(tiny_scene, tmp_path / "run", base=str(tmp_path / "absent.ply"))
     assert training_loop.train(created) == BAD_INPUT
@@ -226,10 +227,10 @@ def test_base_path_is_relative_to_the_job(tiny, tmp_path):
 def test_base_is_finest_complete_level(tmp_path):
     coarse, fine = base(10), base(30)
     run = RunFolder(tmp_path / "run")
-    with pytest.raises(LodgsError, match="There is no"):
+    with pytest.raises(LodgsError, match="does not exist"):
         read_base(run.path)
     run.create()
-    with pytest.raises(LodgsError, match=r"no finished run.*to the end"):
+    with pytest.raises(LodgsError, match=r"not a finished run.*Finish training"):
         read_base(run.path)
     levels = [Level(1, coarse), Level(2, fine)]
     write_bundle(run.bundle, Bundle("flod", levels))
