@@ -93,7 +93,7 @@ def test_only_regular_files_are_opened(tmp_path):
     pipe = tmp_path / "pipe.json"
     os.mkfifo(pipe)
     for path in (pipe, tmp_path, "/dev/zero"):
-        with pytest.raises(LodgsError, match="Cannot read .*: not a file"):
+        with pytest.raises(LodgsError, match=r"Cannot read .*: not a file"):
             read_json(path)
     with pytest.raises(LodgsError, match="No such file"):
         open_file(tmp_path / "none.json")

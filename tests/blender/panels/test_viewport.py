@@ -23,7 +23,8 @@ def test_an_error_is_shown_until_the_next_redraw_succeeds(bpy, viewport, draw_pa
         viewport._draw()
     messages = [text for text in draw_panel("viewport", "LODGS_PT_viewport").texts if "memory" in text]
     assert messages == [
-        "Cannot draw splats: RuntimeError: no more memory on the card. Disable Gaussian Splats to draw points."
+        "Cannot draw splats: RuntimeError: no more memory on the card. "
+        "Disable Gaussian Splats to draw points."
     ]
     assert capsys.readouterr().err.count("Traceback") == 1
     assert bpy.context.scene.lodgs_viewport.splats and second_scene.lodgs_viewport.splats
