@@ -154,7 +154,7 @@ def rows_of(nodes: int, pixels: float) -> list[dict]:
     )
     balls = np.concatenate([splats.means, sizes[:, None]], axis=1)
     cuts: dict[str, Cut] = {
-        "HSPT": lambda camera, k: hspt.find_cut(camera, camera.focal / k, town.NEAR),
+        "HSPT": lambda camera, k: hspt.cut(camera, camera.focal / k, town.NEAR),
         "HSPT without culling": lambda camera, k: hspt.cut_at(camera.center, k),
         "traversal of all nodes": traversal(tree, balls),
         "test of all nodes (Eq. 5)": exhaustive_test(tree, balls),

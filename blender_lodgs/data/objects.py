@@ -174,7 +174,8 @@ def splats_of(cloud: bpy.types.PointCloud, weights: np.ndarray | None = None) ->
         return None
     if weights is not None:
         base[:, 3] *= weights
-    sh = np.stack([base[:, :3], *(read_attribute(cloud, name) for name in sh_names(cloud))], axis=1)
+    higher = [values for name in sh_names(cloud) if (values := read_attribute(cloud, name)) is not None]
+    sh = np.stack([base[:, :3], *higher], axis=1)
     tiny = np.float32(1e-30)
     opacity = np.clip(base[:, 3].astype(np.float64), *_OPACITIES)
     logits = np.log(opacity / (1 - opacity)).astype(np.float32)

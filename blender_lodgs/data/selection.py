@@ -385,7 +385,8 @@ def _detach(obj: bpy.types.Object) -> None:
 def rule_modifier(obj: bpy.types.Object) -> bpy.types.NodesModifier | None:
     """Return the modifier of a rule, of any rule and version."""
     for modifier in obj.modifiers:
-        group = modifier.node_group if isinstance(modifier, bpy.types.NodesModifier) else None
-        if group and groups.RULE in group:
-            return modifier
+        if isinstance(modifier, bpy.types.NodesModifier):
+            group = modifier.node_group
+            if group and groups.RULE in group:
+                return modifier
     return None

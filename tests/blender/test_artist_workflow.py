@@ -226,10 +226,10 @@ class Way:
         cleaning = self.lodgs("data.cleaning")
         centre, radius = self.sphere
         graph = self.bpy.context.evaluated_depsgraph_get()
-        counts = cleaning.count_left(self.root, graph)
+        counts = cleaning.count_remaining(self.root, graph)
         for level, item in zip(self.trained().levels, self.root.lodgs.levels, strict=True):
             inside = np.linalg.norm(level.splats.means - centre, axis=1) < radius
-            hidden = cleaning.hidden(item.object.data)
+            hidden = cleaning.hidden_mask(item.object.data)
             assert not hidden[~inside].any(), "floaters are detected among the cropped splats"
             assert counts[item.number] == (np.count_nonzero(inside & ~hidden), len(inside))
             assert counts[item.number][0] < len(inside)

@@ -53,8 +53,8 @@ def evaluate_run(
           ``drawn``, ``psnr``, ``ssim``, ``frame_s``, ``veil``. Cumulative levels include all coarser ones.
         - ``train_psnr``, ``veil``, ``oversized``, ``worst``, ``fitted_psnr`` of the finest level
           (``evaluate.summary``)
-        - ``aside``, if the scene has views off its path (``scenes.offset_views``): mean ``psnr`` of the finest
-          level and names of these ``views``
+        - ``aside``, if the scene has views off its path (``scenes.offset_views``): mean ``psnr`` of the
+          finest level and names of these ``views``
         - ``selective``: quality with the rule, selected per view, and once for the mean training camera
           (not if the bundle exceeds memory), with the rule's controls; empty without a rule
         - ``frame_s``: seconds per frame ``by_distance``, including selection, and in ``full`` detail, drawn

@@ -241,7 +241,7 @@ def test_base_is_finest_complete_level(tmp_path):
     write_ply(tmp_path / "plain.ply", coarse)
     np.testing.assert_array_equal(read_base(tmp_path / "plain.ply")[0].means, coarse.means)
     write_ply(tmp_path / "empty.ply", base(0))
-    with pytest.raises(LodgsError, match="empty.ply has none"):
+    with pytest.raises(LodgsError, match=r"empty\.ply has none"):
         read_base(tmp_path / "empty.ply")
 
 
