@@ -50,7 +50,7 @@ def test_zip_contains_only_the_packages_and_their_files(archive):
         p.relative_to(REPOSITORY).as_posix()
         for r in ("blender_lodgs", "training")
         for p in (REPOSITORY / r).rglob("*.*")
-        if p.suffix in (".py", ".wgsl")
+        if p.suffix in (".py", ".pyi", ".typed", ".wgsl")
     }
     data = {"__init__.py", "blender_manifest.toml", "LICENSE"}
     data |= {"pyproject.toml", *(f"requirements/{name}.txt" for name in ("trainer", "cluster", "cuda"))}

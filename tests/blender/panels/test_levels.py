@@ -185,7 +185,7 @@ def test_panels_explain_the_coarse_level_of_a_tree(tree, draw_panel):
     assert any("Level 1 holds coarse nodes of a tree" in text for text in texts)
     tree.lodgs.tell = "LEVELS"
     layout = draw_panel("viewport", "LODGS_PT_viewport")
-    assert not layout.colors and any("half as large" in text for text in layout.texts)
+    assert not layout.colors and any("half the size" in text for text in layout.texts)
 
 
 def test_state_of_streaming_is_shown(bpy, lodgs, draw, draw_panel, tmp_path, monkeypatch):

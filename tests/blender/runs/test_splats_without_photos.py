@@ -129,7 +129,7 @@ def test_views_along_a_curve(bpy, fake, root, tmp_path):
     fake()
     training = root.lodgs.training
     training.views_from, training.views = "CURVE", 30
-    with pytest.raises(RuntimeError, match="No curve is chosen"):
+    with pytest.raises(RuntimeError, match="no curve is chosen"):
         bpy.ops.lodgs.train(folder=str(tmp_path / "run"))
     bpy.ops.curve.primitive_bezier_circle_add(radius=6, location=(1, 2, 1.7))
     training.curve = circle = bpy.context.object
