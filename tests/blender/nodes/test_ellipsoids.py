@@ -55,6 +55,7 @@ def rendered(bpy, path) -> np.ndarray:
     return values.reshape(image.size[1], image.size[0], 4)
 
 
+@pytest.mark.nightly
 def test_cycles_matches_the_rasterizer(bpy, lodgs, scene, renderer, tmp_path):
     scene.lodgs_render.ellipsoids = True
     cycles = rendered(bpy, tmp_path / "cycles.png")

@@ -449,6 +449,7 @@ def test_nothing_to_see_is_the_background(bpy, lodgs, scene, tmp_path):
     assert f12(bpy, tmp_path)[..., :3].max() == 0
 
 
+@pytest.mark.nightly
 def test_no_program_outlives_blender(bundle, tmp_path):
     """A Blender that renders and is then killed: its renderer ends, and takes its files along."""
     script = tmp_path / "script.py"

@@ -603,6 +603,7 @@ def test_mistakes_are_reported(bpy, jobs, fake, root, tmp_path, monkeypatch):
     assert not bpy.ops.lodgs.train.poll()
 
 
+@pytest.mark.nightly
 def test_the_real_trainer(bpy, jobs, tmp_path, monkeypatch):
     """Train levels from small images in a few steps, cancel and resume."""
     if not TRAINER:
@@ -636,6 +637,7 @@ def test_resume_uses_the_current_backend(bpy, lodgs, jobs, fake, root, tmp_path)
     assert Job.from_file(tmp_path / "run" / "job.toml").backend == "cpu"
 
 
+@pytest.mark.nightly
 def test_octree_levels_are_cumulative_and_follow_the_distance(bpy, lodgs, jobs, tmp_path, monkeypatch):
     """With the real trainer, all levels arrive together, twice, and are selected by distance at once."""
     if not TRAINER:
