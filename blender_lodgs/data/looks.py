@@ -20,7 +20,7 @@ from ...training.editing.paint import COLUMNS as PAINT
 from ...training.lod.crop import Crop
 from .. import compat
 from ..attributes import sh_names
-from ..nodes import ellipsoids
+from ..nodes import display, ellipsoids
 from ..nodes import look as groups
 from ..nodes.building import add_switched_modifier, find_modifier, remove_modifier, replace_driver
 from . import crops
@@ -195,6 +195,7 @@ def _attach(obj: bpy.types.Object, root: bpy.types.Object, regions: list[bpy.typ
     last = obj.modifiers.find(ellipsoids.NAME)
     if last >= 0:
         obj.modifiers.move(len(obj.modifiers) - 1, last)
+    display.keep_last(obj)
     for number, source in enumerate((root, *regions)):
         if number:
             crops.follow(obj, modifier, number, source)

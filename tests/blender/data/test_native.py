@@ -273,6 +273,8 @@ def test_blender_draws_looks_paint_and_weights(bpy, lodgs, make, with_splats, tm
     names = lodgs("training.editing.paint").COLUMNS
     for name, column in zip(names, paint.T, strict=True):
         lodgs("attributes").write_attribute(obj.data, name, "FLOAT", column)
+    names = [modifier.name for modifier in obj.modifiers]
+    assert names.index("LODGS Native Splats") > next(i for i, name in enumerate(names) if "Look" in name)
     lodgs("data.selection").follow_crops(root)
     bpy.context.scene.lodgs_viewport.drawn_by = "BLENDER"
     shown = evaluated(bpy, obj)
