@@ -8,7 +8,7 @@ The result is composited into the active framebuffer, which is linear, below exi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import gpu
 import numpy as np
@@ -18,9 +18,6 @@ from ...training.editing.look import Looks
 from .arrangement import WIDTH, Arrangement, Placement
 from .shaders import MAX_TEXTURES, bind_textures, copy_shader, empty_texture, palette, program
 
-if TYPE_CHECKING:
-    from .resident import Store
-
 DILATION = (0.3, 0.0)
 """3DGS's filter: variance added to projected splats in square pixels, and opacity compensation (off)."""
 MIP_FILTER = (0.1, 1.0)
@@ -29,6 +26,14 @@ MIP_FILTER = (0.1, 1.0)
 Frame = tuple[float, float, float, float]
 FULL_FRAME: Frame = (-1.0, -1.0, 1.0, 1.0)
 """Left, bottom, right and top of clip space."""
+
+
+class UploadedSplats(Protocol):
+    """Splats on the graphics card, as ``resident.Store`` has them."""
+
+    textures: list[gpu.types.GPUTexture | None]
+    texture_slots: int
+    higher: int
 
 
 def instances_texture(
@@ -119,7 +124,7 @@ class Canvas:
 
 
 def draw(
-    store: Store,
+    store: UploadedSplats,
     instances: gpu.types.GPUTexture,
     count: int,
     placements: Sequence[Placement],
@@ -179,7 +184,7 @@ def _write_depth(depth: gpu.types.GPUTexture) -> None:
 
 
 def _blend(
-    store: Store,
+    store: UploadedSplats,
     textures: dict[str, gpu.types.GPUTexture],
     count: int,
     projection: Matrix,

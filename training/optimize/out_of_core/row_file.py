@@ -395,7 +395,7 @@ class RowFile:
             place = self._folder if self._file is None else self._file.name
             self._broken = LodgsError(
                 f"Cannot read or write {place}: {error.strerror or error}.",
-                "Free disk space or choose another folder, then resume the run.",
+                "Free some space or choose another folder, then resume the run.",
             )
             raise self._broken from error
 

@@ -263,7 +263,7 @@ def _full(folder: RunFolder, at: int, counted) -> None:
     try:
         run_steps(folder, 0, STEPS)
     except LodgsError as error:
-        os._exit(8 if "No space left on device" in str(error) and "Free disk space" in str(error) else 7)
+        os._exit(8 if "No space left on device" in str(error) and "Free some space" in str(error) else 7)
     os._exit(0)
 
 
