@@ -9,13 +9,10 @@ import bpy
 
 from ...training.methods import METHODS, PRESETS, MethodInfo, method_info
 from ...training.runs.job import MAX_CELLS, Job
+from ...training.settings import label_of
 from ...training.splats.levels import MAX_LEVELS
 from . import crops, photographs, viewpoints
-
-_MAX_INTEGER = 2**31 - 1
-_MAX_FLOAT = 3.4e38
-_MIN_STEP = 1e-6
-"""Smallest number above 0 that Blender displays."""
+from .setting_properties import property_of
 
 COMMON_PARAMETERS = "depth_weight", "depth"
 """Parameters in the panel for every method."""
@@ -66,26 +63,6 @@ def _preset_value(f: Field, method: str):
     return lambda group: getattr(method_info(method).preset(group.id_data.lodgs.training.preset), f.name)
 
 
-def _property(f: Field, label: str, **options) -> Any:
-    """Create a Blender property of the parameter's type and range."""
-    about = f.metadata
-    options = {"name": label, "options": set(), **options}
-    if isinstance(f.default, bool):
-        return bpy.props.BoolProperty(**options)
-    if isinstance(f.default, str) and "get" in options:  # a getter of an enum would have to return integers
-        return bpy.props.StringProperty(**options)
-    if isinstance(f.default, str):
-        items = [(name, name.replace("_", " ").title(), "") for name in about["choices"]]
-        return bpy.props.EnumProperty(items=items, **options)
-    low, high, above = about["low"], about["high"], about["above"]
-    if isinstance(f.default, int):
-        low = low if above is None else above + 1
-        return bpy.props.IntProperty(min=int(low), max=int(min(high, _MAX_INTEGER)), **options)
-    subtype = "PIXEL" if about["unit"] == "px" else "FACTOR" if (low, high) == (0, 1) else "NONE"
-    low = low if above is None else above + _MIN_STEP
-    return bpy.props.FloatProperty(min=low, max=min(high, _MAX_FLOAT), subtype=subtype, **options)
-
-
 def _use(name: str, label: str, description: str) -> Any:
     """Create a checkbox that enables the user's own value; it starts as the previous default."""
 
@@ -103,13 +80,11 @@ def _use(name: str, label: str, description: str) -> Any:
 
 def _properties_of(f: Field, method: str) -> dict[str, Any]:
     """Return three properties: the artist's value, its switch, and the preset's value to show until then."""
-    name, label = f.name, f.metadata["label"] or f.name.replace("_", " ").title()
-    about = f.metadata["about"].removesuffix(".")  # Blender adds one
-    tooltip = f"{about}. Value of the preset; tick the box to change it"
+    tooltip = f"{f.metadata['about']} Value of the preset; tick the box to change it"
     return {
-        name: _property(f, label, description=about, default=f.default),
-        f"use_{name}": _use(name, label, "Use your own value instead of the preset's"),
-        f"preset_{name}": _property(f, label, description=tooltip, get=_preset_value(f, method)),
+        f.name: property_of(f),
+        f"use_{f.name}": _use(f.name, label_of(f), "Use your own value instead of the preset's"),
+        f"preset_{f.name}": property_of(f, description=tooltip, get=_preset_value(f, method)),
     }
 
 

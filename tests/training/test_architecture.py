@@ -40,6 +40,7 @@ FLOORS = {
         ("lod",),
         ("scenes",),
         ("splats",),
+        ("settings",),
         ("documents",),
         ("files",),
         ("errors", "plugins", "__init__"),

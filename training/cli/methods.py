@@ -7,7 +7,7 @@ import json
 from textwrap import fill
 
 from ..methods import METHODS, PRESETS, method_info
-from ..optimize.parameters import describe_values
+from ..settings import describe_values
 
 _WIDTH = 110
 

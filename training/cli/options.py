@@ -5,12 +5,14 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from dataclasses import Field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..errors import LodgsError
 from ..lod.rule import all_controls
+from ..settings import default_of, describe_values
 
 if TYPE_CHECKING:
     from ..splats.similarity import Similarity
@@ -64,13 +66,48 @@ def parse_color(text: str) -> tuple[float, float, float] | None:
     return red, green, blue
 
 
+def option_name(name: str) -> str:
+    """Return the command-line option of a setting or control."""
+    return f"--{name.replace('_', '-')}"
+
+
+def add_setting(parser: argparse._ActionsContainer, f: Field) -> None:
+    """Add the option of a setting, without bounds. Options that the user omits are not in the result."""
+    default, choices, unit = default_of(f), f.metadata["choices"], f.metadata["unit"]
+    about = f.metadata["about"].removesuffix(".").replace("%", "%%")
+    about = about[0].lower() + about[1:] if about[1:2].islower() else about  # not an abbreviation
+    if default is not False and default != "":
+        about += f" (default {default})"
+    options: dict[str, Any] = {"default": argparse.SUPPRESS, "help": about}
+    if isinstance(default, bool):
+        options["action"] = "store_true"
+    elif choices:
+        options["choices"] = list(choices)
+    else:
+        options["metavar"] = f.metadata["metavar"] or unit.upper() or "N"
+        options["type"] = _parser_of(f)
+    if isinstance(f.default, tuple):
+        options["nargs"] = len(f.default)
+    parser.add_argument(option_name(f.name), **options)
+
+
+def _parser_of(f: Field) -> Callable[[str], bool | int | float | str]:
+    def parse(text: str) -> bool | int | float | str:
+        try:
+            return type(default_of(f))(text)
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"{text} is not {describe_values(f)}") from None
+
+    return parse
+
+
 def add_controls(parser: argparse.ArgumentParser) -> None:
     """Add an option for each control that any rule has."""
     group = parser.add_argument_group("level of detail by camera distance, depending on the method's rule")
     for control in all_controls().values():
         default = "" if control.follows else f" (default: the file's, else {control.default:g})"
         group.add_argument(
-            f"--{control.name.replace('_', '-')}", type=int if control.whole else float, metavar="N",
+            option_name(control.name), type=int if control.whole else float, metavar="N",
             help=control.about.replace("%", "%%") + default,
         )  # fmt: skip
 

@@ -1,51 +1,19 @@
-"""Parameters of methods: dataclass fields with bounds, units and help. Does not import torch."""
+"""Parameters of methods, and their values in presets and jobs. Does not import torch."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import Field, dataclass, field, fields, replace
-from math import inf, isfinite
+from dataclasses import Field, dataclass, replace
 from typing import Any
 
 from ..documents import quote
 from ..errors import LodgsError
 from ..scenes.depths import DEPTH_KINDS
+from ..settings import check_value, setting, settings_of
 
 MAX_MARGIN_SHARE = 0.1
 """Maximum share of all splats for margins."""
 MAX_MARGIN_SPLATS = 4000
 """Maximum number of splats for margins."""
-MAX_INTEGER = 2**31 - 1
-"""Maximum value of any integer parameter."""
-MAX_NUMBER = 1e9
-"""Maximum value of any other numeric parameter."""
-
-
-def parameter(
-    default: Any,
-    about: str = "",
-    *,
-    label: str = "",
-    low: float = 0,
-    high: float = inf,
-    above: float | None = None,
-    unit: str = "",
-    choices: Sequence[str] = (),
-) -> Any:
-    """Create a field of a `Parameters` class. The arguments are in the field's ``metadata``, by name.
-
-    Args:
-        default: a bool, int, float or str, or a tuple of one of these with an entry per level. Determines the
-            type of values.
-        about: help text, one or two sentences.
-        label: label in panels; "" derives it from the name.
-        low, high: inclusive bounds of a number, further limited by MAX_INTEGER or MAX_NUMBER.
-        above: exclusive lower bound, in place of ``low``.
-        unit: "px", "steps", ...; "" for a pure number.
-        choices: valid values of a str.
-    """
-    metadata = {"about": about, "label": label, "low": low, "high": high, "above": above}
-    return field(default=default, metadata=metadata | {"unit": unit, "choices": tuple(choices)})
 
 
 @dataclass(frozen=True)
@@ -56,62 +24,62 @@ class Parameters:
     multiples of the scene extent.
     """
 
-    steps: int = parameter(3000, "Training steps.", above=0, unit="steps")
-    max_splats: int = parameter(
+    steps: int = setting(3000, "Training steps.", above=0, unit="steps")
+    max_splats: int = setting(
         60_000,
         "Maximum number of splats. Those with the largest gradients are densified first. If the scene has "
         "more points, training starts from a random sample.",
         above=0,
     )
-    grad_threshold: float = parameter(
+    grad_threshold: float = setting(
         1e-4,
         "Mean image-plane gradient (3DGS units, at one megapixel) above which splats are added.",
     )
-    min_opacity: float = parameter(0.005, "Remove splats below this opacity.", high=1)
-    sh_degree: int = parameter(3, "Degree of spherical harmonics for view-dependent colour, 0 to 3.", high=3)
-    sh_interval: int = parameter(250, "Steps between increases of the harmonics' degree.", unit="steps")
-    ssim_weight: float = parameter(0.2, "Weight of D-SSIM relative to L1 in the loss.", high=1)
-    free_depth: float = parameter(
+    min_opacity: float = setting(0.005, "Remove splats below this opacity.", high=1)
+    sh_degree: int = setting(3, "Degree of spherical harmonics for view-dependent colour, 0 to 3.", high=3)
+    sh_interval: int = setting(250, "Steps between increases of the harmonics' degree.", unit="steps")
+    ssim_weight: float = setting(0.2, "Weight of D-SSIM relative to L1 in the loss.", high=1)
+    free_depth: float = setting(
         0.5,
         "Remove splats closer to a training camera, or to the midpoint of two neighbouring cameras, than "
         "this fraction of its nearest scene points. Within the same distance outside the frame, keep only "
         "splats seen by two or more photos. 0 disables.",
         high=1,
     )
-    largest: float = parameter(
+    largest: float = setting(
         0.3,
         "Maximum standard deviation of a splat, as a fraction of its distance from the nearest training "
         "camera. 0 disables.",
     )
-    random_background: bool = parameter(
+    random_background: bool = setting(
         True,
         "Use a random background colour in every step, so that splats cannot use the black background as a "
         "scene colour. Disable for photos with a black background.",
     )
-    margin: float = parameter(
+    margin: float = setting(
         0.5,
         "Width of the margin around photos, as a fraction of their size. Areas outside all photos are filled "
         "with blurred colours at the depth of the edge. 0 disables.",
         high=2,
     )
-    antialias: bool = parameter(
+    antialias: bool = setting(
         True,
         "Use the 2D filter of Mip-Splatting, which preserves the brightness of splats smaller than a pixel, "
         "instead of the dilation of 3DGS. Runs that start from a base use the base's setting.",
     )
-    dropout: float = parameter(
+    dropout: float = setting(
         0.2,
         "Fraction of random splats to drop in each step, which reduces overfitting to few photos. It "
         "decreases to 0 at 40 photos, and is 0 in the last eighth of the steps. Not in the papers.",
         high=0.5,
     )
-    depth_weight: float = parameter(
+    depth_weight: float = setting(
         0.0,
         "Initial weight of the depth loss where depth is known (see depth): L1 of inverse depth, in inverse "
         "median depths. It decreases to a hundredth. 0 disables.",
         label="Depth Weight",
     )
-    depth: str = parameter(
+    depth: str = setting(
         "metric",
         "Source of depth: maps in the folder depths in scene units (metric), maps of depth (relative) or of "
         "inverse depth (inverse) with scale and shift fitted to the scene's points in each view, or only "
@@ -119,25 +87,25 @@ class Parameters:
         label="Depth Source",
         choices=DEPTH_KINDS,
     )
-    match_exposure: bool = parameter(
+    match_exposure: bool = setting(
         True,
         "Before training, correct photos whose exposure or white balance differs from their neighbours, by "
         "shared scene points. Smooth changes along the sequence remain.",
     )
-    lr_exposure: float = parameter(
+    lr_exposure: float = setting(
         0.0,
         "Learning rate of a colour gain and offset per photo, which renders do not use. For photos with "
         "different exposure or white balance. 0 disables.",
     )
-    lr_means: float = parameter(
+    lr_means: float = setting(
         3e-4,
         "Learning rate of positions, times the scene extent, at the start of a level (FLoD) or the run.",
     )
-    lr_means_final: float = parameter(3e-5, "Learning rate of positions, times the scene extent, at the end.")
-    lr_scales: float = parameter(1e-2, "Learning rate of log-scales.")
-    lr_quats: float = parameter(1e-3, "Learning rate of quaternions.")
-    lr_opacities: float = parameter(5e-2, "Learning rate of opacity logits.")
-    lr_sh: float = parameter(
+    lr_means_final: float = setting(3e-5, "Learning rate of positions, times the scene extent, at the end.")
+    lr_scales: float = setting(1e-2, "Learning rate of log-scales.")
+    lr_quats: float = setting(1e-3, "Learning rate of quaternions.")
+    lr_opacities: float = setting(5e-2, "Learning rate of opacity logits.")
+    lr_sh: float = setting(
         2.5e-3, "Learning rate of the base colour. Higher harmonics use a twentieth of it."
     )
 
@@ -182,30 +150,30 @@ class Parameters:
 class DensityParameters(Parameters):
     """Parameters of methods with the density control of 3DGS (``optimize.density_control``)."""
 
-    first_resolution: float = parameter(
+    first_resolution: float = setting(
         0.35,
         "Initial side of the training images, as a fraction of the full side. 1 always trains at full size.",
         above=0,
         high=1,
     )
-    full_resolution: float = parameter(
+    full_resolution: float = setting(
         0.5, "Fraction of the steps after which training images have full size.", high=1
     )
-    long_axis: bool = parameter(
+    long_axis: bool = setting(
         True,
         "Densify by splitting splats in two along their longest axis, which changes the image little. "
         "Otherwise clone small splats and split large ones at random, as in 3DGS.",
     )
-    clone_extent: float = parameter(
+    clone_extent: float = setting(
         0.01,
         "Without 'long_axis', split splats larger than this multiple of the scene extent and clone smaller "
         "ones.",
     )
-    prune_interval: int = parameter(
+    prune_interval: int = setting(
         100, "Steps between removals of transparent splats. 0 disables.", unit="steps"
     )
-    opacity_reset_interval: int = parameter(0, "Steps between opacity resets. 0 disables.", unit="steps")
-    lr_means_steps: int = parameter(
+    opacity_reset_interval: int = setting(0, "Steps between opacity resets. 0 disables.", unit="steps")
+    lr_means_steps: int = setting(
         0,
         "Steps over which the learning rate of positions decays. 0 uses all steps (FLoD: of the level).",
         unit="steps",
@@ -251,7 +219,7 @@ def override(parameters: Parameters, values: dict) -> Parameters:
     Raises:
         LodgsError: unknown name, invalid value, or wrong number of entries.
     """
-    all_fields = {f.name: f for f in fields(parameters)}
+    all_fields = settings_of(parameters)
     if unknown := sorted(set(values) - set(all_fields)):
         raise LodgsError(
             f"Cannot read the job: unknown parameter {quote(unknown[0])}.",
@@ -260,54 +228,17 @@ def override(parameters: Parameters, values: dict) -> Parameters:
     overrides = {name: value for name, value in values.items() if value is not None}
     result: dict[str, Any] = {name: getattr(parameters, name) for name in all_fields} | overrides
     if "levels" in all_fields:
-        result["levels"] = _check_value(all_fields["levels"], result["levels"])
+        result["levels"] = check_value(all_fields["levels"], result["levels"])
     for name, f in all_fields.items():
         value = result[name]
         if isinstance(f.default, tuple):
             result[name] = _per_level(f, value, result["levels"], name in overrides)
         else:
             value = value[0] if isinstance(value, list) and len(value) == 1 else value
-            result[name] = _check_value(f, value)
+            result[name] = check_value(f, value)
     overridden = replace(parameters, **result)
     overridden.check()
     return overridden
-
-
-def describe_values(f: Field) -> str:
-    """Describe the valid values of a parameter or tuple entry, as "a number above 0 and at most 1"."""
-    metadata = f.metadata
-    default = f.default[0] if isinstance(f.default, tuple) else f.default
-    if isinstance(default, bool):
-        return "true or false"
-    if isinstance(default, str):
-        return f"one of: {', '.join(metadata['choices'])}"
-    kind = "a whole number" if isinstance(default, int) else "a number"
-    low = f"of at least {metadata['low']}" if metadata["above"] is None else f"above {metadata['above']}"
-    return f"{kind} {low}" + (f" and at most {metadata['high']}" if metadata["high"] < inf else "")
-
-
-def _check_value(f: Field, value: Any) -> Any:
-    """Convert a value to the field's type.
-
-    Raises:
-        LodgsError: wrong type, or out of bounds.
-    """
-    default = f.default[0] if isinstance(f.default, tuple) else f.default
-    low, high, above, choices = (f.metadata[name] for name in ("low", "high", "above", "choices"))
-    if isinstance(default, bool):
-        valid = isinstance(value, bool)
-    elif isinstance(default, str):
-        valid = value in choices
-    else:
-        integer = isinstance(value, int) and not isinstance(value, bool)
-        valid = integer or (isinstance(default, float) and isinstance(value, float) and isfinite(value))
-        valid = valid and value <= high and (value >= low if above is None else value > above)
-        limit = MAX_INTEGER if isinstance(default, int) else MAX_NUMBER
-        if valid and value > limit:
-            raise LodgsError(f"{f.name} = {quote(value)} is too large.", f"Use at most {limit:g}.")
-    if not valid:
-        raise LodgsError(f"{f.name} = {quote(value)} is invalid.", f"Use {describe_values(f)}.")
-    return type(default)(value)
 
 
 def _per_level(f: Field, value: Any, levels: int, explicit: bool) -> tuple:
@@ -319,4 +250,4 @@ def _per_level(f: Field, value: Any, levels: int, explicit: bool) -> tuple:
             "Use one entry per level, coarse to fine, or a single number.",
         )
     entries = entries[:1] * (levels - len(entries)) + entries[-levels:]
-    return tuple(_check_value(f, entry) for entry in entries)
+    return tuple(check_value(f, entry) for entry in entries)

@@ -9,16 +9,16 @@ import pytest
 def made_up(bpy, lodgs, monkeypatch):
     """The group of a method that nobody knew, on an object."""
     parameters, methods = lodgs("training.optimize.parameters"), lodgs("training.methods")
-    parameter = parameters.parameter
+    setting = lodgs("training.settings").setting
 
     @dataclass(frozen=True)
     class Made(parameters.Parameters):
-        decay: float = parameter(0.25, "Share that decays.", label="Faintness", high=1)
-        width: float = parameter(3.0, "Width.", above=0, unit="px")
-        turns: int = parameter(2, "Turns.", above=1, high=7)
-        fast: bool = parameter(True, "Whether it hurries.")
-        kind: str = parameter("far_off", "Kind.", choices=("near", "far_off"))
-        shares: tuple[float, ...] = parameter((0.5, 0.5), "Shares.")
+        decay: float = setting(0.25, "Share that decays.", label="Faintness", high=1)
+        width: float = setting(3.0, "Width.", above=0, unit="px")
+        turns: int = setting(2, "Turns.", above=1, high=7)
+        fast: bool = setting(True, "Whether it hurries.")
+        kind: str = setting("far_off", "Kind.", choices=("near", "far_off"))
+        shares: tuple[float, ...] = setting((0.5, 0.5), "Shares.")
 
     offered = ("decay", "width", "turns", "fast", "kind", "shares")
     presets = {"draft": Made(), "standard": Made(width=4.5, kind="near"), "paper": Made()}

@@ -30,11 +30,12 @@ from training.splats.ply import write_ply
 ABOUT = """
 from dataclasses import dataclass
 from ...optimize.method_info import MethodInfo
-from ...optimize.parameters import Parameters, parameter
+from ...optimize.parameters import Parameters
+from ...settings import setting
 
 @dataclass(frozen=True)
 class TinyParameters(Parameters):
-    lr_decay: float = parameter(0.1, "Learning rate of decays.", above=0)
+    lr_decay: float = setting(0.1, "Learning rate of decays.", above=0)
 
 METHOD = MethodInfo(
     name="tiny", number=99, label="Tiny", about="for tests", parameters=TinyParameters,

@@ -6,16 +6,17 @@ import pytest
 
 from training.errors import LodgsError
 from training.methods import METHODS, PRESETS, method_info
-from training.optimize.parameters import Parameters, override, parameter
+from training.optimize.parameters import Parameters, override
+from training.settings import setting
 
 
 @dataclass(frozen=True)
 class ExampleParameters(Parameters):
-    levels: int = parameter(3, "Levels.", low=1, high=4)
-    shares: tuple[float, ...] = parameter((0.5, 0.5, 0.5), "Shares.", above=0, high=1)
-    depth: float = parameter(-1.0, "Depth.", low=-2, high=3, unit="m")
-    kind: str = parameter("near", "Kind.", choices=("near", "far"))
-    fast: bool = parameter(False, "Fast.")
+    levels: int = setting(3, "Levels.", low=1, high=4)
+    shares: tuple[float, ...] = setting((0.5, 0.5, 0.5), "Shares.", above=0, high=1)
+    depth: float = setting(-1.0, "Depth.", low=-2, high=3, unit="m")
+    kind: str = setting("near", "Kind.", choices=("near", "far"))
+    fast: bool = setting(False, "Fast.")
 
 
 @pytest.mark.parametrize("method", METHODS.values(), ids=lambda method: method.name)

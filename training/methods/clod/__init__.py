@@ -3,7 +3,8 @@
 from dataclasses import dataclass, replace
 
 from ...optimize.method_info import MethodInfo
-from ...optimize.parameters import PAPER, STANDARD, parameter
+from ...optimize.parameters import PAPER, STANDARD
+from ...settings import setting
 from ..threedgs import ThreedgsParameters
 
 
@@ -11,10 +12,10 @@ from ..threedgs import ThreedgsParameters
 class ClodParameters(ThreedgsParameters):
     """Parameters of CLoD-GS, which is 3DGS until the decay begins."""
 
-    begin: float = parameter(
+    begin: float = setting(
         0.5, "Fraction of the steps before the decay begins; with a base it begins immediately.", high=1
     )
-    keep_share: float = parameter(
+    keep_share: float = setting(
         0.74,
         "When the decay begins, keep the splats that contribute most to the pixels of the views, so "
         "that views draw this fraction of their splats. 1 keeps all. Not in the paper.",
@@ -22,48 +23,48 @@ class ClodParameters(ThreedgsParameters):
         high=1,
         label="Keep Share",
     )
-    by_importance: bool = parameter(
+    by_importance: bool = setting(
         True,
         "Initialize each splat's decay from its contribution to the views. Short schedules need it to "
         "learn decays. Not in the paper.",
     )
-    sigma_init: float = parameter(10.0, "Initial decay of all splats, if 'by_importance' is off.", above=0)
-    log_sigma: bool = parameter(
+    sigma_init: float = setting(10.0, "Initial decay of all splats, if 'by_importance' is off.", above=0)
+    log_sigma: bool = setting(
         True, "Train the logarithm of the decay, so that updates are relative. Not in the paper."
     )
-    lr_sigma: float = parameter(1e-2, "Learning rate of the decay.")
-    s_v_most: float = parameter(
+    lr_sigma: float = setting(1e-2, "Learning rate of the decay.")
+    s_v_most: float = setting(
         10.0,
         "Maximum virtual distance scale in training (CLoD-GS: 3, 5 or 10).",
         low=1,
         label="Max Distance",
     )
-    log_uniform: bool = parameter(
+    log_uniform: bool = setting(
         True, "Sample the virtual distance scale uniformly in the logarithm; the paper samples it linearly."
     )
-    random_weight: float = parameter(
+    random_weight: float = setting(
         0.5, "Loss weight of the image at the random scale, relative to the image at scale 1 (CLoD-GS: 1)."
     )
-    exponent: float = parameter(
+    exponent: float = setting(
         0.7,
         "Exponent of the target splat count: at scale s the target fraction is s to the power of "
         "minus this value (CLoD-GS: 1.5).",
         above=0,
     )
-    onset: float = parameter(2.0, "Scale up to which the target is all splats (CLoD-GS: 1).", low=1)
-    count_weight: float = parameter(
+    onset: float = setting(2.0, "Scale up to which the target is all splats (CLoD-GS: 1).", low=1)
+    count_weight: float = setting(
         1.0, "Weight of the splat count regularization, which is multiplied by (s_v - 1)² (CLoD-GS: λ_reg)."
     )
-    count_softness: float = parameter(
+    count_softness: float = setting(
         0.5,
         "Width of the sigmoid that gives the splat count a gradient, in log opacity relative to the "
         "threshold.",
         above=0,
     )
-    tau: float = parameter(
+    tau: float = setting(
         0.02, "Minimum attenuated opacity of a drawn splat (CLoD-GS: τ, value not published).", above=0
     )
-    reference_quantile: float = parameter(
+    reference_quantile: float = setting(
         0.99,
         "Quantile of the distances between views and their visible points, used as the reference "
         "distance. 0 uses the farthest splat of each view, as published.",

@@ -4,7 +4,8 @@ from dataclasses import dataclass, replace
 
 from ...errors import LodgsError
 from ...optimize.method_info import MethodInfo
-from ...optimize.parameters import PAPER, STANDARD, DensityParameters, parameter
+from ...optimize.parameters import PAPER, STANDARD, DensityParameters
+from ...settings import setting
 from ...splats.levels import MAX_LEVELS
 
 PAPER_FOOTPRINT = 40.0
@@ -24,11 +25,11 @@ class FlodParameters(DensityParameters):
     Tuples have one entry per level, coarse to fine. ``max_splats`` limits the last level.
     """
 
-    levels: int = parameter(5, "Number of levels (FLoD: L_max).", low=1, high=MAX_LEVELS)
-    rho: float = parameter(
+    levels: int = setting(5, "Number of levels (FLoD: L_max).", low=1, high=MAX_LEVELS)
+    rho: float = setting(
         4.0, "Ratio of the minimum splat sizes of two neighbouring levels (FLoD: rho).", above=1
     )
-    footprint: float = parameter(
+    footprint: float = setting(
         16.0,
         "Minimum splat size of level 1, in pixels at the scene's median depth. Sets lambda and the "
         "screen size (gamma) that selects levels by distance.",
@@ -36,49 +37,49 @@ class FlodParameters(DensityParameters):
         above=0,
         unit="px",
     )
-    s_min_1: float = parameter(
+    s_min_1: float = setting(
         0.0, "Minimum splat size of level 1 in scene units (FLoD: lambda). 0 derives it from 'footprint'."
     )
-    steps: tuple[int, ...] = parameter(
+    steps: tuple[int, ...] = setting(
         (250, 400, 500, 750, 1250), "Training steps of each level.", above=0, unit="steps"
     )
-    densify_until: tuple[float, ...] = parameter(
+    densify_until: tuple[float, ...] = setting(
         (0.5,) * 5, "Fraction of a level's steps in which splats are added and removed.", high=1
     )
-    densify_interval: tuple[int, ...] = parameter(
+    densify_interval: tuple[int, ...] = setting(
         (50,) * 5, "Steps between two densifications.", above=0, unit="steps"
     )
-    budget_ratio: float = parameter(
+    budget_ratio: float = setting(
         0.6,
         "Maximum splat count of a level, as a fraction of the next finer level's; below 1 every level "
         "adds splats. The levels of the paper have about this ratio.",
         above=0,
         high=1,
     )
-    overlap_interval: int = parameter(
+    overlap_interval: int = setting(
         50,
         "Steps between two overlap prunings, in all levels but the finest (FLoD, Sec. 4.3). 0 disables.",
         unit="steps",
     )
-    rejoin_points: bool = parameter(
+    rejoin_points: bool = setting(
         True,
         "Add points of the initial point cloud that overlap pruning removed again at the first level "
         "with room for them. Gives finer levels exact start positions in short schedules. Not in the "
         "paper.",
     )
 
-    first_level: int = parameter(
+    first_level: int = setting(
         1, "First level to train. Above 1 it needs a base: the level before it.", low=1
     )
-    last_level: int = parameter(0, "Last level to train. 0 means the finest.")
-    finish_share: float = parameter(
+    last_level: int = setting(0, "Last level to train. 0 means the finest.")
+    finish_share: float = setting(
         0.2,
         "Additional steps at the end that train the three finest levels as blended by distance, as a "
         "fraction of all levels' steps. Coarser levels with fine detail restart from the most "
         "important splats of the finest level. Not in the paper.",
         high=1,
     )
-    drawn: float = parameter(
+    drawn: float = setting(
         0.53,
         "Maximum number of splats drawn by distance in the training views, as a fraction of those of "
         "the finest level. Sets the size of the levels that the finishing steps restart. Not in the "
@@ -86,7 +87,7 @@ class FlodParameters(DensityParameters):
         above=0,
         high=1,
     )
-    finish_alone: float = parameter(
+    finish_alone: float = setting(
         0.5,
         "Fraction of the finishing steps that render a single level, so that each level also works "
         "without the others.",

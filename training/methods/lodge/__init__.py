@@ -5,7 +5,8 @@ from itertools import pairwise
 
 from ...errors import LodgsError
 from ...optimize.method_info import MethodInfo
-from ...optimize.parameters import PAPER, STANDARD, parameter
+from ...optimize.parameters import PAPER, STANDARD
+from ...settings import setting
 from ...splats.levels import MAX_LEVELS
 from ..threedgs import ThreedgsParameters
 
@@ -20,19 +21,19 @@ class LodgeParameters(ThreedgsParameters):
     Without a base, ``steps`` train the finest level by 3DGS. Tuples have one entry per level, coarse to fine.
     """
 
-    levels: int = parameter(3, "Number of levels, including the finest.", low=1, high=MAX_LEVELS)
-    distances: tuple[float, ...] = parameter(
+    levels: int = setting(3, "Number of levels, including the finest.", low=1, high=MAX_LEVELS)
+    distances: tuple[float, ...] = setting(
         (0.0,) * 3,
         "Distance from which each level is drawn, in median depths of the scene, falling to 0 for the "
         "finest (LODGE: d_l). 0 for another level chooses the distance that draws the fewest splats.",
     )
-    prune_weight: float = parameter(
+    prune_weight: float = setting(
         0.1,
         "Minimum blending weight of a splat in any pixel; a coarser level drops splats below it "
         "(LODGE: γ, value not published).",
         high=1,
     )
-    drawn: float = parameter(
+    drawn: float = setting(
         0.59,
         "Maximum number of splats drawn by distance in the training views, as a fraction of those of "
         "the finest level; above it, 'prune_weight' increases for the level. 1 disables. Not in the "
@@ -40,7 +41,7 @@ class LodgeParameters(ThreedgsParameters):
         above=0,
         high=1,
     )
-    keep: float = parameter(
+    keep: float = setting(
         1.0,
         "Maximum splat count of a level, as a fraction of the next finer level's; remaining splats "
         "grow to fill the gaps. Use 0.3 to 0.4 in scenes of many small splats that all matter to some "
@@ -48,31 +49,31 @@ class LodgeParameters(ThreedgsParameters):
         above=0,
         high=1,
     )
-    tune_steps: int = parameter(
+    tune_steps: int = setting(
         400, "Steps after each of the three prunings of a level.", above=0, unit="steps"
     )
-    tune_range: float = parameter(
+    tune_range: float = setting(
         0.3, "Random variation of distances while a level is tuned, as a fraction of the distance.", high=0.9
     )
-    tune_alone: float = parameter(
+    tune_alone: float = setting(
         0.25,
         "Fraction of the tuning steps that render the level alone, on images downscaled for its "
         "distance. Trains levels that no training view is far enough to show. Not in the paper.",
         high=1,
     )
-    chunks: int = parameter(
+    chunks: int = setting(
         0,
         "Number of chunks: fixed splat sets that blend into each other as the camera moves. 0 uses "
         "LODGE's Eq. 5, and none below 8 chunks; 1 disables chunks.",
         high=96,
     )
-    visible_weight: float = parameter(
+    visible_weight: float = setting(
         0.01,
         "Minimum blending weight in any view from inside a chunk; its set omits splats below it "
         "(LODGE: a fixed threshold, value not published). 0 keeps all.",
         high=1,
     )
-    filter_variance: float = parameter(
+    filter_variance: float = setting(
         0.2,
         "Variance of the filter that smooths a level, in square pixels at its distance (LODGE: s, "
         "value not published; this is Mip-Splatting's).",

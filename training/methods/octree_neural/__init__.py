@@ -4,7 +4,8 @@ from dataclasses import dataclass, replace
 
 from ...errors import LodgsError
 from ...optimize.method_info import MethodInfo
-from ...optimize.parameters import AS_PUBLISHED, parameter
+from ...optimize.parameters import AS_PUBLISHED
+from ...settings import setting
 from ..octree import OctreeParameters
 
 
@@ -12,53 +13,53 @@ from ..octree import OctreeParameters
 class NeuralOctreeParameters(OctreeParameters):
     """Parameters of Octree-GS with neural anchors. ``sh_degree`` applies to baking."""
 
-    max_splats: int = parameter(
+    max_splats: int = setting(
         180_000, "Maximum number of Gaussians of all levels together; levels add up.", above=0
     )
-    min_opacity: float = parameter(
+    min_opacity: float = setting(
         0.005, "Minimum summed opacity of an anchor's Gaussians; anchors below it are removed.", high=1
     )
-    lr_scales: float = parameter(7e-3, "Learning rate of the anchors' log extents.")
-    offsets: int = parameter(5, "Gaussians per anchor (Octree-GS: 10).", above=0, high=100)
-    features: int = parameter(32, "Length of an anchor's feature vector.", high=1024)
-    direct: bool = parameter(
+    lr_scales: float = setting(7e-3, "Learning rate of the anchors' log extents.")
+    offsets: int = setting(5, "Gaussians per anchor (Octree-GS: 10).", above=0, high=100)
+    features: int = setting(32, "Length of an anchor's feature vector.", high=1024)
+    direct: bool = setting(
         True,
         "Give each Gaussian its own shape, colour and opacity, to which the networks' output is "
         "added. Short schedules need it. Not in the paper.",
     )
-    view_shapes: bool = parameter(
+    view_shapes: bool = setting(
         False,
         "Let opacity and covariance depend on the view direction, as in the paper. Overfits if there "
         "are few photos, and baking cannot represent it.",
     )
-    appearance: int = parameter(
+    appearance: int = setting(
         0,
         "Length of each view's appearance vector, for photos in changing light. 0 disables.",
         high=1024,
     )
-    lr_features: float = parameter(7.5e-3, "Learning rate of the features.")
-    lr_offsets: float = parameter(
+    lr_features: float = setting(7.5e-3, "Learning rate of the features.")
+    lr_offsets: float = setting(
         1e-2,
         "Initial learning rate of the Gaussians' offsets, which are in units of their anchor's extent.",
     )
-    lr_offsets_final: float = parameter(1e-4, "Final learning rate of the offsets.")
-    lr_looks: float = parameter(
+    lr_offsets_final: float = setting(1e-4, "Final learning rate of the offsets.")
+    lr_looks: float = setting(
         1e-2,
         "Learning rate of the Gaussians' own scales and colours; opacities use five times, "
         "quaternions a fifth of it.",
     )
-    lr_network: float = parameter(
+    lr_network: float = setting(
         2e-3,
         "Learning rate of the opacity network; the covariance network uses twice, the colour network "
         "four times this value.",
     )
-    lr_network_final: float = parameter(
+    lr_network_final: float = setting(
         0.01,
         "Final learning rates of opacity, colour and appearance, as a fraction of the initial ones.",
         high=1,
     )
-    lr_appearance: float = parameter(5e-2, "Learning rate of the appearance vectors.")
-    bake_ridge: float = parameter(0.001, "Ridge regularization of the higher harmonics in baking.", above=0)
+    lr_appearance: float = setting(5e-2, "Learning rate of the appearance vectors.")
+    bake_ridge: float = setting(0.001, "Ridge regularization of the higher harmonics in baking.", above=0)
 
     def check(self) -> None:
         super().check()

@@ -3,7 +3,8 @@
 from dataclasses import dataclass, replace
 
 from ...optimize.method_info import MethodInfo
-from ...optimize.parameters import PAPER, STANDARD, parameter
+from ...optimize.parameters import PAPER, STANDARD
+from ...settings import setting
 from ..threedgs import ThreedgsParameters
 
 
@@ -14,12 +15,12 @@ class TreeParameters(ThreedgsParameters):
     Without a base, the first ``steps`` train the leaves by 3DGS; the schedules of 3DGS span all steps.
     """
 
-    tune_steps: int = parameter(
+    tune_steps: int = setting(
         600,
         "Training steps for cuts of the tree, one view per step. 0 keeps the tree as built.",
         unit="steps",
     )
-    pixels: float = parameter(
+    pixels: float = setting(
         0.5,
         "Granularity of the cuts in training, in pixels of the training images; also the initial "
         "value for rendering.",
@@ -27,41 +28,41 @@ class TreeParameters(ThreedgsParameters):
         high=100,
         unit="px",
     )
-    lod_noise: float = parameter(
+    lod_noise: float = setting(
         10.0,
         "Random coarsening in training: granularity is multiplied by 1 + this value times r⁴, with r "
         "uniform from 0 to 1. Most cuts are fine, some coarse.",
         high=100,
     )
-    node_rate: float = parameter(
+    node_rate: float = setting(
         2.0,
         "Learning rates of inner nodes, as multiples of the current 3DGS rates; with a base, of the "
         "final ones.",
         high=100,
     )
-    leaf_rate: float = parameter(
+    leaf_rate: float = setting(
         0.5,
         "Learning rates of leaves, as multiples of the same rates; they fall to 0.03 of this value. 0 "
         "freezes the leaves.",
         high=100,
     )
-    resize_interval: int = parameter(
+    resize_interval: int = setting(
         1000,
         "Steps between two updates of node sizes, which decide the cuts. 0 keeps the sizes of the "
         "built tree.",
         unit="steps",
     )
 
-    grow_interval: int = parameter(
+    grow_interval: int = setting(
         0,
         "Steps between two density controls of the tree: leaves above 'max_threshold' split while "
         "'max_splats' allows. 0 disables.",
         unit="steps",
     )
-    grow_until: float = parameter(
+    grow_until: float = setting(
         0.85, "Fraction of 'tune_steps' after which the tree keeps its shape.", high=1
     )
-    unseen_epochs: float = parameter(
+    unseen_epochs: float = setting(
         0.0,
         "Epochs after which density control removes leaves that were in no training image. 0 disables.",
     )

@@ -1,0 +1,62 @@
+"""Blender properties of settings (``training.settings``)."""
+
+from __future__ import annotations
+
+from dataclasses import Field
+from typing import Any
+
+import bpy
+
+from ...training.settings import MAX_INTEGER, default_of, label_of
+
+MAX_FLOAT = 3.4e38
+_MIN_STEP = 1e-6
+"""Smallest number above 0 that Blender displays."""
+
+
+def property_of(f: Field, **options: Any) -> Any:
+    """Return a Blender property with the label, help, default, bounds and unit of a setting.
+
+    Args:
+        options: arguments of ``bpy.props`` that replace the generated ones. With ``get``, the property has no
+            default, and a choice is a text.
+    """
+    about = f.metadata["about"].removesuffix(".")  # Blender adds one
+    options = {"name": label_of(f), "description": about, "options": set(), **options}
+    if "get" not in options:
+        options.setdefault("default", f.default)
+    default = default_of(f)
+    if isinstance(default, bool):
+        return bpy.props.BoolProperty(**options)
+    if isinstance(default, str):
+        return _text_property(f, options)
+    ranges = _ranges(f)
+    if isinstance(default, int):
+        return bpy.props.IntProperty(**ranges | options)
+    unit, bounded = f.metadata["unit"], (f.metadata["low"], f.metadata["high"]) == (0, 1)
+    options = {"subtype": "PIXEL" if unit == "px" else "FACTOR" if bounded else "NONE", **ranges, **options}
+    if isinstance(f.default, tuple):
+        return bpy.props.FloatVectorProperty(size=len(f.default), **options)
+    return bpy.props.FloatProperty(**options)
+
+
+def _text_property(f: Field, options: dict[str, Any]) -> Any:
+    if path := f.metadata["path"]:
+        subtype = "DIR_PATH" if path == "folder" else "FILE_PATH"
+        path_options = {"subtype": subtype, "options": {"PATH_SUPPORTS_BLEND_RELATIVE"}}
+        return bpy.props.StringProperty(**options | path_options)
+    if not f.metadata["choices"] or "get" in options:  # a getter of an enum would have to return integers
+        return bpy.props.StringProperty(**options)
+    items = [(name, name.replace("_", " ").title(), text) for name, text in f.metadata["choices"].items()]
+    return bpy.props.EnumProperty(**{"items": items} | options)
+
+
+def _ranges(f: Field) -> dict[str, float]:
+    """Return the bounds of a number and of its slider, as arguments of ``bpy.props``."""
+    low, high, above, soft = (f.metadata[name] for name in ("low", "high", "above", "soft"))
+    if isinstance(default_of(f), int):
+        ranges = {"min": int(low) if above is None else int(above) + 1, "max": int(min(high, MAX_INTEGER))}
+    else:
+        ranges = {"min": low if above is None else above + _MIN_STEP, "max": min(high, MAX_FLOAT)}
+    sliders = {"soft_min": soft[0], "soft_max": soft[1]}
+    return ranges | {name: value for name, value in sliders.items() if value is not None}
