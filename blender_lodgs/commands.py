@@ -21,7 +21,8 @@ from ..training.editing.edit import ConcatenatedRows, run_to_end
 from ..training.errors import LodgsError
 from ..training.evaluate.messages import summary_lines
 from ..training.runs.folder import RunFolder
-from ..training.runs.job import Job, check_views
+from ..training.runs.job import KEYS, Job
+from ..training.settings import check_value
 from ..training.splats.bundle import write_bundle
 from ..training.splats.dialects import Warn
 from ..training.splats.formats import PLY, find_format, write_splats
@@ -265,7 +266,8 @@ def _capture(args: argparse.Namespace) -> int:
             )
     width, height = args.size or viewpoints.image_size(scene, settings)
     views = settings.views if args.views is None else args.views
-    check_views(views, width)
+    check_value(KEYS["views"], views)
+    check_value(KEYS["view_width"], width)
     settings.views = views
     if not args.range:
         environment.require(environment.trainer_python())

@@ -30,14 +30,12 @@ def property_of(f: Field, **options: Any) -> Any:
         return bpy.props.BoolProperty(**options)
     if isinstance(default, str):
         return _text_property(f, options)
-    ranges = _ranges(f)
-    if isinstance(default, int):
-        return bpy.props.IntProperty(**ranges | options)
-    unit, bounded = f.metadata["unit"], (f.metadata["low"], f.metadata["high"]) == (0, 1)
-    options = {"subtype": "PIXEL" if unit == "px" else "FACTOR" if bounded else "NONE", **ranges, **options}
+    bounded = isinstance(default, float) and (f.metadata["low"], f.metadata["high"]) == (0, 1)
+    subtype = "PIXEL" if f.metadata["unit"] == "px" else "FACTOR" if bounded else "NONE"
+    options = {"subtype": subtype, **_ranges(f), **options}
     if isinstance(f.default, tuple):
         return bpy.props.FloatVectorProperty(size=len(f.default), **options)
-    return bpy.props.FloatProperty(**options)
+    return (bpy.props.IntProperty if isinstance(default, int) else bpy.props.FloatProperty)(**options)
 
 
 def _text_property(f: Field, options: dict[str, Any]) -> Any:

@@ -7,13 +7,15 @@ from typing import Any
 
 import bpy
 
-from ...training.methods import METHODS, PRESETS, MethodInfo, method_info
-from ...training.runs.job import MAX_CELLS, Job
+from ...training.methods import METHODS, MethodInfo, method_info
+from ...training.runs.job import KEYS, MAX_CELLS, Job
 from ...training.settings import label_of
 from ...training.splats.levels import MAX_LEVELS
 from . import crops, photographs, viewpoints
 from .setting_properties import property_of
 
+PANEL_KEYS = {name: f for name, f in KEYS.items() if f.metadata.get("panel")}
+"""Job keys that are stored as settings of a scene root."""
 COMMON_PARAMETERS = "depth_weight", "depth"
 """Parameters in the panel for every method."""
 MIN_HOLD_OUT = 40
@@ -126,19 +128,14 @@ class TrainingCell(bpy.types.PropertyGroup):
 class TrainingSettings(viewpoints.ViewsSettings, bpy.types.PropertyGroup):
     """Settings of the Training panel and the newest run of a scene root (``root.lodgs.training``).
 
+    Job keys that are declared with a panel (PANEL_KEYS) have a property of the same name.
     ``run`` is the folder of that run, relative to the .blend file if possible. Everything else about the run
     is read from the folder.
     """
 
-    method: bpy.props.EnumProperty(
-        name="Method",
-        description="Training method, which determines the kind of levels",
+    method: property_of(
+        KEYS["method"],
         items=[(m.name, m.label, f"{m.label}: {m.about}", m.number) for m in METHODS.values()],
-    )
-    preset: bpy.props.EnumProperty(
-        name="Preset",
-        description="Duration and quality of the training",
-        items=[(name, name.title(), text) for name, text in PRESETS.items()],
     )
     start_from: bpy.props.EnumProperty(
         name="Start From",
@@ -176,34 +173,13 @@ class TrainingSettings(viewpoints.ViewsSettings, bpy.types.PropertyGroup):
         description="Median depth of the photos, in the scene's own units. 0 if unknown",
         options={"HIDDEN"},
     )
-    base: bpy.props.StringProperty(
-        name="Splats",
-        description="Splat PLY or folder of a finished run to start from",
-        subtype="FILE_PATH",
-        options={"PATH_SUPPORTS_BLEND_RELATIVE"},
-    )
-    image_scale: bpy.props.FloatProperty(
-        name="Image Scale",
-        description="Scale of the photos for training. Increase it for finer detail and longer training",
-        default=0.5,
-        min=0.01,
-        soft_min=0.1,
-        max=1.0,
-        subtype="FACTOR",
-    )
+    image_scale: property_of(KEYS["image_scale"], min=0.01)
     region: bpy.props.PointerProperty(
         type=bpy.types.Object,
         name="Region",
         description="Box or sphere of this scene to train in detail; the rest is trained coarsely. If empty, "
         "everything is trained in detail",
         poll=lambda settings, obj: obj in crops.crops_of(settings.id_data),
-    )
-    test_every: bpy.props.IntProperty(
-        name="Hold Out Every",
-        description="Hold out every n-th view by name to measure quality. 0 trains on all views",
-        default=Job.test_every,
-        min=0,
-        soft_max=16,
     )
     use_test_every: _use(
         "test_every", "Hold Out Every", "Use your own number instead of the default for this number of photos"
@@ -214,9 +190,6 @@ class TrainingSettings(viewpoints.ViewsSettings, bpy.types.PropertyGroup):
         f"fewer than {MIN_HOLD_OUT} photos. Tick the box to change it",
         get=_default_interval,
         options=set(),
-    )
-    seed: bpy.props.IntProperty(
-        name="Seed", description="Seed of random choices. Runs with the same seed are equal", default=0, min=0
     )
     divide_by: bpy.props.EnumProperty(
         name="Divide By",
@@ -265,15 +238,6 @@ class TrainingSettings(viewpoints.ViewsSettings, bpy.types.PropertyGroup):
         max=MAX_CELLS,
         options=set(),
     )
-    polish: bpy.props.IntProperty(
-        name="Border Steps",
-        description="Training steps that match the borders of neighbouring cells after all are trained. 0 "
-        "disables them",
-        default=Job.polish,
-        min=0,
-        soft_max=2000,
-        options=set(),
-    )
     at_once: bpy.props.IntProperty(
         name="Cells at Once",
         description="Number of cells that train at the same time on this computer. Each needs its own "
@@ -302,18 +266,6 @@ class TrainingSettings(viewpoints.ViewsSettings, bpy.types.PropertyGroup):
     output: bpy.props.StringProperty(
         name="Runs Folder",
         description="Folder for new runs. If empty, lodgs_runs next to the .blend file",
-        subtype="DIR_PATH",
-        options={"PATH_SUPPORTS_BLEND_RELATIVE"},
-    )
-    model: bpy.props.StringProperty(
-        name="Model",
-        description="Folder of the COLMAP model. If empty, the largest model of the scene",
-        subtype="DIR_PATH",
-        options={"PATH_SUPPORTS_BLEND_RELATIVE"},
-    )
-    images: bpy.props.StringProperty(
-        name="Photos",
-        description="Folder of the photos. If empty, the folder next to the model",
         subtype="DIR_PATH",
         options={"PATH_SUPPORTS_BLEND_RELATIVE"},
     )
@@ -348,6 +300,9 @@ class TrainingSettings(viewpoints.ViewsSettings, bpy.types.PropertyGroup):
         return getattr(self, f"parameters_{self.method}")
 
 
+TrainingSettings.__annotations__ |= {
+    name: property_of(f) for name, f in PANEL_KEYS.items() if name not in TrainingSettings.__annotations__
+}
 TrainingSettings.__annotations__ |= {
     f"parameters_{name}": bpy.props.PointerProperty(
         name=METHODS[name].label, description="Parameters that differ from the preset", type=parameters

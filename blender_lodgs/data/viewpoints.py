@@ -10,7 +10,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ...training.errors import LodgsError
-from ...training.runs.job import VIEW_WIDTHS, VIEWS, Job
+from ...training.runs.job import KEYS, MIN_VIEWS
 from ...training.scenes.cameras import Camera
 from ...training.scenes.viewpoints import (
     DOMES,
@@ -28,6 +28,7 @@ from . import changes
 from .cameras import scene_camera, view_from, view_of
 from .objects import root_of
 from .placement import matrix_of
+from .setting_properties import property_of
 
 SAMPLE = 100_000
 """Approximate number of splats for the preview of a dome."""
@@ -74,23 +75,14 @@ class ViewsSettings:
             ("CURVE", "Along Curve", "Cameras along a curve that look ahead, to both sides and back in turn"),
         ],
     )
-    views: bpy.props.IntProperty(
-        name="Views", description="Number of views", default=Job.views, min=VIEWS[0], max=VIEWS[1]
-    )
+    views: property_of(KEYS["views"])
     show_views: bpy.props.BoolProperty(
         name="Show Views",
         description="Show the views in the viewport",
         default=False,
         options=set(),
     )
-    view_width: bpy.props.IntProperty(
-        name="View Width",
-        description="Width of the rendered images. Training scales them by Image Scale",
-        default=Job.view_width,
-        min=VIEW_WIDTHS[0],
-        max=VIEW_WIDTHS[1],
-        subtype="PIXEL",
-    )
+    view_width: property_of(KEYS["view_width"])
     height: bpy.props.FloatProperty(
         name="Height",
         description="Height of the views above the top of the subject. 0 uses twice their spacing",
@@ -369,7 +361,7 @@ def _require_two(cameras: list[bpy.types.Object]) -> list[bpy.types.Object]:
     Raises:
         LodgsError: There are fewer than two.
     """
-    if len(cameras) < VIEWS[0]:
+    if len(cameras) < MIN_VIEWS:
         raise LodgsError(
             f"Cannot train: the Blender scene has {len(cameras)} camera(s), but two views are needed.",
             "Add cameras, or choose other views.",

@@ -12,6 +12,7 @@ from .. import extension
 from ..data import roots, viewpoints
 from ..data.training import (
     COMMON_PARAMETERS,
+    PANEL_KEYS,
     has_level_distances,
     hold_out_interval,
     level_distances,
@@ -80,7 +81,9 @@ class LODGS_PT_training_advanced(Panel):
             row = layout.row(align=True)
             row.prop(settings, "region")
             row.operator("lodgs.add_region", text="", icon="ADD")
-        layout.prop(settings, "seed")
+        for name, key in PANEL_KEYS.items():
+            if key.metadata["panel"] == "Advanced":
+                layout.prop(settings, name)
         _draw_parameter(layout, settings, "test_every")
         for f in panel_parameters(settings.method):
             if f.name not in COMMON_PARAMETERS or root.lodgs.scene_folder:

@@ -22,6 +22,7 @@ from ...training.cli.job_options import options_of
 from ...training.documents import parse_json
 from ...training.errors import LodgsError, printable
 from ...training.runs.folder import RunFolder
+from ...training.runs.job import CHANGEABLE
 from .. import extension
 from ..data import viewpoints
 from . import job_settings, run_folders
@@ -35,9 +36,8 @@ _INSTALL = f"Copy {SCRIPT} to the scripts folder of the manager."
 MAX_BYTES = 1 << 20
 """Maximum size of a response."""
 _KEYS = ("scene", "out", "method", "preset", "image_scale", "cells", "polish")
-"""Job keys with a setting in the job type. The other keys are passed as command-line options."""
-_DEVICE_KEYS = ("backend", "photo_memory", "splat_memory")
-"""Job keys that depend on the computer. Each worker uses its own values."""
+"""Job keys with a setting in the job type. The other keys are passed as command-line options, except
+CHANGEABLE ones, for which each worker uses its own values."""
 
 
 @dataclass(frozen=True)
@@ -176,7 +176,7 @@ def prepare(root: bpy.types.Object, folder: str = "") -> Submission:
     return Submission(manager, root.name, {
         "scene": job.scene, "output": job.out, "columns": columns, "rows": rows, "method": job.method,
         "preset": job.preset, "image_scale": job.image_scale, "polish": job.polish,
-        "options": shlex.join(options_of(job, exclude=(*_KEYS, *_DEVICE_KEYS))),
+        "options": shlex.join(options_of(job, exclude=(*_KEYS, *CHANGEABLE))),
     })  # fmt: skip
 
 

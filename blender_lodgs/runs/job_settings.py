@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import Field
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +17,13 @@ from ...training.runs.folder import RunFolder
 from ...training.runs.job import DOME, Job
 from .. import extension
 from ..data import crops, viewpoints
-from ..data.training import has_level_distances, hold_out_interval, level_distances, panel_parameters
+from ..data.training import (
+    PANEL_KEYS,
+    has_level_distances,
+    hold_out_interval,
+    level_distances,
+    panel_parameters,
+)
 from .run_folders import run_folder, run_state
 
 if TYPE_CHECKING:
@@ -36,21 +42,24 @@ def make_job(root: bpy.types.Object, out: Path, parameters: dict) -> Job:
         LodgsError: the root has no COLMAP folder, no splats to start from, or an invalid setting.
     """
     settings = root.lodgs.training
+    without_photos = viewpoints.has_only_splats(root)
     values = {
-        **(_capture_keys(root, out) if viewpoints.has_only_splats(root) else _photo_keys(root, out)),
+        **{name: _key_value(settings, f) for name, f in PANEL_KEYS.items()},
+        **(_capture_keys(root, out) if without_photos else _photo_keys(root, out)),
         "out": str(out),
-        "method": settings.method,
-        "preset": settings.preset,
-        "seed": settings.seed,
         "test_every": hold_out_interval(root),
-        "image_scale": _as_typed(settings.image_scale),
         "backend": extension.preferences().backend,
-        "cells": "" if viewpoints.has_only_splats(root) else settings.grid,
-        "polish": settings.polish,
+        "cells": "" if without_photos else settings.grid,
         "region": crops.crop_text(root, settings.region) if settings.region in crops.crops_of(root) else "",
         "parameters": changed_parameters(settings) | parameters,
     }
     return Job.from_dict(values)
+
+
+def _key_value(settings: TrainingSettings, f: Field) -> Any:
+    """Return the value of a job key that has a property of the same name."""
+    value = getattr(settings, f.name)
+    return bpy.path.abspath(value) if f.metadata["path"] else _as_typed(value)
 
 
 def _photo_keys(root: bpy.types.Object, out: Path) -> dict:
@@ -69,8 +78,6 @@ def _photo_keys(root: bpy.types.Object, out: Path) -> dict:
         )
     return {
         "scene": bpy.path.abspath(root.lodgs.scene_folder),
-        "model": bpy.path.abspath(settings.model),
-        "images": bpy.path.abspath(settings.images),
         "base": base,
     }
 
@@ -85,6 +92,8 @@ def _capture_keys(root: bpy.types.Object, out: Path) -> dict:
             f"Cannot train '{root.name}' with {info.label}: it has no photos.", "Choose the method LODGE."
         )
     return {
+        "model": "",
+        "images": "",
         "base": str(run.base),
         "capture": DOME if settings.views_from == "DOME" else str(run.cameras),
         "views": settings.views,
@@ -127,8 +136,7 @@ def _as_typed(value):
 
 def apply_job(settings: TrainingSettings, job: Job) -> None:
     """Copy the values of a job to the training settings that the panel has."""
-    names = {field.name for field in fields(Job)} - {"region"}
-    for name in names.intersection(settings.bl_rna.properties.keys()):
+    for name in (*PANEL_KEYS, "views", "view_width"):
         setattr(settings, name, getattr(job, name))
     settings.region = crops.region_object(settings.id_data, job.crop) if job.crop else None
     settings.start_from = "FILE" if job.base else "POINTS"

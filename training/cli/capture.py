@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from .options import BACKEND_HELP, SOURCE_HELP, warn
+from ..runs.job import DOME, KEYS
+from ..settings import check_value
+from .options import BACKEND_HELP, SOURCE_HELP, add_setting, warn
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -16,17 +18,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--cameras", type=Path, metavar="DIR",
         help="folder of camera files (*.json) to render (default: cameras all around)",
     )  # fmt: skip
-    parser.add_argument("--views", type=int, default=64, help="number of cameras all around (default 64)")
-    parser.add_argument("--view-width", type=int, default=960, help="their width in pixels (default 960)")
+    for name in ("views", "view_width"):
+        add_setting(parser, KEYS[name], KEYS[name].default)
     parser.add_argument("--backend", default="auto", help=BACKEND_HELP)
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
     from ..runs.capture import capture
-    from ..runs.job import DOME, check_views
 
-    check_views(options.views, options.view_width)
+    for name in ("views", "view_width"):
+        check_value(KEYS[name], getattr(options, name))
     views, points = capture(
         options.source, options.out, options.cameras or DOME, options.views, options.view_width,
         backend=options.backend, warn=warn,

@@ -5,74 +5,14 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Collection
-from dataclasses import MISSING, asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 
 from ..documents import parse_json
 from ..errors import LodgsError, printable
-from ..methods import METHODS, PRESETS
-from ..runs.job import BACKENDS, Job
-
-
-def _natural(text: str) -> int:
-    try:
-        if 0 <= (value := int(text)) < 2**31:
-            return value
-    except ValueError:
-        pass
-    raise argparse.ArgumentTypeError(f"{text} is not a whole number from 0 to {2**31 - 1}")
-
-
-_OPTIONS: dict[str, dict] = {
-    "scene": {"metavar": "DIR", "help": "folder of the COLMAP scene"},
-    "out": {"metavar": "RUN", "help": "run folder; the same command resumes a run in it"},
-    "method": {"choices": list(METHODS), "help": "training method; lodgs methods describes them"},
-    "preset": {"choices": list(PRESETS), "help": "training effort"},
-    "base": {"metavar": "PATH", "help": "run, bundle or PLY to start from instead of the scene's points"},
-    "capture": {
-        "metavar": "dome|DIR",
-        "help": "instead of a scene, train on renders of the base: from all around (dome), or from a folder "
-        "of camera files",
-    },
-    "views": {"metavar": "N", "type": _natural, "help": "number of dome views"},
-    "view_width": {"metavar": "N", "type": _natural, "help": "width of dome views in pixels; aspect 3:2"},
-    "image_scale": {"metavar": "FACTOR", "type": float, "help": "training image size over photo size"},
-    "test_every": {"metavar": "N", "type": _natural, "help": "hold out every N-th view; 0 holds out none"},
-    "validation": {
-        "action": "store_true",
-        "help": "for tuning: hold out the views between the held-out ones instead, and exclude those",
-    },
-    "seed": {"metavar": "N", "type": _natural, "help": "random seed"},
-    "backend": {"choices": list(BACKENDS), "help": "rasterizer; auto is cuda if that works, else cpu"},
-    "exposure": {"metavar": "STOPS", "type": float, "help": "stops added to linear (EXR) images"},
-    "photo_memory": {
-        "metavar": "MB",
-        "type": _natural,
-        "help": "budget for photos in memory; 0 uses a quarter of the free memory, at most 2048",
-    },
-    "splat_memory": {
-        "metavar": "MB",
-        "type": _natural,
-        "help": "budget for splats in memory (method tree); 0 uses half of the free memory",
-    },
-    "region": {
-        "metavar": "SHAPE",
-        "help": "region to train in detail: 'box X Y Z X Y Z' (two opposite corners) or 'sphere X Y Z "
-        "RADIUS', in the scene's coordinates. The rest is trained coarsely",
-    },
-    "cells": {
-        "metavar": "CxR",
-        "help": "divide the ground into columns x rows of cells, train them one by one, and merge them",
-    },
-    "polish": {
-        "metavar": "N",
-        "type": _natural,
-        "help": "steps that fit the borders of neighbouring cells to each other at the end; 0 disables",
-    },
-    "model": {"metavar": "DIR", "help": "folder of the COLMAP model, if not in the usual place"},
-    "images": {"metavar": "DIR", "help": "folder of the photos, if not in the usual place"},
-}
-"""Arguments of argparse for each key of a job; defaults are the job's own."""
+from ..runs.job import Job
+from ..settings import settings_of
+from .options import add_setting, option_name
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -81,12 +21,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "job", nargs="?", type=Path, metavar="JOB",
         help="job file (TOML or JSON), or the scene's folder; a run's job.toml resumes the run",
     )  # fmt: skip
-    defaults = {key.name: key.default for key in fields(Job)}
-    for name, option in _OPTIONS.items():
-        has_default = defaults[name] is not False and defaults[name] not in ("", MISSING)
-        default = f" (default {defaults[name]})" if has_default else ""
-        option = option | {"help": option["help"] + default}
-        parser.add_argument(f"--{name.replace('_', '-')}", default=argparse.SUPPRESS, **option)
+    for f in settings_of(Job).values():
+        add_setting(parser, f)
     parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE",
         help="parameter of the method, repeatable; lodgs methods NAME lists them",
@@ -99,7 +35,7 @@ def job_from_options(options: argparse.Namespace) -> Job:
     Raises:
         LodgsError: neither a job file nor a scene and a run folder, or an invalid value.
     """
-    changes = {name: value for name, value in vars(options).items() if name in _OPTIONS}
+    changes = {name: value for name, value in vars(options).items() if name in settings_of(Job)}
     values = {}
     if options.job and options.job.is_dir():
         changes = {"scene": str(options.job)} | changes
@@ -120,13 +56,11 @@ def options_of(job: Job, exclude: Collection[str] = ()) -> list[str]:
     Args:
         exclude: keys to omit.
     """
-    values = {key.name: getattr(job, key.name) for key in fields(Job) if key.name in _OPTIONS}
-    defaults = {key.name: key.default for key in fields(Job)}
     words: list[str] = []
-    for name, value in values.items():
-        if name not in exclude and value != defaults[name]:
-            option = f"--{name.replace('_', '-')}"
-            words += [option] if _OPTIONS[name].get("action") else [option, str(value)]
+    for name, f in settings_of(job).items():
+        value = getattr(job, name)
+        if name not in exclude and value != f.default:
+            words += [option_name(name)] if value is True else [option_name(name), str(value)]
     for name, value in job.parameters.items():
         words += ["--set", f"{name}={json.dumps(value)}"]
     return words

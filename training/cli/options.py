@@ -71,14 +71,18 @@ def option_name(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
 
-def add_setting(parser: argparse._ActionsContainer, f: Field) -> None:
-    """Add the option of a setting, without bounds. Options that the user omits are not in the result."""
+def add_setting(parser: argparse._ActionsContainer, f: Field, value: Any = argparse.SUPPRESS) -> None:
+    """Add the option of a setting. Its bounds are not checked.
+
+    Args:
+        value: value of an omitted option. By default, omitted options are absent from the result.
+    """
     default, choices, unit = default_of(f), f.metadata["choices"], f.metadata["unit"]
     about = f.metadata["about"].removesuffix(".").replace("%", "%%")
     about = about[0].lower() + about[1:] if about[1:2].islower() else about  # not an abbreviation
     if default is not False and default != "":
         about += f" (default {default})"
-    options: dict[str, Any] = {"default": argparse.SUPPRESS, "help": about}
+    options: dict[str, Any] = {"default": value, "help": about}
     if isinstance(default, bool):
         options["action"] = "store_true"
     elif choices:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import Field, asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -11,90 +11,152 @@ from ..documents import quote, read_json, read_toml
 from ..errors import LodgsError
 from ..files import atomic_write
 from ..lod.crop import Crop, is_crop_text
-from ..methods import method_info, resolve_parameters
+from ..methods import METHODS, PRESETS, method_info, resolve_parameters
 from ..optimize.parameters import Parameters
+from ..settings import check_value, setting, settings_of
 from .folder import RunFolder
 
 BACKENDS = ("auto", "cpu", "cuda", "gpu", "reference")
-CHANGEABLE = ("backend", "out", "photo_memory", "splat_memory")
-"""Keys that may change when a run is resumed, because they do not change what is trained."""
-MAX_STOPS = 32
-"""Maximum exposure change of linear images, in stops."""
 DOME = "dome"
 """Value of ``capture`` for views from all directions."""
-VIEWS, VIEW_WIDTHS = (2, 2000), (32, 8192)
-"""Limits of the number of views of a dome, and of their image width in pixels."""
-POLISH_STEPS = 300
-"""Default number of steps that fit a cell's borders to its neighbours."""
+MIN_VIEWS = 2
+"""Minimum number of views to train on."""
 MAX_CELLS = 256
 """Maximum number of cells of a scene."""
 MAX_PATH = 2000
 """Maximum length of a path, so that a job with all of its paths fits the size limit of a TOML file."""
-_KINDS: dict[str, tuple[type | tuple[type, ...], str]] = {
-    "str": (str, "a text in quotation marks"),
-    "int": (int, "a whole number"),
-    "float": ((int, float), "a number"),
-    "bool": (bool, "true or false"),
-    "dict": (dict, "a table below a line with its name in brackets"),
-}
-"""Accepted types by annotation of a key, and their names in messages."""
 
 
 @dataclass(frozen=True)
 class Job:
     """Scene, method, settings and output folder of a run.
 
-    Attributes:
-        scene: folder of the COLMAP scene; "" if there is none, see ``capture``.
-        out: run folder; created if it does not exist.
-        method, preset: names from METHODS and PRESETS of ``training.methods``.
-        base: run, bundle or PLY of splats to start from instead of the scene's points, for methods that
-            support it; "" for none.
-        capture: viewpoints for rendering the base as training images if there is no scene: DOME, or a folder
-            of camera files; "" if there is a scene.
-        views, view_width: number of views of a dome, and their image width in pixels.
-        seed: random seed. Runs of the same job on one machine are bit-identical, except with cuda.
-        backend: rasterizer, one of BACKENDS; auto is cuda if available, else cpu. May change on resume.
-        image_scale: training image size relative to the photo, 0 < s <= 1.
-        test_every: every n-th view by name is held out to measure quality; 0 trains on all views.
-        validation: hold out the views between the test views instead, and exclude the test views, so that
-            choosing settings does not use the views that report quality.
-        exposure: stops added to linear (EXR) images before training.
-        photo_memory: megabytes for decoded photos; further ones are decoded in the background. 0 is a quarter
-            of the free memory, at most 2 GB. Does not change the result.
-        splat_memory: megabytes for splats and their optimizer state, for methods that keep the others on disk
-            (tree). 0 is half of the free memory. If not all fit, the result depends on it slightly.
-        region: part of the scene to train in detail, in scene coordinates, see ``Crop.from_text``; for a part
-            of a scene in cells, its region file (``scenes.regions``); "" for the full scene.
-        cells: number of cells on the ground that are trained separately and merged, "COLUMNSxROWS"; "" for
-            none.
-        polish: steps that fit each cell's borders to its neighbours after training; 0 disables.
-        model, images: folders of the COLMAP model and of the photos, if they are not in the usual place.
-        parameters: changed parameters of the preset, by name.
+    Each key is a ``setting`` with additional metadata:
+
+    - changeable: the key may change when a run is resumed, because it does not change what is trained.
+    - panel: Blender stores the key as a property of the training settings of a scene; "Advanced" also draws
+      it in that panel.
+    - unless: predicate of the texts that are not a path, for keys that are paths.
     """
 
-    scene: str
-    out: str
-    method: str = "flod"
-    preset: str = "draft"
-    base: str = ""
-    capture: str = ""
-    views: int = 64
-    view_width: int = 960
-    seed: int = 0
-    backend: str = "auto"
-    image_scale: float = 0.5
-    test_every: int = 8
-    validation: bool = False
-    exposure: float = 0.0
-    photo_memory: int = 0
-    splat_memory: int = 0
-    model: str = ""
-    images: str = ""
-    region: str = ""
-    cells: str = ""
-    polish: int = POLISH_STEPS
+    scene: str = setting("", "Folder of the COLMAP scene.", path="folder", metavar="DIR")
+    out: str = setting(
+        "", "Run folder. The same job resumes a run in it.", path="folder", metavar="RUN", changeable=True
+    )
+    method: str = setting(
+        "flod",
+        "Training method, which determines the kind of levels.",
+        choices={method.name: f"{method.label}: {method.about}" for method in METHODS.values()},
+        panel="Training",
+    )
+    preset: str = setting("draft", "Duration and quality of the training.", choices=PRESETS, panel="Training")
+    base: str = setting(
+        "",
+        "Run, bundle or splat PLY to start from instead of the scene's points.",
+        label="Splats",
+        path="file",
+        metavar="PATH",
+        panel="Training",
+    )
+    capture: str = setting(
+        "",
+        "Views of the base to render and to train on instead of a scene: dome (from all sides), or a folder "
+        "of camera files.",
+        path="folder",
+        metavar="dome|DIR",
+        unless=lambda text: text == DOME,
+    )
+    views: int = setting(64, "Number of views to render.", low=MIN_VIEWS, high=2000)
+    view_width: int = setting(
+        960,
+        "Width of the rendered views. Training scales them by the image scale.",
+        low=32,
+        high=8192,
+        unit="px",
+    )
+    seed: int = setting(0, "Seed of random choices. Runs with the same seed are equal.", panel="Advanced")
+    backend: str = setting(
+        "auto",
+        "Rasterizer. The choice auto is cuda if that works, otherwise cpu.",
+        choices=BACKENDS,
+        changeable=True,
+    )
+    image_scale: float = setting(
+        0.5,
+        "Scale of the photos for training. Increase it for finer detail and longer training.",
+        above=0,
+        high=1,
+        soft=(0.1, None),
+        metavar="FACTOR",
+        panel="Training",
+    )
+    test_every: int = setting(
+        8,
+        "Hold out every n-th view by name to measure quality. 0 trains on all views.",
+        label="Hold Out Every",
+        soft=(None, 16),
+        panel="Training",
+    )
+    validation: bool = setting(
+        False,
+        "Hold out the views between the test views instead, and exclude the test views. For choosing "
+        "settings without the views that report quality.",
+    )
+    exposure: float = setting(
+        0.0, "Exposure change of linear (EXR) images before training.", low=-32, high=32, unit="stops"
+    )
+    photo_memory: int = setting(
+        0,
+        "Memory for decoded photos. 0 uses a quarter of the free memory, at most 2048 MB. Does not change "
+        "the result.",
+        unit="MB",
+        changeable=True,
+    )
+    splat_memory: int = setting(
+        0,
+        "Memory for splats and their optimizer state (method tree). 0 uses half of the free memory. If not "
+        "all splats fit, the result depends on it slightly.",
+        unit="MB",
+        changeable=True,
+    )
+    model: str = setting(
+        "",
+        "Folder of the COLMAP model. If empty, the largest model of the scene.",
+        path="folder",
+        metavar="DIR",
+        panel="Training",
+    )
+    images: str = setting(
+        "",
+        "Folder of the photos. If empty, the folder next to the model.",
+        label="Photos",
+        path="folder",
+        metavar="DIR",
+        panel="Training",
+    )
+    region: str = setting(
+        "",
+        "Region to train in detail, in the scene's coordinates: 'box X Y Z X Y Z' (two opposite corners) or "
+        "'sphere X Y Z RADIUS'. The rest is trained coarsely.",
+        path="file",
+        metavar="SHAPE",
+        unless=is_crop_text,
+    )
+    cells: str = setting(
+        "",
+        "Columns and rows of cells on the ground, such as 2x4, which are trained separately and merged.",
+        metavar="CxR",
+    )
+    polish: int = setting(
+        300,
+        "Training steps that match the borders of neighbouring cells after all are trained. 0 disables them.",
+        label="Border Steps",
+        soft=(None, 2000),
+        unit="steps",
+        panel="Training",
+    )
     parameters: dict = field(default_factory=dict)
+    """Changed parameters of the preset, by name."""
 
     @classmethod
     def from_file(cls, path: Path) -> Job:
@@ -126,52 +188,31 @@ class Job:
         Raises:
             LodgsError: a key is unknown, missing or invalid.
         """
-        keys = [key.name for key in fields(cls)]
-        unknown = sorted(set(values) - set(keys))
-        if unknown:
-            raise LodgsError(f"Unknown key in job: {quote(unknown[0])}.", f"Use one of: {', '.join(keys)}.")
-        values = {"scene": "", **values} if values.get("capture") else dict(values)
+        declared = settings_of(cls)
+        if unknown := sorted(set(values) - {*declared, "parameters"}):
+            raise LodgsError(
+                f"Unknown key in job: {quote(unknown[0])}.", f"Use one of: {', '.join(declared)}, parameters."
+            )
         for key in ("out",) if values.get("capture") else ("scene", "out"):
             if not values.get(key):
                 raise LodgsError(f"The job has no key '{key}'.", f'Add a line: {key} = "..."')
-        for key in ("scene", "out", "base", "capture", "model", "images", "region"):
-            value = values.get(key)
-            if not value or (key, value) == ("capture", DOME):
-                continue
-            if not (key == "region" and isinstance(value, str) and is_crop_text(value)):
-                values[key] = _path(key, value, folder)
-        job = cls(**values)
+        parameters = values.get("parameters", {})
+        if not isinstance(parameters, dict):
+            raise LodgsError(
+                f"parameters = {quote(parameters)} is invalid.", "Use a table below a line [parameters]."
+            )
+        checked = {key: check_value(f, values[key]) for key, f in declared.items() if key in values}
+        for key, value in checked.items():
+            if value and _is_path(declared[key], value):
+                checked[key] = _absolute_path(key, value, folder)
+        job = cls(**checked, parameters=parameters)
         job._check()
         return job
 
     def _check(self) -> None:
-        for key in fields(self):
-            value, (kind, name) = getattr(self, key.name), _KINDS[str(key.type)]
-            if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
-                raise LodgsError(f"Invalid job key {key.name} = {quote(value)}.", f"Give {name}.")
-        if not (0 <= self.seed < 2**31 and 0 <= self.test_every < 2**31) or self.test_every == 1:
-            raise LodgsError(
-                f"Invalid job keys seed = {self.seed!r}, test_every = {self.test_every!r}.",
-                f"Give whole numbers from 0 to {2**31 - 1}; test_every must not be 1.",
-            )
-        if not 0 < self.image_scale <= 1:
-            raise LodgsError(
-                f"Invalid job key image_scale = {self.image_scale!r}.", "Give a number above 0, at most 1."
-            )
-        if not abs(self.exposure) <= MAX_STOPS:
-            raise LodgsError(
-                f"Invalid job key exposure = {self.exposure!r}.",
-                f"Give stops from {-MAX_STOPS} to {MAX_STOPS}.",
-            )
-        for key, unit in (("photo_memory", "megabytes"), ("splat_memory", "megabytes"), ("polish", "steps")):
-            if not 0 <= getattr(self, key) < 2**31:
-                raise LodgsError(
-                    f"Invalid job key {key} = {getattr(self, key)!r}.", f"Give {unit} from 0 to {2**31 - 1}."
-                )
-        if self.backend not in BACKENDS:
-            raise LodgsError(
-                f"Unknown backend: {quote(self.backend)}.", f"Use one of: {', '.join(BACKENDS)}."
-            )
+        """Check keys against each other, and the parameters."""
+        if self.test_every == 1:
+            raise LodgsError("test_every = 1 leaves no view to train on.", "Use 0 or at least 2.")
         continues = self.resolved_parameters().continues_levels
         if continues and not self.base:
             raise LodgsError(
@@ -198,7 +239,6 @@ class Job:
                     f"The job has both 'capture' and '{key}'.",
                     "Remove 'capture' to train on photos, or the other key to train on captured views.",
                 )
-        check_views(self.views, self.view_width)
 
     def _check_cells(self) -> None:
         columns, rows = self.grid
@@ -276,6 +316,12 @@ class Job:
             Path(temporary).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
+KEYS = settings_of(Job)
+"""Declarations of all keys except ``parameters``, by name."""
+CHANGEABLE = tuple(name for name, key in KEYS.items() if key.metadata.get("changeable"))
+"""Keys that may change when a run is resumed."""
+
+
 def save_job(job: Job, folder: RunFolder) -> None:
     """Write a resolved job into its run folder. Only CHANGEABLE keys may differ from an existing job.
 
@@ -297,21 +343,13 @@ def save_job(job: Job, folder: RunFolder) -> None:
     job.write(folder.job)
 
 
-def check_views(views: int, width: int) -> None:
-    """Check number and image width of captured views.
-
-    Raises:
-        LodgsError: a value is outside VIEWS or VIEW_WIDTHS.
-    """
-    for name, value, (low, high) in (("views", views, VIEWS), ("view_width", width, VIEW_WIDTHS)):
-        if not low <= value <= high:
-            raise LodgsError(f"Invalid {name} = {value}.", f"Give a number from {low} to {high}.")
+def _is_path(f: Field, value: str) -> bool:
+    exception = f.metadata.get("unless")
+    return bool(f.metadata["path"]) and not (exception and exception(value))
 
 
-def _path(key: str, value: object, folder: Path) -> str:
+def _absolute_path(key: str, value: str, folder: Path) -> str:
     """Return an absolute path; relative paths are relative to ``folder``."""
-    if not isinstance(value, str):
-        raise LodgsError(f"Invalid path {key} = {quote(value)}.", "Give a path in quotation marks.")
     try:
         path = str((folder / value).expanduser().resolve())
     except (OSError, ValueError, RuntimeError) as error:  # NUL, unknown ~name, link cycle

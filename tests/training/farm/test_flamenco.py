@@ -14,7 +14,7 @@ from training.optimize.method_info import PRESETS
 from training.runs import train as training_loop
 from training.runs.blocks.plan import read_plan
 from training.runs.folder import RunFolder
-from training.runs.job import POLISH_STEPS, Job
+from training.runs.job import Job
 from training.splats.bundle import read_bundle
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -90,7 +90,7 @@ def test_settings_match_methods_and_presets(tmp_path):
     settings = {setting["key"]: setting for setting in compiled(tmp_path)["type"]["settings"]}
     assert set(settings["method"]["choices"]) == {name for name, info in METHODS.items() if info.cell_method}
     assert settings["preset"]["choices"] == list(PRESETS)
-    assert settings["polish"]["default"] == POLISH_STEPS
+    assert settings["polish"]["default"] == Job.polish
     for setting in settings.values():
         assert setting["type"] in ("string", "int32", "float", "bool") and setting["description"]
 

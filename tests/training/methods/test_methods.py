@@ -18,7 +18,7 @@ from training.runs import train as training_loop
 from training.runs.base import read_base
 from training.runs.failures import BAD_INPUT
 from training.runs.folder import RunFolder
-from training.runs.job import Job
+from training.runs.job import KEYS, Job
 from training.runs.measure import evaluate_run
 from training.scenes.colmap import read_scene
 from training.scenes.images import load_image
@@ -99,6 +99,7 @@ def tiny(tmp_path, monkeypatch):
     monkeypatch.setattr(methods, "__path__", [*methods.__path__, str(folder.parent)])
     actual = methods.discover()
     monkeypatch.setitem(methods.METHODS, "tiny", actual["tiny"])
+    monkeypatch.setitem(KEYS["method"].metadata["choices"], "tiny", "")
     yield actual["tiny"]
     for name in [name for name in sys.modules if name.startswith("training.methods.tiny_folder")]:
         del sys.modules[name]

@@ -29,7 +29,7 @@ from training.runs.blocks.train import BlocksStopped, train_blocks
 from training.runs.data import training_data
 from training.runs.events import MAX_BYTES, event_line
 from training.runs.folder import RunFolder
-from training.runs.job import POLISH_STEPS, Job
+from training.runs.job import Job
 from training.scenes.cameras import Camera
 from training.scenes.colmap import Scene
 from training.scenes.regions import Region
@@ -174,7 +174,7 @@ def test_seams_need_polish_steps_and_a_rule_without_weights(tiny_scene, tmp_path
         return read_plan(RunFolder(job.out)).seams
 
     planned_seams = seams("one")
-    assert planned_seams and all(seam.job.parameters["steps"] == POLISH_STEPS for seam in planned_seams)
+    assert planned_seams and all(seam.job.parameters["steps"] == Job.polish for seam in planned_seams)
     assert all(seam.region.seam and seam.job.base == str(seam.folder.base) for seam in planned_seams)
     assert not seams("none", polish=0) and not seams("clod", method="clod")
 
