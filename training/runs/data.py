@@ -53,10 +53,7 @@ def training_data(
     region = Region.read(Path(job.cell)) if job.cell else None
     scene = full_scene if region is None else region.select_views(full_scene)
     if pixels:
-        scene = exclude_views(scene, _undecodable(scene.cameras))
-        for camera in scene.cameras:
-            if camera.mask is not None:
-                check_mask(camera.mask, camera.width, camera.height)
+        scene = _exclude_undecodable(scene)
     warnings = list(scene.warnings)
     if scene.distorted:
         report("status", message=f"Undistorting {len(scene.distorted)} views")
@@ -71,14 +68,7 @@ def training_data(
         scene = replace(scene, warnings=[*scene.warnings, *depths.warnings])
     gains = None
     if pixels and parameters.match_exposure:
-        report("status", message="Comparing exposure of the photos")
-        trained = {camera.name for camera in full_scene.split(job.test_every, job.validation)[0]}
-        gains = exposure_gains(
-            scene, [camera for camera in scene.cameras if camera.name in trained], job.exposure
-        )
-        if gains:
-            largest = max(abs(np.log(gain)).max() for gain in gains.values())
-            report("status", message=f"Compensating exposure differences of up to {np.expm1(largest):.0%}")
+        gains = _match_exposure(job, scene, full_scene, report)
     if job.crop is not None:
         scene = thin_outside_region(scene, job.crop, int(OUTSIDE_SHARE * parameters.max_splats))
     warnings += [warning for warning in scene.warnings if warning not in warnings]
@@ -141,6 +131,34 @@ def _scene_folder(job: Job, folder: RunFolder, report: Callable[..., None]) -> P
             backend=job.backend, report=report_view,
         )  # fmt: skip
     return folder.captured
+
+
+def _match_exposure(
+    job: Job, scene: Scene, full_scene: Scene, report: Callable[..., None]
+) -> dict[str, np.ndarray]:
+    """Return the exposure gains of the training views by name; see ``exposure_gains``."""
+    report("status", message="Comparing exposure of the photos")
+    trained = {camera.name for camera in full_scene.split(job.test_every, job.validation)[0]}
+    gains = exposure_gains(
+        scene, [camera for camera in scene.cameras if camera.name in trained], job.exposure
+    )
+    if gains:
+        largest = max(abs(np.log(gain)).max() for gain in gains.values())
+        report("status", message=f"Compensating exposure differences of up to {np.expm1(largest):.0%}")
+    return gains
+
+
+def _exclude_undecodable(scene: Scene) -> Scene:
+    """Drop views whose photo cannot be decoded.
+
+    Raises:
+        LodgsError: the mask of another view is invalid.
+    """
+    scene = exclude_views(scene, _undecodable(scene.cameras))
+    for camera in scene.cameras:
+        if camera.mask is not None:
+            check_mask(camera.mask, camera.width, camera.height)
+    return scene
 
 
 def _undecodable(cameras: Sequence[Camera]) -> dict[str, str]:

@@ -75,11 +75,8 @@ def evaluate_run(
     data = training_data(job, folder, lambda kind, **values: _report_warning(warn, kind, values))
     bundle = open_if_large(folder.bundle) or read_bundle(folder.bundle)
     evaluation = Evaluation(data, job.backend, bundle.antialias)
-    rule = find_rule(bundle.rule)
-    if rule is None and (controls or bundle.rule):
-        raise LodgsError(*unknown_rule_error(bundle.rule))
+    rule, values = _resolve_rule(bundle, controls or {})
     report = _measure_levels(job, evaluation, bundle)
-    values = resolve_controls(bundle, controls or {}) if rule else {}
     if rule:
         report |= _measure_rule(job, evaluation, bundle, rule, values)
     if folder.model.exists():
@@ -110,6 +107,18 @@ def _finished_job(folder: RunFolder) -> Job:
             f"Restore the scene, or set its new path in {folder.job} (scene = ...).",
         )
     return job
+
+
+def _resolve_rule(bundle: Bundle, controls: Values) -> tuple[Rule | None, Values]:
+    """Return the rule of a bundle and the values of all its controls; (None, {}) without a rule.
+
+    Raises:
+        LodgsError: the rule is unknown, has no such control, or there are controls without a rule.
+    """
+    rule = find_rule(bundle.rule)
+    if rule is None and (controls or bundle.rule):
+        raise LodgsError(*unknown_rule_error(bundle.rule))
+    return rule, resolve_controls(bundle, controls) if rule else {}
 
 
 def _report_warning(warn: Warn, kind: str, values: dict[str, Any]) -> None:
