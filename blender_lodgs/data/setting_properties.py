@@ -9,7 +9,7 @@ import bpy
 
 from ...training.settings import MAX_INTEGER, default_of, label_of
 
-MAX_FLOAT = 3.4e38
+_MAX_FLOAT = 3.4e38
 _MIN_STEP = 1e-6
 """Smallest number above 0 that Blender displays."""
 
@@ -49,12 +49,14 @@ def _text_property(f: Field, options: dict[str, Any]) -> Any:
     return bpy.props.EnumProperty(**{"items": items} | options)
 
 
-def _ranges(f: Field) -> dict[str, float]:
+def _ranges(f: Field) -> dict[str, Any]:
     """Return the bounds of a number and of its slider, as arguments of ``bpy.props``."""
     low, high, above, soft = (f.metadata[name] for name in ("low", "high", "above", "soft"))
     if isinstance(default_of(f), int):
-        ranges = {"min": int(low) if above is None else int(above) + 1, "max": int(min(high, MAX_INTEGER))}
+        ranges: dict[str, Any] = {"max": int(min(high, MAX_INTEGER))}
+        ranges["min"] = int(low) if above is None else int(above) + 1
     else:
-        ranges = {"min": low if above is None else above + _MIN_STEP, "max": min(high, MAX_FLOAT)}
+        ranges = {"max": min(high, _MAX_FLOAT)}
+        ranges["min"] = low if above is None else above + _MIN_STEP
     sliders = {"soft_min": soft[0], "soft_max": soft[1]}
     return ranges | {name: value for name, value in sliders.items() if value is not None}
