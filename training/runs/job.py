@@ -244,8 +244,8 @@ class Job:
         columns, rows = self.grid
         if not 0 < columns * rows <= MAX_CELLS:
             raise LodgsError(
-                f"Invalid job key cells = {self.cells!r}.",
-                f"Give columns and rows such as 2x4, at most {MAX_CELLS} cells.",
+                f"cells = {quote(self.cells)} is invalid.",
+                f"Use columns and rows such as 2x4, at most {MAX_CELLS} cells.",
             )
         for key in ("base", "capture", "region"):
             if getattr(self, key):

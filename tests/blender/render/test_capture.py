@@ -348,7 +348,7 @@ def test_transparent_film_gives_images_with_alpha(bpy, scene, capture, tmp_path)
          "the Blender scene is empty"),
         (lambda bpy: setattr(bpy.context.scene.render, "engine", "LODGS"), ["--around"], "only splats"),
         (lambda bpy: setattr(bpy.context.view_layer, "use", False), ["--around"], "none of its view layers"),
-        (lambda bpy: None, ["--around", "--views", "1"], "Invalid views = 1"),
+        (lambda bpy: None, ["--around", "--views", "1"], "views = 1 is invalid"),
         (lambda bpy: None, ["--around", "--range", "0-3"], "FIRST-LAST"),
         (lambda bpy: None, ["--around", "--range", "5-3"], "FIRST-LAST"),
         (lambda bpy: None, ["--around", "--cameras"], "not allowed with"),
