@@ -60,7 +60,8 @@ def options_of(job: Job, exclude: Collection[str] = ()) -> list[str]:
     for name, f in settings_of(job).items():
         value = getattr(job, name)
         if name not in exclude and value != f.default:
-            words += [option_name(name)] if value is True else [option_name(name), str(value)]
+            switch = option_name(name if value else f"no_{name}")
+            words += [switch] if isinstance(value, bool) else [option_name(name), str(value)]
     for name, value in job.parameters.items():
         words += ["--set", f"{name}={json.dumps(value)}"]
     return words

@@ -80,11 +80,11 @@ def add_setting(parser: argparse._ActionsContainer, f: Field, value: Any = argpa
     default, choices, unit = default_of(f), f.metadata["choices"], f.metadata["unit"]
     about = f.metadata["about"].removesuffix(".").replace("%", "%%")
     about = about[0].lower() + about[1:] if about[1:2].islower() else about  # not an abbreviation
-    if default is not False and default != "":
+    if not isinstance(default, bool) and default != "":
         about += f" (default {default})"
     options: dict[str, Any] = {"default": value, "help": about}
     if isinstance(default, bool):
-        options["action"] = "store_true"
+        options["action"] = argparse.BooleanOptionalAction if default else "store_true"
     elif choices:
         options["choices"] = list(choices)
     else:
