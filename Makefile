@@ -12,7 +12,7 @@ PYTEST := -m pytest -n auto
 quick test test-5.0 test-5.2 nightly fuzz: export OMP_NUM_THREADS := 1  # the workers already use every core
 export LODGS_TRAINER_PYTHON := $(CURDIR)/$(VENV)
 
-.PHONY: help setup demo check quick test test-5.0 test-5.2 nightly fuzz attacks lint docs tables bench bench-quality bench-lod bench-tree bench-blocks extension pins \
+.PHONY: help setup demo check quick test test-5.0 test-5.2 nightly fuzz attacks lint docs tables bench bench-quality bench-lod bench-tree bench-blocks extension release pins \
 	window interop clean
 
 help:
@@ -24,14 +24,15 @@ help:
 	@echo "make nightly    long tests and those of laboratory tools"
 	@echo "make fuzz       20,000 corrupt inputs for every reader (INPUTS=20000, SEED=number), some minutes"
 	@echo "make lint       style and types"
-	@echo "make docs       build/api: trainer API reference from docstrings"
-	@echo "make tables     regenerate docs/job.md, docs/parameters.md and docs/controls.md"
+	@echo "make docs       build/site: the documentation; warnings are errors"
+	@echo "make tables     regenerate the generated pages of docs/"
 	@echo "make bench      speed, as ratios within one run (BASE=old.json compares)"
 	@echo "make bench-quality  PSNR and veil over time, all methods (SCENES=\"DIR ...\", METHODS=\"flod ...\", BASE=other checkout)"
 	@echo "make bench-lod  levels and chunks on a town of 3 million splats (first run: over an hour; STAGES=\"town lodge others table\")"
 	@echo "make bench-tree  cuts of trees with up to 10 million nodes, and training them in 400 MB (first run: an hour, 10 GB)"
 	@echo "make bench-blocks  overhead of distributing blocks, and a plot for 1 to 64 workers (half an hour on an idle machine)"
 	@echo "make extension  dist/lodgs-VERSION.zip, validated by Blender"
+	@echo "make release    dist/: extension, extension repository, Python package, site and checksums"
 	@echo "make pins       update requirements/*.txt from requirements/*.in (UPGRADE=1 takes the newest allowed versions)"
 	@echo "make window     tour in a real Blender window, with screenshots (METHOD=flod; needs Blender, Xvfb, ImageMagick)"
 	@echo "make interop    other programs read our files; naga translates our shaders (needs Node)"
@@ -74,7 +75,7 @@ lint: setup
 	$(VENV) tools/prose.py
 
 docs: setup
-	$(VENV) -m pdoc --docformat google --output-directory build/api training
+	$(VENV) -m mkdocs build --quiet --strict
 
 tables: setup
 	$(VENV) tools/tables.py
@@ -101,8 +102,11 @@ bench-blocks: setup
 extension: setup
 	$(VENV) tools/extension.py
 
+release: setup
+	$(VENV) tools/release.py $(if $(TAG),--tag $(TAG))
+
 pins: setup
-	for name in trainer cuda cluster develop blender-5.0; do $(LOCK) $(if $(UPGRADE),--upgrade) --python-version 3.11 \
+	for name in pip trainer cuda cluster develop blender-5.0; do $(LOCK) $(if $(UPGRADE),--upgrade) --python-version 3.11 \
 		requirements/$$name.in -o requirements/$$name.txt || exit 1; done
 	for name in blender-5.2 blender-5.3; do $(LOCK) $(if $(UPGRADE),--upgrade) --python-version 3.13 \
 		requirements/$$name.in -o requirements/$$name.txt || exit 1; done

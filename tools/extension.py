@@ -1,26 +1,33 @@
 """Build dist/lodgs-VERSION.zip with Blender's extension tool, and validate it.
 
-Needs a Python with pip and the bpy wheel: ``python tools/extension.py``.
+Needs git, and a Python with pip and the bpy wheel: ``python tools/extension.py``.
 """
 
 from __future__ import annotations
 
 import hashlib
 import importlib.util
+import shutil
 import subprocess
 import sys
+import tempfile
 import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 
 
-def blender_tool() -> Path:
-    """Return the extension tool of the bpy wheel; exit with a message if it is missing."""
+def read_manifest() -> dict:
+    """Return the extension's manifest."""
+    return tomllib.loads((ROOT / "blender_manifest.toml").read_text(encoding="utf-8"))
+
+
+def blender_tool() -> list[str]:
+    """Return the command of the extension tool in the bpy wheel; exit with a message if it is missing."""
     spec = importlib.util.find_spec("bpy")  # finds the tool without starting Blender
     for folder in spec.submodule_search_locations or [] if spec else []:
         for tool in Path(folder).glob("*/scripts/addons_core/bl_pkg/cli/blender_ext.py"):
-            return tool
+            return [sys.executable, str(tool)]
     sys.exit("extension: the package bpy is not installed. Run `make setup` first.")
 
 
@@ -40,27 +47,49 @@ def fetch_wheels(wheels: list[str]) -> None:
             sys.exit(f"extension: {wheel} differs from the wheel in requirements/trainer.txt. Delete it.")
 
 
-def build(folder: Path) -> Path:
-    """Build and validate the zip.
+def tracked_files() -> list[str]:
+    """Return the paths of all files that git tracks, relative to the repository's root."""
+    command = ["git", "-C", str(ROOT), "ls-files", "-z"]
+    names = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    return [name for name in names.split("\0") if name and (ROOT / name).is_file()]
+
+
+def build(folder: Path, version: str | None = None) -> Path:
+    """Build and validate the zip from the tracked files.
 
     Args:
         folder: output folder; created if it does not exist.
+        version: replaces the manifest's version, for tests of updates.
 
     Returns:
         The zip file. Exits with Blender's message on errors.
     """
-    manifest = tomllib.loads((ROOT / "blender_manifest.toml").read_text(encoding="utf-8"))
+    manifest = read_manifest()
     fetch_wheels(manifest["wheels"])
     folder.mkdir(parents=True, exist_ok=True)
-    archive = folder / f"{manifest['id']}-{manifest['version']}.zip"
-    tool = [sys.executable, str(blender_tool())]
-    for command in (
-        [*tool, "build", "--source-dir", str(ROOT), "--output-filepath", str(archive)],
-        [*tool, "validate", str(archive)],
-    ):
-        if code := subprocess.run(command, check=False).returncode:
-            sys.exit(code)
+    archive = folder / f"{manifest['id']}-{version or manifest['version']}.zip"
+    with tempfile.TemporaryDirectory() as work:
+        for name in [*tracked_files(), *manifest["wheels"]]:
+            target = Path(work, name)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, target)
+        if version:
+            copy = Path(work, "blender_manifest.toml")
+            copy.write_text(copy.read_text("utf-8").replace(manifest["version"], version, 1), "utf-8")
+        for command in (
+            ["build", "--source-dir", work, "--output-filepath", str(archive)],
+            ["validate", str(archive)],
+        ):
+            if code := subprocess.run([*blender_tool(), *command], check=False).returncode:
+                sys.exit(code)
     return archive
+
+
+def write_repository(folder: Path) -> None:
+    """Write index.json and index.html for the zips of a folder, which Blender accepts as a repository."""
+    command = [*blender_tool(), "server-generate", f"--repo-dir={folder}", "--html"]
+    if code := subprocess.run(command, check=False).returncode:
+        sys.exit(code)
 
 
 if __name__ == "__main__":

@@ -11,12 +11,17 @@ from __future__ import annotations
 import ctypes.util
 import hashlib
 import os
+import re
 import shutil
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from training import packages  # noqa: E402
 
 
 def find_python(version: str) -> str | None:
@@ -64,19 +69,18 @@ def find_python(version: str) -> str | None:
 def make(folder: str, python: str, lock: str) -> None:
     """Create a virtual environment with the packages of a lock file, unless it is up to date."""
     environment, requirements = ROOT / folder, ROOT / "requirements" / lock
-    digest = hashlib.sha256(requirements.read_bytes()).hexdigest()
+    texts = [requirements.read_text(encoding="utf-8")]
+    if "\ntorch==" in texts[0]:
+        texts.append(packages.TORCH_CPU.read_text(encoding="utf-8"))
+    digest = hashlib.sha256("".join(texts).encode()).hexdigest()
     stamp = environment / "requirements.sha256"
     if stamp.exists() and stamp.read_text() == digest:
         return
-    print(f"setup: {folder} with {python} (a few minutes on first use)", flush=True)
+    print(f"setup: {folder} with {python} (a minute or two on first use)", flush=True)
     scripts = environment / ("Scripts" if os.name == "nt" else "bin")
     if not (scripts / "pip").exists() and not (scripts / "pip.exe").exists():
         subprocess.run([python, "-m", "venv", "--clear", str(environment)], check=True)
-    subprocess.run(
-        [str(scripts / "python"), "-m", "pip", "install", "--quiet", "--disable-pip-version-check",
-         "--require-hashes", "--only-binary=:all:", "-r", str(requirements)],
-        check=True,
-    )  # fmt: skip
+    install(scripts, texts, requirements)
     loaded = subprocess.run(
         [str(scripts / "python"), "-c", "import os, sys, bpy; sys.stdout.flush(); os._exit(0)"],
         capture_output=True, text=True, check=False,
@@ -91,6 +95,50 @@ def make(folder: str, python: str, lock: str) -> None:
         print("setup: libxfixes3 libgl1 libxkbcommon0 libsm6 libice6.", file=sys.stderr)
         sys.exit(1)
     stamp.write_text(digest)
+
+
+def install(scripts: Path, texts: list[str], requirements: Path) -> None:
+    """Install the packages of a lock file, by uv if it can be had and else by pip.
+
+    Without an NVIDIA driver, PyTorch is its CPU build, if this system needs another one and it can be
+    downloaded.
+
+    Args:
+        scripts: folder of the environment's programs.
+        texts: text of the lock, and TORCH_CPU's if the lock contains PyTorch.
+        requirements: the lock file.
+    """
+    pip = [str(scripts / "python"), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+    cpu_only = len(texts) > 1 and packages.has_cpu_build() and shutil.which("nvidia-smi") is None
+    if cpu_only:
+        torch = subprocess.run([*pip, *packages.torch_cpu_options()], check=False, capture_output=True)
+        cpu_only = torch.returncode == 0
+        if not cpu_only:
+            print("setup: no CPU build of PyTorch available; the CUDA build needs 4 GB more.", flush=True)
+    uv = find_uv(pip)
+    with tempfile.TemporaryDirectory() as work:
+        if cpu_only:
+            requirements = Path(work, requirements.name)
+            requirements.write_text(packages.without_cuda(texts[0]), encoding="utf-8")
+        options = [*packages.HASHED, *["--no-deps"] * cpu_only, f"--requirement={requirements}"]
+        fast = [str(uv), "pip", "install", "--quiet", f"--python={scripts / 'python'}", *options]
+        if uv is None or subprocess.run(fast, check=False).returncode:  # uv ignores pip's configuration
+            subprocess.run([*pip, *options], check=True)
+
+
+def find_uv(pip: list[str]) -> str | None:
+    """Return the path of uv, which installs packages in parallel. Install the locked one if it is missing."""
+    program = shutil.which("uv") or str(Path(pip[0]).with_name("uv"))
+    if shutil.which(program):
+        return program
+    lock = (ROOT / "requirements" / "develop.txt").read_text(encoding="utf-8")
+    entry = re.search(r"^uv==.*\n(?:[ ].*\n)+", lock, re.MULTILINE)
+    with tempfile.TemporaryDirectory() as work:
+        requirements = Path(work, "uv.txt")
+        requirements.write_text(entry[0] if entry else "", encoding="utf-8")
+        command = [*pip, *packages.HASHED, "--no-deps", f"--requirement={requirements}"]
+        subprocess.run(command, check=False, capture_output=True)
+    return shutil.which(program)
 
 
 def main() -> int:

@@ -134,12 +134,11 @@ def display(x_server: str) -> Iterator[str]:
 
 def run_script(blender: str, plan: dict, log: Path) -> str:
     """Run a script in Blender; return the reason for its failure, or an empty string."""
-    script = (
-        ROOT / "tools" / f"window_{next((k for k in ('flight', 'cells', 'walk') if plan.get(k)), 'tour')}.py"
-    )
+    name = next((key for key in ("flight", "cells", "walk", "pictures") if plan.get(key)), "tour")
+    script = ROOT / "tools" / f"window_{name}.py"
     command = [
         blender, "--gpu-backend", "opengl", "--window-geometry", "0", "0", *map(str, SIZE),
-        *(["--enable-event-simulate"] if plan.get("walk") else []),
+        *(["--enable-event-simulate"] if plan.get("walk") or plan.get("pictures") else []),
         "--python-exit-code", "1", "--python", str(script), "--", json.dumps(plan),
     ]  # fmt: skip
     with open(log, "wb") as output:

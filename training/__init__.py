@@ -6,11 +6,25 @@ numpy. ``rasterize``, ``methods`` and ``evaluate`` need the trainer's environmen
 The functions of ``api`` are available here and are imported on first use.
 """
 
-from importlib import import_module
+import re
+from importlib import import_module, metadata
+from pathlib import Path
 
 __all__ = ["VERSION", "load_bundle", "load_scene", "render_image", "select", "train"]  # pyright: ignore
 
-VERSION = "0.1.0"
+_MANIFEST = Path(__file__).resolve().parent.parent / "blender_manifest.toml"
+
+
+def _read_version() -> str:
+    """Return the version of the manifest beside the package, or of the installed package ``lodgs``."""
+    if _MANIFEST.exists():
+        match = re.search(r'^version = "([^"]+)"', _MANIFEST.read_text(encoding="utf-8"), re.MULTILINE)
+        if match:
+            return match[1]
+    return metadata.version("lodgs")
+
+
+VERSION = _read_version()
 
 
 def __getattr__(name: str):

@@ -15,12 +15,15 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
+import time
 from contextlib import suppress
 from pathlib import Path
 
 import bpy
 
+from ...training import packages
 from ...training.errors import LodgsError
 from ...training.files import atomic_write
 from .. import extension
@@ -30,6 +33,10 @@ REQUIREMENTS = extension.FOLDER / "requirements" / "cluster.txt"
 """Packages for training, and Dask for training several cells of a large scene at once."""
 CUDA_REQUIREMENTS = extension.FOLDER / "requirements" / "cuda.txt"
 """The same packages and those for NVIDIA GPUs, installed if there are a GPU and nvcc to compile with."""
+PIP_REQUIREMENTS = extension.FOLDER / "requirements" / "pip.txt"
+"""A pip that understands PIP_OPTIONS."""
+PIP_OPTIONS = ("--progress-bar=raw", "--resume-retries=5")
+"""Options that report the progress of downloads and resume interrupted ones."""
 
 MODULES = (
     "torch", "numba", "scipy", "pycolmap", "OpenEXR", "PIL", "plyfile", "torchmetrics", "wgpu", "distributed",
@@ -58,6 +65,7 @@ class EnvironmentSetup:
         self._process: subprocess.Popen[str] | None = None
         self._inherited: tuple[int, ...] = ()
         self._cancelled = False
+        self._started = time.monotonic()
         # bpy is not thread-safe: read everything that needs it here
         self._variables = processes.environment()
         self._previous = environment.ready_environments()[:1]
@@ -101,15 +109,33 @@ class EnvironmentSetup:
         self._run("venv", [str(self._base), "-m", "venv", str(folder)])
         python = str(environment.python_of(folder))
         pip = [python, "-m", "pip", "install", "--disable-pip-version-check", "--no-input"]
-        pins = ["--require-hashes", "--only-binary=:all:", f"--requirement={self._requirements}"]
-        self._run("pip install", [*pip, *pins])
+        self._run("pip install", [*pip, *packages.HASHED, f"--requirement={PIP_REQUIREMENTS}"])
+        pip += PIP_OPTIONS
+        with tempfile.TemporaryDirectory() as work:
+            lock, options = self._requirements, list(packages.HASHED)
+            if lock != CUDA_REQUIREMENTS and packages.has_cpu_build() and self._install_torch(pip):
+                lock = Path(work, lock.name)
+                lock.write_text(packages.without_cuda(self._requirements.read_text("utf-8")), "utf-8")
+                options.append("--no-deps")
+            self._run("pip install", [*pip, *options, f"--requirement={lock}"])
         self.message = "Testing the environment"
         self._run("import of the packages", [python, "-c", f"import {', '.join(MODULES)}"])
         with atomic_write(folder / environment.READY) as file:
             file.write_text(json.dumps({"base": str(self._base)}), encoding="utf-8")
 
+    def _install_torch(self, pip: list[str]) -> bool:
+        """Install the CPU build of PyTorch. Return False if it cannot be downloaded."""
+        try:
+            self._run("pip install", [*pip, *packages.torch_cpu_options()])
+        except LodgsError:
+            if self._cancelled:
+                raise
+            return False
+        return True
+
     def _run(self, task: str, command: list[str]) -> None:
         lines: list[str] = []
+        download = "Downloading"
         with subprocess.Popen(
             command,
             cwd=extension.FOLDER,
@@ -128,9 +154,14 @@ class EnvironmentSetup:
             if self._cancelled:  # while this program started
                 self._stop()
             for line in filter(None, map(str.strip, self._process.stdout)):
+                if line.startswith("Progress "):
+                    self.message = f"{download} {format_progress(line)}, {self._elapsed()}"
+                    continue
                 lines.append(line)
                 if line.startswith(("Collecting ", "Downloading ", "Installing ")):
-                    self.message = shorten_pip_line(line)
+                    download = shorten_pip_line(line)
+                    self.message = f"{download}, {self._elapsed()}"
+                    download = download.partition(" (")[0]
                     self.fraction += (0.95 - self.fraction) * 0.03
         if self._cancelled or self._process.returncode:
             errors = [line for line in lines if line.lower().startswith(("error", "fatal"))] or lines
@@ -139,6 +170,10 @@ class EnvironmentSetup:
                 f"Cannot install the trainer: {task} failed{f': {reason}' if reason else ''}.",
                 "Check the network and the free disk space, then try again.",
             )
+
+    def _elapsed(self) -> str:
+        minutes, seconds = divmod(int(time.monotonic() - self._started), 60)
+        return f"{minutes}:{seconds:02d} min"
 
     def _remove_all_but(self, keep: list[Path]) -> bool:
         """Remove older and incomplete environments. Return False if one is in use and stays."""
@@ -229,6 +264,12 @@ def shorten_pip_line(line: str) -> str:
         return "Installing the packages"
     size = re.search(r" \([\d.]+ [kMG]B\)$", line)
     return f"{verb} {re.split(r'-[0-9]|[^A-Za-z0-9_.-]', name)[0]}{size[0] if size else ''}"
+
+
+def format_progress(line: str) -> str:
+    """Format a line of pip's raw progress, "Progress 96000000 of 192000000", as "96 of 192 MB"."""
+    done, _, total = (line.split() + ["0"] * 4)[1:4]
+    return f"{int(done) / 1e6:.0f} of {int(total) / 1e6:.0f} MB"
 
 
 def _new_folder(parent: Path) -> Path:

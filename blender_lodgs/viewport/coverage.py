@@ -17,7 +17,7 @@ from mathutils import Matrix
 
 from ...training.scenes.cameras import Camera
 from ...training.scenes.rendered_views import sample_coverage
-from ..data import viewpoints
+from ..data import roots, viewpoints
 
 ENOUGH_VIEWS = 3
 """Number of views that have to see a point to reconstruct its position."""
@@ -89,7 +89,7 @@ def measure(context: bpy.types.Context) -> Coverage:
 def draw(scene: bpy.types.Scene) -> None:
     """Draw the dots into the active framebuffer, tested against its depth."""
     measured = current(scene)
-    if measured is None:
+    if measured is None or roots.active_root(bpy.context) is not None:  # its panel hides, too
         return
     colors = np.asarray(COLORS, np.float32)[np.minimum(measured.counts, ENOUGH_VIEWS) - 1]
     content = {"pos": measured.points.astype(np.float32), "color": colors}

@@ -16,6 +16,7 @@ INPUTS = [
 def environment_setup(lodgs, tmp_path, monkeypatch):
     module, environment = lodgs("runs.environment_setup"), lodgs("runs.environment")
     monkeypatch.setattr(module, "current", None)
+    monkeypatch.setattr(module.packages, "has_cpu_build", lambda: False)
     monkeypatch.setattr(environment, "environments_folder", lambda: tmp_path / "trainer")
     monkeypatch.delenv(environment.VARIABLE, raising=False)
     lodgs("extension").preferences().python = ""
@@ -85,6 +86,8 @@ def test_packages_must_match_the_lock_file(
     lock = tmp_path / "lock.txt"
     lock.write_text(f"tiny @ {wheel.as_uri()} --hash=sha256:{digest}\n")
     monkeypatch.setattr(environment_setup, "REQUIREMENTS", lock)
+    monkeypatch.setattr(environment_setup, "PIP_REQUIREMENTS", lock)  # keeps the pip of this Python
+    monkeypatch.setattr(environment_setup, "PIP_OPTIONS", ())
     monkeypatch.setattr(environment_setup, "MODULES", ("tiny",))
     with monkeypatch.context() as real:
         real.setattr(environment_setup, "find_base_python", lambda: Path(sys.executable))
@@ -210,7 +213,7 @@ def test_environment_of_a_running_program_is_not_removed(
 
 
 def test_gpu_packages_are_installed_if_nvcc_exists(bpy, environment_setup, fake, tmp_path, monkeypatch):
-    fake(pip=f'echo "$@" > {tmp_path}/arguments')
+    fake(pip=f'echo "$@" >> {tmp_path}/arguments')
     programs = {"nvidia-smi": "/nvidia-smi"}
     monkeypatch.setattr(environment_setup.shutil, "which", programs.get)
     for lock in ("cluster.txt", "cuda.txt"):
@@ -218,6 +221,34 @@ def test_gpu_packages_are_installed_if_nvcc_exists(bpy, environment_setup, fake,
         arguments = (tmp_path / "arguments").read_text()
         assert arguments.strip().endswith(lock) and "--require-hashes --only-binary=:all:" in arguments
         programs["nvcc"] = "/nvcc"
+
+
+def test_cpu_build_of_torch_replaces_the_cuda_build(bpy, environment_setup, fake, tmp_path, monkeypatch):
+    log = f"for last; do :; done; cat ${{last#*=}} >> {tmp_path}/installed"
+    monkeypatch.setattr(environment_setup.packages, "has_cpu_build", lambda: True)
+    fake(pip=f'echo "$@" >> {tmp_path}/arguments; {log}')
+    assert bpy.ops.lodgs.make_environment() == {"FINISHED"}
+    assert f"--index-url={environment_setup.packages.TORCH_INDEX}" in (tmp_path / "arguments").read_text()
+    installed = (tmp_path / "installed").read_text()
+    assert "torch==2.13.0+cpu" in installed and "numba==" in installed
+    assert "nvidia-" not in installed and "\ntorch==2.13.0 " not in installed
+
+    (tmp_path / "installed").unlink()
+    unreachable = 'case "$*" in *torch-cpu*) echo "ERROR: no network"; exit 1;; esac'
+    fake(pip=f"{unreachable}; {log}")
+    assert bpy.ops.lodgs.make_environment() == {"FINISHED"}
+    installed = (tmp_path / "installed").read_text()
+    assert "nvidia-cublas==" in installed and "\ntorch==2.13.0 " in installed
+
+
+def test_progress_shows_size_and_time(bpy, environment_setup, fake, monkeypatch):
+    messages = []
+    message = property(lambda self: messages[-1], lambda self, text: messages.append(text))
+    monkeypatch.setattr(environment_setup.EnvironmentSetup, "message", message, raising=False)
+    fake(pip="echo 'Downloading torch-2.13.0-cp311.whl (191.8 MB)'; echo Progress 96000000 of 191800000")
+    assert bpy.ops.lodgs.make_environment() == {"FINISHED"}
+    assert "Downloading torch (191.8 MB), 0:00 min" in messages
+    assert "Downloading torch 96 of 192 MB, 0:00 min" in messages
 
 
 def test_oldest_supported_python_is_preferred(lodgs, environment_setup, monkeypatch):
