@@ -25,7 +25,7 @@ help:
 	@echo "make fuzz       20,000 corrupt inputs for every reader (INPUTS=20000, SEED=number), some minutes"
 	@echo "make lint       style and types"
 	@echo "make docs       build/api: trainer API reference from docstrings"
-	@echo "make tables     regenerate docs/parameters.md and docs/controls.md from the code"
+	@echo "make tables     regenerate docs/reference/parameters.md, controls.md and docs/command-line/commands.md"
 	@echo "make bench      speed, as ratios within one run (BASE=old.json compares)"
 	@echo "make bench-quality  PSNR and veil over time, all methods (SCENES=\"DIR ...\", METHODS=\"flod ...\", BASE=other checkout)"
 	@echo "make bench-lod  levels and chunks on a town of 3 million splats (first run: over an hour; STAGES=\"town lodge others table\")"
