@@ -2,7 +2,8 @@
 
 Pixels follow ``docs/development/rasterizer.md``. Splats are blended from back to front in half floats, in
 display space like the training images, in a separate offscreen buffer. Geometry in front of a splat's mean
-hides the splat. The result is composited into the active framebuffer, which is linear, below existing overlays.
+hides the splat. The result is composited into the active framebuffer, which is linear, below existing
+overlays.
 """
 
 from __future__ import annotations
