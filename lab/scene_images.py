@@ -1,4 +1,4 @@
-"""Create the images of docs/scenes.md that need no window: masks, alpha, lens distortion and a region.
+"""Create the images of docs/manual/photos.md that need no window: masks, alpha, lens distortion and a region.
 
     python lab/scene_images.py build/scene_images [masks alone lens region]
 

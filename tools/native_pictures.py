@@ -1,4 +1,4 @@
-"""Render the image of docs/native-splats.md: the same level by LODGS and by Blender.
+"""Render the image of docs/manual/native-splats.md: the same level by LODGS and by Blender.
 
 Run with Blender 5.3 as a module and a graphics driver (software Vulkan will do):
 
@@ -29,7 +29,7 @@ ENGINES = {"Workbench": "BLENDER_WORKBENCH", "EEVEE": "BLENDER_EEVEE", "Cycles":
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="render the image of docs/native-splats.md")
+    parser = argparse.ArgumentParser(description="render the image of docs/manual/native-splats.md")
     parser.add_argument("levels", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--engines", nargs="*", default=["Workbench"], choices=ENGINES)

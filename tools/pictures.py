@@ -43,7 +43,8 @@ def main() -> int:
         scene = Path(work, "lantern_garden")
         shutil.copytree(ROOT / "examples" / "lantern_garden", scene)
         plan = {
-            "scene": str(scene), "file": str(Path(work, "garden.blend")), "run": str(Path(work, "run")), "out": str(out), "pictures": True,
+            "scene": str(scene), "run": str(Path(work, "run")), "file": str(Path(work, "garden.blend")),
+             "out": str(out), "pictures": True,
             "parameters": PARAMETERS, "camera": [camera, "-window", "root"],
         }  # fmt: skip
         with window.display(x_server) as os.environ["DISPLAY"]:

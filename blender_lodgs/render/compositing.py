@@ -61,7 +61,7 @@ def combine_with_meshes(scene: bpy.types.Scene, mesh_engine: str = "CYCLES") -> 
         if not _is_ours(tree):
             raise LodgsError(
                 f"Cannot combine with meshes: the scene '{scene.name}' has compositor nodes.",
-                "Add a Z Combine node for both images and depths, as docs/rendering.md explains.",
+                "Add a Z Combine node for both images and depths (manual: Rendering).",
             )
         meshes = scene.lodgs_render.meshes = bpy.data.scenes.new(f"{scene.name} Meshes")
         meshes.render.engine = mesh_engine

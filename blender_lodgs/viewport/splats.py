@@ -1,8 +1,9 @@
 """Drawing of Gaussians into a framebuffer, from splats on the graphics card.
 
-Pixels follow ``docs/rasterizer.md``. Splats are blended from back to front in half floats, in display space
-like the training images, in a separate offscreen buffer. Geometry in front of a splat's mean hides the splat.
-The result is composited into the active framebuffer, which is linear, below existing overlays.
+Pixels follow ``docs/development/rasterizer.md``. Splats are blended from back to front in half floats, in
+display space like the training images, in a separate offscreen buffer. Geometry in front of a splat's mean
+hides the splat. The result is composited into the active framebuffer, which is linear, below existing
+overlays.
 """
 
 from __future__ import annotations

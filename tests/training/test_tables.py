@@ -1,10 +1,11 @@
-"""Generated documentation pages match the declarations of methods and rules."""
+"""Generated documentation pages match the declarations of methods, rules and commands."""
 
 from pathlib import Path
 
 import pytest
 
 from tools import tables
+from training.cli import COMMANDS, job_options
 from training.lod.rule import rules
 from training.methods import METHODS
 
@@ -28,3 +29,17 @@ def test_every_parameter_and_control_has_one_row():
         section = controls.split(f"\n## {rule.name}\n")[1].split("\n## ")[0]
         for control in rule.controls:
             assert f"`--{control.name.replace('_', '-')}` | {control.label} | " in section
+
+
+def test_every_command_has_its_options():
+    page = tables.commands_page()
+    for command in COMMANDS:
+        assert f"\n## {command}\n" in page
+    train = page.split("\n## train\n")[1].split("\n## ")[0]
+    rows = [line for line in train.splitlines() if line.startswith("| `")]
+    assert [row.split("`")[1].split()[0] for row in rows] == ["JOB", *_train_options()]
+    assert all(row.count(" | ") == 2 for row in rows)
+
+
+def _train_options() -> list[str]:
+    return [f"--{name.replace('_', '-')}" for name in job_options._OPTIONS] + ["--set"]

@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "source", type=Path,
-        help=f"{SOURCE_HELP}; with splat-transform also .spz, .sog and others: see docs/formats.md",
+        help=f"{SOURCE_HELP}; with splat-transform also .spz, .sog and others: see docs/reference/formats.md",
     )  # fmt: skip
     _add_outputs(parser)
     _add_cleaning(parser)

@@ -1,6 +1,6 @@
 """Bundles: one PLY with every level of detail, which ordinary viewers open at the finest level.
 
-``docs/bundle.md`` specifies the format.
+``docs/reference/bundle.md`` specifies the format.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Dialects of splat PLYs: conversion to the 3DGS layout, or a refusal.
 
-A table in ``docs/bundle.md`` lists the programs, their columns and the treatment of each.
+A table in ``docs/reference/bundle.md`` lists the programs, their columns and the treatment of each.
 """
 
 from __future__ import annotations

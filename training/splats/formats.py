@@ -54,7 +54,7 @@ class SplatFormat(NamedTuple):
         label: name in menus.
         about: tooltip in menus.
         splat_bytes: bytes per splat for each SH degree from 0 on. For formats that compress by content, these
-            are averages of trained scenes (``docs/formats.md``).
+            are averages of trained scenes (``docs/reference/formats.md``).
         max_degree: highest SH degree that the format stores.
         palette_size: maximum number of coefficient sets, a power of two, if splats share sets of SH
             coefficients; else 0.

@@ -1,4 +1,4 @@
-"""Folders of levels of detail: one plain PLY per level and a manifest, as ``docs/bundle.md`` specifies."""
+"""Folders of levels of detail: one plain PLY per level and a manifest (``docs/reference/bundle.md``)."""
 
 from __future__ import annotations
 

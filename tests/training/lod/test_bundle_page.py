@@ -1,4 +1,4 @@
-"""An implementation of docs/bundle.md with only numpy and plyfile selects the same splats as ours."""
+"""A reader written from docs/reference/bundle.md with only numpy and plyfile selects the same splats."""
 
 import json
 from pathlib import Path
@@ -267,7 +267,7 @@ def test_selection_from_the_documentation_matches(name, write_named):
 
 @pytest.mark.parametrize("name", rules())
 def test_documentation_covers_every_rule_and_control(name):
-    page = (ROOT / "docs" / "bundle.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "reference" / "bundle.md").read_text(encoding="utf-8")
     assert f"## Rule `{name}`" in page
     section = page.split(f"## Rule `{name}`")[1].split("\n#")[0]
     rule = rules()[name]
