@@ -75,7 +75,7 @@ lint: setup
 	$(VENV) tools/prose.py
 
 docs: setup
-	$(VENV) -m mkdocs build --quiet --strict
+	NO_MKDOCS_2_WARNING=1 $(VENV) -m mkdocs build --quiet --strict
 
 tables: setup
 	$(VENV) tools/tables.py
