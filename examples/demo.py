@@ -73,8 +73,16 @@ def main() -> int:
     if "curve" in measured:
         report["curve"] = [_splat_count_row(row) for row in measured["curve"]]
     (out / "report.json").write_text(json.dumps(report, indent=1))
+    page = [sys.executable, str(ROOT / "examples" / "demo_page.py"), str(run.path)]
+    page += [str(out / "report.json"), str(out / "index.html")]
+    code = subprocess.run(page, cwd=ROOT, check=False).returncode
+    if code:
+        return code
     print(f"Finished in {time.monotonic() - started:.0f} seconds. Files in {os.path.relpath(out)}:")
-    print("scene.blend, bundle.ply, levels.png (comparison of the levels), report.json")
+    print("  index.html   compare the levels in a browser: open this next")
+    print("  scene.blend  the scene in Blender, with levels by distance")
+    print("  bundle.ply   all levels in one file, which ordinary viewers open at the finest")
+    print("  levels.png   comparison of the levels; report.json has the numbers")
     if run.costs.exists():
         print(f"In {os.path.relpath(run.path)}: costs.png (costs measured to choose the levels' distances)")
     return 0
