@@ -139,7 +139,8 @@ def train(options: argparse.Namespace) -> dict:
     store = method.store
     cut_times, counts, times = [], [], []
     assert store is not None
-    take = store.load_cut
+    take, load_cut = store.load_cut, method.load_cut
+    loaded: list[RecordOptimizer] = []
     if not WAYS[options.way]:
         method.view_index = lambda step: method.data.training_view(step, 0)
 
@@ -152,7 +153,11 @@ def train(options: argparse.Namespace) -> dict:
         counts.append(len(rows))
         return rows
 
-    store.load_cut = timed_take  # pyright: ignore
+    def kept_cut(*arguments) -> RecordOptimizer:
+        loaded[:] = [load_cut(*arguments)]
+        return loaded[0]
+
+    store.load_cut, method.load_cut = timed_take, kept_cut  # pyright: ignore
     resize = store.update_sizes
     resize_times = []
 
@@ -168,8 +173,7 @@ def train(options: argparse.Namespace) -> dict:
         method.train_step(step)
         times.append(time.perf_counter() - start - (sum(resize_times) - resizing))
         if counts[-1] > largest:
-            assert isinstance(method._optimizer, RecordOptimizer)
-            largest, splats = counts[-1], method._optimizer.gaussians
+            largest, splats = counts[-1], loaded[0].gaussians
             for name, tensor in vars(splats).items():  # no copy, which would count as memory
                 np.save(options.folder / f"largest_{name}.npy", tensor.detach().numpy())
             (options.folder / "largest_view.txt").write_text(str(method.view_index(step)))

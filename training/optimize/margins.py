@@ -38,7 +38,7 @@ MIN_BLUR_WEIGHT = 0.02
 """Share of a blur's weight that has to be known."""
 
 
-class Margins:
+class MarginGenerator:
     """Generator of splats around the photos of training views.
 
     Args:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Generic, NamedTuple, Protocol, TypeVar
+from dataclasses import dataclass, field
+from typing import Generic, NamedTuple, Protocol, TypeVar, cast
 
 import numpy as np
 import torch
@@ -15,28 +15,17 @@ from ..scenes.cameras import Camera
 from ..splats.gaussians import Splats
 from ..splats.levels import Level
 from ..splats.ply import Columns
-from .density_control import require_rows
+from .background import Background
+from .depth_loss import DepthLoss
+from .dropout import Dropout
 from .exposure import Exposure
-from .margins import Margins
-from .model import OUTSIDE, PEAK_STATS, Model
+from .growth_region import GrowthRegion
+from .margins import MarginGenerator
+from .model import Model
 from .parameters import Parameters
-from .schedules import due, log_linear
-from .support import INTERVAL
+from .schedules import due
+from .support import INTERVAL, SupportPruning
 from .training_data import TrainingData, TrainingView
-
-FINAL_DEPTH_WEIGHT = 0.01
-"""Weight of the depth loss at the end, as a share of the initial one."""
-DROPOUT_VIEWS = 40
-"""Number of training views from which dropout is disabled."""
-DROPOUT_END = 7 / 8
-"""Share of the steps after which dropout is disabled."""
-
-
-@dataclass
-class Drawing:
-    """One rendered image of a step. Methods add fields that they need after ``backward``."""
-
-    rendering: Rendering
 
 
 class Optimizer(Protocol):
@@ -47,6 +36,26 @@ class Optimizer(Protocol):
 
     def zero_grad(self) -> None:
         """Clear the gradients."""
+
+
+@dataclass
+class Drawing:
+    """One rendered image of a step. Methods add fields that they need after ``backward``.
+
+    Attributes:
+        optimizer: optimizer of the rows that the image was rendered from; None for that of the model.
+    """
+
+    rendering: Rendering
+    optimizer: Optimizer | None = field(default=None, kw_only=True)
+
+    def accumulate_stats(self, model: Model, shrink: float) -> None:
+        """Add the image's statistics for density control to ``model.stats``, after ``backward``.
+
+        Args:
+            shrink: factor by which the image was reduced.
+        """
+        model.accumulate_stats(self.rendering, shrink)
 
 
 class StepResult(NamedTuple):
@@ -62,6 +71,25 @@ class StepResult(NamedTuple):
     target: Target
 
 
+class ImageModel(Protocol):
+    """Model that renders images itself. The levels only approximate it."""
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return the model as arrays by name."""
+        ...
+
+    def load_arrays(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Restore the result of :meth:`arrays`. Invalid arrays leave the model unchanged.
+
+        Raises:
+            KeyError, ValueError: an array is missing, or has another shape or type.
+        """
+
+    def render_image(self, camera: Camera) -> torch.Tensor:
+        """Render the image of a camera, (H, W, 3)."""
+        ...
+
+
 P = TypeVar("P", bound=Parameters)
 D = TypeVar("D", bound=Drawing)
 
@@ -69,13 +97,21 @@ D = TypeVar("D", bound=Drawing)
 class Method(ABC, Generic[P, D]):
     """A training run, step by step. P is the class of its parameters, D that of its drawings.
 
-    All methods share :meth:`train_step` and define views, images and density control. Random numbers depend
-    only on (seed, step), so a resumed run repeats an uninterrupted one.
+    A method defines ``setup``, ``set_learning_rates``, ``control_density`` and ``levels_after``, usually
+    ``draw``, and overrides other hooks as needed. The components below have a part of the training step
+    each. Random numbers depend only on (seed, step), so a resumed run repeats an uninterrupted one.
 
     Attributes:
-        model: trained rows.
+        model: trained rows. Set by ``setup``.
+        levels: number of levels. Set by ``setup`` if there are several.
+        facts: scene facts declared by the method's rule, by name. Set by ``setup``.
+        controls: initial values of the rule's controls, by name; others keep the rule's defaults. Set by
+            ``setup``.
+        image_model: model that the levels only approximate, or None if they are complete. Set by ``setup``.
+        extra_optimizers: optimizers of tensors outside the model. Set by ``setup``.
         device: device of the tensors.
         warn: report a warning about the run, one sentence. Set by the caller.
+        background, depth_loss, dropout, exposure, margins, region, support: components.
 
     Args:
         backend: rasterizer backend.
@@ -83,34 +119,66 @@ class Method(ABC, Generic[P, D]):
     """
 
     model: Model
+    levels: int = 1
+    image_model: ImageModel | None = None
 
     def __init__(
         self, data: TrainingData, parameters: P, seed: int, backend: str, base: Splats | None = None
     ) -> None:
         self.warn: Callable[[str], None] = lambda message: None
         self.data = data
-        self.parameters = parameters
+        self.parameters = p = parameters
         self.seed = seed
         self.backend = backend
         self.device = tensor_device(backend)
-        self.exposure = Exposure([view.name for view in data.train], parameters.lr_exposure, self.device)
+        self.facts: dict[str, float] = {}
+        self.controls: dict[str, float] = {}
+        self.extra_optimizers: list[Optimizer] = []
+        self.background = Background(data, p.random_background, seed)
+        self.depth_loss = DepthLoss(*(p.depth_weight, data.median_depth) if data.depths else (0.0, 0.0))
+        self.dropout = Dropout(p.dropout, len(data.train), seed, self.device)
+        self.exposure = Exposure([view.name for view in data.train], p.lr_exposure, self.device)
+        self.margins = MarginGenerator(data.train, p.margin, data.near, backend)
+        self.region = GrowthRegion(data.region)
+        self.support = SupportPruning(data.train, data.scene.points, p.free_depth, p.largest)
         self.setup(base)
+
+    # -- to define -------------------------------------------------------------------------------------
 
     @abstractmethod
     def setup(self, base: Splats | None) -> None:
         """Create ``model`` and other state for the first step, from a base or the scene's points."""
 
-    # -- result ---------------------------------------------------------------------------------------
+    @abstractmethod
+    def set_learning_rates(self, step: int) -> None:
+        """Set the optimizers' learning rates of a step."""
+
+    @abstractmethod
+    def control_density(self, step: int) -> None:
+        """Add and remove splats if due, after the optimizers' step.
+
+        Raises:
+            LodgsError: no splats remain.
+        """
+
+    @abstractmethod
+    def levels_after(self, step: int) -> list[Level]:
+        """Return the levels that a step finished or updated, coarse to fine."""
+
+    def draw(self, view: TrainingView, step: int) -> Sequence[D]:
+        """Render the images of the loss, one or more. The first is reported.
+
+        By default, render one image of all splats with :meth:`render_weights`.
+        """
+        weights, min_scale = self.render_weights(view, step)
+        return [cast(D, Drawing(self.rasterize_model(view.camera, step, weights, min_scale)))]
+
+    # -- progress and result, to override --------------------------------------------------------------
 
     @property
     def steps(self) -> int:
         """Number of steps of the run."""
         return self.parameters.total_steps
-
-    @property
-    def levels(self) -> int:
-        """Number of levels."""
-        return 1
 
     @property
     def splats(self) -> int:
@@ -121,28 +189,20 @@ class Method(ABC, Generic[P, D]):
         """Return the finest level (1-based) that a step trains."""
         return 1
 
+    def ends_level(self, step: int) -> bool:
+        """Return True if a step finishes a level or the run."""
+        return step + 1 == self.steps or self.level_at(step + 1) > self.level_at(step)
+
     def stage(self, step: int) -> str:
         """Describe the part of the run that a step belongs to, for progress reports."""
         return f"level {self.level_at(step)} of {self.levels}"
-
-    @abstractmethod
-    def levels_after(self, step: int) -> list[Level]:
-        """Return the levels that a step finished or updated, coarse to fine."""
-
-    def facts(self) -> dict[str, float]:
-        """Return the scene facts declared by the method's rule, by name."""
-        return {}
 
     def tables(self) -> dict[str, Columns]:
         """Return the tables of the bundle that the method's rule reads, by name."""
         return {}
 
-    def controls(self) -> dict[str, float]:
-        """Return initial values of the rule's controls for this run. The others keep the rule's defaults."""
-        return {}
-
     def meta(self) -> dict:
-        """Return the metadata of the run's bundle. Methods extend it."""
+        """Return the metadata of the run's bundle."""
         data = self.data
         central = min(data.full_train, key=lambda camera: np.linalg.norm(camera.center - data.mean_camera))
         target = central.center + data.median_depth * central.world_to_camera[2, :3]
@@ -155,109 +215,37 @@ class Method(ABC, Generic[P, D]):
             **({"antialias": True} if self.parameters.antialias else {}),
         }
 
-    # -- step ------------------------------------------------------------------------------------------
+    # -- parts of a step, to override ------------------------------------------------------------------
 
-    def train_step(self, step: int) -> StepResult:
-        """Make a step, numbered from 0."""
-        view = self.choose_view(step)
-        result = self.step_on_device(view, step) or self.step_with_autograd(view, step)
-        self.control_density(step)
-        if self.parameters.margin and not self.data.transparent and self.adds_margins(step):
-            self.extend_margins(step)
-        if due(INTERVAL, step + 1) or self.ends_level(step):
-            self.exposure.center()
-            self.prune_unsupported(step)
-        return result
+    def begin_step(self, step: int) -> StepResult | None:
+        """Prepare a step before its view is chosen. A result replaces the whole step."""
 
-    def step_with_autograd(self, view: TrainingView, step: int) -> StepResult:
-        """Render, compute gradients by autograd and step the optimizers."""
-        drawings = self.draw(view, step)
-        loss = self.loss(drawings, view, step)
-        loss.backward()
-        self.model.freeze_gradients()
-        self.accumulate_stats(drawings, view, step)
-        self.limit_growth(step)
-        self.set_learning_rates(step)
-        for optimizer in (*self.optimizers(), *self.exposure.optimizers(step / self.steps)):
-            optimizer.step()
-            optimizer.zero_grad()
-        rendering = drawings[0].rendering
-        image = self.composite_over_black(rendering.image, rendering.alpha, step)
-        return StepResult(float(loss.detach()), lambda: image, view.target)
+    def view_index(self, step: int) -> int | None:
+        """Return the index of a step's training view, or None if :meth:`begin_step` makes the step.
 
-    def step_on_device(self, view: TrainingView, step: int) -> StepResult | None:
-        """Make the step entirely on the backend's device. Return None if it cannot."""
-        p = self.parameters
-        target = view.target
-        allowed = self.allows_device_step(step) and not (p.lr_exposure or self.outputs or self.data.region)
-        if not allowed or target.mask is not None or target.alpha is not None:
-            return None
-        device_model = self.model.device_model(self.backend, p.antialias)
-        if device_model is None:
-            return None
-        weights, min_scale = self.render_weights(view, step)
-        self.set_learning_rates(step)
-        loss = device_model.step(
-            view.camera,
-            target,
-            near=self.data.near,
-            sh_degree=self.sh_degree(step),
-            background=self.background(step),
-            ssim_weight=p.ssim_weight,
-            weights=weights,
-            min_scale=min_scale,
-            shrink=view.shrink if self.collects_stats(view, step) else None,
-        )
-        return StepResult(loss, lambda: self.composite_over_black(*device_model.last_image(), step), target)
-
-    def allows_device_step(self, step: int) -> bool:
-        """Return True if :meth:`step_on_device` may replace :meth:`step_with_autograd`.
-
-        The step must render one image of all splats with :meth:`render_weights` and use this class's loss.
+        It depends on (seed, step). Each epoch uses every view once.
         """
-        return False
-
-    def render_weights(self, view: TrainingView, step: int) -> tuple[torch.Tensor | None, float]:
-        """Return weights (N,) and minimum standard deviation of splats in a step; see ``rasterize``."""
-        return None, 0.0
-
-    def dropout_weights(self, step: int, share: float) -> torch.Tensor | None:
-        """Return weights (N,) that drop random splats from a step, or None without dropout.
-
-        The remaining splats become more opaque to compensate (DropGaussian, Park et al. 2025). With few
-        images, splats overfit to single images; dropout makes others replace them.
-
-        Args:
-            share: share of the schedule's steps completed before this one.
-        """
-        rate = self.parameters.dropout * (1 - len(self.data.train) / DROPOUT_VIEWS)
-        if rate <= 0 or share >= DROPOUT_END:
-            return None
-        draws = np.random.default_rng([self.seed, step, 13]).random(len(self.model), np.float32)
-        return torch.from_numpy((draws >= rate) / np.float32(1 - rate)).to(self.device)
-
-    def choose_view(self, step: int) -> TrainingView:
-        """Return the training view of a step."""
-        return self.data.view_at(step, self.planned_view)
-
-    def planned_view(self, step: int) -> tuple[int, float] | None:
-        """Forecast the view and ``shrink`` of a step, or None if :meth:`choose_view` is not called there.
-
-        Images are read ahead by this forecast. It may change later.
-        """
-        return (self.view_index(step), self.shrink(step)) if step < self.steps else None
-
-    def view_index(self, step: int) -> int:
-        """Return the index of a step's training view, from (seed, step). Each epoch uses every view once."""
         return self.data.training_view(step, self.seed)
 
     def shrink(self, step: int) -> float:
         """Return the factor by which the image of a step is reduced."""
         return 1
 
-    @abstractmethod
-    def draw(self, view: TrainingView, step: int) -> Sequence[D]:
-        """Render the images of the loss, one or more. The first is reported."""
+    def sh_degree(self, step: int) -> int:
+        """Return the active degree of harmonics, which increases during training."""
+        p = self.parameters
+        return min(p.sh_degree, step // max(p.sh_interval, 1))
+
+    def render_weights(self, view: TrainingView, step: int) -> tuple[torch.Tensor | None, float]:
+        """Return weights (N,) and minimum standard deviation of splats in a step; see ``rasterize``."""
+        return None, 0.0
+
+    def allows_device_step(self, step: int) -> bool:
+        """Return True if the backend may make the step entirely on its device, without autograd.
+
+        The step must render one image of all splats with :meth:`render_weights` and use this class's loss.
+        """
+        return False
 
     def loss(self, drawings: Sequence[D], view: TrainingView, step: int) -> torch.Tensor:
         """Return the loss of a step: the sum of the images' photometric losses (3DGS, Eq. 7).
@@ -273,130 +261,66 @@ class Method(ABC, Generic[P, D]):
             )
             for drawing in drawings
         )
-        return sum(additional, first) + self.depth_loss(drawings[0].rendering, view, step)
-
-    def depth_loss(self, rendering: Rendering, view: TrainingView, step: int) -> torch.Tensor | float:
-        """Return the weighted mean |Σ w / z − 1 / depth| over pixels with known depth.
-
-        As in H3DGS (Kerbl et al. 2024), but in inverse median depths.
-        """
-        rendered = rendering.inverse_depth
-        truth = view.target.inverse_depth
-        if rendered is None or truth is None:
-            return 0.0
-        p = self.parameters
-        truth = truth.to(rendered)
-        valid = truth.isfinite()
-        error = torch.where(valid, rendered - truth, 0).abs().sum() / valid.sum().clamp_min(1)
-        weight = log_linear(p.depth_weight, FINAL_DEPTH_WEIGHT * p.depth_weight, step / self.steps)
-        return weight * self.data.median_depth * error
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        """Additional outputs of a step's renderings; see ``rasterize``."""
-        return ("inverse_depth",) if self.data.depths and self.parameters.depth_weight else ()
+        depth_loss = self.depth_loss(drawings[0].rendering, view.target, step / self.steps)
+        return sum(additional, first) + depth_loss
 
     def collects_stats(self, view: TrainingView, step: int) -> bool:
         """Return True if :meth:`control_density` uses the statistics of a step."""
         return True
 
-    def accumulate_stats(self, drawings: Sequence[D], view: TrainingView, step: int) -> None:
-        """Add a step's statistics for :meth:`control_density` to ``model.stats``, after ``backward``."""
-        if self.collects_stats(view, step):
-            self.model.accumulate_stats(drawings[0].rendering, view.shrink)
+    def add_margins(self, step: int) -> None:
+        """Add splats of ``margins`` to the model if due, ideally when no more splats are added."""
 
-    def limit_growth(self, step: int) -> None:
-        """Clear the gradient statistics outside the job's region, so that no splats are added there."""
-        region = self.data.region
-        model = self.model
-        if region is None:
-            return
-        if OUTSIDE not in model.columns or due(INTERVAL, step):
-            outside = ~region.contains(model["means"].detach().cpu().numpy())
-            model.columns[OUTSIDE] = torch.from_numpy(outside).to(model["means"])
-        for name in ("gradient_sum", PEAK_STATS[0]):
-            if name in model.stats:
-                model.stats[name][model.columns[OUTSIDE] > 0] = 0
-
-    @abstractmethod
-    def set_learning_rates(self, step: int) -> None:
-        """Set the optimizers' learning rates of a step."""
-
-    def optimizers(self) -> Sequence[Optimizer]:
-        """Return the optimizers to step."""
-        return (self.model.adam,)
-
-    @abstractmethod
-    def control_density(self, step: int) -> None:
-        """Add and remove splats if due, after the optimizers' step.
-
-        Raises:
-            LodgsError: no splats remain.
-        """
-
-    def ends_level(self, step: int) -> bool:
-        """Return True if a step finishes a level or the run."""
-        return step + 1 == self.steps or self.level_at(step + 1) > self.level_at(step)
-
-    def adds_margins(self, step: int) -> bool:
-        """Return True if margins are added after a step, ideally when no more splats are added."""
-        return False
-
-    @torch.no_grad()
-    def extend_margins(self, step: int) -> None:
-        """Add splats that extend the images beyond their edges."""
-        room = self.parameters.margin_room(self.budget_at(step))
-        self.append_margins(vars(self.margins().extend(self.gaussians_at(step), room)), step)
-
-    def budget_at(self, step: int) -> int:
-        """Return the maximum number of splats after a step."""
-        return self.parameters.max_splats
-
-    def growth_limit(self, step: int) -> int:
-        """Return the maximum number of splats for densification, which reserves the budget of margins."""
-        return self.budget_at(step) - self.parameters.margin_room(self.budget_at(step))
-
-    def margins(self) -> Margins:
-        """Return the generator of margin splats."""
-        return Margins(self.data.train, self.parameters.margin, self.data.near, self.backend)
-
-    def gaussians_at(self, step: int) -> Gaussians:
-        """Return all splats as a step renders them."""
-        return self.model.gaussians
-
-    def append_margins(self, rows: Mapping[str, torch.Tensor], step: int) -> None:
-        """Add splats in the form of :meth:`gaussians_at` to the model, by the names of ``model.NAMES``."""
-        self.model.append(rows)
-
-    @torch.no_grad()
     def prune_unsupported(self, step: int) -> None:
-        """Remove splats too close to the training views, and limit the size of the others.
+        """Remove splats in free space, at intervals and at the ends of levels.
 
         Raises:
             LodgsError: no splats remain.
         """
-        p = self.parameters
-        model = self.model
-        if not (p.free_depth or p.largest):
-            return
-        support = self.data.support
-        means = model["means"].detach().cpu().numpy()
-        distances, positions = support.nearest_positions(means)
-        if p.largest:
-            sizes = np.maximum(p.largest * distances, np.finfo(np.float32).tiny)
-            limits = torch.from_numpy(np.log(sizes)).to(model["log_scales"])
-            model["log_scales"].clamp_max_(limits[:, None])
-        if p.free_depth:
-            intruding = support.find_intruding(means, distances, positions, p.free_depth)
-            model.keep(torch.from_numpy(~intruding))
-            require_rows(model, step, "free_depth")
+        self.support.prune(self.model, step)
 
-    # -- rendering -------------------------------------------------------------------------------------
+    # -- checkpoints, to override ----------------------------------------------------------------------
 
-    def sh_degree(self, step: int) -> int:
-        """Return the active degree of harmonics, which increases during training."""
-        p = self.parameters
-        return min(p.sh_degree, step // max(p.sh_interval, 1))
+    def state_dict(self) -> dict:
+        """Return the state that the next step depends on, as tensors and numbers."""
+        return {"model": self.model.state_dict(), "exposure": self.exposure.state_dict()}
+
+    def load_state_dict(self, state: dict) -> None:
+        """Restore a state."""
+        self.model.load_state_dict(state["model"])
+        self.exposure.load_state_dict(state["exposure"])
+
+    def close(self) -> None:
+        """Close open files."""
+
+    # -- the step of all methods -----------------------------------------------------------------------
+
+    def train_step(self, step: int) -> StepResult:
+        """Make a step, numbered from 0."""
+        if result := self.begin_step(step):
+            return result
+        view = self.choose_view(step)
+        result = self._step_on_device(view, step) or self._step_with_autograd(view, step)
+        self.control_density(step)
+        if self.parameters.margin and not self.data.transparent:
+            with torch.no_grad():
+                self.add_margins(step)
+        if due(INTERVAL, step + 1) or self.ends_level(step):
+            self.exposure.center()
+            self.prune_unsupported(step)
+        return result
+
+    def choose_view(self, step: int) -> TrainingView:
+        """Return the training view of a step."""
+        return self.data.view_at(step, self.planned_view)
+
+    def planned_view(self, step: int) -> tuple[int, float] | None:
+        """Forecast the view and ``shrink`` of a step, or None if it has no view.
+
+        Images are read ahead by this forecast. It may change later.
+        """
+        index = self.view_index(step) if step < self.steps else None
+        return None if index is None else (index, self.shrink(step))
 
     def rasterize_model(
         self,
@@ -416,52 +340,51 @@ class Method(ABC, Generic[P, D]):
             near=self.data.near,
             antialias=self.parameters.antialias,
             background=self.background(step),
-            outputs=self.outputs,
+            outputs=self.depth_loss.outputs,
             backend=self.backend,
         )
 
-    def background(self, step: int) -> tuple[float, float, float]:
-        """Return the background colour of a step, the same for all of its images.
+    def _step_with_autograd(self, view: TrainingView, step: int) -> StepResult:
+        """Render, compute gradients by autograd and step the optimizers."""
+        drawings = self.draw(view, step)
+        loss = self.loss(drawings, view, step)
+        loss.backward()
+        self.model.freeze_gradients()
+        if self.collects_stats(view, step):
+            drawings[0].accumulate_stats(self.model, view.shrink)
+        self.region.clear_outside(self.model, step)
+        self.set_learning_rates(step)
+        optimizers = drawings[0].optimizer or self.model.adam, *self.extra_optimizers
+        for optimizer in (*optimizers, *self.exposure.optimizers(step / self.steps)):
+            optimizer.step()
+            optimizer.zero_grad()
+        rendering = drawings[0].rendering
+        image = self.background.remove(rendering.image, rendering.alpha, step)
+        return StepResult(float(loss.detach()), lambda: image, view.target)
 
-        It is always random for transparent images, so that splats match their transparency.
-        """
-        if not (self.parameters.random_background or self.data.transparent):
-            return 0.0, 0.0, 0.0
-        red, green, blue = np.random.default_rng([self.seed, step, 5]).random(3)
-        return red, green, blue
-
-    @torch.no_grad()
-    def composite_over_black(self, image: torch.Tensor, alpha: torch.Tensor, step: int) -> torch.Tensor:
-        """Replace the background of a step's image (H, W, 3) by black."""
-        background = torch.tensor(self.background(step)).to(image)
-        return image - (1 - alpha[..., None]) * background
-
-    # -- checkpoints -----------------------------------------------------------------------------------
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Return model data that is missing from the levels. Empty if levels are complete."""
-        return {}
-
-    def load_arrays(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Restore the result of :meth:`arrays`. Invalid arrays leave the model unchanged.
-
-        Raises:
-            KeyError, ValueError: an array is missing, or has another shape or type.
-        """
-        raise NotImplementedError("levels are complete")
-
-    def render_image(self, camera: Camera) -> torch.Tensor:
-        """Render the model itself, (H, W, 3). Only called if :meth:`arrays` is not empty."""
-        raise NotImplementedError("levels are complete")
-
-    def close(self) -> None:
-        """Close open files."""
-
-    def state_dict(self) -> dict:
-        """Return the state that the next step depends on, as tensors and numbers."""
-        return {"model": self.model.state_dict(), "exposure": self.exposure.state_dict()}
-
-    def load_state_dict(self, state: dict) -> None:
-        """Restore a state."""
-        self.model.load_state_dict(state["model"])
-        self.exposure.load_state_dict(state["exposure"])
+    def _step_on_device(self, view: TrainingView, step: int) -> StepResult | None:
+        """Make the step entirely on the backend's device. Return None if it cannot."""
+        p = self.parameters
+        target = view.target
+        needs_autograd = p.lr_exposure or self.depth_loss.outputs or self.data.region
+        if needs_autograd or not self.allows_device_step(step):
+            return None
+        if target.mask is not None or target.alpha is not None:
+            return None
+        device_model = self.model.device_model(self.backend, p.antialias)
+        if device_model is None:
+            return None
+        weights, min_scale = self.render_weights(view, step)
+        self.set_learning_rates(step)
+        loss = device_model.step(
+            view.camera,
+            target,
+            near=self.data.near,
+            sh_degree=self.sh_degree(step),
+            background=self.background(step),
+            ssim_weight=p.ssim_weight,
+            weights=weights,
+            min_scale=min_scale,
+            shrink=view.shrink if self.collects_stats(view, step) else None,
+        )
+        return StepResult(loss, lambda: self.background.remove(*device_model.last_image(), step), target)

@@ -19,10 +19,6 @@ NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh")
 """Tensors of every splat. A model of splats may train further tensors, (N,), under other names."""
 PEAK_STATS = ("gradient_max", "radius_max")
 """Stats of densification by maxima: gradient as in ``gradient_sum``, and radius in pixels."""
-
-
-OUTSIDE = "outside"
-"""Column that marks rows outside the job's region with 1: no splats are added there."""
 FROZEN = "held"
 """Column that marks rows excluded from training with 1. Only present if there are any."""
 
@@ -201,7 +197,8 @@ class Model:
     def accumulate_stats(self, rendering: Rendering, shrink: float = 1) -> None:
         """Add image-plane gradient norms and draw counts to the stats, after ``backward``.
 
-        Raises ``PEAK_STATS``, if kept, to the largest gradient and radius.
+        Also adds the opacities of drawn splats to ``opacity_sum``, if kept, and raises ``PEAK_STATS``, if
+        kept, to the largest gradient and radius.
 
         Args:
             shrink: factor by which the image was reduced, which enlarged gradients by the same factor (see
@@ -209,10 +206,14 @@ class Model:
         """
         gradient = rendering.grad2d.norm(dim=1) / shrink
         self.stats["gradient_sum"] += gradient
-        self.stats["seen"] += rendering.radii > 0
+        drawn = rendering.radii > 0
+        self.stats["seen"] += drawn
         for name, values in zip(PEAK_STATS, (gradient, rendering.radii), strict=True):
             if name in self.stats:
                 self.stats[name] = torch.maximum(self.stats[name], values)
+        if "opacity_sum" in self.stats:
+            opacities = self["opacity_logits"].detach().sigmoid()
+            self.stats["opacity_sum"] += torch.where(drawn, opacities, 0)
 
     def reset_stats(self) -> None:
         """Set all stats to zero."""

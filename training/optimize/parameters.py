@@ -138,6 +138,10 @@ class Parameters:
         """Return the share of a budget of splats that is reserved for margins."""
         return min(int(MAX_MARGIN_SHARE * budget), MAX_MARGIN_SPLATS) if self.margin else 0
 
+    def growth_limit(self, budget: int) -> int:
+        """Return the maximum number of splats for densification, which reserves the budget of margins."""
+        return budget - self.margin_room(budget)
+
     def check(self) -> None:
         """Check parameters against each other. Methods override this.
 
@@ -177,6 +181,35 @@ class DensityParameters(Parameters):
         0,
         "Steps over which the learning rate of positions decays. 0 uses all steps (FLoD: of the level).",
         unit="steps",
+    )
+
+
+@dataclass(frozen=True)
+class SplatParameters(DensityParameters):
+    """Parameters of methods that train splats as 3DGS does (``optimize.splat_method``)."""
+
+    densify_until: float = setting(
+        0.5, "Fraction of the steps in which splats are added and removed.", high=1
+    )
+    densify_interval: int = setting(50, "Steps between two densifications.", above=0, unit="steps")
+    densify_from: int = setting(0, "First step with densification.", unit="steps")
+    densify_by: str = setting(
+        "mean",
+        "Criterion for adding splats: the mean image-plane gradient over the views since the last "
+        "densification (mean), or the maximum gradient times the maximum radius times opacity^(1/5) "
+        "(max; LODGE, Eq. 6).",
+        choices=("mean", "max"),
+    )
+    max_threshold: float = setting(
+        0.015,
+        "Threshold of the criterion 'max' at one megapixel: gradients in 3DGS units, radii of three "
+        "standard deviations in pixels (LODGE: 0.015 outdoors, 0.03 indoors).",
+    )
+    least_weight: float = setting(
+        0.0,
+        "Minimum blending weight of a splat in any training view; splats below it are removed at 8, "
+        "16 and 24 thirtieths of the steps (LODGE, A.2: 0.02). 0 keeps all.",
+        high=1,
     )
 
 

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
+import torch
 from scipy.spatial import KDTree
 
 from ..scenes.cameras import Camera
+from .density_control import require_rows
+from .model import Model
 
 NEIGHBOURS = (1, 2, 4)
 """Ranks of the neighbours of a camera to form midpoints with."""
@@ -98,3 +102,46 @@ class Support:
             photos += camera.sees(points[around])
         intruding[near[around]] |= photos < MIN_PHOTOS
         return intruding
+
+
+class SupportPruning:
+    """Removal of splats in free space, and limits on the size of others.
+
+    Args:
+        cameras, points: see :class:`Support`.
+        free_depth: share of the nearest depth that is free space; 0 disables.
+        largest: maximum standard deviation of a splat, as a share of its distance from the nearest camera
+            or midpoint; 0 disables.
+    """
+
+    def __init__(
+        self, cameras: Sequence[Camera], points: np.ndarray, free_depth: float, largest: float
+    ) -> None:
+        self._cameras = cameras
+        self._points = points
+        self._free_depth = free_depth
+        self._largest = largest
+
+    @cached_property
+    def _support(self) -> Support:
+        return Support(self._cameras, self._points)
+
+    @torch.no_grad()
+    def prune(self, model: Model, step: int) -> None:
+        """Remove splats too close to the training views, and limit the size of the others.
+
+        Raises:
+            LodgsError: no splats remain.
+        """
+        if not (self._free_depth or self._largest):
+            return
+        means = model["means"].detach().cpu().numpy()
+        distances, positions = self._support.nearest_positions(means)
+        if self._largest:
+            sizes = np.maximum(self._largest * distances, np.finfo(np.float32).tiny)
+            limits = torch.from_numpy(np.log(sizes)).to(model["log_scales"])
+            model["log_scales"].clamp_max_(limits[:, None])
+        if self._free_depth:
+            intruding = self._support.find_intruding(means, distances, positions, self._free_depth)
+            model.keep(torch.from_numpy(~intruding))
+            require_rows(model, step, "free_depth")

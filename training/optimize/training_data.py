@@ -22,7 +22,6 @@ from ..scenes.exposures import remove_gain
 from ..scenes.images import load_image, load_mask
 from .image_cache import ImageCache, default_budget
 from .memory import TARGET_BYTES
-from .support import Support
 
 ALPHA_SAMPLES = 3
 """Number of images to check for transparency."""
@@ -152,11 +151,6 @@ class TrainingData:
     def focal(self) -> float:
         """Median focal length of the training views, in pixels."""
         return float(np.median([camera.focal for camera in self.full_train]))
-
-    @cached_property
-    def support(self) -> Support:
-        """Free space around the training cameras."""
-        return Support(self.train, self.scene.points)
 
     @cached_property
     def near(self) -> float:

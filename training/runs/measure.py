@@ -181,12 +181,14 @@ def _measure_rule(job: Job, evaluation: Evaluation, bundle: Bundle, rule: Rule, 
 def _measure_networks(job: Job, folder: RunFolder, evaluation: Evaluation) -> dict:
     """Return the quality of the run's neural model before baking."""
     method = create(job.method, evaluation.data, job.resolved_parameters(), job.seed, job.backend)
+    model = method.image_model
+    assert model is not None
     arrays = read_arrays(folder.model)
     try:
-        method.load_arrays(arrays)
+        model.load_arrays(arrays)
     except (KeyError, ValueError) as error:
         raise array_error(folder.model, error) from error
-    return evaluation.measure_images(method.render_image)
+    return evaluation.measure_images(model.render_image)
 
 
 def _finite(value):

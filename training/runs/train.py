@@ -302,11 +302,11 @@ class _TrainingRun:
         bundle = replace(
             self._empty_bundle(), levels=levels, meta=meta, tables=self.method.tables() | self._view_tables()
         )
-        if arrays := self.method.arrays():
+        if image_model := self.method.image_model:
             with atomic_write(self.folder.model) as temporary, open(temporary, "wb") as file:
-                np.savez(file, **arrays)
+                np.savez(file, **image_model.arrays())
             if self.data.test:
-                neural_psnr = self.evaluation.measure_images(self.method.render_image)["psnr"]
+                neural_psnr = self.evaluation.measure_images(image_model.render_image)["psnr"]
                 resident = ResidentBundle(bundle, self.evaluation.backend)
                 baked_psnr = self.evaluation.measure_by_distance(resident, resolve_controls(bundle, {}))[
                     "psnr"
@@ -340,8 +340,8 @@ class _TrainingRun:
             self.job.method,
             [],
             info.rule,
-            method.facts(),
-            method.controls(),
+            method.facts,
+            method.controls,
             rule is not None and rule.cumulative,
             method.meta(),
         )

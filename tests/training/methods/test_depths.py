@@ -61,7 +61,7 @@ def test_depth_loss_matches_reference(data):
     method = create_method("3dgs", data, 0.7)
     view = method.choose_view(0)
     drawings = method.draw(view, 0)
-    actual = float(method.depth_loss(drawings[0].rendering, view, 0).detach())
+    actual = float(method.depth_loss(drawings[0].rendering, view.target, 0.0).detach())
     gaussians = Gaussians(*(tensor.detach().double() for tensor in vars(method.model.gaussians).values()))
     drawn = rasterize(
         gaussians,
@@ -76,7 +76,7 @@ def test_depth_loss_matches_reference(data):
     assert drawn is not None and drawn.shape == small.shape
     expected = 0.7 * data.median_depth * np.abs(drawn.numpy() - small).mean()
     assert actual == pytest.approx(expected, rel=0.02)  # a corner between floor and wall is no plane
-    later = float(method.depth_loss(drawings[0].rendering, view, method.steps).detach())
+    later = float(method.depth_loss(drawings[0].rendering, view.target, 1.0).detach())
     assert later == pytest.approx(actual / 100, rel=1e-3)
 
 

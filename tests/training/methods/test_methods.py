@@ -72,9 +72,6 @@ class Method(method.Method):
         weights = torch.exp(-self.model["decay"] ** 2)
         return [Drawing(self.rasterize_model(view.camera, step, weights=w)) for w in (None, weights)]
 
-    def accumulate_stats(self, drawings, view, step):
-        self.model.accumulate_stats(drawings[0].rendering)
-
     def set_learning_rates(self, step):
         pass
 
@@ -268,7 +265,7 @@ def test_scene_metadata(data, tiny):
     assert eye == pytest.approx(data.train[middle].center)
     assert data.train[middle].view_space(target[None])[0] == pytest.approx([0, 0, data.median_depth])
     assert meta["camera_center"] == pytest.approx(np.mean([c.center for c in data.train], 0).tolist())
-    assert {"scene_extent", "median_depth"} <= set(meta) and method.facts() == {}
+    assert {"scene_extent", "median_depth"} <= set(meta) and method.facts == {}
     assert torch.device("cpu") == method.device
 
 
@@ -285,7 +282,7 @@ def test_step_has_random_background_and_image_has_none(data, name):
     black = create(name, data, override(presets["draft"], {"random_background": False}), 0, "cpu")
     expected = black.draw(view, 3)[0].rendering
     torch.testing.assert_close(drawn.image - expected.image, (1 - drawn.alpha[..., None]) * behind)
-    torch.testing.assert_close(method.composite_over_black(drawn.image, drawn.alpha, 3), expected.image)
+    torch.testing.assert_close(method.background.remove(drawn.image, drawn.alpha, 3), expected.image)
     assert (drawn.alpha < 0.5).any()
     colors = {method.background(step) for step in range(9)}
     assert len(colors) == 9 and black.background(3) == (0, 0, 0) == tuple(

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from training.methods import METHODS, create
-from training.optimize.margins import DEPTH_FACTOR, Margins, blur_outward
+from training.optimize.margins import DEPTH_FACTOR, MarginGenerator, blur_outward
 from training.optimize.parameters import override
 from training.rasterize import Gaussians, rasterize
 from training.scenes.cameras import Camera
@@ -38,8 +38,8 @@ def draw(gaussians: Gaussians, view: Camera):
     return rasterize(gaussians, view, near=NEAR, backend="cpu")
 
 
-def margins(*cameras: Camera, share: float = 0.5) -> Margins:
-    return Margins(cameras, share, NEAR, "cpu")
+def margins(*cameras: Camera, share: float = 0.5) -> MarginGenerator:
+    return MarginGenerator(cameras, share, NEAR, "cpu")
 
 
 def test_margins_continue_a_wall_beyond_the_photo():
@@ -96,7 +96,7 @@ def test_margins_scale_with_the_scene():
     scale = 1000.0
     splats = wall(4, -4, 4)
     large = replace(splats, means=scale * splats.means, log_scales=splats.log_scales + np.log(scale))
-    scaled = Margins([camera(), camera(x=scale)], 0.5, scale * NEAR, "cpu").extend(large, 10_000)
+    scaled = MarginGenerator([camera(), camera(x=scale)], 0.5, scale * NEAR, "cpu").extend(large, 10_000)
     assert scaled.means.numpy() / scale == pytest.approx(small.means.numpy(), rel=1e-3, abs=1e-3)
     assert scaled.log_scales.numpy() - np.log(scale) == pytest.approx(small.log_scales.numpy(), abs=1e-3)
 

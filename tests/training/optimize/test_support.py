@@ -94,5 +94,6 @@ def test_training_removes_intruding_splats_and_limits_sizes(data):
     method.prune_unsupported(0)
     assert len(method.model) == count + 1
     largest = method.model["log_scales"].detach().exp().amax(1).numpy()
-    allowed = p.largest * data.support.nearest_positions(method.model["means"].detach().numpy())[0]
+    support = Support(data.train, data.scene.points)
+    allowed = p.largest * support.nearest_positions(method.model["means"].detach().numpy())[0]
     assert (largest <= allowed * 1.0001).all() and largest[-1] == pytest.approx(allowed[-1], rel=1e-4)

@@ -3,13 +3,12 @@
 from dataclasses import dataclass, replace
 
 from ...optimize.method_info import MethodInfo
-from ...optimize.parameters import PAPER, STANDARD
+from ...optimize.parameters import PAPER, STANDARD, SplatParameters
 from ...settings import setting
-from ..threedgs import ThreedgsParameters
 
 
 @dataclass(frozen=True)
-class ClodParameters(ThreedgsParameters):
+class ClodParameters(SplatParameters):
     """Parameters of CLoD-GS, which is 3DGS until the decay begins."""
 
     begin: float = setting(

@@ -6,7 +6,7 @@ s_v > 1, where fewer splats have to reproduce the same photo (Sec. 3.3).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,12 +17,12 @@ from ...optimize.density_control import require_rows
 from ...optimize.method import Drawing
 from ...optimize.model import Model, splat_rates
 from ...optimize.schedules import due
+from ...optimize.splat_method import SplatMethod
 from ...optimize.training_data import TrainingView
 from ...rasterize import contributions
 from ...scenes.cameras import Camera
 from ...splats.gaussians import Splats
 from ...splats.levels import Level
-from ..threedgs import train as threedgs_train
 from . import ClodParameters
 
 SIGMAS = (1e-3, 50.0)
@@ -53,7 +53,7 @@ class ClodDrawing(Drawing):
     in_view: torch.Tensor
 
 
-class Method(threedgs_train.Method):
+class Method(SplatMethod):
     """Training of CLoD-GS.
 
     Attributes:
@@ -75,6 +75,7 @@ class Method(threedgs_train.Method):
         peaks = p.densify_by == "max"
         self.model = Model(tensors | {SIGMA: self._encode(sigma)}, rates, peaks=peaks)
         self.reference = self._far_distance(p.reference_quantile) if p.reference_quantile else 0.0
+        self.facts = {"reference": self.reference, "tau": p.tau}
 
     def levels_after(self, step: int) -> list[Level]:
         """Return the single level at the end, sorted by mean weight over the training views, so that
@@ -86,9 +87,6 @@ class Method(threedgs_train.Method):
         splats.extras[SIGMA] = self.sigma.detach().cpu().numpy()
         order = torch.argsort(self.mean_weight(), descending=True, stable=True)
         return [Level(1, splats.select(order.cpu().numpy()))]
-
-    def facts(self) -> dict[str, float]:
-        return {"reference": self.reference, "tau": self.parameters.tau}
 
     # -- the decay -------------------------------------------------------------------------------------
 
@@ -124,7 +122,7 @@ class Method(threedgs_train.Method):
 
     # -- steps -----------------------------------------------------------------------------------------
 
-    def draw(self, view: TrainingView, step: int) -> list[Drawing]:
+    def draw(self, view: TrainingView, step: int) -> Sequence[Drawing]:
         if step < self.decay_start:
             return super().draw(view, step)
         if step == self.decay_start:
@@ -177,13 +175,12 @@ class Method(threedgs_train.Method):
             self.model.keep(self.drawn_anywhere())
             require_rows(self.model, step, "tau")
 
-    def adds_margins(self, step: int) -> bool:
+    def add_margins(self, step: int) -> None:
         """Add margins once the decay has begun, which removes splats of low weight in the photos."""
-        return step == self.decay_start > 0
-
-    def append_margins(self, rows: Mapping[str, torch.Tensor], step: int) -> None:
-        sigma = torch.full_like(rows["opacity_logits"], self.parameters.sigma_init)
-        super().append_margins({**rows, SIGMA: self._encode(sigma)}, step)
+        if step == self.decay_start > 0:
+            rows = self.margin_rows()
+            sigma = torch.full_like(rows["opacity_logits"], self.parameters.sigma_init)
+            self.model.append({**rows, SIGMA: self._encode(sigma)})
 
     @torch.no_grad()
     def drawn_anywhere(self) -> torch.Tensor:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Mapping
 from dataclasses import replace
 from itertools import accumulate
 
@@ -27,7 +26,6 @@ from ...optimize.method import Drawing
 from ...optimize.model import Model, splat_rates
 from ...optimize.schedules import due, log_linear, shrink_at
 from ...optimize.training_data import TrainingView
-from ...rasterize import Gaussians
 from ...splats.gaussians import Splats
 from ...splats.levels import Level
 from . import BLENDED_LEVELS, PAPER_REACH, FlodParameters, finish
@@ -51,16 +49,15 @@ class Method(method.Method[FlodParameters, Drawing]):
         points, colors = drop_duplicates(data.scene.points, data.scene.point_colors)
         self.points, self.colors = sample_points(points, colors, p.max_splats, self.seed)
         self.completed: dict[int, dict[str, torch.Tensor]] = {}
+        self.levels = p.levels
+        if p.levels > 1:
+            self.controls = {"gamma": initial_gamma(self.s_min[-2] * data.focal / data.median_depth)}
         if base is None:
             self.model = self._new_model(self._from_points(1))
         else:
             self._store_for_finishing(p.first_level - 1, base)
             tensors = from_splats(base, p.sh_degree, self.device)
             self.model = self._new_model(self._next_level_tensors(tensors, 0.0, p.first_level))
-
-    @property
-    def levels(self) -> int:
-        return self.parameters.levels
 
     def level_at(self, step: int) -> int:
         return min(bisect_right(self._ends, step) + self.parameters.first_level, self.parameters.end)
@@ -90,19 +87,6 @@ class Method(method.Method[FlodParameters, Drawing]):
             self.start_finishing()
         return [finished]
 
-    def controls(self) -> dict[str, float]:
-        """Return the gamma at which the finest level reaches as far as the paper's, in median depths.
-
-        d_proj(l) = s_min(l) / gamma * f (Eq. 8) falls with s_min. With a fixed gamma, the finest level of
-        a smaller footprint, or of more levels, would never be drawn. The maximum is the paper's value,
-        one pixel, so that coarse levels do not appear at distances where their lack of detail is visible.
-        """
-        if self.levels == 1:
-            return {}
-        pixels = self.s_min[-2] * self.data.focal / self.data.median_depth
-        value = max(min(pixels / PAPER_REACH, 1.0), all_controls()["gamma"].low)
-        return {"gamma": float(f"{value:.6g}")}  # Blender stores as many digits
-
     def meta(self) -> dict:
         footprint = self.s_min[0] * self.data.focal / self.data.median_depth
         return {"rho": self.parameters.rho, **super().meta(), "footprint_px": footprint}
@@ -116,9 +100,6 @@ class Method(method.Method[FlodParameters, Drawing]):
     def sh_degree(self, step: int) -> int:
         return super().sh_degree(self._skipped_steps + step)
 
-    def draw(self, view: TrainingView, step: int) -> list[Drawing]:
-        return [Drawing(self.rasterize_model(view.camera, step, *self.render_weights(view, step)))]
-
     def allows_device_step(self, step: int) -> bool:
         return True
 
@@ -126,7 +107,8 @@ class Method(method.Method[FlodParameters, Drawing]):
         if self.is_finishing(step):
             values = self._finishing_values(step)
             return finish.weights(self.model, self.s_min, view.camera, values), 0.0
-        return self.dropout_weights(step, self._progress(step)), self.s_min[self.level_at(step) - 1]
+        dropout = self.dropout.weights(len(self.model), step, self._progress(step))
+        return dropout, self.s_min[self.level_at(step) - 1]
 
     def collects_stats(self, view: TrainingView, step: int) -> bool:
         return not self.is_finishing(step) and self._level_step(step) < self._densify_until(step)
@@ -155,7 +137,7 @@ class Method(method.Method[FlodParameters, Drawing]):
                 model.mean_gradient(),
                 threshold=p.grad_threshold * self.data.threshold_scale,
                 clone_below=None if p.long_axis else p.clone_extent * self.data.extent,
-                max_splats=self.growth_limit(step),
+                max_splats=p.growth_limit(self.budget(level)),
                 rng=np.random.default_rng([self.seed, step, 1]),
                 min_scale=s_min,
             )
@@ -172,25 +154,23 @@ class Method(method.Method[FlodParameters, Drawing]):
                 "Lower 'footprint' (or 's_min_1'), so that coarse levels keep more splats.",
             )
 
-    def adds_margins(self, step: int) -> bool:
+    def add_margins(self, step: int) -> None:
+        """Add margins when the densification of a level ends."""
         local = self._level_step(step)
-        return not self.is_finishing(step) and local < self._densify_until(step) <= local + 1
-
-    def budget_at(self, step: int) -> int:
-        return self.budget(self.level_at(step))
-
-    def gaussians_at(self, step: int) -> Gaussians:
-        scales = self.model["log_scales"].detach().exp() + self.s_min[self.level_at(step) - 1]
-        return replace(self.model.gaussians, log_scales=scales.log())
-
-    def append_margins(self, rows: Mapping[str, torch.Tensor], step: int) -> None:
-        scales = constrained_log_scales(rows["log_scales"].exp(), self.s_min[self.level_at(step) - 1])
-        super().append_margins({**rows, "log_scales": scales}, step)
+        if self.is_finishing(step) or not local < self._densify_until(step) <= local + 1:
+            return
+        level = self.level_at(step)
+        s_min = self.s_min[level - 1]
+        log_scales = (self.model["log_scales"].detach().exp() + s_min).log()
+        gaussians = replace(self.model.gaussians, log_scales=log_scales)
+        rows = vars(self.margins.extend(gaussians, self.parameters.margin_room(self.budget(level))))
+        log_scales = constrained_log_scales(rows["log_scales"].exp(), s_min)
+        self.model.append({**rows, "log_scales": log_scales})
 
     def _finishing_values(self, step: int) -> Values:
         """Return the rule's controls for a finishing step."""
         rng = np.random.default_rng([self.seed, step, 3])
-        return finish.random_values(rng, self.controls()["gamma"], self.model, self.parameters.finish_alone)
+        return finish.random_values(rng, self.controls["gamma"], self.model, self.parameters.finish_alone)
 
     def _progress(self, step: int) -> float:
         """Return the fraction of a run of all levels that is complete before a step."""
@@ -261,7 +241,7 @@ class Method(method.Method[FlodParameters, Drawing]):
         max_size = finish.FINE_PIXELS * data.median_depth / data.focal
         fine = [number for number in levels if 0 < self.s_min[number - 1] <= max_size]
         if fine:
-            gamma = self.controls()["gamma"]
+            gamma = self.controls["gamma"]
             levels |= finish.restart_levels(levels, fine, self.s_min, data, p, gamma, self.backend)
         self.model = finish.join_levels(levels, finish.learning_rates(p, data.extent, 0.0))
         self.completed = {}
@@ -281,6 +261,20 @@ class Method(method.Method[FlodParameters, Drawing]):
     def load_state_dict(self, state: dict) -> None:
         super().load_state_dict(state)
         self.completed = state.get("kept", {})
+
+
+def initial_gamma(pixels: float) -> float:
+    """Return the gamma at which the finest level reaches as far as the paper's, in median depths.
+
+    d_proj(l) = s_min(l) / gamma * f (Eq. 8) falls with s_min. With a fixed gamma, the finest level of a
+    smaller footprint, or of more levels, would never be drawn. The maximum is the paper's value, one pixel,
+    so that coarse levels do not appear at distances where their lack of detail is visible.
+
+    Args:
+        pixels: minimum size of the level before the finest, in pixels at the median depth.
+    """
+    value = max(min(pixels / PAPER_REACH, 1.0), all_controls()["gamma"].low)
+    return float(f"{value:.6g}")  # Blender stores as many digits
 
 
 def well_separated(means: torch.Tensor, distance: float) -> torch.Tensor:

@@ -5,17 +5,16 @@ from itertools import pairwise
 
 from ...errors import LodgsError
 from ...optimize.method_info import MethodInfo
-from ...optimize.parameters import PAPER, STANDARD
+from ...optimize.parameters import PAPER, STANDARD, SplatParameters
 from ...settings import setting
 from ...splats.levels import MAX_LEVELS
-from ..threedgs import ThreedgsParameters
 
 ROUNDS = (0.2, 0.6, 1.0)
 """Fractions of the pruning threshold in the rounds that prune and tune a level (LODGE, A.2)."""
 
 
 @dataclass(frozen=True)
-class LodgeParameters(ThreedgsParameters):
+class LodgeParameters(SplatParameters):
     """Parameters of LODGE.
 
     Without a base, ``steps`` train the finest level by 3DGS. Tuples have one entry per level, coarse to fine.

@@ -7,6 +7,8 @@ steps. The last steps compute the splat sets of chunks, one per step.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 
@@ -18,13 +20,13 @@ from ...optimize.density_control import require_rows
 from ...optimize.method import Drawing, StepResult
 from ...optimize.model import NAMES
 from ...optimize.pruning import importance_threshold, log_scale_gain
+from ...optimize.refining import RefiningMethod
 from ...optimize.training_data import TrainingView
 from ...rasterize import Gaussians, photometric_loss
 from ...scenes.cameras import pick_evenly
 from ...splats.gaussians import Splats
 from ...splats.levels import Level
 from ...splats.ply import Columns
-from ..threedgs.refining import RefiningMethod
 from . import ROUNDS, LodgeParameters, chunks
 from .composite import (
     IndexedLevel,
@@ -63,6 +65,8 @@ class Method(RefiningMethod):
                 "Cannot train a single level: the base already is that level.", "Set levels to 2 or more."
             )
         super().setup(base)
+        self.levels = p.levels
+        self.background.end = self.finest_steps  # the finest level already prevents a fit to the background
         self.d_l = {p.levels: 0.0}
         self.finished: dict[int, IndexedLevel] = {}
         self.costs: list[dict] = []
@@ -79,10 +83,6 @@ class Method(RefiningMethod):
     def tuned_steps(self) -> int:
         """Number of steps before the chunks."""
         return self.finest_steps + self.parameters.base_steps
-
-    @property
-    def levels(self) -> int:
-        return self.parameters.levels
 
     def level_at(self, step: int) -> int:
         if step < self.finest_steps:
@@ -138,18 +138,18 @@ class Method(RefiningMethod):
         single = self.refines(step) and self._renders_single(step)
         return self._distance_ratio(self.level_at(step)) if single else super().shrink(step)
 
-    def choose_view(self, step: int) -> TrainingView:
+    def begin_step(self, step: int) -> StepResult | None:
+        """Compute a chunk, or prune the level if a round begins."""
+        if step >= self.tuned_steps:
+            return self._chunk_step(step)
         if step >= self.finest_steps and self._level_step(step) % self.parameters.tune_steps == 0:
             self.begin_round(step)
-        return super().choose_view(step)
+        return None
 
-    def planned_view(self, step: int) -> tuple[int, float] | None:
-        return super().planned_view(step) if step < self.tuned_steps else None
+    def view_index(self, step: int) -> int | None:
+        return super().view_index(step) if step < self.tuned_steps else None
 
-    def train_step(self, step: int) -> StepResult:
-        return super().train_step(step) if step < self.tuned_steps else self._chunk_step(step)
-
-    def draw(self, view: TrainingView, step: int) -> list[Drawing]:
+    def draw(self, view: TrainingView, step: int) -> Sequence[Drawing]:
         if step < self.finest_steps:
             return super().draw(view, step)
         number, near = self.level_at(step), self.data.near
@@ -161,18 +161,15 @@ class Method(RefiningMethod):
             scale = 1 / rng.uniform(1 - spread, 1 + spread)
             rows = visible_rows({**self.finished, number: level}, self.d_l, view.camera, near, scale)
         trained_rows = torch.from_numpy(rows[number]).long().to(self.device)
-        parts = [smooth(self.select_rows(trained_rows), self._std(self.d_l[number]))]
+        optimizer = self.select_rows(trained_rows)
+        parts = [smooth(optimizer.gaussians, self._std(self.d_l[number]))]
         if len(rows) > 1:
             parts.insert(
                 0,
                 gather_rows(self.finished, {n: level_rows for n, level_rows in rows.items() if n != number}),
             )
         rendering = self.rasterize_model(view.camera, step, gaussians=Gaussians.concatenated(parts))
-        return [Drawing(rendering)]
-
-    def background(self, step: int) -> tuple[float, float, float]:
-        """Return black for coarser levels; the finest level already prevents a fit to the background."""
-        return super().background(step) if step < self.finest_steps else (0.0, 0.0, 0.0)
+        return [Drawing(rendering, optimizer=optimizer)]
 
     # -- levels ----------------------------------------------------------------------------------------
 

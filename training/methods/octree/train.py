@@ -7,13 +7,15 @@ rounded in training.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 
 from ...lod.rules.octree import BIAS
 from ...optimize import method
+from ...optimize.anchors import growing
+from ...optimize.anchors.parameters import OctreeParameters
 from ...optimize.density_control import require_rows, sample_gaussians
 from ...optimize.initialize import from_points
 from ...optimize.method import Drawing
@@ -25,7 +27,6 @@ from ...rasterize.rendering import ALPHA_MIN
 from ...scenes.cameras import Camera
 from ...splats.gaussians import Splats
 from ...splats.levels import Level
-from . import OctreeParameters, growing
 
 MARGIN = "margin"
 """Column that marks margin splats."""
@@ -41,8 +42,10 @@ class Method(method.Method[OctreeParameters, Drawing]):
     def setup(self, base: Splats | None) -> None:
         p = self.parameters
         self.schedule, points, colors, level = growing.create_anchors(
-            self.data, p, self.seed, self.growth_limit(0)
+            self.data, p, self.seed, p.growth_limit(p.max_splats)
         )
+        self.levels = self.schedule.tree.levels
+        self.facts = self.schedule.tree.facts()
         tensors = from_points(points, colors, p.sh_degree, self.device)
         tensors["log_scales"] = growing.log_spacing(points, level, columns=3).to(self.device)
         zeros = torch.zeros(len(points), device=self.device)
@@ -50,10 +53,6 @@ class Method(method.Method[OctreeParameters, Drawing]):
         columns = {"level": levels, "bias": zeros, MARGIN: torch.zeros_like(levels, dtype=torch.bool)}
         self._rates = splat_rates(p, self.data.extent)
         self.model = Model(tensors, self._rates, columns, stats={"opacity_sum": zeros.clone()})
-
-    @property
-    def levels(self) -> int:
-        return self.schedule.tree.levels
 
     def level_at(self, step: int) -> int:
         return self.schedule.level_at(step)
@@ -66,9 +65,6 @@ class Method(method.Method[OctreeParameters, Drawing]):
         splats.extras |= {"lod_level": level.astype(np.uint8), BIAS: self.model.columns["bias"].cpu().numpy()}
         return [Level(number, splats.select(level == number)) for number in range(1, self.levels + 1)]
 
-    def facts(self) -> dict[str, float]:
-        return self.schedule.tree.facts()
-
     def meta(self) -> dict:
         tree = self.schedule.tree
         return {"voxel": tree.voxel, **super().meta()}
@@ -78,12 +74,9 @@ class Method(method.Method[OctreeParameters, Drawing]):
     def shrink(self, step: int) -> float:
         return self.schedule.shrink(step)
 
-    def draw(self, view: TrainingView, step: int) -> list[Drawing]:
-        return [Drawing(self.rasterize_model(view.camera, step, *self.render_weights(view, step)))]
-
     def render_weights(self, view: TrainingView, step: int) -> tuple[torch.Tensor | None, float]:
         weights = self.schedule.weights(view.camera, self.model, step, full=view.shrink == 1)
-        dropout = self.dropout_weights(step, step / self.parameters.steps)
+        dropout = self.dropout.weights(len(weights), step, step / self.parameters.steps)
         return (weights if dropout is None else weights * dropout), 0.0
 
     def allows_device_step(self, step: int) -> bool:
@@ -101,13 +94,6 @@ class Method(method.Method[OctreeParameters, Drawing]):
         scales = self.model["log_scales"][drawn].exp() / self.data.median_depth
         return loss + self.parameters.volume_weight * scales.prod(1).mean()
 
-    def accumulate_stats(self, drawings: Sequence[Drawing], view: TrainingView, step: int) -> None:
-        super().accumulate_stats(drawings, view, step)
-        if self.collects_stats(view, step):
-            opacity = self.model["opacity_logits"].detach().sigmoid()
-            drawn = drawings[0].rendering.radii > 0
-            self.model.stats["opacity_sum"] += torch.where(drawn, opacity, 0)
-
     def set_learning_rates(self, step: int) -> None:
         p, lr = self.parameters, self.schedule.learning_rates(self._rates, step)
         lr["means"] = log_linear(p.lr_means, p.lr_means_final, step / p.steps) * self.data.extent
@@ -121,13 +107,13 @@ class Method(method.Method[OctreeParameters, Drawing]):
         if self.schedule.reassigns_after(step):
             self.reassign_levels(step)
 
-    def adds_margins(self, step: int) -> bool:
-        return self.schedule.is_growing(step) and not self.schedule.is_growing(step + 1)
-
-    def append_margins(self, rows: Mapping[str, torch.Tensor], step: int) -> None:
-        """Add margin splats to the coarsest level, for all distances."""
-        ones = torch.ones_like(rows["opacity_logits"])
-        super().append_margins({**rows, "level": ones, MARGIN: ones.bool()}, step)
+    def add_margins(self, step: int) -> None:
+        """Add margins to the coarsest level, for all distances, when growth ends."""
+        if self.schedule.is_growing(step) and not self.schedule.is_growing(step + 1):
+            room = self.parameters.margin_room(self.parameters.max_splats)
+            rows = vars(self.margins.extend(self.model.gaussians, room))
+            ones = torch.ones_like(rows["opacity_logits"])
+            self.model.append({**rows, "level": ones, MARGIN: ones.bool()})
 
     # -- anchors ---------------------------------------------------------------------------------------
 
@@ -147,7 +133,7 @@ class Method(method.Method[OctreeParameters, Drawing]):
         rows["log_scales"] -= float(np.log(1.6))
         rows["opacity_logits"].clamp_max_(growing.MAX_NEW_LOGIT)
         rows |= {"level": level, "bias": model.columns["bias"][source]}
-        rows = growing.limit_growth(self.schedule, model, rows, step, self.growth_limit(step))
+        rows = growing.limit_growth(self.schedule, model, rows, step, p.growth_limit(p.max_splats))
 
         opacity = model.read("opacity_logits").sigmoid()
         faint = model.read("opacity_sum") < p.min_opacity * model.read("seen")

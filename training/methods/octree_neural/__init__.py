@@ -3,10 +3,10 @@
 from dataclasses import dataclass, replace
 
 from ...errors import LodgsError
+from ...optimize.anchors.parameters import OctreeParameters
 from ...optimize.method_info import MethodInfo
 from ...optimize.parameters import AS_PUBLISHED
 from ...settings import setting
-from ..octree import OctreeParameters
 
 
 @dataclass(frozen=True)

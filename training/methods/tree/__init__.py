@@ -3,13 +3,12 @@
 from dataclasses import dataclass, replace
 
 from ...optimize.method_info import MethodInfo
-from ...optimize.parameters import PAPER, STANDARD
+from ...optimize.parameters import PAPER, STANDARD, SplatParameters
 from ...settings import setting
-from ..threedgs import ThreedgsParameters
 
 
 @dataclass(frozen=True)
-class TreeParameters(ThreedgsParameters):
+class TreeParameters(SplatParameters):
     """Parameters of A LoD of Gaussians.
 
     Without a base, the first ``steps`` train the leaves by 3DGS; the schedules of 3DGS span all steps.

@@ -22,15 +22,15 @@ from ...lod.tree.shape import LEAVES, leaf_only_columns
 from ...optimize.initialize import from_splats
 from ...optimize.method import Drawing, StepResult
 from ...optimize.out_of_core.view_order import ViewOrder
+from ...optimize.refining import RefiningMethod
 from ...optimize.schedules import due
+from ...optimize.splat_method import SplatMethod
 from ...optimize.training_data import TrainingView
-from ...rasterize import Gaussians, Rendering, records
+from ...rasterize import Rendering, records
 from ...rasterize.adam import LearningRate
 from ...splats.gaussians import SplatRows
 from ...splats.levels import Level
 from ...splats.ply import Columns
-from ..threedgs import train as threedgs_train
-from ..threedgs.refining import RefiningMethod
 from . import TreeParameters
 from .build import ForestBuilder
 from .density import TreeDensityControl
@@ -106,6 +106,8 @@ class Method(RefiningMethod):
         super().setup(None if base is None else base.select(slice(0, 0)))
         # density control and margins belong to the 3DGS steps only
         self._densify_until = min(self._densify_until, self.finest_steps)
+        self.levels = LEAVES
+        self.controls = {"pixels": self.parameters.pixels}  # render with the granularity of training
         self.store: NodeStore | None = None
         self._base = base
         self._table: Columns = {}
@@ -119,10 +121,6 @@ class Method(RefiningMethod):
     @property
     def steps(self) -> int:
         return self.finest_steps + self.parameters.base_steps
-
-    @property
-    def levels(self) -> int:
-        return LEAVES
 
     @property
     def splats(self) -> int:
@@ -159,47 +157,40 @@ class Method(RefiningMethod):
             return {}
         return {BLOCKS: self._table or build_levels(self.store, self.data.scratch)[1]}
 
-    def controls(self) -> dict[str, float]:
-        """Initialize the granularity in rendering to that of training."""
-        return {"pixels": self.parameters.pixels}
-
     # -- steps -----------------------------------------------------------------------------------------
 
     @cached_property
     def _view_order(self) -> ViewOrder:
         return ViewOrder(np.array([camera.center for camera in self.data.train]), self.seed)
 
-    def view_index(self, step: int) -> int:
+    def view_index(self, step: int) -> int | None:
         """Choose a training view; in steps on cuts, consecutive views are mostly close to each other."""
         if not self.refines(step):
             return super().view_index(step)
         return self._view_order(step - self.finest_steps)
 
-    def train_step(self, step: int) -> StepResult:
+    def begin_step(self, step: int) -> StepResult | None:
+        """Build the tree, or update the sizes of its nodes if due."""
         if step == self.finest_steps:
             return self._build_step(step)
-        if step < self.finest_steps:
-            return super().train_step(step)
-        assert self.store is not None
-        if due(self.parameters.resize_interval, step - self.finest_steps):
+        if self.store is not None and due(self.parameters.resize_interval, step - self.finest_steps):
             self.store.update_sizes()
-        arguments = super().train_step(step)
-        self.store.cache.end_step(step - self.finest_steps)
-        return arguments
+        return None
 
     def set_learning_rates(self, step: int) -> None:
         if self._base is None:
-            threedgs_train.Method.set_learning_rates(self, step)  # the schedule continues
+            SplatMethod.set_learning_rates(self, step)  # the schedule continues
         else:
             super().set_learning_rates(step)
 
-    def draw(self, view: TrainingView, step: int) -> list[Drawing]:
+    def draw(self, view: TrainingView, step: int) -> Sequence[Drawing]:
         if not self.refines(step):
             return super().draw(view, step)
-        gaussians = self._load_cut(view, step, self._pixels(step))
-        return [Drawing(self.rasterize_model(view.camera, step, gaussians=gaussians))]
+        optimizer = self.load_cut(view, step, self._pixels(step))
+        optimizer.rendering = self.rasterize_model(view.camera, step, gaussians=optimizer.gaussians)
+        return [Drawing(optimizer.rendering, optimizer=optimizer)]
 
-    def _load_cut(self, view: TrainingView, step: int, pixels: float) -> Gaussians:
+    def load_cut(self, view: TrainingView, step: int, pixels: float) -> RecordOptimizer:
         """Load the cut of a view for rendering; only its splats take part in the next update."""
         assert self.store is not None
         indices = self.store.load_cut(view.camera, pixels, self.data.near)
@@ -211,19 +202,21 @@ class Method(RefiningMethod):
                 f"{-(-self._reported_budget // 10**6):,} MB."
             )
         rate_factors, number = self._rate_factors(indices, step), step + 1 - self.finest_steps
-        self._optimizer = RecordOptimizer(self.store, indices, self.model.lr, rate_factors, number)
-        return self._optimizer.gaussians
-
-    def accumulate_stats(self, drawings: Sequence[Drawing], view: TrainingView, step: int) -> None:
-        super().accumulate_stats(drawings, view, step)
-        if isinstance(self._optimizer, RecordOptimizer):
-            self._optimizer.rendering = drawings[0].rendering
+        return RecordOptimizer(self.store, indices, self.model.lr, rate_factors, number)
 
     def control_density(self, step: int) -> None:
         super().control_density(step)
         p, done = self.parameters, step - self.finest_steps
-        if self.store is None or done > p.grow_until * p.tune_steps or not due(p.grow_interval, done):
+        if self.store is None:
             return
+        if done <= p.grow_until * p.tune_steps and due(p.grow_interval, done):
+            self._rebuild_store(done)
+        self.store.cache.end_step(done)
+
+    def _rebuild_store(self, done: int) -> None:
+        """Replace the store by one of the tree after density control."""
+        assert self.store is not None
+        p = self.parameters
         control = TreeDensityControl(
             self.store,
             threshold=p.max_threshold * self.data.threshold_scale,
@@ -250,12 +243,12 @@ class Method(RefiningMethod):
             self.model = self.new_model(no_splats)
             self.store.fill(ForestBuilder(leaves))
         view = self.choose_view(step)
-        gaussians = self._load_cut(view, step, self.parameters.pixels)
+        gaussians = self.load_cut(view, step, self.parameters.pixels).gaussians
         rendering = self.rasterize_model(view.camera, step, gaussians=gaussians)
         loss = self.loss([Drawing(rendering)], view, step)
         return StepResult(
             float(loss),
-            partial(self.composite_over_black, rendering.image, rendering.alpha, step),
+            partial(self.background.remove, rendering.image, rendering.alpha, step),
             view.target,
         )
 

@@ -30,7 +30,7 @@ def trained(clod, until=None):
 
 
 def bundle_of(clod, levels) -> Bundle:
-    return Bundle("clod", levels, "decay", clod.facts())
+    return Bundle("clod", levels, "decay", clod.facts)
 
 
 def test_steps_before_decay_equal_3dgs(data):
@@ -55,7 +55,7 @@ def test_training_weights_equal_rule(data):
         falloff, _, drawn = clod.attenuate(camera, s_v)
         opacity = clod.model["opacity_logits"].sigmoid()
         columns = {"sigma_d": clod.sigma.detach().numpy(), "opacity": opacity.detach().numpy()}
-        facts = collect_facts(rule, clod.facts(), [(1, {})], 1)
+        facts = collect_facts(rule, clod.facts, [(1, {})], 1)
         means = clod.model["means"].detach().numpy()
         values = {"s_v": s_v, "at_most": 0}
         expected = rule.weights(means, camera.center, camera.focal, columns, facts, values)
@@ -137,7 +137,7 @@ def test_reference_distance(data):
     clod = make(data, reference_quantile=0.9)
     assert clod.reference == pytest.approx(np.quantile(np.concatenate(visible), 0.9), rel=1e-5)
     published = make(data, reference_quantile=0.0)
-    assert published.facts()["reference"] == 0
+    assert published.facts["reference"] == 0
     assert published.normalized_distances(data.train[0]).max() == pytest.approx(1)
 
 
@@ -153,7 +153,7 @@ def test_prefixes_are_coarser_and_counts_fall_with_scale(data):
     assert counts[0] > counts[1] > counts[2] > 0
     mean = np.zeros(len(level.splats))
     for view in data.train:
-        rule, facts = rules()["decay"], collect_facts(rules()["decay"], clod.facts(), [(1, {})], 1)
+        rule, facts = rules()["decay"], collect_facts(rules()["decay"], clod.facts, [(1, {})], 1)
         opacity = 1 / (1 + np.exp(-level.splats.opacity_logits))
         columns = {"sigma_d": level.splats.extras["sigma_d"], "opacity": opacity}
         values = {"s_v": 1.0, "at_most": 0}

@@ -50,7 +50,7 @@ def test_absolute_minimum_size_is_used(data):
 def test_finest_level_reach_is_independent_of_footprint(data, values):
     """In the paper: 40 pixels at the median depth, a ratio of 4 between levels, gamma 1 (Eq. 3, 8)."""
     flod = make(data, **({"levels": 5, "steps": 6, "footprint": 16.0} | values))
-    (gamma,) = flod.controls().values()
+    (gamma,) = flod.controls.values()
     reach = flod.s_min[-2] / gamma * data.focal / data.median_depth
     assert reach == pytest.approx(40 / 4**3, rel=1e-5)
 
@@ -58,14 +58,14 @@ def test_finest_level_reach_is_independent_of_footprint(data, values):
 def test_gamma_of_presets(data):
     for preset, gamma in (("draft", 0.4), ("standard", 0.4), ("paper", 1.0)):
         flod = Method(data, METHOD.preset(preset), seed=0, backend="cpu")
-        assert flod.controls() == {"gamma": pytest.approx(gamma, rel=1e-5)}
+        assert flod.controls == {"gamma": pytest.approx(gamma, rel=1e-5)}
 
 
 @pytest.mark.parametrize("s_min_1, expected", [(1e-9, 0.01), (1e9, 1)])
 def test_gamma_is_clamped(data, s_min_1, expected):
-    assert make(data, s_min_1=s_min_1).controls() == {"gamma": expected}
+    assert make(data, s_min_1=s_min_1).controls == {"gamma": expected}
     assert all_controls()["gamma"].validate(expected) == expected
-    assert make(data, levels=1, steps=[4]).controls() == {}
+    assert make(data, levels=1, steps=[4]).controls == {}
 
 
 @pytest.mark.slow
@@ -265,7 +265,7 @@ def test_enlarged_splats_become_fainter(data):
     finest["log_scales"] -= torch.tensor([6.0, 5.0, 7.0])
     for antialias in (True, False):
         p = replace(flod.parameters, antialias=antialias)
-        anew = finish.restart_levels(levels, [1, 2], flod.s_min, data, p, flod.controls()["gamma"], "cpu")[2]
+        anew = finish.restart_levels(levels, [1, 2], flod.s_min, data, p, flod.controls["gamma"], "cpu")[2]
         places = {tuple(mean): row for row, mean in enumerate(finest["means"].tolist())}
         rows = [places[tuple(mean)] for mean in anew["means"].tolist()]
         own, raised = finest["log_scales"][rows].exp().numpy(), anew["log_scales"].exp().numpy()
@@ -287,7 +287,7 @@ def test_views_by_distance_respect_drawn_limit(data, drawn):
     levels = finish.split_levels(flod.model, flod.s_min)
     bundle, by_distance, finest = Bundle("flod", levels, "bands"), 0, 0
     for camera in data.train:
-        values = resolve_controls(bundle, flod.controls())
+        values = resolve_controls(bundle, flod.controls)
         shown, _ = select(bundle, camera.center, camera.focal, values)
         by_distance += camera.sees(shown.means, data.near).sum()
         finest += camera.sees(handed[-1].splats.means, data.near).sum()
@@ -302,7 +302,7 @@ def test_finishing_steps_render_rule_selection(data, alone):
         view, values = flod.choose_view(step), flod._finishing_values(step)
         assert (values["first"] == values["last"]) == bool(alone)
         visible.add(values["gamma"])
-        assert 1 / 1.3 <= values["gamma"] / flod.controls()["gamma"] <= 1.3
+        assert 1 / 1.3 <= values["gamma"] / flod.controls["gamma"] <= 1.3
         splats, weights = select(bundle, view.camera.center, view.camera.focal, values)
         with torch.no_grad():
             drawn = flod.draw(view, step)[0].rendering.image
@@ -382,7 +382,7 @@ def test_coarse_levels_alone_equal_full_run(data):
             alone = levels.pop(0)
             assert (alone.number, alone.facts) == (level.number, level.facts)
             assert_same(alone.splats, level.splats)
-    assert not levels and coarse.controls() == full_run.controls()
+    assert not levels and coarse.controls == full_run.controls
 
 
 def test_fine_levels_continue_from_coarse_level(data):

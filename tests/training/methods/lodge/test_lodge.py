@@ -14,8 +14,8 @@ from training.methods import create, method_info
 from training.methods.lodge import LodgeParameters
 from training.methods.lodge.composite import IndexedLevel, LevelStack, gather_rows, visible_rows
 from training.methods.lodge.thresholds import CANDIDATES, MAX_CURVES, Thresholds
-from training.methods.threedgs.train import PRUNE_AT
 from training.optimize.parameters import override
+from training.optimize.splat_method import PRUNE_AT
 from training.rasterize import Gaussians, contributions, rasterize
 from training.scenes.cameras import Camera
 from training.splats.bundle import read_bundle, write_bundle

@@ -51,12 +51,12 @@ def test_half_size_image_needs_one_level_less(data):
 
 
 def test_image_size_matches_joined_levels(data, monkeypatch):
-    monkeypatch.setattr("training.methods.octree.schedule.MIN_SIDE", 4)
+    monkeypatch.setattr("training.optimize.anchors.schedule.MIN_SIDE", 4)
     octree = make(data, levels=4, steps=400, coarse_share=0.5, far_share=1e-9)
     schedule = octree.schedule
     assert [schedule.join_steps[2:], schedule.shrink(0)] == [[95, 158], 4]  # two of four levels: two halvings
     assert [schedule.shrink(step) for step in (94, 95, 157, 158, 399)] == [4, 2, 2, 1, 1]
-    monkeypatch.setattr("training.methods.octree.schedule.MIN_SIDE", 20)  # of 48 pixels: one halving at most
+    monkeypatch.setattr("training.optimize.anchors.schedule.MIN_SIDE", 20)  # of 48 pixels: one halving
     assert schedule.shrink(0) == 2
     assert make(data, levels=4, steps=400, coarse_share=0.5, far_share=0.0).schedule.shrink(0) == 1
 
@@ -89,7 +89,7 @@ def test_gradients_are_independent_of_image_size(data, monkeypatch):
 def test_random_far_and_full_steps(data, monkeypatch):
     octree = make(data, far_share=0.5, full_share=0.5, steps=400, coarse_share=0.0)
     assert {octree.schedule.shrink(step) for step in range(400)} == {1}  # half of 48 pixels would be too few
-    monkeypatch.setattr("training.methods.octree.schedule.MIN_SIDE", 12)
+    monkeypatch.setattr("training.optimize.anchors.schedule.MIN_SIDE", 12)
     shrink_factors = np.array([octree.schedule.shrink(step) for step in range(400)])
     assert set(shrink_factors) == {1, 2, 4}
     assert 0.4 < (shrink_factors == 1).mean() < 0.6
@@ -230,7 +230,7 @@ def test_splats_of_low_weight_are_pruned(data, far_share, monkeypatch):
     """The reference renders weights as features, one column per splat. Coarse splats hidden by finer ones
     count for distant views.
     """
-    monkeypatch.setattr("training.methods.octree.schedule.MIN_SIDE", 12)
+    monkeypatch.setattr("training.optimize.anchors.schedule.MIN_SIDE", 12)
     octree = make(data, far_share=far_share, least_weight=0.3)
     octree.model["opacity_logits"].data.fill_(2.0)
     model, level, largest = octree.model, octree.model.columns["level"], torch.zeros(len(octree.model))

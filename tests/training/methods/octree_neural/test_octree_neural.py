@@ -11,6 +11,7 @@ from training.methods.octree_neural.train import Method
 from training.optimize.parameters import override
 from training.rasterize import Gaussians, contributions, rasterize
 from training.runs.arrays import read_arrays
+from training.scenes.cameras import Camera
 
 
 def make(data, **values) -> Method:
@@ -49,9 +50,9 @@ def test_decoding_matches_papers(data, changes):
     direct = method.parameters.direct
     if direct:
         method.model["looks"].data[:, 1::2, 0] = -30
-    counts = method.decode(camera, torch.arange(len(method.model))).anchor.bincount()
+    counts = method.decoder.decode(method.model, camera, torch.arange(len(method.model))).anchor.bincount()
     anchor = int((counts == 2).nonzero()[0])
-    g = method.decode(camera, torch.tensor([anchor]))
+    g = method.decoder.decode(method.model, camera, torch.tensor([anchor]))
     tensors = method.model.adam.tensors
     model = {name: tensor.detach()[anchor].double().numpy() for name, tensor in tensors.items()}
     direction = model["means"] - camera.center
@@ -89,10 +90,9 @@ def test_anchors_reaching_into_the_image_are_visible(data):
     beside = 0
     for camera in data.train:
         camera = replace(camera, fx=8 * camera.fx, fy=8 * camera.fy)  # a narrow view
-        visible = method.visible_anchors(camera, torch.ones(len(method.model)))
+        visible = method.decoder.visible_anchors(method.model, camera, torch.ones(len(method.model)))
         with torch.no_grad():
-            all_of_it = method.rasterize_decoded(method.decode(camera, everything), camera).image
-            drawn = method.rasterize_decoded(method.decode(camera, visible), camera).image
+            all_of_it, drawn = (draw_anchors(method, camera, anchors) for anchors in (everything, visible))
         assert (drawn - all_of_it).abs().max() < 1e-5
         local = method.model["means"][visible].detach().numpy() @ camera.world_to_camera[:3, :3].T
         x, _, z = (local + camera.world_to_camera[:3, 3]).T
@@ -107,7 +107,7 @@ def test_gaussians_of_low_weight_are_disabled(data):
     method.schedule.join_steps = [0] * len(method.schedule.join_steps)
     largest = torch.zeros_like(method.model.stats["seen"])
     for view, camera in enumerate(data.train):
-        g = method.decode(camera, method.drawn_anchors(camera), view)
+        g = method.decoder.decode(method.model, camera, method.drawn_anchors(camera), view)
         actual = contributions(g.gaussians(), [camera], near=data.near, backend="reference").largest
         largest[g.anchor, g.offset_index] = torch.maximum(largest[g.anchor, g.offset_index], actual)
     stay = (largest >= 0.1).any(1)
@@ -127,7 +127,7 @@ def test_anchors_without_gaussians_are_removed(data, monkeypatch):
     drawings[0].rendering.grad2d = torch.zeros(len(drawings[0].rendering.radii), 2)
     unseen = 5 - int((drawings[0].anchors < 5).sum())
     initial = len(method.model)
-    method.accumulate_stats(drawings, view, 0)
+    drawings[0].accumulate_stats(method.model, view.shrink)
     method.grow(20)
     assert unseen < 5
     assert len(method.model) == initial - 5 + unseen
@@ -135,6 +135,11 @@ def test_anchors_without_gaussians_are_removed(data, monkeypatch):
 
 def draw(splats, camera, data):
     return rasterize(Gaussians.of(splats), camera, near=data.near).image
+
+
+def draw_anchors(method: Method, camera: Camera, anchors: torch.Tensor) -> torch.Tensor:
+    """Return the networks' image of these anchors."""
+    return method.decoder.rasterize(method.decoder.decode(method.model, camera, anchors), camera).image
 
 
 def drawn_in_training(method: Method) -> torch.Tensor:
@@ -158,9 +163,7 @@ def test_baking_is_exact_without_view_dependence(data, appearance):
     baked = method.bake()
     for camera in (data.train[0], data.test[0]):
         with torch.no_grad():
-            everything = method.rasterize_decoded(
-                method.decode(camera, drawn_in_training(method)), camera
-            ).image
+            everything = draw_anchors(method, camera, drawn_in_training(method))
         assert everything.max() > 0.2
         assert (draw(baked, camera, data) - everything).abs().max() < 1e-3
 
@@ -175,7 +178,7 @@ def test_baking_uses_the_median_view(data):
             continue
         far = [float((means[anchor] - torch.as_tensor(c.center).float()).norm()) for c in visible]
         camera = visible[int(np.argsort(far)[(len(far) - 1) // 2])]
-        anchors.append(method.decode(camera, torch.tensor([anchor])))
+        anchors.append(method.decoder.decode(method.model, camera, torch.tensor([anchor])))
     opacity = torch.cat([g.opacities for g in anchors]).detach()
     scales = torch.cat([g.scales for g in anchors]).detach()
     np.testing.assert_allclose(1 / (1 + np.exp(-baked.opacity_logits)), opacity, rtol=1e-4)
@@ -195,8 +198,8 @@ def test_baking_fits_harmonics(data):
     baked = method.bake()
     camera = data.test[1]
     with torch.no_grad():
-        g = method.decode(camera, drawn_in_training(method))
-        drawn = method.rasterize_decoded(g, camera).image
+        g = method.decoder.decode(method.model, camera, drawn_in_training(method))
+        drawn = method.decoder.rasterize(g, camera).image
         flat = np.array(baked.sh)
         flat[:, 1:] = 0
     error = (draw(baked, camera, data) - drawn).abs().mean()

@@ -106,10 +106,13 @@ def test_learning_rates_continue_and_start_low_with_base(data, base):
     assert based.model.adam.lr["means"] == pytest.approx(p.lr_means_final * data.extent)
 
 
-def test_margins_are_added_before_the_tree_is_built(data):
+def test_margins_are_added_before_the_tree_is_built(data, monkeypatch):
     """The number of later steps has no influence."""
-    tree = make(data, tune_steps=40, densify_until=0.9)
-    assert [step for step in range(tree.steps) if tree.adds_margins(step)] == [11]
+    tree, steps = make(data, tune_steps=40, densify_until=0.9), []
+    monkeypatch.setattr(tree.model, "append", lambda rows: steps.append(step))
+    for step in range(tree.steps):
+        tree.add_margins(step)
+    assert steps == [11]
 
 
 def test_without_tuning_leaves_equal_the_base(data, base):
@@ -215,7 +218,7 @@ def test_bundle_has_block_table(data, base):
 
 def test_rendering_uses_trained_granularity(data, base):
     tree = make(data, base, tune_steps=0, pixels=3.0)
-    bundle = Bundle("tree", trained(tree), "cut", controls=tree.controls())
+    bundle = Bundle("tree", trained(tree), "cut", controls=tree.controls)
     assert resolve_controls(bundle, {})["pixels"] == 3
 
 

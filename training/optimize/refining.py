@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
 
-from ...lod.blocks import spatial_order
-from ...optimize.initialize import from_splats
-from ...optimize.method import Optimizer
-from ...optimize.training_data import TrainingView
-from ...rasterize import Adam, Gaussians
-from ...splats.gaussians import Splats
-from . import train as threedgs_train
+from ..lod.blocks import spatial_order
+from ..rasterize import Adam, Gaussians
+from ..splats.gaussians import Splats
+from .initialize import from_splats
+from .splat_method import SplatMethod
+from .training_data import TrainingView
 
 
 class RowOptimizer:
@@ -23,21 +21,24 @@ class RowOptimizer:
         adam: optimizer of all rows.
         rows: (M,) int64 indices of the rows.
         leaves: their values by name, the leaves of the image's gradient graph.
+
+    Attributes:
+        gaussians: the rows as splats, for rendering.
     """
 
     def __init__(self, adam: Adam, rows: torch.Tensor, leaves: dict[str, torch.Tensor]) -> None:
         self._adam, self._rows, self._leaves = adam, rows, leaves
+        self.gaussians = Gaussians(**leaves)
 
     def step(self) -> None:
         """Update these rows by one step."""
         self._adam.step_rows(self._rows, {name: leaf.grad for name, leaf in self._leaves.items()})
 
     def zero_grad(self) -> None:
-        """Drop the rows with their gradients; the next image has other rows."""
-        self._leaves = {}
+        """Do nothing; the next image has other rows."""
 
 
-class RefiningMethod(threedgs_train.Method):
+class RefiningMethod(SplatMethod):
     """3DGS steps, none with a base, followed by steps that refine only the rendered rows.
 
     Subclasses define the images of the refining steps and control density in them; the rules of 3DGS do not
@@ -50,7 +51,6 @@ class RefiningMethod(threedgs_train.Method):
     def setup(self, base: Splats | None) -> None:
         p = self.parameters
         self.finest_steps = 0 if base is not None else p.steps
-        self._optimizer: Optimizer | None = None
         if base is None:
             super().setup(None)
             return
@@ -60,17 +60,13 @@ class RefiningMethod(threedgs_train.Method):
         self._densify_until = 0
 
     def refines(self, step: int) -> bool:
-        """Return whether a step follows the 3DGS steps."""
+        """Return True if a step follows the 3DGS steps."""
         return step >= self.finest_steps
 
-    def select_rows(self, rows: torch.Tensor) -> Gaussians:
-        """Select (M,) int64 rows for rendering; only they take part in the next update."""
+    def select_rows(self, rows: torch.Tensor) -> RowOptimizer:
+        """Select (M,) int64 rows for rendering. The drawing with this optimizer updates only them."""
         leaves = {name: tensor.requires_grad_() for name, tensor in self.model.read_rows(rows).items()}
-        self._optimizer = RowOptimizer(self.model.adam, rows, leaves)
-        return Gaussians(**leaves)
-
-    def optimizers(self) -> Sequence[Optimizer]:
-        return super().optimizers() if self._optimizer is None else (self._optimizer,)
+        return RowOptimizer(self.model.adam, rows, leaves)
 
     def shrink(self, step: int) -> float:
         return 1 if self.refines(step) else super().shrink(step)

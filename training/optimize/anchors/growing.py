@@ -12,11 +12,12 @@ import numpy as np
 import torch
 
 from ...lod.rules.octree import fade_weights, target_level
-from ...optimize.initialize import drop_duplicates, neighbour_scale
-from ...optimize.model import Model
-from ...optimize.training_data import TrainingData
 from ...scenes.cameras import Camera
-from . import OctreeParameters, tree
+from ..initialize import drop_duplicates, neighbour_scale
+from ..model import Model
+from ..training_data import TrainingData
+from . import anchor_octree
+from .parameters import OctreeParameters
 from .schedule import Schedule
 
 MAX_NEW_LOGIT = float(np.log(0.1 / 0.9))
@@ -37,12 +38,12 @@ def create_anchors(
     p = parameters
     all_points, _ = drop_duplicates(data.full_scene.points, data.full_scene.point_colors)
     points, colors = drop_duplicates(data.scene.points, data.scene.point_colors)
-    octree = tree.build(
+    tree = anchor_octree.build(
         all_points, data.full_train, focal_px=data.focal, footprint=p.footprint,
         quantiles=(p.nearest, p.farthest), levels=p.levels, coarser=p.coarser_levels,
     )  # fmt: skip
-    schedule = Schedule(data, p, seed, octree)
-    level = tree.anchors(points, octree)
+    schedule = Schedule(data, p, seed, tree)
+    level = anchor_octree.anchors(points, tree)
     rows = np.flatnonzero(level > 0)
     rows = rows[needed_by_views(schedule, points[rows], level[rows])]
     if len(rows) > max_anchors:
@@ -54,12 +55,12 @@ def needed_by_views(schedule: Schedule, points: np.ndarray, level: np.ndarray) -
     """Return whether enough views need the level (N,) of a point (N, 3): the pruning of the paper, by
     distance alone.
     """
-    octree, cameras = schedule.tree, schedule.data.train
+    tree, cameras = schedule.tree, schedule.data.train
     view_count = np.zeros(len(points))
     for camera in cameras:
         distances = np.linalg.norm(points - camera.center, axis=1)
-        distances *= octree.focal_px / camera.focal
-        needed = target_level(distances, 0.0, octree.d_max, octree.levels)
+        distances *= tree.focal_px / camera.focal
+        needed = target_level(distances, 0.0, tree.d_max, tree.levels)
         view_count += fade_weights(needed, level) >= 0.5
     return view_count >= max(schedule.parameters.visible_share * len(cameras), 1)
 
@@ -170,8 +171,8 @@ def matching_levels(
     that photos need, and only if a photo needs it, so that images of photos hardly change. Not in the
     paper.
     """
-    p, octree = schedule.parameters, schedule.tree
-    pixel = octree.d_max / octree.focal_px  # at level 1's distance
+    p, tree = schedule.parameters, schedule.tree
+    pixel = tree.d_max / tree.focal_px  # at level 1's distance
     width = log_scales.amax(1).sub(float(np.log(pixel))) / float(np.log(2))
     finer, coarser = (1 + torch.tensor(limit).log2() - width for limit in (p.narrowest, p.widest))
     finer = torch.maximum(level, finer.ceil().clamp_max(min(newest, p.coarser_levels + 1)))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from training.errors import LodgsError
-from training.methods.octree import tree as octree
+from training.optimize.anchors import anchor_octree as octree
 from training.scenes.cameras import Camera
 
 

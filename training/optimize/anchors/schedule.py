@@ -11,12 +11,12 @@ import numpy as np
 import torch
 
 from ...lod.rules.octree import fade_weights, target_level
-from ...optimize.model import Model
-from ...optimize.training_data import TrainingData, TrainingView
 from ...rasterize.adam import LearningRate
 from ...scenes.cameras import Camera
-from . import OctreeParameters
-from .tree import AnchorOctree
+from ..model import Model
+from ..training_data import TrainingData, TrainingView
+from .anchor_octree import AnchorOctree
+from .parameters import OctreeParameters
 
 MIN_SIDE = 32
 """Minimum length of the shorter side of a downscaled photo, in pixels."""

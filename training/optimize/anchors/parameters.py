@@ -1,0 +1,132 @@
+"""Parameters of methods with anchors in an octree. Does not import torch."""
+
+from dataclasses import dataclass
+
+from ...errors import LodgsError
+from ...settings import setting
+from ...splats.levels import MAX_LEVELS
+from ..parameters import Parameters
+
+
+@dataclass(frozen=True)
+class OctreeParameters(Parameters):
+    """Parameters of Octree-GS, shared by explicit and neural anchors."""
+
+    max_splats: int = setting(
+        90_000,
+        "Maximum number of splats of all levels together; levels add up. The five levels of FLoD have "
+        "over 110,000.",
+        above=0,
+    )
+    grad_threshold: float = setting(
+        5e-5, "Mean image-plane gradient (3DGS units) above which anchors grow, at one megapixel."
+    )
+    levels: int = setting(
+        0,
+        "Number of levels (Octree-GS: K). 0 derives it from the range of distances (Eq. 3).",
+        high=MAX_LEVELS,
+    )
+    nearest: float = setting(
+        0.05,
+        "Quantile of the distances between views and points used as the smallest distance (Octree-GS: "
+        "d_min).",
+        high=1,
+    )
+    farthest: float = setting(
+        0.95,
+        "Quantile used as the largest distance (Octree-GS: d_max), beyond which only level 1 is drawn.",
+        high=1,
+    )
+    coarser_levels: int = setting(
+        3, "Additional coarse levels before those of Eq. 3, for views from farther away than any photo."
+    )
+    footprint: float = setting(
+        1.0,
+        "Voxel size in pixels, at the distance where the voxel's level appears.",
+        above=0,
+        unit="px",
+    )
+    narrowest: float = setting(
+        0.8,
+        "Minimum standard deviation of a splat along its longest axis, in pixels at the distance "
+        "where its level appears. Narrower splats move to a finer level, up to the first one after "
+        "'coarser_levels'.",
+        unit="px",
+    )
+    widest: float = setting(
+        26.0,
+        "Maximum standard deviation of a splat along its longest axis, in the same pixels. Wider "
+        "splats move to a coarser level.",
+        above=0,
+        unit="px",
+    )
+    visible_share: float = setting(
+        0.0,
+        "Minimum fraction of the views that need an anchor; others are dropped. Anchors that no view "
+        "needs are always dropped.",
+        high=1,
+    )
+    coarse_share: float = setting(
+        0.25,
+        "Fraction of the steps in which levels join one by one; in these steps anchors also grow into "
+        "the next level.",
+        high=1,
+    )
+    coarse_factor: float = setting(
+        1.5,
+        "Ratio of the steps before a level joins to those before the next one joins (Octree-GS: 1/omega).",
+        above=0,
+    )
+    grow_interval: int = setting(50, "Steps between two growth passes.", above=0, unit="steps")
+    grow_until: float = setting(
+        0.55,
+        "Fraction of the steps in which anchors are added and removed; after it they are only removed "
+        "at the end.",
+        high=1,
+    )
+    least_weight: float = setting(
+        0.02,
+        "Minimum blending weight of a splat in any training view; splats below it are removed when "
+        "growth ends and at the end. 0 keeps all. Not in the paper; from RadSplat.",
+        high=1,
+    )
+    candidates: int = setting(
+        2, "New positions that each splat with a large gradient proposes in a growth pass.", above=0
+    )
+    grow_harder: float = setting(
+        0.2,
+        "Exponent of the gradient threshold: it grows by 2 to this power from level to level, after "
+        "'coarser_levels' (Octree-GS: beta).",
+    )
+    bias_rate: float = setting(
+        0.0025,
+        "Increase of a splat's level bias in each growth pass where its gradient is at least a "
+        "quarter of the threshold.",
+    )
+    far_share: float = setting(
+        0.05,
+        "Fraction of the steps that use a downscaled photo, as if seen from 2, 4, ... times the "
+        "distance. If above 0, all steps before the finest level joins do so too.",
+        high=1,
+    )
+    full_share: float = setting(
+        0.4,
+        "Fraction of the remaining steps that draw all levels at every distance, like a view at full detail.",
+        high=1,
+    )
+    lr_end: float = setting(
+        0.1,
+        "Final learning rates, as a fraction of the initial ones; they fall once growth ends. 1 keeps "
+        "them constant, as in the paper. Positions have their own schedule.",
+        high=1,
+    )
+    volume_weight: float = setting(
+        0.0, "Loss weight of the mean splat volume, with lengths in median depths."
+    )
+
+    def check(self) -> None:
+        if self.nearest >= self.farthest:
+            raise LodgsError(
+                f"'nearest' is {self.nearest}, but must be less than 'farthest', {self.farthest}.",
+                "Give a smaller number.",
+            )

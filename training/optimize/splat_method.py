@@ -1,0 +1,120 @@
+"""3D Gaussian splatting (Kerbl et al. 2023): a single level, and the base class of methods that extend it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+
+from ..rasterize import contributions
+from ..splats.gaussians import Splats
+from ..splats.levels import Level
+from .density_control import densify, peak_scores, prune, require_rows, reset_opacities
+from .initialize import drop_duplicates, from_points, from_splats, sample_points
+from .method import Drawing, Method
+from .model import Model, splat_rates
+from .parameters import SplatParameters
+from .schedules import due, log_linear, shrink_at
+from .training_data import TrainingView
+
+PRUNE_AT = (8 / 30, 16 / 30, 24 / 30)
+"""Fractions of the steps after which splats of low weight are pruned, if enabled."""
+
+
+class SplatMethod(Method[SplatParameters, Drawing]):
+    """Training of a 3DGS model."""
+
+    def setup(self, base: Splats | None) -> None:
+        p, scene = self.parameters, self.data.scene
+        self._from_base = base is not None
+        if base is not None:
+            tensors = from_splats(base, p.sh_degree, self.device)
+        else:
+            points, colors = drop_duplicates(scene.points, scene.point_colors)
+            points, colors = sample_points(points, colors, p.growth_limit(p.max_splats), self.seed)
+            tensors = from_points(points, colors, p.sh_degree, self.device)
+        self.model = self.new_model(tensors)
+        self._densify_until = p.densify_until * self.scheduled_steps
+
+    @property
+    def scheduled_steps(self) -> int:
+        """Number of steps over which learning rates fall and image resolution grows."""
+        return self.parameters.steps
+
+    def new_model(self, tensors: Mapping[str, torch.Tensor]) -> Model:
+        """Create a model with the statistics that the densification criterion needs."""
+        p = self.parameters
+        return Model(tensors, splat_rates(p, self.data.extent), peaks=p.densify_by == "max")
+
+    def levels_after(self, step: int) -> list[Level]:
+        """Return the single level after the last step."""
+        return [Level(1, self.model.splats())] if step + 1 == self.steps else []
+
+    def shrink(self, step: int) -> float:
+        p = self.parameters
+        return shrink_at(step / self.scheduled_steps, p.first_resolution, p.full_resolution)
+
+    def sh_degree(self, step: int) -> int:
+        return self.parameters.sh_degree if self._from_base else super().sh_degree(step)
+
+    def allows_device_step(self, step: int) -> bool:
+        return True
+
+    def render_weights(self, view: TrainingView, step: int) -> tuple[torch.Tensor | None, float]:
+        return self.dropout.weights(len(self.model), step, step / self.scheduled_steps), 0.0
+
+    def collects_stats(self, view: TrainingView, step: int) -> bool:
+        return step < self._densify_until
+
+    def set_learning_rates(self, step: int) -> None:
+        p = self.parameters
+        rate = log_linear(p.lr_means, p.lr_means_final, step / (p.lr_means_steps or self.scheduled_steps))
+        self.model.lr["means"] = rate * self.data.extent
+
+    def control_density(self, step: int) -> None:
+        p, model, completed = self.parameters, self.model, step + 1
+        if p.least_weight and completed in (round(share * p.steps) for share in PRUNE_AT):
+            self.prune_unimportant(step)
+        if completed > self._densify_until:
+            return
+        if due(p.densify_interval, completed) and completed >= p.densify_from:
+            peaks = p.densify_by == "max"
+            densify(
+                model,
+                peak_scores(model) if peaks else model.mean_gradient(),
+                threshold=(p.max_threshold if peaks else p.grad_threshold) * self.data.threshold_scale,
+                clone_below=None if p.long_axis else p.clone_extent * self.data.extent,
+                max_splats=p.growth_limit(p.max_splats),
+                rng=np.random.default_rng([self.seed, step, 1]),
+            )
+            model.reset_stats()
+        if due(p.prune_interval, completed):
+            prune(model, p.min_opacity)
+            require_rows(model, step, "min_opacity")
+        if due(p.opacity_reset_interval, completed):
+            reset_opacities(model)
+
+    @torch.no_grad()
+    def prune_unimportant(self, step: int) -> None:
+        """Remove splats of low weight in all training views, which include the margins (RadSplat)."""
+        p, data = self.parameters, self.data
+        contribution = contributions(
+            self.model.gaussians,
+            (camera.widened(p.margin) for camera in data.train),
+            near=data.near,
+            antialias=p.antialias,
+            backend=self.backend,
+        )
+        self.model.keep(contribution.largest >= p.least_weight)
+        require_rows(self.model, step, "least_weight")
+
+    def add_margins(self, step: int) -> None:
+        """Add margins when densification ends."""
+        if step < self._densify_until <= step + 1:
+            self.model.append(self.margin_rows())
+
+    def margin_rows(self) -> dict[str, torch.Tensor]:
+        """Create margin splats within the budget, as rows of the model."""
+        p = self.parameters
+        return vars(self.margins.extend(self.model.gaussians, p.margin_room(p.max_splats)))
