@@ -24,11 +24,10 @@ from ..scenes.cameras import Camera
 from ..splats.gaussians import SH_C0
 from ..splats.sh import degree_from_count
 from .adam import Adam
-from .features import depths, normals
+from .features import blended_values, name_outputs
 from .gaussians import Gaussians
 from .rendering import (
     OUTPUTS,
-    BackendOutput,
     Contributions,
     KernelCamera,
     RasterSettings,
@@ -101,48 +100,14 @@ def rasterize(
     view = KernelCamera.of(camera, near, window)
     _check_inputs(gaussians, view, weights, antialias, outputs, features, limit)
     gaussians = replace(gaussians, sh=_coefficients(gaussians.sh))
-    means = gaussians.means
-    planes = [name for name in ("depth", "inverse_depth") if name in outputs]
-    blended = [] if features is None else [features]
-    if planes:
-        depth = depths(means, view)[:, None]
-        values = {"depth": depth, "inverse_depth": 1 / depth.clamp_min(view.near or 1e-6)}
-        blended += [values[name] for name in planes]
-    if "normals" in outputs:
-        blended.append(normals(gaussians, view))
     red, green, blue = (float(value) for value in background)
     settings = RasterSettings(
         view, float(min_scale), antialias, (red, green, blue), _degree(gaussians.sh, sh_degree),
         median="median_depth" in outputs, absolute="absgrad2d" in outputs, limit=limit, rows=rows,
     )  # fmt: skip
-    output = _backend(backend, means).rasterize(
-        gaussians, weights, torch.cat(blended, 1) if blended else means.new_zeros(len(means), 0), settings
-    )
-    rendering = _name_outputs(output, outputs, planes, None if features is None else features.shape[1])
-    if output.median is not None:
-        padded = torch.cat([depths(means, view), means.new_zeros(1)])  # index -1 selects the zero
-        rendering.median_depth = padded[output.median.long()]
-    return rendering
-
-
-def _name_outputs(
-    output: BackendOutput, outputs: Collection[str], planes: Sequence[str], feature_count: int | None
-) -> Rendering:
-    """Split the blended features into caller features, depth planes and normals."""
-    rendering = Rendering(
-        output.image, output.alpha, output.radii, output.grad2d, output.tile_counts, output.absgrad2d
-    )
-    first = feature_count or 0
-    if feature_count is not None:
-        rendering.features = output.features[..., :first]
-    by_name = dict(zip(planes, output.features[..., first:].unbind(-1), strict=False))
-    if "depth" in outputs:
-        empty = output.alpha == 0
-        rendering.depth = torch.where(empty, 0, by_name["depth"] / output.alpha.masked_fill(empty, 1))
-    rendering.inverse_depth = by_name.get("inverse_depth")
-    if "normals" in outputs:
-        rendering.normals = output.features[..., -3:]
-    return rendering
+    values = blended_values(gaussians, view, outputs, features)
+    output = _backend(backend, gaussians.means).rasterize(gaussians, weights, values, settings)
+    return name_outputs(output, gaussians, view, outputs, None if features is None else features.shape[1])
 
 
 @torch.no_grad()
