@@ -2,26 +2,36 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
+from textwrap import dedent
 
 import pytest
 
+from training.splats.bundle import read_bundle
+
 ROOT = Path(__file__).resolve().parents[2]
 
-METHOD = """
-from dataclasses import replace
-from lodgs.methods.threedgs import METHOD as BASE
 
-METHOD = replace(BASE, name="plugged", number=1000, label="Plugged", about="for tests", rule="plugged")
-"""
-TRAIN = """
-from lodgs.methods.threedgs.train import Method as Base
+def recipe_block(language: str, text: str) -> str:
+    """Return the code block of CONTRIBUTING's recipe "Add a method" that contains a text."""
+    recipe = (
+        (ROOT / "CONTRIBUTING.md")
+        .read_text(encoding="utf-8")
+        .split("\n## Add a method\n")[1]
+        .split("\n## ")[0]
+    )
+    blocks = re.findall(rf"^ *```{language}\n(.*?)^ *```$", recipe, re.DOTALL | re.MULTILINE)
+    (block,) = (dedent(block) for block in blocks if text in block)
+    return block
 
-class Method(Base):
-    pass
-"""
+
+METHOD = recipe_block("python", "METHOD = MethodInfo(")
+TRAIN = recipe_block("python", "class Method(")
+ENTRY_POINT = tomllib.loads(recipe_block("toml", "entry-points"))["project"]["entry-points"]["lodgs.methods"]
 RULE = """
 import numpy as np
 from lodgs.lod.rule import NO_TABLES, Rule
@@ -46,10 +56,10 @@ BROKEN = {
 }
 """Group, module and expected reason of broken plug-ins by name."""
 SOURCES = {
-    "taken_number/__init__.py": METHOD.replace('"plugged", number=1000', '"numbered", number=3'),
-    "taken_name/__init__.py": METHOD.replace('"plugged", n', '"3dgs", n'),
+    "taken_number/__init__.py": METHOD.replace('"mymethod"', '"numbered"').replace("number=1000", "number=3"),
+    "taken_name/__init__.py": METHOD.replace('"mymethod"', '"3dgs"'),
     "no_method/__init__.py": "METHOD = 3",
-    "no_train/__init__.py": METHOD.replace('"plugged", number=1000', '"no_train", number=1001'),
+    "no_train/__init__.py": METHOD.replace('"mymethod"', '"no_train"').replace("number=1000", "number=1001"),
     "crash.py": "1 / 0",
     "no_rule.py": "RULE = None",
     "taken_rule.py": "from lodgs.lod.rules.decay import RULE",
@@ -72,13 +82,13 @@ def install(folder: Path, package: str, entries: str, files: dict[str, str]) -> 
 def run(tmp_path_factory):
     """Return ``run(*arguments)``, which runs Python with a plug-in and broken plug-ins installed."""
     folder = tmp_path_factory.mktemp("site")
-    files = {"plugged/__init__.py": METHOD, "plugged/train.py": TRAIN, "plugged/rule.py": RULE}
-    install(
-        folder,
-        "plugged",
-        "[lodgs.methods]\nplugged = plugged\n[lodgs.rules]\nplugged = plugged.rule\n",
-        files,
+    method = METHOD.replace(
+        "    parameters=MyParameters,", '    parameters=MyParameters,\n    rule="plugged",'
     )
+    files = {"mymethod/__init__.py": method, "mymethod/train.py": TRAIN, "mymethod/rule.py": RULE}
+    ((name, module),) = ENTRY_POINT.items()
+    entries = f"[lodgs.methods]\n{name} = {module}\n[lodgs.rules]\nplugged = mymethod.rule\n"
+    install(folder, "mymethod", entries, files)
     groups = {
         group: "".join(f"{name} = {module}\n" for name, (g, module, _) in BROKEN.items() if g == group)
         for group in ("lodgs.methods", "lodgs.rules")
@@ -99,7 +109,18 @@ def run(tmp_path_factory):
 def test_methods_are_listed_and_broken_plugins_only_warn(run):
     process = run("-m", "training", "methods")
     lines = process.stdout.splitlines()
-    assert lines[-1].split() == ["plugged", "Plugged:", "for", "tests"]
+    assert lines[-1].split() == [
+        "mymethod",
+        "My",
+        "method:",
+        "the",
+        "points",
+        "of",
+        "the",
+        "scene",
+        "as",
+        "splats",
+    ]
     assert [line.split()[0] for line in lines[:-1]].count("3dgs") == 1
     for name, (group, _, reason) in BROKEN.items():
         warning = f"Skipped '{name}' ({group}) of the package broken: "
@@ -128,22 +149,22 @@ def test_restricted_rules_are_unknown(run):
 
 
 @pytest.mark.slow
-def test_method_trains_and_its_rule_selects(run, tiny_scene, tmp_path):
+def test_method_of_the_recipe_trains_and_its_rule_selects(run, tiny_scene, tmp_path):
+    """Training writes a bundle, and rendering by distance uses the rule."""
     process = run(
-        "-m", "training", "train", "--scene", tiny_scene, "--out", tmp_path / "run", "--method", "plugged",
-        "--set", "steps=3", "--image-scale", "1", "--test-every", "0", "--backend", "cpu",
+        "-m", "training", "train", "--scene", tiny_scene, "--out", tmp_path / "run", "--method", "mymethod",
+        "--set", "steps=3", "--set", "interval=2", "--image-scale", "1", "--test-every", "0",
+        "--backend", "cpu",
     )  # fmt: skip
     events = [json.loads(line) for line in process.stdout.splitlines()]
-    assert events[-1]["event"] == "done" and events[0]["method"] == "plugged"
-    render = (
-        "-m",
-        "training",
-        "render",
-        tmp_path / "run",
-        "--view",
-        "00.jpg",
-        "--out",
-        tmp_path / "view.png",
-    )
-    run(*render, "--by-distance")
-    assert (tmp_path / "view.png").stat().st_size > 100
+    assert events[-1]["event"] == "done" and events[0]["method"] == "mymethod"
+    bundle = read_bundle(tmp_path / "run" / "bundle.ply")
+    assert (bundle.method, bundle.rule) == ("mymethod", "plugged")
+    assert [level.number for level in bundle.levels] == [1] and len(bundle.levels[0].splats) > 10
+    view = tmp_path / "view.png"
+    run("-m", "training", "render", tmp_path / "run", "--view", "00.jpg", "--out", view, "--by-distance")
+    assert view.stat().st_size > 100
+
+
+def test_recipe_imports_no_other_method():
+    assert ENTRY_POINT == {"mymethod": "mymethod"} and "lodgs.methods." not in METHOD + TRAIN
