@@ -43,8 +43,8 @@ class ClodDrawing(Drawing):
     Attributes:
         s_v: the scale.
         attenuated: (N,) attenuated opacities.
-        shown: (N,) whether they are above the threshold.
-        inside: (N,) whether the splat's mean is in the image.
+        drawn: (N,) True if they are above the threshold.
+        in_view: (N,) True if the splat's mean is in the image.
     """
 
     s_v: float
@@ -58,7 +58,7 @@ class Method(SplatMethod):
 
     Attributes:
         reference: reference distance in scene units; 0 uses the farthest splat of each view.
-        begins: step at which the decay begins.
+        decay_start: step at which the decay begins.
     """
 
     parameters: ClodParameters

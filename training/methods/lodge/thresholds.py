@@ -58,7 +58,7 @@ class Thresholds:
         Args:
             levels: existing levels by number, finest first.
             d_l: their distances in scene units.
-            most: maximum distance.
+            max_distance: maximum distance.
 
         Returns:
             The distance, and a report: the tried ``distances``, the ``costs`` of each, and the cost

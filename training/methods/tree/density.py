@@ -82,8 +82,8 @@ class TreeDensityControl:
         threshold: minimum score of a leaf to split; the highest scores are split first.
         min_opacity: minimum opacity of a leaf; leaves below it are dead.
         unseen_since: leaves that were in no image since this step, counted from 1, are dead.
-        now: number of completed steps.
-        most: maximum number of leaves of the tree.
+        step: number of completed steps.
+        max_leaves: maximum number of leaves of the tree.
         region: only leaves inside it are split; None for all.
 
     Attributes:

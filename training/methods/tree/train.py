@@ -45,9 +45,9 @@ class RecordOptimizer:
 
     Args:
         store: storage of all records.
-        places: (M,) int64 cache indices of the cut.
+        indices: (M,) int64 cache indices of the cut.
         lr: learning rates by name, as of ``Adam`` at the time of the step.
-        shares: (M,) factors on these rates.
+        rate_factors: (M,) factors on these rates.
         number: number of the step, from 1.
 
     Attributes:

@@ -30,7 +30,7 @@ def create_anchors(
     """Build the octree of a scene and choose the initial points.
 
     Args:
-        most: maximum number of anchors.
+        max_anchors: maximum number of anchors.
 
     Returns:
         The schedule with its tree; points (N, 3), their colours (N, 3) uint8, and their levels (N,).
