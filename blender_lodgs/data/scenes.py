@@ -41,7 +41,7 @@ def set_bundle_facts(root: bpy.types.Object, bundle: Bundle) -> None:
     settings, rule = root.lodgs, check_rule(bundle)
     for control in rule.controls if rule else ():
         control.validate(bundle.controls.get(control.name, control.default))
-    if rule is not None and (rule.always_active or not rule.complete) and settings.rule != bundle.rule:
+    if rule is not None and (rule.weights_full_detail or not rule.complete) and settings.rule != bundle.rule:
         settings.mode = "SELECTIVE"
     settings.method, settings.rule, settings.cumulative = bundle.method, bundle.rule, bundle.cumulative
     settings.facts, settings.meta = json.dumps(bundle.facts), json.dumps(bundle.meta)

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import bpy
 
 from ...training.errors import LodgsError
-from ...training.lod.rules.cut import RULE as CUT
+from ...training.lod.rule import resolve_rule
 from ...training.runs.folder import RunFolder
 from ...training.runs.outcome import run_outcome
 from ...training.splats.bundle import read_header, read_tables
@@ -218,8 +218,9 @@ class Watch:
         self.levels[event["level"]] = event
 
     def _stays_in_file(self, root: bpy.types.Object, event: dict) -> bool:
-        """Return whether a level's tree exceeds the memory budget: about half of its nodes are leaves."""
-        return event.get("rule") == CUT.name and 2 * event["splats"] >= root.lodgs.stream.budget
+        """Return whether a level's scene exceeds the memory budget and is read in pages."""
+        rule = resolve_rule(event.get("rule", ""))
+        return rule.exceeds_budget(event["splats"], root.lodgs.stream.budget)
 
     def _read_level(self, event: dict) -> Level:
         splats = read_ply(self.folder.find_file(event["path"]))

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from ..errors import LodgsError
+from ..lod.rule import resolve_rule
 from ..lod.selection import check_rule
-from ..lod.tree.paging import is_tree
-from ..lod.tree.shape import complete_levels
 from ..splats.bundle import open_bundle, write_bundle
 from ..splats.dialects import Warn, comments_from_meta, ignore, meta_from_comments
 from ..splats.file_rows import DrawableRows
@@ -25,7 +24,7 @@ from ..splats.formats import (
 )
 from ..splats.gaussians import SplatRows, Splats
 from ..splats.level_folder import read_folder, write_folder
-from ..splats.levels import Bundle, Level
+from ..splats.levels import Bundle
 from ..splats.ply import write_ply
 from ..splats.similarity import Similarity
 from .bake_filter import bake_filter
@@ -98,7 +97,7 @@ def edit(
         finest = ConcatenatedRows.of_level(exported, exported.levels[-1].number)
         run_to_end(write_splats(path, finest, exported.meta))
     if folder is not None or streamed is not None:
-        levels = complete_levels(_in_memory(edited)) if is_tree(edited) else edited
+        levels = resolve_rule(edited.rule).complete_levels(edited)
         if folder is not None:
             write_folder(folder, levels)
         if streamed is not None:
@@ -157,11 +156,3 @@ def _write_like(source: Path, bundle: Bundle, out: Path, edited: Bundle) -> None
         write_ply(out, edited.levels[0].rows, comments)
     else:
         write_bundle(out, edited)
-
-
-def _in_memory(bundle: Bundle) -> Bundle:
-    levels = [
-        Level(level.number, level.rows.select(slice(0, len(level.rows))), level.facts)
-        for level in bundle.levels
-    ]
-    return replace(bundle, levels=levels)

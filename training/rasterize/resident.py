@@ -20,9 +20,8 @@ from torch.nn.functional import pad
 
 from ..editing.look import Looks, change_colors
 from ..errors import LodgsError
-from ..lod.blocks import SIZE, spatial_order
-from ..lod.on_disk import CulledReader, open_if_large
-from ..lod.partial_read import BLOCKS, read_header_and_tables, read_part
+from ..lod.blocks import BLOCKS, SIZE, spatial_order
+from ..lod.on_disk import CulledReader, open_if_large, read_header_and_tables, read_part
 from ..lod.query import LodQuery, SplatSelector
 from ..lod.rule import OPACITY, Region, Values, all_rule_columns, collect_facts
 from ..lod.selection import check_rule, require_rule, standalone_error, standalone_levels

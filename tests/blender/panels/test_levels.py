@@ -182,7 +182,7 @@ def tree(bpy, lodgs, tmp_path):
 
 def test_panels_explain_the_coarse_level_of_a_tree(tree, draw_panel):
     texts = draw_panel("levels", "LODGS_PT_levels").texts
-    assert any("Level 1 holds coarse nodes of a tree" in text for text in texts)
+    assert any("Only level 2 is a complete scene" in text for text in texts)
     tree.lodgs.tell = "LEVELS"
     layout = draw_panel("viewport", "LODGS_PT_viewport")
     assert not layout.colors and any("half the size" in text for text in layout.texts)
