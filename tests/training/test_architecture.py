@@ -155,16 +155,38 @@ def test_there_is_no_circle_of_files():
         raise AssertionError("a circle:\n" + "\n".join(f"{a} imports {b}" for a, b in inside))
 
 
-@pytest.mark.parametrize(("package", "limit"), [("training/methods", 20), ("training/lod", 25)])
-def test_parts_of_a_package_hardly_import_each_other(package, limit):
+def arrows_inside(package: str) -> set[Arrow]:
+    return {arrow for arrow in arrows() if all(file.startswith(f"{package}/") for file in arrow)}
+
+
+def test_rules_and_trees_hardly_import_each_other():
+    inside = arrows_inside("training/lod")
+    assert 0 < len(inside) <= 25, sorted(inside)
+
+
+def test_methods_hardly_import_each_other():
     """A part is a file or a folder; files of one folder may import each other."""
+    package = "training/methods"
 
     def part(file: str) -> str:
         return file.removeprefix(f"{package}/").split("/")[0]
 
-    inside = {arrow for arrow in arrows() if all(file.startswith(f"{package}/") for file in arrow)}
-    between = {(part(a), part(b)) for a, b in inside if part(a) != part(b)}
-    assert 0 < len(between) <= limit, sorted(between)
+    between = {(part(a), part(b)) for a, b in arrows_inside(package) if part(a) != part(b)}
+    assert 0 < len(between) <= 20, sorted(between)
+
+
+TREE = {
+    "training/lod/rules/cut.py",
+    "training/lod/tree/",
+    "training/methods/tree/",
+    "blender_lodgs/nodes/rules/cut.py",
+}
+"""Files that know the tree of splats; all others use it through ``Rule`` and ``MethodInfo``."""
+
+
+def test_only_its_own_files_import_the_tree():
+    importing = {a for a, b in arrows() if b.startswith(tuple(TREE)) and not a.startswith(tuple(TREE))}
+    assert not importing, sorted(importing)
 
 
 @pytest.mark.parametrize(

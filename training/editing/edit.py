@@ -72,12 +72,8 @@ def edit(
     Raises:
         LodgsError: cannot read or write a file, the source contradicts its rule, or no splats remain.
     """
-    for path in (out, *plain, folder, streamed):
-        if path is not None and path.resolve() == source.resolve():
-            raise LodgsError(f"Cannot overwrite the source {path}.", "Choose another output file.")
-    kinds = {find_format(path) for path in plain}
-    if streamed is not None or not kinds <= {PLY, SPLAT}:
-        find_splat_transform()  # fail before minutes of work
+    paths = [path for path in (out, *plain, folder, streamed) if path is not None]
+    _check_outputs(source, paths, plain, streamed)
     bundle = _open(source, warn)
     check_rule(bundle)
     edited = apply_looks_to_levels(clean_bundle(bundle, cleaning), looks)
@@ -92,18 +88,34 @@ def edit(
         f"level {level.number}: {len(result.rows):,} of {len(level.rows):,} splats"
         for level, result in zip(bundle.levels, edited.levels, strict=True)
     ]
+    _export(edited, plain, folder, streamed, antialiased)
+    return "\n".join([*report, *(f"{path}: written" for path in paths)])
+
+
+def _check_outputs(source: Path, paths: Sequence[Path], plain: Sequence[Path], streamed: Path | None) -> None:
+    """Raise an error before minutes of work if an output cannot be written."""
+    for path in paths:
+        if path.resolve() == source.resolve():
+            raise LodgsError(f"Cannot overwrite the source {path}.", "Choose another output file.")
+    if streamed is not None or not {find_format(path) for path in plain} <= {PLY, SPLAT}:
+        find_splat_transform()
+
+
+def _export(
+    edited: Bundle, plain: Sequence[Path], folder: Path | None, streamed: Path | None, antialiased: bool
+) -> None:
+    """Write the finest level and the complete levels in other formats; arguments as for :func:`edit`."""
     for path in plain:
         exported = edited if antialiased or find_format(path).antialiased else bake_filter(edited)
         finest = ConcatenatedRows.of_level(exported, exported.levels[-1].number)
         run_to_end(write_splats(path, finest, exported.meta))
-    if folder is not None or streamed is not None:
-        levels = resolve_rule(edited.rule).complete_levels(edited)
-        if folder is not None:
-            write_folder(folder, levels)
-        if streamed is not None:
-            run_to_end(write_streamed_levels(streamed, levels if antialiased else bake_filter(levels)))
-    paths = [path for path in (out, *plain, folder, streamed) if path is not None]
-    return "\n".join([*report, *(f"{path}: written" for path in paths)])
+    if folder is None and streamed is None:
+        return
+    levels = resolve_rule(edited.rule).complete_levels(edited)
+    if folder is not None:
+        write_folder(folder, levels)
+    if streamed is not None:
+        run_to_end(write_streamed_levels(streamed, levels if antialiased else bake_filter(levels)))
 
 
 def run_to_end(steps: Iterator[str]) -> None:

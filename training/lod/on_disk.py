@@ -182,7 +182,7 @@ class CulledReader:
             query: skip blocks whose splats have no weight by this query.
         """
         visible = self._blocks.in_view(camera, 0.0)
-        if query is not None and self._rule is not None and self._rule.independent and query.region() is None:
+        if query is not None and self._rule is not None and query.region() is None:
             band = query.distance_band(self._blocks.columns)
             visible &= self._blocks.in_band(np.array(query.eye, np.float32), *band)[0]
         limit = max(_MAX_SURPLUS * np.count_nonzero(visible), _BATCH // SIZE)

@@ -340,7 +340,7 @@ class SplatSelector:
         count = len(subset.blocks)
         visible = np.ones(count, bool)
         full = np.full(count, query is None)
-        if query is not None and query.resolved_rule.independent and not in_region:
+        if query is not None and not in_region:
             band = query.distance_band(subset.maxima(query.resolved_rule))
             visible, inside = subset.blocks.in_band(np.array(query.eye, np.float32), *band)
             if query.resolved_rule.fills_band(dict(query.values)) and query.crops is None:

@@ -213,7 +213,7 @@ class ResidentBundle:
     """A bundle's levels, ready to render images.
 
     Levels in memory become resident as a whole. Of levels on disk, only the splats that a camera may see are
-    read (``lod.on_disk``). A file is read on demand: if it has a block table (``lod.partial_read``) and its
+    read (``lod.on_disk``). A file is read on demand: if it has a block table (``lod.blocks``) and its
     rule defines regions, only the splats of the camera's region are resident.
 
     Args:

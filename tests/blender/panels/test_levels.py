@@ -62,7 +62,7 @@ def test_one_level_warns_if_splats_are_trained_for_distances(root, draw, name):
     root(name).lodgs.mode = "SINGLE"
     layout = draw()
     assert layout.properties == ["mode", "single_level"]
-    assert any("too opaque" in text for text in layout.texts) == rules()[name].always_active
+    assert any("too opaque" in text for text in layout.texts) == rules()[name].weights_full_detail
 
 
 def test_levels_without_a_known_rule_cause_a_hint(root, draw):
