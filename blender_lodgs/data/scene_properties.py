@@ -96,7 +96,7 @@ class SplatTable(bpy.types.PropertyGroup):
 
 
 class SplatStream(bpy.types.PropertyGroup):
-    """File of a tree whose top levels are in the splat scene; see ``streams``."""
+    """File whose coarsest splats are in the splat scene; see ``streams``."""
 
     file: bpy.props.StringProperty(
         name="File",

@@ -185,7 +185,7 @@ def delete_excluded(root: bpy.types.Object) -> int:
         The number of deleted splats.
 
     Raises:
-        LodgsError: As :func:`read_levels`, or the levels are only the top of a tree in a file.
+        LodgsError: As :func:`read_levels`, or the levels are only the coarsest splats of a file.
     """
     file = streams.file_of(root)
     if file is not None:

@@ -294,6 +294,11 @@ class Rule(ABC):
         """Return whether a scene with so many splats in its finest level is paged for a memory budget."""
         return False
 
+    @property
+    def color_legend(self) -> str:
+        """Explanation of the colours by level, as a sentence; "" if each level has its own colour."""
+        return ""
+
     def splat_level(
         self, columns: Mapping[str, np.ndarray], facts: Mapping[str, float]
     ) -> np.ndarray | float:

@@ -213,6 +213,10 @@ class Cut(Rule):
         k = detail_of(focal_px, values["pixels"])
         return 0.0, (k + MIN_DETAIL) * (1 + 4 * ROUNDING) * highest[PARENT_SIZE].astype(np.float64)
 
+    @property
+    def color_legend(self) -> str:
+        return "Each colour stands for half the size of the previous one; white is the finest level."
+
     def splat_level(self, columns, facts) -> np.ndarray:
         """Return a colour number: the octave of a node's size, OCTAVES + 1 for leaves."""
         return _octave(columns[NODE_SIZE])
