@@ -27,7 +27,8 @@ import torch
 
 from examples import town
 from training.evaluate.metrics import psnr
-from training.lod.partial_read import BLOCKS, block_table, read_part
+from training.lod.blocks import BLOCKS, block_table
+from training.lod.on_disk import read_part
 from training.lod.rules.chunks import RULE, TABLE, member_columns
 from training.lod.selection import resolve_controls
 from training.methods.lodge.chunks import chunk_rows
@@ -143,7 +144,8 @@ def without_visibility(file: Path) -> Path:
         level.number: replace(level.splats, extras=member_columns(np.stack(sets[level.number])))
         for level in bundle.levels
     }
-    tables = {**bundle.tables, BLOCKS: block_table(RULE, splats)}
+    columns = ((number, level.extras) for number, level in splats.items())
+    tables = {**bundle.tables, BLOCKS: block_table(RULE.block_bounds, columns)}
     levels_out = [replace(level, splats=splats[level.number]) for level in bundle.levels]
     write_bundle(path, replace(bundle, levels=levels_out, tables=tables))
     return path

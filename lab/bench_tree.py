@@ -21,9 +21,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import numpy as np
 
 from examples import town
-from training.lod.rules.cut import ABOVE_ROOT, detail_of
+from training.lod.tree.nodes import ABOVE_ROOT, detail_of
 from training.lod.tree.shape import Tree
 from training.methods.tree.build import build
+from training.methods.tree.sequential_point_tree import SequentialPointTree
 from training.rasterize.cpu.compile import (
     STRICT,
     f32,
@@ -33,7 +34,6 @@ from training.rasterize.cpu.compile import (
     run_serial,
     thread_count,
 )
-from training.rasterize.sequential_point_tree import SequentialPointTree
 from training.scenes.cameras import Camera
 
 NODES = (100_000, 1_000_000, 10_000_000)

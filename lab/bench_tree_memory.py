@@ -26,10 +26,11 @@ import numpy as np
 import torch
 
 from examples import town
-from training.lod.rules.cut import detail_of
+from training.lod.tree.nodes import detail_of
 from training.methods import method_info
 from training.methods.tree import TreeParameters
 from training.methods.tree.build import ForestBuilder
+from training.methods.tree.sequential_point_tree import image_borders
 from training.methods.tree.store import record_layout
 from training.methods.tree.train import Method, RecordOptimizer
 from training.optimize.memory import keep_freed_memory
@@ -37,7 +38,6 @@ from training.optimize.out_of_core.cut_cache import MMAP_BYTES, SLOT_BYTES
 from training.optimize.parameters import override
 from training.optimize.training_data import TrainingData
 from training.rasterize import Gaussians, rasterize
-from training.rasterize.sequential_point_tree import image_borders
 from training.scenes.cameras import read_camera_folder, write_camera
 from training.scenes.colmap import Scene
 from training.scenes.images import write_png

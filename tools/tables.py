@@ -102,7 +102,7 @@ def controls_page() -> str:
             if rule.complete
             else "All levels form one set."
         )
-        always = " Its weights also apply to a single level." if rule.always_active else ""
+        always = " Its weights also apply to a single level." if rule.weights_full_detail else ""
         parts.append(f"{relation}{always} Required data: {'; '.join(listed) or 'none'}.")
     return "\n\n".join(parts) + "\n"
 

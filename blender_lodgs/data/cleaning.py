@@ -15,8 +15,7 @@ import numpy as np
 from ...training.editing import cleaning
 from ...training.errors import LodgsError
 from ...training.lod.crop import crop_mask
-from ...training.lod.rules.cut import RULE as CUT
-from ...training.lod.tree.resident import COLUMNS
+from ...training.lod.rule import Relations, resolve_rule
 from ...training.scenes.cameras import Camera
 from ...training.splats.levels import Bundle
 from ..attributes import BASE, HIDDEN, SCALE, SELECTION, read_attribute, view_attribute, write_attribute
@@ -85,13 +84,13 @@ def selected_mask(cloud: bpy.types.PointCloud) -> np.ndarray:
 def find(root: bpy.types.Object, test: Test) -> dict[int, np.ndarray]:
     """Apply a test to the visible splats of each level.
 
-    In a tree, the test applies to leaves; nodes without remaining leaves are added.
+    Splats that depend on others, as nodes of a tree on leaves, follow them.
 
     Returns:
         Masks (N,) bool by level number.
     """
     masks = {item.number: test(item.object.data) & ~hidden_mask(item.object.data) for item in levels(root)}
-    return _with_nodes(root, masks)
+    return _with_dependents(root, masks)
 
 
 def find_floaters(
@@ -112,8 +111,10 @@ def find_floaters(
         for item in levels(root)
     }
     remaining_masks = {number: mask.copy() for number, mask in visible.items()}
-    cleaning.exclude_floaters(remaining_masks, means, gap / unit_length(root), share, _tree_relations(root))
-    return _with_nodes(root, {number: visible[number] & ~mask for number, mask in remaining_masks.items()})
+    cleaning.exclude_floaters(remaining_masks, means, _relations(root), gap / unit_length(root), share)
+    return _with_dependents(
+        root, {number: visible[number] & ~mask for number, mask in remaining_masks.items()}
+    )
 
 
 def hide(root: bpy.types.Object, masks: Mapping[int, np.ndarray]) -> int:
@@ -158,8 +159,7 @@ def extend_selection(
 ) -> int:
     """Add splats to the selection, or remove them from it.
 
-    Hidden splats are never selected. In a tree, the selection covers leaves, and nodes without remaining
-    leaves.
+    Hidden splats are never selected. Splats that depend on others follow them.
 
     Args:
         strengths: (N,) by level number; splats with values other than 0 are selected.
@@ -173,7 +173,7 @@ def extend_selection(
         masks[item.number] = mask = selected_mask(item.object.data)
         mask[strengths[item.number] > 0] = not remove
         mask &= ~hidden_mask(item.object.data)
-    return select(root, _with_nodes(root, masks))
+    return select(root, _with_dependents(root, masks))
 
 
 def preview_selection(root: bpy.types.Object | None, masks: Mapping[int, np.ndarray]) -> None:
@@ -332,30 +332,25 @@ def levels(root: bpy.types.Object) -> list[SplatLevel]:
     return [item for item in root.lodgs.levels if item.exists]
 
 
-def _with_nodes(root: bpy.types.Object, masks: dict[int, np.ndarray]) -> dict[int, np.ndarray]:
-    """Add the tree nodes without remaining leaves to masks of leaves; other scenes keep their masks."""
-    tree = _tree_relations(root)
-    if tree is None:
-        return masks
+def _with_dependents(root: bpy.types.Object, masks: dict[int, np.ndarray]) -> dict[int, np.ndarray]:
+    """Add the visible splats that depend on others and do not remain without them."""
     removed = {item.number: masks[item.number] | hidden_mask(item.object.data) for item in levels(root)}
-    remaining_masks = tree.with_ancestors({number: ~mask for number, mask in removed.items()})
-    return {
-        item.number: ~remaining_masks[item.number] & ~hidden_mask(item.object.data) for item in levels(root)
-    }
+    remaining = _relations(root).completed({number: ~mask for number, mask in removed.items()})
+    return {item.number: ~remaining[item.number] & ~hidden_mask(item.object.data) for item in levels(root)}
 
 
-def _tree_relations(root: bpy.types.Object) -> cleaning.TreeRelations | None:
-    """Return the parent relations of the levels' splats, or None if they are not a tree."""
-    if root.lodgs.rule != CUT.name:
-        return None
-    columns, means = {}, {}
-    for item in levels(root):
+def _relations(root: bpy.types.Object) -> Relations:
+    """Return the relations among the splats of the levels."""
+    related, columns = resolve_rule(root.lodgs.rule).relations, {}
+    for item in levels(root) if related.columns else ():
         cloud = item.object.data
-        means[item.number] = read_attribute(cloud, "position")
+        means = dict(zip("xyz", read_attribute(cloud, "position").T, strict=True))
         zeros = np.zeros(len(cloud.points), np.float32)
-        values = {name: read_attribute(cloud, name) for name in COLUMNS}
+        values = {
+            name: means[name] if name in means else read_attribute(cloud, name) for name in related.columns
+        }
         columns[item.number] = {name: zeros if x is None else x for name, x in values.items()}
-    return cleaning.TreeRelations(columns, means)
+    return related(columns)
 
 
 def splat_attribute(cloud: bpy.types.PointCloud, name: str) -> np.ndarray:

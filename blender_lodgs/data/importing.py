@@ -10,8 +10,9 @@ from pathlib import Path
 import bpy
 from mathutils import Matrix
 
+from ...training.lod.on_disk import open_paged
+from ...training.lod.rule import resolve_rule
 from ...training.lod.selection import unknown_rule_error
-from ...training.lod.tree.paging import TreeFile, is_tree, read_budgeted
 from ...training.methods import METHODS
 from ...training.scenes.cameras import Camera, camera_extent
 from ...training.scenes.colmap import read_scene
@@ -160,9 +161,9 @@ class SplatsFile:
     """Contents of a splat file.
 
     Attributes:
-        bundle: Levels; for a tree that stays in its file, its coarsest splats.
-        total: Number of splats of such a tree; 0 if the bundle has all splats.
-        budget: Maximum number of splats of such a tree in memory.
+        bundle: Levels; for splats that stay in their file, the coarsest ones.
+        total: Number of splats in such a file; 0 if the bundle has all splats.
+        budget: Maximum number of splats of such a file in memory.
         warnings: Sentences about differences from the display of the original program.
     """
 
@@ -180,8 +181,8 @@ def read_splats_file(path: Path | str, budget: int = 0) -> SplatsFile:
     Does not access Blender's data and may run in a thread.
 
     Args:
-        budget: Maximum number of splats of a tree in memory; 0 for all. Of a larger tree, only the coarsest
-            splats are read; LODGS streams finer ones from the file as the camera approaches (``streams``).
+        budget: Maximum number of splats of a paged file in memory; 0 for all. Of a larger one, only the
+            coarsest splats are read; LODGS streams finer ones as the camera approaches (``streams``).
 
     Raises:
         LodgsError: The file cannot be read.
@@ -189,9 +190,10 @@ def read_splats_file(path: Path | str, budget: int = 0) -> SplatsFile:
     path, warnings, total = Path(path), [], 0
     if path.name == STREAMED_FILE:
         path = path.resolve().parent
-    if budget and not path.is_dir() and is_plain_ply(path) and is_tree(read_header(path)):
-        total = TreeFile(path).total
-        bundle, _ = read_budgeted(path, budget if total <= budget else streams.resident_count(budget))
+    if budget and not path.is_dir() and is_plain_ply(path) and _is_paged(path):
+        paged = open_paged(path)
+        total = paged.total
+        bundle = paged.top(budget if total <= budget else streams.resident_count(budget))
         count = sum(len(level.splats) for level in bundle.levels)
         if count < total:
             warnings.append(
@@ -203,6 +205,10 @@ def read_splats_file(path: Path | str, budget: int = 0) -> SplatsFile:
         with open_as_ply(path) as file:
             bundle = (read_folder if file.is_dir() else read_bundle)(file, warnings.append)
     return SplatsFile(path, bundle, total, budget, warnings)
+
+
+def _is_paged(path: Path) -> bool:
+    return resolve_rule(read_header(path).rule).paged_file is not None
 
 
 def place_splats(

@@ -43,7 +43,7 @@ def read_paint(root: bpy.types.Object) -> dict[int, np.ndarray]:
     """Return the paint (N, 4) of each level by number; zeros for levels without paint.
 
     Raises:
-        LodgsError: The levels are only the top of a tree in a file.
+        LodgsError: The levels are only the coarsest splats of a file.
     """
     file = streams.file_of(root)
     if file is not None:

@@ -6,7 +6,7 @@ import json
 
 import bpy
 
-from ...training.lod.rule import Control, Rule, rules
+from ...training.lod.rule import Control, Rule, resolve_rule, rules
 from .property_callbacks import look_up, tag_owner
 from .selection import read_json
 from .training import TrainingSettings
@@ -96,7 +96,7 @@ class SplatTable(bpy.types.PropertyGroup):
 
 
 class SplatStream(bpy.types.PropertyGroup):
-    """File of a tree whose top levels are in the splat scene; see ``streams``."""
+    """File whose coarsest splats are in the splat scene; see ``streams``."""
 
     file: bpy.props.StringProperty(
         name="File",
@@ -373,7 +373,7 @@ class SplatScene(bpy.types.PropertyGroup):
     @property
     def complete(self) -> bool:
         """True if every level is a complete scene (``Rule.complete``); otherwise only the finest is."""
-        return not self.by_distance or rules()[self.rule].complete
+        return resolve_rule(self.rule).complete
 
     @property
     def controls(self) -> bpy.types.PropertyGroup | None:

@@ -41,7 +41,7 @@ def set_bundle_facts(root: bpy.types.Object, bundle: Bundle) -> None:
     settings, rule = root.lodgs, check_rule(bundle)
     for control in rule.controls if rule else ():
         control.validate(bundle.controls.get(control.name, control.default))
-    if rule is not None and (rule.always_active or not rule.complete) and settings.rule != bundle.rule:
+    if rule is not None and (rule.weights_full_detail or not rule.complete) and settings.rule != bundle.rule:
         settings.mode = "SELECTIVE"
     settings.method, settings.rule, settings.cumulative = bundle.method, bundle.rule, bundle.cumulative
     settings.facts, settings.meta = json.dumps(bundle.facts), json.dumps(bundle.meta)
@@ -185,7 +185,7 @@ def delete_excluded(root: bpy.types.Object) -> int:
         The number of deleted splats.
 
     Raises:
-        LodgsError: As :func:`read_levels`, or the levels are only the top of a tree in a file.
+        LodgsError: As :func:`read_levels`, or the levels are only the coarsest splats of a file.
     """
     file = streams.file_of(root)
     if file is not None:

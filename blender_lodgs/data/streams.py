@@ -1,6 +1,6 @@
-"""Streaming of large trees: the scene stores the top of a tree, LODGS reads finer splats from its file.
+"""Streaming of large files: the scene stores the coarsest splats, LODGS reads finer ones from the file.
 
-The scene's objects hold the coarsest splats as a complete tree: modifiers, exports and saved files use these.
+The scene's objects hold the coarsest splats as complete levels: modifiers, exports and saved files use these.
 LODGS draws finer splats from the file as the camera approaches. One budget covers both.
 """
 
@@ -44,12 +44,12 @@ class Source:
 
 
 def resident_count(budget: int) -> int:
-    """Return the maximum number of splats of a larger tree in the scene's objects."""
+    """Return the maximum number of splats of a larger file in the scene's objects."""
     return max(min(int(RESIDENT_SHARE * budget), MAX_RESIDENT), 1)
 
 
 def start_streaming(root: bpy.types.Object, path: Path, budget: int, total: int) -> None:
-    """Start streaming for a scene that holds the top of a tree."""
+    """Start streaming for a scene that holds the coarsest splats of a file."""
     stream = root.lodgs.stream
     absolute = str(path.absolute())
     stream.file = absolute

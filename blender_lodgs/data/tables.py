@@ -11,7 +11,7 @@ import json
 import bpy
 import numpy as np
 
-from ...training.lod.partial_read import BLOCKS
+from ...training.lod.blocks import BLOCKS
 from ...training.lod.rule import Tables, find_rule
 from ...training.lod.rules.chunks import COLUMNS as SPHERE
 from ...training.scenes.view_tables import VIEW_TABLES as VIEWS

@@ -10,8 +10,7 @@ from bpy_extras.io_utils import ExportHelper
 
 from ...training.editing.bake_filter import bake_filter
 from ...training.errors import LodgsError
-from ...training.lod.tree.paging import is_tree
-from ...training.lod.tree.shape import complete_levels
+from ...training.lod.rule import resolve_rule
 from ...training.splats.bundle import write_bundle
 from ...training.splats.formats import (
     FORMATS,
@@ -148,7 +147,7 @@ class LODGS_OT_export_bundle(_FileExport, bpy.types.Operator):
         root = roots.active_root(context)
         if self.order == "stream" and not root.lodgs.complete:
             raise LodgsError(
-                "Cannot write the coarsest level first: in a tree it is not a complete scene.",
+                "Cannot write the coarsest level first: it is not a complete scene.",
                 "Set First to Finest Level.",
             )
         bundle = scenes.read_levels(root, self.placed, self.looked)
@@ -262,7 +261,7 @@ class _FolderExport(_ExportOperator):
     def _bundle(self, context) -> Bundle:
         """Return the levels, each a complete scene."""
         bundle = scenes.read_levels(roots.active_root(context), self.placed, self.looked)
-        return complete_levels(bundle) if is_tree(bundle) else bundle
+        return resolve_rule(bundle.rule).complete_levels(bundle)
 
 
 class LODGS_OT_export_folder(_FolderExport, bpy.types.Operator):

@@ -65,8 +65,7 @@ class LODGS_PT_levels(LevelsPanel):
             "LODGS_UL_levels", "", settings, "levels", settings, "active_level", rows=rows
         )
         if not settings.complete and len(settings.levels) > 1:
-            first, *_, finest = (item.number for item in settings.levels)
-            text = f"Level {first} holds coarse nodes of a tree: only level {finest} is a complete scene."
+            text = f"Only level {settings.levels[-1].number} is a complete scene."
             say(self.layout, text, "INFO")
 
 
@@ -84,7 +83,7 @@ class LODGS_PT_detail(LevelsPanel):
         if rule is None:
             problem, remedy = unknown_rule_error(settings.rule)
             say(layout, f"{problem} {remedy}" if settings.rule else problem, "INFO")
-        elif rule.always_active and settings.mode == "SINGLE":
+        elif rule.weights_full_detail and settings.mode == "SINGLE":
             text = "These splats are trained for By Distance. As one level they look too opaque."
             say(layout, text, "INFO")
 

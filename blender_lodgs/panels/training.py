@@ -6,7 +6,7 @@ import bpy
 
 from ...training.errors import LodgsError
 from ...training.evaluate.messages import summary_lines
-from ...training.lod.rules.cut import RULE as CUT
+from ...training.lod.rule import resolve_rule
 from ...training.methods import method_info
 from .. import extension
 from ..data import roots, viewpoints
@@ -93,7 +93,7 @@ class LODGS_PT_training_advanced(Panel):
         if root.lodgs.scene_folder:
             layout.prop(settings, "model")
             layout.prop(settings, "images")
-        if method_info(settings.method).rule == CUT.name:
+        if resolve_rule(method_info(settings.method).rule).paged_file is not None:
             layout.prop(root.lodgs.stream, "budget")
         layout.prop(settings, "output")
         layout.operator("lodgs.open_run", icon="FILE_FOLDER", text="Open Run…")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ...training.lod.colors import level_color
-from ...training.lod.rule import find_rule
+from ...training.lod.rule import resolve_rule
 from .. import compat, viewport
 from ..data import roots
 from ..viewport import views
@@ -42,15 +42,11 @@ class LODGS_PT_viewport(Panel):
             column.active = len(root.lodgs.levels) != 1  # a single level has a single colour
             column.label(text="Colours")
             row = column.row(align=True)
-            rule = find_rule(root.lodgs.rule)
-            for tell in ("OWN", "LEVELS", "BANDS", *(["CHUNKS"] if rule and rule.tables else [])):
+            rule = resolve_rule(root.lodgs.rule)
+            for tell in ("OWN", "LEVELS", "BANDS", *(["CHUNKS"] if rule.tables else [])):
                 row.prop_enum(root.lodgs, "tell", tell)
-            if root.lodgs.tell in ("LEVELS", "BANDS") and column.active and not root.lodgs.complete:
-                say(
-                    layout,
-                    "Each colour stands for half the size of the previous one; white is the finest level.",
-                    "COLOR",
-                )
+            if root.lodgs.tell in ("LEVELS", "BANDS") and column.active and rule.color_legend:
+                say(layout, rule.color_legend, "COLOR")
             elif root.lodgs.tell in ("LEVELS", "BANDS") and column.active:
                 _legend(layout, [item.number for item in root.lodgs.levels if item.exists])
         if viewport.problem:

@@ -157,7 +157,7 @@ def frame_path(pattern: str, scene: bpy.types.Scene, frame: int) -> Path:
     return path.with_name(re.sub(r"#+(?=[^#]*$)", number, path.name))
 
 
-def placed_splats(depsgraph: bpy.types.Depsgraph) -> list[renderer.PlacedSplats | renderer.PlacedTree]:
+def placed_splats(depsgraph: bpy.types.Depsgraph) -> list[renderer.PlacedSplats | renderer.PlacedFile]:
     """Return the visible splats of a depsgraph in the form of splat files, so that both render equally.
 
     For an object whose splats are selected only by a rule, all its splats are returned with the arguments of
@@ -169,8 +169,8 @@ def placed_splats(depsgraph: bpy.types.Depsgraph) -> list[renderer.PlacedSplats 
         placement = (matrix, level, instance.antialias)
         is_empty = not len(evaluated.data.points)
         if instance.source is not None and (choice := shown.camera_query(instance, depsgraph)):
-            tree = instance.source.path, matrix, instance.antialias, choice, instance.looks
-            placed.append(renderer.PlacedTree(*tree))
+            file = instance.source.path, matrix, instance.antialias, choice, instance.looks
+            placed.append(renderer.PlacedFile(*file))
             continue
         if not _is_selected_by_rule(instance, depsgraph):
             if not is_empty:

@@ -86,11 +86,11 @@ class PlacedSplats:
 
 
 @dataclass(frozen=True)
-class PlacedTree:
-    """A tree of splats in a file, for one frame. The renderer reads only the visible nodes.
+class PlacedFile:
+    """A file of splats for one frame. The renderer reads only the visible part.
 
     Attributes:
-        path: bundle with the rule ``cut``.
+        path: bundle, see ``training.lod.query.PagedFile``.
         matrix: see :class:`PlacedSplats`.
         antialias: see :class:`PlacedSplats`.
         choice: see :class:`PlacedSplats`.
@@ -150,7 +150,7 @@ class Renderer:
 
     def draw_frame(
         self,
-        sets: list[PlacedSplats | PlacedTree],
+        sets: list[PlacedSplats | PlacedFile],
         camera: Camera,
         near: float,
         on_progress: OnProgress,
@@ -249,15 +249,15 @@ class Renderer:
             last = []
         return " ".join([f"The renderer stopped with exit code {code}.", *last])
 
-    def _write_sets(self, sets: list[PlacedSplats | PlacedTree]) -> list[dict]:
+    def _write_sets(self, sets: list[PlacedSplats | PlacedFile]) -> list[dict]:
         """Write new and changed splats to files. Return the descriptions of all sets for the request."""
         sent: dict[int, _SentSet] = {}
         described = []
         for item in sets:
-            if isinstance(item, PlacedTree):
+            if isinstance(item, PlacedFile):
                 described.append(
                     {
-                        "tree": str(item.path), "matrix": item.matrix.tolist(), "antialias": item.antialias,
+                        "paged": str(item.path), "matrix": item.matrix.tolist(), "antialias": item.antialias,
                         "choice": item.choice.as_dict(), "looks": looks_as_dicts(item.looks),
                     }
                 )  # fmt: skip
@@ -342,7 +342,7 @@ _last_use = 0.0
 
 
 def draw_frame(
-    sets: list[PlacedSplats | PlacedTree], camera: Camera, near: float, on_progress: OnProgress, **options
+    sets: list[PlacedSplats | PlacedFile], camera: Camera, near: float, on_progress: OnProgress, **options
 ) -> RenderedFrame | None:
     """Call :meth:`Renderer.draw_frame` of the shared renderer. Start it if needed, and once more if it dies.
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import bpy
 
 from ...training.errors import LodgsError
-from ...training.lod.rules.cut import RULE as CUT
+from ...training.lod.rule import resolve_rule
 from ...training.runs.folder import RunFolder
 from ...training.runs.outcome import run_outcome
 from ...training.splats.bundle import read_header, read_tables
@@ -68,7 +68,7 @@ class Watch:
         method: name of the trained method.
         last_event: time of the last event, in seconds since the epoch.
         offset: number of bytes read from the event file.
-        reading: top of a finished tree, being read. Set only if the tree does not fit into memory.
+        reading: coarsest splats of a finished run, being read. Set only if it does not fit into memory.
     """
 
     folder: RunFolder
@@ -138,7 +138,7 @@ class Watch:
             for event in events:
                 self._handle_event(root, event)
             if self.reading is not None:
-                self._show_tree(root, self.reading)
+                self._show_coarsest(root, self.reading)
                 return True
             if not alive:
                 self._set_end()
@@ -218,8 +218,9 @@ class Watch:
         self.levels[event["level"]] = event
 
     def _stays_in_file(self, root: bpy.types.Object, event: dict) -> bool:
-        """Return whether a level's tree exceeds the memory budget: about half of its nodes are leaves."""
-        return event.get("rule") == CUT.name and 2 * event["splats"] >= root.lodgs.stream.budget
+        """Return whether a level's scene exceeds the memory budget and is read in pages."""
+        rule = resolve_rule(event.get("rule", ""))
+        return rule.exceeds_budget(event["splats"], root.lodgs.stream.budget)
 
     def _read_level(self, event: dict) -> Level:
         splats = read_ply(self.folder.find_file(event["path"]))
@@ -232,8 +233,8 @@ class Watch:
             event.get("controls", {}), event.get("cumulative", False), event["meta"],
         )  # fmt: skip
 
-    def _show_tree(self, root: bpy.types.Object, reading: Future[importing.SplatsFile]) -> None:
-        """Show a finished tree when its top has been read."""
+    def _show_coarsest(self, root: bpy.types.Object, reading: Future[importing.SplatsFile]) -> None:
+        """Show the coarsest splats of a finished run when they have been read."""
         if not reading.done():
             return
         self.reading = None

@@ -1,6 +1,6 @@
-"""Streaming of splat trees larger than memory, in background threads.
+"""Streaming of splats larger than memory, in background threads.
 
-One thread reads the pages that the camera needs (``training.lod.tree.paging``). The worker thread of
+One thread reads the pages that the camera needs (``training.lod.query.Pager``). The worker thread of
 ``arrangement`` copies them, so that the drawing thread only uploads drawn splats. This module does not use
 bpy.
 """
@@ -13,9 +13,10 @@ import time
 import numpy as np
 
 from ...training.errors import LodgsError
-from ...training.lod.query import LodQuery
-from ...training.lod.rules.cut import NODE_SIZE, PARENT, PARENT_SIZE, detail_of
-from ...training.lod.tree.paging import SIZE, Pager
+from ...training.lod.blocks import SIZE
+from ...training.lod.on_disk import open_paged
+from ...training.lod.query import LodQuery, Pager
+from ...training.lod.rule import resolve_rule
 from ...training.splats.gaussians import Splats
 from ..data.streams import Source
 
@@ -26,14 +27,14 @@ PAUSE = 0.02
 
 
 class Stream:
-    """The part of a tree on disk that the camera needs, in the record layout of ``resident``.
+    """The part of a file that the camera needs, in the record layout of ``resident``.
 
     Attributes:
         source: the file.
         ready: at least as many splats are in memory as the scene has; until then the scene's are drawn.
         problem: error that ended streaming; empty if there is none.
         records: (rows, 4 * texels) float32 of all slots in memory, see ``resident.read_records``.
-        columns: (rows,) float32 by name, of the rule ``cut``. Slots with parent size 0 are never selected.
+        columns: (rows,) float32 by name, of the rule. Empty slots are never selected.
         higher: number of SH coefficients beyond the first.
         taken: number of copied updates.
     """
@@ -97,9 +98,9 @@ class Stream:
         splats = Splats.concatenated([splats for _, splats in update.pages])
         rows = np.repeat(starts - (np.cumsum(counts) - counts), counts) + np.arange(len(splats))
         self.records[rows] = records_of(splats)
-        for name in PARENT:
+        for name in self.columns.keys() - update.columns.keys():
             self.columns[name][rows] = splats.extras[name]
-        self.columns[NODE_SIZE], self.columns[PARENT_SIZE] = update.sizes
+        self.columns |= update.columns
         self.taken += 1
         return (starts[:, None] + np.arange(SIZE)).reshape(-1).astype(np.int32)
 
@@ -111,25 +112,23 @@ class Stream:
 
     def _forward_request(self) -> None:
         if self._pager is not None and self._request is not None:
-            query, direction = self._request
-            k = detail_of(query.focal_px, dict(query.values)["pixels"])
-            self._pager.ask(np.array(query.eye), k, None if direction is None else np.array(direction))
+            self._pager.ask(*self._request)
 
     def _open(self) -> None:
         """Open the file and wait in a separate thread until the stream is ready."""
         try:
-            pager = Pager(self.source.path, self.source.budget)
-            if pager.file.total != self.source.total:
+            file = open_paged(self.source.path)
+            pager = file.pager(self.source.budget)
+            if file.total != self.source.total:
                 raise LodgsError(
-                    f"Cannot stream {self.source.path.name}: it has {pager.file.total:,} splats instead of "
+                    f"Cannot stream {self.source.path.name}: it has {file.total:,} splats instead of "
                     f"{self.source.total:,} as the imported file.",
                     "Import the file again.",
                 )
             self.higher = (pager.sh_degree + 1) ** 2 - 1
             self.records = np.zeros((pager.rows, 4 * record_texels(self.higher)), np.float32)
-            self.columns = {
-                name: np.zeros(pager.rows, np.float32) for name in (NODE_SIZE, PARENT_SIZE, *PARENT)
-            }
+            names = resolve_rule(file.bundle.rule).columns
+            self.columns = {name: np.zeros(pager.rows, np.float32) for name in names}
             self._pager = pager
             self._forward_request()
             pager.start()

@@ -5,7 +5,7 @@ modifiers (``selection.evaluated_query``), so time and views do not change splat
 modifiers are read after evaluation. A worker thread selects the splats when a query changes and sorts them
 when the view turns (``arrangement``); ``view_state`` uploads them in small steps.
 
-For trees on disk (``streaming``), the worker thread also copies new pages, while no viewport uploads them.
+For streamed files (``streaming``), the worker thread also copies new pages, while no viewport uploads them.
 """
 
 from __future__ import annotations

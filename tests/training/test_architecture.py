@@ -43,7 +43,7 @@ FLOORS = {
         ("settings",),
         ("documents",),
         ("files",),
-        ("errors", "plugins", "__init__"),
+        ("errors", "packages", "plugins", "__init__"),
     ),
 }
 """The rooms of both packages, from the top: each may import those on the floors below it, and itself."""
@@ -155,17 +155,28 @@ def test_there_is_no_circle_of_files():
         raise AssertionError("a circle:\n" + "\n".join(f"{a} imports {b}" for a, b in inside))
 
 
+def arrows_inside(package: str) -> set[Arrow]:
+    return {arrow for arrow in arrows() if all(file.startswith(f"{package}/") for file in arrow)}
+
+
 @pytest.mark.parametrize(("package", "limit"), [("training/methods", 20), ("training/lod", 25)])
-def test_parts_of_a_package_hardly_import_each_other(package, limit):
-    """In methods every file is a part. In lod a folder is a part, whose files may import each other."""
+def test_files_of_a_package_hardly_import_each_other(package, limit):
+    inside = arrows_inside(package)
+    assert 0 < len(inside) <= limit, sorted(inside)
 
-    def part(file: str) -> str:
-        inner = file.removeprefix(f"{package}/")
-        return inner if package == "training/methods" else inner.split("/")[0]
 
-    inside = {arrow for arrow in arrows() if all(file.startswith(f"{package}/") for file in arrow)}
-    between = {(part(a), part(b)) for a, b in inside if part(a) != part(b)}
-    assert 0 < len(between) <= limit, sorted(between)
+TREE = {
+    "training/lod/rules/cut.py",
+    "training/lod/tree/",
+    "training/methods/tree/",
+    "blender_lodgs/nodes/rules/cut.py",
+}
+"""Files that know the tree of splats; all others use it through ``Rule`` and ``MethodInfo``."""
+
+
+def test_only_its_own_files_import_the_tree():
+    importing = {a for a, b in arrows() if b.startswith(tuple(TREE)) and not a.startswith(tuple(TREE))}
+    assert not importing, sorted(importing)
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from functools import partial
 from pathlib import Path
 from textwrap import dedent
 
@@ -44,6 +45,52 @@ class Plugged(Rule):
 
 RULE = Plugged()
 """
+RECIPE = """
+from math import inf
+
+import numpy as np
+from lodgs.lod.rule import NO_COLUMNS, NO_TABLES, Control, Rule, distances
+
+class Rings(Rule):
+    name = "rings"
+    level_facts = ("radius",)
+    columns = ("importance",)
+    lengths = ("radius",)
+    controls = (Control("gain", 1.0, 0.1, 10.0, "Gain", "Factor on all radii"),)
+
+    def weights(self, means, position, focal_px, columns, facts, values, tables=NO_TABLES):
+        near, far = self.distance_band(focal_px, facts, values)
+        distance = distances(means, position) / (1 + columns["importance"])
+        return ((distance >= near) & (distance < far)).astype(np.float32)
+
+    def distance_band(self, focal_px, facts, values, highest=NO_COLUMNS):
+        return values["gain"] * facts["radius"], values["gain"] * facts["coarser_radius"] or inf
+
+RULE = Rings()
+"""
+EXPORT = """
+import sys
+import numpy as np
+from training.splats.bundle import write_bundle
+from training.splats.gaussians import Splats
+from training.splats.levels import Bundle, Level
+
+def level(number, count, radius):
+    means, rest = np.zeros((count, 3), "f4"), np.ones((count, 4), "f4")
+    importance = {"importance": np.arange(count, dtype="f4") % 2}
+    splats = Splats(means, rest, means - 2, means[:, 0], means[:, None], importance)
+    return Level(number, splats, {"radius": radius})
+
+write_bundle(sys.argv[1], Bundle("", [level(1, 10, 8.0), level(2, 20, 0.0)], "rings"))
+"""
+SELECT = """
+import sys
+import training
+
+for distance in (5, 10, 30, 40):
+    selected = training.select(training.load_bundle(sys.argv[1]), (0, 0, distance), 500, {"gain": 1.5})
+    print(*[len(rows) for rows, _ in selected.values()])
+"""
 BROKEN = {
     "absent_package": ("lodgs.methods", "no_such_package", "No module named 'no_such_package'"),
     "taken_number": ("lodgs.methods", "taken_number", "another method has the number 3"),
@@ -78,6 +125,16 @@ def install(folder: Path, package: str, entries: str, files: dict[str, str]) -> 
         path.write_text(text)
 
 
+def run_python(folder: Path, *arguments) -> subprocess.CompletedProcess:
+    """Run Python with the packages of a folder installed."""
+    process = subprocess.run(
+        [sys.executable, *map(str, arguments)], capture_output=True, text=True, timeout=240, check=False,
+        cwd=ROOT, env=os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(folder)])},
+    )  # fmt: skip
+    assert process.returncode == 0, process.stdout + process.stderr
+    return process
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """Return ``run(*arguments)``, which runs Python with a plug-in and broken plug-ins installed."""
@@ -94,16 +151,7 @@ def run(tmp_path_factory):
         for group in ("lodgs.methods", "lodgs.rules")
     }
     install(folder, "broken", "".join(f"[{group}]\n{lines}" for group, lines in groups.items()), SOURCES)
-
-    def run(*arguments) -> subprocess.CompletedProcess:
-        process = subprocess.run(
-            [sys.executable, *map(str, arguments)], capture_output=True, text=True, timeout=240, check=False,
-            cwd=ROOT, env=os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(folder)])},
-        )  # fmt: skip
-        assert process.returncode == 0, process.stdout + process.stderr
-        return process
-
-    return run
+    return partial(run_python, folder)
 
 
 def test_methods_are_listed_and_broken_plugins_only_warn(run):
@@ -141,6 +189,20 @@ def test_rules_are_found_and_broken_plugins_only_warn(run):
 
 def test_plugins_import_no_torch(run):
     run("-W", "ignore", "-c", "import sys, training.methods; assert 'torch' not in sys.modules")
+
+
+def test_recipe_for_a_rule(tmp_path):
+    """A new rule needs one module: it selects, and edits scale its lengths."""
+    install(tmp_path, "rings", "[lodgs.rules]\nrings = rings\n", {"rings.py": RECIPE})
+    bundle, larger = tmp_path / "bundle.ply", tmp_path / "larger.ply"
+    run_python(tmp_path, "-c", EXPORT, bundle)
+    assert "rings" in run_python(tmp_path, "-m", "training", "info", bundle).stdout
+    # the fine level ends at 12, and at 24 for the important half
+    counts = run_python(tmp_path, "-c", SELECT, bundle).stdout.splitlines()
+    assert counts == ["0 20", "0 20", "10 0", "10 0"]
+    run_python(tmp_path, "-m", "training", "edit", bundle, "--out", larger, "--scale", "2")
+    counts = run_python(tmp_path, "-c", SELECT, larger).stdout.splitlines()
+    assert counts == ["0 20", "0 20", "5 10", "5 10"]
 
 
 def test_restricted_rules_are_unknown(run):

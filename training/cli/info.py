@@ -6,7 +6,7 @@ import argparse
 import json
 from pathlib import Path
 
-from ..lod.rule import find_rule
+from ..lod.selection import standalone_levels
 from ..splats.bundle import open_bundle
 from ..splats.bundle_header import json_default
 from ..splats.file_rows import DrawableRows
@@ -71,7 +71,6 @@ def describe(path: str | Path) -> str:
 
 
 def _completeness(bundle: Bundle) -> str:
-    rule = find_rule(bundle.rule)
-    if rule is not None and not rule.complete and len(bundle.levels) > 1:
+    if len(standalone_levels(bundle)) < len(bundle.levels):
         return "only the finest complete"
     return "each level adds to the coarser ones" if bundle.cumulative else "each level complete"

@@ -1,7 +1,7 @@
 """Clean-up of splats: tests for unwanted splats, and removal of them from all levels.
 
-Splats are tested one by one for position, size and opacity; floaters are found among all levels together. In
-a tree, the leaves are tested; inner nodes remain while any leaf below them remains. numpy only.
+Splats are tested one by one for position, size and opacity; floaters are found among all levels together.
+Splats that depend on others follow them (``lod.rule.Relations``). numpy only.
 """
 
 from __future__ import annotations
@@ -13,28 +13,21 @@ from math import inf
 import numpy as np
 
 from ..errors import LodgsError
+from ..lod.blocks import BLOCKS, block_table
 from ..lod.crop import Crop, crop_mask
-from ..lod.partial_read import BLOCKS, block_table
-from ..lod.rule import find_rule
-from ..lod.rules.cut import PARENT, PARENT_SIZE
-from ..lod.selection import unknown_rule_error
-from ..lod.tree.pages import page_table
-from ..lod.tree.paging import is_tree
-from ..lod.tree.resident import COLUMNS, ResidentTree
+from ..lod.rule import Masks, Relations, Rule, find_rule, resolve_rule
+from ..lod.selection import rule_columns, unknown_rule_error
 from ..scenes.cameras import Camera
 from ..scenes.view_tables import VIEW_TABLES
 from ..splats.gaussians import SplatRows, Splats
-from ..splats.levels import Bundle
-from ..splats.ply import BATCH_ROWS
+from ..splats.levels import Bundle, Level
+from ..splats.ply import Columns, read_batches
 
 MAX_FLOATER_SHARE = 0.001
 """Clusters with at most this fraction of all splats are floaters."""
 GAPS_ACROSS = 48
 """The default gap is the diagonal of the middle 80 % of the splats divided by this number."""
 _MAX_CELL = (1 << 20) - 2
-
-Masks = Mapping[int, np.ndarray]
-"""An array (N, ...) per level, by level number: usually (N,) bool."""
 
 
 def find_large(scales: np.ndarray, limit: float) -> np.ndarray:
@@ -147,44 +140,38 @@ def clean_bundle(bundle: Bundle, cleaning: Cleaning) -> Bundle:
     Raises:
         LodgsError: as :func:`keep_splats`.
     """
-    tree = is_tree(bundle)
+    related = resolve_rule(bundle.rule).relations
     masks, means, columns = {}, {}, {}
     for level in bundle.levels:
         batches = [
-            (cleaning.keeps(splats), splats.means, {name: splats.extras.get(name) for name in COLUMNS})
+            (cleaning.keeps(splats), splats.means, relation_columns(splats, related))
             for splats in read_batches(level.rows)
         ]
         masks[level.number] = np.concatenate([mask for mask, _, _ in batches])
-        if cleaning.drop_floaters or tree:
+        if cleaning.drop_floaters:
             means[level.number] = np.concatenate([batch_means for _, batch_means, _ in batches])
-        if tree:
-            columns[level.number] = {
-                name: np.concatenate([_or_zeros(batch[name], len(mask)) for mask, _, batch in batches])
-                for name in COLUMNS
-            }
-    relations = TreeRelations(columns, means) if tree else None
+        columns[level.number] = {
+            name: np.concatenate([batch[name] for _, _, batch in batches]) for name in related.columns
+        }
+    relations = related(columns)
     if cleaning.drop_floaters:
-        exclude_floaters(masks, means, cleaning.gap, cleaning.share, relations)
+        exclude_floaters(masks, means, relations, cleaning.gap, cleaning.share)
     return keep_splats(bundle, masks, relations)
 
 
 def exclude_floaters(
     masks: dict[int, np.ndarray],
-    means: Masks,
+    means: Mapping[int, np.ndarray],
+    relations: Relations,
     gap: float,
     share: float,
-    relations: TreeRelations | None = None,
 ) -> None:
-    """Remove floaters from the masks of remaining splats, (N,) bool; in a tree, only leaves are tested.
+    """Remove floaters among the testable splats from the masks of remaining splats, (N,) bool.
 
     Args:
         means: (N, 3) of each level.
     """
-    if relations:
-        tested = relations.leaves
-    else:
-        tested = {number: np.ones(len(mask), bool) for number, mask in masks.items()}
-    rows = {number: np.flatnonzero(mask & tested[number]) for number, mask in masks.items()}
+    rows = {number: np.flatnonzero(mask) for number, mask in relations.testable(masks).items()}
     tested_means = np.concatenate([means[number][level_rows] for number, level_rows in rows.items()])
     floating = find_floaters(tested_means, gap, share)
     begin = 0
@@ -193,14 +180,13 @@ def exclude_floaters(
         begin += len(level_rows)
 
 
-def keep_splats(bundle: Bundle, masks: Masks, relations: TreeRelations | None = None) -> Bundle:
+def keep_splats(bundle: Bundle, masks: Masks, relations: Relations | None = None) -> Bundle:
     """Return a bundle with only the splats of the masks, (N,) bool each, and updated tables.
 
-    In a tree, only the masks of leaves count. A node with one remaining child is replaced by that child, so
-    that every node still has two children or none, and every cut is complete.
+    Dependent splats follow the others, see ``rule.Relations.pruned``.
 
     Args:
-        relations: of a tree, if already computed.
+        relations: of the splats, if already computed.
 
     Raises:
         LodgsError: no splats remain, or the bundle has tables of an unknown rule.
@@ -208,9 +194,7 @@ def keep_splats(bundle: Bundle, masks: Masks, relations: TreeRelations | None = 
     rule = find_rule(bundle.rule)
     if bundle.rule and rule is None and bundle.tables.keys() - set(VIEW_TABLES):
         raise LodgsError(*unknown_rule_error(bundle.rule))
-    changed: dict[int, dict[str, np.ndarray]] = {}
-    if is_tree(bundle):
-        masks, changed = (relations or TreeRelations.of(bundle)).pruned(masks)
+    masks, changed = (relations or read_relations(bundle)).pruned(masks)
     levels = []
     for level in bundle.levels:
         rows = np.flatnonzero(masks[level.number])
@@ -224,95 +208,40 @@ def keep_splats(bundle: Bundle, masks: Masks, relations: TreeRelations | None = 
     if not any(len(level.rows) for level in levels):
         raise LodgsError("No splats remain.", "Check the crops and limits.")
     tables = dict(bundle.tables)
-    if BLOCKS in tables and is_tree(bundle):
-        tables[BLOCKS] = page_table(changed)
-    elif BLOCKS in tables and rule is not None:
-        parts = [
-            block_table(rule, {level.number: splats})
-            for level in levels
-            for splats in read_batches(level.rows)
-        ]
-        tables[BLOCKS] = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    if BLOCKS in tables and rule is not None:
+        tables[BLOCKS] = block_table(rule.block_bounds, _rule_columns(rule, levels, changed))
     return replace(bundle, levels=levels, tables=tables)
 
 
-class TreeRelations:
-    """Parents and children among the splats of a tree, whose levels are concatenated.
+def _rule_columns(
+    rule: Rule, levels: Sequence[Level], changed: Mapping[int, Columns]
+) -> Iterator[tuple[int, Columns]]:
+    """Yield level numbers with the rule's columns of consecutive rows, changed or as in their source."""
+    for level in levels:
+        if level.number in changed:
+            yield level.number, changed[level.number]
+            continue
+        for splats in read_batches(level.rows):
+            yield level.number, rule_columns(rule, splats)
 
-    Args:
-        columns: of the rule ``cut``, (N,) of each level.
-        means: (N, 3) of each level.
-    """
 
-    def __init__(self, columns: Mapping[int, Mapping[str, np.ndarray]], means: Masks) -> None:
-        self._numbers = list(means)
-        self._ends = np.cumsum([len(level_means) for level_means in means.values()])
-        all_means = np.concatenate(list(means.values()))
-        self._columns = {
-            name: np.concatenate([columns[number][name] for number in self._numbers]) for name in COLUMNS
+def read_relations(bundle: Bundle) -> Relations:
+    """Return the relations of a bundle's splats."""
+    related = resolve_rule(bundle.rule).relations
+    columns: dict[int, Columns] = {}
+    for level in bundle.levels if related.columns else ():
+        batches = [relation_columns(splats, related) for splats in read_batches(level.rows)]
+        columns[level.number] = {
+            name: np.concatenate([batch[name] for batch in batches]) for name in related.columns
         }
-        tree = ResidentTree(self._columns | dict(zip("xyz", all_means.T, strict=True)))
-        tree.update(np.arange(len(all_means)))
-        self._parents = tree.parents
-        self._children = self._count_children(np.ones(len(all_means), bool))
+    return related(columns)
 
-    @classmethod
-    def of(cls, bundle: Bundle) -> TreeRelations:
-        """Return the relations of a bundle's levels."""
-        columns, means = {}, {}
-        for level in bundle.levels:
-            parts = list(read_batches(level.rows))
-            means[level.number] = np.concatenate([part.means for part in parts])
-            columns[level.number] = {
-                name: np.concatenate([_or_zeros(part.extras.get(name), len(part)) for part in parts])
-                for name in COLUMNS
-            }
-        return cls(columns, means)
 
-    @property
-    def leaves(self) -> Masks:
-        """Masks of the leaves."""
-        return self._by_level(self._children == 0)
-
-    def with_ancestors(self, masks: Masks) -> dict[int, np.ndarray]:
-        """Return masks of the remaining leaves and all their ancestors."""
-        return self._by_level(self._with_ancestors(masks))
-
-    def pruned(self, masks: Masks) -> tuple[dict[int, np.ndarray], dict[int, dict[str, np.ndarray]]]:
-        """Return masks of the remaining splats, and their new columns (M,), see :func:`keep_splats`."""
-        remaining = self._with_ancestors(masks)
-        single = remaining & (self._count_children(remaining) == 1)
-        # each node takes the parent of its highest ancestor in a chain of nodes with one child
-        own = np.arange(len(remaining), dtype=np.int32)
-        replaced = np.where((self._parents >= 0) & single[self._parents], self._parents, own)
-        while not np.array_equal(higher := replaced[replaced], replaced):
-            replaced = higher
-        remaining &= ~single
-        columns = {name: self._columns[name] for name in COLUMNS}
-        for name in (PARENT_SIZE, *PARENT):
-            columns[name] = columns[name][replaced]
-        masks = self._by_level(remaining)
-        by_level = {name: self._by_level(column) for name, column in columns.items()}
-        return masks, {
-            number: {name: by_level[name][number][mask] for name in COLUMNS} for number, mask in masks.items()
-        }
-
-    def _with_ancestors(self, masks: Masks) -> np.ndarray:
-        remaining = np.concatenate([masks[number] for number in self._numbers]) & (self._children == 0)
-        added = np.flatnonzero(remaining)
-        while len(added):
-            parents = np.unique(self._parents[added])
-            added = parents[(parents >= 0) & ~remaining[parents]]
-            remaining[added] = True
-        return remaining
-
-    def _count_children(self, mask: np.ndarray) -> np.ndarray:
-        """Return the number of each node's children (N,) in a mask."""
-        parents = self._parents[mask]
-        return np.bincount(parents[parents >= 0], minlength=len(mask))
-
-    def _by_level(self, values: np.ndarray) -> dict[int, np.ndarray]:
-        return dict(zip(self._numbers, np.split(values, self._ends[:-1]), strict=True))
+def relation_columns(splats: Splats, related: type[Relations]) -> Columns:
+    """Return the columns (N,) that determine relations; missing ones are zeros."""
+    available = splats.extras | dict(zip("xyz", splats.means.T, strict=True))
+    zeros = np.zeros(len(splats), np.float32)
+    return {name: available.get(name, zeros) for name in related.columns}
 
 
 @dataclass(frozen=True)
@@ -337,16 +266,6 @@ class RowSubset:
         splats = self.source.select(self.rows[index])
         splats.extras |= {name: column[index] for name, column in self.columns.items()}
         return splats
-
-
-def read_batches(rows: SplatRows) -> Iterator[Splats]:
-    """Read all splats, BATCH_ROWS at a time; yields at least one batch, which may be empty."""
-    for begin in range(0, max(len(rows), 1), BATCH_ROWS):
-        yield rows.select(slice(begin, begin + BATCH_ROWS))
-
-
-def _or_zeros(column: np.ndarray | None, count: int) -> np.ndarray:
-    return np.zeros(count, np.float32) if column is None else column
 
 
 def assign_cells(means: np.ndarray, gap: float) -> tuple[np.ndarray, np.ndarray]:

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from ..errors import LodgsError
+from ..lod.rule import resolve_rule
 from ..lod.selection import check_rule
-from ..lod.tree.paging import is_tree
-from ..lod.tree.shape import complete_levels
 from ..splats.bundle import open_bundle, write_bundle
 from ..splats.dialects import Warn, comments_from_meta, ignore, meta_from_comments
 from ..splats.file_rows import DrawableRows
@@ -25,7 +24,7 @@ from ..splats.formats import (
 )
 from ..splats.gaussians import SplatRows, Splats
 from ..splats.level_folder import read_folder, write_folder
-from ..splats.levels import Bundle, Level
+from ..splats.levels import Bundle
 from ..splats.ply import write_ply
 from ..splats.similarity import Similarity
 from .bake_filter import bake_filter
@@ -73,12 +72,8 @@ def edit(
     Raises:
         LodgsError: cannot read or write a file, the source contradicts its rule, or no splats remain.
     """
-    for path in (out, *plain, folder, streamed):
-        if path is not None and path.resolve() == source.resolve():
-            raise LodgsError(f"Cannot overwrite the source {path}.", "Choose another output file.")
-    kinds = {find_format(path) for path in plain}
-    if streamed is not None or not kinds <= {PLY, SPLAT}:
-        find_splat_transform()  # fail before minutes of work
+    paths = [path for path in (out, *plain, folder, streamed) if path is not None]
+    _check_outputs(source, paths, plain, streamed)
     bundle = _open(source, warn)
     check_rule(bundle)
     edited = apply_looks_to_levels(clean_bundle(bundle, cleaning), looks)
@@ -93,18 +88,34 @@ def edit(
         f"level {level.number}: {len(result.rows):,} of {len(level.rows):,} splats"
         for level, result in zip(bundle.levels, edited.levels, strict=True)
     ]
+    _export(edited, plain, folder, streamed, antialiased)
+    return "\n".join([*report, *(f"{path}: written" for path in paths)])
+
+
+def _check_outputs(source: Path, paths: Sequence[Path], plain: Sequence[Path], streamed: Path | None) -> None:
+    """Raise an error before minutes of work if an output cannot be written."""
+    for path in paths:
+        if path.resolve() == source.resolve():
+            raise LodgsError(f"Cannot overwrite the source {path}.", "Choose another output file.")
+    if streamed is not None or not {find_format(path) for path in plain} <= {PLY, SPLAT}:
+        find_splat_transform()
+
+
+def _export(
+    edited: Bundle, plain: Sequence[Path], folder: Path | None, streamed: Path | None, antialiased: bool
+) -> None:
+    """Write the finest level and the complete levels in other formats; arguments as for :func:`edit`."""
     for path in plain:
         exported = edited if antialiased or find_format(path).antialiased else bake_filter(edited)
         finest = ConcatenatedRows.of_level(exported, exported.levels[-1].number)
         run_to_end(write_splats(path, finest, exported.meta))
-    if folder is not None or streamed is not None:
-        levels = complete_levels(_in_memory(edited)) if is_tree(edited) else edited
-        if folder is not None:
-            write_folder(folder, levels)
-        if streamed is not None:
-            run_to_end(write_streamed_levels(streamed, levels if antialiased else bake_filter(levels)))
-    paths = [path for path in (out, *plain, folder, streamed) if path is not None]
-    return "\n".join([*report, *(f"{path}: written" for path in paths)])
+    if folder is None and streamed is None:
+        return
+    levels = resolve_rule(edited.rule).complete_levels(edited)
+    if folder is not None:
+        write_folder(folder, levels)
+    if streamed is not None:
+        run_to_end(write_streamed_levels(streamed, levels if antialiased else bake_filter(levels)))
 
 
 def run_to_end(steps: Iterator[str]) -> None:
@@ -157,11 +168,3 @@ def _write_like(source: Path, bundle: Bundle, out: Path, edited: Bundle) -> None
         write_ply(out, edited.levels[0].rows, comments)
     else:
         write_bundle(out, edited)
-
-
-def _in_memory(bundle: Bundle) -> Bundle:
-    levels = [
-        Level(level.number, level.rows.select(slice(0, len(level.rows))), level.facts)
-        for level in bundle.levels
-    ]
-    return replace(bundle, levels=levels)

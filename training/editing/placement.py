@@ -8,23 +8,23 @@ from typing import Any
 import numpy as np
 
 from ..errors import LodgsError
-from ..lod.partial_read import BLOCKS
-from ..lod.rule import Rule, find_rule
-from ..lod.selection import rule_columns, unknown_rule_error
-from ..lod.tree.pages import BOUNDS, page_table
+from ..lod.blocks import BLOCKS, block_table
+from ..lod.rule import find_rule
+from ..lod.selection import unknown_rule_error
 from ..scenes import view_tables
 from ..scenes.ground import find_ground, ground_placement, points_near_cameras
 from ..splats.gaussians import SplatRows, Splats
 from ..splats.levels import META_LENGTHS, NO_SPLATS, Bundle, Level
-from ..splats.ply import BATCH_ROWS, Columns
+from ..splats.ply import read_batches
 from ..splats.similarity import Similarity, TransformedRows
+from .cleaning import read_relations
 
 
 def transform_bundle(bundle: Bundle, placement: Similarity) -> Bundle:
     """Return a bundle with splats and all positions and lengths transformed.
 
-    Levels on disk stay there until they are written. Columns of a rule with ``linked_columns`` are loaded
-    into memory, about 150 bytes per splat.
+    Levels on disk stay there until they are written. Columns of related splats (``lod.rule.Relations``) are
+    loaded into memory.
 
     Raises:
         LodgsError: unknown rule, whose lengths are unknown.
@@ -42,12 +42,10 @@ def transform_bundle(bundle: Bundle, placement: Similarity) -> Bundle:
     def scale(facts: dict[str, float]) -> dict[str, float]:
         return {n: value * placement.scale if n in lengths else value for n, value in facts.items()}
 
-    if rule and rule.linked_columns:
-        new_columns = _linked_columns(bundle, rule, placement)
-    else:
-        new_columns = [{} for _ in bundle.levels]
+    new_columns = read_relations(bundle).transformed(placement)
     levels = []
-    for level, columns in zip(bundle.levels, new_columns, strict=True):
+    for level in bundle.levels:
+        columns = new_columns.get(level.number, {})
         if level.on_disk is None:
             splats = transform(level.splats)
             splats.extras |= columns
@@ -61,9 +59,8 @@ def transform_bundle(bundle: Bundle, placement: Similarity) -> Bundle:
             tables[name] = placement.transform_columns(tables[name], lengths, places)
     if view_tables.VIEWS in tables:
         tables[view_tables.VIEWS] = view_tables.transform_views(tables[view_tables.VIEWS], placement)
-    if BOUNDS[0] in tables.get(BLOCKS, {}):
-        numbers = [level.number for level in bundle.levels]
-        tables[BLOCKS] = page_table(dict(zip(numbers, new_columns, strict=True)))
+    if rule and new_columns and BLOCKS in tables:
+        tables[BLOCKS] = block_table(rule.block_bounds, new_columns.items())
     meta = _transform_meta(bundle.meta, placement)
     return replace(bundle, levels=levels, facts=scale(bundle.facts), tables=tables, meta=meta)
 
@@ -101,11 +98,7 @@ def upright_placement(
 
 def _opaque_means(rows: SplatRows) -> np.ndarray:
     """Return the means (P, 3) float32 of splats with an opacity above 1/2."""
-    means = [np.zeros((0, 3), np.float32)]
-    for begin in range(0, len(rows), BATCH_ROWS):
-        splats = rows.select(slice(begin, begin + BATCH_ROWS))
-        means.append(splats.means[splats.opacity_logits > 0])
-    return np.concatenate(means)
+    return np.concatenate([splats.means[splats.opacity_logits > 0] for splats in read_batches(rows)])
 
 
 def _transform_meta(meta: dict, placement: Similarity) -> dict:
@@ -131,18 +124,3 @@ def _scale_lengths(value: Any, scale: float, is_length: bool = False) -> Any:
         case int() | float() if is_length:
             return float(f"{value * scale:.6g}")
     return value
-
-
-def _linked_columns(bundle: Bundle, rule: Rule, placement: Similarity) -> list[Columns]:
-    """Return the rule's columns of each level after the transform, corrected for rounding."""
-    parts, ends = [], []
-    for level in bundle.levels:
-        for begin in range(0, max(len(level.rows), 1), BATCH_ROWS):
-            splats = level.rows.select(slice(begin, begin + BATCH_ROWS))
-            parts.append(rule_columns(rule, splats) | dict(zip("xyz", splats.means.T.copy(), strict=True)))
-        ends.append(len(level.rows))
-    original = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    transformed = placement.transform_columns(original, rule.lengths, (*rule.places, ("x", "y", "z")))
-    transformed |= rule.reconcile(original, transformed)
-    parts = [np.split(transformed[name], np.cumsum(ends)[:-1]) for name in rule.columns]
-    return [dict(zip(rule.columns, columns, strict=True)) for columns in zip(*parts, strict=True)]

@@ -12,7 +12,7 @@ from ..files import atomic_write
 from ..lod.colors import level_color
 from ..lod.on_disk import read_visible
 from ..lod.rule import Values, find_rule
-from ..lod.selection import complete_splats, select, standalone_levels
+from ..lod.selection import complete_splats, full_detail_controls, select, standalone_levels
 from ..scenes.cameras import Camera
 from ..scenes.images import write_png
 from ..splats.gaussians import SH_C0, Splats
@@ -41,7 +41,7 @@ def write_level_sheet(
 
     rule = find_rule(bundle.rule)
     tiles = []
-    if rule is None or not rule.always_active:
+    if full_detail_controls(bundle) is None:
         tiles = [
             tile(f"level {level.number}", complete_splats(bundle, level))
             for level in standalone_levels(bundle)

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 
 from ..lod.on_disk import CulledReader
-from ..lod.rule import Values, find_rule
-from ..lod.selection import BundleSelector, complete_splats, resolve_controls
+from ..lod.rule import Values
+from ..lod.selection import BundleSelector, complete_splats, full_detail_controls
 from ..optimize.training_data import TrainingData
 from ..rasterize import Gaussians, Rendering, Target, rasterize, tensor_device
 from ..rasterize.resident import ResidentBundle, SplatSet, WeightedSet, draw
@@ -35,18 +35,17 @@ opacities; None means 1."""
 def full_detail_source(bundle: Bundle, level: Level) -> SplatSource:
     """Return a source of the splats at full detail up to a level.
 
-    The source returns all splats of the level. Rules that are always active weight them, because the method
-    trained with these weights. Of levels on disk, the source reads only splats that the camera sees.
+    The source returns all splats of the level. Some rules weight them, because the method trained with these
+    weights. Of levels on disk, the source reads only splats that the camera sees.
     """
     if bundle.on_disk:
         return _visible_source(bundle, level)
-    rule = find_rule(bundle.rule)
-    if rule is None or not rule.always_active:
+    drawn = replace(bundle, levels=bundle.drawn_levels(level.number))
+    controls = full_detail_controls(drawn)
+    if controls is None:
         splats = complete_splats(bundle, level)
         return lambda camera: (splats, None)
-    drawn = replace(bundle, levels=bundle.drawn_levels(level.number))
     selector = BundleSelector(drawn)
-    controls = resolve_controls(drawn, {})
     return lambda camera: (selector.splats, selector.weights(camera.center, camera.focal, controls))
 
 
@@ -182,12 +181,12 @@ class Evaluation:
         return self.measure(lambda camera: resident.draw(camera, values, **self._options), count)
 
     def measure_level(self, bundle: Bundle, level: Level) -> dict:
-        """Measure a complete level, weighted by the bundle's rule if it is always active."""
-        rule = find_rule(bundle.rule)
+        """Measure a complete level, with the weights of full detail."""
         drawn = replace(bundle, levels=bundle.drawn_levels(level.number))
         resident = ResidentBundle(drawn, self.backend)
-        if rule is not None and rule.always_active:
-            return self.measure_by_distance(resident, resolve_controls(drawn, {}))
+        controls = full_detail_controls(drawn)
+        if controls is not None:
+            return self.measure_by_distance(resident, controls)
         total = sum(len(part.rows) for part in drawn.levels)
         return self.measure(
             lambda camera: resident.draw_level(level.number, camera, **self._options), lambda camera: total

@@ -1,22 +1,26 @@
-"""Levels on disk: read only the splats that a camera can see. numpy only."""
+"""Levels on disk: read only some levels, or the splats of a region or a camera. numpy only."""
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
+from ..errors import LodgsError
 from ..scenes.cameras import Camera
-from ..splats.bundle import open_bundle, read_header
+from ..splats.bundle import open_bundle, read_bundle, read_header, read_tables
 from ..splats.dialects import Warn, drop_undrawable, dropped_message, ignore
 from ..splats.gaussians import SplatRows, Splats
 from ..splats.levels import Bundle
-from .blocks import SIZE, Blocks
-from .query import LodQuery
-from .rule import Rule, find_rule
-from .selection import rule_columns
+from ..splats.ply import extra_columns
+from ..splats.ply import splat_columns as columns_in_file
+from .blocks import BLOCKS, BOUNDS, SIZE, BlockIndex
+from .query import LodQuery, PagedFile
+from .rule import Region, Rule, find_rule, resolve_rule
+from .selection import require_rule, rule_columns
 
 MAX_IN_MEMORY = 4_000_000
 """Default limit of splats to keep all of a file in memory: 1 GB at degree 3."""
@@ -28,6 +32,79 @@ _GAP = 4
 """Read gaps of up to so many blocks along with their neighbours, instead of seeking."""
 _MAX_SURPLUS = 2
 """Keep blocks in memory while they are at most so many times those that a camera can see."""
+
+
+def read_header_and_tables(path: str | Path) -> Bundle:
+    """Return a bundle with its tables and levels, but without splats.
+
+    Raises:
+        LodgsError: as ``read_bundle``.
+    """
+    return replace(read_header(path), tables=read_tables(path))
+
+
+def read_part(
+    path: str | Path, numbers: Collection[int], region: Region | None = None, warn: Warn = ignore
+) -> tuple[Bundle, int]:
+    """Read some levels of a bundle, or their splats that are visible in a region.
+
+    Skips blocks without such splats. Splats keep the file's order; other levels are empty.
+
+    Args:
+        numbers: of the levels.
+        region: None: all splats; also if the file has no table of blocks.
+        warn: as for ``read_bundle``.
+
+    Returns:
+        The bundle, and the number of bytes read.
+
+    Raises:
+        LodgsError: as ``read_bundle``; unknown rule, if there is a region.
+    """
+    size = 0
+
+    def rows_of(bundle: Bundle) -> dict[int, np.ndarray]:
+        nonlocal size
+        size = sum(column.nbytes for table in bundle.tables.values() for column in table.values())
+        rows = {level.number: np.zeros(0, np.int64) for level in bundle.levels if level.number not in numbers}
+        table = bundle.tables.get(BLOCKS)
+        if table is None or region is None:
+            return rows
+        index = BlockIndex.from_table(table)
+        if index is None:
+            return rows
+        rule, zeros = require_rule(bundle), np.zeros(len(index), np.float32)
+        columns = {name: index.columns.get(name, zeros) for name in rule.columns}
+        level_rows = index.level_rows(rule.visible_in_region(columns, region))
+        rows |= {number: level_rows.get(number, np.zeros(0, np.int64)) for number in numbers}
+        return rows
+
+    bundle = read_bundle(path, warn, rows_of)
+    rule = None if region is None or BLOCKS not in bundle.tables else require_rule(bundle)
+    for level in bundle.levels:
+        columns = columns_in_file(level.splats) | extra_columns(level.splats)
+        size += sum(column.dtype.itemsize for column in columns.values()) * len(level.splats)
+        if rule is not None and region is not None:
+            visible = rule.visible_in_region(rule_columns(rule, level.splats), region)
+            level.splats = level.splats.select(visible)
+    return bundle, size
+
+
+def open_paged(path: str | Path) -> PagedFile:
+    """Open a bundle whose rule allows reads of only the part that a camera needs.
+
+    Raises:
+        LodgsError: as ``read_bundle``, or another rule.
+    """
+    name = read_header(path).rule
+    paged_file = resolve_rule(name).paged_file
+    if paged_file is None:
+        raise LodgsError(
+            f"Cannot read {path} in pages: "
+            + (f"its rule '{name}' needs the complete file." if name else "it has no rule."),
+            "Open the file completely.",
+        )
+    return paged_file(Path(path))
 
 
 def supports_culled_reads(rule: str) -> bool:
@@ -77,27 +154,21 @@ class CulledReader:
         self._rows = rows
         self._rule = rule
         self._path = str(path)
-        bounds, maxima, undrawable = [], [], 0
-        for begin in range(0, len(rows), _BATCH):
+        parts, undrawable = [], 0
+        for begin in range(0, max(len(rows), 1), _BATCH):
             splats = rows.select(slice(begin, begin + _BATCH))
             missing = len(splats) - len(drop_undrawable(splats, self._path))
             undrawable += missing
-            blocks = Blocks.of(splats.means, splats.log_scales)
+            part = BlockIndex.of(splats.means, splats.log_scales)
             if missing:  # coordinates may be invalid
-                blocks.low[:], blocks.high[:] = -_FAR, _FAR
-            bounds.append((blocks.low, blocks.high, blocks.reach))
-            columns = {} if rule is None else rule_columns(rule, splats)
-            maxima.append({name: blocks.highest(column) for name, column in columns.items()})
+                for name in BOUNDS:
+                    part.columns[name] = np.full(len(part), _FAR if name.startswith("high") else -_FAR)
+            if rule is not None:
+                part.add_maxima(rule_columns(rule, splats))
+            parts.append(part)
         if undrawable:
             warn(dropped_message(undrawable, self._path))
-        empty = Blocks.of(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32))
-        low, high, reach = (
-            np.concatenate([getattr(empty, name), *(batch[i] for batch in bounds)])
-            for i, name in enumerate(("low", "high", "reach"))
-        )
-        self._blocks = Blocks(len(rows), low, high, reach)
-        names = maxima[0] if maxima else {}
-        self._highest = {name: np.concatenate([batch[name] for batch in maxima]) for name in names}
+        self._blocks = BlockIndex.joined(parts)
         self._in_memory: np.ndarray | None = None
         self.splats_read = len(rows)
 
@@ -111,8 +182,8 @@ class CulledReader:
             query: skip blocks whose splats have no weight by this query.
         """
         visible = self._blocks.in_view(camera, 0.0)
-        if query is not None and self._rule is not None and self._rule.independent and query.region() is None:
-            band = query.distance_band(self._highest)
+        if query is not None and self._rule is not None and query.region() is None:
+            band = query.distance_band(self._blocks.columns)
             visible &= self._blocks.in_band(np.array(query.eye, np.float32), *band)[0]
         limit = max(_MAX_SURPLUS * np.count_nonzero(visible), _BATCH // SIZE)
         in_memory = self._in_memory

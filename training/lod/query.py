@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
 from ..scenes.cameras import Camera
-from .blocks import SIZE, Blocks
+from ..splats.gaussians import Splats
+from ..splats.levels import Bundle
+from .blocks import SIZE, BlockIndex
 from .crop import Crop, crop_mask
 from .rule import HIDDEN, NO_RULE, OPACITY, Region, Rule, Tables, all_rule_columns, rules
 
@@ -140,6 +143,108 @@ class LodQuery:
         }  # fmt: skip
 
 
+@dataclass(frozen=True)
+class PageUpdate:
+    """Pages to copy into memory.
+
+    Attributes:
+        pages: first row in memory, and splats, of each page.
+        columns: new values of all rows in memory, (rows,) each, for the rule; its other columns are those of
+            the splats.
+    """
+
+    pages: list[tuple[int, Splats]]
+    columns: dict[str, np.ndarray]
+
+
+class Pager(Protocol):
+    """Reads the pages of a file that a camera needs, in a thread.
+
+    The caller owns the memory of ``rows`` splats and copies updates into it (:meth:`take`), where new pages
+    replace old ones. Then the weights of the rule give a complete selection of the splats in memory.
+
+    Attributes:
+        rows: number of rows in memory; initially all are empty, and have weight 0.
+        sh_degree: of the splats.
+        arrived: number of updates so far.
+        short: whether the camera needs more than the budget.
+        problem: error that ended the thread, else "".
+    """
+
+    rows: int
+    sh_degree: int
+    arrived: int
+    short: bool
+    problem: str
+
+    @property
+    def splats(self) -> int:
+        """Number of splats in memory or being read."""
+        ...
+
+    @property
+    def idle(self) -> bool:
+        """Whether the caller has taken all pages that fit the budget, or the thread has ended."""
+        ...
+
+    def start(self) -> None:
+        """Start the thread, which reads the first pages of the file, then requested ones."""
+
+    def stop(self) -> None:
+        """Stop the thread, without waiting for reads from a slow disk."""
+
+    def ask(self, query: LodQuery, direction: Sequence[float] | None = None) -> None:
+        """Request the pages that a query selects. Returns immediately.
+
+        Args:
+            direction: (3,) of length 1, the view direction: pages outside the view come later; None: the
+                camera looks in all directions.
+        """
+
+    def take(self) -> PageUpdate | None:
+        """Return the next update, if there is one; the caller must apply it before the next call."""
+
+
+class PagedFile(Protocol):
+    """A bundle of which only the part that a camera needs is in memory, see ``Rule.paged_file``.
+
+    Attributes:
+        bundle: the bundle without splats.
+        total: number of splats in the file.
+    """
+
+    bundle: Bundle
+    total: int
+
+    def visible(self, query: LodQuery, camera: Camera | None = None, near: float = 0.0) -> dict[int, Splats]:
+        """Return by level number the drawable splats that a query selects.
+
+        Args:
+            camera: in the splats' space; skip blocks outside its image.
+            near: depth where its image begins, in the splats' units.
+        """
+        ...
+
+    def top(self, budget: int) -> Bundle:
+        """Read the coarsest splats as a smaller, complete bundle.
+
+        Args:
+            budget: maximum number of splats.
+
+        Raises:
+            LodgsError: the file cannot be read, or the budget is too small.
+        """
+        ...
+
+    def pager(self, budget: int) -> Pager:
+        """Return a pager, not started yet, for a maximum number of splats in memory.
+
+        Raises:
+            LodgsError: the budget is too small.
+        """
+        ...
+
+
 class SplatSelector:
     """Selects splats of one set, for one query after another.
 
@@ -220,7 +325,7 @@ class SplatSelector:
             return rows, np.ones(len(rows), np.float32)
         columns = {name: blocks.of_rows(evaluated, column) for name, column in columns.items()}
         weights = _weigh(query, blocks.of_rows(evaluated, subset.means), columns)
-        if (visible & full).any():  # of binary rules: weights are 0 or 1
+        if (visible & full).any():  # inside the band, weights are 0 or 1
             selected = np.ones(len(rows), bool)
             selected[np.repeat(evaluated[visible], SIZE)[: len(rows)]] = weights > 0
             rows = rows[selected]
@@ -232,13 +337,13 @@ class SplatSelector:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return (B,) bool: blocks in the distance band, and blocks where all splats have weight 1."""
         assert subset.blocks is not None
-        count = len(subset.blocks.low)
+        count = len(subset.blocks)
         visible = np.ones(count, bool)
         full = np.full(count, query is None)
-        if query is not None and query.resolved_rule.independent and not in_region:
-            band = query.distance_band(subset.highest(query.resolved_rule))
+        if query is not None and not in_region:
+            band = query.distance_band(subset.maxima(query.resolved_rule))
             visible, inside = subset.blocks.in_band(np.array(query.eye, np.float32), *band)
-            if query.resolved_rule.binary and query.crops is None:
+            if query.resolved_rule.fills_band(dict(query.values)) and query.crops is None:
                 full = inside
         return visible, full
 
@@ -261,8 +366,7 @@ class _Subset:
     rows: np.ndarray | None
     means: np.ndarray
     columns: Mapping[str, np.ndarray]
-    blocks: Blocks | None
-    _highest: dict[str, np.ndarray] = field(default_factory=dict)
+    blocks: BlockIndex | None
 
     @classmethod
     def of(
@@ -272,12 +376,10 @@ class _Subset:
         columns: Mapping[str, np.ndarray],
         log_scales: np.ndarray | None,
     ) -> _Subset:
-        return cls(rows, means, columns, None if log_scales is None else Blocks.of(means, log_scales))
+        return cls(rows, means, columns, None if log_scales is None else BlockIndex.of(means, log_scales))
 
-    def highest(self, rule: Rule) -> Mapping[str, np.ndarray]:
-        """Return the maximum of each of a rule's columns in each block, (B,)."""
+    def maxima(self, rule: Rule) -> Mapping[str, np.ndarray]:
+        """Return the columns of the blocks, (B,), with the maximum of each of a rule's columns."""
         assert self.blocks is not None
-        for name in rule.columns:
-            if name not in self._highest:
-                self._highest[name] = self.blocks.highest(self.columns[name])
-        return self._highest
+        self.blocks.add_maxima({name: self.columns[name] for name in rule.columns})
+        return self.blocks.columns

@@ -22,8 +22,9 @@ import numpy as np
 
 from ..errors import LodgsError
 from ..plugins import RULES_GROUP, load_plugins
+from ..splats.levels import Bundle
 from ..splats.ply import Columns
-from ..splats.similarity import AxisNames
+from ..splats.similarity import AxisNames, Similarity
 
 STEP = 1.25
 """Factor of one step of :meth:`Rule.raise_control`."""
@@ -99,6 +100,46 @@ class Control:
         return int(value) if self.whole else float(value)
 
 
+Masks = Mapping[int, np.ndarray]
+"""(N,) bool of each level, by level number."""
+
+
+class Relations:
+    """Relations among the splats of all levels, which edits preserve. By default there are none.
+
+    Args:
+        columns: (N,) float32 of each level, by level number; at least the class's ``columns``.
+
+    Attributes:
+        columns: names of the columns that determine the relations; x, y and z are those of the means.
+    """
+
+    columns: ClassVar[tuple[str, ...]] = ()
+
+    def __init__(self, columns: Mapping[int, Columns]) -> None:
+        return
+
+    def testable(self, masks: Masks) -> Masks:
+        """Return the masks without splats that depend on others, which clean-up does not test."""
+        return masks
+
+    def completed(self, masks: Masks) -> Masks:
+        """Return masks of remaining splats with the dependent ones that remain with them."""
+        return masks
+
+    def pruned(self, masks: Masks) -> tuple[Masks, Mapping[int, Columns]]:
+        """Return the masks of the splats to keep, and their changed columns (M,) by level number.
+
+        Args:
+            masks: of the remaining splats; those of dependent splats do not count.
+        """
+        return masks, {}
+
+    def transformed(self, placement: Similarity) -> Mapping[int, Columns]:
+        """Return the columns (N,), by level number, that a transform cannot compute splat by splat."""
+        return {}
+
+
 class Rule(ABC):
     """A rule that gives each splat of a level a weight, depending on the camera.
 
@@ -113,12 +154,12 @@ class Rule(ABC):
         tables: names of tables of the bundle; the rule works without a missing one.
         lengths: the facts, columns and table columns that are lengths in scene units.
         places: the columns and table columns that are positions, as names of x, y and z.
-        linked_columns: columns of a splat must agree with those of others, see :meth:`reconcile`.
-        always_active: weights apply at full detail, too: without them a level is not as trained.
         independent: weights do not depend on other splats, so that subsets can be evaluated.
-        binary: every splat inside its level's :meth:`distance_band` has weight 1.
-        complete: each level, with the coarser ones if levels add up, is a complete scene; otherwise only the
-            finest is.
+        block_bounds: columns of the table of blocks (``blocks.BLOCKS``) besides ``level``, for partial reads
+            of files: each is the reduction of a column over the rows of a block.
+        relations: relations among splats that edits preserve.
+        paged_file: class of files (``query.PagedFile``) of which only a part is in memory; None: files are
+            read completely.
         sweep: a control and values of it that a report measures one by one; None for no such curve.
     """
 
@@ -131,11 +172,10 @@ class Rule(ABC):
     tables: ClassVar[tuple[str, ...]] = ()
     lengths: ClassVar[tuple[str, ...]] = ()
     places: ClassVar[tuple[AxisNames, ...]] = ()
-    linked_columns: ClassVar[bool] = False
-    always_active: ClassVar[bool] = False
     independent: ClassVar[bool] = True
-    binary: ClassVar[bool] = False
-    complete: ClassVar[bool] = True
+    block_bounds: ClassVar[Mapping[str, tuple[str, np.ufunc]]] = {}
+    relations: ClassVar[type[Relations]] = Relations
+    paged_file: ClassVar[type[Any] | None] = None
     sweep: ClassVar[tuple[str, tuple[float, ...]] | None] = None
 
     @abstractmethod
@@ -178,6 +218,10 @@ class Rule(ABC):
         """
         return 0.0, inf
 
+    def fills_band(self, values: Values) -> bool:
+        """Return whether every splat inside its level's :meth:`distance_band` has weight 1."""
+        return False
+
     def check(self, tables: Tables) -> None:
         """Check the rule's tables.
 
@@ -185,15 +229,6 @@ class Rule(ABC):
             ValueError: a table is invalid; the message is a clause without a full stop.
         """
         return
-
-    def reconcile(self, original: Columns, transformed: Columns) -> Columns:
-        """Return columns (N,) that rounding has made inconsistent, corrected; for ``linked_columns``.
-
-        Args:
-            original: the rule's columns and x, y and z of the means, of the splats of all levels.
-            transformed: the same after a transform of the splats.
-        """
-        return {}
 
     def region(self, position: np.ndarray, values: Values, tables: Tables) -> Region | None:
         """Return the region of a camera position; None if the rule has no regions, or none here.
@@ -222,12 +257,47 @@ class Rule(ABC):
         return np.zeros(len(means), np.float32)
 
     def standalone_levels(self, levels: Sequence[int]) -> Sequence[int]:
-        """Return the numbers of the levels that are complete scenes: all, or only the finest.
+        """Return the numbers of the levels that are complete scenes, with the coarser ones if levels add up.
 
         Args:
             levels: numbers of the existing levels, ascending.
         """
-        return levels if self.complete else levels[-1:]
+        return levels
+
+    @property
+    def complete(self) -> bool:
+        """Whether every level is a complete scene, see :meth:`standalone_levels`."""
+        return len(self.standalone_levels((1, 2))) == 2
+
+    def complete_levels(self, bundle: Bundle) -> Bundle:
+        """Return a bundle whose levels are complete scenes, for programs without this rule."""
+        return bundle
+
+    def full_detail_values(self, levels: Sequence[int], recorded: Values | None = None) -> Values | None:
+        """Return control values of the weights without which a single level is not as trained.
+
+        Args:
+            levels: numbers of the existing levels, ascending.
+            recorded: values in the bundle.
+
+        Returns:
+            None: a single level needs no weights.
+        """
+        return None
+
+    @property
+    def weights_full_detail(self) -> bool:
+        """Whether single levels need weights, see :meth:`full_detail_values`."""
+        return self.full_detail_values((1,)) is not None
+
+    def exceeds_budget(self, finest: int, budget: int) -> bool:
+        """Return whether a scene with so many splats in its finest level is paged for a memory budget."""
+        return False
+
+    @property
+    def color_legend(self) -> str:
+        """Explanation of the colours by level, as a sentence; "" if each level has its own colour."""
+        return ""
 
     def splat_level(
         self, columns: Mapping[str, np.ndarray], facts: Mapping[str, float]
@@ -327,6 +397,11 @@ NO_RULE = NoRule()
 def find_rule(name: str) -> Rule | None:
     """Return the rule of that name; None if unknown."""
     return rules().get(name)
+
+
+def resolve_rule(name: str) -> Rule:
+    """Return the rule of that name; NO_RULE if there is none or it is unknown."""
+    return rules().get(name, NO_RULE)
 
 
 def all_controls() -> dict[str, Control]:

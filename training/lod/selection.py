@@ -10,7 +10,7 @@ import numpy as np
 from ..errors import LodgsError
 from ..splats.gaussians import Splats
 from ..splats.levels import Bundle, Level
-from .rule import OPACITY, Rule, Values, collect_facts, find_rule
+from .rule import OPACITY, Rule, Values, collect_facts, find_rule, resolve_rule
 
 
 @dataclass
@@ -177,11 +177,15 @@ def rule_columns(rule: Rule, splats: Splats) -> dict[str, np.ndarray]:
     return columns
 
 
+def full_detail_controls(bundle: Bundle) -> Values | None:
+    """Return control values whose weights a single level needs; None if it needs none."""
+    numbers = [level.number for level in bundle.levels]
+    return resolve_rule(bundle.rule).full_detail_values(numbers, bundle.controls)
+
+
 def standalone_levels(bundle: Bundle) -> list[Level]:
     """Return the levels that are complete scenes, coarse to fine, see ``Rule.standalone_levels``."""
-    rule = find_rule(bundle.rule)
-    numbers = [level.number for level in bundle.levels]
-    standalone = numbers if rule is None else rule.standalone_levels(numbers)
+    standalone = resolve_rule(bundle.rule).standalone_levels([level.number for level in bundle.levels])
     return [level for level in bundle.levels if level.number in standalone]
 
 

@@ -20,9 +20,8 @@ from torch.nn.functional import pad
 
 from ..editing.look import Looks, change_colors
 from ..errors import LodgsError
-from ..lod.blocks import SIZE, spatial_order
-from ..lod.on_disk import CulledReader, open_if_large
-from ..lod.partial_read import BLOCKS, read_header_and_tables, read_part
+from ..lod.blocks import BLOCKS, SIZE, spatial_order
+from ..lod.on_disk import CulledReader, open_if_large, read_header_and_tables, read_part
 from ..lod.query import LodQuery, SplatSelector
 from ..lod.rule import OPACITY, Region, Values, all_rule_columns, collect_facts
 from ..lod.selection import check_rule, require_rule, standalone_error, standalone_levels
@@ -214,7 +213,7 @@ class ResidentBundle:
     """A bundle's levels, ready to render images.
 
     Levels in memory become resident as a whole. Of levels on disk, only the splats that a camera may see are
-    read (``lod.on_disk``). A file is read on demand: if it has a block table (``lod.partial_read``) and its
+    read (``lod.on_disk``). A file is read on demand: if it has a block table (``lod.blocks``) and its
     rule defines regions, only the splats of the camera's region are resident.
 
     Args:

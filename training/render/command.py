@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import LodgsError
-from ..lod.rule import Values, find_rule
-from ..lod.selection import resolve_controls
+from ..lod.rule import Values
+from ..lod.selection import full_detail_controls, resolve_controls
 from ..rasterize import cpu_fallback_reason
 from ..rasterize.resident import ResidentBundle
 from ..runs.data import training_data
@@ -173,8 +173,7 @@ def draw_bundle(
         LodgsError: the level or a control does not exist, or as :func:`.scene.draw`.
     """
     bundle = resident.bundle
-    rule = find_rule(bundle.rule)
-    if controls is not None or (rule is not None and rule.always_active and not level):
+    if controls is not None or (not level and full_detail_controls(bundle) is not None):
         sets = resident.select_by_rule(camera, resolve_controls(bundle, controls or {}))
     else:
         sets = resident.select_level(level or bundle.levels[-1].number, camera)

@@ -15,7 +15,6 @@ from ..errors import LodgsError
 from ..lod.crop import SHAPES, Crop
 from ..lod.query import LodQuery
 from ..lod.rule import NO_RULE, Rule, fact_names, find_rule
-from ..lod.rules.cut import RULE as CUT
 from ..scenes.cameras import MAX_COORDINATE, Camera, camera_from_dict, check_render_size
 
 MAX_BACKGROUND = 1e6
@@ -43,17 +42,17 @@ class CancelRequest:
 
 @dataclass(frozen=True)
 class SetRequest:
-    """A set of splats in a file or a tree, see ``scene.Instance``.
+    """A set of splats in a file or a paged bundle, see ``scene.Instance``.
 
     Attributes:
-        file: file name in the folder of arrays; "" for a tree.
+        file: file name in the folder of arrays; "" for a paged bundle.
         count: number of splats.
         matrix: see ``scene.Instance``.
         level: see ``scene.Instance``.
         antialias: see ``scene.Instance``.
         columns: names of the extra columns in the file.
         query: rule and arguments that weight the splats in addition to the file's weights, or None.
-        tree: path of a bundle of the rule ``cut``, of which the query's cut is read; or None.
+        paged: path of a bundle of which only the splats that the query selects are read; or None.
         looks: see ``scene.Instance``.
     """
 
@@ -64,7 +63,7 @@ class SetRequest:
     antialias: bool = False
     columns: tuple[str, ...] = ()
     query: LodQuery | None = None
-    tree: Path | None = None
+    paged: Path | None = None
     looks: Looks = ()
 
 
@@ -152,19 +151,19 @@ def _set(values: Any) -> SetRequest:
     matrix = np.reshape(_numbers({"matrix": matrix.ravel().tolist()}, "matrix", 16, MAX_COORDINATE), (4, 4))
     if matrix[3].tolist() != [0, 0, 0, 1]:
         raise _invalid("matrix", values["matrix"])
-    tree = _path(values, "tree")
+    paged = _path(values, "paged")
     query = _query(_typed(values, "choice", dict)) if values.get("choice") is not None else None
-    if tree is not None and (query is None or query.rule != CUT.name):
-        raise _invalid("choice", "given with a tree")
+    if paged is not None and (query is None or query.resolved_rule.paged_file is None):
+        raise _invalid("choice", "given with a paged file")
     return SetRequest(
-        file="" if tree else _name(values, "file"),
-        count=0 if tree else _integer(values, "count", 0, MAX_SPLATS),
+        file="" if paged else _name(values, "file"),
+        count=0 if paged else _integer(values, "count", 0, MAX_SPLATS),
         matrix=matrix,
-        level=0 if tree else _integer(values, "level", 0, MAX_LEVEL_NUMBER),
+        level=0 if paged else _integer(values, "level", 0, MAX_LEVEL_NUMBER),
         antialias=bool(values.get("antialias")),
         columns=_columns(values),
         query=query,
-        tree=tree,
+        paged=paged,
         looks=_looks(values),
     )
 

@@ -9,7 +9,7 @@ in it shows. The folder is removed when standard input ends, however the other p
      "photograph": PATH or null, "mask": PATH or null, "holdout": PATH or null,
      "sets": [{"file": NAME, "count": N, "matrix": 4x4, "level": 3,
                "columns": [NAME, ...], "choice": {...} or null, "looks": [...]},
-              {"tree": PATH, "matrix": 4x4, "choice": {...}, "looks": [...]}, ...]}
+              {"paged": PATH, "matrix": 4x4, "choice": {...}, "looks": [...]}, ...]}
     {"cancel": 7}
 
 Answers to a frame are ``progress`` (frame, share) and ``warning`` (frame, message), then ``frame`` (frame,
@@ -21,9 +21,9 @@ with the depth of objects that hide splats, in the size of the camera or the win
 A set is read when its file is first named, and discarded when a frame does not name it. Its file may be
 removed after an answer ``frame``. A choice (``lod.query``: ``rule``, ``eye`` in the set's coordinates,
 ``focal_px``, and ``facts``, ``values`` and ``tables`` by name) weights the splats by a rule, in addition to
-the file's weights. The rule's columns are the file's columns of the same names. A tree is a bundle of the
-rule ``cut``, of which only the visible part is read. Looks (``editing.look``) change colours and opacities:
-{"crop": {...} or null for everywhere, "look": {"exposure": 0.5, ...}}.
+the file's weights. The rule's columns are the file's columns of the same names. Of a paged bundle
+(``lod.query.PagedFile``), only the visible part is read. Looks (``editing.look``) change colours and
+opacities: {"crop": {...} or null for everywhere, "look": {"exposure": 0.5, ...}}.
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ import torch
 from .. import VERSION
 from ..errors import LodgsError, is_out_of_memory
 from ..evaluate.metrics import psnr
-from ..lod.tree.paging import TreeFile
+from ..lod.on_disk import open_paged
+from ..lod.query import PagedFile
 from ..rasterize import cpu_fallback_reason, resolve_backend
 from ..runs.events import event_line
 from ..scenes.cameras import camera_to_dict
@@ -90,8 +91,8 @@ class _Server:
         self._backend = backend
         self._answers = answers
         self._sets: dict[str, SplatSet] = {}
-        self._trees: dict[Path, tuple[tuple[int, int], TreeFile]] = {}
-        self._cuts: dict[tuple, list[tuple[int, SplatSet]]] = {}
+        self._files: dict[Path, tuple[tuple[int, int], PagedFile]] = {}
+        self._parts: dict[tuple, list[tuple[int, SplatSet]]] = {}
         self._requests: queue.SimpleQueue[FrameRequest] = queue.SimpleQueue()
         self._cancelled: set[int] = set()
 
@@ -180,18 +181,20 @@ class _Server:
         """Return the sets of a frame, and keep those that the last frame has loaded."""
         sets: dict[str, SplatSet] = {}
         instances = []
-        cuts = {
-            i: self._find_cut(item, request) for i, item in enumerate(request.sets) if item.tree is not None
+        parts = {
+            i: self._find_parts(item, request)
+            for i, item in enumerate(request.sets)
+            if item.paged is not None
         }
-        self._cuts = {key: self._cuts[key] for key, _ in cuts.values() if key in self._cuts}
+        self._parts = {key: self._parts[key] for key, _ in parts.values() if key in self._parts}
         for i, item in enumerate(request.sets):
-            if i in cuts:
-                key, read = cuts[i]
-                if key not in self._cuts:
-                    self._cuts[key] = read()
+            if i in parts:
+                key, read = parts[i]
+                if key not in self._parts:
+                    self._parts[key] = read()
                 instances += [
                     Instance(splats, item.matrix, level, item.antialias, item.query, item.looks)
-                    for level, splats in self._cuts[key]
+                    for level, splats in self._parts[key]
                 ]
                 continue
             if item.file not in sets:
@@ -205,15 +208,15 @@ class _Server:
         self._sets = sets
         return instances
 
-    def _find_cut(
+    def _find_parts(
         self, item: SetRequest, request: FrameRequest
     ) -> tuple[tuple, Callable[[], list[tuple[int, SplatSet]]]]:
-        """Return the cache key of a tree's cut, and a function that reads the cut as sets by level number.
+        """Return the cache key of a paged set, and a function that reads its visible part by level.
 
         Raises:
             LodgsError: the file cannot be read.
         """
-        path, query = item.tree, item.query
+        path, query = item.paged, item.query
         assert path is not None and query is not None
         try:
             stat = path.stat()
@@ -223,9 +226,9 @@ class _Server:
                 "Choose the file again under Streaming, or clear it to draw the levels in the scene.",
             ) from error
         stamp = stat.st_mtime_ns, stat.st_size
-        if path not in self._trees or self._trees[path][0] != stamp:
-            self._trees[path] = stamp, TreeFile(path)
-        file = self._trees[path][1]
+        if path not in self._files or self._files[path][0] != stamp:
+            self._files[path] = stamp, open_paged(path)
+        file = self._files[path][1]
         camera, unit = None, 1.0
         if is_similarity(item.matrix):
             camera, unit = request.camera.in_object_space(item.matrix)
@@ -233,8 +236,8 @@ class _Server:
         camera_key = None if camera is None else json.dumps(camera_to_dict(camera, near))
 
         def read() -> list[tuple[int, SplatSet]]:
-            cut = file.cut(query, camera, near)
-            return [(level, SplatSet(splats, None, self._backend)) for level, splats in cut.items()]
+            parts = file.visible(query, camera, near)
+            return [(level, SplatSet(splats, None, self._backend)) for level, splats in parts.items()]
 
         return (path, stamp, query, camera_key), read
 

@@ -19,7 +19,7 @@ import numpy as np
 from ..errors import LodgsError
 from ..splats.gaussians import Splats
 
-PROTOCOL = 2
+PROTOCOL = 3
 """Version of the protocol. Both sides come from one installation, so other versions are refused."""
 
 MARK = ".lodgs-renderer"

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.special import expit, logit
 
 from ..errors import LodgsError
-from ..lod.rule import find_rule
-from ..lod.selection import complete_splats, resolve_controls, select
+from ..lod.rule import Values
+from ..lod.selection import complete_splats, full_detail_controls, select
 from ..splats.bundle import open_bundle, read_bundle, read_header
 from ..splats.dialects import Warn, ignore
 from ..splats.file_rows import DrawableRows
@@ -55,8 +55,7 @@ def open_base(path: str | Path, warn: Warn = ignore) -> tuple[SplatRows, bool]:
                 "Finish training it first, or choose a PLY file of splats.",
             )
     head = None if path.is_dir() else read_header(path)
-    rule = None if head is None else find_rule(head.rule)
-    if head is None or head.cumulative or (rule is not None and rule.always_active):
+    if head is None or head.cumulative or full_detail_controls(head) is not None:
         bundle = (read_folder if path.is_dir() else read_bundle)(path, warn)
         splats: SplatRows = _finest(bundle)
     else:
@@ -68,18 +67,18 @@ def open_base(path: str | Path, warn: Warn = ignore) -> tuple[SplatRows, bool]:
 
 
 def _finest(bundle: Bundle) -> Splats:
-    rule = find_rule(bundle.rule)
-    if rule is not None and rule.always_active and "camera_center" in bundle.meta:
-        return _with_weights_baked(bundle, np.asarray(bundle.meta["camera_center"]))
+    controls = full_detail_controls(bundle)
+    if controls is not None and "camera_center" in bundle.meta:
+        return _with_weights_baked(bundle, np.asarray(bundle.meta["camera_center"]), controls)
     return complete_splats(bundle, bundle.levels[-1])
 
 
-def _with_weights_baked(bundle: Bundle, center: np.ndarray) -> Splats:
+def _with_weights_baked(bundle: Bundle, center: np.ndarray, controls: Values) -> Splats:
     """Return all splats, with the weights for a camera position (3,) multiplied into their opacities.
 
-    A rule that always weights was trained with these weights.
+    The splats were trained with these weights.
     """
-    splats, weights = select(bundle, center, 1.0, resolve_controls(bundle, {}))
+    splats, weights = select(bundle, center, 1.0, controls)
     if weights is None:
         return splats
     opacities = np.clip(weights * expit(splats.opacity_logits), 1e-6, 1 - 1e-6)

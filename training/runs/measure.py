@@ -169,7 +169,7 @@ def _measure_rule(job: Job, evaluation: Evaluation, bundle: Bundle, rule: Rule, 
         report["curve"] = [
             {name: step, **evaluation.measure_by_distance(resident, {**values, name: step})} for step in steps
         ]
-    if not rule.always_active:
+    if not rule.weights_full_detail:
         finest = standalone_levels(bundle)[-1]
         report["frame_s"] = evaluation.frame_times({
             "by_distance": lambda camera: resident.draw(camera, values, near=data.near),

@@ -50,6 +50,12 @@ BATCH_ROWS = 1 << 15
 Columns = dict[str, np.ndarray]
 
 
+def read_batches(rows: SplatRows) -> Iterator[Splats]:
+    """Read all splats, BATCH_ROWS at a time; yields at least one batch, which may be empty."""
+    for begin in range(0, max(len(rows), 1), BATCH_ROWS):
+        yield rows.select(slice(begin, begin + BATCH_ROWS))
+
+
 class ElementPart(NamedTuple):
     """Rows of an element: their number, and a function that returns the columns of a range."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from ....training.lod.rules.cut import MIN_DETAIL, NODE_SIZE, PARENT, PARENT_SIZE
+from ....training.lod.tree.nodes import MIN_DETAIL, NODE_SIZE, PARENT, PARENT_SIZE
 from ..building import Field
 from . import RuleInputs
 

@@ -146,10 +146,11 @@ def test_of_a_tree_leaves_are_selected_and_nodes_that_stand_for_nothing_else(bpy
     looks, size = viewport
     middle, cleaning = (size[0] / 2, size[1] / 2), lodgs("data.cleaning")
     stroke(bpy, (0, 0), radius=1, through=True)
-    family = cleaning._tree_relations(root)
+    family = cleaning._relations(root)
+    every = {level.number: np.ones(len(level.splats), bool) for level in bundle.levels}
     stroke(bpy, middle, (middle[0] + 40, middle[1]), radius=150, through=True)
     stroke(bpy, (middle[0] - 80, middle[1]), radius=150, through=True)
-    masks, leaves, some = selected(lodgs, root), family.leaves, 0
+    masks, leaves, some = selected(lodgs, root), family.testable(every), 0
     for level in bundle.levels:
         one, clear = near(looks, size, level.splats.means, (middle[0] - 80, middle[1]), 150)
         # a capsule around the first stroke: two discs and the box between them
@@ -160,7 +161,7 @@ def test_of_a_tree_leaves_are_selected_and_nodes_that_stand_for_nothing_else(bpy
         np.testing.assert_array_equal(masks[level.number][asked], one[asked])
         some += int(one[asked].sum())
     assert some > 20
-    stays = family.with_ancestors({number: ~mask for number, mask in masks.items()})
+    stays = family.completed({number: ~mask for number, mask in masks.items()})
     for number, mask in masks.items():
         np.testing.assert_array_equal(mask, ~stays[number])
     assert sum(int((mask & ~leaves[number]).sum()) for number, mask in masks.items()) > 0

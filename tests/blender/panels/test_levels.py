@@ -62,7 +62,7 @@ def test_one_level_warns_if_splats_are_trained_for_distances(root, draw, name):
     root(name).lodgs.mode = "SINGLE"
     layout = draw()
     assert layout.properties == ["mode", "single_level"]
-    assert any("too opaque" in text for text in layout.texts) == rules()[name].always_active
+    assert any("too opaque" in text for text in layout.texts) == rules()[name].weights_full_detail
 
 
 def test_levels_without_a_known_rule_cause_a_hint(root, draw):
@@ -182,7 +182,7 @@ def tree(bpy, lodgs, tmp_path):
 
 def test_panels_explain_the_coarse_level_of_a_tree(tree, draw_panel):
     texts = draw_panel("levels", "LODGS_PT_levels").texts
-    assert any("Level 1 holds coarse nodes of a tree" in text for text in texts)
+    assert any("Only level 2 is a complete scene" in text for text in texts)
     tree.lodgs.tell = "LEVELS"
     layout = draw_panel("viewport", "LODGS_PT_viewport")
     assert not layout.colors and any("half the size" in text for text in layout.texts)

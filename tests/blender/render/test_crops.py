@@ -81,7 +81,7 @@ def test_streamed_tree_is_cropped(bpy, lodgs, camera, tmp_path):
         if budget:
             placed = engine.placed_splats(bpy.context.evaluated_depsgraph_get())
             (crop,) = placed[0].choice.crops
-            assert isinstance(placed[0], lodgs("render.renderer").PlacedTree)
+            assert isinstance(placed[0], lodgs("render.renderer").PlacedFile)
             assert (crop.shape, crop.outside) == ("BOX", False)
             expected = Crop.from_matrix("BOX", np.array(box.matrix_world))
             np.testing.assert_allclose(crop.to_own, expected.to_own, rtol=1e-5)

@@ -69,7 +69,8 @@ def drawn_means(view):
 
 def test_cuts_are_complete_while_finer_splats_are_loaded(bpy, lodgs, tree, path, root, draw_from):
     views, truth = lodgs("viewport.views"), Truth(tree)
-    index = lodgs("training.lod.tree.paging").TreeFile(path).index()
+    paging = lodgs("training.lod.tree.paging")
+    index = paging.TreeFile(path).index()
     view, streamed, numbers, complete = views.ViewState(), 0, [], False
     base_count = sum(len(item.object.data.points) for item in root.lodgs.levels)
     for position in POSITIONS:
@@ -88,7 +89,10 @@ def test_cuts_are_complete_while_finer_splats_are_loaded(bpy, lodgs, tree, path,
                     break
                 time.sleep(0.005)
             assert stream.ready and base_count + stream.splats <= BUDGET
-            if (index.detail(np.array(position)) < 1001 / pixels).sum() <= (BUDGET - base_count) // 512:
+            if (
+                len(paging.page_order(index, np.array(position), 1001 / pixels))
+                <= (BUDGET - base_count) // 512
+            ):
                 streamed += 1
                 np.testing.assert_array_equal(np.sort(numbers[-1]), truth.cut(position, pixels))
     assert streamed == len(POSITIONS)

@@ -9,21 +9,21 @@ from tests.training.lod.tree.trees import random_leaves, surfaces, tree_of, writ
 from training.__main__ import main
 from training.editing.cleaning import (
     Cleaning,
-    TreeRelations,
     clean_bundle,
     find_far,
     find_floaters,
     find_unseen,
     keep_splats,
+    read_relations,
 )
 from training.errors import LodgsError
+from training.lod.blocks import BLOCKS, block_table
 from training.lod.crop import Crop, crop_mask
-from training.lod.partial_read import BLOCKS, block_table, read_part
+from training.lod.on_disk import open_paged, read_part
 from training.lod.query import LodQuery, SplatSelector
 from training.lod.rule import OPACITY, collect_facts, rules
 from training.lod.selection import resolve_controls, select_levels
-from training.lod.tree.paging import TreeFile, read_budgeted
-from training.lod.tree.resident import COLUMNS, ResidentTree
+from training.lod.tree.nodes import COLUMNS, ResidentTree
 from training.scenes.cameras import Camera, look_at
 from training.splats.bundle import read_bundle, write_bundle
 from training.splats.gaussians import Splats
@@ -61,7 +61,7 @@ def bundle_of(name, rng):
         column = {axis: rng.normal(0, 4, 3).astype(np.float32) for axis in "xyz"}
         tables[table] = column | {"radius": np.float32([5, 6, 7])}
     if name == "chunks":
-        tables[BLOCKS] = block_table(rule, {level.number: level.splats for level in levels})
+        tables[BLOCKS] = block_table(rule.block_bounds, ((x.number, x.splats.extras) for x in levels))
     facts = dict.fromkeys(rule.scene_facts, 5.0)
     if "tau" in facts:
         facts["tau"] = 0.004
@@ -261,7 +261,9 @@ def test_cropped_tree_is_a_valid_tree():
 def test_nodes_are_removed_with_their_last_leaf():
     tree = tree_of(random_leaves(200, np.random.default_rng(6)))
     masks = {1: np.ones(199, bool), 2: np.arange(200) < 130}
-    stays, family = TreeRelations.of(tree).with_ancestors(masks), TreeRelations.of(tree)
+    relations = read_relations(tree)
+    stays = relations.completed(masks)
+    leaves = relations.testable({1: masks[1], 2: np.ones(200, bool)})
     splats = Splats.concatenated([level.splats for level in tree.levels])
     place = {(size, *mean): i for i, (size, mean) in enumerate(
         zip(splats.extras["node_size"].tolist(), splats.means.tolist(), strict=True))}  # fmt: skip
@@ -274,7 +276,7 @@ def test_nodes_are_removed_with_their_last_leaf():
             key = [splats.extras[name][node].item() for name in names]
             node = place.get(tuple(key)) if splats.extras["parent_size"][node] < 1e38 else None
     np.testing.assert_array_equal(np.flatnonzero(np.concatenate([stays[1], stays[2]])), sorted(alive))
-    assert (family.leaves[2]).all() and not family.leaves[1].any()
+    assert leaves[2].all() and not leaves[1].any()
 
 
 def test_cropped_tree_on_disk_can_be_paged(tmp_path):
@@ -292,14 +294,14 @@ def test_cropped_tree_on_disk_can_be_paged(tmp_path):
             np.testing.assert_array_equal(first.splats.extras[name], second.splats.extras[name])
     np.testing.assert_equal(present.tables[BLOCKS], in_memory.tables[BLOCKS])
 
-    file = TreeFile(out)
+    file = open_paged(out)
     choice = LodQuery("cut", (1.0, 2.0, 3.0), 400.0, (), (("pixels", 2.0),))
     expected = select_levels(present, np.float32(choice.eye), 400.0, {"pixels": 2.0})
     for first in expected:
-        cut = file.cut(choice)[first.number]
+        cut = file.visible(choice)[first.number]
         assert sorted(map(tuple, cut.means)) == sorted(map(tuple, first.splats.means))
-    top, total = read_budgeted(out, 1024)
-    assert total == sum(len(level.splats) for level in present.levels)
+    top = file.top(1024)
+    assert file.total == sum(len(level.splats) for level in present.levels)
     _, count = drawn_for_each_leaf(top, (0, 0, 0), 1e5)
     assert (count == 1).all()
 
@@ -310,8 +312,8 @@ def test_block_table_is_updated(tmp_path):
     crop = ["--crop-box", "-3", "-3", "-3", "4", "4", "4"]
     assert main(["edit", str(tmp_path / "all.ply"), "--out", str(tmp_path / "some.ply"), *crop]) == 0
     result = read_bundle(tmp_path / "some.ply")
-    levels = {level.number: level.splats for level in result.levels}
-    np.testing.assert_equal(result.tables[BLOCKS], block_table(rules()["chunks"], levels))
+    levels = ((level.number, level.splats.extras) for level in result.levels)
+    np.testing.assert_equal(result.tables[BLOCKS], block_table(rules()["chunks"].block_bounds, levels))
     part, _ = read_part(tmp_path / "some.ply", [3], (1,))
     member = result.levels[2].splats.extras["chunks_0"].astype(int) & 2 != 0
     np.testing.assert_array_equal(part.levels[2].splats.means, result.levels[2].splats.means[member])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from training.lod.blocks import SIZE, Blocks, block_quantiles, spatial_order
+from training.lod.blocks import SIZE, BlockIndex, block_quantiles, spatial_order
 from training.rasterize import Gaussians, rasterize
 from training.scenes.cameras import Camera, look_at
 from training.splats.gaussians import Splats
@@ -37,7 +37,7 @@ def cameras():
 
 
 def test_culled_blocks_are_invisible(splats):
-    blocks, gaussians, left_out = Blocks.of(splats.means, splats.log_scales), Gaussians.of(splats), 0
+    blocks, gaussians, left_out = BlockIndex.of(splats.means, splats.log_scales), Gaussians.of(splats), 0
     for camera in cameras():
         for near in (0.05, 2.0):
             visible = blocks.in_view(camera, near)
@@ -54,7 +54,7 @@ def test_blocks_outside_the_image_are_culled():
     """Eight rows of splats along x, at different positions."""
     means = np.zeros((8 * SIZE, 3), np.float32)
     means[:, 0] = np.repeat(np.arange(-35, 45, 10), SIZE)
-    blocks = Blocks.of(means, np.full((8 * SIZE, 3), -5.0))
+    blocks = BlockIndex.of(means, np.full((8 * SIZE, 3), -5.0))
     camera = Camera(
         "", 100, 100, 100.0, 100.0, 50.0, 50.0, look_at(np.zeros(3), np.array([1.0, 0, 0]), (0, 0, 1))
     )
@@ -67,29 +67,27 @@ def test_blocks_outside_the_image_are_culled():
 
 
 def test_bounds_and_distances(splats):
-    blocks = Blocks.of(splats.means, splats.log_scales)
+    blocks = BlockIndex.of(splats.means, splats.log_scales)
     for position in ((0, 0, 0), (30, -4, 2)):
         distance = np.linalg.norm(splats.means.astype(np.float64) - position, axis=1)
         minimum, limit = (np.repeat(item, SIZE)[:COUNT] for item in blocks.distances(position))
         assert (minimum <= distance + 1e-9).all() and (distance <= limit + 1e-9).all()
     tight = np.linalg.norm(blocks.high - blocks.low, axis=1)
     shuffled = splats.select(np.random.default_rng(0).permutation(COUNT))
-    loose = np.linalg.norm(
-        np.subtract(*[getattr(Blocks.of(shuffled.means, shuffled.log_scales), n) for n in ("high", "low")]),
-        axis=1,
-    )
+    mixed = BlockIndex.of(shuffled.means, shuffled.log_scales)
+    loose = np.linalg.norm(mixed.high - mixed.low, axis=1)
     assert np.median(tight) < 0.4 * np.median(loose)
 
 
 def test_rows_of_blocks(splats):
-    blocks = Blocks.of(splats.means, splats.log_scales)
-    assert len(blocks.low) == 41
+    blocks = BlockIndex.of(splats.means, splats.log_scales)
+    assert len(blocks) == 41
     np.testing.assert_array_equal(blocks.rows(np.ones(41, bool)), np.arange(COUNT))
     subset = np.zeros(41, bool)
     subset[[1, 40]] = True
     np.testing.assert_array_equal(blocks.rows(subset), [*range(SIZE, 2 * SIZE), *range(40 * SIZE, COUNT)])
     assert blocks.rows(np.zeros(41, bool)).size == 0
-    nothing = Blocks.of(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32))
+    nothing = BlockIndex.of(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32))
     assert nothing.rows(np.zeros(0, bool)).size == 0 and spatial_order(np.zeros((0, 3))).size == 0
 
 

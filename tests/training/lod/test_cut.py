@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from training.lod.rule import rules
-from training.lod.rules.cut import ABOVE_ROOT, MIN_DETAIL, min_parent_size
+from training.lod.tree.nodes import ABOVE_ROOT, MIN_DETAIL, min_parent_size
 
 CUT = rules()["cut"]
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from training.errors import LodgsError
-from training.lod.blocks import SIZE, spatial_order
-from training.lod.partial_read import BLOCKS, block_table, read_part
+from training.lod.blocks import BLOCKS, SIZE, block_table, spatial_order
+from training.lod.on_disk import read_part
 from training.lod.rule import rules
 from training.lod.rules.chunks import in_chunk, member_columns
 from training.splats.bundle import read_bundle, write_bundle
@@ -36,7 +36,7 @@ def bundle():
         levels.append(Level(number, splats, {"d_l": 4.0 - number if number < 3 else 0.0}))
     x = np.arange(30, dtype=np.float32) + 0.5
     chunks = {"x": x, "y": 0 * x, "z": 0 * x, "radius": 0 * x + 1}
-    blocks = block_table(rules()["chunks"], {level.number: level.splats for level in levels})
+    blocks = block_table(rules()["chunks"].block_bounds, ((x.number, x.splats.extras) for x in levels))
     return Bundle("lodge", levels, "chunks", tables={"chunks": chunks, BLOCKS: blocks})
 
 

@@ -9,8 +9,7 @@ import torch
 from training.editing.look import Look
 from training.errors import LodgsError
 from training.lod import on_disk
-from training.lod.blocks import SIZE, spatial_order
-from training.lod.partial_read import BLOCKS, block_table
+from training.lod.blocks import BLOCKS, SIZE, block_table, spatial_order
 from training.lod.query import LodQuery, SplatSelector
 from training.lod.rule import HIDDEN, rules
 from training.lod.rules.chunks import member_columns
@@ -151,7 +150,7 @@ def indexed(path) -> Bundle:
         splats = detail.splats.select(spatial_order(detail.splats.means))
         near = np.linalg.norm(splats.means - CENTRES[:, None], axis=2) < 7
         levels.append(replace(detail, splats=replace(splats, extras=member_columns(near))))
-    table = block_table(rules()["chunks"], {x.number: x.splats for x in levels})
+    table = block_table(rules()["chunks"].block_bounds, ((x.number, x.splats.extras) for x in levels))
     source = replace(source, levels=levels, tables={**source.tables, BLOCKS: table})
     write_bundle(path, source)
     return source

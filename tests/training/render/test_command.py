@@ -11,8 +11,7 @@ from PIL import Image
 from tests.training.conftest import write_tiny_scene
 from tests.training.lod.tree.trees import tree_of
 from training.__main__ import main
-from training.lod.blocks import spatial_order
-from training.lod.partial_read import BLOCKS, block_table
+from training.lod.blocks import BLOCKS, block_table, spatial_order
 from training.lod.rule import rules
 from training.lod.rules.chunks import member_columns
 from training.lod.selection import select
@@ -96,7 +95,7 @@ def test_only_needed_splats_are_read(make_splats, camera, tmp_path, capsys):
         levels.append(Level(number, replace(splats, extras=extras), {"d_l": 2.0 * (number < 2)}))
     centers = np.float32([-1, 3])
     chunks = {"x": centers, "y": 0 * centers, "z": 0 * centers, "radius": np.float32([9, 9])}
-    blocks = block_table(rule, {level.number: level.splats for level in levels})
+    blocks = block_table(rule.block_bounds, ((level.number, level.splats.extras) for level in levels))
     bundle = Bundle("lodge", levels, "chunks", tables={"chunks": chunks, BLOCKS: blocks})
     write_bundle(tmp_path / "blocks.ply", bundle)
     write_bundle(tmp_path / "plain.ply", replace(bundle, tables={"chunks": chunks}))

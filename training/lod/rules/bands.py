@@ -35,7 +35,6 @@ class Bands(Rule):
     name = "bands"
     level_facts = ("s_min",)
     lengths = level_facts
-    binary = True
     controls = (
         Control(
             "gamma", 1.0, 0.01, 1000.0, "Screen Size",
@@ -64,6 +63,9 @@ class Bands(Rule):
         near = facts["s_min"] / values["gamma"] * focal_px if facts["finer"] <= last else 0.0
         far = facts["coarser_s_min"] / values["gamma"] * focal_px if facts["coarser"] >= first else inf
         return near, far
+
+    def fills_band(self, values: Values) -> bool:
+        return True
 
     def weights(self, means, position, focal_px, columns, facts, values, tables=NO_TABLES) -> np.ndarray:
         near, far = self.distance_band(focal_px, facts, values)

@@ -36,6 +36,7 @@ class Chunks(Rule):
     name = "chunks"
     level_facts = ("d_l",)
     columns = MEMBER_COLUMNS
+    block_bounds = {name: (name, np.bitwise_or) for name in MEMBER_COLUMNS}
     tables = (TABLE,)
     lengths = ("d_l", "radius")
     places = (("x", "y", "z"),)
@@ -65,6 +66,10 @@ class Chunks(Rule):
             return 0.0, inf
         near, far = _ends(facts)
         return near / values["distance_scale"], far / values["distance_scale"]
+
+    def fills_band(self, values: Values) -> bool:
+        """Return whether sets of chunks are disabled."""
+        return not values["chunks"]
 
     def weights(self, means, position, focal_px, columns, facts, values, tables=NO_TABLES) -> np.ndarray:
         near_chunks = self.near_chunks(position, values, tables)

@@ -2,81 +2,162 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
+from ...scenes.view_tables import VIEW_TABLES
+from ...splats.gaussians import Splats
+from ...splats.levels import MAX_LEVELS, Bundle, Level
 from ...splats.ply import Columns
+from ...splats.similarity import Similarity
 from ..colors import LEVEL_COLORS
-from ..rule import NO_COLUMNS, NO_TABLES, Control, Rule, Values, axis_distances, distances
+from ..rule import NO_COLUMNS, NO_TABLES, Control, Masks, Relations, Rule, Values, distances
+from ..tree.nodes import (
+    ABOVE_ROOT,
+    BLOCK_BOUNDS,
+    COLUMNS,
+    MIN_DETAIL,
+    NODE_SIZE,
+    PARENT,
+    PARENT_SIZE,
+    ROUNDING,
+    ResidentTree,
+    detail_of,
+    hash_rows,
+    is_fine_enough,
+    min_parent_size,
+    node_keys,
+    round_up,
+)
+from ..tree.paging import TreeFile
 
-NODE_SIZE, PARENT_SIZE = "node_size", "parent_size"
-"""Columns of sizes, in scene units: of the node (0 for leaves) and of its parent."""
-PARENT = ("parent_x", "parent_y", "parent_z")
-"""Columns of the parent's mean."""
-ABOVE_ROOT = 3.0e38
-"""Parent size of the root, which has no parent: larger than any distance, but finite for files."""
-MIN_DETAIL = 8.0
-"""Minimum detail k of a camera: cuts are proper for every k from here on."""
-ROUNDING = 2.0**-20
-"""Relative margin on a parent's size: 16 float32 ulps. Comparing a distance with k size, for parent and
-child, has an error of at most 9 ulps."""
+THINNING = 4
+"""Ratio of splats of two complete levels: half the detail of a surface."""
+MIN_SPLATS = 500
+"""Minimum number of splats of a complete level."""
 _BLOCK = 1 << 14
 """Splats per batch, so that a batch fits into the processor's cache."""
 OCTAVES = len(LEVEL_COLORS) - 1
 """Number of colours for node sizes, one per factor of 2, repeating; leaves have a colour of their own."""
 
 
-def detail_of(focal_px: float, pixels: float) -> float:
-    """Return the detail k of a camera: a node is fine enough from the distance k size on."""
-    return max(focal_px / pixels, MIN_DETAIL)
+class TreeRelations(Relations):
+    """Parents and children among the nodes of a tree, whose levels are concatenated.
 
-
-def is_fine_enough(
-    axes: Sequence[np.ndarray], sizes: np.ndarray, position: np.ndarray, k: float
-) -> np.ndarray:
-    """Return (N,) bool: nodes that are fine enough, ‖c - μ‖ >= k size.
-
-    All operations are float32, so that a node gives the same bits as itself and as a parent.
-
-    Args:
-        axes: x, y and z of means, (N,) float32 each.
-        sizes: (N,) float32.
-        position: (3,) c, of the camera.
-        k: see :func:`detail_of`.
+    Clean-up tests leaves. An inner node remains while any leaf below it remains. If only one child remains,
+    the child replaces it, so that every node still has two children or none, and every cut is complete.
     """
-    with np.errstate(over="ignore"):
-        return axis_distances(axes, position) >= np.float32(k) * sizes
 
+    columns = (*COLUMNS, *"xyz")
 
-def min_parent_size(child_sizes: np.ndarray, distance: np.ndarray) -> np.ndarray:
-    """Return the minimum sizes (N,) float64 of parents that keep cuts proper, with a margin for float32.
+    def __init__(self, columns: Mapping[int, Columns]) -> None:
+        self._numbers = list(columns)
+        self._ends = np.cumsum([len(level_columns[NODE_SIZE]) for level_columns in columns.values()])
+        self._columns = {
+            name: np.concatenate([level_columns[name] for level_columns in columns.values()])
+            for name in self.columns
+        }
 
-    The size is size_child + d / MIN_DETAIL, with the distance d of child and parent. If a parent is fine
-    enough, ‖c - μ_p‖ >= k size_p, so is its child, because ‖c - μ_c‖ >= ‖c - μ_p‖ - d >= k size_p - d >=
-    k size_child for every k >= MIN_DETAIL.
+    @cached_property
+    def _parents(self) -> np.ndarray:
+        """Row of each node's parent, (N,) int32; -1 if there is none."""
+        tree = ResidentTree(self._columns)
+        tree.update(np.arange(self._ends[-1]))
+        return tree.parents
 
-    Args:
-        child_sizes: (N,).
-        distance: (N,) of the children's means from their parents'.
-    """
-    return (child_sizes + np.asarray(distance, np.float64) / MIN_DETAIL) * (1 + ROUNDING)
+    @cached_property
+    def _children(self) -> np.ndarray:
+        """Number of each node's children, (N,)."""
+        return self._count_children(np.ones(self._ends[-1], bool))
 
+    def testable(self, masks: Masks) -> Masks:
+        """Return the leaves in the masks."""
+        leaves = self._by_level(self._children == 0)
+        return {number: mask & leaves[number] for number, mask in masks.items()}
 
-def round_up(values: np.ndarray) -> np.ndarray:
-    """Return the smallest float32 values (N,) that are not below float64 values."""
-    rounded = values.astype(np.float32)
-    return np.where(rounded < values, np.nextafter(rounded, np.float32(np.inf)), rounded)
+    def completed(self, masks: Masks) -> Masks:
+        """Return masks of the remaining leaves and all their ancestors."""
+        return self._by_level(self._with_ancestors(masks))
 
+    def pruned(self, masks: Masks) -> tuple[Masks, Mapping[int, Columns]]:
+        remaining = self._with_ancestors(masks)
+        single = remaining & (self._count_children(remaining) == 1)
+        # each node takes the parent of its highest ancestor in a chain of nodes with one child
+        own = np.arange(len(remaining), dtype=np.int32)
+        replaced = np.where((self._parents >= 0) & single[self._parents], self._parents, own)
+        while not np.array_equal(higher := replaced[replaced], replaced):
+            replaced = higher
+        remaining &= ~single
+        columns = {name: self._columns[name] for name in COLUMNS}
+        for name in (PARENT_SIZE, *PARENT):
+            columns[name] = columns[name][replaced]
+        masks = self._by_level(remaining)
+        by_level = {name: self._by_level(column) for name, column in columns.items()}
+        return masks, {
+            number: {name: by_level[name][number][mask] for name in COLUMNS} for number, mask in masks.items()
+        }
 
-def hash_rows(rows: np.ndarray) -> np.ndarray:
-    """Return 64-bit hashes (N,) of rows (N, 4) float32."""
-    words = np.ascontiguousarray(rows).view(np.uint32).astype(np.uint64)
-    hashes = np.zeros(len(rows), np.uint64)
-    for word in words.T:
-        hashes = (hashes ^ word) * np.uint64(0x9E3779B97F4A7C15)
-        hashes ^= hashes >> np.uint64(29)
-    return hashes
+    def transformed(self, placement: Similarity) -> Mapping[int, Columns]:
+        """Return sizes that keep cuts proper, and keep nodes at the same position distinguishable.
+
+        Sizes are the scaled ones, or a few ulps larger. Needs about 150 bytes per node.
+        """
+        original = self._columns
+        transformed = placement.transform_columns(
+            original, (NODE_SIZE, PARENT_SIZE), (PARENT, ("x", "y", "z"))
+        )
+        inside = (original[PARENT_SIZE] > 0) & (original[PARENT_SIZE] < ABOVE_ROOT)
+        # nodes know their parent by size and position: one key per parent, shared by its children
+        parent_hashes = hash_rows(node_keys(*(original[name] for name in (PARENT_SIZE, *PARENT)))[inside])
+        keys, first, key_of_child = np.unique(parent_hashes, return_index=True, return_inverse=True)
+        own_hashes = hash_rows(node_keys(*(original[name] for name in (NODE_SIZE, *"xyz"))))
+        key_of_node = np.searchsorted(keys, own_hashes).clip(max=max(len(keys) - 1, 0))
+        is_parent = original[NODE_SIZE] > 0
+        if len(keys):
+            is_parent &= keys[key_of_node] == own_hashes
+        sizes = transformed[NODE_SIZE].copy()
+        parents = np.stack([transformed[axis][inside] for axis in PARENT], axis=1)
+        means = np.stack([transformed[axis][inside] for axis in "xyz"], axis=1)
+        distance = np.sqrt(np.square(means.astype(np.float64) - parents).sum(axis=1))
+        key_sizes = transformed[PARENT_SIZE][inside][first]
+        key_positions = parents[first] + np.float32(0)
+        while len(keys):
+            sizes[is_parent] = key_sizes[key_of_node[is_parent]]
+            minimum = np.zeros(len(keys))
+            np.maximum.at(minimum, key_of_child, min_parent_size(sizes[inside], distance))
+            larger = np.maximum(key_sizes, round_up(minimum))
+            duplicate = np.ones(len(keys), bool)
+            hashes = hash_rows(np.column_stack([larger, key_positions]))
+            duplicate[np.unique(hashes, return_index=True)[1]] = False
+            larger[duplicate] = np.nextafter(larger[duplicate], np.float32(np.inf))
+            if np.array_equal(larger, key_sizes):
+                break
+            key_sizes = larger
+        parent_sizes = original[PARENT_SIZE].copy()
+        parent_sizes[inside] = key_sizes[key_of_child]
+        transformed |= {NODE_SIZE: sizes, PARENT_SIZE: parent_sizes}
+        by_level = {name: self._by_level(transformed[name]) for name in COLUMNS}
+        return {number: {name: by_level[name][number] for name in COLUMNS} for number in self._numbers}
+
+    def _with_ancestors(self, masks: Masks) -> np.ndarray:
+        remaining = np.concatenate([masks[number] for number in self._numbers]) & (self._children == 0)
+        added = np.flatnonzero(remaining)
+        while len(added):
+            parents = np.unique(self._parents[added])
+            added = parents[(parents >= 0) & ~remaining[parents]]
+            remaining[added] = True
+        return remaining
+
+    def _count_children(self, mask: np.ndarray) -> np.ndarray:
+        """Return the number of each node's children (N,) in a mask."""
+        parents = self._parents[mask]
+        return np.bincount(parents[parents >= 0], minlength=len(mask))
+
+    def _by_level(self, values: np.ndarray) -> dict[int, np.ndarray]:
+        return dict(zip(self._numbers, np.split(values, self._ends[:-1]), strict=True))
 
 
 class Cut(Rule):
@@ -93,11 +174,12 @@ class Cut(Rule):
     """
 
     name = "cut"
-    complete = False
-    columns = (NODE_SIZE, PARENT_SIZE, *PARENT)
+    columns = COLUMNS
     lengths = (NODE_SIZE, PARENT_SIZE)
     places = (PARENT,)
-    linked_columns = True
+    block_bounds = BLOCK_BOUNDS
+    relations = TreeRelations
+    paged_file = TreeFile
     controls = (
         Control(
             "pixels", 1.0, 0.1, 100.0, "Granularity",
@@ -131,41 +213,9 @@ class Cut(Rule):
         k = detail_of(focal_px, values["pixels"])
         return 0.0, (k + MIN_DETAIL) * (1 + 4 * ROUNDING) * highest[PARENT_SIZE].astype(np.float64)
 
-    def reconcile(self, original: Columns, transformed: Columns) -> Columns:
-        """Return sizes that keep cuts proper, and keep nodes at the same position distinguishable.
-
-        Sizes are the scaled ones, or a few ulps larger.
-        """
-        inside = (original[PARENT_SIZE] > 0) & (original[PARENT_SIZE] < ABOVE_ROOT)
-        # nodes know their parent by size and position: one key per parent, shared by its children
-        parent_hashes = hash_rows(node_keys(*(original[name] for name in (PARENT_SIZE, *PARENT)))[inside])
-        keys, first, key_of_child = np.unique(parent_hashes, return_index=True, return_inverse=True)
-        own_hashes = hash_rows(node_keys(*(original[name] for name in (NODE_SIZE, *"xyz"))))
-        key_of_node = np.searchsorted(keys, own_hashes).clip(max=max(len(keys) - 1, 0))
-        is_parent = original[NODE_SIZE] > 0
-        if len(keys):
-            is_parent &= keys[key_of_node] == own_hashes
-        sizes = transformed[NODE_SIZE].copy()
-        parents = np.stack([transformed[axis][inside] for axis in PARENT], axis=1)
-        means = np.stack([transformed[axis][inside] for axis in "xyz"], axis=1)
-        distance = np.sqrt(np.square(means.astype(np.float64) - parents).sum(axis=1))
-        key_sizes = transformed[PARENT_SIZE][inside][first]
-        key_positions = parents[first] + np.float32(0)
-        while len(keys):
-            sizes[is_parent] = key_sizes[key_of_node[is_parent]]
-            minimum = np.zeros(len(keys))
-            np.maximum.at(minimum, key_of_child, min_parent_size(sizes[inside], distance))
-            larger = np.maximum(key_sizes, round_up(minimum))
-            duplicate = np.ones(len(keys), bool)
-            hashes = hash_rows(np.column_stack([larger, key_positions]))
-            duplicate[np.unique(hashes, return_index=True)[1]] = False
-            larger[duplicate] = np.nextafter(larger[duplicate], np.float32(np.inf))
-            if np.array_equal(larger, key_sizes):
-                break
-            key_sizes = larger
-        parent_sizes = original[PARENT_SIZE].copy()
-        parent_sizes[inside] = key_sizes[key_of_child]
-        return {NODE_SIZE: sizes, PARENT_SIZE: parent_sizes}
+    @property
+    def color_legend(self) -> str:
+        return "Each colour stands for half the size of the previous one; white is the finest level."
 
     def splat_level(self, columns, facts) -> np.ndarray:
         """Return a colour number: the octave of a node's size, OCTAVES + 1 for leaves."""
@@ -178,10 +228,42 @@ class Cut(Rule):
     def coarser(self, values: Values, levels: Sequence[int]) -> Values | None:
         return self.raise_control(values, "pixels")
 
+    def standalone_levels(self, levels: Sequence[int]) -> Sequence[int]:
+        """Return the level of the leaves."""
+        return levels[-1:]
 
-def node_keys(sizes: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Return keys (N, 4) float32 that identify nodes, from sizes and positions (N,) float32."""
-    return np.stack([sizes, x, y, z], axis=1) + np.float32(0)  # turns -0 into 0
+    def complete_levels(self, bundle: Bundle) -> Bundle:
+        """Return cuts as levels of the rule ``bands``.
+
+        The finest level has the leaves. Each coarser one is a cut at one node size, the smallest size with at
+        most 1 / THINNING of the finer level's splats, down to MIN_SPLATS. The rule selects them by distance
+        with the tree's limit of pixels per node.
+        """
+        levels = [level.rows for level in bundle.levels]
+        splats = Splats.concatenated([rows.select(slice(0, len(rows))) for rows in levels])
+        own = splats.extras[NODE_SIZE]
+        parent = splats.extras[PARENT_SIZE]
+        splats = replace(splats, extras={name: x for name, x in splats.extras.items() if name not in COLUMNS})
+        sizes = np.unique(own)
+        counts = np.searchsorted(np.sort(own), sizes, "right")
+        counts -= np.searchsorted(np.sort(parent), sizes, "right")
+        cuts = [0.0]
+        limit = counts[0] // THINNING
+        while limit >= MIN_SPLATS and len(cuts) < MAX_LEVELS:
+            index = int(np.argmax(counts <= limit))  # counts decrease
+            cuts.append(float(sizes[index]))
+            limit = counts[index] // THINNING
+        levels = [
+            Level(number, splats.select((own <= size) & (parent > size)), {"s_min": size})
+            for number, size in enumerate(reversed(cuts), 1)
+        ]
+        tables = {name: table for name, table in bundle.tables.items() if name in VIEW_TABLES}
+        controls = {"gamma": bundle.controls.get("pixels", self.controls[0].default), "first": 1}
+        return replace(bundle, levels=levels, rule="bands", controls=controls, tables=tables)
+
+    def exceeds_budget(self, finest: int, budget: int) -> bool:
+        """Return whether all nodes exceed the budget; about half of them are leaves."""
+        return 2 * finest >= budget
 
 
 def _octave(sizes: np.ndarray) -> np.ndarray:

@@ -72,7 +72,6 @@ class Decay(Rule):
             whole=True, step=1000,
         ),
     )  # fmt: skip
-    always_active = True
     independent = False
     sweep = ("s_v", (1.0, 1.5, 2.0, 3.0, 5.0))
 
@@ -101,6 +100,9 @@ class Decay(Rule):
         s_v = self.virtual_scale(normalized, columns, tau, values)
         weight = attenuation(normalized, columns[SIGMA], s_v).astype(np.float32)
         return np.where(columns[OPACITY] * weight > tau * s_v, weight, np.float32(0))
+
+    def full_detail_values(self, levels: Sequence[int], recorded: Values | None = None) -> Values | None:
+        return self.resolve_controls({}, levels, recorded)
 
     def coarser(self, values: Values, levels: Sequence[int]) -> Values | None:
         return self.raise_control(values, "s_v")

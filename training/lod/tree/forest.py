@@ -15,8 +15,7 @@ from ...splats.gaussians import Splats
 from ...splats.levels import NO_SPLATS, Level
 from ...splats.ply import Columns
 from ...splats.scratch import ScratchFile
-from ..rules.cut import NODE_SIZE, PARENT, PARENT_SIZE
-from .pages import page_table, streaming_order
+from .nodes import NODE_SIZE, PARENT, PARENT_SIZE, parent_index, streaming_order
 from .shape import LEAVES, NODES, Tree, UniqueSizes
 
 Piece = tuple[Splats, Tree]
@@ -264,8 +263,8 @@ class _LevelFile:
         keys, self.keys = np.concatenate(self.keys), []
         columns: Columns = dict(zip(_KEYS, keys.T, strict=True))
         order = streaming_order(columns).astype(np.int32)
-        table = page_table({number: {name: column[order] for name, column in columns.items()}})
-        return Level(number, NO_SPLATS, on_disk=_SortedRows(self.splats, order)), table
+        index = parent_index(number, {name: column[order] for name, column in columns.items()})
+        return Level(number, NO_SPLATS, on_disk=_SortedRows(self.splats, order)), index.as_table()
 
 
 @dataclass(frozen=True)

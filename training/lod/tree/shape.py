@@ -3,34 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from ...scenes.view_tables import VIEW_TABLES
 from ...splats.gaussians import Splats
-from ...splats.levels import MAX_LEVELS, Bundle, Level
-from ..rules.bands import RULE as BANDS
-from ..rules.cut import (
+from ...splats.levels import Level
+from .nodes import (
     ABOVE_ROOT,
+    COLUMNS,
     NODE_SIZE,
     PARENT,
     PARENT_SIZE,
-    RULE,
     hash_rows,
     min_parent_size,
     node_keys,
     round_up,
+    streaming_order,
 )
-from .pages import streaming_order
 
 NODES, LEAVES = 1, 2
 """Level numbers: inner nodes, and leaves, which are the full scene."""
-THINNING = 4
-"""Ratio of splats of two complete levels: half the detail of a surface."""
-MIN_SPLATS = 500
-"""Minimum number of splats of a complete level."""
 
 
 @dataclass(frozen=True)
@@ -111,13 +105,13 @@ class Tree:
     def levels(self, splats: Splats) -> list[Level]:
         """Return the levels of a bundle from all nodes (2N - 1): inner nodes, and leaves.
 
-        Both are sorted coarse to fine, with neighbours in space close together (``paging.streaming_order``).
+        Both are sorted coarse to fine, with neighbours in space close together (``nodes.streaming_order``).
         """
         sizes = UniqueSizes().sizes(self, splats.means, splats.log_scales)
         splats.extras |= self.columns(splats.means, sizes)
         levels = []
         for number, begin, end in ((NODES, self.leaves, len(self)), (LEAVES, 0, self.leaves)):
-            columns = {name: splats.extras[name][begin:end] for name in RULE.columns}
+            columns = {name: splats.extras[name][begin:end] for name in COLUMNS}
             levels.append(Level(number, splats.select(streaming_order(columns) + begin)))
         return levels
 
@@ -126,7 +120,7 @@ class UniqueSizes:
     """Computes sizes such that no two nodes have the same size and position.
 
     If only a part of a tree is read, children identify their parent by its size and position
-    (``paging.ResidentTree``), but equal splats have equal parents. Keeps 8 bytes per node in memory.
+    (``nodes.ResidentTree``), but equal splats have equal parents. Keeps 8 bytes per node in memory.
     """
 
     def __init__(self) -> None:
@@ -191,33 +185,3 @@ def leaf_only_columns(count: int) -> Mapping[str, np.ndarray]:
     zeros = np.zeros(count, np.float32)
     parent_sizes = np.full(count, ABOVE_ROOT, np.float32)
     return {NODE_SIZE: zeros, PARENT_SIZE: parent_sizes} | dict.fromkeys(PARENT, zeros)
-
-
-def complete_levels(bundle: Bundle) -> Bundle:
-    """Return a tree as complete levels, for programs without a rule for trees.
-
-    The finest level has the leaves. Each coarser one is a cut at one node size, the smallest size with at
-    most 1 / THINNING of the finer level's splats, down to MIN_SPLATS. The rule ``bands`` selects them by
-    distance with the tree's limit of pixels per node.
-    """
-    splats = Splats.concatenated([level.splats for level in bundle.levels])
-    own = splats.extras[NODE_SIZE]
-    parent = splats.extras[PARENT_SIZE]
-    splats = replace(
-        splats, extras={name: x for name, x in splats.extras.items() if name not in RULE.columns}
-    )
-    sizes = np.unique(own)
-    counts = np.searchsorted(np.sort(own), sizes, "right") - np.searchsorted(np.sort(parent), sizes, "right")
-    cuts = [0.0]
-    limit = counts[0] // THINNING
-    while limit >= MIN_SPLATS and len(cuts) < MAX_LEVELS:
-        index = int(np.argmax(counts <= limit))  # counts decrease
-        cuts.append(float(sizes[index]))
-        limit = counts[index] // THINNING
-    levels = [
-        Level(number, splats.select((own <= size) & (parent > size)), {"s_min": size})
-        for number, size in enumerate(reversed(cuts), 1)
-    ]
-    tables = {name: table for name, table in bundle.tables.items() if name in VIEW_TABLES}
-    controls = {"gamma": bundle.controls.get("pixels", RULE.controls[0].default), "first": 1}
-    return replace(bundle, levels=levels, rule=BANDS.name, controls=controls, tables=tables)

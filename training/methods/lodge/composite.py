@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from ...lod.blocks import Blocks
+from ...lod.blocks import BlockIndex
 from ...lod.rule import collect_facts
 from ...lod.rules.chunks import RULE
 from ...rasterize import Gaussians, contributions
@@ -37,14 +37,14 @@ class IndexedLevel:
 
     gaussians: Gaussians
     means: np.ndarray
-    blocks: Blocks
+    blocks: BlockIndex
 
     @classmethod
-    def of(cls, gaussians: Gaussians, blocks: Blocks | None = None) -> IndexedLevel:
+    def of(cls, gaussians: Gaussians, blocks: BlockIndex | None = None) -> IndexedLevel:
         """Create a level, computing ``blocks`` if they are not given."""
         gaussians = gaussians.detach()
         means = gaussians.means.cpu().numpy()
-        return cls(gaussians, means, blocks or Blocks.of(means, gaussians.log_scales.cpu().numpy()))
+        return cls(gaussians, means, blocks or BlockIndex.of(means, gaussians.log_scales.cpu().numpy()))
 
     def __len__(self) -> int:
         return len(self.gaussians)

@@ -13,8 +13,7 @@ import numpy as np
 import torch
 
 from ...errors import LodgsError
-from ...lod.blocks import Blocks, block_quantiles, spatial_order
-from ...lod.partial_read import BLOCKS, block_table
+from ...lod.blocks import BLOCKS, BlockIndex, block_quantiles, block_table, spatial_order
 from ...lod.rules.chunks import RULE, TABLE, member_columns
 from ...optimize.density_control import require_rows
 from ...optimize.method import Drawing, StepResult
@@ -72,7 +71,7 @@ class Method(RefiningMethod):
         self.costs: list[dict] = []
         self.centres, self.radii = np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
         self.sets: dict[int, list[np.ndarray]] = {}
-        self._blocks: Blocks | None = None  # blocks of the level in training, as of its last pruning
+        self._blocks: BlockIndex | None = None  # blocks of the level in training, as of its last pruning
         self._single_share = p.tune_alone
 
     @property
@@ -122,10 +121,10 @@ class Method(RefiningMethod):
         if not len(self.centres):
             return {}
         x, y, z = self.centres.T
-        splats = {number: self._make_level(number).splats for number in sorted(self.sets)}
+        levels = ((number, self._make_level(number).splats.extras) for number in sorted(self.sets))
         return {
             TABLE: {"x": x, "y": y, "z": z, "radius": self.radii},
-            BLOCKS: block_table(RULE, splats),
+            BLOCKS: block_table(RULE.block_bounds, levels),
         }
 
     def meta(self) -> dict:
@@ -364,7 +363,7 @@ class Method(RefiningMethod):
             "d_l": self.d_l, "finished": finished, "costs": self.costs, "alone": self._single_share,
             "blocks": {} if blocks is None else {
                 "count": blocks.count, "low": torch.from_numpy(blocks.low),
-                "high": torch.from_numpy(blocks.high), "reach": torch.from_numpy(blocks.reach),
+                "high": torch.from_numpy(blocks.high), "reach": torch.from_numpy(blocks.columns["reach"]),
             },
             "centres": torch.from_numpy(self.centres), "radii": torch.from_numpy(self.radii),
             "sets": {
@@ -381,7 +380,8 @@ class Method(RefiningMethod):
         }
         self._blocks = None
         if blocks := state["blocks"]:
-            self._blocks = Blocks(blocks["count"], *(blocks[n].numpy() for n in ("low", "high", "reach")))
+            bounds = (blocks[name].numpy() for name in ("low", "high", "reach"))
+            self._blocks = BlockIndex.from_bounds(blocks["count"], *bounds)
         self.centres, self.radii = state["centres"].numpy(), state["radii"].numpy()
         self.sets = {
             number: [

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from ...lod.rules.cut import MIN_DETAIL, detail_of
 from ...lod.tree.forest import Forest, ForestShape, Piece, combine_trees
+from ...lod.tree.nodes import MIN_DETAIL, detail_of
 from ...lod.tree.shape import Tree
 from ...optimize.memory import free_memory
 from ...optimize.model import NAMES
@@ -25,7 +25,9 @@ from ...optimize.out_of_core.cut_cache import CutCache, CutTooLarge
 from ...optimize.out_of_core.row_file import RowFile, RowLayout
 from ...rasterize import Gaussians
 from ...rasterize.records import gather_gaussians
-from ...rasterize.sequential_point_tree import (
+from ...scenes.cameras import Camera
+from ...splats.gaussians import Splats
+from .sequential_point_tree import (
     LEAF,
     UpperTree,
     first_below,
@@ -33,8 +35,6 @@ from ...rasterize.sequential_point_tree import (
     node_bounds,
     search_lists,
 )
-from ...scenes.cameras import Camera
-from ...splats.gaussians import Splats
 
 BATCH_NODES = 1 << 14
 """Number of nodes to process at a time in passes over all nodes."""

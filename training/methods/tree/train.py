@@ -16,7 +16,7 @@ from functools import cached_property, partial
 import numpy as np
 import torch
 
-from ...lod.partial_read import BLOCKS
+from ...lod.blocks import BLOCKS
 from ...lod.tree.forest import build_levels
 from ...lod.tree.shape import LEAVES, leaf_only_columns
 from ...optimize.initialize import from_splats

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import LodgsError
-from ...lod.rule import find_rule
+from ...lod.rule import resolve_rule
 from ...methods import method_info
 from ...optimize.memory import MAX_BYTES, TARGET_BYTES
 from ...optimize.parameters import Parameters
@@ -325,8 +325,8 @@ def _part_job(job: Job, parameters: Parameters, method: str = "") -> Job:
 
 def _polishes(job: Job) -> bool:
     """Return whether borders of cells are fitted; the rule must not weight splats at full detail."""
-    rule = find_rule(method_info(method_info(job.method).cell_method).rule)
-    return job.polish > 0 and (rule is None or not rule.always_active)
+    rule = resolve_rule(method_info(method_info(job.method).cell_method).rule)
+    return job.polish > 0 and not rule.weights_full_detail
 
 
 def _seam_job(job: Job) -> Job:

@@ -9,15 +9,14 @@ from training.lod.rule import rules
 from training.lod.selection import BundleSelector, resolve_controls, select_levels
 from training.lod.tree import paging
 from training.lod.tree.forest import build_levels, max_subtree_leaves, merge_forest, split_tree
-from training.lod.tree.pages import page_table
-from training.lod.tree.paging import Pager
+from training.lod.tree.paging import TreeFile
 from training.lod.tree.shape import Tree
 from training.methods.tree.build import build
 from training.splats.bundle import read_bundle, write_bundle
 from training.splats.levels import Bundle
 
 from .test_shape import nodes
-from .trees import random_leaves, random_tree
+from .trees import page_table, random_leaves, random_tree
 
 CUT = rules()["cut"]
 FOCAL = 1000.0
@@ -127,7 +126,7 @@ def test_equal_splats_are_paged_correctly(tmp_path, longest, budget, monkeypatch
     monkeypatch.setattr(paging, "PAGES_PER_UPDATE", 2)
     splats, tree = with_twins()
     full = BundleSelector(Bundle("tree", read_back(tmp_path, split_tree(splats, tree, longest)), "cut"))
-    pager = Pager(tmp_path / "a.ply", budget)
+    pager = TreeFile(tmp_path / "a.ply").pager(budget)
     tags, means = np.zeros(pager.rows, int), np.zeros((pager.rows, 3), np.float32)
     columns = {name: np.zeros(pager.rows, np.float32) for name in CUT.columns}
 
@@ -147,7 +146,7 @@ def test_equal_splats_are_paged_correctly(tmp_path, longest, budget, monkeypatch
                     tags[rows], means[rows] = page.sh[:, 0, 0], page.means
                     for name in CUT.columns[2:]:
                         columns[name][rows] = page.extras[name]
-                columns["node_size"], columns["parent_size"] = update.sizes
+                columns |= update.columns
                 drawn(position, pixels)
             if budget > len(tree):
                 selected = full.weights(position, FOCAL, {"pixels": pixels}) > 0

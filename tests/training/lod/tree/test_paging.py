@@ -7,18 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.training.lod.tree.trees import random_leaves, tree_of
+from tests.training.lod.tree.trees import page_table, random_leaves, tree_of
 from training.errors import LodgsError
 from training.lod import query as by_values
-from training.lod.blocks import SIZE
-from training.lod.partial_read import BLOCKS
+from training.lod.blocks import BLOCKS, BOUNDS, SIZE, BlockIndex
+from training.lod.on_disk import open_paged
 from training.lod.rule import rules
-from training.lod.rules.cut import ABOVE_ROOT
 from training.lod.selection import BundleSelector, select
 from training.lod.tree import paging
-from training.lod.tree.pages import page_table, streaming_order
-from training.lod.tree.paging import Pager, TreeFile, read_budgeted
-from training.lod.tree.resident import ResidentTree
+from training.lod.tree.nodes import ABOVE_ROOT, ResidentTree, streaming_order
+from training.lod.tree.paging import TreeFile
 from training.scenes.cameras import Camera, look_at
 from training.splats.bundle import read_bundle, write_bundle
 from training.splats.levels import Bundle, Level
@@ -92,7 +90,7 @@ class Memory:
             self.means[rows] = splats.means
             for name in CUT.columns[2:]:
                 self.columns[name][rows] = splats.extras[name]
-        self.columns["node_size"], self.columns["parent_size"] = update.sizes
+        self.columns |= update.columns
 
     def shown(self, position, pixels):
         """Return the means of the splats that a camera sees."""
@@ -111,7 +109,7 @@ EYES = [(0, 0, 3), (0.5, 0.2, 2), (-8, 8, 1), (7, -7, 0.5), (7, -6, 0.2), (60, 0
 
 
 def test_sufficient_budget_gives_the_full_cut(truth, path):
-    pager = Pager(path, 10**6)
+    pager = TreeFile(path).pager(10**6)
     memory = Memory(pager)
     for position in EYES:
         for pixels in (1.0, 4.0, 30.0):
@@ -124,7 +122,7 @@ def test_sufficient_budget_gives_the_full_cut(truth, path):
 def test_cuts_are_complete_within_a_budget(truth, path, budget, monkeypatch):
     """Also while pages arrive, and for other cameras."""
     monkeypatch.setattr(paging, "PAGES_PER_UPDATE", 3)
-    pager, equal = Pager(path, budget), 0
+    pager, equal = TreeFile(path).pager(budget), 0
     memory = Memory(pager)
     assert pager.rows <= budget
     memory.take(pager.step(None, 0.0))  # nothing is there before
@@ -137,7 +135,7 @@ def test_cuts_are_complete_within_a_budget(truth, path, budget, monkeypatch):
                         truth.require_complete(truth.nodes(memory.shown(second, pixels)))
             drawn = truth.nodes(memory.shown(position, pixels))
             truth.require_complete(drawn)
-            needed = np.flatnonzero(pager._index.detail(np.array(position)) < FOCAL / pixels * 1.001)
+            needed = paging.page_order(pager._index, np.array(position), FOCAL / pixels * 1.001)
             if len(needed) <= budget // SIZE:
                 equal += 1
                 np.testing.assert_array_equal(np.sort(drawn), truth.cut(position, pixels))
@@ -146,30 +144,28 @@ def test_cuts_are_complete_within_a_budget(truth, path, budget, monkeypatch):
 
 def test_coarse_pages_load_first_and_old_pages_are_evicted_first(path):
     file = TreeFile(path)
-    order = file.index().order(np.array([7, -7, 0.5]), 1000.0)
-    sizes, place = file.index().parent_size[order], np.arange(len(order))
+    order = paging.page_order(file.index(), np.array([7, -7, 0.5]), 1000.0)
+    sizes, place = file.index().columns["parent_size"][order], np.arange(len(order))
     assert np.corrcoef(np.log(np.minimum(sizes, 100)), place)[0, 1] < -0.5
-    pager = Pager(path, 12 * SIZE)
+    pager = TreeFile(path).pager(12 * SIZE)
     a, b, c = ((0, 0, 40), 300.0), ((9, 9, 1), 60.0), ((-9, -9, 1), 60.0)
     present = []
     for position, pixels in (a, b, c, a, b):
         list(come_in(pager, Memory(pager), position, pixels))
         present.append(set(np.flatnonzero(pager._slot_of >= 0)))
         assert len(present[-1]) <= 12 and pager.splats <= 12 * SIZE
-        needed = pager.file.index().detail(np.array(position)) < max(FOCAL / pixels, 32) * (
-            1 + paging.ROUNDING
-        )
-        assert pager.short == (needed.sum() > 12)
+        needed = paging.page_order(pager.file.index(), np.array(position), max(FOCAL / pixels, 32))
+        assert pager.short == (len(needed) > 12)
     assert present[0] <= present[1]  # there was room
 
 
 def test_thread_reads_requested_pages(truth, path):
-    pager = Pager(path, 10**6)
+    pager = TreeFile(path).pager(10**6)
     memory, used = Memory(pager), 0
     pager.start()
     try:
         for position in EYES[:4]:
-            pager.ask(np.array(position), FOCAL)
+            pager.ask(by_values.LodQuery("cut", position, FOCAL, (), (("pixels", 1.0),)))
             expected, until = truth.cut(position, 1.0), time.monotonic() + 60
             while not pager.idle and time.monotonic() < until:
                 if (update := pager.take()) is not None:
@@ -185,7 +181,7 @@ def test_thread_reads_requested_pages(truth, path):
 
 
 def test_thread_reports_errors(path, monkeypatch):
-    pager = Pager(path, 5000)
+    pager = TreeFile(path).pager(5000)
     monkeypatch.setattr(pager.file, "read", lambda pages: (_ for _ in ()).throw(OSError("the disk is gone")))
     pager.start()
     pager._thread.join(10)
@@ -195,8 +191,9 @@ def test_thread_reports_errors(path, monkeypatch):
 
 @pytest.mark.parametrize("budget", [SIZE, 5000, 10**6])
 def test_budgeted_read_gives_a_smaller_tree(truth, path, budget, tmp_path):
-    bundle, total = read_budgeted(path, budget)
-    assert total == 2 * LEAVES - 1
+    file = open_paged(path)
+    bundle = file.top(budget)
+    assert file.total == 2 * LEAVES - 1
     assert 0 < sum(len(level.splats) for level in bundle.levels) <= budget
     write_bundle(tmp_path / "small.ply", bundle)
     choice = BundleSelector(read_bundle(tmp_path / "small.ply"))
@@ -215,7 +212,7 @@ def test_budgeted_read_gives_a_smaller_tree(truth, path, budget, tmp_path):
 def test_budgeted_read_for_one_camera(truth, path):
     for position in EYES[-2:]:
         k = FOCAL / 20
-        part, _ = read_budgeted(path, 10**6, np.array(position), k)
+        part = TreeFile(path).top(10**6, np.array(position), k)
         assert sum(len(level.splats) for level in part.levels) < 1.8 * LEAVES
         splats, _ = select(part, np.array(position), FOCAL, {"pixels": 20.0})
         np.testing.assert_array_equal(np.sort(truth.nodes(splats.means)), truth.cut(position, 20.0))
@@ -285,8 +282,8 @@ def test_page_table_equals_the_index_from_reading(truth, tmp_path):
     write_bundle(tmp_path / "a.ply", bundle)
     write_bundle(tmp_path / "b.ply", replace(bundle, tables={BLOCKS: table}))
     single, second = (TreeFile(tmp_path / name).index() for name in ("a.ply", "b.ply"))
-    for name in ("low", "high", "parent_size"):
-        np.testing.assert_array_equal(getattr(single, name), getattr(second, name))
+    for name in (*BOUNDS, "parent_size"):
+        np.testing.assert_array_equal(single.columns[name], second.columns[name])
     means = truth.choice.splats.means[truth.parents]
     first = means[:SIZE][truth.parents[:SIZE] >= 0]
     assert (single.low[0] <= first.min(axis=0)).all() and (single.high[0] >= first.max(axis=0)).all()
@@ -299,7 +296,7 @@ def test_undrawable_splats_leave_no_holes(truth, tmp_path):
     means[5], means[7000] = np.nan, np.inf
     leaves = replace(leaves, means=means)
     write_bundle(tmp_path / "tree.ply", replace(truth.bundle, levels=[Level(1, above), Level(2, leaves)]))
-    pager = Pager(tmp_path / "tree.ply", 10**6)
+    pager = TreeFile(tmp_path / "tree.ply").pager(10**6)
     memory = Memory(pager)
     list(come_in(pager, memory, (0, 0, 3), 1.0))
     truth.require_complete(truth.nodes(memory.shown((0, 0, 3), 1.0)))
@@ -309,13 +306,13 @@ def test_other_rules_and_small_budgets_are_reported(truth, tmp_path):
     leaves = truth.bundle.levels[1].splats
     write_bundle(tmp_path / "a.ply", Bundle("flod", [Level(1, leaves, {"s_min": 0.0})], "bands"))
     write_bundle(tmp_path / "b.ply", truth.bundle)
-    for read in (TreeFile, lambda path: read_budgeted(path, 10**5), lambda path: Pager(path, 10**5)):
-        with pytest.raises(LodgsError, match="not a tree of splats"):
-            read(tmp_path / "a.ply")
-    for read, budget in ((read_budgeted, 0), (Pager, 300)):
+    with pytest.raises(LodgsError, match="its rule 'bands' needs the complete file"):
+        open_paged(tmp_path / "a.ply")
+    file = TreeFile(tmp_path / "b.ply")
+    for read, budget in ((file.top, 0), (file.pager, 300)):
         with pytest.raises(LodgsError, match=f"budget of {budget} splats is too small"):
-            read(tmp_path / "b.ply", budget)
-    bundle, _ = read_budgeted(tmp_path / "b.ply", 1)
+            read(budget)
+    bundle = file.top(1)
     assert [len(level.splats) for level in bundle.levels] == [0, 1]
 
 
@@ -325,18 +322,25 @@ def test_cut_is_read_from_disk(truth, path, pixels):
     file, shares = TreeFile(path), []
     for position in EYES:
         choice = by_values.LodQuery("cut", position, FOCAL, (), (("pixels", pixels),))
-        result = file.cut(choice)
+        result = file.visible(choice)
         expected = truth.cut(position, pixels)
         drawn = truth.nodes(np.concatenate([splats.means for splats in result.values()]))
         np.testing.assert_array_equal(np.sort(drawn), expected)
         assert not result[2].extras["node_size"].any() and result[1].extras["node_size"].all()
         direction_to = look_at(np.array(position), np.array([1, 2, 0.5]), (0, 0, 1))
         camera = Camera("", 300, 200, 250, 250, 150, 100, direction_to)
-        visible = truth.nodes(np.concatenate([item.means for item in file.cut(choice, camera, 0.1).values()]))
+        parts = file.visible(choice, camera, 0.1).values()
+        visible = truth.nodes(np.concatenate([splats.means for splats in parts]))
         assert set(visible) <= set(expected)
         assert set(expected[camera.sees(truth.choice.splats.means[expected], 0.1)]) <= set(visible)
         shares.append(len(visible) / len(expected))
     assert min(shares) < 0.75 or pixels > 1 or path.stem == "by size"  # few splats are in wide blocks
+
+
+def index_of(places, sizes):
+    """Return an index of pages that are points."""
+    bounds = dict(zip(BOUNDS, [*places.T, *places.T], strict=True))
+    return BlockIndex({1: SIZE * len(places)}, bounds | {"parent_size": sizes})
 
 
 def test_pages_in_view_load_first(truth):
@@ -346,23 +350,23 @@ def test_pages_in_view_load_first(truth):
     direction_to = rng.normal(size=(500, 3))
     direction_to /= np.linalg.norm(direction_to, axis=1, keepdims=True)
     places = position + 7 * direction_to
-    index = paging.PageIndex(places, places, np.full(500, 1e-4))
+    index = index_of(places, np.full(500, 1e-4))
     for k, result in ((1e6, 500), (6e4, 0)):
-        assert len(index.order(position, k, direction)) == result
+        assert len(paging.page_order(index, position, k, direction)) == result
     ahead = np.degrees(np.arccos(direction_to @ direction)) < 50
-    order = index.order(position, 1e6, direction)
+    order = paging.page_order(index, position, 1e6, direction)
     assert 20 < ahead.sum() < 200 and ahead[order[: ahead.sum()]].all()
 
     columns, below = truth.choice.splats.extras, truth.parents >= 0
     above = np.stack([columns[f"parent_{axis}"] for axis in "xyz"], 1).astype(np.float64)
-    index = paging.PageIndex(above, above, columns["parent_size"].astype(np.float64))
-    result = index.ahead(np.array([-3.0, 2, 0.5]), direction)
+    index = index_of(above, columns["parent_size"].astype(np.float64))
+    result = paging.pages_ahead(index, np.array([-3.0, 2, 0.5]), direction)
     assert 0.1 < result.mean() < 0.9
     assert result[truth.parents[result & below]].all()
 
 
 def test_cuts_are_complete_for_every_view_direction(truth, path):
-    pager = Pager(path, 24 * SIZE)
+    pager = TreeFile(path).pager(24 * SIZE)
     memory, position = Memory(pager), np.array([0, 0, 0.5])
     for direction in ((1, 0, 0), (-1, 0, 0), (0, 1, 0)):
         while (update := pager.step(position, FOCAL, np.array(direction, float))) is not None:

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from training.lod.rule import rules
-from training.lod.rules.cut import ABOVE_ROOT, MIN_DETAIL
 from training.lod.selection import resolve_controls, select_levels
-from training.lod.tree.shape import complete_levels, leaf_only_columns, splat_area, splat_size
+from training.lod.tree.nodes import ABOVE_ROOT, MIN_DETAIL
+from training.lod.tree.shape import leaf_only_columns, splat_area, splat_size
 from training.splats.bundle import read_bundle, write_bundle
 from training.splats.gaussians import Splats
 from training.splats.level_folder import read_folder, write_folder
@@ -104,7 +104,7 @@ def test_complete_levels_are_complete_scenes(tmp_path):
     splats.sh[:, 0, 0] = np.arange(len(tree))
     splats.extras["own"] = np.arange(len(tree), dtype=np.float32)
     bundle = Bundle("tree", tree.levels(splats), "cut", controls={"pixels": 2.0}, meta={"seed": 3})
-    result = complete_levels(bundle)
+    result = rules()["cut"].complete_levels(bundle)
     counts = [len(level.splats) for level in result.levels]
     assert len(counts) == 3 and counts[2] == 9000 and counts[1] <= 2250 and 500 <= counts[0] <= counts[1] / 4
     assert counts[1] > 1000 and [level.number for level in result.levels] == [1, 2, 3]

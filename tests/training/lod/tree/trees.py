@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from training.lod.blocks import spatial_order
-from training.lod.partial_read import BLOCKS
-from training.lod.rules.cut import ABOVE_ROOT, min_parent_size
-from training.lod.tree.pages import page_table, streaming_order
+from training.lod.blocks import BLOCKS, block_table, spatial_order
+from training.lod.tree.nodes import ABOVE_ROOT, BLOCK_BOUNDS, min_parent_size, streaming_order
 from training.lod.tree.shape import Tree
 from training.splats.bundle import write_bundle
 from training.splats.gaussians import Splats
@@ -93,6 +91,11 @@ def tree_of(leaves: Splats) -> Bundle:
     leaves.extras = {name: column[:count] for name, column in extras.items()}
     above = nodes.select(np.argsort(-sizes[count:], kind="stable") + count)
     return Bundle("tree", [Level(1, above), Level(2, leaves)], "cut")
+
+
+def page_table(columns):
+    """Return the table of blocks of a tree, from the columns of its levels by number."""
+    return block_table(BLOCK_BOUNDS, columns.items())
 
 
 def write_in_pages(path, tree):

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from tests.training.lod.tree.trees import surfaces
-from training.lod.rules.cut import min_parent_size
 from training.lod.selection import BundleSelector, resolve_controls
 from training.lod.tree.forest import merge_forest
+from training.lod.tree.nodes import min_parent_size
 from training.lod.tree.shape import splat_size
 from training.methods import create, method_info
 from training.methods.tree.store import record_layout

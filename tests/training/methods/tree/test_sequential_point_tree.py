@@ -12,9 +12,9 @@ from tests.training.lod.tree.trees import random_tree, surfaces
 from training.lod.rule import rules
 from training.lod.tree.shape import Tree
 from training.methods.tree.build import build
+from training.methods.tree.sequential_point_tree import SequentialPointTree
 from training.rasterize import Gaussians, rasterize
 from training.rasterize.cpu.compile import set_thread_count, thread_count
-from training.rasterize.sequential_point_tree import SequentialPointTree
 from training.scenes.cameras import Camera, look_at
 
 CUT = rules()["cut"]

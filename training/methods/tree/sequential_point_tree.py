@@ -13,12 +13,12 @@ import math
 
 import numpy as np
 
-from ..lod.blocks import PIXELS, REACH, SLANT
-from ..lod.rules.cut import detail_of
-from ..lod.tree.forest import forest_shape
-from ..lod.tree.shape import Tree
-from ..scenes.cameras import Camera
-from .cpu.compile import STRICT, Buffers, f32, inlined, kernel, run_parallel, run_serial
+from ...lod.blocks import PIXELS, REACH, SLANT
+from ...lod.tree.forest import forest_shape
+from ...lod.tree.nodes import detail_of
+from ...lod.tree.shape import Tree
+from ...rasterize.cpu.compile import STRICT, Buffers, f32, inlined, kernel, run_parallel, run_serial
+from ...scenes.cameras import Camera
 
 SLACK = 1e-5
 """Upper bound of the relative rounding errors of distances and sizes in single precision."""
@@ -265,7 +265,7 @@ def image_borders(camera: Camera, near: float) -> np.ndarray:
 
 @inlined(STRICT)
 def _is_fine(balls, i, position, k):
-    """Compute ``lod.rules.cut.is_fine_enough`` of a node, bit for bit."""
+    """Compute ``lod.tree.nodes.is_fine_enough`` of a node, bit for bit."""
     x, y, z = balls[i, 0] - position[0], balls[i, 1] - position[1], balls[i, 2] - position[2]
     return np.sqrt(x * x + y * y + z * z) >= k * balls[i, 3]
 
