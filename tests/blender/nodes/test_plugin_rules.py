@@ -16,12 +16,12 @@ bpy = start_blender()
 def lodgs(name):
     return importlib.import_module(f"{EXTENSION}.{name}")
 
-assert "plugged" in lodgs("training.methods").METHODS
+assert "mymethod" in lodgs("training.methods").METHODS
 assert "plugged" not in lodgs("training.lod.rule").rules()
 levels, gaussians = lodgs("training.splats.levels"), lodgs("training.splats.gaussians")
 ones = np.ones((5, 4), np.float32)
 splats = gaussians.Splats(ones[:, :3], ones, ones[:, :3], ones[:, 0], ones[:, None, :3])
-bundle = levels.Bundle("plugged", [levels.Level(n, splats) for n in (1, 2)], rule="plugged")
+bundle = levels.Bundle("mymethod", [levels.Level(n, splats) for n in (1, 2)], rule="plugged")
 lodgs("training.splats.bundle").write_bundle(sys.argv[1], bundle)
 root = lodgs("blender_lodgs.data.importing").import_splats(bpy.context, sys.argv[1])
 assert root.lodgs.rule == "plugged" and root.lodgs.mode == "SINGLE" and not root.lodgs.by_distance
@@ -30,9 +30,9 @@ assert len(root.lodgs.levels) == 2
 
 
 def test_scene_with_a_plugin_rule_shows_one_level(tmp_path):
-    files = {"plugged/__init__.py": METHOD, "plugged/train.py": TRAIN, "plugged/rule.py": RULE}
-    entries = "[lodgs.methods]\nplugged = plugged\n[lodgs.rules]\nplugged = plugged.rule\n"
-    install(tmp_path, "plugged", entries, files)
+    files = {"mymethod/__init__.py": METHOD, "mymethod/train.py": TRAIN, "mymethod/rule.py": RULE}
+    entries = "[lodgs.methods]\nmymethod = mymethod\n[lodgs.rules]\nplugged = mymethod.rule\n"
+    install(tmp_path, "mymethod", entries, files)
     process = subprocess.run(
         [sys.executable, "-c", SCRIPT, tmp_path / "bundle.ply"], capture_output=True, text=True, timeout=240,
         check=False, cwd=ROOT, env=os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(tmp_path)])},
