@@ -22,6 +22,7 @@ from ...training.splats.bundle import read_bundle, read_header
 from ...training.splats.formats import STREAMED_FILE, is_plain_ply, open_as_ply
 from ...training.splats.level_folder import read_folder
 from ...training.splats.levels import Bundle
+from ..nodes.camera_choices import VIEWPORT
 from . import objects, scenes, streams
 from .photographs import match_render, new_camera, views
 from .placement import axes_of, new_axes
@@ -258,7 +259,7 @@ def _fill(root: bpy.types.Object, file: SplatsFile, level_objects: Sequence[bpy.
     root.lodgs.single_level = file.bundle.levels[-1].number
     if file.total:
         streams.start_streaming(root, file.path, file.budget, file.total)
-        root.lodgs.eye = "VIEW"  # stream for the viewport
+        root.lodgs.eye = VIEWPORT.identifier  # stream for the viewport
 
 
 @contextmanager
