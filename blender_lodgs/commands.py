@@ -16,8 +16,7 @@ from ..training.cli.info import describe
 from ..training.cli.job_options import add_options, job_from_options
 from ..training.cli.methods import describe_method, describe_methods
 from ..training.cli.options import parse_size
-from ..training.editing.bake_filter import bake_filter
-from ..training.editing.edit import ConcatenatedRows, run_to_end
+from ..training.editing.export import export_finest_level, run_to_end
 from ..training.errors import LodgsError
 from ..training.evaluate.messages import summary_lines
 from ..training.runs.folder import RunFolder
@@ -25,7 +24,7 @@ from ..training.runs.job import KEYS, Job
 from ..training.settings import check_value
 from ..training.splats.bundle import write_bundle
 from ..training.splats.dialects import Warn
-from ..training.splats.formats import PLY, find_format, write_splats
+from ..training.splats.formats import FORMATS, PLY, find_format
 from . import extension
 from .data import importing, scenes, viewpoints
 from .render.capture import noise_warning, render_views, write_model
@@ -107,9 +106,8 @@ def _add_export(commands: _Commands) -> None:
     )
     export.set_defaults(command=_export)
     export.add_argument("blend", type=Path, help=".blend file")
-    export.add_argument(
-        "bundle", type=Path, help="file to write: a bundle (.ply), .spz, .sog, .compressed.ply or .splat"
-    )
+    others = ", ".join(kind.suffix for kind in FORMATS if kind is not PLY)
+    export.add_argument("bundle", type=Path, help=f"file to write: a bundle (.ply), or {others}")
     export.add_argument("--root", help="name of the scene root, if the file holds several")
     export.add_argument(
         "--placed",
@@ -242,12 +240,7 @@ def _export(args: argparse.Namespace) -> int:
     if find_format(args.bundle) is PLY:
         write_bundle(args.bundle, bundle)
     else:
-        exported = bundle if find_format(args.bundle).antialiased else bake_filter(bundle)
-        run_to_end(
-            write_splats(
-                args.bundle, ConcatenatedRows.of_level(exported, exported.levels[-1].number), exported.meta
-            )
-        )
+        run_to_end(export_finest_level(args.bundle, bundle))
     return DONE
 
 

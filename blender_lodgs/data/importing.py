@@ -19,9 +19,10 @@ from ...training.scenes.formats import ensure_colmap_scene
 from ...training.scenes.undistort import cached_undistorted_scene
 from ...training.scenes.view_tables import read_view_tables
 from ...training.splats.bundle import read_bundle, read_header
-from ...training.splats.formats import STREAMED_FILE, is_plain_ply, open_as_ply
+from ...training.splats.formats import is_plain_ply, open_as_ply
 from ...training.splats.level_folder import read_folder
 from ...training.splats.levels import Bundle
+from ...training.splats.streamed_levels import STREAMED_FILE
 from ..nodes.camera_choices import VIEWPORT
 from . import objects, scenes, streams
 from .photographs import match_render, new_camera, views

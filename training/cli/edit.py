@@ -10,7 +10,7 @@ from typing import Any
 from ..editing.look import RANGES, Look
 from ..errors import LodgsError
 from ..lod.crop import Crop
-from ..splats.formats import FORMATS
+from ..splats.formats import FORMATS, READABLE
 from .options import SOURCE_HELP, add_placement, placement_of, warn
 
 _LIMITS = "max_size", "min_opacity", "max_distance", "min_views", "gap", "share"
@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "source", type=Path,
-        help=f"{SOURCE_HELP}; with splat-transform also .spz, .sog and others: see docs/reference/formats.md",
+        help=f"{SOURCE_HELP}; also {', '.join(READABLE[1:])} (see docs/reference/formats.md)",
     )  # fmt: skip
     _add_outputs(parser)
     _add_cleaning(parser)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,21 +15,16 @@ from ..lod.tree.shape import complete_levels
 from ..splats.bundle import open_bundle, write_bundle
 from ..splats.dialects import Warn, comments_from_meta, ignore, meta_from_comments
 from ..splats.file_rows import DrawableRows
-from ..splats.formats import (
-    PLY,
-    SPLAT,
-    find_format,
-    find_splat_transform,
-    write_splats,
-    write_streamed_levels,
-)
-from ..splats.gaussians import SplatRows, Splats
+from ..splats.formats import find_format
 from ..splats.level_folder import read_folder, write_folder
 from ..splats.levels import Bundle, Level
 from ..splats.ply import write_ply
 from ..splats.similarity import Similarity
+from ..splats.splat_transform import find_splat_transform
+from ..splats.streamed_levels import write_streamed_levels
 from .bake_filter import bake_filter
 from .cleaning import Cleaning, clean_bundle
+from .export import export_finest_level, run_to_end
 from .look import Looks, apply_looks_to_levels
 from .placement import transform_bundle, upright_placement
 
@@ -76,8 +71,7 @@ def edit(
     for path in (out, *plain, folder, streamed):
         if path is not None and path.resolve() == source.resolve():
             raise LodgsError(f"Cannot overwrite the source {path}.", "Choose another output file.")
-    kinds = {find_format(path) for path in plain}
-    if streamed is not None or not kinds <= {PLY, SPLAT}:
+    if streamed is not None or any(find_format(path).write is None for path in plain):
         find_splat_transform()  # fail before minutes of work
     bundle = _open(source, warn)
     check_rule(bundle)
@@ -94,9 +88,7 @@ def edit(
         for level, result in zip(bundle.levels, edited.levels, strict=True)
     ]
     for path in plain:
-        exported = edited if antialiased or find_format(path).antialiased else bake_filter(edited)
-        finest = ConcatenatedRows.of_level(exported, exported.levels[-1].number)
-        run_to_end(write_splats(path, finest, exported.meta))
+        run_to_end(export_finest_level(path, edited, antialiased))
     if folder is not None or streamed is not None:
         levels = complete_levels(_in_memory(edited)) if is_tree(edited) else edited
         if folder is not None:
@@ -105,37 +97,6 @@ def edit(
             run_to_end(write_streamed_levels(streamed, levels if antialiased else bake_filter(levels)))
     paths = [path for path in (out, *plain, folder, streamed) if path is not None]
     return "\n".join([*report, *(f"{path}: written" for path in paths)])
-
-
-def run_to_end(steps: Iterator[str]) -> None:
-    """Exhaust an iterator of progress messages."""
-    for _ in steps:
-        pass
-
-
-@dataclass(frozen=True)
-class ConcatenatedRows:
-    """Several sets of splats on disk as one."""
-
-    sets: Sequence[SplatRows]
-
-    @classmethod
-    def of_level(cls, bundle: Bundle, number: int) -> ConcatenatedRows:
-        """Return all splats that are drawn at a level."""
-        return cls([level.rows for level in bundle.drawn_levels(number)])
-
-    def __len__(self) -> int:
-        return sum(map(len, self.sets))
-
-    def select(self, index: slice | np.ndarray, /) -> Splats:
-        """Read a range of all rows."""
-        assert isinstance(index, slice)
-        begin, end, _ = index.indices(len(self))
-        parts, first = [], 0
-        for rows in self.sets:
-            parts.append(rows.select(slice(max(begin - first, 0), max(min(end - first, len(rows)), 0))))
-            first += len(rows)
-        return Splats.concatenated(parts)
 
 
 def _open(source: Path, warn: Warn) -> Bundle:

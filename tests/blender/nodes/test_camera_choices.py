@@ -1,10 +1,9 @@
 """Camera choices: stored numbers, and a choice that only its entry in the table declares."""
 
-import shutil
 import subprocess
 import sys
 
-from tests.training.test_plugins import ROOT
+from tests.checkout import ROOT, copy_checkout
 
 ENTRY = '    CameraChoice("SECOND", "Second Object", "Another object", object="second_eye"),\n'
 LAST = "    VIEWPORT,\n)\n"
@@ -62,9 +61,7 @@ assert visible() == (0, 0, 0)
 
 
 def test_entry_of_the_table_declares_a_choice(tmp_path):
-    shutil.copytree(ROOT / "blender_lodgs", tmp_path / "blender_lodgs")
-    for name in ("training", "__init__.py", "blender_manifest.toml"):
-        (tmp_path / name).symlink_to(ROOT / name)
+    copy_checkout(tmp_path, "blender_lodgs")
     table = tmp_path / "blender_lodgs/nodes/camera_choices.py"
     text = table.read_text()
     assert text.count(LAST) == 1
