@@ -7,11 +7,11 @@ from math import inf
 from pathlib import Path
 from typing import Any
 
-from ..editing.look import RANGES, Look
+from ..editing.look import LOOK_SETTINGS, Look
 from ..errors import LodgsError
 from ..lod.crop import Crop
 from ..splats.formats import FORMATS, READABLE
-from .options import SOURCE_HELP, add_placement, placement_of, warn
+from .options import SOURCE_HELP, add_placement, add_setting, placement_of, setting_values, warn
 
 _LIMITS = "max_size", "min_opacity", "max_distance", "min_views", "gap", "share"
 """Options that are numbers from 0 on; names of ``Cleaning``'s attributes."""
@@ -98,14 +98,8 @@ def _add_cleaning(parser: argparse.ArgumentParser) -> None:
 
 def _add_look(parser: argparse.ArgumentParser) -> None:
     look = parser.add_argument_group("look, of all splats or with --keep all of those inside the crops")
-    look.add_argument("--exposure", type=float, metavar="N", help="stops; 1 doubles the light")
-    look.add_argument(
-        "--temperature", type=float, metavar="K",
-        help="white balance: temperature in kelvins of the light to make white; above 6500 is warmer",
-    )  # fmt: skip
-    look.add_argument("--tint", type=float, nargs=3, metavar="N", help="colour that white turns into, 0 to 1")
-    look.add_argument("--saturation", type=float, metavar="N", help="0 is grey, 1 is unchanged")
-    look.add_argument("--opacity", type=float, metavar="N", help="opacity factor, 0 to 1")
+    for f in LOOK_SETTINGS.values():
+        add_setting(look, f)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -175,7 +169,5 @@ def _crops(options: argparse.Namespace) -> list[Crop]:
 
 def _look(options: argparse.Namespace) -> Look | None:
     """Return the look that the user set; None without any option of it."""
-    values = {name: value for name in RANGES if (value := getattr(options, name)) is not None}
-    if "tint" in values:
-        values["tint"] = tuple(values["tint"])
+    values = setting_values(options, Look)
     return Look(**values) if values else None
