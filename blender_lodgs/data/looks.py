@@ -29,7 +29,7 @@ from .setting_properties import property_of
 
 _DISPLAY: dict[str, dict[str, Any]] = {
     "exposure": {"step": 10, "precision": 2},
-    "temperature": {"step": 10_000, "precision": 0, "subtype": "COLOR_TEMPERATURE"},
+    "temperature": {"step": 10_000, "precision": 0},
     "tint": {"subtype": "COLOR_GAMMA"},
     "saturation": {"precision": 3, "subtype": "FACTOR"},
     "opacity": {"precision": 3},

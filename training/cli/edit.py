@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import argparse
-from math import inf
 from pathlib import Path
-from typing import Any
 
+from ..editing.cleaning import LIMITS, Cleaning
 from ..editing.look import LOOK_SETTINGS, Look
 from ..errors import LodgsError
 from ..lod.crop import Crop
 from ..splats.formats import FORMATS, READABLE
 from .options import SOURCE_HELP, add_placement, add_setting, placement_of, setting_values, warn
-
-_LIMITS = "max_size", "min_opacity", "max_distance", "min_views", "gap", "share"
-"""Options that are numbers from 0 on; names of ``Cleaning``'s attributes."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -69,31 +65,13 @@ def _add_cleaning(parser: argparse.ArgumentParser) -> None:
         help="side of the crops to keep (default: inside); all: keep everything, and apply the look only "
         "inside them",
     )  # fmt: skip
-    parser.add_argument(
-        "--max-size", type=float, metavar="N", help="remove splats with a larger standard deviation"
-    )
-    parser.add_argument(
-        "--min-opacity", type=float, metavar="N", help="remove splats with a lower opacity, 0 to 1"
-    )
-    parser.add_argument("--drop-floaters", action="store_true", help="remove small isolated clusters")
-    parser.add_argument(
-        "--gap", type=float, metavar="N",
-        help="minimum distance of floaters from other splats (default: from the density of splats)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--share", type=float, metavar="N",
-        help="maximum size of a floater, as a fraction of all splats (default 0.001)",
-    )  # fmt: skip
-    parser.add_argument(
+    tests = parser.add_argument_group("clean-up, which removes matching splats")
+    for f in LIMITS.values():
+        add_setting(tests, f)
+    tests.add_argument(
         "--scene", type=Path, metavar="DIR",
         help="COLMAP folder of the photos, for --max-distance, --min-views and --ground",
     )  # fmt: skip
-    parser.add_argument(
-        "--max-distance", type=float, metavar="N", help="remove splats farther from every photo's camera"
-    )
-    parser.add_argument(
-        "--min-views", type=int, metavar="N", help="remove splats inside the frames of fewer photos"
-    )
 
 
 def _add_look(parser: argparse.ArgumentParser) -> None:
@@ -104,12 +82,11 @@ def _add_look(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
-    from ..editing.cleaning import Cleaning
     from ..editing.edit import edit
     from ..runs.folder import RunFolder
     from ..splats.formats import open_as_ply
 
-    limits: dict[str, Any] = _limits(options)
+    limits = setting_values(options, Cleaning)
     crops = _crops(options)
     look = _look(options)
     look_crops: list[Crop | None] = [None]
@@ -133,7 +110,7 @@ def run(options: argparse.Namespace) -> int:
         raise LodgsError(
             "Cannot write the edited splats: no output.", "Add --out, --plain, --folder or --streamed."
         )
-    cleaning = Cleaning(tuple(crops), drop_floaters=options.drop_floaters, **limits)
+    cleaning = Cleaning(tuple(crops), **limits)
     folder = RunFolder(options.source)
     with open_as_ply(folder.bundle if folder.bundle.exists() else folder.path) as source:
         print(
@@ -146,19 +123,6 @@ def run(options: argparse.Namespace) -> int:
             )
         )  # fmt: skip
     return 0
-
-
-def _limits(options: argparse.Namespace) -> dict[str, float]:
-    """Return the limits that the user set, by name.
-
-    Raises:
-        LodgsError: a limit is negative or not finite.
-    """
-    limits = {name: value for name in _LIMITS if (value := getattr(options, name)) is not None}
-    for name, value in limits.items():
-        if not 0 <= value < inf:
-            raise LodgsError(f"--{name.replace('_', '-')} cannot be {value:g}.", "Use a number from 0 on.")
-    return limits
 
 
 def _crops(options: argparse.Namespace) -> list[Crop]:

@@ -6,6 +6,7 @@ import argparse
 import sys
 from collections.abc import Callable
 from dataclasses import Field
+from math import inf
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -80,7 +81,7 @@ def add_setting(parser: argparse._ActionsContainer, f: Field, value: Any = argpa
     default, choices, unit = default_of(f), f.metadata["choices"], f.metadata["unit"]
     about = f.metadata["about"].removesuffix(".").replace("%", "%%")
     about = about[0].lower() + about[1:] if about[1:2].islower() else about  # not an abbreviation
-    if not isinstance(default, bool) and default != "":
+    if not isinstance(default, bool) and default not in ("", inf):
         about += f" (default {default})"
     options: dict[str, Any] = {"default": value, "help": about}
     if isinstance(default, bool):
