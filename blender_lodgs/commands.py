@@ -15,8 +15,8 @@ import bpy
 from ..training.cli.info import describe
 from ..training.cli.job_options import add_options, job_from_options
 from ..training.cli.methods import describe_method, describe_methods
-from ..training.cli.options import parse_size
-from ..training.editing.export import export_finest_level, run_to_end
+from ..training.cli.options import add_setting, parse_size
+from ..training.editing.export import EXPORT_OPTIONS, export_finest_level, run_to_end
 from ..training.errors import LodgsError
 from ..training.evaluate.messages import summary_lines
 from ..training.runs.folder import RunFolder
@@ -109,12 +109,8 @@ def _add_export(commands: _Commands) -> None:
     others = ", ".join(kind.suffix for kind in FORMATS if kind is not PLY)
     export.add_argument("bundle", type=Path, help=f"file to write: a bundle (.ply), or {others}")
     export.add_argument("--root", help="name of the scene root, if the file holds several")
-    export.add_argument(
-        "--placed",
-        action="store_true",
-        help="apply the scene's location, rotation and scale instead of keeping COLMAP's coordinates",
-    )
-    export.add_argument("--as-trained", action="store_true", help="ignore the scene's look")
+    add_setting(export, EXPORT_OPTIONS["placed"], value=False)
+    export.add_argument("--as-trained", dest="looked", action="store_false", help="ignore the scene's look")
 
 
 def _add_capture(commands: _Commands) -> None:
@@ -236,7 +232,7 @@ def _export(args: argparse.Namespace) -> int:
             f"Cannot export {args.blend}: {len(matches)} splat scenes match.",
             f"Name one of its scenes with --root: {names}.",
         )
-    bundle = scenes.read_levels(matches[0], args.placed, not args.as_trained)
+    bundle = scenes.read_levels(matches[0], args.placed, args.looked)
     if find_format(args.bundle) is PLY:
         write_bundle(args.bundle, bundle)
     else:

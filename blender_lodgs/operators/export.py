@@ -9,7 +9,7 @@ import bpy
 from bpy_extras.io_utils import ExportHelper
 
 from ...training.editing.bake_filter import bake_filter
-from ...training.editing.export import export_finest_level
+from ...training.editing.export import EXPORT_OPTIONS, export_finest_level
 from ...training.errors import LodgsError
 from ...training.lod.tree.paging import is_tree
 from ...training.lod.tree.shape import complete_levels
@@ -22,6 +22,7 @@ from ...training.splats.splat_format import SplatFormat
 from ...training.splats.streamed_levels import STREAMED_FILE, write_streamed_levels
 from ..data import roots, scenes, selection
 from ..data.objects import megabytes, sh_degree
+from ..data.setting_properties import property_of
 from .base import ReadLevelsOperator, report_errors
 from .modal import BackgroundOperator
 
@@ -54,29 +55,14 @@ def _size(context: bpy.types.Context, kind: SplatFormat, level: int = 0) -> str:
 class _ExportOperator(ReadLevelsOperator):
     """Base class with the options of all exports."""
 
-    placed: bpy.props.BoolProperty(
-        name="As Placed",
-        description="Apply the scene's location, rotation and scale in Blender; disable to keep COLMAP's "
-        "coordinates. Transforms of single levels and instances are ignored",
-        default=False,
-    )
-    looked: bpy.props.BoolProperty(
-        name="With Look",
-        description="Apply the colours and opacities of the Look panel; disable to export the splats as "
-        "trained",
-        default=True,
-    )
+    placed: property_of(EXPORT_OPTIONS["placed"])
+    looked: property_of(EXPORT_OPTIONS["looked"])
 
 
 class _ForeignExport(_ExportOperator):
     """Base class with the options of exports for other programs."""
 
-    antialiased: bpy.props.BoolProperty(
-        name="Antialiased",
-        description="Keep opacities as trained, for viewers with Mip-Splatting's filter; disable for other "
-        "viewers, which would draw small splats too bold. SPZ files store this choice themselves",
-        default=False,
-    )
+    antialiased: property_of(EXPORT_OPTIONS["antialiased"])
 
 
 class _FileExport(_ExportOperator, ExportHelper):

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from ..editing.cleaning import LIMITS, Cleaning
+from ..editing.export import EXPORT_OPTIONS
 from ..editing.look import LOOK_SETTINGS, Look
 from ..errors import LodgsError
 from ..lod.crop import Crop
@@ -45,10 +46,7 @@ def _add_outputs(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--streamed", type=Path, metavar="DIR", help="folder of levels to write for streaming in browsers"
     )
-    parser.add_argument(
-        "--antialiased", action="store_true",
-        help="keep opacities as trained in --plain and --streamed, for viewers with Mip-Splatting's filter",
-    )  # fmt: skip
+    add_setting(parser, EXPORT_OPTIONS["antialiased"], value=False)
 
 
 def _add_cleaning(parser: argparse.ArgumentParser) -> None:

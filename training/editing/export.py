@@ -8,10 +8,37 @@ from pathlib import Path
 
 import numpy as np
 
+from ..settings import setting, settings_of
 from ..splats.formats import find_format, write_splats
 from ..splats.gaussians import SplatRows, Splats
 from ..splats.levels import Bundle
 from .bake_filter import bake_filter
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """Options of exports in Blender's dialogs and in both command lines."""
+
+    placed: bool = setting(
+        False,
+        "Apply the scene's location, rotation and scale in Blender; otherwise keep COLMAP's coordinates. "
+        "Transforms of single levels and instances are ignored.",
+        label="As Placed",
+    )
+    looked: bool = setting(
+        True,
+        "Apply the colours and opacities of the Look panel; otherwise export the splats as trained.",
+        label="With Look",
+    )
+    antialiased: bool = setting(
+        False,
+        "Keep opacities as trained, for viewers with Mip-Splatting's filter; otherwise bake the filter for "
+        "other viewers, which would draw small splats too bold. SPZ files store this choice themselves.",
+    )
+
+
+EXPORT_OPTIONS = settings_of(ExportOptions)
+"""The settings of exports, by name."""
 
 
 def export_finest_level(path: Path, bundle: Bundle, antialiased: bool = False) -> Iterator[str]:
