@@ -125,13 +125,10 @@ def _add_capture(commands: _Commands) -> None:
     capture.add_argument("blend", type=Path, help=".blend file")
     capture.add_argument("--out", type=Path, required=True, help="folder for the COLMAP scene")
     source = capture.add_mutually_exclusive_group()
-    source.add_argument(
-        "--around", action="store_true", help="place views around the selected objects, or all"
-    )
-    source.add_argument("--above", action="store_true", help="place a grid of views above these objects")
-    source.add_argument("--cameras", action="store_true", help="use every camera of the scene")
-    source.add_argument("--animation", action="store_true", help="use the frames of the active camera")
-    source.add_argument("--curve", metavar="NAME", help="place views along a curve")
+    for pattern in viewpoints.VIEW_PATTERNS:
+        about = pattern.about[0].lower() + pattern.about[1:]
+        kind = {"metavar": "NAME"} if pattern.option == "curve" else {"action": "store_true"}
+        source.add_argument(f"--{pattern.option}", help=about, **kind)
     capture.add_argument("--views", type=int, metavar="N", help="number of views, except with --cameras")
     capture.add_argument("--size", type=parse_size, metavar="WxH", help="image size in pixels")
     capture.add_argument(
@@ -244,9 +241,9 @@ def _capture(args: argparse.Namespace) -> int:
     _open(args.blend)
     scene = bpy.context.scene
     settings = scene.lodgs_capture
-    for name in ("around", "above", "cameras", "animation", "curve"):
-        if getattr(args, name):
-            settings.views_from = {"around": "DOME", "above": "GRID"}.get(name, name.upper())
+    for pattern in viewpoints.VIEW_PATTERNS:
+        if getattr(args, pattern.option):
+            settings.views_from = pattern.identifier
     if args.curve:
         settings.curve = bpy.data.objects.get(args.curve)
         if settings.curve is None or settings.curve.type != "CURVE":
