@@ -14,7 +14,7 @@ from ...training.lod.selection import unknown_rule_error
 from ...training.lod.tree.paging import TreeFile, is_tree, read_budgeted
 from ...training.methods import METHODS
 from ...training.scenes.cameras import Camera, camera_extent
-from ...training.scenes.colmap import read_scene
+from ...training.scenes.colmap import Scene, read_scene
 from ...training.scenes.formats import ensure_colmap_scene
 from ...training.scenes.undistort import cached_undistorted_scene
 from ...training.scenes.view_tables import read_view_tables
@@ -62,16 +62,8 @@ def import_colmap(
     Raises:
         LodgsError: The folder has no readable scene. The file is unchanged in that case.
     """
-    manager = context.window_manager
-    manager.progress_begin(0, 1)  # at the mouse pointer
-    try:
-        model, images = (Path(path) if path else None for path in (model, images))
-        folder = Path(folder) if model else ensure_colmap_scene(Path(folder), warn)
-        scene = read_scene(folder, model, images, manager.progress_update)
-    finally:
-        manager.progress_end()
-    for message in scene.warnings:
-        warn(message)
+    model, images = (Path(path) if path else None for path in (model, images))
+    scene = _read_photo_scene(context, Path(folder), model, images, warn)
     undistorted = cached_undistorted_scene(scene)
     undistorted_cameras = {camera.name: camera for camera in undistorted.cameras} if undistorted else {}
     extent = scene.extent(default=1.0)
@@ -91,13 +83,37 @@ def import_colmap(
         distorted = set(scene.distorted) - undistorted_cameras.keys()
         _add_views(context, root, cameras, extent, near, photographs, distorted, scene.names)
         if len(scene.points):
-            points = objects.new_points(
-                f"{root.name} points", scene.points, scene.point_colors, radius=extent / 400
-            )
-            points.parent = axes
-            collection_of(root).objects.link(points)
-            root.lodgs.points = points
+            _add_points(root, scene, radius=extent / 400)
     return root
+
+
+def _read_photo_scene(
+    context: bpy.types.Context,
+    folder: Path,
+    model: Path | None,
+    images: Path | None,
+    warn: Callable[[str], object],
+) -> Scene:
+    """Read a COLMAP scene or an export with progress at the mouse pointer; see :func:`import_colmap`."""
+    manager = context.window_manager
+    manager.progress_begin(0, 1)
+    try:
+        if model is None:
+            folder = ensure_colmap_scene(folder, warn)
+        scene = read_scene(folder, model, images, manager.progress_update)
+    finally:
+        manager.progress_end()
+    for message in scene.warnings:
+        warn(message)
+    return scene
+
+
+def _add_points(root: bpy.types.Object, scene: Scene, radius: float) -> None:
+    """Add the coloured points of a COLMAP scene to a root."""
+    points = objects.new_points(f"{root.name} points", scene.points, scene.point_colors, radius=radius)
+    points.parent = axes_of(root)
+    collection_of(root).objects.link(points)
+    root.lodgs.points = points
 
 
 def _add_views(

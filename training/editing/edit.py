@@ -59,8 +59,7 @@ def edit(
         plain: files for the finest level only, in the formats of their names.
         folder: output folder of levels.
         streamed: output folder of levels for streaming in browsers.
-        antialiased: keep opacities as trained in ``plain`` and ``streamed``; otherwise bake the filter into
-            them (:func:`.bake_filter.bake_filter`), except in formats that record the filter.
+        antialiased: for ``plain`` and ``streamed``, see :class:`.export.ExportOptions`.
 
     Returns:
         A report of the remaining splats of each level, and of the files.
@@ -68,8 +67,9 @@ def edit(
     Raises:
         LodgsError: cannot read or write a file, the source contradicts its rule, or no splats remain.
     """
-    for path in (out, *plain, folder, streamed):
-        if path is not None and path.resolve() == source.resolve():
+    outputs = [path for path in (out, *plain, folder, streamed) if path is not None]
+    for path in outputs:
+        if path.resolve() == source.resolve():
             raise LodgsError(f"Cannot overwrite the source {path}.", "Choose another output file.")
     if streamed is not None or any(find_format(path).write is None for path in plain):
         find_splat_transform()  # fail before minutes of work
@@ -87,16 +87,22 @@ def edit(
         f"level {level.number}: {len(result.rows):,} of {len(level.rows):,} splats"
         for level, result in zip(bundle.levels, edited.levels, strict=True)
     ]
+    _export(edited, plain, folder, streamed, antialiased)
+    return "\n".join([*report, *(f"{path}: written" for path in outputs)])
+
+
+def _export(
+    bundle: Bundle, plain: Sequence[Path], folder: Path | None, streamed: Path | None, antialiased: bool
+) -> None:
+    """Write a bundle for other programs; see :func:`edit`."""
     for path in plain:
-        run_to_end(export_finest_level(path, edited, antialiased))
+        run_to_end(export_finest_level(path, bundle, antialiased))
     if folder is not None or streamed is not None:
-        levels = complete_levels(_in_memory(edited)) if is_tree(edited) else edited
+        levels = complete_levels(_in_memory(bundle)) if is_tree(bundle) else bundle
         if folder is not None:
             write_folder(folder, levels)
         if streamed is not None:
             run_to_end(write_streamed_levels(streamed, levels if antialiased else bake_filter(levels)))
-    paths = [path for path in (out, *plain, folder, streamed) if path is not None]
-    return "\n".join([*report, *(f"{path}: written" for path in paths)])
 
 
 def _open(source: Path, warn: Warn) -> Bundle:
