@@ -46,7 +46,7 @@ def evaluated_query(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph)
     def value(name: str):
         return compat.get_input(modifier, name)
 
-    choice = CHOICES[value(groups.CAMERA_SOURCE)]
+    choice = CHOICES[min(max(value(groups.CAMERA_SOURCE), 0), len(CHOICES) - 1)]
     is_stored = value(groups.FREEZE) or choice.viewport
     if is_stored or choice.position:
         position = tuple(value(groups.CAMERA_POSITION))

@@ -53,8 +53,8 @@ CHOICES = (
 
 
 def find_choice(identifier: str) -> CameraChoice:
-    """Return the choice with a value of ``SplatScene.eye``."""
-    return next(choice for choice in CHOICES if choice.identifier == identifier)
+    """Return the choice with a value of ``SplatScene.eye``; the first one for a value of a newer version."""
+    return next((choice for choice in CHOICES if choice.identifier == identifier), CHOICES[0])
 
 
 def position_expression(source: str, freeze: str) -> str:

@@ -111,9 +111,13 @@ class RuleInputs:
         is_stored = self[FREEZE]
         for number, choice in enumerate(CHOICES):
             if choice.viewport:
-                source = self[CAMERA_SOURCE]
+                source = self._source()
                 is_stored = is_stored.maximum((source > number - 0.5) & (source < number + 0.5))
         return is_stored
+
+    def _source(self) -> Field:
+        """Return the index of the camera choice."""
+        return self[CAMERA_SOURCE].minimum(len(CHOICES) - 1.0)
 
     def _camera(self) -> bpy.types.NodeSocket:
         """Select the camera position by CAMERA_SOURCE and FREEZE."""
@@ -128,7 +132,7 @@ class RuleInputs:
             info = nodes.add("GeometryNodeObjectInfo", transform_space="RELATIVE")
             nodes.link(self._sockets[choice.object] if choice.object else active_camera, info, "Object")
             positions.append(info.outputs["Location"])
-        index = self[FREEZE].where(float(len(CHOICES)), self[CAMERA_SOURCE])
+        index = self[FREEZE].where(float(len(CHOICES)), self._source())
         return nodes.index_switch(index, *positions, stored, kind="VECTOR")
 
 
