@@ -15,9 +15,8 @@ import bpy
 from ..training.cli.info import describe
 from ..training.cli.job_options import add_options, job_from_options
 from ..training.cli.methods import describe_method, describe_methods
-from ..training.cli.options import parse_size
-from ..training.editing.bake_filter import bake_filter
-from ..training.editing.edit import ConcatenatedRows, run_to_end
+from ..training.cli.options import add_setting, parse_size
+from ..training.editing.export import EXPORT_OPTIONS, export_finest_level, run_to_end
 from ..training.errors import LodgsError
 from ..training.evaluate.messages import summary_lines
 from ..training.runs.folder import RunFolder
@@ -25,7 +24,7 @@ from ..training.runs.job import KEYS, Job
 from ..training.settings import check_value
 from ..training.splats.bundle import write_bundle
 from ..training.splats.dialects import Warn
-from ..training.splats.formats import PLY, find_format, write_splats
+from ..training.splats.formats import FORMATS, PLY, find_format
 from . import extension
 from .data import importing, scenes, viewpoints
 from .render.capture import noise_warning, render_views, write_model
@@ -107,16 +106,11 @@ def _add_export(commands: _Commands) -> None:
     )
     export.set_defaults(command=_export)
     export.add_argument("blend", type=Path, help=".blend file")
-    export.add_argument(
-        "bundle", type=Path, help="file to write: a bundle (.ply), .spz, .sog, .compressed.ply or .splat"
-    )
+    others = ", ".join(kind.suffix for kind in FORMATS if kind is not PLY)
+    export.add_argument("bundle", type=Path, help=f"file to write: a bundle (.ply), or {others}")
     export.add_argument("--root", help="name of the scene root, if the file holds several")
-    export.add_argument(
-        "--placed",
-        action="store_true",
-        help="apply the scene's location, rotation and scale instead of keeping COLMAP's coordinates",
-    )
-    export.add_argument("--as-trained", action="store_true", help="ignore the scene's look")
+    add_setting(export, EXPORT_OPTIONS["placed"], value=False)
+    export.add_argument("--as-trained", dest="looked", action="store_false", help="ignore the scene's look")
 
 
 def _add_capture(commands: _Commands) -> None:
@@ -131,13 +125,10 @@ def _add_capture(commands: _Commands) -> None:
     capture.add_argument("blend", type=Path, help=".blend file")
     capture.add_argument("--out", type=Path, required=True, help="folder for the COLMAP scene")
     source = capture.add_mutually_exclusive_group()
-    source.add_argument(
-        "--around", action="store_true", help="place views around the selected objects, or all"
-    )
-    source.add_argument("--above", action="store_true", help="place a grid of views above these objects")
-    source.add_argument("--cameras", action="store_true", help="use every camera of the scene")
-    source.add_argument("--animation", action="store_true", help="use the frames of the active camera")
-    source.add_argument("--curve", metavar="NAME", help="place views along a curve")
+    for pattern in viewpoints.VIEW_PATTERNS:
+        about = pattern.about[0].lower() + pattern.about[1:]
+        kind = {"metavar": "NAME"} if pattern.option == "curve" else {"action": "store_true"}
+        source.add_argument(f"--{pattern.option}", help=about, **kind)
     capture.add_argument("--views", type=int, metavar="N", help="number of views, except with --cameras")
     capture.add_argument("--size", type=parse_size, metavar="WxH", help="image size in pixels")
     capture.add_argument(
@@ -238,16 +229,11 @@ def _export(args: argparse.Namespace) -> int:
             f"Cannot export {args.blend}: {len(matches)} splat scenes match.",
             f"Name one of its scenes with --root: {names}.",
         )
-    bundle = scenes.read_levels(matches[0], args.placed, not args.as_trained)
+    bundle = scenes.read_levels(matches[0], args.placed, args.looked)
     if find_format(args.bundle) is PLY:
         write_bundle(args.bundle, bundle)
     else:
-        exported = bundle if find_format(args.bundle).antialiased else bake_filter(bundle)
-        run_to_end(
-            write_splats(
-                args.bundle, ConcatenatedRows.of_level(exported, exported.levels[-1].number), exported.meta
-            )
-        )
+        run_to_end(export_finest_level(args.bundle, bundle))
     return DONE
 
 
@@ -255,9 +241,9 @@ def _capture(args: argparse.Namespace) -> int:
     _open(args.blend)
     scene = bpy.context.scene
     settings = scene.lodgs_capture
-    for name in ("around", "above", "cameras", "animation", "curve"):
-        if getattr(args, name):
-            settings.views_from = {"around": "DOME", "above": "GRID"}.get(name, name.upper())
+    for pattern in viewpoints.VIEW_PATTERNS:
+        if getattr(args, pattern.option):
+            settings.views_from = pattern.identifier
     if args.curve:
         settings.curve = bpy.data.objects.get(args.curve)
         if settings.curve is None or settings.curve.type != "CURVE":

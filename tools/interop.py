@@ -20,11 +20,11 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from training.splats.bundle import read_bundle, write_bundle  # noqa: E402
-from training.splats.formats import STREAMED_FILE, level_arguments  # noqa: E402
 from training.splats.gaussians import Splats  # noqa: E402
 from training.splats.level_folder import write_folder  # noqa: E402
 from training.splats.levels import Bundle, Level  # noqa: E402
 from training.splats.ply import write_ply  # noqa: E402
+from training.splats.streamed_levels import STREAMED_FILE, level_arguments  # noqa: E402
 
 PACKAGE = "@playcanvas/splat-transform"
 VERSION = "3.7.0"

@@ -50,7 +50,7 @@ def panel_digests(bpy) -> dict[str, str]:
     modules = [importlib.import_module(f"{package}.panels.{name}") for name in names]
     for module in modules:
         if hasattr(module, "say"):
-            module.say = lambda layout, text, icon: layout.label(text=text)
+            vars(module)["say"] = lambda layout, text, icon: layout.label(text=text)
     layouts: dict[str, list] = {}
     for prepare in (lambda bpy: None, _import_scene, _add_levels):
         prepare(bpy)

@@ -8,6 +8,7 @@ before. Crops also apply to new points.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
 import bpy
 import numpy as np
@@ -24,23 +25,67 @@ from .cameras import view_from
 from .placement import axes_of
 from .scene_properties import SplatLevel
 
-TESTS = [
-    ("LARGE", "Large", "Splats larger than a length, such as fog"),
-    ("FAINT", "Faint", "Splats of low opacity"),
-    ("FAR", "Far", "Splats far from every camera of the photos"),
-    ("UNSEEN", "Few Views", "Splats in the frames of few cameras, occluded or not"),
-    ("FLOATERS", "Floaters", "Small clusters of splats that are far from others"),
-    ("SELECTED", "Selected", "Splats selected with the brush, the lasso or in Edit Mode"),
-]
-"""Items of the enum property of tests."""
-
 Test = Callable[[bpy.types.PointCloud], np.ndarray]
 """Function from a level's point cloud to a mask (N,) bool."""
+
+
+class CleanupTest(NamedTuple):
+    """A test for unwanted splats, for menus and the operator.
+
+    Attributes:
+        identifier, label, about: entry of the enum of tests.
+        noun: the matching splats, in menus.
+        limits: names of its settings in ``cleaning.LIMITS``; empty for the selection.
+        find: function of the context, the root and the limits that returns masks (N,) by level number.
+    """
+
+    identifier: str
+    label: str
+    noun: str
+    about: str
+    limits: tuple[str, ...]
+    find: Callable[..., dict[int, np.ndarray]]
+
+
+TESTS = (
+    CleanupTest(
+        "LARGE", "Large", "Large Splats", "Splats larger than a length, such as fog", ("max_size",),
+        lambda context, root, size: find(root, size_test(root, size)),
+    ),
+    CleanupTest(
+        "FAINT", "Faint", "Faint Splats", "Splats of low opacity", ("min_opacity",),
+        lambda context, root, opacity: find(root, opacity_test(opacity)),
+    ),
+    CleanupTest(
+        "FAR", "Far", "Far Splats", "Splats far from every camera of the photos", ("max_distance",),
+        lambda context, root, distance: find(root, distance_test(context, root, distance)),
+    ),
+    CleanupTest(
+        "UNSEEN", "Few Views", "Rarely Seen Splats", "Splats in the frames of few cameras, occluded or not",
+        ("min_views",), lambda context, root, views: find(root, views_test(context, root, views)),
+    ),
+    CleanupTest(
+        "FLOATERS", "Floaters", "Floaters", "Small clusters of splats that are far from others",
+        ("gap", "share"),
+        lambda context, root, gap, percent: find_floaters(context, root, gap, percent / 100),
+    ),
+    CleanupTest(
+        "SELECTED", "Selected", "Selected Splats",
+        "Splats selected with the brush, the lasso or in Edit Mode", (),
+        lambda context, root: find(root, selected_mask),
+    ),
+)  # fmt: skip
+
 
 _in_stroke: dict[int, np.ndarray] = {}
 """Selection masks of the current stroke, by ``session_uid`` of the point cloud."""
 _counts: dict[int, tuple[tuple, int]] = {}
 """Cache keys and numbers of remaining splats, by ``session_uid`` of the point cloud."""
+
+
+def limit_property(name: str) -> str:
+    """Return the operator property of a limit: ``size`` for ``max_size``."""
+    return name.removeprefix("max_").removeprefix("min_")
 
 
 def size_test(root: bpy.types.Object, max_size: float) -> Test:

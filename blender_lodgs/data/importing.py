@@ -15,14 +15,16 @@ from ...training.lod.rule import resolve_rule
 from ...training.lod.selection import unknown_rule_error
 from ...training.methods import METHODS
 from ...training.scenes.cameras import Camera, camera_extent
-from ...training.scenes.colmap import read_scene
+from ...training.scenes.colmap import Scene, read_scene
 from ...training.scenes.formats import ensure_colmap_scene
 from ...training.scenes.undistort import cached_undistorted_scene
 from ...training.scenes.view_tables import read_view_tables
 from ...training.splats.bundle import read_bundle, read_header
-from ...training.splats.formats import STREAMED_FILE, is_plain_ply, open_as_ply
+from ...training.splats.formats import is_plain_ply, open_as_ply
 from ...training.splats.level_folder import read_folder
 from ...training.splats.levels import Bundle
+from ...training.splats.streamed_levels import STREAMED_FILE
+from ..nodes.camera_choices import VIEWPORT
 from . import objects, scenes, streams
 from .photographs import match_render, new_camera, views
 from .placement import axes_of, new_axes
@@ -61,16 +63,8 @@ def import_colmap(
     Raises:
         LodgsError: The folder has no readable scene. The file is unchanged in that case.
     """
-    manager = context.window_manager
-    manager.progress_begin(0, 1)  # at the mouse pointer
-    try:
-        model, images = (Path(path) if path else None for path in (model, images))
-        folder = Path(folder) if model else ensure_colmap_scene(Path(folder), warn)
-        scene = read_scene(folder, model, images, manager.progress_update)
-    finally:
-        manager.progress_end()
-    for message in scene.warnings:
-        warn(message)
+    model, images = (Path(path) if path else None for path in (model, images))
+    scene = _read_photo_scene(context, Path(folder), model, images, warn)
     undistorted = cached_undistorted_scene(scene)
     undistorted_cameras = {camera.name: camera for camera in undistorted.cameras} if undistorted else {}
     extent = scene.extent(default=1.0)
@@ -90,13 +84,37 @@ def import_colmap(
         distorted = set(scene.distorted) - undistorted_cameras.keys()
         _add_views(context, root, cameras, extent, near, photographs, distorted, scene.names)
         if len(scene.points):
-            points = objects.new_points(
-                f"{root.name} points", scene.points, scene.point_colors, radius=extent / 400
-            )
-            points.parent = axes
-            collection_of(root).objects.link(points)
-            root.lodgs.points = points
+            _add_points(root, scene, radius=extent / 400)
     return root
+
+
+def _read_photo_scene(
+    context: bpy.types.Context,
+    folder: Path,
+    model: Path | None,
+    images: Path | None,
+    warn: Callable[[str], object],
+) -> Scene:
+    """Read a COLMAP scene or an export with progress at the mouse pointer; see :func:`import_colmap`."""
+    manager = context.window_manager
+    manager.progress_begin(0, 1)
+    try:
+        if model is None:
+            folder = ensure_colmap_scene(folder, warn)
+        scene = read_scene(folder, model, images, manager.progress_update)
+    finally:
+        manager.progress_end()
+    for message in scene.warnings:
+        warn(message)
+    return scene
+
+
+def _add_points(root: bpy.types.Object, scene: Scene, radius: float) -> None:
+    """Add the coloured points of a COLMAP scene to a root."""
+    points = objects.new_points(f"{root.name} points", scene.points, scene.point_colors, radius=radius)
+    points.parent = axes_of(root)
+    collection_of(root).objects.link(points)
+    root.lodgs.points = points
 
 
 def _add_views(
@@ -264,7 +282,7 @@ def _fill(root: bpy.types.Object, file: SplatsFile, level_objects: Sequence[bpy.
     root.lodgs.single_level = file.bundle.levels[-1].number
     if file.total:
         streams.start_streaming(root, file.path, file.budget, file.total)
-        root.lodgs.eye = "VIEW"  # stream for the viewport
+        root.lodgs.eye = VIEWPORT.identifier  # stream for the viewport
 
 
 @contextmanager

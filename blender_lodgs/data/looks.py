@@ -10,12 +10,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import bpy
 from mathutils import Matrix
 
-from ...training.editing.look import DAYLIGHT, NEUTRAL, RANGES, Look
+from ...training.editing.look import LOOK_SETTINGS, NEUTRAL, Look
 from ...training.editing.paint import COLUMNS as PAINT
 from ...training.lod.crop import Crop
 from .. import compat
@@ -25,9 +25,16 @@ from ..nodes import look as groups
 from ..nodes.building import add_switched_modifier, find_modifier, remove_modifier, replace_driver
 from . import crops
 from .objects import root_of
+from .setting_properties import property_of
 
-PARTS = tuple(RANGES)
-"""The properties of a look, in the order of panels."""
+_DISPLAY: dict[str, dict[str, Any]] = {
+    "exposure": {"step": 10, "precision": 2},
+    "temperature": {"step": 10_000, "precision": 0},
+    "tint": {"subtype": "COLOR_GAMMA"},
+    "saturation": {"precision": 3, "subtype": "FACTOR"},
+    "opacity": {"precision": 3},
+}
+"""Arguments of the properties of a look that only concern Blender."""
 
 
 class PlacedLook(NamedTuple):
@@ -56,37 +63,6 @@ def _matrix(self) -> list[float]:
 class LookSettings(bpy.types.PropertyGroup):
     """A look: see ``training.editing.look.Look``."""
 
-    exposure: bpy.props.FloatProperty(
-        name="Exposure",
-        description="Brightness of the splats in stops. Each stop doubles the light",
-        default=NEUTRAL.exposure, min=RANGES["exposure"][0], max=RANGES["exposure"][1],
-        soft_min=-4.0, soft_max=4.0, step=10, precision=2, update=_changed,
-    )  # fmt: skip
-    temperature: bpy.props.FloatProperty(
-        name="Temperature",
-        description="White balance: colour temperature of the light that appears white. Values below "
-        f"{DAYLIGHT:.0f} K make colours colder, above it warmer",
-        default=NEUTRAL.temperature, min=RANGES["temperature"][0], max=RANGES["temperature"][1],
-        soft_max=12_000.0, step=10_000, precision=0, subtype="COLOR_TEMPERATURE", update=_changed,
-    )  # fmt: skip
-    tint: bpy.props.FloatVectorProperty(
-        name="Tint",
-        description="Display colour that multiplies all splat colours",
-        default=NEUTRAL.tint, min=RANGES["tint"][0], max=RANGES["tint"][1], size=3,
-        subtype="COLOR_GAMMA", update=_changed,
-    )  # fmt: skip
-    saturation: bpy.props.FloatProperty(
-        name="Saturation",
-        description="Saturation of the splats. 0 is grey, 1 is as trained",
-        default=NEUTRAL.saturation, min=RANGES["saturation"][0], max=RANGES["saturation"][1],
-        soft_max=2.0, precision=3, subtype="FACTOR", update=_changed,
-    )  # fmt: skip
-    opacity: bpy.props.FloatProperty(
-        name="Opacity",
-        description="Factor for the opacity of every splat",
-        default=NEUTRAL.opacity, min=RANGES["opacity"][0], max=RANGES["opacity"][1], precision=3,
-        subtype="FACTOR", update=_changed,
-    )  # fmt: skip
     outside: bpy.props.BoolProperty(
         name="Outside",
         description="Apply the look outside the region instead of inside",
@@ -97,6 +73,12 @@ class LookSettings(bpy.types.PropertyGroup):
         description="Colour matrix of the look, row by row, for node groups",
         size=9, get=_matrix, options={"HIDDEN"},
     )  # fmt: skip
+
+
+LookSettings.__annotations__ |= {
+    name: property_of(f, options={"ANIMATABLE"}, update=_changed, **_DISPLAY.get(name, {}))
+    for name, f in LOOK_SETTINGS.items()
+}
 
 
 def looks_of(
@@ -126,12 +108,12 @@ def regions_of(root: bpy.types.Object) -> list[bpy.types.Object]:
 
 def is_set(obj: bpy.types.Object) -> bool:
     """Return True if a property of the look of a root or a crop is set."""
-    return any(obj.lodgs_look.is_property_set(name) for name in PARTS)
+    return any(obj.lodgs_look.is_property_set(name) for name in LOOK_SETTINGS)
 
 
 def reset(root: bpy.types.Object, obj: bpy.types.Object) -> None:
     """Reset the look of the root or of one of its crops; its animation stays."""
-    for name in (*PARTS, "outside"):
+    for name in (*LOOK_SETTINGS, "outside"):
         obj.lodgs_look.property_unset(name)
     attach(root)
     obj.update_tag()
@@ -169,14 +151,15 @@ def _read_look(settings: LookSettings) -> Look:
     """Return the look of properties, clamped: animation can exceed their ranges."""
 
     def clamp(name: str, value: float) -> float:
-        low, high = RANGES[name]
-        return min(max(value, low), high)
+        bounds = LOOK_SETTINGS[name].metadata
+        return min(max(value, bounds["low"]), bounds["high"])
 
-    red, green, blue = (clamp("tint", channel) for channel in settings.tint)
-    exposure, temperature, saturation, opacity = (
-        clamp(name, getattr(settings, name)) for name in PARTS if name != "tint"
-    )
-    return Look(exposure, temperature, (red, green, blue), saturation, opacity)
+    values: dict[str, Any] = {}
+    for name in LOOK_SETTINGS:
+        value = getattr(settings, name)
+        vector = not isinstance(value, float)
+        values[name] = tuple(clamp(name, v) for v in value) if vector else clamp(name, value)
+    return Look(**values)
 
 
 def _attach(obj: bpy.types.Object, root: bpy.types.Object, regions: list[bpy.types.Object]) -> None:

@@ -7,6 +7,7 @@ import json
 import bpy
 
 from ...training.lod.rule import Control, Rule, resolve_rule, rules
+from ..nodes.camera_choices import CHOICES, find_choice
 from .property_callbacks import look_up, tag_owner
 from .selection import read_json
 from .training import TrainingSettings
@@ -294,21 +295,7 @@ class SplatScene(bpy.types.PropertyGroup):
     eye: bpy.props.EnumProperty(
         name="Camera",
         description="Camera from which distances are measured",
-        items=[
-            ("CAMERA", "Scene Camera", "Active camera of the scene"),
-            ("OBJECT", "Object", "Origin of an object"),
-            (
-                "TRAINING",
-                "Training Cameras",
-                "Mean position of the training cameras, which never moves",
-            ),
-            (
-                "VIEW",
-                "Viewport",
-                "View of the 3D viewport that moved last. Renders keep its selection: choose Scene Camera "
-                "before rendering",
-            ),
-        ],
+        items=[(choice.identifier, choice.label, choice.about) for choice in CHOICES],
         update=_camera_changed,
     )
     freeze: bpy.props.BoolProperty(
@@ -327,13 +314,6 @@ class SplatScene(bpy.types.PropertyGroup):
     )
     held_focal: bpy.props.FloatProperty(
         name="Frozen Focal Length", default=1000.0, subtype="PIXEL", update=tag_owner, options={"HIDDEN"}
-    )
-    eye_object: bpy.props.PointerProperty(
-        name="Object",
-        description="Object from whose origin distances are measured",
-        type=bpy.types.Object,
-        poll=_can_be_camera,
-        update=_camera_input_changed,
     )
     focal_px: bpy.props.FloatProperty(
         name="Focal Length",
@@ -376,6 +356,11 @@ class SplatScene(bpy.types.PropertyGroup):
         return resolve_rule(self.rule).complete
 
     @property
+    def follows_viewport(self) -> bool:
+        """True if the camera for levels of detail is the viewport's and moves with it."""
+        return find_choice(self.eye).viewport and not self.freeze
+
+    @property
     def controls(self) -> bpy.types.PropertyGroup | None:
         """The properties of the rule's controls, or None without a rule."""
         return getattr(self, self.rule) if self.by_distance else None
@@ -386,4 +371,15 @@ SplatScene.__annotations__ |= {
         name=name.title(), description="Level of detail that a camera requests", type=controls
     )
     for name, controls in CONTROLS.items()
+}
+SplatScene.__annotations__ |= {
+    choice.object: bpy.props.PointerProperty(
+        name=choice.label,
+        description="Object from whose origin distances are measured",
+        type=bpy.types.Object,
+        poll=_can_be_camera,
+        update=_camera_input_changed,
+    )
+    for choice in CHOICES
+    if choice.object
 }

@@ -24,6 +24,7 @@ from ..nodes import display
 from ..nodes import look as look_groups
 from ..nodes import rules as groups
 from ..nodes.building import remove_modifier, replace_driver
+from ..nodes.camera_choices import CHOICES, find_choice, position_expression
 from . import crops, looks
 from .placement import axes_of
 from .tables import read_table
@@ -45,12 +46,12 @@ def evaluated_query(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph)
     def value(name: str):
         return compat.get_input(modifier, name)
 
-    is_frozen = value(groups.FREEZE) or value(groups.CAMERA_SOURCE) >= groups.VIEW_SOURCE
-    source = groups.CAMERA_SOURCES[min(max(value(groups.CAMERA_SOURCE), 0), groups.VIEW_SOURCE)]
-    if is_frozen or source == "TRAINING":
+    choice = CHOICES[min(max(value(groups.CAMERA_SOURCE), 0), len(CHOICES) - 1)]
+    is_stored = value(groups.FREEZE) or choice.viewport
+    if is_stored or choice.position:
         position = tuple(value(groups.CAMERA_POSITION))
     else:
-        obj = depsgraph.scene.camera if source == "CAMERA" else value(groups.CAMERA_OBJECT)
+        obj = value(choice.object) if choice.object else depsgraph.scene.camera
         position = (0.0, 0.0, 0.0)  # the default of geometry nodes without an object
         if obj is not None:
             location = obj.evaluated_get(depsgraph).matrix_world.translation
@@ -58,7 +59,7 @@ def evaluated_query(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph)
     return LodQuery(
         rule.name,
         position,
-        value(groups.STORED_FOCAL if is_frozen else groups.FOCAL),
+        value(groups.STORED_FOCAL if is_stored else groups.FOCAL),
         tuple((name, value(name)) for name in fact_names(rule)),
         tuple((control.name, value(control.name)) for control in rule.controls),
         tuple((name, _table_columns(value(groups.table_socket(name)))) for name in rule.tables),
@@ -115,9 +116,10 @@ def camera_position(root: bpy.types.Object, scene: bpy.types.Scene) -> tuple[flo
     For the viewport this is the position of the scene camera.
     """
     settings = root.lodgs
-    if settings.eye == "TRAINING":
-        return tuple(settings.camera_center)
-    obj = settings.eye_object if settings.eye == "OBJECT" else scene.camera
+    choice = find_choice(settings.eye)
+    if choice.position and not choice.viewport:
+        return tuple(getattr(settings, choice.position))
+    obj = getattr(settings, choice.object) if choice.object else scene.camera
     if obj is None:
         return (0.0, 0.0, 0.0)  # as in geometry nodes
     return tuple(axes_of(root).matrix_world.inverted_safe() @ obj.matrix_world.translation)
@@ -236,7 +238,7 @@ def _object_inputs(
         slots = item.object.material_slots if item.exists else ()
         material = {groups.MATERIAL: slots[0].material if slots else None}
         cropping = crops.modifier_of(item.object) if item.exists else None
-        camera = {groups.CAMERA_OBJECT: root.lodgs.eye_object}
+        camera = {choice.object: getattr(root.lodgs, choice.object) for choice in CHOICES if choice.object}
         display_modifier = item.object.modifiers.get(display.NAME) if item.exists else None
         points = {display.MATERIAL: material[groups.MATERIAL] or display.points_material()}
         for owner, inputs in (
@@ -347,10 +349,10 @@ def _drive_level(root: bpy.types.Object, obj: bpy.types.Object, rule: Rule, fact
         if compat.has_input(modifier, name):
             _drive(obj, compat.input_path(modifier, name), root, name, **{name: source})
     # Setting it would mark the points as changed at every move of the viewport.
+    expression = position_expression(groups.CAMERA_SOURCE, groups.FREEZE)
     for axis in range(3) if compat.has_input(modifier, groups.CAMERA_POSITION) else ():
-        sources = {"held": f"held_eye[{axis}]", "center": f"camera_center[{axis}]"}
+        sources = {choice.position: f"{choice.position}[{axis}]" for choice in CHOICES if choice.position}
         sources |= {name: name for name in (groups.CAMERA_SOURCE, groups.FREEZE)}
-        expression = f"held if {groups.FREEZE} or {groups.CAMERA_SOURCE} == {groups.VIEW_SOURCE} else center"
         _drive(
             obj, compat.input_path(modifier, groups.CAMERA_POSITION), root, expression, index=axis, **sources
         )

@@ -127,7 +127,7 @@ def camera_query(instance: SplatInstance, depsgraph: bpy.types.Depsgraph) -> sel
     if query is None or not query.rule or instance.source is None or root is None or camera is None:
         return query
     settings = root.lodgs
-    if settings.eye != "VIEW" or settings.freeze:
+    if not settings.follows_viewport:
         return query
     location = camera.evaluated_get(depsgraph).matrix_world.translation
     position = tuple(axes_of(root).evaluated_get(depsgraph).matrix_world.inverted_safe() @ location)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import bpy
 
 from .. import extension
+from ..nodes.camera_choices import find_choice
 from . import photographs, scenes, selection
 from .properties import RenderSettings
 from .property_callbacks import ON_CHANGE
@@ -21,14 +22,16 @@ def _active_view(settings: SplatScene, context: bpy.types.Context) -> None:
 
 
 def _camera_changed(settings: SplatScene, context: bpy.types.Context) -> None:
-    if settings.eye == "VIEW" and not settings.freeze:  # until a viewport reports its position
+    if settings.follows_viewport:  # until a viewport reports its position
         _store_camera(settings, context)
     selection.update_inputs(settings.id_data)
     settings.id_data.update_tag()
 
 
 def _freeze(settings: SplatScene, context: bpy.types.Context) -> None:
-    if settings.freeze and settings.eye != "VIEW":  # focal_px still belongs to the moving camera
+    if (
+        settings.freeze and not find_choice(settings.eye).viewport
+    ):  # focal_px still belongs to the moving camera
         _store_camera(settings, context)
     selection.update_inputs(settings.id_data)
     settings.id_data.update_tag()

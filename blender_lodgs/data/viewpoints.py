@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import bpy
 import numpy as np
@@ -52,28 +52,58 @@ def _is_curve(settings: bpy.types.PropertyGroup, obj: bpy.types.Object) -> bool:
     return obj.type == "CURVE"
 
 
+class ViewPattern(NamedTuple):
+    """A pattern of the cameras that render training images.
+
+    Attributes:
+        identifier, label, about: entry of the enum ``ViewsSettings.views_from``.
+        option: name of its option on the command line.
+        setting: property of ``ViewsSettings`` for this pattern only, or "".
+    """
+
+    identifier: str
+    label: str
+    about: str
+    option: str
+    setting: str = ""
+
+
+VIEW_PATTERNS = (
+    ViewPattern(
+        "DOME",
+        "All Around",
+        "Dome of cameras around the splats or the selected objects, for an object seen from outside",
+        "around",
+    ),
+    ViewPattern(
+        "GRID",
+        "Above",
+        "Grid of cameras above the splats or the selected objects that look down and to four sides, "
+        "as a drone does, for terrain and towns",
+        "above",
+        setting="height",
+    ),
+    ViewPattern("CAMERAS", "Cameras", "All cameras of the Blender scene", "cameras"),
+    ViewPattern(
+        "ANIMATION", "Animation", "Scene camera at frames spread evenly over the frame range", "animation"
+    ),
+    ViewPattern(
+        "CURVE",
+        "Along Curve",
+        "Cameras along a curve that look ahead, to both sides and back in turn",
+        "curve",
+        setting="curve",
+    ),
+)
+
+
 class ViewsSettings:
     """Settings of views for rendering training images, of splats or of a Blender scene."""
 
     views_from: bpy.props.EnumProperty(
         name="Views From",
         description="Placement of the cameras that render training images",
-        items=[
-            (
-                "DOME",
-                "All Around",
-                "Dome of cameras around the splats or the selected objects, for an object seen from outside",
-            ),
-            (
-                "GRID",
-                "Above",
-                "Grid of cameras above the splats or the selected objects that look down and to four sides, "
-                "as a drone does, for terrain and towns",
-            ),
-            ("CAMERAS", "Cameras", "All cameras of the Blender scene"),
-            ("ANIMATION", "Animation", "Scene camera at frames spread evenly over the frame range"),
-            ("CURVE", "Along Curve", "Cameras along a curve that look ahead, to both sides and back in turn"),
-        ],
+        items=[(pattern.identifier, pattern.label, pattern.about) for pattern in VIEW_PATTERNS],
     )
     views: property_of(KEYS["views"])
     show_views: bpy.props.BoolProperty(

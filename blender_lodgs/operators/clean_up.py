@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import bpy
 from mathutils import Matrix
 
-from ...training.editing.cleaning import MAX_FLOATER_SHARE
+from ...training.editing.cleaning import LIMITS
 from ...training.errors import LodgsError
 from ..data import cleaning, crops, roots, scenes
+from ..data.setting_properties import property_of
 from .base import EditLevelsOperator, SceneOperator, report_errors
 from .brush import TOOLS
 
@@ -111,7 +114,11 @@ class LODGS_OT_hide_splats(EditLevelsOperator, bpy.types.Operator):
     bl_label = "Hide Splats"
     bl_options = {"REGISTER", "UNDO"}
 
-    test: bpy.props.EnumProperty(name="Splats", description="Splats to match", items=cleaning.TESTS)
+    test: bpy.props.EnumProperty(
+        name="Splats",
+        description="Splats to match",
+        items=[(test.identifier, test.label, test.about) for test in cleaning.TESTS],
+    )
     action: bpy.props.EnumProperty(
         name="Action",
         description="Action on the matching splats",
@@ -121,40 +128,13 @@ class LODGS_OT_hide_splats(EditLevelsOperator, bpy.types.Operator):
         ],
         options={"SKIP_SAVE"},
     )
-    size: bpy.props.FloatProperty(
-        name="Size", description="Match splats whose largest standard deviation exceeds this",
-        default=1.0, min=0.0, subtype="DISTANCE", options={"SKIP_SAVE"},
-    )  # fmt: skip
-    opacity: bpy.props.FloatProperty(
-        name="Opacity", description="Match splats less opaque than this", default=0.05, min=0.0, max=1.0,
-        subtype="FACTOR",
-    )  # fmt: skip
-    distance: bpy.props.FloatProperty(
-        name="Distance", description="Match splats farther than this from every camera", default=10.0,
-        min=0.0, subtype="DISTANCE", options={"SKIP_SAVE"},
-    )  # fmt: skip
-    views: bpy.props.IntProperty(
-        name="Views",
-        description="Match splats inside the frames of fewer cameras than this",
-        default=3,
-        min=1,
-    )
-    gap: bpy.props.FloatProperty(
-        name="Gap", description="Merge clusters closer than this; clusters twice as far apart stay separate",
-        default=0.0, min=0.0, subtype="DISTANCE", options={"SKIP_SAVE"},
-    )  # fmt: skip
-    share: bpy.props.FloatProperty(
-        name="Largest Cluster", description="Keep clusters with more than this share of all splats",
-        default=100 * MAX_FLOATER_SHARE, min=0.0, max=100.0, precision=2, subtype="PERCENTAGE",
-    )  # fmt: skip
 
     def draw(self, context):
         layout = self.layout
         layout.use_property_split = True
         layout.prop(self, "test")
-        for name in {"FLOATERS": ("gap", "share"), "UNSEEN": ("views",), "FAR": ("distance",),
-                     "LARGE": ("size",), "FAINT": ("opacity",)}.get(self.test, ()):  # fmt: skip
-            layout.prop(self, name)
+        for name in self._chosen_test().limits:
+            layout.prop(self, cleaning.limit_property(name))
         layout.prop(self, "action")
 
     def invoke(self, context, event):
@@ -178,18 +158,28 @@ class LODGS_OT_hide_splats(EditLevelsOperator, bpy.types.Operator):
         self.report({"INFO"}, f"{count:,} splats hidden: {by_level}")
         return {"FINISHED"}
 
+    def _chosen_test(self):
+        return next(test for test in cleaning.TESTS if test.identifier == self.test)
+
     def _matches(self, context, root):
-        if self.test == "FLOATERS":
-            return cleaning.find_floaters(context, root, self.gap, self.share / 100)
-        if self.test == "FAR":
-            test = cleaning.distance_test(context, root, self.distance)
-        elif self.test == "UNSEEN":
-            test = cleaning.views_test(context, root, self.views)
-        elif self.test == "LARGE":
-            test = cleaning.size_test(root, self.size)
-        else:
-            test = cleaning.opacity_test(self.opacity) if self.test == "FAINT" else cleaning.selected_mask
-        return cleaning.find(root, test)
+        test = self._chosen_test()
+        limits = (getattr(self, cleaning.limit_property(name)) for name in test.limits)
+        return test.find(context, root, *limits)
+
+
+def _limit(name: str) -> Any:
+    """Create the operator property of a limit of ``training.editing.cleaning``."""
+    f = LIMITS[name]
+    start = f.metadata["start"]
+    if name == "share":
+        return property_of(f, default=100 * start, max=100.0, precision=2, subtype="PERCENTAGE")
+    options = {"SKIP_SAVE"} if f.metadata["unit"] == "length" else set()  # suggested for each scene
+    return property_of(f, default=start, options=options)
+
+
+LODGS_OT_hide_splats.__annotations__ |= {
+    cleaning.limit_property(name): _limit(name) for test in cleaning.TESTS for name in test.limits
+}
 
 
 class LODGS_OT_show_hidden_splats(EditLevelsOperator, bpy.types.Operator):
@@ -233,12 +223,13 @@ class LODGS_MT_clean_up(bpy.types.Menu):
             operator = layout.operator("lodgs.add_crop", text=f"Crop Splats to {shape.title()}", icon=icon)
             operator.shape = shape
         layout.separator()
-        for test, name, _ in cleaning.TESTS:
-            layout.operator("lodgs.hide_splats", text=f"Hide {_object_of(test, name)}").test = test
+        for test in cleaning.TESTS:
+            layout.operator("lodgs.hide_splats", text=f"Hide {test.noun}").test = test.identifier
         layout.separator()
-        for test, name, _ in cleaning.TESTS[:-1]:
-            operator = layout.operator("lodgs.hide_splats", text=f"Select {_object_of(test, name)}")
-            operator.test, operator.action = test, "SELECT"
+        for test in cleaning.TESTS:
+            if test.limits:
+                operator = layout.operator("lodgs.hide_splats", text=f"Select {test.noun}")
+                operator.test, operator.action = test.identifier, "SELECT"
         for tool in TOOLS if context.mode == "OBJECT" else ():
             layout.operator("wm.tool_set_by_id", text=tool.bl_label).name = tool.bl_idname
         for action, name in (("DESELECT", "Deselect Splats"), ("INVERT", "Invert Splat Selection")):
@@ -246,11 +237,6 @@ class LODGS_MT_clean_up(bpy.types.Menu):
         layout.separator()
         layout.operator("lodgs.show_hidden_splats")
         layout.operator("lodgs.delete_left_out")
-
-
-def _object_of(test: str, name: str) -> str:
-    """Return the noun of a menu entry for a test of ``cleaning.TESTS``."""
-    return {"UNSEEN": "Rarely Seen Splats", "FLOATERS": "Floaters"}.get(test, f"{name} Splats")
 
 
 def _menu(self, context):

@@ -9,26 +9,21 @@ import bpy
 from bpy_extras.io_utils import ExportHelper
 
 from ...training.editing.bake_filter import bake_filter
+from ...training.editing.export import EXPORT_OPTIONS, export_finest_level
 from ...training.errors import LodgsError
 from ...training.lod.rule import resolve_rule
 from ...training.splats.bundle import write_bundle
-from ...training.splats.formats import (
-    FORMATS,
-    PLY,
-    STREAMED_FILE,
-    SplatFormat,
-    find_format,
-    write_splats,
-    write_streamed_levels,
-)
+from ...training.splats.formats import FORMATS, PLY, find_format
+from ...training.splats.formats.sog import FORMAT as SOG
 from ...training.splats.level_folder import write_folder
 from ...training.splats.levels import Bundle, Level
+from ...training.splats.splat_format import SplatFormat
+from ...training.splats.streamed_levels import STREAMED_FILE, write_streamed_levels
 from ..data import roots, scenes, selection
 from ..data.objects import megabytes, sh_degree
+from ..data.setting_properties import property_of
 from .base import ReadLevelsOperator, report_errors
 from .modal import BackgroundOperator
-
-_SOG = find_format(Path("level.sog"))
 
 
 def _size(context: bpy.types.Context, kind: SplatFormat, level: int = 0) -> str:
@@ -59,29 +54,14 @@ def _size(context: bpy.types.Context, kind: SplatFormat, level: int = 0) -> str:
 class _ExportOperator(ReadLevelsOperator):
     """Base class with the options of all exports."""
 
-    placed: bpy.props.BoolProperty(
-        name="As Placed",
-        description="Apply the scene's location, rotation and scale in Blender; disable to keep COLMAP's "
-        "coordinates. Transforms of single levels and instances are ignored",
-        default=False,
-    )
-    looked: bpy.props.BoolProperty(
-        name="With Look",
-        description="Apply the colours and opacities of the Look panel; disable to export the splats as "
-        "trained",
-        default=True,
-    )
+    placed: property_of(EXPORT_OPTIONS["placed"])
+    looked: property_of(EXPORT_OPTIONS["looked"])
 
 
 class _ForeignExport(_ExportOperator):
     """Base class with the options of exports for other programs."""
 
-    antialiased: bpy.props.BoolProperty(
-        name="Antialiased",
-        description="Keep opacities as trained, for viewers with Mip-Splatting's filter; disable for other "
-        "viewers, which would draw small splats too bold. SPZ files store this choice themselves",
-        default=False,
-    )
+    antialiased: property_of(EXPORT_OPTIONS["antialiased"])
 
 
 class _FileExport(_ExportOperator, ExportHelper):
@@ -226,9 +206,7 @@ class LODGS_OT_export_plain(_ForeignExport, _FileExport, _ConvertingExport, bpy.
         path = self._path()
         meta = selection.read_json(root.lodgs.meta)
         bundle = Bundle("", [Level(1, splats)], meta=meta, tables=scenes.view_tables(root, self.placed))
-        if not (self.antialiased or find_format(path).antialiased):
-            bundle = bake_filter(bundle)
-        yield from self.follow(write_splats(path, bundle.levels[0].rows, bundle.meta))
+        yield from self.follow(export_finest_level(path, bundle, self.antialiased))
         self.written = f"{len(splats):,} splats written to {path}"
 
 
@@ -292,7 +270,7 @@ class LODGS_OT_export_streamed(_ForeignExport, _FolderExport, _ConvertingExport,
 
     bl_idname = "lodgs.export_streamed"
     bl_label = "Export for Web"
-    kind = _SOG
+    kind = SOG
 
     def work(self, context):
         bundle = self._bundle(context)
@@ -308,7 +286,9 @@ def _levels(bundle: Bundle) -> str:
 
 def _menu(self, context):
     self.layout.operator(LODGS_OT_export_bundle.bl_idname, text="Splat Level Bundle (.ply)")
-    self.layout.operator(LODGS_OT_export_plain.bl_idname, text="Plain Splats (.ply, .spz, .sog, .splat)")
+    self.layout.operator(
+        LODGS_OT_export_plain.bl_idname, text=f"Plain Splats ({', '.join(kind.suffix for kind in FORMATS)})"
+    )
     self.layout.operator(LODGS_OT_export_folder.bl_idname, text="Splat Level Folder")
     self.layout.operator(LODGS_OT_export_streamed.bl_idname, text="Splat Levels for the Web (folder)")
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import bpy
 
+from ...training.scenes.formats import FORMAT_NAMES
 from ..data import importing, photographs, roots, scenes
 from ..runs import photo_preparation
 from .base import report_errors
@@ -20,8 +21,7 @@ class LODGS_OT_import_colmap(bpy.types.Operator):
 
     directory: bpy.props.StringProperty(
         name="Folder",
-        description="Folder of a COLMAP scene with its photos, or of an export of nerfstudio, Polycam, "
-        "Record3D, Metashape, OpenMVG or Bundler",
+        description=f"Folder of a COLMAP scene with its photos, or of an export: {FORMAT_NAMES}",
         subtype="DIR_PATH",
     )
     filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN"})

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import bpy
 
-from ...training.splats.formats import READABLE
+from ...training.splats.formats import FILE_EXTENSIONS, READABLE
 from ..data import importing, photographs, roots, scenes
 from ..runs import photo_preparation
 from .modal import BackgroundOperator
@@ -92,7 +92,7 @@ class LODGS_FH_splats(bpy.types.FileHandler):
     bl_idname = "LODGS_FH_splats"
     bl_label = "Gaussian Splats (LODGS)"
     bl_import_operator = LODGS_OT_import_splats.bl_idname
-    bl_file_extensions = ";".join(ending for ending in READABLE if ending.startswith("."))
+    bl_file_extensions = ";".join(FILE_EXTENSIONS)
 
     @classmethod
     def poll_drop(cls, context):
@@ -100,7 +100,9 @@ class LODGS_FH_splats(bpy.types.FileHandler):
 
 
 def _menu(self, context):
-    self.layout.operator(LODGS_OT_import_splats.bl_idname, text="Gaussian Splats (.ply, .spz, .sog, .splat)")
+    self.layout.operator(
+        LODGS_OT_import_splats.bl_idname, text=f"Gaussian Splats ({', '.join(FILE_EXTENSIONS)})"
+    )
 
 
 CLASSES = (LODGS_OT_import_splats, LODGS_FH_splats)

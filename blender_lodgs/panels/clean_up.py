@@ -42,8 +42,8 @@ class LODGS_PT_clean_up(LevelsPanel):
 
         layout.label(text="Hide in All Levels")
         grid = layout.grid_flow(row_major=True, columns=2, even_columns=True, align=True)
-        for test, name, _ in cleaning.TESTS:
-            grid.operator("lodgs.hide_splats", text=name).test = test
+        for test in cleaning.TESTS:
+            grid.operator("lodgs.hide_splats", text=test.label).test = test.identifier
 
         column = layout.column(align=True)
         for number, (visible, total) in cleaning.count_remaining(root, context.view_layer.depsgraph).items():

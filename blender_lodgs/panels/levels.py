@@ -7,6 +7,7 @@ import bpy
 from ...training.lod.rule import find_rule
 from ...training.lod.selection import unknown_rule_error
 from ..data import loaded, objects, roots, scenes, selection, streams
+from ..nodes.camera_choices import find_choice
 from ..viewport import views
 from .parts import LevelsPanel, say, split_column
 
@@ -105,11 +106,12 @@ class LODGS_PT_detail(LevelsPanel):
             row = column.row(align=True)
             row.prop(settings, "eye")
             row.prop(settings, "freeze", text="", icon="FREEZE")
-            if settings.eye == "OBJECT":
-                column.prop(settings, "eye_object")
-            elif settings.eye == "TRAINING":
-                column.prop(settings, "camera_center", text="Position")
-            if context.scene.camera is None and settings.eye != "VIEW":
+            camera = find_choice(settings.eye)
+            if camera.object:
+                column.prop(settings, camera.object)
+            elif camera.position and not camera.viewport:
+                column.prop(settings, camera.position, text="Position")
+            if context.scene.camera is None and not camera.viewport:
                 layout.label(text="No active camera", icon="ERROR")
         for item in settings.tables:
             if item.collection and len(item.collection.objects) > 1:  # the first object holds the rows

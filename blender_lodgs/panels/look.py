@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bpy
 
+from ...training.editing.look import LOOK_SETTINGS
 from ..data import crops, looks, roots
 from .parts import LevelsPanel, split_column
 
@@ -65,7 +66,7 @@ class LODGS_PT_look_regions(LevelsPanel):
 def _draw_look(layout: bpy.types.UILayout, obj: bpy.types.Object) -> None:
     column = split_column(layout)
     column.use_property_decorate = True  # looks can be animated
-    for name in looks.PARTS:
+    for name in LOOK_SETTINGS:
         column.prop(obj.lodgs_look, name)
 
 

@@ -8,7 +8,7 @@ import bpy
 
 from ..data import roots
 from ..data.placement import axes_of
-from ..data.viewpoints import ViewsSettings
+from ..data.viewpoints import VIEW_PATTERNS, ViewsSettings
 from ..runs import environment_setup
 
 
@@ -53,10 +53,9 @@ def draw_views(column: bpy.types.UILayout, settings: ViewsSettings, count: int) 
         count: number of cameras.
     """
     column.prop(settings, "views_from")
-    if settings.views_from == "CURVE":
-        column.prop(settings, "curve")
-    if settings.views_from == "GRID":
-        column.prop(settings, "height")
+    for pattern in VIEW_PATTERNS:
+        if pattern.identifier == settings.views_from and pattern.setting:
+            column.prop(settings, pattern.setting)
     if settings.views_from == "CAMERAS":
         column.label(text=f"{count} camera{'' if count == 1 else 's'}")
     else:

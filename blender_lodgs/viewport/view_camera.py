@@ -125,7 +125,7 @@ def store_view(scene: bpy.types.Scene, position: Position, focal_px: float) -> N
 
 
 def _follows(root: bpy.types.Object) -> bool:
-    return root.lodgs.eye == "VIEW" and not root.lodgs.freeze
+    return root.lodgs.follows_viewport
 
 
 def _store_pending() -> float | None:

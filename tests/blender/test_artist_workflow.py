@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from training.splats.bundle import read_bundle
-from training.splats.formats import PROGRAM
 from training.splats.ply import read_ply
+from training.splats.splat_transform import PROGRAM
 
 ROOT = Path(__file__).resolve().parents[2]
 OWN = os.environ.get("LODGS_WAY", "")

@@ -5,9 +5,11 @@ from pathlib import Path
 import pytest
 
 from tools import tables
-from training.cli import COMMANDS, job_options
+from training.cli import COMMANDS
+from training.cli.options import option_name
 from training.lod.rule import rules
 from training.methods import METHODS
+from training.runs.job import KEYS
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -42,4 +44,4 @@ def test_every_command_has_its_options():
 
 
 def _train_options() -> list[str]:
-    return [f"--{name.replace('_', '-')}" for name in job_options._OPTIONS] + ["--set"]
+    return [*map(option_name, KEYS), "--set"]

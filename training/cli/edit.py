@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import argparse
-from math import inf
 from pathlib import Path
-from typing import Any
 
-from ..editing.look import RANGES, Look
+from ..editing.cleaning import LIMITS, Cleaning
+from ..editing.export import EXPORT_OPTIONS
+from ..editing.look import LOOK_SETTINGS, Look
 from ..errors import LodgsError
 from ..lod.crop import Crop
-from ..splats.formats import FORMATS
-from .options import SOURCE_HELP, add_placement, placement_of, warn
-
-_LIMITS = "max_size", "min_opacity", "max_distance", "min_views", "gap", "share"
-"""Options that are numbers from 0 on; names of ``Cleaning``'s attributes."""
+from ..splats.formats import FORMATS, READABLE
+from .options import SOURCE_HELP, add_placement, add_setting, placement_of, setting_values, warn
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -27,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "source", type=Path,
-        help=f"{SOURCE_HELP}; with splat-transform also .spz, .sog and others: see docs/reference/formats.md",
+        help=f"{SOURCE_HELP}; also {', '.join(READABLE[1:])} (see docs/reference/formats.md)",
     )  # fmt: skip
     _add_outputs(parser)
     _add_cleaning(parser)
@@ -49,10 +46,7 @@ def _add_outputs(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--streamed", type=Path, metavar="DIR", help="folder of levels to write for streaming in browsers"
     )
-    parser.add_argument(
-        "--antialiased", action="store_true",
-        help="keep opacities as trained in --plain and --streamed, for viewers with Mip-Splatting's filter",
-    )  # fmt: skip
+    add_setting(parser, EXPORT_OPTIONS["antialiased"], value=False)
 
 
 def _add_cleaning(parser: argparse.ArgumentParser) -> None:
@@ -69,53 +63,28 @@ def _add_cleaning(parser: argparse.ArgumentParser) -> None:
         help="side of the crops to keep (default: inside); all: keep everything, and apply the look only "
         "inside them",
     )  # fmt: skip
-    parser.add_argument(
-        "--max-size", type=float, metavar="N", help="remove splats with a larger standard deviation"
-    )
-    parser.add_argument(
-        "--min-opacity", type=float, metavar="N", help="remove splats with a lower opacity, 0 to 1"
-    )
-    parser.add_argument("--drop-floaters", action="store_true", help="remove small isolated clusters")
-    parser.add_argument(
-        "--gap", type=float, metavar="N",
-        help="minimum distance of floaters from other splats (default: from the density of splats)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--share", type=float, metavar="N",
-        help="maximum size of a floater, as a fraction of all splats (default 0.001)",
-    )  # fmt: skip
-    parser.add_argument(
+    tests = parser.add_argument_group("clean-up, which removes matching splats")
+    for f in LIMITS.values():
+        add_setting(tests, f)
+    tests.add_argument(
         "--scene", type=Path, metavar="DIR",
         help="COLMAP folder of the photos, for --max-distance, --min-views and --ground",
     )  # fmt: skip
-    parser.add_argument(
-        "--max-distance", type=float, metavar="N", help="remove splats farther from every photo's camera"
-    )
-    parser.add_argument(
-        "--min-views", type=int, metavar="N", help="remove splats inside the frames of fewer photos"
-    )
 
 
 def _add_look(parser: argparse.ArgumentParser) -> None:
     look = parser.add_argument_group("look, of all splats or with --keep all of those inside the crops")
-    look.add_argument("--exposure", type=float, metavar="N", help="stops; 1 doubles the light")
-    look.add_argument(
-        "--temperature", type=float, metavar="K",
-        help="white balance: temperature in kelvins of the light to make white; above 6500 is warmer",
-    )  # fmt: skip
-    look.add_argument("--tint", type=float, nargs=3, metavar="N", help="colour that white turns into, 0 to 1")
-    look.add_argument("--saturation", type=float, metavar="N", help="0 is grey, 1 is unchanged")
-    look.add_argument("--opacity", type=float, metavar="N", help="opacity factor, 0 to 1")
+    for f in LOOK_SETTINGS.values():
+        add_setting(look, f)
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
-    from ..editing.cleaning import Cleaning
     from ..editing.edit import edit
     from ..runs.folder import RunFolder
     from ..splats.formats import open_as_ply
 
-    limits: dict[str, Any] = _limits(options)
+    limits = setting_values(options, Cleaning)
     crops = _crops(options)
     look = _look(options)
     look_crops: list[Crop | None] = [None]
@@ -139,7 +108,7 @@ def run(options: argparse.Namespace) -> int:
         raise LodgsError(
             "Cannot write the edited splats: no output.", "Add --out, --plain, --folder or --streamed."
         )
-    cleaning = Cleaning(tuple(crops), drop_floaters=options.drop_floaters, **limits)
+    cleaning = Cleaning(tuple(crops), **limits)
     folder = RunFolder(options.source)
     with open_as_ply(folder.bundle if folder.bundle.exists() else folder.path) as source:
         print(
@@ -154,19 +123,6 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _limits(options: argparse.Namespace) -> dict[str, float]:
-    """Return the limits that the user set, by name.
-
-    Raises:
-        LodgsError: a limit is negative or not finite.
-    """
-    limits = {name: value for name in _LIMITS if (value := getattr(options, name)) is not None}
-    for name, value in limits.items():
-        if not 0 <= value < inf:
-            raise LodgsError(f"--{name.replace('_', '-')} cannot be {value:g}.", "Use a number from 0 on.")
-    return limits
-
-
 def _crops(options: argparse.Namespace) -> list[Crop]:
     outside = options.keep == "outside"
     boxes = [Crop.box(box[:3], box[3:], outside) for box in options.crop_box]
@@ -175,7 +131,5 @@ def _crops(options: argparse.Namespace) -> list[Crop]:
 
 def _look(options: argparse.Namespace) -> Look | None:
     """Return the look that the user set; None without any option of it."""
-    values = {name: value for name in RANGES if (value := getattr(options, name)) is not None}
-    if "tint" in values:
-        values["tint"] = tuple(values["tint"])
+    values = setting_values(options, Look)
     return Look(**values) if values else None

@@ -6,13 +6,14 @@ import argparse
 import sys
 from collections.abc import Callable
 from dataclasses import Field
+from math import inf
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..errors import LodgsError
 from ..lod.rule import all_controls
-from ..settings import default_of, describe_values
+from ..settings import check_value, default_of, describe_values, settings_of
 
 if TYPE_CHECKING:
     from ..splats.similarity import Similarity
@@ -80,7 +81,7 @@ def add_setting(parser: argparse._ActionsContainer, f: Field, value: Any = argpa
     default, choices, unit = default_of(f), f.metadata["choices"], f.metadata["unit"]
     about = f.metadata["about"].removesuffix(".").replace("%", "%%")
     about = about[0].lower() + about[1:] if about[1:2].islower() else about  # not an abbreviation
-    if not isinstance(default, bool) and default != "":
+    if not isinstance(default, bool) and default not in ("", inf):
         about += f" (default {default})"
     options: dict[str, Any] = {"default": value, "help": about}
     if isinstance(default, bool):
@@ -93,6 +94,19 @@ def add_setting(parser: argparse._ActionsContainer, f: Field, value: Any = argpa
     if isinstance(f.default, tuple):
         options["nargs"] = len(f.default)
     parser.add_argument(option_name(f.name), **options)
+
+
+def setting_values(options: argparse.Namespace, declaration: Any) -> dict[str, Any]:
+    """Return the settings of a dataclass that the user set, by name.
+
+    Raises:
+        LodgsError: a value is out of its bounds.
+    """
+    values = {name: vars(options)[name] for name in settings_of(declaration) if name in options}
+    for name, value in values.items():
+        for entry in value if isinstance(value, list) else [value]:
+            check_value(settings_of(declaration)[name], entry)
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
 
 
 def _parser_of(f: Field) -> Callable[[str], bool | int | float | str]:

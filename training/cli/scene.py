@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 from ..errors import LodgsError
+from ..scenes.formats import FORMAT_NAMES
 from ..scenes.reconstruct import LENSES, PRESETS
 from .options import warn
 
@@ -20,8 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     source.add_argument(
         "--from", dest="source", type=Path, metavar="DIR",
-        help="folder of an export, recognised by its files: transforms.json (nerfstudio, instant-ngp, "
-        "NeRF-synthetic), Polycam, Record3D, Metashape XML, OpenMVG, Bundler",
+        help=f"folder of an export, recognised by its files: {FORMAT_NAMES}",
     )  # fmt: skip
     parser.add_argument(
         "--out", type=Path, metavar="DIR",

@@ -19,6 +19,7 @@ from ..lod.rule import Masks, Relations, Rule, find_rule, resolve_rule
 from ..lod.selection import rule_columns, unknown_rule_error
 from ..scenes.cameras import Camera
 from ..scenes.view_tables import VIEW_TABLES
+from ..settings import setting, settings_of
 from ..splats.gaussians import SplatRows, Splats
 from ..splats.levels import Bundle, Level
 from ..splats.ply import Columns, read_batches
@@ -98,23 +99,39 @@ class Cleaning:
 
     Attributes:
         crops: see ``crop.crop_mask``.
-        max_size: see :func:`find_large`.
-        min_opacity: see :func:`find_faint`.
-        max_distance: see :func:`find_far`, from the cameras.
-        min_views: see :func:`find_unseen`, by the cameras.
         cameras: in the splats' space.
-        drop_floaters, gap, share: see :func:`find_floaters`, among splats that pass the other tests.
     """
 
     crops: tuple[Crop, ...] = ()
-    max_size: float = inf
-    min_opacity: float = 0.0
-    max_distance: float = inf
-    min_views: int = 0
     cameras: tuple[Camera, ...] = ()
-    drop_floaters: bool = False
-    gap: float = 0.0
-    share: float = MAX_FLOATER_SHARE
+    max_size: float = setting(
+        inf,
+        "Match splats whose largest standard deviation exceeds this.",
+        label="Size", unit="length", start=1.0,
+    )  # fmt: skip
+    min_opacity: float = setting(
+        0.0, "Match splats less opaque than this.", label="Opacity", high=1, start=0.05
+    )
+    max_distance: float = setting(
+        inf,
+        "Match splats farther than this from every camera.",
+        label="Distance", unit="length", start=10.0,
+    )  # fmt: skip
+    min_views: int = setting(
+        0, "Match splats inside the frames of fewer cameras than this.", label="Views", start=3
+    )
+    drop_floaters: bool = setting(False, "Match small isolated clusters among the splats that remain.")
+    gap: float = setting(
+        0.0,
+        "Merge clusters closer than this; clusters twice as far apart stay separate. 0 uses the density of "
+        "the splats.",
+        unit="length", start=0.0,
+    )  # fmt: skip
+    share: float = setting(
+        MAX_FLOATER_SHARE,
+        "Keep clusters with more than this share of all splats.",
+        label="Largest Cluster", high=1, start=MAX_FLOATER_SHARE,
+    )  # fmt: skip
 
     def keeps(self, splats: Splats) -> np.ndarray:
         """Return (N,) bool: splats that pass all tests except the one for floaters."""
@@ -130,6 +147,10 @@ class Cleaning:
         if self.min_views > 0:
             mask &= ~find_unseen(splats.means, self.cameras, self.min_views)
         return mask
+
+
+LIMITS = settings_of(Cleaning)
+"""The settings of the tests, by name. Blender's tools start with the values ``start``."""
 
 
 def clean_bundle(bundle: Bundle, cleaning: Cleaning) -> Bundle:

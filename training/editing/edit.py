@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,21 +13,16 @@ from ..lod.selection import check_rule
 from ..splats.bundle import open_bundle, write_bundle
 from ..splats.dialects import Warn, comments_from_meta, ignore, meta_from_comments
 from ..splats.file_rows import DrawableRows
-from ..splats.formats import (
-    PLY,
-    SPLAT,
-    find_format,
-    find_splat_transform,
-    write_splats,
-    write_streamed_levels,
-)
-from ..splats.gaussians import SplatRows, Splats
+from ..splats.formats import find_format
 from ..splats.level_folder import read_folder, write_folder
 from ..splats.levels import Bundle
 from ..splats.ply import write_ply
 from ..splats.similarity import Similarity
+from ..splats.splat_transform import find_splat_transform
+from ..splats.streamed_levels import write_streamed_levels
 from .bake_filter import bake_filter
 from .cleaning import Cleaning, clean_bundle
+from .export import export_finest_level, run_to_end
 from .look import Looks, apply_looks_to_levels
 from .placement import transform_bundle, upright_placement
 
@@ -63,8 +57,7 @@ def edit(
         plain: files for the finest level only, in the formats of their names.
         folder: output folder of levels.
         streamed: output folder of levels for streaming in browsers.
-        antialiased: keep opacities as trained in ``plain`` and ``streamed``; otherwise bake the filter into
-            them (:func:`.bake_filter.bake_filter`), except in formats that record the filter.
+        antialiased: for ``plain`` and ``streamed``, see :class:`.export.ExportOptions`.
 
     Returns:
         A report of the remaining splats of each level, and of the files.
@@ -72,8 +65,8 @@ def edit(
     Raises:
         LodgsError: cannot read or write a file, the source contradicts its rule, or no splats remain.
     """
-    paths = [path for path in (out, *plain, folder, streamed) if path is not None]
-    _check_outputs(source, paths, plain, streamed)
+    outputs = [path for path in (out, *plain, folder, streamed) if path is not None]
+    _check_outputs(source, outputs, plain, streamed)
     bundle = _open(source, warn)
     check_rule(bundle)
     edited = apply_looks_to_levels(clean_bundle(bundle, cleaning), looks)
@@ -89,64 +82,32 @@ def edit(
         for level, result in zip(bundle.levels, edited.levels, strict=True)
     ]
     _export(edited, plain, folder, streamed, antialiased)
-    return "\n".join([*report, *(f"{path}: written" for path in paths)])
+    return "\n".join([*report, *(f"{path}: written" for path in outputs)])
 
 
-def _check_outputs(source: Path, paths: Sequence[Path], plain: Sequence[Path], streamed: Path | None) -> None:
+def _check_outputs(
+    source: Path, outputs: Sequence[Path], plain: Sequence[Path], streamed: Path | None
+) -> None:
     """Raise an error before minutes of work if an output cannot be written."""
-    for path in paths:
+    for path in outputs:
         if path.resolve() == source.resolve():
             raise LodgsError(f"Cannot overwrite the source {path}.", "Choose another output file.")
-    if streamed is not None or not {find_format(path) for path in plain} <= {PLY, SPLAT}:
+    if streamed is not None or any(find_format(path).write is None for path in plain):
         find_splat_transform()
 
 
 def _export(
-    edited: Bundle, plain: Sequence[Path], folder: Path | None, streamed: Path | None, antialiased: bool
+    bundle: Bundle, plain: Sequence[Path], folder: Path | None, streamed: Path | None, antialiased: bool
 ) -> None:
-    """Write the finest level and the complete levels in other formats; arguments as for :func:`edit`."""
+    """Write a bundle for other programs; see :func:`edit`."""
     for path in plain:
-        exported = edited if antialiased or find_format(path).antialiased else bake_filter(edited)
-        finest = ConcatenatedRows.of_level(exported, exported.levels[-1].number)
-        run_to_end(write_splats(path, finest, exported.meta))
-    if folder is None and streamed is None:
-        return
-    levels = resolve_rule(edited.rule).complete_levels(edited)
-    if folder is not None:
-        write_folder(folder, levels)
-    if streamed is not None:
-        run_to_end(write_streamed_levels(streamed, levels if antialiased else bake_filter(levels)))
-
-
-def run_to_end(steps: Iterator[str]) -> None:
-    """Exhaust an iterator of progress messages."""
-    for _ in steps:
-        pass
-
-
-@dataclass(frozen=True)
-class ConcatenatedRows:
-    """Several sets of splats on disk as one."""
-
-    sets: Sequence[SplatRows]
-
-    @classmethod
-    def of_level(cls, bundle: Bundle, number: int) -> ConcatenatedRows:
-        """Return all splats that are drawn at a level."""
-        return cls([level.rows for level in bundle.drawn_levels(number)])
-
-    def __len__(self) -> int:
-        return sum(map(len, self.sets))
-
-    def select(self, index: slice | np.ndarray, /) -> Splats:
-        """Read a range of all rows."""
-        assert isinstance(index, slice)
-        begin, end, _ = index.indices(len(self))
-        parts, first = [], 0
-        for rows in self.sets:
-            parts.append(rows.select(slice(max(begin - first, 0), max(min(end - first, len(rows)), 0))))
-            first += len(rows)
-        return Splats.concatenated(parts)
+        run_to_end(export_finest_level(path, bundle, antialiased))
+    if folder is not None or streamed is not None:
+        levels = resolve_rule(bundle.rule).complete_levels(bundle)
+        if folder is not None:
+            write_folder(folder, levels)
+        if streamed is not None:
+            run_to_end(write_streamed_levels(streamed, levels if antialiased else bake_filter(levels)))
 
 
 def _open(source: Path, warn: Warn) -> Bundle:

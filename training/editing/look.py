@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import LodgsError
 from ..lod.crop import Crop
+from ..settings import check_value, setting, settings_of
 from ..splats.gaussians import SH_C0, SplatRows, Splats
 from ..splats.levels import Bundle
 from .paint import apply_paint
@@ -26,11 +26,6 @@ DAYLIGHT = 6500.0
 """Temperature in kelvins that changes nothing."""
 LUMA = (0.2126, 0.7152, 0.0722)
 """Luma coefficients of the channels (ITU-R BT.709)."""
-RANGES = {
-    "exposure": (-10.0, 10.0), "temperature": (2500.0, 20_000.0), "tint": (0.0, 1.0),
-    "saturation": (0.0, 4.0), "opacity": (0.0, 1.0),
-}  # fmt: skip
-"""What each part of a look may be."""
 _MIN_FACTOR = 1e-6
 _RGB_OF_XYZ = np.array(
     ((3.2406, -1.5372, -0.4986), (-0.9689, 1.8758, 0.0415), (0.0557, -0.2040, 1.0570))
@@ -41,30 +36,32 @@ _RGB_OF_XYZ = np.array(
 class Look:
     """A change of colours and opacities; the defaults change nothing. Hashable.
 
-    Attributes:
-        exposure: in stops; one more doubles the light.
-        temperature: in kelvins, of the light to make white; above DAYLIGHT, colours get warmer.
-        tint: display-coded colour that white turns into.
-        saturation: 0 is grey.
-        opacity: factor on opacities.
-
     Raises:
-        LodgsError: a value is out of RANGES.
+        LodgsError: a value is out of its bounds.
     """
 
-    exposure: float = 0.0
-    temperature: float = DAYLIGHT
-    tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    saturation: float = 1.0
-    opacity: float = 1.0
+    exposure: float = setting(
+        0.0, "Brightness in stops. Each stop doubles the light.", low=-10, high=10, soft=(-4, 4)
+    )
+    temperature: float = setting(
+        DAYLIGHT,
+        "White balance: colour temperature of the light that appears white. Values below "
+        f"{DAYLIGHT:.0f} K make colours colder, above it warmer.",
+        low=2500, high=20_000, soft=(None, 12_000), unit="K",
+    )  # fmt: skip
+    tint: tuple[float, float, float] = setting(
+        (1.0, 1.0, 1.0), "Display colour that multiplies all splat colours, 0 to 1.", high=1
+    )
+    saturation: float = setting(
+        1.0, "Saturation of the splats. 0 is grey, 1 is as trained.", high=4, soft=(None, 2)
+    )
+    opacity: float = setting(1.0, "Factor for the opacity of every splat, 0 to 1.", high=1)
 
     def __post_init__(self) -> None:
-        for name, (low, high) in RANGES.items():
+        for name, f in LOOK_SETTINGS.items():
             value = getattr(self, name)
-            numbers = value if name == "tint" else [value]
-            if not all(low <= number <= high for number in numbers):
-                text = " ".join(f"{number:g}" for number in numbers)
-                raise LodgsError(f"The {name} of a look cannot be {text}.", f"Use {low:g} to {high:g}.")
+            for number in value if isinstance(value, tuple) else (value,):
+                check_value(f, number)
 
     @property
     def matrix(self) -> np.ndarray:
@@ -82,6 +79,8 @@ class Look:
         return asdict(self) | {"tint": list(self.tint)}
 
 
+LOOK_SETTINGS = settings_of(Look)
+"""The settings of a look, by name."""
 NEUTRAL = Look()
 
 Looks = Sequence[tuple[Crop | None, Look]]

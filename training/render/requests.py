@@ -10,7 +10,7 @@ from typing import Any, TypeGuard
 import numpy as np
 
 from ..documents import parse_json
-from ..editing.look import RANGES, Look, Looks
+from ..editing.look import LOOK_SETTINGS, Look, Looks
 from ..errors import LodgsError
 from ..lod.crop import SHAPES, Crop
 from ..lod.query import LodQuery
@@ -225,7 +225,7 @@ def _looks(values: dict) -> Looks:
         look = dict(_typed(item, "look", dict))
         red, green, blue = _numbers(look, "tint", 3, MAX_NUMBER)
         del look["tint"]
-        numbers = _named_numbers({"look": look}, "look", [name for name in RANGES if name != "tint"])
+        numbers = _named_numbers({"look": look}, "look", [name for name in LOOK_SETTINGS if name != "tint"])
         crop = None if item.get("crop") is None else _crop(item["crop"])
         looks.append((crop, Look(tint=(red, green, blue), **numbers)))
     return tuple(looks)

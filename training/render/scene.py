@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -110,22 +111,28 @@ def draw(
     check_render_size(width, height)
     _check_transforms(instances)
     numbers = sorted({instance.level for instance in instances}) if levels else []
-    try:
+    instances = [instance for instance in instances if len(instance.splats)]
+    with _memory_errors(instances, width, height):
         image = RenderedImage.empty(width, height, background, depth, numbers)
         back_color = background or (0.0, 0.0, 0.0)
         if limit is not None:  # meshes also hide the background, so it is added to unlimited pixels later
             image.image[limit < NO_DEPTH], image.alpha[limit < NO_DEPTH] = 0, 0
             back_color = 0.0, 0.0, 0.0
-        instances = [
-            replace(instance, splats=instance.splats.with_looks(instance.looks))
-            for instance in instances
-            if len(instance.splats)
-        ]
         if not instances:
             return image
+        instances = [
+            replace(instance, splats=instance.splats.with_looks(instance.looks)) for instance in instances
+        ]
         options = {"background": back_color, "window": window, "backend": backend}
         completed = _draw_strips(image, instances, camera, near, limit, progress, options)
-        return image if completed else None
+    return image if completed else None
+
+
+@contextmanager
+def _memory_errors(instances: Sequence[Instance], width: int, height: int) -> Iterator[None]:
+    """Report insufficient memory as an error with the numbers of splats and pixels."""
+    try:
+        yield
     except Exception as error:
         if not is_out_of_memory(error):
             raise

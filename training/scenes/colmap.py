@@ -218,16 +218,7 @@ def read_scene(
     if images is None:
         images = find_image_folder(folder, model, [pose.name for pose in poses])
     images = _absolute(images)
-    if not images.is_dir():
-        raise LodgsError(
-            f"Cannot read scene: image folder {images} does not exist.", "Choose the folder of the photos."
-        )
-    base = folder if images == folder else images.parent
-    views = ViewCollector(
-        ImageFiles(images, folder),
-        SidecarFiles(base / MASKS, ".png"),
-        SidecarFiles(base / DEPTHS, *DEPTH_SUFFIXES),
-    )
+    views = _view_collector(folder, images)
     for number, pose in enumerate(poses):
         if progress and number % 50 == 0:
             progress(0.5 * number / len(poses))
@@ -254,6 +245,20 @@ def read_scene(
         names=list(dict.fromkeys(pose.name.replace("\\", "/") for pose in poses)),
         distorted=views.distorted,
         warnings=[*warnings, *views.warnings(images)],
+    )
+
+
+def _view_collector(folder: Path, images: Path) -> ViewCollector:
+    """Return an empty collector for the photos, masks and depth maps of a scene."""
+    if not images.is_dir():
+        raise LodgsError(
+            f"Cannot read scene: image folder {images} does not exist.", "Choose the folder of the photos."
+        )
+    base = folder if images == folder else images.parent
+    return ViewCollector(
+        ImageFiles(images, folder),
+        SidecarFiles(base / MASKS, ".png"),
+        SidecarFiles(base / DEPTHS, *DEPTH_SUFFIXES),
     )
 
 

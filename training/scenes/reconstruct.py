@@ -102,21 +102,19 @@ def reconstruct(
         ordered: True if the names follow the camera path, as for video frames; then only neighbouring photos
             are compared, which is faster.
         lens: one of LENSES; "" selects "one" if all photos have the same size, else "each".
-        masks: folder of masks that are black in ignored areas; the mask of ``a/b.jpg`` is ``a/b.jpg.png`` or
-            ``a/b.png``.
+        masks: folder of masks, black in ignored areas: ``a/b.jpg.png`` or ``a/b.png`` for ``a/b.jpg``.
         report: called with the progress.
 
     Raises:
         LodgsError: if there are too few photos, too few overlap, or a file cannot be written.
     """
-    photos = Path(os.path.abspath(photos))
-    out = Path(os.path.abspath(out))
+    photos, out = (Path(os.path.abspath(path)) for path in (photos, out))
     masks = None if masks is None else Path(os.path.abspath(masks))
     work = out / "colmap"
-    outputs = [work, out / "sparse", out / MASKS]
+    other_folders = [work, out / "sparse", out / MASKS, *([masks] if masks else [])]
     if not photos.is_relative_to(out):
-        outputs.append(out / "images")
-    names, excluded, sizes = _list_photos(photos, [*outputs, *([masks] if masks else [])])
+        other_folders.append(out / "images")
+    names, excluded, sizes = _list_photos(photos, other_folders)
     _check_photos(photos, names, excluded)
     _check_output(out, work)
     size, features = PRESETS[preset]
@@ -126,14 +124,10 @@ def reconstruct(
     }  # fmt: skip
     try:
         _start_work(work, settings)
-        images = photos if photos.is_relative_to(out) else out / "images"
-        image_names = names if images == photos else [_import_photo(photos, name, images) for name in names]
-        masks_folder = ""
-        if masks:
-            masks_folder = str(_link_masks(masks, photos, dict(zip(names, image_names, strict=True)), out))
+        images, image_names, linked_masks = _link_inputs(photos, names, masks, out)
         request = settings | {
             "photos": str(images), "names": image_names, "ordered": ordered, "work": str(work),
-            "masks": masks_folder,
+            "masks": str(linked_masks or ""),
         }  # fmt: skip
         result = _run_colmap(request, work, report)
         if len(result["placed"]) < MIN_PHOTOS:
@@ -149,6 +143,20 @@ def reconstruct(
         out, len(image_names), result["placed"], result["points"], result["error"],
         _summarize(image_names, result), exclusion_messages(excluded),
     )  # fmt: skip
+
+
+def _link_inputs(
+    photos: Path, names: list[str], masks: Path | None, out: Path
+) -> tuple[Path, list[str], Path | None]:
+    """Bring photos and masks into the scene; return their folders there and the photos' names."""
+    images, image_names = photos, names
+    if not photos.is_relative_to(out):
+        images = out / "images"
+        image_names = [_import_photo(photos, name, images) for name in names]
+    if masks is None:
+        return images, image_names, None
+    masks = _link_masks(masks, photos, dict(zip(names, image_names, strict=True)), out)
+    return images, image_names, masks
 
 
 def draw_pairs(names: Sequence[str], pairs: Sequence[Sequence], placed: Sequence[str]) -> np.ndarray:

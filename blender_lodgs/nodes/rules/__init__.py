@@ -25,31 +25,28 @@ import bpy
 from ....training.lod.rule import Rule, fact_names, restrict_rules, rules
 from ...attributes import COLUMN, OPACITY_LOGIT, WEIGHT
 from ..building import VERSION, Field, Nodes, ensure_group, is_edited
+from ..camera_choices import CHOICES
 
 CAMERA_SOURCE = "eye"
+"""Socket and property with the index of the camera choice in ``camera_choices.CHOICES``."""
 FREEZE = "freeze"
-CAMERA_OBJECT = "eye_object"
 CAMERA_POSITION = "eye_position"
 FOCAL = "focal_px"
 STORED_FOCAL = "held_focal"
 MATERIAL = "material"
-CAMERA_SOURCES = ("CAMERA", "OBJECT", "TRAINING", "VIEW")
-"""Values of the socket CAMERA_SOURCE, as ``SplatScene.eye``. The position of the last two sources, and of a
-frozen camera, is the socket CAMERA_POSITION."""
-VIEW_SOURCE = CAMERA_SOURCES.index("VIEW")
 RULE = "lodgs_rule"
 """Custom property of these groups: the name of the rule."""
 
 _SHARED = {
     CAMERA_SOURCE: "NodeSocketInt",
     FREEZE: "NodeSocketBool",
-    CAMERA_OBJECT: "NodeSocketObject",
+    **{choice.object: "NodeSocketObject" for choice in CHOICES if choice.object},
     CAMERA_POSITION: "NodeSocketVector",
     FOCAL: "NodeSocketFloat",
     STORED_FOCAL: "NodeSocketFloat",
     MATERIAL: "NodeSocketMaterial",
 }
-_SHARED_VERSION = 2
+_SHARED_VERSION = 30 + len(CHOICES)  # groups are rebuilt for a new choice
 
 restrict_rules([module.name for module in iter_modules(__path__)])
 
@@ -110,20 +107,33 @@ class RuleInputs:
         return 1.0 / ((self.column(OPACITY_LOGIT) * -1.0).exp() + 1.0)
 
     def _is_stored(self) -> Field:
-        """Return 1 if the camera is frozen or is the viewport's: its focal length is then a stored value."""
-        return self[FREEZE].maximum(self[CAMERA_SOURCE] > VIEW_SOURCE - 0.5)
+        """Return 1 if the camera is frozen or a viewport's: its focal length is then a stored value."""
+        is_stored = self[FREEZE]
+        for number, choice in enumerate(CHOICES):
+            if choice.viewport:
+                source = self._source()
+                is_stored = is_stored.maximum((source > number - 0.5) & (source < number + 0.5))
+        return is_stored
+
+    def _source(self) -> Field:
+        """Return the index of the camera choice."""
+        return self[CAMERA_SOURCE].minimum(len(CHOICES) - 1.0)
 
     def _camera(self) -> bpy.types.NodeSocket:
         """Select the camera position by CAMERA_SOURCE and FREEZE."""
         nodes = self.nodes
         active_camera = nodes.add("GeometryNodeInputActiveCamera").outputs["Active Camera"]
+        stored = self._sockets[CAMERA_POSITION]
         positions = []
-        for obj in (active_camera, self._sockets[CAMERA_OBJECT]):
+        for choice in CHOICES:
+            if choice.position:
+                positions.append(stored)
+                continue
             info = nodes.add("GeometryNodeObjectInfo", transform_space="RELATIVE")
-            nodes.link(obj, info, "Object")
+            nodes.link(self._sockets[choice.object] if choice.object else active_camera, info, "Object")
             positions.append(info.outputs["Location"])
-        index = self[FREEZE].where(2.0, self[CAMERA_SOURCE].minimum(2.0))
-        return nodes.index_switch(index, *positions, self._sockets[CAMERA_POSITION], kind="VECTOR")
+        index = self[FREEZE].where(float(len(CHOICES)), self._source())
+        return nodes.index_switch(index, *positions, stored, kind="VECTOR")
 
 
 @cache

@@ -2,15 +2,18 @@
 
 import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.blender.fake_trainer import splats
+from tests.checkout import ROOT, copy_checkout, recipe_code
 from training.splats.bundle import write_bundle
-from training.splats.formats import PROGRAM
 from training.splats.levels import Bundle, Level
+from training.splats.splat_transform import PROGRAM
 
 HERE = Path(__file__).parents[3] / "build" / "interop" / "node_modules" / ".bin"
 
@@ -64,7 +67,7 @@ def test_streamed_levels_round_trip(bpy, lodgs, root, tmp_path, theirs):
 
 def test_missing_program_is_reported(bpy, lodgs, root, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setattr(lodgs("training.splats.formats"), "_FOLDERS", ())
+    monkeypatch.setattr(lodgs("training.splats.splat_transform"), "_FOLDERS", ())
     for export in (
         lambda: bpy.ops.lodgs.export_streamed(directory=str(tmp_path / "web")),
         lambda: bpy.ops.lodgs.export_plain(filepath=str(tmp_path / "a.spz"), source="LEVEL", level=1),
@@ -74,3 +77,31 @@ def test_missing_program_is_reported(bpy, lodgs, root, tmp_path, monkeypatch):
         with pytest.raises(RuntimeError, match="npm install --global"):
             export()
     assert {path.name for path in tmp_path.iterdir()} == {"in.ply", "b.spz"}
+
+
+SCRIPT = """
+import sys
+from pathlib import Path
+import numpy as np
+from tools import blender_module
+
+folder = blender_module.REPOSITORY = Path(sys.argv[1])
+bpy = blender_module.start_blender()
+bpy.ops.lodgs.import_splats(filepath=str(folder / "in.ply"))
+properties = bpy.ops.lodgs.export_plain.get_rna_type().properties
+assert properties["kind"].enum_items[".xyz"].name == "XYZ" and "*.xyz" in properties["filter_glob"].default
+assert properties["kind"].default == ".ply"
+bpy.ops.lodgs.export_plain(filepath=str(folder / "out.xyz"), source="LEVEL", level=1)
+assert len(np.loadtxt(folder / "out.xyz")) == 40
+"""
+
+
+def test_recipe_adds_a_format_to_the_operator(tmp_path):
+    copy_checkout(tmp_path, "training")
+    (tmp_path / "training/splats/formats/xyz.py").write_text(recipe_code("Add an export format"))
+    write_bundle(tmp_path / "in.ply", Bundle("made", [Level(1, splats(40))]))
+    process = subprocess.run(
+        [sys.executable, "-c", SCRIPT, tmp_path], capture_output=True, text=True, timeout=240, check=False,
+        cwd=ROOT,
+    )  # fmt: skip
+    assert process.returncode == 0, process.stdout + process.stderr

@@ -343,7 +343,7 @@ def test_folder_stays_a_folder_and_counts_are_printed(tmp_path, capsys):
         (["--crop-box", *"000001"], "flat"),
         (["--crop-sphere", *"0000"], "radius"),
         (["--max-size", "0"], "No splats remain"),
-        (["--min-opacity", "-1"], "--min-opacity cannot be -1"),
+        (["--min-opacity", "-1"], "min_opacity = -1.0 is invalid"),
         (["--min-views", "1"], "--scene"),
         (["--out", "all.ply"], "Cannot overwrite"),
     ],

@@ -181,7 +181,7 @@ NEUTRAL = {"exposure": 0, "temperature": 6500, "tint": [1, 1, 1], "saturation": 
         ([{"look": NEUTRAL | {"tint": [1, 1]}}], "not valid"),
         ([{"look": NEUTRAL | {"contrast": 1}}], "not valid"),
         ([{"look": NEUTRAL, "crop": {"shape": "BOX"}}], "not valid"),
-        ([{"look": NEUTRAL | {"saturation": 99}}], "saturation of a look"),
+        ([{"look": NEUTRAL | {"saturation": 99}}], "saturation = 99"),
         ([{"look": NEUTRAL}] * 300, "not valid"),
     ],
 )  # fmt: skip

@@ -3,30 +3,31 @@
 import os
 import shutil
 import struct
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests.checkout import copy_checkout, recipe_code
 from training.__main__ import main
 from training.errors import LodgsError
 from training.splats.bundle import read_bundle, write_bundle
 from training.splats.formats import (
     FORMATS,
-    PROGRAM,
     STREAMED_FILE,
     find_format,
     open_as_ply,
-    read_splat,
-    run_splat_transform,
-    write_splat,
     write_splats,
-    write_streamed_levels,
 )
+from training.splats.formats.splat import read_splat, write_splat
 from training.splats.gaussians import SH_C0, Splats
 from training.splats.level_folder import read_folder
 from training.splats.levels import Bundle, Level
 from training.splats.ply import read_ply
+from training.splats.splat_transform import PROGRAM, run_splat_transform
+from training.splats.streamed_levels import write_streamed_levels
 
 NODE_PROGRAMS = Path(__file__).parents[3] / "build" / "interop" / "node_modules" / ".bin"
 """npm's program folder after ``make interop``."""
@@ -76,7 +77,7 @@ def test_splat_row_matches_its_specification(tmp_path):
         np.float32([[1, 2, 3]]), np.float32([[1, -1, 1, 1]]), np.log(np.float32([[0.1, 0.2, 0.3]])),
         np.float32([0]), np.float32([[[0.1 / SH_C0, -0.5 / SH_C0, 1 / SH_C0]]]),
     )  # fmt: skip
-    write_splat(tmp_path / "a.splat", splats)
+    write_splat(tmp_path / "a.splat", splats, {})
     row = struct.unpack("<6f8B", (tmp_path / "a.splat").read_bytes())
     assert np.allclose(row[:6], [1, 2, 3, 0.1, 0.2, 0.3])
     assert row[6:] == (153, 0, 255, 128, 192, 64, 192, 192)
@@ -84,7 +85,7 @@ def test_splat_row_matches_its_specification(tmp_path):
 
 def test_splat_round_trips(tmp_path):
     splats = random_splats(70_000)
-    write_splat(tmp_path / "a.splat", splats)
+    write_splat(tmp_path / "a.splat", splats, {})
     actual = read_splat(tmp_path / "a.splat")
     assert np.array_equal(actual.means, splats.means)
     assert np.allclose(actual.log_scales, splats.log_scales, atol=1e-5)
@@ -102,7 +103,7 @@ def test_truncated_splat_file_raises_one_sentence(tmp_path):
 
 def test_splat_transform_reads_our_splat(tmp_path, splat_transform):
     splats = random_splats(300)
-    write_splat(tmp_path / "a.splat", splats)
+    write_splat(tmp_path / "a.splat", splats, {})
     run_splat_transform([str(tmp_path / "a.splat"), str(tmp_path / "b.ply")])
     assert_similar(read_ply(tmp_path / "b.ply"), splats, colours=6)  # colours beyond 0 and 1 are clipped
 
@@ -184,7 +185,7 @@ def test_unreadable_file_raises_one_sentence(tmp_path, splat_transform):
 
 def test_missing_program_error_tells_how_to_install_it(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setattr("training.splats.formats._FOLDERS", ())
+    monkeypatch.setattr("training.splats.splat_transform._FOLDERS", ())
     with pytest.raises(LodgsError, match="npm install --global @playcanvas/splat-transform"):
         finish(write_splats(tmp_path / "a.spz", random_splats(3), {}))
     finish(write_splats(tmp_path / "a.splat", random_splats(3), {}))
@@ -265,3 +266,20 @@ def test_edit_command_writes_all_formats_alike(tmp_path, monkeypatch, capsys, cu
     assert np.array_equal(read_splat(tmp_path / "one.splat").means, plain.means)
     assert np.array_equal(out.up_rotation, np.eye(3))
     assert main(["edit", "in.ply"]) == 2  # nothing to write
+
+
+def test_recipe_adds_a_format_to_the_command_line(tmp_path):
+    copy_checkout(tmp_path, "training")
+    (tmp_path / "training/splats/formats/xyz.py").write_text(recipe_code("Add an export format"))
+    splats = random_splats(20)
+    write_bundle(tmp_path / "in.ply", Bundle("", [Level(1, splats)]))
+
+    def run(*arguments):
+        command = [sys.executable, "-m", "training", "edit", *arguments]
+        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=100, check=False)
+
+    process = run("in.ply", "--plain", "out.xyz")
+    assert process.returncode == 0, process.stderr
+    np.testing.assert_allclose(np.loadtxt(tmp_path / "out.xyz"), splats.means, rtol=1e-6)
+    assert ".xyz" in run("--help").stdout
+    assert ".xyz" in run("in.ply", "--plain", "out.abc").stderr

@@ -24,7 +24,7 @@ from .exported import (
 )
 from .point_cloud import read_points
 
-NAME = "transforms.json"
+NAME = "nerfstudio (transforms.json)"
 _FILES = "transforms.json", "transforms_train.json"
 _SUPPORTED_MODELS = (
     "", "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV_FISHEYE",

@@ -1,0 +1,131 @@
+"""Splat files of other programs. Each module of this package declares one format as ``FORMAT``.
+
+LODGS itself reads and writes PLY and ``.splat``. splat-transform reads and writes the others.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from pathlib import Path
+from pkgutil import iter_modules
+
+from ...documents import open_file
+from ...errors import LodgsError
+from ...files import atomic_write
+from ..dialects import comments_from_meta
+from ..gaussians import SplatRows
+from ..ply import write_ply
+from ..splat_format import SplatFormat
+from ..splat_transform import find_splat_transform, run_splat_transform, splat_transform_steps
+from ..streamed_levels import STREAMED_FILE, count_lods
+from .ply import FORMAT as PLY
+
+FORMATS: tuple[SplatFormat, ...] = tuple(
+    sorted(
+        (import_module(f"{__name__}.{module.name}").FORMAT for module in iter_modules(__path__)),
+        key=lambda kind: (kind is not PLY, -kind.splat_bytes[-1], kind.suffix),
+    )
+)
+"""Export formats: PLY, then by size, largest first."""
+FILE_EXTENSIONS = (
+    *(kind.suffix for kind in FORMATS if kind.readable and kind.suffix.rfind(".") == 0),
+    ".ksplat",
+)
+"""Last parts of the names of readable files."""
+READABLE = (*FILE_EXTENSIONS, STREAMED_FILE)
+"""Ends of the names of readable files; :data:`STREAMED_FILE` is a complete name."""
+
+
+def find_format(path: Path) -> SplatFormat:
+    """Return the export format for a file name.
+
+    Raises:
+        LodgsError: no format has the name's suffix.
+    """
+    matches = [kind for kind in FORMATS if path.name.lower().endswith(kind.suffix)]
+    if not matches:
+        suffixes = ", ".join(kind.suffix for kind in FORMATS)
+        raise LodgsError(f"Cannot write {path.name}: unsupported export format.", f"Use one of {suffixes}.")
+    return max(matches, key=lambda kind: len(kind.suffix))
+
+
+def write_splats(path: Path, splats: SplatRows, meta: dict) -> Iterator[str]:
+    """Write splats in the format of the file name, and yield while splat-transform runs.
+
+    A generator that is closed early leaves no files behind.
+
+    Args:
+        meta: meta of the splats' bundle.
+
+    Yields:
+        The program's last line of output.
+
+    Raises:
+        LodgsError: the file cannot be written, the format does not support the splats, or splat-transform is
+            missing or fails.
+    """
+    kind = find_format(path)
+    if kind.write is not None:
+        kind.write(path, splats, meta)
+        return
+    degree = splats.select(slice(0, 0)).sh_degree
+    if degree > kind.max_degree:
+        raise LodgsError(
+            f"Cannot write SH degree {degree} as {kind.label}: it supports degree 0 to {kind.max_degree}.",
+            "Write a PLY instead.",
+        )
+    find_splat_transform()  # reports a missing program before files are written
+    with tempfile.TemporaryDirectory(prefix="lodgs-") as folder:
+        plain = Path(folder, "splats.ply")
+        converted = Path(folder, f"converted{kind.suffix}")
+        write_ply(plain, splats, comments_from_meta(meta))
+        yield from splat_transform_steps([str(plain), str(converted)])
+        with atomic_write(path) as temporary:
+            shutil.move(converted, temporary)
+
+
+@contextmanager
+def open_as_ply(path: Path) -> Iterator[Path]:
+    """Yield a PLY with the splats of a file, or a folder of PLYs with streamed levels.
+
+    A PLY or a folder is yielded unchanged. Other files are converted to a temporary one of the same name.
+
+    Raises:
+        LodgsError: the file cannot be read, or splat-transform is missing or fails.
+    """
+    if path.is_dir() and (path / STREAMED_FILE).is_file():
+        path = path / STREAMED_FILE
+    if path.is_dir() or is_plain_ply(path):
+        yield path
+        return
+    name = path.name.lower()
+    open_file(path).close()  # reports an unreadable file
+    stem = path.resolve().parent.name if name == STREAMED_FILE else path.stem.removesuffix(".compressed")
+    with tempfile.TemporaryDirectory(prefix="lodgs-") as folder:
+        converted = Path(folder, f"{stem or 'splats'}.ply")
+        if name == STREAMED_FILE:
+            converted = converted.with_suffix("")
+            for lod in range(count_lods(path)):
+                run_splat_transform(["-L", str(lod), str(path), str(converted / f"lod{lod}.ply")])
+        elif readers := [kind.read for kind in FORMATS if kind.read and name.endswith(kind.suffix)]:
+            write_ply(converted, readers[0](path))
+        else:
+            run_splat_transform([str(path), str(converted)])
+        yield converted
+
+
+def is_plain_ply(path: Path) -> bool:
+    """Return True if a file needs no conversion: an uncompressed PLY, or an unknown format.
+
+    Raises:
+        LodgsError: the file cannot be read.
+    """
+    name = path.name.lower()
+    if not name.endswith(PLY.suffix):
+        return not name.endswith(READABLE)
+    with open_file(path) as file:
+        return b"packed_position" not in file.read(4096)

@@ -1,0 +1,50 @@
+"""Declaration of a file format for splats."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from .gaussians import SplatRows, Splats
+
+
+class SplatFormat(NamedTuple):
+    """A file format for the splats of one level.
+
+    Attributes:
+        suffix: end of the file name.
+        label: name in menus.
+        about: tooltip in menus.
+        splat_bytes: bytes per splat for each SH degree from 0 on. For formats that compress by content, these
+            are averages of trained scenes (``docs/reference/formats.md``).
+        max_degree: highest SH degree that the format stores.
+        palette_size: maximum number of coefficient sets, a power of two, if splats share sets of SH
+            coefficients; else 0.
+        antialiased: True if the format stores that splats need Mip-Splatting's 2D filter.
+        write: function that writes splats with the meta of their bundle; None for splat-transform.
+        read: function that reads a file; None for splat-transform.
+        readable: False if files cannot be imported.
+    """
+
+    suffix: str
+    label: str
+    about: str
+    splat_bytes: tuple[float, ...]
+    max_degree: int
+    palette_size: int = 0
+    antialiased: bool = False
+    write: Callable[[Path, SplatRows, dict], None] | None = None
+    read: Callable[[Path], Splats] | None = None
+    readable: bool = True
+
+    def size(self, count: int, degree: int) -> float:
+        """Estimate the file size of splats in bytes."""
+        degree = min(degree, len(self.splat_bytes) - 1)
+        palette = min(1 << count.bit_length() - 1, self.palette_size) if count else 0
+        return count * self.splat_bytes[degree] + 0.88 * palette * higher_coefficients(degree)
+
+
+def higher_coefficients(degree: int) -> int:
+    """Return the number of SH coefficients of three channels beyond the base colour."""
+    return 3 * ((degree + 1) ** 2 - 1)
