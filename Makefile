@@ -12,7 +12,7 @@ PYTEST := -m pytest -n auto
 quick test test-5.0 test-5.2 nightly fuzz: export OMP_NUM_THREADS := 1  # the workers already use every core
 export LODGS_TRAINER_PYTHON := $(CURDIR)/$(VENV)
 
-.PHONY: help setup demo check quick test test-5.0 test-5.2 nightly fuzz attacks lint docs tables bench bench-quality bench-lod bench-tree bench-blocks extension release pins \
+.PHONY: help setup demo check quick test test-5.0 test-5.2 nightly fuzz attacks lint docs pictures tables bench bench-quality bench-lod bench-tree bench-blocks extension release pins \
 	window interop clean
 
 help:
@@ -25,6 +25,7 @@ help:
 	@echo "make fuzz       20,000 corrupt inputs for every reader (INPUTS=20000, SEED=number), some minutes"
 	@echo "make lint       style and types"
 	@echo "make docs       build/site: the documentation; warnings are errors"
+	@echo "make pictures   retake the pictures of docs/images in a real Blender window (needs Blender, Xvfb, ImageMagick)"
 	@echo "make tables     regenerate the generated pages of docs/"
 	@echo "make bench      speed, as ratios within one run (BASE=old.json compares)"
 	@echo "make bench-quality  PSNR and veil over time, all methods (SCENES=\"DIR ...\", METHODS=\"flod ...\", BASE=other checkout)"
@@ -77,6 +78,9 @@ lint: setup
 docs: setup
 	NO_MKDOCS_2_WARNING=1 $(VENV) -m mkdocs build --quiet --strict
 
+pictures: setup
+	$(VENV) tools/pictures.py
+
 tables: setup
 	$(VENV) tools/tables.py
 
@@ -103,7 +107,7 @@ extension: setup
 	$(VENV) tools/extension.py
 
 release: setup
-	$(VENV) tools/release.py $(if $(TAG),--tag $(TAG))
+	$(VENV) tools/release.py $(if $(TAG),--tag $(TAG)) $(if $(SITE),--site $(SITE))
 
 pins: setup
 	for name in pip trainer cuda cluster develop blender-5.0; do $(LOCK) $(if $(UPGRADE),--upgrade) --python-version 3.11 \

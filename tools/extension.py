@@ -54,12 +54,13 @@ def tracked_files() -> list[str]:
     return [name for name in names.split("\0") if name and (ROOT / name).is_file()]
 
 
-def build(folder: Path, version: str | None = None) -> Path:
+def build(folder: Path, version: str | None = None, website: str | None = None) -> Path:
     """Build and validate the zip from the tracked files.
 
     Args:
         folder: output folder; created if it does not exist.
         version: replaces the manifest's version, for tests of updates.
+        website: address of the documentation, added to the manifest.
 
     Returns:
         The zip file. Exits with Blender's message on errors.
@@ -73,9 +74,11 @@ def build(folder: Path, version: str | None = None) -> Path:
             target = Path(work, name)
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(ROOT / name, target)
-        if version:
-            copy = Path(work, "blender_manifest.toml")
-            copy.write_text(copy.read_text("utf-8").replace(manifest["version"], version, 1), "utf-8")
+        copy = Path(work, "blender_manifest.toml")
+        text = copy.read_text("utf-8").replace(manifest["version"], version or manifest["version"], 1)
+        if website:
+            text = text.replace('\ntype = "add-on"', f'\nwebsite = "{website}"\ntype = "add-on"', 1)
+        copy.write_text(text, "utf-8")
         for command in (
             ["build", "--source-dir", work, "--output-filepath", str(archive)],
             ["validate", str(archive)],

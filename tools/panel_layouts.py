@@ -93,12 +93,7 @@ def _add_levels(bpy) -> None:
         scenes.set_level(root, levels.Level(number, splats, {"s_min": 4.0 - number}))
 
 
-def read_digests() -> dict[str, str]:
-    """Return the digests at the time of the last ``make pictures``."""
-    return json.loads(DIGESTS.read_text(encoding="utf-8"))
-
-
 if __name__ == "__main__":
-    DIGESTS.write_text(json.dumps(panel_digests(start_blender()), indent=1) + "\n", encoding="utf-8")
-    sys.stdout.flush()
-    os._exit(0)
+    text = json.dumps(panel_digests(start_blender()), indent=1) + "\n"
+    Path(sys.argv[1] if sys.argv[1:] else DIGESTS).write_text(text, encoding="utf-8")
+    os._exit(0)  # Blender as a module can hang when Python ends

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import os
 import re
 import shutil
 import subprocess
@@ -25,18 +26,20 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="Build all files of a release.")
     parser.add_argument("--out", type=Path, default=ROOT / "dist")
     parser.add_argument("--tag", help="fail unless it is v and the manifest's version")
+    parser.add_argument("--site", help="address of the published documentation, for manifest and site")
     parser.add_argument("--dirty", action="store_true", help="allow uncommitted changes")
     options = parser.parse_args()
     version = extension.read_manifest()["version"]
     check_release(version, options.tag, options.dirty)
     out: Path = options.out.resolve()
     shutil.rmtree(out, ignore_errors=True)
-    archive = extension.build(out)
+    archive = extension.build(out, website=options.site)
     (out / "repository").mkdir()
     shutil.copy2(archive, out / "repository")
     extension.write_repository(out / "repository")
     run([sys.executable, "-m", "hatchling", "build", "--directory", str(out)])
     site = ROOT / "build" / "site"
+    os.environ.update(SITE_URL=options.site or "", NO_MKDOCS_2_WARNING="1")
     shutil.rmtree(site, ignore_errors=True)
     run([sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict"])
     shutil.make_archive(str(out / f"lodgs-{version}-site"), "zip", site)
