@@ -110,7 +110,7 @@ release: setup
 	$(VENV) tools/release.py $(if $(TAG),--tag $(TAG)) $(if $(SITE),--site $(SITE))
 
 pins: setup
-	for name in pip trainer cuda cluster develop blender-5.0; do $(LOCK) $(if $(UPGRADE),--upgrade) --python-version 3.11 \
+	for name in pip uv trainer cuda cluster develop blender-5.0; do $(LOCK) $(if $(UPGRADE),--upgrade) --python-version 3.11 \
 		requirements/$$name.in -o requirements/$$name.txt || exit 1; done
 	for name in blender-5.2 blender-5.3; do $(LOCK) $(if $(UPGRADE),--upgrade) --python-version 3.13 \
 		requirements/$$name.in -o requirements/$$name.txt || exit 1; done

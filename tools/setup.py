@@ -11,7 +11,6 @@ from __future__ import annotations
 import ctypes.util
 import hashlib
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -131,13 +130,8 @@ def find_uv(pip: list[str]) -> str | None:
     program = shutil.which("uv") or str(Path(pip[0]).with_name("uv"))
     if shutil.which(program):
         return program
-    lock = (ROOT / "requirements" / "develop.txt").read_text(encoding="utf-8")
-    entry = re.search(r"^uv==.*\n(?:[ ].*\n)+", lock, re.MULTILINE)
-    with tempfile.TemporaryDirectory() as work:
-        requirements = Path(work, "uv.txt")
-        requirements.write_text(entry[0] if entry else "", encoding="utf-8")
-        command = [*pip, *packages.HASHED, "--no-deps", f"--requirement={requirements}"]
-        subprocess.run(command, check=False, capture_output=True)
+    lock = ROOT / "requirements" / "uv.txt"
+    subprocess.run([*pip, *packages.HASHED, f"--requirement={lock}"], check=False, capture_output=True)
     return shutil.which(program)
 
 

@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 
 from tools import blender_versions, extension, setup
+from training import packages
 
 ROOT = Path(__file__).resolve().parents[2]
 REQUIREMENTS = ROOT / "requirements"
-LOCKS = ["trainer", "cuda", "cluster", "develop", "blender-5.0", "blender-5.2", "blender-5.3"]
+LOCKS = ["pip", "uv", "trainer", "cuda", "cluster", "develop", "blender-5.0", "blender-5.2", "blender-5.3"]
 
 PIN = r"(?P<name>[A-Za-z0-9._-]+)==(?P<version>[^\s;]+)(?P<marker> ; [^\\]+?)?"
 
@@ -42,7 +43,8 @@ def locked(path: Path) -> set[tuple[str, str]]:
 
 
 def test_every_lock_has_an_input_file():
-    assert {path.stem for path in REQUIREMENTS.glob("*.txt")} == set(LOCKS)
+    by_hand = packages.TORCH_CPU.stem
+    assert {path.stem for path in REQUIREMENTS.glob("*.txt")} == {*LOCKS, by_hand}
     assert {path.stem for path in REQUIREMENTS.glob("*.in")} == {*LOCKS, "tests"}
 
 
@@ -63,7 +65,7 @@ def test_trainer_versions_are_the_same_everywhere(name):
 def test_zip_contains_the_tested_wheel(tmp_path, monkeypatch):
     (wheel,) = tomllib.loads((ROOT / "blender_manifest.toml").read_text())["wheels"]
     name, version, *_ = Path(wheel).name.split("-")
-    for lock in LOCKS:
+    for lock in set(LOCKS) - {"pip", "uv"}:
         assert (name, version) in locked(REQUIREMENTS / f"{lock}.txt")
     monkeypatch.setattr(extension, "ROOT", tmp_path)
     for folder in ("wheels", "requirements"):
@@ -87,10 +89,33 @@ def test_setup_installs_a_lock_once_per_change(tmp_path, monkeypatch):
     )
     python.chmod(0o755)
     monkeypatch.setattr(setup, "ROOT", tmp_path)
+    monkeypatch.setattr(setup, "find_uv", lambda pip: None)
     for text, times in (("one", 1), ("one", 1), ("two", 2)):
         lock.write_text(text)
         setup.make(".venv", str(python), "some.txt")
-        assert log.read_text().count(f"--require-hashes --only-binary=:all: -r {lock}\n") == times
+        assert log.read_text().count(f"--require-hashes --only-binary=:all: --requirement={lock}\n") == times
+
+
+def test_setup_prefers_the_cpu_build_of_torch(tmp_path, monkeypatch):
+    monkeypatch.setattr(setup, "find_uv", lambda pip: "uv")
+    monkeypatch.setattr(setup.packages, "has_cpu_build", lambda: True)
+    monkeypatch.setattr(setup.shutil, "which", lambda name: None)
+    lock = REQUIREMENTS / "cluster.txt"
+    installed = []
+
+    def run(command, **_):
+        texts = [Path(word.partition("=")[2]).read_text() for word in command if "--requirement=" in word]
+        installed.append((command[0], *texts))
+        failed = command[0] == "uv" or (unreachable and "+cpu" in texts[0])
+        return setup.subprocess.CompletedProcess(command, int(failed), "", "")
+
+    monkeypatch.setattr(setup.subprocess, "run", run)
+    for unreachable in (False, True):
+        installed.clear()
+        setup.install(tmp_path, [lock.read_text(), packages.TORCH_CPU.read_text()], lock)
+        torch, fast, slow = installed
+        assert "torch==2.13.0+cpu" in torch[1] and fast[0] == "uv"
+        assert slow[1] == (lock.read_text() if unreachable else packages.without_cuda(lock.read_text()))
 
 
 def test_newer_blenders_than_those_tested_are_named():
