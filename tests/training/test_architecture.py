@@ -43,7 +43,7 @@ FLOORS = {
         ("settings",),
         ("documents",),
         ("files",),
-        ("errors", "plugins", "__init__"),
+        ("errors", "packages", "plugins", "__init__"),
     ),
 }
 """The rooms of both packages, from the top: each may import those on the floors below it, and itself."""
