@@ -46,6 +46,7 @@ _generation = 0
 
 def take_all() -> Steps:
     """Take all pictures. A failed assertion ends the script with its message."""
+    bpy.ops.wm.save_as_mainfile(filepath=PLAN["file"])
     area = viewport()[0]
     area.type = "PREFERENCES"
     yield from preferences()
@@ -154,7 +155,6 @@ def capture() -> Steps:
 
 
 def import_scene() -> Steps:
-    bpy.ops.wm.save_as_mainfile(filepath=PLAN["file"])
     yield from show_panels("scene", "LODGS_PT_training")
     press("lodgs.import_colmap", directory=PLAN["scene"])
     overview()
