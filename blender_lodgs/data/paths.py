@@ -1,8 +1,8 @@
 """Paths of splat scenes follow the .blend file when it is saved elsewhere or its project is moved.
 
 Blender remaps its own relative paths ("//"), but not those of extensions. Saving also makes the paths of the
-project relative: those below the folder of the .blend, and those of scenes whose photos have relative paths, as
-after Blender's Make Paths Relative.
+project relative: those below the folder of the .blend, and those of scenes whose photos have relative paths,
+as after Blender's Make Paths Relative.
 """
 
 from __future__ import annotations
