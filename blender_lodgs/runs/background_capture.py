@@ -96,7 +96,7 @@ def capture_folder(scene: bpy.types.Scene) -> Path:
     return Path(bpy.path.abspath(folder or "//lodgs_capture")).resolve()
 
 
-def start(context: bpy.types.Context, warn: viewpoints.Warn) -> BackgroundCapture:
+def start(context: bpy.types.Context, warn: viewpoints.Warn = print) -> BackgroundCapture:
     """Start to capture the current Blender scene, or continue an earlier capture.
 
     Args:

@@ -386,6 +386,7 @@ def test_frames_of_unsupported_cameras_are_left_out(bpy, scene, capture, tmp_pat
     """Markers switch to an orthographic camera in the middle of the range."""
     moving = new_camera(bpy, (0, -9, 3), (75, 0, 0))
     flat = new_camera(bpy, (0, -9, 3), (75, 0, 0), type="ORTHO")
+    flat.name = "Flat"
     for frame, x in ((1, -1), (6, 1)):
         moving.location.x = x
         moving.keyframe_insert("location", frame=frame)
@@ -393,8 +394,8 @@ def test_frames_of_unsupported_cameras_are_left_out(bpy, scene, capture, tmp_pat
     for frame, camera in ((1, moving), (3, flat), (5, moving)):
         scene.timeline_markers.new(camera.name, frame=frame).camera = camera
     assert capture("--animation", "--views", "6", "--range", "1-9") == 0
-    (line,) = [line for line in capfd.readouterr().err.splitlines() if line.startswith("warning: ")]
-    assert "Frames 3, 4 are left out" in line and f"'{flat.name}' is ortho" in line
+    (line,) = [line for line in capfd.readouterr().err.splitlines() if "left out" in line]
+    assert line.startswith("warning: ") and "Frames 3, 4 are left out" in line and "'Flat' is ortho" in line
     assert len(list((tmp_path / "out" / "images").iterdir())) == 4
 
 
