@@ -261,16 +261,19 @@ def _capture(args: argparse.Namespace) -> int:
     def report(number: int, count: int) -> None:
         _print(f"View {number} of {count}")
 
+    def warn(message: str) -> None:
+        _print(f"warning: {message}")
+
     folder = args.out.resolve()
     engine = scene.render.engine
     if engine.startswith(("BLENDER_EEVEE", "BLENDER_WORKBENCH")):
         name = "Workbench" if "WORKBENCH" in engine else "EEVEE"
         _print(f"{name} needs a GPU, also in background mode. If Blender crashes now, use Cycles.")
     if warning := noise_warning(scene):
-        _print(f"warning: {warning}")
+        warn(warning)
     try:
         with _interrupts():
-            count = render_views(bpy.context, folder, width, height, args.range, report)
+            count = render_views(bpy.context, folder, width, height, args.range, report, warn)
             if args.range:
                 _print(f"{folder}: views {args.range[0]} to {min(args.range[1], count)} of {count}")
             else:

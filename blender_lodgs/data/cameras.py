@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
 import bpy
 import numpy as np
+from mathutils import Matrix
 
 from ...training.errors import LodgsError
+from ...training.runs.job import MIN_VIEWS
 from ...training.scenes.cameras import Camera
 from .placement import matrix_of
+
+ORTHOGONAL = 1e-5
+"""Maximum stretch of a camera's axes without scale that counts as rounding: 0.01 pixels of 1,000."""
+
+
+class UnsupportedCameraError(LodgsError):
+    """A camera that LODGS cannot use."""
 
 
 def scene_camera(scene: bpy.types.Scene) -> bpy.types.Object:
@@ -23,13 +36,90 @@ def scene_camera(scene: bpy.types.Scene) -> bpy.types.Object:
     return scene.camera
 
 
+@dataclass(frozen=True)
+class RenderView:
+    """A camera object in one image of a render. Stereo renders have one for each eye.
+
+    Attributes:
+        obj: Evaluated camera object.
+        matrix: Matrix from the camera to Blender's world. Its scale is ignored, as in Blender.
+        shift_x: Horizontal shift of the lens.
+    """
+
+    obj: bpy.types.Object
+    matrix: Matrix
+    shift_x: float
+
+    @classmethod
+    def of(cls, obj: bpy.types.Object) -> RenderView:
+        """Return the view of an evaluated camera object."""
+        return cls(obj, obj.matrix_world.copy(), obj.data.shift_x)
+
+    @property
+    def world_to_camera(self) -> Matrix:
+        """The inverse of the matrix with normalised columns, as Cycles and viewports use it.
+
+        Raises:
+            UnsupportedCameraError: The camera has no size.
+        """
+        _require_size(self.obj, np.array(self.matrix, np.float64))
+        return self.matrix.normalized().inverted()
+
+    def projection(self, depsgraph: bpy.types.Depsgraph, width: int, height: int) -> Matrix:
+        """Return the matrix from the camera to clip space for an image of this size."""
+        render, camera = depsgraph.scene.render, self.obj.data
+        projection = self.obj.calc_matrix_camera(
+            depsgraph, x=width, y=height, scale_x=render.pixel_aspect_x, scale_y=render.pixel_aspect_y
+        )
+        if camera.type == "PERSP" and self.shift_x != camera.shift_x:
+            sensor = camera.sensor_height if camera.sensor_fit == "VERTICAL" else camera.sensor_width
+            projection[0][2] += (self.shift_x - camera.shift_x) * projection[0][0] * sensor / camera.lens
+        return projection
+
+    def pinhole(
+        self, depsgraph: bpy.types.Depsgraph, width: int, height: int
+    ) -> tuple[Camera, np.ndarray | None]:
+        """Convert the view to a camera in Blender's world for an image of this size.
+
+        Returns:
+            The camera, and the (4, 4) float64 transform of the world that makes it see what this view sees:
+            a shear or a mirroring, if the scale of parents or of the camera has this effect. None otherwise.
+
+        Raises:
+            UnsupportedCameraError: The object is not a perspective camera, or has no size.
+        """
+        _require_perspective(self.obj)
+        p = self.projection(depsgraph, width, height)
+        world_to_camera, deformation = _split_pose(self.obj, np.array(self.matrix, np.float64))
+        return Camera(
+            name=self.obj.name,
+            width=width,
+            height=height,
+            fx=p[0][0] * width / 2,
+            fy=p[1][1] * height / 2,
+            cx=(1 - p[0][2]) * width / 2,
+            cy=(1 + p[1][2]) * height / 2,
+            world_to_camera=world_to_camera,
+        ), deformation
+
+
+def _require_perspective(obj: bpy.types.Object) -> None:
+    """Raise UnsupportedCameraError if an object is not a perspective camera."""
+    if obj.type != "CAMERA" or obj.data.type != "PERSP":
+        kind = "not a camera" if obj.type != "CAMERA" else obj.data.type.lower()
+        raise UnsupportedCameraError(
+            f"Cannot render with LODGS: '{obj.name}' is {kind}, but a perspective camera is needed.",
+            "Set its lens type to Perspective.",
+        )
+
+
 def view_of(
     obj: bpy.types.Object,
     depsgraph: bpy.types.Depsgraph,
     width: int,
     height: int,
 ) -> tuple[Camera, float]:
-    """Convert a camera object to a camera in Blender's world.
+    """Convert an evaluated camera object to a camera in Blender's world.
 
     The object's scale is ignored, as in Blender.
 
@@ -37,44 +127,56 @@ def view_of(
         The camera for an image of this size, and its clip start.
 
     Raises:
-        LodgsError: The object is not a perspective camera.
+        UnsupportedCameraError: The object is no perspective camera, has no size, or is sheared or mirrored.
     """
-    camera = obj.data
-    if obj.type != "CAMERA" or camera.type != "PERSP":
-        kind = "not a camera" if obj.type != "CAMERA" else camera.type.lower()
-        raise LodgsError(
-            f"Cannot render with LODGS: '{obj.name}' is {kind}, but a perspective camera is needed.",
-            "Set its lens type to Perspective.",
+    camera, deformation = RenderView.of(obj).pinhole(depsgraph, width, height)
+    if deformation is not None:
+        effect = "mirrors" if np.linalg.det(deformation[:3, :3]) < 0 else "shears"
+        raise UnsupportedCameraError(
+            f"Cannot use camera '{obj.name}': its scale or that of a parent {effect} its image.",
+            "Apply the scale of the camera and its parents (Object > Apply > Scale).",
         )
-    render = depsgraph.scene.render
-    p = obj.calc_matrix_camera(
-        depsgraph, x=width, y=height, scale_x=render.pixel_aspect_x, scale_y=render.pixel_aspect_y
-    )
-    return Camera(
-        name=obj.name,
-        width=width,
-        height=height,
-        fx=p[0][0] * width / 2,
-        fy=p[1][1] * height / 2,
-        cx=(1 - p[0][2]) * width / 2,
-        cy=(1 + p[1][2]) * height / 2,
-        world_to_camera=_world_to_camera(obj),
-    ), camera.clip_start
+    return camera, obj.data.clip_start
 
 
-def _world_to_camera(obj: bpy.types.Object) -> np.ndarray:
-    """Return the (4, 4) float64 inverse of an object's pose without scale, in OpenCV axes.
+def _require_size(obj: bpy.types.Object, matrix: np.ndarray) -> None:
+    """Raise UnsupportedCameraError if the axes of a camera's matrix (4, 4) span no space."""
+    lengths = np.linalg.norm(matrix[:3, :3], axis=0)
+    if not np.isfinite(matrix).all() or lengths.min() == 0 or np.linalg.cond(matrix[:3, :3] / lengths) > 1e5:
+        raise UnsupportedCameraError(
+            f"Cannot render with LODGS: the scale of camera '{obj.name}' or of a parent is 0.",
+            "Give them a scale above 0 along all axes.",
+        )
+
+
+def _split_pose(obj: bpy.types.Object, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """Split the matrix (4, 4) of a camera, without scale, into a rigid pose and a deformation.
 
     Blender's cameras look along -z with y up.
+
+    Returns:
+        (4, 4) float64 ``world_to_camera``, OpenCV axes, and the transform of :meth:`RenderView.pinhole`.
     """
-    pose = np.array(obj.matrix_world, np.float64)
-    axes = pose[:3, :3] / np.linalg.norm(pose[:3, :3], axis=0)
+    _require_size(obj, matrix)
+    axes = matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=0)
+    axes *= 1.0, -1.0, -1.0
     # Blender's float32 axes are orthogonal to about 1e-7 only; make them so in float64.
-    u, _, vh = np.linalg.svd(axes * (1.0, -1.0, -1.0))
+    u, scales, vh = np.linalg.svd(axes)
     rotation = (u @ vh).T
+    is_mirrored = np.linalg.det(rotation) < 0
+    if is_mirrored:
+        rotation[0] *= -1
+    pose = _to_origin(rotation, matrix[:3, 3])
+    if not is_mirrored and np.abs(scales - 1).max() < ORTHOGONAL:
+        return pose, None
+    return pose, np.linalg.inv(pose) @ _to_origin(np.linalg.inv(axes), matrix[:3, 3])
+
+
+def _to_origin(linear: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """Return the (4, 4) matrix that maps a position to the origin with a linear part (3, 3)."""
     matrix = np.eye(4)
-    matrix[:3, :3] = rotation
-    matrix[:3, 3] = -rotation @ pose[:3, 3]
+    matrix[:3, :3] = linear
+    matrix[:3, 3] = -linear @ position
     return matrix
 
 
@@ -100,3 +202,32 @@ def view_from(
     camera, near = view_of(obj.evaluated_get(depsgraph), depsgraph, width, height)
     local, unit = camera.in_object_space(matrix_of(root, depsgraph))
     return local, near / unit
+
+
+def supported_views(
+    shots: Iterable[bpy.types.Object | int],
+    see: Callable[[Any], tuple[Camera, float]],
+    warn: Callable[[str], object],
+) -> list[tuple[Any, tuple[Camera, float]]]:
+    """Return the shots whose camera LODGS can use with their views, and warn of the others.
+
+    Args:
+        shots: Camera objects, or frames of the scene's camera.
+        see: Function that returns the view and the clip start of a shot.
+        warn: Function called with one sentence for each camera that is left out.
+
+    Raises:
+        UnsupportedCameraError: Fewer than two views remain.
+    """
+    views, problems = [], {}
+    for shot in shots:
+        try:
+            views.append((shot, see(shot)))
+        except UnsupportedCameraError as error:
+            problems.setdefault(str(error), (error, []))[1].append(shot)
+    for error, skipped in problems.values():
+        if len(views) < MIN_VIEWS:
+            raise error
+        frames = ", ".join(str(shot) for shot in skipped if isinstance(shot, int))
+        warn(f"{error.what} {f'Frames {frames} are' if frames else 'It is'} left out. {error.remedy}")
+    return views

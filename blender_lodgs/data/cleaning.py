@@ -8,6 +8,7 @@ before. Crops also apply to new points.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import NamedTuple
 
 import bpy
@@ -21,7 +22,7 @@ from ...training.scenes.cameras import Camera
 from ...training.splats.levels import Bundle
 from ..attributes import BASE, HIDDEN, SCALE, SELECTION, read_attribute, view_attribute, write_attribute
 from . import changes, crops, photographs, selection
-from .cameras import view_from
+from .cameras import UnsupportedCameraError, view_from
 from .placement import axes_of
 from .scene_properties import SplatLevel
 
@@ -306,13 +307,14 @@ def cameras(context: bpy.types.Context, root: bpy.types.Object) -> list[Camera]:
     views = photographs.views(root)
     width, height = (context.scene.render.resolution_x, context.scene.render.resolution_y)
     depsgraph = context.evaluated_depsgraph_get()
-    result = [
-        # Blender does not evaluate hidden views; their own pose is always valid.
-        photographs.camera_of(view)
-        if view.data.lodgs.width
-        else view_from(root, depsgraph, width, height, view)[0]
-        for view in views or [obj for obj in context.scene.objects if obj.type == "CAMERA"]
-    ]
+    result = []
+    for view in views or [obj for obj in context.scene.objects if obj.type == "CAMERA"]:
+        if view.data.lodgs.width:
+            # Blender does not evaluate hidden views; their own pose is always valid.
+            result.append(photographs.camera_of(view))
+            continue
+        with suppress(UnsupportedCameraError):  # such as orthographic cameras
+            result.append(view_from(root, depsgraph, width, height, view)[0])
     if not result:
         raise LodgsError(
             f"Cannot find splats by camera: '{root.name}' has no cameras.",

@@ -1,6 +1,8 @@
-"""Relative paths of splat scenes stay valid when the file is saved in another folder.
+"""Paths of splat scenes follow the .blend file when it is saved elsewhere or its project is moved.
 
-Blender remaps its own relative paths ("//"), but not those of extensions.
+Blender remaps its own relative paths ("//"), but not those of extensions. Saving also makes the paths of the
+project relative: those below the folder of the .blend, and those of scenes whose photos have relative paths,
+as after Blender's Make Paths Relative.
 """
 
 from __future__ import annotations
@@ -13,12 +15,12 @@ import bpy
 
 _previous: list[tuple[bpy.types.bpy_struct, str, str]] = []
 """Owners, property names and values of paths before the file is saved in another folder."""
-_open_file = ""
-"""File that was open then."""
+_target = ""
+"""File that is being saved."""
 
 
-def relative_paths() -> Iterator[tuple[bpy.types.bpy_struct, str, str]]:
-    """Return the relative paths of this file's scenes as tuples of owner, property name and value."""
+def scene_paths() -> Iterator[tuple[bpy.types.bpy_struct, str, str]]:
+    """Return the paths of this file's scenes as tuples of owner, property name and value."""
     owners: list[bpy.types.bpy_struct] = []
     for obj in bpy.data.objects:
         if obj.is_editable and obj.lodgs.is_root:
@@ -30,23 +32,47 @@ def relative_paths() -> Iterator[tuple[bpy.types.bpy_struct, str, str]]:
             owners += [scene.lodgs_render, scene.lodgs_capture]
     for owner in owners:
         for prop in owner.bl_rna.properties:
-            if prop.type == "STRING" and prop.subtype in ("FILE_PATH", "DIR_PATH"):
-                value = getattr(owner, prop.identifier)
-                if value.startswith("//"):
-                    yield owner, prop.identifier, value
+            is_path = prop.type == "STRING" and prop.subtype in ("FILE_PATH", "DIR_PATH")
+            if is_path and (value := getattr(owner, prop.identifier)):
+                yield owner, prop.identifier, value
+
+
+def _project_folders(folder: str) -> list[str]:
+    """Return the folders whose files move together with a .blend file in a folder."""
+    photos = {
+        os.path.dirname(bpy.path.abspath(image.filepath))
+        for image in bpy.data.images
+        if image.filepath.startswith("//") and image.library is None
+    }
+    scenes = {bpy.path.abspath(obj.lodgs.scene_folder) for obj in bpy.data.objects if obj.lodgs.scene_folder}
+    return [folder, *(scene for scene in scenes if any(_is_inside(photo, scene) for photo in photos))]
+
+
+def _is_inside(path: str, folder: str) -> bool:
+    """Return whether an absolute path is a folder or below it."""
+    path, folder = (os.path.normcase(os.path.abspath(item)) for item in (path, folder))
+    return path == folder or path.startswith(os.path.join(folder, ""))
 
 
 @bpy.app.handlers.persistent
 def _on_save(path: str = "", *_) -> None:
     """Make paths relative to the folder where the file will be saved."""
-    global _open_file
+    global _target
     _previous.clear()
-    _open_file = bpy.data.filepath
-    old_folder, new_folder = (os.path.dirname(os.path.abspath(file)) for file in (_open_file, path))
-    if not (_open_file and path) or old_folder == new_folder:
+    _target = path
+    if not path:
         return
-    for owner, name, value in list(relative_paths()):
+    old_folder, new_folder = (os.path.dirname(os.path.abspath(file)) for file in (bpy.data.filepath, path))
+    projects = _project_folders(new_folder)
+    for owner, name, value in list(scene_paths()):
         remapped = bpy.path.abspath(value)
+        if not os.path.isabs(remapped):
+            continue
+        if value.startswith("//"):
+            if old_folder == new_folder:
+                continue
+        elif not any(_is_inside(remapped, folder) for folder in projects):
+            continue
         with suppress(ValueError):  # on another drive
             remapped = bpy.path.relpath(remapped, start=new_folder)
         setattr(owner, name, remapped)
@@ -55,8 +81,8 @@ def _on_save(path: str = "", *_) -> None:
 
 @bpy.app.handlers.persistent
 def _on_saved(*_) -> None:
-    """Restore the paths if the open file has not moved: after saving a copy or a failed save."""
-    if bpy.data.filepath == _open_file:
+    """Restore the paths after saving a copy or a failed save."""
+    if os.path.abspath(bpy.data.filepath) != os.path.abspath(_target):
         for owner, name, value in _previous:
             setattr(owner, name, value)
     _previous.clear()

@@ -107,12 +107,16 @@ class ViewSettings(bpy.types.PropertyGroup):
     fx: bpy.props.FloatProperty(name="Focal Length X", description="Horizontal focal length", subtype="PIXEL")
     fy: bpy.props.FloatProperty(name="Focal Length Y", description="Vertical focal length", subtype="PIXEL")
     photograph: bpy.props.StringProperty(
-        name="Photo", description="Image file of the photo", subtype="FILE_PATH"
+        name="Photo",
+        description="Image file of the photo",
+        subtype="FILE_PATH",
+        options={"PATH_SUPPORTS_BLEND_RELATIVE"},
     )
     mask: bpy.props.StringProperty(
         name="Mask",
         description="Image that is black where training ignores the photo. Empty for none",
         subtype="FILE_PATH",
+        options={"PATH_SUPPORTS_BLEND_RELATIVE"},
     )
     distorted: bpy.props.BoolProperty(
         name="Distorted", description="The photo has lens distortion, which the camera does not show"

@@ -195,7 +195,10 @@ class SplatScene(bpy.types.PropertyGroup):
         options={"HIDDEN"},
     )
     scene_folder: bpy.props.StringProperty(
-        name="Scene", description="Folder of the COLMAP scene on disk", subtype="DIR_PATH"
+        name="Scene",
+        description="Folder of the COLMAP scene on disk",
+        subtype="DIR_PATH",
+        options={"PATH_SUPPORTS_BLEND_RELATIVE"},
     )
     method: bpy.props.StringProperty(
         name="Method", description="Method that trained the levels. Empty for a plain splat file"

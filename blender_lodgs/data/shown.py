@@ -16,6 +16,11 @@ from .. import attributes
 from . import looks, roots, selection, streams
 from .placement import axes_of
 
+MIN_SCALE = 1e-9
+"""Scale of an instance below which nothing of it is visible."""
+MIN_THICKNESS = 1e-5
+"""Minimum ratio of the smallest to the largest scale of an instance; the renderer refuses flat ones."""
+
 
 @dataclass(frozen=True)
 class SplatInstance:
@@ -93,7 +98,9 @@ def splat_instances(
         shown_by = (instance.parent if instance.is_instance else obj).original
         if viewport is not None and not shown_by.visible_in_viewport_get(viewport):
             continue
-        matrix = np.array(instance.matrix_world, np.float64)
+        matrix = _drawable(np.array(instance.matrix_world, np.float64))
+        if matrix is None:
+            continue
         original = obj.original
         evaluated = original.evaluated_get(depsgraph)
         level, root = levels.get(original) or (0, roots.root_of(original))
@@ -105,6 +112,22 @@ def splat_instances(
         instances.append(SplatInstance(original, evaluated, matrix, level, antialias, looks=look))
     instances.sort(key=lambda instance: (instance.level, instance.object.name))
     return _with_sources(instances, depsgraph)
+
+
+def _drawable(matrix: np.ndarray) -> np.ndarray | None:
+    """Return the matrix (4, 4) of an instance, slightly thickened if it is flat.
+
+    None for an instance that is scaled to a point, as objects often are at the start of an animation.
+    """
+    if not np.isfinite(matrix).all():
+        return None
+    u, scales, vh = np.linalg.svd(matrix[:3, :3])
+    if scales[0] < MIN_SCALE:
+        return None
+    thinnest = MIN_THICKNESS * scales[0]
+    if scales[2] < thinnest:
+        matrix[:3, :3] = u * np.maximum(scales, thinnest) @ vh
+    return matrix
 
 
 def drop_streamed_levels(instances: list[SplatInstance]) -> list[SplatInstance]:

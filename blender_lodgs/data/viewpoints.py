@@ -25,7 +25,7 @@ from ...training.scenes.viewpoints import (
 from ...training.splats.gaussians import Splats
 from .. import attributes
 from . import changes
-from .cameras import scene_camera, view_from, view_of
+from .cameras import scene_camera, supported_views, view_from, view_of
 from .objects import root_of
 from .placement import matrix_of
 from .setting_properties import property_of
@@ -44,8 +44,15 @@ _SOLID = {"MESH", "CURVE", "SURFACE", "FONT", "META", "VOLUME", "POINTCLOUD", "C
 Shot = bpy.types.Object | int | tuple[Camera, float]
 """Camera of an image: a camera object, a frame of the active camera, or a placed view and its near depth."""
 
+Warn = Callable[[str], object]
+"""Function called with a sentence about the views."""
+
 _cache: dict[str, tuple[tuple, Any]] = {}
 """Last key and value of each kind, for redraws of viewports."""
+
+
+def _ignore(message: str) -> None:
+    """Ignore a warning, in previews."""
 
 
 def _is_curve(settings: bpy.types.PropertyGroup, obj: bpy.types.Object) -> bool:
@@ -136,11 +143,11 @@ def has_only_splats(root: bpy.types.Object) -> bool:
 
 def view_count(settings: bpy.types.PropertyGroup) -> int:
     """Return the number of views of the settings."""
-    return len(_cameras(bpy.context.scene)) if settings.views_from == "CAMERAS" else settings.views
+    return _count(_cameras(bpy.context.scene)) if settings.views_from == "CAMERAS" else settings.views
 
 
 def training_views(
-    context: bpy.types.Context, root: bpy.types.Object, splats: Splats
+    context: bpy.types.Context, root: bpy.types.Object, splats: Splats, warn: Warn = _ignore
 ) -> list[tuple[Camera, float]]:
     """Return the views of a root's settings in its splats' coordinates, each with its near depth.
 
@@ -148,6 +155,7 @@ def training_views(
 
     Args:
         splats: Finest level of the root.
+        warn: Function called with a sentence for each camera that is left out.
 
     Raises:
         LodgsError: There are fewer than two cameras, no curve or a curve of length 0; or the root is scaled
@@ -159,10 +167,16 @@ def training_views(
         case "CAMERAS":
             cameras = _require_two(_cameras(context.scene))
             depsgraph = context.evaluated_depsgraph_get()
-            return [view_from(root, depsgraph, width, height, camera) for camera in cameras]
+            views = supported_views(
+                cameras, lambda camera: view_from(root, depsgraph, width, height, camera), warn
+            )
+            return [view for _, view in views]
         case "ANIMATION":
             frames = _frames(context.scene, settings.views)
-            return _animated(context, frames, lambda depsgraph: view_from(root, depsgraph, width, height))
+            views = _animated(
+                context, frames, lambda depsgraph: view_from(root, depsgraph, width, height), warn
+            )
+            return [view for _, view in views]
         case "CURVE":
             world_to_own = np.linalg.inv(matrix_of(root))
             points = _curve_points(settings.curve) @ world_to_own[:3, :3].T + world_to_own[:3, 3]
@@ -174,25 +188,17 @@ def training_views(
     return []
 
 
-def capture_shots(context: bpy.types.Context, width: int, height: int) -> list[Shot]:
+def capture_shots(context: bpy.types.Context, width: int, height: int, warn: Warn = _ignore) -> list[Shot]:
     """Return the shots of a Blender scene according to its settings (``Scene.lodgs_capture``).
 
+    Args:
+        warn: Function called with a sentence for each camera that is left out.
+
     Raises:
-        LodgsError: There are fewer than two cameras, no curve or a curve of length 0; the camera does not
-            move or is not a perspective camera; or the scene is empty.
+        LodgsError: There are fewer than two cameras that LODGS can use, no curve or a curve of length 0; the
+            camera does not move; or the scene is empty.
     """
-    scene, settings = context.scene, context.scene.lodgs_capture
-    match settings.views_from:
-        case "CAMERAS":
-            cameras = _require_two([obj for obj in _cameras(scene) if root_of(obj) is None])
-            _shot_views(context, cameras, width, height)
-            return list(cameras)
-        case "ANIMATION":
-            frames = _frames(scene, settings.views)
-            _shot_views(context, [frames[0], frames[len(frames) // 2], frames[-1]], width, height)
-            return list(frames)
-    views, near = placed_capture_views(context, width, height)
-    return [(view, near) for view in views]
+    return [shot for shot, _ in _shots_with_views(context, width, height, warn)]
 
 
 def capture_views(context: bpy.types.Context, width: int, height: int) -> list[tuple[Camera, float]]:
@@ -201,20 +207,26 @@ def capture_views(context: bpy.types.Context, width: int, height: int) -> list[t
     Raises:
         LodgsError: As :func:`capture_shots`.
     """
-    return _shot_views(context, capture_shots(context, width, height), width, height)
+    return [view for _, view in _shots_with_views(context, width, height, _ignore)]
 
 
-def _shot_views(
-    context: bpy.types.Context, shots: Sequence[Shot], width: int, height: int
-) -> list[tuple[Camera, float]]:
+def _shots_with_views(
+    context: bpy.types.Context, width: int, height: int, warn: Warn
+) -> Sequence[tuple[Shot, tuple[Camera, float]]]:
     def see(depsgraph: bpy.types.Depsgraph, camera: bpy.types.Object) -> tuple[Camera, float]:
         return view_of(camera.evaluated_get(depsgraph), depsgraph, width, height)
 
-    scene, frames = context.scene, [shot for shot in shots if isinstance(shot, int)]
-    if frames:
-        return _animated(context, frames, lambda depsgraph: see(depsgraph, scene_camera(scene)))
-    depsgraph = context.evaluated_depsgraph_get()
-    return [shot if isinstance(shot, tuple) else see(depsgraph, shot) for shot in shots]
+    scene, settings = context.scene, context.scene.lodgs_capture
+    match settings.views_from:
+        case "CAMERAS":
+            cameras = _require_two([obj for obj in _cameras(scene) if root_of(obj) is None])
+            depsgraph = context.evaluated_depsgraph_get()
+            return supported_views(cameras, lambda camera: see(depsgraph, camera), warn)
+        case "ANIMATION":
+            frames = _frames(scene, settings.views)
+            return _animated(context, frames, lambda depsgraph: see(depsgraph, scene_camera(scene)), warn)
+    views, near = placed_capture_views(context, width, height)
+    return [((view, near), (view, near)) for view in views]
 
 
 def placed_capture_views(
@@ -246,7 +258,7 @@ def capture_view_count(scene: bpy.types.Scene) -> int:
     """Return the number of views of a Blender scene's capture settings."""
     match scene.lodgs_capture.views_from:
         case "CAMERAS":
-            return sum(root_of(obj) is None for obj in _cameras(scene))
+            return _count(obj for obj in _cameras(scene) if root_of(obj) is None)
         case "ANIMATION":
             return len(_frames(scene, scene.lodgs_capture.views))
     return scene.lodgs_capture.views
@@ -385,6 +397,11 @@ def _cameras(scene: bpy.types.Scene) -> list[bpy.types.Object]:
     return sorted((obj for obj in scene.objects if obj.type == "CAMERA"), key=lambda obj: obj.name)
 
 
+def _count(cameras: Iterable[bpy.types.Object]) -> int:
+    """Return the number of perspective cameras."""
+    return sum(camera.data.type == "PERSP" for camera in cameras)
+
+
 def _require_two(cameras: list[bpy.types.Object]) -> list[bpy.types.Object]:
     """Return the cameras.
 
@@ -409,21 +426,24 @@ def _animated(
     context: bpy.types.Context,
     frames: Sequence[int],
     see: Callable[[bpy.types.Depsgraph], tuple[Camera, float]],
-) -> list[tuple[Camera, float]]:
-    """Return the results of ``see`` at some frames of the scene.
+    warn: Warn,
+) -> list[tuple[int, tuple[Camera, float]]]:
+    """Return frames of the scene with the results of ``see``, as :func:`supported_views`.
 
     Raises:
-        LodgsError: The camera does not move.
+        LodgsError: The camera does not move, or cannot be used.
     """
     scene, frame, subframe = context.scene, context.scene.frame_current, context.scene.frame_subframe
-    views = []
+
+    def see_at(number: int) -> tuple[Camera, float]:
+        scene.frame_set(number)
+        return see(context.evaluated_depsgraph_get())
+
     try:
-        for number in frames:
-            scene.frame_set(number)
-            views.append(see(context.evaluated_depsgraph_get()))
+        views = supported_views(frames, see_at, warn)
     finally:
         scene.frame_set(frame, subframe=subframe)
-    if not np.ptp([view.world_to_camera for view, _ in views], axis=0).any():
+    if not np.ptp([view.world_to_camera for _, (view, _) in views], axis=0).any():
         raise LodgsError(
             f"Cannot place views: the camera '{scene_camera(scene).name}' does not move in the frame range.",
             "Animate the camera, or choose other views.",

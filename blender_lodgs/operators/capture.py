@@ -21,7 +21,7 @@ class LODGS_OT_capture_scene(bpy.types.Operator):
 
     @report_errors
     def execute(self, context):
-        work = background_capture.start(context)
+        work = background_capture.start(context, lambda message: self.report({"WARNING"}, message))
         processes.follow(work.step)
         if work.problem:
             self.report({"ERROR"}, work.problem)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import bpy
 
+from ...training.scenes.check import ERROR
 from ..data import native, photographs, roots
-from ..runs import photo_preparation
+from ..runs import photo_preparation, scene_check
 from .parts import Panel, say, split_column
 
 
@@ -30,6 +31,7 @@ class LODGS_PT_scene(Panel):
         row.operator("lodgs.remove_scene", text="", icon="TRASH")
         if root.lodgs.scene_folder:
             column.prop(root.lodgs, "scene_folder", text="Folder")
+            _draw_check(layout, root)
         if root.lodgs.levels:
             column.prop(root.lodgs, "antialias")
         row = layout.row(align=True)
@@ -57,6 +59,16 @@ def _draw_import(layout: bpy.types.UILayout, another: bool) -> None:
         column.operator("lodgs.find_cameras", text="Import Photos…", icon="IMAGE_DATA")
         column.operator("lodgs.import_colmap", text="Import COLMAP Scene…", icon="CAMERA_DATA")
         column.operator("lodgs.import_splats", text="Import Splats…", icon="POINTCLOUD_DATA")
+
+
+def _draw_check(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:
+    """Draw the button of the check before training, and the findings of the last check."""
+    layout.operator("lodgs.check_scene", icon="VIEWZOOM")
+    findings = scene_check.last_findings(root)
+    if findings == []:
+        layout.label(text="Nothing found that lowers the quality", icon="CHECKMARK")
+    for finding in findings or ():
+        say(layout, str(finding), "CANCEL" if finding.severity == ERROR else "ERROR")
 
 
 def _draw_camera_search(column: bpy.types.UILayout) -> None:

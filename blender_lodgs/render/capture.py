@@ -38,6 +38,7 @@ def render_views(
     height: int,
     only: tuple[int, int] | None = None,
     on_view: ViewCallback = lambda number, count: None,
+    warn: viewpoints.Warn = print,
 ) -> int:
     """Render the missing views of a capture (``Scene.lodgs_capture``).
 
@@ -51,6 +52,7 @@ def render_views(
         height: height of the images in pixels.
         only: numbers of the first and last view to render, from 1. The range may exceed the number of views.
         on_view: function called before each view.
+        warn: function called with a sentence for each camera that is left out.
 
     Returns:
         Number of views of the capture.
@@ -60,7 +62,7 @@ def render_views(
     """
     check_render_size(width, height)
     _check(context.scene)
-    shots = viewpoints.capture_shots(context, width, height)
+    shots = viewpoints.capture_shots(context, width, height, warn)
     names = [f"view_{number:04d}" for number in range(1, len(shots) + 1)]
     existing = {file.stem for file in (folder / CAMERAS).glob("*.json")}
     if existing - set(names):

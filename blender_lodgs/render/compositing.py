@@ -19,7 +19,7 @@ from . import engine
 _COPIED = (
     "resolution_x", "resolution_y", "resolution_percentage", "pixel_aspect_x", "pixel_aspect_y",
     "use_border", "use_crop_to_border", "border_min_x", "border_max_x", "border_min_y", "border_max_y",
-    "fps", "fps_base",
+    "fps", "fps_base", "use_multiview", "views_format",
 )  # fmt: skip
 
 
@@ -135,9 +135,14 @@ def render_mesh_depth(scene: bpy.types.Scene, frames: Iterable[int]) -> Iterator
         The written file of each frame (:func:`depth_file_pattern`).
 
     Raises:
-        LodgsError: the scene has no camera, or a file cannot be written.
+        LodgsError: the scene has no camera or several views, or a file cannot be written.
     """
     scene_camera(scene)
+    if scene.render.use_multiview:
+        raise LodgsError(
+            "Cannot render mesh depth for a stereo or multi-view render.",
+            "Use Combine with Meshes, or disable Stereoscopy.",
+        )
     pattern = depth_file_pattern(scene)
     meshes = bpy.data.scenes.new(f"{scene.name} Depth")
     try:
@@ -195,6 +200,7 @@ def _copy_settings(scene: bpy.types.Scene, meshes: bpy.types.Scene) -> None:
     """Copy objects, camera and render settings of a scene to its mesh scene, without the splats."""
     for name in _COPIED:
         setattr(meshes.render, name, getattr(scene.render, name))
+    _copy_views(scene.render, meshes.render)
     meshes.camera, meshes.world = scene.camera, scene.world
     meshes.frame_start, meshes.frame_end = scene.frame_start, scene.frame_end
     meshes.view_settings.view_transform = scene.view_settings.view_transform
@@ -210,6 +216,15 @@ def _copy_settings(scene: bpy.types.Scene, meshes: bpy.types.Scene) -> None:
         if marker.camera is not None:
             meshes.timeline_markers.new(marker.name, frame=marker.frame).camera = marker.camera
     _exclude_splats(scene, meshes)
+
+
+def _copy_views(source: bpy.types.RenderSettings, target: bpy.types.RenderSettings) -> None:
+    """Copy the views of stereo and multi-view renders."""
+    for view in source.views:
+        copy = target.views.get(view.name) or target.views.new(view.name)
+        copy.use, copy.camera_suffix = view.use, view.camera_suffix
+    for view in [view for view in target.views if view.name not in source.views]:
+        target.views.remove(view)
 
 
 def _exclude_splats(scene: bpy.types.Scene, meshes: bpy.types.Scene) -> None:

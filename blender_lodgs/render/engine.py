@@ -7,8 +7,10 @@ the compositor combines both images by depth.
 from __future__ import annotations
 
 import re
+import traceback
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -17,12 +19,12 @@ import numpy as np
 
 from ...training.editing.paint import COLUMNS as PAINT
 from ...training.editing.paint import apply_paint
-from ...training.errors import LodgsError
+from ...training.errors import LodgsError, is_out_of_memory
 from ...training.lod.rule import all_rule_columns
 from ...training.splats.gaussians import Splats
 from .. import attributes
 from ..data import changes, objects, roots, selection, shown
-from ..data.cameras import scene_camera, view_of
+from ..data.cameras import RenderView, scene_camera
 from . import renderer
 
 ID = "LODGS"
@@ -47,30 +49,71 @@ class LodgsEngine(bpy.types.RenderEngine):
                 self.register_pass(scene, renderlayer, LEVEL_MASK.format(number), 1, "X", "VALUE")
 
     def render(self, depsgraph):
+        try:
+            self._render_views(depsgraph)
+        except Exception as error:
+            message = str(error)
+            if not isinstance(error, LodgsError):
+                traceback.print_exc()
+                message = _unexpected(depsgraph.scene.frame_current, error)
+            self.error_set(message)
+            self.report({"ERROR"}, message)  # otherwise Blender would write a black image
+
+    def _render_views(self, depsgraph: bpy.types.Depsgraph) -> None:
+        """Render the image of each eye or camera in a stereo or multi-view render, else one image."""
         size = self.resolution_x, self.resolution_y
         window = render_border(depsgraph.scene.render, *size)
-        try:
-            frame = _render_function(depsgraph, *size, window, self._on_progress)
-        except LodgsError as error:
-            self.error_set(str(error))
-            self.report({"ERROR"}, str(error))  # otherwise Blender would write a black image
-            return
-        if frame is None or self.test_break():
-            return
-        planes = frame.planes
-        _, _, width, height = window
-        result = self.begin_result(0, 0, width, height, layer=depsgraph.view_layer.name)
-        for target in result.layers[0].passes:
-            names = [f"{target.name}.{channel}" for channel in target.channel_id]
-            if all(name in planes for name in names):
-                pixels = np.stack([planes[name][::-1] for name in names], axis=2)  # rows from the bottom
-                target.rect.foreach_set(np.ascontiguousarray(pixels).reshape(-1))
-        self.end_result(result)
+        names = self._view_names(depsgraph)
+        for index, name in enumerate(names):
+            view = self._view(depsgraph, name)
 
-    def _on_progress(self, fraction: float, text: str) -> bool:
-        self.update_progress(fraction)
-        self.update_stats("", text)
-        return not self.test_break()
+            def on_progress(fraction: float, text: str, done: int = index) -> bool:
+                self.update_progress((done + fraction) / len(names))
+                self.update_stats("", text)
+                return not self.test_break()
+
+            frame = _render_function(depsgraph, *size, window, on_progress, view)
+            if frame is None or self.test_break():
+                return
+            _, _, width, height = window
+            result = self.begin_result(0, 0, width, height, layer=depsgraph.view_layer.name, view=name)
+            _write_passes(result.layers[0].passes, frame.planes)
+            self.end_result(result)
+
+    def _view_names(self, depsgraph: bpy.types.Depsgraph) -> list[str]:
+        """Return the names of the views of a stereo or multi-view render, or [""]."""
+        if not depsgraph.scene.render.use_multiview:
+            return [""]
+        result = self.begin_result(0, 0, 1, 1, layer=depsgraph.view_layer.name)
+        names = [view.name for view in result.views]
+        self.end_result(result, cancel=True)
+        return names or [""]
+
+    def _view(self, depsgraph: bpy.types.Depsgraph, name: str) -> RenderView:
+        """Return the camera of an eye or of a view of a multi-view render."""
+        camera = scene_camera(depsgraph.scene).evaluated_get(depsgraph)
+        if not name:
+            return RenderView.of(camera)
+        self.active_view_set(name)
+        camera = self.camera_override or camera
+        return RenderView(camera, self.camera_model_matrix(camera), self.camera_shift_x(camera))
+
+
+def _write_passes(passes: Iterable[bpy.types.RenderPass], planes: dict[str, np.ndarray]) -> None:
+    """Copy the planes of a frame into the passes of a render layer that have planes."""
+    for target in passes:
+        names = [f"{target.name}.{channel}" for channel in target.channel_id]
+        if all(name in planes for name in names):
+            pixels = np.stack([planes[name][::-1] for name in names], axis=2)  # rows from the bottom
+            target.rect.foreach_set(np.ascontiguousarray(pixels).reshape(-1))
+
+
+def _unexpected(frame: int, error: Exception) -> str:
+    """Return the message about an error in LODGS itself."""
+    if is_out_of_memory(error):
+        return f"Cannot render frame {frame}: not enough memory. Close other files and programs."
+    reason = f"unexpected {type(error).__name__} ({error})"
+    return f"Cannot render frame {frame}: {reason}. Report it with the text in Blender's system console."
 
 
 def render_frame(
@@ -79,8 +122,9 @@ def render_frame(
     height: int,
     window: tuple[int, int, int, int],
     on_progress: renderer.OnProgress = lambda fraction, text: True,
+    view: RenderView | None = None,
 ) -> renderer.RenderedFrame | None:
-    """Render the splats of a depsgraph from its scene's camera.
+    """Render the splats of a depsgraph from a camera, as Cycles does.
 
     Args:
         depsgraph: evaluated depsgraph.
@@ -88,6 +132,7 @@ def render_frame(
         height: height of the full image in pixels.
         window: left, bottom, width and height of the rendered part in pixels.
         on_progress: see ``renderer.OnProgress``.
+        view: camera, or None for the scene's camera.
 
     Returns:
         The frame with the passes of the view layer, or None if it was cancelled.
@@ -98,13 +143,17 @@ def render_frame(
     """
     scene = depsgraph.scene
     layer = depsgraph.view_layer
-    camera, near = view_of(scene_camera(scene).evaluated_get(depsgraph), depsgraph, width, height)
+    view = view or RenderView.of(scene_camera(scene).evaluated_get(depsgraph))
+    camera, deformation = view.pinhole(depsgraph, width, height)
+    splats = placed_splats(depsgraph)
+    if deformation is not None:
+        splats = [replace(item, matrix=deformation @ item.matrix) for item in splats]
     left, bottom, window_width, window_height = window
     settings = scene.lodgs_render
     return renderer.draw_frame(
-        placed_splats(depsgraph),
+        splats,
         camera,
-        near,
+        view.obj.data.clip_start,
         on_progress,
         background=None if scene.render.film_transparent else tuple(settings.background),
         depth=layer.use_pass_z,
@@ -138,6 +187,11 @@ def holdout_file(scene: bpy.types.Scene, frame: int) -> Path | None:
     """
     if not scene.lodgs_render.holdout:
         return None
+    if scene.render.use_multiview:
+        raise LodgsError(
+            "Cannot hold out meshes in a stereo or multi-view render.",
+            "Clear Hold Out, and use Combine with Meshes.",
+        )
     path = frame_path(scene.lodgs_render.holdout, scene.original, frame)
     if not path.is_file():
         raise LodgsError(
@@ -150,6 +204,8 @@ def holdout_file(scene: bpy.types.Scene, frame: int) -> Path | None:
 def frame_path(pattern: str, scene: bpy.types.Scene, frame: int) -> Path:
     """Replace the last # characters of a file name by the frame number, as Blender does."""
     path = Path(bpy.path.abspath(pattern, library=scene.library))
+    if not path.name:
+        raise LodgsError(f"Cannot use the depth files {pattern}: it is a folder.", "Choose a file.")
 
     def number(match: re.Match) -> str:
         return "-" * (frame < 0) + str(abs(frame)).zfill(len(match[0]))

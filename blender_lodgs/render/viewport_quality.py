@@ -16,7 +16,7 @@ import numpy as np
 from ...training.errors import LodgsError
 from ...training.render.image import RenderedImage
 from ..data import shown
-from ..data.cameras import scene_camera
+from ..data.cameras import RenderView, scene_camera
 from ..viewport import views
 from . import engine, renderer
 
@@ -109,16 +109,15 @@ def _render_frame(
     height: int,
     window: tuple[int, int, int, int],
     on_progress: renderer.OnProgress,
+    eye: RenderView | None = None,
 ) -> renderer.RenderedFrame:
     """Render like ``engine.render_frame``, but only colour and alpha."""
     scene = depsgraph.scene
     settings = scene.render
-    camera = scene_camera(scene).evaluated_get(depsgraph)
-    projection = camera.calc_matrix_camera(
-        depsgraph, x=width, y=height, scale_x=settings.pixel_aspect_x, scale_y=settings.pixel_aspect_y
-    )
+    eye = eye or RenderView.of(scene_camera(scene).evaluated_get(depsgraph))
+    projection = eye.projection(depsgraph, width, height)
     if projection[3][3] == 0:  # perspective: no far clipping, as in F12
-        projection[2][2], projection[2][3] = -1.0, -2.0 * camera.data.clip_start
+        projection[2][2], projection[2][3] = -1.0, -2.0 * eye.obj.data.clip_start
     background = None if settings.film_transparent else tuple(scene.lodgs_render.background)
     result = RenderedImage.empty(width, height, background)
     view = views.ViewState()
@@ -126,8 +125,8 @@ def _render_frame(
     with screen.bind():  # type: ignore[attr-defined]
         gpu.state.active_framebuffer_get().clear(color=(0, 0, 0, 0), depth=1.0)
         views.draw_splats(
-            view, shown.splat_instances(depsgraph), depsgraph, camera.matrix_world.normalized().inverted(),
-            projection, ALL_SPLATS, under_overlays=False, wait=True,
+            view, shown.splat_instances(depsgraph), depsgraph, eye.world_to_camera, projection,
+            ALL_SPLATS, under_overlays=False, wait=True,
         )  # fmt: skip
     if view.canvas.frame is not None:
         with view.canvas.frame.bind():  # type: ignore[union-attr]

@@ -96,8 +96,11 @@ def capture_folder(scene: bpy.types.Scene) -> Path:
     return Path(bpy.path.abspath(folder or "//lodgs_capture")).resolve()
 
 
-def start(context: bpy.types.Context) -> BackgroundCapture:
+def start(context: bpy.types.Context, warn: viewpoints.Warn = print) -> BackgroundCapture:
     """Start to capture the current Blender scene, or continue an earlier capture.
+
+    Args:
+        warn: function called with a sentence for each camera that is left out.
 
     Raises:
         LodgsError: a capture is running, the trainer is missing, the views are invalid, or the folder is not
@@ -107,9 +110,8 @@ def start(context: bpy.types.Context) -> BackgroundCapture:
     if current is not None and current.running:
         raise LodgsError("A capture is already running.", "Wait for it or cancel it.")
     folder = capture_folder(context.scene)
-    count = len(
-        viewpoints.capture_shots(context, *viewpoints.image_size(context.scene, context.scene.lodgs_capture))
-    )
+    size = viewpoints.image_size(context.scene, context.scene.lodgs_capture)
+    count = len(viewpoints.capture_shots(context, *size, warn))
     environment.require(environment.trainer_python())
     copy, log = folder / "capture.blend", folder / "capture.log"
     try:

@@ -238,16 +238,18 @@ def follow(watch: Watch, show: Callable[[Watch], None] | None = None) -> None:
         processes.follow(step)
 
 
-def _export_inputs(root: bpy.types.Object, run: RunFolder, job: Job) -> None:
-    """Write the current splats of a root to a run, and the views to render them from."""
+def _export_inputs(root: bpy.types.Object, run: RunFolder, job: Job) -> list[str]:
+    """Write the current splats of a root to a run, and the views to render them from. Return warnings."""
     bundle = scenes.read_levels(root)
-    views = []
+    views, warnings = [], []
     if job.capture:
-        views = viewpoints.training_views(bpy.context, root, complete_splats(bundle, bundle.levels[-1]))
+        splats = complete_splats(bundle, bundle.levels[-1])
+        views = viewpoints.training_views(bpy.context, root, splats, warnings.append)
     run.create()
     write_bundle(run.base, bundle)
     for number, (camera, near) in enumerate(views):
         write_camera(run.cameras / f"{number:04d}.json", camera, near)
+    return warnings
 
 
 def _launch(
@@ -257,8 +259,7 @@ def _launch(
     python = environment.trainer_python()
     at_once = root.lodgs.training.at_once if job.cells else 1
     environment.require(python, at_once)
-    if export:
-        _export_inputs(root, run, job)
+    warnings = _export_inputs(root, run, job) if export else []
     run.create()
     if write_job:
         job.resolved().write(run.job)
@@ -276,7 +277,10 @@ def _launch(
             "Check the trainer's Python in the preferences of LODGS.",
         ) from error
     link_run(root, run)
-    return start_watching(Watch(run, root.session_uid, process=process, offset=root.lodgs.training.read))
+    offset = root.lodgs.training.read
+    return start_watching(
+        Watch(run, root.session_uid, process=process, view_warnings=warnings, offset=offset)
+    )
 
 
 def reattach() -> None:

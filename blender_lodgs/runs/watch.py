@@ -63,6 +63,7 @@ class Watch:
         levels: newest ``level`` event of each level.
         summary: ``done`` event of a finished run, with its quality.
         warnings: warnings of the run.
+        view_warnings: those of them about the views that Blender exported.
         cancel_requested: whether the run was asked to stop.
         stopping: (kind, cell number) of parts that were asked to stop.
         method: name of the trained method.
@@ -83,6 +84,7 @@ class Watch:
     levels: dict[int, dict] = field(default_factory=dict)
     summary: dict = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
+    view_warnings: list[str] = field(default_factory=list)
     cancel_requested: bool = False
     stopping: set[tuple[str, int]] = field(default_factory=set)
     method: str = ""
@@ -175,7 +177,7 @@ class Watch:
             case "hello":
                 self.problem, self.message = "", "Reading the scene"
                 self.method = event.get("method", "")
-                self.warnings.clear()
+                self.warnings = list(self.view_warnings)
             case "status":
                 self.message = event["message"]
                 self.fraction = _fraction(event)

@@ -39,7 +39,7 @@ def test_every_command_has_its_options():
         assert f"\n## {command}\n" in page
     train = page.split("\n## train\n")[1].split("\n## ")[0]
     rows = [line for line in train.splitlines() if line.startswith("| `")]
-    assert [row.split("`")[1].split()[0] for row in rows] == ["JOB", *_train_options()]
+    assert [row.split("`")[1].split()[0] for row in rows] == ["JOB", *_train_options(), "--check"]
     assert all(row.count(" | ") == 2 for row in rows)
 
 

@@ -6,6 +6,7 @@ import argparse
 import signal
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import LodgsError
@@ -20,11 +21,37 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.description = "Prints events as JSON, one per line."
     add_options(parser)
+    parser.add_argument(
+        "--check", action="store_true",
+        help="check the scene instead, and print findings that lower the quality, with their remedies; "
+        "exit code 2 if training is impossible",
+    )  # fmt: skip
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
+    if options.check:
+        return check_job(options)
     return train_job(lambda: job_from_options(options))
+
+
+def check_job(options: argparse.Namespace) -> int:
+    """Print the findings about the scene of a job and return the exit code."""
+    from ..scenes.check import ERROR, check_folder
+
+    if not (options.job and options.job.is_file()):
+        vars(options).setdefault("out", "run")  # nothing is written
+    job = job_from_options(options)
+    if job.capture:
+        print("Nothing to check: training renders its own views.")
+        return 0
+    model, images = (Path(path) if path else None for path in (job.model, job.images))
+    findings = check_folder(Path(job.scene), model, images, image_scale=job.image_scale)
+    for finding in findings:
+        print(f"{finding.severity}: {finding}")
+    if not findings:
+        print("Nothing found that lowers the quality.")
+    return 2 if any(finding.severity == ERROR for finding in findings) else 0
 
 
 def train_job(make_job: Callable[[], Job], **placement: Any) -> int:

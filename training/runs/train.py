@@ -35,6 +35,7 @@ from ..optimize.training_data import TrainingData
 from ..rasterize import Gaussians, contributions, cpu_fallback_reason, resolve_backend, tensor_device, warm_up
 from ..rasterize.gpu.default_device import default_adapter as graphics_device
 from ..rasterize.resident import ResidentBundle
+from ..scenes.check import check_scene
 from ..scenes.orientation import up_rotation
 from ..scenes.regions import Region
 from ..scenes.view_tables import make_view_tables
@@ -139,6 +140,9 @@ def _train(
             job = replace(job, base="" if merged_is_result else str(merged))
         events("status", message="Reading the scene")
         data = training_data(job, folder, events)
+        if not job.cell:
+            for finding in check_scene(data.full_scene, job.image_scale):
+                events("warning", message=str(finding))
         events("status", message="Preparing to train (up to a minute on first use)")
         torch.set_num_threads(1)  # torch's threads would compete with the kernels' threads
         keep_freed_memory()

@@ -11,7 +11,7 @@ from ..documents import read_json
 from ..errors import LodgsError
 from .level_folder import write_folder
 from .levels import MAX_READ_LEVELS, Bundle
-from .splat_transform import find_splat_transform, splat_transform_steps
+from .splat_transform import FiniteRows, find_splat_transform, splat_transform_steps
 
 STREAMED_FILE = "lod-meta.json"
 """Main file of streamed levels, in a folder of their own."""
@@ -35,7 +35,8 @@ def write_streamed_levels(folder: Path, bundle: Bundle) -> Iterator[str]:
     ]
     if not levels:
         raise LodgsError("Cannot export levels: they contain no splats.", "Make some splats visible.")
-    bundle = replace(bundle, levels=levels)
+    finite = [replace(level, on_disk=FiniteRows(level.rows)) for level in levels]
+    bundle = replace(bundle, levels=finite)
     if folder.is_dir() and any(folder.iterdir()) and not (folder / STREAMED_FILE).exists():
         raise LodgsError(f"Cannot export to {folder}: it contains other files.", "Choose an empty folder.")
     find_splat_transform()  # reports a missing program before files are written

@@ -138,3 +138,19 @@ def test_panels_for_splats_are_hidden_until_a_scene_has_levels(bpy, lodgs):
     assert not any(panel.poll(bpy.context) for panel in panels)
     scenes.set_level(root, Level(1, splats(5)))
     assert all(panel.poll(bpy.context) for panel in panels)
+
+
+def test_check_lists_its_findings(bpy, lodgs, root, draw_panel, tmp_path, capfd):
+    assert "Nothing found that lowers the quality" not in draw_panel("scene", "LODGS_PT_scene").texts
+    assert bpy.ops.lodgs.check_scene() == {"FINISHED"}
+    assert "Nothing found that lowers the quality" in draw_panel("scene", "LODGS_PT_scene").texts
+    root.lodgs.training.image_scale = 0.25
+    root.lodgs.scene_folder = str(GARDEN)
+    assert bpy.ops.lodgs.check_scene() == {"FINISHED"}
+    assert "48 of 48 photos have fewer than 200" in " ".join(draw_panel("scene", "LODGS_PT_scene").texts)
+    root.lodgs.scene_folder = str(tmp_path)
+    assert bpy.ops.lodgs.check_scene() == {"FINISHED"}
+    assert "holds no COLMAP model" in " ".join(draw_panel("scene", "LODGS_PT_scene").texts)
+    root.lodgs.scene_folder = ""
+    with pytest.raises(RuntimeError, match="it has no photos"):
+        bpy.ops.lodgs.check_scene()

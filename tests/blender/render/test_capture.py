@@ -364,6 +364,41 @@ def test_mistakes_are_reported(bpy, scene, capture, tmp_path, capfd, change, arg
     assert not (tmp_path / "out").exists()
 
 
+def test_unsupported_cameras_are_left_out(bpy, scene, capture, tmp_path, capfd):
+    """One orthographic, mirrored or sheared camera among many does not stop a capture."""
+    for angle in (-20, 0, 20):
+        new_camera(bpy, (angle / 10, -9, 3), (75, 0, 0))
+    new_camera(bpy, (0, -9, 3), (75, 0, 0), type="ORTHO").name = "Flat"
+    new_camera(bpy, (0, -9, 3), (75, 0, 0)).name = "Mirror"
+    bpy.data.objects["Mirror"].scale = (-1, 1, 1)
+    sheared, rig = new_camera(bpy, (0, -9, 3), (75, 20, 0)), bpy.data.objects.new("Rig", None)
+    scene.collection.objects.link(rig)
+    sheared.name, sheared.parent, rig.scale, rig.rotation_euler = "Sheared", rig, (2, 1, 1), (0, 0, 0.4)
+    assert capture("--cameras", "--range", "1-9") == 0
+    errors = capfd.readouterr().err
+    for name, reason in (("Flat", "is ortho"), ("Mirror", "mirrors"), ("Sheared", "shears")):
+        (line,) = [line for line in errors.splitlines() if f"'{name}'" in line]
+        assert line.startswith("warning: ") and reason in line and "left out" in line
+    assert len(list((tmp_path / "out" / "images").iterdir())) == 3
+
+
+def test_frames_of_unsupported_cameras_are_left_out(bpy, scene, capture, tmp_path, capfd):
+    """Markers switch to an orthographic camera in the middle of the range."""
+    moving = new_camera(bpy, (0, -9, 3), (75, 0, 0))
+    flat = new_camera(bpy, (0, -9, 3), (75, 0, 0), type="ORTHO")
+    flat.name = "Flat"
+    for frame, x in ((1, -1), (6, 1)):
+        moving.location.x = x
+        moving.keyframe_insert("location", frame=frame)
+    scene.camera, scene.frame_start, scene.frame_end = moving, 1, 6
+    for frame, camera in ((1, moving), (3, flat), (5, moving)):
+        scene.timeline_markers.new(camera.name, frame=frame).camera = camera
+    assert capture("--animation", "--views", "6", "--range", "1-9") == 0
+    (line,) = [line for line in capfd.readouterr().err.splitlines() if "left out" in line]
+    assert line.startswith("warning: ") and "Frames 3, 4 are left out" in line and "'Flat' is ortho" in line
+    assert len(list((tmp_path / "out" / "images").iterdir())) == 4
+
+
 def test_folder_that_is_not_writable(bpy, scene, capture, tmp_path, capfd):
     (tmp_path / "out").write_text("a file")
     assert capture("--around", "--views", "2", "--range", "1-2") == 2

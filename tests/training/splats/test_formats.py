@@ -283,3 +283,23 @@ def test_recipe_adds_a_format_to_the_command_line(tmp_path):
     np.testing.assert_allclose(np.loadtxt(tmp_path / "out.xyz"), splats.means, rtol=1e-6)
     assert ".xyz" in run("--help").stdout
     assert ".xyz" in run("in.ply", "--plain", "out.abc").stderr
+
+
+@pytest.mark.parametrize("write", ["one file", "streamed levels"])
+def test_program_receives_finite_values(tmp_path, stand_in, write):
+    """splat-transform 2 writes ruined files from infinite scales."""
+    stand_in(
+        'for last; do case "$last" in *.ply) cp "$last" "$0.ply";; esac; done\n'
+        'mkdir -p "$(dirname "$last")"; touch "$last"'
+    )
+    splats = random_splats(50)
+    splats.log_scales[::5, 1], splats.opacity_logits[::7] = -np.inf, np.inf
+    if write == "one file":
+        finish(write_splats(tmp_path / "x.sog", splats, {}))
+    else:
+        finish(write_streamed_levels(tmp_path / "out", Bundle("", [Level(1, splats)])))
+    received = read_ply(tmp_path / f"{PROGRAM}.ply")
+    assert np.isfinite(received.log_scales).all() and np.isfinite(received.opacity_logits).all()
+    finite = np.isfinite(splats.log_scales)
+    assert np.array_equal(received.log_scales[finite], splats.log_scales[finite])
+    assert (received.log_scales[~finite] <= -20).all()

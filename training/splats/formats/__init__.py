@@ -20,7 +20,7 @@ from ..dialects import comments_from_meta
 from ..gaussians import SplatRows
 from ..ply import write_ply
 from ..splat_format import SplatFormat
-from ..splat_transform import find_splat_transform, run_splat_transform, splat_transform_steps
+from ..splat_transform import FiniteRows, find_splat_transform, run_splat_transform, splat_transform_steps
 from ..streamed_levels import STREAMED_FILE, count_lods
 from .ply import FORMAT as PLY
 
@@ -82,7 +82,7 @@ def write_splats(path: Path, splats: SplatRows, meta: dict) -> Iterator[str]:
     with tempfile.TemporaryDirectory(prefix="lodgs-") as folder:
         plain = Path(folder, "splats.ply")
         converted = Path(folder, f"converted{kind.suffix}")
-        write_ply(plain, splats, comments_from_meta(meta))
+        write_ply(plain, FiniteRows(splats), comments_from_meta(meta))
         yield from splat_transform_steps([str(plain), str(converted)])
         with atomic_write(path) as temporary:
             shutil.move(converted, temporary)

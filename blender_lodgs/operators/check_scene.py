@@ -1,0 +1,50 @@
+"""Operator that checks a scene before training."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor, wait
+
+import bpy
+
+from ...training.scenes.check import Finding
+from .. import extension
+from ..data import roots
+from ..runs import scene_check
+from .base import SceneOperator
+from .modal import SteppedOperator
+
+
+class LODGS_OT_check_scene(SceneOperator, SteppedOperator, bpy.types.Operator):
+    bl_idname = "lodgs.check_scene"
+    bl_label = "Check Scene"
+    bl_description = "Look for facts about the photos and cameras that lower the quality of training"
+
+    _findings: list[Finding] | None = None
+
+    def invoke(self, context, event):
+        return self.execute(context) if bpy.app.background else self.start_modal(context)
+
+    def work(self, context):
+        root = roots.active_root(context)
+        uid = root.session_uid
+        reader = ThreadPoolExecutor(1, "lodgs-check")
+        try:
+            reading = reader.submit(scene_check.read_findings(root))
+            while wait([reading], 0.01).not_done:
+                yield
+        finally:
+            reader.shutdown(wait=False)
+        self._findings = reading.result()
+        scene_check.store_findings(uid, self._findings)
+        extension.redraw()
+
+    def status_text(self, context, count):
+        return "Checking the scene, Esc to stop"
+
+    def result_text(self, count):
+        if self._findings is None:
+            return "Scene not checked"
+        return "\n".join(map(str, self._findings)) or "Nothing found that lowers the quality"
+
+
+CLASSES = (LODGS_OT_check_scene,)

@@ -1,0 +1,218 @@
+"""Cameras of Blender: splats stand where Cycles draws cubes, or a message says why not."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from training.splats.bundle import write_bundle
+from training.splats.gaussians import SH_C0, Splats
+from training.splats.levels import Bundle, Level
+
+pytestmark = pytest.mark.usefixtures("renderer")
+
+MARKS = {
+    (1, 0, 0): (0, 0, 0),
+    (0, 1, 0): (1, 0, 0.3),
+    (0, 0, 1): (-0.8, 0.6, 0.5),
+    (1, 1, 0): (0.2, -0.9, 0.8),
+}
+"""Positions of opaque marks by colour."""
+
+
+@pytest.fixture
+def scene(bpy):
+    """A scene with a camera and an emissive cube at each mark, for Cycles."""
+    from mathutils import Vector
+
+    scene = bpy.context.scene
+    camera = bpy.data.objects.new("cam", bpy.data.cameras.new("cam"))
+    scene.collection.objects.link(camera)
+    camera.location = (-2.5, 4.3, 2)
+    camera.rotation_euler = (Vector((0, 0, 0.3)) - camera.location).to_track_quat("-Z", "Y").to_euler()
+    scene.camera = camera
+    render = scene.render
+    render.resolution_x, render.resolution_y, render.dither_intensity = 96, 72, 0
+    render.image_settings.file_format = "PNG"
+    scene.view_settings.view_transform = "Standard"
+    scene.cycles.samples = 1
+    for color, place in MARKS.items():
+        bpy.ops.mesh.primitive_cube_add(size=0.15, location=place)
+        material = bpy.data.materials.new("mark")
+        material.use_nodes = True
+        tree = material.node_tree
+        tree.nodes.clear()
+        emission = tree.nodes.new("ShaderNodeEmission")
+        emission.inputs[0].default_value = (*color, 1)
+        tree.links.new(emission.outputs[0], tree.nodes.new("ShaderNodeOutputMaterial").inputs[0])
+        bpy.context.object.data.materials.append(material)
+    return scene
+
+
+@pytest.fixture
+def root(bpy, lodgs, scene, tmp_path):
+    """A small splat at each mark."""
+    colors = np.array(list(MARKS), np.float32)
+    count = len(colors)
+    splats = Splats(
+        means=np.array(list(MARKS.values()), np.float32),
+        quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        log_scales=np.full((count, 3), -2.6, np.float32),
+        opacity_logits=np.full(count, 8, np.float32),
+        sh=((colors - 0.5) / SH_C0)[:, None],
+    )
+    path = tmp_path / "marks.ply"
+    write_bundle(path, Bundle("", [Level(1, splats)]))
+    return lodgs("data.importing").import_splats(bpy.context, path, upright=False)
+
+
+def shear(bpy, scene):
+    rig = bpy.data.objects.new("rig", None)
+    scene.collection.objects.link(rig)
+    rig.scale, rig.rotation_euler = (1.6, 0.8, 1.1), (0.1, 0.2, 0.5)
+    scene.camera.parent = rig
+
+
+def mirror(bpy, scene):
+    scene.camera.scale = (-1, 1, 1)
+
+
+def stereo(bpy, scene, mode="OFFAXIS"):
+    scene.render.use_multiview = True
+    scene.render.image_settings.views_format = "INDIVIDUAL"
+    scene.camera.data.stereo.interocular_distance = 0.6
+    scene.camera.data.stereo.convergence_distance = 4
+    scene.camera.data.stereo.convergence_mode = mode
+
+
+def toe_in(bpy, scene):
+    stereo(bpy, scene, "TOE")
+    scene.camera.data.sensor_fit = "VERTICAL"
+
+
+def several_cameras(bpy, scene):
+    stereo(bpy, scene)
+    scene.render.views_format = "MULTIVIEW"
+    for view, suffix in zip(scene.render.views, ("_L", "_R"), strict=True):
+        view.camera_suffix = suffix
+    scene.camera.name = "cam_L"
+    other = scene.camera.copy()
+    other.name, other.location = "cam_R", (-3.5, 3.6, 2)
+    scene.collection.objects.link(other)
+
+
+def draw(bpy, engine, path: Path) -> dict[str, dict]:
+    """Render with an engine. Return the centre of each mark in pixels, by file name."""
+    scene = bpy.context.scene
+    for obj in scene.objects:
+        if obj.type == "MESH":
+            obj.hide_render = engine == "LODGS"
+    scene.render.engine = engine
+    scene.render.filepath = str(path / "image.png")
+    assert bpy.ops.render.render(write_still=True) == {"FINISHED"}
+    return {file.name: centres(bpy, file) for file in sorted(path.glob("*.png"))}
+
+
+def centres(bpy, path: Path) -> dict:
+    image = bpy.data.images.load(str(path))
+    image.colorspace_settings.name = "Non-Color"
+    values = np.array(image.pixels[:], np.float32).reshape(image.size[1], image.size[0], 4)[::-1, :, :3]
+    bpy.data.images.remove(image)
+    places = {}
+    for color in MARKS:
+        rows, columns = np.nonzero(((values > 0.4) == np.array(color, bool)).all(-1))
+        places[color] = (columns.mean(), rows.mean()) if len(rows) else None
+    return places
+
+
+@pytest.mark.parametrize("change", [None, shear, mirror, stereo, toe_in, several_cameras])
+def test_splats_stand_where_cycles_draws_cubes(bpy, scene, root, tmp_path, change):
+    if change:
+        change(bpy, scene)
+    images = {}
+    for engine in ("CYCLES", "LODGS"):
+        (tmp_path / engine).mkdir()
+        images[engine] = draw(bpy, engine, tmp_path / engine)
+    views = 2 if scene.render.use_multiview else 1
+    assert images["CYCLES"].keys() == images["LODGS"].keys() and len(images["CYCLES"]) == views
+    for name, expected in images["CYCLES"].items():
+        assert sum(place is not None for place in expected.values()) >= 3
+        for color, place in expected.items():
+            if place is not None:
+                assert images["LODGS"][name][color] == pytest.approx(place, abs=1), (name, color)
+    if views == 2:
+        left, right = images["LODGS"].values()
+        assert abs(left[1, 0, 0][0] - right[1, 0, 0][0]) > 0.3 or left[0, 0, 1] != right[0, 0, 1]
+
+
+def test_depth_of_a_sheared_camera_is_that_of_cycles(bpy, lodgs, scene, root):
+    """Combine with Meshes compares both depths."""
+    shear(bpy, scene)
+    bpy.context.view_layer.update()
+    scene.view_layers[0].use_pass_z = True
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    planes = lodgs("render.engine").render_frame(depsgraph, 96, 72, (0, 0, 96, 72)).planes
+    colors = np.stack([planes[f"Combined.{channel}"] for channel in "RGB"], axis=2)
+    rows, columns = np.nonzero(((colors > 0.4) == np.array((1, 0, 0), bool)).all(-1))
+    depth = planes["Depth.Z"][rows, columns].mean()
+    world_to_camera = scene.camera.matrix_world.normalized().inverted()  # as in Cycles
+    assert depth == pytest.approx(-world_to_camera.translation.z, abs=0.15)
+
+
+@pytest.mark.parametrize("change", [shear, mirror])
+def test_export_of_a_deformed_camera_names_the_scale(bpy, scene, root, tmp_path, change):
+    change(bpy, scene)
+    bpy.context.view_layer.objects.active = root
+    with pytest.raises(RuntimeError, match=r"Cannot use camera 'cam': its scale .* Apply the scale"):
+        bpy.ops.lodgs.export_camera(filepath=str(tmp_path / "camera.json"))
+    assert not (tmp_path / "camera.json").exists()
+
+
+@pytest.mark.parametrize("scale", [(0, 0, 0), (1, 1, 0)])
+def test_camera_of_no_size_is_reported(bpy, scene, root, tmp_path, scale):
+    scene.camera.scale = scale
+    with pytest.raises(RuntimeError, match="the scale of camera 'cam' or of a parent is 0"):
+        draw(bpy, "LODGS", tmp_path)
+    assert not list(tmp_path.glob("*.png"))
+
+
+def test_splats_may_grow_from_nothing(bpy, scene, root, tmp_path):
+    for frame, scale in ((1, 0), (3, 1)):
+        root.scale = (scale,) * 3
+        root.keyframe_insert("scale", frame=frame)
+    scene.frame_start, scene.frame_end = 1, 3
+    for obj in scene.objects:
+        obj.hide_render |= obj.type == "MESH"
+    scene.render.engine, scene.render.filepath = "LODGS", str(tmp_path / "f_####.png")
+    bpy.ops.render.render(animation=True)
+    files = sorted(tmp_path.glob("f_*.png"))
+    assert [any(centres(bpy, file).values()) for file in files] == [False, True, True]
+
+
+def test_flat_splats_are_drawn(bpy, scene, root, tmp_path):
+    root.scale = (1, 0, 1)
+    assert any(draw(bpy, "LODGS", tmp_path)["image.png"].values())
+
+
+def test_unexpected_error_is_reported(bpy, lodgs, scene, root, tmp_path, monkeypatch):
+    def fail(*_):
+        raise ZeroDivisionError("a test")
+
+    monkeypatch.setattr(lodgs("render.engine"), "_render_function", fail)
+    with pytest.raises(RuntimeError, match=r"Cannot render frame 1: unexpected ZeroDivisionError \(a test\)"):
+        draw(bpy, "LODGS", tmp_path)
+    assert not list(tmp_path.glob("*.png"))
+
+
+def test_holdout_in_stereo_is_refused(bpy, scene, root, tmp_path):
+    stereo(bpy, scene)
+    scene.lodgs_render.holdout = str(tmp_path / "depth_####.exr")
+    with pytest.raises(RuntimeError, match="Cannot hold out meshes in a stereo"):
+        draw(bpy, "LODGS", tmp_path)
+
+
+def test_folder_as_holdout_is_refused(bpy, scene, root, tmp_path):
+    scene.lodgs_render.holdout = os.sep
+    with pytest.raises(RuntimeError, match="Cannot use the depth files"):
+        draw(bpy, "LODGS", tmp_path)

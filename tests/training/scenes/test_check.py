@@ -1,0 +1,97 @@
+"""Check of a scene before training."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from training.__main__ import main
+from training.scenes.check import check_folder, check_scene
+from training.scenes.colmap import read_scene
+
+GARDEN = Path(__file__).resolve().parents[3] / "examples" / "lantern_garden"
+
+
+@pytest.fixture
+def copy(tmp_path):
+    return Path(shutil.copytree(GARDEN, tmp_path / "scene"))
+
+
+def texts(findings):
+    return "\n".join(f"{finding.severity}: {finding}" for finding in findings)
+
+
+def test_good_scene_has_no_findings(capsys):
+    assert check_folder(GARDEN) == []
+    assert main(["train", str(GARDEN), "--check"]) == 0
+    assert capsys.readouterr().out == "Nothing found that lowers the quality.\n"
+
+
+def test_missing_photos_are_counted(copy, capsys):
+    for file in sorted((copy / "images").iterdir())[:3]:
+        file.unlink()
+    assert main(["train", "--scene", str(copy), "--check"]) == 0
+    printed = capsys.readouterr().out
+    assert "warning: 3 of " in printed and f"Copy their photos to {copy / 'images'}" in printed
+
+
+def test_scene_that_cannot_be_read_is_an_error(tmp_path, capsys):
+    assert main(["train", str(tmp_path), "--check"]) == 2
+    assert capsys.readouterr().out.startswith("error: Cannot read scene: ")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_few_and_tiny_photos():
+    scene = read_scene(GARDEN)
+    side = max(scene.cameras[0].width, scene.cameras[0].height)
+    few = replace(scene, cameras=scene.cameras[:5], names=scene.names[:5])
+    assert "only 5 views" in texts(check_scene(few))
+    assert check_scene(replace(scene, cameras=scene.cameras[:1]))[0].severity == "error"
+    found = texts(check_scene(scene, image_scale=100 / side))
+    assert f"{len(scene.cameras)} of {len(scene.cameras)} photos have fewer" in found and "100)" in found
+
+
+def moved(scene, offset):
+    def move(camera):
+        pose = camera.world_to_camera.copy()
+        pose[:3, 3] -= pose[:3, :3] @ offset
+        return replace(camera, world_to_camera=pose)
+
+    points = (scene.points.astype(np.float64) + offset).astype(np.float32)
+    return replace(scene, cameras=list(map(move, scene.cameras)), points=points)
+
+
+def test_far_origin():
+    scene = read_scene(GARDEN)
+    assert "far from its origin" not in texts(check_scene(moved(scene, np.array([50.0, 20, 1]))))
+    (finding,) = check_scene(moved(scene, np.array([456789.5, 5432109.25, 312.5])))
+    assert "around (45" in finding.what and "local origin" in finding.remedy
+
+
+def test_scene_without_points(copy):
+    (copy / "sparse" / "0" / "points3D.bin").unlink()
+    (finding,) = [finding for finding in check_folder(copy) if "no points" in finding.what]
+    assert finding.severity == "warning" and finding.remedy.startswith("Export the points")
+
+
+def test_views_without_overlap(monkeypatch):
+    scene = read_scene(GARDEN)
+    names = [camera.name for camera in scene.cameras]
+    half, rest = len(names) // 2, len(names) - len(names) // 2 - 1
+    rows = {name: np.arange(100) + 200 * (number >= half) for number, name in enumerate(names)}
+    rows[names[-1]] = np.arange(19)
+    monkeypatch.setattr("training.scenes.check.observations", lambda scene, names: rows)
+    isolated, groups = check_scene(scene)
+    assert f"1 of {len(names)} views share fewer" in isolated.what and names[-1] in isolated.what
+    assert f"2 groups without common points, the largest of {half} and {rest} views" in groups.what
+
+
+def test_photos_of_other_exposure(copy):
+    file = sorted((copy / "images").iterdir())[4]
+    pixels = np.asarray(Image.open(file).convert("RGB"))
+    Image.fromarray((pixels * 0.6).astype(np.uint8)).save(file, quality=97)
+    found = texts(check_folder(copy))
+    assert "Exposure or white balance differs" in found and file.name in found and "match_exposure" in found

@@ -1,0 +1,208 @@
+"""Check of a scene before training, for facts that lower the quality without any error. No torch."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ..errors import LodgsError
+from .colmap import Progress, Scene, observations, read_scene
+
+MIN_VIEWS = 2
+"""Number of views below which nothing can be trained."""
+FEW_VIEWS = 20
+"""Number of views below which floaters are likely."""
+SMALL_SIDE = 200
+"""Longer side of a photo, in pixels at the trained scale, below which details are lost."""
+MIN_SHARED = 20
+"""Number of points that a view must share with other views to overlap them."""
+MAX_ROUNDING = 0.25
+"""Maximum rounding error of float32 coordinates, in pixels of a photo at the median depth."""
+ERROR, WARNING = "error", "warning"
+NO_POINTS = "The scene has no points"
+"""First words of the warning of ``read_scene`` about a scene without points."""
+
+
+class Finding(NamedTuple):
+    """A fact about a scene that affects training.
+
+    Attributes:
+        severity: "error" if training is impossible, "warning" if the quality is lower.
+        what: sentence with the fact and its effect.
+        remedy: the user's next step, in the imperative.
+    """
+
+    severity: str
+    what: str
+    remedy: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.what} {self.remedy}".strip()
+
+
+def check_folder(
+    folder: Path,
+    model: Path | None = None,
+    images: Path | None = None,
+    *,
+    image_scale: float = 1.0,
+    progress: Progress | None = None,
+) -> list[Finding]:
+    """Read a scene as training does, and return the findings of its reading and of :func:`check_scene`.
+
+    Photos of other exposure are only found if Pillow and SciPy are installed.
+
+    Args:
+        folder, model, images, progress: see ``read_scene``.
+        image_scale: scale of the photos in training.
+
+    Returns:
+        The findings, the most severe first. A scene that cannot be read is one finding.
+    """
+    try:
+        scene = read_scene(folder, model, images, progress)
+        findings = [*check_scene(scene, image_scale), *_exposure(scene)]
+    except LodgsError as error:
+        return [Finding(ERROR, error.what, error.remedy)]
+    findings += [*_missing(scene), *_no_points(scene)]
+    findings += [Finding(WARNING, text) for text in scene.warnings if not text.startswith(NO_POINTS)]
+    return sorted(findings, key=lambda finding: finding.severity)
+
+
+def check_scene(scene: Scene, image_scale: float = 1.0) -> list[Finding]:
+    """Return the findings of which reading the scene does not warn, without decoding its photos."""
+    return [*_views(scene), *_sizes(scene, image_scale), *_origin(scene), *_overlap(scene)]
+
+
+def _views(scene: Scene) -> Iterator[Finding]:
+    count = len(scene.cameras)
+    if count < MIN_VIEWS:
+        yield Finding(ERROR, f"The scene has {count} view(s), but training needs {MIN_VIEWS}.", "Add photos.")
+    elif count < FEW_VIEWS:
+        yield Finding(
+            WARNING,
+            f"The scene has only {count} views, which often causes floaters.",
+            f"Add photos that overlap, at least {FEW_VIEWS} and better 100.",
+        )
+
+
+def _missing(scene: Scene) -> Iterator[Finding]:
+    missing = len(scene.names) - len(scene.cameras)
+    if missing > 0:
+        yield Finding(
+            WARNING,
+            f"{missing} of {len(scene.names)} views of the model have no usable photo.",
+            f"Copy their photos to {scene.images_folder}, or choose another image folder.",
+        )
+
+
+def _sizes(scene: Scene, image_scale: float) -> Iterator[Finding]:
+    sides = [image_scale * max(camera.width, camera.height) for camera in scene.cameras]
+    small = [side for side in sides if side < SMALL_SIDE]
+    if small:
+        yield Finding(
+            WARNING,
+            f"{len(small)} of {len(sides)} photos have fewer than {SMALL_SIDE} pixels on their longer side "
+            f"in training (smallest: {min(small):.0f}), which loses details.",
+            "Use larger photos, or increase the image scale.",
+        )
+
+
+def _no_points(scene: Scene) -> Iterator[Finding]:
+    if not len(scene.points):
+        yield Finding(
+            WARNING,
+            f"{NO_POINTS} to start from, and random points cost several dB.",
+            "Export the points too, or find the cameras again with COLMAP.",
+        )
+
+
+def _origin(scene: Scene) -> Iterator[Finding]:
+    focal = np.median([camera.focal for camera in scene.cameras])
+    depth = scene.median_depth(default=scene.extent(default=1.0))
+    distance = float(np.linalg.norm(scene.center))
+    pixels = np.finfo(np.float32).eps * distance * focal / max(depth, 1e-30)
+    if pixels > MAX_ROUNDING:
+        x, y, z = scene.center
+        yield Finding(
+            WARNING,
+            f"The scene lies far from its origin, around ({x:.0f}, {y:.0f}, {z:.0f}). Rounding of its "
+            f"coordinates moves splats by {pixels:.1f} pixels.",
+            "Export the scene with a local origin.",
+        )
+
+
+def _overlap(scene: Scene) -> Iterator[Finding]:
+    """Find views that share too few points with other views, and groups of views without common points."""
+    names = [camera.name for camera in scene.cameras]
+    observed = observations(scene, names)
+    if not observed or len(names) < MIN_VIEWS:
+        return
+    view = np.repeat(np.arange(len(names)), [len(observed.get(name, ())) for name in names])
+    point = np.concatenate([observed[name] for name in names if name in observed])
+    shared = np.bincount(point, minlength=len(scene.points))[point] > 1
+    counts = np.bincount(view[shared], minlength=len(names))
+    isolated = np.flatnonzero(counts < MIN_SHARED)
+    if len(isolated):
+        yield Finding(
+            WARNING,
+            f"{len(isolated)} of {len(names)} views share fewer than {MIN_SHARED} points with other views "
+            f"(such as {names[isolated[0]]}).",
+            "Take photos between them, or remove them.",
+        )
+    groups = _groups(view[shared], point[shared], np.flatnonzero(counts >= MIN_SHARED))
+    if len(groups) > 1:
+        sizes = " and ".join(str(len(group)) for group in groups[:2])
+        yield Finding(
+            WARNING,
+            f"The views form {len(groups)} groups without common points, the largest of {sizes} views. "
+            "Their parts of the scene may not fit together.",
+            "Take photos that connect the groups, or train each group on its own.",
+        )
+
+
+def _groups(view: np.ndarray, point: np.ndarray, members: np.ndarray) -> list[list[int]]:
+    """Return the groups of views that observations (O,) of shared points connect, the largest first.
+
+    Args:
+        members: views to divide into groups; others are left out.
+    """
+    order = np.lexsort((view, point))
+    view, point = view[order], point[order]
+    kept = np.isin(view, members)
+    view, point = view[kept], point[kept]
+    pairs = np.unique(np.stack([view[:-1], view[1:]], axis=1)[point[:-1] == point[1:]], axis=0)
+    parent = list(range(int(members.max(initial=0)) + 1))
+
+    def root(number: int) -> int:
+        while parent[number] != number:
+            parent[number] = number = parent[parent[number]]
+        return number
+
+    for first, second in pairs.tolist():
+        parent[root(first)] = root(second)
+    groups: dict[int, list[int]] = {}
+    for number in members.tolist():
+        groups.setdefault(root(number), []).append(number)
+    return sorted(groups.values(), key=len, reverse=True)
+
+
+def _exposure(scene: Scene) -> Iterator[Finding]:
+    """Find photos whose exposure or white balance differs from that of their neighbours."""
+    try:
+        from .exposures import exposure_gains
+    except ImportError:
+        return
+    gains = exposure_gains(scene, [camera for camera in scene.cameras if camera.name not in scene.distorted])
+    if gains:
+        deviations = {name: float(np.abs(np.log(gain)).max()) for name, gain in gains.items()}
+        worst = max(deviations, key=lambda name: deviations[name])
+        yield Finding(
+            WARNING,
+            f"Exposure or white balance differs between photos, by {np.expm1(deviations[worst]):.0%} "
+            f"in {worst}.",
+            "Keep match_exposure enabled, or take photos with fixed exposure.",
+        )
