@@ -77,6 +77,11 @@ def render_animation(context: bpy.types.Context, frames: Iterable[int]) -> Itera
         raise LodgsError(
             "Cannot render a video in viewport quality.", "Choose an image format in the Output tab."
         )
+    if scene.render.use_multiview:
+        raise LodgsError(
+            "Cannot render a stereo or multi-view animation in viewport quality.",
+            "Render it with F12's animation, or disable Stereoscopy in the Output tab.",
+        )
     try:
         for frame in frames:
             scene.frame_set(frame)

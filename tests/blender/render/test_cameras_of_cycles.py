@@ -108,6 +108,9 @@ def draw(bpy, engine, path: Path) -> dict[str, dict]:
     for obj in scene.objects:
         if obj.type == "MESH":
             obj.hide_render = engine == "LODGS"
+        elif obj.type == "POINTCLOUD":  # Blender 5.3 draws splats in Cycles
+            obj.driver_remove("hide_render")
+            obj.hide_render = engine == "CYCLES"
     scene.render.engine = engine
     scene.render.filepath = str(path / "image.png")
     assert bpy.ops.render.render(write_still=True) == {"FINISHED"}
@@ -144,6 +147,30 @@ def test_splats_stand_where_cycles_draws_cubes(bpy, scene, root, tmp_path, chang
     if views == 2:
         left, right = images["LODGS"].values()
         assert abs(left[1, 0, 0][0] - right[1, 0, 0][0]) > 0.3 or left[0, 0, 1] != right[0, 0, 1]
+
+
+@pytest.mark.parametrize("change", [shear, mirror, stereo])
+def test_viewport_quality_draws_the_same(bpy, lodgs, scene, root, tmp_path, change):
+    quality = lodgs("render.viewport_quality")
+    try:
+        quality._require_graphics()
+    except lodgs("training.errors").LodgsError as error:
+        pytest.skip(str(error))
+    change(bpy, scene)
+    expected = draw(bpy, "LODGS", tmp_path)
+    with lodgs("render.engine").use_renderer(quality._render_frame):
+        drawn = draw(bpy, "LODGS", tmp_path)
+    assert expected.keys() == drawn.keys()
+    for name, places in expected.items():
+        for color, place in places.items():
+            if place is not None:
+                assert drawn[name][color] == pytest.approx(place, abs=0.5), (name, color)
+
+
+def test_stereo_animation_in_viewport_quality_is_refused(bpy, lodgs, scene, root):
+    stereo(bpy, scene)
+    with pytest.raises(lodgs("training.errors").LodgsError, match="stereo or multi-view animation"):
+        next(lodgs("render.viewport_quality").render_animation(bpy.context, [1]))
 
 
 def test_depth_of_a_sheared_camera_is_that_of_cycles(bpy, lodgs, scene, root):
@@ -216,3 +243,14 @@ def test_folder_as_holdout_is_refused(bpy, scene, root, tmp_path):
     scene.lodgs_render.holdout = os.sep
     with pytest.raises(RuntimeError, match="Cannot use the depth files"):
         draw(bpy, "LODGS", tmp_path)
+
+
+def test_meshes_are_combined_for_the_same_views(bpy, lodgs, scene, root):
+    several_cameras(bpy, scene)
+    scene.render.views.new("third").camera_suffix = "_T"
+    meshes = lodgs("render.compositing").combine_with_meshes(scene)
+    assert meshes.render.use_multiview and meshes.render.views_format == "MULTIVIEW"
+    views = [[(view.name, view.camera_suffix, view.use) for view in s.render.views] for s in (scene, meshes)]
+    assert views[0] == views[1]
+    with pytest.raises(lodgs("training.errors").LodgsError, match="Cannot render mesh depth for a stereo"):
+        next(lodgs("render.compositing").render_mesh_depth(scene, [1]))
