@@ -74,6 +74,7 @@ def take_all() -> Steps:
     yield from compare()
     yield from export()
     yield from cells()
+    yield from restore_panels()
 
 
 def picture(name: str) -> None:
@@ -89,14 +90,7 @@ def show_panels(*names: str) -> Steps:
     global _generation
     _generation += 1
     package = f"{LODGS}.blender_lodgs.panels."
-    parts = module("panels.parts")
-    panels = [*parts.Panel.__subclasses__(), *parts.LevelsPanel.__subclasses__()]
-    panels = [cls for cls in panels if hasattr(cls, "bl_label")]
-    panels.sort(key=lambda cls: hasattr(cls, "bl_parent_id"))
-    for cls in reversed(panels):  # subpanels first
-        for registered in (cls, *cls.__subclasses__()):
-            if registered.is_registered:
-                bpy.utils.unregister_class(registered)
+    panels = unregister_panels()
     for cls in panels:
         shown = cls.__module__.removeprefix(package) in names or cls.__name__ in names
         content = {"bl_idname": f"{cls.__name__}_{_generation}"}
@@ -107,6 +101,26 @@ def show_panels(*names: str) -> Steps:
     yield 0.5
     region("UI").active_panel_category = "LODGS"
     yield from settle()
+
+
+def unregister_panels() -> list[type[bpy.types.Panel]]:
+    """Unregister all panels of the tab and their copies; return the panels, subpanels last."""
+    parts = module("panels.parts")
+    panels = [*parts.Panel.__subclasses__(), *parts.LevelsPanel.__subclasses__()]
+    panels = [cls for cls in panels if hasattr(cls, "bl_label")]
+    panels.sort(key=lambda cls: hasattr(cls, "bl_parent_id"))
+    for cls in reversed(panels):  # subpanels first
+        for registered in (cls, *cls.__subclasses__()):
+            if registered.is_registered:
+                bpy.utils.unregister_class(registered)
+    return panels
+
+
+def restore_panels() -> Steps:
+    """Register the extension's own panels again, which it unregisters when Blender quits."""
+    for cls in unregister_panels():
+        bpy.utils.register_class(cls)
+    yield 0.2
 
 
 def scene_root() -> bpy.types.Object:
