@@ -28,6 +28,7 @@ MAX_NESTING = 16
 MAX_INTEGER = 2**63 - 1
 """Largest integer that 64 bits hold."""
 
+_LFS_POINTER = b"version https://git-lfs.github.com/spec/"
 _UNPRINTABLE = re.compile("[\0\ud800-\udfff]")
 _QUOTES = reprlib.Repr()
 _QUOTES.maxstring = _QUOTES.maxother = 200
@@ -37,10 +38,18 @@ def open_file(path: str | Path) -> IO[bytes]:
     """Open a regular file for reading. Pipes and devices, which may have no end, are refused.
 
     Raises:
-        LodgsError: the file does not exist, is not a regular file, or may not be read.
+        LodgsError: the file does not exist, is not a regular file, may not be read, or is a Git LFS pointer.
     """
     try:
-        return open_regular(path)
+        file = open_regular(path)
+        if file.read(len(_LFS_POINTER)) != _LFS_POINTER:
+            file.seek(0)
+            return file
+        file.close()
+        raise LodgsError(
+            f"Cannot read {printable(path)}: it is a Git LFS pointer in place of the file.",
+            "Run `git lfs pull` in its repository, or download the file itself.",
+        )
     except OSError as error:
         reason = error.strerror or str(error)
     except ValueError:  # a NUL or half a surrogate pair

@@ -119,3 +119,13 @@ def test_piped_output_is_utf_8_on_any_console():
         cwd=Path(__file__).parents[2],
     )
     assert process.returncode == 0 and "⁴" in process.stdout.decode("utf-8")
+
+
+def test_git_lfs_pointers_are_named(tmp_path):
+    path = tmp_path / "points3D.bin"
+    path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n")
+    with pytest.raises(LodgsError, match=r"Git LFS pointer .* `git lfs pull`"):
+        open_file(path)
+    path.write_bytes(b"version https")  # shorter than the mark
+    with open_file(path) as file:
+        assert file.read() == b"version https"

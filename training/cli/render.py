@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import nullcontext
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ..errors import LodgsError
 from .options import BACKEND_HELP, SOURCE_HELP, add_controls, control_values, parse_color, parse_size, warn
+
+if TYPE_CHECKING:
+    from ..render.command import RenderSource
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,10 +41,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
-    from ..lod.rule import find_rule
-    from ..lod.selection import unknown_rule_error
-    from ..render.command import RenderSource, render
-    from ..scenes.cameras import check_render_size, read_camera
+    from ..render.command import RenderSource
+    from ..scenes.cameras import check_render_size
+    from ..splats.formats import open_as_ply
 
     if options.size:
         check_render_size(*options.size)
@@ -48,7 +52,17 @@ def run(options: argparse.Namespace) -> int:
         raise LodgsError(
             "Cannot combine --level with selection of levels by distance.", "Use only one of them."
         )
-    source = RenderSource.read(options.source, warn)
+    with open_as_ply(options.source) if options.source.is_file() else nullcontext(options.source) as path:
+        return _render(options, RenderSource.read(path, warn), controls)
+
+
+def _render(options: argparse.Namespace, source: RenderSource, controls: dict[str, float]) -> int:
+    """Render a source, whose file may be temporary."""
+    from ..lod.rule import find_rule
+    from ..lod.selection import unknown_rule_error
+    from ..render.command import render
+    from ..scenes.cameras import read_camera
+
     if options.camera:
         camera, near = read_camera(options.camera)
     else:

@@ -12,6 +12,7 @@ import numpy as np
 
 from ..errors import LodgsError, printable
 from ..files import check_folder
+from . import point_cloud
 from .cameras import MAX_COORDINATE, Camera, camera_extent, pick_evenly
 from .colmap_model import (
     DAMAGED_REMEDY,
@@ -24,7 +25,7 @@ from .colmap_model import (
     read_points,
     read_poses,
 )
-from .image_files import ImageFiles, SidecarFiles, find_image_folder
+from .image_files import MASK_SUFFIXES, ImageFiles, SidecarFiles, find_image_folder
 from .orientation import up_rotation
 from .view_selection import OUTLIER_FACTOR, ViewCollector, exclusion_messages, find_outliers, quote_name
 
@@ -213,10 +214,12 @@ def read_scene(
     """
     folder = _absolute(folder)
     warnings: list[str] = []
-    model = _largest_model(folder, warnings) if model is None else _absolute(model)
+    if model is None:
+        model, images = _choose_model(folder, images, warnings)
+    model = _absolute(model)
     intrinsics, poses = _read_registered(model)
     if images is None:
-        images = find_image_folder(folder, model, [pose.name for pose in poses])
+        images, _ = find_image_folder(folder, model, [pose.name for pose in poses])
     images = _absolute(images)
     views = _view_collector(folder, images)
     for number, pose in enumerate(poses):
@@ -257,7 +260,7 @@ def _view_collector(folder: Path, images: Path) -> ViewCollector:
     base = folder if images == folder else images.parent
     return ViewCollector(
         ImageFiles(images, folder),
-        SidecarFiles(base / MASKS, ".png"),
+        SidecarFiles(base / MASKS, *MASK_SUFFIXES),
         SidecarFiles(base / DEPTHS, *DEPTH_SUFFIXES),
     )
 
@@ -267,6 +270,11 @@ def _read_inlier_points(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return positions, colours and ids of the points without outliers, and a mask (V,) of inlier cameras."""
     points, colors, ids = read_points(model)
+    cloud = _point_cloud(model)
+    if not len(points) and cloud is not None:
+        positions, colors = point_cloud.read_points(cloud)
+        points, ids = positions.astype(np.float32), np.zeros(0, np.int64)
+        warnings.append(f"The model {model} has no points; {len(points):,} were read from {cloud}.")
     if not len(points):
         warnings.append(f"The scene has no points: {model} has no points3D{model_suffix(model)} with points.")
     valid = (np.abs(points) <= MAX_COORDINATE).all(axis=1)
@@ -277,7 +285,14 @@ def _read_inlier_points(
             f"Skipped {np.sum(~valid):,} points of {model}: their position is not finite, or more than "
             f"{OUTLIER_FACTOR:,} times the median distance from the cameras."
         )
-    return points[valid], colors[valid], ids[valid], inlier_cameras
+    return points[valid], colors[valid], ids[valid] if len(ids) else ids, inlier_cameras
+
+
+def _point_cloud(model: Path) -> Path | None:
+    """Return the point cloud in place of a model's points: points3D.ply, or the only PLY of the folder."""
+    clouds = sorted(path for path in model.iterdir() if path.suffix.lower() == ".ply" and path.is_file())
+    named = [path for path in clouds if path.stem.lower() == "points3d"]
+    return named[0] if named else clouds[0] if len(clouds) == 1 else None
 
 
 def _read_registered(model: Path) -> tuple[dict[int, Intrinsics], list[Pose]]:
@@ -377,10 +392,11 @@ def _absolute(path: Path | str) -> Path:
     return path
 
 
-def _largest_model(folder: Path, warnings: list[str]) -> Path:
-    """Return the first result of :func:`find_models`, and warn about smaller models."""
+def _choose_model(folder: Path, images: Path | None, warnings: list[str]) -> tuple[Path, Path | None]:
+    """Return the first result of :func:`find_models` that has photos, and their folder; warn about others."""
     models = find_models(folder)
     if not models:
+        _require_complete_model(folder)
         raise LodgsError(
             f"Cannot read scene: {folder} holds no COLMAP model.",
             "Choose a folder with sparse/0/cameras.bin, images.bin and points3D.bin (or .txt), or convert "
@@ -390,4 +406,23 @@ def _largest_model(folder: Path, warnings: list[str]) -> Path:
     for model, count in zip(models, counts, strict=True):
         if count < counts[0]:
             warnings.append(f"Skipped {model}: a smaller model of {count} views.")
-    return models[0]
+    for model in models if images is None else ():
+        images, photos = find_image_folder(folder, model, [pose.name for pose in read_poses(model)])
+        if photos:
+            if model != models[0]:
+                warnings.append(f"Used {model}: the photos of {models[0]} are missing.")
+            return model, images
+    return models[0], images
+
+
+def _require_complete_model(folder: Path) -> None:
+    """Raise an error that names the missing file, if a folder has a part of a COLMAP model."""
+    for root in (folder, folder / "sparse", folder / "sparse" / "0"):
+        for suffix in (".bin", ".txt"):
+            present = {name for name in ("cameras", "images") if (root / f"{name}{suffix}").is_file()}
+            if len(present) == 1:
+                missing = ({"cameras", "images"} - present).pop()
+                raise LodgsError(
+                    f"Cannot read scene: {root / f'{missing}{suffix}'} is missing.",
+                    f"Copy it beside {present.pop()}{suffix}, or export the model again.",
+                )

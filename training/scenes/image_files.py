@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import os
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from ..errors import LodgsError
+from .images import IMAGE_SUFFIXES
 
+MASK_SUFFIXES = (".png", *(suffix for suffix in IMAGE_SUFFIXES if suffix != ".png"))
+"""Suffixes of masks, preferred ones first."""
 _COMMON_NAMES = ("images", "input", "image", "rgb", "photos")
 
 
@@ -18,17 +21,23 @@ class ImageFiles:
     Args:
         folder: folder of the photos; it may be a link.
         scene: second folder that links inside ``folder`` may point into.
+
+    Attributes:
+        renamed: names that only match a file with another suffix or case, with that file.
     """
 
     def __init__(self, folder: Path, scene: Path) -> None:
         self._folder = folder
         self._allowed = [Path(os.path.realpath(path)) for path in (folder, scene)]
         self._by_normal_name: dict[str, Path] | None = None
+        self._by_stem: dict[str, list[Path]] = {}
+        self.renamed: dict[str, Path] = {}
 
     def find(self, name: str) -> Path | None:
         """Return the file with this name, or None.
 
-        Other Unicode forms (macOS) and backslashes (Windows) match, too.
+        Other Unicode forms (macOS) and backslashes (Windows) match, too. So does another suffix or case if
+        only one file has it; see ``renamed``.
 
         Raises:
             LodgsError: if the name is not UTF-8 or leaves the folder, or the file is a link to another
@@ -44,7 +53,12 @@ class ImageFiles:
                 self._by_normal_name = {
                     _normalized(path.relative_to(self._folder).as_posix()): path for path in paths
                 }
+                for other, path in self._by_normal_name.items():
+                    if other.lower().endswith((*IMAGE_SUFFIXES, ".exr")):
+                        self._by_stem.setdefault(_stem(other), []).append(path)
             file = self._by_normal_name.get(_normalized(str(relative)))
+            if file is None and len(similar := self._by_stem.get(_stem(str(relative)), [])) == 1:
+                file = self.renamed[name] = similar[0]
         if file is not None:
             real = Path(os.path.realpath(file))
             if not any(real.is_relative_to(folder) for folder in self._allowed):
@@ -104,8 +118,13 @@ def relative_image_path(name: str) -> PurePosixPath:
     return path
 
 
-def find_image_folder(folder: Path, model: Path, names: Sequence[str]) -> Path:
-    """Return the folder in or around the scene that contains the most image names of the model."""
+def find_image_folder(folder: Path, model: Path, names: Sequence[str]) -> tuple[Path, int]:
+    """Return the folder in or around the scene that contains the most image names of the model.
+
+    Returns:
+        The folder, and the number of names that it contains. Other suffixes (``a.png`` for ``a.jpg``) count
+        if no folder has a name as it is.
+    """
     roots = [folder, *(parent for parent in model.parents if folder in parent.parents)]
     if "sparse" in (folder.name, folder.parent.name):  # the user chose the model; the scene is its parent
         roots += folder.parents[: 1 if folder.name == "sparse" else 2]
@@ -116,7 +135,28 @@ def find_image_folder(folder: Path, model: Path, names: Sequence[str]) -> Path:
         candidates += [*(root / name for name in _COMMON_NAMES), *sorted(root.glob("images*")), root]
     names = [name for name in names if _is_inside(name)]
     counts = [sum(os.path.isfile(candidate / name) for name in names) for candidate in candidates]
-    return candidates[counts.index(max(counts))]
+    if not any(counts):
+        counts = [len(_stems(names) & _stems(_file_names(candidate))) for candidate in candidates]
+    return candidates[counts.index(max(counts))], max(counts)
+
+
+def _file_names(folder: Path) -> list[str]:
+    """Return the names of the images in a folder and its subfolders, relative to it."""
+    found = ((Path(parent), name) for parent, _, names in os.walk(folder) for name in names)
+    return [
+        (parent / name).relative_to(folder).as_posix()
+        for parent, name in found
+        if name.lower().endswith((*IMAGE_SUFFIXES, ".exr"))
+    ]
+
+
+def _stems(names: Iterable[str]) -> set[str]:
+    return {_stem(name) for name in names}
+
+
+def _stem(name: str) -> str:
+    """Return a name for comparison without its suffix and without regard to case."""
+    return _normalized(str(PurePosixPath(name.replace("\\", "/")).with_suffix(""))).casefold()
 
 
 def _is_inside(name: str) -> bool:

@@ -265,7 +265,9 @@ def load_mask(path: Path, width: int, height: int) -> np.ndarray:
         LodgsError: if the file cannot be read, or its aspect ratio differs from the given size.
     """
     check_mask(path, width, height)
-    return load_image(path, width, height)[..., 0]
+    mask = load_image(path, width, height)[..., 0]
+    lossy = path.suffix.lower() in (".jpg", ".jpeg", ".webp")  # nearly black and nearly white
+    return (mask >= 0.5).astype(np.float32) if lossy else mask
 
 
 def check_mask(path: Path, width: int, height: int) -> None:

@@ -25,8 +25,8 @@ from ..errors import LodgsError
 from ..files import atomic_write, check_folder, link_or_copy
 from . import pycolmap_process
 from .colmap import MASKS, find_models
-from .image_files import SidecarFiles
-from .images import IMAGE_SUFFIXES, check_mask, image_size, load_image, write_png
+from .image_files import MASK_SUFFIXES, SidecarFiles
+from .images import IMAGE_SUFFIXES, check_mask, image_size, load_image, load_mask, write_png
 from .view_selection import exclusion_messages
 
 PRESETS = {"draft": (1000, 2048), "standard": (1600, 4096)}
@@ -317,10 +317,17 @@ def _link_masks(masks: Path, photos: Path, image_names: Mapping[str, str], out: 
     """
     folder = out / MASKS
     for name, image_name in image_names.items():
-        mask = SidecarFiles(masks, ".png").find(name)
+        mask = SidecarFiles(masks, *MASK_SUFFIXES).find(name)
         if mask is not None:
-            check_mask(mask, *image_size(photos / name))
-            link_or_copy(mask, folder / f"{image_name}.png")
+            size = image_size(photos / name)
+            check_mask(mask, *size)
+            target = folder / f"{image_name}.png"
+            if mask.suffix.lower() == ".png":
+                link_or_copy(mask, target)
+            else:
+                target.parent.mkdir(parents=True, exist_ok=True)
+                codes = (255 * load_mask(mask, *size)).astype(np.uint8)
+                write_png(target, np.repeat(codes[..., None], 3, axis=2))
     if not folder.is_dir():
         first = next(iter(image_names))
         raise LodgsError(

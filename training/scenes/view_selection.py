@@ -95,6 +95,12 @@ class ViewCollector:
                     f"Skipped {len(names):,} views without a file in {folder}: "
                     f"{', '.join(map(quote_name, names[:MAX_NAMED]))}{more}."
                 )
+        if renamed := self._files.renamed:
+            name, file = next(iter(renamed.items()))
+            messages.append(
+                f"Matched {len(renamed):,} photos with another suffix or case, such as {file.name} for "
+                f"{quote_name(name)}."
+            )
         for attribute, sidecars in ("mask", self._masks), ("depth", self._depths):
             if all(getattr(camera, attribute) is None for camera in self.cameras):
                 messages += filter(None, [sidecars.mismatch_warning(quote_name(self.cameras[0].name))])

@@ -24,7 +24,7 @@ from ..documents import open_file
 from ..errors import LodgsError
 from ..files import atomic_write
 from .dialects import Warn, drawable_3dgs, ignore, reject_unsupported
-from .gaussians import SplatRows, Splats
+from .gaussians import SH_C0, SplatRows, Splats
 
 MAX_HEADER_BYTES = 1 << 20
 """Maximum length of a header."""
@@ -44,6 +44,7 @@ _TYPES = {
 }
 # Rows are converted in blocks that fit in the processor's cache.
 _BLOCK = 4096
+_F_DC, _RGB = ["f_dc_0", "f_dc_1", "f_dc_2"], ["red", "green", "blue"]
 BATCH_ROWS = 1 << 15
 """Rows per batch when splats are larger than memory."""
 
@@ -190,19 +191,29 @@ def splats_from_rows(rows: np.ndarray, path: str | Path) -> Splats:
     splats = _empty_splats(len(rows), degree)
     columns = {name: column for name, column in splat_columns(splats).items() if name not in NORMALS}
     missing = [name for name in columns if name not in names]
+    if missing == _F_DC and set(_RGB) <= set(names) and rows.dtype["red"].itemsize == 1:
+        missing = []  # nerfstudio's splats without harmonics have 8-bit colours
     if missing:
         raise LodgsError(
             f"Cannot read {path}: it is not a PLY of Gaussian splats: it has no {', '.join(missing)}.",
             "Choose a PLY from a 3DGS trainer; other point clouds and meshes contain no splats.",
         )
+    colored = _F_DC[0] not in names
+    sources = dict(zip(_F_DC, _RGB, strict=True)) if colored else {}
     extras = {
-        name: np.empty(len(rows), rows.dtype[name].newbyteorder("=")) for name in names if name not in columns
+        name: np.empty(len(rows), rows.dtype[name].newbyteorder("="))
+        for name in names
+        if name not in columns and name not in sources.values()
     }
-    pairs = [(column, np.asarray(rows[name])) for name, column in (columns | extras).items()]
+    pairs = [
+        (column, np.asarray(rows[sources.get(name, name)])) for name, column in (columns | extras).items()
+    ]
     with np.errstate(over="ignore", invalid="ignore"):  # infinities and NaN are dropped later
         for block in _blocks(len(rows)):
             for column, source in pairs:
                 column[block] = source[block]
+            if colored:
+                splats.sh[block, 0] = (splats.sh[block, 0] / 255 - 0.5) / SH_C0
         has_normals = any(extras[name].any() for name in NORMALS if name in extras)
     if not has_normals:
         extras = {name: column for name, column in extras.items() if name not in NORMALS}

@@ -249,3 +249,16 @@ def test_unsupported_column_raises_one_sentence(tmp_path, make_splats, name, col
     with pytest.raises(LodgsError, match=f"Cannot write column .{name}"):
         write_ply(tmp_path / "a.ply", make_splats(2, 0, **{name: column}))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_nerfstudio_splats_with_rgb_colours(tmp_path):
+    names = ["x", "y", "z", "red", "green", "blue", "opacity", *(f"scale_{i}" for i in range(3))]
+    kinds = [(name, "u1" if name in ("red", "green", "blue") else "f4") for name in names]
+    rows = np.zeros(2, [*kinds, *((f"rot_{i}", "f4") for i in range(4))])
+    rows["red"], rows["green"], rows["blue"], rows["rot_0"] = [255, 0], [0, 128], [51, 255], 1
+    path = tmp_path / "nerfstudio.ply"
+    PlyData([PlyElement.describe(rows, "vertex")]).write(path)
+    splats = read_ply(path)
+    colors = 0.5 + 0.28209479177387814 * splats.sh[:, 0]  # 1 / (2 sqrt(pi)), of degree 0
+    assert np.allclose(colors, [[1, 0, 0.2], [0, 128 / 255, 1]], atol=1e-6)
+    assert splats.sh.shape == (2, 1, 3) and not splats.extras

@@ -207,7 +207,7 @@ def _write(scene: Path, views: list[ExportedView], points: np.ndarray, colors: n
     if not images.is_relative_to(scene):
         for view in views:
             link_or_copy(view.image, scene / "images" / view.image.relative_to(images))
-    elif find_image_folder(scene, sparse / "0", [view.image.name for view in views]) != images:
+    elif find_image_folder(scene, sparse / "0", [view.image.name for view in views])[0] != images:
         images = scene
     sparse.mkdir(parents=True, exist_ok=True)
     names = [view.image.relative_to(images).as_posix() for view in views]

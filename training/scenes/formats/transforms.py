@@ -12,6 +12,7 @@ from typing import Any
 
 from ...errors import LodgsError
 from ..images import image_size
+from ..point_cloud import read_points
 from .exported import (
     ExportedScene,
     ExportedView,
@@ -22,7 +23,6 @@ from .exported import (
     parse_array,
     read_document,
 )
-from .point_cloud import read_points
 
 NAME = "nerfstudio (transforms.json)"
 _FILES = "transforms.json", "transforms_train.json"

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from plyfile import PlyData, PlyParseError
 
-from ...documents import open_file
-from ...errors import LodgsError
+from ..documents import open_file
+from ..errors import LodgsError
 
 
 def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
