@@ -48,7 +48,7 @@ def check(scene, model, content: object) -> None:
             len(result.points) == len(result.point_colors)
             and np.abs(result.points).max(initial=0) <= MAX_COORDINATE
         )
-        assert np.isfinite(result.extent() if len(result.points) else result.center).all()
+        assert np.isfinite(result.extent(default=1.0) if len(result.points) else result.center).all()
         assert np.isfinite(result.up_rotation()).all()
         assert "".join(result.warnings).encode() is not None  # printable
 

@@ -156,7 +156,7 @@ def _stems(names: Iterable[str]) -> set[str]:
 
 def _stem(name: str) -> str:
     """Return a name for comparison without its suffix and without regard to case."""
-    return _normalized(str(PurePosixPath(name.replace("\\", "/")).with_suffix(""))).casefold()
+    return _normalized(os.path.splitext(str(PurePosixPath(name.replace("\\", "/"))))[0]).casefold()
 
 
 def _is_inside(name: str) -> bool:
