@@ -10,7 +10,8 @@ from ..runs import run_folders
 
 OPERATORS = (
     ("lodgs.check_scene", "lodgs.train", "lodgs.resume_training", "lodgs.cancel_training", "lodgs.open_run",
-     "lodgs.add_region", "lodgs.plan_cells", "lodgs.submit_to_flamenco", "lodgs.show_log", "lodgs.show_costs"),
+     "lodgs.add_region", "lodgs.plan_cells", "lodgs.submit_to_flamenco", "lodgs.show_log",
+     "lodgs.show_costs"),
     ("lodgs.look_through", "lodgs.compare_view", "lodgs.compare_worst", "lodgs.measure_views",
      "lodgs.cancel_measuring"),
     ("lodgs.use_engine", "lodgs.render_quick", "lodgs.combine_with_meshes", "lodgs.separate_meshes",
