@@ -31,12 +31,11 @@ MARK = "lodgs-in-use"
 def environment() -> dict[str, str]:
     """Return environment variables for another Python, without those that Blender set for its own.
 
-    Compiled code goes to the user's folder, because the extension's folder may be read-only.
+    Python's compiled files go to the user's folder, because the extension's folder may be read-only.
     """
     values = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "__PYVENV_LAUNCHER__"))}
-    cache = extension.user_folder("cache")
-    values.setdefault("NUMBA_CACHE_DIR", str(cache / "numba"))
-    return values | {"PYTHONPYCACHEPREFIX": str(cache / "pycache"), "PYTHONUTF8": "1"}
+    compiled = extension.user_folder("cache") / "pycache"
+    return values | {"PYTHONPYCACHEPREFIX": str(compiled), "PYTHONUTF8": "1"}
 
 
 def spawn(command: list[str], log: Path, output: Path) -> subprocess.Popen:

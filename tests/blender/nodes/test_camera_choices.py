@@ -5,6 +5,9 @@ import sys
 
 from tests.checkout import ROOT, copy_checkout
 
+pytestmark = pytest.mark.one_blender
+
+
 ENTRY = '    CameraChoice("SECOND", "Second Object", "Another object", object="second_eye"),\n'
 LAST = "    VIEWPORT,\n)\n"
 SCRIPT = """

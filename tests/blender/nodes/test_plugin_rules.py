@@ -6,6 +6,9 @@ import sys
 
 from tests.training.test_plugins import METHOD, ROOT, RULE, TRAIN, install
 
+pytestmark = pytest.mark.one_blender
+
+
 SCRIPT = """
 import importlib, sys
 import numpy as np

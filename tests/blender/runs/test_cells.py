@@ -11,6 +11,9 @@ from tests.blender.fake_trainer import COUNTS, STEPS
 from training.runs.blocks.plan import plan
 from training.scenes.colmap import read_scene
 
+pytestmark = pytest.mark.one_blender
+
+
 GARDEN = Path(__file__).resolve().parents[3] / "examples" / "lantern_garden"
 
 

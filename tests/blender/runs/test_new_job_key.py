@@ -5,6 +5,9 @@ import sys
 
 from tests.training.runs.test_new_job_key import checkout_with_key
 
+pytestmark = pytest.mark.one_blender
+
+
 SCRIPT = """
 import importlib
 from pathlib import Path

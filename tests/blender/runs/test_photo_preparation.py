@@ -12,6 +12,8 @@ from training.scenes.colmap_model import make_intrinsics, write_model
 from training.scenes.images import write_png
 from training.scenes.undistort import cached_undistorted_scene
 
+pytestmark = pytest.mark.one_blender
+
 
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory):
