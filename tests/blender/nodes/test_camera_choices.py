@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 from tests.checkout import ROOT, copy_checkout
 
 pytestmark = pytest.mark.one_blender
