@@ -206,14 +206,14 @@ def view_from(
 
 def supported_views(
     shots: Iterable[bpy.types.Object | int],
-    see: Callable[[Any], tuple[Camera, float]],
+    view_of_shot: Callable[[Any], tuple[Camera, float]],
     warn: Callable[[str], object],
 ) -> list[tuple[Any, tuple[Camera, float]]]:
     """Return the shots whose camera LODGS can use with their views, and warn of the others.
 
     Args:
         shots: Camera objects, or frames of the scene's camera.
-        see: Function that returns the view and the clip start of a shot.
+        view_of_shot: Function that returns the view and the clip start of a shot.
         warn: Function called with one sentence for each camera that is left out.
 
     Raises:
@@ -222,7 +222,7 @@ def supported_views(
     views, problems = [], {}
     for shot in shots:
         try:
-            views.append((shot, see(shot)))
+            views.append((shot, view_of_shot(shot)))
         except UnsupportedCameraError as error:
             problems.setdefault(str(error), (error, []))[1].append(shot)
     for error, skipped in problems.values():

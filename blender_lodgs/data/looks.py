@@ -182,9 +182,9 @@ def _attach(obj: bpy.types.Object, root: bpy.types.Object, regions: list[bpy.typ
     for number, source in enumerate((root, *regions)):
         if number:
             crops.follow(obj, modifier, number, source)
-            driver = replace_driver(obj, compat.input_path(modifier, groups.BEYOND.format(number)), "value")
+            driver = replace_driver(obj, compat.input_path(modifier, groups.OUTSIDE.format(number)), "value")
             crops.read_from(driver, source, "lodgs_look.outside", 0.0)
-        for row, name in enumerate(groups.ROWS):
+        for row, name in enumerate(groups.MATRIX_ROWS):
             path = compat.input_path(modifier, name.format(number))
             for column in range(3):
                 driver = replace_driver(obj, path, "value", column)

@@ -42,8 +42,8 @@ def new_camera(
     """Create a camera object of a view in COLMAP's world, not yet in a collection.
 
     Args:
-        extent: Extent of the scene in its own units; sets the display size of the object.
-        near: Depth where splats begin in training and evaluation, in the same units.
+        extent: extent of the scene in scene units; sets the display size of the object.
+        near: Depth where splats begin in training and evaluation, in scene units.
         photograph: Show the view's photo behind it.
         distorted: The photo has lens distortion.
     """

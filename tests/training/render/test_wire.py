@@ -128,5 +128,5 @@ def test_invalid_sets_raise_one_sentence(valid, change):
     "line", [b"no json", b"[]", b"[" * 5000, b"\xff", b'{"a": 1e999}', b'{"frame": NaN}', b""]
 )
 def test_invalid_lines_raise_one_sentence(line):
-    with pytest.raises(LodgsError, match="A request is not valid"):
+    with pytest.raises(LodgsError, match="Cannot read the request"):
         parse_line(line)
