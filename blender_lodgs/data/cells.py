@@ -41,10 +41,10 @@ class CellPlan:
     """Plan of a job's cells.
 
     Attributes:
-        job: Job with the planned grid in ``cells``; "" for a single cell.
-        planned: Planned cells.
-        outlines: Corners of each cell; see :func:`outlines`.
-        view_indices: Indices of each cell's views, sorted by name.
+        job: job with the planned grid in ``cells``; "" for a single cell.
+        planned: planned cells.
+        outlines: corners of each cell; see :func:`outlines`.
+        view_indices: indices of each cell's views, sorted by name.
     """
 
     job: Job
@@ -57,11 +57,11 @@ def plan_cells(job: Job, splats: int = 0, memory: int = 0) -> CellPlan:
     """Plan the cells of a job. Takes a while; needs no bpy and may run in a thread.
 
     Args:
-        splats: Maximum number of splats per cell; the job gets the fewest cells within it. 0 for no limit.
-        memory: Maximum number of bytes per cell, in the same way. Without both, the job's own grid is used.
+        splats: maximum number of splats per cell; the job gets the fewest cells within it. 0 for no limit.
+        memory: maximum number of bytes per cell, in the same way. Without both, the job's own grid is used.
 
     Raises:
-        LodgsError: The scene cannot be read or divided into these cells.
+        LodgsError: the scene cannot be read or divided into these cells.
     """
     scene = read_planned_scene(job)
     if splats or memory:

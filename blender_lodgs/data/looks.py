@@ -87,7 +87,7 @@ def looks_of(
     """Return the looks of a scene that change anything, as evaluated in the depsgraph, the root's first.
 
     Args:
-        to_own: Matrix from the world to the splats' own space.
+        to_own: matrix from the world to the splats' own space.
     """
     root_look, placed_looks = _read_look(root.evaluated_get(depsgraph).lodgs_look), []
     if root_look != NEUTRAL:
@@ -182,7 +182,7 @@ def _attach(obj: bpy.types.Object, root: bpy.types.Object, regions: list[bpy.typ
     for number, source in enumerate((root, *regions)):
         if number:
             crops.follow(obj, modifier, number, source)
-            driver = replace_driver(obj, compat.input_path(modifier, groups.OUTSIDE.format(number)), "value")
+            driver = replace_driver(obj, compat.input_path(modifier, groups.BEYOND.format(number)), "value")
             crops.read_from(driver, source, "lodgs_look.outside", 0.0)
         for row, name in enumerate(groups.MATRIX_ROWS):
             path = compat.input_path(modifier, name.format(number))

@@ -154,11 +154,11 @@ def training_views(
     Empty for a dome, which the trainer places.
 
     Args:
-        splats: Finest level of the root.
-        warn: Function called with a sentence for each camera that is left out.
+        splats: finest level of the root.
+        warn: function called with a sentence for each camera that is left out.
 
     Raises:
-        LodgsError: There are fewer than two cameras, no curve or a curve of length 0; or the root is scaled
+        LodgsError: there are fewer than two cameras, no curve or a curve of length 0; or the root is scaled
             differently along its axes.
     """
     settings = root.lodgs.training
@@ -192,10 +192,10 @@ def capture_shots(context: bpy.types.Context, width: int, height: int, warn: War
     """Return the shots of a Blender scene according to its settings (``Scene.lodgs_capture``).
 
     Args:
-        warn: Function called with a sentence for each camera that is left out.
+        warn: function called with a sentence for each camera that is left out.
 
     Raises:
-        LodgsError: There are fewer than two cameras that LODGS can use, no curve or a curve of length 0; the
+        LodgsError: there are fewer than two cameras that LODGS can use, no curve or a curve of length 0; the
             camera does not move; or the scene is empty.
     """
     return [shot for shot, _ in _shots_with_views(context, width, height, warn)]
@@ -205,7 +205,7 @@ def capture_views(context: bpy.types.Context, width: int, height: int) -> list[t
     """Return the views and near depths of the shots of :func:`capture_shots`, in Blender's world.
 
     Raises:
-        LodgsError: As :func:`capture_shots`.
+        LodgsError: as :func:`capture_shots`.
     """
     return [view for _, view in _shots_with_views(context, width, height, _ignore)]
 
@@ -240,7 +240,7 @@ def placed_capture_views(
     are used.
 
     Raises:
-        LodgsError: There is no object or no curve.
+        LodgsError: there is no object or no curve.
     """
     settings = context.scene.lodgs_capture
     match settings.views_from:
@@ -282,7 +282,7 @@ def _corners(context: bpy.types.Context) -> np.ndarray:
     """Return the corners (8 N, 3) of the bounding boxes of the selection, or of all rendered objects.
 
     Raises:
-        LodgsError: There are no objects.
+        LodgsError: there are no objects.
     """
     depsgraph = context.evaluated_depsgraph_get()
     objects = [obj for obj in context.view_layer.objects if root_of(obj) is None]
@@ -300,7 +300,7 @@ def _boxes(
     """Yield the bounding-box corners (8, 3) of each rendered object, also in collection instances.
 
     Args:
-        transform: Transform of the collection instance.
+        transform: transform of the collection instance.
     """
     for obj in objects:
         if obj.hide_render:
@@ -322,7 +322,7 @@ def preview_views(root: bpy.types.Object) -> list[Camera]:
     They are in the splats' world.
 
     Raises:
-        LodgsError: There are no opaque splats or no curve.
+        LodgsError: there are no opaque splats or no curve.
     """
     settings = root.lodgs.training
     match settings.views_from:
@@ -344,7 +344,7 @@ def preview_dome(root: bpy.types.Object) -> tuple[list[Camera], tuple[float, flo
     The dome is computed from a sample of the splats.
 
     Raises:
-        LodgsError: There are no opaque splats.
+        LodgsError: there are no opaque splats.
     """
     count = root.lodgs.training.views
     views, near = _cached(
@@ -413,7 +413,7 @@ def _require_two(cameras: list[bpy.types.Object]) -> list[bpy.types.Object]:
     """Return the cameras.
 
     Raises:
-        LodgsError: There are fewer than two.
+        LodgsError: there are fewer than two.
     """
     if len(cameras) < MIN_VIEWS:
         raise LodgsError(
@@ -441,7 +441,7 @@ def _animated(
         view_in: returns the view in an evaluated depsgraph.
 
     Raises:
-        LodgsError: The camera does not move, or cannot be used.
+        LodgsError: the camera does not move, or cannot be used.
     """
     scene, frame, subframe = context.scene, context.scene.frame_current, context.scene.frame_subframe
 
@@ -465,7 +465,7 @@ def _curve_points(curve: bpy.types.Object | None) -> np.ndarray:
     """Return the points (P, 3) of a curve in Blender's world, at display resolution.
 
     Raises:
-        LodgsError: There is no curve, or it does not have one spline.
+        LodgsError: there is no curve, or it does not have one spline.
     """
     if curve is None:
         raise LodgsError("Cannot place views: no curve is chosen.", "Choose a curve, or choose other views.")

@@ -19,13 +19,13 @@ from .crops import OBJECT, SIZE, SPHERE, USE, inside_crop
 COUNT = "lodgs_looks"
 """Custom property of these groups: their number of regions with a local look."""
 NAME = "LODGS Look"
-MATRIX_ROWS, OPACITY, OUTSIDE = ("red_{}", "green_{}", "blue_{}"), "opacity_{}", "outside_{}"
+MATRIX_ROWS, OPACITY, BEYOND = ("red_{}", "green_{}", "blue_{}"), "opacity_{}", "beyond_{}"
 """Sockets of each look: the rows of its colour matrix, its opacity factor, and a flag that is 1 if the look
-applies outside its region. Look 0 applies everywhere and has no flag. The looks of regions are numbered from 1
-and also have the sockets of a crop."""
+applies outside its region. Look 0 applies everywhere and has no flag. The looks of regions are numbered from
+1 and also have the sockets of a crop."""
 HIGHER_SH = "lodgs_higher_sh"
 """Custom property of these groups: number of SH coefficients above degree 0 that they change."""
-_VERSION = 4
+_VERSION = 3
 
 
 def look_group(count: int, higher: int) -> bpy.types.GeometryNodeTree:
@@ -49,7 +49,7 @@ def look_group(count: int, higher: int) -> bpy.types.GeometryNodeTree:
         color = _apply_matrix(nodes, sockets, 0, color)
         rows = [sockets[row.format(0)] for row in MATRIX_ROWS]
         for number in range(1, count + 1):
-            enabled, outside = (nodes.field(sockets[name.format(number)]) for name in (USE, OUTSIDE))
+            enabled, outside = (nodes.field(sockets[name.format(number)]) for name in (USE, BEYOND))
             inside = inside_crop(nodes, sockets, number, position)
             affected = enabled & (outside > 0.5).where(1.0 - inside, inside)
             mapped = _apply_matrix(nodes, sockets, number, color)
@@ -104,7 +104,7 @@ def is_current(tree: bpy.types.NodeTree | None, count: int, higher: int) -> bool
 def _add_sockets(tree: bpy.types.GeometryNodeTree, number: int) -> None:
     kinds = dict.fromkeys(MATRIX_ROWS, "NodeSocketVector") | {OPACITY: "NodeSocketFloat"}
     if number:
-        kinds |= {OBJECT: "NodeSocketObject"} | dict.fromkeys((SIZE, SPHERE, USE, OUTSIDE), "NodeSocketFloat")
+        kinds |= {OBJECT: "NodeSocketObject"} | dict.fromkeys((SIZE, SPHERE, USE, BEYOND), "NodeSocketFloat")
     for name, kind in kinds.items():
         tree.interface.new_socket(name.format(number), in_out="INPUT", socket_type=kind)
 

@@ -26,14 +26,15 @@ MAX_POSITIONS = 120
 def measure_veil(evaluation: Evaluation, source: SplatSource) -> dict[str, float]:
     """Measure the share of veiled pixels at positions halfway between training cameras.
 
-    A pixel is veiled if splats nearer than ``VEIL_DEPTH`` times the scene's median depth stop at least half of its light.
+    A pixel is veiled if splats nearer than ``VEIL_DEPTH`` times the scene's median depth stop at least half
+    of its light.
 
     Args:
         source: returns the splats of a camera.
 
     Returns:
-        ``mean`` and ``max`` over the positions, from 0 to 1. The positions are those of :func:`.midpoint_views`, or
-        ``MAX_POSITIONS`` evenly chosen ones.
+        ``mean`` and ``max`` over the positions, from 0 to 1. The positions are those of
+        :func:`.midpoint_views`, or ``MAX_POSITIONS`` evenly chosen ones.
     """
     shares = []
     for camera in pick_evenly(midpoint_views(evaluation.data.train), MAX_POSITIONS):

@@ -311,5 +311,6 @@ def _invalid(key: str, value: Any) -> LodgsError:
     text = "nothing" if value is None else repr(value)
     text = text if len(text) < 100 else f"{text[:100]}..."
     return LodgsError(
-        f'Cannot read the request: "{key}" cannot be {text}.', "Use the same version of LODGS on both sides."
+        f'Cannot read the request: "{key}" cannot be {text}.',
+        "Use an extension and a trainer of the same version.",
     )

@@ -106,7 +106,7 @@ def reconstruct(
         report: called with the progress.
 
     Raises:
-        LodgsError: if there are too few photos, too few overlap, or a file cannot be written.
+        LodgsError: there are too few photos, too few overlap, or a file cannot be written.
     """
     photos, out = (Path(os.path.abspath(path)) for path in (photos, out))
     masks = None if masks is None else Path(os.path.abspath(masks))
