@@ -81,7 +81,7 @@ class Control:
 
     @property
     def flag(self) -> bool:
-        """Whether the control is a checkbox."""
+        """True if the control is a checkbox."""
         return self.integer and (self.low, self.high) == (0, 1)
 
     def validate(self, value: float) -> float:
@@ -266,7 +266,7 @@ class Rule(ABC):
 
     @property
     def complete(self) -> bool:
-        """Whether every level is a complete scene, see :meth:`standalone_levels`."""
+        """True if every level is a complete scene, see :meth:`standalone_levels`."""
         return len(self.standalone_levels((1, 2))) == 2
 
     def complete_levels(self, bundle: Bundle) -> Bundle:
@@ -287,7 +287,7 @@ class Rule(ABC):
 
     @property
     def weights_full_detail(self) -> bool:
-        """Whether single levels need weights, see :meth:`full_detail_values`."""
+        """True if single levels need weights, see :meth:`full_detail_values`."""
         return self.full_detail_values((1,)) is not None
 
     def exceeds_budget(self, finest: int, budget: int) -> bool:

@@ -424,5 +424,5 @@ def _require_complete_model(folder: Path) -> None:
                 missing = ({"cameras", "images"} - present).pop()
                 raise LodgsError(
                     f"Cannot read scene: {root / f'{missing}{suffix}'} is missing.",
-                    f"Copy it beside {present.pop()}{suffix}, or export the model again.",
+                    f"Copy it next to {present.pop()}{suffix}, or export the model again.",
                 )

@@ -331,7 +331,7 @@ def _link_masks(masks: Path, photos: Path, image_names: Mapping[str, str], out: 
     if not folder.is_dir():
         first = next(iter(image_names))
         raise LodgsError(
-            f"Cannot use masks: {masks} holds no mask of these photos.",
+            f"Cannot use masks: {masks} has no mask of these photos.",
             f"Name the mask of {first} {first}.png.",
         )
     return folder

@@ -177,7 +177,8 @@ NEUTRAL = {"exposure": 0, "temperature": 6500, "tint": [1, 1, 1], "saturation": 
 @pytest.mark.parametrize(
     ("looks", "message"),
     [
-        ("red", "Cannot read the request"), (["red"], "Cannot read the request"), ([{"look": {}}], "Cannot read the request"),
+        ("red", "Cannot read the request"), (["red"], "Cannot read the request"),
+        ([{"look": {}}], "Cannot read the request"),
         ([{"look": NEUTRAL | {"tint": [1, 1]}}], "Cannot read the request"),
         ([{"look": NEUTRAL | {"contrast": 1}}], "Cannot read the request"),
         ([{"look": NEUTRAL, "crop": {"shape": "BOX"}}], "Cannot read the request"),
