@@ -118,7 +118,7 @@ class Scene:
             default: value if no camera sees a point; None raises an error.
 
         Raises:
-            LodgsError: if no camera sees a point.
+            LodgsError: no camera sees a point.
         """
         if np.isfinite(self._median_depth):
             return self._median_depth
@@ -162,7 +162,7 @@ def find_models(folder: Path) -> list[Path]:
     ``dense/0/sparse``. It visits at most MAX_FOLDERS folders, upper levels first.
 
     Raises:
-        LodgsError: if the folder does not exist.
+        LodgsError: the folder does not exist.
     """
     folder = _absolute(folder)
     check_folder(folder, "Choose the folder of a COLMAP scene.")
@@ -210,7 +210,7 @@ def read_scene(
         progress: called now and then.
 
     Raises:
-        LodgsError: if there is no folder, model or photo, or a model file is damaged.
+        LodgsError: there is no folder, model or photo, or a model file is damaged.
     """
     folder = _absolute(folder)
     warnings: list[str] = []
@@ -299,7 +299,7 @@ def _read_registered(model: Path) -> tuple[dict[int, Intrinsics], list[Pose]]:
     """Return the lenses by id and the poses sorted by name.
 
     Raises:
-        LodgsError: if a file is missing or damaged, or there is no pose.
+        LodgsError: a file is missing or damaged, or there is no pose.
     """
     suffix = model_suffix(model)
     if not suffix:
@@ -331,7 +331,7 @@ def exclude_views(scene: Scene, reasons: dict[str, str]) -> Scene:
         reasons: a sentence by view name, which follows "Skipped <name>:".
 
     Raises:
-        LodgsError: if no view remains.
+        LodgsError: no view remains.
     """
     if not reasons:
         return scene
@@ -384,7 +384,7 @@ def _absolute(path: Path | str) -> Path:
     """Return an absolute path that is valid in other processes; links are kept.
 
     Raises:
-        LodgsError: if the path is not UTF-8, because jobs and Blender cannot store it.
+        LodgsError: the path is not UTF-8, because jobs and Blender cannot store it.
     """
     path = Path(os.path.abspath(path))
     if printable(path) != str(path):
@@ -424,5 +424,5 @@ def _require_complete_model(folder: Path) -> None:
                 missing = ({"cameras", "images"} - present).pop()
                 raise LodgsError(
                     f"Cannot read scene: {root / f'{missing}{suffix}'} is missing.",
-                    f"Copy it beside {present.pop()}{suffix}, or export the model again.",
+                    f"Copy it next to {present.pop()}{suffix}, or export the model again.",
                 )

@@ -40,7 +40,7 @@ def run_program(
         The error message of the program; "" after success.
 
     Raises:
-        OSError: if the disk is full or the program cannot be started.
+        OSError: the disk is full or the program cannot be started.
     """
     package = Path(__file__).resolve().parents[1]  # training, or lodgs after pip install
     with subprocess.Popen(

@@ -78,7 +78,7 @@ def write_rendered_model(
         The number of views and the number of points.
 
     Raises:
-        LodgsError: if a view lacks a file or depth, or no two views show the same surface.
+        LodgsError: a view lacks a file or depth, or no two views show the same surface.
     """
     from .write_colmap import write_visible_points  # imports pycolmap, which reading must not require
 
@@ -201,7 +201,7 @@ def read_exr_depth(file: Path) -> np.ndarray:
     count.
 
     Raises:
-        LodgsError: if the file cannot be read or contains no depth.
+        LodgsError: the file cannot be read or contains no depth.
     """
     try:
         channels = [channel for _, _, part in read_parts(file) for channel in part.items()]

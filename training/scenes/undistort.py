@@ -44,7 +44,7 @@ def undistort_scene(scene: Scene, cache: Path) -> Scene:
     Undistorted images are cropped to contain no empty pixels (COLMAP's blank_pixels = 0).
 
     Raises:
-        LodgsError: if pycolmap is missing or fails, photos of one camera differ in size, or the cache cannot
+        LodgsError: pycolmap is missing or fails, photos of one camera differ in size, or the cache cannot
             be written.
     """
     if not scene.distorted:
@@ -77,7 +77,7 @@ def cached_undistorted_scene(scene: Scene) -> Scene | None:
     """Return the undistorted scene from the cache inside the scene's folder, or None if it is not cached.
 
     Raises:
-        LodgsError: if the cached scene is damaged.
+        LodgsError: the cached scene is damaged.
     """
     if not scene.distorted:
         return scene

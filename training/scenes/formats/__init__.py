@@ -91,7 +91,7 @@ def convert_export(folder: Path, out: Path | None = None) -> ConvertedScene:
             written next to the photos, which stay unchanged.
 
     Raises:
-        LodgsError: if the format is unknown, the export is damaged, or the scene cannot be written.
+        LodgsError: the format is unknown, the export is damaged, or the scene cannot be written.
     """
     folder = folder.absolute()
     check_folder(folder, "Choose the folder of another program's export.")

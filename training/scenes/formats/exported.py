@@ -93,7 +93,7 @@ def get_number(values: Mapping[str, Any], name: str, default: float | None = Non
     """Return a number by name.
 
     Raises:
-        LodgsError: if there is neither a number nor a default.
+        LodgsError: there is neither a number nor a default.
     """
     value = values.get(name, default)
     if isinstance(value, bool) or not isinstance(value, int | float):
@@ -105,7 +105,7 @@ def parse_array(value: Any, *shape: int) -> np.ndarray:
     """Return nested or flat lists of numbers as an array of the given shape.
 
     Raises:
-        LodgsError: if the value has another shape, or contains anything but finite numbers.
+        LodgsError: the value has another shape, or contains anything but finite numbers.
     """
     try:
         array = np.array(value, np.float64)
@@ -129,7 +129,7 @@ def colmap_lens(
         tangential: OpenCV's p1, p2; for a fisheye, the same terms of its angles.
 
     Raises:
-        LodgsError: if a parameter is invalid.
+        LodgsError: a parameter is invalid.
     """
     k = [*radial, *[0.0] * 6][: max(6, len(radial))]
     if fisheye and any(tangential):
@@ -155,7 +155,7 @@ def invert_pose(camera_to_world: np.ndarray, opengl: bool = False) -> np.ndarray
         opengl: True for a pose in OpenGL's camera axes.
 
     Raises:
-        LodgsError: if the pose is not a rotation and translation.
+        LodgsError: the pose is not a rotation and translation.
     """
     pose = np.eye(4)
     if len(camera_to_world) < 3:
