@@ -13,6 +13,7 @@ from typing import Any
 
 import bpy
 
+from ...training.runs.processes import PARENT, identity
 from .. import extension
 
 if sys.platform != "win32":
@@ -31,16 +32,19 @@ MARK = "lodgs-in-use"
 def environment() -> dict[str, str]:
     """Return environment variables for another Python, without those that Blender set for its own.
 
-    Compiled code goes to the user's folder, because the extension's folder may be read-only.
+    Compiled code goes to the user's folder, because the extension's folder may be read-only. Programs of a
+    Blender without a window stop when Blender ends.
     """
     values = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "__PYVENV_LAUNCHER__"))}
     cache = extension.user_folder("cache")
     values.setdefault("NUMBA_CACHE_DIR", str(cache / "numba"))
+    if bpy.app.background:
+        values[PARENT] = f"{os.getpid()} {identity(os.getpid())}"
     return values | {"PYTHONPYCACHEPREFIX": str(cache / "pycache"), "PYTHONUTF8": "1"}
 
 
 def spawn(command: list[str], log: Path, output: Path) -> subprocess.Popen:
-    """Start a program that may outlive Blender, in the extension's folder.
+    """Start a program that may outlive Blender's window, in the extension's folder.
 
     Args:
         command: program and arguments.
