@@ -19,7 +19,7 @@ from ..training.cli.options import add_setting, parse_size
 from ..training.editing.export import EXPORT_OPTIONS, export_finest_level, run_to_end
 from ..training.errors import LodgsError
 from ..training.evaluate.messages import summary_lines
-from ..training.runs.folder import RunFolder
+from ..training.runs.folder import RunFolder, find_splats
 from ..training.runs.job import KEYS, Job
 from ..training.settings import check_value
 from ..training.splats.bundle import write_bundle
@@ -150,9 +150,9 @@ def _add_frames(commands: _Commands) -> None:
 
 
 def _add_info(commands: _Commands) -> None:
-    info = commands.add_parser("info", help="describe a bundle or a 3DGS PLY file")
+    info = commands.add_parser("info", help="describe a bundle, a run or a 3DGS PLY file")
     info.set_defaults(command=_info)
-    info.add_argument("file", type=Path, help="file to describe")
+    info.add_argument("file", type=Path, help="file or run folder to describe")
 
 
 def _train(args: argparse.Namespace) -> int:
@@ -321,7 +321,7 @@ def _open(blend: Path) -> None:
 
 
 def _info(args: argparse.Namespace) -> int:
-    print(describe(args.file))
+    print(describe(find_splats(args.file)))
     return DONE
 
 
