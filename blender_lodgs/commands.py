@@ -182,6 +182,7 @@ def _train(args: argparse.Namespace) -> int:
         return CANCELLED
     if args.export:
         write_bundle(args.export, scenes.read_levels(root))
+        _print(f"{args.export}: written")
     return DONE
 
 
@@ -234,6 +235,7 @@ def _export(args: argparse.Namespace) -> int:
         write_bundle(args.bundle, bundle)
     else:
         run_to_end(export_finest_level(args.bundle, bundle))
+    _print(f"{args.bundle}: written")
     return DONE
 
 
@@ -337,6 +339,7 @@ def _save(path: Path) -> None:
             f"Cannot create folder {path.parent}: {error.strerror}.", "Choose another folder."
         ) from error
     bpy.ops.wm.save_as_mainfile(filepath=str(path.resolve()), check_existing=False)
+    _print(f"{path}: written")
 
 
 def _print(text: str) -> None:
