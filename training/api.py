@@ -35,7 +35,7 @@ __all__ = ["FinishedRun", "LodgsError", "load_bundle", "load_scene", "render_ima
 
 AnyPath = str | PathLike[str]
 Event = Mapping[str, Any]
-"""An event of a run, see ``runs.events``: its kind as "event", and further values by name."""
+"""An event of a run, as in its ``events.jsonl``: its kind as "event", and further values by name."""
 
 
 def load_scene(folder: AnyPath, *, model: AnyPath | None = None, images: AnyPath | None = None) -> Scene:
