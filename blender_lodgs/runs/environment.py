@@ -86,7 +86,7 @@ def trainer_python() -> Path:
     raise LodgsError(
         "The trainer is not installed.",
         "Press Install Trainer in the preferences of LODGS, or set the environment variable "
-        f"{VARIABLE} to a Python that has it.",
+        f"{VARIABLE} to a Python with the wheel of LODGS.",
     )
 
 
