@@ -19,7 +19,7 @@ from ..training.cli.options import add_setting, parse_size
 from ..training.editing.export import EXPORT_OPTIONS, export_finest_level, run_to_end
 from ..training.errors import LodgsError
 from ..training.evaluate.messages import summary_lines
-from ..training.runs.folder import RunFolder
+from ..training.runs.folder import RunFolder, find_splats
 from ..training.runs.job import KEYS, Job
 from ..training.settings import check_value
 from ..training.splats.bundle import write_bundle
@@ -150,9 +150,9 @@ def _add_frames(commands: _Commands) -> None:
 
 
 def _add_info(commands: _Commands) -> None:
-    info = commands.add_parser("info", help="describe a bundle or a 3DGS PLY file")
+    info = commands.add_parser("info", help="describe a bundle, a run or a 3DGS PLY file")
     info.set_defaults(command=_info)
-    info.add_argument("file", type=Path, help="file to describe")
+    info.add_argument("file", type=Path, help="file or run folder to describe")
 
 
 def _train(args: argparse.Namespace) -> int:
@@ -182,6 +182,7 @@ def _train(args: argparse.Namespace) -> int:
         return CANCELLED
     if args.export:
         write_bundle(args.export, scenes.read_levels(root))
+        _print(f"{args.export}: written")
     return DONE
 
 
@@ -234,6 +235,7 @@ def _export(args: argparse.Namespace) -> int:
         write_bundle(args.bundle, bundle)
     else:
         run_to_end(export_finest_level(args.bundle, bundle))
+    _print(f"{args.bundle}: written")
     return DONE
 
 
@@ -321,7 +323,7 @@ def _open(blend: Path) -> None:
 
 
 def _info(args: argparse.Namespace) -> int:
-    print(describe(args.file))
+    print(describe(find_splats(args.file)))
     return DONE
 
 
@@ -337,6 +339,7 @@ def _save(path: Path) -> None:
             f"Cannot create folder {path.parent}: {error.strerror}.", "Choose another folder."
         ) from error
     bpy.ops.wm.save_as_mainfile(filepath=str(path.resolve()), check_existing=False)
+    _print(f"{path}: written")
 
 
 def _print(text: str) -> None:

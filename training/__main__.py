@@ -13,6 +13,7 @@ from typing import NoReturn
 from . import VERSION
 from .cli import COMMANDS, PROGRAM, check
 from .errors import LodgsError, is_out_of_memory
+from .runs import processes
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -30,6 +31,7 @@ def main(arguments: list[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else arguments
     if arguments == ["check"]:  # needs no packages
         return check.run()
+    processes.stop_with_parent()
     try:
         options = _parser(arguments).parse_args(arguments)
         code = _module(options.command).run(options)

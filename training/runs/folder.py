@@ -279,6 +279,22 @@ class RunFolder:
         return holder if isinstance(holder, dict) else {}
 
 
+def find_splats(path: Path) -> Path:
+    """Return the bundle of a finished run, or the path itself if it is not a run folder.
+
+    Raises:
+        LodgsError: the run is not finished.
+    """
+    run = RunFolder(path)
+    if not run.job.exists():
+        return path
+    if not run.bundle.exists():
+        raise LodgsError(
+            f"Cannot read {path}: the run is not finished (no bundle.ply).", "Train it to the end."
+        )
+    return run.bundle
+
+
 def _take(request: Path) -> bool:
     """Delete a request file; return whether it existed."""
     try:

@@ -9,7 +9,6 @@ import sys
 import threading
 import time
 import traceback
-from _thread import interrupt_main
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -45,6 +44,7 @@ from ..splats.file_rows import open_ply
 from ..splats.gaussians import SplatRows, Splats
 from ..splats.levels import NO_SPLATS, Bundle, Level
 from ..splats.ply import BATCH_ROWS, Columns, read_ply, write_ply
+from . import processes
 from .base import open_base
 from .blocks.plan import write_plan
 from .blocks.train import BlocksStopped, train_blocks
@@ -441,7 +441,7 @@ def _interrupt_on_cancel(folder: RunFolder):
         while not finished.wait(0.1):
             with suppress(OSError):
                 if folder.take_cancel():
-                    _interrupt()
+                    processes.interrupt()
                     return
 
     previous = None
@@ -457,14 +457,6 @@ def _interrupt_on_cancel(folder: RunFolder):
         watcher.join()
         if previous is not None:
             signal.signal(signal.SIGINT, previous)
-
-
-def _interrupt() -> None:
-    """Send Ctrl-C to the main thread, even while it waits for another program."""
-    if hasattr(signal, "pthread_kill"):
-        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
-    else:
-        interrupt_main()
 
 
 @contextmanager

@@ -30,8 +30,12 @@ class Camera:
 
     Attributes:
         name: image path relative to the scene's image folder, with forward slashes.
-        width, height: image size in pixels.
-        fx, fy, cx, cy: intrinsics in pixels; pixel centres lie at +0.5, as in COLMAP.
+        width: image width in pixels.
+        height: image height in pixels.
+        fx: horizontal focal length in pixels.
+        fy: vertical focal length in pixels.
+        cx: principal point in pixels, from the left; pixel centres lie at +0.5, as in COLMAP.
+        cy: principal point in pixels, from the top.
         world_to_camera: (4, 4) float64 rigid transform, OpenCV axes, COLMAP world.
         image: path of the photo, or None.
         mask: path of a mask with the photo's aspect ratio, black in ignored areas, or None.

@@ -47,7 +47,9 @@ class Scene:
     """A COLMAP model with its photos, in COLMAP's world.
 
     Attributes:
-        folder, model, images_folder: source folders.
+        folder: folder of the scene.
+        model: folder of the model.
+        images_folder: folder of the photos.
         cameras: views with a usable photo, sorted by name; their size is the photo's size.
         points: (P, 3) float32, possibly empty.
         point_colors: (P, 3) uint8.
