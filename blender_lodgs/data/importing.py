@@ -17,6 +17,7 @@ from ...training.methods import METHODS
 from ...training.scenes.cameras import Camera, camera_extent
 from ...training.scenes.colmap import Scene, read_scene
 from ...training.scenes.formats import ensure_colmap_scene
+from ...training.scenes.triangulate import cached_points
 from ...training.scenes.undistort import cached_undistorted_scene
 from ...training.scenes.view_tables import read_view_tables
 from ...training.splats.bundle import read_bundle, read_header
@@ -101,7 +102,7 @@ def _read_photo_scene(
     try:
         if model is None:
             folder = ensure_colmap_scene(folder, warn)
-        scene = read_scene(folder, model, images, manager.progress_update)
+        scene = cached_points(read_scene(folder, model, images, manager.progress_update))
     finally:
         manager.progress_end()
     for message in scene.warnings:

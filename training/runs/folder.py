@@ -4,6 +4,7 @@
           costs.png (plot of the costs measured to choose the levels' distances)
           model.npz (networks of a method that has them)
           undistorted/ (photos without lens distortion, if the scene folder is read-only)
+          triangulated/ (points of a scene without points, if the scene folder is read-only)
           blocks/ (runs of the parts of a scene in cells, and their merged bundle)
           captured/ (COLMAP scene rendered from splats that have no photos)
           base.ply, cameras/ (splats and views that Blender exported for the run)
@@ -54,6 +55,7 @@ class RunFolder:
         self.log = self.path / "trainer.log"
         self.output = self.path / "trainer.out"
         self.undistorted = self.path / "undistorted"
+        self.triangulated = self.path / "triangulated"
         self.captured = self.path / "captured"
         self.base = self.path / "base.ply"
         self.cameras = self.path / "cameras"
@@ -263,8 +265,9 @@ class RunFolder:
         for folder in (self.path, self.checkpoints, self.levels_folder):
             remove_temporaries(folder)
         self.reserve.unlink(missing_ok=True)
-        for temporary in self.undistorted.glob("undistorting-*"):
-            shutil.rmtree(temporary, ignore_errors=True)
+        for cache in (self.undistorted, self.triangulated):
+            for temporary in cache.glob("*ing-*"):
+                shutil.rmtree(temporary, ignore_errors=True)
         with suppress(FileNotFoundError):
             if self._cancel.stat().st_mtime < _STARTED - _STALE_SECONDS:
                 self._cancel.unlink()

@@ -50,7 +50,7 @@ from .blocks.plan import write_plan
 from .blocks.train import BlocksStopped, train_blocks
 from .blocks.workers import HERE, workers
 from .checkpoints import read_newest, remove_checkpoints, write_checkpoint
-from .data import training_data
+from .data import training_data, with_points
 from .events import PROTOCOL, EventWriter, event_line
 from .failures import CANCELLED, CRASHED, DONE, describe_error
 from .folder import RunFolder
@@ -134,7 +134,9 @@ def _train(
         merged_is_result = bool(job.cells) and METHODS[job.method].cell_method == job.method
         if job.cells:
             merged = folder.bundle if merged_is_result else folder.merged
-            division = write_plan(job, folder)
+            division = write_plan(
+                job, folder, add_points=lambda scene: with_points(scene, job, folder, events)
+            )
             with workers(on, resources) as submit:
                 train_blocks(division, merged, submit, events)
             job = replace(job, base="" if merged_is_result else str(merged))

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import LodgsError
-from .colmap import Progress, Scene, observations, read_scene
+from .colmap import NO_POINTS, Progress, Scene, observations, read_scene
 
 MIN_VIEWS = 2
 """Number of views below which nothing can be trained."""
@@ -22,8 +22,6 @@ MIN_SHARED = 20
 MAX_ROUNDING = 0.25
 """Maximum rounding error of float32 coordinates, in pixels of a photo at the median depth."""
 ERROR, WARNING = "error", "warning"
-NO_POINTS = "The scene has no points"
-"""First words of the warning of ``read_scene`` about a scene without points."""
 
 
 class Finding(NamedTuple):
@@ -115,8 +113,8 @@ def _no_points(scene: Scene) -> Iterator[Finding]:
     if not len(scene.points):
         yield Finding(
             WARNING,
-            f"{NO_POINTS} to start from, and random points cost several dB.",
-            "Export the points too, or find the cameras again with COLMAP.",
+            f"{NO_POINTS}. Training triangulates them from the photos first, which takes minutes.",
+            "Export the points too to save this time.",
         )
 
 

@@ -37,6 +37,8 @@ MAX_DEPTH_CAMERAS = 500
 """Maximum number of cameras used to compute the median depth."""
 MAX_FOLDERS = 20_000
 """Maximum number of folders searched for models."""
+NO_POINTS = "The scene has no points"
+"""First words of the warning about a scene without points."""
 
 Progress = Callable[[float], object]
 """Callback that receives the completed fraction, from 0 to 1."""
@@ -57,6 +59,7 @@ class Scene:
         warnings: one sentence per skipped or suspicious item.
         point_ids: (P,) int64 ids of the model; empty if the points come from another source.
         names: names of all views of the model, sorted, with or without a photo. Default: the cameras' names.
+        point_model: folder of the model that records the points' observations. Default: ``model``.
     """
 
     folder: Path
@@ -69,6 +72,7 @@ class Scene:
     warnings: list[str] = field(default_factory=list)
     point_ids: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
     names: Sequence[str] = ()
+    point_model: Path | None = None
 
     def split(self, test_every: int, validation: bool = False) -> tuple[list[Camera], list[Camera]]:
         """Split the cameras into training cameras and held-out cameras.
@@ -278,7 +282,10 @@ def _read_inlier_points(
         points, ids = positions.astype(np.float32), np.zeros(0, np.int64)
         warnings.append(f"The model {model} has no points; {len(points):,} were read from {cloud}.")
     if not len(points):
-        warnings.append(f"The scene has no points: {model} has no points3D{model_suffix(model)} with points.")
+        warnings.append(
+            f"{NO_POINTS}: {model} has no points3D{model_suffix(model)} with points. Training triangulates "
+            "them from the photos."
+        )
     valid = (np.abs(points) <= MAX_COORDINATE).all(axis=1)
     outliers, inlier_cameras = find_outliers(points[valid], cameras)
     valid[valid] = ~outliers
@@ -361,7 +368,7 @@ def observations(scene: Scene, names: Collection[str]) -> dict[str, np.ndarray]:
     order = np.argsort(scene.point_ids)
     sorted_ids = scene.point_ids[order]
     indices = {}
-    for name, ids in read_observations(scene.model, names).items():
+    for name, ids in read_observations(scene.point_model or scene.model, names).items():
         slots = np.searchsorted(sorted_ids, ids).clip(max=len(order) - 1)
         indices[name] = order[slots[sorted_ids[slots] == ids]]
     return indices if any(map(len, indices.values())) else {}

@@ -93,6 +93,16 @@ class Intrinsics:
         cx, cy = self.parameters[self.lens.focals : self.lens.focals + 2]
         return float(fx), float(fy), float(cx), float(cy)
 
+    def resized(self, width: int, height: int) -> Intrinsics:
+        """Return the lens for photos of another size."""
+        if (width, height) == (self.width, self.height):
+            return self
+        focals, parameters = self.lens.focals, self.parameters.copy()
+        scale_x, scale_y = width / self.width, height / self.height
+        parameters[:focals] *= (scale_x,) if focals == 1 else (scale_x, scale_y)
+        parameters[focals : focals + 2] *= scale_x, scale_y
+        return Intrinsics(self.lens, width, height, parameters)
+
 
 @dataclass(frozen=True)
 class Pose:

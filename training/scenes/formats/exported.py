@@ -49,15 +49,7 @@ class ExportedView:
 
     def sized(self, width: int, height: int) -> ExportedView:
         """Return the view with the lens scaled to photos of the given size."""
-        lens = self.lens
-        focals = lens.lens.focals
-        if (width, height) == (lens.width, lens.height):
-            return self
-        parameters = lens.parameters.copy()
-        scale_x, scale_y = width / lens.width, height / lens.height
-        parameters[:focals] *= (scale_x,) if focals == 1 else (scale_x, scale_y)
-        parameters[focals : focals + 2] *= scale_x, scale_y
-        return replace(self, lens=make_intrinsics(lens.lens.name, width, height, parameters))
+        return replace(self, lens=self.lens.resized(width, height))
 
     def camera(self, name: str) -> Camera:
         """Return the pinhole part of the camera."""
