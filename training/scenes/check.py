@@ -10,6 +10,7 @@ import numpy as np
 
 from ..errors import LodgsError
 from .colmap import NO_POINTS, Progress, Scene, observations, read_scene
+from .triangulate import cached_points
 
 MIN_VIEWS = 2
 """Number of views below which nothing can be trained."""
@@ -61,7 +62,7 @@ def check_folder(
         The findings, the most severe first. A scene that cannot be read is one finding.
     """
     try:
-        scene = read_scene(folder, model, images, progress)
+        scene = cached_points(read_scene(folder, model, images, progress))
         findings = [*check_scene(scene, image_scale), *_exposure(scene)]
     except LodgsError as error:
         return [Finding(ERROR, error.what, error.remedy)]
@@ -110,7 +111,7 @@ def _sizes(scene: Scene, image_scale: float) -> Iterator[Finding]:
 
 
 def _no_points(scene: Scene) -> Iterator[Finding]:
-    if not len(scene.points):
+    if not len(scene.points) and any(camera.depth is None for camera in scene.cameras):
         yield Finding(
             WARNING,
             f"{NO_POINTS}. Training triangulates them from the photos first, which takes minutes.",

@@ -283,8 +283,8 @@ def _read_inlier_points(
         warnings.append(f"The model {model} has no points; {len(points):,} were read from {cloud}.")
     if not len(points):
         warnings.append(
-            f"{NO_POINTS}: {model} has no points3D{model_suffix(model)} with points. Training triangulates "
-            "them from the photos."
+            f"{NO_POINTS}: {model} has no points3D{model_suffix(model)} with points. Training creates them "
+            f"from the {'photos' if any(camera.depth is None for camera in cameras) else 'depth maps'}."
         )
     valid = (np.abs(points) <= MAX_COORDINATE).all(axis=1)
     outliers, inlier_cameras = find_outliers(points[valid], cameras)

@@ -151,7 +151,9 @@ def _extract(request: dict, work: Path, deadline: float) -> tuple[dict[int, np.n
         with pycolmap.Database.open(work / DATABASE) as database:
             for name in names:
                 image = database.read_image_with_name(name)
-                pixels = pycolmap.Bitmap.read(work / "photos" / name, as_rgb=True).to_array()
+                photo = pycolmap.Bitmap.read(work / "photos" / name, as_rgb=True)
+                assert image is not None and photo is not None
+                pixels = photo.to_array()
                 x, y = database.read_keypoints(image.image_id)[:, :2].astype(int).T
                 height, width = pixels.shape[:2]
                 colors[photo_number(name)] = pixels[y.clip(0, height - 1), x.clip(0, width - 1)]

@@ -212,10 +212,16 @@ def _triangulate(scene: Scene, work: Path, report: Report, exposure: float) -> P
             result.update(message["result"])
         elif "photos" in message:
             numbers = message["photos"]
-            views = [(n, scene.cameras[n - 1], sizes[n - 1]) for n in numbers]
+
+            def write(n: int) -> bool:
+                return _write_photo(n, scene.cameras[n - 1], sizes[n - 1], work, exposure)
+
             with ThreadPoolExecutor(DECODERS) as pool:
-                written = pool.map(lambda view: _write_photo(*view, work, exposure), views)
-                return {"photos": [n for n, usable in zip(numbers, written, strict=True) if usable]}
+                return {
+                    "photos": [
+                        n for n, usable in zip(numbers, pool.map(write, numbers), strict=True) if usable
+                    ]
+                }
         elif message["stage"] != last_stage or time.monotonic() > next_report:
             last_stage, next_report = message["stage"], time.monotonic() + REPORT_SECONDS
             report(STAGES[last_stage], message["done"], message["total"])

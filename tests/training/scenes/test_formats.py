@@ -328,7 +328,7 @@ def test_missing_files_give_warnings(tmp_path):
 
     write_transforms(tmp_path, remove)
     scene = convert_export(tmp_path)
-    assert scene.views == 3 and len(scene.warnings) == 3
+    assert scene.views == 3 and len(scene.warnings) == 2
     assert "nowhere.ply" in scene.warnings[0]
     assert scene.warnings[1].startswith("1 masks are missing, such as")
     check(tmp_path, [pixels(*project(pose)) for pose in poses()])
