@@ -2,7 +2,7 @@
 
     python tools/attacks_blocks.py [--kills 10] [--seed 0]
 
-``lodgs blocks run --on tcp://...`` trains a plan with a scheduler and two workers. The attack kills at random
+``lodgs blocks run --on KEY`` trains a plan with a scheduler and two workers. The attack kills at random
 times: trainers, Dask's worker processes, and simulated computers (a worker with all its child processes, by
 kill or by shutdown); then once the scheduler and once the command, which are restarted. One run has too
 little disk space (a small tmpfs, which needs root on Linux). Some runs are stopped with Ctrl-C or by
@@ -57,13 +57,14 @@ class Cluster:
     """A Dask scheduler and workers on this computer, started by their commands.
 
     Attributes:
-        address: address of the scheduler; stays the same after a restart.
+        key: the scheduler's key file; its address and key stay the same after a restart.
     """
 
     def __init__(self, work: Path) -> None:
         with socket.create_server(("127.0.0.1", 0)) as server:
-            self.address = "tcp://{}:{}".format(*server.getsockname())
+            self.port = str(server.getsockname()[1])
         self.work = work
+        self.key = str(work / "cluster.pem")
         self.workers = []
         self.start_scheduler()
         for _ in range(WORKERS):
@@ -71,18 +72,18 @@ class Cluster:
 
     def start_scheduler(self) -> None:
         """Start the scheduler."""
-        port = self.address.rpartition(":")[2]
-        self.scheduler = self._start("scheduler", "--host", "127.0.0.1", "--port", port)
+        self.scheduler = self._start("scheduler", "--host", "127.0.0.1", "--port", self.port)
+        while not Path(self.key).exists():
+            time.sleep(0.1)
 
     def start_worker(self) -> None:
         """Start another worker."""
-        folder = ("--local-directory", str(self.work / "dask"))
-        self.workers.append(self._start("worker", self.address, "--nthreads", "1", *folder))
+        self.workers.append(self._start("worker"))
 
-    def _start(self, *arguments: str) -> psutil.Process:
+    def _start(self, action: str, *options: str) -> psutil.Process:
         with (self.work / "dask.log").open("ab") as log:
             process = subprocess.Popen(
-                [sys.executable, "-m", "dask", *arguments, "--dashboard-address", ":0"], env=ENVIRONMENT,
+                [sys.executable, "-m", "training", "blocks", action, self.key, *options], env=ENVIRONMENT,
                 stdout=log, stderr=log, start_new_session=True,
             )  # fmt: skip
         return psutil.Process(process.pid)
@@ -163,7 +164,7 @@ class BlockAttack:
         with (run.path / "trainer.out").open("wb") as output, run.log.open("ab") as log:
             return subprocess.Popen(
                 [sys.executable, "-m", "training", "blocks", "run", str(run.path), "--on",
-                 on or self.cluster.address],
+                 on or self.cluster.key],
                 env=ENVIRONMENT, stdout=output, stderr=log, start_new_session=True,
             )  # fmt: skip
 
@@ -337,7 +338,7 @@ def main() -> int:
     options = parser.parse_args()
     with block_attack(random.Random(options.seed)) as attack:
         figures = {"kills": attack.kill_all(options.kills)}
-        figures |= {f"stops, on {on}": attack.stop(on) for on in ("here", "local:2", attack.cluster.address)}
+        figures |= {f"stops, on {on}": attack.stop(on) for on in ("here", "local:2", attack.cluster.key)}
         if sys.platform == "linux" and os.geteuid() == 0:
             figures["disk"] = attack.fill_disk()
         else:

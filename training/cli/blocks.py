@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -38,7 +39,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     train.add_argument("run", type=Path, help="run folder of the plan")
     train.add_argument(
         "--on", default="here", metavar="WHERE",
-        help="here, one at a time (default); local:N, N at a time; or a Dask scheduler, tcp://HOST:8786",
+        help="here, one at a time (default); local:N, N at a time; or the key file of a scheduler",
+    )  # fmt: skip
+    train.add_argument(
+        "--no-tls", action="store_true",
+        help="permit --on tcp://HOST:8786, a Dask scheduler without encryption: everybody who reaches its "
+        "port can run programs as its user",
     )  # fmt: skip
     train.add_argument(
         "--only", metavar="PART",
@@ -49,11 +55,37 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--takes", action="append", default=[], metavar="NAME=NUMBER",
         help="Dask resources that each block needs, such as GPU=1",
     )  # fmt: skip
+    scheduler = actions.add_parser("scheduler", help="distribute blocks to the workers of several computers")
+    scheduler.add_argument("key", type=Path, help="key file to write; every worker needs a copy")
+    scheduler.add_argument(
+        "--host", metavar="HOST", help="address of this computer for the others (default: its main address)"
+    )
+    scheduler.add_argument(
+        "--port", type=parse_positive, default=8786, metavar="N", help="port for connections (default 8786)"
+    )
+    worker = actions.add_parser("worker", help="train blocks of a scheduler on this computer")
+    worker.add_argument("key", type=Path, help="copy of the scheduler's key file")
+    worker.add_argument(
+        "--offers", action="append", default=[], metavar="NAME=NUMBER",
+        help="Dask resources of this worker, such as GPU=1",
+    )  # fmt: skip
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
-    return _plan(options) if options.action == "plan" else _train(options)
+    match options.action:
+        case "plan":
+            return _plan(options)
+        case "run":
+            return _train(options)
+    from ..runs.blocks import cluster
+
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    if options.action == "scheduler":
+        cluster.run_scheduler(options.key, options.host, options.port)
+    else:
+        cluster.run_worker(options.key, parse_resources(options.offers))
+    return 0
 
 
 def _plan(options: argparse.Namespace) -> int:
@@ -104,7 +136,10 @@ def _train(options: argparse.Namespace) -> int:
 
     if not options.only:
         return train_job(
-            lambda: read_planned_job(options.run), on=options.on, resources=parse_resources(options.takes)
+            lambda: read_planned_job(options.run),
+            on=options.on,
+            resources=parse_resources(options.takes),
+            tls=not options.no_tls,
         )
     division = read_plan(RunFolder(options.run))
     part = division.part(options.only)

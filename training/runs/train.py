@@ -12,7 +12,7 @@ import traceback
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 import torch
@@ -48,7 +48,7 @@ from . import processes
 from .base import open_base
 from .blocks.plan import write_plan
 from .blocks.train import BlocksStopped, train_blocks
-from .blocks.workers import HERE, workers
+from .blocks.workers import workers
 from .checkpoints import read_newest, remove_checkpoints, write_checkpoint
 from .data import training_data, with_points
 from .events import PROTOCOL, EventWriter, event_line
@@ -61,15 +61,13 @@ PROGRESS_SECONDS = 0.25, 10.0
 """Minimum and maximum seconds between ``progress`` events; a thousandth of the elapsed time in between."""
 
 
-def train(
-    job: Job, stream: IO[str] | None = None, on: str = HERE, resources: dict[str, float] | None = None
-) -> int:
+def train(job: Job, stream: IO[str] | None = None, **placement: Any) -> int:
     """Start or resume a job.
 
     Args:
         job: the job. A run folder that contains another job is rejected.
         stream: additional output for events.
-        on, resources: workers that train the blocks of a scene in cells, see ``blocks.workers``.
+        placement: arguments of ``blocks.workers.workers``, which train the cells of a scene.
 
     Returns:
         An exit code. Errors end in an ``error`` event, never in a traceback on the stream.
@@ -78,7 +76,7 @@ def train(
     try:
         folder.create()
         with folder.locked():
-            return _start_or_resume(job.resolved(), folder, stream, on, resources)
+            return _start_or_resume(job.resolved(), folder, stream, placement)
     except BaseException as error:  # another process or job owns the run: do not write into it
         code, event = _final_event(error)
         if stream is not None:
@@ -87,9 +85,7 @@ def train(
         return code
 
 
-def _start_or_resume(
-    job: Job, folder: RunFolder, stream: IO[str] | None, on: str, resources: dict[str, float] | None
-) -> int:
+def _start_or_resume(job: Job, folder: RunFolder, stream: IO[str] | None, placement: dict[str, Any]) -> int:
     """Start or resume the run in a locked folder, or repeat its final event; return an exit code."""
     save_job(job, folder)
     end = folder.end_event()
@@ -100,7 +96,7 @@ def _start_or_resume(
         return DONE
     events = EventWriter(folder.events_file, folder.reserve, stream)
     try:
-        return _train(job, folder, events, on, resources)
+        return _train(job, folder, events, placement)
     except BaseException as error:
         code, event = _final_event(error)
         events.write_final(**event)
@@ -122,9 +118,7 @@ def _final_event(error: BaseException) -> tuple[int, dict]:
     return code, {"kind": "error", "what": problem, "remedy": remedy}
 
 
-def _train(
-    job: Job, folder: RunFolder, events: EventWriter, on: str, resources: dict[str, float] | None
-) -> int:
+def _train(job: Job, folder: RunFolder, events: EventWriter, placement: dict[str, Any]) -> int:
     started = time.monotonic()
     events(
         "hello", protocol=PROTOCOL, version=VERSION, method=job.method, preset=job.preset,
@@ -137,7 +131,7 @@ def _train(
             division = write_plan(
                 job, folder, add_points=lambda scene: with_points(scene, job, folder, events)
             )
-            with workers(on, resources) as submit:
+            with workers(**placement) as submit:
                 train_blocks(division, merged, submit, events)
             job = replace(job, base="" if merged_is_result else str(merged))
         events("status", message="Reading the scene")

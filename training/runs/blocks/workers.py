@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import subprocess
 import sys
@@ -16,12 +15,11 @@ from typing import Any, Protocol
 from ...errors import LodgsError
 from ..failures import CANCELLED
 from ..folder import RunFolder
+from .cluster import import_dask, local_cluster, read_key_file
 
 HERE = "here"
 TIMEOUT_SECONDS = 20
 """Seconds to wait for a scheduler or nvidia-smi."""
-_IGNORE_INTERRUPT = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
-"""Preload code of local Dask workers: a terminal sends Ctrl-C to all processes, and this one handles it."""
 _PACKAGE = (__package__ or "").partition(".")[0]
 
 
@@ -95,7 +93,7 @@ def train_block(folder: str, threads: int = 0, cards: Sequence[str] = ()) -> int
     if threads:
         environment.setdefault("LODGS_THREADS", str(threads))
     if cards:
-        environment["CUDA_VISIBLE_DEVICES"] = cards[int(_distributed().get_worker().name) % len(cards)]
+        environment["CUDA_VISIBLE_DEVICES"] = cards[int(import_dask().get_worker().name) % len(cards)]
     with run.log.open("ab") as log:
         return subprocess.run(
             [sys.executable, "-m", _PACKAGE, "train", str(run.job)], env=environment, check=False,
@@ -104,14 +102,16 @@ def train_block(folder: str, threads: int = 0, cards: Sequence[str] = ()) -> int
 
 
 @contextmanager
-def workers(on: str = HERE, resources: dict[str, float] | None = None) -> Iterator[Submit]:
+def workers(on: str = HERE, resources: dict[str, float] | None = None, tls: bool = True) -> Iterator[Submit]:
     """Start workers and yield a function that submits blocks to them.
 
     Args:
         on: HERE, one block at a time; "local:N", N blocks at a time on this computer, sharing its cores and
-            graphics cards; or the address of a Dask scheduler, "tcp://HOST:8786", whose workers access run
-            and scene under the same paths.
+            graphics cards; the key file of a scheduler, see ``cluster.run_scheduler``; or the address of a
+            Dask scheduler, "tls://HOST:8786", with the certificates of Dask's configuration. The workers
+            access run and scene under the same paths.
         resources: Dask resources that each block requires, such as {"GPU": 1}.
+        tls: False to permit "tcp://HOST:8786", where everybody who reaches the port can run programs.
 
     Raises:
         LodgsError: the cluster is unknown or unreachable, or Dask is not installed.
@@ -121,28 +121,36 @@ def workers(on: str = HERE, resources: dict[str, float] | None = None) -> Iterat
             yield lambda folder: pool.submit(train_block, str(folder))
         return
     kind, _, count = on.partition(":")
-    if not (kind == "local" and count.isdecimal() and int(count)) and "://" not in on:
+    local = kind == "local" and count.isdecimal() and int(count) > 0
+    if not local and "://" not in on and not os.path.isfile(on):
         raise LodgsError(
             f"Unknown workers '{on}'.",
-            "Use here, local:2 (two blocks at a time) or tcp://HOST:8786 (a Dask scheduler).",
+            "Use here, local:2 (two blocks at a time), or the file that lodgs blocks scheduler has written.",
         )
-    distributed = _distributed()
-    threads = 0
-    cards = []
-    cluster: Any = on
-    if kind == "local":
-        n = int(count)
-        cards = graphics_cards()
-        threads = max(_cores() // n, 1)
-        cluster = distributed.LocalCluster(
-            n_workers=n, threads_per_worker=1, processes=True, dashboard_address=":0", resources=resources,
-            silence_logs=logging.ERROR, preload=[_IGNORE_INTERRUPT],
-        )  # fmt: skip
-    try:
-        client = distributed.Client(cluster, timeout=TIMEOUT_SECONDS)
-    except (OSError, ValueError) as error:
+    if tls and "://" in on and not on.startswith("tls://"):
         raise LodgsError(
-            f"Cannot connect to the Dask scheduler at {on}.", "Start it, or correct the address."
+            f"Cannot use {on}: other users could run programs through its unencrypted connections.",
+            "Start it with lodgs blocks scheduler FILE and use --on FILE, or add --no-tls.",
+        )
+    distributed = import_dask()
+    threads, cards = 0, []
+    cluster: Any = on
+    security = None
+    if local:
+        cards = graphics_cards()
+        threads = max(_cores() // int(count), 1)
+        cluster = local_cluster(int(count), resources)
+        security = cluster.security
+    elif "://" not in on:
+        cluster, security = read_key_file(Path(on))
+    try:
+        client = distributed.Client(cluster, timeout=TIMEOUT_SECONDS, security=security)
+    except (OSError, ValueError, TypeError) as error:  # TypeError: no certificates for a tls:// address
+        if local:
+            cluster.close()
+        raise LodgsError(
+            f"Cannot connect to the Dask scheduler at {on}.",
+            "Start it, or correct the address. Copy its key file again if it has a new key.",
         ) from error
 
     def submit(folder: Path) -> Pending:
@@ -159,7 +167,7 @@ def workers(on: str = HERE, resources: dict[str, float] | None = None) -> Iterat
         yield submit
     finally:
         client.close()
-        if kind == "local":
+        if local:
             cluster.close()
 
 
@@ -180,14 +188,3 @@ def graphics_cards() -> list[str]:
 def _cores() -> int:
     """Return the number of cores available to this process."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _distributed() -> Any:
-    try:
-        import distributed
-    except ModuleNotFoundError:
-        raise LodgsError(
-            f"Dask is not installed in {sys.executable}.",
-            'Install it with: pip install "lodgs[cluster]", or train on: here.',
-        ) from None
-    return distributed

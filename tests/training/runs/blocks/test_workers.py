@@ -50,7 +50,7 @@ def test_missing_dask_is_reported_with_its_installation(monkeypatch):
 def test_unreachable_scheduler_is_reported(monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.setattr(workers_module, "TIMEOUT_SECONDS", 1)
-    with pytest.raises(LodgsError, match="Cannot connect"), workers("tcp://127.0.0.1:1"):
+    with pytest.raises(LodgsError, match="Cannot connect"), workers("tcp://127.0.0.1:1", tls=False):
         pass
 
 
@@ -167,25 +167,22 @@ def test_computer_without_cards(monkeypatch):
 def test_external_scheduler_trains_a_block_and_its_loss_is_reported(block, tmp_path, monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.setattr(workers_module, "TIMEOUT_SECONDS", 5)
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
-    address, root = f"tcp://127.0.0.1:{port}", Path(workers_module.__file__).parents[3]
+    key, root = tmp_path / "cluster.pem", Path(workers_module.__file__).parents[3]
 
-    def dask(*arguments):
+    def command(*arguments):
         return subprocess.Popen(
-            [sys.executable, "-m", "dask", *arguments, "--dashboard-address", ":0"],
+            [sys.executable, "-m", "training", "blocks", *arguments],
             env={**os.environ, "PYTHONPATH": str(root)}, stderr=subprocess.DEVNULL,
         )  # fmt: skip
 
-    scheduler = dask("scheduler", "--host", "127.0.0.1", "--port", str(port))
-    worker = dask(
-        "worker", address, "--nthreads", "1", "--local-directory", str(tmp_path), "--resources", "GPU=1",
-        "--death-timeout", "60",
-    )  # fmt: skip
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    scheduler = command("scheduler", str(key), "--host", "127.0.0.1", "--port", str(port))
+    while not key.exists():
+        time.sleep(0.1)
+    worker = command("worker", str(key), "--offers", "GPU=1")
     try:
-        while not listening(port):
-            time.sleep(0.1)
-        with pytest.raises(LodgsError, match="Lost the connection"), workers(address, {"GPU": 1}) as submit:
+        with pytest.raises(LodgsError, match="Lost the connection"), workers(str(key), {"GPU": 1}) as submit:
             assert submit(block.path).result() == 0
             assert block.state() == "done"
             scheduler.kill()
@@ -199,12 +196,3 @@ def test_external_scheduler_trains_a_block_and_its_loss_is_reported(block, tmp_p
         for process in (scheduler, worker):
             process.kill()
             process.wait()
-
-
-def listening(port: int) -> bool:
-    """Return whether a server listens on a local port."""
-    try:
-        socket.create_connection(("127.0.0.1", port)).close()
-    except OSError:
-        return False
-    return True
