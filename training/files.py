@@ -12,13 +12,14 @@ import time
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import IO, BinaryIO
 
 from .errors import LodgsError
 
 DISK_FULL = {errno.ENOSPC, errno.EDQUOT}
 """Error codes of a full disk or an exceeded quota."""
+_DEVICE = re.compile(r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9\xb9\xb2\xb3])\s*([.:].*)?", re.I)
 
 
 def cache_folder() -> Path:
@@ -30,6 +31,24 @@ def cache_folder() -> Path:
     else:
         base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     return base / "lodgs"
+
+
+def names_device(path: str | Path, windows: bool = os.name == "nt") -> bool:
+    """Return whether a path names a device of Windows, which opening may trigger: CON, \\\\.\\PhysicalDrive0.
+
+    Devices and pipes of other systems are files of another kind, see `open_regular`.
+    """
+    text = str(path).replace("/", "\\")
+    if re.match(r"\\[\\?][.?]\\(?!([A-Z]:|UNC)\\)", text, re.IGNORECASE):
+        return True
+    return windows and any(_DEVICE.fullmatch(part.strip(" .")) for part in text.split("\\"))
+
+
+def network_share(path: str | Path) -> str:
+    """Return the share, or a similar prefix, of a Windows path that leads to another computer, or ""."""
+    drive = PureWindowsPath(re.sub(r"^[\\/]\?\?", r"\\\\?", str(path))).drive.replace("/", "\\").lower()
+    is_local = not drive.startswith("\\\\") or re.fullmatch(r"\\\\[?.]\\[a-z]:", drive)
+    return "" if is_local else drive
 
 
 @contextmanager
@@ -115,6 +134,8 @@ def open_regular(path: str | Path, writing: bool = False) -> BinaryIO:
     Raises:
         OSError: the file cannot be opened, or is not a regular file.
     """
+    if names_device(path):
+        raise OSError(errno.EINVAL, "it names a device", str(path))
     flags = os.O_RDWR if writing else os.O_RDONLY
     descriptor = os.open(path, flags | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):

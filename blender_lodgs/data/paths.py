@@ -1,4 +1,4 @@
-"""Paths of splat scenes follow the .blend file when it is saved elsewhere or its project is moved.
+"""Paths of .blend files: their safe use, and their changes when a project is moved.
 
 Blender remaps its own relative paths ("//"), but not those of extensions. Saving also makes the paths of the
 project relative: those below the folder of the .blend, and those of scenes whose photos have relative paths,
@@ -10,13 +10,44 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import suppress
+from pathlib import Path
 
 import bpy
+
+from ...training.errors import LodgsError
+from ...training.files import names_device, network_share
 
 _previous: list[tuple[bpy.types.bpy_struct, str, str]] = []
 """Owners, property names and values of paths before the file is saved in another folder."""
 _target = ""
 """File that is being saved."""
+
+
+def absolute_path(value: str, library: bpy.types.Library | None = None) -> Path:
+    """Return a path of the .blend file or of a user, to open it on the user's request.
+
+    Args:
+        library: library of the property's owner.
+
+    Raises:
+        LodgsError: the path names a device.
+    """
+    path = bpy.path.abspath(value, library=library)
+    if names_device(path):
+        raise LodgsError(f"Cannot open {path}: it names a device.", "Choose a file or folder.")
+    return Path(path)
+
+
+def automatic_path(value: str, library: bpy.types.Library | None = None) -> Path | None:
+    """Return a path of the .blend file to open without a request of the user, or None if that is unsafe.
+
+    A stranger's file must not make Windows log in to the computer that the file names. Hence network shares
+    are excluded, except the one that holds the .blend file.
+    """
+    path = bpy.path.abspath(value, library=library)
+    share = network_share(path)
+    unsafe = not value or names_device(path) or (share and share != network_share(bpy.data.filepath))
+    return None if unsafe else Path(path)
 
 
 def scene_paths() -> Iterator[tuple[bpy.types.bpy_struct, str, str]]:

@@ -13,6 +13,7 @@ from pathlib import Path
 import bpy
 
 from ..attributes import HIDDEN
+from .paths import absolute_path, automatic_path
 
 RESIDENT_SHARE = 0.25
 """Share of the budget for the scene's own objects."""
@@ -66,18 +67,24 @@ def stop_streaming(root: bpy.types.Object) -> None:
 
 
 def file_of(root: bpy.types.Object) -> Path | None:
-    """Return the file whose top a scene holds, or None."""
+    """Return the file whose top a scene holds, or None.
+
+    Raises:
+        LodgsError: the path names a device.
+    """
     file = root.lodgs.stream.file
-    return Path(bpy.path.abspath(file, library=root.library)) if file else None
+    return absolute_path(file, root.library) if file else None
 
 
 def source_of(root: bpy.types.Object) -> Source | None:
     """Return the source of a scene's finer splats.
 
     Returns:
-        None if the scene has all splats, shows a single level, or was edited.
+        None if the scene has all splats, shows a single level, or was edited, or if its file is on another
+        computer, see ``automatic_path``.
     """
-    path, settings = file_of(root), root.lodgs
+    settings = root.lodgs
+    path = automatic_path(settings.stream.file, root.library)
     if path is None or settings.mode != "SELECTIVE" or is_edited(root):
         return None
     stream = settings.stream

@@ -21,6 +21,7 @@ from ...training.splats.splat_format import SplatFormat
 from ...training.splats.streamed_levels import STREAMED_FILE, write_streamed_levels
 from ..data import roots, scenes, selection
 from ..data.objects import megabytes, sh_degree
+from ..data.paths import absolute_path
 from ..data.setting_properties import property_of
 from .base import ReadLevelsOperator, report_errors
 from .modal import BackgroundOperator
@@ -78,7 +79,7 @@ class _FileExport(_ExportOperator, ExportHelper):
         return super().invoke(context, event)
 
     def _path(self) -> Path:
-        return Path(bpy.path.abspath(self.filepath))
+        return absolute_path(self.filepath)
 
 
 class _ConvertingExport(BackgroundOperator):
@@ -234,7 +235,7 @@ class _FolderExport(_ExportOperator):
         self.layout.label(text=f"Estimated size: {_size(context, self.kind, -1)}")
 
     def _folder(self) -> Path:
-        return Path(bpy.path.abspath(self.directory))
+        return absolute_path(self.directory)
 
     def _bundle(self, context) -> Bundle:
         """Return the levels, each a complete scene."""

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import bpy
 
 from ...training.scenes.reconstruct import PRESETS
+from ..data.paths import absolute_path
 from ..runs import photo_preparation, processes
 from .base import report_errors
 
@@ -62,12 +61,12 @@ class LODGS_OT_find_cameras(bpy.types.Operator):
 
     @report_errors
     def execute(self, context):
-        photos = Path(bpy.path.abspath(self.directory)).resolve()
-        video = Path(bpy.path.abspath(self.filepath)).resolve() if self.filepath else photos
+        photos = absolute_path(self.directory).resolve()
+        video = absolute_path(self.filepath).resolve() if self.filepath else photos
         if video.is_file() and video.suffix.lower() in bpy.path.extensions_movie:
             photos = video
         default_out = photos.with_name(f"{photos.stem if photos.is_file() else photos.name}_scene")
-        out = Path(bpy.path.abspath(self.out)).resolve() if self.out else default_out
+        out = absolute_path(self.out).resolve() if self.out else default_out
         lens = "" if self.lens == "AUTO" else self.lens
         work = photo_preparation.find_cameras(photos, out, self.preset, self.ordered, lens)
         processes.follow(work.step)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import bpy
 
 from ...training.scenes.formats import FORMAT_NAMES
 from ..data import importing, photographs, roots, scenes
+from ..data.paths import absolute_path
 from ..runs import photo_preparation
 from .base import report_errors
 
@@ -46,7 +45,7 @@ class LODGS_OT_import_colmap(bpy.types.Operator):
         first = not roots.roots(context.scene)
         root = importing.import_colmap(
             context,
-            Path(bpy.path.abspath(self.directory)),
+            absolute_path(self.directory),
             upright=self.upright,
             photographs=self.photographs,
             warn=warn,

@@ -9,6 +9,7 @@ import bpy
 
 from ...training.splats.formats import FILE_EXTENSIONS, READABLE
 from ..data import importing, photographs, roots, scenes
+from ..data.paths import absolute_path
 from ..runs import photo_preparation
 from .modal import BackgroundOperator
 
@@ -68,7 +69,7 @@ class LODGS_OT_import_splats(BackgroundOperator, bpy.types.Operator):
         self._imported = []
         try:
             for path in self.paths():
-                read = reader.submit(importing.read_splats_file, bpy.path.abspath(str(path)), self.budget)
+                read = reader.submit(importing.read_splats_file, absolute_path(str(path)), self.budget)
                 while self._modal and not read.done():
                     yield
                 root = yield from importing.place_splats(context, read.result(), self.upright, warn)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import bpy
 from bpy_extras.io_utils import ExportHelper
 
 from ...training.scenes.cameras import write_camera
 from ..data import cameras, roots
+from ..data.paths import absolute_path
 from ..render import compositing, engine, viewport_quality
 from .base import report_errors, show_image
 from .modal import FrameOperator
@@ -130,7 +129,7 @@ class LODGS_OT_export_camera(bpy.types.Operator, ExportHelper):
         camera, near = cameras.view_from(
             roots.active_root(context), context.evaluated_depsgraph_get(), width, height
         )
-        path = Path(bpy.path.abspath(self.filepath))
+        path = absolute_path(self.filepath)
         write_camera(path, camera, near)
         self.report({"INFO"}, f"Camera written to {path}")
         return {"FINISHED"}

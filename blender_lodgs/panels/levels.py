@@ -127,7 +127,7 @@ def _draw_counts(layout: bpy.types.UILayout, context: bpy.types.Context, root: b
     position = choice.region_label() if choice else ""
     if position:
         column.label(text=position)
-    if not streams.file_of(root):  # when streaming, viewports draw more splats than the levels hold
+    if not root.lodgs.stream.file:  # when streaming, viewports draw more splats than the levels hold
         visible, total = scenes.count_visible(context, root)
         column.label(text=f"{visible:,} of {total:,} splats shown")
     if choice and position:
@@ -142,7 +142,7 @@ class LODGS_PT_stream(LevelsPanel):
     @classmethod
     def poll(cls, context):
         root = roots.root_with_levels(context)
-        return root is not None and streams.file_of(root) is not None
+        return root is not None and bool(root.lodgs.stream.file)
 
     def draw(self, context):
         root, layout = roots.active_root(context), self.layout

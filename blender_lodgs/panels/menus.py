@@ -45,7 +45,7 @@ class LODGS_MT_runs(bpy.types.Menu):
     def draw(self, context):
         root = roots.active_root(context)
         runs = run_folders.find_runs(root) if root is not None else []
-        current = run_folders.run_folder(root) if root is not None else None
+        current = run_folders.automatic_run(root) if root is not None else None
         for run in runs:
             text = (
                 f"{run.folder.path.name}: {method_info(run.job.method).label}, {run.job.preset}, {run.state}"

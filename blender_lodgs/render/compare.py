@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import bpy
 import numpy as np
@@ -18,6 +17,7 @@ from ...training.scenes.cameras import Camera
 from ...training.scenes.color import srgb_from_linear
 from .. import extension
 from ..data import cameras, photographs
+from ..data.paths import absolute_path
 from ..viewport import wipe
 from ..viewport.wipe import Comparison
 from . import engine, renderer
@@ -72,8 +72,8 @@ def compare_view(
         camera, near = cameras.view_of(view.evaluated_get(depsgraph), depsgraph, width, height)
         frame = renderer.draw_frame(
             engine.placed_splats(depsgraph), camera, near, on_progress, background=(0.0, 0.0, 0.0),
-            photograph=Path(bpy.path.abspath(facts.photograph)),
-            mask=Path(bpy.path.abspath(facts.mask)) if facts.mask else None,
+            photograph=absolute_path(facts.photograph),
+            mask=absolute_path(facts.mask) if facts.mask else None,
         )  # fmt: skip
     if frame is None:
         return None

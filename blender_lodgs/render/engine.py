@@ -25,6 +25,7 @@ from ...training.splats.gaussians import Splats
 from .. import attributes
 from ..data import changes, objects, roots, selection, shown
 from ..data.cameras import RenderView, scene_camera
+from ..data.paths import absolute_path
 from . import renderer
 
 ID = "LODGS"
@@ -203,7 +204,7 @@ def holdout_file(scene: bpy.types.Scene, frame: int) -> Path | None:
 
 def frame_path(pattern: str, scene: bpy.types.Scene, frame: int) -> Path:
     """Replace the last # characters of a file name by the frame number, as Blender does."""
-    path = Path(bpy.path.abspath(pattern, library=scene.library))
+    path = absolute_path(pattern, library=scene.library)
     if not path.name:
         raise LodgsError(f"Cannot use the depth files {pattern}: it is a folder.", "Choose a file.")
 

@@ -12,6 +12,7 @@ from ...training.errors import LodgsError
 from ...training.scenes.rendered_views import CAMERAS
 from .. import extension
 from ..data import viewpoints
+from ..data.paths import absolute_path
 from . import environment, processes
 from .messages import format_duration
 
@@ -93,7 +94,7 @@ def capture_folder(scene: bpy.types.Scene) -> Path:
             "Cannot choose a folder for the capture: the .blend file is not saved.",
             "Save it, or choose a folder.",
         )
-    return Path(bpy.path.abspath(folder or "//lodgs_capture")).resolve()
+    return absolute_path(folder or "//lodgs_capture").resolve()
 
 
 def start(context: bpy.types.Context, warn: viewpoints.Warn = print) -> BackgroundCapture:

@@ -10,10 +10,9 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import bpy
-
 from ...training.errors import LodgsError
 from .. import extension
+from ..data.paths import absolute_path
 from . import processes
 
 VARIABLE = "LODGS_TRAINER_PYTHON"
@@ -80,7 +79,7 @@ def trainer_python() -> Path:
     """
     path = os.environ.get(VARIABLE) or extension.preferences().python
     if path:
-        return Path(bpy.path.abspath(path))
+        return absolute_path(path)
     for newest in ready_environments()[:1]:
         return python_of(newest)
     raise LodgsError(

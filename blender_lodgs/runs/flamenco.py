@@ -13,7 +13,6 @@ import shlex
 import urllib.error
 import urllib.request
 from dataclasses import dataclass
-from pathlib import Path
 from urllib.parse import urlsplit
 
 import bpy
@@ -25,6 +24,7 @@ from ...training.runs.folder import RunFolder
 from ...training.runs.job import CHANGEABLE
 from .. import extension
 from ..data import viewpoints
+from ..data.paths import absolute_path
 from . import job_settings, run_folders
 
 JOB_TYPE = "lodgs-blocks"
@@ -167,7 +167,7 @@ def prepare(root: bpy.types.Object, folder: str = "") -> Submission:
             "Cannot choose a run folder: the .blend file is not saved.",
             "Save it in a folder that all workers see, or set Runs Folder.",
         )
-    out = Path(bpy.path.abspath(folder)).resolve() if folder else run_folders.new_run_folder(root)
+    out = absolute_path(folder).resolve() if folder else run_folders.new_run_folder(root)
     if RunFolder(out).state() != "empty":
         raise LodgsError(f"Cannot train in {out}: the folder contains a run.", "Choose another folder.")
     job = job_settings.make_job(root, out, {})

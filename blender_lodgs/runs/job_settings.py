@@ -17,6 +17,7 @@ from ...training.runs.folder import RunFolder
 from ...training.runs.job import DOME, Job
 from .. import extension
 from ..data import crops, viewpoints
+from ..data.paths import absolute_path
 from ..data.training import (
     PANEL_KEYS,
     has_level_distances,
@@ -59,7 +60,9 @@ def make_job(root: bpy.types.Object, out: Path, parameters: dict) -> Job:
 def _key_value(settings: TrainingSettings, f: Field) -> Any:
     """Return the value of a job key that has a property of the same name."""
     value = getattr(settings, f.name)
-    return bpy.path.abspath(value) if f.metadata["path"] else _as_typed(value)
+    if f.metadata["path"]:
+        return str(absolute_path(value)) if value else ""
+    return _as_typed(value)
 
 
 def _photo_keys(root: bpy.types.Object, out: Path) -> dict:
@@ -77,7 +80,7 @@ def _photo_keys(root: bpy.types.Object, out: Path) -> dict:
             "Choose Points in Start From, or train one cell.",
         )
     return {
-        "scene": bpy.path.abspath(root.lodgs.scene_folder),
+        "scene": str(absolute_path(root.lodgs.scene_folder)),
         "base": base,
     }
 
@@ -176,7 +179,7 @@ def base_path(root: bpy.types.Object, out: Path) -> str:
                 "Cannot start from a file: no file is chosen.",
                 "Choose a PLY or a run folder, or start from points.",
             )
-        return bpy.path.abspath(settings.base)
+        return str(absolute_path(settings.base))
     if settings.start_from == "SCENE":
         return str(RunFolder(out).base)
     run = run_folder(root)

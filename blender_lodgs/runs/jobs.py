@@ -21,9 +21,10 @@ from ...training.scenes.cameras import write_camera
 from ...training.splats.bundle import write_bundle
 from .. import extension
 from ..data import cells, scenes, viewpoints
+from ..data.paths import absolute_path, automatic_path
 from . import environment, processes
 from .job_settings import make_job
-from .run_folders import is_on_other_computer, link_run, new_run_folder, run_folder, run_state
+from .run_folders import link_run, new_run_folder, run_folder, run_state
 from .watch import Watch, root_by_uid, start_watching, watch_of, watches
 
 
@@ -39,7 +40,7 @@ def start(root: bpy.types.Object, folder: str = "", parameters: dict | None = No
     Raises:
         LodgsError: the trainer is missing, a setting is invalid, or the folder is in use.
     """
-    run = RunFolder(Path(bpy.path.abspath(folder)).resolve()) if folder else RunFolder(new_run_folder(root))
+    run = RunFolder(absolute_path(folder).resolve()) if folder else RunFolder(new_run_folder(root))
     return _start(root, run, make_job(root, run.path, parameters or {}))
 
 
@@ -200,7 +201,7 @@ def attach(root: bpy.types.Object, folder: str, *, reload: bool = True) -> Watch
     Raises:
         LodgsError: the folder contains no run.
     """
-    run = RunFolder(Path(bpy.path.abspath(folder)).resolve())
+    run = RunFolder(absolute_path(folder).resolve())
     if run_state(run) == "empty":
         raise LodgsError(
             f"Cannot open {run.path}: it contains no run.", "Choose a folder that contains a job.toml file."
@@ -287,7 +288,7 @@ def _launch(
 def reattach() -> None:
     """Attach to the runs of all scene roots that are not watched: after loading a file, undo and redo."""
     for root in [obj for obj in bpy.data.objects if obj.lodgs.training.run and obj.is_editable]:
-        if watch_of(root) is None and not is_on_other_computer(bpy.path.abspath(root.lodgs.training.run)):
+        if watch_of(root) is None and automatic_path(root.lodgs.training.run):
             with suppress(LodgsError):  # the panel reports a missing folder
                 watch = attach(root, root.lodgs.training.run, reload=False)
                 if bpy.app.background:

@@ -18,6 +18,7 @@ from ...training.scenes.undistort import cached_undistorted_scene
 from ...training.splats.dialects import Warn
 from .. import extension
 from ..data import importing, photographs, roots
+from ..data.paths import absolute_path
 from . import environment, processes
 from .watch import root_by_uid
 
@@ -143,9 +144,9 @@ def undistort_photos(root: bpy.types.Object, warn: Warn) -> None:
         return
     uid = root.session_uid
     settings = root.lodgs.training
-    scene = Path(bpy.path.abspath(root.lodgs.scene_folder))
+    scene = absolute_path(root.lodgs.scene_folder)
     paths = {"--model": settings.model, "--images": settings.images}
-    options = [argument for name, path in paths.items() if path for argument in (name, path)]
+    options = [text for name, path in paths.items() if path for text in (name, str(absolute_path(path)))]
     log = extension.user_folder("logs") / "undistort.log"
 
     def finish(work: PhotoPreparation) -> None:
@@ -176,8 +177,8 @@ def undistort_photos(root: bpy.types.Object, warn: Warn) -> None:
 
 def _read_scene(root: bpy.types.Object) -> Scene:
     settings = root.lodgs.training
-    model, images = (Path(path) if path else None for path in (settings.model, settings.images))
-    return read_scene(Path(bpy.path.abspath(root.lodgs.scene_folder)), model, images)
+    model, images = (absolute_path(path) if path else None for path in (settings.model, settings.images))
+    return read_scene(absolute_path(root.lodgs.scene_folder), model, images)
 
 
 def _start(

@@ -13,6 +13,7 @@ from typing import Any
 
 import bpy
 
+from ...training.files import open_regular
 from ...training.runs.processes import PARENT, identity
 from .. import extension
 
@@ -114,7 +115,7 @@ def is_in_use(folder: Path) -> bool:
 def last_lines(log: Path) -> list[str]:
     """Return the lines of a log, or of its last LOG_END bytes. A missing log has no lines."""
     try:
-        with open(log, "rb") as file:
+        with open_regular(log) as file:
             file.seek(max(file.seek(0, 2) - LOG_END, 0))
             return file.read().decode("utf-8", "replace").splitlines()
     except OSError:

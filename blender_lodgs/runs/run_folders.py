@@ -5,13 +5,14 @@ from __future__ import annotations
 import itertools
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path, PureWindowsPath
+from pathlib import Path
 
 import bpy
 
 from ...training.errors import LodgsError
 from ...training.runs.folder import RunFolder
 from ...training.runs.job import Job
+from ..data.paths import absolute_path, automatic_path
 
 LOG = "LODGS trainer log"
 """Name of the text block that shows a trainer's log."""
@@ -27,14 +28,24 @@ class RunRecord:
 
 
 def run_folder(root: bpy.types.Object) -> RunFolder | None:
-    """Return the folder of the root's newest run, watched or not."""
+    """Return the folder of the root's newest run, watched or not.
+
+    Raises:
+        LodgsError: its path names a device.
+    """
     run = root.lodgs.training.run
-    return RunFolder(bpy.path.abspath(run)) if run else None
+    return RunFolder(absolute_path(run)) if run else None
+
+
+def automatic_run(root: bpy.types.Object) -> RunFolder | None:
+    """Return the folder of the root's newest run, or None as ``automatic_path``."""
+    path = automatic_path(root.lodgs.training.run)
+    return RunFolder(path) if path else None
 
 
 def cost_plot(root: bpy.types.Object) -> Path | None:
     """Return the image file with the cost curve of the root's run, if it exists."""
-    run = run_folder(root)
+    run = automatic_run(root)
     return run.costs if run is not None and run.costs.is_file() else None
 
 
@@ -79,20 +90,24 @@ def link_run(root: bpy.types.Object, run: RunFolder) -> None:
 def runs_parent(root: bpy.types.Object) -> Path:
     """Return the parent of the root's run folders: from the settings, next to the .blend file, or at home."""
     if root.lodgs.training.output:
-        return Path(bpy.path.abspath(root.lodgs.training.output)).resolve()
+        return absolute_path(root.lodgs.training.output).resolve()
     if bpy.data.is_saved:
-        return Path(bpy.path.abspath("//lodgs_runs"))
+        return absolute_path("//lodgs_runs")
     return Path.home() / "lodgs_runs"
 
 
 def find_runs(root: bpy.types.Object) -> list[RunRecord]:
     """Return the root's own run and all runs of its photos, sorted by path.
 
-    The parent of new run folders and the parent of the newest run are searched.
+    The parent of new run folders and the parent of the newest run are searched, but not automatically unsafe
+    paths, see ``automatic_path``.
     """
-    current = run_folder(root)
-    parents = {runs_parent(root), *([current.path.parent] if current else [])}
-    scene = Path(bpy.path.abspath(root.lodgs.scene_folder)) if root.lodgs.scene_folder else None
+    current = automatic_run(root)
+    output = root.lodgs.training.output
+    parents = {current.path.parent} if current else set()
+    if not output or automatic_path(output):
+        parents.add(runs_parent(root))
+    scene = automatic_path(root.lodgs.scene_folder)
     records = {}
     for parent in parents:
         for file in parent.glob("*/job.toml"):
@@ -111,13 +126,3 @@ def new_run_folder(root: bpy.types.Object) -> Path:
     name = bpy.path.clean_name(root.name)
     names = itertools.chain([name], (f"{name}-{n}" for n in itertools.count(2)))
     return next(parent / n for n in names if not (parent / n).exists())
-
-
-def is_on_other_computer(folder: str) -> bool:
-    """Return whether a folder is on a network share that does not hold the .blend file.
-
-    Such a folder is read on request only: opening a stranger's file must not make Windows log in to the
-    computer that the file names.
-    """
-    share = PureWindowsPath(folder).drive
-    return share.startswith(("\\\\", "//")) and share != PureWindowsPath(bpy.data.filepath).drive

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 
 import bpy
 
 from ...training.errors import LodgsError
 from ...training.scenes.check import Finding, check_folder
+from ..data.paths import absolute_path
 
 _findings: dict[int, list[Finding]] = {}
 """Findings by the session uid of the scene root."""
@@ -25,7 +25,7 @@ def read_findings(root: bpy.types.Object) -> Callable[[], list[Finding]]:
     if not settings.scene_folder:
         raise LodgsError(f"Cannot check '{root.name}': it has no photos.", "Import a COLMAP scene.")
     folder, model, images = (
-        Path(bpy.path.abspath(path)) if path else None
+        absolute_path(path) if path else None
         for path in (settings.scene_folder, settings.training.model, settings.training.images)
     )
     return partial(check_folder, folder, model, images, image_scale=settings.training.image_scale)

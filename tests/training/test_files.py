@@ -8,7 +8,7 @@ import pytest
 
 from training import files
 from training.errors import LodgsError
-from training.files import atomic_write
+from training.files import atomic_write, names_device, network_share, open_regular
 
 
 def test_file_appears_complete_and_temporary_is_removed(tmp_path):
@@ -83,3 +83,57 @@ def test_blocks_do_not_wait_without_a_writable_cache_folder(tmp_path, monkeypatc
     monkeypatch.setattr(files, "cache_folder", lambda: tmp_path / "file")
     with files.exclusive("work"), files.exclusive("work"):
         pass
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        r"\\.\PhysicalDrive0", r"\\.\C:", "//./pipe/lodgs", r"\\?\GLOBALROOT\Device", r"\??\PIPE\x", "CON",
+        "nul.txt", r"C:\photos\Aux.jpg", "photos/lpt3", "prn .png", "nul. .", "com\N{SUPERSCRIPT ONE}",
+        "CONIN$", "con:x",
+    ],
+)  # fmt: skip
+def test_names_of_windows_devices(path):
+    """The names are those of Microsoft's "Naming Files, Paths, and Namespaces"."""
+    assert names_device(path, windows=True)
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "console.png",
+        "a/com10",
+        "aux_1.png",
+        r"\\?\C:\long\a.ply",
+        r"\\?\UNC\server\share\a",
+        r"\\server\share\a",
+        "/con_",
+    ],
+)
+def test_names_of_files_are_no_devices(path):
+    assert not names_device(path, windows=True)
+
+
+def test_files_of_other_systems_may_have_the_names_of_windows_devices():
+    assert not names_device("/photos/con.png", windows=False)
+
+
+@pytest.mark.parametrize(
+    ("path", "share"),
+    [
+        (r"\\Server\Share\a", r"\\server\share"), ("//server/share/a", r"\\server\share"),
+        (r"/\server\share", r"\\server\share"), (r"\\?\UNC\server\share\a", r"\\?\unc\server\share"),
+        (r"\??\UNC\server\share\a", r"\\?\unc\server\share"), (r"C:\a", ""), (r"\\?\C:\a", ""), (r"\a\b", ""),
+        ("/a/b", ""), ("a/b", ""), ("", ""),
+    ],
+)  # fmt: skip
+def test_network_share_of_a_path(path, share):
+    assert network_share(path) == share
+
+
+@pytest.mark.skipif(os.name != "posix", reason="no named pipes or devices as files")
+def test_devices_and_pipes_are_not_opened(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", "/dev/zero", "/dev/stdin", tmp_path, r"\\.\pipe\x"):
+        with pytest.raises(OSError, match=r"not a file|a device"):
+            open_regular(path)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..documents import open_file
 from ..errors import LodgsError
 from .cameras import MAX_COORDINATE, Camera, pick_evenly
 from .colmap import Scene, observations
@@ -238,7 +239,7 @@ def read_depth_map(path: Path) -> np.ndarray:
         LodgsError: the file cannot be read or contains no depth.
     """
     try:
-        with open(path, "rb") as file:
+        with open_file(path) as file:
             head = file.read(6)
         if head[:4] == MAGIC:
             depth = read_exr_depth(path)

@@ -3,6 +3,7 @@
 import os
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -63,3 +64,59 @@ def test_project_can_be_moved(bpy, lodgs, tmp_path, place):
     view = lodgs("data.photographs").views(root)[0]
     assert Path(bpy.path.abspath(view.data.lodgs.photograph)).is_file()
     assert root.lodgs.training.output == "/elsewhere"
+
+
+DEVICES = (r"\\.\PhysicalDrive0", "//\\\\.\\pipe" if os.name == "nt" else r"\\?\GLOBALROOT\x")
+
+
+@pytest.mark.parametrize(
+    "value", ["", r"\\server\share\a", "/\\server/share/a", r"\\?\UNC\server\share", *DEVICES]
+)
+def test_other_computers_and_devices_are_not_opened_automatically(bpy, lodgs, value):
+    assert lodgs("data.paths").automatic_path(value) is None
+
+
+def test_local_files_and_the_share_of_the_blend_are_opened(bpy, lodgs, saved, tmp_path, monkeypatch):
+    paths = lodgs("data.paths")
+    assert paths.automatic_path("//runs/one") == tmp_path / "a" / "runs" / "one"
+    monkeypatch.setattr(
+        paths, "bpy", SimpleNamespace(path=bpy.path, data=SimpleNamespace(filepath=r"\\NAS\city\a.blend"))
+    )
+    assert paths.automatic_path(r"\\nas\City\runs\one") is not None
+    assert paths.automatic_path(r"\\nas\other\run") is None
+
+
+def test_hostile_paths_of_a_file_open_nothing(bpy, lodgs, saved, monkeypatch):
+    """Viewports, panels and menus draw without a request of the user."""
+    folders, streams = lodgs("runs.run_folders"), lodgs("data.streams")
+    training = saved.lodgs.training
+    opened = []
+    for name in ("is_file", "is_dir", "exists", "resolve", "glob", "stat"):
+        monkeypatch.setattr(Path, name, lambda path, *_, name=name, **__: opened.append((name, path)))
+    for value in (r"\\server\share\run", *DEVICES):
+        training.run = training.output = saved.lodgs.stream.file = saved.lodgs.scene_folder = value
+        assert folders.cost_plot(saved) is None
+        assert folders.automatic_run(saved) is None
+        assert folders.find_runs(saved) == []
+        assert streams.source_of(saved) is None
+    assert opened == []
+
+
+@pytest.mark.parametrize("value", DEVICES)
+def test_devices_are_refused_on_request(lodgs, saved, value):
+    saved.lodgs.stream.file = saved.lodgs.training.run = value
+    error = lodgs("training.errors").LodgsError
+    calls = (
+        lambda: lodgs("data.streams").file_of(saved),
+        lambda: lodgs("runs.run_folders").run_folder(saved),
+        lambda: lodgs("render.engine").frame_path(value, saved.users_scene[0], 1),
+    )
+    for call in calls:
+        with pytest.raises(error, match="names a device"):
+            call()
+
+
+def test_only_one_module_resolves_paths():
+    package = Path(__file__).parents[3] / "blender_lodgs"
+    users = [path.name for path in package.rglob("*.py") if "path.abspath(" in path.read_text("utf-8")]
+    assert sorted(users) == ["compositing.py", "paths.py"]  # the first only resolves the folder of the .blend
