@@ -12,8 +12,9 @@ import math
 import re
 import reprlib
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, AnyStr
 
 from .errors import LodgsError, printable
 from .files import open_regular
@@ -55,6 +56,18 @@ def open_file(path: str | Path) -> IO[bytes]:
     except ValueError:  # a NUL or half a surrogate pair
         reason = "the name is not a valid file name"
     raise LodgsError(f"Cannot read {printable(path)}: {reason}.", "Check the path and its permissions.")
+
+
+def read_lines(file: IO[AnyStr], max_length: int) -> Iterator[AnyStr]:
+    """Yield the lines of a file, which may be one endless line.
+
+    Raises:
+        ValueError: a line has ``max_length`` bytes or characters.
+    """
+    while line := file.readline(max_length):
+        if len(line) == max_length:
+            raise ValueError(f"a line exceeds {max_length:,} bytes")
+        yield line
 
 
 def quote(value: Any) -> str:

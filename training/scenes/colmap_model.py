@@ -1,22 +1,24 @@
 """Files of a COLMAP model: cameras, poses and points, binary or text. numpy only.
 
 File formats: https://colmap.github.io/format.html. Rigs and frames of newer COLMAP versions are ignored,
-because images.bin and images.txt also hold each view's own pose. Time is linear in the file size; memory is
-at most five times the file size, or ten times for text.
+because images.bin and images.txt also hold each view's own pose. Time is linear in the file size. Binary
+files are mapped and text is read by lines, so memory depends on valid records, not on the file size.
 """
 
 from __future__ import annotations
 
+import mmap
 import struct
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
-from ..documents import open_file
+from ..documents import open_file, read_lines
 from ..errors import LodgsError, printable
 from ..splats.similarity import Similarity
 
@@ -24,6 +26,8 @@ DAMAGED_REMEDY = "Copy the model again, or rewrite it with COLMAP's model_conver
 
 _MAX_SIDE = 1 << 31
 """Exclusive limit of an image's width and height."""
+_MAX_NAME = 1 << 16
+_MAX_LINE = 1 << 26  # bytes of a million 2D points
 
 
 @dataclass(frozen=True)
@@ -191,21 +195,21 @@ def _read(model: Path, name: str, parsers: dict) -> Any:
     """
     suffix = model_suffix(model)
     path = model / f"{name}{suffix}"
-    with open_file(path) as file:
-        try:
-            data = file.read()
-        except OSError as error:
-            raise LodgsError(f"Cannot read {path}: {error.strerror}.", "Check the folder.") from error
     try:
-        return parsers[suffix](data.removeprefix(_UTF8_MARK) if suffix == ".txt" else data)
+        with open_file(path) as file:
+            if suffix == ".txt":
+                return parsers[suffix](file)
+            return parsers[suffix](mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+    except OSError as error:
+        raise LodgsError(f"Cannot read {path}: {error.strerror}.", "Check the folder.") from error
     except (ValueError, IndexError, KeyError, struct.error) as error:
         raise LodgsError(
             f"Cannot read {path}: the file is damaged or truncated ({error}).", DAMAGED_REMEDY
         ) from error
 
 
-def _parse_cameras_bin(data: bytes) -> dict[int, Intrinsics]:
-    (count,) = struct.unpack_from("<Q", data)
+def _parse_cameras_bin(data: mmap.mmap) -> dict[int, Intrinsics]:
+    count = _record_count(data, 48)
     offset = 8
     cameras = {}
     for _ in range(count):
@@ -213,21 +217,21 @@ def _parse_cameras_bin(data: bytes) -> dict[int, Intrinsics]:
         lens = _LENSES.get(model_id)
         if lens is None:
             raise ValueError(f"camera model {model_id} is unknown")
-        parameters = np.frombuffer(data, "<f8", lens.parameters, offset + 24)
+        parameters = np.frombuffer(data, "<f8", lens.parameters, offset + 24).copy()
         offset += 24 + 8 * lens.parameters
         cameras[camera_id] = _intrinsics(lens, width, height, parameters)
     return cameras
 
 
-def _parse_cameras_txt(data: bytes) -> dict[int, Intrinsics]:
+def _parse_cameras_txt(file: IO[bytes]) -> dict[int, Intrinsics]:
     cameras = {}
-    for line in _content_lines(data):
+    for line in _content_lines(file):
         camera_id, model_name, width, height, *parameters = line.split()
         lens = _LENS_BY_NAME.get(model_name)
         if lens is None:
             raise ValueError(f"camera model {model_name} is unknown")
         cameras[int(camera_id)] = _intrinsics(lens, int(width), int(height), np.array(parameters, float))
-    _check_count(len(cameras), data, "cameras")
+    _check_count(len(cameras), file, "cameras")
     return cameras
 
 
@@ -296,13 +300,13 @@ def write_model(
         (model / file).write_bytes(struct.pack("<Q", count) + b"".join(records))
 
 
-def _parse_images_bin(data: bytes) -> list[Pose]:
-    (count,) = struct.unpack_from("<Q", data)
+def _parse_images_bin(data: mmap.mmap) -> list[Pose]:
+    count = _record_count(data, 73)
     offset = 8
     poses = []
     for _ in range(count):
         _, *pose, camera_id = struct.unpack_from("<i7di", data, offset)
-        end = data.index(b"\0", offset + 64)
+        end = _name_end(data, offset + 64)
         name = data[offset + 64 : end]
         (points2d,) = struct.unpack_from("<Q", data, end + 1)
         offset = end + 9 + 24 * points2d
@@ -312,10 +316,10 @@ def _parse_images_bin(data: bytes) -> list[Pose]:
     return poses
 
 
-def _parse_images_txt(data: bytes) -> list[Pose]:
+def _parse_images_txt(file: IO[bytes]) -> list[Pose]:
     """Parse two lines per image; the second line, its 2D points, may be empty and is skipped."""
     poses = []
-    lines = iter(data.split(b"\n"))
+    lines = _lines(file)
     for line in lines:
         line = line.strip()
         if not line or line.startswith(b"#"):
@@ -324,16 +328,16 @@ def _parse_images_txt(data: bytes) -> list[Pose]:
         _, *pose, camera_id, name = line.split(maxsplit=9)
         next(lines, None)
         poses.append(_pose(name, int(camera_id), [float(number) for number in pose]))
-    _check_count(len(poses), data, "images")
+    _check_count(len(poses), file, "images")
     return poses
 
 
-def _parse_observations_bin(data: bytes, names: Collection[str]) -> dict[str, np.ndarray]:
-    (count,) = struct.unpack_from("<Q", data)
+def _parse_observations_bin(data: mmap.mmap, names: Collection[str]) -> dict[str, np.ndarray]:
+    count = _record_count(data, 73)
     offset = 8
     point_ids = {}
     for _ in range(count):
-        end = data.index(b"\0", offset + 64)
+        end = _name_end(data, offset + 64)
         (points2d,) = struct.unpack_from("<Q", data, end + 1)
         if (name := _decode_name(data[offset + 64 : end])) in names:
             point_ids[name] = _valid_ids(np.frombuffer(data, _POINT2D, points2d, end + 9)["point"])
@@ -341,9 +345,9 @@ def _parse_observations_bin(data: bytes, names: Collection[str]) -> dict[str, np
     return point_ids
 
 
-def _parse_observations_txt(data: bytes, names: Collection[str]) -> dict[str, np.ndarray]:
+def _parse_observations_txt(file: IO[bytes], names: Collection[str]) -> dict[str, np.ndarray]:
     point_ids = {}
-    lines = iter(data.split(b"\n"))
+    lines = _lines(file)
     for line in lines:
         line = line.strip()
         if not line or line.startswith(b"#"):
@@ -352,6 +356,20 @@ def _parse_observations_txt(data: bytes, names: Collection[str]) -> dict[str, np
         if (name := _decode_name(line.split(maxsplit=9)[9])) in names:
             point_ids[name] = _valid_ids(np.array(points2d.split()[2::3], np.int64))
     return point_ids
+
+
+def _record_count(data: mmap.mmap, least: int) -> int:
+    """Return the promised number of records, of at least the given bytes each."""
+    (count,) = struct.unpack_from("<Q", data)
+    if 8 + count * least > len(data):
+        raise ValueError(f"it is too short for {count} records")
+    return count
+
+
+def _name_end(data: mmap.mmap, begin: int) -> int:
+    if (end := data.find(b"\0", begin, begin + _MAX_NAME)) < 0:
+        raise ValueError("a name has no end")
+    return end
 
 
 def _valid_ids(ids: np.ndarray) -> np.ndarray:
@@ -397,10 +415,10 @@ _NO_POINTS = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(
 _UTF8_MARK = b"\xef\xbb\xbf"  # Windows programs write it at the start of UTF-8 files
 
 
-def _parse_points_bin(data: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    (count,) = struct.unpack_from("<Q", data)
+def _parse_points_bin(data: mmap.mmap) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    count = _record_count(data, _POINT.itemsize)
     body = np.frombuffer(data, np.uint8, offset=8)
-    starts = _point_starts(body)
+    starts = _point_starts(body, count)
     if len(starts) != count:
         raise ValueError(f"it has {len(starts)} points instead of {count}")
     if not count:
@@ -409,12 +427,12 @@ def _parse_points_bin(data: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return _to_float32(records["xyz"]), records["rgb"].copy(), records["id"].astype(np.int64)
 
 
-def _point_starts(body: np.ndarray) -> np.ndarray:
-    """Return the offsets of the records of points3D.bin, computed block by block."""
+def _point_starts(body: np.ndarray, expected: int) -> np.ndarray:
+    """Return the offsets of the records of points3D.bin, computed block by block; stop after too many."""
     offsets = [np.zeros(0, np.int64)]
     offset = 0
     count = 0
-    while offset < len(body):
+    while offset < len(body) and count <= expected:
         starts, end = _record_chain(body[offset : offset + _BLOCK])
         count += len(starts)
         if not len(starts) or offset + end > len(body):
@@ -453,12 +471,10 @@ def _record_chain(block: np.ndarray) -> tuple[np.ndarray, int]:
     return starts[chain], int(ends[chain[-1]]) if len(chain) else 0
 
 
-def _parse_points_txt(data: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    lines = _content_lines(data)
-    _check_count(len(lines), data, "points")
-    if not lines:
-        return _NO_POINTS
-    table = np.loadtxt(lines, usecols=range(7), ndmin=2)
+def _parse_points_txt(file: IO[bytes]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    lines = chain(["0 0 0 0 0 0 0"], _content_lines(file))  # numpy warns of a table without lines
+    table = np.loadtxt(lines, usecols=range(7), ndmin=2)[1:]
+    _check_count(len(table), file, "points")
     colors = np.nan_to_num(table[:, 4:]).clip(0, 255).astype(np.uint8)
     return _to_float32(table[:, 1:4]), colors, np.nan_to_num(table[:, 0]).astype(np.int64)
 
@@ -469,15 +485,24 @@ def _to_float32(positions: np.ndarray) -> np.ndarray:
         return positions.astype(np.float32)
 
 
-def _content_lines(data: bytes) -> list[str]:
-    """Return the stripped lines without blank lines and comments."""
-    lines = (line.strip() for line in data.decode("utf-8", "surrogateescape").split("\n"))
-    return [line for line in lines if line and not line.startswith("#")]
+def _lines(file: IO[bytes]) -> Iterator[bytes]:
+    if file.read(len(_UTF8_MARK)) != _UTF8_MARK:
+        file.seek(0)
+    return read_lines(file, _MAX_LINE)
 
 
-def _check_count(count: int, data: bytes, kind: str) -> None:
+def _content_lines(file: IO[bytes]) -> Iterator[str]:
+    """Yield the stripped lines without blank lines and comments."""
+    for line in _lines(file):
+        text = line.decode("utf-8", "surrogateescape").strip()
+        if text and not text.startswith("#"):
+            yield text
+
+
+def _check_count(count: int, file: IO[bytes], kind: str) -> None:
     """Raise ValueError if a truncated file has fewer records than COLMAP's comment in its header states."""
-    for line in data[:1000].split(b"\n"):
+    file.seek(0)
+    for line in file.read(1000).split(b"\n"):
         key, _, value = line.partition(b":")
         if key.strip() == f"# Number of {kind}".encode():
             expected = int(value.split(b",")[0])

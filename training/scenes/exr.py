@@ -15,6 +15,10 @@ MAX_BYTES = 2 << 30
 """Maximum memory of all channels of a file."""
 
 
+_WINDOW_BYTES = 16
+_MAX_CHUNKS = 1 << 20
+
+
 class Truncated(Exception):
     """Raised for an image file that ends too early."""
 
@@ -36,7 +40,8 @@ def exr_size(file: IO[bytes]) -> tuple[int, int]:
         (size,) = struct.unpack("<I", file.read(4))
         if file.tell() + size > end:
             raise Truncated
-        attributes[name] = file.read(size)
+        attributes[name] = file.read(min(size, _WINDOW_BYTES))
+        file.seek(max(size - _WINDOW_BYTES, 0), 1)
     left, top, right, bottom = struct.unpack("<4i", attributes[b"displayWindow"])
     _, first, _, last = struct.unpack("<4i", attributes[b"dataWindow"])
     lines = _LINES.get(attributes[b"compression"][0])
@@ -52,7 +57,7 @@ _NOT_SCANLINES = 0x200 | 0x800 | 0x1000  # tiles, deep data, several parts
 
 def _check_chunks(file: IO[bytes], count: int, end: int) -> None:
     """Raise Truncated unless the chunk offset table is filled in and the last chunk is complete."""
-    if file.tell() + 8 * count > end:
+    if file.tell() + 8 * count > end or count > _MAX_CHUNKS:
         raise Truncated
     offsets = np.frombuffer(file.read(8 * count), "<u8")
     if not offsets.all() or offsets.max(initial=0) + 8 > end:

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..documents import open_file
 from ..errors import LodgsError
+from ..splats.packed_files import webp_size
 from .color import srgb_from_linear
 from .exr import MAGIC, Truncated, exr_size, read_parts
 
@@ -31,6 +32,10 @@ _LARGE = 1 << 25
 """Number of pixels above which an image is reduced while decoding, to at least twice the requested size."""
 _STRIP = 1 << 20
 """Approximate number of pixels averaged at a time; each takes about 100 bytes."""
+
+_BLOCK = 1 << 20
+_MAX_BLOCKS = 1 << 10
+"""Blocks of a file that are searched for its end: a gigabyte."""
 
 # JPEG markers with the size: all start-of-frame markers, which excludes DHT (C4), JPG (C8) and DAC (CC).
 _START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
@@ -184,22 +189,11 @@ def _read_tiff_tags(file: IO[bytes]) -> dict[int, int]:
 
 
 def _webp_size(file: IO[bytes]) -> tuple[int, int]:
-    """Read the size from the first chunk, whose type determines the layout (RFC 9649); check the length."""
-    file.seek(4)
-    length, kind, chunk = struct.unpack("<I4s4s", file.read(12))
-    if kind != b"WEBP":
-        raise ValueError
-    body = file.read(14)[4:]
-    file.seek(0, 2)
-    if file.tell() < length + 8:
+    file.seek(0)
+    head = file.read(30)
+    if file.seek(0, 2) < int.from_bytes(head[4:8], "little") + 8:
         raise Truncated
-    if chunk == b"VP8 ":
-        width, height = struct.unpack("<6xHH", body)
-        return width & 0x3FFF, height & 0x3FFF
-    if chunk == b"VP8L":
-        (packed,) = struct.unpack("<xI5x", body)
-        return (packed & 0x3FFF) + 1, (packed >> 14 & 0x3FFF) + 1
-    return int.from_bytes(body[4:7], "little") + 1, int.from_bytes(body[7:10], "little") + 1
+    return webp_size(head)
 
 
 def _check_end(file: IO[bytes], marker: bytes) -> None:
@@ -210,8 +204,15 @@ def _check_end(file: IO[bytes], marker: bytes) -> None:
     if file.read() == marker:
         return
     file.seek(position)
-    if marker not in file.read():
-        raise Truncated
+    end = b""
+    for _ in range(_MAX_BLOCKS):
+        block = file.read(_BLOCK)
+        if marker in end + block:
+            return
+        if not block:
+            break
+        end = block[-len(marker) :]
+    raise Truncated
 
 
 @dataclass(frozen=True)

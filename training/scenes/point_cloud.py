@@ -5,10 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from plyfile import PlyData, PlyParseError
 
-from ..documents import open_file
 from ..errors import LodgsError
+from ..splats.ply import read_elements
 
 
 def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -18,12 +17,11 @@ def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
         LodgsError: the file is missing or damaged, or has no points.
     """
     try:
-        with open_file(path) as file:
-            vertices = PlyData.read(file)["vertex"].data
+        vertices = read_elements(path, splats=False)[0]["vertex"]
         points = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
-    except LodgsError:
-        raise
-    except (PlyParseError, KeyError, ValueError, TypeError, MemoryError, OSError) as error:
+    except LodgsError as error:
+        raise LodgsError(error.what, "Export the points again.") from error
+    except (KeyError, ValueError, TypeError) as error:
         raise LodgsError(f"Cannot read points from {path}: {error}.", "Export the points again.") from error
     colors = np.full((len(points), 3), 128, np.uint8)
     names = ("red", "green", "blue")

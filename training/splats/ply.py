@@ -20,7 +20,7 @@ from typing import IO, NamedTuple
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 
-from ..documents import open_file
+from ..documents import open_file, read_lines
 from ..errors import LodgsError
 from ..files import atomic_write
 from .dialects import Warn, drawable_3dgs, ignore, reject_unsupported
@@ -30,6 +30,7 @@ MAX_HEADER_BYTES = 1 << 20
 """Maximum length of a header."""
 MAX_COLUMNS = 1000
 """Maximum number of columns of all elements together; ours have 70 per level."""
+_MAX_LINE = 1 << 20
 NORMALS = ("nx", "ny", "nz")
 # PLY's type names, from C. Viewers support no others.
 _TYPES = {
@@ -221,19 +222,21 @@ def splats_from_rows(rows: np.ndarray, path: str | Path) -> Splats:
     return splats
 
 
-def read_elements(path: str | Path) -> tuple[dict[str, np.ndarray], list[str]]:
+def read_elements(path: str | Path, splats: bool = True) -> tuple[dict[str, np.ndarray], list[str]]:
     """Read the elements of a PLY as structured rows (memory-mapped if binary), and its comments in order.
 
     Elements without columns are skipped. So is everything from the first list on, such as a mesh's faces:
     only reading all of its rows would show where a list ends, and lists describe no splats.
 
+    Args:
+        splats: require a ``vertex`` of splats in a supported dialect, not only any ``vertex``.
+
     Raises:
-        LodgsError: the file is not a PLY, has no ``vertex`` of splats or an unsupported dialect, or is
-            truncated.
+        LodgsError: the file is not such a PLY, or is truncated.
     """
     path = Path(path)
     with open_file(path) as file:
-        header, counts = _read_header(file, path)
+        header, counts = _read_header(file, path, splats)
         begin = file.tell()
         size = os.fstat(file.fileno()).st_size
         layout: list[tuple[str, np.dtype, int]] = []
@@ -325,7 +328,7 @@ def _header_lines(element: Element) -> list[str]:
     return lines
 
 
-def _read_header(file: IO[bytes], path: Path) -> tuple[PlyData, list[int]]:
+def _read_header(file: IO[bytes], path: Path, splats: bool = True) -> tuple[PlyData, list[int]]:
     """Read the header of a PLY of splats, and stop at the first row.
 
     Returns:
@@ -360,8 +363,9 @@ def _read_header(file: IO[bytes], path: Path) -> tuple[PlyData, list[int]]:
         raise LodgsError(
             f"Cannot read {path}: it has lists in its vertices.", "Choose a .ply of Gaussian splats."
         )
-    reject_unsupported([column.name for column in vertex.properties], _comments(header), path)
-    splats_from_rows(vertex.data, path)
+    if splats:
+        reject_unsupported([column.name for column in vertex.properties], _comments(header), path)
+        splats_from_rows(vertex.data, path)
     return header, counts
 
 
@@ -399,7 +403,7 @@ def _read_text(
         if least > size + 1:
             raise ValueError("it is too short for its rows")
         elements: dict[str, np.ndarray] = {}
-        lines = io.TextIOWrapper(file, "ascii", "replace")
+        lines = read_lines(io.TextIOWrapper(file, "ascii", "replace"), _MAX_LINE)
         for name, row, count in layout:
             with warnings.catch_warnings():
                 warnings.simplefilter(

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from .gaussians import SplatRows, Splats
+from .gaussians import SplatRows
 
 
 class SplatFormat(NamedTuple):
@@ -35,7 +35,7 @@ class SplatFormat(NamedTuple):
     palette_size: int = 0
     antialiased: bool = False
     write: Callable[[Path, SplatRows, dict], None] | None = None
-    read: Callable[[Path], Splats] | None = None
+    read: Callable[[Path], SplatRows] | None = None
     readable: bool = True
 
     def size(self, count: int, degree: int) -> float:

@@ -352,7 +352,7 @@ def test_point_records_among_zeros():
     random = np.random.default_rng(1)
     lengths = random.integers(0, 40, 3000)
     records = [struct.pack("<Q3d3BdQ", 0, 0, 0, 0, 0, 0, 0, 0, n) + bytes(8 * int(n)) for n in lengths]
-    starts = model_files._point_starts(np.frombuffer(b"".join(records), np.uint8))
+    starts = model_files._point_starts(np.frombuffer(b"".join(records), np.uint8), len(records))
     np.testing.assert_array_equal(starts, np.concatenate([[0], np.cumsum(51 + 8 * lengths)[:-1]]))
 
 

@@ -205,10 +205,12 @@ def test_records_across_block_borders(monkeypatch):
     records = [random.bytes(43) + struct.pack("<Q", n) + random.bytes(8 * int(n)) for n in lengths]
     body = np.frombuffer(b"".join(records), np.uint8)
     starts = np.concatenate([[0], np.cumsum(51 + 8 * lengths)[:-1]])
-    np.testing.assert_array_equal(colmap_model._point_starts(body), starts)
+    np.testing.assert_array_equal(colmap_model._point_starts(body, len(starts)), starts)
     for cut in (1, 30, 51, 60):
         with pytest.raises(ValueError, match="ends inside point"):
-            colmap_model._point_starts(body[: -cut if lengths[-1] * 8 + 51 > cut else -(cut + 7)])
+            colmap_model._point_starts(
+                body[: -cut if lengths[-1] * 8 + 51 > cut else -(cut + 7)], len(starts)
+            )
 
 
 def test_outlier_points_are_dropped(scene):

@@ -7,22 +7,24 @@ Format: the manual of Bundler v0.4 (https://www.cs.cornell.edu/~snavely/bundler/
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from array import array
+from collections.abc import Iterable
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
-from ...documents import open_file
+from ...documents import open_file, read_lines
 from ...errors import LodgsError
 from ..colmap_model import make_intrinsics
 from ..images import image_size
 from .exported import OPENGL, ExportedScene, ExportedView, find_image, invert_pose
 
 NAME = "Bundler"
-MAX_BYTES = 1 << 28
-"""Maximum size of an input file."""
-_LINE_END = re.compile(r"(\s+0)?(\s+[-+.\deE]+)?$")
-"""Optional end of a line in the list: a 0 and the initial focal length."""
+_MAX_LINE = 1 << 24
+_MAX_LIST = 1 << 26
+"""Maximum bytes of a line, and of the list of photos."""
+_NUMBER = re.compile(r"[-+.\deE]+")
 _LISTS = "list.txt", "bundle.out.list.txt", "image_list.txt"
 
 
@@ -43,14 +45,15 @@ def read(path: Path) -> ExportedScene:
     names = _read_names(path)
     try:
         with open_file(path) as file:
-            data = file.read(MAX_BYTES + 1)
-        head, *lines = filter(None, map(bytes.strip, data.split(b"\n")))
-        if not head.startswith(b"# Bundle file v0.3") or len(data) > MAX_BYTES:
-            raise ValueError(f"its version is not 0.3, or it exceeds {MAX_BYTES:,} bytes")
-        count, points = map(int, lines[0].split())
-        cameras = _parse_numbers(lines[1 : 1 + 5 * count], (count, 15))
-        # Each point has three lines: position, colour, and the views that see it.
-        positions, colors = (_parse_numbers(lines[1 + 5 * count + n :: 3], (points, 3)) for n in range(2))
+            lines = filter(None, map(bytes.strip, read_lines(file, _MAX_LINE)))
+            if not next(lines, b"").startswith(b"# Bundle file v0.3"):
+                raise ValueError("its version is not 0.3")
+            count, points = map(int, next(lines, b"").split())
+            cameras = _parse_numbers(islice(lines, 5 * count), (count, 15))
+            # Each point has three lines: position, colour, and the views that see it.
+            rows = (first + b" " + second for first, second, _ in zip(lines, lines, lines, strict=True))
+            table = _parse_numbers(islice(rows, points + 1), (points, 6))
+        positions, colors = table[:, :3], table[:, 3:]
     except (ValueError, IndexError, OverflowError) as error:
         raise LodgsError(
             f"Cannot read {path}: the file is damaged or truncated ({error}).", "Export it again."
@@ -77,9 +80,12 @@ def read(path: Path) -> ExportedScene:
     return ExportedScene(views, positions, colors.clip(0, 255).astype(np.uint8), excluded)
 
 
-def _parse_numbers(lines: Sequence[bytes], shape: tuple[int, int]) -> np.ndarray:
+def _parse_numbers(lines: Iterable[bytes], shape: tuple[int, int]) -> np.ndarray:
     """Return the finite numbers of the lines as an array."""
-    numbers = np.array(b" ".join(lines).split(), np.float64).reshape(shape)
+    values = array("d")
+    for line in lines:
+        values.extend(map(float, line.split()))
+    numbers = np.array(values).reshape(shape)
     if not np.isfinite(numbers).all():
         raise ValueError("a value is not a finite number")
     return numbers
@@ -101,5 +107,14 @@ def _read_names(path: Path) -> list[str]:
     if list_file is None:
         raise LodgsError(f"Cannot read {path}: there is no list of photos.", f"Add {_LISTS[0]} next to it.")
     with open_file(list_file) as file:
-        text = file.read(MAX_BYTES).decode("utf-8", "replace")
-    return [_LINE_END.sub("", line.strip()) for line in text.splitlines() if line.strip()]
+        text = file.read(_MAX_LIST).decode("utf-8", "replace")
+    return [_photo_name(line.strip()) for line in text.splitlines() if line.strip()]
+
+
+def _photo_name(line: str) -> str:
+    """Return a line of the list without its optional end: a 0 and the initial focal length."""
+    parts = line.rsplit(maxsplit=2)
+    if len(parts) == 3 and parts[1] == "0" and _NUMBER.fullmatch(parts[2]):
+        return parts[0]
+    parts = line.rsplit(maxsplit=1)
+    return parts[0] if len(parts) == 2 and _NUMBER.fullmatch(parts[1]) else line

@@ -168,7 +168,11 @@ def find_image(folder: Path, name: str) -> Path:
     Returns:
         A file in the folder or below it, or the expected path if there is no such file.
     """
-    parts = [part for part in name.replace("\\", "/").split("/") if part not in ("", ".", "..")]
+    parts = [
+        part
+        for part in name.replace("\\", "/").split("/")
+        if part not in ("", ".", "..") and not Path(part).drive
+    ]
     candidates = [folder.joinpath(*parts[start:]) for start in range(len(parts))] or [folder]
     for candidate in candidates:
         stem = candidate.stem if candidate.suffix in _SUFFIXES else candidate.name

@@ -106,8 +106,8 @@ def _parse_xml(path: Path) -> Element:
     with open_file(path) as file:
         data = file.read(MAX_BYTES + 1)
     try:
-        if len(data) > MAX_BYTES or b"<!DOCTYPE" in data or b"<!ENTITY" in data:
-            raise ValueError(f"it exceeds {MAX_BYTES:,} bytes, or defines entities")
+        if len(data) > MAX_BYTES or b"<!DOCTYPE" in data or b"<!ENTITY" in data or b"\0" in data:
+            raise ValueError(f"it exceeds {MAX_BYTES:,} bytes, defines entities, or is not UTF-8")
         return ElementTree.fromstring(data)
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise LodgsError(

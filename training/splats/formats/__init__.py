@@ -18,6 +18,7 @@ from ...errors import LodgsError
 from ...files import atomic_write
 from ..dialects import comments_from_meta
 from ..gaussians import SplatRows
+from ..packed_files import check_packed_file
 from ..ply import write_ply
 from ..splat_format import SplatFormat
 from ..splat_transform import FiniteRows, find_splat_transform, run_splat_transform, splat_transform_steps
@@ -104,6 +105,7 @@ def open_as_ply(path: Path) -> Iterator[Path]:
         return
     name = path.name.lower()
     open_file(path).close()  # reports an unreadable file
+    check_packed_file(path)
     stem = path.resolve().parent.name if name == STREAMED_FILE else path.stem.removesuffix(".compressed")
     with tempfile.TemporaryDirectory(prefix="lodgs-") as folder:
         converted = Path(folder, f"{stem or 'splats'}.ply")

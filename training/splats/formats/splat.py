@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from ...documents import open_file
 from ...errors import LodgsError
 from ...files import atomic_write
 from ..gaussians import SH_C0, SplatRows, Splats
-from ..ply import BATCH_ROWS
+from ..ply import BATCH_ROWS, release_pages
 from ..splat_format import SplatFormat
 
 _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
@@ -38,28 +39,38 @@ def write_splat(path: Path, splats: SplatRows, meta: dict) -> None:
             file.write(rows.data)
 
 
-def read_splat(path: Path) -> Splats:
-    """Read a ``.splat``. Opacities of 0 and 255 become nearby ones with finite logits.
+class SplatFile:
+    """Rows of a ``.splat``, mapped into memory. Opacities of 0 and 255 become nearby ones with finite logits.
 
     Raises:
         LodgsError: the file cannot be read, or its last row is incomplete.
     """
-    with open_file(path) as file:
-        data = file.read()
-    if not data or len(data) % _ROW.itemsize:
-        raise LodgsError(
-            f"Cannot read {path}: {len(data):,} bytes are not a multiple of {_ROW.itemsize}.",
-            "Export it again.",
-        )
-    rows = np.frombuffer(data, _ROW)
-    rgba = rows["rgba"].astype(np.float32) / 255
-    opacity = rgba[:, 3].clip(0.25 / 255, 1 - 0.25 / 255)
-    with np.errstate(divide="ignore", invalid="ignore"):  # dropped later, because they cannot be drawn
-        log_scales = np.log(rows["scale"])
-    return Splats(
-        rows["mean"].copy(), rows["quat"].astype(np.float32) / 128 - 1, log_scales,
-        np.log(opacity / (1 - opacity)), (rgba[:, None, :3] - 0.5) / np.float32(SH_C0),
-    )  # fmt: skip
+
+    def __init__(self, path: Path) -> None:
+        with open_file(path) as file:
+            size = os.fstat(file.fileno()).st_size
+            if not size or size % _ROW.itemsize:
+                raise LodgsError(
+                    f"Cannot read {path}: {size:,} bytes are not a multiple of {_ROW.itemsize}.",
+                    "Export it again.",
+                )
+            self._rows = np.memmap(file, _ROW, "r")
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def select(self, index: slice | np.ndarray, /) -> Splats:
+        """Return the splats of a range of rows, or of ascending rows (M,)."""
+        rows = np.array(self._rows[index])
+        release_pages(self._rows)
+        rgba = rows["rgba"].astype(np.float32) / 255
+        opacity = rgba[:, 3].clip(0.25 / 255, 1 - 0.25 / 255)
+        with np.errstate(divide="ignore", invalid="ignore"):  # dropped later, because they cannot be drawn
+            log_scales = np.log(rows["scale"])
+        return Splats(
+            rows["mean"].copy(), rows["quat"].astype(np.float32) / 128 - 1, log_scales,
+            np.log(opacity / (1 - opacity)), (rgba[:, None, :3] - 0.5) / np.float32(SH_C0),
+        )  # fmt: skip
 
 
 FORMAT = SplatFormat(
@@ -69,5 +80,5 @@ FORMAT = SplatFormat(
     (32.0,),
     max_degree=0,
     write=write_splat,
-    read=read_splat,
+    read=SplatFile,
 )

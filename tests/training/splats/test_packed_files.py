@@ -1,0 +1,90 @@
+"""Compressed splat files that promise or unpack to more than they hold; layouts as their formats document."""
+
+import gzip
+import io
+import json
+import struct
+import zipfile
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from training.errors import LodgsError
+from training.splats.formats import open_as_ply
+from training.splats.packed_files import check_packed_file, webp_size
+
+
+def spz(count: int, degree: int, body: bytes) -> bytes:
+    """Version 3: magic, version, number of splats, SH degree, fractional bits, flags, reserved."""
+    head = struct.pack("<IIIBBBB", 0x5053474E, 3, count, degree, 12, 0, 0)
+    return gzip.compress(head + body, 1)
+
+
+def ksplat(count: int, size: int) -> bytes:
+    return struct.pack("<BBHIIII", 0, 1, 0, 1, 1, count, count).ljust(size, b"\0")
+
+
+def webp(width: int, height: int, **options) -> bytes:
+    file = io.BytesIO()
+    Image.new("RGBA", (width, height), (1, 2, 3, 255)).save(file, "WEBP", **options)
+    return file.getvalue()
+
+
+def sog(meta: dict, image: bytes, compression: int = zipfile.ZIP_STORED) -> bytes:
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", compression) as archive:
+        archive.writestr("meta.json", json.dumps(meta))
+        archive.writestr("means_l.webp", image)
+    return file.getvalue()
+
+
+COMPRESSED_PLY = (
+    b"ply\nformat binary_little_endian 1.0\nelement chunk %d\nproperty float min_x\n"
+    b"element vertex %d\nproperty uint packed_position\nend_header\n"
+)
+GOOD = {
+    "a.spz": spz(1000, 3, bytes(1000 * (20 + 45))),
+    "b.spz": spz(0, 0, b""),
+    "a.ksplat": ksplat(2, 4096 + 1024 + 88),
+    "a.sog": sog({"version": 2, "count": 16}, webp(4, 4, lossless=True)),
+    "v1.sog": sog({"means": {"shape": [16, 3]}}, webp(4, 4)),
+    "a.compressed.ply": COMPRESSED_PLY % (1, 2) + bytes(12),
+    "other.xyz": b"",
+}
+BAD = {
+    "bomb.spz": spz(10, 0, bytes(10_000_000)),
+    "short.spz": spz(1000, 0, bytes(100_000))[:-20],
+    "magic.spz": gzip.compress(b"no splats" * 10),
+    "degree.spz": spz(1, 9, b""),
+    "many.ksplat": ksplat(2**32 - 1, 8192),
+    "short.ksplat": b"\0" * 19,
+    "bomb.sog": sog({"count": 1}, bytes(50_000_000), zipfile.ZIP_DEFLATED),
+    "wide.sog": sog({"count": 16}, webp(8192, 2048, lossless=True)),
+    "many.sog": sog({"count": 2**40}, webp(4, 4)),
+    "count.sog": sog({"count": "x"}, webp(4, 4)),
+    "shape.sog": sog({"means": {"shape": []}}, webp(4, 4)),
+    "list.sog": sog({"means": []}, webp(4, 4)),
+    "image.sog": sog({"count": 16}, b"RIFF"),
+    "text.sog": b"PK no archive",
+    "many.compressed.ply": COMPRESSED_PLY % (1, 2**40) + bytes(100),
+}
+
+
+@pytest.mark.parametrize("name", GOOD)
+def test_complete_files_pass(tmp_path, name):
+    (tmp_path / name).write_bytes(GOOD[name])
+    check_packed_file(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_files_that_promise_or_unpack_too_much_are_refused(tmp_path, name):
+    (tmp_path / name).write_bytes(BAD[name])
+    with pytest.raises(LodgsError, match="Cannot read"), open_as_ply(tmp_path / name):
+        pass
+
+
+@pytest.mark.parametrize("options", [{}, {"lossless": True}, {"exif": b"Exif\0\0MM\0*\0\0\0\x08\0\0"}])
+def test_webp_size_of_all_layouts(options):
+    data = np.frombuffer(webp(300, 17, **options), np.uint8)
+    assert webp_size(data[:30].tobytes()) == (300, 17)
