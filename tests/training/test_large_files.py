@@ -9,6 +9,7 @@ import pytest
 from training.documents import read_json
 from training.errors import LodgsError
 from training.scenes.colmap_model import read_cameras, read_observations, read_points, read_poses
+from training.scenes.depths import read_depth_map
 from training.scenes.formats import bundler, metashape
 from training.scenes.images import image_size
 from training.scenes.point_cloud import read_points as read_point_cloud
@@ -100,6 +101,13 @@ def test_large_images(tmp_path, within, head):
     path = sparse(tmp_path / "a", head, SIZE if head == EXR else 200_000_000)
     with pytest.raises(LodgsError, match="Cannot read"):
         within(10, lambda: image_size(path))
+
+
+def test_large_header_of_a_depth_map(tmp_path, within):
+    path = tmp_path / "a.npy"
+    path.write_bytes(b"\x93NUMPY\2\0" + struct.pack("<I", 2**31))
+    with pytest.raises(LodgsError, match="header is too long"):
+        within(10, lambda: read_depth_map(path))
 
 
 def test_large_documents(tmp_path, within):

@@ -38,6 +38,8 @@ MAX_ADDED_POINTS = 100_000
 """Maximum number of points added from depth maps."""
 DISTANCE_RANGE = 0.3, 1000
 """Plausible median depth of the maps, in distances to the nearest camera; others suggest a wrong unit."""
+_MAX_NUMPY_HEADER = 1 << 16
+"""Maximum bytes of an NPY header, which numpy would read into memory."""
 
 
 class DepthPriors:
@@ -240,11 +242,13 @@ def read_depth_map(path: Path) -> np.ndarray:
     """
     try:
         with open_file(path) as file:
-            head = file.read(6)
+            head = file.read(12)
         if head[:4] == MAGIC:
             depth = read_exr_depth(path)
             return np.where(depth < MAX_COORDINATE, depth, np.nan)
-        if head == b"\x93NUMPY":
+        if head.startswith(b"\x93NUMPY"):
+            if head[6:7] != b"\1" and int.from_bytes(head[8:12], "little") > _MAX_NUMPY_HEADER:
+                raise ValueError("its header is too long")
             values = _read_numpy(path)
         else:
             from PIL import Image

@@ -20,8 +20,10 @@ from .ply import read_elements
 _SPZ = struct.Struct("<IIIB3x")
 _SPZ_MAGIC = 0x5053474E
 _SPZ_COEFFICIENTS = {0: 0, 1: 3, 2: 8, 3: 15, 4: 24}
-_SPZ_SPLAT = 20
-"""Maximum bytes of a splat without harmonics: position, opacity, colour, scale and rotation."""
+_SPZ_SPLAT = 16, 20
+"""Minimum and maximum bytes of a splat without harmonics: position, opacity, colour, scale and rotation."""
+_MAX_DEFLATION = 1032
+"""Maximum ratio of Deflate, https://zlib.net/zlib_tech.html."""
 _KSPLAT_HEADER = 4096
 _KSPLAT_SPLAT = 24
 """Bytes of a splat at the highest compression."""
@@ -54,13 +56,13 @@ def check_packed_file(path: Path) -> None:
         ) from error
 
 
-def _check_spz(file: IO[bytes], _: int) -> None:
+def _check_spz(file: IO[bytes], size: int) -> None:
     """Unpack the file without storing it (the gzip format of versions 1 to 3)."""
     if file.read(2) != b"\x1f\x8b":  # version 4 compresses its parts separately
         return
     file.seek(0)
     unpacker = zlib.decompressobj(wbits=31)
-    unpacked, head, limit = 0, b"", _SPZ.size
+    unpacked, head, least, limit = 0, b"", _SPZ.size, _SPZ.size
     while block := unpacker.unconsumed_tail or file.read(_BLOCK):
         data = unpacker.decompress(block, _BLOCK)
         unpacked += len(data)
@@ -68,12 +70,19 @@ def _check_spz(file: IO[bytes], _: int) -> None:
             magic, _, count, degree = _SPZ.unpack(head[: _SPZ.size])
             if magic != _SPZ_MAGIC:
                 raise ValueError("it is not an SPZ file")
-            limit = _SPZ.size + count * (_SPZ_SPLAT + 3 * _SPZ_COEFFICIENTS[degree])
+            least, limit = (
+                _SPZ.size + count * (splat + 3 * _SPZ_COEFFICIENTS[degree]) for splat in _SPZ_SPLAT
+            )
+            if least > _MAX_DEFLATION * size:
+                raise ValueError(f"it is too short for {count:,} splats")
         if unpacked > limit + _BLOCK:
             raise ValueError(f"it unpacks to more than {limit:,} bytes")
         if unpacker.eof:
-            return
-    raise ValueError("it is truncated")
+            break
+    if not unpacker.eof or unpacked < least:
+        raise ValueError("it is truncated")
+    if unpacker.unused_data or file.read(1):
+        raise ValueError("it has data after its end")
 
 
 def _check_ksplat(file: IO[bytes], size: int) -> None:

@@ -55,6 +55,9 @@ GOOD = {
 BAD = {
     "bomb.spz": spz(10, 0, bytes(10_000_000)),
     "short.spz": spz(1000, 0, bytes(100_000))[:-20],
+    "many.spz": spz(2**32 - 1, 3, bytes(10_000)),
+    "few.spz": spz(1000, 0, bytes(10_000)),
+    "two.spz": spz(1, 0, bytes(20)) + gzip.compress(bytes(100)),
     "magic.spz": gzip.compress(b"no splats" * 10),
     "degree.spz": spz(1, 9, b""),
     "many.ksplat": ksplat(2**32 - 1, 8192),
