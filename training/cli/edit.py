@@ -46,7 +46,8 @@ def _add_outputs(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--streamed", type=Path, metavar="DIR", help="folder of levels to write for streaming in browsers"
     )
-    add_setting(parser, EXPORT_OPTIONS["antialiased"], value=False)
+    for name in ("antialiased", "original_place"):
+        add_setting(parser, EXPORT_OPTIONS[name], value=False)
 
 
 def _add_cleaning(parser: argparse.ArgumentParser) -> None:
@@ -83,6 +84,7 @@ def run(options: argparse.Namespace) -> int:
     from ..editing.edit import edit
     from ..runs.folder import find_splats
     from ..splats.formats import open_as_ply
+    from ..splats.level_folder import read_origin
 
     limits = setting_values(options, Cleaning)
     crops = _crops(options)
@@ -97,26 +99,25 @@ def run(options: argparse.Namespace) -> int:
         raise LodgsError(
             "Cannot test splats against photos: their scene is missing.", "Add its folder with --scene."
         )
-    points = None
-    if options.scene is not None:
-        from ..scenes.colmap import read_scene
-
-        scene = read_scene(options.scene)
-        limits["cameras"] = tuple(scene.cameras)
-        points = scene.points
     if not (options.out or options.plain or options.folder or options.streamed):
         raise LodgsError(
             "Cannot write the edited splats: no output.", "Add --out, --plain, --folder or --streamed."
         )
-    cleaning = Cleaning(tuple(crops), **limits)
+    points = None
     with open_as_ply(find_splats(options.source)) as source:
+        if options.scene is not None:
+            from ..scenes.colmap import read_scene
+
+            scene = read_scene(options.scene, origin=read_origin(source))
+            limits["cameras"] = tuple(scene.cameras)
+            points = scene.points
         print(
             edit(
-                source, options.out, cleaning, warn,
+                source, options.out, Cleaning(tuple(crops), **limits), warn,
                 placement=placement_of(options), upright=options.upright, ground=options.ground,
                 points=points, looks=[(crop, look) for crop in look_crops] if look else (),
                 plain=options.plain, folder=options.folder, streamed=options.streamed,
-                antialiased=options.antialiased,
+                antialiased=options.antialiased, original_place=options.original_place,
             )
         )  # fmt: skip
     return 0

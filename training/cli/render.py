@@ -65,6 +65,7 @@ def _render(options: argparse.Namespace, source: RenderSource, controls: dict[st
 
     if options.camera:
         camera, near = read_camera(options.camera)
+        camera = camera.moved(-source.origin)
     else:
         camera, near = source.view(options.view, options.scene)
     if options.size:

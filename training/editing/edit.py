@@ -16,6 +16,7 @@ from ..splats.file_rows import DrawableRows
 from ..splats.formats import find_format
 from ..splats.level_folder import read_folder, write_folder
 from ..splats.levels import Bundle
+from ..splats.origin import describe_origin
 from ..splats.ply import write_ply
 from ..splats.similarity import Similarity
 from ..splats.splat_transform import find_splat_transform
@@ -42,6 +43,7 @@ def edit(
     folder: Path | None = None,
     streamed: Path | None = None,
     antialiased: bool = False,
+    original_place: bool = False,
 ) -> str:
     """Edit a bundle, a folder of levels or any 3DGS PLY, and write the result.
 
@@ -58,6 +60,7 @@ def edit(
         folder: output folder of levels.
         streamed: output folder of levels for streaming in browsers.
         antialiased: for ``plain`` and ``streamed``, see :class:`.export.ExportOptions`.
+        original_place: for ``plain``, see :class:`.export.ExportOptions`.
 
     Returns:
         A report of the remaining splats of each level, and of the files.
@@ -81,8 +84,13 @@ def edit(
         f"level {level.number}: {len(result.rows):,} of {len(level.rows):,} splats"
         for level, result in zip(bundle.levels, edited.levels, strict=True)
     ]
-    _export(edited, plain, folder, streamed, antialiased)
-    return "\n".join([*report, *(f"{path}: written" for path in outputs)])
+    for path in plain:
+        run_to_end(export_finest_level(path, edited, antialiased, original_place))
+    _export_levels(edited, folder, streamed, antialiased)
+    report += [f"{path}: written" for path in outputs]
+    if edited.origin.any() and not (original_place and outputs == list(plain)):
+        report.append(describe_origin(edited.origin))
+    return "\n".join(report)
 
 
 def _check_outputs(
@@ -96,12 +104,8 @@ def _check_outputs(
         find_splat_transform()
 
 
-def _export(
-    bundle: Bundle, plain: Sequence[Path], folder: Path | None, streamed: Path | None, antialiased: bool
-) -> None:
-    """Write a bundle for other programs; see :func:`edit`."""
-    for path in plain:
-        run_to_end(export_finest_level(path, bundle, antialiased))
+def _export_levels(bundle: Bundle, folder: Path | None, streamed: Path | None, antialiased: bool) -> None:
+    """Write the levels of a bundle for other programs; see :func:`edit`."""
     if folder is not None or streamed is not None:
         levels = resolve_rule(bundle.rule).complete_levels(bundle)
         if folder is not None:
@@ -122,10 +126,10 @@ def _open(source: Path, warn: Warn) -> Bundle:
 
 def _write_like(source: Path, bundle: Bundle, out: Path, edited: Bundle) -> None:
     """Write an edited bundle in the format of its source: folder of levels, plain PLY or bundle."""
-    comments = comments_from_meta(bundle.meta)
+    comments = comments_from_meta(edited.meta)
     if source.is_dir():
         write_folder(out, edited)
-    elif bundle == Bundle("", bundle.levels[:1], meta=meta_from_comments(comments)):
+    elif bundle == Bundle("", bundle.levels[:1], meta=meta_from_comments(comments_from_meta(bundle.meta))):
         write_ply(out, edited.levels[0].rows, comments)
     else:
         write_bundle(out, edited)

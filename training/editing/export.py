@@ -8,10 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
+from ..errors import LodgsError
 from ..settings import setting, settings_of
-from ..splats.formats import find_format, write_splats
+from ..splats.dialects import comments_from_meta
+from ..splats.formats import PLY, find_format, write_splats
 from ..splats.gaussians import SplatRows, Splats
 from ..splats.levels import Bundle
+from ..splats.origin import NO_ORIGIN
+from ..splats.ply import write_ply
 from .bake_filter import bake_filter
 
 
@@ -35,28 +39,48 @@ class ExportOptions:
         "Keep opacities as trained, for viewers with Mip-Splatting's filter; otherwise bake the filter for "
         "other viewers, which would draw small splats too bold. SPZ files store this choice themselves.",
     )
+    original_place: bool = setting(
+        False,
+        "Write a georeferenced scene at its original place, with positions in double precision; otherwise "
+        "relative to its local origin. PLY only.",
+        label="Original Place",
+    )
 
 
 EXPORT_OPTIONS = settings_of(ExportOptions)
 """The settings of exports, by name."""
 
 
-def export_finest_level(path: Path, bundle: Bundle, antialiased: bool = False) -> Iterator[str]:
+def export_finest_level(
+    path: Path, bundle: Bundle, antialiased: bool = False, original_place: bool = False
+) -> Iterator[str]:
     """Write the finest level of a bundle in the format of the file name.
 
     Args:
         antialiased: keep opacities as trained; otherwise bake the filter into them
             (:func:`.bake_filter.bake_filter`), except in formats that record the filter.
+        original_place: add the local origin, see :class:`ExportOptions`.
 
     Yields:
         Progress messages, as :func:`..splats.formats.write_splats`.
 
     Raises:
-        LodgsError: as :func:`..splats.formats.write_splats`.
+        LodgsError: as :func:`..splats.formats.write_splats`, or the format has no double precision.
     """
+    origin = bundle.origin if original_place else NO_ORIGIN
+    if origin.any() and find_format(path) is not PLY:
+        raise LodgsError(
+            f"Cannot write {path} at the original place: only PLY has positions in double precision.",
+            "Write a PLY, or keep the local origin.",
+        )
     if not (antialiased or find_format(path).antialiased):
         bundle = bake_filter(bundle)
-    yield from write_splats(path, ConcatenatedRows.of_level(bundle, bundle.levels[-1].number), bundle.meta)
+    rows = ConcatenatedRows.of_level(bundle, bundle.levels[-1].number)
+    if origin.any():
+        meta = {name: value for name, value in bundle.meta.items() if name != "origin"}
+        write_ply(path, rows, comments_from_meta(meta), origin)
+        return
+    yield from write_splats(path, rows, bundle.meta)
 
 
 def run_to_end(steps: Iterator[str]) -> None:

@@ -103,8 +103,12 @@ def _opaque_means(rows: SplatRows) -> np.ndarray:
 
 
 def _transform_meta(meta: dict, placement: Similarity) -> dict:
-    """Return a bundle's metadata with transformed positions, directions and lengths."""
+    """Return a bundle's metadata with transformed positions, directions and lengths.
+
+    The result has other coordinates than the original scene, so it has no local origin.
+    """
     transformed = dict(meta) if placement.scale == 1 else _scale_lengths(meta, placement.scale)
+    transformed.pop("origin", None)
     for name in ("camera_center", "view"):
         if name in meta:
             points = placement.transform_points(np.asarray(meta[name], np.float64).reshape(-1, 3))

@@ -213,6 +213,7 @@ class Method(ABC, Generic[P, D]):
             "scene_extent": data.extent,
             "median_depth": data.median_depth,
             **({"antialias": True} if self.parameters.antialias else {}),
+            **({"origin": data.scene.origin.tolist()} if data.scene.origin.any() else {}),
         }
 
     # -- parts of a step, to override ------------------------------------------------------------------

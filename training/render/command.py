@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..errors import LodgsError
 from ..lod.rule import Values
 from ..lod.selection import full_detail_controls, resolve_controls
@@ -20,7 +22,7 @@ from ..scenes.colmap import read_scene
 from ..scenes.view_tables import read_view_tables
 from ..splats.bundle import read_header, read_tables
 from ..splats.dialects import Warn, ignore
-from ..splats.level_folder import read_folder
+from ..splats.level_folder import read_folder, read_origin
 from ..splats.levels import Bundle
 from .image import RenderedImage, check_suffix, read_depth, write_image
 from .scene import Instance, draw
@@ -34,11 +36,13 @@ class RenderSource:
         levels: file of which only the header has been read, or the contents of a folder of levels.
         rule: name of the rule, see ``Bundle``.
         run: run that contains the file, or None.
+        origin: local origin of the levels, (3,).
     """
 
     levels: Path | Bundle
     rule: str
     run: RunFolder | None
+    origin: np.ndarray
 
     @classmethod
     def read(cls, path: Path, warn: Warn = ignore) -> RenderSource:
@@ -65,7 +69,8 @@ class RenderSource:
             path = run.bundle
         levels = read_folder(path, warn) if path.is_dir() else path
         rule = (levels if isinstance(levels, Bundle) else read_header(levels)).rule
-        return cls(levels, rule, run if run.job.exists() else None)
+        origin = levels.origin if isinstance(levels, Bundle) else read_origin(levels)
+        return cls(levels, rule, run if run.job.exists() else None, origin)
 
     def view(self, name: str, scene: Path | None = None) -> tuple[Camera, float]:
         """Find the view of a photo.
@@ -75,7 +80,7 @@ class RenderSource:
             scene: folder of the COLMAP scene; None: the bundle's views, or the run's scene.
 
         Returns:
-            The camera in the photo's size, and the depth of the near plane.
+            The camera in the photo's size, relative to the local origin, and the depth of the near plane.
 
         Raises:
             LodgsError: no photo, or several photos have the name, or the scene is unknown.
@@ -95,7 +100,7 @@ class RenderSource:
     def _views(self, scene: Path | None) -> tuple[Sequence[Camera], float]:
         """Return the cameras of all photos and the depth of the near plane."""
         if scene is not None:
-            model = read_scene(scene)
+            model = read_scene(scene, origin=self.origin)
             return model.cameras, model.near()
         tables = self.levels.tables if isinstance(self.levels, Bundle) else read_tables(self.levels)
         cameras, near, _ = read_view_tables(tables)

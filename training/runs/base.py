@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from scipy.special import expit, logit
 
 from ..errors import LodgsError
 from ..lod.rule import Values
@@ -15,9 +14,10 @@ from ..splats.bundle import open_bundle, read_bundle, read_header
 from ..splats.dialects import Warn, ignore
 from ..splats.file_rows import DrawableRows
 from ..splats.gaussians import SplatRows, Splats
-from ..splats.level_folder import read_folder
+from ..splats.level_folder import read_folder, read_origin
 from ..splats.levels import Bundle
 from .folder import RunFolder
+from .job import Job
 
 
 def read_base(path: str | Path, warn: Warn = ignore) -> tuple[Splats, bool]:
@@ -42,7 +42,48 @@ def open_base(path: str | Path, warn: Warn = ignore) -> tuple[SplatRows, bool]:
     Raises:
         LodgsError: the path does not exist, the run is not finished, the file is unreadable or has no splats.
     """
-    path = Path(path)
+    path = _base_file(Path(path))
+    head = None if path.is_dir() else read_header(path)
+    if head is None or head.cumulative or full_detail_controls(head) is not None:
+        bundle = (read_folder if path.is_dir() else read_bundle)(path, warn)
+        splats: SplatRows = _finest(bundle)
+    else:
+        bundle, rows = open_bundle(path)
+        splats = DrawableRows(rows[bundle.levels[-1].number], warn)
+    if not len(splats):
+        raise LodgsError(f"Cannot read base splats: {path} has none.", "Choose another run or PLY file.")
+    return splats, bundle.antialias
+
+
+def read_base_origin(path: str | Path) -> np.ndarray:
+    """Return the local origin (3,) of a base.
+
+    Raises:
+        LodgsError: as :func:`open_base`.
+    """
+    return read_origin(_base_file(Path(path)))
+
+
+def base_origin(job: Job) -> np.ndarray | None:
+    """Return the local origin of a job's base, in which the job trains; None to choose the scene's own.
+
+    A base without an origin lies near 0, so its scene chooses the origin, except for captures of the base.
+
+    Raises:
+        LodgsError: as :func:`open_base`.
+    """
+    if not job.base:
+        return None
+    origin = read_base_origin(job.base)
+    return origin if origin.any() or job.capture else None
+
+
+def _base_file(path: Path) -> Path:
+    """Return the file, or folder of levels, of a base.
+
+    Raises:
+        LodgsError: the path does not exist, or is a run that is not finished.
+    """
     if not path.exists():
         raise LodgsError(
             f"Cannot read base splats: {path} does not exist.", "Choose a run folder or a PLY file of splats."
@@ -54,16 +95,7 @@ def open_base(path: str | Path, warn: Warn = ignore) -> tuple[SplatRows, bool]:
                 f"Cannot read base splats: {path.parent} is not a finished run (it has no {path.name}).",
                 "Finish training it first, or choose a PLY file of splats.",
             )
-    head = None if path.is_dir() else read_header(path)
-    if head is None or head.cumulative or full_detail_controls(head) is not None:
-        bundle = (read_folder if path.is_dir() else read_bundle)(path, warn)
-        splats: SplatRows = _finest(bundle)
-    else:
-        bundle, rows = open_bundle(path)
-        splats = DrawableRows(rows[bundle.levels[-1].number], warn)
-    if not len(splats):
-        raise LodgsError(f"Cannot read base splats: {path} has none.", "Choose another run or PLY file.")
-    return splats, bundle.antialias
+    return path
 
 
 def _finest(bundle: Bundle) -> Splats:
@@ -78,6 +110,8 @@ def _with_weights_baked(bundle: Bundle, center: np.ndarray, controls: Values) ->
 
     The splats were trained with these weights.
     """
+    from scipy.special import expit, logit  # Blender lacks scipy
+
     splats, weights = select(bundle, center, 1.0, controls)
     if weights is None:
         return splats

@@ -17,7 +17,8 @@ from ..scenes.viewpoints import dome_views
 from ..scenes.write_colmap import write_visible_points
 from ..splats.dialects import Warn, ignore
 from ..splats.gaussians import Splats
-from .base import read_base
+from ..splats.origin import NO_ORIGIN
+from .base import read_base, read_base_origin
 from .job import DOME
 
 POINTS = 60_000
@@ -57,12 +58,14 @@ def capture(
     if problem := cpu_fallback_reason(backend):
         warn(problem)
     splats, antialias = read_base(base, warn)
+    origin = read_base_origin(base)
     if source == DOME:
         cameras, near = dome_views(splats, views, width, round(width * 2 / 3))
     else:
         cameras, near = read_camera_folder(Path(source))
+        cameras = [camera.moved(-origin) for camera in cameras]
     return len(cameras), write_scene(
-        scene, splats, cameras, near, backend=backend, antialias=antialias, report=report
+        scene, splats, cameras, near, backend=backend, antialias=antialias, report=report, origin=origin
     )
 
 
@@ -75,6 +78,7 @@ def write_scene(
     backend: str = "auto",
     antialias: bool = False,
     report: ReportView = lambda number, count: None,
+    origin: np.ndarray = NO_ORIGIN,
 ) -> int:
     """Write scene/images/*.jpg and scene/sparse/0/*.bin, or nothing if an error occurs.
 
@@ -90,6 +94,7 @@ def write_scene(
         backend: rasterizer.
         antialias: rendering mode of the splats, see ``Bundle.antialias``.
         report: called before each view with its number and the number of views.
+        origin: (3,) local origin of the splats, which the written scene adds.
 
     Returns:
         The number of points.
@@ -105,7 +110,7 @@ def write_scene(
         shutil.rmtree(temporary, ignore_errors=True)
         for folder in ("images", "depths"):
             (temporary / folder).mkdir(parents=True)
-        count = _write(temporary, splats, cameras, near, points, backend, antialias, report)
+        count = _write(temporary, splats, cameras, near, points, backend, antialias, report, origin)
         shutil.rmtree(temporary / "depths")
         temporary.rename(scene)
     except OSError as error:
@@ -127,6 +132,7 @@ def _write(
     backend: str,
     antialias: bool,
     report: ReportView,
+    origin: np.ndarray,
 ) -> int:
     gaussians = Gaussians.of(splats)
     rng = np.random.default_rng(0)
@@ -149,5 +155,5 @@ def _write(
         colors.append(image[y, x])
     return write_visible_points(
         scene, views, lambda number: np.load(scene / "depths" / f"{number}.npy"),
-        np.concatenate(positions), np.concatenate(colors),
+        np.concatenate(positions), np.concatenate(colors), origin,
     )  # fmt: skip

@@ -21,6 +21,8 @@ from ..scenes.regions import Region
 from ..scenes.rendered_views import thin_evenly
 from ..scenes.triangulate import triangulate_scene
 from ..scenes.undistort import undistort_cache, undistort_scene
+from ..splats.bundle import read_header
+from .base import base_origin
 from .capture import capture
 from .folder import RunFolder
 from .job import Job
@@ -50,7 +52,9 @@ def training_data(
     """
     report = report or _ignore
     model, images = (Path(path) if path else None for path in (job.model, job.images))
-    full_scene = read_scene(_scene_folder(job, folder, report), model=model, images=images)
+    full_scene = read_scene(
+        _scene_folder(job, folder, report), model=model, images=images, origin=_origin(job, folder)
+    )
     parameters = job.resolved_parameters()
     add_depths = pixels and parameters.depth == "metric" and not job.cell and not job.cells
     if not (add_depths and all(camera.depth is not None for camera in full_scene.cameras)):
@@ -117,6 +121,16 @@ def with_points(scene: Scene, job: Job, folder: RunFolder, report: Callable[...,
 
 def _ignore(kind: str, **values: object) -> None:
     pass
+
+
+def _origin(job: Job, folder: RunFolder) -> np.ndarray | None:
+    """Return the local origin of a job's scene, or None to choose it from the cameras.
+
+    A finished run can be evaluated without its base.
+    """
+    if job.base and not Path(job.base).exists() and folder.bundle.exists():
+        return read_header(folder.bundle).origin
+    return base_origin(job)
 
 
 def thin_outside_region(scene: Scene, region: Crop, limit: int) -> Scene:

@@ -128,7 +128,8 @@ def _report_warning(warn: Warn, kind: str, values: dict[str, Any]) -> None:
 
 def _measure_levels(job: Job, evaluation: Evaluation, bundle: Bundle) -> dict:
     """Return the report's head, the summary of the finest level, ``levels`` and ``aside``."""
-    offset_cameras = [camera.scaled(job.image_scale) for camera in read_offset_views(Path(job.scene))]
+    offset_views = read_offset_views(Path(job.scene), bundle.origin)
+    offset_cameras = [camera.scaled(job.image_scale) for camera in offset_views]
     levels = standalone_levels(bundle)
     *coarser, finest = levels
     summary = summarize(evaluation, bundle)

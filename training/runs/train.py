@@ -34,7 +34,7 @@ from ..optimize.training_data import TrainingData
 from ..rasterize import Gaussians, contributions, cpu_fallback_reason, resolve_backend, tensor_device, warm_up
 from ..rasterize.gpu.default_device import default_adapter as graphics_device
 from ..rasterize.resident import ResidentBundle
-from ..scenes.check import check_scene
+from ..scenes.check import INFO, check_scene
 from ..scenes.orientation import up_rotation
 from ..scenes.regions import Region
 from ..scenes.view_tables import make_view_tables
@@ -138,7 +138,7 @@ def _train(job: Job, folder: RunFolder, events: EventWriter, placement: dict[str
         data = training_data(job, folder, events)
         if not job.cell:
             for finding in check_scene(data.full_scene, job.image_scale):
-                events("warning", message=str(finding))
+                events("status" if finding.severity == INFO else "warning", message=str(finding))
         events("status", message="Preparing to train (up to a minute on first use)")
         torch.set_num_threads(1)  # torch's threads would compete with the kernels' threads
         keep_freed_memory()

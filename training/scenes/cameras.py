@@ -120,6 +120,14 @@ class Camera:
         )
         return inside & (depth > near)
 
+    def moved(self, offset: np.ndarray) -> Camera:
+        """Return the camera in a world whose coordinates are larger by an offset (3,) float64."""
+        if not np.any(offset):
+            return self
+        pose = self.world_to_camera.copy()
+        pose[:3, 3] -= pose[:3, :3] @ offset
+        return replace(self, world_to_camera=pose)
+
     def resized(self, width: int, height: int) -> Camera:
         """Return the view at another resolution, with scaled intrinsics."""
         sx, sy = width / self.width, height / self.height
@@ -194,6 +202,8 @@ def pick_evenly(items: Sequence[T], limit: int) -> list[T]:
 
 def write_camera(path: Path, camera: Camera, near: float) -> None:
     """Write a camera and its near depth as JSON.
+
+    Camera files have the coordinates of the original scene: add the splats' local origin (``Camera.moved``).
 
     Raises:
         LodgsError: the file cannot be written.

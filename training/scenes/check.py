@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import LodgsError
+from ..splats.origin import describe_origin
 from .colmap import NO_POINTS, Progress, Scene, observations, read_scene
 from .triangulate import cached_points
 
@@ -20,16 +21,14 @@ SMALL_SIDE = 200
 """Longer side of a photo, in pixels at the trained scale, below which details are lost."""
 MIN_SHARED = 20
 """Number of points that a view must share with other views to overlap them."""
-MAX_ROUNDING = 0.25
-"""Maximum rounding error of float32 coordinates, in pixels of a photo at the median depth."""
-ERROR, WARNING = "error", "warning"
+ERROR, WARNING, INFO = SEVERITIES = "error", "warning", "info"
 
 
 class Finding(NamedTuple):
     """A fact about a scene that affects training.
 
     Attributes:
-        severity: "error" if training is impossible, "warning" if the quality is lower.
+        severity: "error" if training is impossible, "warning" if the quality is lower, else "info".
         what: sentence with the fact and its effect.
         remedy: the user's next step, in the imperative.
     """
@@ -68,7 +67,7 @@ def check_folder(
         return [Finding(ERROR, error.what, error.remedy)]
     findings += [*_missing(scene), *_no_points(scene)]
     findings += [Finding(WARNING, text) for text in scene.warnings if not text.startswith(NO_POINTS)]
-    return sorted(findings, key=lambda finding: finding.severity)
+    return sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity))
 
 
 def check_scene(scene: Scene, image_scale: float = 1.0) -> list[Finding]:
@@ -120,18 +119,8 @@ def _no_points(scene: Scene) -> Iterator[Finding]:
 
 
 def _origin(scene: Scene) -> Iterator[Finding]:
-    focal = np.median([camera.focal for camera in scene.cameras])
-    depth = scene.median_depth(default=scene.extent(default=1.0))
-    distance = float(np.linalg.norm(scene.center))
-    pixels = np.finfo(np.float32).eps * distance * focal / max(depth, 1e-30)
-    if pixels > MAX_ROUNDING:
-        x, y, z = scene.center
-        yield Finding(
-            WARNING,
-            f"The scene lies far from its origin, around ({x:.0f}, {y:.0f}, {z:.0f}). Rounding of its "
-            f"coordinates moves splats by {pixels:.1f} pixels.",
-            "Export the scene with a local origin.",
-        )
+    if scene.origin.any():
+        yield Finding(INFO, f"The scene lies far from 0. {describe_origin(scene.origin)}")
 
 
 def _overlap(scene: Scene) -> Iterator[Finding]:

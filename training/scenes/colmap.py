@@ -12,6 +12,7 @@ import numpy as np
 
 from ..errors import LodgsError, printable
 from ..files import check_folder
+from ..splats.origin import NO_ORIGIN, choose_origin
 from . import point_cloud
 from .cameras import MAX_COORDINATE, Camera, camera_extent, pick_evenly
 from .colmap_model import (
@@ -46,7 +47,7 @@ Progress = Callable[[float], object]
 
 @dataclass(frozen=True)
 class Scene:
-    """A COLMAP model with its photos, in COLMAP's world.
+    """A COLMAP model with its photos, relative to a local origin (``splats.origin``).
 
     Attributes:
         folder: folder of the scene.
@@ -60,6 +61,7 @@ class Scene:
         point_ids: (P,) int64 ids of the model; empty if the points come from another source.
         names: names of all views of the model, sorted, with or without a photo. Default: the cameras' names.
         point_model: folder of the model that records the points' observations. Default: ``model``.
+        origin: (3,) float64 position of the scene's (0, 0, 0) in COLMAP's world; zeros if that is precise.
     """
 
     folder: Path
@@ -73,6 +75,7 @@ class Scene:
     point_ids: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
     names: Sequence[str] = ()
     point_model: Path | None = None
+    origin: np.ndarray = field(default_factory=lambda: NO_ORIGIN)
 
     def split(self, test_every: int, validation: bool = False) -> tuple[list[Camera], list[Camera]]:
         """Split the cameras into training cameras and held-out cameras.
@@ -201,7 +204,11 @@ def _subfolders(folder: Path) -> list[Path]:
 
 
 def read_scene(
-    folder: Path, model: Path | None = None, images: Path | None = None, progress: Progress | None = None
+    folder: Path,
+    model: Path | None = None,
+    images: Path | None = None,
+    progress: Progress | None = None,
+    origin: np.ndarray | None = None,
 ) -> Scene:
     """Read the cameras and points of a COLMAP scene and locate its photos.
 
@@ -214,6 +221,7 @@ def read_scene(
         images: folder of the photos. Default: ``images/``, or another folder in or next to the scene that
             contains the model's image names.
         progress: called now and then.
+        origin: (3,) local origin. Default: ``splats.origin.choose_origin`` for the cameras of the model.
 
     Raises:
         LodgsError: there is no folder, model or photo, or a model file is damaged.
@@ -239,7 +247,13 @@ def read_scene(
             "Choose the folder that holds the images under the names used by the model.",
         )
 
-    points, colors, ids, inliers = _read_inlier_points(model, views.cameras, warnings)
+    points, colors, ids = _read_model_points(model, views.cameras, warnings)
+    if origin is None:
+        origin = choose_origin(np.array([pose.center for pose in poses]), points)
+    views.cameras = [camera.moved(-origin) for camera in views.cameras]
+    with np.errstate(over="ignore"):  # infinite positions are dropped
+        points = (points - origin).astype(np.float32)
+    kept, inliers = _inliers(model, points, views.cameras, warnings)
     views.drop_outliers(inliers)
     if progress:
         progress(1.0)
@@ -248,9 +262,10 @@ def read_scene(
         model=model,
         images_folder=images,
         cameras=views.cameras,
-        points=points,
-        point_colors=colors,
-        point_ids=ids,
+        points=points[kept],
+        point_colors=colors[kept],
+        point_ids=ids[kept] if len(ids) else ids,
+        origin=origin,
         names=list(dict.fromkeys(pose.name.replace("\\", "/") for pose in poses)),
         distorted=views.distorted,
         warnings=[*warnings, *views.warnings(images)],
@@ -271,21 +286,28 @@ def _view_collector(folder: Path, images: Path) -> ViewCollector:
     )
 
 
-def _read_inlier_points(
+def _read_model_points(
     model: Path, cameras: Sequence[Camera], warnings: list[str]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return positions, colours and ids of the points without outliers, and a mask (V,) of inlier cameras."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return positions (P, 3) float64, possibly not finite, colours and ids of the points of a model."""
     points, colors, ids = read_points(model)
     cloud = _point_cloud(model)
     if not len(points) and cloud is not None:
-        positions, colors = point_cloud.read_points(cloud)
-        points, ids = positions.astype(np.float32), np.zeros(0, np.int64)
+        points, colors = point_cloud.read_points(cloud)
+        ids = np.zeros(0, np.int64)
         warnings.append(f"The model {model} has no points; {len(points):,} were read from {cloud}.")
     if not len(points):
         warnings.append(
             f"{NO_POINTS}: {model} has no points3D{model_suffix(model)} with points. Training creates them "
             f"from the {'photos' if any(camera.depth is None for camera in cameras) else 'depth maps'}."
         )
+    return points, colors, ids
+
+
+def _inliers(
+    model: Path, points: np.ndarray, cameras: Sequence[Camera], warnings: list[str]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return masks of the points (P,) and of the cameras (V,) that are no outliers."""
     valid = (np.abs(points) <= MAX_COORDINATE).all(axis=1)
     outliers, inlier_cameras = find_outliers(points[valid], cameras)
     valid[valid] = ~outliers
@@ -294,7 +316,7 @@ def _read_inlier_points(
             f"Skipped {np.sum(~valid):,} points of {model}: their position is not finite, or more than "
             f"{OUTLIER_FACTOR:,} times the median distance from the cameras."
         )
-    return points[valid], colors[valid], ids[valid] if len(ids) else ids, inlier_cameras
+    return valid, inlier_cameras
 
 
 def _point_cloud(model: Path) -> Path | None:

@@ -121,6 +121,11 @@ class Pose:
     camera_id: int
     world_to_camera: np.ndarray
 
+    @property
+    def center(self) -> np.ndarray:
+        """Camera position, (3,) float64."""
+        return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
+
 
 def model_suffix(folder: Path) -> str:
     """Return the suffix of a folder's model files, ".bin" (preferred) or ".txt", or "" without a model."""
@@ -175,7 +180,7 @@ def read_observations(model: Path, names: Collection[str]) -> dict[str, np.ndarr
 
 
 def read_points(model: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Read positions (P, 3) float32, possibly not finite, colours (P, 3) uint8 and ids (P,) int64.
+    """Read positions (P, 3) float64, possibly not finite, colours (P, 3) uint8 and ids (P,) int64.
 
     A model without a points file has no points.
 
@@ -411,7 +416,7 @@ _POINT2D = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 _POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")])
 _TRACK_OFFSET = 43
 _BLOCK = 1 << 17
-_NO_POINTS = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, np.int64)
+_NO_POINTS = np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0, np.int64)
 _UTF8_MARK = b"\xef\xbb\xbf"  # Windows programs write it at the start of UTF-8 files
 
 
@@ -424,7 +429,7 @@ def _parse_points_bin(data: mmap.mmap) -> tuple[np.ndarray, np.ndarray, np.ndarr
     if not count:
         return _NO_POINTS
     records = np.lib.stride_tricks.sliding_window_view(body, _POINT.itemsize)[starts].view(_POINT)[:, 0]
-    return _to_float32(records["xyz"]), records["rgb"].copy(), records["id"].astype(np.int64)
+    return records["xyz"].astype(np.float64), records["rgb"].copy(), records["id"].astype(np.int64)
 
 
 def _point_starts(body: np.ndarray, expected: int) -> np.ndarray:
@@ -476,13 +481,7 @@ def _parse_points_txt(file: IO[bytes]) -> tuple[np.ndarray, np.ndarray, np.ndarr
     table = np.loadtxt(lines, usecols=range(7), ndmin=2)[1:]
     _check_count(len(table), file, "points")
     colors = np.nan_to_num(table[:, 4:]).clip(0, 255).astype(np.uint8)
-    return _to_float32(table[:, 1:4]), colors, np.nan_to_num(table[:, 0]).astype(np.int64)
-
-
-def _to_float32(positions: np.ndarray) -> np.ndarray:
-    """Convert to float32; values above its range become infinite."""
-    with np.errstate(over="ignore"):
-        return positions.astype(np.float32)
+    return table[:, 1:4], colors, np.nan_to_num(table[:, 0]).astype(np.int64)
 
 
 def _lines(file: IO[bytes]) -> Iterator[bytes]:

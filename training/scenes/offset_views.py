@@ -10,17 +10,23 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from ..errors import LodgsError, printable
+from ..splats.origin import NO_ORIGIN
 from .cameras import Camera, read_camera
 from .image_files import ImageFiles
 from .images import image_size
 
 
-def read_offset_views(scene: Path) -> list[Camera]:
+def read_offset_views(scene: Path, origin: np.ndarray = NO_ORIGIN) -> list[Camera]:
     """Read the views of a scene's folder ``aside``, sorted by file name, at their images' size.
 
     Each file has the format of ``cameras.write_camera``, in the model's world; ``name`` is the image's name.
     Without the folder, the list is empty.
+
+    Args:
+        origin: (3,) local origin of the result.
 
     Raises:
         LodgsError: a camera or its image cannot be read.
@@ -28,7 +34,7 @@ def read_offset_views(scene: Path) -> list[Camera]:
     views = []
     files = ImageFiles(scene / "aside", scene)
     for path in sorted((scene / "aside").glob("*.json")):
-        camera, _ = read_camera(path)
+        camera = read_camera(path)[0].moved(-origin)
         try:
             image = files.find(camera.name)
         except LodgsError as error:

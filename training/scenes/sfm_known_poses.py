@@ -266,6 +266,8 @@ def _write(
                 samples.append(colors[number][element.point2D_idx])
             model.add_point3D(point.xyz, track, np.rint(np.mean(samples, axis=0)).astype(np.uint8))
         model.update_point_3d_errors()
+    if any(request["origin"]):  # an identity would change the last bits
+        model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), np.array(request["origin"])))
     (work / "sparse").mkdir()
     model.write_binary(work / "sparse")
     for extra in ("rigs.bin", "frames.bin"):  # readers recreate trivial rigs

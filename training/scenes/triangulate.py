@@ -177,7 +177,8 @@ def _ignore(stage: str, done: int, total: int) -> None:
 def _with_points(scene: Scene, result: Path, report: Report = _ignore) -> Scene:
     """Return the scene with the points of a result and its warnings, and report its message."""
     model = result / "sparse" if (result / "sparse").is_dir() else scene.model
-    points, colors, ids = read_points(model)
+    positions, colors, ids = read_points(model)
+    points = (positions - scene.origin).astype(np.float32)
     inliers = ~find_outliers(points, scene.cameras)[0]
     summary = read_json(result / _SUMMARY)
     report(summary["message"], 1, 1)
@@ -196,7 +197,7 @@ def _triangulate(scene: Scene, work: Path, report: Report, exposure: float) -> P
     _write_cameras(scene, sizes, work)
     detailed = len(sizes) <= DETAILED_PHOTOS or max(map(max, sizes)) <= MAX_SIDE / 2
     request = {
-        "work": str(work), "seconds": MAX_SECONDS,
+        "work": str(work), "seconds": MAX_SECONDS, "origin": scene.origin.tolist(),
         "features": DETAILED_FEATURES if detailed else FEATURES, "octave": -1 if detailed else 0,
         "scales": [
             [camera.width / width, camera.height / height]
@@ -284,8 +285,10 @@ def _write_random_points(scene: Scene, work: Path) -> None:
         )
         for camera in scene.cameras
     ]
-    poses = [(camera.name, camera.world_to_camera) for camera in scene.cameras]
-    write_model(work / "random", lenses, poses, points, np.full((len(points), 3), 128, np.uint8))
+    poses = [(camera.name, camera.moved(scene.origin).world_to_camera) for camera in scene.cameras]
+    write_model(
+        work / "random", lenses, poses, points + scene.origin, np.full((len(points), 3), 128, np.uint8)
+    )
 
 
 def _summarize(scene: Scene, result: Mapping, problem: str) -> dict:

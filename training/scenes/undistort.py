@@ -79,7 +79,7 @@ def cached_undistorted_scene(scene: Scene) -> Scene | None:
 
 
 def _read_cached(target: Path, scene: Scene) -> Scene:
-    result = read_scene(target, model=target / "sparse", images=target / "images")
+    result = read_scene(target, model=target / "sparse", images=target / "images", origin=scene.origin)
     missing = {camera.name for camera in scene.cameras} - {camera.name for camera in result.cameras}
     warnings = [f"Skipped {name}: it cannot be undistorted." for name in sorted(missing)]
     turns = {camera.name: camera.turns for camera in scene.cameras}

@@ -9,6 +9,7 @@ import numpy as np
 import pycolmap
 
 from ..errors import LodgsError
+from ..splats.origin import NO_ORIGIN
 from .cameras import Camera
 from .visibility import visible_points
 
@@ -30,12 +31,14 @@ def write_visible_points(
     depths: Callable[[int], np.ndarray],
     points: np.ndarray,
     colors: np.ndarray,
+    origin: np.ndarray = NO_ORIGIN,
 ) -> int:
     """Write a model as :func:`write_colmap` of the points visible in at least SHORTEST_TRACK views.
 
     Args:
         depths: returns the depth map of a view by index, see :func:`visible_points`; one is in memory at a
             time.
+        origin: (3,) local origin of the cameras and points, which the model adds.
 
     Returns:
         The number of written points.
@@ -52,7 +55,8 @@ def write_visible_points(
         )
     blocks = np.array_split(visible[:, shared], -(-visible.size // _BLOCK), axis=1)
     visible = np.concatenate([thin_tracks(block, LONGEST_TRACK) for block in blocks], axis=1)
-    write_colmap(scene, cameras, points[shared], visible, colors[shared])
+    cameras = [camera.moved(origin) for camera in cameras]
+    write_colmap(scene, cameras, points[shared] + origin, visible, colors[shared])
     return int(shared.sum())
 
 

@@ -25,6 +25,7 @@ from .bundle_header import (
 from .dialects import Warn, comments_from_meta, drawable_3dgs, drop_undrawable, ignore, meta_from_comments
 from .file_rows import FileRows
 from .levels import NO_SPLATS, Bundle, Level
+from .origin import FAR_SPLATS, NO_ORIGIN, ORIGIN_SAMPLE, choose_origin
 from .ply import (
     Columns,
     Element,
@@ -99,8 +100,8 @@ def write_bundle(path: str | Path, bundle: Bundle, order: str = "finest_first") 
 def read_bundle(path: str | Path, warn: Warn = ignore, select_rows: RowSelector | None = None) -> Bundle:
     """Read a bundle bit for bit; any other 3DGS PLY becomes one level of unknown method.
 
-    Splats that cannot be drawn are dropped (`dialects.drop_undrawable`). Elements and comments of other
-    programs are ignored.
+    A third-party PLY far from 0 gets a local origin (``origin.py``). Splats that cannot be drawn are dropped
+    (`dialects.drop_undrawable`). Elements and comments of other programs are ignored.
 
     Args:
         warn: as for `read_ply`.
@@ -113,8 +114,9 @@ def read_bundle(path: str | Path, warn: Warn = ignore, select_rows: RowSelector 
     elements, comments = read_elements(path)
     bundle, lines = parse_comments(comments, path)
     if bundle is None:
-        splats = drawable_3dgs(splats_from_rows(elements["vertex"], path), path, warn)
-        return Bundle("", [Level(1, splats)], meta=meta_from_comments(comments))
+        meta, shift = _plain_meta(elements["vertex"], comments)
+        splats = drawable_3dgs(splats_from_rows(elements["vertex"], path, shift), path, warn)
+        return Bundle("", [Level(1, splats)], meta=meta)
     level_rows = _find_rows(bundle, lines, elements, path)
     try:
         selections = {} if select_rows is None else select_rows(bundle)
@@ -142,13 +144,17 @@ def open_bundle(path: str | Path) -> tuple[Bundle, dict[int, FileRows]]:
     elements, comments = read_elements(path)
     bundle, lines = parse_comments(comments, path)
     if bundle is None:
-        bundle = Bundle("", [Level(1, NO_SPLATS)], meta=meta_from_comments(comments))
-        return bundle, {1: FileRows(elements["vertex"], None, path)}
+        meta, shift = _plain_meta(elements["vertex"], comments)
+        return Bundle("", [Level(1, NO_SPLATS)], meta=meta), {
+            1: FileRows(elements["vertex"], None, path, shift)
+        }
     return bundle, _find_rows(bundle, lines, elements, path)
 
 
 def read_header(path: str | Path) -> Bundle:
     """Read a bundle without splats from the header alone; any other 3DGS PLY is one level of unknown method.
+
+    The local origin of a third-party PLY far from 0 is missing in its meta: `open_bundle` returns it.
 
     Raises:
         LodgsError: as `read_bundle`.
@@ -170,6 +176,20 @@ def read_tables(path: str | Path) -> dict[str, Columns]:
         return pop_tables([line for line in parse_comments(comments, path)[1] if "table" in line], elements)
     except INCONSISTENCIES as error:
         raise inconsistent(path, error) from error
+
+
+def _plain_meta(rows: np.ndarray, comments: list[str]) -> tuple[dict, np.ndarray]:
+    """Return the meta of a plain PLY, and the local origin to subtract from its positions (3,) float64.
+
+    A PLY that names its local origin is already relative to it.
+    """
+    meta = meta_from_comments(comments)
+    if "origin" in meta or not set("xyz") <= set(rows.dtype.names or ()):
+        return meta, NO_ORIGIN
+    sample = rows[:: max(1, len(rows) // ORIGIN_SAMPLE)]
+    means = np.stack([np.asarray(sample[axis], np.float64) for axis in "xyz"], axis=1)
+    origin = choose_origin(means, far=FAR_SPLATS)
+    return meta | ({"origin": origin.tolist()} if origin.any() else {}), origin
 
 
 def _find_rows(

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection, Iterable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,6 +30,7 @@ _ANCHOR_SCALES = ("scale_3", "scale_4", "scale_5")
 # Columns of time: Spacetime Gaussians, 4D Gaussian Splatting (rotor and two-quaternion forms).
 _TEMPORAL = {"trbf_center", "trbf_scale", "motion_0", "scale_t", "scale_t_0", "t_scale", "rot_r_0"}
 _MIP = "SplatRenderMode: mip"
+_ORIGIN = "lodgs origin "
 
 
 def ignore(message: str) -> None:
@@ -136,17 +138,28 @@ def _apply_filter_3d(
 
 
 def meta_from_comments(comments: Iterable[str]) -> dict:
-    """Return a bundle's meta for the render mode in the comments of a foreign PLY.
+    """Return a bundle's meta for the render mode and the local origin in the comments of a plain PLY.
 
-    The result is ``{"antialias": True}`` for splats trained with Mip-Splatting's 2D filter (Brush, Postshot),
-    else empty.
+    ``antialias`` is True for splats trained with Mip-Splatting's 2D filter (Brush, Postshot). ``origin`` is
+    that of :func:`comments_from_meta`.
     """
-    return {"antialias": True} if _render_mode(comments) == "mip" else {}
+    comments = list(comments)
+    meta: dict = {"antialias": True} if _render_mode(comments) == "mip" else {}
+    for comment in comments:
+        if comment.startswith(_ORIGIN):
+            with suppress(ValueError):
+                origin = [float(number) for number in comment.removeprefix(_ORIGIN).split()]
+                if len(origin) == 3 and max(map(abs, origin)) <= MAX_COORDINATE:
+                    meta["origin"] = origin
+    return meta
 
 
 def comments_from_meta(meta: dict) -> list[str]:
-    """Return the comments that tell other programs the render mode in a bundle's meta."""
-    return [_MIP] if meta.get("antialias") else []
+    """Return the comments about the render mode and the local origin in a bundle's meta."""
+    comments = [_MIP] if meta.get("antialias") else []
+    if any(origin := meta.get("origin", ())):
+        comments.append(_ORIGIN + " ".join(repr(float(number)) for number in origin))
+    return comments
 
 
 def _render_mode(comments: Iterable[str]) -> str:

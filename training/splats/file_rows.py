@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from .dialects import Warn, drop_undrawable, dropped_message, ignore, to_3dgs
 from .gaussians import Splats
+from .origin import NO_ORIGIN
 from .ply import BATCH_ROWS, read_elements, release_pages, splats_from_rows
 
 _ROW = "row"
@@ -24,11 +25,13 @@ class FileRows:
         vertices: the 3DGS columns of each splat, structured.
         extras: the extra columns, structured, or None.
         path: path of the file.
+        origin: (3,) local origin that is subtracted from the positions of a file of another program.
     """
 
     vertices: np.ndarray
     extras: np.ndarray | None
     path: str | Path
+    origin: np.ndarray = field(default_factory=lambda: NO_ORIGIN)
 
     def __len__(self) -> int:
         return len(self.vertices)
@@ -49,7 +52,7 @@ class FileRows:
         Raises:
             LodgsError: as ``splats_from_rows``.
         """
-        splats = splats_from_rows(self.vertices[index], self.path)
+        splats = splats_from_rows(self.vertices[index], self.path, self.origin)
         if self.extras is not None:
             extras = self.extras[index]
             splats.extras |= {column: np.array(extras[column]) for column in extras.dtype.names or ()}

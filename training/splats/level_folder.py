@@ -8,10 +8,12 @@ import re
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
+import numpy as np
+
 from ..documents import read_json
 from ..errors import LodgsError
 from ..files import atomic_write
-from .bundle import read_header
+from .bundle import open_bundle
 from .bundle_header import (
     INCONSISTENCIES,
     bundle_line,
@@ -125,6 +127,33 @@ def read_folder(folder: str | Path, warn: Warn = ignore) -> Bundle:
     folder = Path(folder)
     if (folder / MANIFEST_FILE).exists():
         return _read_manifest(folder, warn)
+    coarse_first = _find_series(folder)
+    head, rows = open_bundle(coarse_first[-1])
+    shift = next(iter(rows.values())).origin
+    levels = [Level(i, read_ply(file, warn, shift)) for i, file in enumerate(coarse_first, 1)]
+    return Bundle("", levels, meta=head.meta)
+
+
+def read_origin(path: str | Path) -> np.ndarray:
+    """Return the local origin (3,) of a bundle, a folder of levels or any 3DGS PLY; read no splats.
+
+    Raises:
+        LodgsError: the file cannot be read.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        return open_bundle(path)[0].origin
+    if (path / MANIFEST_FILE).exists():
+        return _parse_manifest(path)[0].origin
+    return open_bundle(_find_series(path)[-1])[0].origin
+
+
+def _find_series(folder: Path) -> list[Path]:
+    """Return the files of a folder's only series of levels, from coarse to fine.
+
+    Raises:
+        LodgsError: the folder has no levels, several series or too many levels.
+    """
     series: dict[str, list[tuple[int, Path]]] = {}
     for file in folder.glob("*.ply"):
         if match := re.fullmatch(r"(|.+_)lod(\d+)\.ply", file.name):
@@ -134,14 +163,13 @@ def read_folder(folder: str | Path, warn: Warn = ignore) -> Bundle:
             f"Cannot read {folder}: it has {len(series) or 'no'} series of levels (lod0.ply, lod1.ply, ...).",
             "Choose a folder with one series, or a single PLY.",
         )
-    coarse_first = [file for _, file in sorted(next(iter(series.values())), reverse=True)]
-    if len(coarse_first) > MAX_READ_LEVELS:
+    files = [file for _, file in sorted(next(iter(series.values())), reverse=True)]
+    if len(files) > MAX_READ_LEVELS:
         raise LodgsError(
-            f"Cannot read {folder}: it has {len(coarse_first)} levels, more than {MAX_READ_LEVELS}.",
+            f"Cannot read {folder}: it has {len(files)} levels, more than {MAX_READ_LEVELS}.",
             "Remove files from the series.",
         )
-    levels = [Level(i, read_ply(file, warn)) for i, file in enumerate(coarse_first, 1)]
-    return Bundle("", levels, meta=read_header(coarse_first[-1]).meta)
+    return files
 
 
 def _read_manifest(folder: Path, warn: Warn) -> Bundle:
@@ -150,9 +178,8 @@ def _read_manifest(folder: Path, warn: Warn) -> Bundle:
     A level of a cumulative bundle consists of the rows of its file after those of the next coarser level.
     """
     manifest_file = folder / MANIFEST_FILE
+    bundle, manifest = _parse_manifest(folder)
     try:
-        manifest = read_json(manifest_file)
-        bundle = parse_bundle(manifest, manifest["levels"], manifest["meta"], manifest_file)
         lines = sorted(manifest["levels"], key=lambda line: line["level"])
         begin = 0
         for level, line in zip(bundle.levels, lines, strict=True):
@@ -169,3 +196,17 @@ def _read_manifest(folder: Path, warn: Warn) -> Bundle:
         return bundle
     except INCONSISTENCIES as error:
         raise inconsistent(manifest_file, error) from error
+
+
+def _parse_manifest(folder: Path) -> tuple[Bundle, dict]:
+    """Return the bundle that a manifest describes, without splats, and the manifest.
+
+    Raises:
+        LodgsError: the manifest cannot be read or is inconsistent.
+    """
+    file = folder / MANIFEST_FILE
+    try:
+        manifest = read_json(file)
+        return parse_bundle(manifest, manifest["levels"], manifest["meta"], file), manifest
+    except INCONSISTENCIES as error:
+        raise inconsistent(file, error) from error

@@ -14,13 +14,14 @@ import numpy as np
 
 from ..errors import LodgsError
 from .gaussians import SplatRows, Splats
+from .origin import NO_ORIGIN
 from .ply import BATCH_ROWS, Columns
 
 MAX_LEVELS = 12
 """Maximum number of levels of a job or a scene; a header has no room for many more."""
 MAX_READ_LEVELS = 64
 """Maximum number of levels in a file that is read."""
-META_SHAPES = {"camera_center": (3,), "up_rotation": (3, 3), "view": (2, 3)}
+META_SHAPES = {"camera_center": (3,), "up_rotation": (3, 3), "view": (2, 3), "origin": (3,)}
 """Required shapes of entries of meta, whose numbers must not exceed MAX_COORDINATE."""
 META_LENGTHS = ("scene_extent", "median_depth", "voxel", "distances")
 """Keys of meta, at any depth, whose values are lengths in scene units."""
@@ -93,6 +94,11 @@ class Bundle:
         """Rotation to a scene with z up, (3, 3) float64, from ``meta``; by default from -y up, as in most
         files."""
         return np.array(self.meta.get("up_rotation", ((1, 0, 0), (0, 0, 1), (0, -1, 0))), np.float64)
+
+    @property
+    def origin(self) -> np.ndarray:
+        """Local origin (``origin.py``): the original place of the splats' (0, 0, 0), (3,) float64."""
+        return np.array(self.meta.get("origin", NO_ORIGIN), np.float64)
 
     @property
     def on_disk(self) -> bool:

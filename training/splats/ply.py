@@ -25,6 +25,7 @@ from ..errors import LodgsError
 from ..files import atomic_write
 from .dialects import Warn, drawable_3dgs, ignore, reject_unsupported
 from .gaussians import SH_C0, SplatRows, Splats
+from .origin import NO_ORIGIN
 
 MAX_HEADER_BYTES = 1 << 20
 """Maximum length of a header."""
@@ -106,7 +107,7 @@ class Element:
         return self.count * self.dtype.itemsize
 
 
-def read_ply(path: str | Path, warn: Warn = ignore) -> Splats:
+def read_ply(path: str | Path, warn: Warn = ignore, origin: np.ndarray = NO_ORIGIN) -> Splats:
     """Read the element ``vertex`` of any 3DGS PLY.
 
     ASCII, little- and big-endian files of SH degree 0 to 4 are supported, with columns in any order and of
@@ -116,26 +117,37 @@ def read_ply(path: str | Path, warn: Warn = ignore) -> Splats:
 
     Args:
         warn: receives one sentence for each omission or changed look, see `dialects.Warn`.
+        origin: (3,) local origin to subtract from the positions.
 
     Raises:
         LodgsError: the file is not a PLY, is truncated, lacks the columns of splats, or has an unsupported
             dialect.
     """
     elements, _ = read_elements(path)
-    return drawable_3dgs(splats_from_rows(elements["vertex"], path), path, warn)
+    return drawable_3dgs(splats_from_rows(elements["vertex"], path, origin), path, warn)
 
 
-def write_ply(path: str | Path, splats: SplatRows, comments: Sequence[str] = ()) -> None:
+def write_ply(
+    path: str | Path, splats: SplatRows, comments: Sequence[str] = (), origin: np.ndarray = NO_ORIGIN
+) -> None:
     """Write splats as one binary little-endian ``vertex``, with extras after the 3DGS columns.
 
     Args:
         splats: splats in memory, or a source that is read in batches.
         comments: header comments, such as those of `dialects.comments_from_meta`.
+        origin: (3,) local origin to add to the positions, which are then of type double.
 
     Raises:
         LodgsError: the file cannot be written, or PLY does not support the name or type of an extra.
     """
-    write_elements(path, [Element.from_splats("vertex", [splats], all_columns)], comments)
+
+    def columns(splats: Splats) -> Columns:
+        if not origin.any():
+            return all_columns(splats)
+        means = splats.means.astype(np.float64) + origin
+        return all_columns(splats) | dict(zip("xyz", means.T, strict=True))
+
+    write_elements(path, [Element.from_splats("vertex", [splats], columns)], comments)
 
 
 def splat_columns(splats: Splats) -> Columns:
@@ -172,11 +184,12 @@ def to_records(columns: Columns) -> np.ndarray:
     return records
 
 
-def splats_from_rows(rows: np.ndarray, path: str | Path) -> Splats:
+def splats_from_rows(rows: np.ndarray, path: str | Path, origin: np.ndarray = NO_ORIGIN) -> Splats:
     """Convert the structured rows of an element with the 3DGS columns to splats.
 
     Args:
         path: path of the file, for messages.
+        origin: (3,) local origin to subtract from the positions.
 
     Raises:
         LodgsError: columns are missing, or the number of f_rest columns fits no SH degree.
@@ -213,6 +226,8 @@ def splats_from_rows(rows: np.ndarray, path: str | Path) -> Splats:
         for block in _blocks(len(rows)):
             for column, source in pairs:
                 column[block] = source[block]
+            for axis in np.flatnonzero(origin):
+                splats.means[block, axis] = rows["xyz"[axis]][block].astype(np.float64) - origin[axis]
             if colored:
                 splats.sh[block, 0] = (splats.sh[block, 0] / 255 - 0.5) / SH_C0
         has_normals = any(extras[name].any() for name in NORMALS if name in extras)

@@ -54,23 +54,6 @@ def test_few_and_tiny_photos():
     assert f"{len(scene.cameras)} of {len(scene.cameras)} photos have fewer" in found and "100)" in found
 
 
-def moved(scene, offset):
-    def move(camera):
-        pose = camera.world_to_camera.copy()
-        pose[:3, 3] -= pose[:3, :3] @ offset
-        return replace(camera, world_to_camera=pose)
-
-    points = (scene.points.astype(np.float64) + offset).astype(np.float32)
-    return replace(scene, cameras=list(map(move, scene.cameras)), points=points)
-
-
-def test_far_origin():
-    scene = read_scene(GARDEN)
-    assert "far from its origin" not in texts(check_scene(moved(scene, np.array([50.0, 20, 1]))))
-    (finding,) = check_scene(moved(scene, np.array([456789.5, 5432109.25, 312.5])))
-    assert "around (45" in finding.what and "local origin" in finding.remedy
-
-
 def test_scene_without_points(copy):
     (copy / "sparse" / "0" / "points3D.bin").unlink()
     (finding,) = [finding for finding in check_folder(copy) if "no points" in finding.what]

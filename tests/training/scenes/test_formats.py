@@ -173,7 +173,7 @@ def test_bundler(tmp_path):
         expected.append(pixels(x * factor, y * factor, (80, 80), (WIDTH / 2, HEIGHT / 2)))
     check(tmp_path, expected, names)
     scene = read_scene(tmp_path)
-    np.testing.assert_allclose(scene.points, POINTS, atol=1e-5)
+    np.testing.assert_allclose(scene.points + scene.origin, POINTS, atol=1e-5)
     np.testing.assert_array_equal(scene.point_colors[:, 0], np.arange(40))
 
 

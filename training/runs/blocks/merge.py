@@ -144,8 +144,14 @@ def _batches(rows: FileRows) -> Iterator[Splats]:
 
 def _check_compatible(block: Block, bundle: tuple[Bundle, Mapping[int, FileRows]], first: Bundle) -> None:
     head, rows = bundle
-    if not rows or (head.method, head.rule, head.facts) != (first.method, first.rule, first.facts):
+    if not rows or _kind(head) != _kind(first):
         raise LodgsError(
-            f"Cannot merge {block.folder.path}: its method, rule or facts differ from those of other blocks.",
+            f"Cannot merge {block.folder.path}: its method, rule, facts or local origin differ from those of "
+            "other blocks.",
             "Train all blocks with the jobs of the same plan.",
         )
+
+
+def _kind(head: Bundle) -> tuple:
+    """Return the parts of a header that all blocks share."""
+    return head.method, head.rule, head.facts, head.origin.tolist()

@@ -27,6 +27,7 @@ from ...optimize.parameters import Parameters
 from ...scenes.colmap import Scene, read_scene
 from ...scenes.regions import Region, plan_cells
 from ...scenes.triangulate import cached_points
+from ..base import base_origin
 from ..folder import RunFolder
 from ..job import MAX_CELLS, Job
 
@@ -152,7 +153,7 @@ def read_planned_scene(job: Job, add_points: Callable[[Scene], Scene] = cached_p
         LodgsError: the scene cannot be read, or has no points.
     """
     model, images = (Path(path) if path else None for path in (job.model, job.images))
-    scene = add_points(read_scene(Path(job.scene), model=model, images=images))
+    scene = add_points(read_scene(Path(job.scene), model=model, images=images, origin=base_origin(job)))
     if not len(scene.points):
         raise LodgsError(
             f"Cannot divide scene: the COLMAP model in {scene.model} has no 3D points.",
