@@ -25,6 +25,7 @@ from ..training.settings import check_value
 from ..training.splats.bundle import write_bundle
 from ..training.splats.dialects import Warn
 from ..training.splats.formats import FORMATS, PLY, find_format
+from ..training.splats.origin import describe_origin
 from . import extension
 from .data import importing, scenes, viewpoints
 from .render.capture import noise_warning, render_views, write_model
@@ -213,9 +214,12 @@ def _methods(args: argparse.Namespace) -> int:
 def _import(args: argparse.Namespace) -> int:
     _empty_file()
     if args.source.is_dir():
-        _import_photos(args.source.resolve(), lambda m: _print(f"warning: {m}"))
+        root = _import_photos(args.source.resolve(), lambda m: _print(f"warning: {m}"))
     else:
-        importing.import_splats(bpy.context, args.source.resolve(), warn=lambda m: _print(f"warning: {m}"))
+        root = importing.import_splats(
+            bpy.context, args.source.resolve(), warn=lambda m: _print(f"warning: {m}")
+        )
+    _print(f"'{root.name}': {scenes.contents(root)}")
     _save(args.blend)
     return DONE
 
@@ -236,6 +240,8 @@ def _export(args: argparse.Namespace) -> int:
     else:
         run_to_end(export_finest_level(args.bundle, bundle))
     _print(f"{args.bundle}: written")
+    if origin := describe_origin(bundle.origin):
+        _print(origin)
     return DONE
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -77,6 +78,8 @@ def import_colmap(
         root.empty_display_size = extent / 4
         root.lodgs.scene_folder = str(scene.folder)
         root.lodgs.camera_center = scene.center
+        if scene.origin.any():
+            root.lodgs.meta = json.dumps({"origin": scene.origin.tolist()})
         root.lodgs.training.median_depth = scene.median_depth(default=0.0)
         root.lodgs.training.model = str(scene.model) if model else ""
         root.lodgs.training.images = str(scene.images_folder) if images else ""

@@ -20,6 +20,7 @@ from ...training.lod.selection import check_rule, complete_splats, standalone_er
 from ...training.scenes.view_tables import VIEWS, make_view_tables, transform_views
 from ...training.splats.gaussians import Splats
 from ...training.splats.levels import Bundle, Level
+from ...training.splats.origin import describe_origin
 from .. import compat, extension
 from ..nodes import ellipsoids
 from . import cleaning, crops, looks, objects, painting, selection, streams, tables
@@ -36,9 +37,15 @@ def set_bundle_facts(root: bpy.types.Object, bundle: Bundle) -> None:
     levels or levels without splats.
 
     Raises:
-        LodgsError: a recorded value is invalid or contradicts the rule. Nothing is changed in that case.
+        LodgsError: a recorded value is invalid or contradicts the rule, or the local origin is not that of
+            the scene's views. Nothing is changed in that case.
     """
     settings, rule = root.lodgs, check_rule(bundle)
+    if views(root) and not np.array_equal(bundle.origin, selection.origin_of(root)):
+        raise LodgsError(
+            f"Cannot show levels in '{root.name}': their local origin is not that of the scene's cameras.",
+            "Import the splats as a new scene.",
+        )
     for control in rule.controls if rule else ():
         control.validate(bundle.controls.get(control.name, control.default))
     if rule is not None and (rule.weights_full_detail or not rule.complete) and settings.rule != bundle.rule:
@@ -86,7 +93,7 @@ def set_level(root: bpy.types.Object, level: Level) -> bpy.types.Object:
 
 
 def contents(root: bpy.types.Object) -> str:
-    """Describe the contents of a splat scene briefly: photos, views, points, levels and splats."""
+    """Describe the contents of a splat scene briefly: photos, views, points, levels, splats, local origin."""
     levels = [item.object for item in root.lodgs.levels if item.exists]
     counts = (
         (len(views_with_photo(root)), "photo"),
@@ -95,7 +102,9 @@ def contents(root: bpy.types.Object) -> str:
         (len(levels), "level"),
         (sum(len(obj.data.points) for obj in levels), "splat"),
     )
-    return ", ".join(f"{count:,} {noun}{'s' * (count != 1)}" for count, noun in counts if count)
+    text = ", ".join(f"{count:,} {noun}{'s' * (count != 1)}" for count, noun in counts if count)
+    origin = describe_origin(selection.origin_of(root))
+    return f"{text}. {origin}" if origin else text
 
 
 def prepare_refill(root: bpy.types.Object, number: int) -> None:

@@ -18,6 +18,7 @@ import numpy as np
 from ...training.errors import LodgsError
 from ...training.lod.query import LodQuery
 from ...training.lod.rule import Rule, collect_facts, fact_names, find_rule
+from ...training.splats.levels import Bundle
 from .. import compat
 from ..nodes import crops as crop_groups
 from ..nodes import display
@@ -103,6 +104,11 @@ def read_json(text: str) -> dict:
     except (ValueError, RecursionError):
         return {}
     return content if isinstance(content, dict) else {}
+
+
+def origin_of(root: bpy.types.Object) -> np.ndarray:
+    """Return the local origin of a splat scene, (3,) float64 (``training.splats.origin``)."""
+    return Bundle("", [], meta=read_json(root.lodgs.meta)).origin
 
 
 def read_facts(text: str) -> dict[str, float]:

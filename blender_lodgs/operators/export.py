@@ -17,6 +17,7 @@ from ...training.splats.formats import FORMATS, PLY, find_format
 from ...training.splats.formats.sog import FORMAT as SOG
 from ...training.splats.level_folder import write_folder
 from ...training.splats.levels import Bundle, Level
+from ...training.splats.origin import describe_origin
 from ...training.splats.splat_format import SplatFormat
 from ...training.splats.streamed_levels import STREAMED_FILE, write_streamed_levels
 from ..data import roots, scenes, selection
@@ -63,6 +64,11 @@ class _ForeignExport(_ExportOperator):
     """Base class with the options of exports for other programs."""
 
     antialiased: property_of(EXPORT_OPTIONS["antialiased"])
+
+
+def _origin_text(bundle: Bundle) -> str:
+    """Return a sentence about the local origin of exported splats, after a space; "" without one."""
+    return f". {describe_origin(bundle.origin)}" if bundle.origin.any() else ""
 
 
 class _FileExport(_ExportOperator, ExportHelper):
@@ -133,7 +139,7 @@ class LODGS_OT_export_bundle(_FileExport, bpy.types.Operator):
             )
         bundle = scenes.read_levels(root, self.placed, self.looked)
         write_bundle(self._path(), bundle, self.order)
-        self.report({"INFO"}, f"{_levels(bundle)} written to {self._path()}")
+        self.report({"INFO"}, f"{_levels(bundle)} written to {self._path()}{_origin_text(bundle)}")
         return {"FINISHED"}
 
 
@@ -143,6 +149,8 @@ class LODGS_OT_export_plain(_ForeignExport, _FileExport, _ConvertingExport, bpy.
     bl_idname = "lodgs.export_plain"
     bl_label = "Export Splats"
     suffix = "_plain"
+
+    original_place: property_of(EXPORT_OPTIONS["original_place"])
 
     filter_glob: bpy.props.StringProperty(
         default=";".join(f"*{kind.suffix}" for kind in FORMATS), options={"HIDDEN"}
@@ -191,6 +199,10 @@ class LODGS_OT_export_plain(_ForeignExport, _FileExport, _ConvertingExport, bpy.
         stores_filter = find_format(Path(f"splats{self.kind}")).antialiased
         row.active = roots.active_root(context).lodgs.antialias and not stores_filter
         row.prop(self, "antialiased")
+        if selection.origin_of(roots.active_root(context)).any():
+            row = layout.row()
+            row.active = not self.placed
+            row.prop(self, "original_place")
         layout.label(text="Format and Estimated Size")
         column = layout.column(align=True)
         column.use_property_split = False
@@ -200,15 +212,23 @@ class LODGS_OT_export_plain(_ForeignExport, _FileExport, _ConvertingExport, bpy.
 
     def work(self, context):
         root = roots.active_root(context)
+        if self.placed and self.original_place:
+            raise LodgsError(
+                "Cannot export at the original place: As Placed uses the place in Blender.",
+                "Disable one of them.",
+            )
         if self.source == "LEVEL":
             splats = scenes.read_level(root, self.level, self.placed, self.looked)
         else:
             splats = scenes.visible_splats(context, root, self.placed, self.looked)
         path = self._path()
         meta = selection.read_json(root.lodgs.meta)
+        if self.placed:
+            meta.pop("origin", None)
         bundle = Bundle("", [Level(1, splats)], meta=meta, tables=scenes.view_tables(root, self.placed))
-        yield from self.follow(export_finest_level(path, bundle, self.antialiased))
-        self.written = f"{len(splats):,} splats written to {path}"
+        yield from self.follow(export_finest_level(path, bundle, self.antialiased, self.original_place))
+        origin = "" if self.original_place else _origin_text(bundle)
+        self.written = f"{len(splats):,} splats written to {path}{origin}"
 
 
 _SUFFIXES = sorted((kind.suffix for kind in FORMATS), key=len, reverse=True)
@@ -262,7 +282,7 @@ class LODGS_OT_export_folder(_FolderExport, bpy.types.Operator):
             )
         bundle = self._bundle(context)
         write_folder(folder, bundle)
-        self.report({"INFO"}, f"{_levels(bundle)} written to {folder}")
+        self.report({"INFO"}, f"{_levels(bundle)} written to {folder}{_origin_text(bundle)}")
         return {"FINISHED"}
 
 
@@ -277,7 +297,7 @@ class LODGS_OT_export_streamed(_ForeignExport, _FolderExport, _ConvertingExport,
         bundle = self._bundle(context)
         bundle = bundle if self.antialiased else bake_filter(bundle)
         yield from self.follow(write_streamed_levels(self._folder(), bundle))
-        self.written = f"{_levels(bundle)} written: {self._folder() / STREAMED_FILE}"
+        self.written = f"{_levels(bundle)} written: {self._folder() / STREAMED_FILE}{_origin_text(bundle)}"
 
 
 def _levels(bundle: Bundle) -> str:

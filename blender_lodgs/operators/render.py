@@ -6,7 +6,7 @@ import bpy
 from bpy_extras.io_utils import ExportHelper
 
 from ...training.scenes.cameras import write_camera
-from ..data import cameras, roots
+from ..data import cameras, roots, selection
 from ..data.paths import absolute_path
 from ..render import compositing, engine, viewport_quality
 from .base import report_errors, show_image
@@ -126,11 +126,10 @@ class LODGS_OT_export_camera(bpy.types.Operator, ExportHelper):
     @report_errors
     def execute(self, context):
         width, height = engine.render_size(context.scene.render)
-        camera, near = cameras.view_from(
-            roots.active_root(context), context.evaluated_depsgraph_get(), width, height
-        )
+        root = roots.active_root(context)
+        camera, near = cameras.view_from(root, context.evaluated_depsgraph_get(), width, height)
         path = absolute_path(self.filepath)
-        write_camera(path, camera, near)
+        write_camera(path, camera.moved(selection.origin_of(root)), near)
         self.report({"INFO"}, f"Camera written to {path}")
         return {"FINISHED"}
 

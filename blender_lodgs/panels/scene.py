@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import bpy
 
-from ...training.scenes.check import ERROR
-from ..data import native, photographs, roots
+from ...training.scenes.check import ERROR, INFO, WARNING
+from ...training.splats.origin import format_number
+from ..data import native, photographs, roots, selection
 from ..runs import photo_preparation, scene_check
 from .parts import Panel, say, split_column
+
+_ICONS = {ERROR: "CANCEL", WARNING: "ERROR", INFO: "INFO"}
 
 
 class LODGS_PT_scene(Panel):
@@ -34,6 +37,9 @@ class LODGS_PT_scene(Panel):
             _draw_check(layout, root)
         if root.lodgs.levels:
             column.prop(root.lodgs, "antialias")
+        origin = selection.origin_of(root)
+        if origin.any():
+            say(layout, f"Local origin {'  '.join(map(format_number, origin))}", "EMPTY_AXIS")
         row = layout.row(align=True)
         for name, part in (("Cameras", root.lodgs.cameras), ("Points", root.lodgs.points)):
             if part is not None:
@@ -68,7 +74,7 @@ def _draw_check(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:
     if findings == []:
         layout.label(text="Nothing found that lowers the quality", icon="CHECKMARK")
     for finding in findings or ():
-        say(layout, str(finding), "CANCEL" if finding.severity == ERROR else "ERROR")
+        say(layout, str(finding), _ICONS[finding.severity])
 
 
 def _draw_camera_search(column: bpy.types.UILayout) -> None:

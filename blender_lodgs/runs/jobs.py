@@ -250,7 +250,7 @@ def _export_inputs(root: bpy.types.Object, run: RunFolder, job: Job) -> list[str
     run.create()
     write_bundle(run.base, bundle)
     for number, (camera, near) in enumerate(views):
-        write_camera(run.cameras / f"{number:04d}.json", camera, near)
+        write_camera(run.cameras / f"{number:04d}.json", camera.moved(bundle.origin), near)
     return warnings
 
 

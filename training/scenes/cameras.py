@@ -125,6 +125,8 @@ class Camera:
         if not np.any(offset):
             return self
         pose = self.world_to_camera.copy()
+        left, _, right = np.linalg.svd(pose[:3, :3])
+        pose[:3, :3] = left @ right  # a rotation in float32 would move a far camera by its rounding
         pose[:3, 3] -= pose[:3, :3] @ offset
         return replace(self, world_to_camera=pose)
 

@@ -154,3 +154,10 @@ def test_check_lists_its_findings(bpy, lodgs, root, draw_panel, tmp_path, capfd)
     root.lodgs.scene_folder = ""
     with pytest.raises(RuntimeError, match="it has no photos"):
         bpy.ops.lodgs.check_scene()
+
+
+def test_panel_shows_the_local_origin(bpy, lodgs, draw_panel, tmp_path):
+    meta = {"origin": [500_000.0, 4_200_000.0, 300.5]}
+    write_bundle(tmp_path / "b.ply", Bundle("", [Level(1, splats(9))], meta=meta))
+    lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply")
+    assert "Local origin 500000  4200000  300.5" in " ".join(draw_panel("scene", "LODGS_PT_scene").texts)
