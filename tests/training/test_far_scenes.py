@@ -222,6 +222,7 @@ def test_edits_name_the_origin_or_add_it(tmp_path, capsys):
     turned = tmp_path / "turned.ply"  # other coordinates than the scene's
     assert main(["edit", str(tmp_path / "b.ply"), "--out", str(turned), "--rotate=90,0,0"]) == 0
     assert not read_header(turned).origin.any()
+    assert "drops the local origin" in capsys.readouterr().out
 
 
 def test_edit_against_photos_uses_the_origin_of_the_splats(far, tmp_path, capsys):

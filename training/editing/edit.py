@@ -90,6 +90,8 @@ def edit(
     report += [f"{path}: written" for path in outputs]
     if edited.origin.any() and not (original_place and outputs == list(plain)):
         report.append(describe_origin(edited.origin))
+    elif bundle.origin.any() and not edited.origin.any():
+        report.append("The placement drops the local origin: positions are no longer those of the original.")
     return "\n".join(report)
 
 

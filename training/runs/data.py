@@ -22,6 +22,7 @@ from ..scenes.rendered_views import thin_evenly
 from ..scenes.triangulate import triangulate_scene
 from ..scenes.undistort import undistort_cache, undistort_scene
 from ..splats.bundle import read_header
+from ..splats.origin import describe_origin
 from .base import base_origin
 from .capture import capture
 from .folder import RunFolder
@@ -143,7 +144,7 @@ def thin_outside_region(scene: Scene, region: Crop, limit: int) -> Scene:
     if not inside.any():
         raise LodgsError(
             "Cannot train the region: it contains none of the scene's points.",
-            "Move the region or remove it. It is in the scene's COLMAP coordinates.",
+            f"Move the region or remove it. {describe_origin(scene.origin)}".strip(),
         )
     outside = np.flatnonzero(~inside)
     if len(outside) > limit:
