@@ -165,8 +165,10 @@ def test_capture_is_written_at_the_original_place(tmp_path):
     assert main(["capture", str(tmp_path / "b.ply"), *arguments]) == 0
     points, _, _ = read_points(tmp_path / "scene" / "sparse" / "0")
     assert len(points) and np.abs(points - OFFSET).max() < 10
-    job = {"method": "3dgs", "base": str(tmp_path / "b.ply"), "capture": "dome", "views": 4, "view_width": 60}
-    run = api.train("", tmp_path / "run", parameters={"steps": 2}, image_scale=1.0, backend="cpu", **job)
+    job: dict = {"method": "3dgs", "base": str(tmp_path / "b.ply"), "capture": "dome", "views": 4}
+    run = api.train(
+        "", tmp_path / "run", parameters={"steps": 2}, image_scale=1.0, backend="cpu", view_width=60, **job
+    )
     assert read_bundle(run.bundle).origin.tolist() == (OFFSET + 0.25).tolist()  # not that of the capture
 
 

@@ -144,7 +144,8 @@ def thin_outside_region(scene: Scene, region: Crop, limit: int) -> Scene:
     if not inside.any():
         raise LodgsError(
             "Cannot train the region: it contains none of the scene's points.",
-            f"Move the region or remove it. {describe_origin(scene.origin)}".strip(),
+            "Move the region or remove it. It is in the scene's COLMAP coordinates. "
+            f"{describe_origin(scene.origin)}".strip(),
         )
     outside = np.flatnonzero(~inside)
     if len(outside) > limit:
