@@ -30,6 +30,7 @@ RECORD3D = {
     "K": [80, 0, 0, 0, 82, 0, 47, 37, 1],
     "w": 96,
     "h": 72,
+    "perFrameIntrinsicCoeffs": [[80, 82, 47, 37], [81, 83, 47, 37]],
 }
 LENS = {
     "value0": {"width": 96, "height": 72, "focal_length": 80, "principal_point": [47, 37]},
@@ -49,7 +50,9 @@ BUNDLER = (
 )
 METASHAPE = """<document version="2.0.0"><chunk><sensors><sensor id="0" type="frame"><calibration>
 <resolution width="96" height="72"/><f>80</f><cx>1</cx><cy>2</cy><k1>0.1</k1><p1>0.01</p1></calibration>
-</sensor></sensors><cameras><camera id="0" sensor_id="0" label="a">
+</sensor><sensor id="1" master_id="0"><calibration><resolution width="96" height="72"/><f>80</f></calibration>
+<rotation>1 0 0 0 1 0 0 0 1</rotation><location>1 0 0</location></sensor></sensors><cameras>
+<camera id="1" sensor_id="1" master_id="0" label="b"/><camera id="0" sensor_id="0" label="a">
 <transform>1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1</transform>
 </camera></cameras><transform><scale>2</scale></transform></chunk></document>"""
 PLY_HEADER = "ply\nformat ascii 1.0\nelement vertex 2\n"

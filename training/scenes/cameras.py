@@ -138,6 +138,16 @@ class Camera:
             fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy,
         )  # fmt: skip
 
+    def turned(self, turns: int) -> Camera:
+        """Return an upright view in the axes of its stored photo, 1 or 3 clockwise turns from upright."""
+        axes = np.eye(4)
+        axes[:2, :2] = ((0, 1), (-1, 0)) if turns == 1 else ((0, -1), (1, 0))
+        cx, cy = (self.cy, self.width - self.cx) if turns == 1 else (self.height - self.cy, self.cx)
+        return replace(
+            self, width=self.height, height=self.width, fx=self.fy, fy=self.fx, cx=cx, cy=cy,
+            world_to_camera=axes @ self.world_to_camera,
+        )  # fmt: skip
+
     def scaled(self, share: float) -> Camera:
         """Return the view with image sides multiplied by ``share`` and rounded down to whole pixels."""
         return self.resized(max(int(self.width * share), 1), max(int(self.height * share), 1))

@@ -280,7 +280,7 @@ def _view_collector(folder: Path, images: Path) -> ViewCollector:
         )
     base = folder if images == folder else images.parent
     return ViewCollector(
-        ImageFiles(images, folder),
+        ImageFiles(images),
         SidecarFiles(base / MASKS, *MASK_SUFFIXES),
         SidecarFiles(base / DEPTHS, *DEPTH_SUFFIXES),
     )

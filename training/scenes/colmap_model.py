@@ -66,6 +66,18 @@ _LENSES = dict(
     )
 )
 _LENS_BY_NAME = {lens.name: lens for lens in _LENSES.values()}
+_TWO_FOCALS = {
+    "SIMPLE_PINHOLE": "PINHOLE",
+    "SIMPLE_RADIAL": "OPENCV",
+    "RADIAL": "OPENCV",
+    "SIMPLE_RADIAL_FISHEYE": "OPENCV_FISHEYE",
+    "RADIAL_FISHEYE": "OPENCV_FISHEYE",
+    "SIMPLE_DIVISION": "DIVISION",
+    "SIMPLE_FISHEYE": "FISHEYE",
+}
+"""Lens with two focal lengths for each lens with one; further distortion parameters are 0."""
+_TANGENTIAL = "OPENCV", "FULL_OPENCV", "THIN_PRISM_FISHEYE"
+"""Lenses whose third and fourth distortion parameters are p1 and p2."""
 
 
 @dataclass(frozen=True)
@@ -98,14 +110,44 @@ class Intrinsics:
         return float(fx), float(fy), float(cx), float(cy)
 
     def resized(self, width: int, height: int) -> Intrinsics:
-        """Return the lens for photos of another size."""
+        """Return the lens for photos of another size, scaled along each axis.
+
+        A lens with one focal length becomes one with two if the proportions differ.
+        """
         if (width, height) == (self.width, self.height):
             return self
-        focals, parameters = self.lens.focals, self.parameters.copy()
         scale_x, scale_y = width / self.width, height / self.height
-        parameters[:focals] *= (scale_x,) if focals == 1 else (scale_x, scale_y)
-        parameters[focals : focals + 2] *= scale_x, scale_y
-        return Intrinsics(self.lens, width, height, parameters)
+        lens, focals = self.lens, self.lens.focals
+        center = self.parameters[focals : focals + 2] * (scale_x, scale_y)
+        distortion = self.parameters[focals + 2 :]
+        if focals == 1 and scale_x != scale_y and lens.name in _TWO_FOCALS:
+            lens = _LENS_BY_NAME[_TWO_FOCALS[lens.name]]
+            distortion = np.pad(distortion, (0, lens.parameters - 4 - len(distortion)))
+        scales = (scale_x, scale_y)[: lens.focals]
+        focal = self.parameters[:focals] * scales
+        return Intrinsics(lens, width, height, np.concatenate([focal, center, distortion]))
+
+    def turned(self, turns: int) -> Intrinsics:
+        """Return the lens for photos turned back by clockwise quarter turns.
+
+        Raises:
+            LodgsError: if the distortion cannot be turned.
+        """
+        lens, (cx, cy) = self.lens, self.pinhole[2:]
+        focal = self.parameters[: lens.focals][::-1]
+        center = (cy, self.width - cx) if turns == 1 else (self.height - cy, cx)
+        distortion = self.parameters[lens.focals + 2 :].copy()
+        if lens.name in _TANGENTIAL and distortion.any():
+            # (p2, p1) and (sx1, sy1) are vectors in the image.
+            sign = 1 if turns == 1 else -1
+            p1, p2 = distortion[2:4]
+            distortion[2:4] = -sign * p2, sign * p1
+            if lens.name == "THIN_PRISM_FISHEYE":
+                x, y = distortion[6:8]
+                distortion[6:8] = sign * y, -sign * x
+        elif lens.name == "RAD_TAN_THIN_PRISM_FISHEYE":
+            raise LodgsError(f"it is turned by its EXIF data only, which lens {lens.name} does not allow.")
+        return Intrinsics(lens, self.height, self.width, np.concatenate([focal, center, distortion]))
 
 
 @dataclass(frozen=True)
@@ -322,19 +364,90 @@ def _parse_images_bin(data: mmap.mmap) -> list[Pose]:
 
 
 def _parse_images_txt(file: IO[bytes]) -> list[Pose]:
-    """Parse two lines per image; the second line, its 2D points, may be empty and is skipped."""
+    """Parse the lines of the images; the lines of their 2D points are skipped."""
     poses = []
-    lines = _lines(file)
-    for line in lines:
-        line = line.strip()
-        if not line or line.startswith(b"#"):
-            continue
+    for line, _ in _image_lines(file):
         # The name is the rest of the line: it may contain spaces.
         _, *pose, camera_id, name = line.split(maxsplit=9)
-        next(lines, None)
         poses.append(_pose(name, int(camera_id), [float(number) for number in pose]))
     _check_count(len(poses), file, "images")
     return poses
+
+
+def _image_lines(file: IO[bytes]) -> Iterator[tuple[bytes, bytes]]:
+    """Yield the line of each image of images.txt and the line of its 2D points, which may be missing.
+
+    COLMAP writes a second line for each image, possibly empty. Files from other sources omit it or have
+    further blank lines.
+
+    Raises:
+        ValueError: a line is neither.
+    """
+    image = b""
+    for number, line in enumerate(_lines(file), 1):
+        line = line.strip()
+        if not line or line.startswith(b"#"):
+            continue
+        if _is_points_line(line):
+            if not image:
+                raise ValueError(f"line {number} is not an image")
+            yield image, line
+            image = b""
+            continue
+        if len(line.split(maxsplit=9)) < 10:
+            raise ValueError(f"line {number} is not an image of 10 values")
+        if image:
+            yield image, b""
+        image = line
+    if image:
+        yield image, b""
+
+
+def write_strict_text(model: Path, folder: Path) -> Path:
+    """Write a text model as COLMAP writes it, with two lines per image, to a new folder, and return it.
+
+    A binary model is returned as it is.
+
+    Raises:
+        LodgsError: a file is missing or damaged.
+        OSError: a file cannot be written.
+    """
+    if model_suffix(model) != ".txt":
+        return model
+    folder.mkdir()
+    for name, lines in (
+        ("images", _strict_images),
+        ("cameras", _encoded_lines),
+        ("points3D", _strict_points),
+    ):
+        with open(folder / f"{name}.txt", "wb") as target:
+            if (model / f"{name}.txt").is_file():
+                _read(model, name, {".txt": lambda file, lines=lines, to=target: to.writelines(lines(file))})
+    for path in (model / "rigs.txt", model / "frames.txt"):
+        if path.is_file():
+            (folder / path.name).write_bytes(path.read_bytes())
+    return folder
+
+
+def _strict_images(file: IO[bytes]) -> Iterator[bytes]:
+    return (image + b"\n" + points + b"\n" for image, points in _image_lines(file))
+
+
+def _encoded_lines(file: IO[bytes]) -> Iterator[bytes]:
+    return (line.encode("utf-8", "surrogateescape") + b"\n" for line in _content_lines(file))
+
+
+def _strict_points(file: IO[bytes]) -> Iterator[bytes]:
+    """Yield the lines of points with the reprojection error, which COLMAP requires."""
+    for line in _encoded_lines(file):
+        yield line if len(line.split(maxsplit=7)) > 7 else line.strip() + b" 0\n"
+
+
+def _is_points_line(line: bytes) -> bool:
+    """Return True for numbers in groups of x, y and a point's id, which is an integer."""
+    tokens = line.split()
+    ids = b"".join(tokens[2::3]).replace(b"-", b"")
+    return len(tokens) % 3 == 0 and ids.isdigit() and not b"".join(tokens).translate(None, _NUMERIC)
 
 
 def _parse_observations_bin(data: mmap.mmap, names: Collection[str]) -> dict[str, np.ndarray]:
@@ -352,12 +465,7 @@ def _parse_observations_bin(data: mmap.mmap, names: Collection[str]) -> dict[str
 
 def _parse_observations_txt(file: IO[bytes], names: Collection[str]) -> dict[str, np.ndarray]:
     point_ids = {}
-    lines = _lines(file)
-    for line in lines:
-        line = line.strip()
-        if not line or line.startswith(b"#"):
-            continue
-        points2d = next(lines, b"")
+    for line, points2d in _image_lines(file):
         if (name := _decode_name(line.split(maxsplit=9)[9])) in names:
             point_ids[name] = _valid_ids(np.array(points2d.split()[2::3], np.int64))
     return point_ids
@@ -417,6 +525,7 @@ _POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error",
 _TRACK_OFFSET = 43
 _BLOCK = 1 << 17
 _NO_POINTS = np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0, np.int64)
+_NUMERIC = b"0123456789.+-eEnaifNAIF"  # characters of numbers, including nan and inf
 _UTF8_MARK = b"\xef\xbb\xbf"  # Windows programs write it at the start of UTF-8 files
 
 
@@ -503,7 +612,6 @@ def _check_count(count: int, file: IO[bytes], kind: str) -> None:
     file.seek(0)
     for line in file.read(1000).split(b"\n"):
         key, _, value = line.partition(b":")
-        if key.strip() == f"# Number of {kind}".encode():
-            expected = int(value.split(b",")[0])
-            if count < expected:
-                raise ValueError(f"it has {count} {kind} instead of {expected}")
+        number = value.split(b",")[0].strip()
+        if key.strip() == f"# Number of {kind}".encode() and number.isdigit() and count < int(number):
+            raise ValueError(f"it has {count} {kind}, but its header states {number.decode()}")

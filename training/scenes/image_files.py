@@ -19,16 +19,14 @@ class ImageFiles:
     """Files of an image folder by the names that a model uses.
 
     Args:
-        folder: folder of the photos; it may be a link.
-        scene: second folder that links inside ``folder`` may point into.
+        folder: folder of the photos. It and its files may be links to other folders.
 
     Attributes:
         renamed: names that only match a file with another suffix or case, with that file.
     """
 
-    def __init__(self, folder: Path, scene: Path) -> None:
+    def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._allowed = [Path(os.path.realpath(path)) for path in (folder, scene)]
         self._by_normal_name: dict[str, Path] | None = None
         self._by_stem: dict[str, list[Path]] = {}
         self.renamed: dict[str, Path] = {}
@@ -40,8 +38,8 @@ class ImageFiles:
         only one file has it; see ``renamed``.
 
         Raises:
-            LodgsError: the name is not UTF-8 or leaves the folder, or the file is a link to another
-                folder. ``what`` continues a sentence such as "Skipped <name>:".
+            LodgsError: if the name is not UTF-8 or leaves the folder. ``what`` continues a sentence such as
+                "Skipped <name>:".
         """
         relative = relative_image_path(name)
         file = self._folder / name
@@ -59,10 +57,6 @@ class ImageFiles:
             file = self._by_normal_name.get(_normalized(str(relative)))
             if file is None and len(similar := self._by_stem.get(_stem(str(relative)), [])) == 1:
                 file = self.renamed[name] = similar[0]
-        if file is not None:
-            real = Path(os.path.realpath(file))
-            if not any(real.is_relative_to(folder) for folder in self._allowed):
-                raise LodgsError("it is a link to a file outside the scene's folder.")
         return file
 
 
@@ -85,7 +79,7 @@ class SidecarFiles:
             return None
         for suffix in self._suffixes:
             for path in (self.folder / f"{name}{suffix}", (self.folder / name).with_suffix(suffix)):
-                if path.is_file():
+                if os.path.isfile(path):
                     return path
         return None
 

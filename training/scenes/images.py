@@ -110,6 +110,11 @@ def quarter_turns(path: Path) -> int:
 
     Phones and cameras store the sensor's image and record the orientation separately.
     """
+    return _QUARTER_TURNS.get(exif_orientation(path), 0)
+
+
+def exif_orientation(path: Path) -> int:
+    """Return the EXIF orientation, 1 to 8; 1 without EXIF data."""
     try:
         with open_file(path) as file:
             if (head := file.read(4))[:2] == b"\xff\xd8":
@@ -117,8 +122,8 @@ def quarter_turns(path: Path) -> int:
             else:
                 tags = _read_tiff_tags(file) if head in _TIFF else {}
     except (LodgsError, OSError, struct.error, IndexError, KeyError, ValueError, Truncated):
-        return 0
-    return _QUARTER_TURNS.get(tags.get(_ORIENTATION, 1), 0)
+        return 1
+    return tags.get(_ORIENTATION, 1)
 
 
 def _read_exif(file: IO[bytes]) -> bytes:
@@ -286,10 +291,12 @@ def check_mask(path: Path, width: int, height: int) -> None:
         )
 
 
-def same_proportions(width_a: int, height_a: int, width_b: int, height_b: int) -> bool:
-    """Return True if two sizes have the same aspect ratio, up to rounding to whole pixels."""
+def same_proportions(
+    width_a: int, height_a: int, width_b: int, height_b: int, tolerance: float = 0.01
+) -> bool:
+    """Return True if two aspect ratios differ by less than the tolerance and rounding to whole pixels."""
     shortest = min(width_a, height_a, width_b, height_b)
-    return bool(abs(np.log(width_a * height_b / (height_a * width_b))) <= 0.01 + 1 / shortest)
+    return bool(abs(np.log(width_a * height_b / (height_a * width_b))) <= tolerance + 1 / shortest)
 
 
 def check_image(path: Path) -> None:

@@ -32,7 +32,7 @@ def read_offset_views(scene: Path, origin: np.ndarray = NO_ORIGIN) -> list[Camer
         LodgsError: a camera or its image cannot be read.
     """
     views = []
-    files = ImageFiles(scene / "aside", scene)
+    files = ImageFiles(scene / "aside")
     for path in sorted((scene / "aside").glob("*.json")):
         camera = read_camera(path)[0].moved(-origin)
         try:

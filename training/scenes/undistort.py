@@ -17,6 +17,7 @@ from ..errors import LodgsError
 from . import pycolmap_process
 from .cameras import Camera
 from .colmap import DEPTHS, MASKS, Scene, read_scene
+from .colmap_model import write_strict_text
 from .depths import read_depth_map
 from .exr import write_exr
 from .images import load_exr, load_image, load_mask, write_png
@@ -94,7 +95,6 @@ def _read_cached(target: Path, scene: Scene) -> Scene:
 def _undistort_into(target: Path, scene: Scene) -> None:
     """Run this module as a program in a temporary folder, and rename the result to the target."""
     request = {
-        "model": str(scene.model),
         "images": str(scene.images_folder),
         "sizes": {camera.name: [camera.width, camera.height] for camera in scene.cameras},
         "source_pixels": [
@@ -104,6 +104,7 @@ def _undistort_into(target: Path, scene: Scene) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=target.parent, prefix="undistorting-") as work:
         request["work"] = work
+        request["model"] = str(write_strict_text(scene.model, Path(work) / "text"))
         masks = Path(work) / MASKS
         for camera in scene.cameras:
             if camera.mask is not None:

@@ -11,12 +11,16 @@ from ..errors import LodgsError, printable
 from .cameras import Camera
 from .colmap_model import Intrinsics, Pose
 from .image_files import ImageFiles, SidecarFiles
-from .images import image_size, quarter_turns
+from .images import exif_orientation, image_size, quarter_turns, same_proportions
 
 OUTLIER_FACTOR = 1000
 """Points and cameras farther from the camera centre than this multiple of the median distance are dropped."""
 MAX_NAMED = 5
 """Maximum number of views named by warnings of one kind; the remaining ones are counted."""
+MAX_STRETCH = 0.02
+"""Maximum difference in proportions of a photo and its camera; the camera is scaled along each axis."""
+_UNMIRRORED_TURNS = {6: 1, 8: 3}
+"""Single clockwise quarter turns by EXIF orientation, without mirrored ones."""
 
 
 class ViewCollector:
@@ -31,7 +35,6 @@ class ViewCollector:
         self._masks = masks
         self._depths = depths
         self._missing: list[str] = []
-        self._reshaped: list[str] = []
         self.cameras: list[Camera] = []
         self.distorted: list[str] = []
         self.excluded: list[tuple[str, str]] = []
@@ -54,7 +57,11 @@ class ViewCollector:
                 name, lens.width, lens.height, *lens.pinhole, pose.world_to_camera, image, *sidecars,
                 turns=quarter_turns(image),
             )  # fmt: skip
-            if (width, height) != (lens.width, lens.height):
+            if turns := photo_turns(image, width, height, lens.width, lens.height):
+                if lens.distorted:
+                    raise LodgsError("only its EXIF data turns it upright: turn its pixels (exiftran -a).")
+                camera = camera.turned(turns)
+            if (width, height) != (camera.width, camera.height):
                 camera = camera.resized(width, height)
             if flaw := camera.flaw:
                 raise LodgsError(f"{flaw}.")
@@ -64,12 +71,6 @@ class ViewCollector:
         self.cameras.append(camera)
         if lens.distorted:
             self.distorted.append(name)
-        stretch = np.log(width) + np.log(lens.height) - np.log(height) - np.log(lens.width)
-        if abs(stretch) > 0.01 + 1 / min(width, height):  # more than rounding to whole pixels explains
-            self._reshaped.append(
-                f"{quote_name(name)} is {width}x{height}, but its camera in the model is "
-                f"{lens.width}x{lens.height}: check that the photo is neither rotated nor cropped."
-            )
 
     def drop_outliers(self, inliers: np.ndarray) -> None:
         """Drop the cameras outside the mask ``inliers`` (V,)."""
@@ -104,10 +105,29 @@ class ViewCollector:
         for attribute, sidecars in ("mask", self._masks), ("depth", self._depths):
             if all(getattr(camera, attribute) is None for camera in self.cameras):
                 messages += filter(None, [sidecars.mismatch_warning(quote_name(self.cameras[0].name))])
-        messages += self._reshaped[:MAX_NAMED]
-        if len(self._reshaped) > MAX_NAMED:
-            messages.append(f"{len(self._reshaped) - MAX_NAMED:,} more photos have another aspect ratio.")
         return messages
+
+
+def photo_turns(path: Path, width: int, height: int, lens_width: int, lens_height: int) -> int:
+    """Return the clockwise quarter turns that make a photo fit a lens of another size: 0, 1 or 3.
+
+    Sizes fit if their proportions differ by less than MAX_STRETCH. The turn of a photo comes from its EXIF
+    data.
+
+    Args:
+        width, height: size of the photo as stored.
+
+    Raises:
+        LodgsError: if no turn makes them fit. ``what`` continues a sentence such as "Skipped <name>:".
+    """
+    if same_proportions(width, height, lens_width, lens_height, MAX_STRETCH):
+        return 0
+    turns = _UNMIRRORED_TURNS.get(exif_orientation(path), 0)
+    is_turned = same_proportions(height, width, lens_width, lens_height, MAX_STRETCH)
+    if is_turned and turns:
+        return turns
+    reason = f"its size {width}x{height} does not match its camera's {lens_width}x{lens_height}"
+    raise LodgsError(f"{reason}: the photo was {'rotated' if is_turned else 'cropped'}.")
 
 
 def exclusion_messages(excluded: Sequence[tuple[str, str]]) -> list[str]:

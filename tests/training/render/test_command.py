@@ -1,6 +1,7 @@
 """The render command: images of views, and its errors."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -19,6 +20,7 @@ from training.rasterize import Gaussians, render
 from training.runs.job import Job
 from training.scenes.cameras import camera_to_dict, read_camera, write_camera
 from training.splats.bundle import write_bundle
+from training.splats.formats.splat import read_splat, write_splat
 from training.splats.levels import Bundle, Level
 from training.splats.ply import write_ply
 
@@ -310,3 +312,25 @@ def test_graphics_device_matches_the_cpu(graphics, bundle, camera, tmp_path, opt
     difference = np.abs(images[0] - images[1])
     assert difference.max() <= 1 and (difference > 0).mean() <= 1e-3
     assert images[0][..., :3].std() > 10, "the image is empty"
+
+
+@pytest.mark.parametrize("suffix", [".spz", ".splat"])
+def test_other_formats_are_rendered(make_splats, camera, tmp_path, monkeypatch, suffix):
+    """A copy stands in for splat-transform."""
+    splats = make_splats(30)
+    write_ply(tmp_path / "a.ply", splats)
+    if suffix == ".splat":
+        write_splat(tmp_path / "a.splat", splats, {})
+        splats = read_splat(tmp_path / "a.splat")
+    else:
+        shutil.copy(tmp_path / "a.ply", tmp_path / "a.spz")
+        with open(tmp_path / "a.spz", "r+b") as file:
+            file.write(b"NGSP")
+        monkeypatch.setattr(
+            "training.splats.formats.run_splat_transform",
+            lambda arguments: shutil.copy(tmp_path / "a.ply", arguments[-1]),
+        )
+    write_camera(tmp_path / "camera.json", camera, 0.01)
+    source, out = str(tmp_path / f"a{suffix}"), str(tmp_path / "a.png")
+    assert main(["render", source, "--camera", str(tmp_path / "camera.json"), "--out", out]) == 0
+    np.testing.assert_array_equal(pixels(tmp_path / "a.png"), expected(splats, camera))

@@ -6,6 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from training.scenes.cameras import Camera, look_at
+from training.scenes.colmap_model import Intrinsics, make_intrinsics
 
 POSE = np.array([[0.0, 1, 0, -2], [-1, 0, 0, 3], [0, 0, 1, 4], [0, 0, 0, 1]])
 """A quarter turn about z and a translation: world point (x, y, z) is (y - 2, 3 - x, z + 4) in camera axes."""
@@ -65,3 +66,38 @@ def test_look_at_centres_target_with_up_above(up):
     np.testing.assert_allclose(pose @ [*target, 1], [0, 0, np.sqrt(14), 1], atol=1e-12)
     x, y, _ = pose[:3, :3] @ up
     assert abs(x) < 1e-12 and (y < -0.5 or up == (3, 2, 1))  # y points down
+
+
+LENSES = {
+    "SIMPLE_PINHOLE": (), "PINHOLE": (), "SIMPLE_RADIAL": (0.05,), "RADIAL": (0.05, -0.02),
+    "OPENCV": (0.05, -0.02, 0.004, -0.003),
+    "FULL_OPENCV": (0.05, -0.02, 0.004, -0.003, 0.01, 0.02, 0.0, 0.01),
+    "OPENCV_FISHEYE": (0.05, -0.02, 0.004, -0.003), "SIMPLE_RADIAL_FISHEYE": (0.05,),
+    "RADIAL_FISHEYE": (0.05, -0.02), "SIMPLE_FISHEYE": (), "SIMPLE_DIVISION": (-0.05,),
+    "THIN_PRISM_FISHEYE": (0.05, -0.02, 0.004, -0.003, 0.01, 0.02, 0.005, -0.006),
+}  # fmt: skip
+ONE_FOCAL = {name for name in LENSES if name.startswith(("SIMPLE", "RADIAL"))}
+
+
+def project_with_colmap(lens: Intrinsics, rays: np.ndarray) -> np.ndarray:
+    camera = pycolmap.Camera(
+        model=lens.lens.name, width=lens.width, height=lens.height, params=lens.parameters.tolist()
+    )
+    return np.array([camera.img_from_cam(ray) for ray in rays])
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_lenses_fit_resized_and_turned_photos(name):
+    """Pixels of COLMAP, moved by hand to the changed photo. An upright photo has 72 x 96 pixels."""
+    focal = (80.0,) if name in ONE_FOCAL else (80.0, 84.0)
+    lens = make_intrinsics(name, 72, 96, np.array([*focal, 35.0, 50.0, *LENSES[name]]))
+    rays = np.array([(0.1, 0.2, 1.0), (-0.3, 0.25, 1.0), (0.2, -0.4, 1.0)])
+    pixels = project_with_colmap(lens, rays)
+    np.testing.assert_allclose(
+        project_with_colmap(lens.resized(144, 200), rays), pixels * (2, 200 / 96), atol=1e-9
+    )
+    x, y = pixels.T
+    view = Camera("", 72, 96, *lens.pinhole, np.eye(4))
+    for turns, stored in ((1, np.stack([y, 72 - x], axis=1)), (3, np.stack([96 - y, x], axis=1))):
+        turned_rays = rays @ view.turned(turns).world_to_camera[:3, :3].T
+        np.testing.assert_allclose(project_with_colmap(lens.turned(turns), turned_rays), stored, atol=1e-9)

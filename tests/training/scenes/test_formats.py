@@ -12,6 +12,7 @@ from training.errors import LodgsError
 from training.scenes.colmap import read_scene
 from training.scenes.depths import DepthPriors, add_depth_points
 from training.scenes.formats import convert_export, find_export
+from training.scenes.point_cloud import read_points
 from training.scenes.triangulate import random_start_points
 
 from .depth_walls import write_png_map
@@ -378,3 +379,22 @@ def test_folders_without_export_are_rejected(tmp_path):
     (tmp_path / "transforms.json").unlink()
     with pytest.raises(LodgsError, match="already is a COLMAP scene"):
         convert_export(tmp_path)
+
+
+def test_point_clouds_with_impossible_headers_are_rejected_quickly(tmp_path):
+    """Rows beyond the end of the file, and lists of faces after the points, which are not read."""
+
+    def write(rows: int, faces: int) -> Path:
+        path = tmp_path / "points.ply"
+        axes = "".join(f"property float {axis}\n" for axis in "xyz")
+        lists = f"element face {faces}\nproperty list uchar int vertex_indices\n" if faces else ""
+        path.write_text(
+            f"ply\nformat ascii 1.0\nelement vertex {rows}\n{axes}{lists}end_header\n0 1 2\n3 4 5\n"
+        )
+        return path
+
+    points, _ = read_points(write(2, 20_000_000))
+    assert points.tolist() == [[0, 1, 2], [3, 4, 5]]
+    for rows in (3, 2**40, 2**70):
+        with pytest.raises(LodgsError, match=r"points\.ply"):
+            read_points(write(rows, 0))

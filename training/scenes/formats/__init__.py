@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,8 +20,8 @@ from ...files import check_folder, link_or_copy
 from ..colmap import DEPTHS, MASKS, find_models
 from ..colmap_model import write_model
 from ..image_files import find_image_folder
-from ..images import image_size, same_proportions
-from ..view_selection import exclusion_messages
+from ..images import image_size
+from ..view_selection import exclusion_messages, photo_turns
 from . import bundler, metashape, openmvg, polycam, record3d, transforms
 from .exported import ExportedScene, ExportedView
 
@@ -112,7 +113,7 @@ def convert_export(folder: Path, out: Path | None = None) -> ConvertedScene:
             f"Cannot convert {path}: it has no usable view.{reason}", "Check the photos next to it."
         )
     warnings = [*exported.warnings, *exclusion_messages(excluded)]
-    if missing := [view.mask for view in views if view.mask is not None and not view.mask.is_file()]:
+    if missing := [view.mask for view in views if view.mask is not None and not os.path.isfile(view.mask)]:
         warnings.append(
             f"{len(missing)} masks are missing, such as {missing[0]}. Their photos are not masked."
         )
@@ -132,19 +133,25 @@ def convert_export(folder: Path, out: Path | None = None) -> ConvertedScene:
 def _usable_views(exported: ExportedScene) -> tuple[list[ExportedView], list[tuple[str, str]]]:
     """Return the views with a readable photo and a valid camera, and (name, reason) pairs of the others."""
     views, excluded = [], list(exported.excluded)
-    for view in exported.views:
+    unique = {(view.image, view.world_to_camera.tobytes()): view for view in exported.views}
+    counts = Counter(image for image, _ in unique)
+    for view in unique.values():
         name = view.image.name
+        if counts[view.image] > 1:
+            excluded.append((name, f"{counts[view.image]} views have the photo {view.image}."))
+            continue
         try:
             width, height = image_size(view.image)
         except LodgsError as error:
             excluded.append((name, error.what))
             continue
         lens = view.lens
-        if not same_proportions(width, height, lens.width, lens.height):
-            reason = f"its size {width}x{height} does not match its camera's {lens.width}x{lens.height}"
-            excluded.append((name, f"{reason}: the photo was rotated or cropped."))
+        try:
+            turns = photo_turns(view.image, width, height, lens.width, lens.height)
+            view = (view.turned(turns) if turns else view).sized(width, height)
+        except LodgsError as error:
+            excluded.append((name, error.what))
             continue
-        view = view.sized(width, height)
         if flaw := view.camera(name).flaw:
             excluded.append((name, f"{flaw}."))
         else:
@@ -169,7 +176,7 @@ def _write(scene: Path, views: list[ExportedView], points: np.ndarray, colors: n
     sparse.mkdir(parents=True, exist_ok=True)
     names = [view.image.relative_to(images).as_posix() for view in views]
     for view, name in zip(views, names, strict=True):
-        if view.mask is not None and view.mask.is_file():
+        if view.mask is not None and os.path.isfile(view.mask):
             link_or_copy(view.mask, scene / MASKS / f"{name}.png")
         if view.depth is not None and view.has_depth:
             link_or_copy(view.depth, scene / DEPTHS / f"{name}{view.depth.suffix.lower()}")

@@ -18,14 +18,15 @@ from ...documents import open_file, read_lines
 from ...errors import LodgsError
 from ..colmap_model import make_intrinsics
 from ..images import image_size
-from .exported import OPENGL, ExportedScene, ExportedView, find_image, invert_pose
+from .exported import OPENGL, ExportedScene, ExportedView, PhotoFinder, invert_pose
 
 NAME = "Bundler"
 _MAX_LINE = 1 << 24
 _MAX_LIST = 1 << 26
 """Maximum bytes of a line, and of the list of photos."""
 _NUMBER = re.compile(r"[-+.\deE]+")
-_LISTS = "list.txt", "bundle.out.list.txt", "image_list.txt"
+_LISTS = "list.txt", "bundle.out.list.txt", "image_list.txt", "imagelist.lst"
+"""Names of the list; RealityCapture writes the last one."""
 
 
 def find(folder: Path) -> Path | None:
@@ -64,11 +65,12 @@ def read(path: Path) -> ExportedScene:
             "Export both files again.",
         )
     views, excluded = [], []
+    photos = PhotoFinder(_image_root(path))
     for name, (focal, k1, k2, *pose) in zip(names, cameras, strict=False):
-        image = find_image(_image_root(path), name)
         try:
             if not focal > 0:
                 raise LodgsError("Bundler has no camera for it.")
+            image = photos.find(name)
             width, height = image_size(image)
             lens = make_intrinsics("RADIAL", width, height, np.array([focal, width / 2, height / 2, k1, k2]))
             matrix = np.eye(4)
@@ -77,7 +79,7 @@ def read(path: Path) -> ExportedScene:
             views.append(ExportedView(image, lens, invert_pose(np.linalg.inv(OPENGL @ matrix))))
         except (LodgsError, ValueError, np.linalg.LinAlgError) as error:
             excluded.append((name, error.what if isinstance(error, LodgsError) else f"{error}."))
-    return ExportedScene(views, positions, colors.clip(0, 255).astype(np.uint8), excluded)
+    return ExportedScene(views, positions, colors.clip(0, 255).astype(np.uint8), excluded, photos.warnings())
 
 
 def _parse_numbers(lines: Iterable[bytes], shape: tuple[int, int]) -> np.ndarray:

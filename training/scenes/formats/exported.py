@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -21,6 +22,8 @@ MAX_JSON_BYTES = 1 << 26
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Conversion between OpenCV's camera axes and OpenGL's (x right, y up, looking along -z)."""
 _SUFFIXES = *IMAGE_SUFFIXES, ".exr", *(suffix.upper() for suffix in IMAGE_SUFFIXES), ".EXR"
+_NO_PHOTOS = ".", "mask", "depth", "normal", "conf", "sparse"
+"""First letters of folders without photos, lower case."""
 _NO_POINTS = np.zeros((0, 3))
 
 
@@ -45,11 +48,20 @@ class ExportedView:
     @property
     def has_depth(self) -> bool:
         """True if the depth map exists in a supported format."""
-        return self.depth is not None and self.depth.suffix.lower() in DEPTH_SUFFIXES and self.depth.is_file()
+        return (
+            self.depth is not None
+            and self.depth.suffix.lower() in DEPTH_SUFFIXES
+            and os.path.isfile(self.depth)
+        )
 
     def sized(self, width: int, height: int) -> ExportedView:
         """Return the view with the lens scaled to photos of the given size."""
         return replace(self, lens=self.lens.resized(width, height))
+
+    def turned(self, turns: int) -> ExportedView:
+        """Return the view for a photo that only its EXIF data turns upright, see ``Camera.turned``."""
+        pose = self.camera("").turned(turns).world_to_camera
+        return replace(self, lens=self.lens.turned(turns), world_to_camera=pose)
 
     def camera(self, name: str) -> Camera:
         """Return the pinhole part of the camera."""
@@ -177,6 +189,78 @@ def find_image(folder: Path, name: str) -> Path:
     for candidate in candidates:
         stem = candidate.stem if candidate.suffix in _SUFFIXES else candidate.name
         for path in (candidate, *(candidate.with_name(stem + suffix) for suffix in _SUFFIXES)):
-            if path.is_file():
+            if os.path.isfile(path):  # Path.is_file raises for long names
                 return path
     return candidates[0]
+
+
+class PhotoFinder:
+    """Finds photos below a folder by the last parts of their exported names.
+
+    Args:
+        folder: folder of the export.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._by_stem: dict[str, list[Path]] | None = None
+        self._moved: list[tuple[Path, Path]] = []
+
+    def find(self, name: str, *roots: Path) -> Path:
+        """Return a photo at its exported place, else the only photo below the folder with its name.
+
+        The result is the expected path if there is no such photo.
+
+        Args:
+            roots: folders that the name is relative to, the preferred one first. Default: the folder.
+
+        Raises:
+            LodgsError: if several photos match.
+        """
+        expected = [find_image(root, name) for root in roots or (self._folder,)]
+        for path in expected:
+            if os.path.isfile(path):
+                return path
+        if (path := self.locate(name)) is None:
+            return expected[0]
+        self._moved.append((expected[0], path))
+        return path
+
+    def locate(self, name: str) -> Path | None:
+        """Return the photo below the folder that has most of the name's last parts, or None.
+
+        Raises:
+            LodgsError: if several photos match. ``what`` continues a sentence such as "Skipped <name>:".
+        """
+        if self._by_stem is None:
+            self._by_stem = {}
+            for parent, folders, files in os.walk(self._folder):
+                folders[:] = sorted(entry for entry in folders if not entry.lower().startswith(_NO_PHOTOS))
+                for path in (Path(parent, entry) for entry in sorted(files)):
+                    if path.suffix in _SUFFIXES:
+                        self._by_stem.setdefault(path.stem.casefold(), []).append(path)
+        parts = name.replace("\\", "/").casefold().split("/")
+        stem = parts[-1] if Path(parts[-1]).suffix not in _SUFFIXES else Path(parts[-1]).stem
+        matches = self._by_stem.get(stem, [])
+        ranks = [_shared_parts(parts, path) for path in matches]
+        matches = [path for path, rank in zip(matches, ranks, strict=True) if rank == max(ranks)]
+        if len(matches) > 1:
+            raise LodgsError(f"several photos have this name, such as {matches[0]} and {matches[1]}.")
+        return matches[0] if matches else None
+
+    def warnings(self) -> list[str]:
+        """Return a sentence about the photos found in another place than the export states."""
+        if not self._moved:
+            return []
+        expected, path = self._moved[0]
+        return [f"Found {len(self._moved):,} photos in another place, such as {path} instead of {expected}."]
+
+
+def _shared_parts(parts: list[str], path: Path) -> tuple[int, bool]:
+    """Return the number of equal parent folders at the end of two paths, and True for equal file names."""
+    count = 0
+    for part, folder in zip(reversed(parts[:-1]), reversed(path.parts[:-1]), strict=False):
+        if part != folder.casefold():
+            break
+        count += 1
+    return count, parts[-1] == path.name.casefold()

@@ -7,6 +7,8 @@ fisheye's x has the length of its angle to the axis.
 
 from __future__ import annotations
 
+import os
+from collections.abc import Mapping
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
@@ -15,12 +17,11 @@ import numpy as np
 
 from ...documents import open_file
 from ...errors import LodgsError
-from ..colmap import MASKS
 from ..colmap_model import Intrinsics
-from ..images import IMAGE_SUFFIXES
 from .exported import (
     ExportedScene,
     ExportedView,
+    PhotoFinder,
     colmap_lens,
     find_image,
     get_number,
@@ -63,12 +64,14 @@ def read(path: Path) -> ExportedScene:
     if chunk is None:
         raise LodgsError(f"Cannot read {path}: it has no chunk.", "Export the cameras again.")
     lenses: dict[str, Intrinsics | LodgsError] = {}
-    for sensor in chunk.iterfind("sensors/sensor"):
+    sensors = {sensor.get("id", ""): sensor for sensor in chunk.iterfind("sensors/sensor")}
+    for sensor in sensors.values():
         try:
             lenses[sensor.get("id", "")] = _parse_lens(sensor)
         except LodgsError as error:
             lenses[sensor.get("id", "")] = error
     cameras = [camera for camera in chunk.iter("camera") if camera.get("label") is not None]
+    by_id = {camera.get("id", ""): camera for camera in chunk.iter("camera")}
     aligned = [camera.get(_COMPONENT, "") for camera in cameras if camera.find("transform") is not None]
     largest = max(aligned, key=aligned.count, default="")
     transforms = {
@@ -79,22 +82,21 @@ def read(path: Path) -> ExportedScene:
         chunk_transform = _parse_transform(chunk)
         base = transforms[largest] = np.eye(4) if chunk_transform is None else chunk_transform
     scale = np.cbrt(np.linalg.det(base[:3, :3]))
-    files = _PhotoFinder(path.parent, chunk)
+    files = _LabelFinder(path.parent, chunk)
     views, excluded = [], []
     for camera in cameras:
-        label, pose_text = camera.get("label", ""), camera.findtext("transform")
+        label = camera.get("label", "")
         try:
             if camera.get("enabled") in ("0", "false"):
                 raise LodgsError("it is disabled in Metashape.")
-            if pose_text is None:
-                raise LodgsError("Metashape did not align it.")
-            transform = transforms.get(camera.get(_COMPONENT, ""))
+            local, aligned_camera = _rig_pose(camera, by_id, sensors)
+            transform = transforms.get(aligned_camera.get(_COMPONENT, ""))
             if transform is None:
                 raise LodgsError("Metashape did not align it with the largest group of photos.")
             lens = lenses.get(camera.get("sensor_id", ""))
             if not isinstance(lens, Intrinsics):
                 raise lens or LodgsError("it has no lens.")
-            pose = np.linalg.solve(base, transform @ parse_array(pose_text.split(), 4, 4))
+            pose = np.linalg.solve(base, transform @ local)
             pose[:3, 3] *= scale
             views.append(ExportedView(files.find(camera), lens, invert_pose(pose)))
         except LodgsError as error:
@@ -147,6 +149,48 @@ def _parse_lens(sensor: Element) -> Intrinsics:
     )  # fmt: skip
 
 
+def _rig_pose(
+    camera: Element, cameras: Mapping[str, Element], sensors: Mapping[str, Element]
+) -> tuple[np.ndarray, Element]:
+    """Return a camera's pose (4, 4) in its component, and the camera whose transform states it.
+
+    A camera of a rig without a transform has the pose of its master, times the offset of its own sensor in
+    the frame of the master's sensor (Metashape's Sensor.location and Sensor.rotation, in the chunk's units).
+
+    Raises:
+        LodgsError: if neither the camera nor a master is aligned, or an offset is missing or invalid.
+    """
+    offset = np.eye(4)
+    for _ in range(len(cameras) + 1):
+        if (text := camera.findtext("transform")) is not None:
+            return parse_array(text.split(), 4, 4) @ offset, camera
+        master = cameras.get(camera.get("master_id", ""))
+        if master is None or master is camera:
+            break
+        own, other = (sensors.get(entry.get("sensor_id", "")) for entry in (camera, master))
+        # The rig's reference sensor may differ from the sensor of the reference camera.
+        offset = np.linalg.solve(_sensor_offset(other), _sensor_offset(own)) @ offset
+        camera = master
+    raise LodgsError("Metashape did not align it.")
+
+
+def _sensor_offset(sensor: Element | None) -> np.ndarray:
+    """Return the pose (4, 4) of a sensor in the frame of its rig; the identity for a master."""
+    offset = np.eye(4)
+    part = sensor if sensor is None or sensor.find("rig") is None else sensor.find("rig")
+    if part is None:
+        return offset
+    rotation, location = part.findtext("rotation"), part.findtext("location")
+    if sensor is not None and sensor.get("master_id") is not None and rotation is None and location is None:
+        raise LodgsError("its sensor has no position in its rig.")
+    if rotation is not None:
+        offset[:3, :3] = parse_array(rotation.split(), 3, 3)
+    if location is not None:
+        offset[:3, 3] = parse_array(location.split(), 3)
+    invert_pose(offset)
+    return offset
+
+
 def _parse_transform(part: Element) -> np.ndarray | None:
     """Return the transform of a chunk or component to the world, (4, 4) with scale; None if unknown."""
     element = part.find("transform")
@@ -164,7 +208,7 @@ def _parse_transform(part: Element) -> np.ndarray | None:
     return transform
 
 
-class _PhotoFinder:
+class _LabelFinder:
     """Finds photos by camera label, in the folder or anywhere below it."""
 
     def __init__(self, folder: Path, chunk: Element) -> None:
@@ -172,7 +216,7 @@ class _PhotoFinder:
         self._groups = {
             camera: group.get("label", "") for group in chunk.iter("group") for camera in group.iter("camera")
         }
-        self._by_name: dict[str, list[Path]] | None = None
+        self._photos = PhotoFinder(folder)
 
     def find(self, camera: Element) -> Path:
         """Return a camera's photo, or the expected path if there is no photo.
@@ -181,20 +225,11 @@ class _PhotoFinder:
             LodgsError: several photos match.
         """
         label = camera.get("label", "")
-        candidates = [find_image(self._folder / name, label) for name in _IMAGES]
-        for path in candidates:
-            if path.is_file():
+        for name in _IMAGES:
+            path = find_image(self._folder / name, label)
+            if os.path.isfile(path):
                 return path
-        if self._by_name is None:
-            self._by_name = {}
-            for file in sorted(self._folder.rglob("*")):
-                if file.suffix.lower() in IMAGE_SUFFIXES and not file.is_relative_to(self._folder / MASKS):
-                    for name in (file.name, file.stem):
-                        self._by_name.setdefault(name, []).append(file)
-        matches = self._by_name.get(label, [])
-        if len(matches) > 1:  # Metashape names groups after their folders
-            group = self._groups.get(camera)
-            matches = [file for file in matches if file.parent.name == group] or matches
-        if len(matches) > 1:
-            raise LodgsError(f"several photos have this name, such as {matches[0]} and {matches[1]}.")
-        return matches[0] if matches else candidates[0]
+        # Metashape names groups after their folders.
+        return (
+            self._photos.locate(f"{self._groups.get(camera, '')}/{label}") or self._folder / "images" / label
+        )

@@ -18,8 +18,8 @@ from ..colmap_model import Intrinsics
 from .exported import (
     ExportedScene,
     ExportedView,
+    PhotoFinder,
     colmap_lens,
-    find_image,
     get_number,
     invert_pose,
     parse_array,
@@ -58,6 +58,7 @@ def read(path: Path) -> ExportedScene:
     except LodgsError as error:
         raise LodgsError(f"Cannot read {path}: {error.what}", "Export it again.") from error
     views, excluded = [], []
+    photos = PhotoFinder(path.parent)
     for entry in entries:
         name = str(entry.get("filename", "")) if isinstance(entry, dict) else ""
         try:
@@ -66,11 +67,11 @@ def read(path: Path) -> ExportedScene:
                 raise LodgsError("OpenMVG has no pose for it.")
             lens = _parse_lens(lenses.get(entry.get("id_intrinsic")))
             rotation, center = parse_array(pose.get("rotation"), 3, 3), parse_array(pose.get("center"), 3)
-            image = _find_view_image(path.parent, root, str(entry.get("local_path", "")), name)
+            image = _find_view_image(photos, path.parent, root, str(entry.get("local_path", "")), name)
             views.append(ExportedView(image, lens, invert_pose(np.column_stack([rotation.T, center]))))
         except (LodgsError, AttributeError, TypeError) as error:
             excluded.append((name, error.what if isinstance(error, LodgsError) else "its entry is damaged."))
-    return ExportedScene(views, points, np.full((len(points), 3), 128, np.uint8), excluded)
+    return ExportedScene(views, points, np.full((len(points), 3), 128, np.uint8), excluded, photos.warnings())
 
 
 def _parse_lens(values: Any) -> Intrinsics:
@@ -97,11 +98,7 @@ def _parse_lens(values: Any) -> Intrinsics:
     return colmap_lens(*size, (focal, focal), principal_point, radial, tangential, fisheye)
 
 
-def _find_view_image(folder: Path, root: str, local: str, name: str) -> Path:
+def _find_view_image(photos: PhotoFinder, folder: Path, root: str, local: str, name: str) -> Path:
     """Look for a photo next to the file, in ``images`` and at OpenMVG's own path."""
-    candidates = [
-        find_image(place, f"{local}/{name}") for place in (folder / "images", folder, folder.parent)
-    ]
-    if root:
-        candidates.append(find_image(Path(root), f"{local}/{name}"))
-    return next((path for path in candidates if path.is_file()), candidates[0])
+    roots = [folder / "images", folder, folder.parent, *([Path(root)] if root else [])]
+    return photos.find(f"{local}/{name}", *roots)

@@ -5,11 +5,14 @@ Format: https://github.com/PolyCam/polyform (keyframes, corrected ones, blur sco
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ...errors import LodgsError
+from ..images import image_size
 from .exported import (
     ExportedScene,
     ExportedView,
@@ -46,7 +49,8 @@ def read(path: Path) -> ExportedScene:
             values = read_document(file)
             if get_number(values, "blur_score", MIN_SHARPNESS) < MIN_SHARPNESS:
                 raise LodgsError("Polycam rates it as blurred.")
-            width, height = get_number(values, "width"), get_number(values, "height")
+            image = find_image(images, file.stem)
+            width, height = _photo_size(values, path.parent / "cameras" / file.name, image)
             lens = colmap_lens(
                 width, height, (get_number(values, "fx"), get_number(values, "fy")),
                 (get_number(values, "cx", width / 2), get_number(values, "cy", height / 2)),
@@ -54,7 +58,19 @@ def read(path: Path) -> ExportedScene:
             rows = [[get_number(values, f"t_{row}{column}") for column in range(4)] for row in range(3)]
             pose = invert_pose(np.array(rows), opengl=True)
             depth = path.parent / "depth" / f"{file.stem}.png"
-            views.append(ExportedView(find_image(images, file.stem), lens, pose, depth=depth))
+            views.append(ExportedView(image, lens, pose, depth=depth))
         except LodgsError as error:
             excluded.append((file.name, error.what))
     return ExportedScene(views, excluded=excluded)
+
+
+def _photo_size(values: Mapping[str, Any], original: Path, image: Path) -> tuple[float, float]:
+    """Return the size that a camera is stated for: its own, that of the uncorrected camera, or the photo's.
+
+    Newer versions write no size into corrected cameras.
+    """
+    for source in (values, read_document(original) if original.is_file() else {}):
+        size = get_number(source, "width", 0), get_number(source, "height", 0)
+        if min(size) > 0:
+            return size
+    return image_size(image)

@@ -1,7 +1,7 @@
-"""Record3D exports: metadata of all frames in one JSON file, photos in ``rgb``.
+"""Record3D exports and unpacked .r3d files: metadata of all frames in one JSON file, photos in ``rgb(d)``.
 
 Format: https://record3d.app (poses as quaternion xyzw and position, camera to world, OpenGL axes; K by
-columns).
+columns; perFrameIntrinsicCoeffs as fx, fy, cx, cy of each frame).
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import LodgsError
-from ..colmap_model import rotation_matrix
+from ..colmap_model import Intrinsics, rotation_matrix
 from ..images import IMAGE_SUFFIXES
 from .exported import (
     ExportedScene,
@@ -24,12 +24,13 @@ from .exported import (
 )
 
 NAME = "Record3D"
+_PHOTOS = "rgb", "rgbd"
 
 
 def find(folder: Path) -> Path | None:
     """Return the metadata file if there is a folder of photos next to it."""
     candidates = (folder / name for name in ("metadata", "metadata.json"))
-    return next((path for path in candidates if path.is_file() and (folder / "rgb").is_dir()), None)
+    return next((path for path in candidates if path.is_file() and _photo_folder(path)), None)
 
 
 def read(path: Path) -> ExportedScene:
@@ -41,18 +42,17 @@ def read(path: Path) -> ExportedScene:
     document = read_document(path)
     try:
         poses = parse_array(document.get("poses"), -1, 7)
-        fx, fy, cx, cy = parse_array(document.get("K"), 3, 3).T[[0, 1, 0, 1], [0, 1, 2, 2]]
-        lens = colmap_lens(get_number(document, "w"), get_number(document, "h"), (fx, fy), (cx, cy))
+        lenses = _parse_lenses(document, len(poses))
     except LodgsError as error:
         raise LodgsError(f"Cannot read {path}: {error.what}", "Export it again.") from error
-    files = [file for file in (path.parent / "rgb").iterdir() if file.suffix.lower() in IMAGE_SUFFIXES]
+    folder = _photo_folder(path) or path.parent
+    files = [file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES]
     files.sort(key=lambda file: (len(file.stem), file.stem))
     by_number = dict(enumerate(files))
     if len(files) != len(poses):
         if not all(file.stem.isdecimal() for file in files):
             raise LodgsError(
-                f"Cannot read {path}: it has {len(poses)} poses, but {path.parent / 'rgb'} has {len(files)} "
-                "photos.",
+                f"Cannot read {path}: it has {len(poses)} poses, but {folder} has {len(files)} photos.",
                 "Export it again, or name the photos by frame number, starting with 0.jpg.",
             )
         by_number = {int(file.stem): file for file in files}
@@ -63,10 +63,39 @@ def read(path: Path) -> ExportedScene:
             excluded.append((f"frame {number}", "it has no photo."))
             continue
         try:
-            views.append(ExportedView(file, lens, invert_pose(_pose_matrix(pose), opengl=True)))
+            views.append(ExportedView(file, lenses[number], invert_pose(_pose_matrix(pose), opengl=True)))
         except LodgsError as error:
             excluded.append((file.name, error.what))
     return ExportedScene(views, excluded=excluded)
+
+
+def _photo_folder(path: Path) -> Path | None:
+    """Return the folder of the photos next to the metadata file, or None."""
+    return next((path.parent / name for name in _PHOTOS if (path.parent / name).is_dir()), None)
+
+
+def _parse_lenses(document: dict, count: int) -> list[Intrinsics]:
+    """Return the lens of each frame; frames without own values have the common lens.
+
+    Raises:
+        LodgsError: if a value is missing or invalid.
+    """
+    size = get_number(document, "w"), get_number(document, "h")
+    frames = document.get("perFrameIntrinsicCoeffs") or []
+    coefficients = parse_array([frame[:4] for frame in frames], -1, 4) if _is_table(frames) else []
+    if len(coefficients) not in (0, count):
+        raise LodgsError(f"it has {count} poses, but {len(coefficients)} perFrameIntrinsicCoeffs.")
+    if not len(coefficients):
+        matrix = parse_array(document.get("K"), 3, 3).T
+        coefficients = np.tile(matrix[[0, 1, 0, 1], [0, 1, 2, 2]], (count, 1))
+    return [colmap_lens(*size, (fx, fy), (cx, cy)) for fx, fy, cx, cy in coefficients]
+
+
+def _is_table(frames: object) -> bool:
+    """Return True for a list of lists; raise LodgsError for other values."""
+    if not (isinstance(frames, list) and all(isinstance(frame, list) for frame in frames)):
+        raise LodgsError("its perFrameIntrinsicCoeffs are not a list of fx, fy, cx, cy.")
+    return bool(frames)
 
 
 def _pose_matrix(pose: np.ndarray) -> np.ndarray:

@@ -16,6 +16,7 @@ from ..point_cloud import read_points
 from .exported import (
     ExportedScene,
     ExportedView,
+    PhotoFinder,
     colmap_lens,
     find_image,
     get_number,
@@ -50,26 +51,31 @@ def read(path: Path) -> ExportedScene:
         raise LodgsError(f"Cannot read {path}: it has no frames.", "Export it again.")
     common = {name: value for name, value in document.items() if name != "frames"}
     views, excluded = [], []
+    photos = PhotoFinder(path.parent)
     for number, frame in enumerate(frames, 1):
-        values = common | (frame if isinstance(frame, dict) else {})
+        own = frame if isinstance(frame, dict) else {}
+        # A frame's field of view replaces the common focal length.
+        replaced = ("fl_x", "fl_y") if "camera_angle_x" in own else ()
+        values = {name: value for name, value in common.items() if name not in replaced} | own
         values = {name: value for name, value in values.items() if value is not None}
         try:
-            views.append(_parse_view(path.parent, values))
+            views.append(_parse_view(path.parent, values, photos))
         except LodgsError as error:
             excluded.append((str(values.get("file_path", f"frame {number}")), error.what))
     point_cloud = document.get("ply_file_path")
     if isinstance(point_cloud, str):
         try:
-            return ExportedScene(views, *read_points(find_image(path.parent, point_cloud)), excluded)
+            points = read_points(find_image(path.parent, point_cloud))
+            return ExportedScene(views, *points, excluded, photos.warnings())
         except LodgsError as error:
-            return ExportedScene(views, excluded=excluded, warnings=[error.what])
-    return ExportedScene(views, excluded=excluded)
+            return ExportedScene(views, excluded=excluded, warnings=[error.what, *photos.warnings()])
+    return ExportedScene(views, excluded=excluded, warnings=photos.warnings())
 
 
-def _parse_view(folder: Path, values: Mapping[str, Any]) -> ExportedView:
+def _parse_view(folder: Path, values: Mapping[str, Any], photos: PhotoFinder) -> ExportedView:
     if not isinstance(values.get("file_path"), str):
         raise LodgsError("it has no file_path.")
-    image = find_image(folder, values["file_path"])
+    image = photos.find(values["file_path"])
     width, height = get_number(values, "w", 0), get_number(values, "h", 0)
     if not (width > 0 and height > 0):
         width, height = image_size(image)

@@ -1,0 +1,35 @@
+"""Corpus of small inputs after public bug reports, see CONTRIBUTING.md."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from training.scenes.colmap import read_scene
+from training.scenes.formats import ensure_colmap_scene
+
+CASES = Path(__file__).parents[2] / "data" / "cases"
+
+
+@pytest.mark.parametrize("name", sorted(path.name for path in CASES.iterdir()))
+def test_case(tmp_path, name):
+    case = json.loads((CASES / name / "case.json").read_text())
+    scene_folder = Path(shutil.copytree(CASES / name / "export", tmp_path / name))
+    for path, (width, height, *orientation) in case["photos"].items():
+        (scene_folder / path).parent.mkdir(parents=True, exist_ok=True)
+        exif = Image.Exif()
+        exif[274] = orientation[0] if orientation else 1
+        Image.new("RGB", (width, height)).save(scene_folder / path, exif=exif)
+    warnings = []
+    scene = read_scene(ensure_colmap_scene(scene_folder, warnings.append))
+    cameras = {Path(camera.name).name: camera for camera in scene.cameras}
+    assert sorted(cameras) == sorted(case["views"]), warnings
+    for view, expected in case["views"].items():
+        pixels, _ = cameras[view].project(np.array([expected["point"]]))
+        np.testing.assert_allclose(pixels, [expected["pixel"]], atol=1e-9, err_msg=view)
+        assert [cameras[view].width, cameras[view].height] == expected["size"]
+    for text in case["warnings"]:
+        assert any(text in warning for warning in [*warnings, *scene.warnings]), (text, warnings)
