@@ -245,3 +245,25 @@ def test_program_stops_when_its_parent_is_killed(tmp_path):
         time.sleep(0.01)
     images = list(tmp_path.glob("cache/undistorting-*/undistorted/images/*"))
     assert len(images) < len(names)
+
+
+def test_text_models_made_by_hand_are_undistorted(tmp_path):
+    """COLMAP itself takes each second image for the 2D points of the first."""
+    synthetic.write_scene(tmp_path, synthetic.camera("OPENCV"), names=["a.png", "b.png"], pixels=ramps())
+    model = tmp_path / "sparse" / "0"
+    expected = undistort_scene(read_scene(tmp_path), tmp_path / "cache").cameras
+    pycolmap.Reconstruction(model).write_text(model)
+    for file in model.glob("*.bin"):
+        file.unlink()
+    lines = (model / "images.txt").read_text().splitlines()
+    images = [line for line in lines if line.endswith(".png")]
+    (model / "images.txt").write_text("\n".join(images))
+    points = [
+        line.split()[:7] for line in (model / "points3D.txt").read_text().splitlines() if line[0] != "#"
+    ]
+    (model / "points3D.txt").write_text("\n".join(" ".join(point) for point in points))
+    cameras = undistort_scene(read_scene(tmp_path), tmp_path / "text").cameras
+    assert [camera.name for camera in cameras] == [camera.name for camera in expected] == ["a.png", "b.png"]
+    for camera, other in zip(cameras, expected, strict=True):
+        assert (camera.width, camera.height) == (other.width, other.height)
+        np.testing.assert_allclose(camera.world_to_camera, other.world_to_camera, atol=1e-12)
