@@ -18,10 +18,10 @@ from ...errors import LodgsError
 from ...files import check_folder, link_or_copy
 from ..cameras import Camera
 from ..colmap import DEPTHS, MASKS, find_models
-from ..colmap_model import write_model
 from ..image_files import find_image_folder
 from ..images import image_size, same_proportions
 from ..view_selection import exclusion_messages
+from ..write_colmap import write_model
 from . import bundler, metashape, openmvg, polycam, record3d, transforms
 from .exported import ExportedScene, ExportedView
 
