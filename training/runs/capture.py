@@ -13,6 +13,8 @@ from PIL import Image
 from ..errors import LodgsError
 from ..rasterize import Gaussians, cpu_fallback_reason, rasterize
 from ..scenes.cameras import Camera, read_camera_folder
+from ..scenes.colmap import read_scene
+from ..scenes.images import check_image
 from ..scenes.viewpoints import dome_views
 from ..scenes.write_colmap import write_visible_points
 from ..splats.dialects import Warn, ignore
@@ -116,6 +118,18 @@ def write_scene(
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     return count
+
+
+def is_complete(scene: Path) -> bool:
+    """Return whether a captured scene has all its files, undamaged."""
+    try:
+        captured = read_scene(scene)
+        for camera in captured.cameras:
+            assert camera.image is not None
+            check_image(camera.image)
+    except LodgsError:
+        return False
+    return len(captured.cameras) == len(captured.names) and len(captured.points) > 0
 
 
 def _write(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -20,7 +21,7 @@ from ..scenes.images import check_image, check_mask
 from ..scenes.regions import Region
 from ..scenes.rendered_views import thin_evenly
 from ..scenes.undistort import undistort_cache, undistort_scene
-from .capture import capture
+from .capture import capture, is_complete
 from .folder import RunFolder
 from .job import Job
 
@@ -121,6 +122,9 @@ def _scene_folder(job: Job, folder: RunFolder, report: Callable[..., None]) -> P
     """Return the folder of the job's scene; capture it from the base first if the job asks for it."""
     if not job.capture:
         return Path(job.scene)
+    if folder.captured.exists() and not is_complete(folder.captured):
+        report("warning", message=f"The views in {folder.captured} are damaged. They are rendered again.")
+        shutil.rmtree(folder.captured)
     if not folder.captured.exists():
 
         def report_view(number: int, count: int) -> None:
