@@ -15,10 +15,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, BinaryIO
 
-from .errors import LodgsError
-
-DISK_FULL = {errno.ENOSPC, errno.EDQUOT}
-"""Error codes of a full disk or an exceeded quota."""
+from .errors import LodgsError, system_remedy
 
 
 def cache_folder() -> Path:
@@ -58,9 +55,7 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
             raise
         raise LodgsError(
             f"Cannot write {path}: {error.strerror or error}.",
-            "Free some space there or choose another folder."
-            if error.errno in DISK_FULL
-            else "Choose another name or folder.",
+            system_remedy(error, "Choose another name or folder."),
         ) from error
     finally:
         with suppress(OSError):

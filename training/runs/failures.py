@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from ..errors import LodgsError, is_out_of_memory
-from ..files import DISK_FULL
+from ..errors import DISK_FULL, LodgsError, is_out_of_memory, system_remedy
 
 DONE, CRASHED, BAD_INPUT, CANCELLED = 0, 1, 2, 3
 """Exit codes of ``python -m training train``."""
@@ -22,7 +21,7 @@ def describe_error(error: BaseException) -> tuple[str, str, int]:
         path = f" ({error.filename})" if error.filename else ""
         return (
             f"Training stopped: {error.strerror or error}{path}.",
-            "Check that the disk is connected and writable, then resume the run.",
+            system_remedy(error, "Check that the disk is connected and writable, then resume the run."),
             BAD_INPUT,
         )
     kind = type(error).__name__

@@ -45,6 +45,7 @@ from ..splats.file_rows import open_ply
 from ..splats.gaussians import SplatRows, Splats
 from ..splats.levels import NO_SPLATS, Bundle, Level
 from ..splats.ply import BATCH_ROWS, Columns, read_ply, write_ply
+from . import parent
 from .base import open_base
 from .blocks.plan import write_plan
 from .blocks.train import BlocksStopped, train_blocks
@@ -52,7 +53,7 @@ from .blocks.workers import HERE, workers
 from .checkpoints import read_newest, remove_checkpoints, write_checkpoint
 from .data import training_data
 from .events import PROTOCOL, EventWriter, event_line
-from .failures import CANCELLED, CRASHED, DONE, describe_error
+from .failures import BAD_INPUT, CANCELLED, CRASHED, DONE, describe_error
 from .folder import RunFolder
 from .job import Job, save_job
 
@@ -75,6 +76,7 @@ def train(
         An exit code. Errors end in an ``error`` event, never in a traceback on the stream.
     """
     folder = RunFolder(job.out)
+    parent.watch()
     try:
         folder.create()
         with folder.locked():
@@ -113,6 +115,9 @@ def _final_event(error: BaseException) -> tuple[int, dict]:
     """Return exit code and final event of a training that ends with an exception."""
     if isinstance(error, BlocksStopped):
         return CANCELLED, {"kind": "cancelled", "message": str(error)}
+    if isinstance(error, KeyboardInterrupt) and parent.ended.is_set():
+        problem = "Training stopped: the process that started it has ended."
+        return BAD_INPUT, {"kind": "error", "what": problem, "remedy": "Resume the run."}
     if isinstance(error, KeyboardInterrupt):
         return CANCELLED, {"kind": "cancelled", "message": "Stopped. The run can be resumed."}
     problem, remedy, code = describe_error(error)
@@ -267,8 +272,10 @@ class _TrainingRun:
         last_checkpoint = last_progress = self._started
         while self.step < method.steps:
             self.folder.require_lock()
-            if received or self.folder.take_cancel():
+            if received or parent.ended.is_set() or self.folder.take_cancel():
                 self._save()
+                if parent.ended.is_set():
+                    raise KeyboardInterrupt
                 message = f"Stopped at step {self.step} of {method.steps}. The run can be resumed."
                 self.events("cancelled", step=self.step, message=message)
                 return False
@@ -440,7 +447,7 @@ def _interrupt_on_cancel(folder: RunFolder):
     def watch() -> None:
         while not finished.wait(0.1):
             with suppress(OSError):
-                if folder.take_cancel():
+                if parent.ended.is_set() or folder.take_cancel():
                     _interrupt()
                     return
 

@@ -101,40 +101,22 @@ def test_capture_overwrites_nothing_and_leaves_no_partial_scene(ball, tmp_path):
         dome_views(faint, 4)
 
 
-@pytest.mark.parametrize(
-    "damaged", ["sparse/0/images.bin", "sparse/0/points3D.bin", "images/dome_0002.jpg", "images"]
-)
+@pytest.mark.parametrize("damaged", ["sparse/0/images.bin", "sparse/0/points3D.bin", "images/dome_0002.jpg"])
 def test_damaged_captured_views_are_rendered_again(ball, tmp_path, damaged):
-    """For example by a disk error, or by a user who deletes photos."""
     run = RunFolder(tmp_path / "run")
     run.create()
     write_ply(run.base, ball)
-    job = Job.from_dict(
-        {
-            "scene": "",
-            "base": str(run.base),
-            "out": str(run.path),
-            "method": "lodge",
-            "capture": "dome",
-            "views": 4,
-            "view_width": 48,
-            "image_scale": 1.0,
-        }
-    )
+    keys = {"scene": "", "base": str(run.base), "out": str(run.path), "method": "lodge", "capture": "dome"}
+    job = Job.from_dict({**keys, "views": 4, "view_width": 48, "image_scale": 1.0})
     training_data(job, run)
     files = sorted(path for path in run.captured.rglob("*") if path.is_file())
     before = [path.read_bytes() for path in files]
     path = run.captured / damaged
-    if path.is_dir():
-        shutil.rmtree(path)
-    else:
-        path.write_bytes(path.read_bytes()[:-20])
-    warnings = []
-    training_data(
-        job, run, lambda kind, **values: warnings.append(values["message"]) if kind == "warning" else None
-    )
+    path.write_bytes(path.read_bytes()[:-20])
+    reports = []
+    training_data(job, run, lambda kind, **values: reports.append(f"{kind}: {values['message']}"))
     assert [path.read_bytes() for path in files] == before
-    assert "are damaged. They are rendered again" in warnings[0]
+    assert reports[0].startswith("warning: ") and "damaged. They are rendered again" in reports[0]
 
 
 def test_views_along_a_path_are_level_and_look_in_all_directions(ball):
