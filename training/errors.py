@@ -49,6 +49,25 @@ def system_remedy(error: OSError, default: str = "") -> str:
     return default
 
 
+_ABOUT_THE_FILE = {
+    errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EINVAL, errno.ELOOP, errno.ENAMETOOLONG, errno.ENXIO
+}  # fmt: skip
+"""Error codes that concern one file, which is missing or no regular file."""
+
+
+def is_system_problem(error: BaseException) -> bool:
+    """Return whether an error concerns the computer, a disk or permissions, not the content of one file."""
+    if isinstance(error, OSError) and error.errno is not None:
+        return error.errno not in _ABOUT_THE_FILE
+    return is_out_of_memory(error)
+
+
+def read_error(path: object, error: OSError, remedy: str) -> LodgsError:
+    """Return the error of a file that cannot be read; a SystemProblem if the file is not to blame."""
+    kind = SystemProblem if is_system_problem(error) else LodgsError
+    return kind(f"Cannot read {printable(path)}: {error.strerror or error}.", system_remedy(error, remedy))
+
+
 def printable(text: object) -> str:
     """Return a name, a path or a sentence with NUL characters and lone surrogates escaped."""
     return _UNPRINTABLE.sub(lambda match: f"\\x{ord(match[0]):02x}", str(text))

@@ -15,7 +15,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, BinaryIO
 
-from .errors import LodgsError, system_remedy
+from .errors import LodgsError, is_system_problem, read_error, system_remedy
 
 
 def cache_folder() -> Path:
@@ -99,6 +99,27 @@ def check_folder(folder: Path, remedy: str) -> None:
         raise LodgsError(f"{folder} is a file, not a folder.", "Unpack it first." if is_archive else remedy)
     if not folder.is_dir():
         raise LodgsError(f"The folder {folder} does not exist.", remedy)
+
+
+def is_file(path: str | Path) -> bool:
+    """Return whether a regular file exists, also for names that are too long or invalid.
+
+    Raises:
+        SystemProblem: the system cannot tell, for example because a network share is lost.
+    """
+    try:
+        return stat.S_ISREG(os.stat(path).st_mode)
+    except ValueError:
+        return False
+    except OSError as error:
+        raise_system_problem(error)
+        return False
+
+
+def raise_system_problem(error: OSError) -> None:
+    """Raise SystemProblem unless the error concerns only its file; the ``onerror`` of ``os.walk``."""
+    if is_system_problem(error):
+        raise read_error(error.filename, error, "Check that its disk is connected.") from error
 
 
 def open_regular(path: str | Path, writing: bool = False) -> BinaryIO:

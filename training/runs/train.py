@@ -144,7 +144,7 @@ def _train(
                 train_blocks(division, merged, submit, events)
             job = replace(job, base="" if merged_is_result else str(merged))
         events("status", message="Reading the scene")
-        data = training_data(job, folder, events)
+        data = training_data(job, folder, events, keep_views=True)
         if not job.cell:
             for finding in check_scene(data.full_scene, job.image_scale):
                 events("warning", message=str(finding))

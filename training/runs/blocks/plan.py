@@ -170,6 +170,8 @@ def plan(job: Job, scene: Scene | None = None) -> list[PlannedCell]:
     Raises:
         LodgsError: the scene cannot be read, or not divided into these cells.
     """
+    if not job.cells:
+        raise LodgsError("Cannot plan cells: the scene has only one cell.", "Use at least 2 cells.")
     scene = read_planned_scene(job) if scene is None else scene
     undivided, _ = _divided(job)
     training = _training_views(job, scene)

@@ -14,7 +14,7 @@ from types import ModuleType
 
 import numpy as np
 
-from ...errors import LodgsError
+from ...errors import LodgsError, SystemProblem
 from ...files import check_folder, link_or_copy
 from ..cameras import Camera
 from ..colmap import DEPTHS, MASKS, find_models
@@ -179,6 +179,8 @@ def _usable_views(exported: ExportedScene) -> tuple[list[ExportedView], list[tup
         name = view.image.name
         try:
             width, height = image_size(view.image)
+        except SystemProblem:
+            raise
         except LodgsError as error:
             excluded.append((name, error.what))
             continue
