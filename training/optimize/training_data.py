@@ -105,7 +105,7 @@ class TrainingData:
         self.region = region
         self._train_names = {camera.name for camera in train}
         self._gains = gains or {}
-        self._sizes = {camera.name: (camera.width, camera.height) for camera in scene.cameras}
+        self._sizes = {camera.image: (camera.width, camera.height) for camera in scene.cameras}
         self.full_train = [camera.scaled(image_scale) for camera in all_train]
         self.train = [camera.scaled(image_scale) for camera in train]
         self.test = [camera.scaled(image_scale) for camera in test]
@@ -216,10 +216,10 @@ class TrainingData:
     def _read(self, camera: Camera) -> Target:
         """Load an image at the camera's size, in planar layout as needed by losses."""
         assert camera.image is not None
-        self._check_size(camera)
         size = (camera.width, camera.height)
         alpha = self.transparent
         image = load_image(camera.image, *size, exposure=self.exposure, alpha=alpha)
+        self._check_size(camera.image)
         if camera.name in self._gains:
             image[..., :3] = remove_gain(image[..., :3], self._gains[camera.name])
         planes = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))
@@ -231,13 +231,13 @@ class TrainingData:
             inverse_depth[mask <= 0.5] = np.nan
         return Target(planes[:3].permute(1, 2, 0), mask, planes[3] if alpha else None, inverse_depth)
 
-    def _check_size(self, camera: Camera) -> None:
-        """Raise LodgsError if a photo was replaced by one of another size."""
-        assert camera.image is not None
-        expected, size = self._sizes[camera.name], image_size(camera.image)
+    def _check_size(self, image: Path) -> None:
+        """Raise LodgsError if a photo of the scene was replaced by one of another size."""
+        size = image_size(image)
+        expected = self._sizes.get(image, size)
         if size != expected:
             raise LodgsError(
-                f"Cannot train: the size of {camera.image} changed from {expected[0]}x{expected[1]} to "
+                f"Cannot train: the size of {image} changed from {expected[0]}x{expected[1]} to "
                 f"{size[0]}x{size[1]} pixels.",
                 "Restore the photo, then resume the run.",
             )

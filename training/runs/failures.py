@@ -16,9 +16,10 @@ def describe_error(error: BaseException) -> tuple[str, str, int]:
         remedy = "Lower max_splats or image_scale, or close other programs; then resume the run."
         return "Training stopped: not enough memory.", remedy, BAD_INPUT
     if isinstance(error, OSError):
-        if error.errno in DISK_FULL:
-            return "Training stopped: the disk is full.", "Free some space and resume the run.", BAD_INPUT
         path = f" ({error.filename})" if error.filename else ""
+        if error.errno in DISK_FULL:
+            remedy = "Free some space and resume the run."
+            return f"Training stopped: the disk is full{path}.", remedy, BAD_INPUT
         return (
             f"Training stopped: {error.strerror or error}{path}.",
             system_remedy(error, "Check that the disk is connected and writable, then resume the run."),

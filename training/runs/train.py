@@ -327,6 +327,7 @@ class _TrainingRun:
                     f"Held-out views: {neural_psnr:.2f} dB with networks, "
                     f"{baked_psnr:.2f} dB baked for Blender."
                 )
+        self.folder.require_lock()
         write_bundle(self.folder.bundle, bundle)
         return bundle
 
@@ -376,6 +377,7 @@ class _TrainingRun:
         complete = [level.number for level in standalone_levels(bundle)]
         for position, level in enumerate(levels, 1):
             path = self.folder.levels_folder / f"level_{level.number}.ply"
+            self.folder.require_lock()  # writing would create a folder that was moved
             write_ply(path, level.rows, comments_from_meta(bundle.meta))
             record = {
                 "level": level.number,
@@ -399,6 +401,7 @@ class _TrainingRun:
             write_cost_plot(self.folder.costs, bundle.meta)
 
     def _save(self) -> None:
+        self.folder.require_lock()
         write_checkpoint(self.folder, self.step, self.levels, self.method.state_dict())
 
     def _resume(self) -> None:
