@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -156,7 +157,9 @@ def _write(
         image = (rendering.image.cpu().numpy().clip(0, 1) * 255).round().astype(np.uint8)
         depth = rendering.median_depth.cpu().numpy()
         Image.fromarray(image).save(scene / "images" / view.name, quality=95, subsampling=0)
-        np.save(scene / "depths" / f"{number}.npy", depth)
+        content = io.BytesIO()  # np.save reports a full disk without its name
+        np.save(content, depth)
+        (scene / "depths" / f"{number}.npy").write_bytes(content.getbuffer())
         x, y = rng.integers([view.width, view.height], size=(points // len(views) + 1, 2)).T
         x, y = x[depth[y, x] > 0], y[depth[y, x] > 0]
         positions.append(view.unproject(np.column_stack([x, y]) + 0.5, depth[y, x]))
