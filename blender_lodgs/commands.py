@@ -168,7 +168,7 @@ def _train(args: argparse.Namespace) -> int:
     root = _import_for(job)
     job_settings.apply_job(root.lodgs.training, job)  # for the panel when the .blend is opened
     watch = jobs.start_or_resume(root, job)
-    with _interrupts():
+    with _interrupts(signal.SIGINT, signal.SIGTERM):
         jobs.follow(watch, _ProgressBar())
     for line in summary_lines(watch.summary):
         _print(line)
@@ -277,7 +277,7 @@ def _capture(args: argparse.Namespace) -> int:
     if warning := noise_warning(scene):
         warn(warning)
     try:
-        with _interrupts():
+        with _interrupts(signal.SIGINT):  # SIGTERM ends a slow render at once, as the panel needs
             count = render_views(bpy.context, folder, width, height, args.range, report, warn)
             if args.range:
                 _print(f"{folder}: views {args.range[0]} to {min(args.range[1], count)} of {count}")
@@ -389,9 +389,8 @@ class _ProgressBar:
 
 
 @contextmanager
-def _interrupts():
-    """Make Ctrl-C and SIGTERM raise KeyboardInterrupt; by default background Blender exits immediately."""
-    numbers = signal.SIGINT, signal.SIGTERM
+def _interrupts(*numbers: int):
+    """Make signals raise KeyboardInterrupt; by default background Blender exits immediately."""
     previous = [signal.signal(number, signal.default_int_handler) for number in numbers]
     try:
         yield
