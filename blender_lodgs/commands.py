@@ -19,7 +19,7 @@ from ..training.cli.options import add_setting, parse_size
 from ..training.editing.export import EXPORT_OPTIONS, export_finest_level, run_to_end
 from ..training.errors import LodgsError, describe_system_error, system_remedy
 from ..training.evaluate.messages import summary_lines
-from ..training.runs.folder import RunFolder
+from ..training.runs.folder import RunFolder, find_splats
 from ..training.runs.job import KEYS, Job
 from ..training.settings import check_value
 from ..training.splats.bundle import write_bundle
@@ -111,8 +111,8 @@ def _add_export(commands: _Commands) -> None:
     )
     export.set_defaults(command=_export)
     export.add_argument("blend", type=Path, help=".blend file")
-    others = ", ".join(kind.suffix for kind in FORMATS if kind is not PLY)
-    export.add_argument("bundle", type=Path, help=f"file to write: a bundle (.ply), or {others}")
+    other_suffixes = ", ".join(kind.suffix for kind in FORMATS if kind is not PLY)
+    export.add_argument("bundle", type=Path, help=f"file to write: a bundle (.ply), or {other_suffixes}")
     export.add_argument("--root", help="name of the scene root, if the file holds several")
     add_setting(export, EXPORT_OPTIONS["placed"], value=False)
     export.add_argument("--as-trained", dest="looked", action="store_false", help="ignore the scene's look")
@@ -155,9 +155,9 @@ def _add_frames(commands: _Commands) -> None:
 
 
 def _add_info(commands: _Commands) -> None:
-    info = commands.add_parser("info", help="describe a bundle or a 3DGS PLY file")
+    info = commands.add_parser("info", help="describe a bundle, a run or a 3DGS PLY file")
     info.set_defaults(command=_info)
-    info.add_argument("file", type=Path, help="file to describe")
+    info.add_argument("file", type=Path, help="file or run folder to describe")
 
 
 def _train(args: argparse.Namespace) -> int:
@@ -187,6 +187,7 @@ def _train(args: argparse.Namespace) -> int:
         return CANCELLED
     if args.export:
         write_bundle(args.export, scenes.read_levels(root))
+        _print(f"{args.export}: written")
     return DONE
 
 
@@ -239,6 +240,7 @@ def _export(args: argparse.Namespace) -> int:
         write_bundle(args.bundle, bundle)
     else:
         run_to_end(export_finest_level(args.bundle, bundle))
+    _print(f"{args.bundle}: written")
     return DONE
 
 
@@ -326,7 +328,7 @@ def _open(blend: Path) -> None:
 
 
 def _info(args: argparse.Namespace) -> int:
-    print(describe(args.file))
+    print(describe(find_splats(args.file)))
     return DONE
 
 
@@ -349,6 +351,7 @@ def _save(path: Path) -> None:
         raise LodgsError(
             f"Cannot save {path}: {reason}.", "Free some space on this disk, or choose another folder."
         ) from error
+    _print(f"{path}: written")
 
 
 def _print(text: str) -> None:

@@ -77,7 +77,8 @@ def new_point_cloud(name: str, count: int) -> bpy.types.PointCloud:
     return cloud
 
 
-def _identifier(modifier: bpy.types.NodesModifier, name: str) -> str:
+def _input_identifier(modifier: bpy.types.NodesModifier, name: str) -> str:
+    """Return the identifier of the group input called ``name``."""
     return next(
         item.identifier
         for item in modifier.node_group.interface.items_tree
@@ -95,7 +96,7 @@ def has_input(modifier: bpy.types.NodesModifier, name: str) -> bool:
 
 def input_path(modifier: bpy.types.NodesModifier, name: str) -> str:
     """Return the data path, from the modifier's object, of the group input called ``name``."""
-    identifier, owner = _identifier(modifier, name), f'modifiers["{modifier.name}"]'
+    identifier, owner = _input_identifier(modifier, name), f'modifiers["{modifier.name}"]'
     if hasattr(modifier, "properties"):
         return f"{owner}.properties.inputs.{identifier}.value"
     return f'{owner}["{identifier}"]'
@@ -103,7 +104,7 @@ def input_path(modifier: bpy.types.NodesModifier, name: str) -> str:
 
 def get_input(modifier: bpy.types.NodesModifier, name: str):
     """Return the value of the group input called ``name``."""
-    identifier = _identifier(modifier, name)
+    identifier = _input_identifier(modifier, name)
     if hasattr(modifier, "properties"):
         return getattr(modifier.properties.inputs, identifier).value
     return modifier[identifier]
@@ -111,7 +112,7 @@ def get_input(modifier: bpy.types.NodesModifier, name: str):
 
 def set_input(modifier: bpy.types.NodesModifier, name: str, value) -> None:
     """Set the group input called ``name`` and tag the object for evaluation."""
-    identifier = _identifier(modifier, name)
+    identifier = _input_identifier(modifier, name)
     if hasattr(modifier, "properties"):
         getattr(modifier.properties.inputs, identifier).value = value
     else:

@@ -8,6 +8,8 @@ import shutil
 import tempfile
 from pathlib import Path
 
+from training.files import cache_folder
+
 REPOSITORY = Path(__file__).resolve().parents[1]
 EXTENSION = "bl_ext.user_default.lodgs"
 """Package name of the installed extension."""
@@ -16,12 +18,18 @@ EXTENSION = "bl_ext.user_default.lodgs"
 def start_blender():
     """Import bpy, enable the extension in a temporary Blender user folder, and return the module.
 
-    Call it once per process. The user's Blender settings are neither read nor written.
+    Call it once per process. The user's Blender settings are neither read nor written. All processes share
+    one folder of compiled code, because compiling takes half a minute.
     """
     resources = Path(tempfile.mkdtemp(prefix="lodgs-blender-"))
     link = resources / "extensions" / "user_default" / "lodgs"
     link.parent.mkdir(parents=True)
     link.symlink_to(REPOSITORY, target_is_directory=True)
+    compiled = cache_folder() / "blender-module"
+    compiled.mkdir(parents=True, exist_ok=True)
+    own = resources / "extensions" / ".user" / "user_default" / "lodgs"
+    own.mkdir(parents=True)
+    (own / "cache").symlink_to(compiled, target_is_directory=True)
     os.environ["BLENDER_USER_RESOURCES"] = str(resources)
 
     import bpy  # isort: skip

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+import re
 import shutil
 import subprocess
 import sys
@@ -93,6 +94,10 @@ def write_repository(folder: Path) -> None:
     command = [*blender_tool(), "server-generate", f"--repo-dir={folder}", "--html"]
     if code := subprocess.run(command, check=False).returncode:
         sys.exit(code)
+    page = folder / "index.html"
+    text = page.read_text(encoding="utf-8")
+    if "<td>~</td>" in text:  # no website
+        page.write_text(re.sub(r" *<t[hd]>(Website|~)</t[hd]>\n", "", text), encoding="utf-8")
 
 
 if __name__ == "__main__":

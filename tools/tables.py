@@ -224,7 +224,7 @@ def _possible(f: Field) -> str:
 def _range(control: Control) -> str:
     if control.follows:
         return "existing levels"
-    text = f"{_value(control.low)} to {_value(control.high)}" + (", whole number" if control.whole else "")
+    text = f"{_value(control.low)} to {_value(control.high)}" + (", whole number" if control.integer else "")
     return text + (" pixels" if control.unit == "PIXEL" else "")
 
 

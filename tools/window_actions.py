@@ -16,9 +16,11 @@ import time
 import traceback
 from collections.abc import Callable, Generator, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import bpy
 import numpy as np
+from bpy_extras.view3d_utils import location_3d_to_region_2d
 from mathutils import Matrix, Vector
 
 LODGS = "bl_ext.user_default.lodgs"
@@ -82,6 +84,33 @@ def scroll(times: int) -> None:
             bpy.ops.view2d.scroll_up(deltay=40)
         for _ in range(times):
             bpy.ops.view2d.scroll_down(deltay=40)
+
+
+def scene_root() -> bpy.types.Object:
+    """Return the splat scene. Undo replaces the object, so do not keep it."""
+    (root,) = module("data.roots").roots(bpy.context.scene)
+    return root
+
+
+def world_position(*position: float) -> Vector:
+    """Transform a position of the example scene to Blender's world."""
+    return scene_root().lodgs.axes.matrix_world @ Vector(position)
+
+
+def window_pixel(*position: float) -> tuple[int, int]:
+    """Project a position of the example scene to a pixel of the window."""
+    pixel = location_3d_to_region_2d(region(), viewport()[1], world_position(*position))
+    return round(region().x + pixel.x), round(region().y + pixel.y)
+
+
+def check_installation() -> Generator[float, None, Any]:
+    """Show the extension's preferences and check the trainer; return ``runs.environment.report``."""
+    bpy.context.preferences.active_section = "ADDONS"
+    bpy.context.window_manager.addon_search = "LODGS"
+    press("preferences.addon_expand", module=LODGS)
+    press("lodgs.check_environment")
+    yield from settle()
+    return module("runs.environment").report
 
 
 def look_at(target: Vector, distance: float) -> None:

@@ -12,7 +12,6 @@ import sys
 from pathlib import Path
 
 import bpy
-from bpy_extras.view3d_utils import location_3d_to_region_2d
 from mathutils import Vector
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -23,6 +22,7 @@ from tools.window_actions import (
     OUT,
     PLAN,
     Steps,
+    check_installation,
     drag,
     look_from,
     module,
@@ -30,12 +30,15 @@ from tools.window_actions import (
     press,
     press_f12,
     region,
+    scene_root,
     screenshot,
     settle,
     start,
     type_in,
     until,
     viewport,
+    window_pixel,
+    world_position,
 )
 
 TABLE = (0.0, 0.05, 0.8)
@@ -92,9 +95,9 @@ def show_panels(*names: str) -> Steps:
     package = f"{LODGS}.blender_lodgs.panels."
     panels = unregister_panels()
     for cls in panels:
-        shown = cls.__module__.removeprefix(package) in names or cls.__name__ in names
+        is_open = cls.__module__.removeprefix(package) in names or cls.__name__ in names
         content = {"bl_idname": f"{cls.__name__}_{_generation}"}
-        content["bl_options"] = set() if shown else {"DEFAULT_CLOSED"}
+        content["bl_options"] = set() if is_open else {"DEFAULT_CLOSED"}
         if hasattr(cls, "bl_parent_id"):
             content["bl_parent_id"] = f"{cls.bl_parent_id}_{_generation}"
         bpy.utils.register_class(type(content["bl_idname"], (cls,), content))
@@ -123,34 +126,13 @@ def restore_panels() -> Steps:
     yield 0.2
 
 
-def scene_root() -> bpy.types.Object:
-    """Return the splat scene. Undo replaces the object, so do not keep it."""
-    return module("data.roots").roots(bpy.context.scene)[0]
-
-
-def world_position(*position: float) -> Vector:
-    """Transform a position of the example scene to Blender's world."""
-    return scene_root().lodgs.axes.matrix_world @ Vector(position)
-
-
-def window_pixel(*position: float) -> tuple[int, int]:
-    """Project a position of the example scene to a pixel of the window."""
-    pixel = location_3d_to_region_2d(region(), viewport()[1], world_position(*position))
-    return round(region().x + pixel.x), round(region().y + pixel.y)
-
-
 def overview() -> None:
     """Look at the table from in front of it, with the sidebar's width in mind."""
     look_from(world_position(-1.5, -2.6, 1.5), world_position(0.35, 0.2, 0.85))
 
 
 def preferences() -> Steps:
-    bpy.context.preferences.active_section = "ADDONS"
-    bpy.context.window_manager.addon_search = "LODGS"
-    press("preferences.addon_expand", module=LODGS)
-    press("lodgs.check_environment")
-    yield from settle()
-    report = module("runs.environment").report
+    report = yield from check_installation()
     report.python = (
         "/home/artist/.config/blender/5.2/extensions/.user/user_default/lodgs/trainer/1/bin/python"
     )

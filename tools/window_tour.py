@@ -24,6 +24,7 @@ from tools.window_actions import (
     PLAN,
     Steps,
     changed_share,
+    check_installation,
     leave_camera,
     look_at,
     module,
@@ -73,12 +74,7 @@ def preferences() -> Steps:
     assert LODGS in bpy.context.preferences.addons, "The extension is not enabled."
     area = viewport()[0]
     area.type = "PREFERENCES"
-    bpy.context.preferences.active_section = "ADDONS"
-    bpy.context.window_manager.addon_search = "LODGS"
-    press("preferences.addon_expand", module=LODGS)
-    press("lodgs.check_environment")
-    yield from settle()
-    report = module("runs.environment").report
+    report = yield from check_installation()
     assert report.ok, f"No trainer found: {report.problems}"
     screenshot("preferences", report.versions["torch"])
     area.type = "VIEW_3D"

@@ -14,8 +14,6 @@ import time
 from pathlib import Path
 
 import bpy
-from bpy_extras.view3d_utils import location_3d_to_region_2d
-from mathutils import Vector
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -33,6 +31,7 @@ from tools.window_actions import (
     press,
     press_f12,
     region,
+    scene_root,
     screenshot,
     scroll,
     settle,
@@ -40,6 +39,8 @@ from tools.window_actions import (
     type_in,
     until,
     viewport,
+    window_pixel,
+    world_position,
 )
 
 JOB = {"max_splats": 60_000, "steps": (150, 250, 300, 450, 1000)} if PLAN["long"] else {
@@ -72,23 +73,6 @@ def walk() -> Steps:
     yield from undo(steps, initial)
     yield from click()
     yield from shoot()
-
-
-def scene_root() -> bpy.types.Object:
-    """Return the splat scene. Undo replaces the object, so do not keep it."""
-    (root,) = module("data.roots").roots(bpy.context.scene)
-    return root
-
-
-def world_position(*position: float) -> Vector:
-    """Transform a position of the example scene to Blender's world."""
-    return scene_root().lodgs.axes.matrix_world @ Vector(position)
-
-
-def window_pixel(*position: float) -> tuple[int, int]:
-    """Project a position of the example scene to a pixel of the window."""
-    pixel = location_3d_to_region_2d(region(), viewport()[1], world_position(*position))
-    return round(region().x + pixel.x), round(region().y + pixel.y)
 
 
 def train() -> Steps:

@@ -15,6 +15,7 @@ from typing import NoReturn
 from . import VERSION
 from .cli import COMMANDS, PROGRAM, check
 from .errors import LodgsError, describe_system_error
+from .runs import processes
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -55,6 +56,7 @@ def _run_command(arguments: list[str]) -> int:
     if arguments == ["check"]:  # needs no packages
         code = check.run()
     else:
+        processes.stop_with_parent()
         options = _parser(arguments).parse_args(arguments)
         code = _module(options.command).run(options)
         if options.command in ("train", "blocks"):  # their output is in the run folder, too

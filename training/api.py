@@ -1,8 +1,8 @@
 """Python interface: read scenes and splats, train, select levels and render.
 
 Coordinates and lengths are in the scene's units. Cameras have OpenCV axes (``scenes.cameras.Camera``). Wrong
-arguments and files raise a :class:`~.errors.LodgsError`. Warnings about files use Python's ``warnings``. Only
-:func:`train` and :func:`render_image` import torch.
+arguments and files raise a ``LodgsError``. Warnings about files use Python's ``warnings``. Only ``train`` and
+``render_image`` import torch.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 from .errors import LodgsError
 from .lod.selection import BundleSelector, resolve_controls
 from .runs.failures import CANCELLED, DONE
-from .runs.folder import RunFolder
+from .runs.folder import RunFolder, find_splats
 from .runs.job import Job
 from .scenes.cameras import Camera
 from .scenes.colmap import Scene, read_scene
@@ -31,11 +31,11 @@ from .splats.formats import open_as_ply
 from .splats.level_folder import read_folder
 from .splats.levels import Bundle
 
-__all__ = ["FinishedRun", "load_bundle", "load_scene", "render_image", "select", "train"]
+__all__ = ["FinishedRun", "LodgsError", "load_bundle", "load_scene", "render_image", "select", "train"]
 
 AnyPath = str | PathLike[str]
 Event = Mapping[str, Any]
-"""An event of a run, see ``runs.events``: its kind as "event", and further values by name."""
+"""An event of a run, as in its ``events.jsonl``: its kind as "event", and further values by name."""
 
 
 def load_scene(folder: AnyPath, *, model: AnyPath | None = None, images: AnyPath | None = None) -> Scene:
@@ -96,8 +96,8 @@ def train(
     Args:
         scene: folder of a COLMAP scene or of another program's export; "" with the key ``capture``.
         out: run folder. The same call resumes an interrupted run. A finished run is not trained again.
-        progress: receives each event. Events of the kind "progress" have ``step``, ``steps`` and ``psnr`` in
-            dB. Raise KeyboardInterrupt in it to stop.
+        progress: receives each event. Events with ``event["event"] == "progress"`` have ``step``, ``of`` (the
+            number of steps) and ``psnr`` in dB. Raise KeyboardInterrupt in it to stop.
         keys: other keys of a job, such as method, preset, image_scale and parameters, see ``runs.job.Job``.
 
     Raises:
@@ -185,15 +185,7 @@ def load_bundle(path: AnyPath) -> Bundle:
         >>> bundle.levels[0].splats.means.shape
         (5, 3)
     """
-    path = Path(path)
-    run = RunFolder(path)
-    if run.job.exists():
-        if not run.bundle.exists():
-            raise LodgsError(
-                f"Cannot read {path}: the run is not finished (no bundle.ply).", "Train it to the end."
-            )
-        path = run.bundle
-    with open_as_ply(path) as ply:
+    with open_as_ply(find_splats(Path(path))) as ply:
         return read_folder(ply, _warn) if ply.is_dir() else read_bundle(ply, _warn)
 
 

@@ -27,7 +27,7 @@ def scene_camera(scene: bpy.types.Scene) -> bpy.types.Object:
     """Return the active camera object of a scene.
 
     Raises:
-        LodgsError: The scene has no camera.
+        LodgsError: the scene has no camera.
     """
     if scene.camera is None:
         raise LodgsError(
@@ -41,9 +41,9 @@ class RenderView:
     """A camera object in one image of a render. Stereo renders have one for each eye.
 
     Attributes:
-        obj: Evaluated camera object.
-        matrix: Matrix from the camera to Blender's world. Its scale is ignored, as in Blender.
-        shift_x: Horizontal shift of the lens.
+        obj: evaluated camera object.
+        matrix: matrix from the camera to Blender's world. Its scale is ignored, as in Blender.
+        shift_x: horizontal shift of the lens.
     """
 
     obj: bpy.types.Object
@@ -60,7 +60,7 @@ class RenderView:
         """The inverse of the matrix with normalised columns, as Cycles and viewports use it.
 
         Raises:
-            UnsupportedCameraError: The camera has no size.
+            UnsupportedCameraError: the camera has no size.
         """
         _require_size(self.obj, np.array(self.matrix, np.float64))
         return self.matrix.normalized().inverted()
@@ -86,7 +86,7 @@ class RenderView:
             a shear or a mirroring, if the scale of parents or of the camera has this effect. None otherwise.
 
         Raises:
-            UnsupportedCameraError: The object is not a perspective camera, or has no size.
+            UnsupportedCameraError: the object is not a perspective camera, or has no size.
         """
         _require_perspective(self.obj)
         p = self.projection(depsgraph, width, height)
@@ -127,7 +127,7 @@ def view_of(
         The camera for an image of this size, and its clip start.
 
     Raises:
-        UnsupportedCameraError: The object is no perspective camera, has no size, or is sheared or mirrored.
+        UnsupportedCameraError: the object is no perspective camera, has no size, or is sheared or mirrored.
     """
     camera, deformation = RenderView.of(obj).pinhole(depsgraph, width, height)
     if deformation is not None:
@@ -140,7 +140,7 @@ def view_of(
 
 
 def _require_size(obj: bpy.types.Object, matrix: np.ndarray) -> None:
-    """Raise UnsupportedCameraError if the axes of a camera's matrix (4, 4) span no space."""
+    """Raise UnsupportedCameraError if the axes of a camera's matrix (4, 4) are in one plane."""
     lengths = np.linalg.norm(matrix[:3, :3], axis=0)
     if not np.isfinite(matrix).all() or lengths.min() == 0 or np.linalg.cond(matrix[:3, :3] / lengths) > 1e5:
         raise UnsupportedCameraError(
@@ -190,13 +190,13 @@ def view_from(
     """Convert a camera object to a camera in the coordinates of a splat scene's files.
 
     Args:
-        obj: Camera object; None for the active camera of the scene.
+        obj: camera object; None for the active camera of the scene.
 
     Returns:
         The camera and its clip start, in units of the files.
 
     Raises:
-        LodgsError: The scene has no camera, or the root is scaled differently along its axes.
+        LodgsError: the scene has no camera, or the root is scaled differently along its axes.
     """
     obj = obj or scene_camera(depsgraph.scene)
     camera, near = view_of(obj.evaluated_get(depsgraph), depsgraph, width, height)
@@ -206,23 +206,23 @@ def view_from(
 
 def supported_views(
     shots: Iterable[bpy.types.Object | int],
-    see: Callable[[Any], tuple[Camera, float]],
+    view_of_shot: Callable[[Any], tuple[Camera, float]],
     warn: Callable[[str], object],
 ) -> list[tuple[Any, tuple[Camera, float]]]:
-    """Return the shots whose camera LODGS can use with their views, and warn of the others.
+    """Return the shots with supported cameras and their views, and warn of other shots.
 
     Args:
-        shots: Camera objects, or frames of the scene's camera.
-        see: Function that returns the view and the clip start of a shot.
-        warn: Function called with one sentence for each camera that is left out.
+        shots: camera objects, or frames of the scene's camera.
+        view_of_shot: function that returns the view and the clip start of a shot.
+        warn: function called with one sentence for each camera that is left out.
 
     Raises:
-        UnsupportedCameraError: Fewer than two views remain.
+        UnsupportedCameraError: fewer than two views remain.
     """
     views, problems = [], {}
     for shot in shots:
         try:
-            views.append((shot, see(shot)))
+            views.append((shot, view_of_shot(shot)))
         except UnsupportedCameraError as error:
             problems.setdefault(str(error), (error, []))[1].append(shot)
     for error, skipped in problems.values():

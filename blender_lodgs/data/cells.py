@@ -41,27 +41,27 @@ class CellPlan:
     """Plan of a job's cells.
 
     Attributes:
-        job: Job with the planned grid in ``cells``; "" for a single cell.
-        planned: Planned cells.
-        outlines: Corners of each cell; see :func:`outlines`.
-        places: Indices of each cell's views, sorted by name.
+        job: job with the planned grid in ``cells``; "" for a single cell.
+        planned: planned cells.
+        outlines: corners of each cell; see :func:`outlines`.
+        view_indices: indices of each cell's views, sorted by name.
     """
 
     job: Job
     planned: list[PlannedCell]
     outlines: list[tuple[np.ndarray, np.ndarray]]
-    places: list[list[int]]
+    view_indices: list[list[int]]
 
 
 def plan_cells(job: Job, splats: int = 0, memory: int = 0) -> CellPlan:
     """Plan the cells of a job. Takes a while; needs no bpy and may run in a thread.
 
     Args:
-        splats: Maximum number of splats per cell; the job gets the fewest cells within it. 0 for no limit.
-        memory: Maximum number of bytes per cell, in the same way. Without both, the job's own grid is used.
+        splats: maximum number of splats per cell; the job gets the fewest cells within it. 0 for no limit.
+        memory: maximum number of bytes per cell, in the same way. Without both, the job's own grid is used.
 
     Raises:
-        LodgsError: The scene cannot be read or divided into these cells.
+        LodgsError: the scene cannot be read or divided into these cells.
     """
     scene = read_planned_scene(job)
     if splats or memory:
@@ -71,8 +71,8 @@ def plan_cells(job: Job, splats: int = 0, memory: int = 0) -> CellPlan:
         job = replace(job, cells="")
     regions = [cell.region for cell in planned]
     index_of = {name: index for index, name in enumerate(scene.names)}
-    places = [[index_of[name] for name in region.views] for region in regions]
-    return CellPlan(job, planned, outlines(scene, regions), places)
+    view_indices = [[index_of[name] for name in region.views] for region in regions]
+    return CellPlan(job, planned, outlines(scene, regions), view_indices)
 
 
 def outlines(scene: Scene, regions: list[Region]) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -101,12 +101,16 @@ def store_plan(settings: TrainingSettings, cell_plan: CellPlan) -> None:
     settings.columns, settings.rows = cell_plan.job.grid if cell_plan.job.cells else (1, 1)
     resize_cells(settings, len(cell_plan.planned))
     entries = zip(
-        settings.planned_cells, cell_plan.planned, cell_plan.outlines, cell_plan.places, strict=True
+        settings.planned_cells, cell_plan.planned, cell_plan.outlines, cell_plan.view_indices, strict=True
     )
-    for cell, planned, (outline, enlarged), places in entries:
+    for cell, planned, (outline, enlarged), view_indices in entries:
         cell.views, cell.points = planned.views, planned.points
         cell.splats, cell.steps, cell.megabytes = planned.splats, planned.steps, planned.memory / 1e6
-        cell.outline, cell.enlarged, cell.places = outline.ravel(), enlarged.ravel(), json.dumps(places)
+        cell.outline, cell.enlarged, cell.view_indices = (
+            outline.ravel(),
+            enlarged.ravel(),
+            json.dumps(view_indices),
+        )
     settings.planned_for = _plan_key(settings, cell_plan.job)
 
 
@@ -136,8 +140,8 @@ def _plan_key(settings: TrainingSettings, job: Job) -> str:
 
 def cell_cameras(root: bpy.types.Object, cell: TrainingCell) -> tuple[np.ndarray, np.ndarray]:
     """Return positions (V, 3) and frame corners (V, 4, 3) of a cell's existing cameras, in scene units."""
-    places = set(json.loads(cell.places or "[]"))
-    cameras = [view for view in photographs.views(root) if view.data.lodgs.place in places]
+    view_indices = set(json.loads(cell.view_indices or "[]"))
+    cameras = [view for view in photographs.views(root) if view.data.lodgs.place in view_indices]
     poses = np.array([view.matrix_basis for view in cameras], np.float64).reshape(-1, 4, 4)
     half_sizes = [(v.width / v.fx / 2, v.height / v.fy / 2) for v in (view.data.lodgs for view in cameras)]
     frames = [[(-x, y, -1), (x, y, -1), (x, -y, -1), (-x, -y, -1)] for x, y in half_sizes]

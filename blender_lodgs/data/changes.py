@@ -48,14 +48,15 @@ def selecting() -> Iterator[None]:
 
 
 def painting() -> AbstractContextManager[None]:
-    """Mark the changes in the block as paint: :func:`version` changes only for modified objects."""
+    """Mark the changes in the block as paint: :func:`version` changes for objects, not for point clouds."""
     return _limit_reports("paint")
 
 
 @contextmanager
 def _limit_reports(kind: str) -> Iterator[None]:
+    """Mark the changes in the block as changes of a kind, "selection" or "paint"."""
     global _change_kind
-    bpy.context.view_layer.update()  # report earlier changes as such first
+    bpy.context.view_layer.update()  # reports earlier changes under their own kind
     _change_kind = kind
     try:
         yield

@@ -104,7 +104,7 @@ def distance_test(context: bpy.types.Context, root: bpy.types.Object, max_distan
     """Return a test for splats farther than a length in the world from every camera.
 
     Raises:
-        LodgsError: As :func:`cameras`.
+        LodgsError: as :func:`cameras`.
     """
     positions = np.array([camera.center for camera in cameras(context, root)])
     max_distance /= unit_length(root)
@@ -115,7 +115,7 @@ def views_test(context: bpy.types.Context, root: bpy.types.Object, min_views: in
     """Return a test for splats in the frames of fewer than ``least`` cameras.
 
     Raises:
-        LodgsError: As :func:`cameras`.
+        LodgsError: as :func:`cameras`.
     """
     views = cameras(context, root)
     return lambda cloud: cleaning.find_unseen(splat_attribute(cloud, "position"), views, min_views)
@@ -145,7 +145,7 @@ def find_floaters(
     """Find floaters among the splats that are neither hidden nor cropped; see ``cleaning.find_floaters``.
 
     Args:
-        gap: Length in the world; 0 for ``cleaning.default_gap``.
+        gap: length in the world; 0 for ``cleaning.default_gap``.
 
     Returns:
         Masks (N,) bool by level number.
@@ -209,7 +209,7 @@ def extend_selection(
 
     Args:
         strengths: (N,) by level number; splats with values other than 0 are selected.
-        remove: Remove these splats from the selection instead.
+        remove: remove these splats from the selection instead.
 
     Returns:
         The number of selected splats.
@@ -266,7 +266,7 @@ def remaining(root: bpy.types.Object, bundle: Bundle, depsgraph: bpy.types.Depsg
     """Return the levels of a scene without hidden and cropped splats; see ``cleaning.keep_splats``.
 
     Raises:
-        LodgsError: No splat remains.
+        LodgsError: no splat remains.
     """
     cropped, clouds = crops.evaluated_crops(root, depsgraph), {item.number: item for item in levels(root)}
     masks = {
@@ -302,7 +302,7 @@ def cameras(context: bpy.types.Context, root: bpy.types.Object) -> list[Camera]:
     """Return the cameras of a scene, or of the Blender scene if it has none, in the splats' space.
 
     Raises:
-        LodgsError: There are no cameras, or the root is scaled differently along its axes.
+        LodgsError: there are no cameras, or the root is scaled differently along its axes.
     """
     views = photographs.views(root)
     width, height = (context.scene.render.resolution_x, context.scene.render.resolution_y)
@@ -358,7 +358,7 @@ def bounds(root: bpy.types.Object) -> tuple[np.ndarray, np.ndarray]:
     with a margin: flat ground often lies in the outermost layer.
 
     Raises:
-        LodgsError: The scene has neither splats nor points.
+        LodgsError: the scene has neither splats nor points.
     """
     objects = [item.object for item in levels(root)] or [root.lodgs.points]
     if objects[-1] is None:
@@ -404,7 +404,7 @@ def splat_attribute(cloud: bpy.types.PointCloud, name: str) -> np.ndarray:
     """Return a splat attribute without a copy; see ``attributes.view_attribute``.
 
     Raises:
-        LodgsError: The point cloud no longer has the attribute.
+        LodgsError: the point cloud no longer has the attribute.
     """
     values = view_attribute(cloud, name)
     if values is None:

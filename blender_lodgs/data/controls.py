@@ -24,10 +24,10 @@ def update_controls(root: bpy.types.Object, recorded: dict[str, float] | None = 
     """Set controls that the user has not set to recorded values, or to the rule's defaults for the levels.
 
     Args:
-        recorded: Values by name from a bundle or run; None keeps the previous ones.
+        recorded: values by name from a bundle or run; None keeps the previous ones.
 
     Raises:
-        LodgsError: A value is invalid.
+        LodgsError: a value is invalid.
     """
     settings, rule = root.lodgs, find_rule(root.lodgs.rule)
     previous = selection.read_facts(settings.recorded)

@@ -38,7 +38,7 @@ def new_crop(root: bpy.types.Object, shape: str, matrix: Matrix, keep: str = "IN
     """Create a crop.
 
     Args:
-        matrix: World matrix of the box from -1 to 1, or of the sphere of radius 1.
+        matrix: world matrix of the box from -1 to 1, or of the sphere of radius 1.
     """
     name = "Region" if keep == "ALL" else "Crop"
     obj = bpy.data.objects.new(f"{name} {shape.title()}", None)
@@ -69,7 +69,7 @@ def evaluated_crop(obj: bpy.types.Object, to_own: Matrix, depsgraph: bpy.types.D
     """Return the box or sphere of a crop, as evaluated in the depsgraph.
 
     Args:
-        to_own: Matrix from the world to the space of the result.
+        to_own: matrix from the world to the space of the result.
     """
     sphere = obj.empty_display_type == DISPLAY_TYPES["SPHERE"]
     return _crop(to_own, obj, depsgraph, obj.empty_display_size, sphere, obj.lodgs_crop.keep == "OUTSIDE")
@@ -88,7 +88,7 @@ def modifier_crops(
     """Return the crops of an evaluated level's modifier; None if it has no such modifier or it is off.
 
     Args:
-        is_on: Function that returns True for an enabled modifier.
+        is_on: function that returns True for an enabled modifier.
     """
     modifier = modifier_of(evaluated)
     count = groups.crop_count(modifier.node_group) if modifier is not None else None
@@ -135,7 +135,7 @@ def followed_by(obj: bpy.types.Object, count_key: str = groups.COUNT) -> list[bp
     """Return the objects that a level's modifier follows.
 
     Args:
-        count_key: Custom property of the node group with its number of objects.
+        count_key: custom property of the node group with its number of objects.
     """
     modifier = find_modifier(obj, count_key)
     if modifier is None or modifier.node_group is None:
@@ -207,7 +207,7 @@ def read_from(driver: bpy.types.Driver, obj: bpy.types.Object, source: str, with
     """Give a driver the variable ``value``, read from an object's property.
 
     Args:
-        without: Value if the extension, and with it the property, is missing.
+        without: value if the extension, and with it the property, is missing.
     """
     variable = driver.variables.new()
     variable.name, variable.type = "value", "SINGLE_PROP"

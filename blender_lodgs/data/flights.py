@@ -23,13 +23,13 @@ ELEVATION = math.radians(20)
 
 @all_or_nothing()
 def add_path(context: bpy.types.Context, root: bpy.types.Object) -> bpy.types.Object:
-    """Create a camera that moves along a scene's views by name over the frame range.
+    """Create a camera that moves along a scene's views, in the order of their names, over the frame range.
 
     The path is smooth and has constant speed. The camera is a child of the scene's axes and becomes the
     active camera.
 
     Raises:
-        LodgsError: There are fewer than two views, or all are at one position.
+        LodgsError: there are fewer than two views, or all are at one position.
     """
     cameras = pick_evenly(views(root), MAX_KEYS)
     if len(cameras) < 2:
@@ -51,19 +51,19 @@ def add_path(context: bpy.types.Context, root: bpy.types.Object) -> bpy.types.Ob
         camera.location, camera.rotation_quaternion = position, rotation
         for name in ("location", "rotation_quaternion"):
             camera.keyframe_insert(name, frame=begin + float(time) * (end - begin))
-    camera.update_tag(refresh={"TIME"})  # inserting keys left it at the last one
+    camera.update_tag(refresh={"TIME"})  # inserting keyframes left the camera at the last one
     context.scene.camera = camera
     return camera
 
 
 @all_or_nothing()
 def add_turntable(context: bpy.types.Context, root: bpy.types.Object) -> bpy.types.Object:
-    """Create a camera that circles most of a scene once in the frame range, as a seamless loop.
+    """Create a camera that circles the central part of a scene once in the frame range, as a seamless loop.
 
     The camera is a child of an empty at the center and becomes the active camera.
 
     Raises:
-        LodgsError: The scene has neither splats nor points.
+        LodgsError: the scene has neither splats nor points.
     """
     bounds = central_bounds(root)
     if bounds is None:

@@ -28,13 +28,13 @@ def align_to_ground(root: bpy.types.Object, positions: np.ndarray | None = None,
     Args:
         places: (P, 3) three or more points of the ground in Blender's world; None detects the plane below the
             scene.
-        flip: Turn the other side of the ground up.
+        flip: turn the other side of the ground up.
 
     Returns:
         The rotation of the scene in degrees.
 
     Raises:
-        LodgsError: The points define no plane, no ground is detected, or the root is scaled differently along
+        LodgsError: the points define no plane, no ground is detected, or the root is scaled differently along
             its axes.
     """
     placement, up = placement_of(root), np.array([0.0, 0.0, 1.0])
@@ -54,7 +54,7 @@ def scale(root: bpy.types.Object, factor: float) -> None:
     The clip distances of its cameras are scaled along.
 
     Raises:
-        LodgsError: The root is scaled differently along its axes.
+        LodgsError: the root is scaled differently along its axes.
     """
     _leave_edit_mode()
     x, y, _ = root.matrix_world.translation
@@ -105,7 +105,7 @@ def measure_distance(positions: np.ndarray) -> float:
     """Return the distance between two selected positions.
 
     Raises:
-        LodgsError: The number of positions is not two, or they coincide.
+        LodgsError: the number of positions is not two, or they coincide.
     """
     if len(positions) != 2:
         raise LodgsError(

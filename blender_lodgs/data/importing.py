@@ -17,6 +17,7 @@ from ...training.methods import METHODS
 from ...training.scenes.cameras import Camera, camera_extent
 from ...training.scenes.colmap import Scene, read_scene
 from ...training.scenes.formats import ensure_colmap_scene
+from ...training.scenes.triangulate import cached_points
 from ...training.scenes.undistort import cached_undistorted_scene
 from ...training.scenes.view_tables import read_view_tables
 from ...training.splats.bundle import read_bundle, read_header
@@ -49,19 +50,19 @@ def import_colmap(
     If the Blender scene has no camera, the first view becomes its camera and sets the render size.
 
     Args:
-        folder: Folder of the scene or of a model in it, or another program's export, which is converted
+        folder: folder of the scene or of a model in it, or another program's export, which is converted
             (``formats.ensure_colmap_scene``).
-        model: Folder of the model; by default the largest one. Training uses the same one.
-        images: Folder of the photos; by default the one next to the model. Training uses the same one.
-        upright: Rotate the scene so that the cameras' mean up direction is +z; otherwise keep COLMAP's axes.
-        photographs: Show the photo of each view behind it.
-        warn: Function that receives a sentence for each omission or irregularity.
+        model: folder of the model; by default the largest one. Training uses the same one.
+        images: folder of the photos; by default the one next to the model. Training uses the same one.
+        upright: rotate the scene so that the cameras' mean up direction is +z; otherwise keep COLMAP's axes.
+        photographs: show the photo of each view behind it.
+        warn: function that receives a sentence for each omission or irregularity.
 
     Returns:
         The scene root.
 
     Raises:
-        LodgsError: The folder has no readable scene. The file is unchanged in that case.
+        LodgsError: the folder has no readable scene. The file is unchanged in that case.
     """
     model, images = (Path(path) if path else None for path in (model, images))
     scene = _read_photo_scene(context, Path(folder), model, images, warn)
@@ -101,7 +102,7 @@ def _read_photo_scene(
     try:
         if model is None:
             folder = ensure_colmap_scene(folder, warn)
-        scene = read_scene(folder, model, images, manager.progress_update)
+        scene = cached_points(read_scene(folder, model, images, manager.progress_update))
     finally:
         manager.progress_end()
     for message in scene.warnings:
@@ -130,7 +131,7 @@ def _add_views(
     """Add a camera object to a scene for each view; see :func:`new_camera`.
 
     Args:
-        names: Names of all views of the model, in order; if empty, those of ``cameras``.
+        names: names of all views of the model, in order; if empty, those of ``cameras``.
     """
     root.lodgs.cameras = bpy.data.collections.new(f"{root.name} cameras")
     collection_of(root).children.link(root.lodgs.cameras)
@@ -155,16 +156,16 @@ def import_splats(
     """Import a bundle, a folder of levels, or a 3DGS PLY as a single level, as a new splat scene.
 
     Args:
-        budget: See :func:`read_splats_file`.
-        upright: Rotate the scene as the bundle records, or so that -y is up, as in most splat files;
+        budget: see :func:`read_splats_file`.
+        upright: rotate the scene as the bundle records, or so that -y is up, as in most splat files;
             otherwise keep the axes.
-        warn: Function that receives a sentence for each difference from the display of the original program.
+        warn: function that receives a sentence for each difference from the display of the original program.
 
     Returns:
         The scene root.
 
     Raises:
-        LodgsError: The file cannot be read or has invalid values. The file is unchanged in that case.
+        LodgsError: the file cannot be read or has invalid values. The file is unchanged in that case.
     """
     steps = place_splats(context, read_splats_file(path, budget), upright, warn)
     while True:
@@ -179,10 +180,10 @@ class SplatsFile:
     """Contents of a splat file.
 
     Attributes:
-        bundle: Levels; for splats that stay in their file, the coarsest ones.
-        total: Number of splats in such a file; 0 if the bundle has all splats.
-        budget: Maximum number of splats of such a file in memory.
-        warnings: Sentences about differences from the display of the original program.
+        bundle: levels; for splats that stay in their file, the coarsest ones.
+        total: number of splats in such a file; 0 if the bundle has all splats.
+        budget: maximum number of splats of such a file in memory.
+        warnings: sentences about differences from the display of the original program.
     """
 
     path: Path
@@ -199,11 +200,11 @@ def read_splats_file(path: Path | str, budget: int = 0) -> SplatsFile:
     Does not access Blender's data and may run in a thread.
 
     Args:
-        budget: Maximum number of splats of a paged file in memory; 0 for all. Of a larger one, only the
+        budget: maximum number of splats of a paged file in memory; 0 for all. Of a larger one, only the
             coarsest splats are read; LODGS streams finer ones as the camera approaches (``streams``).
 
     Raises:
-        LodgsError: The file cannot be read.
+        LodgsError: the file cannot be read.
     """
     path, warnings, total = Path(path), [], 0
     if path.name == STREAMED_FILE:
@@ -273,7 +274,7 @@ def _fill(root: bpy.types.Object, file: SplatsFile, level_objects: Sequence[bpy.
     """Add a file's levels and metadata to a scene.
 
     Args:
-        level_objects: Object of each level, or None to create one.
+        level_objects: object of each level, or None to create one.
     """
     for level, obj in zip(file.bundle.levels, level_objects, strict=True):
         scenes.put_level(root, level, obj)

@@ -87,7 +87,7 @@ def looks_of(
     """Return the looks of a scene that change anything, as evaluated in the depsgraph, the root's first.
 
     Args:
-        to_own: Matrix from the world to the splats' own space.
+        to_own: matrix from the world to the splats' own space.
     """
     root_look, placed_looks = _read_look(root.evaluated_get(depsgraph).lodgs_look), []
     if root_look != NEUTRAL:
@@ -184,7 +184,7 @@ def _attach(obj: bpy.types.Object, root: bpy.types.Object, regions: list[bpy.typ
             crops.follow(obj, modifier, number, source)
             driver = replace_driver(obj, compat.input_path(modifier, groups.BEYOND.format(number)), "value")
             crops.read_from(driver, source, "lodgs_look.outside", 0.0)
-        for row, name in enumerate(groups.ROWS):
+        for row, name in enumerate(groups.MATRIX_ROWS):
             path = compat.input_path(modifier, name.format(number))
             for column in range(3):
                 driver = replace_driver(obj, path, "value", column)

@@ -42,7 +42,7 @@ def add_to_scene(
         The new scene roots.
 
     Raises:
-        LodgsError: An object is linked, has no splats, or is scaled differently along its axes; or levels of
+        LodgsError: an object is linked, has no splats, or is scaled differently along its axes; or levels of
             one scene differ in position. Nothing is changed then.
     """
     splats = [_read_movable(obj) for obj in clouds]

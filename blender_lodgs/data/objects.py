@@ -70,7 +70,7 @@ def new_points(name: str, positions: np.ndarray, colors: np.ndarray, radius: flo
     Args:
         positions: (P, 3), in the object's own space.
         colors: (P, 3) uint8, sRGB.
-        radius: Display radius in the object's units.
+        radius: display radius in the object's units.
     """
     cloud = compat.new_point_cloud(name, len(positions))
     write_attribute(cloud, "position", "FLOAT_VECTOR", positions)
@@ -107,7 +107,7 @@ def complete_attributes(obj: bpy.types.Object, splats: Splats) -> None:
     """Give a splat object the attributes and modifiers by which LODGS edits, draws and exports it.
 
     Args:
-        splats: Splats of the object, as :func:`read_splats` returns them.
+        splats: splats of the object, as :func:`read_splats` returns them.
     """
     cloud = obj.data
     rename_sh(cloud)
@@ -133,11 +133,11 @@ def read_splats(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = N
     """Return the splats of an object with all edits.
 
     Args:
-        depsgraph: Apply modifiers as evaluated in it, and multiply opacities by their weights; None reads the
+        depsgraph: apply modifiers as evaluated in it, and multiply opacities by their weights; None reads the
             object's data.
 
     Raises:
-        LodgsError: The object has no splat attributes.
+        LodgsError: the object has no splat attributes.
     """
     types = obj.data  # evaluated data keeps no custom properties
     cloud = obj.evaluated_get(depsgraph).data if depsgraph else types
@@ -229,7 +229,7 @@ def read_column(
     """Return the column (N,) stored by :func:`write_column`, or None if the attribute is not such a column.
 
     Args:
-        types: Original datablock with the recorded types; evaluated data have none.
+        types: original datablock with the recorded types; evaluated data have none.
     """
     values, dtype = read_attribute(data, name), types.get(_TYPE + name)
     if values is not None and values.ndim == 2:

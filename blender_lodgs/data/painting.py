@@ -43,7 +43,7 @@ def read_paint(root: bpy.types.Object) -> dict[int, np.ndarray]:
     """Return the paint (N, 4) of each level by number; zeros for levels without paint.
 
     Raises:
-        LodgsError: The levels are only the coarsest splats of a file.
+        LodgsError: the levels are only the coarsest splats of a file.
     """
     file = streams.file_of(root)
     if file is not None:
@@ -66,8 +66,8 @@ def blend(
     """Blend a colour over the paint (N, 4) of each level.
 
     Args:
-        share: Opacity (N,) of the colour by level number.
-        color: Display-coded colour; None for the splats' own colours, which erases paint.
+        share: opacity (N,) of the colour by level number.
+        color: display-coded colour; None for the splats' own colours, which erases paint.
     """
     result = {}
     for number, values in painted.items():

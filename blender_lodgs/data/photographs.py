@@ -42,10 +42,10 @@ def new_camera(
     """Create a camera object of a view in COLMAP's world, not yet in a collection.
 
     Args:
-        extent: Extent of the scene in its own units; sets the display size of the object.
-        near: Depth where splats begin in training and evaluation, in the same units.
-        photograph: Show the view's photo behind it.
-        distorted: The photo has lens distortion.
+        extent: extent of the scene in scene units; sets the display size of the object.
+        near: depth where splats begin in training and evaluation, in scene units.
+        photograph: show the view's photo behind it.
+        distorted: the photo has lens distortion.
     """
     data = bpy.data.cameras.new(camera.name)
     _fit(data, camera, distorted)
@@ -68,8 +68,8 @@ def show_undistorted(
     """Replace the photos of a scene's views by undistorted ones, and adjust the cameras.
 
     Args:
-        names: Names of all views of the model, in order.
-        scene: Undistorted scene; see ``undistort.undistort_scene``.
+        names: names of all views of the model, in order.
+        scene: undistorted scene; see ``undistort.undistort_scene``.
     """
     undistorted = {camera.name: camera for camera in scene.cameras}
     for view in views(root):
@@ -153,14 +153,14 @@ def look_through(context: bpy.types.Context, root: bpy.types.Object, step: int =
     """Make one of the views the active camera and set the render size.
 
     Args:
-        step: Number of views to advance by name from the active camera; 0 takes the active object if it is a
+        step: number of views to advance by name from the active camera; 0 takes the active object if it is a
             view.
 
     Returns:
         The camera object.
 
     Raises:
-        LodgsError: The scene has no cameras.
+        LodgsError: the scene has no cameras.
     """
     cameras = views(root)
     if not cameras:
@@ -181,7 +181,7 @@ def look_at_scene(context: bpy.types.Context, root: bpy.types.Object, warn: Warn
     the scene.
 
     Args:
-        warn: Function that receives a sentence for each mesh that is hidden because it blocks the view from
+        warn: function that receives a sentence for each mesh that is hidden because it blocks the view from
             the photos, such as the cube of a new file.
     """
     viewpoint = photo_viewpoint(root)

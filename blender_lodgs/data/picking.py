@@ -31,12 +31,12 @@ def scene_at(
     Splats are treated as round, with their mean width, and sorted by their means.
 
     Args:
-        viewport: See ``shown.splat_instances``.
-        view: Matrix from the world to the camera's space.
-        projection: Matrix from the camera's space to clip space.
-        size: Size (W, H) of the viewport in pixels.
-        at: Pixel, x from the left and y from below.
-        before: Depth in the world beyond which splats are occluded at the pixel.
+        viewport: see ``shown.splat_instances``.
+        view: matrix from the world to the camera's space.
+        projection: matrix from the camera's space to clip space.
+        size: size (W, H) of the viewport in pixels.
+        at: pixel, x from the left and y from below.
+        before: depth in the world beyond which splats are occluded at the pixel.
 
     Returns:
         None if the splats at the pixel hide less than half of the background.

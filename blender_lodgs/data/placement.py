@@ -56,10 +56,10 @@ def matrix_of(root: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = No
     """Return the (4, 4) float64 matrix from a splat scene's coordinates to Blender's world, unrounded.
 
     Args:
-        depsgraph: Use the evaluated transform; None for the original one.
+        depsgraph: use the evaluated transform; None for the original one.
 
     Raises:
-        LodgsError: The root is scaled differently along its axes.
+        LodgsError: the root is scaled differently along its axes.
     """
     axes = axes_of(root)
     evaluated = axes.evaluated_get(depsgraph) if depsgraph else axes
@@ -76,7 +76,7 @@ def placement_of(root: bpy.types.Object) -> Similarity:
     """Return the transform of :func:`matrix_of` with exactly orthogonal axes.
 
     Raises:
-        LodgsError: The root is scaled differently along its axes.
+        LodgsError: the root is scaled differently along its axes.
     """
     return Similarity.from_matrix(_orthogonal(matrix_of(root)))
 
@@ -85,7 +85,7 @@ def move(root: bpy.types.Object, further: Similarity) -> None:
     """Apply a transform in Blender's world to a splat scene; the root stays unchanged.
 
     Raises:
-        LodgsError: The root is scaled differently along its axes.
+        LodgsError: the root is scaled differently along its axes.
     """
     placement = further.compose(placement_of(root))
     axes_of(root).matrix_world = Matrix(placement.matrix.tolist())

@@ -18,7 +18,7 @@ def roots(scene: bpy.types.Scene) -> list[bpy.types.Object]:
 
 
 def active_root(context: bpy.types.Context) -> bpy.types.Object | None:
-    """Return the root of the active object's splat scene, or the only root of the Blender scene."""
+    """Return the root of the active object's splat scene, or else the only root of the Blender scene."""
     root = root_of(context.active_object)
     candidates = [root] if root is not None else roots(context.scene)
     return candidates[0] if len(candidates) == 1 else None
@@ -26,23 +26,23 @@ def active_root(context: bpy.types.Context) -> bpy.types.Object | None:
 
 def shows_splats(scene: bpy.types.Scene) -> bool:
     """Return True if a Blender scene has splat scenes, also in collection instances."""
-    return bool(roots(scene)) or any(map(_instanced, scene.objects))
+    return bool(roots(scene)) or any(map(_instanced_roots, scene.objects))
 
 
 def shows_levels(scene: bpy.types.Scene) -> bool:
     """Return True if a Blender scene has levels of splats, also in collection instances."""
     has_levels = any(item.exists for root in roots(scene) for item in root.lodgs.levels)
-    return has_levels or any(map(_instanced, scene.objects))
+    return has_levels or any(map(_instanced_roots, scene.objects))
 
 
-def linked(context: bpy.types.Context) -> bool:
+def is_linked(context: bpy.types.Context) -> bool:
     """Return True if the active splat scene, or one in the selected instance, is linked from another file."""
     root, obj = active_root(context), context.active_object
-    candidates = [root] if root is not None else [] if obj is None else _instanced(obj)
+    candidates = [root] if root is not None else [] if obj is None else _instanced_roots(obj)
     return any(not candidate.is_editable for candidate in candidates)
 
 
-def _instanced(obj: bpy.types.Object) -> list[bpy.types.Object]:
+def _instanced_roots(obj: bpy.types.Object) -> list[bpy.types.Object]:
     """Return the roots in the collection that an object is an instance of."""
     collection = obj.instance_collection if obj.instance_type == "COLLECTION" else None
     return [] if collection is None else [member for member in collection.all_objects if member.lodgs.is_root]

@@ -161,9 +161,9 @@ def _control_group(rule: Rule) -> type[bpy.types.PropertyGroup]:
         if control.flag:
             return bpy.props.BoolProperty(default=bool(control.default), **options)
         soft = control.soft or (control.low, control.high)
-        number = int if control.whole else float
-        make = bpy.props.IntProperty if control.whole else bpy.props.FloatProperty
-        options |= {"step": control.step} if control.whole else {}
+        number = int if control.integer else float
+        make = bpy.props.IntProperty if control.integer else bpy.props.FloatProperty
+        options |= {"step": control.step} if control.integer else {}
         return make(
             subtype=control.unit, default=number(control.default),
             min=number(control.low), max=number(control.high),
@@ -242,7 +242,7 @@ class SplatScene(bpy.types.PropertyGroup):
     )
     camera_center: bpy.props.FloatVectorProperty(
         name="Mean Training Camera",
-        description="Mean position of the training cameras, in the scene's own units",
+        description="Mean position of the training cameras, in scene units",
         size=3,
         subtype="XYZ",
         precision=4,
@@ -312,7 +312,7 @@ class SplatScene(bpy.types.PropertyGroup):
     )
     held_eye: bpy.props.FloatVectorProperty(
         name="Frozen Position",
-        description="Frozen camera position, or the last one of the viewport, in the scene's own units",
+        description="Frozen camera position, or the last one of the viewport, in scene units",
         size=3,
         subtype="XYZ",
         update=_camera_input_changed,

@@ -36,7 +36,7 @@ def set_bundle_facts(root: bpy.types.Object, bundle: Bundle) -> None:
     levels or levels without splats.
 
     Raises:
-        LodgsError: A recorded value is invalid or contradicts the rule. Nothing is changed in that case.
+        LodgsError: a recorded value is invalid or contradicts the rule. Nothing is changed in that case.
     """
     settings, rule = root.lodgs, check_rule(bundle)
     for control in rule.controls if rule else ():
@@ -102,7 +102,7 @@ def prepare_refill(root: bpy.types.Object, number: int) -> None:
     """Remove tables, streaming and all levels but one, whose object the first new level reuses.
 
     Args:
-        number: Number of that level. If there is none of this number, the finest level takes it.
+        number: number of that level. If there is none of this number, the finest level takes it.
     """
     tables.remove_tables(root)
     streams.stop_streaming(root)
@@ -126,13 +126,13 @@ def read_levels(root: bpy.types.Object, placed: bool = False, looked: bool = Fal
     """Return the edited levels of a splat scene, without modifiers, hidden splats and cropped splats.
 
     Args:
-        placed: Apply the scene's placement in Blender, so that the result is upright; otherwise use the
+        placed: apply the scene's placement in Blender, so that the result is upright; otherwise use the
             splats' own world. Transforms of single level objects are ignored.
-        looked: Apply paint and looks (``looks``); otherwise return trained colours, with paint in separate
+        looked: apply paint and looks (``looks``); otherwise return trained colours, with paint in separate
             columns.
 
     Raises:
-        LodgsError: There are no levels, or crops remove all splats; for a placed bundle also if the root is
+        LodgsError: there are no levels, or crops remove all splats; for a placed bundle also if the root is
             scaled differently along its axes or the rule is unknown.
     """
     levels = [
@@ -163,7 +163,7 @@ def view_tables(root: bpy.types.Object, placed: bool = False) -> dict[str, dict[
     """Return a scene's views as tables of its bundle, in their original order.
 
     Args:
-        placed: See :func:`read_levels`.
+        placed: see :func:`read_levels`.
     """
     cameras = sorted(
         (view for view in views(root) if view.data.lodgs.width), key=lambda view: view.data.lodgs.place
@@ -185,7 +185,7 @@ def delete_excluded(root: bpy.types.Object) -> int:
         The number of deleted splats.
 
     Raises:
-        LodgsError: As :func:`read_levels`, or the levels are only the coarsest splats of a file.
+        LodgsError: as :func:`read_levels`, or the levels are only the coarsest splats of a file.
     """
     file = streams.file_of(root)
     if file is not None:
@@ -212,11 +212,11 @@ def read_level(root: bpy.types.Object, number: int, placed: bool = False, looked
     """Return one edited level; if levels are cumulative, with all coarser ones.
 
     Args:
-        placed: See :func:`read_levels`.
-        looked: See :func:`read_levels`.
+        placed: see :func:`read_levels`.
+        looked: see :func:`read_levels`.
 
     Raises:
-        LodgsError: The level does not exist or is not a complete scene; or as :func:`read_levels`.
+        LodgsError: the level does not exist or is not a complete scene; or as :func:`read_levels`.
     """
     bundle = read_levels(root, placed, looked)
     for level in bundle.levels:
@@ -236,11 +236,11 @@ def visible_splats(
     Columns that some visible levels lack are dropped.
 
     Args:
-        placed: See :func:`read_levels`.
-        looked: See :func:`read_levels`.
+        placed: see :func:`read_levels`.
+        looked: see :func:`read_levels`.
 
     Raises:
-        LodgsError: No splats are visible, or the levels differ in their degree of spherical harmonics; for
+        LodgsError: no splats are visible, or the levels differ in their degree of spherical harmonics; for
             placed splats also if the root is scaled differently along its axes.
     """
     with _without_native_drawing(context):
@@ -304,7 +304,7 @@ def show_only(root: bpy.types.Object, number: int) -> None:
     """Show one level everywhere; if levels are cumulative, with all coarser ones.
 
     Raises:
-        LodgsError: The level is not a complete scene.
+        LodgsError: the level is not a complete scene.
     """
     _require_complete(root, number)
     root.lodgs.mode, root.lodgs.single_level = "SINGLE", number
@@ -347,7 +347,7 @@ def put_level(
     """Add or replace a level's object and list entry, without updating list-wide settings and drivers.
 
     Args:
-        level_object: New object with the level's splats, in no collection; None to create it.
+        level_object: new object with the level's splats, in no collection; None to create it.
     """
     settings = root.lodgs
     new_object = level_object or objects.new_splats("", painting.transfer(root, level).splats)

@@ -302,10 +302,10 @@ def _drive(
     """Drive a property by an expression of the root's properties.
 
     Args:
-        index: Component of a vector.
-        without: Fallback values by name if the extension, and with it the properties, is missing; 0 by
+        index: component of a vector.
+        without: fallback values by name if the extension, and with it the properties, is missing; 0 by
             default.
-        sources: Paths in ``lodgs`` by variable name.
+        sources: paths in ``lodgs`` by variable name.
     """
     driver = replace_driver(obj, path, expression, index)
     for name, source in sources.items():

@@ -27,14 +27,14 @@ class SplatInstance:
     """A visible object with splats, or an instance of one.
 
     Attributes:
-        object: Original object.
-        evaluated: Evaluated object; valid until the depsgraph is evaluated again.
+        object: original object.
+        evaluated: evaluated object; valid until the depsgraph is evaluated again.
         matrix_world: (4, 4) float64, from the splats' space to Blender's world.
-        level: Number of the level in its splat scene, 1 is the coarsest; 0 for splats that are not a level.
-        antialias: See ``SplatScene.antialias``.
-        source: File with finer splats of the scene. All levels of the scene are then instances with this
+        level: number of the level in its splat scene, 1 is the coarsest; 0 for splats that are not a level.
+        antialias: see ``SplatScene.antialias``.
+        source: file with finer splats of the scene. All levels of the scene are then instances with this
             source, and streamed splats replace them at the finest one.
-        looks: See ``looks.looks_of``.
+        looks: see ``looks.looks_of``.
     """
 
     object: bpy.types.Object
@@ -80,7 +80,7 @@ def splat_instances(
     ``depsgraph.mode``.
 
     Args:
-        viewport: Exclude objects that this viewport hides by local view or object type.
+        viewport: exclude objects that this viewport hides by local view or object type.
     """
     if not any(is_splats(cloud) for cloud in bpy.data.pointclouds):
         return []

@@ -26,12 +26,12 @@ class Source:
 
     Attributes:
         scene: ``session_uid`` of the root.
-        path: Bundle.
-        total: Number of splats in the bundle.
-        budget: Maximum number of streamed splats in memory, in addition to those of the scene's objects.
-        here: Number of splats in the scene's objects.
-        level: Number of the finest level; streamed splats replace it.
-        begun: Counter that changes when the file may have been replaced.
+        path: bundle.
+        total: number of splats in the bundle.
+        budget: maximum number of streamed splats in memory, in addition to those of the scene's objects.
+        here: number of splats in the scene's objects.
+        level: number of the finest level; streamed splats replace it.
+        begun: counter that changes when the file may have been replaced.
     """
 
     scene: int

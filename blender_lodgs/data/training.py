@@ -113,14 +113,14 @@ class TrainingCell(bpy.types.PropertyGroup):
     steps: bpy.props.IntProperty(name="Steps", description="Number of training steps")
     megabytes: bpy.props.FloatProperty(name="Memory", description="Estimated memory of its training, in MB")
     outline: bpy.props.FloatVectorProperty(
-        name="Outline", description="Corners of the cell on the ground, in the scene's own units", size=12
+        name="Outline", description="Corners of the cell on the ground, in scene units", size=12
     )
     enlarged: bpy.props.FloatVectorProperty(
         name="Training Area",
-        description="Corners of the area that its training covers, in the scene's own units",
+        description="Corners of the area that its training covers, in scene units",
         size=12,
     )
-    places: bpy.props.StringProperty(
+    view_indices: bpy.props.StringProperty(
         name="View Indices", description="Indices of its views, sorted by name, as JSON", options={"HIDDEN"}
     )
 
@@ -170,7 +170,7 @@ class TrainingSettings(viewpoints.ViewsSettings, bpy.types.PropertyGroup):
     )
     median_depth: bpy.props.FloatProperty(
         name="Median Depth",
-        description="Median depth of the photos, in the scene's own units. 0 if unknown",
+        description="Median depth of the photos, in scene units. 0 if unknown",
         options={"HIDDEN"},
     )
     image_scale: property_of(KEYS["image_scale"], min=0.01)

@@ -154,11 +154,11 @@ def training_views(
     Empty for a dome, which the trainer places.
 
     Args:
-        splats: Finest level of the root.
-        warn: Function called with a sentence for each camera that is left out.
+        splats: finest level of the root.
+        warn: function called with a sentence for each camera that is left out.
 
     Raises:
-        LodgsError: There are fewer than two cameras, no curve or a curve of length 0; or the root is scaled
+        LodgsError: there are fewer than two cameras, no curve or a curve of length 0; or the root is scaled
             differently along its axes.
     """
     settings = root.lodgs.training
@@ -178,9 +178,9 @@ def training_views(
             )
             return [view for _, view in views]
         case "CURVE":
-            world_to_own = np.linalg.inv(matrix_of(root))
-            points = _curve_points(settings.curve) @ world_to_own[:3, :3].T + world_to_own[:3, 3]
-            views, near = walk_views(splats, points, world_to_own[:3, 2], settings.views, width, height)
+            world_to_root = np.linalg.inv(matrix_of(root))
+            points = _curve_points(settings.curve) @ world_to_root[:3, :3].T + world_to_root[:3, 3]
+            views, near = walk_views(splats, points, world_to_root[:3, 2], settings.views, width, height)
             return [(view, near) for view in views]
         case "GRID":
             views, near = _aerial_views(root, opaque_means(splats), settings, width, height)
@@ -192,10 +192,10 @@ def capture_shots(context: bpy.types.Context, width: int, height: int, warn: War
     """Return the shots of a Blender scene according to its settings (``Scene.lodgs_capture``).
 
     Args:
-        warn: Function called with a sentence for each camera that is left out.
+        warn: function called with a sentence for each camera that is left out.
 
     Raises:
-        LodgsError: There are fewer than two cameras that LODGS can use, no curve or a curve of length 0; the
+        LodgsError: there are fewer than two cameras that LODGS can use, no curve or a curve of length 0; the
             camera does not move; or the scene is empty.
     """
     return [shot for shot, _ in _shots_with_views(context, width, height, warn)]
@@ -205,7 +205,7 @@ def capture_views(context: bpy.types.Context, width: int, height: int) -> list[t
     """Return the views and near depths of the shots of :func:`capture_shots`, in Blender's world.
 
     Raises:
-        LodgsError: As :func:`capture_shots`.
+        LodgsError: as :func:`capture_shots`.
     """
     return [view for _, view in _shots_with_views(context, width, height, _ignore)]
 
@@ -213,7 +213,7 @@ def capture_views(context: bpy.types.Context, width: int, height: int) -> list[t
 def _shots_with_views(
     context: bpy.types.Context, width: int, height: int, warn: Warn
 ) -> Sequence[tuple[Shot, tuple[Camera, float]]]:
-    def see(depsgraph: bpy.types.Depsgraph, camera: bpy.types.Object) -> tuple[Camera, float]:
+    def evaluated_view(depsgraph: bpy.types.Depsgraph, camera: bpy.types.Object) -> tuple[Camera, float]:
         return view_of(camera.evaluated_get(depsgraph), depsgraph, width, height)
 
     scene, settings = context.scene, context.scene.lodgs_capture
@@ -221,10 +221,12 @@ def _shots_with_views(
         case "CAMERAS":
             cameras = _require_two([obj for obj in _cameras(scene) if root_of(obj) is None])
             depsgraph = context.evaluated_depsgraph_get()
-            return supported_views(cameras, lambda camera: see(depsgraph, camera), warn)
+            return supported_views(cameras, lambda camera: evaluated_view(depsgraph, camera), warn)
         case "ANIMATION":
             frames = _frames(scene, settings.views)
-            return _animated(context, frames, lambda depsgraph: see(depsgraph, scene_camera(scene)), warn)
+            return _animated(
+                context, frames, lambda depsgraph: evaluated_view(depsgraph, scene_camera(scene)), warn
+            )
     views, near = placed_capture_views(context, width, height)
     return [((view, near), (view, near)) for view in views]
 
@@ -238,7 +240,7 @@ def placed_capture_views(
     are used.
 
     Raises:
-        LodgsError: There is no object or no curve.
+        LodgsError: there is no object or no curve.
     """
     settings = context.scene.lodgs_capture
     match settings.views_from:
@@ -280,7 +282,7 @@ def _corners(context: bpy.types.Context) -> np.ndarray:
     """Return the corners (8 N, 3) of the bounding boxes of the selection, or of all rendered objects.
 
     Raises:
-        LodgsError: There are no objects.
+        LodgsError: there are no objects.
     """
     depsgraph = context.evaluated_depsgraph_get()
     objects = [obj for obj in context.view_layer.objects if root_of(obj) is None]
@@ -298,7 +300,7 @@ def _boxes(
     """Yield the bounding-box corners (8, 3) of each rendered object, also in collection instances.
 
     Args:
-        placed: Transform of the collection instance.
+        transform: transform of the collection instance.
     """
     for obj in objects:
         if obj.hide_render:
@@ -320,7 +322,7 @@ def preview_views(root: bpy.types.Object) -> list[Camera]:
     They are in the splats' world.
 
     Raises:
-        LodgsError: There are no opaque splats or no curve.
+        LodgsError: there are no opaque splats or no curve.
     """
     settings = root.lodgs.training
     match settings.views_from:
@@ -330,9 +332,9 @@ def preview_views(root: bpy.types.Object) -> list[Camera]:
             key = *_finest_cloud(root)[1:], settings.views, settings.height, matrix_of(root).tobytes()
             return _cached("above", key, lambda: _aerial_views(root, _sample_positions(root), settings)[0])
         case "CURVE":
-            world_to_own = np.linalg.inv(matrix_of(root))
-            points = _curve_points(settings.curve) @ world_to_own[:3, :3].T + world_to_own[:3, 3]
-            return views_along(points, world_to_own[:3, 2], settings.views, 3, 2)
+            world_to_root = np.linalg.inv(matrix_of(root))
+            points = _curve_points(settings.curve) @ world_to_root[:3, :3].T + world_to_root[:3, 3]
+            return views_along(points, world_to_root[:3, 2], settings.views, 3, 2)
     return []
 
 
@@ -342,7 +344,7 @@ def preview_dome(root: bpy.types.Object) -> tuple[list[Camera], tuple[float, flo
     The dome is computed from a sample of the splats.
 
     Raises:
-        LodgsError: There are no opaque splats.
+        LodgsError: there are no opaque splats.
     """
     count = root.lodgs.training.views
     views, near = _cached(
@@ -370,8 +372,13 @@ def _sample_positions(root: bpy.types.Object) -> np.ndarray:
 def _aerial_views(
     root: bpy.types.Object, points: np.ndarray, settings: Any, width: int = 3, height: int = 2
 ) -> tuple[list[Camera], float]:
-    """Return views above points (N, 3), along Blender's up axis, and their near depth; all in the root's
-    world."""
+    """Return views above points and their near depth, in the root's coordinates.
+
+    The views are above the points in the direction of Blender's z axis.
+
+    Args:
+        points: (N, 3) in the root's coordinates.
+    """
     matrix = matrix_of(root)
     views, near = aerial_views(
         points @ matrix[:3, :3].T + matrix[:3, 3], settings.views, width, height, settings.height
@@ -406,7 +413,7 @@ def _require_two(cameras: list[bpy.types.Object]) -> list[bpy.types.Object]:
     """Return the cameras.
 
     Raises:
-        LodgsError: There are fewer than two.
+        LodgsError: there are fewer than two.
     """
     if len(cameras) < MIN_VIEWS:
         raise LodgsError(
@@ -425,22 +432,25 @@ def _frames(scene: bpy.types.Scene, count: int) -> list[int]:
 def _animated(
     context: bpy.types.Context,
     frames: Sequence[int],
-    see: Callable[[bpy.types.Depsgraph], tuple[Camera, float]],
+    view_in: Callable[[bpy.types.Depsgraph], tuple[Camera, float]],
     warn: Warn,
 ) -> list[tuple[int, tuple[Camera, float]]]:
-    """Return frames of the scene with the results of ``see``, as :func:`supported_views`.
+    """Return frames of the scene with their views, as :func:`supported_views`.
+
+    Args:
+        view_in: returns the view in an evaluated depsgraph.
 
     Raises:
-        LodgsError: The camera does not move, or cannot be used.
+        LodgsError: the camera does not move, or cannot be used.
     """
     scene, frame, subframe = context.scene, context.scene.frame_current, context.scene.frame_subframe
 
-    def see_at(number: int) -> tuple[Camera, float]:
+    def view_at(number: int) -> tuple[Camera, float]:
         scene.frame_set(number)
-        return see(context.evaluated_depsgraph_get())
+        return view_in(context.evaluated_depsgraph_get())
 
     try:
-        views = supported_views(frames, see_at, warn)
+        views = supported_views(frames, view_at, warn)
     finally:
         scene.frame_set(frame, subframe=subframe)
     if not np.ptp([view.world_to_camera for _, (view, _) in views], axis=0).any():
@@ -455,7 +465,7 @@ def _curve_points(curve: bpy.types.Object | None) -> np.ndarray:
     """Return the points (P, 3) of a curve in Blender's world, at display resolution.
 
     Raises:
-        LodgsError: There is no curve, or it does not have one spline.
+        LodgsError: there is no curve, or it does not have one spline.
     """
     if curve is None:
         raise LodgsError("Cannot place views: no curve is chosen.", "Choose a curve, or choose other views.")
@@ -465,7 +475,7 @@ def _curve_points(curve: bpy.types.Object | None) -> np.ndarray:
             "Choose another curve, or join its splines.",
         )
     corners = _cached(
-        "way", (curve.data.session_uid, changes.version(curve.data)), lambda: _tessellate(curve)
+        "curve", (curve.data.session_uid, changes.version(curve.data)), lambda: _tessellate(curve)
     )
     matrix = np.array(curve.matrix_world, np.float64)
     return corners @ matrix[:3, :3].T + matrix[:3, 3]

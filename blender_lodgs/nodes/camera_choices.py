@@ -64,9 +64,9 @@ def position_expression(source: str, freeze: str) -> str:
         source: variable with the index of the choice.
         freeze: variable that is true for a frozen camera.
     """
-    others = [
+    branches = [
         f"{choice.position} if {source} == {number} else "
         for number, choice in enumerate(CHOICES)
         if choice.position not in ("", STORED_POSITION)
     ]
-    return f"{STORED_POSITION} if {freeze} else {''.join(others)}{STORED_POSITION}"
+    return f"{STORED_POSITION} if {freeze} else {''.join(branches)}{STORED_POSITION}"

@@ -19,11 +19,11 @@ from .crops import OBJECT, SIZE, SPHERE, USE, inside_crop
 COUNT = "lodgs_looks"
 """Custom property of these groups: their number of regions with a local look."""
 NAME = "LODGS Look"
-ROWS, OPACITY, BEYOND = ("red_{}", "green_{}", "blue_{}"), "opacity_{}", "beyond_{}"
-"""Sockets of each look: the rows of its colour matrix, and its opacity factor. Look 0 applies everywhere. The
-looks of regions follow from 1: they also have the sockets of a crop, and a flag that is 1 if the look applies
-outside the region."""
-HIGHER = "lodgs_higher_sh"
+MATRIX_ROWS, OPACITY, BEYOND = ("red_{}", "green_{}", "blue_{}"), "opacity_{}", "beyond_{}"
+"""Sockets of each look: the rows of its colour matrix, its opacity factor, and a flag that is 1 if the look
+applies outside its region. Look 0 applies everywhere and has no flag. The looks of regions are numbered from
+1 and also have the sockets of a crop."""
+HIGHER_SH = "lodgs_higher_sh"
 """Custom property of these groups: number of SH coefficients above degree 0 that they change."""
 _VERSION = 3
 
@@ -39,28 +39,28 @@ def look_group(count: int, higher: int) -> bpy.types.GeometryNodeTree:
     higher = changed_sh(higher)
 
     def build(nodes: Nodes) -> None:
-        nodes.tree[COUNT], nodes.tree[HIGHER] = count, higher
+        nodes.tree[COUNT], nodes.tree[HIGHER_SH] = count, higher
         for number in range(count + 1):
             _add_sockets(nodes.tree, number)
         sockets = nodes.add("NodeGroupInput").outputs
         position = nodes.add("GeometryNodeInputPosition").outputs["Position"]
         color = _painted_color(nodes)
         opacity = nodes.field(sockets[OPACITY.format(0)])
-        color = _mapped(nodes, sockets, 0, color)
-        rows = [sockets[row.format(0)] for row in ROWS]
+        color = _apply_matrix(nodes, sockets, 0, color)
+        rows = [sockets[row.format(0)] for row in MATRIX_ROWS]
         for number in range(1, count + 1):
-            enabled, beyond = (nodes.field(sockets[name.format(number)]) for name in (USE, BEYOND))
+            enabled, outside = (nodes.field(sockets[name.format(number)]) for name in (USE, BEYOND))
             inside = inside_crop(nodes, sockets, number, position)
-            affected = enabled & (beyond > 0.5).where(1.0 - inside, inside)
-            mapped = _mapped(nodes, sockets, number, color)
+            affected = enabled & (outside > 0.5).where(1.0 - inside, inside)
+            mapped = _apply_matrix(nodes, sockets, number, color)
             color = [affected.where(new, old) for new, old in zip(mapped, color, strict=True)]
             opacity = opacity * affected.where(nodes.field(sockets[OPACITY.format(number)]), 1.0)
             if compat.NATIVE_SPLATS:
-                local = [sockets[row.format(number)] for row in ROWS]
+                local = [sockets[row.format(number)] for row in MATRIX_ROWS]
                 rows = _product_where(nodes, affected, local, rows)
         display_color = nodes.add("FunctionNodeCombineColor")
         for socket, channel in zip(display_color.inputs, color, strict=False):
-            nodes.tree.links.new(_linear(channel.clip(0.0, 1.0)).socket, socket)
+            nodes.tree.links.new(_linear_from_srgb(channel.clip(0.0, 1.0)).socket, socket)
         points = sockets["Geometry"]
         for name, kind, value in (
             (COLOR, "FLOAT_COLOR", display_color.outputs["Color"]),
@@ -96,13 +96,13 @@ def is_current(tree: bpy.types.NodeTree | None, count: int, higher: int) -> bool
     return (
         tree is not None
         and tree.get(COUNT) == count
-        and tree.get(HIGHER) == changed_sh(higher)
+        and tree.get(HIGHER_SH) == changed_sh(higher)
         and tree.get(VERSION) == _VERSION
     )
 
 
 def _add_sockets(tree: bpy.types.GeometryNodeTree, number: int) -> None:
-    kinds = dict.fromkeys(ROWS, "NodeSocketVector") | {OPACITY: "NodeSocketFloat"}
+    kinds = dict.fromkeys(MATRIX_ROWS, "NodeSocketVector") | {OPACITY: "NodeSocketFloat"}
     if number:
         kinds |= {OBJECT: "NodeSocketObject"} | dict.fromkeys((SIZE, SPHERE, USE, BEYOND), "NodeSocketFloat")
     for name, kind in kinds.items():
@@ -118,14 +118,14 @@ def _painted_color(nodes: Nodes) -> list[Field]:
     return [(1.0 - amount) * channel + coat for channel, coat in zip(base, paint, strict=True)]
 
 
-def _mapped(nodes: Nodes, sockets, number: int, color: list[Field]) -> list[Field]:
+def _apply_matrix(nodes: Nodes, sockets, number: int, color: list[Field]) -> list[Field]:
     """Multiply a colour by the matrix of a look."""
     vector = nodes.add("ShaderNodeCombineXYZ")
     for channel, axis in zip(color, "XYZ", strict=True):
         nodes.link(channel.socket, vector, axis)
     return [
         nodes.field(nodes.vector("DOT_PRODUCT", sockets[row.format(number)], vector.outputs["Vector"]))
-        for row in ROWS
+        for row in MATRIX_ROWS
     ]
 
 
@@ -192,6 +192,6 @@ def _changed_harmonics(
     return points
 
 
-def _linear(srgb: Field) -> Field:
+def _linear_from_srgb(srgb: Field) -> Field:
     """Convert sRGB to linear, as ``training.scenes.color.linear_from_srgb``."""
     return (srgb > 0.04045).where(((srgb + 0.055) / 1.055).power(2.4), srgb / 12.92)

@@ -19,7 +19,7 @@ class LODGS_PT_capture(Panel):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return roots.active_root(context) is None and not roots.linked(context)
+        return roots.active_root(context) is None and not roots.is_linked(context)
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, work = self.layout, background_capture.current

@@ -19,7 +19,7 @@ class LODGS_PT_scene(Panel):
         if native.loose_splats(context):
             layout.operator("lodgs.add_to_scene", icon="ADD")
         _draw_import(layout, another=roots.shows_splats(context.scene))
-        if roots.linked(context):
+        if roots.is_linked(context):
             say(layout, roots.LINKED, "LINKED")
         if root is None:
             if roots.roots(context.scene):

@@ -196,7 +196,7 @@ def holdout_file(scene: bpy.types.Scene, frame: int) -> Path | None:
     if not path.is_file():
         raise LodgsError(
             f"Cannot hold out meshes: the depth file of frame {frame} is missing: {path}.",
-            "Press Render Mesh Depth (for all frames, the button beside it), or clear Hold Out.",
+            "Press Render Mesh Depth (for all frames, the button next to it), or clear Hold Out.",
         )
     return path
 

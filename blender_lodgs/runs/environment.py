@@ -28,7 +28,10 @@ TIMEOUT = 60.0
 READY = "lodgs-ready.json"
 """File in an environment that is completely installed and tested."""
 
-_REMEDY = "Press Install Trainer in the preferences of LODGS, or choose another Python there."
+_REMEDY = (
+    "Press Install Trainer in the preferences of LODGS, or choose another Python there or in the environment "
+    f"variable {VARIABLE}."
+)
 
 
 @dataclass
@@ -82,7 +85,8 @@ def trainer_python() -> Path:
         return python_of(newest)
     raise LodgsError(
         "The trainer is not installed.",
-        "Press Install Trainer in the preferences of LODGS.",
+        "Press Install Trainer in the preferences of LODGS, or set the environment variable "
+        f"{VARIABLE} to a Python with the wheel of LODGS.",
     )
 
 

@@ -1,6 +1,7 @@
 """Training runs from Blender: start, follow, cancel, resume and attach.
 
-A run continues when Blender closes. Opening the .blend file attaches to it again by its folder.
+A run continues when Blender's window closes. Opening the .blend file attaches to it again by its folder. In
+background, the trainer saves and stops when Blender ends.
 """
 
 from __future__ import annotations

@@ -13,6 +13,7 @@ from typing import Any
 
 import bpy
 
+from ...training.runs.processes import PARENT, identity
 from .. import extension
 
 if sys.platform != "win32":
@@ -31,16 +32,18 @@ MARK = "lodgs-in-use"
 def environment() -> dict[str, str]:
     """Return environment variables for another Python, without those that Blender set for its own.
 
-    Compiled code goes to the user's folder, because the extension's folder may be read-only.
+    Python's compiled files go to the user's folder, because the extension's folder may be read-only. Programs
+    of a Blender without a window stop when Blender ends.
     """
     values = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "__PYVENV_LAUNCHER__"))}
-    cache = extension.user_folder("cache")
-    values.setdefault("NUMBA_CACHE_DIR", str(cache / "numba"))
-    return values | {"PYTHONPYCACHEPREFIX": str(cache / "pycache"), "PYTHONUTF8": "1"}
+    if bpy.app.background:
+        values[PARENT] = f"{os.getpid()} {identity(os.getpid())}"
+    compiled = extension.user_folder("cache") / "pycache"
+    return values | {"PYTHONPYCACHEPREFIX": str(compiled), "PYTHONUTF8": "1"}
 
 
 def spawn(command: list[str], log: Path, output: Path) -> subprocess.Popen:
-    """Start a program that may outlive Blender, in the extension's folder.
+    """Start a program that may outlive Blender's window, in the extension's folder.
 
     Args:
         command: program and arguments.

@@ -24,11 +24,11 @@ def read_findings(root: bpy.types.Object) -> Callable[[], list[Finding]]:
     settings = root.lodgs
     if not settings.scene_folder:
         raise LodgsError(f"Cannot check '{root.name}': it has no photos.", "Import a COLMAP scene.")
-    folder, *others = (
+    folder, model, images = (
         Path(bpy.path.abspath(path)) if path else None
         for path in (settings.scene_folder, settings.training.model, settings.training.images)
     )
-    return partial(check_folder, folder, *others, image_scale=settings.training.image_scale)
+    return partial(check_folder, folder, model, images, image_scale=settings.training.image_scale)
 
 
 def store_findings(uid: int, findings: list[Finding]) -> None:

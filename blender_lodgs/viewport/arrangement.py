@@ -36,7 +36,7 @@ _serials = itertools.count()
 class PagedSplats(Protocol):
     """Splats that are read from disk page by page, see ``streaming.Stream``."""
 
-    taken: int
+    copied_updates: int
     records: np.ndarray
     columns: dict[str, np.ndarray]
 
@@ -100,13 +100,13 @@ class Pool:
     def apply_updates(self) -> None:
         """Copy newly read pages of paged splats. Nobody may read the pool meanwhile."""
         for first, paged in self.paged:
-            previous = paged.taken
+            previous = paged.copied_updates
             rows = paged.take()
             if self._applied.get(first) != previous:  # another pool took pages, or this pool is new
                 rows = np.arange(len(paged.records), dtype=np.int32)
-            if self._applied.get(first) == paged.taken:
+            if self._applied.get(first) == paged.copied_updates:
                 continue
-            self._applied[first] = paged.taken
+            self._applied[first] = paged.copied_updates
             records = paged.records[rows]
             targets = rows + np.int32(first)
             self.means[targets] = records[:, 0:3]

@@ -23,8 +23,8 @@ ENOUGH_VIEWS = 3
 """Number of views that have to see a point to reconstruct its position."""
 COLORS = ((0.9, 0.1, 0.05, 1.0), (1.0, 0.65, 0.0, 1.0), (0.2, 0.8, 0.25, 1.0))
 """Colours of points seen by one view, two views, and at least ENOUGH_VIEWS views."""
-PIXELS = 160
-"""Width in pixels of the depth images."""
+DEPTH_WIDTH = 160
+"""Width of the depth images in pixels."""
 MAX_POINTS = 40_000
 """Maximum number of dots."""
 DOT_SIZE = 3.0
@@ -71,7 +71,7 @@ def measure(context: bpy.types.Context) -> Coverage:
     scene, window = context.scene, context.window_manager
     width, height = viewpoints.image_size(scene, scene.lodgs_capture)
     views = viewpoints.capture_views(context, width, height)
-    screen = gpu.types.GPUOffScreen(PIXELS, max(round(PIXELS * height / width), 1))
+    screen = gpu.types.GPUOffScreen(DEPTH_WIDTH, max(round(DEPTH_WIDTH * height / width), 1))
     depths = []
     window.progress_begin(0, len(views))
     try:
@@ -88,11 +88,11 @@ def measure(context: bpy.types.Context) -> Coverage:
 
 def draw(scene: bpy.types.Scene) -> None:
     """Draw the dots into the active framebuffer, tested against its depth."""
-    measured = current(scene)
-    if measured is None or roots.active_root(bpy.context) is not None:  # its panel hides, too
+    coverage = current(scene)
+    if coverage is None or roots.active_root(bpy.context) is not None:  # the panel is hidden then, too
         return
-    colors = np.asarray(COLORS, np.float32)[np.minimum(measured.counts, ENOUGH_VIEWS) - 1]
-    content = {"pos": measured.points.astype(np.float32), "color": colors}
+    colors = np.asarray(COLORS, np.float32)[np.minimum(coverage.counts, ENOUGH_VIEWS) - 1]
+    content = {"pos": coverage.points.astype(np.float32), "color": colors}
     shader = gpu.shader.from_builtin("POINT_FLAT_COLOR")
     batch = batch_for_shader(shader, "POINTS", content)
     with gpu.matrix.push_pop_projection():  # type: ignore[attr-defined]
@@ -112,7 +112,7 @@ def _settings(scene: bpy.types.Scene) -> tuple:
 
 @contextmanager
 def _surfaces_only(space: bpy.types.SpaceView3D, system: bpy.types.PreferencesSystem) -> Iterator[None]:
-    """Make a viewport draw only surfaces, once each: antialiasing draws several times."""
+    """Make a viewport draw only surfaces, without antialiasing, which draws each frame several times."""
     previous = space.shading.type, space.overlay.show_overlays, system.viewport_aa
     try:
         space.shading.type, space.overlay.show_overlays, system.viewport_aa = "SOLID", False, "OFF"

@@ -36,7 +36,7 @@ class Stream:
         records: (rows, 4 * texels) float32 of all slots in memory, see ``resident.read_records``.
         columns: (rows,) float32 by name, of the rule. Empty slots are never selected.
         higher: number of SH coefficients beyond the first.
-        taken: number of copied updates.
+        copied_updates: number of copied updates.
     """
 
     def __init__(self, source: Source) -> None:
@@ -46,7 +46,7 @@ class Stream:
         self.records = np.zeros((0, 0), np.float32)
         self.columns: dict[str, np.ndarray] = {}
         self.higher = 0
-        self.taken = 0
+        self.copied_updates = 0
         self._pager: Pager | None = None
         self._request: tuple[LodQuery, Direction | None] | None = None
         self._stopping = False
@@ -71,7 +71,7 @@ class Stream:
     def busy(self) -> bool:
         """True while pages are being read or wait to be copied."""
         if self.problem:
-            return self.arrived != self.taken
+            return self.arrived != self.copied_updates
         return self._pager is None or not self.ready or not self._pager.idle
 
     def request(self, query: LodQuery, direction: Direction | None) -> None:
@@ -101,7 +101,7 @@ class Stream:
         for name in self.columns.keys() - update.columns.keys():
             self.columns[name][rows] = splats.extras[name]
         self.columns |= update.columns
-        self.taken += 1
+        self.copied_updates += 1
         return (starts[:, None] + np.arange(SIZE)).reshape(-1).astype(np.int32)
 
     def stop(self) -> None:
@@ -142,7 +142,9 @@ class Stream:
 
     def _is_ready(self, pager: Pager) -> bool:
         return (
-            self._request is not None and self.taken > 0 and (pager.idle or pager.splats >= self.source.here)
+            self._request is not None
+            and self.copied_updates > 0
+            and (pager.idle or pager.splats >= self.source.here)
         )
 
 

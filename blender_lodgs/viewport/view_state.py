@@ -114,9 +114,9 @@ class ViewState:
         end = now + min(max(now - self.loaded if started else 0, LOADING[0]), LOADING[1])
         self.loaded = now
         begin = 0
-        shown = started and self._show(source, loading, store, missing)  # uploads of earlier redraws
+        is_drawn = started and self._show(source, loading, store, missing)  # uploads of earlier redraws
         while begin < len(missing) and (
-            wait or (started and not shown and not begin) or time.monotonic() < end
+            wait or (started and not is_drawn and not begin) or time.monotonic() < end
         ):
             batch = missing[begin : begin + resident.UPLOAD_BATCH]
             batch = batch[: source.count_in_first_cloud(batch)]
@@ -128,7 +128,7 @@ class ViewState:
             begin += len(batch)
         missing = missing[begin:]
         self.missing = store, missing
-        if wait or (not shown and not len(missing) and time.monotonic() < end):
+        if wait or (not is_drawn and not len(missing) and time.monotonic() < end):
             self._show(source, loading, store, missing)
 
     def _show(self, source: Resident, loading: Arrangement, store: Store, missing: np.ndarray) -> bool:

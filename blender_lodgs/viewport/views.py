@@ -351,7 +351,7 @@ def _placements(
                 scene=(root or instance.object).session_uid,
                 tell=root.lodgs.tell if root else "OWN",
                 antialias=instance.antialias,
-                arrived=(paged.arrived if update else paged.taken) if paged else 0,
+                arrived=(paged.arrived if update else paged.copied_updates) if paged else 0,
                 looks=instance.looks,
             )
         )

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from tools.blender_module import EXTENSION, start_blender
+from training.files import cache_folder
 
 _exit_status: int | None = None
 
@@ -122,6 +123,7 @@ def blender(bpy, tmp_path, monkeypatch):
     )
     program.chmod(0o755)
     monkeypatch.setattr(bpy.app, "binary_path", str(program))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache_folder().parent))  # compiled code
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     return program
 

@@ -12,6 +12,9 @@ import pytest
 
 from tests.blender.fake_trainer import COUNTS, splats
 
+pytestmark = pytest.mark.one_blender
+
+
 SCENE = Path(__file__).resolve().parents[2] / "examples" / "lantern_garden"
 
 

@@ -121,6 +121,8 @@ def test_blender_installs_updates_and_removes_from_a_repository(archive, tmp_pat
     dist.mkdir()
     shutil.copy2(archive, dist)
     extension.write_repository(dist)
+    page = (dist / "index.html").read_text(encoding="utf-8")
+    assert "lodgs-" in page and page.count("<th>") == page.count("<td>") and "<td>~</td>" not in page
     extension.build(tmp_path / "next", version="99.0.0")
     extension.write_repository(tmp_path / "next")
     handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=dist)

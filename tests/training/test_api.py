@@ -90,7 +90,7 @@ def test_load_scene_converts_an_export(tmp_path):
         '{"fl_x": 8, "w": 8, "h": 6, "frames": [{"file_path": "a.png", "transform_matrix":'
         " [[1,0,0,0],[0,1,0,0],[0,0,1,4],[0,0,0,1]]}]}"
     )
-    with pytest.warns(UserWarning, match="random points"):
+    with pytest.warns(UserWarning, match="The scene has no points"):
         scene = lodgs.load_scene(tmp_path)
     assert [camera.name for camera in scene.cameras] == ["a.png"]
 

@@ -85,6 +85,11 @@ def test_info(bundle, levels, tmp_path, monkeypatch, capsys, file_regression):
     write_ply(tmp_path / "splats.ply", levels[0])
     assert main(["info", "bundle.ply"]) == main(["info", "splats.ply"]) == 0
     file_regression.check(capsys.readouterr().out, basename="info")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "job.toml").touch()
+    (tmp_path / "bundle.ply").rename(tmp_path / "run" / "bundle.ply")
+    assert main(["info", "run"]) == 0
+    assert "bundle.ply: flod, 3 levels" in capsys.readouterr().out
 
 
 def test_report_of_evaluate(file_regression):

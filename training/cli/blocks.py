@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ..errors import LodgsError
 from . import PROGRAM
 from .job_options import add_options, job_from_options, parse_resources
 from .options import parse_positive
 from .train import train_job
+
+if TYPE_CHECKING:
+    from ..runs.folder import RunFolder
+    from ..runs.job import Job
+    from ..scenes.colmap import Scene
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -55,7 +62,8 @@ def _plan(options: argparse.Namespace) -> int:
     from ..runs.job import save_job
 
     job = job_from_options(options).resolved()
-    scene = read_planned_scene(job)
+    folder = RunFolder(job.out)
+    scene = read_planned_scene(job, lambda scene: _with_points(scene, job, folder))
     if options.block_splats or options.block_memory:
         if job.cells:
             raise LodgsError(
@@ -68,7 +76,6 @@ def _plan(options: argparse.Namespace) -> int:
             "Add --cells 2x4, for 2 columns of 4 cells, or --block-splats 1000000.",
         )
     planned = plan(job, scene)
-    folder = RunFolder(job.out)
     folder.create()
     if folder.job.exists():  # refuses a folder with another job before the plan is written
         save_job(job, folder)
@@ -77,6 +84,17 @@ def _plan(options: argparse.Namespace) -> int:
     print(plan_table(planned))
     print(f"Train them with: {PROGRAM} blocks run {folder.path}", flush=True)
     return 0
+
+
+def _with_points(scene: Scene, job: Job, folder: RunFolder) -> Scene:
+    if len(scene.points):
+        return scene
+    from ..runs.data import with_points  # imports torch
+
+    def report(kind: str, message: str, **values: object) -> None:
+        print(message if kind == "status" else f"{kind}: {message}", file=sys.stderr, flush=True)
+
+    return with_points(scene, job, folder, report)
 
 
 def _train(options: argparse.Namespace) -> int:

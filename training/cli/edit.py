@@ -81,7 +81,7 @@ def _add_look(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
     from ..editing.edit import edit
-    from ..runs.folder import RunFolder
+    from ..runs.folder import find_splats
     from ..splats.formats import open_as_ply
 
     limits = setting_values(options, Cleaning)
@@ -109,8 +109,7 @@ def run(options: argparse.Namespace) -> int:
             "Cannot write the edited splats: no output.", "Add --out, --plain, --folder or --streamed."
         )
     cleaning = Cleaning(tuple(crops), **limits)
-    folder = RunFolder(options.source)
-    with open_as_ply(folder.bundle if folder.bundle.exists() else folder.path) as source:
+    with open_as_ply(find_splats(options.source)) as source:
         print(
             edit(
                 source, options.out, cleaning, warn,

@@ -1,4 +1,4 @@
-"""``lodgs info``: describe a file of splats."""
+"""``lodgs info``: describe the splats of a file or a run."""
 
 from __future__ import annotations
 
@@ -7,25 +7,28 @@ import json
 from pathlib import Path
 
 from ..lod.selection import standalone_levels
+from ..runs.folder import find_splats
 from ..splats.bundle import open_bundle
 from ..splats.bundle_header import json_default
 from ..splats.file_rows import DrawableRows
 from ..splats.level_folder import read_folder
 from ..splats.levels import Bundle, bounding_box
 from ..splats.ply import Element, all_columns
+from .options import SOURCE_HELP
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    parser.add_argument("file", type=Path, help="bundle, folder of levels, or any 3DGS PLY")
+    parser.add_argument("file", type=Path, help=SOURCE_HELP)
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
     from ..splats.formats import open_as_ply
 
-    with open_as_ply(options.file) as path:
-        print(describe(path).replace(str(path), str(options.file)))
+    file = find_splats(options.file)
+    with open_as_ply(file) as path:
+        print(describe(path).replace(str(path), str(file)))
     return 0
 
 

@@ -53,13 +53,24 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _convert(options: argparse.Namespace) -> int:
+    from ..scenes.colmap import read_scene
     from ..scenes.formats import convert_export
+    from ..scenes.triangulate import write_points
 
-    scene = convert_export(options.source, options.out)
-    for message in scene.warnings:
+    export = convert_export(options.source, options.out)
+    warnings, points = export.warnings, export.points
+    scene = None if points else read_scene(export.folder)
+    if scene is not None and any(camera.depth is None for camera in scene.cameras):
+        scene = write_points(scene, _print_progress)
+        warnings, points = [*warnings, *scene.warnings], len(scene.points)
+    for message in warnings:
         warn(message)
-    print(f"{scene.folder}: {scene.views} views, {scene.points:,} points, from {scene.source}")
+    print(f"{export.folder}: {export.views} views, {points:,} points, from {export.source}")
     return 0
+
+
+def _print_progress(stage: str, done: int, total: int) -> None:
+    print(f"{stage} {done} of {total}" if total > 1 else stage, file=sys.stderr, flush=True)
 
 
 def _reconstruct(options: argparse.Namespace) -> int:
@@ -68,12 +79,9 @@ def _reconstruct(options: argparse.Namespace) -> int:
     if options.out is None:
         raise LodgsError("Cannot reconstruct the photos: no output folder.", "Add --out DIR.")
 
-    def report(stage: str, done: int, total: int) -> None:
-        print(f"{stage} {done} of {total}" if total > 1 else stage, file=sys.stderr, flush=True)
-
     scene = reconstruct(
         options.photos, options.out, preset=options.preset, ordered=options.ordered, lens=options.lens,
-        masks=options.masks, report=report,
+        masks=options.masks, report=_print_progress,
     )  # fmt: skip
     for message in scene.excluded:
         warn(message)

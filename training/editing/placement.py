@@ -68,10 +68,11 @@ def transform_bundle(bundle: Bundle, placement: Similarity) -> Bundle:
 def upright_placement(
     bundle: Bundle, upright: bool = False, ground: bool = False, points: np.ndarray | None = None
 ) -> Similarity:
-    """Return the transform that turns a bundle's scene upright (z up), and optionally puts its ground at z =
-    0.
+    """Return the transform that aligns a bundle's scene with z up or with its ground.
 
     Args:
+        upright: turn the scene so that its up axis is z.
+        ground: turn the scene upright and move its ground to z = 0.
         points: (P, 3) for ground detection; None: the means of the finest level's opaque splats.
 
     Raises:

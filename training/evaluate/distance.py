@@ -38,8 +38,9 @@ def measure_farther_views(evaluation: Evaluation, bundle: Bundle, values: Values
         values: values of the rule's controls.
 
     Returns:
-        ``factor`` of FACTORS, ``drawn`` and ``drawn_full`` (splats in the image, by distance and at full
-        detail), and ``psnr`` of the image by distance against full detail; means over views.
+        A dict for each factor in FACTORS: ``factor``, ``drawn`` (splats in the image with levels selected by
+        distance), ``drawn_full`` (splats in the image at full detail) and ``psnr`` between these images.
+        The numbers are means over the views.
     """
     rows = []
     source = full_detail_source(bundle, bundle.levels[-1])
@@ -69,14 +70,15 @@ def measure_popping(evaluation: Evaluation, bundle: Bundle, values: Values, came
     """Measure the largest jump between frames while the camera moves back, relative to full detail.
 
     The camera moves back from 1 to 8 times its distance in FRAMES equal factors. A jump is the mean absolute
-    difference of two consecutive frames, divided by that of the same frames at full detail unless it is 0.
+    difference of two consecutive frames, divided by the same difference at full detail. Pairs of frames that
+    are equal at full detail do not count.
 
     Args:
         values: values of the rule's controls.
 
     Returns:
-        The largest jump as ``by distance``; or as ``faded`` and ``hard`` (levels switched without fading) if
-        the rule can fade levels.
+        The largest jump as ``by distance``. If the rule can fade levels: the largest jump with fading as
+        ``faded``, and without fading as ``hard``.
     """
     source = full_detail_source(bundle, bundle.levels[-1])
     resident = ResidentBundle(bundle, evaluation.backend)

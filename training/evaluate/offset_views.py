@@ -26,15 +26,15 @@ MAX_POSITIONS = 120
 def measure_veil(evaluation: Evaluation, source: SplatSource) -> dict[str, float]:
     """Measure the share of veiled pixels at positions halfway between training cameras.
 
-    A pixel is veiled if half of its light is stopped in front of ``VEIL_DEPTH`` times the scene's median
-    depth.
+    A pixel is veiled if splats nearer than ``VEIL_DEPTH`` times the scene's median depth stop at least half
+    of its light.
 
     Args:
         source: returns the splats of a camera.
 
     Returns:
-        ``mean`` and ``max`` over the positions, from 0 to 1. The positions are those of :func:`halfway`, or
-        ``MAX_POSITIONS`` evenly chosen ones.
+        ``mean`` and ``max`` over the positions, from 0 to 1. The positions are those of
+        :func:`.midpoint_views`, or ``MAX_POSITIONS`` evenly chosen ones.
     """
     shares = []
     for camera in pick_evenly(midpoint_views(evaluation.data.train), MAX_POSITIONS):
@@ -47,14 +47,15 @@ def measure_veil(evaluation: Evaluation, source: SplatSource) -> dict[str, float
 
 
 def count_oversized(data: TrainingData, source: SplatSource) -> int:
-    """Count opaque splats among the cameras with a standard deviation over half the median depth.
+    """Count the oversized opaque splats near the cameras.
 
-    Splats among the cameras are at most the scene's extent away from the mean camera position. Opacities
-    include the weights for the training camera nearest to that position.
+    A splat is oversized if its largest standard deviation exceeds ``OVERSIZED_SCALE`` times the median
+    depth. It is near the cameras if its distance from the mean camera position is at most the scene's extent.
+    Opacities include the weights for the training camera nearest to the mean camera position.
     """
     central = min(data.train, key=lambda camera: np.linalg.norm(camera.center - data.mean_camera))
     splats, weights = source(central)
-    among = np.linalg.norm(splats.means - data.mean_camera, axis=1) <= data.extent
+    near_cameras = np.linalg.norm(splats.means - data.mean_camera, axis=1) <= data.extent
     opaque = expit(splats.opacity_logits) * (1 if weights is None else weights) >= OPAQUE_OPACITY
     large = splats.log_scales.max(axis=1) > np.log(OVERSIZED_SCALE * data.median_depth)
-    return int((among & opaque & large).sum())
+    return int((near_cameras & opaque & large).sum())

@@ -184,7 +184,7 @@ class Pager(Protocol):
 
     @property
     def idle(self) -> bool:
-        """Whether the caller has taken all pages that fit the budget, or the thread has ended."""
+        """True if the caller has taken all pages that fit the budget, or the thread has ended."""
         ...
 
     def start(self) -> None:

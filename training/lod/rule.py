@@ -61,7 +61,7 @@ class Control:
         soft: range of the slider; None: a checkbox or a number field instead of a slider.
         label, about: label and tooltip.
         unit: Blender's subtype of the property: "NONE", "PIXEL", "FACTOR".
-        whole: only whole numbers are valid; with the range 0 to 1 the control is a checkbox.
+        integer: only whole numbers are valid; with the range 0 to 1 the control is a checkbox.
         step: step of the arrows of a whole number.
         follows: "coarsest" or "finest" if the value is the number of a level and follows the existing levels
             (``Rule.defaults``) until the user sets it.
@@ -75,14 +75,14 @@ class Control:
     about: str
     soft: tuple[float, float] | None = None
     unit: str = "NONE"
-    whole: bool = False
+    integer: bool = False
     step: int = 1
     follows: str = ""
 
     @property
     def flag(self) -> bool:
-        """Whether the control is a checkbox."""
-        return self.whole and (self.low, self.high) == (0, 1)
+        """True if the control is a checkbox."""
+        return self.integer and (self.low, self.high) == (0, 1)
 
     def validate(self, value: float) -> float:
         """Return the value as int or float.
@@ -91,13 +91,13 @@ class Control:
             LodgsError: wrong type, or out of range.
         """
         number = isinstance(value, int | float | np.number) and self.low <= value <= self.high
-        if not number or (self.whole and value != int(value)):
-            kind = "a whole number" if self.whole else "a number"
+        if not number or (self.integer and value != int(value)):
+            kind = "a whole number" if self.integer else "a number"
             raise LodgsError(
                 f"{self.name} = {value!r} is invalid.",
                 f"Use {kind} from {self.low:g} to {self.high:g}.",
             )
-        return int(value) if self.whole else float(value)
+        return int(value) if self.integer else float(value)
 
 
 Masks = Mapping[int, np.ndarray]
@@ -266,7 +266,7 @@ class Rule(ABC):
 
     @property
     def complete(self) -> bool:
-        """Whether every level is a complete scene, see :meth:`standalone_levels`."""
+        """True if every level is a complete scene, see :meth:`standalone_levels`."""
         return len(self.standalone_levels((1, 2))) == 2
 
     def complete_levels(self, bundle: Bundle) -> Bundle:
@@ -287,7 +287,7 @@ class Rule(ABC):
 
     @property
     def weights_full_detail(self) -> bool:
-        """Whether single levels need weights, see :meth:`full_detail_values`."""
+        """True if single levels need weights, see :meth:`full_detail_values`."""
         return self.full_detail_values((1,)) is not None
 
     def exceeds_budget(self, finest: int, budget: int) -> bool:

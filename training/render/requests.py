@@ -310,4 +310,7 @@ def _typed(values: dict, key: str, kind: type) -> Any:
 def _invalid(key: str, value: Any) -> LodgsError:
     text = "nothing" if value is None else repr(value)
     text = text if len(text) < 100 else f"{text[:100]}..."
-    return LodgsError(f'A request is not valid: "{key}" cannot be {text}.')
+    return LodgsError(
+        f'Cannot read the request: "{key}" cannot be {text}.',
+        "Use an extension and a trainer of the same version.",
+    )

@@ -2,7 +2,7 @@
 
 Requests are JSON objects on standard input, one per line. Answers (``runs.events.event_line``) go to
 standard output. Arrays are in files of one folder (``wire``) that belongs to this process, as a marker file
-in it shows. The folder is removed when standard input ends, however the other program ended.
+in it shows. The folder is removed when standard input ends, also if the other program crashed.
 
     {"frame": 7, "out": NAME, "camera": {...}, "near": 0.1, "background": [r, g, b] or null,
      "depth": true, "levels": true, "window": [left, top, width, height] or null,
@@ -178,7 +178,7 @@ class _Server:
         )  # fmt: skip
 
     def _instances(self, frame: int, request: FrameRequest) -> list[Instance]:
-        """Return the sets of a frame, and keep those that the last frame has loaded."""
+        """Return the instances of a frame. Sets that the last frame has loaded are reused."""
         sets: dict[str, SplatSet] = {}
         instances = []
         parts = {

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -46,9 +47,11 @@ def write_checkpoint(folder: RunFolder, step: int, levels: list[dict], method: d
 
 
 def remove_checkpoints(folder: RunFolder) -> None:
-    """Delete all checkpoints of a finished run."""
+    """Delete all checkpoints of a finished run, and their folder if it is empty."""
     for path in [*_newest_first(folder), *folder.checkpoints.glob("*_????????.bin")]:
         path.unlink(missing_ok=True)
+    with suppress(OSError):  # it has other files, or does not exist
+        folder.checkpoints.rmdir()
 
 
 def read_newest(

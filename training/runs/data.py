@@ -23,6 +23,7 @@ from ..scenes.exposures import exposure_gains
 from ..scenes.images import check_image, check_mask
 from ..scenes.regions import Region
 from ..scenes.rendered_views import thin_evenly
+from ..scenes.triangulate import triangulate_scene
 from ..scenes.undistort import undistort_cache, undistort_scene
 from ..scenes.view_selection import quote_name
 from .capture import capture, is_complete
@@ -63,6 +64,10 @@ def training_data(
     report = report or _ignore
     model, images = (Path(path) if path else None for path in (job.model, job.images))
     full_scene = read_scene(_scene_folder(job, folder, report), model=model, images=images)
+    parameters = job.resolved_parameters()
+    add_depths = pixels and parameters.depth == "metric" and not job.cell and not job.cells
+    if not (add_depths and all(camera.depth is not None for camera in full_scene.cameras)):
+        full_scene = with_points(full_scene, job, folder, report)
     region = Region.read(Path(job.cell)) if job.cell else None
     scene = full_scene if region is None else region.select_views(full_scene)
     if pixels:
@@ -73,9 +78,8 @@ def training_data(
     if scene.distorted:
         report("status", message=f"Undistorting {len(scene.distorted)} views")
         scene = undistort_scene(scene, undistort_cache(scene, folder.undistorted))
-    parameters = job.resolved_parameters()
     depths = None
-    if pixels and parameters.depth == "metric" and region is None and not job.cells:
+    if add_depths:
         scene = add_depth_points(scene)
     full_scene = full_scene if job.cells or region is not None else scene
     if pixels and parameters.depth_weight:
@@ -102,6 +106,28 @@ def training_data(
         region=job.crop,
         gains=gains,
     )  # fmt: skip
+
+
+def with_points(scene: Scene, job: Job, folder: RunFolder, report: Callable[..., None]) -> Scene:
+    """Return a job's scene with points; triangulate them first if it has none, once per scene.
+
+    Args:
+        folder: the job's run.
+        report: called with the kind and values of an event.
+
+    Raises:
+        LodgsError: as ``triangulate_scene``.
+    """
+    if len(scene.points):
+        return scene
+
+    def report_stage(stage: str, done: int, total: int) -> None:
+        if total > 1:
+            report("status", message=f"{stage} {done} of {total}", step=done, of=total)
+        else:
+            report("status", message=stage)
+
+    return triangulate_scene(scene, folder.triangulated, report_stage, job.exposure)
 
 
 def _ignore(kind: str, **values: object) -> None:

@@ -5,6 +5,7 @@
           model.npz (networks of a method that has them)
           views.json (views and photo sizes with which the run began)
           undistorted/ (photos without lens distortion, if the scene folder is read-only)
+          triangulated/ (points of a scene without points, if the scene folder is read-only)
           blocks/ (runs of the parts of a scene in cells, and their merged bundle)
           captured/ (COLMAP scene rendered from splats that have no photos)
           base.ply, cameras/ (splats and views that Blender exported for the run)
@@ -56,6 +57,7 @@ class RunFolder:
         self.output = self.path / "trainer.out"
         self.views = self.path / "views.json"
         self.undistorted = self.path / "undistorted"
+        self.triangulated = self.path / "triangulated"
         self.captured = self.path / "captured"
         self.base = self.path / "base.ply"
         self.cameras = self.path / "cameras"
@@ -265,8 +267,9 @@ class RunFolder:
         for folder in (self.path, self.checkpoints, self.levels_folder):
             remove_temporaries(folder)
         self.reserve.unlink(missing_ok=True)
-        for temporary in self.undistorted.glob("undistorting-*"):
-            shutil.rmtree(temporary, ignore_errors=True)
+        for cache in (self.undistorted, self.triangulated):
+            for temporary in cache.glob("*ing-*"):
+                shutil.rmtree(temporary, ignore_errors=True)
         with suppress(FileNotFoundError):
             if self._cancel.stat().st_mtime < _STARTED - _STALE_SECONDS:
                 self._cancel.unlink()
@@ -279,6 +282,22 @@ class RunFolder:
         except (OSError, ValueError):
             return {}
         return holder if isinstance(holder, dict) else {}
+
+
+def find_splats(path: Path) -> Path:
+    """Return the bundle of a finished run, or the path itself if it is not a run folder.
+
+    Raises:
+        LodgsError: the run is not finished.
+    """
+    run = RunFolder(path)
+    if not run.job.exists():
+        return path
+    if not run.bundle.exists():
+        raise LodgsError(
+            f"Cannot read {path}: the run is not finished (no bundle.ply).", "Train it to the end."
+        )
+    return run.bundle
 
 
 def _take(request: Path) -> bool:

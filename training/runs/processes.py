@@ -7,7 +7,13 @@ import platform
 import signal
 import subprocess
 import sys
+import threading
+import time
+from _thread import interrupt_main
 from pathlib import Path
+
+PARENT = "LODGS_PARENT"
+"""Environment variable with the ID and the identity of the process that a command must not outlive."""
 
 
 def identity(pid: int) -> str:
@@ -35,6 +41,32 @@ def kill(pid: int, expected: str) -> bool:
     except OSError:
         return False
     return True
+
+
+def interrupt() -> None:
+    """Send Ctrl-C to the main thread, even while it waits for another program."""
+    if hasattr(signal, "pthread_kill"):
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+    else:
+        interrupt_main()
+
+
+def stop_with_parent() -> None:
+    """Interrupt this process as Ctrl-C does when the process in :data:`PARENT` has ended.
+
+    Does nothing without the variable, or if that process is not visible, as from inside a container.
+    """
+    number, _, expected = os.environ.get(PARENT, "").partition(" ")
+    if number.isdecimal() and expected and identity(int(number)) == expected:
+        threading.Thread(target=_interrupt_after, args=(int(number), expected), daemon=True).start()
+
+
+def _interrupt_after(pid: int, expected: str) -> None:
+    failures = 0
+    while failures < 2:  # a busy system may fail to report the process once
+        time.sleep(0.5)
+        failures = 0 if identity(pid) == expected else failures + 1
+    interrupt()
 
 
 def _started(pid: int) -> str:

@@ -9,7 +9,6 @@ import sys
 import threading
 import time
 import traceback
-from _thread import interrupt_main
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -45,13 +44,13 @@ from ..splats.file_rows import open_ply
 from ..splats.gaussians import SplatRows, Splats
 from ..splats.levels import NO_SPLATS, Bundle, Level
 from ..splats.ply import BATCH_ROWS, Columns, read_ply, write_ply
-from . import parent
+from . import parent, processes
 from .base import open_base
 from .blocks.plan import write_plan
 from .blocks.train import BlocksStopped, train_blocks
 from .blocks.workers import HERE, workers
 from .checkpoints import read_newest, remove_checkpoints, write_checkpoint
-from .data import training_data
+from .data import training_data, with_points
 from .events import PROTOCOL, EventWriter, event_line
 from .failures import BAD_INPUT, CANCELLED, CRASHED, DONE, describe_error
 from .folder import RunFolder
@@ -139,7 +138,9 @@ def _train(
         merged_is_result = bool(job.cells) and METHODS[job.method].cell_method == job.method
         if job.cells:
             merged = folder.bundle if merged_is_result else folder.merged
-            division = write_plan(job, folder)
+            division = write_plan(
+                job, folder, add_points=lambda scene: with_points(scene, job, folder, events)
+            )
             with workers(on, resources) as submit:
                 train_blocks(division, merged, submit, events)
             job = replace(job, base="" if merged_is_result else str(merged))
@@ -451,7 +452,7 @@ def _interrupt_on_cancel(folder: RunFolder):
         while not finished.wait(0.1):
             with suppress(OSError):
                 if parent.ended.is_set() or folder.take_cancel():
-                    _interrupt()
+                    processes.interrupt()
                     return
 
     previous = None
@@ -467,14 +468,6 @@ def _interrupt_on_cancel(folder: RunFolder):
         watcher.join()
         if previous is not None:
             signal.signal(signal.SIGINT, previous)
-
-
-def _interrupt() -> None:
-    """Send Ctrl-C to the main thread, even while it waits for another program."""
-    if hasattr(signal, "pthread_kill"):
-        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
-    else:
-        interrupt_main()
 
 
 @contextmanager

@@ -22,7 +22,7 @@ def smooth_path(positions: np.ndarray, quats: np.ndarray) -> tuple[np.ndarray, n
         for constant speed along the path. All are float64.
 
     Raises:
-        LodgsError: if there are fewer than two poses, or all share one position.
+        LodgsError: there are fewer than two poses, or all share one position.
     """
     positions = np.asarray(positions, np.float64)
     quats = np.asarray(quats, np.float64)

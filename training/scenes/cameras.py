@@ -30,8 +30,12 @@ class Camera:
 
     Attributes:
         name: image path relative to the scene's image folder, with forward slashes.
-        width, height: image size in pixels.
-        fx, fy, cx, cy: intrinsics in pixels; pixel centres lie at +0.5, as in COLMAP.
+        width: image width in pixels.
+        height: image height in pixels.
+        fx: horizontal focal length in pixels.
+        fy: vertical focal length in pixels.
+        cx: principal point in pixels, from the left; pixel centres lie at +0.5, as in COLMAP.
+        cy: principal point in pixels, from the top.
         world_to_camera: (4, 4) float64 rigid transform, OpenCV axes, COLMAP world.
         image: path of the photo, or None.
         mask: path of a mask with the photo's aspect ratio, black in ignored areas, or None.
@@ -192,7 +196,7 @@ def write_camera(path: Path, camera: Camera, near: float) -> None:
     """Write a camera and its near depth as JSON.
 
     Raises:
-        LodgsError: if the file cannot be written.
+        LodgsError: the file cannot be written.
     """
     with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(camera_to_dict(camera, near), indent=1) + "\n", encoding="utf-8")
@@ -212,7 +216,7 @@ def read_camera(path: Path) -> tuple[Camera, float]:
         The camera and its near depth.
 
     Raises:
-        LodgsError: if the file cannot be read or contains no valid camera.
+        LodgsError: the file cannot be read or contains no valid camera.
     """
     values = read_json(path, f"The camera {path}")
     try:
@@ -228,7 +232,7 @@ def read_camera_folder(folder: Path) -> tuple[list[Camera], float]:
         The cameras, sorted and named by file name, and their smallest near depth.
 
     Raises:
-        LodgsError: if the folder has fewer than two files, or a file cannot be read.
+        LodgsError: the folder has fewer than two files, or a file cannot be read.
     """
     files = sorted(folder.glob("*.json"))
     if len(files) < 2:
@@ -245,7 +249,7 @@ def camera_from_dict(values: dict) -> tuple[Camera, float]:
     """Return the camera and the near depth (default 0.01) of the JSON values of :func:`camera_to_dict`.
 
     Raises:
-        LodgsError: if a key is missing or invalid.
+        LodgsError: a key is missing or invalid.
     """
     remedy = "Give width, height, fx, fy, cx, cy and world_to_camera (4x4, OpenCV axes)."
     try:

@@ -9,7 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import LodgsError
-from .colmap import Progress, Scene, observations, read_scene
+from .colmap import NO_POINTS, Progress, Scene, observations, read_scene
+from .triangulate import cached_points
 
 MIN_VIEWS = 2
 """Number of views below which nothing can be trained."""
@@ -22,8 +23,6 @@ MIN_SHARED = 20
 MAX_ROUNDING = 0.25
 """Maximum rounding error of float32 coordinates, in pixels of a photo at the median depth."""
 ERROR, WARNING = "error", "warning"
-NO_POINTS = "The scene has no points"
-"""First words of the warning of ``read_scene`` about a scene without points."""
 
 
 class Finding(NamedTuple):
@@ -63,7 +62,7 @@ def check_folder(
         The findings, the most severe first. A scene that cannot be read is one finding.
     """
     try:
-        scene = read_scene(folder, model, images, progress)
+        scene = cached_points(read_scene(folder, model, images, progress))
         findings = [*check_scene(scene, image_scale), *_exposure(scene)]
     except LodgsError as error:
         return [Finding(ERROR, error.what, error.remedy)]
@@ -112,11 +111,11 @@ def _sizes(scene: Scene, image_scale: float) -> Iterator[Finding]:
 
 
 def _no_points(scene: Scene) -> Iterator[Finding]:
-    if not len(scene.points):
+    if not len(scene.points) and any(camera.depth is None for camera in scene.cameras):
         yield Finding(
             WARNING,
-            f"{NO_POINTS} to start from, and random points cost several dB.",
-            "Export the points too, or find the cameras again with COLMAP.",
+            f"{NO_POINTS}. Training triangulates them from the photos first, which takes minutes.",
+            "Export the points too to save this time.",
         )
 
 

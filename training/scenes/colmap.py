@@ -37,6 +37,8 @@ MAX_DEPTH_CAMERAS = 500
 """Maximum number of cameras used to compute the median depth."""
 MAX_FOLDERS = 20_000
 """Maximum number of folders searched for models."""
+NO_POINTS = "The scene has no points"
+"""First words of the warning about a scene without points."""
 
 Progress = Callable[[float], object]
 """Callback that receives the completed fraction, from 0 to 1."""
@@ -47,7 +49,9 @@ class Scene:
     """A COLMAP model with its photos, in COLMAP's world.
 
     Attributes:
-        folder, model, images_folder: source folders.
+        folder: folder of the scene.
+        model: folder of the model.
+        images_folder: folder of the photos.
         cameras: views with a usable photo, sorted by name; their size is the photo's size.
         points: (P, 3) float32, possibly empty.
         point_colors: (P, 3) uint8.
@@ -55,6 +59,7 @@ class Scene:
         warnings: one sentence per skipped or suspicious item.
         point_ids: (P,) int64 ids of the model; empty if the points come from another source.
         names: names of all views of the model, sorted, with or without a photo. Default: the cameras' names.
+        point_model: folder of the model that records the points' observations. Default: ``model``.
     """
 
     folder: Path
@@ -67,6 +72,7 @@ class Scene:
     warnings: list[str] = field(default_factory=list)
     point_ids: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
     names: Sequence[str] = ()
+    point_model: Path | None = None
 
     def split(self, test_every: int, validation: bool = False) -> tuple[list[Camera], list[Camera]]:
         """Split the cameras into training cameras and held-out cameras.
@@ -118,7 +124,7 @@ class Scene:
             default: value if no camera sees a point; None raises an error.
 
         Raises:
-            LodgsError: if no camera sees a point.
+            LodgsError: no camera sees a point.
         """
         if np.isfinite(self._median_depth):
             return self._median_depth
@@ -162,7 +168,7 @@ def find_models(folder: Path) -> list[Path]:
     ``dense/0/sparse``. It visits at most MAX_FOLDERS folders, upper levels first.
 
     Raises:
-        LodgsError: if the folder does not exist.
+        LodgsError: the folder does not exist.
     """
     folder = _absolute(folder)
     check_folder(folder, "Choose the folder of a COLMAP scene.")
@@ -210,7 +216,7 @@ def read_scene(
         progress: called now and then.
 
     Raises:
-        LodgsError: if there is no folder, model or photo, or a model file is damaged.
+        LodgsError: there is no folder, model or photo, or a model file is damaged.
     """
     folder = _absolute(folder)
     warnings: list[str] = []
@@ -276,7 +282,10 @@ def _read_inlier_points(
         points, ids = positions.astype(np.float32), np.zeros(0, np.int64)
         warnings.append(f"The model {model} has no points; {len(points):,} were read from {cloud}.")
     if not len(points):
-        warnings.append(f"The scene has no points: {model} has no points3D{model_suffix(model)} with points.")
+        warnings.append(
+            f"{NO_POINTS}: {model} has no points3D{model_suffix(model)} with points. Training creates them "
+            f"from the {'photos' if any(camera.depth is None for camera in cameras) else 'depth maps'}."
+        )
     valid = (np.abs(points) <= MAX_COORDINATE).all(axis=1)
     outliers, inlier_cameras = find_outliers(points[valid], cameras)
     valid[valid] = ~outliers
@@ -299,7 +308,7 @@ def _read_registered(model: Path) -> tuple[dict[int, Intrinsics], list[Pose]]:
     """Return the lenses by id and the poses sorted by name.
 
     Raises:
-        LodgsError: if a file is missing or damaged, or there is no pose.
+        LodgsError: a file is missing or damaged, or there is no pose.
     """
     suffix = model_suffix(model)
     if not suffix:
@@ -331,7 +340,7 @@ def exclude_views(scene: Scene, reasons: dict[str, str]) -> Scene:
         reasons: a sentence by view name, which follows "Skipped <name>:".
 
     Raises:
-        LodgsError: if no view remains.
+        LodgsError: no view remains.
     """
     if not reasons:
         return scene
@@ -359,7 +368,7 @@ def observations(scene: Scene, names: Collection[str]) -> dict[str, np.ndarray]:
     order = np.argsort(scene.point_ids)
     sorted_ids = scene.point_ids[order]
     indices = {}
-    for name, ids in read_observations(scene.model, names).items():
+    for name, ids in read_observations(scene.point_model or scene.model, names).items():
         slots = np.searchsorted(sorted_ids, ids).clip(max=len(order) - 1)
         indices[name] = order[slots[sorted_ids[slots] == ids]]
     return indices if any(map(len, indices.values())) else {}
@@ -384,7 +393,7 @@ def _absolute(path: Path | str) -> Path:
     """Return an absolute path that is valid in other processes; links are kept.
 
     Raises:
-        LodgsError: if the path is not UTF-8, because jobs and Blender cannot store it.
+        LodgsError: the path is not UTF-8, because jobs and Blender cannot store it.
     """
     path = Path(os.path.abspath(path))
     if printable(path) != str(path):
@@ -424,5 +433,5 @@ def _require_complete_model(folder: Path) -> None:
                 missing = ({"cameras", "images"} - present).pop()
                 raise LodgsError(
                     f"Cannot read scene: {root / f'{missing}{suffix}'} is missing.",
-                    f"Copy it beside {present.pop()}{suffix}, or export the model again.",
+                    f"Copy it next to {present.pop()}{suffix}, or export the model again.",
                 )

@@ -92,6 +92,16 @@ class Intrinsics:
         cx, cy = self.parameters[self.lens.focals : self.lens.focals + 2]
         return float(fx), float(fy), float(cx), float(cy)
 
+    def resized(self, width: int, height: int) -> Intrinsics:
+        """Return the lens for photos of another size."""
+        if (width, height) == (self.width, self.height):
+            return self
+        focals, parameters = self.lens.focals, self.parameters.copy()
+        scale_x, scale_y = width / self.width, height / self.height
+        parameters[:focals] *= (scale_x,) if focals == 1 else (scale_x, scale_y)
+        parameters[focals : focals + 2] *= scale_x, scale_y
+        return Intrinsics(self.lens, width, height, parameters)
+
 
 @dataclass(frozen=True)
 class Pose:
@@ -132,7 +142,7 @@ def read_cameras(model: Path) -> dict[int, Intrinsics]:
     """Read the cameras of a model by COLMAP's id.
 
     Raises:
-        LodgsError: if the file is missing or damaged.
+        LodgsError: the file is missing or damaged.
     """
     return _read(model, "cameras", {".bin": _parse_cameras_bin, ".txt": _parse_cameras_txt})
 
@@ -141,7 +151,7 @@ def read_poses(model: Path) -> list[Pose]:
     """Read the registered images of a model, in the file's order.
 
     Raises:
-        LodgsError: if the file is missing or damaged.
+        LodgsError: the file is missing or damaged.
     """
     return _read(model, "images", {".bin": _parse_images_bin, ".txt": _parse_images_txt})
 
@@ -150,7 +160,7 @@ def read_observations(model: Path, names: Collection[str]) -> dict[str, np.ndarr
     """Read the ids (O,) int64 of the points that the named images observe, by image name.
 
     Raises:
-        LodgsError: if the file is missing or damaged.
+        LodgsError: the file is missing or damaged.
     """
     parsers = {
         ".bin": partial(_parse_observations_bin, names=names),
@@ -165,7 +175,7 @@ def read_points(model: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     A model without a points file has no points.
 
     Raises:
-        LodgsError: if the file is damaged.
+        LodgsError: the file is damaged.
     """
     if not (model / f"points3D{model_suffix(model)}").is_file():
         return _NO_POINTS
@@ -176,7 +186,7 @@ def _read(model: Path, name: str, parsers: dict) -> Any:
     """Parse a model file with the parser of its suffix.
 
     Raises:
-        LodgsError: if the file is missing or damaged.
+        LodgsError: the file is missing or damaged.
     """
     suffix = model_suffix(model)
     path = model / f"{name}{suffix}"
@@ -233,8 +243,8 @@ def make_intrinsics(name: str, width: int, height: int, parameters: np.ndarray) 
     """Return intrinsics for the name of a COLMAP camera model.
 
     Raises:
-        ValueError: if the size, a focal length or a parameter is invalid.
-        KeyError: if the name is unknown.
+        ValueError: the size, a focal length or a parameter is invalid.
+        KeyError: the name is unknown.
     """
     return _intrinsics(_LENS_BY_NAME[name], width, height, parameters)
 

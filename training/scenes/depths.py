@@ -74,7 +74,7 @@ class DepthPriors:
         """Return a view's inverse depth 1 / z, (H, W) float32, NaN where unknown; None without any depth.
 
         Raises:
-            LodgsError: if the depth map cannot be read.
+            LodgsError: the depth map cannot be read.
         """
         return self._inverse(camera) if self._usable else None
 
@@ -183,7 +183,7 @@ def add_depth_points(scene: Scene) -> Scene:
     Scenes whose maps contradict the existing points stay unchanged, apart from a warning.
 
     Raises:
-        LodgsError: if a map or a photo cannot be read.
+        LodgsError: a map or a photo cannot be read.
     """
     views = [camera for camera in scene.cameras if camera.depth is not None]
     if len(scene.points) >= FEW_POINTS or not views:
@@ -235,7 +235,7 @@ def read_depth_map(path: Path) -> np.ndarray:
     counts, or another depth channel. Integers in NPY and grey PNG files count UNIT each.
 
     Raises:
-        LodgsError: if the file cannot be read or contains no depth.
+        LodgsError: the file cannot be read or contains no depth.
     """
     try:
         with open(path, "rb") as file:

@@ -48,7 +48,7 @@ def exposure_gains(scene: Scene, cameras: Sequence[Camera], exposure: float = 0.
         by MIN_DEVIATION, the model has no observations, or there are more than MAX_PHOTOS photos.
 
     Raises:
-        LodgsError: if a photo cannot be read.
+        LodgsError: a photo cannot be read.
     """
     if not 2 < len(cameras) <= MAX_PHOTOS:
         return {}

@@ -78,7 +78,7 @@ def read_parts(path: Path) -> list[tuple[str, dict, dict[str, np.ndarray]]]:
     """Read name, header and channels (H, W) by name of each part of a file. Values stay as stored.
 
     Raises:
-        LodgsError: if the channels need more memory than MAX_BYTES.
+        LodgsError: the channels need more memory than MAX_BYTES.
         RuntimeError, OSError, ValueError: if OpenEXR cannot read the file.
     """
     import OpenEXR
@@ -113,7 +113,7 @@ def write_exr(path: Path, channels: dict[str, np.ndarray]) -> None:
     """Write channels (H, W) by name as float32.
 
     Raises:
-        OSError: if the file cannot be written.
+        OSError: the file cannot be written.
     """
     import OpenEXR
 

@@ -35,7 +35,7 @@ def fit_plane(points: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarra
         The unit normal (3,) and the points' centroid (3,), which is on the plane; float64.
 
     Raises:
-        LodgsError: if there are fewer than three points, or they are on a line.
+        LodgsError: there are fewer than three points, or they are on a line.
     """
     points = np.asarray(points, np.float64).reshape(-1, 3)
     if len(points) < 3:
@@ -70,7 +70,7 @@ def find_ground(points: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndar
         As :func:`fit_plane`.
 
     Raises:
-        LodgsError: if no plane reaches the minimum score.
+        LodgsError: no plane reaches the minimum score.
     """
     points = np.asarray(points, np.float64).reshape(-1, 3)
     points = points[np.isfinite(points).all(axis=1)]

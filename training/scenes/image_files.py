@@ -41,7 +41,7 @@ class ImageFiles:
         only one file has it; see ``renamed``.
 
         Raises:
-            LodgsError: if the name is not UTF-8 or leaves the folder, or the file is a link to another
+            LodgsError: the name is not UTF-8 or leaves the folder, or the file is a link to another
                 folder. ``what`` continues a sentence such as "Skipped <name>:".
         """
         relative = relative_image_path(name)
@@ -108,7 +108,7 @@ def relative_image_path(name: str) -> PurePosixPath:
     """Return an image name as a path relative to the image folder, on every operating system.
 
     Raises:
-        LodgsError: if the name is not UTF-8 or leaves the folder.
+        LodgsError: the name is not UTF-8 or leaves the folder.
     """
     path = PurePosixPath(name.replace("\\", "/"))
     windows_path = PureWindowsPath(name)

@@ -50,7 +50,7 @@ def image_size(path: Path) -> tuple[int, int]:
     EXR is its display window; the size of a TIFF is that of its first image.
 
     Raises:
-        LodgsError: if the file is missing, not a regular file, empty, in another format or truncated, or has
+        LodgsError: the file is missing, not a regular file, empty, in another format or truncated, or has
             no pixels or more than MAX_PIXELS.
     """
     with open_file(path) as file:
@@ -88,7 +88,7 @@ def check_image_size(path: Path, size: tuple[int, int]) -> tuple[int, int]:
     """Return the size (width, height) of an image file if it is within the limits.
 
     Raises:
-        LodgsError: if the image has no pixels or more than MAX_PIXELS.
+        LodgsError: the image has no pixels or more than MAX_PIXELS.
     """
     width, height = size
     if width < 1 or height < 1:
@@ -244,7 +244,7 @@ def load_image(path: Path, width: int, height: int, exposure: float = 0.0, alpha
         alpha: return colours over black and alpha as a fourth channel. By default, alpha is ignored.
 
     Raises:
-        LodgsError: if the file cannot be read.
+        LodgsError: the file cannot be read.
     """
     with _open_image(path, width, height, large=_LARGE, alpha=alpha) as image:
         result = np.empty((height, width, 4 if alpha else 3), np.float32)
@@ -263,7 +263,7 @@ def load_mask(path: Path, width: int, height: int) -> np.ndarray:
     """Load a photo's mask at the given size, (height, width) float32; 0 marks ignored pixels.
 
     Raises:
-        LodgsError: if the file cannot be read, or its aspect ratio differs from the given size.
+        LodgsError: the file cannot be read, or its aspect ratio differs from the given size.
     """
     check_mask(path, width, height)
     mask = load_image(path, width, height)[..., 0]
@@ -275,7 +275,7 @@ def check_mask(path: Path, width: int, height: int) -> None:
     """Check the header of a mask for a photo of the given size.
 
     Raises:
-        LodgsError: if the file is not an image, or its aspect ratio differs from the photo's.
+        LodgsError: the file is not an image, or its aspect ratio differs from the photo's.
     """
     mask_width, mask_height = image_size(path)
     if not same_proportions(mask_width, mask_height, width, height):
@@ -296,7 +296,7 @@ def check_image(path: Path) -> None:
     """Decode an image at the smallest size that its format supports, and discard the result.
 
     Raises:
-        LodgsError: if the file cannot be read.
+        LodgsError: the file cannot be read.
     """
     with _open_image(path, 1, 1, large=0):
         pass
@@ -396,7 +396,7 @@ def load_exr(path: Path) -> np.ndarray:
     """Load premultiplied linear light and alpha of an EXR over its display window, (H, W, 4) float32.
 
     Raises:
-        LodgsError: if the file cannot be read.
+        LodgsError: the file cannot be read.
     """
     with _open_image(path, 1, 1, large=_LARGE, alpha=True) as image:
         if not image.linear:

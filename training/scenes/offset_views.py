@@ -23,7 +23,7 @@ def read_offset_views(scene: Path) -> list[Camera]:
     Without the folder, the list is empty.
 
     Raises:
-        LodgsError: if a camera or its image cannot be read.
+        LodgsError: a camera or its image cannot be read.
     """
     views = []
     files = ImageFiles(scene / "aside", scene)

@@ -15,7 +15,7 @@ def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Read the finite points (P, 3) and their colours (P, 3) uint8, grey by default.
 
     Raises:
-        LodgsError: if the file is missing or damaged, or has no points.
+        LodgsError: the file is missing or damaged, or has no points.
     """
     try:
         with open_file(path) as file:

@@ -1,12 +1,14 @@
 """Run pycolmap in a separate process: it may abort its process, and Pillow corrupts memory next to it.
 
-A module that runs as such a program starts with :func:`read_request` and answers with :func:`send`.
+A module that runs as such a program starts with :func:`read_request`, answers with :func:`send`, and obtains
+more data with :func:`ask`.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import queue
 import subprocess
 import sys
 import tempfile
@@ -23,6 +25,10 @@ CHECK_SECONDS = 2.0
 """Seconds between two checks of the free disk space."""
 
 
+_replies: queue.SimpleQueue[dict] = queue.SimpleQueue()
+"""Replies of the parent process that :func:`ask` has not returned yet."""
+
+
 def run_program(
     module: str, request: dict, work: Path, on_message: Callable[[dict], object] | None = None
 ) -> str:
@@ -34,13 +40,14 @@ def run_program(
         module: module name.
         request: JSON object that the program receives.
         work: folder that the program writes to.
-        on_message: receives each object that the program sends.
+        on_message: receives each object that the program sends. Its result, unless None, is the reply that
+            :func:`ask` returns in the program.
 
     Returns:
         The error message of the program; "" after success.
 
     Raises:
-        OSError: if the disk is full or the program cannot be started.
+        OSError: the disk is full or the program cannot be started.
     """
     package = Path(__file__).resolve().parents[1]  # training, or lodgs after pip install
     with subprocess.Popen(
@@ -64,7 +71,11 @@ def run_program(
                 child.stdin.flush()  # stdin stays open, because closing it stops the program
             for line in child.stdout:
                 if on_message is not None and line.startswith("{"):
-                    on_message(json.loads(line))
+                    reply = on_message(json.loads(line))
+                    if reply is not None:
+                        with suppress(OSError):  # the program may have ended
+                            child.stdin.write(json.dumps(reply) + "\n")
+                            child.stdin.flush()
             child.wait()
             reader.join()
             with suppress(OSError):
@@ -84,8 +95,11 @@ def read_request() -> dict:
     request = json.loads(sys.stdin.readline())
 
     def wait() -> None:
-        while os.read(0, 4096):
-            pass
+        received = b""
+        while data := os.read(0, 4096):  # a blocked read of sys.stdin would abort Python's exit
+            *lines, received = (received + data).split(b"\n")
+            for line in lines:
+                _replies.put(json.loads(line))
         os._exit(1)
 
     threading.Thread(target=wait, daemon=True).start()
@@ -106,6 +120,12 @@ def load_pycolmap() -> ModuleType:
 def send(**values: object) -> None:
     """Send an object to the parent process."""
     print(json.dumps(values), flush=True)
+
+
+def ask(**values: object) -> dict:
+    """Send an object to the parent process and return its reply."""
+    send(**values)
+    return _replies.get()
 
 
 def _kill_on_full_disk(child: subprocess.Popen[str], folder: Path) -> None:

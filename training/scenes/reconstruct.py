@@ -106,7 +106,7 @@ def reconstruct(
         report: called with the progress.
 
     Raises:
-        LodgsError: if there are too few photos, too few overlap, or a file cannot be written.
+        LodgsError: there are too few photos, too few overlap, or a file cannot be written.
     """
     photos, out = (Path(os.path.abspath(path)) for path in (photos, out))
     masks = None if masks is None else Path(os.path.abspath(masks))
@@ -333,7 +333,7 @@ def _link_masks(masks: Path, photos: Path, image_names: Mapping[str, str], out: 
     if not folder.is_dir():
         first = next(iter(image_names))
         raise LodgsError(
-            f"Cannot use masks: {masks} holds no mask of these photos.",
+            f"Cannot use masks: {masks} has no mask of these photos.",
             f"Name the mask of {first} {first}.png.",
         )
     return folder

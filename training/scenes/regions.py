@@ -53,7 +53,7 @@ class Region:
         """Return the scene with only the region's views.
 
         Raises:
-            LodgsError: if the scene has none of them.
+            LodgsError: the scene has none of them.
         """
         names = frozenset(self.views)
         cameras = [camera for camera in scene.cameras if camera.name in names]
@@ -103,7 +103,7 @@ class Region:
         """Write the region as JSON; infinite bounds become null.
 
         Raises:
-            OSError: if the file cannot be written.
+            OSError: the file cannot be written.
         """
         values = {
             "ground": self.ground.tolist(), "cell": _finite(self.cell), "area": _finite(self.area),
@@ -117,7 +117,7 @@ class Region:
         """Read a region written by :meth:`write`, bit by bit.
 
         Raises:
-            LodgsError: if the file cannot be read or contains no region.
+            LodgsError: the file cannot be read or contains no region.
         """
         values = read_json(path, f"The region {path}")
         try:
@@ -146,7 +146,7 @@ def plan_cells(scene: Scene, columns: int, rows: int) -> list[Region]:
         columns, rows: number of columns and rows, at least 1.
 
     Raises:
-        LodgsError: if there are too few views or distinct positions for the number of cells.
+        LodgsError: there are too few views or distinct positions for the number of cells.
     """
     cameras = scene.cameras
     if len(cameras) < 2 * columns * rows:

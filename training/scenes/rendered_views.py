@@ -79,7 +79,7 @@ def write_rendered_model(
         The number of views and the number of points.
 
     Raises:
-        LodgsError: if a view lacks a file or depth, or no two views show the same surface.
+        LodgsError: a view lacks a file or depth, or no two views show the same surface.
     """
     cameras, _ = read_camera_folder(folder / CAMERAS)
     views = [replace(camera, name=f"{camera.name}.png") for camera in cameras]
@@ -200,7 +200,7 @@ def read_exr_depth(file: Path) -> np.ndarray:
     count.
 
     Raises:
-        LodgsError: if the file cannot be read or contains no depth.
+        LodgsError: the file cannot be read or contains no depth.
     """
     try:
         channels = [channel for _, _, part in read_parts(file) for channel in part.items()]

@@ -19,15 +19,15 @@ from .pycolmap_process import send
 if TYPE_CHECKING:
     import pycolmap
 
-GLOBAL_FROM = 100
-"""Number of photos above which the global mapper runs first."""
-GLOBAL_SHARE = 0.9
-"""Share of placed photos below which the incremental mapper runs after the global one."""
-EXHAUSTIVE = 80
-"""Maximum number of unordered photos for comparing all pairs; larger sets compare similar photos only."""
-SIMILAR = 30
+MAX_INCREMENTAL_PHOTOS = 100
+"""Maximum number of photos for the incremental mapper alone. Larger sets run the global mapper first."""
+MIN_GLOBAL_SHARE = 0.9
+"""Minimum share of photos that the global mapper must place. Otherwise the incremental mapper runs too."""
+MAX_EXHAUSTIVE_PHOTOS = 80
+"""Maximum number of unordered photos for comparing all pairs. Larger sets compare only similar photos."""
+SIMILAR_PHOTOS = 30
 """Number of similar photos compared with each photo."""
-OVERLAP = 10
+SUBSEQUENT_PHOTOS = 10
 """Number of subsequent photos compared with each ordered photo, plus some at doubling distances."""
 _VOCABULARY_SAMPLES = 60_000
 """Approximate number of descriptors used to build the vocabulary tree."""
@@ -78,20 +78,21 @@ def _match(request: dict, work: Path, database: Path) -> None:
     cpu = pycolmap.Device.cpu
     if request["ordered"]:
         options = pycolmap.SequentialPairingOptions()
-        options.overlap = OVERLAP
-        if count > 4 * OVERLAP:
+        options.overlap = SUBSEQUENT_PHOTOS
+        if count > 4 * SUBSEQUENT_PHOTOS:
             options.vocab_tree_path = _build_vocabulary(work, database)
             options.loop_detection = True
-        send(stage="pairs", done=0, total=count * (OVERLAP + 4))
+        send(stage="pairs", done=0, total=count * (SUBSEQUENT_PHOTOS + 4))
         pycolmap.match_sequential(database, pairing_options=options, device=cpu)
-    elif count <= EXHAUSTIVE:
+    elif count <= MAX_EXHAUSTIVE_PHOTOS:
         send(stage="pairs", done=0, total=count * (count - 1) // 2)
         pycolmap.match_exhaustive(database, device=cpu)
     else:
         options = pycolmap.VocabTreePairingOptions()
-        options.num_images = SIMILAR
+        options.num_images = SIMILAR_PHOTOS
         options.vocab_tree_path = _build_vocabulary(work, database)
-        send(stage="pairs", done=0, total=count * SIMILAR * 2 // 3)  # an estimate: many pairs are mutual
+        # an estimate: many pairs are mutual
+        send(stage="pairs", done=0, total=count * SIMILAR_PHOTOS * 2 // 3)
         pycolmap.match_vocabtree(database, pairing_options=options, device=cpu)
 
 
@@ -134,12 +135,12 @@ def _map(request: dict, work: Path, database: Path) -> pycolmap.Reconstruction |
     models.mkdir()
     send(stage="cameras", done=0, total=count)
     best = None
-    if count > GLOBAL_FROM:
+    if count > MAX_INCREMENTAL_PHOTOS:
         options = pycolmap.GlobalPipelineOptions()
         options.image_names = request["names"]
         results = pycolmap.global_mapping(database, request["photos"], models, options)
         best = _largest(list(results.values()))
-    if best is None or best.num_reg_images() < GLOBAL_SHARE * count:
+    if best is None or best.num_reg_images() < MIN_GLOBAL_SHARE * count:
         options = pycolmap.IncrementalPipelineOptions()
         options.image_names = request["names"]
         options.min_model_size = 3

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
-import shutil
 import sys
 import tempfile
-import time
 from collections import defaultdict
 from contextlib import suppress
 from dataclasses import replace
@@ -23,6 +20,7 @@ from .colmap import DEPTHS, MASKS, Scene, read_scene
 from .depths import read_depth_map
 from .exr import write_exr
 from .images import load_exr, load_image, load_mask, write_png
+from .scene_cache import remove_abandoned, scene_digest, writable_cache
 
 if TYPE_CHECKING:
     import pycolmap
@@ -32,8 +30,6 @@ CACHE_FOLDER = ".undistorted"
 _VERSION = b"4"  # format of the cached files
 _SOURCE_PIXELS = "source_pixels"
 """Folder of arrays with the position of each undistorted pixel in the photo, as fractions of its sides."""
-_ABANDONED_SECONDS = 86_400.0
-"""Age at which an unfinished folder in the cache counts as abandoned."""
 
 
 def undistort_scene(scene: Scene, cache: Path) -> Scene:
@@ -44,15 +40,15 @@ def undistort_scene(scene: Scene, cache: Path) -> Scene:
     Undistorted images are cropped to contain no empty pixels (COLMAP's blank_pixels = 0).
 
     Raises:
-        LodgsError: if pycolmap is missing or fails, photos of one camera differ in size, or the cache cannot
+        LodgsError: pycolmap is missing or fails, photos of one camera differ in size, or the cache cannot
             be written.
     """
     if not scene.distorted:
         return scene
     try:
-        target = cache / _digest(scene)
+        target = cache / scene_digest(scene, _VERSION)
         if not target.is_dir():
-            _remove_abandoned(cache)
+            remove_abandoned(cache, "undistorting-")
             _undistort_into(target, scene)
     except OSError as error:
         raise LodgsError(
@@ -64,25 +60,19 @@ def undistort_scene(scene: Scene, cache: Path) -> Scene:
 
 def undistort_cache(scene: Scene, fallback: Path) -> Path:
     """Return the cache folder inside the scene's folder, or ``fallback`` if that is not writable."""
-    cache = scene.folder / CACHE_FOLDER
-    try:
-        cache.mkdir(exist_ok=True)
-        with tempfile.TemporaryFile(dir=cache):
-            return cache
-    except OSError:
-        return fallback
+    return writable_cache(scene, CACHE_FOLDER, fallback)
 
 
 def cached_undistorted_scene(scene: Scene) -> Scene | None:
     """Return the undistorted scene from the cache inside the scene's folder, or None if it is not cached.
 
     Raises:
-        LodgsError: if the cached scene is damaged.
+        LodgsError: the cached scene is damaged.
     """
     if not scene.distorted:
         return scene
     try:
-        target = scene.folder / CACHE_FOLDER / _digest(scene)
+        target = scene.folder / CACHE_FOLDER / scene_digest(scene, _VERSION)
         return _read_cached(target, scene) if target.is_dir() else None
     except OSError:
         return None
@@ -94,29 +84,11 @@ def _read_cached(target: Path, scene: Scene) -> Scene:
     warnings = [f"Skipped {name}: it cannot be undistorted." for name in sorted(missing)]
     turns = {camera.name: camera.turns for camera in scene.cameras}
     cameras = [replace(camera, turns=turns[camera.name]) for camera in result.cameras]
-    return replace(result, cameras=cameras, names=scene.names, warnings=[*scene.warnings, *warnings])
-
-
-def _digest(scene: Scene) -> str:
-    """Return a digest of the names, sizes and times of all files of the model and the views."""
-    digest = hashlib.blake2b(_VERSION, digest_size=16)
-    model = sorted(path for path in scene.model.iterdir() if path.suffix in (".bin", ".txt"))
-    files = [(path.name, path) for path in model]
-    files += [(camera.name, camera.image) for camera in scene.cameras if camera.image is not None]
-    files += [(camera.name, camera.mask) for camera in scene.cameras if camera.mask is not None]
-    files += [(camera.name, camera.depth) for camera in scene.cameras if camera.depth is not None]
-    for name, path in files:
-        status = path.stat()
-        text = f"{name}\0{status.st_size}\0{status.st_mtime_ns}\0"
-        digest.update(text.encode("utf-8", "surrogateescape"))
-    return digest.hexdigest()
-
-
-def _remove_abandoned(cache: Path) -> None:
-    """Remove the unfinished folders of killed programs."""
-    for folder in cache.glob("undistorting-*"):
-        if time.time() - folder.stat().st_mtime > _ABANDONED_SECONDS:
-            shutil.rmtree(folder, ignore_errors=True)
+    return replace(
+        result, cameras=cameras, names=scene.names, points=scene.points, point_colors=scene.point_colors,
+        point_ids=scene.point_ids, point_model=scene.point_model or scene.model,
+        warnings=[*scene.warnings, *warnings],
+    )  # fmt: skip
 
 
 def _undistort_into(target: Path, scene: Scene) -> None:

@@ -55,7 +55,7 @@ def read_view_tables(tables: dict[str, Columns]) -> tuple[list[Camera], float, s
     Without the tables, there are no cameras.
 
     Raises:
-        LodgsError: if the tables are damaged.
+        LodgsError: the tables are damaged.
     """
     views = tables.get(VIEWS)
     if views is None:

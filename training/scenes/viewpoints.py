@@ -35,7 +35,7 @@ def dome_views(splats: Splats, count: int, width: int = 960, height: int = 640) 
     cameras.
 
     Raises:
-        LodgsError: if there is no opaque splat.
+        LodgsError: there is no opaque splat.
     """
     return dome_views_around(opaque_means(splats), count, width, height)
 
@@ -56,7 +56,7 @@ def dome_views_around(
         lowest: sine of the dome's lowest elevation: 0 is level, -1 straight below.
 
     Raises:
-        LodgsError: if there is no point.
+        LodgsError: there is no point.
     """
     if not len(points):
         raise _no_splats_error()
@@ -91,7 +91,7 @@ def aerial_views(
         altitude: height above the top; 0 selects HEIGHT times the spacing of the views.
 
     Raises:
-        LodgsError: if there is no point, or the points have no horizontal extent.
+        LodgsError: there is no point, or the points have no horizontal extent.
     """
     if not len(points):
         raise _no_splats_error()
@@ -142,7 +142,7 @@ def views_along(
     """Return the views of :func:`walk_views`, independent of the splats.
 
     Raises:
-        LodgsError: if the path has no length or is vertical.
+        LodgsError: the path has no length or is vertical.
     """
     lengths = np.linalg.norm(np.diff(path, axis=0), axis=1)
     knots = np.concatenate([[0], np.cumsum(lengths)])
@@ -174,7 +174,7 @@ def opaque_means(splats: Splats) -> np.ndarray:
     """Return the means of the opaque splats, (N, 3) float64.
 
     Raises:
-        LodgsError: if there is no opaque splat.
+        LodgsError: there is no opaque splat.
     """
     means = splats.means[splats.opacity_logits > np.log(OPAQUE / (1 - OPAQUE))].astype(np.float64)
     if not len(means):

@@ -45,7 +45,7 @@ def write_visible_points(
         The number of written points.
 
     Raises:
-        LodgsError: if no point is visible in enough views.
+        LodgsError: no point is visible in enough views.
     """
     visible = np.stack([visible_points(depths(n), view, points)[1] for n, view in enumerate(cameras)])
     shared = visible.sum(axis=0) >= SHORTEST_TRACK

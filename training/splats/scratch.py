@@ -15,7 +15,7 @@ from .gaussians import Splats
 from .ply import all_columns, splats_from_rows, to_records
 
 _PAGE = 64
-"""Rows per page. Wanted rows on neighbouring pages are read together."""
+"""Rows per page. Requested rows on neighbouring pages are read together."""
 _RUN = 1 << 15
 """Maximum number of rows of one read."""
 
@@ -36,7 +36,7 @@ class ScratchFile:
         self._folder = folder
         self._count = 0
         self._row = np.dtype([])
-        with self._errors_as_sentences():
+        with self._readable_errors():
             self._file = tempfile.TemporaryFile(dir=folder, buffering=0)  # noqa: SIM115
 
     def __enter__(self) -> ScratchFile:
@@ -60,9 +60,9 @@ class ScratchFile:
         """
         records = to_records(all_columns(splats))
         self._row = self._row if self._row.names else records.dtype
-        assert records.dtype == self._row, "splats of other columns"
+        assert records.dtype == self._row, "splats with other columns"
         self._count = max(self._count, begin + len(splats))
-        with self._errors_as_sentences():
+        with self._readable_errors():
             self._file.seek(begin * self._row.itemsize)
             remaining = records.view(np.uint8).data
             while remaining:
@@ -99,7 +99,7 @@ class ScratchFile:
 
     def _read(self, begin: int, end: int) -> np.ndarray:
         records = np.empty(end - begin, self._row)
-        with self._errors_as_sentences():
+        with self._readable_errors():
             self._file.seek(begin * self._row.itemsize)
             remaining = records.view(np.uint8).data
             while remaining:
@@ -110,7 +110,7 @@ class ScratchFile:
         return records
 
     @contextmanager
-    def _errors_as_sentences(self) -> Iterator[None]:
+    def _readable_errors(self) -> Iterator[None]:
         """Turn OSError into LodgsError."""
         try:
             yield

@@ -193,10 +193,10 @@ def _add_sockets(tree: bpy.types.GeometryNodeTree, rule: Rule) -> None:
     for name in fact_names(rule):
         tree.interface.new_socket(name, in_out="INPUT", socket_type="NodeSocketFloat")
     for control in rule.controls:
-        kind = "NodeSocketInt" if control.whole else "NodeSocketFloat"
+        kind = "NodeSocketInt" if control.integer else "NodeSocketFloat"
         socket = tree.interface.new_socket(control.name, in_out="INPUT", socket_type=kind)
         socket.description = control.about
-        number = int if control.whole else float
+        number = int if control.integer else float
         socket.min_value, socket.max_value = number(control.low), number(control.high)
         socket.default_value = number(control.default)
     for name in rule.tables:

@@ -33,7 +33,7 @@ def other_than_default(control):
         return not control.default
     if control.follows:
         return {"finest": 1, "coarsest": 2}[control.follows]
-    return control.default + (3000 if control.step > 1 else 2 if control.whole else 0.5)
+    return control.default + (3000 if control.step > 1 else 2 if control.integer else 0.5)
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,9 @@ from training.splats.bundle import write_bundle
 from training.splats.levels import Bundle, Level
 from training.splats.splat_transform import PROGRAM
 
+pytestmark = pytest.mark.one_blender
+
+
 HERE = Path(__file__).parents[3] / "build" / "interop" / "node_modules" / ".bin"
 
 

@@ -6,8 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.training.scenes.walls import write_walls
 from training.scenes.colmap import read_scene
+from training.scenes.colmap_model import make_intrinsics
 from training.scenes.images import write_png
+from training.scenes.write_colmap import write_model
 
 
 @pytest.fixture
@@ -215,7 +218,7 @@ def test_another_program_s_export(bpy, lodgs, tmp_path):
     (tmp_path / "transforms.json").write_text(json.dumps({"camera_angle_x": 1.0, "frames": frames}))
     said = []
     root = lodgs("data.importing").import_colmap(bpy.context, tmp_path, upright=False, warn=said.append)
-    assert "random" in said[0]
+    assert "Training creates them from the photos" in said[0]
     bpy.context.view_layer.update()
     for number, pose in enumerate(poses):
         camera = next(each for each in root.lodgs.cameras.objects if each.name == f"{number}.png")
@@ -230,3 +233,24 @@ def test_damaged_export_is_rejected(bpy, lodgs, tmp_path):
     with pytest.raises(RuntimeError, match=r"transforms\.json is not valid"):
         bpy.ops.lodgs.import_colmap(directory=str(tmp_path))
     assert _everything(bpy) == before and [each.name for each in tmp_path.iterdir()] == ["transforms.json"]
+
+
+def test_scene_without_points_shows_cameras_then_triangulated_points(bpy, lodgs, tmp_path):
+    """Blender reads the points that the trainer cached; it has no pycolmap to triangulate them."""
+    folder, told = write_walls(tmp_path / "walls"), []
+    import_colmap = lodgs("data.importing").import_colmap
+    root = import_colmap(bpy.context, folder, warn=told.append)
+    assert len(lodgs("data.photographs").views(root)) == 6 and root.lodgs.points is None
+    (message,) = told
+    assert "has no points" in message and "Training creates them from the photos." in message
+    triangulate = lodgs("training.scenes.triangulate")
+    scene = read_scene(folder)
+    cached = folder / triangulate.CACHE_FOLDER / triangulate._digest(scene, 0.0)
+    lens = make_intrinsics("PINHOLE", 320, 240, np.array([300.0, 300, 160, 120]))
+    poses = [(camera.name, camera.world_to_camera) for camera in scene.cameras]
+    points = np.random.default_rng(0).normal(size=(50, 3))
+    write_model(cached / "sparse", [lens] * 6, poses, points, np.full((50, 3), 99, np.uint8))
+    (cached / "summary.json").write_text('{"message": "Triangulated 50 points.", "warnings": []}')
+    told.clear()
+    root = import_colmap(bpy.context, folder, warn=told.append)
+    assert told == [] and len(root.lodgs.points.data.points) == 50

@@ -3,7 +3,12 @@
 import subprocess
 import sys
 
+import pytest
+
 from tests.checkout import ROOT, copy_checkout
+
+pytestmark = pytest.mark.one_blender
+
 
 ENTRY = '    CameraChoice("SECOND", "Second Object", "Another object", object="second_eye"),\n'
 LAST = "    VIEWPORT,\n)\n"

@@ -4,7 +4,12 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 from tests.training.test_plugins import METHOD, ROOT, RULE, TRAIN, install
+
+pytestmark = pytest.mark.one_blender
+
 
 SCRIPT = """
 import importlib, sys

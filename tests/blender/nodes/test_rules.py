@@ -29,7 +29,7 @@ def random_arguments(rule, rng):
     for control in rule.controls:
         low, high = RANGES.get(control.name) or control.soft or (control.low, min(control.high, 5))
         values[control.name] = (
-            max(int(rng.integers(low, high + 1)), 0) if control.whole else rng.uniform(low, high)
+            max(int(rng.integers(low, high + 1)), 0) if control.integer else rng.uniform(low, high)
         )
     return facts, values
 

@@ -51,9 +51,9 @@ def test_every_control_of_a_rule_has_a_property_of_its_type(root, draw, name):
     assert layout.sliders == [control.name for control in controls if control.soft]
     properties = scene_root.lodgs.controls.bl_rna.properties
     for control in controls:
-        kind = "BOOLEAN" if control.flag else "INT" if control.whole else "FLOAT"
+        kind = "BOOLEAN" if control.flag else "INT" if control.integer else "FLOAT"
         assert properties[control.name].type == kind
-        if control.whole and not control.flag:
+        if control.integer and not control.flag:
             assert properties[control.name].step == control.step
 
 

@@ -7,6 +7,9 @@ import pytest
 from tests.blender.panels.conftest import RecordingLayout
 from training.lod.colors import level_color
 
+pytestmark = pytest.mark.one_blender
+
+
 GARDEN = Path(__file__).resolve().parents[3] / "examples" / "lantern_garden"
 OUTDATED = "The settings have changed. Plan the cells again."
 

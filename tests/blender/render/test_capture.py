@@ -12,6 +12,9 @@ import pytest
 from training.scenes.cameras import read_camera_folder
 from training.scenes.images import image_size
 
+pytestmark = pytest.mark.one_blender
+
+
 TRAINER = os.environ.get("LODGS_TRAINER_PYTHON", "")
 AS_BLENDER = Path(__file__).resolve().parents[1] / "as_blender.py"
 SIZE = "64x48"

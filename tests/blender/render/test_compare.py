@@ -14,6 +14,9 @@ from training.splats.bundle import write_bundle
 from training.splats.gaussians import Splats
 from training.splats.levels import Bundle, Level
 
+pytestmark = pytest.mark.one_blender
+
+
 GARDEN = Path(__file__).resolve().parents[3] / "examples" / "lantern_garden"
 
 

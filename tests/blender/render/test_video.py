@@ -9,6 +9,9 @@ import pytest
 from tests.training.scenes.walls import CAMERA_POSITIONS, render_photo
 from training.scenes.images import write_png
 
+pytestmark = pytest.mark.one_blender
+
+
 BLURRED = (1, 2, 4, 7, 8, 10, 11)
 
 

@@ -11,6 +11,9 @@ from tests.blender.fake_trainer import COUNTS, STEPS
 from training.runs.blocks.plan import plan
 from training.scenes.colmap import read_scene
 
+pytestmark = pytest.mark.one_blender
+
+
 GARDEN = Path(__file__).resolve().parents[3] / "examples" / "lantern_garden"
 
 
@@ -65,7 +68,7 @@ def test_plan_matches_the_trainers(bpy, lodgs, job_settings, root):
         )  # fmt: skip
         assert cell.points == region.start_points(scene).sum()
         assert cell.megabytes == pytest.approx(planned.memory / 1e6)
-        assert [names[place] for place in json.loads(cell.places)] == list(region.views)
+        assert [names[place] for place in json.loads(cell.view_indices)] == list(region.views)
         eyes, frames = lodgs("data.cells").cell_cameras(root, cell)
         centers = [camera.center for camera in scene.cameras if camera.name in region.views]
         np.testing.assert_allclose(eyes, centers, atol=1e-4)
@@ -95,7 +98,7 @@ def test_outlines_lie_on_the_ground_and_contain_their_cameras(bpy, lodgs, root):
     assert (np.sum(inside, axis=0) == 1).all(), "each camera is in one cell"
     for inner, outer, cell in zip(corners, enlarged, settings.planned_cells, strict=True):
         assert contains(outer, inner).all() and (sides(outer) > 1.05 * sides(inner)).all()
-        assert set(np.flatnonzero(contains(outer, centers))) <= set(json.loads(cell.places))
+        assert set(np.flatnonzero(contains(outer, centers))) <= set(json.loads(cell.view_indices))
 
 
 def test_plan_is_outdated_by_changed_settings(bpy, lodgs, job_settings, root, tmp_path):

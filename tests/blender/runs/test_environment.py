@@ -1,9 +1,12 @@
 """Selection and checks of the trainer's Python."""
 
 import json
+import os
 from pathlib import Path
 
 import pytest
+
+pytestmark = pytest.mark.one_blender
 
 
 @pytest.fixture
@@ -104,6 +107,13 @@ def test_check_reports_devices(bpy, lodgs, environment, preferences, tmp_path):
     )  # an older trainer without the command
     bpy.ops.lodgs.check_environment()
     assert environment.report.ok and environment.report.devices == ""
+
+
+def test_programs_of_a_background_blender_stop_with_it(bpy, lodgs):
+    processes = lodgs("training.runs.processes")
+    assert bpy.app.background
+    number, _, identity = lodgs("runs.processes").environment()[processes.PARENT].partition(" ")
+    assert int(number) == os.getpid() and identity == processes.identity(os.getpid())
 
 
 def test_blender_variables_are_removed_from_the_trainers_environment(lodgs, monkeypatch):

@@ -7,6 +7,9 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.one_blender
+
+
 INPUTS = [
     Path(__file__).resolve().parents[3] / "requirements" / f"{name}.in" for name in ("trainer", "cluster")
 ]

@@ -12,6 +12,9 @@ from types import SimpleNamespace
 
 import pytest
 
+pytestmark = pytest.mark.one_blender
+
+
 SETTINGS = [
     {"key": key}
     for key in ("scene", "output", "columns", "rows", "method", "preset", "image_scale", "polish", "options")

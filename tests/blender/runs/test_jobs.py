@@ -10,6 +10,9 @@ import pytest
 
 from tests.blender.fake_trainer import COUNTS, LEAVES, splats
 
+pytestmark = pytest.mark.one_blender
+
+
 REPOSITORY = Path(__file__).resolve().parents[3]
 TRAINER = os.environ.get("LODGS_TRAINER_PYTHON", "")
 
@@ -604,11 +607,10 @@ def test_mistakes_are_reported(bpy, jobs, fake, root, tmp_path, monkeypatch):
 
 
 @pytest.mark.nightly
-def test_the_real_trainer(bpy, jobs, tmp_path, monkeypatch):
+def test_the_real_trainer(bpy, jobs, tmp_path):
     """Train levels from small images in a few steps, cancel and resume."""
     if not TRAINER:
         pytest.skip("no trainer; set LODGS_TRAINER_PYTHON")
-    monkeypatch.setenv("NUMBA_CACHE_DIR", "")  # cache of the checkout, so that kernels compile once
     bpy.ops.lodgs.import_colmap(directory=str(REPOSITORY / "examples" / "lantern_garden"), photographs=False)
     (root,) = [obj for obj in bpy.data.objects if obj.lodgs.is_root]
     root.lodgs.training.image_scale = 0.1
@@ -638,11 +640,10 @@ def test_resume_uses_the_current_backend(bpy, lodgs, jobs, fake, root, tmp_path)
 
 
 @pytest.mark.nightly
-def test_octree_levels_are_cumulative_and_follow_the_distance(bpy, lodgs, jobs, tmp_path, monkeypatch):
+def test_octree_levels_are_cumulative_and_follow_the_distance(bpy, lodgs, jobs, tmp_path):
     """With the real trainer, all levels arrive together, twice, and are selected by distance at once."""
     if not TRAINER:
         pytest.skip("no trainer; set LODGS_TRAINER_PYTHON")
-    monkeypatch.setenv("NUMBA_CACHE_DIR", "")
     bpy.ops.lodgs.import_colmap(directory=str(REPOSITORY / "examples" / "lantern_garden"), photographs=False)
     (root,) = [obj for obj in bpy.data.objects if obj.lodgs.is_root]
     root.lodgs.training.image_scale, root.lodgs.training.method = 0.1, "octree"

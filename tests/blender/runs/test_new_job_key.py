@@ -3,7 +3,12 @@
 import subprocess
 import sys
 
+import pytest
+
 from tests.training.runs.test_new_job_key import checkout_with_key
+
+pytestmark = pytest.mark.one_blender
+
 
 SCRIPT = """
 import importlib

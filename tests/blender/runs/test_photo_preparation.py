@@ -13,6 +13,8 @@ from training.scenes.images import write_png
 from training.scenes.undistort import cached_undistorted_scene
 from training.scenes.write_colmap import write_model
 
+pytestmark = pytest.mark.one_blender
+
 
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory):

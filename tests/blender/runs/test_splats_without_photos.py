@@ -12,6 +12,9 @@ from training.splats.bundle import read_bundle, write_bundle
 from training.splats.gaussians import Splats
 from training.splats.levels import Bundle, Level
 
+pytestmark = pytest.mark.one_blender
+
+
 TRAINER = os.environ.get("LODGS_TRAINER_PYTHON", "")
 
 
@@ -169,10 +172,9 @@ def test_training_with_photos_starts_from_the_current_splats(bpy, lodgs, fake, r
     np.testing.assert_array_equal(read_bundle(job.base).levels[-1].splats.means, ball().means)
 
 
-def test_the_real_trainer_adds_levels_to_splats_without_photos(bpy, lodgs, root, tmp_path, monkeypatch):
+def test_the_real_trainer_adds_levels_to_splats_without_photos(bpy, lodgs, root, tmp_path):
     if not TRAINER:
         pytest.skip("no trainer; set LODGS_TRAINER_PYTHON")
-    monkeypatch.setenv("NUMBA_CACHE_DIR", "")  # cache of the checkout, so that kernels compile once
     jobs, training = lodgs("runs.jobs"), root.lodgs.training
     training.views, training.view_width, training.image_scale = 8, 96, 1.0
     (item,) = root.lodgs.levels

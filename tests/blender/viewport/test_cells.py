@@ -24,7 +24,7 @@ def root(bpy, lodgs):
         cell = settings.planned_cells.add()
         cell.outline = np.ravel([(a, -4, 0), (b, -4, 0), (b, 4, 0), (a, 4, 0)])
         cell.enlarged = np.ravel([(a - 1, -5, 0), (b + 1, -5, 0), (b + 1, 5, 0), (a - 1, 5, 0)])
-        cell.places = str([index])
+        cell.view_indices = str([index])
     bpy.context.view_layer.update()
     return root
 
@@ -54,7 +54,7 @@ def test_frames_of_cell_cameras_match_their_views(lodgs, root):
         [(-0.25, -0.25, 1), (0.25, -0.25, 1), (0.25, 0.25, 1), (-0.25, 0.25, 1)]
     )
     np.testing.assert_allclose(corners, truth[None], atol=1e-6)
-    cell.places = "[7]"  # its camera was deleted
+    cell.view_indices = "[7]"  # its camera was deleted
     positions, corners = lodgs("data.cells").cell_cameras(root, cell)
     assert positions.shape == (0, 3) and corners.shape == (0, 4, 3)
 

@@ -114,7 +114,7 @@ def test_a_resting_view_redraws_until_loading_ends(lodgs, root, draw_from, monke
         elif view.pending is None and stream.ready and not stream.busy:
             break
         time.sleep(0.002)
-    assert not stream.busy and view.arrived == stream.ready + stream.taken and slices > 3
+    assert not stream.busy and view.arrived == stream.ready + stream.copied_updates and slices > 3
 
 
 def test_streamed_image_matches_the_whole_file(bpy, lodgs, path, root, draw_from):

@@ -55,7 +55,7 @@ def test_ranges_cover_each_view_once_and_the_model_depends_on_all(tmp_path):
 
 
 @needs_node
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.skipif(importlib.util.find_spec("bpy") is None, reason="Blender's module is not installed")
 def test_commands_of_the_tasks_give_the_same_scene_as_one_command(tmp_path, monkeypatch):
     monkeypatch.setenv("LODGS_TRAINER_PYTHON", sys.executable)

@@ -46,7 +46,7 @@ def test_declarations_are_complete(name):
     for control in rule.controls:
         assert control.low <= control.default <= control.high
         assert control.label and control.about and not control.about.endswith(".")
-        assert all_controls()[control.name].whole == control.whole
+        assert all_controls()[control.name].integer == control.integer
 
 
 @pytest.mark.parametrize("name", RULES)
@@ -72,9 +72,9 @@ def test_files_preserve_rule_facts_and_selection(name, tmp_path):
 def any_values(rule: Rule, rng: np.random.Generator) -> dict[str, float]:
     values = {}
     for control in rule.controls:
-        low, high = (control.low, min(control.high, 4)) if control.whole else control.soft or (1, 4)
+        low, high = (control.low, min(control.high, 4)) if control.integer else control.soft or (1, 4)
         value = rng.uniform(low, high)
-        values[control.name] = round(value) if control.whole else value
+        values[control.name] = round(value) if control.integer else value
     if "first" in values:
         values["first"], values["last"] = sorted((values["first"], values["last"]))
     return values
@@ -178,7 +178,7 @@ def test_missing_and_unknown_rules_are_reported(rule, message):
 
 @pytest.mark.parametrize("value", [0.5, 3, -1, float("nan"), float("inf"), 10**400, "2", None])
 def test_invalid_control_values_are_rejected(value):
-    control = Control("turns", 1, 0, 2, "Turns", "How many", whole=True)
+    control = Control("turns", 1, 0, 2, "Turns", "How many", integer=True)
     with pytest.raises(LodgsError, match=r"turns = .* is invalid. Use a whole number from 0 to 2."):
         control.validate(value)
 

@@ -117,7 +117,7 @@ def depth_error(run: Path) -> float:
     return float(np.median(np.concatenate(errors)))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_depth_loss_improves_depth_and_replaces_points(walls, tmp_path, capsys):
     """Train on a floor of random squares, from depth maps of unknown scale, and from maps without points.
 

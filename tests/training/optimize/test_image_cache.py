@@ -220,6 +220,7 @@ def test_planned_views_match_chosen_views(scene, name):
     assert method.planned_view(method.steps) is None
 
 
+@pytest.mark.nightly
 def test_memory_stays_within_the_budget(tmp_path):
     """Measured by tracemalloc, including moments of losses."""
     side, views = 320, 24

@@ -41,7 +41,11 @@ def test_splats_behind_limit_are_hidden(backend, axis_camera):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["degree 3", "antialiased", "needles", "screen-filling", "caps", "crowd"])
+@pytest.mark.parametrize(
+    "name",
+    ["degree 3", "antialiased", "needles", "screen-filling", "caps",
+     pytest.param("crowd", marks=pytest.mark.nightly)],
+)  # fmt: skip
 def test_limits_match_reference(name, backend, make_splats, odd_camera):
     """With a different limit in every pixel, relative L2 errors are at most 5e-4."""
     splats, options = scene(name, make_splats)

@@ -24,6 +24,7 @@ class Client:
 
     def __init__(self, folder: Path, *options: str) -> None:
         self.folder = folder
+        self.hello: dict = {}
         folder.mkdir()
         command = [sys.executable, "-m", "training", "serve", str(folder), *options]
         self.process = subprocess.Popen(
@@ -47,9 +48,21 @@ class Client:
                 return event
 
 
+@pytest.fixture(scope="module")
+def client(tmp_path_factory):
+    """A renderer that the tests share, because it takes seconds to start. Each test names its own sets."""
+    yield from start(tmp_path_factory.mktemp("client"))
+
+
 @pytest.fixture
-def client(tmp_path):
-    client = Client(tmp_path / "frames", "--backend", "cpu")
+def own_client(tmp_path):
+    """A renderer that the test may end."""
+    yield from start(tmp_path)
+
+
+def start(folder: Path):
+    client = Client(folder / "frames", "--backend", "cpu")
+    client.hello = client.receive("hello")
     yield client
     client.process.kill()
     client.process.wait()
@@ -60,12 +73,11 @@ def request(camera, sets, frame=1, **values) -> dict:
 
 
 def test_frames_match_draw(client, make_splats, camera):
-    hello = client.receive("hello")
-    assert hello["protocol"] == wire.PROTOCOL and hello["backend"] == "cpu"
+    assert client.hello["protocol"] == wire.PROTOCOL and client.hello["backend"] == "cpu"
     splats, weights = make_splats(80), np.linspace(0, 1, 80, dtype=np.float32)
-    wire.write_set(client.folder / "one", wire.pack_set(splats, weights))
+    wire.write_set(client.folder / "drawn", wire.pack_set(splats, weights))
     matrix = np.diag([2.0, 2, 2, 1])
-    sets = [{"file": "one", "count": 80, "matrix": matrix.tolist(), "level": 4}]
+    sets = [{"file": "drawn", "count": 80, "matrix": matrix.tolist(), "level": 4}]
     for frame in (1, 2, 3):
         if frame == 3:
             sets[0]["antialias"] = True
@@ -79,25 +91,24 @@ def test_frames_match_draw(client, make_splats, camera):
         assert answer["passes"] == list(expected)
         for expected_plane, plane in zip(expected.values(), planes, strict=True):
             np.testing.assert_array_equal(expected_plane, plane)
-        (client.folder / "one").unlink(missing_ok=True)  # a set is read only once
+        (client.folder / "drawn").unlink(missing_ok=True)  # a set is read only once
 
 
 def test_queries_select_splats_of_a_set(client, make_splats, camera):
     """The file is read only once. Another camera position selects other splats, and only these are drawn."""
-    client.receive("hello")
     splats = make_splats(200)
     splats.extras["lod_bias"] = np.linspace(-1, 1, 200, dtype=np.float32)
-    wire.write_set(client.folder / "one", wire.pack_set(splats, None))
+    wire.write_set(client.folder / "queried", wire.pack_set(splats, None))
     rule, images = rules()["octree"], []
     facts = {"level": 2.0, "finer": 3.0, "coarser": 1.0, "levels": 3.0, "d_max": 1.2, "d_max_focal": 1.5}
     values = {"offset": 0.25, "fade": 1}
     for frame, position in enumerate(((0.0, 0.0, 0.5), (0.5, 0.25, -1.0))):
         choice = LodQuery("octree", position, 1.5, tuple(facts.items()), tuple(values.items())).as_dict()
-        item = {"file": "one", "count": 200, "matrix": np.eye(4).tolist(), "level": 2}
+        item = {"file": "queried", "count": 200, "matrix": np.eye(4).tolist(), "level": 2}
         client.send(**request(camera, [item | {"columns": ["lod_bias"], "choice": choice}], frame))
         answer = client.receive("frame", "error")
         planes = wire.read_planes(client.folder / "frame", len(answer["passes"]), 48, 64)
-        (client.folder / "one").unlink(missing_ok=True)
+        (client.folder / "queried").unlink(missing_ok=True)
         weights = rule.weights(splats.means, np.float32(position), 1.5, splats.extras, facts, values)
         selected = weights > 0
         assert 20 < selected.sum() < 180
@@ -110,10 +121,9 @@ def test_queries_select_splats_of_a_set(client, make_splats, camera):
 
 
 def test_holdout_is_read_or_reported_missing(client, make_splats, camera, tmp_path):
-    client.receive("hello")
     splats = make_splats(80)
-    wire.write_set(client.folder / "one", wire.pack_set(splats, None))
-    sets = [{"file": "one", "count": 80, "matrix": np.eye(4).tolist(), "level": 0}]
+    wire.write_set(client.folder / "behind", wire.pack_set(splats, None))
+    sets = [{"file": "behind", "count": 80, "matrix": np.eye(4).tolist(), "level": 0}]
     depth = np.full((48, 64), 4, np.float32)
     OpenEXR.File({"type": OpenEXR.scanlineimage}, {"L.Depth.Z": depth}).write(str(tmp_path / "depth.exr"))
     options = {"holdout": str(tmp_path / "depth.exr"), "window": [10, 5, 30, 40], "background": None}
@@ -130,7 +140,6 @@ def test_holdout_is_read_or_reported_missing(client, make_splats, camera, tmp_pa
 
 
 def test_invalid_requests_are_answered_with_errors(client, make_splats, camera):
-    client.receive("hello")
     client.send_line("no json")
     assert "not valid" in client.receive("error")["what"]
     client.send(**request(camera, [{"file": "gone", "count": 3, "matrix": np.eye(4).tolist(), "level": 0}]))
@@ -143,9 +152,8 @@ def test_invalid_requests_are_answered_with_errors(client, make_splats, camera):
 
 def test_malformed_requests_do_not_end_the_renderer(client, make_splats, camera):
     """Unhashable frame numbers and transforms that drop all splats once ended the process."""
-    client.receive("hello")
     client.send(cancel={})
-    assert "not valid" in client.receive("error")["what"]
+    assert "Cannot read the request" in client.receive("error")["what"]
     client.send_line("[" * 100_000)
     assert "not valid" in client.receive("error")["what"]
     client.send_line("x" * (3 << 20))  # answered once, however long
@@ -192,9 +200,8 @@ def test_foreign_folder_is_refused(tmp_path):
 
 @pytest.mark.slow
 def test_frame_is_cancelled(client, make_splats, camera):
-    client.receive("hello")
-    wire.write_set(client.folder / "one", wire.pack_set(make_splats(3000), None))
-    sets = [{"file": "one", "count": 3000, "matrix": np.eye(4).tolist(), "level": 0}]
+    wire.write_set(client.folder / "many", wire.pack_set(make_splats(3000), None))
+    sets = [{"file": "many", "count": 3000, "matrix": np.eye(4).tolist(), "level": 0}]
     large = camera.resized(8192, 6144)
     client.send(**request(large, sets, 1))
     client.receive("progress")
@@ -207,22 +214,20 @@ def test_frame_is_cancelled(client, make_splats, camera):
 
 
 @pytest.mark.slow
-def test_renderer_ends_with_its_client(client, make_splats, camera):
+def test_renderer_ends_with_its_client(own_client, make_splats, camera):
     """It ends even in the middle of a large frame, and removes its folder."""
-    client.receive("hello")
-    wire.write_set(client.folder / "one", wire.pack_set(make_splats(3000), None))
-    sets = [{"file": "one", "count": 3000, "matrix": np.eye(4).tolist(), "level": 0}]
-    client.send(**request(camera.resized(8192, 6144), sets, 1))
-    client.receive("progress")
-    client.process.stdin.close()
+    wire.write_set(own_client.folder / "many", wire.pack_set(make_splats(3000), None))
+    sets = [{"file": "many", "count": 3000, "matrix": np.eye(4).tolist(), "level": 0}]
+    own_client.send(**request(camera.resized(8192, 6144), sets, 1))
+    own_client.receive("progress")
+    own_client.process.stdin.close()
     started = time.monotonic()
-    assert client.process.wait(timeout=10) == 0
+    assert own_client.process.wait(timeout=10) == 0
     assert time.monotonic() - started < 5
-    assert not client.folder.exists()
+    assert not own_client.folder.exists()
 
 
 def test_empty_set_is_read_only_once(client, make_splats, camera):
-    client.receive("hello")
     wire.write_set(client.folder / "none", wire.pack_set(make_splats(0), None))
     sets = [{"file": "none", "count": 0, "matrix": np.eye(4).tolist(), "level": 1}]
     for frame in (1, 2):

@@ -103,7 +103,7 @@ def test_request_is_parsed(valid, camera):
     ],
 )  # fmt: skip
 def test_invalid_requests_raise_one_sentence(valid, change):
-    with pytest.raises(LodgsError, match="is not valid"):
+    with pytest.raises(LodgsError, match="Cannot read the request"):
         parse_request(valid | change)
 
 
@@ -120,7 +120,7 @@ def test_invalid_requests_raise_one_sentence(valid, change):
 )  # fmt: skip
 def test_invalid_sets_raise_one_sentence(valid, change):
     valid["sets"][0] |= change
-    with pytest.raises(LodgsError, match="is not valid"):
+    with pytest.raises(LodgsError, match="Cannot read the request"):
         parse_request(valid)
 
 

@@ -13,7 +13,7 @@ import pytest
 from training.errors import LodgsError
 from training.files import atomic_write
 from training.runs import processes
-from training.runs.folder import RunFolder
+from training.runs.folder import RunFolder, find_splats
 
 ROOT = Path(__file__).resolve().parents[3]
 LOCK_RUN = (
@@ -168,3 +168,46 @@ def test_ended_run_is_not_running_where_locks_need_write_access(tmp_path, monkey
     with run.locked():
         assert run.running
     assert not run.running
+
+
+def test_command_stops_when_its_parent_ends(monkeypatch):
+    """A Blender in background that is killed, even by SIGKILL, leaves no trainer behind."""
+    code = """
+import time
+from training.runs.processes import stop_with_parent
+stop_with_parent()
+print("ready", flush=True)
+try:
+    time.sleep(60)
+except KeyboardInterrupt:
+    print("interrupted", flush=True)
+"""
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as parent:
+        monkeypatch.setenv(processes.PARENT, f"{parent.pid} {processes.identity(parent.pid)}")
+        command = [sys.executable, "-c", code]
+        with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as child:
+            assert child.stdout is not None
+            assert child.stdout.readline() == "ready\n"
+            assert child.poll() is None
+            parent.kill()
+            parent.wait()
+            assert child.communicate(timeout=20)[0] == "interrupted\n"
+
+
+@pytest.mark.parametrize("value", [None, "", "1", "x y", f"{os.getpid()} elsewhere 1 boot 5"])
+def test_unknown_parent_is_ignored(monkeypatch, value):
+    """As in a container, which does not see Blender's process."""
+    if value is not None:
+        monkeypatch.setenv(processes.PARENT, value)
+    monkeypatch.setattr(processes.threading, "Thread", lambda **_: pytest.fail("watches"))
+    processes.stop_with_parent()
+
+
+def test_splats_of_a_run(run):
+    assert find_splats(run.path) == run.path
+    run.job.touch()
+    with pytest.raises(LodgsError, match="the run is not finished"):
+        find_splats(run.path)
+    run.bundle.touch()
+    assert find_splats(run.path) == run.bundle
+    assert find_splats(run.bundle) == run.bundle

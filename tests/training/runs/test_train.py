@@ -423,7 +423,7 @@ def test_moved_run_resumes_in_its_new_folder(uninterrupted, stopped, tmp_path):
 
 def test_finished_run_deletes_checkpoints_and_repeats_its_final_event(uninterrupted, capsys):
     folder = RunFolder(uninterrupted["keys"]["out"])
-    assert not list(folder.checkpoints.iterdir())
+    assert not folder.checkpoints.exists()
     events = folder.events_file.read_bytes()
     assert training_loop.train(Job.from_dict(uninterrupted["keys"]), sys.stdout) == 0
     event = json.loads(capsys.readouterr().out)
@@ -551,7 +551,6 @@ def test_scene_with_too_few_views_or_pixels_is_rejected(tiny_scene, tmp_path, vi
     ("change", "message"),
     [
         (lambda scene: [p.unlink() for p in (scene / "images").iterdir()], "view"),
-        (lambda scene: (scene / "sparse/0/points3D.txt").write_text(""), "no 3D points"),
         (lambda scene: (scene / "sparse/0/cameras.txt").unlink(), "cameras.txt is missing"),
         (lambda scene: [p.unlink() for p in sorted((scene / "images").iterdir())[1:]], "1 usable view"),
     ],

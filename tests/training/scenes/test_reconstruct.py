@@ -219,7 +219,7 @@ def test_invalid_inputs_are_rejected(photos, tmp_path):
     with pytest.raises(LodgsError, match="folder colmap of another program"):
         reconstruct(photos, tmp_path / "foreign")
     assert foreign.read_bytes() == b"days of work"
-    with pytest.raises(LodgsError, match="holds no mask"):
+    with pytest.raises(LodgsError, match="has no mask"):
         reconstruct(photos, tmp_path / "masked", masks=tmp_path / "few")
     assert main(["scene", "--photos", str(photos)]) == 2
 

@@ -44,11 +44,11 @@ class Bands(Rule):
         ),
         Control(
             "first", 1, 1, MAX_LEVEL, "Coarsest", "Coarsest level in use, shown at the largest distances",
-            whole=True, follows="coarsest",
+            integer=True, follows="coarsest",
         ),
         Control(
             "last", MAX_LEVEL, 1, MAX_LEVEL, "Finest", "Finest level in use, shown nearest to the camera",
-            whole=True, follows="finest",
+            integer=True, follows="finest",
         ),
     )  # fmt: skip
 

@@ -49,12 +49,12 @@ class Chunks(Rule):
         Control(
             "chunks", 1, 0, 1, "Chunks",
             "Show the fixed sets of the two nearest chunks; 0 measures distances from the camera",
-            whole=True,
+            integer=True,
         ),
         Control(
             "fade", 1, 0, 1, "Fade",
             "Fade between neighbouring chunks; 0 switches to the nearest one's set at once",
-            whole=True,
+            integer=True,
         ),
     )  # fmt: skip
 

@@ -69,7 +69,7 @@ class Decay(Rule):
         Control(
             "at_most", 0, 0, 2**30, "Splat Limit",
             "Maximum number of splats: raises s_v as needed. 0 disables",
-            whole=True, step=1000,
+            integer=True, step=1000,
         ),
     )  # fmt: skip
     independent = False

@@ -62,7 +62,7 @@ class Octree(Rule):
         ),
         Control(
             "fade", 1, 0, 1, "Fade",
-            "Fade levels in as the camera approaches; 0 switches at once", whole=True,
+            "Fade levels in as the camera approaches; 0 switches at once", integer=True,
         ),
     )  # fmt: skip
 

@@ -287,7 +287,7 @@ class TreePager:
 
     @property
     def idle(self) -> bool:
-        """Whether the caller has taken all pages that fit the budget, or the thread has ended."""
+        """True if the caller has taken all pages that fit the budget, or the thread has ended."""
         with self._changed:
             return self._ready is None and (bool(self.problem) or self._settled is self._request)
 

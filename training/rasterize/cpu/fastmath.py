@@ -73,7 +73,7 @@ prefetch: Any = _prefetch  # type checkers do not know that Numba passes the fir
 def exp2(x):
     """Compute 2^x for x <= 127, and 2^-30 below -30. The integer part of x is added to the exponent bits."""
     x = x if x > LOWEST else LOWEST
-    whole = np.floor(x)
-    f = x - whole
+    floor = np.floor(x)
+    f = x - floor
     p = f32(1) + f * (P1 + f * (P2 + f * (P3 + f * P4)))
-    return bits_float(float_bits(p) + (truncated(whole) << np.int32(23)))  # pyright: ignore[reportCallIssue]
+    return bits_float(float_bits(p) + (truncated(floor) << np.int32(23)))  # pyright: ignore[reportCallIssue]

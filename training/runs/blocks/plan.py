@@ -10,7 +10,7 @@ run/  job.toml (with ``cells``)  blocks/
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 from math import ceil
@@ -26,6 +26,7 @@ from ...optimize.memory import MAX_BYTES, TARGET_BYTES
 from ...optimize.parameters import Parameters
 from ...scenes.colmap import Scene, read_scene
 from ...scenes.regions import Region, plan_cells
+from ...scenes.triangulate import cached_points
 from ..folder import RunFolder
 from ..job import MAX_CELLS, Job
 
@@ -141,18 +142,21 @@ class PlannedCell:
     memory: int
 
 
-def read_planned_scene(job: Job) -> Scene:
+def read_planned_scene(job: Job, add_points: Callable[[Scene], Scene] = cached_points) -> Scene:
     """Read the scene of a job with cells.
+
+    Args:
+        add_points: adds points to a scene without points.
 
     Raises:
         LodgsError: the scene cannot be read, or has no points.
     """
     model, images = (Path(path) if path else None for path in (job.model, job.images))
-    scene = read_scene(Path(job.scene), model=model, images=images)
+    scene = add_points(read_scene(Path(job.scene), model=model, images=images))
     if not len(scene.points):
         raise LodgsError(
             f"Cannot divide scene: the COLMAP model in {scene.model} has no 3D points.",
-            "Triangulate points in COLMAP.",
+            f"Triangulate them: lodgs blocks plan {job.scene}.",
         )
     return scene
 
@@ -227,7 +231,11 @@ def choose_cells(job: Job, splats: int = 0, memory: int = 0, scene: Scene | None
 
 
 def write_plan(
-    job: Job, folder: RunFolder, scene: Scene | None = None, planned: list[PlannedCell] | None = None
+    job: Job,
+    folder: RunFolder,
+    scene: Scene | None = None,
+    planned: list[PlannedCell] | None = None,
+    add_points: Callable[[Scene], Scene] = cached_points,
 ) -> Division:
     """Write a job's parts into the run folder; keep an existing division.
 
@@ -235,12 +243,13 @@ def write_plan(
         job: the job.
         folder: its run.
         scene, planned: the job's scene and cells, if already available.
+        add_points: adds points to a scene without points.
 
     Raises:
         LodgsError: as :func:`plan`, or the folder cannot be written.
     """
     if not folder.blocks.exists():
-        scene = scene or read_planned_scene(job)
+        scene = scene or read_planned_scene(job, add_points)
         cells = planned or plan(job, scene)
         _, coarse = _divided(job)
         training = _training_views(job, scene)

@@ -16,7 +16,6 @@ import numpy as np
 
 from ...errors import LodgsError, SystemProblem
 from ...files import check_folder, link_or_copy
-from ..cameras import Camera
 from ..colmap import DEPTHS, MASKS, find_models
 from ..image_files import find_image_folder
 from ..images import image_size, same_proportions
@@ -27,8 +26,6 @@ from .exported import ExportedScene, ExportedView
 
 FORMATS = transforms, polycam, record3d, metashape, openmvg, bundler
 """Supported formats; the first one that recognises a folder is used."""
-RANDOM_POINTS = 30_000
-"""Number of random initial points for exports without points."""
 FORMAT_NAMES = ", ".join(module.NAME for module in FORMATS)
 
 
@@ -91,7 +88,7 @@ def convert_export(folder: Path, out: Path | None = None) -> ConvertedScene:
             written next to the photos, which stay unchanged.
 
     Raises:
-        LodgsError: if the format is unknown, the export is damaged, or the scene cannot be written.
+        LodgsError: the format is unknown, the export is damaged, or the scene cannot be written.
     """
     folder = folder.absolute()
     check_folder(folder, "Choose the folder of another program's export.")
@@ -122,12 +119,6 @@ def convert_export(folder: Path, out: Path | None = None) -> ConvertedScene:
     points, colors = exported.points, exported.colors
     if not len(points) and all(view.has_depth for view in views):
         warnings.append(f"{module.NAME} has no points. Training creates them from the depth maps.")
-    elif not len(points):
-        points = random_start_points([view.camera(str(n)) for n, view in enumerate(views)])
-        colors = np.full((len(points), 3), 128, np.uint8)
-        warnings.append(
-            f"{module.NAME} has no points. Added {len(points):,} random points in the cameras' view."
-        )
     try:
         _write(scene, views, points, colors)
     except OSError as error:
@@ -136,40 +127,6 @@ def convert_export(folder: Path, out: Path | None = None) -> ConvertedScene:
             "Choose another output folder (lodgs scene --from DIR --out DIR).",
         ) from error
     return ConvertedScene(scene, module.NAME, len(views), len(points), warnings)
-
-
-def random_start_points(cameras: list[Camera], count: int = RANDOM_POINTS) -> np.ndarray:
-    """Return random initial points (N, 3) for training, visible in at least two views if any views overlap.
-
-    The points lie on random pixels' rays, around the depth of the point closest to all optical axes. If most
-    cameras do not face that point, as on a walk, the depth is three times the distance between cameras.
-    """
-    rng = np.random.default_rng(0)
-    positions = np.array([camera.center for camera in cameras])
-    axes = np.array([camera.world_to_camera[2, :3] for camera in cameras])
-    projections = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    focus = np.linalg.lstsq(
-        projections.sum(axis=0), np.einsum("nij,nj->i", projections, positions), rcond=None
-    )[0]
-    depths = np.einsum("ni,ni->n", focus - positions, axes)
-    if len(cameras) < 2 or np.mean(depths > 0) < 0.9:
-        distances = np.linalg.norm(positions[:, None] - positions[None, :200], axis=2)
-        nearest = np.where(distances > 0, distances, np.inf).min(axis=1, initial=np.inf)
-        step = float(np.median(nearest[np.isfinite(nearest)])) if np.isfinite(nearest).any() else 1.0
-        depths = np.full(len(cameras), 3 * step)
-    view = rng.integers(len(cameras), size=4 * count)
-    pixels = rng.random((4 * count, 2))
-    depth_factors = np.exp2(rng.uniform(-2, 1, 4 * count))
-    points = np.empty((4 * count, 3))
-    for number in np.unique(view):
-        camera, rows = cameras[number], np.flatnonzero(view == number)
-        depth = max(float(depths[number]), 1e-6) * depth_factors[rows]
-        points[rows] = camera.unproject(pixels[rows] * (camera.width, camera.height), depth)
-    view_counts = np.zeros(len(points), np.int32)
-    for camera in cameras:
-        view_counts += camera.sees(points)
-    shared = points[view_counts >= min(2, len(cameras))]
-    return (shared if len(shared) >= count // 10 else points)[:count]
 
 
 def _usable_views(exported: ExportedScene) -> tuple[list[ExportedView], list[tuple[str, str]]]:

@@ -38,7 +38,7 @@ def read(path: Path) -> ExportedScene:
     """Read the views and the points.
 
     Raises:
-        LodgsError: if a file is damaged.
+        LodgsError: a file is damaged.
     """
     names = _read_names(path)
     try:

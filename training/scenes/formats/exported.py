@@ -49,15 +49,7 @@ class ExportedView:
 
     def sized(self, width: int, height: int) -> ExportedView:
         """Return the view with the lens scaled to photos of the given size."""
-        lens = self.lens
-        focals = lens.lens.focals
-        if (width, height) == (lens.width, lens.height):
-            return self
-        parameters = lens.parameters.copy()
-        scale_x, scale_y = width / lens.width, height / lens.height
-        parameters[:focals] *= (scale_x,) if focals == 1 else (scale_x, scale_y)
-        parameters[focals : focals + 2] *= scale_x, scale_y
-        return replace(self, lens=make_intrinsics(lens.lens.name, width, height, parameters))
+        return replace(self, lens=self.lens.resized(width, height))
 
     def camera(self, name: str) -> Camera:
         """Return the pinhole part of the camera."""
@@ -93,7 +85,7 @@ def get_number(values: Mapping[str, Any], name: str, default: float | None = Non
     """Return a number by name.
 
     Raises:
-        LodgsError: if there is neither a number nor a default.
+        LodgsError: there is neither a number nor a default.
     """
     value = values.get(name, default)
     if isinstance(value, bool) or not isinstance(value, int | float):
@@ -105,7 +97,7 @@ def parse_array(value: Any, *shape: int) -> np.ndarray:
     """Return nested or flat lists of numbers as an array of the given shape.
 
     Raises:
-        LodgsError: if the value has another shape, or contains anything but finite numbers.
+        LodgsError: the value has another shape, or contains anything but finite numbers.
     """
     try:
         array = np.array(value, np.float64)
@@ -129,7 +121,7 @@ def colmap_lens(
         tangential: OpenCV's p1, p2; for a fisheye, the same terms of its angles.
 
     Raises:
-        LodgsError: if a parameter is invalid.
+        LodgsError: a parameter is invalid.
     """
     k = [*radial, *[0.0] * 6][: max(6, len(radial))]
     if fisheye and any(tangential):
@@ -155,7 +147,7 @@ def invert_pose(camera_to_world: np.ndarray, opengl: bool = False) -> np.ndarray
         opengl: True for a pose in OpenGL's camera axes.
 
     Raises:
-        LodgsError: if the pose is not a rotation and translation.
+        LodgsError: the pose is not a rotation and translation.
     """
     pose = np.eye(4)
     if len(camera_to_world) < 3:

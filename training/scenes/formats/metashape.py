@@ -32,7 +32,7 @@ NAME = "Metashape XML"
 MAX_BYTES = 1 << 26
 """Maximum size of an input file."""
 MAX_SKEW = 0.5
-"""Largest b2, in pixels, that is dropped without an error."""
+"""Maximum b2 in pixels that is ignored; larger values are an error."""
 _HEAD_BYTES = 4096
 _COMPONENT = "component_id"
 _IMAGES = "images", "photos", "Images", "."
@@ -57,7 +57,7 @@ def read(path: Path) -> ExportedScene:
     has no points. The chunk's position on earth is dropped, because splats need small coordinates.
 
     Raises:
-        LodgsError: if the file is damaged.
+        LodgsError: the file is damaged.
     """
     chunk = _parse_xml(path).find("chunk")
     if chunk is None:
@@ -178,7 +178,7 @@ class _PhotoFinder:
         """Return a camera's photo, or the expected path if there is no photo.
 
         Raises:
-            LodgsError: if several photos match.
+            LodgsError: several photos match.
         """
         label = camera.get("label", "")
         candidates = [find_image(self._folder / name, label) for name in _IMAGES]

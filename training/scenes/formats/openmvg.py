@@ -40,7 +40,7 @@ def read(path: Path) -> ExportedScene:
     """Read the views and the points, which have no colours.
 
     Raises:
-        LodgsError: if the file is damaged.
+        LodgsError: the file is damaged.
     """
     document = read_document(path)
     try:

@@ -36,7 +36,7 @@ def read(path: Path) -> ExportedScene:
     """Read the views. The photos in numeric order match the poses; if photos are missing, their names do.
 
     Raises:
-        LodgsError: if the file is damaged, or photos are missing and the names are not numbers.
+        LodgsError: the file is damaged, or photos are missing and the names are not numbers.
     """
     document = read_document(path)
     try:
@@ -73,7 +73,7 @@ def _pose_matrix(pose: np.ndarray) -> np.ndarray:
     """Return the matrix (3, 4) of qx, qy, qz, qw and a position.
 
     Raises:
-        LodgsError: if the quaternion is 0.
+        LodgsError: the quaternion is 0.
     """
     if not pose[:4].any():
         raise LodgsError("its pose is not a rotation and translation.")

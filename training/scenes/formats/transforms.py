@@ -42,7 +42,7 @@ def read(path: Path) -> ExportedScene:
     If a scene has several files (train, val, test), only the training views are read.
 
     Raises:
-        LodgsError: if the file is damaged.
+        LodgsError: the file is damaged.
     """
     document = read_document(path)
     frames = document.get("frames")

@@ -307,7 +307,7 @@ def test_older_checkpoint_is_used_if_the_newest_is_corrupt(tmp_path, uninterrupt
     np.testing.assert_array_equal(rows.read(np.arange(len(rows))), uninterrupted[STEPS - 2])
     rows.close()
     remove_checkpoints(folder)
-    assert not list(folder.checkpoints.iterdir())
+    assert not folder.checkpoints.exists()
 
 
 def test_files_of_earlier_processes_are_deleted(tmp_path):

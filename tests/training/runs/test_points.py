@@ -1,0 +1,81 @@
+"""Training of scenes without points."""
+
+import io
+import json
+import os
+import shutil
+import signal
+
+import pytest
+
+from tests.training.scenes.walls import write_walls
+from training.runs import train as training_loop
+from training.runs.blocks.plan import read_planned_scene
+from training.runs.folder import RunFolder
+from training.runs.job import Job
+from training.scenes import triangulate
+
+
+@pytest.fixture(scope="module")
+def walls(tmp_path_factory):
+    return write_walls(tmp_path_factory.mktemp("walls") / "scene")
+
+
+def train(scene, out, on_message=lambda message: None):
+    """Train a few steps; return the exit code and the messages."""
+    messages = []
+
+    class Stream(io.StringIO):
+        def write(self, line):
+            event = json.loads(line) if line.strip() else {}
+            if "message" in event:
+                messages.append(event["message"])
+                on_message(event["message"])
+            return len(line)
+
+    job = Job(
+        str(scene), str(out), method="3dgs", image_scale=0.2, test_every=3, backend="cpu",
+        parameters={"steps": 8, "match_exposure": False},
+    )  # fmt: skip
+    return training_loop.train(job, Stream()), messages
+
+
+@pytest.mark.parametrize("request_stop", ["cancel", "SIGTERM"])
+def test_stop_while_triangulating_then_resume(walls, tmp_path, monkeypatch, request_stop):
+    scene = shutil.copytree(walls, tmp_path / "scene", ignore=shutil.ignore_patterns(".*"))
+    folder = RunFolder(tmp_path / "run")
+
+    def stop(message):
+        if message.startswith("Comparing pair"):
+            if request_stop == "cancel":
+                folder.request_cancel()
+            else:
+                os.kill(os.getpid(), signal.SIGTERM)
+
+    previous = signal.signal(signal.SIGTERM, signal.default_int_handler)  # as the command does
+    try:
+        code, messages = train(scene, folder.path, stop)
+    finally:
+        signal.signal(signal.SIGTERM, previous)
+    assert code == training_loop.CANCELLED and folder.state() == "cancelled"
+    assert any(message.startswith("Extracting features of photo 0 of 6") for message in messages)
+    assert not any((scene / triangulate.CACHE_FOLDER).iterdir())
+
+
+def test_resumed_run_does_not_repeat_and_has_the_same_bits(walls, tmp_path, monkeypatch):
+    code, messages = train(walls, tmp_path / "first")
+    assert code == 0 and sum(message.startswith("Triangulated ") for message in messages) == 1
+    assert not any("no points" in message for message in messages)
+    monkeypatch.setattr(triangulate.pycolmap_process, "run_program", None)
+    run = RunFolder(tmp_path / "second")
+
+    def stop(message):
+        if message.startswith("Training on"):
+            run.request_cancel()
+
+    assert train(walls, run.path, stop)[0] == training_loop.CANCELLED
+    code, messages = train(walls, run.path)
+    assert code == 0 and any(message.startswith("Triangulated ") for message in messages)
+    assert run.bundle.read_bytes() == RunFolder(tmp_path / "first").bundle.read_bytes()
+    job = Job(str(walls), str(tmp_path / "cells"), method="3dgs", cells="1x1")
+    assert len(read_planned_scene(job).points) > triangulate.MIN_POINTS
