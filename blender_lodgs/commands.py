@@ -6,7 +6,7 @@ import argparse
 import re
 import signal
 import sys
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from ..training.cli.job_options import add_options, job_from_options
 from ..training.cli.methods import describe_method, describe_methods
 from ..training.cli.options import add_setting, parse_size
 from ..training.editing.export import EXPORT_OPTIONS, export_finest_level, run_to_end
-from ..training.errors import LodgsError
+from ..training.errors import LodgsError, describe_system_error, system_remedy
 from ..training.evaluate.messages import summary_lines
 from ..training.runs.folder import RunFolder, find_splats
 from ..training.runs.job import KEYS, Job
@@ -57,9 +57,14 @@ def main(arguments: list[str]) -> int:
     except LodgsError as error:
         _print(f"error: {error}")
         return BAD_INPUT
-    except RuntimeError as error:  # a Blender operator failed, such as saving
-        _print(str(error).strip())
-        return CRASHED
+    except KeyboardInterrupt:
+        return CANCELLED
+    except Exception as error:
+        described = describe_system_error(error)
+        if described is None and not isinstance(error, RuntimeError):
+            raise
+        _print(f"error: {described or str(error).strip()}")  # else a Blender operator failed
+        return CRASHED if described is None else BAD_INPUT
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -164,7 +169,7 @@ def _train(args: argparse.Namespace) -> int:
     root = _import_for(job)
     job_settings.apply_job(root.lodgs.training, job)  # for the panel when the .blend is opened
     watch = jobs.start_or_resume(root, job)
-    with _interrupts():
+    with _interrupts(signal.SIGINT, signal.SIGTERM):
         jobs.follow(watch, _ProgressBar())
     for line in summary_lines(watch.summary):
         _print(line)
@@ -280,7 +285,7 @@ def _capture(args: argparse.Namespace) -> int:
     if warning := noise_warning(scene):
         warn(warning)
     try:
-        with _interrupts():
+        with _interrupts(signal.SIGINT):  # SIGTERM ends a slow render at once, as the panel needs
             count = render_views(bpy.context, folder, width, height, args.range, report, warn)
             if args.range:
                 _print(f"{folder}: views {args.range[0]} to {min(args.range[1], count)} of {count}")
@@ -342,14 +347,22 @@ def _save(path: Path) -> None:
         path.resolve().parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise LodgsError(
-            f"Cannot create folder {path.parent}: {error.strerror}.", "Choose another folder."
+            f"Cannot create folder {path.parent}: {error.strerror}.",
+            system_remedy(error, "Choose another folder."),
         ) from error
-    bpy.ops.wm.save_as_mainfile(filepath=str(path.resolve()), check_existing=False)
+    try:
+        bpy.ops.wm.save_as_mainfile(filepath=str(path.resolve()), check_existing=False)
+    except RuntimeError as error:
+        reason = str(error).strip().removeprefix("Error: ").rstrip(".")
+        raise LodgsError(
+            f"Cannot save {path}: {reason}.", "Free some space on this disk, or choose another folder."
+        ) from error
     _print(f"{path}: written")
 
 
 def _print(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
+    with suppress(OSError):  # a full disk
+        print(text, file=sys.stderr, flush=True)
 
 
 class _ProgressBar:
@@ -358,7 +371,7 @@ class _ProgressBar:
     def __init__(self) -> None:
         self._message = ""
         self._levels: set[int] = set()
-        self._terminal = sys.stderr.isatty()
+        self._terminal = sys.stderr is not None and sys.stderr.isatty()
 
     def __call__(self, watch: Watch) -> None:
         for number in sorted(watch.levels.keys() - self._levels):
@@ -385,14 +398,15 @@ class _ProgressBar:
 
 
 @contextmanager
-def _interrupts():
-    """Make Ctrl-C raise KeyboardInterrupt; by default background Blender exits immediately."""
-    previous = signal.signal(signal.SIGINT, signal.default_int_handler)
+def _interrupts(*numbers: int):
+    """Make signals raise KeyboardInterrupt; by default background Blender exits immediately."""
+    previous = [signal.signal(number, signal.default_int_handler) for number in numbers]
     try:
         yield
     finally:
-        if previous is not None:  # None: the handler was not set by Python and cannot be restored
-            signal.signal(signal.SIGINT, previous)
+        for number, handler in zip(numbers, previous, strict=True):
+            if handler is not None:  # None: the handler was not set by Python and cannot be restored
+                signal.signal(number, handler)
 
 
 _command = None

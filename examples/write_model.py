@@ -16,7 +16,6 @@ from pathlib import Path
 
 import numpy as np
 import OpenEXR
-import pycolmap
 from PIL import Image
 
 from training.scenes.cameras import Camera, write_camera
@@ -66,8 +65,12 @@ def write_offset_views(rendered: Path, scene: Path, quality: int) -> None:
         write_camera(photo.with_suffix(".json"), camera, near=0.01)
 
 
-def write_model(rendered: Path, scene: Path, cameras: str, quality: int) -> pycolmap.Reconstruction:
-    """Write scene/images/*.jpg and the model scene/sparse/0/*.bin of a set of cameras."""
+def write_model(rendered: Path, scene: Path, cameras: str, quality: int) -> int:
+    """Write scene/images/*.jpg and the model scene/sparse/0/*.bin of a set of cameras.
+
+    Returns:
+        The number of points.
+    """
     poses = rig.world_to_cameras(cameras)
     names = [rig.view_name(cameras, view) for view in range(len(poses))]
     positions = [read_positions(rendered / "positions" / f"{name}.exr") for name in names]
@@ -92,7 +95,8 @@ def write_model(rendered: Path, scene: Path, cameras: str, quality: int) -> pyco
         x, y = np.floor(positions_2d[rows].T).astype(int)
         colors[rows] += image[y, x]
     colors /= visible.sum(axis=0)[:, None]
-    return write_colmap(scene, views, points, visible, colors)
+    write_colmap(scene, views, points, visible, colors)
+    return len(points)
 
 
 def main():
@@ -107,7 +111,8 @@ def main():
     if options.cameras == "aside":
         write_offset_views(options.rendered, options.scene, options.quality)
     else:
-        print(write_model(options.rendered, options.scene, options.cameras, options.quality).summary())
+        points = write_model(options.rendered, options.scene, options.cameras, options.quality)
+        print(f"{options.scene}: {points:,} points")
 
 
 if __name__ == "__main__":

@@ -5,14 +5,16 @@ from __future__ import annotations
 import argparse
 import io
 import os
+import signal
 import sys
+import traceback
 from contextlib import suppress
 from importlib import import_module
 from typing import NoReturn
 
 from . import VERSION
 from .cli import COMMANDS, PROGRAM, check
-from .errors import LodgsError, is_out_of_memory
+from .errors import LodgsError, describe_system_error
 from .runs import processes
 
 
@@ -29,32 +31,48 @@ def main(arguments: list[str] | None = None) -> int:
         if isinstance(stream, io.TextIOWrapper):  # other programs read UTF-8, whatever the console uses
             stream.reconfigure(encoding=None if stream.isatty() else "utf-8", errors="backslashreplace")
     arguments = sys.argv[1:] if arguments is None else arguments
-    if arguments == ["check"]:  # needs no packages
-        return check.run()
-    processes.stop_with_parent()
     try:
-        options = _parser(arguments).parse_args(arguments)
-        code = _module(options.command).run(options)
-        if options.command not in ("train", "blocks"):  # their output is in the run folder, too
-            sys.stdout.flush()
-        return code
+        return _run_command(arguments)
     except BrokenPipeError:  # the reader of our output has stopped
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115
         return 0
     except LodgsError as error:
         return _fail(str(error))
-    except (MemoryError, RuntimeError) as error:
-        if not is_out_of_memory(error):
+    except (OSError, MemoryError, RuntimeError) as error:
+        if (described := describe_system_error(error)) is None:
             raise
-        return _fail("Not enough memory. Close other programs, or reduce the size of the task.")
-    except OSError as error:
-        return _fail(str(error.strerror or error) + (f" ({error.filename})" if error.filename else ""))
+        unnamed = isinstance(error, OSError) and error.filename is None
+        return _fail((_output_error() if unnamed else "") or str(described))
     except KeyboardInterrupt:
         return 3
     except ModuleNotFoundError:
         if not (problems := check.environment()["problems"]):
             raise
         return _fail(f"{problems[0]} {check.INSTALL}")
+
+
+def _run_command(arguments: list[str]) -> int:
+    """Run one command and write its output; return its exit code."""
+    if arguments == ["check"]:  # needs no packages
+        code = check.run()
+    else:
+        processes.stop_with_parent()
+        options = _parser(arguments).parse_args(arguments)
+        code = _module(options.command).run(options)
+        if options.command in ("train", "blocks"):  # their output is in the run folder, too
+            return code
+    if sys.stdout is not None:  # None: closed, or there is no console
+        sys.stdout.flush()
+    return code
+
+
+def _output_error() -> str:
+    """Return a sentence if standard output cannot be written, else ""."""
+    try:
+        print(flush=True)
+    except OSError as error:
+        return f"Cannot write to standard output: {error.strerror}."
+    return ""
 
 
 def _parser(arguments: list[str]) -> argparse.ArgumentParser:
@@ -74,17 +92,40 @@ def _module(command: str):
 
 
 def _fail(message: str) -> int:
-    print(f"error: {message}", file=sys.stderr)
+    with suppress(OSError):  # a full disk
+        print(f"error: {message}", file=sys.stderr)
     return 2
 
 
 def run() -> NoReturn:
     """Run this process's command, and end the process with its exit code."""
-    code = main()
+    _open_streams()
+    for name in ("SIGINT", "SIGTERM", "SIGBREAK"):  # SIGBREAK: Windows' CTRL_BREAK_EVENT
+        if hasattr(signal, name):  # shells start background programs with SIGINT ignored
+            signal.signal(getattr(signal, name), signal.default_int_handler)
+    try:
+        code = main()
+    except SystemExit as stop:  # argparse has printed help or an error
+        code = int(stop.code or 0)
+    except KeyboardInterrupt:  # a second signal
+        code = 3
+    except Exception:
+        with suppress(OSError):
+            traceback.print_exc()
+        code = 1
     for stream in (sys.stdout, sys.stderr):
-        with suppress(OSError):  # a full disk
+        with suppress(OSError, AttributeError):  # a full disk, or there is no console
             stream.flush()
     os._exit(code)  # native thread pools can hang a normal exit
+
+
+def _open_streams() -> None:
+    """Open closed standard streams on the null device, so that no other file takes their numbers."""
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest number
 
 
 if __name__ == "__main__":

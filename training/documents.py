@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any, AnyStr
 
-from .errors import LodgsError, printable
+from .errors import LodgsError, printable, read_error
 from .files import open_regular
 
 MAX_JSON_BYTES = 1 << 20
@@ -52,10 +52,11 @@ def open_file(path: str | Path) -> IO[bytes]:
             "Run `git lfs pull` in its repository, or download the file itself.",
         )
     except OSError as error:
-        reason = error.strerror or str(error)
+        raise read_error(path, error, "Check the path and its permissions.") from None
     except ValueError:  # a NUL or half a surrogate pair
-        reason = "the name is not a valid file name"
-    raise LodgsError(f"Cannot read {printable(path)}: {reason}.", "Check the path and its permissions.")
+        raise LodgsError(
+            f"Cannot read {printable(path)}: the name is not a valid file name.", "Check the path."
+        ) from None
 
 
 def read_lines(file: IO[AnyStr], max_length: int) -> Iterator[AnyStr]:

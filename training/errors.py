@@ -3,6 +3,8 @@
 import errno
 import re
 
+DISK_FULL = {errno.ENOSPC, errno.EDQUOT}
+"""Error codes of a full disk or an exceeded quota."""
 MAX_TEXT = 1000
 """Maximum number of characters of a sentence. Longer ones, which quote foreign text, lose their middle."""
 _UNPRINTABLE = re.compile("[\0\ud800-\udfff]")
@@ -20,6 +22,50 @@ class LodgsError(Exception):
         self.what = _shorten(printable(what))
         self.remedy = _shorten(printable(remedy))
         super().__init__(f"{self.what} {self.remedy}".strip())
+
+
+class SystemProblem(LodgsError):
+    """A failure of the computer, such as a lost disk or too many open files, whichever file it concerns."""
+
+
+def describe_system_error(error: BaseException) -> LodgsError | None:
+    """Return a failure of the disk, the memory or another part of the computer as sentences, else None."""
+    if is_out_of_memory(error):
+        return SystemProblem("Not enough memory.", "Close other programs, or reduce the size of the task.")
+    if not isinstance(error, OSError):
+        return None
+    action = f"Cannot use {printable(error.filename)}" if error.filename else "Cannot continue"
+    return SystemProblem(f"{action}: {error.strerror or error}.", system_remedy(error))
+
+
+def system_remedy(error: OSError, default: str = "") -> str:
+    """Return the remedy for a full disk or an exceeded limit, or else the default."""
+    if error.errno in DISK_FULL:
+        return "Free some space on this disk, or choose another folder."
+    if error.errno in (errno.EMFILE, errno.ENFILE):
+        return "Raise the limit of open files (ulimit -n), or close other programs."
+    if error.errno == errno.EFBIG:
+        return "Raise the limit of the file size (ulimit -f), or choose another disk."
+    return default
+
+
+_ABOUT_THE_FILE = {
+    errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EINVAL, errno.ELOOP, errno.ENAMETOOLONG, errno.ENXIO
+}  # fmt: skip
+"""Error codes that concern one file, which is missing or no regular file."""
+
+
+def is_system_problem(error: BaseException) -> bool:
+    """Return whether an error concerns the computer, a disk or permissions, not the content of one file."""
+    if isinstance(error, OSError) and error.errno is not None:
+        return error.errno not in _ABOUT_THE_FILE
+    return is_out_of_memory(error)
+
+
+def read_error(path: object, error: OSError, remedy: str) -> LodgsError:
+    """Return the error of a file that cannot be read; a SystemProblem if the file is not to blame."""
+    kind = SystemProblem if is_system_problem(error) else LodgsError
+    return kind(f"Cannot read {printable(path)}: {error.strerror or error}.", system_remedy(error, remedy))
 
 
 def printable(text: object) -> str:

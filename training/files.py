@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import errno
 import os
+import platform
 import re
 import shutil
 import stat
 import sys
+import tempfile
 import time
 import uuid
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path, PureWindowsPath
 from typing import IO, BinaryIO
 
-from .errors import LodgsError
+from .errors import LodgsError, is_system_problem, read_error, system_remedy
 
-DISK_FULL = {errno.ENOSPC, errno.EDQUOT}
-"""Error codes of a full disk or an exceeded quota."""
 _DEVICE = re.compile(r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9\xb9\xb2\xb3])\s*([.:].*)?", re.I)
 
 
@@ -63,9 +64,10 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
         LodgsError: the disk is full, or the location is not writable.
     """
     path = Path(os.path.realpath(path)) if os.path.islink(path) else Path(path)
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
+    temporary = _temporary_path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        _remove_stale(path.parent)
         yield temporary
         with open(temporary, "r+b") as file:
             os.fsync(file.fileno())
@@ -77,21 +79,98 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
             raise
         raise LodgsError(
             f"Cannot write {path}: {error.strerror or error}.",
-            "Free some space there or choose another folder."
-            if error.errno in DISK_FULL
-            else "Choose another name or folder.",
+            system_remedy(error, "Choose another name or folder."),
         ) from error
     finally:
         with suppress(OSError):
             temporary.unlink()
 
 
+@contextmanager
+def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
+    """Yield a new folder, and remove it when the block ends.
+
+    Args:
+        parent: folder that contains it; None for the system's folder for temporary files.
+
+    Raises:
+        OSError: the folder cannot be created.
+    """
+    place = Path(tempfile.gettempdir()) if parent is None else parent
+    _remove_stale(place)
+    folder = place / f".lodgs-{_token()}"
+    folder.mkdir(0o700)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _temporary_path(path: Path) -> Path:
+    """Return a unique path next to ``path``, with a name that is not longer than file systems allow."""
+    return path.with_name(f".{path.name[:50]}.{_token()}.tmp")
+
+
+def _token() -> str:
+    """Return a unique part of a temporary name that identifies this process."""
+    return f"{_host()}-{os.getpid()}-{uuid.uuid4().hex[:4]}"
+
+
+def _host() -> str:
+    return f"{zlib.crc32(platform.node().encode()) & 0xFFFF:04x}"
+
+
+_TEMPORARY = re.compile(r"\.(?:lodgs-|.+\.)([0-9a-f]{4})-(\d+)-[0-9a-f]{4}(?:\.tmp)?")
+"""Name of a temporary file or folder; host and process ID of its owner."""
+
+
 def remove_temporaries(folder: Path) -> None:
     """Remove the temporary files that killed processes left in a folder. No process may be writing there."""
-    for path in folder.glob(".*.tmp"):
-        if re.fullmatch(r"\..+\.[0-9a-f]{8}\.tmp", path.name):
-            with suppress(OSError):
-                path.unlink()
+    for path in folder.glob(".*"):
+        if _TEMPORARY.fullmatch(path.name):
+            _remove(path)
+
+
+def _remove_stale(folder: Path) -> None:
+    """Remove temporary files and folders whose process, of this user and computer, was killed.
+
+    Each folder is searched once per process.
+    """
+    if folder in _searched:
+        return
+    _searched.add(folder)
+    with suppress(OSError), os.scandir(folder) as entries:
+        for entry in entries:
+            match = _TEMPORARY.fullmatch(entry.name)
+            if match and match[1] == _host() and _is_abandoned(entry, int(match[2])):
+                _remove(Path(entry.path))
+
+
+_searched: set[Path] = set()
+
+
+def _is_abandoned(entry: os.DirEntry[str], pid: int) -> bool:
+    """Return whether the process of a temporary file has ended; on Windows, whether the file is a day old."""
+    state = entry.stat(follow_symlinks=False)
+    if sys.platform == "win32":
+        return time.time() - state.st_mtime > 86_400
+    if state.st_uid != os.getuid() or pid == os.getpid():
+        return False
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return True
+    except OSError:  # another user's process
+        return False
+    return False
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with suppress(OSError):
+            path.unlink()
 
 
 def link_or_copy(source: Path, target: Path) -> None:
@@ -108,7 +187,7 @@ def link_or_copy(source: Path, target: Path) -> None:
     try:
         os.link(source, target)
     except OSError:
-        temporary = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.tmp")
+        temporary = _temporary_path(target)
         try:
             shutil.copyfile(source, temporary)
             os.replace(temporary, target)
@@ -123,6 +202,27 @@ def check_folder(folder: Path, remedy: str) -> None:
         raise LodgsError(f"{folder} is a file, not a folder.", "Unpack it first." if is_archive else remedy)
     if not folder.is_dir():
         raise LodgsError(f"The folder {folder} does not exist.", remedy)
+
+
+def is_file(path: str | Path) -> bool:
+    """Return whether a regular file exists, also for names that are too long or invalid.
+
+    Raises:
+        SystemProblem: the system cannot tell, for example because a network share is lost.
+    """
+    try:
+        return stat.S_ISREG(os.stat(path).st_mode)
+    except ValueError:
+        return False
+    except OSError as error:
+        raise_system_problem(error)
+        return False
+
+
+def raise_system_problem(error: OSError) -> None:
+    """Raise SystemProblem unless the error concerns only its file; the ``onerror`` of ``os.walk``."""
+    if is_system_problem(error):
+        raise read_error(error.filename, error, "Check that its disk is connected.") from error
 
 
 def open_regular(path: str | Path, writing: bool = False) -> BinaryIO:

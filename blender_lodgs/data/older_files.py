@@ -1,4 +1,4 @@
-"""Upgrade of files saved by older versions."""
+"""Upgrade of files saved by older versions, and repair of damaged ones."""
 
 from __future__ import annotations
 
@@ -12,8 +12,41 @@ from ..nodes import display
 from . import looks, selection
 
 
+def repair_references(group: bpy.types.PropertyGroup) -> None:
+    """Clear references to data of another type, in a group of settings and the groups inside."""
+    for prop in group.bl_rna.properties:
+        value = getattr(group, prop.identifier, None)
+        if prop.type == "COLLECTION":
+            for item in value or ():
+                repair_references(item)
+        elif isinstance(value, bpy.types.PropertyGroup):
+            repair_references(value)
+        elif isinstance(value, bpy.types.ID) and not isinstance(
+            value, getattr(bpy.types, prop.fixed_type.identifier)
+        ):
+            group.property_unset(prop.identifier)
+
+
+def repair_levels(root: bpy.types.Object) -> None:
+    """Sort the list of levels, and drop entries that share a number or an object with an earlier one."""
+    items = root.lodgs.levels
+    for index in reversed(range(len(items))):
+        earlier = [items[number] for number in range(index)]
+        if any(
+            item.number == items[index].number or (item.object and item.object == items[index].object)
+            for item in earlier
+        ):
+            items.remove(index)
+    for index in range(len(items)):
+        lowest = min(range(index, len(items)), key=lambda number: items[number].number)
+        if lowest != index:
+            items.move(lowest, index)
+
+
 def upgrade_scene(root: bpy.types.Object) -> None:
     """Upgrade a splat scene of an older version; scenes of this version stay unchanged."""
+    repair_references(root.lodgs)
+    repair_levels(root)
     if root.lodgs.itself is None:
         root.lodgs.itself = root
     rule, levels = find_rule(root.lodgs.rule), [item.number for item in root.lodgs.levels if item.exists]

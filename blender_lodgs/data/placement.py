@@ -26,7 +26,7 @@ def axes_of(root: bpy.types.Object) -> bpy.types.Object:
     This is the root itself in older files and for a copy of a root without its children.
     """
     axes = root.lodgs.axes
-    return axes if axes is not None and axes.parent == root else root
+    return axes if isinstance(axes, bpy.types.Object) and axes.parent == root else root
 
 
 def new_axes(root: bpy.types.Object) -> bpy.types.Object:

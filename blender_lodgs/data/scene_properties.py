@@ -48,6 +48,11 @@ def _can_be_camera(self, obj: bpy.types.Object) -> bool:
     return not obj.lodgs.is_root
 
 
+def _is_linked(obj: object, kind: str) -> bool:
+    """Return whether a value is an object of a type in a collection; damaged files refer to other data."""
+    return isinstance(obj, bpy.types.Object) and obj.type == kind and bool(obj.users_collection)
+
+
 class SplatLevel(bpy.types.PropertyGroup):
     """One level of detail of a splat scene. Level 1 is the coarsest."""
 
@@ -75,8 +80,7 @@ class SplatLevel(bpy.types.PropertyGroup):
     @property
     def exists(self) -> bool:
         """False if the artist deleted the level's object or changed its type; the list keeps the entry."""
-        obj = self.object
-        return obj is not None and obj.type == "POINTCLOUD" and bool(obj.users_collection)
+        return _is_linked(self.object, "POINTCLOUD")
 
 
 class SplatTable(bpy.types.PropertyGroup):
@@ -92,8 +96,7 @@ class SplatTable(bpy.types.PropertyGroup):
     @property
     def exists(self) -> bool:
         """False if the artist deleted the table's object."""
-        obj = self.object
-        return obj is not None and obj.type == "MESH" and bool(obj.users_collection)
+        return _is_linked(self.object, "MESH")
 
 
 class SplatStream(bpy.types.PropertyGroup):

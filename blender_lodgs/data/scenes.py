@@ -381,7 +381,7 @@ def put_level(
         bpy.data.pointclouds.remove(old_cloud)
         obj.data.name = name
         new_object = obj
-    if new_object.parent is None:
+    if not new_object.users_collection:  # an existing object keeps its parent, or none after Alt-P
         new_object.parent = axes_of(root)
         collection_of(root).objects.link(new_object)
     item.object = new_object

@@ -14,7 +14,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ...training.errors import LodgsError
+from ...training.errors import LodgsError, system_remedy
 from ...training.files import atomic_write
 from ...training.scenes.cameras import Camera, check_render_size, read_camera, write_camera
 from ...training.scenes.images import image_size
@@ -67,8 +67,10 @@ def render_views(
     existing = {file.stem for file in (folder / CAMERAS).glob("*.json")}
     if existing - set(names):
         raise _different_views(folder)
-    if not existing and any((folder / kind).exists() for kind in ("sparse", CAMERAS, IMAGES, DEPTHS)):
+    others = ("sparse",) if (folder / CAMERAS).is_dir() else ("sparse", CAMERAS, IMAGES, DEPTHS)
+    if not existing and any((folder / kind).exists() for kind in others):
         raise LodgsError(f"Cannot capture to {folder}: it contains another scene.", "Choose another folder.")
+    _mark(folder)
     _prepare(context.scene, width, height)
     first, last = only or (1, len(shots))
     for number in range(first, min(last, len(shots)) + 1):
@@ -87,6 +89,17 @@ def render_views(
         _save(context.scene, folder, name, (width, height))
         write_camera(file, camera, near)  # last, as it marks the view as complete
     return len(shots)
+
+
+def _mark(folder: Path) -> None:
+    """Create the cameras' folder, which marks a capture that ends before its first view is complete."""
+    try:
+        (folder / CAMERAS).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise LodgsError(
+            f"Cannot write {error.filename}: {error.strerror}.",
+            system_remedy(error, "Choose another folder."),
+        ) from error
 
 
 def noise_warning(scene: bpy.types.Scene) -> str | None:

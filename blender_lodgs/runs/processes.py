@@ -49,12 +49,13 @@ def spawn(command: list[str], log: Path, output: Path) -> subprocess.Popen:
     Args:
         command: program and arguments.
         log: file to which standard error is appended.
-        output: file that standard output overwrites.
+        output: file for standard output, emptied first. Two programs that share it overwrite no lines.
 
     Raises:
         OSError: the program or a file cannot be opened.
     """
-    with open(log, "ab") as errors, open(output, "wb") as stdout:
+    open(output, "wb").close()
+    with open(log, "ab") as errors, open(output, "ab") as stdout:
         return _start(command, stdin=subprocess.DEVNULL, stdout=stdout, stderr=errors)
 
 

@@ -154,6 +154,42 @@ def test_input_errors_print_one_sentence_and_exit_with_2(
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no resource limits")
+def test_blend_file_on_a_full_disk_is_named(bpy, lodgs_command, tmp_path, capfd):
+    import resource
+
+    _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
+    try:
+        code = lodgs_command("import", SCENE, "--blend", tmp_path / "scene.blend")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
+    assert code == 2 and f"error: Cannot save {tmp_path / 'scene.blend'}: " in capfd.readouterr().err
+    assert not (tmp_path / "scene.blend").exists()
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "message"),
+    [
+        (
+            PermissionError(13, "Permission denied", "images.bin"),
+            2,
+            "Cannot use images.bin: Permission denied.",
+        ),
+        (MemoryError("Unable to allocate 9 GiB"), 2, "Not enough memory."),
+        (RuntimeError("Error: operator failed"), 1, "Error: operator failed"),
+    ],
+)
+def test_system_errors_are_one_message(lodgs, lodgs_command, monkeypatch, capfd, error, code, message):
+    def fail(*_, **__):
+        raise error
+
+    monkeypatch.setattr(lodgs("data.importing"), "import_colmap", fail)
+    assert lodgs_command("import", SCENE, "--blend", "x.blend") == code
+    output = capfd.readouterr().err
+    assert f"error: {message}" in output and "Traceback" not in output
+
+
 def test_help_exits_with_0(lodgs_command, capfd):
     assert lodgs_command("--help") == 0
     assert "train" in capfd.readouterr().out
@@ -190,11 +226,12 @@ def _start_command(run: Path) -> subprocess.Popen:
     return process
 
 
-def test_ctrl_c_cancels_the_run(bpy, fake, tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
+def test_signals_cancel_the_run(bpy, fake, tmp_path, number):
     """The command receives the signal, cancels the trainer and waits for it."""
     fake("slow")
     with _start_command(tmp_path / "run") as process:
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         assert process.wait(30) == 3
         assert process.stderr is not None
         output = process.stderr.read()

@@ -15,6 +15,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 TRAINER_ONLY = {"torch", "numba", "pycolmap", "PIL", "OpenEXR", "scipy", "torchmetrics", "matplotlib"}
+PROGRAMS = ("sfm", "sfm_known_poses", "undistort", "pycolmap_process")
+"""Files that import pycolmap, in processes of their own."""
 BLENDER_ONLY = {"bpy", "bpy_extras", "gpu", "gpu_extras", "mathutils"}
 
 FLOORS = {
@@ -235,3 +237,13 @@ for name in {modules!r}:
 """
     done = subprocess.run([sys.executable, "-c", blocked], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_pycolmap_runs_only_in_processes_of_its_own():
+    """It replaces the handler of SIGTERM, so that a trainer that imports it cannot save and stop."""
+    programs = {f"training/scenes/{name}.py" for name in PROGRAMS}
+    for file in [file for file in parsed() if "pycolmap" in absolute_imports(file)]:
+        assert file in programs, file
+    for file in programs:
+        at_import = [node for node in parsed()[file].body if isinstance(node, (ast.Import, ast.ImportFrom))]
+        assert all(alias.name != "pycolmap" for node in at_import for alias in node.names), file

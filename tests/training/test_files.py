@@ -2,6 +2,9 @@
 
 import errno
 import os
+import subprocess
+import sys
+from pathlib import Path
 from threading import Thread
 
 import pytest
@@ -9,6 +12,8 @@ import pytest
 from training import files
 from training.errors import LodgsError
 from training.files import atomic_write, names_device, network_share, open_regular
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_file_appears_complete_and_temporary_is_removed(tmp_path):
@@ -59,6 +64,44 @@ def test_path_that_is_a_folder_asks_for_another_name(tmp_path):
 def test_error_about_another_file_passes_through(tmp_path):
     with pytest.raises(FileNotFoundError), atomic_write(tmp_path / "a.txt"):
         (tmp_path / "folder" / "missing.txt").read_bytes()
+
+
+KILLED = """
+import os, pathlib, signal, sys
+from training import files
+folder = pathlib.Path(sys.argv[1])
+with files.atomic_write(folder / "a.ply") as temporary, files.temporary_folder(folder) as inside:
+    temporary.write_text("half")
+    (inside / "level.ply").write_text("half")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows keeps leftovers for a day")
+def test_leftovers_of_killed_processes_are_removed_by_the_next_write(tmp_path, monkeypatch):
+    subprocess.run([sys.executable, "-c", KILLED, str(tmp_path)], cwd=ROOT, check=False)
+    leftovers = list(tmp_path.iterdir())
+    assert len(leftovers) == 2
+    (temporary,) = [path for path in leftovers if path.is_file()]
+    pid = temporary.name.split("-")[1]
+    others = [
+        tmp_path / temporary.name.replace(f"-{pid}-", f"-{os.getppid()}-"),  # a running process
+        tmp_path / f".b.ply.{'0000' if '.0000-' not in temporary.name else '0001'}-{pid}-abcd.tmp",
+        tmp_path / "notes.tmp",
+        tmp_path / ".lodgs-notes",
+    ]
+    for path in others:
+        path.touch()
+    with atomic_write(tmp_path / "b.ply") as target:
+        target.touch()
+    assert sorted(tmp_path.iterdir()) == sorted([*others, tmp_path / "b.ply"])
+
+
+def test_long_names_can_be_written(tmp_path):
+    path = tmp_path / ("ä" * 120 + ".ply")
+    with atomic_write(path) as temporary:
+        temporary.touch()
+    assert os.listdir(tmp_path) == [path.name]
 
 
 def test_blocks_of_one_name_run_in_turn(tmp_path, monkeypatch):

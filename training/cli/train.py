@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import signal
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -64,9 +64,6 @@ def train_job(make_job: Callable[[], Job], **placement: Any) -> int:
     Returns:
         Exit code.
     """
-    for name in ("SIGINT", "SIGTERM", "SIGBREAK"):  # SIGBREAK: Windows' CTRL_BREAK_EVENT
-        if hasattr(signal, name):  # also interrupts the import of torch, which takes seconds
-            signal.signal(getattr(signal, name), signal.default_int_handler)
     from ..runs.events import event_line
 
     try:
@@ -76,9 +73,14 @@ def train_job(make_job: Callable[[], Job], **placement: Any) -> int:
             raise LodgsError(problems[0], check.INSTALL)
         from ..runs.train import train
     except LodgsError as error:
-        print(event_line("error", what=error.what, remedy=error.remedy), flush=True)
+        _print(event_line("error", what=error.what, remedy=error.remedy))
         return 2
     except KeyboardInterrupt:
-        print(event_line("cancelled", message="Stopped before training began."), flush=True)
+        _print(event_line("cancelled", message="Stopped before training began."))
         return 3
     return train(job, sys.stdout, **placement)
+
+
+def _print(line: str) -> None:
+    with suppress(OSError):  # a full disk
+        print(line, flush=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -12,14 +11,14 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ..errors import LodgsError
+from ..errors import LodgsError, SystemProblem
 from ..lod.crop import Crop
 from ..rasterize import Target
 from ..scenes.cameras import Camera, pick_evenly
 from ..scenes.colmap import Scene
 from ..scenes.depths import DepthPriors
 from ..scenes.exposures import remove_gain
-from ..scenes.images import load_image, load_mask
+from ..scenes.images import image_size, load_image, load_mask
 from .image_cache import ImageCache, default_budget
 from .memory import TARGET_BYTES
 
@@ -106,6 +105,7 @@ class TrainingData:
         self.region = region
         self._train_names = {camera.name for camera in train}
         self._gains = gains or {}
+        self._sizes = {camera.image: (camera.width, camera.height) for camera in scene.cameras}
         self.full_train = [camera.scaled(image_scale) for camera in all_train]
         self.train = [camera.scaled(image_scale) for camera in train]
         self.test = [camera.scaled(image_scale) for camera in test]
@@ -172,10 +172,14 @@ class TrainingData:
         """True if any of ``ALPHA_SAMPLES`` training images has transparent pixels."""
         for camera in pick_evenly(self.train, ALPHA_SAMPLES):
             if camera.image is not None:
-                with suppress(LodgsError):  # raised again by the step that needs the image
+                try:
                     pixels = load_image(camera.image, camera.width, camera.height, alpha=True)
-                    if pixels[..., 3].min() < OPAQUE_ALPHA:
-                        return True
+                except SystemProblem:
+                    raise
+                except LodgsError:  # raised again by the step that needs the image
+                    continue
+                if pixels[..., 3].min() < OPAQUE_ALPHA:
+                    return True
         return False
 
     def training_view(self, step: int, seed: int) -> int:
@@ -215,6 +219,7 @@ class TrainingData:
         size = (camera.width, camera.height)
         alpha = self.transparent
         image = load_image(camera.image, *size, exposure=self.exposure, alpha=alpha)
+        self._check_size(camera.image)
         if camera.name in self._gains:
             image[..., :3] = remove_gain(image[..., :3], self._gains[camera.name])
         planes = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))
@@ -225,6 +230,17 @@ class TrainingData:
         if inverse_depth is not None and mask is not None:
             inverse_depth[mask <= 0.5] = np.nan
         return Target(planes[:3].permute(1, 2, 0), mask, planes[3] if alpha else None, inverse_depth)
+
+    def _check_size(self, image: Path) -> None:
+        """Raise LodgsError if a photo of the scene was replaced by one of another size."""
+        size = image_size(image)
+        expected = self._sizes.get(image, size)
+        if size != expected:
+            raise LodgsError(
+                f"Cannot train: the size of {image} changed from {expected[0]}x{expected[1]} to "
+                f"{size[0]}x{size[1]} pixels.",
+                "Restore the photo, then resume the run.",
+            )
 
 
 def _check_scene(scene: Scene, train: Sequence[Camera]) -> None:

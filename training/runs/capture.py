@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -13,6 +14,8 @@ from PIL import Image
 from ..errors import LodgsError
 from ..rasterize import Gaussians, cpu_fallback_reason, rasterize
 from ..scenes.cameras import Camera, read_camera_folder
+from ..scenes.colmap import read_scene
+from ..scenes.images import check_image
 from ..scenes.viewpoints import dome_views
 from ..scenes.write_colmap import write_visible_points
 from ..splats.dialects import Warn, ignore
@@ -123,6 +126,18 @@ def write_scene(
     return count
 
 
+def is_complete(scene: Path) -> bool:
+    """Return whether a captured scene has all its files, undamaged."""
+    try:
+        captured = read_scene(scene)
+        for camera in captured.cameras:
+            assert camera.image is not None
+            check_image(camera.image)
+    except LodgsError:
+        return False
+    return len(captured.cameras) == len(captured.names) and len(captured.points) > 0
+
+
 def _write(
     scene: Path,
     splats: Splats,
@@ -148,7 +163,9 @@ def _write(
         image = (rendering.image.cpu().numpy().clip(0, 1) * 255).round().astype(np.uint8)
         depth = rendering.median_depth.cpu().numpy()
         Image.fromarray(image).save(scene / "images" / view.name, quality=95, subsampling=0)
-        np.save(scene / "depths" / f"{number}.npy", depth)
+        content = io.BytesIO()  # np.save reports a full disk without its name
+        np.save(content, depth)
+        (scene / "depths" / f"{number}.npy").write_bytes(content.getbuffer())
         x, y = rng.integers([view.width, view.height], size=(points // len(views) + 1, 2)).T
         x, y = x[depth[y, x] > 0], y[depth[y, x] > 0]
         positions.append(view.unproject(np.column_stack([x, y]) + 0.5, depth[y, x]))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -9,7 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import LodgsError
+from ..documents import read_json
+from ..errors import LodgsError, SystemProblem
+from ..files import atomic_write
 from ..lod.crop import Crop
 from ..optimize.training_data import TrainingData
 from ..scenes.cameras import Camera
@@ -21,21 +25,29 @@ from ..scenes.regions import Region
 from ..scenes.rendered_views import thin_evenly
 from ..scenes.triangulate import triangulate_scene
 from ..scenes.undistort import undistort_cache, undistort_scene
+from ..scenes.view_selection import quote_name
 from ..splats.bundle import read_header
 from ..splats.origin import describe_origin
 from .base import base_origin
-from .capture import capture
+from .capture import capture, is_complete
 from .folder import RunFolder
 from .job import Job
 
 OUTSIDE_SHARE = 0.1
 """Maximum number of points outside a job's region, as a share of the maximum number of splats."""
+MAX_VIEWS_BYTES = 1 << 26
+"""Maximum size of the file with the views of a run."""
 DECODERS = 4
 """Number of threads that check whether photos can be decoded."""
 
 
 def training_data(
-    job: Job, folder: RunFolder, report: Callable[..., None] | None = None, *, pixels: bool = True
+    job: Job,
+    folder: RunFolder,
+    report: Callable[..., None] | None = None,
+    *,
+    pixels: bool = True,
+    keep_views: bool = False,
 ) -> TrainingData:
     """Read the job's scene; capture and undistort it first where needed, once per scene.
 
@@ -46,6 +58,7 @@ def training_data(
         job: the job.
         folder: its run.
         report: called with the kind and values of an event (status, warning).
+        keep_views: store the views of a new run, and require them when it is resumed.
         pixels: drop views whose photo cannot be decoded. Disable if no pixel is used, to save time.
 
     Raises:
@@ -64,6 +77,8 @@ def training_data(
     scene = full_scene if region is None else region.select_views(full_scene)
     if pixels:
         scene = _exclude_undecodable(scene)
+    if keep_views:
+        scene = _keep_views(scene, folder)
     warnings = list(scene.warnings)
     if scene.distorted:
         report("status", message=f"Undistorting {len(scene.distorted)} views")
@@ -163,6 +178,9 @@ def _scene_folder(job: Job, folder: RunFolder, report: Callable[..., None]) -> P
     """Return the folder of the job's scene; capture it from the base first if the job asks for it."""
     if not job.capture:
         return Path(job.scene)
+    if folder.captured.exists() and not is_complete(folder.captured):
+        report("warning", message=f"The views in {folder.captured} are damaged. They are rendered again.")
+        shutil.rmtree(folder.captured)
     if not folder.captured.exists():
 
         def report_view(number: int, count: int) -> None:
@@ -203,6 +221,27 @@ def _exclude_undecodable(scene: Scene) -> Scene:
     return scene
 
 
+def _keep_views(scene: Scene, folder: RunFolder) -> Scene:
+    """Store the views of a run without checkpoints; else return the scene with the stored views.
+
+    Raises:
+        LodgsError: a view is missing, or its photo has another size.
+    """
+    views = {camera.name: [camera.width, camera.height] for camera in scene.cameras}
+    if not folder.views.exists() or not any(folder.checkpoints.glob("step_*.pt")):
+        with atomic_write(folder.views) as temporary:
+            temporary.write_text(json.dumps(views), "utf-8")
+        return scene
+    stored = read_json(folder.views, max_bytes=MAX_VIEWS_BYTES)
+    if changed := [name for name, size in stored.items() if views.get(name) != size]:
+        raise LodgsError(
+            f"Cannot resume the run in {folder.path}: {len(changed):,} of its {len(stored):,} photos changed "
+            f"or are missing, such as {quote_name(changed[0])}.",
+            "Restore the photos, or train again in another folder.",
+        )
+    return exclude_views(scene, {name: "the run began without it." for name in views.keys() - stored.keys()})
+
+
 def _undecodable(cameras: Sequence[Camera]) -> dict[str, str]:
     """Return the decoding error of each undecodable photo, by view name."""
 
@@ -210,6 +249,8 @@ def _undecodable(cameras: Sequence[Camera]) -> dict[str, str]:
         assert camera.image is not None
         try:
             check_image(camera.image)
+        except SystemProblem:
+            raise
         except LodgsError as error:
             return error.what
         return ""

@@ -253,6 +253,7 @@ class EventWriter:
 
     def __init__(self, path: Path, reserve: Path, stream: IO[str] | None) -> None:
         self._stream = stream
+        self._path = path
         self._reserve = reserve
         self._torn = False
         self._file = path.open("a+b", buffering=0)  # unbuffered: nothing remains to be written on close
@@ -291,8 +292,11 @@ class EventWriter:
     def _append(self, data: bytes) -> None:
         self._torn = True
         while data:
-            written = self._file.write(data)
+            try:
+                written = self._file.write(data)
+            except OSError as error:
+                raise OSError(error.errno, error.strerror, str(self._path)) from error
             if not written:
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self._path))
             data = data[written:]
         self._torn = False

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from ..errors import LodgsError, is_out_of_memory
-from ..files import DISK_FULL
+from ..errors import DISK_FULL, LodgsError, is_out_of_memory, system_remedy
 
 DONE, CRASHED, BAD_INPUT, CANCELLED = 0, 1, 2, 3
 """Exit codes of ``python -m training train``."""
@@ -17,12 +16,13 @@ def describe_error(error: BaseException) -> tuple[str, str, int]:
         remedy = "Lower max_splats or image_scale, or close other programs; then resume the run."
         return "Training stopped: not enough memory.", remedy, BAD_INPUT
     if isinstance(error, OSError):
-        if error.errno in DISK_FULL:
-            return "Training stopped: the disk is full.", "Free some space and resume the run.", BAD_INPUT
         path = f" ({error.filename})" if error.filename else ""
+        if error.errno in DISK_FULL:
+            remedy = "Free some space and resume the run."
+            return f"Training stopped: the disk is full{path}.", remedy, BAD_INPUT
         return (
             f"Training stopped: {error.strerror or error}{path}.",
-            "Check that the disk is connected and writable, then resume the run.",
+            system_remedy(error, "Check that the disk is connected and writable, then resume the run."),
             BAD_INPUT,
         )
     kind = type(error).__name__

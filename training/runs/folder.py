@@ -3,6 +3,7 @@
     run/  job.toml  events.jsonl  checkpoints/  levels/level_1.ply ..  bundle.ply  metrics.json
           costs.png (plot of the costs measured to choose the levels' distances)
           model.npz (networks of a method that has them)
+          views.json (views and photo sizes with which the run began)
           undistorted/ (photos without lens distortion, if the scene folder is read-only)
           triangulated/ (points of a scene without points, if the scene folder is read-only)
           blocks/ (runs of the parts of a scene in cells, and their merged bundle)
@@ -54,6 +55,7 @@ class RunFolder:
         self.costs = self.path / "costs.png"
         self.log = self.path / "trainer.log"
         self.output = self.path / "trainer.out"
+        self.views = self.path / "views.json"
         self.undistorted = self.path / "undistorted"
         self.triangulated = self.path / "triangulated"
         self.captured = self.path / "captured"

@@ -22,10 +22,12 @@ def run_outcome(folder: RunFolder, code: int | None) -> tuple[str, str]:
     if not folder.path.is_dir():
         return "interrupted", f"The run folder {folder.path} does not exist: it was moved or deleted."
     state = folder.state()
+    if code == 2 and state in {"running", "done", "cancelled"}:
+        code = None  # another process trained this run; ours could not lock it
     error = folder.end_event() if state == "failed" else None
     if error is None and code == 2:  # it could not open its run
         printed = read_events(folder.output)[0]
-        error = printed[-1] if printed and printed[-1]["event"] == "error" else None
+        error = next((event for event in reversed(printed) if event["event"] == "error"), None)
     if error is not None:
         return "failed", f"{error['what']} {error.get('remedy', '')}".strip()
     if code == 2:

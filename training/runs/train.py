@@ -44,7 +44,7 @@ from ..splats.file_rows import open_ply
 from ..splats.gaussians import SplatRows, Splats
 from ..splats.levels import NO_SPLATS, Bundle, Level
 from ..splats.ply import BATCH_ROWS, Columns, read_ply, write_ply
-from . import processes
+from . import parent, processes
 from .base import open_base
 from .blocks.plan import write_plan
 from .blocks.train import BlocksStopped, train_blocks
@@ -52,7 +52,7 @@ from .blocks.workers import workers
 from .checkpoints import read_newest, remove_checkpoints, write_checkpoint
 from .data import training_data, with_points
 from .events import PROTOCOL, EventWriter, event_line
-from .failures import CANCELLED, CRASHED, DONE, describe_error
+from .failures import BAD_INPUT, CANCELLED, CRASHED, DONE, describe_error
 from .folder import RunFolder
 from .job import Job, save_job
 
@@ -73,6 +73,7 @@ def train(job: Job, stream: IO[str] | None = None, **placement: Any) -> int:
         An exit code. Errors end in an ``error`` event, never in a traceback on the stream.
     """
     folder = RunFolder(job.out)
+    parent.watch()
     try:
         folder.create()
         with folder.locked():
@@ -109,6 +110,9 @@ def _final_event(error: BaseException) -> tuple[int, dict]:
     """Return exit code and final event of a training that ends with an exception."""
     if isinstance(error, BlocksStopped):
         return CANCELLED, {"kind": "cancelled", "message": str(error)}
+    if isinstance(error, KeyboardInterrupt) and parent.ended.is_set():
+        problem = "Training stopped: the process that started it has ended."
+        return BAD_INPUT, {"kind": "error", "what": problem, "remedy": "Resume the run."}
     if isinstance(error, KeyboardInterrupt):
         return CANCELLED, {"kind": "cancelled", "message": "Stopped. The run can be resumed."}
     problem, remedy, code = describe_error(error)
@@ -135,7 +139,7 @@ def _train(job: Job, folder: RunFolder, events: EventWriter, placement: dict[str
                 train_blocks(division, merged, submit, events)
             job = replace(job, base="" if merged_is_result else str(merged))
         events("status", message="Reading the scene")
-        data = training_data(job, folder, events)
+        data = training_data(job, folder, events, keep_views=True)
         if not job.cell:
             for finding in check_scene(data.full_scene, job.image_scale):
                 events("status" if finding.severity == INFO else "warning", message=str(finding))
@@ -263,8 +267,10 @@ class _TrainingRun:
         last_checkpoint = last_progress = self._started
         while self.step < method.steps:
             self.folder.require_lock()
-            if received or self.folder.take_cancel():
+            if received or parent.ended.is_set() or self.folder.take_cancel():
                 self._save()
+                if parent.ended.is_set():
+                    raise KeyboardInterrupt
                 message = f"Stopped at step {self.step} of {method.steps}. The run can be resumed."
                 self.events("cancelled", step=self.step, message=message)
                 return False
@@ -316,6 +322,7 @@ class _TrainingRun:
                     f"Held-out views: {neural_psnr:.2f} dB with networks, "
                     f"{baked_psnr:.2f} dB baked for Blender."
                 )
+        self.folder.require_lock()
         write_bundle(self.folder.bundle, bundle)
         return bundle
 
@@ -365,6 +372,7 @@ class _TrainingRun:
         complete = [level.number for level in standalone_levels(bundle)]
         for position, level in enumerate(levels, 1):
             path = self.folder.levels_folder / f"level_{level.number}.ply"
+            self.folder.require_lock()  # writing would create a folder that was moved
             write_ply(path, level.rows, comments_from_meta(bundle.meta))
             record = {
                 "level": level.number,
@@ -388,6 +396,7 @@ class _TrainingRun:
             write_cost_plot(self.folder.costs, bundle.meta)
 
     def _save(self) -> None:
+        self.folder.require_lock()
         write_checkpoint(self.folder, self.step, self.levels, self.method.state_dict())
 
     def _resume(self) -> None:
@@ -436,7 +445,7 @@ def _interrupt_on_cancel(folder: RunFolder):
     def watch() -> None:
         while not finished.wait(0.1):
             with suppress(OSError):
-                if folder.take_cancel():
+                if parent.ended.is_set() or folder.take_cancel():
                     processes.interrupt()
                     return
 

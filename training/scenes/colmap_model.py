@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import mmap
 import struct
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
@@ -20,7 +20,6 @@ import numpy as np
 
 from ..documents import open_file, read_lines
 from ..errors import LodgsError, printable
-from ..splats.similarity import Similarity
 
 DAMAGED_REMEDY = "Copy the model again, or rewrite it with COLMAP's model_converter."
 
@@ -41,7 +40,7 @@ class _Lens:
 
 
 # Indexed by COLMAP's model id (colmap/src/colmap/sensor/models.h).
-_LENSES = dict(
+LENSES = dict(
     enumerate(
         [
             _Lens("SIMPLE_PINHOLE", 3, 1),
@@ -65,7 +64,7 @@ _LENSES = dict(
         ]
     )
 )
-_LENS_BY_NAME = {lens.name: lens for lens in _LENSES.values()}
+_LENS_BY_NAME = {lens.name: lens for lens in LENSES.values()}
 _TWO_FOCALS = {
     "SIMPLE_PINHOLE": "PINHOLE",
     "SIMPLE_RADIAL": "OPENCV",
@@ -261,7 +260,7 @@ def _parse_cameras_bin(data: mmap.mmap) -> dict[int, Intrinsics]:
     cameras = {}
     for _ in range(count):
         camera_id, model_id, width, height = struct.unpack_from("<iiQQ", data, offset)
-        lens = _LENSES.get(model_id)
+        lens = LENSES.get(model_id)
         if lens is None:
             raise ValueError(f"camera model {model_id} is unknown")
         parameters = np.frombuffer(data, "<f8", lens.parameters, offset + 24).copy()
@@ -299,52 +298,6 @@ def make_intrinsics(name: str, width: int, height: int, parameters: np.ndarray) 
         KeyError: the name is unknown.
     """
     return _intrinsics(_LENS_BY_NAME[name], width, height, parameters)
-
-
-def write_model(
-    model: Path,
-    lenses: Sequence[Intrinsics],
-    poses: Sequence[tuple[str, np.ndarray]],
-    points: np.ndarray,
-    colors: np.ndarray,
-) -> None:
-    """Write a binary model without tracks. Blender lacks pycolmap, which writes models with tracks.
-
-    Args:
-        model: folder of the model; it must not exist.
-        lenses: lens of each view.
-        poses: name and world_to_camera (4, 4) of each view.
-        points: (P, 3) positions.
-        colors: (P, 3) uint8.
-
-    Raises:
-        OSError: a file cannot be written.
-    """
-    model.mkdir(parents=True)
-    camera_ids: dict[bytes, int] = {}
-    images = []
-    for image_id, (lens, (name, pose)) in enumerate(zip(lenses, poses, strict=True), 1):
-        model_id = next(number for number, known_lens in _LENSES.items() if known_lens is lens.lens)
-        camera = (
-            struct.pack("<iQQ", model_id, lens.width, lens.height) + lens.parameters.astype("<f8").tobytes()
-        )
-        camera_id = camera_ids.setdefault(camera, len(camera_ids) + 1)
-        values = *Similarity(pose[:3, :3], 1.0, pose[:3, 3]).quat, *pose[:3, 3]
-        encoded = name.encode("utf-8", "surrogateescape")
-        images.append(
-            struct.pack("<i7di", image_id, *values, camera_id) + encoded + b"\0" + struct.pack("<Q", 0)
-        )
-    cameras = [struct.pack("<i", camera_id) + camera for camera, camera_id in camera_ids.items()]
-    rows = np.zeros(len(points), _POINT)
-    rows["id"] = np.arange(1, len(points) + 1)
-    rows["xyz"] = points
-    rows["rgb"] = colors
-    for file, count, records in (
-        ("cameras.bin", len(cameras), cameras),
-        ("images.bin", len(images), images),
-        ("points3D.bin", len(rows), [rows.tobytes()]),
-    ):
-        (model / file).write_bytes(struct.pack("<Q", count) + b"".join(records))
 
 
 def _parse_images_bin(data: mmap.mmap) -> list[Pose]:
@@ -458,7 +411,7 @@ def _parse_observations_bin(data: mmap.mmap, names: Collection[str]) -> dict[str
         end = _name_end(data, offset + 64)
         (points2d,) = struct.unpack_from("<Q", data, end + 1)
         if (name := _decode_name(data[offset + 64 : end])) in names:
-            point_ids[name] = _valid_ids(np.frombuffer(data, _POINT2D, points2d, end + 9)["point"])
+            point_ids[name] = _valid_ids(np.frombuffer(data, POINT2D, points2d, end + 9)["point"])
         offset = end + 9 + 24 * points2d
     return point_ids
 
@@ -520,8 +473,8 @@ def rotation_matrix(quaternion: np.ndarray) -> np.ndarray:
 
 
 # A packed record of points3D.bin, followed by `track` pairs of 4-byte integers.
-_POINT2D = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
-_POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")])
+POINT2D = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
+POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")])
 _TRACK_OFFSET = 43
 _BLOCK = 1 << 17
 _NO_POINTS = np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0, np.int64)
@@ -530,14 +483,14 @@ _UTF8_MARK = b"\xef\xbb\xbf"  # Windows programs write it at the start of UTF-8 
 
 
 def _parse_points_bin(data: mmap.mmap) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    count = _record_count(data, _POINT.itemsize)
+    count = _record_count(data, POINT.itemsize)
     body = np.frombuffer(data, np.uint8, offset=8)
     starts = _point_starts(body, count)
     if len(starts) != count:
         raise ValueError(f"it has {len(starts)} points instead of {count}")
     if not count:
         return _NO_POINTS
-    records = np.lib.stride_tricks.sliding_window_view(body, _POINT.itemsize)[starts].view(_POINT)[:, 0]
+    records = np.lib.stride_tricks.sliding_window_view(body, POINT.itemsize)[starts].view(POINT)[:, 0]
     return records["xyz"].astype(np.float64), records["rgb"].copy(), records["id"].astype(np.int64)
 
 
@@ -570,7 +523,7 @@ def _record_chain(block: np.ndarray) -> tuple[np.ndarray, int]:
     run = run[:-1] & zero[4 : len(run) + 3]
     starts = np.flatnonzero(run[_TRACK_OFFSET + 3 :])
     low, middle, high = (block[starts + _TRACK_OFFSET + byte].astype(np.int64) for byte in range(3))
-    ends = starts + _POINT.itemsize + 8 * (low + (middle << 8) + (high << 16))
+    ends = starts + POINT.itemsize + 8 * (low + (middle << 8) + (high << 16))
     end_of_chain = len(starts)
     number = np.full(len(block), end_of_chain)
     number[starts] = np.arange(end_of_chain)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import struct
 from pathlib import Path
 from typing import IO
@@ -126,4 +127,4 @@ def write_exr(path: Path, channels: dict[str, np.ndarray]) -> None:
         planes = {name: np.ascontiguousarray(plane, np.float32) for name, plane in channels.items()}
         OpenEXR.File(header, planes).write(str(path))
     except RuntimeError as error:
-        raise OSError(f"cannot write {path}: {error}") from error
+        raise OSError(errno.EIO, "the disk is full or not writable", str(path)) from error

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from ..errors import LodgsError
+from ..files import is_file, raise_system_problem
 from .images import IMAGE_SUFFIXES
 
 MASK_SUFFIXES = (".png", *(suffix for suffix in IMAGE_SUFFIXES if suffix != ".png"))
@@ -43,10 +44,12 @@ class ImageFiles:
         """
         relative = relative_image_path(name)
         file = self._folder / name
-        if not os.path.isfile(file):  # Path.is_file raises for long names
+        if not is_file(file):
             if self._by_normal_name is None:
                 paths = (
-                    Path(parent) / entry for parent, _, names in os.walk(self._folder) for entry in names
+                    Path(parent) / entry
+                    for parent, _, names in os.walk(self._folder, onerror=raise_system_problem)
+                    for entry in names
                 )
                 self._by_normal_name = {
                     _normalized(path.relative_to(self._folder).as_posix()): path for path in paths
@@ -79,7 +82,7 @@ class SidecarFiles:
             return None
         for suffix in self._suffixes:
             for path in (self.folder / f"{name}{suffix}", (self.folder / name).with_suffix(suffix)):
-                if os.path.isfile(path):
+                if is_file(path):
                     return path
         return None
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import struct
 import zlib
@@ -14,7 +15,7 @@ from typing import IO, TYPE_CHECKING
 import numpy as np
 
 from ..documents import open_file
-from ..errors import LodgsError
+from ..errors import LodgsError, is_system_problem, read_error
 from ..splats.packed_files import webp_size
 from .color import srgb_from_linear
 from .exr import MAGIC, Truncated, exr_size, read_parts
@@ -61,7 +62,7 @@ def image_size(path: Path) -> tuple[int, int]:
         try:
             return check_image_size(path, _read_size(path, file))
         except OSError as error:
-            raise LodgsError(f"Cannot read {path}: {error.strerror}.", "Check the image folder.") from error
+            raise read_error(path, error, "Check the image folder.") from error
         except (struct.error, IndexError, KeyError, ValueError, Truncated) as error:
             raise LodgsError(
                 f"Cannot read {path}: the file is truncated.", "Copy the image again."
@@ -345,6 +346,9 @@ def _open_image(path: Path, width: int, height: int, large: int, alpha: bool = F
     except LodgsError:
         raise
     except Exception as error:  # the libraries raise many exception types for damaged files
+        if is_system_problem(error):
+            problem = error if isinstance(error, OSError) else OSError(errno.ENOMEM, "not enough memory")
+            raise read_error(path, problem, "Check the image folder.") from error
         raise LodgsError(f"Cannot read {path} as an image: {error}.", "Copy or export it again.") from error
 
 

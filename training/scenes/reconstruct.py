@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import LodgsError
+from ..errors import LodgsError, SystemProblem
 from ..files import atomic_write, check_folder, link_or_copy
 from . import pycolmap_process
 from .colmap import MASKS, find_models
@@ -254,6 +254,8 @@ def _list_photos(
             name.encode()
         except UnicodeEncodeError:
             excluded.append((name, "its name is not UTF-8."))
+        except SystemProblem:
+            raise
         except LodgsError as error:
             excluded.append((name, error.what))
         else:

@@ -21,6 +21,7 @@ from .colmap import DEPTHS
 from .exr import read_parts
 from .images import load_image
 from .visibility import visible_points
+from .write_colmap import write_visible_points
 
 IMAGES, CAMERAS = "images", "cameras"
 """Folders of the rendered images and their cameras."""
@@ -80,8 +81,6 @@ def write_rendered_model(
     Raises:
         LodgsError: a view lacks a file or depth, or no two views show the same surface.
     """
-    from .write_colmap import write_visible_points  # imports pycolmap, which reading must not require
-
     cameras, _ = read_camera_folder(folder / CAMERAS)
     views = [replace(camera, name=f"{camera.name}.png") for camera in cameras]
     depth_files = [folder / DEPTHS / f"{view.name}.exr" for view in cameras]

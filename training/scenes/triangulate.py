@@ -22,11 +22,12 @@ from ..errors import LodgsError
 from . import pycolmap_process
 from .cameras import Camera
 from .colmap import NO_POINTS, Scene
-from .colmap_model import make_intrinsics, read_cameras, read_points, read_poses, write_model
+from .colmap_model import make_intrinsics, read_cameras, read_points, read_poses
 from .images import load_image, load_mask, write_png
 from .scene_cache import remove_abandoned, scene_digest, writable_cache
 from .sfm_known_poses import photo_name
 from .view_selection import find_outliers
+from .write_colmap import write_model
 
 CACHE_FOLDER = ".triangulated"
 """Folder inside a scene's folder that caches triangulated points for all runs."""

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import LodgsError, printable
+from ..errors import LodgsError, SystemProblem, printable
 from .cameras import Camera
 from .colmap_model import Intrinsics, Pose
 from .image_files import ImageFiles, SidecarFiles
@@ -65,6 +65,8 @@ class ViewCollector:
                 camera = camera.resized(width, height)
             if flaw := camera.flaw:
                 raise LodgsError(f"{flaw}.")
+        except SystemProblem:
+            raise
         except LodgsError as error:
             self.excluded.append((name, error.what))
             return

@@ -1,16 +1,20 @@
-"""Write COLMAP models of exactly known cameras and points, such as those of rendered scenes."""
+"""Write COLMAP models of known cameras and points, such as those of rendered scenes. numpy only."""
 
 from __future__ import annotations
 
+import os
+import shutil
+import struct
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
 from ..errors import LodgsError
 from ..splats.origin import NO_ORIGIN
+from ..splats.similarity import Similarity
 from .cameras import Camera
+from .colmap_model import LENSES, POINT, POINT2D, Intrinsics, make_intrinsics
 from .visibility import visible_points
 
 SHORTEST_TRACK, LONGEST_TRACK = 2, 4
@@ -66,7 +70,7 @@ def write_colmap(
     points: np.ndarray,
     visible: np.ndarray,
     colors: np.ndarray,
-) -> pycolmap.Reconstruction:
+) -> None:
     """Write the model scene/sparse/0/*.bin. The caller writes the images.
 
     Args:
@@ -75,35 +79,108 @@ def write_colmap(
         points: (N, 3) world positions.
         visible: (V, N) mask of the observations to record.
         colors: (N, 3) in [0, 255].
-    """
-    model = pycolmap.Reconstruction()
-    lens_ids: dict[tuple, int] = {}
-    for number, camera in enumerate(cameras):
-        lens = camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy
-        if lens not in lens_ids:
-            lens_ids[lens] = len(lens_ids) + 1
-            model.add_camera_with_trivial_rig(
-                pycolmap.Camera(
-                    model="PINHOLE", width=camera.width, height=camera.height, params=lens[2:],
-                    camera_id=lens_ids[lens],
-                )
-            )  # fmt: skip
-        pixels, _ = camera.project(points[visible[number]])
-        image = pycolmap.Image(
-            name=camera.name, keypoints=pixels, camera_id=lens_ids[lens], image_id=number + 1
-        )  # fmt: skip
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(camera.world_to_camera[:3]))
-    keypoints = np.cumsum(visible, axis=1) - 1  # index of each observation in its image
-    for index, (point, color) in enumerate(zip(points, np.round(colors).astype(np.uint8), strict=True)):
-        track = pycolmap.Track()
-        for view in np.flatnonzero(visible[:, index]):
-            track.add_element(int(view) + 1, int(keypoints[view, index]))
-        model.add_point3D(point, track, color)
-    model.update_point_3d_errors()
 
-    folder = scene / "sparse" / "0"
-    folder.mkdir(parents=True, exist_ok=True)
-    model.write_binary(folder)
-    for extra in ("rigs.bin", "frames.bin"):  # readers recreate trivial rigs
-        (folder / extra).unlink(missing_ok=True)
-    return model
+    Raises:
+        OSError: if a file cannot be written.
+    """
+    write_model(
+        scene / "sparse" / "0",
+        [
+            make_intrinsics(
+                "PINHOLE", view.width, view.height, np.array([view.fx, view.fy, view.cx, view.cy])
+            )
+            for view in cameras
+        ],
+        [(view.name, view.world_to_camera) for view in cameras],
+        points,
+        np.round(colors).astype(np.uint8),
+        [
+            (np.flatnonzero(seen), view.project(points[seen])[0])
+            for view, seen in zip(cameras, visible, strict=True)
+        ],
+    )
+
+
+def write_model(
+    model: Path,
+    lenses: Sequence[Intrinsics],
+    poses: Sequence[tuple[str, np.ndarray]],
+    points: np.ndarray,
+    colors: np.ndarray,
+    observations: Sequence[tuple[np.ndarray, np.ndarray]] = (),
+) -> None:
+    """Write a binary model completely or not at all. An existing model is replaced.
+
+    Args:
+        model: folder of the model.
+        lenses: lens of each view.
+        poses: name and world_to_camera (4, 4) of each view.
+        points: (P, 3) positions.
+        colors: (P, 3) uint8.
+        observations: indices (O,) of the points that each view sees, and their pixels (O, 2); empty for
+            points without tracks.
+
+    Raises:
+        OSError: if a file cannot be written.
+    """
+    observations = observations or [(np.zeros(0, np.int64), np.zeros((0, 2)))] * len(poses)
+    camera_ids: dict[bytes, int] = {}
+    images = []
+    for image_id, (lens, (name, pose), seen) in enumerate(zip(lenses, poses, observations, strict=True), 1):
+        model_id = next(number for number, known_lens in LENSES.items() if known_lens is lens.lens)
+        camera = (
+            struct.pack("<iQQ", model_id, lens.width, lens.height) + lens.parameters.astype("<f8").tobytes()
+        )
+        camera_id = camera_ids.setdefault(camera, len(camera_ids) + 1)
+        values = *Similarity(pose[:3, :3], 1.0, pose[:3, 3]).quat, *pose[:3, 3]
+        pixels = np.zeros(len(seen[0]), POINT2D)
+        pixels["point"], pixels["xy"] = seen[0] + 1, seen[1]
+        images += [
+            struct.pack("<i7di", image_id, *values, camera_id),
+            name.encode("utf-8", "surrogateescape") + b"\0",
+            struct.pack("<Q", len(pixels)) + pixels.tobytes(),
+        ]
+    cameras = [struct.pack("<i", camera_id) + camera for camera, camera_id in camera_ids.items()]
+    temporary = model.with_name(f".{model.name}.tmp")
+    try:
+        shutil.rmtree(temporary, ignore_errors=True)
+        temporary.mkdir(parents=True)
+        for file, count, records in (
+            ("cameras.bin", len(cameras), cameras),
+            ("images.bin", len(poses), images),
+            ("points3D.bin", len(points), [_point_records(points, colors, observations)]),
+        ):
+            with open(temporary / file, "wb") as stream:
+                stream.writelines([struct.pack("<Q", count), *records])
+                stream.flush()
+                os.fsync(stream.fileno())  # some disks report only now that they are full
+        shutil.rmtree(model, ignore_errors=True)
+        os.replace(temporary, model)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _point_records(
+    points: np.ndarray, colors: np.ndarray, observations: Sequence[tuple[np.ndarray, np.ndarray]]
+) -> bytes:
+    """Return the records of points3D.bin; see :func:`write_model`. Points have the ids 1, 2, ..."""
+    tracked = np.concatenate([np.zeros(0, np.int64), *(indices for indices, _ in observations)])
+    entries = [
+        np.column_stack([np.full(len(seen), n), np.arange(len(seen))])
+        for n, (seen, _) in enumerate(observations, 1)
+    ]
+    track = np.concatenate([np.zeros((0, 2), np.int64), *entries]).astype("<i4")
+    by_point = np.argsort(tracked, kind="stable")
+    lengths = np.bincount(tracked, minlength=len(points))
+    rows = np.zeros(len(points), POINT)
+    rows["id"] = np.arange(1, len(points) + 1)
+    rows["xyz"] = points
+    rows["rgb"] = colors
+    rows["track"] = lengths
+    before = np.concatenate([[0], np.cumsum(lengths)])[:-1]  # entries of all earlier points
+    data = np.zeros(rows.nbytes + track.nbytes, np.uint8)
+    starts = np.arange(len(points)) * POINT.itemsize + before * 8
+    data[starts[:, None] + np.arange(POINT.itemsize)] = rows.view(np.uint8).reshape(-1, POINT.itemsize)
+    ends = (tracked[by_point] + 1) * POINT.itemsize + np.arange(len(track)) * 8
+    data[ends[:, None] + np.arange(8)] = track[by_point].view(np.uint8).reshape(-1, 8)
+    return data.tobytes()

@@ -11,7 +11,6 @@ import os
 import shutil
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -20,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import LodgsError
+from ..files import temporary_folder
 from .gaussians import SplatRows, Splats
 
 PROGRAM = "splat-transform"
@@ -81,8 +81,8 @@ def splat_transform_steps(arguments: Sequence[str]) -> Iterator[str]:
     output = ""
     environment = os.environ | {"PATH": _search_path()}
     for device in ((), ("-g", "cpu", "-i", str(_CPU_ROUNDS))):
-        with tempfile.TemporaryDirectory(prefix="lodgs-") as folder:
-            log = Path(folder, "log")
+        with temporary_folder() as folder:
+            log = folder / "log"
             with open(log, "wb") as stream:
                 process = subprocess.Popen(
                     [command, "-w", "--no-tty", *device, *arguments],

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 from ..documents import read_json
 from ..errors import LodgsError
+from ..files import temporary_folder
 from .level_folder import write_folder
 from .levels import MAX_READ_LEVELS, Bundle
 from .splat_transform import FiniteRows, find_splat_transform, splat_transform_steps
@@ -44,14 +44,14 @@ def write_streamed_levels(folder: Path, bundle: Bundle) -> Iterator[str]:
         folder.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise LodgsError(f"Cannot create {folder}: {error.strerror}.", "Choose another folder.") from error
-    with tempfile.TemporaryDirectory(prefix=".lodgs-", dir=folder.parent) as temporary:
-        plain = Path(temporary, "levels")
-        converted = Path(temporary, "converted")
+    with temporary_folder(folder.parent) as temporary:
+        plain = temporary / "levels"
+        converted = temporary / "converted"
         write_folder(plain, bundle)
         arguments = level_arguments(plain, len(bundle.levels))
         yield from splat_transform_steps([*arguments, str(converted / STREAMED_FILE)])
         if folder.exists():
-            folder.rename(Path(temporary, "previous"))
+            folder.rename(temporary / "previous")
         converted.rename(folder)
 
 

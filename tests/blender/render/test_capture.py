@@ -278,6 +278,18 @@ def test_folder_with_another_scene_is_rejected(bpy, scene, capture, tmp_path, ca
     assert [path for path in (tmp_path / "out").rglob("*") if path.is_file()] == [model]
 
 
+def test_capture_that_ended_in_its_first_view_continues(
+    bpy, lodgs, scene, capture, tmp_path, capfd, monkeypatch
+):
+    module = lodgs("render.capture")
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "write_camera", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        assert capture("--around", "--views", "2", "--range", "1-2") == 3
+    (image,) = (tmp_path / "out" / "images").iterdir()
+    assert capture("--around", "--views", "2", "--range", "1-2") == 0
+    assert {file.stem for file in image.parent.iterdir()} == {"view_0001", "view_0002"}
+
+
 def test_existing_views_are_not_rendered_again(bpy, scene, capture, tmp_path, capfd):
     assert capture("--around", "--views", "4", "--range", "2-3") == 0
     out = tmp_path / "out"

@@ -8,9 +8,10 @@ import pytest
 from tests.training.scenes.walls import CAMERA_POSITIONS, render_photo
 from training.scenes.cameras import look_at
 from training.scenes.colmap import read_scene
-from training.scenes.colmap_model import make_intrinsics, write_model
+from training.scenes.colmap_model import make_intrinsics
 from training.scenes.images import write_png
 from training.scenes.undistort import cached_undistorted_scene
+from training.scenes.write_colmap import write_model
 
 pytestmark = pytest.mark.one_blender
 

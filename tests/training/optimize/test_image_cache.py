@@ -236,6 +236,7 @@ def test_memory_stays_within_the_budget(tmp_path):
     def peak(budget: int) -> int:
         data = TrainingData.__new__(TrainingData)
         data.exposure, data.transparent, data.depths, data._gains = 0.0, False, None, {}
+        data._sizes = {}
         targets = ImageCache(data._read, budget)
         tracemalloc.start()
         for step in range(2 * views):

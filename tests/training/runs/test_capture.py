@@ -13,7 +13,9 @@ from training.evaluate.costs import cost_curves
 from training.rasterize import Gaussians, rasterize
 from training.runs import capture
 from training.runs.capture import write_scene
+from training.runs.data import training_data
 from training.runs.folder import RunFolder
+from training.runs.job import Job
 from training.scenes.cameras import read_camera_folder, write_camera
 from training.scenes.colmap import read_scene
 from training.scenes.images import load_image
@@ -97,6 +99,24 @@ def test_capture_overwrites_nothing_and_leaves_no_partial_scene(ball, tmp_path):
     faint = Splats(**{**vars(ball), "opacity_logits": np.full(600, -3, np.float32)})
     with pytest.raises(LodgsError, match="no opaque splat"):
         dome_views(faint, 4)
+
+
+@pytest.mark.parametrize("damaged", ["sparse/0/images.bin", "sparse/0/points3D.bin", "images/dome_0002.jpg"])
+def test_damaged_captured_views_are_rendered_again(ball, tmp_path, damaged):
+    run = RunFolder(tmp_path / "run")
+    run.create()
+    write_ply(run.base, ball)
+    keys = {"scene": "", "base": str(run.base), "out": str(run.path), "method": "lodge", "capture": "dome"}
+    job = Job.from_dict({**keys, "views": 4, "view_width": 48, "image_scale": 1.0})
+    training_data(job, run)
+    files = sorted(path for path in run.captured.rglob("*") if path.is_file())
+    before = [path.read_bytes() for path in files]
+    path = run.captured / damaged
+    path.write_bytes(path.read_bytes()[:-20])
+    reports = []
+    training_data(job, run, lambda kind, **values: reports.append(f"{kind}: {values['message']}"))
+    assert [path.read_bytes() for path in files] == before
+    assert reports[0].startswith("warning: ") and "damaged. They are rendered again" in reports[0]
 
 
 def test_views_along_a_path_are_level_and_look_in_all_directions(ball):

@@ -69,7 +69,10 @@ def test_find_file_rejects_paths_outside_the_run(run, tmp_path):
 
 
 def test_locking_deletes_only_temporary_files_of_killed_trainers(run):
-    leftovers = [run.checkpoints / ".step_0000001.pt.0123abcd.tmp", run.path / ".bundle.ply.89abcdef.tmp"]
+    leftovers = [
+        run.checkpoints / ".step_0000001.pt.0123-45-89ab.tmp",
+        run.path / ".bundle.ply.89ab-1234567-cdef.tmp",
+    ]
     user_files = [run.path / ".notes.tmp", run.path / "mine.tmp", run.checkpoints / "step_0000001.pt"]
     for path in leftovers + user_files:
         path.write_text("")

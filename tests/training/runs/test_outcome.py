@@ -21,6 +21,16 @@ def test_error_event_of_the_run_or_its_output_is_reported(run):
     assert run_outcome(run, 2) == run_outcome(run, None) == ("failed", "The disk is full. Free some.")
 
 
+@pytest.mark.parametrize(("kind", "state"), [("done", "done"), ("cancelled", "cancelled")])
+def test_rejected_second_trainer_is_no_failure_of_the_run(run, kind, state):
+    """Two Blenders resume one run: the trainer of one of them ends with exit code 2."""
+    run.events_file.write_text(event_line(kind) + "\n")
+    run.output.write_text(event_line("error", what="Another trainer is running.") + "\n" + event_line(kind))
+    assert run_outcome(run, 2) == (state, "")
+    run.events_file.write_text(event_line("hello") + "\n")
+    assert run_outcome(run, 2) == ("failed", "Another trainer is running.")
+
+
 def test_unwritable_run_is_reported_from_the_exit_code(run):
     run.events_file.write_text(event_line("hello") + '\n{"event": "prog')
     state, problem = run_outcome(run, 2)

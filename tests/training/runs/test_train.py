@@ -9,6 +9,7 @@ import signal
 import struct
 import subprocess
 import sys
+import threading
 import time
 import zipfile
 from importlib import import_module
@@ -468,11 +469,34 @@ def test_run_folder_deleted_during_training_is_not_recreated(
         return train_step(self, step)
 
     monkeypatch.setattr(method, "train_step", losing_step)
+    monkeypatch.setattr(training_loop, "CHECKPOINT_SECONDS", 0)  # the step is followed by a write
     assert training_loop.train(Job.from_dict(keys), sys.stdout) == 2
     event = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert event["event"] == "error" and "moved or deleted" in event["what"]
     assert lost == "run/lock" or not (tmp_path / "run").exists()
-    assert not list(tmp_path.glob("run/checkpoints/*"))
+    assert not (tmp_path / "run" / "checkpoints" / "step_0000006.pt").exists()
+
+
+def test_trainer_saves_and_resumes_when_its_parent_ended(uninterrupted, tmp_path, monkeypatch):
+    keys = {**uninterrupted["keys"], "out": str(tmp_path / "run")}
+    method = method_of(keys)
+    train_step = method.train_step
+    ended = threading.Event()
+    monkeypatch.setattr(training_loop.parent, "ended", ended)
+
+    def orphaning_step(self, step):
+        if step == 7:
+            ended.set()
+        return train_step(self, step)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(method, "train_step", orphaning_step)
+        code, events = run_in_process(keys)
+    assert code == 2 and "process that started it has ended" in events[-1]["what"]
+    assert RunFolder(keys["out"]).state() == "failed", "not cancelled: its blocks' run resumes it"
+    ended.clear()
+    assert run_in_process(keys)[0] == 0
+    assert RunFolder(keys["out"]).bundle.read_bytes() == uninterrupted["bundle"]
 
 
 def test_final_event_is_written_to_a_full_disk(uninterrupted, tmp_path, monkeypatch):

@@ -109,7 +109,7 @@ def test_camera_models(tmp_path, model, form):
 
 
 def test_all_camera_models_of_pycolmap_are_supported():
-    supported = {number: (lens.name, lens.parameters) for number, lens in model_files._LENSES.items()}
+    supported = {number: (lens.name, lens.parameters) for number, lens in model_files.LENSES.items()}
     expected = {}
     for name, number in pycolmap.CameraModelId.__members__.items():
         if name != "INVALID":

@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from training.scenes.cameras import look_at
-from training.scenes.colmap_model import make_intrinsics, write_model
+from training.scenes.colmap_model import make_intrinsics
 from training.scenes.images import write_png
+from training.scenes.write_colmap import write_model
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
 CAMERA_POSITIONS = np.array([(0.45 * n - 1.2, -3.2 + 0.1 * (n % 3), 1.2 + 0.15 * (n % 2)) for n in range(6)])

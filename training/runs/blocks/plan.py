@@ -10,7 +10,6 @@ run/  job.toml (with ``cells``)  blocks/
 from __future__ import annotations
 
 import shutil
-import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
@@ -20,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import LodgsError
+from ...files import temporary_folder
 from ...lod.rule import resolve_rule
 from ...methods import method_info
 from ...optimize.memory import MAX_BYTES, TARGET_BYTES
@@ -175,6 +175,8 @@ def plan(job: Job, scene: Scene | None = None) -> list[PlannedCell]:
     Raises:
         LodgsError: the scene cannot be read, or not divided into these cells.
     """
+    if not job.cells:
+        raise LodgsError("Cannot plan cells: the scene has only one cell.", "Use at least 2 cells.")
     scene = read_planned_scene(job) if scene is None else scene
     undivided, _ = _divided(job)
     training = _training_views(job, scene)
@@ -253,7 +255,7 @@ def write_plan(
         _, coarse = _divided(job)
         training = _training_views(job, scene)
         try:
-            with tempfile.TemporaryDirectory(dir=folder.path, prefix="planning-") as work:
+            with temporary_folder(folder.path) as work:
                 temporary = RunFolder(work)
                 if coarse is not None:
                     _write_part(_part_job(job, coarse), temporary.coarse)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from ...errors import LodgsError
+from .. import parent
 from ..failures import CANCELLED
 from ..folder import RunFolder
 from .cluster import import_dask, local_cluster, read_key_file
@@ -95,10 +96,13 @@ def train_block(folder: str, threads: int = 0, cards: Sequence[str] = ()) -> int
     if cards:
         environment["CUDA_VISIBLE_DEVICES"] = cards[int(import_dask().get_worker().name) % len(cards)]
     with run.log.open("ab") as log:
-        return subprocess.run(
-            [sys.executable, "-m", _PACKAGE, "train", str(run.job)], env=environment, check=False,
-            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=log,
-        ).returncode  # fmt: skip
+        trainer = subprocess.Popen(
+            [sys.executable, "-m", _PACKAGE, "train", str(run.job)],
+            env=environment | {parent.VARIABLE: "1"}, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL,
+            stderr=log,
+        )  # fmt: skip
+        with trainer:  # its standard input ends with this process
+            return trainer.wait()
 
 
 @contextmanager

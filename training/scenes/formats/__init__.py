@@ -15,13 +15,13 @@ from types import ModuleType
 
 import numpy as np
 
-from ...errors import LodgsError
+from ...errors import LodgsError, SystemProblem
 from ...files import check_folder, link_or_copy
 from ..colmap import DEPTHS, MASKS, find_models
-from ..colmap_model import write_model
 from ..image_files import find_image_folder
 from ..images import image_size
 from ..view_selection import exclusion_messages, photo_turns
+from ..write_colmap import write_model
 from . import bundler, metashape, openmvg, polycam, record3d, transforms
 from .exported import ExportedScene, ExportedView
 
@@ -142,6 +142,8 @@ def _usable_views(exported: ExportedScene) -> tuple[list[ExportedView], list[tup
             continue
         try:
             width, height = image_size(view.image)
+        except SystemProblem:
+            raise
         except LodgsError as error:
             excluded.append((name, error.what))
             continue

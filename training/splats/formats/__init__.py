@@ -6,7 +6,6 @@ LODGS itself reads and writes PLY and ``.splat``. splat-transform reads and writ
 from __future__ import annotations
 
 import shutil
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
@@ -15,7 +14,7 @@ from pkgutil import iter_modules
 
 from ...documents import open_file
 from ...errors import LodgsError
-from ...files import atomic_write
+from ...files import atomic_write, temporary_folder
 from ..dialects import comments_from_meta
 from ..gaussians import SplatRows
 from ..packed_files import check_packed_file
@@ -80,13 +79,17 @@ def write_splats(path: Path, splats: SplatRows, meta: dict) -> Iterator[str]:
             "Write a PLY instead.",
         )
     find_splat_transform()  # reports a missing program before files are written
-    with tempfile.TemporaryDirectory(prefix="lodgs-") as folder:
-        plain = Path(folder, "splats.ply")
-        converted = Path(folder, f"converted{kind.suffix}")
+    with temporary_folder() as folder:
+        plain = folder / "splats.ply"
+        converted = folder / f"converted{kind.suffix}"
         write_ply(plain, FiniteRows(splats), comments_from_meta(meta))
         yield from splat_transform_steps([str(plain), str(converted)])
-        with atomic_write(path) as temporary:
-            shutil.move(converted, temporary)
+        with (
+            atomic_write(path) as temporary,
+            open(converted, "rb") as source,
+            open(temporary, "wb") as target,
+        ):
+            shutil.copyfileobj(source, target)
 
 
 @contextmanager
@@ -107,8 +110,8 @@ def open_as_ply(path: Path) -> Iterator[Path]:
     open_file(path).close()  # reports an unreadable file
     check_packed_file(path)
     stem = path.resolve().parent.name if name == STREAMED_FILE else path.stem.removesuffix(".compressed")
-    with tempfile.TemporaryDirectory(prefix="lodgs-") as folder:
-        converted = Path(folder, f"{stem or 'splats'}.ply")
+    with temporary_folder() as folder:
+        converted = folder / f"{stem or 'splats'}.ply"
         if name == STREAMED_FILE:
             converted = converted.with_suffix("")
             for lod in range(count_lods(path)):

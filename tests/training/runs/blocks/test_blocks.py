@@ -605,6 +605,31 @@ def test_killed_trainers_and_an_interrupted_run_give_the_same_bundle(tiny_scene,
     assert attacked.bundle.read_bytes() == undisturbed.bundle.read_bytes() and kills >= 2
 
 
+@pytest.mark.slow
+@pytest.mark.nightly
+@pytest.mark.skipif(os.name == "nt", reason="Windows cancels with a file")
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 3), (signal.SIGKILL, -signal.SIGKILL)])
+def test_block_trainers_save_and_end_with_their_parent(tiny_scene, tmp_path, number, code):
+    keys = asdict(job_for(tiny_scene, tmp_path / "run", parameters={**TINY, "steps": 100_000}))
+    path = tmp_path / "job.json"
+    path.write_text(json.dumps(keys))
+    process = subprocess.Popen(
+        [sys.executable, "-m", "training", "train", str(path)], cwd=ROOT, stdout=subprocess.DEVNULL
+    )
+    run = RunFolder(tmp_path / "run")
+    block = RunFolder(run.blocks / "1")
+    deadline = time.monotonic() + 60
+    while not block.last_event("progress") and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.send_signal(number)
+    assert process.wait(30) == code
+    while block.running and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert list(block.checkpoints.glob("*.pt")) and not block.running
+    states = {signal.SIGTERM: ("cancelled", "cancelled"), signal.SIGKILL: ("interrupted", "failed")}
+    assert (run.state(), block.state()) == states[number]
+
+
 def test_progress_of_many_blocks_does_not_fill_the_event_file(monkeypatch):
     """A hundred blocks for two weeks, polled every five minutes."""
     clock = itertools.count(0, 300)

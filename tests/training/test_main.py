@@ -1,0 +1,125 @@
+"""Exit codes of the command line: closed and full outputs, signals, and errors of the system."""
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from training import __main__
+from training.cli import COMMANDS
+from training.runs import parent
+
+ROOT = Path(__file__).resolve().parents[2]
+MISTAKES = {
+    "train": "--scene a --out b --set wings=2",
+    "blocks": "run missing",
+    "methods": "unknown",
+    "evaluate": "missing",
+    "render": "missing --view a.jpg --out a.png",
+    "capture": "missing.ply --out a",
+    "scene": "--from missing",
+    "undistort": "missing",
+    "model": "missing",
+    "edit": "missing.ply --out a.ply",
+    "info": "missing.ply",
+}
+
+pytestmark = pytest.mark.skipif(os.name == "nt", reason="shell redirections and signals of POSIX")
+
+
+def shell(command: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        f"exec '{sys.executable}' {command}",
+        shell=True,
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize("command", MISTAKES)
+def test_mistakes_have_exit_code_2_without_standard_output(tmp_path, monkeypatch, command):
+    """As under pythonw, and as a daemon."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "stdout", None)
+    monkeypatch.setattr(sys, "stderr", None)
+    assert __main__.main([command, *MISTAKES[command].split()]) == 2
+    assert COMMANDS.keys() - MISTAKES.keys() == {"serve", "check", "devices"}
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "message"),
+    [
+        (">&-", 0, ""),
+        ("<&- >&- 2>&-", 0, ""),
+        (">/dev/full", 2, "error: Cannot write to standard output: No space left on device."),
+    ],
+)
+def test_closed_and_full_outputs(words, code, message):
+    result = shell(f"-m training methods {words}")
+    assert (result.returncode, result.stderr.strip()) == (code, message)
+
+
+@pytest.mark.parametrize("words", ["info missing 2>/dev/full", "unknown 2>/dev/full", "info missing 2>&-"])
+def test_mistakes_keep_their_exit_code_if_they_cannot_be_reported(words):
+    assert shell(f"-m training {words}").returncode == 2
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_every_command_is_cancelled_by_signals(number):
+    program = (
+        "import time, types, training.__main__ as m\n"
+        "def run(options): print('started', flush=True); time.sleep(20)\n"
+        "m._module = lambda name: types.SimpleNamespace(run=run, add_arguments=lambda parser: None)\n"
+        "import sys; sys.argv[1:] = ['scene']; m.run()"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", program], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None and process.stdout.readline() == "started\n"
+    process.send_signal(number)
+    assert process.communicate(timeout=10) == ("", "") and process.returncode == 3
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (
+            OSError(errno.EMFILE, "Too many open files", "a.jpg"),
+            "Cannot use a.jpg: Too many open files.",
+        ),
+        (OSError(errno.EFBIG, "File too large"), "Cannot continue: File too large. Raise the limit"),
+        (
+            OSError(errno.ENOSPC, "No space left on device", "b"),
+            "Cannot use b: No space left on device.",
+        ),
+        (MemoryError(), "Not enough memory. Close other programs"),
+    ],
+)
+def test_system_errors_are_one_message(monkeypatch, capsys, error, message):
+    def fail(options):
+        raise error
+
+    monkeypatch.setattr("training.cli.info.run", fail)
+    assert __main__.main(["info", "a.ply"]) == 2
+    assert capsys.readouterr().err.startswith(f"error: {message}")
+
+
+def test_process_notices_the_end_of_its_parent():
+    program = "from training.runs import parent; parent.watch(); raise SystemExit(not parent.ended.wait(9))"
+    process = subprocess.Popen(
+        [sys.executable, "-c", program],
+        cwd=ROOT,
+        stdin=subprocess.PIPE,
+        env={**os.environ, parent.VARIABLE: "1"},
+    )
+    with pytest.raises(subprocess.TimeoutExpired):
+        process.wait(0.5)
+    assert process.stdin is not None
+    process.stdin.close()
+    assert process.wait(5) == 0
