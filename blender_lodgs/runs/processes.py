@@ -14,7 +14,7 @@ from typing import Any
 import bpy
 
 from ...training.files import open_regular
-from ...training.runs.processes import PARENT, identity
+from ...training.runs.processes import parent_variable
 from .. import extension
 
 if sys.platform != "win32":
@@ -38,7 +38,7 @@ def environment() -> dict[str, str]:
     """
     values = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "__PYVENV_LAUNCHER__"))}
     if bpy.app.background:
-        values[PARENT] = f"{os.getpid()} {identity(os.getpid())}"
+        values |= parent_variable()
     compiled = extension.user_folder("cache") / "pycache"
     return values | {"PYTHONPYCACHEPREFIX": str(compiled), "PYTHONUTF8": "1"}
 

@@ -11,7 +11,6 @@ import pytest
 
 from training import __main__
 from training.cli import COMMANDS
-from training.runs import parent
 
 ROOT = Path(__file__).resolve().parents[2]
 MISTAKES = {
@@ -108,18 +107,3 @@ def test_system_errors_are_one_message(monkeypatch, capsys, error, message):
     monkeypatch.setattr("training.cli.info.run", fail)
     assert __main__.main(["info", "a.ply"]) == 2
     assert capsys.readouterr().err.startswith(f"error: {message}")
-
-
-def test_process_notices_the_end_of_its_parent():
-    program = "from training.runs import parent; parent.watch(); raise SystemExit(not parent.ended.wait(9))"
-    process = subprocess.Popen(
-        [sys.executable, "-c", program],
-        cwd=ROOT,
-        stdin=subprocess.PIPE,
-        env={**os.environ, parent.VARIABLE: "1"},
-    )
-    with pytest.raises(subprocess.TimeoutExpired):
-        process.wait(0.5)
-    assert process.stdin is not None
-    process.stdin.close()
-    assert process.wait(5) == 0

@@ -51,6 +51,15 @@ def interrupt() -> None:
         interrupt_main()
 
 
+parent_ended = threading.Event()
+"""Set when the process that started this one has ended; only after :func:`stop_with_parent`."""
+
+
+def parent_variable() -> dict[str, str]:
+    """Return the environment variable for programs that must end with this process."""
+    return {PARENT: f"{os.getpid()} {identity(os.getpid())}"}
+
+
 def stop_with_parent() -> None:
     """Interrupt this process as Ctrl-C does when the process in :data:`PARENT` has ended.
 
@@ -66,6 +75,7 @@ def _interrupt_after(pid: int, expected: str) -> None:
     while failures < 2:  # a busy system may fail to report the process once
         time.sleep(0.5)
         failures = 0 if identity(pid) == expected else failures + 1
+    parent_ended.set()
     interrupt()
 
 

@@ -44,7 +44,7 @@ from ..splats.file_rows import open_ply
 from ..splats.gaussians import SplatRows, Splats
 from ..splats.levels import NO_SPLATS, Bundle, Level
 from ..splats.ply import BATCH_ROWS, Columns, read_ply, write_ply
-from . import parent, processes
+from . import processes
 from .base import open_base
 from .blocks.plan import write_plan
 from .blocks.train import BlocksStopped, train_blocks
@@ -73,7 +73,6 @@ def train(job: Job, stream: IO[str] | None = None, **placement: Any) -> int:
         An exit code. Errors end in an ``error`` event, never in a traceback on the stream.
     """
     folder = RunFolder(job.out)
-    parent.watch()
     try:
         folder.create()
         with folder.locked():
@@ -110,7 +109,7 @@ def _final_event(error: BaseException) -> tuple[int, dict]:
     """Return exit code and final event of a training that ends with an exception."""
     if isinstance(error, BlocksStopped):
         return CANCELLED, {"kind": "cancelled", "message": str(error)}
-    if isinstance(error, KeyboardInterrupt) and parent.ended.is_set():
+    if isinstance(error, KeyboardInterrupt) and processes.parent_ended.is_set():
         problem = "Training stopped: the process that started it has ended."
         return BAD_INPUT, {"kind": "error", "what": problem, "remedy": "Resume the run."}
     if isinstance(error, KeyboardInterrupt):
@@ -267,9 +266,9 @@ class _TrainingRun:
         last_checkpoint = last_progress = self._started
         while self.step < method.steps:
             self.folder.require_lock()
-            if received or parent.ended.is_set() or self.folder.take_cancel():
+            if received or processes.parent_ended.is_set() or self.folder.take_cancel():
                 self._save()
-                if parent.ended.is_set():
+                if processes.parent_ended.is_set():
                     raise KeyboardInterrupt
                 message = f"Stopped at step {self.step} of {method.steps}. The run can be resumed."
                 self.events("cancelled", step=self.step, message=message)
@@ -445,7 +444,7 @@ def _interrupt_on_cancel(folder: RunFolder):
     def watch() -> None:
         while not finished.wait(0.1):
             with suppress(OSError):
-                if parent.ended.is_set() or folder.take_cancel():
+                if processes.parent_ended.is_set() or folder.take_cancel():
                     processes.interrupt()
                     return
 

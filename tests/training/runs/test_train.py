@@ -482,7 +482,7 @@ def test_trainer_saves_and_resumes_when_its_parent_ended(uninterrupted, tmp_path
     method = method_of(keys)
     train_step = method.train_step
     ended = threading.Event()
-    monkeypatch.setattr(training_loop.parent, "ended", ended)
+    monkeypatch.setattr(training_loop.processes, "parent_ended", ended)
 
     def orphaning_step(self, step):
         if step == 7:

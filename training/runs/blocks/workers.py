@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from ...errors import LodgsError
-from .. import parent
+from .. import processes
 from ..failures import CANCELLED
 from ..folder import RunFolder
 from .cluster import import_dask, local_cluster, read_key_file
@@ -98,11 +98,10 @@ def train_block(folder: str, threads: int = 0, cards: Sequence[str] = ()) -> int
     with run.log.open("ab") as log:
         trainer = subprocess.Popen(
             [sys.executable, "-m", _PACKAGE, "train", str(run.job)],
-            env=environment | {parent.VARIABLE: "1"}, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL,
-            stderr=log,
+            env=environment | processes.parent_variable(), stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL, stderr=log,
         )  # fmt: skip
-        with trainer:  # its standard input ends with this process
-            return trainer.wait()
+        return trainer.wait()
 
 
 @contextmanager
