@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 from ...optimize.method_info import MethodInfo
-from ...optimize.parameters import PAPER, STANDARD, SplatParameters
+from ...optimize.parameters import OVERSIZED, PAPER, STANDARD, SplatParameters
 from ...settings import setting
 
 
@@ -76,6 +76,7 @@ _STANDARD = replace(_DRAFT, **STANDARD, steps=30_000, densify_interval=100)
 _PAPER = replace(
     _STANDARD,
     **PAPER,
+    **OVERSIZED,
     begin=1 / 6,
     keep_share=1.0,
     by_importance=False,

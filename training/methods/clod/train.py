@@ -72,7 +72,7 @@ class Method(SplatMethod):
             self.decay_start = self._densify_until = 0
         sigma = torch.full((len(tensors["means"]),), p.sigma_init, device=self.device)
         rates = splat_rates(p, self.data.extent) | {SIGMA: p.lr_sigma}
-        peaks = p.densify_by == "max"
+        peaks = p.densify_by == "max" or p.prune_oversized
         self.model = Model(tensors | {SIGMA: self._encode(sigma)}, rates, peaks=peaks)
         self.reference = self._far_distance(p.reference_quantile) if p.reference_quantile else 0.0
         self.facts = {"reference": self.reference, "tau": p.tau}
@@ -207,7 +207,7 @@ class Method(SplatMethod):
         order = importance.argsort(descending=True, stable=True)
         drawn = contribution.views[order].cumsum(0)
         count = int((drawn <= self.parameters.keep_share * float(drawn[-1])).sum())
-        order = order[: min(max(count, 1), self.parameters.max_splats)]
+        order = order[: min(max(count, 1), self.parameters.splat_limit)]
         keep = torch.zeros(len(gaussians), dtype=torch.bool, device=self.device)
         keep[order] = True
         self.model.keep(keep)

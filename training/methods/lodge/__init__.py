@@ -104,9 +104,9 @@ _DRAFT = LodgeParameters()
 _STANDARD = replace(_DRAFT, **STANDARD, steps=30_000, densify_interval=100, tune_steps=1000)
 _PAPER = replace(
     _STANDARD,
-    **PAPER | {"antialias": True},
+    **PAPER | {"antialias": True, "densify_from": 600},
     densify_interval=300,
-    densify_from=600,
+    prune_oversized=True,
     densify_by="max",
     least_weight=0.02,
     tune_alone=0.0,
