@@ -66,6 +66,19 @@ PUBLISHED = {
         "tune_range": (0.3, "LODGE, A.2"),
         "levels": (3, "LODGE, Table 3: two coarser levels"),
         "prune_oversized": (True, "3DGS, Sec. 5.2"),
+        "tune_each": (True, "LODGE, A.2: each d_l"),
+        "min_ratio": (1.3, "LODGE, Table 3: 28, 47 and 63 m"),
+        "min_chunks": (2, "LODGE, Eq. 5: no minimum"),
+    },
+    "tree": SPLATS | {
+        "steps": (60_000, "A LoD of Gaussians, A.5"),
+        "densify_until": (0.0, "A LoD of Gaussians, A.2: no densification"),
+        "opacity_reset_interval": (0, "A LoD of Gaussians, A.5: coarse stage"),
+        "tune_steps": (150_000, "A LoD of Gaussians, A.5"),
+        "sh_degree": (1, "A LoD of Gaussians, A.2"),
+        "lod_noise": (5.0, "A LoD of Gaussians, A.6"),
+        "max_threshold": (0.0075, "A LoD of Gaussians: half of H3DGS's 0.015"),
+        "unseen_epochs": (2.0, "A LoD of Gaussians, Sec. 4.2"),
     },
     "octree_neural": SHARED | {
         "steps": (40_000, "Octree-GS, Sec. 5.1"),
@@ -225,3 +238,10 @@ def test_octree_initial_level(data, init_level, at_once):
     paper = replace(method_info("octree").preset("paper"), levels=6, init_level=init_level)
     joins = create("octree", data, paper, seed=0, backend="cpu").schedule.join_steps
     assert joins.count(0) == at_once and max(joins) == (10_000 if at_once < 6 else 0)
+
+
+def test_coarse_stage_of_a_lod_of_gaussians_has_no_density_control(data, events):
+    paper = replace(method_info("tree").preset("paper"), tune_steps=0)
+    method = create("tree", data, paper, seed=0, backend="cpu")
+    assert method.steps == 60_001 and method.finest_steps == 60_000
+    assert events(method) == {}
