@@ -17,6 +17,10 @@ from .model import PEAK_STATS, Model
 RESET_OPACITY = 0.01
 """Maximum opacity after an opacity reset."""
 
+OVERSIZED_PIXELS = 20.0
+"""Maximum radius of three standard deviations in an image, in pixels, if oversized splats are removed."""
+OVERSIZED_EXTENT = 0.1
+"""Maximum standard deviation as a fraction of the scene extent, if oversized splats are removed."""
 
 AXIS_SHRINK = 0.45
 """Reduction of the longest axis by a split along it (Improved-GS, arXiv 2508.12313)."""
@@ -117,6 +121,14 @@ def split_longest_axis(
 def prune(model: Model, min_opacity: float) -> None:
     """Remove splats below an opacity."""
     model.keep(model.read("opacity_logits").sigmoid() >= min_opacity)
+
+
+def prune_oversized(model: Model, max_scale: float) -> None:
+    """Remove splats wider than ``max_scale`` (scene units), or than OVERSIZED_PIXELS since the last reset of
+    the statistics (3DGS, Sec. 5.2).
+    """
+    wide = model.read("log_scales").amax(1).exp() > max_scale
+    model.keep(~(wide | (model.read(PEAK_STATS[1]) > OVERSIZED_PIXELS)))
 
 
 def reset_opacities(model: Model) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 from ..documents import quote
 from ..errors import LodgsError
 from ..scenes.depths import DEPTH_KINDS
-from ..settings import check_value, setting, settings_of
+from ..settings import MAX_INTEGER, check_value, setting, settings_of
 
 MAX_MARGIN_SHARE = 0.1
 """Maximum share of all splats for margins."""
@@ -28,12 +28,16 @@ class Parameters:
     max_splats: int = setting(
         60_000,
         "Maximum number of splats. Those with the largest gradients are densified first. If the scene has "
-        "more points, training starts from a random sample.",
-        above=0,
+        "more points, training starts from a random sample. 0 is unlimited.",
     )
     grad_threshold: float = setting(
         1e-4,
         "Mean image-plane gradient (3DGS units, at one megapixel) above which splats are added.",
+    )
+    scale_threshold: bool = setting(
+        True,
+        "Multiply gradient thresholds by the square root of one megapixel over the photos' size, so that "
+        "they mean the same at every size. Disable for the thresholds of the papers as published.",
     )
     min_opacity: float = setting(0.005, "Remove splats below this opacity.", high=1)
     sh_degree: int = setting(3, "Degree of spherical harmonics for view-dependent colour, 0 to 3.", high=3)
@@ -130,9 +134,18 @@ class Parameters:
         return False
 
     @property
+    def splat_limit(self) -> int:
+        """Maximum number of splats; the largest integer if 'max_splats' is unlimited."""
+        return self.max_splats or MAX_INTEGER
+
+    @property
     def max_trained_splats(self) -> int:
-        """Maximum number of splats trained at the same time."""
+        """Maximum number of splats trained at the same time; 0 is unlimited."""
         return self.max_splats
+
+    def threshold_factor(self, image_factor: float) -> float:
+        """Return the factor on gradient thresholds, given that of the image size."""
+        return image_factor if self.scale_threshold else 1.0
 
     def margin_room(self, budget: int) -> int:
         """Return the share of a budget of splats that is reserved for margins."""
@@ -173,6 +186,9 @@ class DensityParameters(Parameters):
         "Without 'long_axis', split splats larger than this multiple of the scene extent and clone smaller "
         "ones.",
     )
+    densify_from: int = setting(
+        0, "First step, of a level in FLoD, in which splats are added or faint ones removed.", unit="steps"
+    )
     prune_interval: int = setting(
         100, "Steps between removals of transparent splats. 0 disables.", unit="steps"
     )
@@ -192,7 +208,6 @@ class SplatParameters(DensityParameters):
         0.5, "Fraction of the steps in which splats are added and removed.", high=1
     )
     densify_interval: int = setting(50, "Steps between two densifications.", above=0, unit="steps")
-    densify_from: int = setting(0, "First step with densification.", unit="steps")
     densify_by: str = setting(
         "mean",
         "Criterion for adding splats: the mean image-plane gradient over the views since the last "
@@ -211,6 +226,11 @@ class SplatParameters(DensityParameters):
         "16 and 24 thirtieths of the steps (LODGE, A.2: 0.02). 0 keeps all.",
         high=1,
     )
+    prune_oversized: bool = setting(
+        False,
+        "At each densification after the first opacity reset, remove splats with a radius above 20 pixels or "
+        "a standard deviation above a tenth of the scene extent, as 3DGS does.",
+    )
 
 
 STANDARD: dict[str, Any] = {
@@ -222,6 +242,8 @@ STANDARD: dict[str, Any] = {
 }
 """Values of presets *standard*: 3DGS as published, with fewer splats."""
 AS_PUBLISHED: dict[str, Any] = {
+    "max_splats": 0,
+    "scale_threshold": False,
     "free_depth": 0.0,
     "largest": 0.0,
     "random_background": False,
@@ -236,10 +258,12 @@ PAPER: dict[str, Any] = AS_PUBLISHED | {
     "long_axis": False,
     "opacity_reset_interval": 3000,
     "grad_threshold": 2e-4,
-    "max_splats": 5_000_000,
+    "densify_from": 501,
     "lr_means_steps": 30_000,
 }
-"""Values of presets *paper* of methods with the density control of 3DGS."""
+"""Values of presets *paper* of methods with the density control of 3DGS, which begins after step 500."""
+OVERSIZED: dict[str, Any] = {"densify_until": 0.499, "prune_oversized": True}
+"""Values of presets *paper* that train 3DGS as its program does: density control ends before step 15,000."""
 
 
 def override(parameters: Parameters, values: dict) -> Parameters:

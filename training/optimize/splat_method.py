@@ -10,7 +10,15 @@ import torch
 from ..rasterize import contributions
 from ..splats.gaussians import Splats
 from ..splats.levels import Level
-from .density_control import densify, peak_scores, prune, require_rows, reset_opacities
+from .density_control import (
+    OVERSIZED_EXTENT,
+    densify,
+    peak_scores,
+    prune,
+    prune_oversized,
+    require_rows,
+    reset_opacities,
+)
 from .initialize import drop_duplicates, from_points, from_splats, sample_points
 from .method import Drawing, Method
 from .model import Model, splat_rates
@@ -32,7 +40,7 @@ class SplatMethod(Method[SplatParameters, Drawing]):
             tensors = from_splats(base, p.sh_degree, self.device)
         else:
             points, colors = drop_duplicates(scene.points, scene.point_colors)
-            points, colors = sample_points(points, colors, p.growth_limit(p.max_splats), self.seed)
+            points, colors = sample_points(points, colors, p.growth_limit(p.splat_limit), self.seed)
             tensors = from_points(points, colors, p.sh_degree, self.device)
         self.model = self.new_model(tensors)
         self._densify_until = p.densify_until * self.scheduled_steps
@@ -45,7 +53,8 @@ class SplatMethod(Method[SplatParameters, Drawing]):
     def new_model(self, tensors: Mapping[str, torch.Tensor]) -> Model:
         """Create a model with the statistics that the densification criterion needs."""
         p = self.parameters
-        return Model(tensors, splat_rates(p, self.data.extent), peaks=p.densify_by == "max")
+        peaks = p.densify_by == "max" or p.prune_oversized
+        return Model(tensors, splat_rates(p, self.data.extent), peaks=peaks)
 
     def levels_after(self, step: int) -> list[Level]:
         """Return the single level after the last step."""
@@ -79,21 +88,30 @@ class SplatMethod(Method[SplatParameters, Drawing]):
         if completed > self._densify_until:
             return
         if due(p.densify_interval, completed) and completed >= p.densify_from:
-            peaks = p.densify_by == "max"
-            densify(
-                model,
-                peak_scores(model) if peaks else model.mean_gradient(),
-                threshold=(p.max_threshold if peaks else p.grad_threshold) * self.data.threshold_scale,
-                clone_below=None if p.long_axis else p.clone_extent * self.data.extent,
-                max_splats=p.growth_limit(p.max_splats),
-                rng=np.random.default_rng([self.seed, step, 1]),
-            )
-            model.reset_stats()
-        if due(p.prune_interval, completed):
+            self._densify(step)
+        if due(p.prune_interval, completed) and completed >= p.densify_from:
             prune(model, p.min_opacity)
             require_rows(model, step, "min_opacity")
-        if due(p.opacity_reset_interval, completed):
-            reset_opacities(model)
+        if due(p.opacity_reset_interval, completed) and completed < self._densify_until:
+            reset_opacities(model)  # not at the end: nothing would remove splats that stay faint
+
+    def _densify(self, step: int) -> None:
+        """Add splats by the criterion and, if enabled, remove oversized ones."""
+        p, model = self.parameters, self.model
+        peaks = p.densify_by == "max"
+        threshold = p.max_threshold if peaks else p.grad_threshold
+        densify(
+            model,
+            peak_scores(model) if peaks else model.mean_gradient(),
+            threshold=threshold * p.threshold_factor(self.data.threshold_scale),
+            clone_below=None if p.long_axis else p.clone_extent * self.data.extent,
+            max_splats=p.growth_limit(p.splat_limit),
+            rng=np.random.default_rng([self.seed, step, 1]),
+        )
+        if p.prune_oversized and 0 < p.opacity_reset_interval < step + 1:
+            prune_oversized(model, OVERSIZED_EXTENT * self.data.extent)
+            require_rows(model, step, "prune_oversized")
+        model.reset_stats()
 
     @torch.no_grad()
     def prune_unimportant(self, step: int) -> None:
@@ -117,4 +135,4 @@ class SplatMethod(Method[SplatParameters, Drawing]):
     def margin_rows(self) -> dict[str, torch.Tensor]:
         """Create margin splats within the budget, as rows of the model."""
         p = self.parameters
-        return vars(self.margins.extend(self.model.gaussians, p.margin_room(p.max_splats)))
+        return vars(self.margins.extend(self.model.gaussians, p.margin_room(p.splat_limit)))

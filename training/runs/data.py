@@ -94,7 +94,7 @@ def training_data(
     if pixels and parameters.match_exposure:
         gains = _match_exposure(job, scene, full_scene, report)
     if job.crop is not None:
-        scene = thin_outside_region(scene, job.crop, int(OUTSIDE_SHARE * parameters.max_splats))
+        scene = thin_outside_region(scene, job.crop, int(OUTSIDE_SHARE * parameters.splat_limit))
     warnings += [warning for warning in scene.warnings if warning not in warnings]
     for warning in warnings:
         report("warning", message=warning)

@@ -83,7 +83,8 @@ class Job:
     )
     image_scale: float = setting(
         0.5,
-        "Scale of the photos for training. Increase it for finer detail and longer training.",
+        "Scale of the photos for training. Increase it for finer detail and longer training. Jobs of preset "
+        "paper that omit it use 1.",
         above=0,
         high=1,
         soft=(0.1, None),
@@ -205,6 +206,8 @@ class Job:
         for key, value in checked.items():
             if value and _is_path(declared[key], value):
                 checked[key] = _absolute_path(key, value, folder)
+        if checked.get("preset") == "paper":
+            checked.setdefault("image_scale", 1.0)
         job = cls(**checked, parameters=parameters)
         job._check()
         return job
@@ -255,6 +258,15 @@ class Job:
                 f"The method '{self.method}' cannot train a scene in cells.",
                 "Choose another method, or remove 'cells'.",
             )
+
+    def warnings(self) -> list[str]:
+        """Return warnings about settings that contradict each other but are valid."""
+        if self.preset != "paper" or self.image_scale == 1:
+            return []
+        return [
+            f"The preset paper trains at the photos' size, but image_scale is {self.image_scale:g}. "
+            "Set it to 1 to reproduce the paper."
+        ]
 
     def with_cells(self, cells: str) -> Job:
         """Return the same job with another number of cells.

@@ -140,6 +140,8 @@ def _train(job: Job, folder: RunFolder, events: EventWriter, placement: dict[str
         events("status", message="Reading the scene")
         data = training_data(job, folder, events, keep_views=True)
         if not job.cell:
+            for warning in job.warnings():
+                events("warning", message=warning)
             for finding in check_scene(data.full_scene, job.image_scale):
                 events("status" if finding.severity == INFO else "warning", message=str(finding))
         events("status", message="Preparing to train (up to a minute on first use)")

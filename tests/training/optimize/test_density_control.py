@@ -11,6 +11,7 @@ from training.optimize.density_control import (
     densify,
     peak_scores,
     prune,
+    prune_oversized,
     reset_opacities,
 )
 from training.optimize.model import NAMES, Model
@@ -149,3 +150,13 @@ def test_opacity_reset_limits_opacity_and_clears_moments(model, moments):
     assert opacity.max().item() == pytest.approx(0.01) and opacity.min().item() == pytest.approx(0.001)
     assert not moments(model, "opacity_logits", 0).any()
     assert moments(model, "means", 0)[0] == 1
+
+
+def test_oversized_splats_are_removed(model):
+    """Radii are in pixels, scales in scene units."""
+    model.stats |= {"gradient_max": torch.zeros(50), "radius_max": torch.linspace(1, 50, 50)}
+    scales = np.full((50, 3), 0.01, np.float32)
+    scales[3, 1], scales[4, 2] = 0.29, 0.31
+    model.assign("log_scales", torch.from_numpy(np.log(scales)))
+    prune_oversized(model, 0.3)
+    assert model.columns["level"].tolist() == [row for row in range(20) if row != 4]

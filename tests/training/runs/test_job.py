@@ -141,7 +141,7 @@ def test_invalid_jobs_are_rejected(tmp_path, text, message):
         ("octree", "coarse_share = 2", "coarse_share = 2 .* at most 1"),
         ("octree", "coarse_factor = 0", "coarse_factor = 0 .* above 0"),
         ("octree", "grow_interval = 0", "grow_interval = 0 .* above 0"),
-        ("octree", "max_splats = 0", "max_splats = 0 .* above 0"),
+        ("octree", "max_splats = -1", "max_splats = -1 .* at least 0"),
         ("octree_neural", "offsets = 0", "offsets = 0 .* above 0"),
         ("octree_neural", "offsets = 101", "offsets = 101 .* at most 100"),
         ("octree_neural", "features = 1025", "features = 1025 .* at most 1024"),
@@ -169,3 +169,14 @@ def test_unused_parameters_are_rejected():
     values = {"scene": "/s", "out": "/o", "method": "octree_neural", "parameters": {"dropout": 0.1}}
     with pytest.raises(LodgsError, match="'dropout'"):
         Job.from_dict(values)
+
+
+def test_preset_paper_trains_at_full_size():
+    """A smaller scale, also from before, is kept with a warning."""
+    values = {"scene": "photos", "out": "run"}
+    paper = Job.from_dict({**values, "preset": "paper"})
+    assert (paper.image_scale, paper.warnings()) == (1.0, [])
+    half = Job.from_dict({**values, "preset": "paper", "image_scale": 0.5})
+    assert half.image_scale == 0.5 and "image_scale is 0.5. Set it to 1" in half.warnings()[0]
+    draft = Job.from_dict(values)
+    assert (draft.image_scale, draft.warnings()) == (0.5, [])

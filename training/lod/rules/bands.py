@@ -1,4 +1,4 @@
-"""FLoD's rule (Seo et al. 2025, Sec. 4.4): one level for each band of camera distances."""
+"""FLoD's rule (Seo et al. 2025, Sec. 5.2): one level for each band of camera distances."""
 
 from __future__ import annotations
 

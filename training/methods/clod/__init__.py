@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 from ...optimize.method_info import MethodInfo
-from ...optimize.parameters import PAPER, STANDARD, SplatParameters
+from ...optimize.parameters import OVERSIZED, PAPER, STANDARD, SplatParameters
 from ...settings import setting
 
 
@@ -27,7 +27,11 @@ class ClodParameters(SplatParameters):
         "Initialize each splat's decay from its contribution to the views. Short schedules need it to "
         "learn decays. Not in the paper.",
     )
-    sigma_init: float = setting(10.0, "Initial decay of all splats, if 'by_importance' is off.", above=0)
+    sigma_init: float = setting(
+        10.0,
+        "Initial decay of all splats, if 'by_importance' is off. 0 derives it from the scene: at the square "
+        "root of 's_v_most' a splat at the median distance has half of its opacity (CLoD-GS: not published).",
+    )
     log_sigma: bool = setting(
         True, "Train the logarithm of the decay, so that updates are relative. Not in the paper."
     )
@@ -52,7 +56,18 @@ class ClodParameters(SplatParameters):
     )
     onset: float = setting(2.0, "Scale up to which the target is all splats (CLoD-GS: 1).", low=1)
     count_weight: float = setting(
-        1.0, "Weight of the splat count regularization, which is multiplied by (s_v - 1)² (CLoD-GS: λ_reg)."
+        1.0, "Weight of the splat count regularization, (CLoD-GS: λ_reg). 0 disables it."
+    )
+    scale_weight: bool = setting(
+        True, "Multiply the splat count regularization by (s_v - 1)² (CLoD-GS: w_s, Table 2)."
+    )
+    count_of: str = setting(
+        "view",
+        "Splats of which the drawn ones are a fraction: those in view, or all (CLoD-GS: N_total).",
+        choices=("view", "all"),
+    )
+    prune_undrawn: bool = setting(
+        True, "Remove splats that no training camera draws, once the decay has begun. Not in the paper."
     )
     count_softness: float = setting(
         0.5,
@@ -66,7 +81,7 @@ class ClodParameters(SplatParameters):
     reference_quantile: float = setting(
         0.99,
         "Quantile of the distances between views and their visible points, used as the reference "
-        "distance. 0 uses the farthest splat of each view, as published.",
+        "distance. 0 trains with the farthest splat in each view, as published, and stores their median.",
         high=1,
     )
 
@@ -76,9 +91,13 @@ _STANDARD = replace(_DRAFT, **STANDARD, steps=30_000, densify_interval=100)
 _PAPER = replace(
     _STANDARD,
     **PAPER,
+    **OVERSIZED,
     begin=1 / 6,
     keep_share=1.0,
     by_importance=False,
+    sigma_init=0.0,
+    count_of="all",
+    prune_undrawn=False,
     log_sigma=False,
     s_v_most=5.0,
     log_uniform=False,

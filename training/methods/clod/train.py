@@ -57,7 +57,8 @@ class Method(SplatMethod):
     """Training of CLoD-GS.
 
     Attributes:
-        reference: reference distance in scene units; 0 uses the farthest splat of each view.
+        reference: reference distance in scene units; 0 uses the farthest splat in each view.
+        initial_sigma: decay of splats whose decay does not follow from their importance.
         decay_start: step at which the decay begins.
     """
 
@@ -70,11 +71,12 @@ class Method(SplatMethod):
         self.decay_start = round(p.begin * p.steps)
         if base is not None:
             self.decay_start = self._densify_until = 0
-        sigma = torch.full((len(tensors["means"]),), p.sigma_init, device=self.device)
-        rates = splat_rates(p, self.data.extent) | {SIGMA: p.lr_sigma}
-        peaks = p.densify_by == "max"
-        self.model = Model(tensors | {SIGMA: self._encode(sigma)}, rates, peaks=peaks)
         self.reference = self._far_distance(p.reference_quantile) if p.reference_quantile else 0.0
+        self.initial_sigma = p.sigma_init or self._sigma_of_scene()
+        sigma = torch.full((len(tensors["means"]),), self.initial_sigma, device=self.device)
+        rates = splat_rates(p, self.data.extent) | {SIGMA: p.lr_sigma}
+        peaks = p.densify_by == "max" or p.prune_oversized
+        self.model = Model(tensors | {SIGMA: self._encode(sigma)}, rates, peaks=peaks)
         self.facts = {"reference": self.reference, "tau": p.tau}
 
     def levels_after(self, step: int) -> list[Level]:
@@ -83,6 +85,9 @@ class Method(SplatMethod):
         """
         if step + 1 != self.steps:
             return []
+        if not self.reference:
+            self.reference = self._median_reach()
+            self.facts = {**self.facts, "reference": self.reference}
         splats = self.model.splats()
         splats.extras[SIGMA] = self.sigma.detach().cpu().numpy()
         order = torch.argsort(self.mean_weight(), descending=True, stable=True)
@@ -99,7 +104,16 @@ class Method(SplatMethod):
         """Return d′ (N,): distances from a camera divided by the reference (Sec. 3.2)."""
         means = self.model["means"].detach()
         distances = (means - torch.as_tensor(camera.center).to(means)).norm(dim=1)
-        return distances / (self.reference or distances.max().clamp_min(1e-20))
+        if self.reference:
+            return distances / self.reference
+        in_view = self._in_view(camera)
+        farthest = distances[in_view] if in_view.any() else distances
+        return distances / farthest.max().clamp_min(1e-20)
+
+    def _in_view(self, camera: Camera) -> torch.Tensor:
+        """Return the splats (N,) whose means are in a camera's image."""
+        means = self.model["means"].detach().cpu().numpy()
+        return torch.from_numpy(camera.sees(means, near=self.data.near)).to(self.device)
 
     def attenuate(self, camera: Camera, s_v: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Return attenuations, attenuated opacities and whether these exceed τ s_v, (N,) each (Eq. 2)."""
@@ -127,8 +141,7 @@ class Method(SplatMethod):
             return super().draw(view, step)
         if step == self.decay_start:
             self.begin_decay()
-        means = self.model["means"].detach().cpu().numpy()
-        in_view = torch.from_numpy(view.camera.sees(means, near=self.data.near)).to(self.device)
+        in_view = self._in_view(view.camera)
         drawings: list[Drawing] = []
         for s_v in (1.0, self.random_scale(step)):
             falloff, opacities, drawn = self.attenuate(view.camera, s_v)
@@ -157,7 +170,7 @@ class Method(SplatMethod):
         return loss
 
     def count_excess(self, drawing: ClodDrawing) -> torch.Tensor:
-        """Return (s_v − 1)² ReLU(η − η_target)², with η the drawn fraction of the splats in view (Eq. 3).
+        """Return (s_v − 1)² ReLU(η − η_target)², with η the drawn fraction of the splats (Eq. 3).
 
         η_target is min(1, (s_v / onset)^-exponent). Counting has no gradient; a straight-through
         estimator uses the sigmoid of ln(α″ / τ s_v).
@@ -166,12 +179,15 @@ class Method(SplatMethod):
         margin = (drawing.attenuated.clamp_min(1e-12) / (p.tau * s_v)).log()
         soft = (margin / p.count_softness).sigmoid()
         counted = drawing.drawn + soft - soft.detach()
-        share = counted[drawing.in_view].sum() / drawing.in_view.sum().clamp_min(1)
-        return (s_v - 1) ** 2 * (share - min(1.0, (s_v / p.onset) ** -p.exponent)).relu() ** 2
+        counts = drawing.in_view if p.count_of == "view" else torch.ones_like(drawing.in_view)
+        share = counted[counts].sum() / counts.sum().clamp_min(1)
+        weight = (s_v - 1) ** 2 if p.scale_weight else 1.0
+        return weight * (share - min(1.0, (s_v / p.onset) ** -p.exponent)).relu() ** 2
 
     def control_density(self, step: int) -> None:
         super().control_density(step)
-        if step >= self.decay_start and due(self.parameters.prune_interval, step + 1):
+        p = self.parameters
+        if p.prune_undrawn and step >= self.decay_start and due(p.prune_interval, step + 1):
             self.model.keep(self.drawn_anywhere())
             require_rows(self.model, step, "tau")
 
@@ -179,7 +195,7 @@ class Method(SplatMethod):
         """Add margins once the decay has begun, which removes splats of low weight in the photos."""
         if step == self.decay_start > 0:
             rows = self.margin_rows()
-            sigma = torch.full_like(rows["opacity_logits"], self.parameters.sigma_init)
+            sigma = torch.full_like(rows["opacity_logits"], self.initial_sigma)
             self.model.append({**rows, SIGMA: self._encode(sigma)})
 
     @torch.no_grad()
@@ -207,7 +223,7 @@ class Method(SplatMethod):
         order = importance.argsort(descending=True, stable=True)
         drawn = contribution.views[order].cumsum(0)
         count = int((drawn <= self.parameters.keep_share * float(drawn[-1])).sum())
-        order = order[: min(max(count, 1), self.parameters.max_splats)]
+        order = order[: min(max(count, 1), self.parameters.splat_limit)]
         keep = torch.zeros(len(gaussians), dtype=torch.bool, device=self.device)
         keep[order] = True
         self.model.keep(keep)
@@ -261,10 +277,31 @@ class Method(SplatMethod):
 
     def _far_distance(self, quantile: float) -> float:
         """Return a quantile of the distances between training views and their visible scene points."""
+        return float(np.quantile(np.concatenate(self._point_distances()), quantile))
+
+    def _sigma_of_scene(self) -> float:
+        """Return the decay that halves the opacity at the median d′ of the scene's points, at the scale
+        √s_v_most. Not in the paper.
+        """
+        visible = [distances for distances in self._point_distances() if len(distances)]
+        normalized = np.concatenate([d / (self.reference or d.max()) for d in visible])
+        sigma = np.median(normalized) * np.sqrt(self.parameters.s_v_most / (2 * np.log(2)))
+        return float(sigma.clip(*SIGMAS))
+
+    def _median_reach(self) -> float:
+        """Return the median distance of the farthest splat in a training view."""
+        means = self.model["means"].detach().cpu().numpy()
+        reaches = [distances.max() for distances in self._distances_in_views(means) if len(distances)]
+        return float(np.median(reaches)) if reaches else 0.0
+
+    def _point_distances(self) -> list[np.ndarray]:
+        """Return each training view's distances to its visible scene points, of which a sample is used."""
         points = self.data.full_scene.points
-        points = points[:: max(1, len(points) // MAX_POINTS)]
-        visible = [
+        return self._distances_in_views(points[:: max(1, len(points) // MAX_POINTS)])
+
+    def _distances_in_views(self, points: np.ndarray) -> list[np.ndarray]:
+        """Return the distances of points (P, 3) in each training view from its camera."""
+        return [
             np.linalg.norm(points[camera.sees(points, near=self.data.near)] - camera.center, axis=1)
             for camera in self.data.full_train
         ]
-        return float(np.quantile(np.concatenate(visible), quantile))

@@ -157,7 +157,8 @@ _PAPER = replace(
     **PAPER,
     footprint=PAPER_FOOTPRINT,
     steps=(10_000, 15_000, 20_000, 25_000, 30_000),
-    densify_until=(0.5, 0.4, 0.4, 0.4, 0.5),
+    # the published program leaves out the last step of density control
+    densify_until=(0.499, 0.399, 0.399, 0.399, 0.499),
     densify_interval=(2000, 1000, 500, 500, 200),
     overlap_interval=1000,
     rejoin_points=False,

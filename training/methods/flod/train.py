@@ -47,7 +47,7 @@ class Method(method.Method[FlodParameters, Drawing]):
         self._skipped_steps = sum(p.steps[: p.first_level - 1])
         self._ends = list(accumulate(p.steps[p.first_level - 1 : p.end]))
         points, colors = drop_duplicates(data.scene.points, data.scene.point_colors)
-        self.points, self.colors = sample_points(points, colors, p.max_splats, self.seed)
+        self.points, self.colors = sample_points(points, colors, p.splat_limit, self.seed)
         self.completed: dict[int, dict[str, torch.Tensor]] = {}
         self.levels = p.levels
         if p.levels > 1:
@@ -131,22 +131,22 @@ class Method(method.Method[FlodParameters, Drawing]):
         if local > self._densify_until(step):
             return
         old_count, s_min = len(model), self.s_min[level - 1]
-        if due(p.densify_interval[level - 1], local):
+        if due(p.densify_interval[level - 1], local) and local >= p.densify_from:
             densify(
                 model,
                 model.mean_gradient(),
-                threshold=p.grad_threshold * self.data.threshold_scale,
+                threshold=p.grad_threshold * p.threshold_factor(self.data.threshold_scale),
                 clone_below=None if p.long_axis else p.clone_extent * self.data.extent,
                 max_splats=p.growth_limit(self.budget(level)),
                 rng=np.random.default_rng([self.seed, step, 1]),
                 min_scale=s_min,
             )
             model.reset_stats()
-        if due(p.prune_interval, local):
+        if due(p.prune_interval, local) and local >= p.densify_from:
             prune(model, p.min_opacity)
         if due(p.overlap_interval, local) and level < p.levels:
             model.keep(well_separated(model.read("means").cpu(), s_min / 2))
-        if due(p.opacity_reset_interval, local):
+        if due(p.opacity_reset_interval, local) and local < self._densify_until(step):
             reset_opacities(model)
         if old_count and not len(model):
             raise LodgsError(
@@ -196,7 +196,7 @@ class Method(method.Method[FlodParameters, Drawing]):
     def budget(self, level: int) -> int:
         """Return the maximum splat count of a level."""
         p = self.parameters
-        return int(p.max_splats * p.budget_ratio ** (p.levels - level))
+        return int(p.splat_limit * p.budget_ratio ** (p.levels - level))
 
     def start_level(self, level: int) -> None:
         """Start the next level from the current one: same scales, a smaller constraint, new Adam state (Eq.

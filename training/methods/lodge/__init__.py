@@ -26,6 +26,12 @@ class LodgeParameters(SplatParameters):
         "Distance from which each level is drawn, in median depths of the scene, falling to 0 for the "
         "finest (LODGE: d_l). 0 for another level chooses the distance that draws the fewest splats.",
     )
+    min_ratio: float = setting(
+        2.0,
+        "Minimum ratio between the chosen distances of neighbouring levels. Those of LODGE's Table 3 have "
+        "ratios down to 1.3.",
+        above=1,
+    )
     prune_weight: float = setting(
         0.1,
         "Minimum blending weight of a splat in any pixel; a coarser level drops splats below it "
@@ -54,6 +60,11 @@ class LodgeParameters(SplatParameters):
     tune_range: float = setting(
         0.3, "Random variation of distances while a level is tuned, as a fraction of the distance.", high=0.9
     )
+    tune_each: bool = setting(
+        False,
+        "Vary the distance of each level by its own random factor while a level is tuned, as in LODGE. "
+        "Otherwise all distances have the same factor.",
+    )
     tune_alone: float = setting(
         0.25,
         "Fraction of the tuning steps that render the level alone, on images downscaled for its "
@@ -63,8 +74,13 @@ class LodgeParameters(SplatParameters):
     chunks: int = setting(
         0,
         "Number of chunks: fixed splat sets that blend into each other as the camera moves. 0 uses "
-        "LODGE's Eq. 5, and none below 8 chunks; 1 disables chunks.",
+        "LODGE's Eq. 5, and none below 'min_chunks'; 1 disables chunks.",
         high=96,
+    )
+    min_chunks: int = setting(
+        8,
+        "Minimum number of chunks from Eq. 5. Fewer are as large as the scene, and distances select better.",
+        low=2,
     )
     visible_weight: float = setting(
         0.01,
@@ -104,12 +120,15 @@ _DRAFT = LodgeParameters()
 _STANDARD = replace(_DRAFT, **STANDARD, steps=30_000, densify_interval=100, tune_steps=1000)
 _PAPER = replace(
     _STANDARD,
-    **PAPER | {"antialias": True},
+    **PAPER | {"antialias": True, "densify_from": 600},
     densify_interval=300,
-    densify_from=600,
+    prune_oversized=True,
     densify_by="max",
     least_weight=0.02,
+    tune_each=True,
     tune_alone=0.0,
+    min_ratio=1.3,
+    min_chunks=2,
     prune_weight=0.02,
     drawn=1.0,
 )

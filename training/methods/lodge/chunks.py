@@ -13,8 +13,6 @@ from ...lod.rules.chunks import MAX_CHUNKS
 from ...scenes.cameras import Camera
 from .composite import IndexedLevel, LevelStack, Rows, gather_rows, rows_at_distances
 
-MIN_CHUNKS = 8
-"""Minimum number of chunks from Eq. 5; fewer would be as large as the scene, and distances select better."""
 RANDOM_TURNS = 4
 """Number of random orientations per camera for the visibility from a chunk (the paper gives no number)."""
 

@@ -19,8 +19,6 @@ VIEWS = 8
 CANDIDATES, NEAR_QUANTILE, FAR_QUANTILE = 9, 0.05, 0.9
 """Number of candidate distances, in equal ratios, and quantiles of the distances of visible splats that
 bound them: the first in any view, the second over all views."""
-MIN_RATIO = 2.0
-"""Minimum ratio between the distances of neighbouring levels."""
 
 
 class Thresholds:
@@ -34,6 +32,7 @@ class Thresholds:
         std: function that returns the smoothing filter's standard deviation for a distance, both in scene
             units.
         antialias: see ``rasterize``.
+        min_ratio: minimum ratio between the distances of neighbouring levels.
     """
 
     def __init__(
@@ -44,10 +43,11 @@ class Thresholds:
         prune_weight: float,
         std: Callable[[float], float],
         antialias: bool = False,
+        min_ratio: float = 2.0,
     ) -> None:
         self._cameras = pick_evenly(cameras, VIEWS)
         self._near, self._backend, self._prune_weight, self._std = near, backend, prune_weight, std
-        self._antialias = antialias
+        self._antialias, self._min_ratio = antialias, min_ratio
 
     @torch.no_grad()
     def choose(
@@ -64,7 +64,7 @@ class Thresholds:
             The distance, and a report: the tried ``distances``, the ``costs`` of each, and the cost
                 ``before``, without the level. Numbers are rounded to keep the bundle header small.
         """
-        min_distance = MIN_RATIO * max(d_l.values())
+        min_distance = self._min_ratio * max(d_l.values())
         candidates = self._candidates(next(iter(levels.values())), min_distance, max_distance)
         costs = [_round(self.cost(levels, d_l, distance)) for distance in candidates]
         views = [(camera, visible_rows(levels, d_l, camera, self._near)) for camera in self._cameras]

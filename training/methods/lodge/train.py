@@ -35,7 +35,7 @@ from .composite import (
     smooth,
     visible_rows,
 )  # fmt: skip
-from .thresholds import MAX_CURVES, MIN_RATIO, Thresholds
+from .thresholds import MAX_CURVES, Thresholds
 
 COUNTED_VIEWS = 24
 """Number of training views in which drawn splats are counted."""
@@ -156,9 +156,8 @@ class Method(RefiningMethod):
         if self._renders_single(step):
             rows = {number: level.in_view(view.camera, near)}
         else:
-            rng, spread = np.random.default_rng([self.seed, step, 8]), self.parameters.tune_range
-            scale = 1 / rng.uniform(1 - spread, 1 + spread)
-            rows = visible_rows({**self.finished, number: level}, self.d_l, view.camera, near, scale)
+            levels, d_l = {**self.finished, number: level}, self.random_distances(step)
+            rows = visible_rows(levels, d_l, view.camera, near, self.random_scale(step))
         trained_rows = torch.from_numpy(rows[number]).long().to(self.device)
         optimizer = self.select_rows(trained_rows)
         parts = [smooth(optimizer.gaussians, self._std(self.d_l[number]))]
@@ -169,6 +168,25 @@ class Method(RefiningMethod):
             )
         rendering = self.rasterize_model(view.camera, step, gaussians=Gaussians.concatenated(parts))
         return [Drawing(rendering, optimizer=optimizer)]
+
+    def random_scale(self, step: int) -> float:
+        """Draw the rule's factor on distances of a tuning step; 1 if each level has its own."""
+        rng, spread = np.random.default_rng([self.seed, step, 8]), self.parameters.tune_range
+        return 1.0 if self.parameters.tune_each else 1 / rng.uniform(1 - spread, 1 + spread)
+
+    def random_distances(self, step: int) -> dict[int, float]:
+        """Draw the distance of each level in a tuning step, uniform around its own (A.2), finest first.
+
+        A level never begins before the next finer one.
+        """
+        if not self.parameters.tune_each:
+            return self.d_l
+        rng, spread = np.random.default_rng([self.seed, step, 8]), self.parameters.tune_range
+        drawn, distance = {}, 0.0
+        for number in sorted(self.d_l, reverse=True):
+            distance = max(self.d_l[number] * rng.uniform(1 - spread, 1 + spread), distance)
+            drawn[number] = distance
+        return drawn
 
     # -- levels ----------------------------------------------------------------------------------------
 
@@ -227,7 +245,7 @@ class Method(RefiningMethod):
         if steps is None:
             return np.inf
         end, begin = coarser[steps] * self.data.median_depth, max(self.d_l.values())
-        return max(end / MIN_RATIO**steps, (begin * end) ** 0.5)
+        return max(end / self.parameters.min_ratio**steps, (begin * end) ** 0.5)
 
     def _begin_level(self, number: int) -> None:
         p, data = self.parameters, self.data
@@ -238,7 +256,7 @@ class Method(RefiningMethod):
             self.d_l[number] = fixed
         else:
             thresholds = Thresholds(
-                data.train, data.near, self.backend, p.prune_weight, self._std, p.antialias
+                data.train, data.near, self.backend, p.prune_weight, self._std, p.antialias, p.min_ratio
             )
             max_distance = self._max_distance(number)
             self.d_l[number], costs = thresholds.choose(self.finished, self.d_l, max_distance)
@@ -298,7 +316,7 @@ class Method(RefiningMethod):
         """Place the chunks once the end of the finest level is known (Eq. 5)."""
         centers = np.array([camera.center for camera in self.data.train])
         count = self.parameters.chunks or chunks.chunk_count(centers, self.d_l[self.levels - 1])
-        if count >= (2 if self.parameters.chunks else chunks.MIN_CHUNKS):
+        if count >= (2 if self.parameters.chunks else self.parameters.min_chunks):
             self.centres, self.radii = chunks.place_chunks(centers, count, self.seed)
 
     @torch.no_grad()

@@ -42,7 +42,7 @@ class Method(method.Method[OctreeParameters, Drawing]):
     def setup(self, base: Splats | None) -> None:
         p = self.parameters
         self.schedule, points, colors, level = growing.create_anchors(
-            self.data, p, self.seed, p.growth_limit(p.max_splats)
+            self.data, p, self.seed, p.growth_limit(p.splat_limit)
         )
         self.levels = self.schedule.tree.levels
         self.facts = self.schedule.tree.facts()
@@ -110,7 +110,7 @@ class Method(method.Method[OctreeParameters, Drawing]):
     def add_margins(self, step: int) -> None:
         """Add margins to the coarsest level, for all distances, when growth ends."""
         if self.schedule.is_growing(step) and not self.schedule.is_growing(step + 1):
-            room = self.parameters.margin_room(self.parameters.max_splats)
+            room = self.parameters.margin_room(self.parameters.splat_limit)
             rows = vars(self.margins.extend(self.model.gaussians, room))
             ones = torch.ones_like(rows["opacity_logits"])
             self.model.append({**rows, "level": ones, MARGIN: ones.bool()})
@@ -133,7 +133,7 @@ class Method(method.Method[OctreeParameters, Drawing]):
         rows["log_scales"] -= float(np.log(1.6))
         rows["opacity_logits"].clamp_max_(growing.MAX_NEW_LOGIT)
         rows |= {"level": level, "bias": model.columns["bias"][source]}
-        rows = growing.limit_growth(self.schedule, model, rows, step, p.growth_limit(p.max_splats))
+        rows = growing.limit_growth(self.schedule, model, rows, step, p.growth_limit(p.splat_limit))
 
         opacity = model.read("opacity_logits").sigmoid()
         faint = model.read("opacity_sum") < p.min_opacity * model.read("seen")

@@ -14,7 +14,7 @@ class NeuralOctreeParameters(OctreeParameters):
     """Parameters of Octree-GS with neural anchors. ``sh_degree`` applies to baking."""
 
     max_splats: int = setting(
-        180_000, "Maximum number of Gaussians of all levels together; levels add up.", above=0
+        180_000, "Maximum number of Gaussians of all levels together; levels add up. 0 is unlimited."
     )
     min_opacity: float = setting(
         0.005, "Minimum summed opacity of an anchor's Gaussians; anchors below it are removed.", high=1
@@ -37,12 +37,26 @@ class NeuralOctreeParameters(OctreeParameters):
         "Length of each view's appearance vector, for photos in changing light. 0 disables.",
         high=1024,
     )
+    appearance_of: str = setting(
+        "",
+        "Photo whose appearance vector renders and baked levels use, by file name. If empty, the mean of all "
+        "photos.",
+    )
+    success_threshold: float = setting(
+        0.0,
+        "Gaussians grow once half of this fraction of 'grow_interval' views drew them, anchors are removed "
+        "once this fraction did, and an anchor's bias follows its mean gradient (Octree-GS: 0.8). 0 decides "
+        "by the views of each interval alone.",
+    )
     lr_features: float = setting(7.5e-3, "Learning rate of the features.")
     lr_offsets: float = setting(
         1e-2,
         "Initial learning rate of the Gaussians' offsets, which are in units of their anchor's extent.",
     )
     lr_offsets_final: float = setting(1e-4, "Final learning rate of the offsets.")
+    scale_offset_rate: bool = setting(
+        False, "Multiply the offsets' learning rates by the scene extent, as in the published program."
+    )
     lr_looks: float = setting(
         1e-2,
         "Learning rate of the Gaussians' own scales and colours; opacities use five times, "
@@ -63,7 +77,7 @@ class NeuralOctreeParameters(OctreeParameters):
 
     def check(self) -> None:
         super().check()
-        if self.max_splats < self.offsets:
+        if self.splat_limit < self.offsets:
             raise LodgsError(
                 f"'max_splats' is {self.max_splats}, but one anchor needs {self.offsets} Gaussians.",
                 "Give a larger number.",
@@ -85,18 +99,24 @@ _PAPER = replace(
     _STANDARD,
     **AS_PUBLISHED,
     steps=40_000,
-    max_splats=10_000_000,
     coarser_levels=0,
     footprint=1.0,
     narrowest=0.0,
     widest=1e9,
-    grow_until=0.625,
+    grow_until=0.6249,
     grad_threshold=2e-4,
     far_share=0.0,
     full_share=0.0,
     least_weight=0.0,
     lr_end=1.0,
     bias_rate=0.01,
+    joins="published",
+    stats_from=500,
+    grow_from=1500,
+    room_exponent=0.0,
+    success_threshold=0.8,
+    appearance=32,
+    scale_offset_rate=True,
     direct=False,
     view_shapes=True,
 )

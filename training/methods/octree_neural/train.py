@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from ...documents import quote
+from ...errors import LodgsError
 from ...lod.rules.octree import BIAS, fade_weights
 from ...optimize import method
 from ...optimize.anchors import growing
@@ -70,7 +72,7 @@ class Method(method.Method[NeuralOctreeParameters, NeuralDrawing]):
         positions = np.random.default_rng(seed).uniform(-0.5, 0.5, (p.offsets, 3))
         self._spread = torch.from_numpy(positions).float()
         """Initial offsets of new anchors' Gaussians within the voxel, used if they have their own looks."""
-        self._max_anchors = p.growth_limit(p.max_splats) // p.offsets
+        self._max_anchors = p.growth_limit(p.splat_limit) // p.offsets
         self.schedule, points, colors, level = growing.create_anchors(self.data, p, seed, self._max_anchors)
         self.levels = self.schedule.tree.levels
         self.facts = self.schedule.tree.facts()
@@ -97,8 +99,24 @@ class Method(method.Method[NeuralOctreeParameters, NeuralDrawing]):
         self._networks_adam = Adam(names, dict.fromkeys(names, 0.0))
         self.extra_optimizers = [self._networks_adam]
         self.decoder = AnchorDecoder(
-            self.networks, p.direct, p.view_shapes, self.data.near, p.antialias, self.backend
+            self.networks,
+            p.direct,
+            p.view_shapes,
+            self.data.near,
+            p.antialias,
+            self.backend,
+            self._rendered_view(),
         )
+
+    def _rendered_view(self) -> int | None:
+        """Return the training view whose appearance is rendered, or None for the mean."""
+        name, names = self.parameters.appearance_of, [camera.name for camera in self.data.train]
+        if name and name not in names:
+            raise LodgsError(
+                f"Cannot use the appearance of {quote(name)}: no training photo has this name.",
+                f"Set appearance_of to the name of one of them, such as {quote(names[0])}.",
+            )
+        return names.index(name) if name else None
 
     def _new_model(self, rows: Mapping[str, torch.Tensor], level: torch.Tensor, bias: torch.Tensor) -> Model:
         """Create a model of anchors; gradient statistics are per Gaussian."""
@@ -197,6 +215,8 @@ class Method(method.Method[NeuralOctreeParameters, NeuralDrawing]):
         p, share = self.parameters, step / self.steps
         self.model.adam.lr = self.schedule.learning_rates(self._rates, step)
         self.model.adam.lr["offsets"] = log_linear(p.lr_offsets, p.lr_offsets_final, share)
+        if p.scale_offset_rate:
+            self.model.adam.lr["offsets"] *= self.data.extent
         rates = {
             "opacity": p.lr_network * p.lr_network_final**share,
             "covariance": 2 * p.lr_network,
@@ -253,17 +273,29 @@ class Method(method.Method[NeuralOctreeParameters, NeuralDrawing]):
         if the sum of its Gaussians' opacities, averaged over the views that drew it, is too low.
         """
         p, model = self.parameters, self.model
-        source, offset_index, level = growing.select_growth(self.schedule, model, step)
+        views = p.success_threshold * p.grow_interval
+        drawn = model.stats["anchor_seen"]
+        ready = model.stats["seen"] > views / 2 if views else None
+        source, offset_index, level = growing.select_growth(self.schedule, model, step, ready)
         extents = model["log_scales"][source, :3].exp()
         rows = self._anchors(model["means"][source] + model["offsets"][source, offset_index] * extents, level)
         rows["features"] = model["features"][source].clone()
         if p.direct:
             rows["looks"][..., 1:] = model["looks"][source, offset_index, None, 1:]
-        rows |= {"level": level, "bias": model.columns["bias"][source]}
+        rows |= {"level": level} if views else {"level": level, "bias": model.columns["bias"][source]}
         rows = growing.limit_growth(self.schedule, model, rows, step, self._max_anchors)
-        model.keep(model.stats["opacity_sum"] >= p.min_opacity * model.stats["anchor_seen"])
+        faint = model.stats["opacity_sum"] < p.min_opacity * drawn
+        if ready is None:
+            model.reset_stats()
+        else:
+            decided = drawn > views
+            faint &= decided
+            for name in ("gradient_sum", "seen"):
+                model.stats[name][ready] = 0
+            for name in ("opacity_sum", "anchor_seen"):
+                model.stats[name][decided] = 0
+        model.keep(~faint)
         model.append(rows)
-        model.reset_stats()
         require_rows(model, step, "min_opacity")
 
     @torch.no_grad()
@@ -303,7 +335,7 @@ class Method(method.Method[NeuralOctreeParameters, NeuralDrawing]):
         """Add margin splats to baked splats, in the coarsest level."""
         if not self.parameters.margin or self.data.transparent:
             return baked
-        room = self.parameters.margin_room(self.parameters.max_splats)
+        room = self.parameters.margin_room(self.parameters.splat_limit)
         margins = self.margins.extend(Gaussians.of(baked, self.device), room)
         level, bias = np.ones(len(margins), np.uint8), np.zeros(len(margins), np.float32)
         arrays = {name: tensor.cpu().numpy() for name, tensor in vars(margins).items()}

@@ -3,11 +3,11 @@
 from dataclasses import replace
 
 from ...optimize.method_info import MethodInfo
-from ...optimize.parameters import PAPER, STANDARD, SplatParameters
+from ...optimize.parameters import OVERSIZED, PAPER, STANDARD, SplatParameters
 
 _DRAFT = SplatParameters()
 _STANDARD = replace(_DRAFT, **STANDARD, steps=30_000, densify_interval=100)
-_PAPER = replace(_STANDARD, **PAPER)
+_PAPER = replace(_STANDARD, **PAPER, **OVERSIZED)
 
 METHOD = MethodInfo(
     name="3dgs",

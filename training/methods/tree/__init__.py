@@ -87,14 +87,15 @@ _STANDARD = replace(
 )
 _PAPER = replace(
     _STANDARD,
-    **PAPER,
+    **PAPER | {"opacity_reset_interval": 0},
     pixels=3.0,
     lod_noise=5.0,
     node_rate=1.0,
     sh_degree=1,
     tune_steps=150_000,
     max_threshold=0.0075,
-    densify_until=0.083,  # 15,000 steps, as in 3DGS, of six times as many steps in total
+    steps=60_000,
+    densify_until=0.0,
     unseen_epochs=2.0,
 )
 

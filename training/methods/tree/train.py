@@ -219,11 +219,11 @@ class Method(RefiningMethod):
         p = self.parameters
         control = TreeDensityControl(
             self.store,
-            threshold=p.max_threshold * self.data.threshold_scale,
+            threshold=p.max_threshold * p.threshold_factor(self.data.threshold_scale),
             min_opacity=p.min_opacity,
             unseen_since=done + 1 - round(p.unseen_epochs * len(self.data.train)) if p.unseen_epochs else 0,
             step=done + 1,
-            max_leaves=p.max_splats,
+            max_leaves=p.splat_limit,
             region=self.data.region,
         )
         updated = self._new_store(self.store.budget)

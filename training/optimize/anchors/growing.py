@@ -78,10 +78,14 @@ def log_spacing(points: np.ndarray, level: np.ndarray, columns: int) -> torch.Te
 
 @torch.no_grad()
 def select_growth(
-    schedule: Schedule, model: Model, step: int
+    schedule: Schedule, model: Model, step: int, ready: torch.Tensor | None = None
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Select Gaussians with large gradients for growth (Octree-GS, Sec. 4.2), and increase the bias of
     anchors with many.
+
+    Args:
+        ready: Gaussians with enough statistics, in the shape of ``seen``; others do not grow. The bias then
+            depends on an anchor's mean gradient over them. None uses all, and the largest gradient.
 
     Returns:
         (C,) each, by decreasing gradient: the anchor, the index of its Gaussian, and the level to grow
@@ -91,12 +95,17 @@ def select_growth(
     gradient, level = model.mean_gradient().view(len(model), -1), columns["level"]
     rise = 2**p.grow_harder
     factor = rise ** (level - 1 - p.coarser_levels).clamp_min(0)
-    threshold = (p.grad_threshold * schedule.data.threshold_scale * factor)[:, None]
+    threshold = (p.grad_threshold * p.threshold_factor(schedule.data.threshold_scale) * factor)[:, None]
     target = level[:, None].expand_as(gradient)
     if step >= p.coarse_share * p.steps:
-        target = (target + (gradient >= threshold * rise)).clamp_max(schedule.tree.levels)
-        columns["bias"] += p.bias_rate * (gradient >= 0.25 * threshold).any(1)
-    source, offset_index = torch.nonzero(gradient >= threshold).unbind(1)
+        if p.grow_next:
+            target = (target + (gradient >= threshold * rise)).clamp_max(schedule.tree.levels)
+        bias_gradient = gradient.amax(1)
+        if ready is not None:
+            bias_gradient = (gradient * ready).sum(1) / ready.sum(1).clamp_min(1)
+        columns["bias"] += p.bias_rate * (bias_gradient >= 0.25 * threshold[:, 0])
+    selected = gradient >= threshold
+    source, offset_index = torch.nonzero(selected if ready is None else selected & ready).unbind(1)
     order = torch.argsort(gradient[source, offset_index], descending=True, stable=True)
     source, offset_index = source[order], offset_index[order]
     return source, offset_index, target[source, offset_index]
@@ -107,11 +116,12 @@ def limit_growth(
 ) -> dict[str, torch.Tensor]:
     """Limit proposed rows, in order, to the budget and to free voxels that views need.
 
-    The budget grows with the square of the steps up to ``max_anchors``, which reserves most of it for finer
+    The budget grows with a power of the steps up to ``max_anchors``, which reserves most of it for finer
     levels.
     """
     p = schedule.parameters
-    room = int(max_anchors * min((step + 1) / (p.grow_until * p.steps), 1.0) ** 2) - len(model)
+    share = min((step + 1) / (p.grow_until * p.steps), 1.0) ** p.room_exponent
+    room = int(max_anchors * share) - len(model)
     free = _free_positions(schedule, model, rows["means"], rows["level"])[: max(room, 0)]
     return {name: row[free] for name, row in rows.items()}
 

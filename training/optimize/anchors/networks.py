@@ -80,6 +80,7 @@ class AnchorDecoder:
         view_shapes: let opacity and covariance depend on the view direction.
         near: near plane, in scene units.
         antialias, backend: see ``rasterize``.
+        rendered_view: training view whose appearance renders use; None for the mean.
     """
 
     networks: Networks
@@ -88,6 +89,7 @@ class AnchorDecoder:
     near: float
     antialias: bool
     backend: str
+    rendered_view: int | None = None
 
     def decode(
         self, model: Model, camera: Camera, anchors: torch.Tensor, view: int | None = None
@@ -95,7 +97,7 @@ class AnchorDecoder:
         """Decode anchors (indices) for a view; return only Gaussians of positive opacity.
 
         Args:
-            view: training view whose appearance to use; None for the mean.
+            view: training view whose appearance to use; None for that of renders.
         """
         count = model["offsets"].shape[1]
         positions = model["means"][anchors].detach()
@@ -112,7 +114,7 @@ class AnchorDecoder:
 
         looks = self.networks.covariance(static_inputs).view(-1, count, 7) + own_looks[..., 1:8]
         looks = looks[index, offset_index]
-        appearance = self.networks.appearance
+        appearance, view = self.networks.appearance, self.rendered_view if view is None else view
         appearance = appearance.mean(0) if view is None else appearance[view]
         color_inputs = torch.cat([inputs, appearance.expand(len(inputs), -1)], 1)
         colors = self.networks.color(color_inputs).view(-1, count, 3) + own_looks[..., 8:]

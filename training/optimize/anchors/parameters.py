@@ -15,8 +15,7 @@ class OctreeParameters(Parameters):
     max_splats: int = setting(
         90_000,
         "Maximum number of splats of all levels together; levels add up. The five levels of FLoD have "
-        "over 110,000.",
-        above=0,
+        "over 110,000. 0 is unlimited.",
     )
     grad_threshold: float = setting(
         5e-5, "Mean image-plane gradient (3DGS units) above which anchors grow, at one megapixel."
@@ -72,12 +71,40 @@ class OctreeParameters(Parameters):
         "the next level.",
         high=1,
     )
+    joins: str = setting(
+        "early",
+        "Schedule of the levels. Early: half of them start at once, and the last one joins before "
+        "'coarse_share' ends. Published: one more starts at once, and the last one joins at its end.",
+        choices=("early", "published"),
+    )
+    init_level: int = setting(
+        -1,
+        "Finest level to train from the start, counted from 0, the coarsest (Octree-GS: initial level). -1 "
+        "derives it from the number of levels.",
+        low=-1,
+        high=MAX_LEVELS - 1,
+    )
     coarse_factor: float = setting(
         1.5,
         "Ratio of the steps before a level joins to those before the next one joins (Octree-GS: 1/omega).",
         above=0,
     )
     grow_interval: int = setting(50, "Steps between two growth passes.", above=0, unit="steps")
+    stats_from: int = setting(
+        0, "Steps before gradients count for growth (Octree-GS: start_stat).", unit="steps"
+    )
+    grow_from: int = setting(0, "Steps before the first growth pass (Octree-GS: update_from).", unit="steps")
+    grow_next: bool = setting(
+        True,
+        "Let anchors with large gradients grow into the next level, once all levels have joined "
+        "(Octree-GS: next level growing).",
+    )
+    room_exponent: float = setting(
+        2.0,
+        "The maximum number of anchors rises to 'max_splats' with this power of the steps, which reserves "
+        "room for finer levels. 0 starts with 'max_splats'. Not in the paper.",
+        high=8,
+    )
     grow_until: float = setting(
         0.55,
         "Fraction of the steps in which anchors are added and removed; after it they are only removed "

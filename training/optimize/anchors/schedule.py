@@ -38,14 +38,15 @@ class Schedule:
     join_steps: list[int] = field(init=False)
 
     def __post_init__(self) -> None:
-        """Compute the join steps: half of the levels start at once, and each trains longer than the next
+        """Compute the join steps: some levels start at once, and each trains longer than the next
         (Sec. 4.3).
         """
-        p, levels = self.parameters, self.tree.levels
-        first = max(levels // 2, 1)
-        intervals = p.coarse_factor ** -np.arange(levels - first + 1.0)
-        ends = np.cumsum(intervals) / intervals.sum() * p.coarse_share * p.steps
-        self.join_steps = [0] * first + [round(end) for end in ends[:-1]]
+        p, levels, published = self.parameters, self.tree.levels, self.parameters.joins == "published"
+        initial = levels // 2 if published else max(levels // 2 - 1, 0)
+        first = min((initial if p.init_level < 0 else p.init_level) + 1, levels)
+        intervals = p.coarse_factor ** -np.arange(levels - first + (0.0 if published else 1.0))
+        ends = np.cumsum(intervals) / max(intervals.sum(), 1e-9) * p.coarse_share * p.steps
+        self.join_steps = [0] * first + [round(end) for end in ends[: levels - first]]
 
     def level_at(self, step: int) -> int:
         """Return the finest joined level."""
@@ -103,11 +104,15 @@ class Schedule:
 
     def collects_stats(self, view: TrainingView, step: int) -> bool:
         """Return whether a step contributes to the statistics for growth."""
-        return self.is_growing(step) and (view.shrink == 1 or step < self.join_steps[-1])
+        return (
+            self.is_growing(step)
+            and step >= self.parameters.stats_from
+            and (view.shrink == 1 or step < self.join_steps[-1])
+        )
 
     def grows_after(self, step: int) -> bool:
         """Return whether anchors are added after a step."""
-        return self.is_growing(step) and self._interval_ends(step)
+        return self.is_growing(step) and step >= self.parameters.grow_from and self._interval_ends(step)
 
     def prunes_unseen_after(self, step: int) -> bool:
         """Return whether splats of low weight are removed after a step: when growth ends, and at the end."""

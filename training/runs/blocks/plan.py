@@ -189,7 +189,8 @@ def plan(job: Job, scene: Scene | None = None) -> list[PlannedCell]:
                 f"Cell {number} is too small to train: {views} views and {points} points.", "Use fewer cells."
             )
         share = views / len(training)
-        splats = max(round(undivided.max_splats * points / len(scene.points)), 1)
+        limit = undivided.max_splats
+        splats = max(round(limit * points / len(scene.points)), 1) if limit else 0
         parameters = replace(undivided, steps=_scaled(undivided.steps, share), max_splats=splats)
         memory = _memory(parameters, views, pixels, job.photo_memory)
         part = _part_job(job, parameters)
@@ -211,6 +212,11 @@ def choose_cells(job: Job, splats: int = 0, memory: int = 0, scene: Scene | None
     """
     scene = read_planned_scene(job) if scene is None else scene
     total = _divided(job)[0].max_splats
+    if not total and (splats or memory):
+        raise LodgsError(
+            "Cannot choose blocks by a limit: the job's number of splats is unlimited.",
+            "Set max_splats, or give the number of cells.",
+        )
     failure = None
     for grid in _grids(scene, total / splats if splats else 1):
         try:
@@ -308,8 +314,9 @@ def plan_table(planned: list[PlannedCell]) -> str:
     """Format the cost of each block as a table."""
     lines = ["block   views    points      max splats     steps  approx. memory"]
     for cell in planned:
+        splats = f"{cell.splats:,}" if cell.splats else "unlimited"
         lines.append(
-            f"{cell.number:5}{cell.views:8,}{cell.points:10,}{cell.splats:16,}{cell.steps:10,}"
+            f"{cell.number:5}{cell.views:8,}{cell.points:10,}{splats:>16}{cell.steps:10,}"
             f"{cell.memory / 1e9:13.1f} GB"
         )
     return "\n".join(lines)

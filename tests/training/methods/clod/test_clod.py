@@ -138,7 +138,9 @@ def test_reference_distance(data):
     assert clod.reference == pytest.approx(np.quantile(np.concatenate(visible), 0.9), rel=1e-5)
     published = make(data, reference_quantile=0.0)
     assert published.facts["reference"] == 0
-    assert published.normalized_distances(data.train[0]).max() == pytest.approx(1)
+    means = published.model["means"].detach().numpy()
+    in_view = data.train[0].sees(means, near=data.near)
+    assert published.normalized_distances(data.train[0])[in_view].max() == pytest.approx(1)
 
 
 def test_prefixes_are_coarser_and_counts_fall_with_scale(data):
@@ -195,3 +197,65 @@ def test_invalid_values_raise():
     for name, value in (("s_v_most", 0.5), ("exponent", 0), ("keep_share", 0), ("tau", 0), ("begin", 1.5)):
         with pytest.raises(LodgsError, match=name):
             override(draft, {name: value})
+
+
+def test_published_distances_are_relative_to_the_farthest_splat_in_view(data):
+    clod = make(data, preset="paper", steps=4, begin=0.0, **NO_RESETS)
+    camera = data.train[2]
+    means = clod.model["means"].detach().numpy()
+    distances = np.linalg.norm(means - camera.center, axis=1)
+    in_view = camera.sees(means, near=data.near)
+    assert distances[~in_view].max() > distances[in_view].max()
+    expected = distances / distances[in_view].max()
+    np.testing.assert_allclose(clod.normalized_distances(camera), expected, rtol=1e-5)
+    trained(clod)
+    means = clod.model["means"].detach().numpy()
+    reaches = [
+        np.linalg.norm(means[view.sees(means, near=data.near)] - view.center, axis=1).max()
+        for view in data.train
+    ]
+    assert clod.facts["reference"] == pytest.approx(np.median(reaches))
+
+
+NO_RESETS = {"opacity_reset_interval": 0, "prune_interval": 0, "densify_until": 0.0}
+
+
+def test_preset_paper_makes_detail_from_the_start(data):
+    """Opacity halves at the median distance and scale √5, so that scale 5 draws a fraction of the splats."""
+    clod = make(data, preset="paper", steps=6, begin=0.0, **NO_RESETS)
+    ratios = []
+    for camera in data.train:
+        points = data.scene.points[camera.sees(data.scene.points, near=data.near)]
+        distances = np.linalg.norm(points - camera.center, axis=1)
+        ratios.append(distances / distances.max())
+    median = np.median(np.concatenate(ratios))
+    sigma = clod.sigma.detach().unique()
+    assert np.exp(-(median**2) * 5 / (2 * float(sigma) ** 2)) == pytest.approx(0.5, abs=1e-5)
+    trained(clod)
+    with torch.no_grad():
+        counts = [sum(clod.attenuate(view, s_v)[2].sum() for view in data.train) for s_v in (1.0, 2.0, 5.0)]
+    assert counts[0] > counts[1] > counts[2] and counts[2] < 0.6 * counts[0]
+
+
+def test_count_of_all_splats_and_ablations(data):
+    """η of Eq. 3 is a fraction of all splats; Table 2 leaves out w_s = (s_v - 1)² or the regularization."""
+    for values, weight in (({}, 9.0), ({"scale_weight": False}, 1.0)):
+        clod = make(data, preset="paper", begin=0.0, **values)
+        opacities = torch.linspace(0, 1, 40, dtype=torch.float64)
+        drawn = opacities > 0.3
+        in_view = torch.arange(40) < 5
+        excess = clod.count_excess(ClodDrawing(None, 4.0, opacities, drawn, in_view))
+        assert excess.item() == pytest.approx(weight * (28 / 40 - 4**-1.5) ** 2)
+    assert make(data, count_weight=0.0).parameters.count_weight == 0
+
+
+@pytest.mark.parametrize("prune_undrawn", [True, False])
+def test_culling_of_undrawn_splats_is_a_parameter(data, prune_undrawn):
+    values = {**NO_RESETS, "prune_interval": 2}
+    clod = make(data, preset="paper", steps=4, begin=0.0, prune_undrawn=prune_undrawn, **values)
+    trained(clod, 1)
+    with torch.no_grad():
+        clod.model["opacity_logits"][:5] = -6.0  # far below tau
+    count = len(clod.model)
+    clod.control_density(1)
+    assert (len(clod.model) < count) == prune_undrawn

@@ -179,15 +179,6 @@ def test_gradients_are_averaged_over_visible_views(data):
     assert torch.equal(flod.model.mean_gradient(), gradient_sum / visible.clamp_min(1))
 
 
-def test_paper_preset_matches_paper():
-    paper = METHOD.preset("paper")
-    assert paper.steps == (10_000, 15_000, 20_000, 25_000, 30_000)
-    until = [share * steps for share, steps in zip(paper.densify_until, paper.steps, strict=True)]
-    assert until == pytest.approx([5000, 6000, 8000, 10000, 15000])
-    assert paper.densify_interval == (2000, 1000, 500, 500, 200)
-    assert (paper.rho, paper.levels, paper.overlap_interval, paper.finish_steps) == (4, 5, 1000, 0)
-
-
 def test_duplicate_points_train_and_too_few_raise(data, tiny_scene, tmp_path):
     from dataclasses import replace
 

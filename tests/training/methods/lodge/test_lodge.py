@@ -171,8 +171,7 @@ def test_paper_preset_matches_paper():
     p = method_info("lodge").preset("paper")
     assert isinstance(p, LodgeParameters)
     assert (p.antialias, p.densify_by, p.max_threshold, p.least_weight) == (True, "max", 0.015, 0.02)
-    assert (p.steps, p.densify_interval, p.densify_from, p.densify_until) == (30_000, 300, 600, 0.5)
-    assert p.opacity_reset_interval == 3000 and round(PRUNE_AT[0] * p.steps) == 8000
+    assert round(PRUNE_AT[0] * p.steps) == 8000
 
 
 def test_antialiased_base_gives_antialiased_levels(data, base):
@@ -277,3 +276,40 @@ def test_costs_fit_in_bundle_header(data, base, tmp_path, count):
 def test_resume_is_bit_identical(data, stop, check_resumed):
     """Stops in the finest level, at its end, within a round, and at the ends of a round and a level."""
     check_resumed(lambda: make(data), stop)
+
+
+def test_distances_vary_level_by_level_as_published(data, base):
+    """A.2: U(0.7 d_l, 1.3 d_l) for each level; other presets have one factor for all."""
+    lodge = make(data, base, preset="paper")
+    lodge.d_l = {3: 0.0, 2: 1.0, 1: 1.5}
+    drawn = [lodge.random_distances(step) for step in range(300)]
+    assert {lodge.random_scale(step) for step in range(9)} == {1.0}
+    first, second = (np.array([distances[number] for distances in drawn]) for number in (2, 1))
+    assert {distances[3] for distances in drawn} == {0.0} and (second >= first).all()
+    assert 0.7 <= first.min() < 0.72 and 1.28 < first.max() <= 1.3
+    assert abs(np.corrcoef(first, second)[0, 1]) < 0.5
+    draft = make(data, base)
+    draft.d_l = lodge.d_l
+    scales = [draft.random_scale(step) for step in range(300)]
+    assert draft.random_distances(0) == lodge.d_l and 1 / 1.3 <= min(scales) < max(scales) <= 1 / 0.7
+
+
+@pytest.mark.parametrize("ratio", [1.3, 2.0])
+def test_minimum_ratio_of_distances_is_a_parameter(data, base, ratio):
+    level = IndexedLevel.of(make(data, base).model.gaussians)
+    thresholds = Thresholds(data.train, data.near, "cpu", 0.02, lambda d: 0.0, min_ratio=ratio)
+    near = 10 * data.median_depth  # beyond all splats, so that only the ratio counts
+    assert thresholds._candidates(level, ratio * near, np.inf)[0] == pytest.approx(ratio * near, rel=1e-3)
+    _, report = thresholds.choose({3: level}, {3: near})
+    assert report["distances"][0] == pytest.approx(ratio * near, rel=1e-3)
+
+
+def test_few_chunks_of_equation_5_are_made_in_preset_paper(data, base):
+    """N = 4 / d_1 max |c_i - mean|, which is 3 here."""
+    centers = np.array([camera.center for camera in data.train])
+    reach = np.linalg.norm(centers - centers.mean(0), axis=1).max()
+    for preset, count in (("paper", 3), ("draft", 0)):
+        lodge = make(data, base, preset=preset)
+        lodge.d_l = {3: 0.0, 2: 4 * reach / 2.9}
+        lodge._place_chunks()
+        assert len(lodge.centres) == count

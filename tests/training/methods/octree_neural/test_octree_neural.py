@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from training.errors import LodgsError
 from training.methods.octree_neural import METHOD
 from training.methods.octree_neural.train import Method
+from training.optimize.anchors import growing
 from training.optimize.parameters import override
 from training.rasterize import Gaussians, contributions, rasterize
 from training.runs.arrays import read_arrays
@@ -247,3 +249,64 @@ def test_growth_at_large_gradients(data):
     apart = method.model["offsets"][count:].detach()
     assert (apart.abs() <= 0.5).all()  # in their voxel, no two in one place
     assert all(len(places.unique(dim=0)) == 4 for places in apart)
+
+
+def test_statistics_are_kept_until_enough_views_drew_an_anchor(data):
+    """Octree-GS program: over 40 views of 100 to grow, over 80 to remove; sums last across passes."""
+    method = make(data, steps=400, coarse_share=0.0, grow_interval=100, success_threshold=0.8, bias_rate=0.5)
+    stats = method.model.stats
+    stats["gradient_sum"][:] = 0.0
+    stats["seen"][0], stats["seen"][1] = 40, 41
+    stats["gradient_sum"][:2] = 1e9
+    stats["anchor_seen"][2], stats["anchor_seen"][3] = 80, 81  # both were transparent in all views
+    means = method.model["means"].detach().clone()
+    method.grow(199)
+    rows = {tuple(mean): row for row, mean in enumerate(method.model["means"].tolist())}
+    assert tuple(means[3].tolist()) not in rows and tuple(means[2].tolist()) in rows
+    kept = method.model.stats
+    assert kept["seen"][0].tolist() == [40] * 4 and kept["seen"][1].tolist() == [0] * 4
+    assert kept["anchor_seen"][2] == 80
+    assert method.model.columns["bias"][:3].tolist() == [0.0, 0.5, 0.0]
+
+
+def test_bias_follows_mean_gradient_of_ready_gaussians(data):
+    method = make(data, steps=400, coarse_share=0.0, grow_interval=100, success_threshold=0.8, bias_rate=0.5)
+    threshold = method.parameters.grad_threshold * data.threshold_scale
+    stats = method.model.stats
+    stats["seen"][0], stats["seen"][1] = 100, 100
+    stats["gradient_sum"][0, 0] = 99 * threshold  # mean of four: 0.2475 thresholds
+    stats["gradient_sum"][1] = 26 * threshold
+    level = method.model.columns["level"]
+    stats["gradient_sum"][:2] *= 2 ** (method.parameters.grow_harder * (level[:2, None] - 1))
+    method.grow(199)
+    assert method.model.columns["bias"][:2].tolist() == [0.0, 0.5]
+
+
+def test_next_level_growth_can_be_disabled(data):
+    for grow_next in (True, False):
+        method = make(data, steps=400, coarse_share=0.0, grow_next=grow_next)
+        method.model.stats["seen"] += 1
+        method.model.stats["gradient_sum"] += 1e9
+        source, _, level = growing.select_growth(method.schedule, method.model, 200)
+        assert (level > method.model.columns["level"][source]).any() == grow_next
+
+
+def test_offset_rate_is_multiplied_by_extent(data):
+    for scaled, factor in ((False, 1.0), (True, data.extent)):
+        method = make(data, scale_offset_rate=scaled)
+        method.set_learning_rates(0)
+        assert method.model.adam.lr["offsets"] == pytest.approx(1e-2 * factor)
+
+
+def test_appearance_of_a_photo_is_rendered(data):
+    name = data.train[1].name
+    method = make(data, appearance=8, appearance_of=name)
+    with torch.no_grad():
+        method.networks.appearance.copy_(torch.randn(method.networks.appearance.shape))
+    anchors, camera = torch.arange(5), data.train[0]
+    rendered, photo, other = (
+        method.decoder.decode(method.model, camera, anchors, view).colors for view in (None, 1, 2)
+    )
+    assert torch.equal(rendered, photo) and not torch.equal(photo, other)
+    with pytest.raises(LodgsError, match=r"appearance of .none\.jpg.: no training photo has"):
+        make(data, appearance=8, appearance_of="none.jpg")

@@ -197,6 +197,10 @@ def test_choose_cells_returns_the_smallest_grid_within_limits(tmp_path):
     assert choose_cells(job, memory=10**12, scene=scene) == "1x1"
     with pytest.raises(LodgsError, match=r"too large|too few|too small"):
         choose_cells(job, splats=3, scene=scene)
+    unlimited = replace(job, parameters={"max_splats": 0})
+    assert {cell.splats for cell in plan(unlimited.with_cells("2x1"), scene)} == {0}
+    with pytest.raises(LodgsError, match=r"number of splats is unlimited\. Set max_splats"):
+        choose_cells(unlimited, splats=100, scene=scene)
 
 
 def street_map(folder: Path) -> Scene:

@@ -1,0 +1,247 @@
+"""Published numbers of presets *paper*, and the steps at which these densify, prune, reset and join levels.
+
+Sources: the papers' texts, and "program" where only the authors' published program has the number.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from training.methods import create, method_info
+from training.methods.flod import train as flod_train
+from training.optimize import splat_method
+
+SHARED = {
+    "max_splats": (0, "3DGS: no limit"),
+    "scale_threshold": (False, "3DGS program: the threshold is not scaled"),
+    "ssim_weight": (0.2, "3DGS, Sec. 7.1: lambda"),
+    "min_opacity": (0.005, "3DGS program: min_opacity"),
+    "antialias": (False, "3DGS"),
+}
+SPLATS = SHARED | {
+    "grad_threshold": (2e-4, "3DGS, Sec. 5.2: tau_pos"),
+    "sh_degree": (3, "3DGS, Sec. 7.1"),
+    "sh_interval": (1000, "3DGS, Sec. 7.1"),
+    "lr_means": (1.6e-4, "3DGS program: position_lr_init"),
+    "lr_means_final": (1.6e-6, "3DGS program: position_lr_final"),
+    "lr_means_steps": (30_000, "3DGS program: position_lr_max_steps"),
+    "lr_scales": (0.005, "3DGS program: scaling_lr"),
+    "lr_quats": (1e-3, "3DGS program: rotation_lr"),
+    "lr_opacities": (0.05, "3DGS program: opacity_lr"),
+    "lr_sh": (0.0025, "3DGS program: feature_lr"),
+    "clone_extent": (0.01, "3DGS program: percent_dense"),
+    "long_axis": (False, "3DGS, Sec. 5.2: clone and split"),
+    "first_resolution": (1.0, "FLoD, LODGE, CLoD-GS: full images"),
+    "opacity_reset_interval": (3000, "3DGS, Sec. 5.2"),
+    "densify_from": (501, "3DGS program: after densify_from_iter = 500"),
+}
+SINGLE = SPLATS | {
+    "steps": (30_000, "3DGS, Sec. 7.1"),
+    "densify_interval": (100, "3DGS, Sec. 5.2"),
+    "densify_until": (0.499, "3DGS program: iteration < densify_until_iter = 15,000"),
+    "prune_oversized": (True, "3DGS, Sec. 5.2"),
+}
+PUBLISHED = {
+    "3dgs": SINGLE,
+    "flod": SPLATS | {
+        "levels": (5, "FLoD, Sec. 6.1: L_max"),
+        "rho": (4.0, "FLoD, Sec. 6.1"),
+        "footprint": (40.0, "FLoD, Sec. 6.1: lambda = 0.2, about 40 pixels at the median depth"),
+        "steps": ((10_000, 15_000, 20_000, 25_000, 30_000), "FLoD, App. B"),
+        "densify_interval": ((2000, 1000, 500, 500, 200), "FLoD, App. B"),
+        "overlap_interval": (1000, "FLoD, App. B"),
+        "prune_interval": (100, "FLoD program: pruning_interval"),
+    },
+    "lodge": SPLATS | {
+        "steps": (30_000, "LODGE, A.2"),
+        "antialias": (True, "LODGE, A.2: 2D filter of Mip-Splatting"),
+        "densify_from": (600, "LODGE, A.2"),
+        "densify_interval": (300, "LODGE, A.2"),
+        "densify_until": (0.5, "LODGE, A.2: to step 15,000"),
+        "densify_by": ("max", "LODGE, Eq. 6"),
+        "max_threshold": (0.015, "LODGE, A.2"),
+        "least_weight": (0.02, "LODGE, A.2"),
+        "tune_steps": (1000, "LODGE, A.2"),
+        "tune_range": (0.3, "LODGE, A.2"),
+        "levels": (3, "LODGE, Table 3: two coarser levels"),
+        "prune_oversized": (True, "3DGS, Sec. 5.2"),
+        "tune_each": (True, "LODGE, A.2: each d_l"),
+        "min_ratio": (1.3, "LODGE, Table 3: 28, 47 and 63 m"),
+        "min_chunks": (2, "LODGE, Eq. 5: no minimum"),
+    },
+    "tree": SPLATS | {
+        "steps": (60_000, "A LoD of Gaussians, A.5"),
+        "densify_until": (0.0, "A LoD of Gaussians, A.2: no densification"),
+        "opacity_reset_interval": (0, "A LoD of Gaussians, A.5: coarse stage"),
+        "tune_steps": (150_000, "A LoD of Gaussians, A.5"),
+        "sh_degree": (1, "A LoD of Gaussians, A.2"),
+        "lod_noise": (5.0, "A LoD of Gaussians, A.6"),
+        "max_threshold": (0.0075, "A LoD of Gaussians: half of H3DGS's 0.015"),
+        "unseen_epochs": (2.0, "A LoD of Gaussians, Sec. 4.2"),
+    },
+    "octree_neural": SHARED | {
+        "steps": (40_000, "Octree-GS, Sec. 5.1"),
+        "nearest": (0.05, "Octree-GS program: dist_ratio"),
+        "farthest": (0.95, "Octree-GS program: dist_ratio"),
+        "coarse_share": (0.25, "Octree-GS program: coarse_iter = 10,000"),
+        "coarse_factor": (1.5, "Octree-GS, Sec. 4.3: 1/omega"),
+        "joins": ("published", "Octree-GS, Sec. 4.3: floor(K/2), the last at coarse_iter"),
+        "stats_from": (500, "Octree-GS program: start_stat"),
+        "grow_from": (1500, "Octree-GS program: update_from"),
+        "grow_until": (0.6249, "Octree-GS program: iteration < update_until = 25,000"),
+        "grow_interval": (100, "Octree-GS, Sec. 4.2: T"),
+        "grad_threshold": (2e-4, "Octree-GS, Sec. 4.2: tau_g"),
+        "grow_harder": (0.2, "Octree-GS, Sec. 4.2: beta"),
+        "room_exponent": (0.0, "Octree-GS: no limit"),
+        "success_threshold": (0.8, "Octree-GS program: success_threshold"),
+        "bias_rate": (0.01, "Octree-GS, Sec. 4.2: epsilon"),
+        "offsets": (10, "Octree-GS program: n_offsets"),
+        "features": (32, "Octree-GS program: feat_dim"),
+        "appearance": (32, "Octree-GS program: appearance_dim"),
+        "volume_weight": (0.01, "Octree-GS, Sec. 5.1: lambda_vol"),
+        "lr_features": (7.5e-3, "Octree-GS program: feature_lr"),
+        "lr_offsets": (1e-2, "Octree-GS program: offset_lr_init"),
+        "lr_offsets_final": (1e-4, "Octree-GS program: offset_lr_final"),
+        "lr_scales": (7e-3, "Octree-GS program: scaling_lr"),
+        "scale_offset_rate": (True, "Octree-GS program: offset_lr_init * spatial_lr_scale"),
+    },
+    "clod": SINGLE | {
+        "begin": (1 / 6, "CLoD-GS, Sec. 4.1: from step 5,000"),
+        "lr_sigma": (0.01, "CLoD-GS, Sec. 4.1"),
+        "s_v_most": (5.0, "CLoD-GS, Sec. 4.1"),
+        "sigma_init": (0.0, "CLoD-GS: not published, from the scene"),
+        "count_of": ("all", "CLoD-GS, Eq. 3: N_total"),
+        "reference_quantile": (0.0, "CLoD-GS, Sec. 3.2: farthest in N_view"),
+        "prune_undrawn": (False, "CLoD-GS: none"),
+        "exponent": (1.5, "CLoD-GS, Eq. 3"),
+        "count_weight": (1.0, "CLoD-GS, Sec. 4.1: lambda_reg"),
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_paper_presets_have_published_numbers(name):
+    paper = method_info(name).preset("paper")
+    for parameter, (value, source) in PUBLISHED[name].items():
+        assert getattr(paper, parameter) == pytest.approx(value), f"{parameter}: {source}"
+
+
+@pytest.fixture
+def events(monkeypatch):
+    """Return run(method): the steps of a run that call each function of density control."""
+
+    def run(method) -> dict[str, list[int]]:
+        calls: dict[str, list[int]] = {}
+        for name in ("densify", "prune", "prune_oversized", "reset_opacities"):
+            for module in (splat_method, flod_train):
+                if hasattr(module, name):
+                    record = lambda *_, name=name, **__: calls.setdefault(name, []).append(step + 1)  # noqa: E731
+                    monkeypatch.setattr(module, name, record)
+        monkeypatch.setattr(type(method), "prune_unimportant", lambda *_: None, raising=False)
+        for step in range(method.steps):
+            if method.parameters.prune_interval and step % 50 == 49:  # all events are at multiples of 50
+                type(method).control_density(method, step)
+        return calls
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("name", "first", "interval", "last"), [("3dgs", 600, 100, 14_900), ("lodge", 600, 300, 15_000)]
+)
+def test_steps_of_density_control(data, events, name, first, interval, last):
+    method = create(name, data, method_info(name).preset("paper"), seed=0, backend="cpu")
+    monitored = events(method)
+    steps = list(range(first, last + 1, interval))
+    assert monitored["densify"] == steps
+    assert monitored["prune_oversized"] == [step for step in steps if step > 3000]
+    assert monitored["prune"] == list(range(600, last + 1, 100))
+    assert monitored["reset_opacities"] == [3000, 6000, 9000, 12_000]
+
+
+def test_steps_of_density_control_of_flod_levels(data, events, monkeypatch):
+    paper = replace(method_info("flod").preset("paper"), overlap_interval=0)
+    method = create("flod", data, paper, seed=0, backend="cpu")
+    monitored = events(method)
+    begin, expected = 0, {"densify": [], "prune": [], "reset_opacities": []}
+    ends, intervals = (5_000, 6_000, 8_000, 10_000, 15_000), (2000, 1000, 500, 500, 200)
+    for steps, end, interval in zip(paper.steps, ends, intervals, strict=True):
+        for local in range(501, end):  # the programs: 500 < iteration < end
+            for name, every in (("densify", interval), ("prune", 100), ("reset_opacities", 3000)):
+                if local % every == 0:
+                    expected[name].append(begin + local)
+        begin += steps
+    assert monitored == expected
+
+
+def test_no_reset_in_last_step_of_density_control(data):
+    """Nothing removes splats that stay faint after it."""
+    values = {"steps": 20, "densify_until": 0.5, "opacity_reset_interval": 5}
+    parameters = replace(method_info("3dgs").preset("draft"), **values)
+    method = create("3dgs", data, parameters, seed=0, backend="cpu")
+    largest = []
+    for step in range(12):
+        method.train_step(step)
+        largest.append(float(method.model.read("opacity_logits").sigmoid().max()))
+    assert largest[4] == pytest.approx(0.01, abs=1e-4) and largest[9] > 0.011
+
+
+def test_threshold_is_scaled_unless_disabled(data):
+    for name in ("3dgs", "flod"):
+        info = method_info(name)
+        assert info.preset("draft").threshold_factor(data.threshold_scale) == np.sqrt(1e6 / (64 * 48))
+        assert info.preset("paper").threshold_factor(data.threshold_scale) == 1
+
+
+def test_unlimited_splats(data):
+    """A limit of 0 keeps all points and lets all splats with gradients grow."""
+    counts = {}
+    for limit in (0, 70, 100_000):
+        values = {"max_splats": limit, "densify_interval": 3, "grad_threshold": 0.0, "margin": 0.0}
+        parameters = replace(method_info("3dgs").preset("draft"), **values, steps=10)
+        method = create("3dgs", data, parameters, seed=0, backend="cpu")
+        for step in range(4):
+            method.train_step(step)
+        counts[limit] = method.splats
+    assert counts[0] == counts[100_000] > counts[70] > 0
+
+
+@pytest.mark.parametrize(
+    ("levels", "joins"),
+    [
+        (1, [0]),
+        (2, [0, 0]),
+        (3, [0, 0, 10_000]),
+        (4, [0, 0, 0, 10_000]),
+        (5, [0, 0, 0, 6_000, 10_000]),
+        (6, [0, 0, 0, 0, 6_000, 10_000]),
+        (8, [0, 0, 0, 0, 0, 4_737, 7_895, 10_000]),
+    ],
+)
+def test_octree_levels_join_as_in_the_program(data, levels, joins):
+    """Joins are a / (1 - q^n) (1 - q^i) with q = 1 / 1.5, n levels to join and a the end of the stage."""
+    paper = replace(method_info("octree_neural").preset("paper"), levels=levels)
+    schedule = create("octree_neural", data, paper, seed=0, backend="cpu").schedule
+    assert schedule.join_steps == joins
+    grows = [step + 1 for step in range(99, 40_000, 100) if schedule.grows_after(step)]
+    assert grows == list(range(1_600, 25_000, 100))
+    view = data.view(0)
+    first = next(step for step in range(40_000) if schedule.collects_stats(view, step))
+    assert first + 1 == 501, "program: iteration > start_stat"
+    assert not schedule.prunes_unseen_after(39_999)
+
+
+@pytest.mark.parametrize(("init_level", "at_once"), [(0, 1), (2, 3), (4, 5), (11, 6)])
+def test_octree_initial_level(data, init_level, at_once):
+    """Octree-GS, Table 5: @2 and @4 count from level 0."""
+    paper = replace(method_info("octree").preset("paper"), levels=6, init_level=init_level)
+    joins = create("octree", data, paper, seed=0, backend="cpu").schedule.join_steps
+    assert joins.count(0) == at_once and max(joins) == (10_000 if at_once < 6 else 0)
+
+
+def test_coarse_stage_of_a_lod_of_gaussians_has_no_density_control(data, events):
+    paper = replace(method_info("tree").preset("paper"), tune_steps=0)
+    method = create("tree", data, paper, seed=0, backend="cpu")
+    assert method.steps == 60_001 and method.finest_steps == 60_000
+    assert events(method) == {}
