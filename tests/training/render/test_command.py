@@ -20,7 +20,7 @@ from training.rasterize import Gaussians, render
 from training.runs.job import Job
 from training.scenes.cameras import camera_to_dict, read_camera, write_camera
 from training.splats.bundle import write_bundle
-from training.splats.formats.splat import read_splat, write_splat
+from training.splats.formats.splat import SplatFile, write_splat
 from training.splats.levels import Bundle, Level
 from training.splats.ply import write_ply
 
@@ -321,7 +321,7 @@ def test_other_formats_are_rendered(make_splats, camera, tmp_path, monkeypatch, 
     write_ply(tmp_path / "a.ply", splats)
     if suffix == ".splat":
         write_splat(tmp_path / "a.splat", splats, {})
-        splats = read_splat(tmp_path / "a.splat")
+        splats = SplatFile(tmp_path / "a.splat").select(slice(None))
     else:
         shutil.copy(tmp_path / "a.ply", tmp_path / "a.spz")
         with open(tmp_path / "a.spz", "r+b") as file:
