@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from ..documents import read_json
-from ..errors import LodgsError
+from ..errors import LodgsError, SystemProblem
 from . import pycolmap_process
 from .cameras import Camera
 from .colmap import NO_POINTS, Scene
@@ -268,6 +268,8 @@ def _write_photo(number: int, camera: Camera, size: tuple[int, int], work: Path,
         visible = pixels[..., 3] >= 0.5
         if camera.mask is not None:
             visible &= load_mask(camera.mask, *size) >= 0.5
+    except SystemProblem:
+        raise
     except LodgsError:  # training names the file
         return False
     name = photo_name(number)
