@@ -29,8 +29,9 @@ class ClodParameters(SplatParameters):
     )
     sigma_init: float = setting(
         10.0,
-        "Initial decay of all splats, if 'by_importance' is off. 0 derives it from the scene: at the square "
-        "root of 's_v_most' a splat at the median distance has half of its opacity (CLoD-GS: not published).",
+        "Initial decay of all splats, if 'by_importance' is off. 0 derives it from each splat's mean "
+        "distance in the views: its opacity is halved at the square root of 's_v_most' (CLoD-GS: not "
+        "published).",
     )
     log_sigma: bool = setting(
         True, "Train the logarithm of the decay, so that updates are relative. Not in the paper."
@@ -56,7 +57,7 @@ class ClodParameters(SplatParameters):
     )
     onset: float = setting(2.0, "Scale up to which the target is all splats (CLoD-GS: 1).", low=1)
     count_weight: float = setting(
-        1.0, "Weight of the splat count regularization, (CLoD-GS: λ_reg). 0 disables it."
+        1.0, "Weight of the splat count regularization (CLoD-GS: λ_reg). 0 disables it."
     )
     scale_weight: bool = setting(
         True, "Multiply the splat count regularization by (s_v - 1)² (CLoD-GS: w_s, Table 2)."
@@ -81,7 +82,7 @@ class ClodParameters(SplatParameters):
     reference_quantile: float = setting(
         0.99,
         "Quantile of the distances between views and their visible points, used as the reference "
-        "distance. 0 trains with the farthest splat in each view, as published, and stores their median.",
+        "distance. 0 trains with the farthest splat in each view, as published, and stores their mean.",
         high=1,
     )
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import log, sqrt
 
 import numpy as np
 import torch
@@ -57,8 +58,7 @@ class Method(SplatMethod):
     """Training of CLoD-GS.
 
     Attributes:
-        reference: reference distance in scene units; 0 uses the farthest splat in each view.
-        initial_sigma: decay of splats whose decay does not follow from their importance.
+        reference: reference distance of the rule in scene units.
         decay_start: step at which the decay begins.
     """
 
@@ -71,12 +71,11 @@ class Method(SplatMethod):
         self.decay_start = round(p.begin * p.steps)
         if base is not None:
             self.decay_start = self._densify_until = 0
-        self.reference = self._far_distance(p.reference_quantile) if p.reference_quantile else 0.0
-        self.initial_sigma = p.sigma_init or self._sigma_of_scene()
-        sigma = torch.full((len(tensors["means"]),), self.initial_sigma, device=self.device)
+        sigma = torch.full((len(tensors["means"]),), p.sigma_init or 1.0, device=self.device)
         rates = splat_rates(p, self.data.extent) | {SIGMA: p.lr_sigma}
         peaks = p.densify_by == "max" or p.prune_oversized
         self.model = Model(tensors | {SIGMA: self._encode(sigma)}, rates, peaks=peaks)
+        self.reference = self._point_distance(p.reference_quantile or 1.0)
         self.facts = {"reference": self.reference, "tau": p.tau}
 
     def levels_after(self, step: int) -> list[Level]:
@@ -85,12 +84,10 @@ class Method(SplatMethod):
         """
         if step + 1 != self.steps:
             return []
-        if not self.reference:
-            self.reference = self._median_reach()
-            self.facts = {**self.facts, "reference": self.reference}
         splats = self.model.splats()
-        splats.extras[SIGMA] = self.sigma.detach().cpu().numpy()
-        order = torch.argsort(self.mean_weight(), descending=True, stable=True)
+        far = self.mean_far_distance()
+        splats.extras[SIGMA] = (self.sigma.detach() * (far / self.reference)).cpu().numpy()
+        order = torch.argsort(self.mean_weight(far), descending=True, stable=True)
         return [Level(1, splats.select(order.cpu().numpy()))]
 
     # -- the decay -------------------------------------------------------------------------------------
@@ -100,35 +97,53 @@ class Method(SplatMethod):
         """σ_d (N,) of all splats."""
         return self.model[SIGMA].exp() if self.parameters.log_sigma else self.model[SIGMA]
 
-    def normalized_distances(self, camera: Camera) -> torch.Tensor:
-        """Return d′ (N,): distances from a camera divided by the reference (Sec. 3.2)."""
-        means = self.model["means"].detach()
-        distances = (means - torch.as_tensor(camera.center).to(means)).norm(dim=1)
-        if self.reference:
-            return distances / self.reference
-        in_view = self._in_view(camera)
-        farthest = distances[in_view] if in_view.any() else distances
-        return distances / farthest.max().clamp_min(1e-20)
+    @torch.no_grad()
+    def far_distance(self, camera: Camera) -> float:
+        """Return the distance where d′ is 1: the reference, or the farthest splat's in view (Sec. 3.2)."""
+        if self.parameters.reference_quantile:
+            return self.reference
+        distances = self._distances_from(camera)[self._in_view(camera)]
+        return float(distances.max()) if len(distances) else self.reference
 
-    def _in_view(self, camera: Camera) -> torch.Tensor:
-        """Return the splats (N,) whose means are in a camera's image."""
-        means = self.model["means"].detach().cpu().numpy()
-        return torch.from_numpy(camera.sees(means, near=self.data.near)).to(self.device)
+    def mean_far_distance(self) -> float:
+        """Return the mean of :meth:`far_distance` over the training views, which the bundle uses for all
+        views: without it, detail would change as the camera turns.
+        """
+        if self.parameters.reference_quantile:
+            return self.reference
+        return float(np.mean([self.far_distance(camera) for camera in self.data.train]))
 
-    def attenuate(self, camera: Camera, s_v: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return attenuations, attenuated opacities and whether these exceed τ s_v, (N,) each (Eq. 2)."""
-        falloff = attenuation(self.normalized_distances(camera), self.sigma, s_v)
+    def attenuate(
+        self, camera: Camera, s_v: float, far: float | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return attenuations, attenuated opacities and whether these exceed τ s_v, (N,) each (Eq. 2).
+
+        Args:
+            far: distance where d′ is 1; None uses :meth:`far_distance`.
+        """
+        normalized = self._distances_from(camera) / (self.far_distance(camera) if far is None else far)
+        falloff = attenuation(normalized, self.sigma, s_v)
         opacities = self.model["opacity_logits"].sigmoid() * falloff
         return falloff, opacities, opacities > self.parameters.tau * s_v
 
     @torch.no_grad()
-    def mean_weight(self) -> torch.Tensor:
+    def mean_weight(self, far: float) -> torch.Tensor:
         """Return the rule's mean weight (N,) at s_v = 1 over the training views."""
         total = torch.zeros(len(self.model), device=self.device)
         for camera in self.data.train:
-            falloff, _, drawn = self.attenuate(camera, 1.0)
+            falloff, _, drawn = self.attenuate(camera, 1.0, far)
             total += falloff * drawn
         return total / len(self.data.train)
+
+    def _distances_from(self, camera: Camera) -> torch.Tensor:
+        """Return the distances (N,) of all splats from a camera."""
+        means = self.model["means"].detach()
+        return (means - torch.as_tensor(camera.center).to(means)).norm(dim=1)
+
+    def _in_view(self, camera: Camera) -> torch.Tensor:
+        """Return the splats (N,) whose mean is in a camera's image."""
+        means = self.model["means"].detach().cpu().numpy()
+        return torch.from_numpy(camera.sees(means, near=self.data.near)).to(self.device)
 
     def _encode(self, sigma: torch.Tensor) -> torch.Tensor:
         """Convert σ_d to the trained parameter."""
@@ -141,10 +156,10 @@ class Method(SplatMethod):
             return super().draw(view, step)
         if step == self.decay_start:
             self.begin_decay()
-        in_view = self._in_view(view.camera)
+        in_view, far = self._in_view(view.camera), self.far_distance(view.camera)
         drawings: list[Drawing] = []
         for s_v in (1.0, self.random_scale(step)):
-            falloff, opacities, drawn = self.attenuate(view.camera, s_v)
+            falloff, opacities, drawn = self.attenuate(view.camera, s_v, far)
             rendering = self.rasterize_model(view.camera, step, weights=falloff * drawn)
             drawings.append(ClodDrawing(rendering, s_v, opacities, drawn, in_view))
         return drawings
@@ -170,17 +185,18 @@ class Method(SplatMethod):
         return loss
 
     def count_excess(self, drawing: ClodDrawing) -> torch.Tensor:
-        """Return (s_v − 1)² ReLU(η − η_target)², with η the drawn fraction of the splats (Eq. 3).
+        """Return w_s ReLU(η − η_target)², with η the drawn fraction of the splats (Eq. 3).
 
-        η_target is min(1, (s_v / onset)^-exponent). Counting has no gradient; a straight-through
-        estimator uses the sigmoid of ln(α″ / τ s_v).
+        w_s is (s_v − 1)², or 1 without ``scale_weight``. η_target is min(1, (s_v / onset)^-exponent).
+        Counting has no gradient; a straight-through estimator uses the sigmoid of ln(α″ / τ s_v).
         """
         p, s_v = self.parameters, drawing.s_v
         margin = (drawing.attenuated.clamp_min(1e-12) / (p.tau * s_v)).log()
         soft = (margin / p.count_softness).sigmoid()
         counted = drawing.drawn + soft - soft.detach()
-        counts = drawing.in_view if p.count_of == "view" else torch.ones_like(drawing.in_view)
-        share = counted[counts].sum() / counts.sum().clamp_min(1)
+        if p.count_of == "view":
+            counted = counted[drawing.in_view]
+        share = counted.sum() / max(len(counted), 1)
         weight = (s_v - 1) ** 2 if p.scale_weight else 1.0
         return weight * (share - min(1.0, (s_v / p.onset) ** -p.exponent)).relu() ** 2
 
@@ -195,7 +211,8 @@ class Method(SplatMethod):
         """Add margins once the decay has begun, which removes splats of low weight in the photos."""
         if step == self.decay_start > 0:
             rows = self.margin_rows()
-            sigma = torch.full_like(rows["opacity_logits"], self.initial_sigma)
+            sigma = self.parameters.sigma_init or float(self.sigma.median())
+            sigma = torch.full_like(rows["opacity_logits"], sigma)
             self.model.append({**rows, SIGMA: self._encode(sigma)})
 
     @torch.no_grad()
@@ -229,6 +246,19 @@ class Method(SplatMethod):
         self.model.keep(keep)
         if self.parameters.by_importance:
             self._begin_by_importance(importance[keep])
+        elif not self.parameters.sigma_init:
+            self._begin_by_distance()
+
+    def _begin_by_distance(self) -> None:
+        """Set σ_d so that each splat's opacity is halved at the scale s = √s_v_most.
+
+        With its mean distance d′ in the views that contain it, exp(−(d′ s)² / 2σ_d²) = 1/2. A σ_d that all
+        splats share would either never attenuate the near splats, or remove the far ones at scale 1.
+        """
+        mean, _ = self._distances()
+        half_scale = sqrt(self.parameters.s_v_most)
+        sigma = mean / self.mean_far_distance() * half_scale / sqrt(2 * log(2))
+        self.model.assign(SIGMA, self._encode(sigma.clamp(*SIGMAS)))
 
     def _begin_by_importance(self, importance: torch.Tensor) -> None:
         """Set opacities and σ_d so that splats look unchanged from near and vanish in order of importance.
@@ -252,7 +282,7 @@ class Method(SplatMethod):
         alpha = opacity * (c * near).exp()
         c = torch.where(alpha > MAX_OPACITY, (MAX_OPACITY / threshold).clamp_min(1.05).log() / scale**2, c)
         self.model.assign("opacity_logits", alpha.clamp(1e-4, MAX_OPACITY).logit())
-        sigma = mean / (self.reference or float(mean.max())) / (2 * c).sqrt()
+        sigma = mean / self.mean_far_distance() / (2 * c).sqrt()
         self.model.assign(SIGMA, self._encode(sigma.clamp(*SIGMAS)))
 
     def _distances(self) -> tuple[torch.Tensor, torch.Tensor]:
@@ -260,13 +290,11 @@ class Method(SplatMethod):
 
         Both are the distance of the nearest view if no view contains the splat.
         """
-        means = self.model["means"].detach()
-        points = means.cpu().numpy()
-        total, views = torch.zeros_like(means[:, 0]), torch.zeros_like(means[:, 0])
+        total = torch.zeros(len(self.model), device=self.device)
+        views = torch.zeros_like(total)
         nearest, closest = torch.full_like(total, torch.inf), torch.full_like(total, torch.inf)
         for camera in self.data.train:
-            in_view = torch.from_numpy(camera.sees(points, near=self.data.near)).to(self.device)
-            distances = (means - torch.as_tensor(camera.center).to(means)).norm(dim=1)
+            in_view, distances = self._in_view(camera), self._distances_from(camera)
             total, views = total + distances * in_view, views + in_view
             nearest = torch.where(in_view, torch.minimum(nearest, distances), nearest)
             closest = torch.minimum(closest, distances)
@@ -275,33 +303,12 @@ class Method(SplatMethod):
             visible, nearest, closest
         )
 
-    def _far_distance(self, quantile: float) -> float:
+    def _point_distance(self, quantile: float) -> float:
         """Return a quantile of the distances between training views and their visible scene points."""
-        return float(np.quantile(np.concatenate(self._point_distances()), quantile))
-
-    def _sigma_of_scene(self) -> float:
-        """Return the decay that halves the opacity at the median d′ of the scene's points, at the scale
-        √s_v_most. Not in the paper.
-        """
-        visible = [distances for distances in self._point_distances() if len(distances)]
-        normalized = np.concatenate([d / (self.reference or d.max()) for d in visible])
-        sigma = np.median(normalized) * np.sqrt(self.parameters.s_v_most / (2 * np.log(2)))
-        return float(sigma.clip(*SIGMAS))
-
-    def _median_reach(self) -> float:
-        """Return the median distance of the farthest splat in a training view."""
-        means = self.model["means"].detach().cpu().numpy()
-        reaches = [distances.max() for distances in self._distances_in_views(means) if len(distances)]
-        return float(np.median(reaches)) if reaches else 0.0
-
-    def _point_distances(self) -> list[np.ndarray]:
-        """Return each training view's distances to its visible scene points, of which a sample is used."""
         points = self.data.full_scene.points
-        return self._distances_in_views(points[:: max(1, len(points) // MAX_POINTS)])
-
-    def _distances_in_views(self, points: np.ndarray) -> list[np.ndarray]:
-        """Return the distances of points (P, 3) in each training view from its camera."""
-        return [
+        points = points[:: max(1, len(points) // MAX_POINTS)]
+        visible = [
             np.linalg.norm(points[camera.sees(points, near=self.data.near)] - camera.center, axis=1)
             for camera in self.data.full_train
         ]
+        return float(np.quantile(np.concatenate(visible), quantile))
