@@ -14,6 +14,13 @@ class TreeParameters(SplatParameters):
     Without a base, the first ``steps`` train the leaves by 3DGS; the schedules of 3DGS span all steps.
     """
 
+    sky_points: int = setting(
+        0,
+        "Number of additional points on a sphere around the scene, for outdoor scenes whose points do not "
+        "cover the sky. They count beside 'max_splats'. A base has none.",
+        high=1_000_000,
+        label="Sky Points",
+    )
     tune_steps: int = setting(
         600,
         "Training steps for cuts of the tree, one view per step. 0 keeps the tree as built.",
@@ -65,6 +72,10 @@ class TreeParameters(SplatParameters):
         0.0,
         "Epochs after which density control removes leaves that were in no training image. 0 disables.",
     )
+
+    @property
+    def max_trained_splats(self) -> int:
+        return self.max_splats and self.max_splats + self.sky_points
 
     @property
     def total_steps(self) -> int:

@@ -19,7 +19,7 @@ import torch
 from ...lod.blocks import BLOCKS
 from ...lod.tree.forest import build_levels
 from ...lod.tree.shape import LEAVES, leaf_only_columns
-from ...optimize.initialize import from_splats
+from ...optimize.initialize import from_points, from_splats
 from ...optimize.method import Drawing, StepResult
 from ...optimize.out_of_core.view_order import ViewOrder
 from ...optimize.refining import RefiningMethod
@@ -38,6 +38,8 @@ from .store import NodeStore, default_budget
 
 FINAL_LEAF_RATE = 0.03
 """Learning rate of leaves at the end, as a fraction of the initial one."""
+SKY_RADIUS, FAR_QUANTILE = 10, 0.99
+"""Radius of the sky as a multiple of the distance of the far points, and their quantile of distances."""
 
 
 class RecordOptimizer:
@@ -104,6 +106,9 @@ class Method(RefiningMethod):
 
     def setup(self, base: SplatRows | None) -> None:
         super().setup(None if base is None else base.select(slice(0, 0)))
+        if base is None and self.parameters.sky_points:
+            points, colors = self.sky_points(self.parameters.sky_points)
+            self.model.append(from_points(points, colors, self.parameters.sh_degree, self.device))
         # density control and margins belong to the 3DGS steps only
         self._densify_until = min(self._densify_until, self.finest_steps)
         self.levels = LEAVES
@@ -112,6 +117,23 @@ class Method(RefiningMethod):
         self._base = base
         self._table: Columns = {}
         self._reported_budget = 0  # bytes of splat_memory in the last warning
+
+    def sky_points(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Place points (A.2) evenly on a sphere around the cameras, in the mean colour of the scene's points.
+
+        Returns:
+            Points (count, 3) and colours (count, 3) uint8. The radius is SKY_RADIUS times the distance of
+                the far points.
+        """
+        scene = self.data.full_scene
+        center = np.mean([camera.center for camera in self.data.full_train], axis=0)
+        far = np.quantile(np.linalg.norm(scene.points - center, axis=1), FAR_QUANTILE)
+        height = 1 - 2 * (np.arange(count) + 0.5) / count  # a spiral with equal areas
+        angle = np.pi * (3 - 5**0.5) * np.arange(count)
+        around = np.sqrt(1 - height**2)
+        directions = np.stack([around * np.cos(angle), around * np.sin(angle), height], axis=1)
+        color = scene.point_colors.mean(axis=0).round().astype(np.uint8)
+        return center + SKY_RADIUS * far * directions, np.tile(color, (count, 1))
 
     @property
     def scheduled_steps(self) -> int:

@@ -95,6 +95,26 @@ def test_first_steps_are_3dgs(data):
     torch.testing.assert_close(tree.model["means"], plain.model["means"])
 
 
+def test_sky_points_lie_evenly_on_a_sphere(data, base):
+    """Off by default; A.2: the initial points are augmented with a sky."""
+    plain, tree = make(data), make(data, sky_points=200)
+    count = len(plain.model)
+    assert len(tree.model) == count + 200 and make(data, base, sky_points=200).splats == len(base)
+    assert torch.equal(tree.model["means"][:count], plain.model["means"])
+    center = np.mean([camera.center for camera in data.train], axis=0)
+    points = tree.model["means"].detach().numpy()[count:] - center
+    radius = 10 * np.quantile(np.linalg.norm(data.scene.points - center, axis=1), 0.99)
+    np.testing.assert_allclose(np.linalg.norm(points, axis=1), radius, rtol=1e-5)
+    np.testing.assert_allclose(points.mean(0), 0, atol=0.01 * radius)
+    # 200 points share the area 4 pi of the unit sphere, so neighbours are sqrt(4 pi / 200) apart
+    scales = tree.model["log_scales"].detach().numpy()[count:].astype(float)
+    np.testing.assert_allclose(np.exp(scales), radius * (4 * np.pi / 200) ** 0.5, rtol=0.15)
+    for camera in data.train:  # and a share of them is in each image
+        assert camera.sees(tree.model["means"].detach().numpy()[count:]).sum() > 2
+    tree.train_step(0)
+    assert tree.parameters.max_trained_splats == tree.parameters.max_splats + 200
+
+
 def test_learning_rates_continue_and_start_low_with_base(data, base):
     tree, based = make(data), make(data, base)
     p = tree.parameters
