@@ -29,6 +29,9 @@ def summary_lines(measures: dict) -> list[str]:
                 f"Frame time by distance: {1e3 * by_distance:.1f} ms, {by_distance / full:.0%} of "
                 f"{1e3 * full:.1f} ms at full detail"
             )
+    match measures.get("loaded"):
+        case int() as count if count:
+            lines.append(f"Splats loaded by distance: {count:,}")
     match measures.get("oversized"):
         case int() as count if count:
             lines.append(f"Oversized opaque splats: {count:,}")

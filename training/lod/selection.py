@@ -162,6 +162,15 @@ class BundleSelector:
             for level, (columns, facts) in zip(self._levels, self._inputs, strict=True)
         ]
 
+    def loaded(self, position: np.ndarray, values: Values) -> int:
+        """Return the number of splats that a viewer loads at a camera position: those of the rule's region,
+        or all without one.
+        """
+        region = self._rule.region(position, values, self._tables)
+        if region is None:
+            return sum(len(level.splats) for level in self._levels)
+        return sum(int(self._rule.visible_in_region(columns, region).sum()) for columns, _ in self._inputs)
+
     def weights(self, position: np.ndarray, focal_px: float, values: Values) -> np.ndarray:
         """Return the weights (N,) of ``splats``; weight 0 means not drawn."""
         return np.concatenate(self.level_weights(position, focal_px, values))

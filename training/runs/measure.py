@@ -7,6 +7,8 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..errors import LodgsError
 from ..evaluate.distance import measure_farther_views, measure_popping
 from ..evaluate.level_sheet import write_level_sheet
@@ -17,7 +19,13 @@ from ..evaluate.views import Evaluation, full_detail_source
 from ..files import atomic_write
 from ..lod.on_disk import open_if_large
 from ..lod.rule import Rule, Values, find_rule
-from ..lod.selection import resolve_controls, select, standalone_levels, unknown_rule_error
+from ..lod.selection import (
+    BundleSelector,
+    resolve_controls,
+    select,
+    standalone_levels,
+    unknown_rule_error,
+)
 from ..methods import create
 from ..rasterize.resident import ResidentBundle
 from ..scenes.offset_views import read_offset_views
@@ -57,6 +65,8 @@ def evaluate_run(
           finest level and names of these ``views``
         - ``selective``: quality with the rule, selected per view, and once for the mean training camera
           (not if the bundle exceeds memory), with the rule's controls; empty without a rule
+        - ``loaded``: mean number of splats that a viewer loads for a view: with chunks those of their sets,
+          otherwise all (not if the bundle exceeds memory)
         - ``frame_s``: seconds per frame ``by_distance``, including selection, and in ``full`` detail, drawn
           alternately; not for rules that always weight
         - ``curve``: as ``selective``, for each value of the rule's ``sweep``
@@ -162,6 +172,9 @@ def _measure_rule(job: Job, evaluation: Evaluation, bundle: Bundle, rule: Rule, 
     per_view = evaluation.measure_by_distance(resident, values)
     report: dict[str, Any] = {"selective": [{"set": "per view", **values, **per_view}]}
     if not bundle.on_disk:
+        selector = BundleSelector(bundle)
+        loaded = [selector.loaded(camera.center, values) for camera in evaluation.cameras]
+        report["loaded"] = round(float(np.mean(loaded)))
         predetermined = select(bundle, data.mean_camera, data.focal, values)
         quality = evaluation.measure_splats(*predetermined)
         report["selective"].append({"set": "predetermined", **values, **quality})

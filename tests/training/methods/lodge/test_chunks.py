@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from training.lod.blocks import spatial_order
-from training.lod.rules.chunks import in_chunk
+from training.lod.rules.chunks import RULE, in_chunk
+from training.lod.selection import BundleSelector, resolve_controls
 from training.methods import create, method_info
 from training.methods.lodge import chunks
 from training.methods.lodge.composite import IndexedLevel
@@ -12,6 +13,7 @@ from training.optimize.parameters import override
 from training.rasterize import Gaussians
 from training.scenes.cameras import Camera, look_at
 from training.splats.gaussians import Splats
+from training.splats.levels import Bundle
 
 NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh")
 
@@ -127,6 +129,30 @@ def test_small_scenes_have_no_chunks_by_default(data):
     lodge = make(data, chunks=0)
     assert [level.number for level in trained(lodge)] == [3, 2, 1] and lodge.tables() == {}
     assert trained(make(data, chunks=1))[-1].splats.extras == {}
+
+
+def test_published_preset_makes_as_few_chunks_as_equation_5_gives(data):
+    """4 / d_1 times the distance of the farthest camera from the mean, below the 8 of other presets."""
+    assert method_info("lodge").preset("paper").min_chunks == 2
+    lodge = make(data, chunks=0, min_chunks=2)
+    trained(lodge, until=9)
+    centers = np.array([camera.center for camera in data.train])
+    reach = np.linalg.norm(centers - centers.mean(0), axis=1).max()
+    assert len(lodge.centres) == np.ceil(4 / (0.8 * data.median_depth) * reach) < 8
+
+
+def test_loaded_splats_are_those_of_the_sets_of_near_chunks(data):
+    lodge = make(data)
+    bundle = Bundle("lodge", trained(lodge)[3:], "chunks", tables=lodge.tables())
+    selector, values = BundleSelector(bundle), resolve_controls(bundle, {})
+    between = (lodge.centres[0] + 0.4 * (lodge.centres[1] - lodge.centres[0])).astype(float)
+    chunks_near = RULE.region(between, values, bundle.tables)
+    assert chunks_near is not None and len(chunks_near) == 2
+    bits = sum(1 << chunk for chunk in chunks_near)
+    members = [level.splats.extras["chunks_0"].astype(int) & bits != 0 for level in bundle.levels]
+    assert selector.loaded(between, values) == sum(item.sum() for item in members)
+    total = sum(len(level.splats) for level in bundle.levels)
+    assert selector.loaded(between, {**values, "chunks": 0}) == total
 
 
 @pytest.mark.parametrize("stop", [19, 20, 21, 22])
