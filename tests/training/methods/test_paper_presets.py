@@ -69,6 +69,12 @@ PUBLISHED = {
         "tune_each": (True, "LODGE, A.2: each d_l"),
         "min_ratio": (1.3, "LODGE, Table 3: 28, 47 and 63 m"),
         "min_chunks": (2, "LODGE, Eq. 5: no minimum"),
+        "tune_alone": (0.0, "LODGE: none"),
+        "drawn": (1.0, "LODGE: none"),
+        "keep": (1.0, "LODGE: none"),
+        "prune_weight": (0.02, "LODGE: gamma, not published"),
+        "visible_weight": (0.01, "LODGE: not published"),
+        "filter_variance": (0.2, "Mip-Splatting: 3D filter"),
     },
     "tree": SPLATS | {
         "steps": (60_000, "A LoD of Gaussians, A.5"),
@@ -79,6 +85,9 @@ PUBLISHED = {
         "lod_noise": (5.0, "A LoD of Gaussians, A.6"),
         "max_threshold": (0.0075, "A LoD of Gaussians: half of H3DGS's 0.015"),
         "unseen_epochs": (2.0, "A LoD of Gaussians, Sec. 4.2"),
+        "sky_points": (0, "A LoD of Gaussians, A.2: number not published, off"),
+        "pixels": (3.0, "A LoD of Gaussians: not published"),
+        "node_rate": (1.0, "A LoD of Gaussians: rates not published, 3DGS's"),
     },
     "octree_neural": SHARED | {
         "steps": (40_000, "Octree-GS, Sec. 5.1"),
@@ -116,6 +125,15 @@ PUBLISHED = {
         "prune_undrawn": (False, "CLoD-GS: none"),
         "exponent": (1.5, "CLoD-GS, Eq. 3"),
         "count_weight": (1.0, "CLoD-GS, Sec. 4.1: lambda_reg"),
+        "scale_weight": (True, "CLoD-GS, Eq. 3: w_s"),
+        "onset": (1.0, "CLoD-GS, Sec. 3.3: target s_v^-1.5 from 1 on"),
+        "log_uniform": (False, "CLoD-GS, Sec. 3.3: U(1, s_v_most)"),
+        "log_sigma": (False, "CLoD-GS, Eq. 2: ReLU(sigma)"),
+        "tau": (1 / 255, "CLoD-GS: not published, least opacity that 3DGS draws"),
+        "count_opacities": (False, "CLoD-GS: not published"),
+        "by_importance": (False, "CLoD-GS: none"),
+        "keep_share": (1.0, "CLoD-GS: none"),
+        "random_weight": (1.0, "CLoD-GS, Eq. 4"),
     },
 }  # fmt: skip
 
@@ -148,7 +166,8 @@ def events(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("name", "first", "interval", "last"), [("3dgs", 600, 100, 14_900), ("lodge", 600, 300, 15_000)]
+    ("name", "first", "interval", "last"),
+    [("3dgs", 600, 100, 14_900), ("clod", 600, 100, 14_900), ("lodge", 600, 300, 15_000)],
 )
 def test_steps_of_density_control(data, events, name, first, interval, last):
     method = create(name, data, method_info(name).preset("paper"), seed=0, backend="cpu")

@@ -76,6 +76,11 @@ class ClodParameters(SplatParameters):
         "threshold.",
         above=0,
     )
+    count_opacities: bool = setting(
+        True,
+        "Train opacities by the splat count regularization, too. Otherwise it trains decays only, which "
+        "keeps the quality at scale 1 (CLoD-GS: not published).",
+    )
     tau: float = setting(
         0.02, "Minimum attenuated opacity of a drawn splat (CLoD-GS: τ, value not published).", above=0
     )
@@ -99,6 +104,7 @@ _PAPER = replace(
     sigma_init=0.0,
     count_of="all",
     prune_undrawn=False,
+    count_opacities=False,
     log_sigma=False,
     s_v_most=5.0,
     log_uniform=False,

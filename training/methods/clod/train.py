@@ -123,7 +123,10 @@ class Method(SplatMethod):
         """
         normalized = self._distances_from(camera) / (self.far_distance(camera) if far is None else far)
         falloff = attenuation(normalized, self.sigma, s_v)
-        opacities = self.model["opacity_logits"].sigmoid() * falloff
+        logits = self.model["opacity_logits"]
+        if not self.parameters.count_opacities:  # images alone decide how a splat looks
+            logits = logits.detach()
+        opacities = logits.sigmoid() * falloff
         return falloff, opacities, opacities > self.parameters.tau * s_v
 
     @torch.no_grad()

@@ -196,6 +196,20 @@ def test_published_count_is_of_all_splats(data, ablation, weight):
     assert clod.count_excess(drawing).item() == pytest.approx(weight * (30 / 40 - 1 / 8) ** 2)
 
 
+@pytest.mark.parametrize("preset", ["draft", "paper"])
+def test_published_count_trains_decays_only(data, preset):
+    clod = make(data, preset=preset, onset=1.0)
+    trained(clod, 13)
+    camera = data.train[0]
+    _, attenuated, drawn = clod.attenuate(camera, 5.0)
+    everything = torch.ones_like(drawn)
+    clod.model.adam.zero_grad()
+    clod.count_excess(ClodDrawing(None, 5.0, attenuated, everything, everything)).backward()
+    assert clod.model["sigma_d"].grad.abs().sum() > 0
+    gradient = clod.model["opacity_logits"].grad
+    assert (gradient is None or not gradient.any()) == (preset == "paper")
+
+
 def test_without_count_weight_only_the_images_count(data):
     """Table 2 without L_reg: the loss is the sum of both images' losses."""
     clod = make(data, preset="paper", count_weight=0.0)

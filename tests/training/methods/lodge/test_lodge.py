@@ -11,7 +11,7 @@ from training.errors import LodgsError
 from training.lod.blocks import spatial_order
 from training.lod.selection import resolve_controls, select
 from training.methods import create, method_info
-from training.methods.lodge import LodgeParameters
+from training.methods.lodge import ROUNDS, LodgeParameters
 from training.methods.lodge.composite import IndexedLevel, LevelStack, gather_rows, visible_rows
 from training.methods.lodge.thresholds import CANDIDATES, MAX_CURVES, Thresholds
 from training.optimize.parameters import override
@@ -170,8 +170,8 @@ def test_importance_equals_reference(data, base):
 def test_paper_preset_matches_paper():
     p = method_info("lodge").preset("paper")
     assert isinstance(p, LodgeParameters)
-    assert (p.antialias, p.densify_by, p.max_threshold, p.least_weight) == (True, "max", 0.015, 0.02)
-    assert round(PRUNE_AT[0] * p.steps) == 8000
+    assert [round(share * p.steps) for share in PRUNE_AT] == [8000, 16_000, 24_000]  # A.2
+    assert ROUNDS == (0.2, 0.6, 1.0) and p.level_steps == 3 * 1000
 
 
 def test_antialiased_base_gives_antialiased_levels(data, base):
