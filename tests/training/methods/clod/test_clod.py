@@ -220,12 +220,10 @@ def test_without_count_weight_only_the_images_count(data):
     assert clod.loss([first, scaled], view, 13).item() == pytest.approx(sum(separate).item())
 
 
+@pytest.mark.slow
 def test_paper_preset_makes_continuous_levels(data):
     """Fewer than 60 % of the splats remain at s_v = 5, and quality falls with them."""
-    clod = make(
-        data, preset="paper", steps=80, begin=1 / 6, lr_means_steps=80, sh_interval=30, densify_until=0.5,
-        densify_interval=20, prune_interval=20,
-    )  # fmt: skip
+    clod = make(data, preset="paper", steps=80, begin=1 / 6, lr_means_steps=80, sh_interval=30)
     bundle = bundle_of(clod, trained(clod))
     resident, evaluation = ResidentBundle(bundle, "cpu"), Evaluation(data, "cpu")
     evaluation.cameras = data.train
