@@ -142,10 +142,13 @@ def _ignore(kind: str, **values: object) -> None:
 def _origin(job: Job, folder: RunFolder) -> np.ndarray | None:
     """Return the local origin of a job's scene, or None to choose it from the cameras.
 
-    A finished run can be evaluated without its base.
+    A finished run can be evaluated without its base. The coarse run of cells, a base that does not exist
+    before training, has the scene's own origin.
     """
-    if job.base and not Path(job.base).exists() and folder.bundle.exists():
+    if job.base and folder.bundle.exists() and not Path(job.base).exists():
         return read_header(folder.bundle).origin
+    if job.base and job.cell and not RunFolder(job.base).bundle.exists():
+        return None
     return base_origin(job)
 
 

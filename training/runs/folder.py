@@ -72,7 +72,7 @@ class RunFolder:
         self._lock_file: IO[bytes] | None = None
 
     def create(self) -> None:
-        """Create the folder and its subfolders.
+        """Create the folder and its subfolders; a finished run needs none for checkpoints.
 
         Raises:
             LodgsError: the folder cannot be written, or as ``reject_links``.
@@ -80,8 +80,10 @@ class RunFolder:
         try:
             self.path.mkdir(parents=True, exist_ok=True)
             self.reject_links()
-            for folder in (self.checkpoints, self.levels_folder):
-                folder.mkdir(exist_ok=True)
+            self.levels_folder.mkdir(exist_ok=True)
+            end = self.end_event()
+            if end is None or end["event"] != "done":
+                self.checkpoints.mkdir(exist_ok=True)
         except OSError as error:
             raise LodgsError(
                 f"Cannot create run folder {self.path}: {error.strerror}.",

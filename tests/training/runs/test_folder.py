@@ -173,8 +173,10 @@ def test_ended_run_is_not_running_where_locks_need_write_access(tmp_path, monkey
 def test_command_stops_when_its_parent_ends(monkeypatch):
     """A Blender in background that is killed, even by SIGKILL, leaves no trainer behind."""
     code = """
+import signal
 import time
 from training.runs.processes import stop_with_parent
+signal.signal(signal.SIGINT, signal.default_int_handler)  # shells ignore it for programs in background
 stop_with_parent()
 print("ready", flush=True)
 try:
