@@ -17,7 +17,6 @@ from . import point_cloud
 from .cameras import MAX_COORDINATE, Camera, camera_extent, pick_evenly
 from .colmap_model import (
     DAMAGED_REMEDY,
-    Intrinsics,
     Pose,
     count_images,
     model_suffix,
@@ -27,6 +26,7 @@ from .colmap_model import (
     read_poses,
 )
 from .image_files import MASK_SUFFIXES, ImageFiles, SidecarFiles, find_image_folder
+from .lenses import Intrinsics
 from .orientation import up_rotation
 from .view_selection import OUTLIER_FACTOR, ViewCollector, exclusion_messages, find_outliers, quote_name
 

@@ -22,8 +22,9 @@ from ..errors import LodgsError, SystemProblem
 from . import pycolmap_process
 from .cameras import Camera
 from .colmap import NO_POINTS, Scene
-from .colmap_model import make_intrinsics, read_cameras, read_points, read_poses
+from .colmap_model import read_cameras, read_points, read_poses
 from .images import load_image, load_mask, write_png
+from .lenses import make_intrinsics
 from .scene_cache import remove_abandoned, scene_digest, writable_cache
 from .sfm_known_poses import photo_name
 from .view_selection import find_outliers

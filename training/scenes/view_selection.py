@@ -9,9 +9,10 @@ import numpy as np
 
 from ..errors import LodgsError, SystemProblem, printable
 from .cameras import Camera
-from .colmap_model import Intrinsics, Pose
+from .colmap_model import Pose
 from .image_files import ImageFiles, SidecarFiles
 from .images import exif_orientation, image_size, quarter_turns, same_proportions
+from .lenses import Intrinsics
 
 OUTLIER_FACTOR = 1000
 """Points and cameras farther from the camera centre than this multiple of the median distance are dropped."""

@@ -14,7 +14,8 @@ from ..errors import LodgsError
 from ..splats.origin import NO_ORIGIN
 from ..splats.similarity import Similarity
 from .cameras import Camera
-from .colmap_model import LENSES, POINT, POINT2D, Intrinsics, make_intrinsics
+from .colmap_model import POINT, POINT2D
+from .lenses import LENSES, Intrinsics, make_intrinsics
 from .visibility import visible_points
 
 SHORTEST_TRACK, LONGEST_TRACK = 2, 4

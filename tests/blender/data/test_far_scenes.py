@@ -9,7 +9,7 @@ from plyfile import PlyData
 
 from training.scenes.cameras import read_camera
 from training.scenes.colmap import read_scene
-from training.scenes.colmap_model import make_intrinsics
+from training.scenes.lenses import make_intrinsics
 from training.scenes.write_colmap import write_model
 from training.splats.bundle import read_bundle, write_bundle
 from training.splats.levels import Bundle, Level

@@ -8,8 +8,8 @@ import pytest
 
 from tests.training.scenes.walls import write_walls
 from training.scenes.colmap import read_scene
-from training.scenes.colmap_model import make_intrinsics
 from training.scenes.images import write_png
+from training.scenes.lenses import make_intrinsics
 from training.scenes.write_colmap import write_model
 
 

@@ -8,8 +8,8 @@ import pytest
 from tests.training.scenes.walls import CAMERA_POSITIONS, render_photo
 from training.scenes.cameras import look_at
 from training.scenes.colmap import read_scene
-from training.scenes.colmap_model import make_intrinsics
 from training.scenes.images import write_png
+from training.scenes.lenses import make_intrinsics
 from training.scenes.undistort import cached_undistorted_scene
 from training.scenes.write_colmap import write_model
 

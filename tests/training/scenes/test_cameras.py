@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from training.scenes.cameras import Camera, look_at
-from training.scenes.colmap_model import Intrinsics, make_intrinsics
+from training.scenes.lenses import Intrinsics, make_intrinsics
 
 POSE = np.array([[0.0, 1, 0, -2], [-1, 0, 0, 3], [0, 0, 1, 4], [0, 0, 0, 1]])
 """A quarter turn about z and a translation: world point (x, y, z) is (y - 2, 3 - x, z + 4) in camera axes."""

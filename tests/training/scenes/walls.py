@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from training.scenes.cameras import look_at
-from training.scenes.colmap_model import make_intrinsics
 from training.scenes.images import write_png
+from training.scenes.lenses import make_intrinsics
 from training.scenes.write_colmap import write_model
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 300.0

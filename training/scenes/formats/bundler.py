@@ -16,8 +16,8 @@ import numpy as np
 
 from ...documents import open_file, read_lines
 from ...errors import LodgsError
-from ..colmap_model import make_intrinsics
 from ..images import image_size
+from ..lenses import make_intrinsics
 from .exported import OPENGL, ExportedScene, ExportedView, PhotoFinder, invert_pose
 
 NAME = "Bundler"

@@ -14,8 +14,8 @@ from ...documents import read_json
 from ...errors import LodgsError
 from ..cameras import Camera
 from ..colmap import DEPTH_SUFFIXES
-from ..colmap_model import Intrinsics, make_intrinsics
 from ..images import IMAGE_SUFFIXES
+from ..lenses import Intrinsics, make_intrinsics
 
 MAX_JSON_BYTES = 1 << 26
 """Maximum size of a JSON file; 5,000 views take about 4 million bytes."""

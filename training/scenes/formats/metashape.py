@@ -17,7 +17,7 @@ import numpy as np
 
 from ...documents import open_file
 from ...errors import LodgsError
-from ..colmap_model import Intrinsics
+from ..lenses import Intrinsics
 from .exported import (
     ExportedScene,
     ExportedView,

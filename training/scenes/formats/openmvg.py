@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import LodgsError
-from ..colmap_model import Intrinsics
+from ..lenses import Intrinsics
 from .exported import (
     ExportedScene,
     ExportedView,

@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import LodgsError
-from ..colmap_model import Intrinsics, rotation_matrix
+from ..colmap_model import rotation_matrix
 from ..images import IMAGE_SUFFIXES
+from ..lenses import Intrinsics
 from .exported import (
     ExportedScene,
     ExportedView,
