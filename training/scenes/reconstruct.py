@@ -314,28 +314,33 @@ def _start_work(work: Path, settings: Mapping[str, object]) -> None:
 def _link_masks(masks: Path, photos: Path, image_names: Mapping[str, str], out: Path) -> Path:
     """Link the masks into the scene under COLMAP's names and return their folder.
 
+    COLMAP drops photos without a mask, so theirs are white.
+
     Args:
         image_names: image name by photo name.
     """
     folder = out / MASKS
-    for name, image_name in image_names.items():
-        mask = SidecarFiles(masks, *MASK_SUFFIXES).find(name)
-        if mask is not None:
-            size = image_size(photos / name)
-            check_mask(mask, *size)
-            target = folder / f"{image_name}.png"
-            if mask.suffix.lower() == ".png":
-                link_or_copy(mask, target)
-            else:
-                target.parent.mkdir(parents=True, exist_ok=True)
-                codes = (255 * load_mask(mask, *size)).astype(np.uint8)
-                write_png(target, np.repeat(codes[..., None], 3, axis=2))
-    if not folder.is_dir():
+    sidecars = SidecarFiles(masks, *MASK_SUFFIXES)
+    files = {name: sidecars.find(name) for name in image_names}
+    if not any(files.values()):
         first = next(iter(image_names))
         raise LodgsError(
             f"Cannot use masks: {masks} has no mask of these photos.",
             f"Name the mask of {first} {first}.png.",
         )
+    for name, mask in files.items():
+        size = image_size(photos / name)
+        target = folder / f"{image_names[name]}.png"
+        if mask is not None:
+            check_mask(mask, *size)
+        if mask is not None and mask.suffix.lower() == ".png":
+            link_or_copy(mask, target)
+        else:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.unlink(missing_ok=True)  # may be a link to a mask that was renamed
+            white = np.ones(size[::-1], np.float32)
+            codes = (255 * (white if mask is None else load_mask(mask, *size))).astype(np.uint8)
+            write_png(target, np.repeat(codes[..., None], 3, axis=2))
     return folder
 
 

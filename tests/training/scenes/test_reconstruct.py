@@ -116,6 +116,20 @@ def test_masks_of_webp_photos(tmp_path):
         assert [path.name for path in linked.iterdir()] == ["b.webp.png.png"]
 
 
+def test_photos_without_a_mask_are_used_unmasked(tmp_path):
+    """COLMAP 4.2.1 drops photos whose mask is missing (MASK_ERROR)."""
+    for name in ("a.png", "b.png"):
+        Image.fromarray(noise(40, 30)).save(tmp_path / name)
+    (tmp_path / "masks").mkdir()
+    write_png(tmp_path / "masks" / "a.png", np.zeros((30, 40, 3), np.uint8))
+    names = {"a.png": "a.png", "b.png": "b.png"}
+    linked = _link_masks(tmp_path / "masks", tmp_path, names, tmp_path / "out")
+    codes = {path.name: np.asarray(Image.open(path)) for path in linked.iterdir()}
+    assert set(codes) == {"a.png.png", "b.png.png"}
+    assert (codes["a.png.png"] == 0).all() and (codes["b.png.png"] == 255).all()
+    assert codes["b.png.png"].shape == (30, 40, 3)
+
+
 @pytest.mark.slow
 def test_folders_of_a_rig_have_one_lens_each(tmp_path):
     """Twelve positions give each lens as many photos as in the other tests."""
