@@ -10,6 +10,8 @@ from math import tan
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ...errors import LodgsError
 from ..images import image_size
 from ..point_cloud import read_points
@@ -30,6 +32,10 @@ _FILES = "transforms.json", "transforms_train.json"
 _SUPPORTED_MODELS = (
     "", "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV_FISHEYE",
 )  # fmt: skip
+_MATRICES = "K", "intrinsics", "intrinsic_matrix", "camera_matrix"
+"""Names of camera matrices that some exporters write instead of focal lengths."""
+_ALIASES = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy"}
+_FLAW = "flaw of the camera matrix"
 
 
 def find(folder: Path) -> Path | None:
@@ -49,11 +55,11 @@ def read(path: Path) -> ExportedScene:
     frames = document.get("frames")
     if not isinstance(frames, list) or not frames:
         raise LodgsError(f"Cannot read {path}: it has no frames.", "Export it again.")
-    common = {name: value for name, value in document.items() if name != "frames"}
+    common = _with_focal_lengths({name: value for name, value in document.items() if name != "frames"})
     views, excluded = [], []
     photos = PhotoFinder(path.parent)
     for number, frame in enumerate(frames, 1):
-        own = frame if isinstance(frame, dict) else {}
+        own = _with_focal_lengths(frame) if isinstance(frame, dict) else {}
         # A frame's field of view replaces the common focal length.
         replaced = ("fl_x", "fl_y") if "camera_angle_x" in own else ()
         values = {name: value for name, value in common.items() if name not in replaced} | own
@@ -86,6 +92,8 @@ def _parse_view(folder: Path, values: Mapping[str, Any], photos: PhotoFinder) ->
         fx = _focal_length(get_number(values, "camera_angle_x"), width)
         fy = _focal_length(get_number(values, "camera_angle_y"), height) if "camera_angle_y" in values else fx
     center = get_number(values, "cx", width / 2), get_number(values, "cy", height / 2)
+    if isinstance(flaw := values.get(_FLAW), str):
+        raise LodgsError(flaw)
     model = str(values.get("camera_model", "")).upper()
     if model not in _SUPPORTED_MODELS:
         raise LodgsError(f"camera model {model} is not supported.")
@@ -99,6 +107,33 @@ def _parse_view(folder: Path, values: Mapping[str, Any], photos: PhotoFinder) ->
     names = (values.get(key) for key in ("mask_path", "depth_file_path"))
     mask, depth = (find_image(folder, name) if isinstance(name, str) else None for name in names)
     return ExportedView(image, lens, invert_pose(pose, opengl=True), mask, depth)
+
+
+def _with_focal_lengths(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return values with focal lengths and centre by name, which some exporters give as a camera matrix."""
+    try:
+        return {**_read_matrix(values), **values}
+    except LodgsError as error:
+        return {**values, _FLAW: error.what}
+
+
+def _read_matrix(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the lens of a camera matrix, of [fx, fy, cx, cy], or of values such as fx; {} without one."""
+    content: Any = next((values[name] for name in _MATRICES if values.get(name) is not None), values)
+    if isinstance(content, dict):
+        return {name: content[other] for name, other in _ALIASES.items() if content.get(other) is not None}
+    numbers = parse_array(content, -1)
+    if np.shape(content) == (4,):
+        return dict(zip(_ALIASES, numbers.tolist(), strict=True))
+    if len(numbers) not in (9, 16):
+        raise LodgsError("its camera matrix is not 3x3 or 4x4 numbers.")
+    matrix = numbers.reshape(int(len(numbers) ** 0.5), -1)[:3, :3]
+    if matrix[2, 0] and not matrix[0, 2]:  # stored by columns, as ARKit does
+        matrix = matrix.T
+    if not (np.array_equal(matrix[2], [0, 0, 1]) and matrix[1, 0] == 0 and abs(matrix[0, 1]) < 0.01):
+        raise LodgsError("its camera matrix is not [fx 0 cx; 0 fy cy; 0 0 1].")
+    lens = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
+    return dict(zip(_ALIASES, map(float, lens), strict=True))
 
 
 def _focal_length(angle: float, size: float) -> float:
