@@ -21,6 +21,7 @@ from ..lenses import make_intrinsics
 from .exported import OPENGL, ExportedScene, ExportedView, PhotoFinder, invert_pose
 
 NAME = "Bundler"
+_VERSION = b"# Bundle file v0.3"
 _MAX_LINE = 1 << 24
 _MAX_LIST = 1 << 26
 """Maximum bytes of a line, and of the list of photos."""
@@ -30,11 +31,24 @@ _LISTS = "list.txt", "bundle.out.list.txt", "image_list.txt", "imagelist.lst"
 
 
 def find(folder: Path) -> Path | None:
-    """Return the path of bundle.out, in the folder or in ``bundle``, if there is a list near it."""
-    for path in (folder / "bundle.out", folder / "bundle" / "bundle.out"):
+    """Return the path of bundle.out, in the folder or in ``bundle``, if there is a list near it.
+
+    Without such a file, the only other Bundler file of these folders with a list is returned.
+    """
+    folders = folder, folder / "bundle"
+    for path in (parent / "bundle.out" for parent in folders):
         if path.is_file() and _find_list(path) is not None:
             return path
-    return None
+    others = [path for parent in folders for path in sorted(parent.glob("*.out")) if _is_bundle(path)]
+    return others[0] if len(others) == 1 and _find_list(others[0]) is not None else None
+
+
+def _is_bundle(path: Path) -> bool:
+    try:
+        with open_file(path) as file:
+            return file.read(len(_VERSION)) == _VERSION
+    except LodgsError:
+        return False
 
 
 def read(path: Path) -> ExportedScene:
@@ -47,7 +61,7 @@ def read(path: Path) -> ExportedScene:
     try:
         with open_file(path) as file:
             lines = filter(None, map(bytes.strip, read_lines(file, _MAX_LINE)))
-            if not next(lines, b"").startswith(b"# Bundle file v0.3"):
+            if not next(lines, b"").startswith(_VERSION):
                 raise ValueError("its version is not 0.3")
             count, points = map(int, next(lines, b"").split())
             cameras = _parse_numbers(islice(lines, 5 * count), (count, 15))
@@ -94,7 +108,8 @@ def _parse_numbers(lines: Iterable[bytes], shape: tuple[int, int]) -> np.ndarray
 
 
 def _find_list(path: Path) -> Path | None:
-    candidates = (folder / name for folder in (path.parent, path.parent.parent) for name in _LISTS)
+    names = *_LISTS, f"{path.name}.list.txt"
+    candidates = (folder / name for folder in (path.parent, path.parent.parent) for name in names)
     return next((candidate for candidate in candidates if candidate.is_file()), None)
 
 
