@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import os
 import re
 import signal
+import socket
 import sys
+import threading
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -36,6 +39,9 @@ from .runs.watch import Watch
 
 DONE, CRASHED, BAD_INPUT, CANCELLED = 0, 1, 2, 3
 """Exit codes, the same as the trainer's."""
+CANCELLED_MESSAGE = "Cancelled. The same command resumes."
+PATIENCE = 2.0
+"""Seconds after a signal until a command ends in the middle of a slow operation of Blender, as a render."""
 _Commands = argparse._SubParsersAction  # argparse has no public name for it
 
 
@@ -53,11 +59,13 @@ def main(arguments: list[str]) -> int:
     except SystemExit as stop:  # argparse has printed help or an error
         return int(stop.code or 0)
     try:
-        return args.command(args)
+        with _interrupts(patience=None if args.command is _train else PATIENCE):
+            return args.command(args)
     except LodgsError as error:
         _print(f"error: {error}")
         return BAD_INPUT
     except KeyboardInterrupt:
+        _print(CANCELLED_MESSAGE)
         return CANCELLED
     except Exception as error:
         described = describe_system_error(error)
@@ -169,8 +177,7 @@ def _train(args: argparse.Namespace) -> int:
     root = _import_for(job)
     job_settings.apply_job(root.lodgs.training, job)  # for the panel when the .blend is opened
     watch = jobs.start_or_resume(root, job)
-    with _interrupts(signal.SIGINT, signal.SIGTERM):
-        jobs.follow(watch, _ProgressBar())
+    jobs.follow(watch, _ProgressBar())
     for line in summary_lines(watch.summary):
         _print(line)
     for warning in watch.warnings:
@@ -184,7 +191,7 @@ def _train(args: argparse.Namespace) -> int:
         _print(watch.folder.log_tail())
         return CRASHED
     if watch.state == "cancelled":
-        _print("Cancelled. The same command resumes.")
+        _print(CANCELLED_MESSAGE)
         return CANCELLED
     if args.export:
         write_bundle(args.export, scenes.read_levels(root))
@@ -284,16 +291,11 @@ def _capture(args: argparse.Namespace) -> int:
         _print(f"{name} needs a GPU, also in background mode. If Blender crashes now, use Cycles.")
     if warning := noise_warning(scene):
         warn(warning)
-    try:
-        with _interrupts(signal.SIGINT):  # SIGTERM ends a slow render at once, as the panel needs
-            count = render_views(bpy.context, folder, width, height, args.range, report, warn)
-            if args.range:
-                _print(f"{folder}: views {args.range[0]} to {min(args.range[1], count)} of {count}")
-            else:
-                _print(write_model(folder))
-    except KeyboardInterrupt:
-        _print("Cancelled. The same command resumes.")
-        return CANCELLED
+    count = render_views(bpy.context, folder, width, height, args.range, report, warn)
+    if args.range:
+        _print(f"{folder}: views {args.range[0]} to {min(args.range[1], count)} of {count}")
+    else:
+        _print(write_model(folder))
     return DONE
 
 
@@ -398,12 +400,37 @@ class _ProgressBar:
 
 
 @contextmanager
-def _interrupts(*numbers: int):
-    """Make signals raise KeyboardInterrupt; by default background Blender exits immediately."""
+def _interrupts(patience: float | None):
+    """Make SIGINT and SIGTERM raise KeyboardInterrupt; by default background Blender exits immediately.
+
+    Python hears a signal only between Blender's operations, so a thread ends a process that is still busy.
+
+    Args:
+        patience: seconds from a signal until the process ends with exit code 3. None: it is never ended.
+    """
+    numbers = signal.SIGINT, signal.SIGTERM
     previous = [signal.signal(number, signal.default_int_handler) for number in numbers]
+    receiver, sender = socket.socketpair()
+    sender.setblocking(False)
+    wakeup = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
+    ended = threading.Event()
+
+    def end_late() -> None:
+        while number := receiver.recv(1):  # empty: the sender is closed
+            if number[0] in numbers and patience is not None and not ended.wait(patience):
+                _print(CANCELLED_MESSAGE)
+                os._exit(CANCELLED)
+
+    thread = threading.Thread(target=end_late, daemon=True)
+    thread.start()
     try:
         yield
     finally:
+        ended.set()
+        signal.set_wakeup_fd(wakeup)
+        sender.close()
+        thread.join()
+        receiver.close()
         for number, handler in zip(numbers, previous, strict=True):
             if handler is not None:  # None: the handler was not set by Python and cannot be restored
                 signal.signal(number, handler)

@@ -240,6 +240,33 @@ def test_signals_cancel_the_run(bpy, fake, tmp_path, number):
     assert last["event"] == "cancelled"
 
 
+@pytest.mark.slow
+def test_sigterm_ends_a_slow_render_with_exit_code_3(bpy, fake, tmp_path):
+    """The render would take hours. Nothing half-written remains."""
+    fake()
+    bpy.ops.mesh.primitive_cube_add()
+    scene = bpy.context.scene
+    scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", 1 << 20, False
+    scene.cycles.use_adaptive_sampling = False
+    blend, out = tmp_path / "scene.blend", tmp_path / "out"
+    bpy.ops.wm.save_as_mainfile(filepath=str(blend))
+    words = ["capture", blend, "--out", out, "--size", "640x480", "--around", "--views", "4"]
+    command = [sys.executable, "-c", COMMAND, *map(str, words)]
+    log = tmp_path / "log"
+    with open(log, "w") as errors, subprocess.Popen(command, stderr=errors) as process:
+        end = time.monotonic() + 60
+        while "View 1 of 4" not in log.read_text():
+            assert time.monotonic() < end and process.poll() is None, log.read_text()
+            time.sleep(0.05)
+        process.send_signal(signal.SIGTERM)
+        try:
+            assert process.wait(20) == 3
+        finally:
+            process.kill()
+    assert log.read_text().count("Cancelled. The same command resumes.") == 1
+    assert not [path for path in out.rglob("*") if path.is_file()]
+
+
 def test_the_trainer_continues_after_blender_is_killed(bpy, lodgs, fake, tmp_path):
     fake("slow")
     with _start_command(tmp_path / "run") as process:
