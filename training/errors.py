@@ -25,7 +25,7 @@ class LodgsError(Exception):
 
 
 class SystemProblem(LodgsError):
-    """A failure of the computer, such as a lost disk or too many open files, whichever file it concerns."""
+    """A failure of the computer, such as a lost disk or too many open files."""
 
 
 def describe_system_error(error: BaseException) -> LodgsError | None:

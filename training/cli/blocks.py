@@ -95,7 +95,7 @@ def _plan(options: argparse.Namespace) -> int:
 
     job = job_from_options(options).resolved()
     folder = RunFolder(job.out)
-    scene = read_planned_scene(job, lambda scene: _with_points(scene, job, folder))
+    scene = read_planned_scene(job, lambda scene: _ensure_points(scene, job, folder))
     if options.block_splats or options.block_memory:
         if job.cells:
             raise LodgsError(
@@ -118,15 +118,15 @@ def _plan(options: argparse.Namespace) -> int:
     return 0
 
 
-def _with_points(scene: Scene, job: Job, folder: RunFolder) -> Scene:
+def _ensure_points(scene: Scene, job: Job, folder: RunFolder) -> Scene:
     if len(scene.points):
         return scene
-    from ..runs.data import with_points  # imports torch
+    from ..runs.data import ensure_points  # imports torch
 
     def report(kind: str, message: str, **values: object) -> None:
         print(message if kind == "status" else f"{kind}: {message}", file=sys.stderr, flush=True)
 
-    return with_points(scene, job, folder, report)
+    return ensure_points(scene, job, folder, report)
 
 
 def _train(options: argparse.Namespace) -> int:

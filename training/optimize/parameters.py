@@ -37,7 +37,7 @@ class Parameters:
     scale_threshold: bool = setting(
         True,
         "Multiply gradient thresholds by the square root of one megapixel over the photos' size, so that "
-        "they mean the same at every size. Disable for the thresholds of the papers as published.",
+        "they mean the same at every size. Disable to use the papers' thresholds unchanged.",
     )
     min_opacity: float = setting(0.005, "Remove splats below this opacity.", high=1)
     sh_degree: int = setting(3, "Degree of spherical harmonics for view-dependent colour, 0 to 3.", high=3)
@@ -187,7 +187,7 @@ class DensityParameters(Parameters):
         "ones.",
     )
     densify_from: int = setting(
-        0, "First step, of a level in FLoD, in which splats are added or faint ones removed.", unit="steps"
+        0, "First step of density control. In FLoD, counted from the start of each level.", unit="steps"
     )
     prune_interval: int = setting(
         100, "Steps between removals of transparent splats. 0 disables.", unit="steps"

@@ -72,7 +72,7 @@ def training_data(
     parameters = job.resolved_parameters()
     add_depths = pixels and parameters.depth == "metric" and not job.cell and not job.cells
     if not (add_depths and all(camera.depth is not None for camera in full_scene.cameras)):
-        full_scene = with_points(full_scene, job, folder, report)
+        full_scene = ensure_points(full_scene, job, folder, report)
     region = Region.read(Path(job.cell)) if job.cell else None
     scene = full_scene if region is None else region.select_views(full_scene)
     if pixels:
@@ -113,7 +113,7 @@ def training_data(
     )  # fmt: skip
 
 
-def with_points(scene: Scene, job: Job, folder: RunFolder, report: Callable[..., None]) -> Scene:
+def ensure_points(scene: Scene, job: Job, folder: RunFolder, report: Callable[..., None]) -> Scene:
     """Return a job's scene with points; triangulate them first if it has none, once per scene.
 
     Args:

@@ -50,7 +50,7 @@ from .blocks.plan import write_plan
 from .blocks.train import BlocksStopped, train_blocks
 from .blocks.workers import workers
 from .checkpoints import read_newest, remove_checkpoints, write_checkpoint
-from .data import training_data, with_points
+from .data import ensure_points, training_data
 from .events import PROTOCOL, EventWriter, event_line
 from .failures import BAD_INPUT, CANCELLED, CRASHED, DONE, describe_error
 from .folder import RunFolder
@@ -132,7 +132,7 @@ def _train(job: Job, folder: RunFolder, events: EventWriter, placement: dict[str
         if job.cells:
             merged = folder.bundle if merged_is_result else folder.merged
             division = write_plan(
-                job, folder, add_points=lambda scene: with_points(scene, job, folder, events)
+                job, folder, add_points=lambda scene: ensure_points(scene, job, folder, events)
             )
             with workers(**placement) as submit:
                 train_blocks(division, merged, submit, events)

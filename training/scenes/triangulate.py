@@ -1,4 +1,4 @@
-"""Points for scenes that bring cameras without points: triangulated by COLMAP, through pycolmap.
+"""Triangulate points of scenes that have cameras but no points, with COLMAP through pycolmap.
 
 .triangulated/<digest>/  sparse/       model with the scene's cameras, the points and their observations
                          summary.json  sentences about the result
@@ -33,7 +33,7 @@ from .write_colmap import write_model
 CACHE_FOLDER = ".triangulated"
 """Folder inside a scene's folder that caches triangulated points for all runs."""
 MAX_SECONDS = 900.0
-"""Maximum time for features and matches: about 1000 photos on two cores. What is matched by then is used."""
+"""Maximum time for features and matches: about 1000 photos on two cores. Later photos are left out."""
 MAX_SIDE = 1000
 """Longer side in pixels of the photos for feature extraction."""
 DETAILED_PHOTOS = 100

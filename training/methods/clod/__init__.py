@@ -64,7 +64,7 @@ class ClodParameters(SplatParameters):
     )
     count_of: str = setting(
         "view",
-        "Splats of which the drawn ones are a fraction: those in view, or all (CLoD-GS: N_total).",
+        "Splats that count as 100 %: those in view, or all (CLoD-GS: N_total).",
         choices=("view", "all"),
     )
     prune_undrawn: bool = setting(

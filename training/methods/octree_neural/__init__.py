@@ -44,9 +44,9 @@ class NeuralOctreeParameters(OctreeParameters):
     )
     success_threshold: float = setting(
         0.0,
-        "Gaussians grow once half of this fraction of 'grow_interval' views drew them, anchors are removed "
-        "once this fraction did, and an anchor's bias follows its mean gradient (Octree-GS: 0.8). 0 decides "
-        "by the views of each interval alone.",
+        "Fraction of 'grow_interval' views that must draw an anchor before it can be removed; Gaussians grow "
+        "after half as many (Octree-GS: 0.8). The bias then follows the mean gradient. 0 decides by the "
+        "views of each interval alone.",
     )
     lr_features: float = setting(7.5e-3, "Learning rate of the features.")
     lr_offsets: float = setting(
