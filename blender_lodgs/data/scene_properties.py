@@ -48,7 +48,7 @@ def _can_be_camera(self, obj: bpy.types.Object) -> bool:
     return not obj.lodgs.is_root
 
 
-def _is_linked(obj: object, kind: str) -> bool:
+def _is_in_collection(obj: object, kind: str) -> bool:
     """Return whether a value is an object of a type in a collection; damaged files refer to other data."""
     return isinstance(obj, bpy.types.Object) and obj.type == kind and bool(obj.users_collection)
 
@@ -80,7 +80,7 @@ class SplatLevel(bpy.types.PropertyGroup):
     @property
     def exists(self) -> bool:
         """False if the artist deleted the level's object or changed its type; the list keeps the entry."""
-        return _is_linked(self.object, "POINTCLOUD")
+        return _is_in_collection(self.object, "POINTCLOUD")
 
 
 class SplatTable(bpy.types.PropertyGroup):
@@ -96,7 +96,7 @@ class SplatTable(bpy.types.PropertyGroup):
     @property
     def exists(self) -> bool:
         """False if the artist deleted the table's object."""
-        return _is_linked(self.object, "MESH")
+        return _is_in_collection(self.object, "MESH")
 
 
 class SplatStream(bpy.types.PropertyGroup):

@@ -285,7 +285,7 @@ def _parse_observations_txt(file: IO[bytes], names: Collection[str]) -> dict[str
 
 
 def _record_count(data: mmap.mmap, least: int) -> int:
-    """Return the promised number of records, of at least the given bytes each."""
+    """Return the declared number of records, of at least the given bytes each."""
     (count,) = struct.unpack_from("<Q", data)
     if 8 + count * least > len(data):
         raise ValueError(f"it is too short for {count} records")

@@ -1,6 +1,6 @@
 """Checks of compressed splat files before splat-transform unpacks them into memory.
 
-A file must be large enough for the splats that it promises, and must not unpack to more than they need.
+A file must be large enough for the splats that it declares, and must not unpack to more than they need.
 """
 
 from __future__ import annotations
