@@ -6,6 +6,7 @@ import bpy
 
 from .. import extension
 from ..data import importing, scenes
+from ..data.original_place import original_place
 from ..runs import background_capture, processes
 from ..viewport import coverage
 from .base import report_errors
@@ -80,9 +81,11 @@ class LODGS_OT_import_capture(bpy.types.Operator):
     @report_errors
     def execute(self, context):
         folder = background_capture.capture_folder(context.scene)
+        place = original_place(context.scene)
         root = importing.import_colmap(
             context, folder, upright=False, warn=lambda message: self.report({"WARNING"}, message)
         )
+        place.place(root)
         self.report({"INFO"}, f"'{root.name}': {scenes.contents(root)}")
         return {"FINISHED"}
 

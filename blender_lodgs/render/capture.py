@@ -22,6 +22,7 @@ from ...training.scenes.rendered_views import CAMERAS, DEPTHS, IMAGES
 from .. import compat, extension
 from ..data import photographs, roots, viewpoints
 from ..data.cameras import scene_camera, view_of
+from ..data.original_place import original_place
 from ..runs import environment, processes
 from .engine import LodgsEngine
 
@@ -72,13 +73,15 @@ def render_views(
         raise LodgsError(f"Cannot capture to {folder}: it contains another scene.", "Choose another folder.")
     _mark(folder)
     _prepare(context.scene, width, height)
+    place = original_place(context.scene, warn)
     first, last = only or (1, len(shots))
     for number in range(first, min(last, len(shots)) + 1):
         name = names[number - 1]
         camera, near = _set_camera(context, shots[number - 1], width, height)
+        camera = place.local_camera(camera)
         file = folder / CAMERAS / f"{name}.json"
         if file.exists():
-            if not _is_same_view(camera, read_camera(file)[0]):
+            if not _is_same_view(camera, read_camera(file)[0].moved(-place.origin)):
                 raise _different_views(folder)
             continue
         on_view(number, len(shots))
@@ -87,7 +90,7 @@ def render_views(
                 f"The rendering of view {number} was cancelled.", "Start the capture again to continue."
             )
         _save(context.scene, folder, name, (width, height))
-        write_camera(file, camera, near)  # last, as it marks the view as complete
+        write_camera(file, camera.moved(place.origin), near)  # last, as it marks the view as complete
     return len(shots)
 
 

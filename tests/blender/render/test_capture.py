@@ -1,5 +1,6 @@
 """Capture of a Blender scene as a COLMAP scene: exact cameras, and depths and points on its surfaces."""
 
+import json
 import os
 import subprocess
 import time
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from training.scenes.cameras import read_camera_folder
+from training.scenes.colmap_model import read_points
 from training.scenes.images import image_size
 
 pytestmark = pytest.mark.one_blender
@@ -427,6 +429,55 @@ def test_compositor_without_an_output_is_reported(bpy, scene, capture, tmp_path,
     assert capture("--around", "--views", "2", "--range", "1-2") == 2
     assert "connect the compositor's output" in capfd.readouterr().err
     assert not [*(tmp_path / "out").glob("cameras/*")]
+
+
+@needs_trainer
+def test_capture_beside_a_georeferenced_scene_has_the_original_place(bpy, lodgs, scene, capture, tmp_path):
+    """Expected values: the original point of a position is rotation⁻¹ (position - location) + origin."""
+    from mathutils import Matrix
+
+    importing, origin = lodgs("data.importing"), np.array([500_000.0, 4_200_000.0, 300.0])
+    with importing.new_scene(bpy.context, "survey") as root:
+        root.lodgs.meta = json.dumps({"origin": origin.tolist()})
+    turn = Matrix.Rotation(radians(30), 4, "Z") @ Matrix.Rotation(radians(-90), 4, "X")
+    root.matrix_basis = Matrix.Translation((5, -3, 2)) @ turn
+    rotation, location = np.array(turn)[:3, :3], np.array([5, -3, 2])
+    cameras = [new_camera(bpy, (x, -9, 3), (75, 0, 0)) for x in (0, 1, 2)]
+    places = [np.array(camera.location) for camera in cameras]
+    assert capture("--cameras", "--range", "1-1") == 0
+    assert capture("--cameras") == 0, "the first view is recognised"
+    views, _ = read_camera_folder(tmp_path / "out" / "cameras")
+    for view, place in zip(views, places, strict=True):
+        expected = rotation.T @ (place - location) + origin
+        np.testing.assert_allclose(view.center, expected, rtol=0, atol=1e-5)
+    points, _, _ = read_points(tmp_path / "out" / "sparse" / "0")
+    in_blender = (points - origin) @ rotation.T + location
+    on_ground = np.abs(in_blender[:, 2]) < 1e-3
+    on_a_cube = (in_blender[:, 2] > 0) & (np.abs(in_blender[:, :2] - (1.25, 0.75)) < 2.3).all(axis=1)
+    is_sky = np.linalg.norm(in_blender, axis=1) > 20
+    assert 0.9 <= (on_ground | on_a_cube).mean() < 1 and (on_ground | on_a_cube | is_sky).all()
+
+    bpy.context.scene.lodgs_capture.folder = str(tmp_path / "out")
+    assert bpy.ops.lodgs.import_capture() == {"FINISHED"}
+    imported = lodgs("data.roots").active_root(bpy.context)
+    assert lodgs("data.selection").origin_of(imported).any()
+    bpy.context.view_layer.update()
+    for view, place in zip(lodgs("data.photographs").views(imported), places, strict=True):
+        np.testing.assert_allclose(view.matrix_world.translation, place, atol=1e-4)
+
+
+def test_capture_beside_a_scaled_georeferenced_scene_keeps_the_place(
+    bpy, lodgs, scene, capture, tmp_path, capfd
+):
+    with lodgs("data.importing").new_scene(bpy.context, "survey") as root:
+        root.lodgs.meta = json.dumps({"origin": [5e5, 4e6, 0]})
+    root.scale = (2, 2, 2)
+    for x in (0, 1):
+        new_camera(bpy, (x, -9, 3), (75, 0, 0))
+    assert capture("--cameras", "--range", "1-2") == 0
+    assert "warning: The views have Blender's coordinates" in capfd.readouterr().err
+    views, _ = read_camera_folder(tmp_path / "out" / "cameras")
+    np.testing.assert_allclose([view.center for view in views], [(0, -9, 3), (1, -9, 3)], atol=1e-5)
 
 
 def test_nothing_is_rendered_without_a_trainer(bpy, scene, capture, tmp_path, capfd, monkeypatch):
