@@ -132,7 +132,7 @@ def ensure_points(scene: Scene, job: Job, folder: RunFolder, report: Callable[..
         else:
             report("status", message=stage)
 
-    return triangulate_scene(scene, folder.triangulated, report_stage, job.exposure)
+    return triangulate_scene(scene, folder.points_cache, report_stage, job.exposure)
 
 
 def _ignore(kind: str, **values: object) -> None:

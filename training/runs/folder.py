@@ -5,7 +5,8 @@
           model.npz (networks of a method that has them)
           views.json (views and photo sizes with which the run began)
           undistorted/ (photos without lens distortion, if the scene folder is read-only)
-          triangulated/ (points of a scene without points, if the scene folder is read-only)
+          triangulated/ (points of a scene without points, if the scene folder is read-only; parts of a
+          divided run use those of the divided run)
           blocks/ (runs of the parts of a scene in cells, and their merged bundle)
           captured/ (COLMAP scene rendered from splats that have no photos)
           base.ply, cameras/ (splats and views that Blender exported for the run)
@@ -89,6 +90,15 @@ class RunFolder:
                 f"Cannot create run folder {self.path}: {error.strerror}.",
                 "Choose a writable folder.",
             ) from error
+
+    @property
+    def points_cache(self) -> Path:
+        """Cache of triangulated points if the scene folder is read-only; parts share the divided run's."""
+        for parent in self.path.parents[:2]:
+            whole = RunFolder(parent.parent)
+            if parent == whole.blocks and whole.job.exists():
+                return whole.triangulated
+        return self.triangulated
 
     def reject_links(self) -> None:
         """Reject links in a run folder, which would redirect writes outside of it.

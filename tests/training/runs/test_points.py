@@ -5,15 +5,18 @@ import json
 import os
 import shutil
 import signal
+from pathlib import Path
 
 import pytest
 
 from tests.training.scenes.walls import write_walls
 from training.runs import train as training_loop
 from training.runs.blocks.plan import read_planned_scene
+from training.runs.data import ensure_points
 from training.runs.folder import RunFolder
 from training.runs.job import Job
 from training.scenes import triangulate
+from training.scenes.colmap import read_scene
 
 
 @pytest.fixture(scope="module")
@@ -79,3 +82,24 @@ def test_resumed_run_does_not_repeat_and_has_the_same_bits(walls, tmp_path, monk
     assert run.bundle.read_bytes() == RunFolder(tmp_path / "first").bundle.read_bytes()
     job = Job(str(walls), str(tmp_path / "cells"), method="3dgs", cells="1x1")
     assert len(read_planned_scene(job).points) > triangulate.MIN_POINTS
+
+
+def test_parts_of_a_read_only_scene_share_the_points(walls, tmp_path, monkeypatch):
+    scene_folder = Path(shutil.copytree(walls, tmp_path / "scene", ignore=shutil.ignore_patterns(".*")))
+    (scene_folder / triangulate.CACHE_FOLDER).write_text("a file, so that no folder can be created")
+    calls = []
+
+    def run_program(*arguments):
+        calls.append(arguments)
+        return "stopped by the test."
+
+    monkeypatch.setattr(triangulate.pycolmap_process, "run_program", run_program)
+    job = Job(str(scene_folder), str(tmp_path / "run"), method="flod", cells="2x1")
+    job.write(tmp_path / "run" / "job.toml")
+    run = RunFolder(tmp_path / "run")
+    for folder in (run, RunFolder(run.coarse), RunFolder(run.blocks / "2"), RunFolder(run.seams / "2")):
+        scene = ensure_points(read_scene(scene_folder), job, folder, lambda kind, **values: None)
+        assert len(scene.points) == triangulate.RANDOM_POINTS and len(calls) == 1
+    other = RunFolder(tmp_path / "blocks" / "1")  # the folder of another run's blocks
+    ensure_points(read_scene(scene_folder), job, other, lambda kind, **values: None)
+    assert len(calls) == 2 and other.triangulated.is_dir()
