@@ -21,7 +21,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     source.add_argument(
         "--from", dest="source", type=Path, metavar="DIR",
-        help=f"folder of an export, recognised by its files: {FORMAT_NAMES}",
+        help=f"folder of an export, recognised by its files: {FORMAT_NAMES}; or of a COLMAP scene that has "
+        "no points",
     )  # fmt: skip
     parser.add_argument(
         "--out", type=Path, metavar="DIR",
@@ -55,13 +56,16 @@ def run(options: argparse.Namespace) -> int:
 def _convert(options: argparse.Namespace) -> int:
     from ..scenes.colmap import read_scene
     from ..scenes.formats import convert_export
-    from ..scenes.triangulate import write_points
+    from ..scenes.triangulate import triangulate_scene, write_points
 
     export = convert_export(options.source, options.out)
     warnings, points = export.warnings, export.points
     scene = None if points else read_scene(export.folder)
     if scene is not None and any(camera.depth is None for camera in scene.cameras):
-        scene = write_points(scene, _print_progress)
+        if export.is_source:
+            scene = triangulate_scene(scene, export.folder, _print_progress)
+        else:
+            scene = write_points(scene, _print_progress)
         warnings, points = [*warnings, *scene.warnings], len(scene.points)
     for message in warnings:
         warn(message)

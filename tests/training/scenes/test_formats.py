@@ -377,6 +377,10 @@ def test_folders_without_export_are_rejected(tmp_path):
     write_transforms(tmp_path)
     convert_export(tmp_path)
     (tmp_path / "transforms.json").unlink()
+    (tmp_path / "sparse" / "0" / "points3D.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+        "end_header\n0 0 1\n"
+    )
     with pytest.raises(LodgsError, match="already is a COLMAP scene"):
         convert_export(tmp_path)
 

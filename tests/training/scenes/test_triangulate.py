@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from training.__main__ import main
 from training.scenes import triangulate
@@ -156,6 +157,44 @@ def test_command_writes_points(walls, tmp_path, capsys):
     assert f"6 views, {len(scene.points):,} points" in printed.out and "Triangulated" in printed.err
     assert np.median(surface_distance(scene.points)) < 0.01 and scene.warnings == []
     assert observations(scene, ["0.png"]) and [p.name for p in (tmp_path / "sparse").iterdir()] == ["0"]
+
+
+def test_command_adds_points_to_a_colmap_scene(walls, tmp_path, capsys):
+    source = Path(shutil.copytree(walls, tmp_path / "scene", ignore=shutil.ignore_patterns(".*")))
+    model = {path.name: path.read_bytes() for path in (source / "sparse" / "0").iterdir()}
+    assert main(["scene", "--from", str(source), "--out", str(tmp_path / "out")]) == 0
+    scene = read_scene(tmp_path / "out")
+    printed = capsys.readouterr()
+    assert f"out: 6 views, {len(scene.points):,} points, from COLMAP" in printed.out
+    assert "no points" not in printed.err
+    assert np.median(surface_distance(scene.points)) < 0.01 and scene.warnings == []
+    assert main(["scene", "--from", str(source)]) == 0
+    assert {path.name: path.read_bytes() for path in (source / "sparse" / "0").iterdir()} == model
+    np.testing.assert_array_equal(cached_points(read_scene(source)).points, scene.points)
+    assert main(["scene", "--from", str(tmp_path / "out")]) == 2
+    assert "already is a COLMAP scene" in capsys.readouterr().err
+
+
+def test_lens_is_kept_where_nothing_can_be_matched(tmp_path):
+    photos = [np.full((HEIGHT, WIDTH, 3), 90, np.uint8)] * 6
+    write_walls(tmp_path / "scene", photos, DISTORTION)
+    assert main(["scene", "--from", str(tmp_path / "scene"), "--out", str(tmp_path / "out")]) == 0
+    scene = read_scene(tmp_path / "out")
+    assert len(scene.distorted) == 6 and len(scene.points) == triangulate.RANDOM_POINTS
+
+
+def test_lens_of_a_turned_photo_is_that_of_its_camera(tmp_path):
+    walls = write_walls(tmp_path / "scene", [np.zeros((WIDTH, HEIGHT, 3), np.uint8)] * 6)  # stored upright
+    for path in (walls / "images").iterdir():
+        exif = Image.Exif()
+        exif[274] = 6
+        Image.new("RGB", (HEIGHT, WIDTH)).save(path, "JPEG", exif=exif)
+    scene = read_scene(walls)
+    (camera, lens), *_ = zip(scene.cameras, triangulate._lenses(scene), strict=True)
+    assert (lens.width, lens.height) == (HEIGHT, WIDTH)
+    assert (
+        lens.pinhole == (FOCAL, FOCAL, HEIGHT / 2, WIDTH / 2) == (camera.fx, camera.fy, camera.cx, camera.cy)
+    )
 
 
 def test_pairs_are_close_and_look_the_same_way():

@@ -17,7 +17,8 @@ import numpy as np
 
 from ...errors import LodgsError, SystemProblem
 from ...files import check_folder, link_or_copy
-from ..colmap import DEPTHS, MASKS, find_models
+from ..colmap import DEPTHS, MASKS, NO_POINTS, find_models, read_scene
+from ..colmap_model import read_cameras, read_poses
 from ..image_files import find_image_folder
 from ..images import image_size
 from ..view_selection import exclusion_messages, photo_turns
@@ -39,6 +40,7 @@ class ConvertedScene:
         source: name of the export's format.
         views, points: number of views and points.
         warnings: a sentence for each skipped or suspicious item.
+        is_source: whether the folder is the COLMAP scene that was given, whose model must not change.
     """
 
     folder: Path
@@ -46,6 +48,7 @@ class ConvertedScene:
     views: int
     points: int
     warnings: list[str]
+    is_source: bool = False
 
 
 def find_export(folder: Path) -> tuple[ModuleType, Path] | None:
@@ -84,7 +87,7 @@ def convert_export(folder: Path, out: Path | None = None) -> ConvertedScene:
     """Convert another program's export to a COLMAP scene with its model in ``sparse/0``.
 
     Args:
-        folder: folder of the export.
+        folder: folder of the export, or of a COLMAP scene without points.
         out: folder of the scene, which receives links to or copies of the photos. By default, the model is
             written next to the photos, which stay unchanged.
 
@@ -94,18 +97,20 @@ def convert_export(folder: Path, out: Path | None = None) -> ConvertedScene:
     folder = folder.absolute()
     check_folder(folder, "Choose the folder of another program's export.")
     export = find_export(folder)
-    if export is None:
-        if find_models(folder):
-            raise LodgsError(f"Cannot convert {folder}: it already is a COLMAP scene.", "Import it directly.")
+    if export is None and not find_models(folder):
         raise LodgsError(
             f"Cannot convert {folder}: its format is unknown.",
             f"Choose an export of {FORMAT_NAMES}, or the folder of a COLMAP scene.",
         )
-    module, path = export
     scene = folder if out is None else out
     if out is not None and out.is_dir() and find_models(out):
         raise LodgsError(f"Cannot write scene: {out} already holds a COLMAP scene.", "Choose another folder.")
-    exported = module.read(path)
+    if export is None:
+        name, path, exported = "COLMAP", folder, _read_model_without_points(folder)
+        if out is None:
+            return ConvertedScene(folder, name, len(exported.views), 0, exported.warnings, is_source=True)
+    else:
+        name, path, exported = export[0].NAME, export[1], export[0].read(export[1])
     views, excluded = _usable_views(exported)
     if not views:
         reason = f" {excluded[0][0]}: {excluded[0][1]}" if excluded else ""
@@ -119,7 +124,7 @@ def convert_export(folder: Path, out: Path | None = None) -> ConvertedScene:
         )
     points, colors = exported.points, exported.colors
     if not len(points) and all(view.has_depth for view in views):
-        warnings.append(f"{module.NAME} has no points. Training creates them from the depth maps.")
+        warnings.append(f"{name} has no points. Training creates them from the depth maps.")
     try:
         _write(scene, views, points, colors)
     except OSError as error:
@@ -127,7 +132,33 @@ def convert_export(folder: Path, out: Path | None = None) -> ConvertedScene:
             f"Cannot write COLMAP scene {scene}: {error.strerror or error}.",
             "Choose another output folder (lodgs scene --from DIR --out DIR).",
         ) from error
-    return ConvertedScene(scene, module.NAME, len(views), len(points), warnings)
+    return ConvertedScene(scene, name, len(views), len(points), warnings)
+
+
+def _read_model_without_points(folder: Path) -> ExportedScene:
+    """Return the views of a COLMAP scene.
+
+    Raises:
+        LodgsError: as ``read_scene``, or the scene has points.
+    """
+    scene = read_scene(folder)
+    if len(scene.points):
+        raise LodgsError(f"Cannot convert {folder}: it already is a COLMAP scene.", "Import it directly.")
+    lenses = read_cameras(scene.model)
+    poses = {pose.name.replace("\\", "/"): pose for pose in read_poses(scene.model)}
+    views = [
+        ExportedView(
+            camera.image,
+            lenses[poses[camera.name].camera_id],
+            poses[camera.name].world_to_camera,
+            camera.mask,
+            camera.depth,
+        )
+        for camera in scene.cameras
+        if camera.image is not None
+    ]
+    warnings = [warning for warning in scene.warnings if not warning.startswith(NO_POINTS)]
+    return ExportedScene(views, warnings=warnings)
 
 
 def _usable_views(exported: ExportedScene) -> tuple[list[ExportedView], list[tuple[str, str]]]:
