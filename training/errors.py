@@ -38,6 +38,14 @@ def describe_system_error(error: BaseException) -> LodgsError | None:
     return SystemProblem(f"{action}: {error.strerror or error}.", system_remedy(error))
 
 
+def system_reason(error: OSError) -> str:
+    """Return the reason of a system error, with the file if the error names one, without a final period."""
+    path = error.filename2 or error.filename
+    if not error.strerror:
+        return str(error)
+    return f"{error.strerror} ({printable(path)})" if path else error.strerror
+
+
 def system_remedy(error: OSError, default: str = "") -> str:
     """Return the remedy for a full disk or an exceeded limit, or else the default."""
     if error.errno in DISK_FULL:

@@ -87,6 +87,17 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
 
 
 @contextmanager
+def name_errors(path: Path) -> Iterator[None]:
+    """Add a path to system errors in the block that name no file, as those of a full disk."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None:
+            error.filename = str(path)
+        raise
+
+
+@contextmanager
 def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
     """Yield a new folder, and remove it when the block ends.
 

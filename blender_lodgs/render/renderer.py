@@ -24,7 +24,7 @@ import bpy
 import numpy as np
 
 from ...training.editing.look import Looks, looks_as_dicts
-from ...training.errors import LodgsError
+from ...training.errors import LodgsError, system_reason
 from ...training.lod.query import LodQuery
 from ...training.render import wire
 from ...training.scenes.cameras import Camera, camera_to_dict
@@ -203,7 +203,7 @@ class Renderer:
             if self.process.poll() is not None or isinstance(error, BrokenPipeError):
                 raise RendererStopped from error
             raise LodgsError(
-                f"Cannot use the renderer's files in {self._folder}: {error.strerror or error}.",
+                f"Cannot use the renderer's files in {self._folder}: {system_reason(error)}.",
                 "Free some disk space.",
             ) from error
 

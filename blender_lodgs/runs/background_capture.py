@@ -8,7 +8,7 @@ from pathlib import Path
 
 import bpy
 
-from ...training.errors import LodgsError
+from ...training.errors import LodgsError, system_reason
 from ...training.scenes.rendered_views import CAMERAS
 from .. import extension
 from ..data import viewpoints
@@ -132,7 +132,7 @@ def start(context: bpy.types.Context, warn: viewpoints.Warn = print) -> Backgrou
         ]
         process = processes.spawn(command, log=log, output=folder / "capture.out")
     except (OSError, RuntimeError) as error:
-        reason = getattr(error, "strerror", None) or str(error).strip()
+        reason = system_reason(error) if isinstance(error, OSError) else str(error).strip()
         raise LodgsError(f"Cannot capture to {folder}: {reason}.", "Choose another folder.") from error
     current = BackgroundCapture(folder, count, process, log, copy)
     return current

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import bpy
 
-from ...training.errors import LodgsError
+from ...training.errors import LodgsError, system_reason
 from ...training.lod.selection import complete_splats
 from ...training.runs.folder import RunFolder
 from ...training.runs.job import CHANGEABLE, Job
@@ -132,7 +132,7 @@ def cancel(root: bpy.types.Object) -> None:
             watch.folder.request_cancel()
         except OSError as error:
             raise LodgsError(
-                f"Cannot write to {watch.folder.path}: {error.strerror}.",
+                f"Cannot cancel the run in {watch.folder.path}: {system_reason(error)}.",
                 "Cancel again to kill the trainer.",
             ) from error
     else:

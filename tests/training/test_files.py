@@ -4,14 +4,19 @@ import errno
 import os
 import subprocess
 import sys
+from contextlib import contextmanager
 from pathlib import Path
 from threading import Thread
 
+import numpy as np
 import pytest
 
 from training import files
-from training.errors import LodgsError
+from training.errors import LodgsError, system_reason
 from training.files import atomic_write, names_device, network_share, open_regular
+from training.render.wire import write_set
+from training.scenes.images import write_png
+from training.scenes.write_colmap import write_model
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -43,6 +48,44 @@ def test_full_disk_raises_one_sentence(tmp_path):
     ):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     assert os.listdir(tmp_path) == []
+
+
+@contextmanager
+def file_size_limit(size: int):
+    resource = pytest.importorskip("resource")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+def write_points(folder: Path) -> None:
+    write_model(folder / "0", [], [], np.zeros((99, 3)), np.zeros((99, 3), np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("write", "name"),
+    [
+        (write_points, "0/points3D.bin"),
+        (lambda folder: write_png(folder / "a.png", np.zeros((50, 50, 3), np.uint8)), "a.png"),
+        (lambda folder: write_set(folder / "a.set", [np.zeros(500)]), "a.set"),
+    ],
+)
+def test_failed_writes_name_their_file(tmp_path, monkeypatch, write, name):
+    monkeypatch.setattr("training.scenes.images.zlib.compress", lambda data, level: data)  # a large file
+    with pytest.raises(OSError) as caught, file_size_limit(1000):
+        write(tmp_path)
+    assert system_reason(caught.value) == f"File too large ({tmp_path / name})"
+    assert not (tmp_path / "0").exists()
+
+
+def test_reason_names_the_target_of_a_failed_copy(tmp_path):
+    with pytest.raises(OSError) as caught:
+        os.replace(tmp_path, tmp_path / "nowhere" / "a")
+    assert system_reason(caught.value) == f"No such file or directory ({tmp_path / 'nowhere' / 'a'})"
+    assert system_reason(OSError("lost")) == "lost"
 
 
 def test_parent_that_is_a_file_raises_one_sentence(tmp_path):

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import LodgsError
+from ..files import name_errors
 from ..splats.gaussians import Splats
 
 PROTOCOL = 3
@@ -78,7 +79,7 @@ def digest(columns: list[np.ndarray]) -> tuple[tuple[int, int], ...]:
 
 def write_set(path: Path, columns: list[np.ndarray]) -> None:
     """Write the columns of :func:`pack_set`."""
-    with open(path, "wb") as file:
+    with name_errors(path), open(path, "wb") as file:
         for column in columns:
             file.write(column.data)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from ..errors import LodgsError
+from ..errors import LodgsError, system_reason
 from ..rasterize import Gaussians, cpu_fallback_reason, rasterize
 from ..scenes.cameras import Camera, read_camera_folder
 from ..scenes.colmap import read_scene
@@ -118,7 +118,7 @@ def write_scene(
         temporary.rename(scene)
     except OSError as error:
         raise LodgsError(
-            f"Cannot write scene {scene}: {error.strerror or error}.",
+            f"Cannot write scene {scene}: {system_reason(error)}.",
             "Free some disk space or choose another folder.",
         ) from error
     finally:

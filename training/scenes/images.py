@@ -16,6 +16,7 @@ import numpy as np
 
 from ..documents import open_file
 from ..errors import LodgsError, is_system_problem, read_error
+from ..files import name_errors
 from ..splats.packed_files import webp_size
 from .color import srgb_from_linear
 from .exr import MAGIC, Truncated, exr_size, read_parts
@@ -491,10 +492,7 @@ def write_png(path: Path, codes: np.ndarray) -> None:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
     head = struct.pack(">IIBBBBB", width, height, 8, {3: 2, 4: 6}[channels], 0, 0, 0)
-    path.write_bytes(
-        b"\x89PNG\r\n\x1a\n"
-        + chunk(b"IHDR", head)
-        + chunk(b"sRGB", b"\0")
-        + chunk(b"IDAT", zlib.compress(lines.tobytes(), 6))
-        + chunk(b"IEND", b"")
-    )
+    data = zlib.compress(lines.tobytes(), 6)
+    chunks = chunk(b"IHDR", head), chunk(b"sRGB", b"\0"), chunk(b"IDAT", data), chunk(b"IEND", b"")
+    with name_errors(path):
+        path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunks))

@@ -19,6 +19,8 @@ from contextlib import suppress
 from pathlib import Path
 from types import ModuleType
 
+from ..files import name_errors
+
 _MIN_FREE_BYTES = 1 << 18
 """Free space below which a disk counts as full."""
 CHECK_SECONDS = 2.0
@@ -140,7 +142,7 @@ def _kill_on_full_disk(child: subprocess.Popen[str], folder: Path) -> None:
 
 def _require_free_space(folder: Path) -> None:
     """Raise OSError if the disk is full: COLMAP would crash, hang or write incomplete images."""
-    with tempfile.TemporaryFile(dir=folder) as file:
+    with name_errors(folder), tempfile.TemporaryFile(dir=folder) as file:
         file.write(os.urandom(_MIN_FREE_BYTES))
         file.flush()
         os.fsync(file.fileno())

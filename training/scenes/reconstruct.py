@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import LodgsError, SystemProblem
+from ..errors import LodgsError, SystemProblem, system_reason
 from ..files import atomic_write, check_folder, link_or_copy
 from . import pycolmap_process
 from .colmap import MASKS, find_models
@@ -136,7 +136,7 @@ def reconstruct(
         _install_model(work, out)
     except OSError as error:
         raise LodgsError(
-            f"Cannot write scene {out}: {error.strerror or error}.",
+            f"Cannot write scene {out}: {system_reason(error)}.",
             "Free disk space or choose another folder.",
         ) from error
     return ReconstructionResult(

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import LodgsError
+from ..errors import LodgsError, system_reason
 from .cameras import MAX_COORDINATE, Camera, read_camera_folder
 from .colmap import DEPTHS
 from .exr import read_parts
@@ -112,7 +112,7 @@ def write_rendered_model(
         (temporary / "sparse").rename(folder / "sparse")
     except OSError as error:
         raise LodgsError(
-            f"Cannot write the model in {folder}: {error.strerror or error}.", "Free disk space."
+            f"Cannot write the model in {folder}: {system_reason(error)}.", "Free disk space."
         ) from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)

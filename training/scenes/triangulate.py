@@ -18,7 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from ..documents import read_json
-from ..errors import LodgsError, SystemProblem
+from ..errors import LodgsError, SystemProblem, system_reason
+from ..files import name_errors
 from . import pycolmap_process
 from .cameras import Camera
 from .colmap import NO_POINTS, Scene
@@ -95,7 +96,7 @@ def triangulate_scene(scene: Scene, fallback: Path, report: Report, exposure: fl
         return _with_points(scene, target, report)
     except OSError as error:
         raise LodgsError(
-            f"Cannot triangulate points of {scene.folder}: {error.strerror or error}.",
+            f"Cannot triangulate points of {scene.folder}: {system_reason(error)}.",
             "Check the images and the free disk space.",
         ) from error
 
@@ -130,7 +131,7 @@ def write_points(scene: Scene, report: Report) -> Scene:
             return replace(_with_points(scene, result, report), point_model=None)
     except OSError as error:
         raise LodgsError(
-            f"Cannot write points to {scene.model}: {error.strerror or error}.", "Free disk space."
+            f"Cannot write points to {scene.model}: {system_reason(error)}.", "Free disk space."
         ) from error
 
 
@@ -238,7 +239,8 @@ def _triangulate(scene: Scene, work: Path, report: Report, exposure: float) -> P
     folder.mkdir()
     os.replace(work / ("sparse" if points >= MIN_POINTS else "random"), folder / "sparse")
     summary = json.dumps(_summarize(scene, result, problem))
-    (folder / _SUMMARY).write_text(summary, encoding="utf-8")
+    with name_errors(folder / _SUMMARY):
+        (folder / _SUMMARY).write_text(summary, encoding="utf-8")
     return folder
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import LodgsError
+from ..errors import LodgsError, system_reason
 from . import pycolmap_process
 from .cameras import Camera
 from .colmap import DEPTHS, MASKS, Scene, read_scene
@@ -53,7 +53,7 @@ def undistort_scene(scene: Scene, cache: Path) -> Scene:
             _undistort_into(target, scene)
     except OSError as error:
         raise LodgsError(
-            f"Cannot undistort {scene.folder}: {error.strerror or error}.",
+            f"Cannot undistort {scene.folder}: {system_reason(error)}.",
             "Check the images and the free disk space.",
         ) from error
     return _read_cached(target, scene)

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import LodgsError
+from ..files import name_errors
 from ..splats.origin import NO_ORIGIN
 from ..splats.similarity import Similarity
 from .cameras import Camera
@@ -151,7 +152,7 @@ def write_model(
             ("images.bin", len(poses), images),
             ("points3D.bin", len(points), [_point_records(points, colors, observations)]),
         ):
-            with open(temporary / file, "wb") as stream:
+            with name_errors(model / file), open(temporary / file, "wb") as stream:
                 stream.writelines([struct.pack("<Q", count), *records])
                 stream.flush()
                 os.fsync(stream.fileno())  # some disks report only now that they are full

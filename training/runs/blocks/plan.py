@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import LodgsError
+from ...errors import LodgsError, system_reason
 from ...files import temporary_folder
 from ...lod.rule import resolve_rule
 from ...methods import method_info
@@ -275,7 +275,7 @@ def write_plan(
                 shutil.move(temporary.blocks, folder.blocks)
         except OSError as error:
             raise LodgsError(
-                f"Cannot write blocks to {folder.path}: {error.strerror or error}.",
+                f"Cannot write blocks to {folder.path}: {system_reason(error)}.",
                 "Choose a writable folder on a disk with free space.",
             ) from error
     return read_plan(folder)

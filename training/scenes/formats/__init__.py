@@ -15,7 +15,7 @@ from types import ModuleType
 
 import numpy as np
 
-from ...errors import LodgsError, SystemProblem
+from ...errors import LodgsError, SystemProblem, system_reason
 from ...files import check_folder, link_or_copy
 from ..colmap import DEPTHS, MASKS, NO_POINTS, find_models, read_scene
 from ..colmap_model import read_cameras, read_poses
@@ -129,7 +129,7 @@ def convert_export(folder: Path, out: Path | None = None) -> ConvertedScene:
         _write(scene, views, points, colors)
     except OSError as error:
         raise LodgsError(
-            f"Cannot write COLMAP scene {scene}: {error.strerror or error}.",
+            f"Cannot write COLMAP scene {scene}: {system_reason(error)}.",
             "Choose another output folder (lodgs scene --from DIR --out DIR).",
         ) from error
     return ConvertedScene(scene, name, len(views), len(points), warnings)
