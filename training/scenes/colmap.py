@@ -25,7 +25,14 @@ from .colmap_model import (
     read_points,
     read_poses,
 )
-from .image_files import MASK_SUFFIXES, ImageFiles, SidecarFiles, find_image_folder
+from .image_files import (
+    MASK_SUFFIXES,
+    MAX_FOLDERS,
+    ImageFiles,
+    SidecarFiles,
+    find_image_folder,
+    find_moved_images,
+)
 from .lenses import Intrinsics
 from .orientation import up_rotation
 from .view_selection import OUTLIER_FACTOR, ViewCollector, exclusion_messages, find_outliers, quote_name
@@ -36,8 +43,6 @@ DEPTH_SUFFIXES = ".exr", ".png", ".npy"
 """File name suffixes of depth maps."""
 MAX_DEPTH_CAMERAS = 500
 """Maximum number of cameras used to compute the median depth."""
-MAX_FOLDERS = 20_000
-"""Maximum number of folders searched for models."""
 NO_POINTS = "The scene has no points"
 """First words of the warning about a scene without points."""
 
@@ -233,7 +238,7 @@ def read_scene(
     model = _absolute(model)
     intrinsics, poses = _read_registered(model)
     if images is None:
-        images, _ = find_image_folder(folder, model, [pose.name for pose in poses])
+        images = _find_images(folder, model, [pose.name for pose in poses], warnings)
     images = _absolute(images)
     views = _view_collector(folder, images)
     for number, pose in enumerate(poses):
@@ -438,12 +443,25 @@ def _choose_model(folder: Path, images: Path | None, warnings: list[str]) -> tup
         if count < counts[0]:
             warnings.append(f"Skipped {model}: a smaller model of {count} views.")
     for model in models if images is None else ():
-        images, photos = find_image_folder(folder, model, [pose.name for pose in read_poses(model)])
+        photo_folder, photos = find_image_folder(folder, model, [pose.name for pose in read_poses(model)])
         if photos:
             if model != models[0]:
                 warnings.append(f"Used {model}: the photos of {models[0]} are missing.")
-            return model, images
+            return model, photo_folder
     return models[0], images
+
+
+def _find_images(folder: Path, model: Path, names: Sequence[str], warnings: list[str]) -> Path:
+    """Return the usual image folder of a model, or any other folder of the scene that has its photos."""
+    images, photos = find_image_folder(folder, model, names)
+    if photos:
+        return images
+    is_model = "sparse" in (folder.name, folder.parent.name)
+    scene = folder.parents[0 if folder.name == "sparse" else 1] if is_model else folder
+    moved = find_moved_images(scene, names)
+    if moved is not None:
+        warnings.append(f"Found the photos in {moved}.")
+    return moved or images
 
 
 def _require_complete_model(folder: Path) -> None:

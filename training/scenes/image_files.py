@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import unicodedata
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from ..errors import LodgsError
@@ -13,6 +14,10 @@ from .images import IMAGE_SUFFIXES
 
 MASK_SUFFIXES = (".png", *(suffix for suffix in IMAGE_SUFFIXES if suffix != ".png"))
 """Suffixes of masks, preferred ones first."""
+NO_PHOTOS = ".", "mask", "depth", "normal", "conf", "sparse"
+"""First letters of folders without photos, lower case."""
+MAX_FOLDERS = 20_000
+"""Maximum number of folders searched for files."""
 _COMMON_NAMES = ("images", "input", "image", "rgb", "photos")
 
 
@@ -46,13 +51,9 @@ class ImageFiles:
         file = self._folder / name
         if not is_file(file):
             if self._by_normal_name is None:
-                paths = (
-                    Path(parent) / entry
-                    for parent, _, names in os.walk(self._folder, onerror=raise_system_problem)
-                    for entry in names
-                )
                 self._by_normal_name = {
-                    _normalized(path.relative_to(self._folder).as_posix()): path for path in paths
+                    _normalized(path.relative_to(self._folder).as_posix()): path
+                    for path in walk_files(self._folder, onerror=raise_system_problem)
                 }
                 for other, path in self._by_normal_name.items():
                     if other.lower().endswith((*IMAGE_SUFFIXES, ".exr")):
@@ -139,12 +140,53 @@ def find_image_folder(folder: Path, model: Path, names: Sequence[str]) -> tuple[
 
 def _file_names(folder: Path) -> list[str]:
     """Return the names of the images in a folder and its subfolders, relative to it."""
-    found = ((Path(parent), name) for parent, _, names in os.walk(folder) for name in names)
-    return [
-        (parent / name).relative_to(folder).as_posix()
-        for parent, name in found
-        if name.lower().endswith((*IMAGE_SUFFIXES, ".exr"))
-    ]
+    return [path.relative_to(folder).as_posix() for path in walk_files(folder) if _is_image(path)]
+
+
+def find_moved_images(folder: Path, names: Iterable[str]) -> Path | None:
+    """Return the only folder below a scene that has most of the model's image names, or None.
+
+    Names match with any suffix and case.
+    """
+    parts_by_stem: dict[str, list[tuple[str, ...]]] = {}
+    for name in filter(_is_inside, names):
+        *parents, stem = PurePosixPath(_stem(name)).parts
+        parts_by_stem.setdefault(stem, []).append(tuple(parents))
+    counts: Counter[Path] = Counter()
+    for path in filter(_is_image, walk_files(folder, NO_PHOTOS)):
+        parents = _normalized(path.parent.as_posix()).casefold().split("/")
+        for parts in parts_by_stem.get(_stem(path.name), []):
+            if not parts or tuple(parents[-len(parts) :]) == parts:
+                counts[path.parents[len(parts)]] += 1
+    best = counts.most_common(2)
+    return best[0][0] if best and (len(best) == 1 or best[0][1] > best[1][1]) else None
+
+
+def walk_files(
+    folder: Path, skip: tuple[str, ...] = (), onerror: Callable[[OSError], None] | None = None
+) -> Iterator[Path]:
+    """Yield the files in a folder and its subfolders, also behind links, sorted by folder and name.
+
+    Each folder is visited once, and at most MAX_FOLDERS are; links to parent folders are not followed.
+
+    Args:
+        skip: first letters of folders to skip, lower case.
+        onerror: called with the error of a folder that cannot be read.
+    """
+    visited = {str(parent) for parent in Path(os.path.realpath(folder)).parents}
+    limit = len(visited) + MAX_FOLDERS
+    for parent, folders, names in os.walk(folder, onerror=onerror, followlinks=True):
+        real = os.path.realpath(parent)
+        if real in visited or len(visited) >= limit:
+            folders.clear()
+            continue
+        visited.add(real)
+        folders[:] = sorted(entry for entry in folders if not (skip and entry.lower().startswith(skip)))
+        yield from (Path(parent, name) for name in sorted(names))
+
+
+def _is_image(path: Path) -> bool:
+    return path.name.lower().endswith((*IMAGE_SUFFIXES, ".exr"))
 
 
 def _stems(names: Iterable[str]) -> set[str]:

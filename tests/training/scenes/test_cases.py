@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from training.errors import LodgsError
 from training.scenes.colmap import read_scene
 from training.scenes.formats import ensure_colmap_scene
 
@@ -23,13 +24,29 @@ def test_case(tmp_path, name):
         exif = Image.Exif()
         exif[274] = orientation[0] if orientation else 1
         Image.new("RGB", (width, height)).save(scene_folder / path, exif=exif)
+    for link, target in case.get("links", {}).items():
+        (scene_folder / link).symlink_to(target, target_is_directory=True)
     warnings = []
-    scene = read_scene(ensure_colmap_scene(scene_folder, warnings.append))
+    try:
+        scene = read_scene(ensure_colmap_scene(scene_folder, warnings.append))
+    except LodgsError as error:
+        assert "error" in case and case["error"] in str(error), error
+        return
+    assert "error" not in case
     cameras = {Path(camera.name).name: camera for camera in scene.cameras}
     assert sorted(cameras) == sorted(case["views"]), warnings
     for view, expected in case["views"].items():
-        pixels, _ = cameras[view].project(np.array([expected["point"]]))
-        np.testing.assert_allclose(pixels, [expected["pixel"]], atol=1e-9, err_msg=view)
+        pixels, _ = cameras[view].moved(scene.origin).project(np.array([expected["point"]]))
+        tolerance = 1e-6 if scene.origin.any() else 1e-9
+        np.testing.assert_allclose(pixels, [expected["pixel"]], rtol=0, atol=tolerance, err_msg=view)
         assert [cameras[view].width, cameras[view].height] == expected["size"]
     for text in case["warnings"]:
-        assert any(text in warning for warning in [*warnings, *scene.warnings]), (text, warnings)
+        assert any(text in warning for warning in [*warnings, *scene.warnings]), (
+            text,
+            warnings,
+            scene.warnings,
+        )
+    if "points" in case:
+        np.testing.assert_allclose(scene.points + scene.origin, case["points"], atol=1e-6)
+    masked = [Path(camera.name).name for camera in scene.cameras if camera.mask is not None]
+    assert masked == case.get("masked", [])

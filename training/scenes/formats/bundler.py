@@ -79,7 +79,7 @@ def read(path: Path) -> ExportedScene:
             "Export both files again.",
         )
     views, excluded = [], []
-    photos = PhotoFinder(_image_root(path))
+    photos = PhotoFinder(_image_root(path), names)
     for name, (focal, k1, k2, *pose) in zip(names, cameras, strict=False):
         try:
             if not focal > 0:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from ...documents import read_json
 from ...errors import LodgsError
 from ..cameras import Camera
 from ..colmap import DEPTH_SUFFIXES
+from ..image_files import NO_PHOTOS, walk_files
 from ..images import IMAGE_SUFFIXES
 from ..lenses import Intrinsics, make_intrinsics
 
@@ -22,8 +23,6 @@ MAX_JSON_BYTES = 1 << 26
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Conversion between OpenCV's camera axes and OpenGL's (x right, y up, looking along -z)."""
 _SUFFIXES = *IMAGE_SUFFIXES, ".exr", *(suffix.upper() for suffix in IMAGE_SUFFIXES), ".EXR"
-_NO_PHOTOS = ".", "mask", "depth", "normal", "conf", "sparse"
-"""First letters of folders without photos, lower case."""
 _NO_POINTS = np.zeros((0, 3))
 
 
@@ -199,32 +198,35 @@ class PhotoFinder:
 
     Args:
         folder: folder of the export.
+        names: exported names of all photos. A photo at the exported place of one is no match for another.
+        roots: folders that the names are relative to, the preferred one first. Default: ``folder``.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, names: Iterable[str] = (), roots: Sequence[Path] = ()) -> None:
         self._folder = folder
+        self._names = names
+        self._roots = roots or (folder,)
         self._by_stem: dict[str, list[Path]] | None = None
         self._moved: list[tuple[Path, Path]] = []
 
-    def find(self, name: str, *roots: Path) -> Path:
+    def find(self, name: str) -> Path:
         """Return a photo at its exported place, else the only photo below the folder with its name.
 
         The result is the expected path if there is no such photo.
 
-        Args:
-            roots: folders that the name is relative to, the preferred one first. Default: the folder.
-
         Raises:
             LodgsError: if several photos match.
         """
-        expected = [find_image(root, name) for root in roots or (self._folder,)]
-        for path in expected:
-            if os.path.isfile(path):
-                return path
-        if (path := self.locate(name)) is None:
-            return expected[0]
-        self._moved.append((expected[0], path))
+        expected = self._expected(name)
+        if os.path.isfile(expected) or (path := self.locate(name)) is None:
+            return expected
+        self._moved.append((expected, path))
         return path
+
+    def _expected(self, name: str) -> Path:
+        """Return the photo at its exported place, or that place in the preferred folder."""
+        places = [find_image(root, name) for root in self._roots]
+        return next((path for path in places if os.path.isfile(path)), places[0])
 
     def locate(self, name: str) -> Path | None:
         """Return the photo below the folder that has most of the name's last parts, or None.
@@ -234,11 +236,10 @@ class PhotoFinder:
         """
         if self._by_stem is None:
             self._by_stem = {}
-            for parent, folders, files in os.walk(self._folder):
-                folders[:] = sorted(entry for entry in folders if not entry.lower().startswith(_NO_PHOTOS))
-                for path in (Path(parent, entry) for entry in sorted(files)):
-                    if path.suffix in _SUFFIXES:
-                        self._by_stem.setdefault(path.stem.casefold(), []).append(path)
+            claimed = set(map(self._expected, self._names))
+            for path in walk_files(self._folder, NO_PHOTOS):
+                if path.suffix in _SUFFIXES and path not in claimed:
+                    self._by_stem.setdefault(path.stem.casefold(), []).append(path)
         parts = name.replace("\\", "/").casefold().split("/")
         stem = parts[-1] if Path(parts[-1]).suffix not in _SUFFIXES else Path(parts[-1]).stem
         matches = self._by_stem.get(stem, [])

@@ -58,7 +58,9 @@ def read(path: Path) -> ExportedScene:
     except LodgsError as error:
         raise LodgsError(f"Cannot read {path}: {error.what}", "Export it again.") from error
     views, excluded = [], []
-    photos = PhotoFinder(path.parent)
+    # Photos lie next to the file, in images or at OpenMVG's own path.
+    roots = path.parent / "images", path.parent, path.parent.parent, *([Path(root)] if root else [])
+    photos = PhotoFinder(path.parent, [_photo_name(entry) for entry in entries], roots)
     for entry in entries:
         name = str(entry.get("filename", "")) if isinstance(entry, dict) else ""
         try:
@@ -67,7 +69,7 @@ def read(path: Path) -> ExportedScene:
                 raise LodgsError("OpenMVG has no pose for it.")
             lens = _parse_lens(lenses.get(entry.get("id_intrinsic")))
             rotation, center = parse_array(pose.get("rotation"), 3, 3), parse_array(pose.get("center"), 3)
-            image = _find_view_image(photos, path.parent, root, str(entry.get("local_path", "")), name)
+            image = photos.find(_photo_name(entry))
             views.append(ExportedView(image, lens, invert_pose(np.column_stack([rotation.T, center]))))
         except (LodgsError, AttributeError, TypeError) as error:
             excluded.append((name, error.what if isinstance(error, LodgsError) else "its entry is damaged."))
@@ -98,7 +100,6 @@ def _parse_lens(values: Any) -> Intrinsics:
     return colmap_lens(*size, (focal, focal), principal_point, radial, tangential, fisheye)
 
 
-def _find_view_image(photos: PhotoFinder, folder: Path, root: str, local: str, name: str) -> Path:
-    """Look for a photo next to the file, in ``images`` and at OpenMVG's own path."""
-    roots = [folder / "images", folder, folder.parent, *([Path(root)] if root else [])]
-    return photos.find(f"{local}/{name}", *roots)
+def _photo_name(entry: Any) -> str:
+    """Return the name of a view's photo with its folder; "" for a damaged entry."""
+    return f"{entry.get('local_path', '')}/{entry.get('filename', '')}" if isinstance(entry, dict) else ""

@@ -57,7 +57,8 @@ def read(path: Path) -> ExportedScene:
         raise LodgsError(f"Cannot read {path}: it has no frames.", "Export it again.")
     common = _with_focal_lengths({name: value for name, value in document.items() if name != "frames"})
     views, excluded = [], []
-    photos = PhotoFinder(path.parent)
+    names = [frame.get("file_path") for frame in frames if isinstance(frame, dict)]
+    photos = PhotoFinder(path.parent, [name for name in names if isinstance(name, str)])
     for number, frame in enumerate(frames, 1):
         own = _with_focal_lengths(frame) if isinstance(frame, dict) else {}
         # A frame's field of view replaces the common focal length.
