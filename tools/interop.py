@@ -28,12 +28,14 @@ from training.splats.streamed_levels import STREAMED_FILE, level_arguments  # no
 
 PACKAGE = "@playcanvas/splat-transform"
 VERSION = "3.7.0"
+MIN_NODE = 22
+"""Oldest major version of Node.js that splat-transform runs in."""
 FOLDER = ROOT / "build" / "interop"
 
 
 def main() -> int:
-    if not shutil.which("node") or not shutil.which("npm"):
-        print("interop: Node.js is not installed. Install it with npm and repeat.")
+    if problem := node_problem():
+        print(f"interop: {problem} Install Node.js {MIN_NODE} or newer with npm (nodejs.org) and repeat.")
         return 2
     if not install():
         print(f"interop: npm cannot install {PACKAGE} {VERSION}, see above.")
@@ -47,6 +49,19 @@ def main() -> int:
     for check, ours, theirs, same in rows:
         print(f"{check:<34}  {ours!s:<34}  {theirs!s:<34}  {'ok' if same else 'DIFFERENT'}")
     return 0 if all(same for *_, same in rows) else 1
+
+
+def node_problem() -> str:
+    """Return a sentence if Node.js or npm is missing or too old for the programs from npm, else ""."""
+    if not shutil.which("node") or not shutil.which("npm"):
+        return "Node.js or npm is not installed."
+    version = subprocess.run(
+        ["node", "--version"], capture_output=True, text=True, check=False
+    ).stdout.strip()
+    major = version.removeprefix("v").split(".")[0]
+    if not major.isdecimal() or int(major) < MIN_NODE:
+        return f"Node.js {version or 'of unknown version'} is too old."
+    return ""
 
 
 def install(name: str = PACKAGE, version: str = VERSION) -> bool:
