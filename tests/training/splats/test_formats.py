@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from tests.checkout import copy_checkout, recipe_code
+from tests.training.splats.test_packed_files import sizes4, spz4
 from training.__main__ import main
 from training.errors import LodgsError
 from training.splats.bundle import read_bundle, write_bundle
@@ -178,7 +179,7 @@ def test_stopped_conversion_leaves_no_files(tmp_path, splat_transform):
 
 
 def test_unreadable_file_raises_one_sentence(tmp_path, splat_transform):
-    (tmp_path / "a.spz").write_bytes(b"no splats")
+    (tmp_path / "a.spz").write_bytes(spz4(300, 0, sizes4(300, 0)))  # zeros are no Zstandard stream
     with pytest.raises(LodgsError, match="splat-transform failed"), open_as_ply(tmp_path / "a.spz"):
         pass
 
