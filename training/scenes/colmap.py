@@ -33,7 +33,7 @@ from .image_files import (
     find_image_folder,
     find_moved_images,
 )
-from .lenses import Intrinsics
+from .lenses import Intrinsics, make_intrinsics
 from .orientation import up_rotation
 from .view_selection import OUTLIER_FACTOR, ViewCollector, exclusion_messages, find_outliers, quote_name
 
@@ -383,6 +383,21 @@ def exclude_views(scene: Scene, reasons: dict[str, str]) -> Scene:
         distorted=[name for name in scene.distorted if name not in reasons],
         warnings=[*scene.warnings, *exclusion_messages(list(reasons.items()))],
     )
+
+
+def scene_lenses(scene: Scene) -> list[Intrinsics]:
+    """Return the lens of each camera, with its distortion, at the size of its photo."""
+    lenses = read_cameras(scene.model)
+    lens_of = {pose.name.replace("\\", "/"): lenses[pose.camera_id] for pose in read_poses(scene.model)}
+    distorted = set(scene.distorted)
+    return [
+        lens_of[camera.name].resized(camera.width, camera.height)
+        if camera.name in distorted
+        else make_intrinsics(  # the camera may be turned as its photo
+            "PINHOLE", camera.width, camera.height, np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+        )
+        for camera in scene.cameras
+    ]
 
 
 def observations(scene: Scene, names: Collection[str]) -> dict[str, np.ndarray]:

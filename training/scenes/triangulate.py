@@ -22,10 +22,9 @@ from ..errors import LodgsError, SystemProblem, system_reason
 from ..files import name_errors
 from . import pycolmap_process
 from .cameras import Camera
-from .colmap import NO_POINTS, Scene
-from .colmap_model import read_cameras, read_points, read_poses
+from .colmap import NO_POINTS, Scene, scene_lenses
+from .colmap_model import read_points
 from .images import load_image, load_mask, write_png
-from .lenses import Intrinsics, make_intrinsics
 from .scene_cache import remove_abandoned, scene_digest, writable_cache
 from .sfm_known_poses import photo_name
 from .view_selection import find_outliers
@@ -252,27 +251,13 @@ def _reduced_size(camera: Camera) -> tuple[int, int]:
 
 def _write_cameras(scene: Scene, sizes: Sequence[tuple[int, int]], work: Path) -> None:
     """Write the cameras as models: "full" as they are, and "poses" for reduced and numbered photos."""
-    lenses = _lenses(scene)
+    lenses = scene_lenses(scene)
     poses = [camera.world_to_camera for camera in scene.cameras]
     names = [camera.name for camera in scene.cameras]
     write_model(work / "full", lenses, list(zip(names, poses, strict=True)), *_NO_POINTS)
     reduced = [lens.resized(*size) for lens, size in zip(lenses, sizes, strict=True)]
     numbers = [photo_name(number) for number in range(1, len(poses) + 1)]
     write_model(work / "poses", reduced, list(zip(numbers, poses, strict=True)), *_NO_POINTS)
-
-
-def _lenses(scene: Scene) -> list[Intrinsics]:
-    """Return the lens of each camera, with its distortion, for its photo's size."""
-    intrinsics = read_cameras(scene.model)
-    lens_of = {pose.name.replace("\\", "/"): intrinsics[pose.camera_id] for pose in read_poses(scene.model)}
-    return [
-        lens_of[camera.name].resized(camera.width, camera.height)
-        if camera.name in scene.distorted
-        else make_intrinsics(  # the camera may be turned as its photo
-            "PINHOLE", camera.width, camera.height, np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-        )
-        for camera in scene.cameras
-    ]
 
 
 def _write_photo(number: int, camera: Camera, size: tuple[int, int], work: Path, exposure: float) -> bool:
@@ -299,7 +284,7 @@ def _write_random_points(scene: Scene, work: Path) -> None:
     points = random_start_points(scene.cameras)
     poses = [(camera.name, camera.moved(scene.origin).world_to_camera) for camera in scene.cameras]
     gray = np.full((len(points), 3), 128, np.uint8)
-    write_model(work / "random", _lenses(scene), poses, points + scene.origin, gray)
+    write_model(work / "random", scene_lenses(scene), poses, points + scene.origin, gray)
 
 
 def _summarize(scene: Scene, result: Mapping, problem: str) -> dict:

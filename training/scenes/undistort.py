@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import os
-import sys
 import tempfile
-from collections import defaultdict
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,15 +13,15 @@ import numpy as np
 from ..errors import LodgsError, system_reason
 from . import pycolmap_process
 from .cameras import Camera
-from .colmap import DEPTHS, MASKS, Scene, read_scene
-from .colmap_model import write_strict_text
+from .colmap import DEPTHS, MASKS, Scene, read_scene, scene_lenses
 from .depths import read_depth_map
 from .exr import write_exr
 from .images import load_exr, load_image, load_mask, write_png
 from .scene_cache import remove_abandoned, scene_digest, writable_cache
+from .write_colmap import write_model
 
 if TYPE_CHECKING:
-    import pycolmap
+    pass
 
 CACHE_FOLDER = ".undistorted"
 """Folder inside a scene's folder that caches undistorted images for all runs and for Blender."""
@@ -41,8 +38,7 @@ def undistort_scene(scene: Scene, cache: Path) -> Scene:
     Undistorted images are cropped to contain no empty pixels (COLMAP's blank_pixels = 0).
 
     Raises:
-        LodgsError: pycolmap is missing or fails, photos of one camera differ in size, or the cache cannot
-            be written.
+        LodgsError: pycolmap is missing or fails, or the cache cannot be written.
     """
     if not scene.distorted:
         return scene
@@ -96,15 +92,19 @@ def _undistort_into(target: Path, scene: Scene) -> None:
     """Run this module as a program in a temporary folder, and rename the result to the target."""
     request = {
         "images": str(scene.images_folder),
-        "sizes": {camera.name: [camera.width, camera.height] for camera in scene.cameras},
+        "names": [camera.name for camera in scene.cameras],
         "source_pixels": [
-            camera.name for camera in scene.cameras if camera.depth is not None or _is_unsupported(camera)
+            camera.name
+            for camera in scene.cameras
+            if camera.depth is not None or not _reads_photo(scene, camera)
         ],
     }
     target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=target.parent, prefix="undistorting-") as work:
         request["work"] = work
-        request["model"] = str(write_strict_text(scene.model, Path(work) / "text"))
+        poses = [(camera.name, camera.moved(scene.origin).world_to_camera) for camera in scene.cameras]
+        no_points = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+        write_model(Path(work) / "sparse", scene_lenses(scene), poses, *no_points)
         masks = Path(work) / MASKS
         for camera in scene.cameras:
             if camera.mask is not None:
@@ -122,7 +122,7 @@ def _undistort_into(target: Path, scene: Scene) -> None:
         for camera in scene.cameras:
             file = Path(work) / _SOURCE_PIXELS / f"{camera.name}.npy"
             if file.exists():
-                _resample_files(camera, np.load(file), Path(work) / "undistorted")
+                _resample_files(scene, camera, np.load(file), Path(work) / "undistorted")
         try:
             os.replace(Path(work) / "undistorted", target)
         except OSError:
@@ -130,12 +130,13 @@ def _undistort_into(target: Path, scene: Scene) -> None:
                 raise
 
 
-def _is_unsupported(camera: Camera) -> bool:
-    """Return True for formats that pycolmap cannot read, clips, or writes in rare variants."""
-    return camera.name.lower().endswith((".webp", ".exr", ".tif", ".tiff"))
+def _reads_photo(scene: Scene, camera: Camera) -> bool:
+    """Return False if pycolmap cannot read a photo, clips it, writes a rare variant or misses its file."""
+    unsupported = camera.name.lower().endswith((".webp", ".exr", ".tif", ".tiff"))
+    return not unsupported and os.path.isfile(scene.images_folder / camera.name)
 
 
-def _resample_files(camera: Camera, source: np.ndarray, out: Path) -> None:
+def _resample_files(scene: Scene, camera: Camera, source: np.ndarray, out: Path) -> None:
     """Undistort the files of a view that pycolmap cannot: its depth map (nearest pixel), unsupported photos.
 
     Args:
@@ -153,11 +154,11 @@ def _resample_files(camera: Camera, source: np.ndarray, out: Path) -> None:
         path = out / DEPTHS / f"{camera.name}.exr"
         path.parent.mkdir(parents=True, exist_ok=True)
         write_exr(path, {"Z": resample(np.nan_to_num(read_depth_map(camera.depth)), order=0)})
-    if camera.image is None or not _is_unsupported(camera):
+    if camera.image is None or _reads_photo(scene, camera):
         return
     path = out / "images" / camera.name
     path.parent.mkdir(parents=True, exist_ok=True)
-    linear = camera.name.lower().endswith(".exr")
+    linear = camera.image.suffix.lower() == ".exr"
     pixels = (
         load_exr(camera.image)
         if linear
@@ -176,8 +177,7 @@ def _resample_files(camera: Camera, source: np.ndarray, out: Path) -> None:
 def _main() -> None:
     request = pycolmap_process.read_request()
     pycolmap = pycolmap_process.load_pycolmap()
-    model = pycolmap.Reconstruction(request["model"])
-    _rescale_cameras(model, request["sizes"])
+    model = pycolmap.Reconstruction(Path(request["work"]) / "sparse")
     for camera in model.cameras.values():
         if camera.is_perspective_fisheye() and camera.is_undistorted():
             # COLMAP treats an ideal fisheye as a pinhole; a distortion below 0.01 px prevents that.
@@ -192,7 +192,7 @@ def _main() -> None:
         output_path=work / "undistorted",
         input_path=work / "model",
         image_path=request["images"],
-        image_names=list(request["sizes"]),
+        image_names=request["names"],
         jpeg_quality=98,
     )
     names = request["source_pixels"]
@@ -213,19 +213,6 @@ def _main() -> None:
             output_path=work / "straight", input_path=work / "masked", image_path=masks, image_names=names
         )
         (work / "straight" / "images").rename(work / "undistorted" / MASKS)
-
-
-def _rescale_cameras(model: pycolmap.Reconstruction, image_sizes: dict[str, list[int]]) -> None:
-    """Scale the model's cameras to the size of their photos; exit if photos of one camera differ in size."""
-    sizes = defaultdict(set)
-    for image in model.images.values():
-        with suppress(UnicodeDecodeError):  # names that are not UTF-8 have no photo
-            if image.name in image_sizes:
-                sizes[image.camera_id].add(tuple(image_sizes[image.name]))
-    for camera_id, camera_sizes in sizes.items():
-        if len(camera_sizes) > 1:
-            sys.exit(f"the photos of camera {camera_id} have several sizes: {sorted(camera_sizes)}.")
-        model.cameras[camera_id].rescale(*camera_sizes.pop())
 
 
 def _source_pixels(undistorted: Any, distorted: Any) -> np.ndarray:

@@ -11,7 +11,7 @@ from PIL import Image
 from training.__main__ import main
 from training.scenes import triangulate
 from training.scenes.cameras import look_at
-from training.scenes.colmap import observations, read_scene
+from training.scenes.colmap import observations, read_scene, scene_lenses
 from training.scenes.images import write_png
 from training.scenes.sfm_known_poses import choose_pairs, epipolar_errors, match_descriptors, relative_pose
 from training.scenes.triangulate import cached_points, triangulate_scene
@@ -190,7 +190,7 @@ def test_lens_of_a_turned_photo_is_that_of_its_camera(tmp_path):
         exif[274] = 6
         Image.new("RGB", (HEIGHT, WIDTH)).save(path, "JPEG", exif=exif)
     scene = read_scene(walls)
-    (camera, lens), *_ = zip(scene.cameras, triangulate._lenses(scene), strict=True)
+    (camera, lens), *_ = zip(scene.cameras, scene_lenses(scene), strict=True)
     assert (lens.width, lens.height) == (HEIGHT, WIDTH)
     assert (
         lens.pinhole == (FOCAL, FOCAL, HEIGHT / 2, WIDTH / 2) == (camera.fx, camera.fy, camera.cx, camera.cy)

@@ -161,16 +161,53 @@ def test_pinhole_views_among_distorted_ones_stay_unchanged(tmp_path):
     assert (undistorted.width, undistorted.height) != (96, 72)
 
 
-def test_failures_are_reported_and_leave_no_files(tmp_path):
-    """Photos of one camera have two sizes; then pycolmap cannot read the model."""
+def test_photos_of_one_camera_may_differ_in_size(tmp_path):
+    """The second photo has the size of the model; the first is smaller, with a rounded height."""
+    synthetic.write_scene(tmp_path, synthetic.camera("OPENCV"), names=["a.png", "b.png"], pixels=ramps())
+    synthetic.write_image(tmp_path / "images" / "a.png", ramps()[::2, ::2][:35])
+    small, large = undistort_scene(read_scene(tmp_path), tmp_path / "cache").cameras
+    assert small.fx == pytest.approx(40) and small.fy == pytest.approx(82 * 35 / 72)
+    assert (large.fx, large.fy) == pytest.approx((80, 82)) and small.width < 50 < large.width
+
+
+def test_photos_with_another_suffix_and_turned_photos(tmp_path):
+    """Pycolmap does not find the first file, and the second is a pinhole view that EXIF turns."""
+    synthetic.write_scene(tmp_path, synthetic.camera("OPENCV"), names=["a.png"], pixels=ramps())
+    expected = undistort_scene(read_scene(tmp_path), tmp_path / "cache").cameras[0]
+    (tmp_path / "images" / "a.png").rename(tmp_path / "images" / "a.PNG")
+    (camera,) = undistort_scene(read_scene(tmp_path), tmp_path / "other").cameras
+    assert (camera.width, camera.cx, camera.cy) == (expected.width, expected.cx, expected.cy)
+    pictures = [load_image(view.image, view.width, view.height) for view in (camera, expected)]
+    assert np.abs(pictures[0] - pictures[1]).max() < 0.02
+
+    model = tmp_path / "text"
+    model.mkdir()
+    (model / "cameras.txt").write_text("1 PINHOLE 72 96 80 82 33 47\n2 SIMPLE_RADIAL 96 72 80 48 36 0.2\n")
+    (model / "images.txt").write_text("1 1 0 0 0 0 0 0 1 b.jpg\n\n2 1 0 0 0 1 0 0 2 a.png\n\n")
+    exif = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
+    synthetic.write_image(tmp_path / "images" / "b.jpg", ramps())
+    content = (tmp_path / "images" / "b.jpg").read_bytes()
+    segment = b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif
+    (tmp_path / "images" / "b.jpg").write_bytes(content[:2] + segment + content[2:])
+    scene = read_scene(tmp_path, model=model)
+    turned = next(camera for camera in scene.cameras if camera.name == "b.jpg")
+    assert (turned.width, turned.height, turned.fx, turned.cx) == (96, 72, 82, 47)
+    result = undistort_scene(scene, tmp_path / "cache").cameras
+    np.testing.assert_allclose(
+        next(camera for camera in result if camera.name == "b.jpg").world_to_camera, turned.world_to_camera,
+        atol=1e-12,
+    )  # fmt: skip
+    assert [(camera.fx, camera.cx) for camera in result if camera.name == "b.jpg"] == [(82, 47)]
+
+
+def test_failures_are_reported_and_leave_no_files(tmp_path, monkeypatch):
     synthetic.write_scene(tmp_path, synthetic.camera("RADIAL"))
-    synthetic.write_image(tmp_path / "images" / "a.png", synthetic.noise(48, 36))
-    with pytest.raises(LodgsError, match="several sizes"):
-        undistort_scene(read_scene(tmp_path), tmp_path / "cache")
-    synthetic.write_image(tmp_path / "images" / "a.png", synthetic.noise())
-    (tmp_path / "sparse" / "0" / "points3D.bin").unlink()
-    with pytest.raises(LodgsError, match="Cannot undistort") as error:
-        undistort_scene(read_scene(tmp_path), tmp_path / "cache")
+    with monkeypatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(tmp_path / "broken"))
+        (tmp_path / "broken").mkdir()
+        (tmp_path / "broken" / "pycolmap.py").write_text("raise ImportError('no libraries')")
+        with pytest.raises(LodgsError, match=r"Cannot undistort.*no libraries") as error:
+            undistort_scene(read_scene(tmp_path), tmp_path / "cache")
     assert "Traceback" not in str(error.value) and error.value.remedy
     assert os.listdir(tmp_path / "cache") == []
     (tmp_path / "file").write_text("in the way")

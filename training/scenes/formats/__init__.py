@@ -17,8 +17,7 @@ import numpy as np
 
 from ...errors import LodgsError, SystemProblem, system_reason
 from ...files import check_folder, link_or_copy
-from ..colmap import DEPTHS, MASKS, NO_POINTS, find_models, read_scene
-from ..colmap_model import read_cameras, read_poses
+from ..colmap import DEPTHS, MASKS, NO_POINTS, find_models, read_scene, scene_lenses
 from ..image_files import find_image_folder
 from ..images import image_size
 from ..view_selection import exclusion_messages, photo_turns
@@ -144,17 +143,11 @@ def _read_model_without_points(folder: Path) -> ExportedScene:
     scene = read_scene(folder)
     if len(scene.points):
         raise LodgsError(f"Cannot convert {folder}: it already is a COLMAP scene.", "Import it directly.")
-    lenses = read_cameras(scene.model)
-    poses = {pose.name.replace("\\", "/"): pose for pose in read_poses(scene.model)}
     views = [
         ExportedView(
-            camera.image,
-            lenses[poses[camera.name].camera_id],
-            poses[camera.name].world_to_camera,
-            camera.mask,
-            camera.depth,
+            camera.image, lens, camera.moved(scene.origin).world_to_camera, camera.mask, camera.depth
         )
-        for camera in scene.cameras
+        for camera, lens in zip(scene.cameras, scene_lenses(scene), strict=True)
         if camera.image is not None
     ]
     warnings = [warning for warning in scene.warnings if not warning.startswith(NO_POINTS)]
