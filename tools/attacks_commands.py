@@ -16,7 +16,6 @@ import json
 import os
 import random
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
@@ -48,6 +47,8 @@ FLOD = (
     "--method", "flod", "--backend", "cpu", "--image-scale", "1", "--test-every", "4", "--set", "levels=2",
     "--set", "steps=[10,12]", "--set", "footprint=6", "--set", "max_splats=900",
 )  # fmt: skip
+PLAIN = "INPUTS/run", "--plain"
+VIEW = "--view", "00.jpg", "--size", "320x240"
 VIEWS = "--views", "4", "--view-width", "64"
 
 
@@ -68,15 +69,14 @@ class Command(NamedTuple):
 COMMANDS = {
     "edit bundle": Command(("edit", "INPUTS/run", "--out", "DISK/edited.ply", "--scale", "2")),
     "edit folder": Command(("edit", "INPUTS/run", "--folder", "DISK/levels")),
-    **{
-        f"edit {ending}": Command(("edit", "INPUTS/run", "--plain", f"DISK/plain.{ending}"), converts=converts)
-        for ending, converts in {
-            "ply": False, "splat": False, "compressed.ply": True, "spz": True, "sog": True,
-        }.items()
-    },
+    "edit ply": Command(("edit", *PLAIN, "DISK/plain.ply")),
+    "edit splat": Command(("edit", *PLAIN, "DISK/plain.splat")),
+    "edit compressed.ply": Command(("edit", *PLAIN, "DISK/plain.compressed.ply"), converts=True),
+    "edit spz": Command(("edit", *PLAIN, "DISK/plain.spz"), converts=True),
+    "edit sog": Command(("edit", *PLAIN, "DISK/plain.sog"), converts=True),
     "edit streamed": Command(("edit", "INPUTS/run", "--streamed", "DISK/streamed"), converts=True),
-    "render png": Command(("render", "INPUTS/run", "--view", "00.jpg", "--size", "320x240", "--out", "DISK/view.png")),
-    "render exr": Command(("render", "INPUTS/run", "--view", "00.jpg", "--size", "320x240", "--out", "DISK/view.exr")),
+    "render png": Command(("render", "INPUTS/run", *VIEW, "--out", "DISK/view.png")),
+    "render exr": Command(("render", "INPUTS/run", *VIEW, "--out", "DISK/view.exr")),
     "capture": Command(("capture", "INPUTS/base.ply", "--out", "DISK/captured", *VIEWS)),
     "scene": Command(("scene", "--from", "INPUTS/export", "--out", "DISK/scene")),
     "undistort": Command(("undistort", "DISK/distorted"), "distorted"),
@@ -218,7 +218,9 @@ class Attack:
         if code != 2 or not reported or "Traceback" in log:
             self.wrong.append(f"{attack}: exit code {code}: {log[-400:]}")
         else:
-            message = f"{attack.split(',')[0]}: {reported[-1].replace(str(self.disk), 'DISK')[:200]}"
+            message = (
+                f"{attack.split(',', maxsplit=1)[0]}: {reported[-1].replace(str(self.disk), 'DISK')[:200]}"
+            )
             self.messages[message] = self.messages.get(message, 0) + 1
 
     def _check_files(self, attack: str, expected: dict[str, bytes]) -> None:
@@ -267,8 +269,10 @@ def opaque_sphere() -> Splats:
     means = rng.normal(size=(600, 3))
     means *= 2 / np.linalg.norm(means, axis=1, keepdims=True)
     quats, scales = np.tile([1.0, 0, 0, 0], (600, 1)), np.full((600, 3), -1.8)
-    arrays = means, quats, scales, np.full(600, 6.0), rng.normal(0, 0.5, (600, 1, 3))
-    return Splats(*(array.astype(np.float32) for array in arrays))
+    sh = rng.normal(0, 0.5, (600, 1, 3))
+    arrays = (array.astype(np.float32) for array in (means, quats, scales, np.full(600, 6.0), sh))
+    means, quats, scales, logits, sh = arrays
+    return Splats(means, quats, scales, logits, sh)
 
 
 def rotation(w: float, x: float, y: float, z: float) -> np.ndarray:

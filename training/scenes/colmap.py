@@ -56,7 +56,8 @@ class Scene:
         cameras: views with a usable photo, sorted by name; their size is the photo's size.
         points: (P, 3) float32, possibly empty.
         point_colors: (P, 3) uint8.
-        distorted: names of views with lens distortion; their cameras are the pinhole part of the lens.
+        distorted: lenses of the views with lens distortion by name, for the photo's size; the cameras of
+            these views are the pinhole part of the lens.
         warnings: one sentence per skipped or suspicious item.
         point_ids: (P,) int64 ids of the model; empty if the points come from another source.
         names: names of all views of the model, sorted, with or without a photo. Default: the cameras' names.
@@ -70,7 +71,7 @@ class Scene:
     cameras: list[Camera]
     points: np.ndarray
     point_colors: np.ndarray
-    distorted: list[str] = field(default_factory=list)
+    distorted: dict[str, Intrinsics] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
     point_ids: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
     names: Sequence[str] = ()
@@ -375,7 +376,7 @@ def exclude_views(scene: Scene, reasons: dict[str, str]) -> Scene:
     return replace(
         scene,
         cameras=remaining,
-        distorted=[name for name in scene.distorted if name not in reasons],
+        distorted={name: lens for name, lens in scene.distorted.items() if name not in reasons},
         warnings=[*scene.warnings, *exclusion_messages(list(reasons.items()))],
     )
 

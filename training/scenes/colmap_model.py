@@ -216,46 +216,6 @@ def _image_lines(file: IO[bytes]) -> Iterator[tuple[bytes, bytes]]:
         yield image, b""
 
 
-def write_strict_text(model: Path, folder: Path) -> Path:
-    """Write a text model as COLMAP writes it, with two lines per image, to a new folder, and return it.
-
-    A binary model is returned as it is.
-
-    Raises:
-        LodgsError: a file is missing or damaged.
-        OSError: a file cannot be written.
-    """
-    if model_suffix(model) != ".txt":
-        return model
-    folder.mkdir()
-    for name, lines in (
-        ("images", _strict_images),
-        ("cameras", _encoded_lines),
-        ("points3D", _strict_points),
-    ):
-        with open(folder / f"{name}.txt", "wb") as target:
-            if (model / f"{name}.txt").is_file():
-                _read(model, name, {".txt": lambda file, lines=lines, to=target: to.writelines(lines(file))})
-    for path in (model / "rigs.txt", model / "frames.txt"):
-        if path.is_file():
-            (folder / path.name).write_bytes(path.read_bytes())
-    return folder
-
-
-def _strict_images(file: IO[bytes]) -> Iterator[bytes]:
-    return (image + b"\n" + points + b"\n" for image, points in _image_lines(file))
-
-
-def _encoded_lines(file: IO[bytes]) -> Iterator[bytes]:
-    return (line.encode("utf-8", "surrogateescape") + b"\n" for line in _content_lines(file))
-
-
-def _strict_points(file: IO[bytes]) -> Iterator[bytes]:
-    """Yield the lines of points with the reprojection error, which COLMAP requires."""
-    for line in _encoded_lines(file):
-        yield line if len(line.split(maxsplit=7)) > 7 else line.strip() + b" 0\n"
-
-
 def _is_points_line(line: bytes) -> bool:
     """Return True for numbers in groups of x, y and a point's id, which is an integer."""
     tokens = line.split()

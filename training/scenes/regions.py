@@ -61,7 +61,8 @@ class Region:
             raise LodgsError(
                 f"Cannot train the region: {scene.folder} has none of its views.", "Create the plan again."
             )
-        return replace(scene, cameras=cameras, distorted=[name for name in scene.distorted if name in names])
+        distorted = {name: lens for name, lens in scene.distorted.items() if name in names}
+        return replace(scene, cameras=cameras, distorted=distorted)
 
     def start_points(self, scene: Scene) -> np.ndarray:
         """Return a mask (P,) of the initial points: those in the enlarged cell or observed by the views."""

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import os
-import sys
 import tempfile
-from collections import defaultdict
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -17,32 +14,29 @@ from ..errors import LodgsError
 from . import pycolmap_process
 from .cameras import Camera
 from .colmap import DEPTHS, MASKS, Scene, read_scene
-from .colmap_model import write_strict_text
 from .depths import read_depth_map
 from .exr import write_exr
 from .images import load_exr, load_image, load_mask, write_png
+from .lenses import make_intrinsics
 from .scene_cache import remove_abandoned, scene_digest, writable_cache
-
-if TYPE_CHECKING:
-    import pycolmap
+from .write_colmap import write_model
 
 CACHE_FOLDER = ".undistorted"
 """Folder inside a scene's folder that caches undistorted images for all runs and for Blender."""
-_VERSION = b"4"  # format of the cached files
+_VERSION = b"5"  # format of the cached files
 _SOURCE_PIXELS = "source_pixels"
 """Folder of arrays with the position of each undistorted pixel in the photo, as fractions of its sides."""
 
 
 def undistort_scene(scene: Scene, cache: Path) -> Scene:
-    """Return the scene with pinhole views only, an empty ``distorted`` list and an unchanged world.
+    """Return the scene with pinhole views only, an empty ``distorted`` and an unchanged world.
 
     Photos and model are written to a folder in ``cache`` that is named after their digest, and reused later.
     The folder appears completely or not at all. A scene without distorted views is returned unchanged.
     Undistorted images are cropped to contain no empty pixels (COLMAP's blank_pixels = 0).
 
     Raises:
-        LodgsError: pycolmap is missing or fails, photos of one camera differ in size, or the cache cannot
-            be written.
+        LodgsError: pycolmap is missing or fails, or the cache cannot be written.
     """
     if not scene.distorted:
         return scene
@@ -96,7 +90,7 @@ def _undistort_into(target: Path, scene: Scene) -> None:
     """Run this module as a program in a temporary folder, and rename the result to the target."""
     request = {
         "images": str(scene.images_folder),
-        "sizes": {camera.name: [camera.width, camera.height] for camera in scene.cameras},
+        "names": [camera.name for camera in scene.cameras],
         "source_pixels": [
             camera.name for camera in scene.cameras if camera.depth is not None or _is_unsupported(camera)
         ],
@@ -104,7 +98,8 @@ def _undistort_into(target: Path, scene: Scene) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=target.parent, prefix="undistorting-") as work:
         request["work"] = work
-        request["model"] = str(write_strict_text(scene.model, Path(work) / "text"))
+        request["model"] = str(Path(work) / "distorted")
+        _write_views(Path(work) / "distorted", scene)
         masks = Path(work) / MASKS
         for camera in scene.cameras:
             if camera.mask is not None:
@@ -128,6 +123,20 @@ def _undistort_into(target: Path, scene: Scene) -> None:
         except OSError:
             if not target.is_dir():  # another process may have written the same content first
                 raise
+
+
+def _write_views(model: Path, scene: Scene) -> None:
+    """Write the lenses and poses of a scene, without points, as a model that pycolmap can read."""
+    cameras = [camera.moved(scene.origin) for camera in scene.cameras]
+    lenses = [
+        scene.distorted.get(camera.name)
+        or make_intrinsics(
+            "PINHOLE", camera.width, camera.height, np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+        )
+        for camera in cameras
+    ]
+    poses = [(camera.name, camera.world_to_camera) for camera in cameras]
+    write_model(model, lenses, poses, np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
 
 
 def _is_unsupported(camera: Camera) -> bool:
@@ -177,7 +186,6 @@ def _main() -> None:
     request = pycolmap_process.read_request()
     pycolmap = pycolmap_process.load_pycolmap()
     model = pycolmap.Reconstruction(request["model"])
-    _rescale_cameras(model, request["sizes"])
     for camera in model.cameras.values():
         if camera.is_perspective_fisheye() and camera.is_undistorted():
             # COLMAP treats an ideal fisheye as a pinhole; a distortion below 0.01 px prevents that.
@@ -192,7 +200,7 @@ def _main() -> None:
         output_path=work / "undistorted",
         input_path=work / "model",
         image_path=request["images"],
-        image_names=list(request["sizes"]),
+        image_names=request["names"],
         jpeg_quality=98,
     )
     names = request["source_pixels"]
@@ -213,19 +221,6 @@ def _main() -> None:
             output_path=work / "straight", input_path=work / "masked", image_path=masks, image_names=names
         )
         (work / "straight" / "images").rename(work / "undistorted" / MASKS)
-
-
-def _rescale_cameras(model: pycolmap.Reconstruction, image_sizes: dict[str, list[int]]) -> None:
-    """Scale the model's cameras to the size of their photos; exit if photos of one camera differ in size."""
-    sizes = defaultdict(set)
-    for image in model.images.values():
-        with suppress(UnicodeDecodeError):  # names that are not UTF-8 have no photo
-            if image.name in image_sizes:
-                sizes[image.camera_id].add(tuple(image_sizes[image.name]))
-    for camera_id, camera_sizes in sizes.items():
-        if len(camera_sizes) > 1:
-            sys.exit(f"the photos of camera {camera_id} have several sizes: {sorted(camera_sizes)}.")
-        model.cameras[camera_id].rescale(*camera_sizes.pop())
 
 
 def _source_pixels(undistorted: Any, distorted: Any) -> np.ndarray:

@@ -28,6 +28,7 @@ class ViewCollector:
     """Collects the usable views of a model and the reasons for skipping the other views.
 
     Attributes:
+        distorted: lenses of the views with lens distortion, as ``Scene.distorted``.
         excluded: (name, sentence) for each skipped view.
     """
 
@@ -37,7 +38,7 @@ class ViewCollector:
         self._depths = depths
         self._missing: list[str] = []
         self.cameras: list[Camera] = []
-        self.distorted: list[str] = []
+        self.distorted: dict[str, Intrinsics] = {}
         self.excluded: list[tuple[str, str]] = []
 
     def add(self, pose: Pose, lens: Intrinsics) -> None:
@@ -59,9 +60,7 @@ class ViewCollector:
                 turns=quarter_turns(image),
             )  # fmt: skip
             if turns := photo_turns(image, width, height, lens.width, lens.height):
-                if lens.distorted:
-                    raise LodgsError("only its EXIF data turns it upright: turn its pixels (exiftran -a).")
-                camera = camera.turned(turns)
+                camera, lens = camera.turned(turns), lens.turned(turns)
             if (width, height) != (camera.width, camera.height):
                 camera = camera.resized(width, height)
             if flaw := camera.flaw:
@@ -73,7 +72,7 @@ class ViewCollector:
             return
         self.cameras.append(camera)
         if lens.distorted:
-            self.distorted.append(name)
+            self.distorted[name] = lens.resized(width, height)
 
     def drop_outliers(self, inliers: np.ndarray) -> None:
         """Drop the cameras outside the mask ``inliers`` (V,)."""
@@ -83,7 +82,7 @@ class ViewCollector:
             for name in outliers
         ]
         self.cameras = [camera for camera in self.cameras if camera.name not in outliers]
-        self.distorted = [name for name in self.distorted if name not in outliers]
+        self.distorted = {name: lens for name, lens in self.distorted.items() if name not in outliers}
 
     def warnings(self, folder: Path) -> list[str]:
         """Return a limited number of warnings, whatever the number of views."""

@@ -35,7 +35,7 @@ def test_camera_models_become_pinholes(tmp_path, model):
     synthetic.write_scene(tmp_path, lens, names=["a.png"], pixels=ramps())
     scene = read_scene(tmp_path)
     result = undistort_scene(scene, tmp_path / "cache")
-    assert result.distorted == [] and result.warnings == []
+    assert not result.distorted and result.warnings == []
     (camera,) = result.cameras
     np.testing.assert_allclose(camera.world_to_camera, scene.cameras[0].world_to_camera, atol=1e-12)
     np.testing.assert_array_equal(result.points, scene.points)
@@ -56,7 +56,7 @@ def test_ideal_fisheye_is_undistorted(tmp_path):
     synthetic.write_scene(tmp_path, lens, names=["a.png"], pixels=ramps())
     result = undistort_scene(read_scene(tmp_path), tmp_path / "cache")
     (camera,) = result.cameras
-    assert result.distorted == []
+    assert not result.distorted
     # r = f atan(tan) instead of r = f tan, at a pixel far from the centre
     u, v = camera.width - 12, int(camera.cy)
     tangent = (u + 0.5 - camera.cx) / camera.fx
@@ -145,7 +145,7 @@ def test_pinhole_views_among_distorted_ones_stay_unchanged(tmp_path):
     (model / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n\n2 1 0 0 0 1 0 0 2 b.png\n\n")
     (model / "points3D.txt").write_text("")
     scene = read_scene(tmp_path, model=model)
-    assert scene.distorted == ["b.png"]
+    assert list(scene.distorted) == ["b.png"]
     pinhole, undistorted = undistort_scene(scene, tmp_path / "cache").cameras
     assert (pinhole.width, pinhole.height, pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy) == (
         96,
@@ -161,16 +161,62 @@ def test_pinhole_views_among_distorted_ones_stay_unchanged(tmp_path):
     assert (undistorted.width, undistorted.height) != (96, 72)
 
 
-def test_failures_are_reported_and_leave_no_files(tmp_path):
-    """Photos of one camera have two sizes; then pycolmap cannot read the model."""
+def test_photos_of_one_lens_may_differ_in_size(tmp_path):
+    synthetic.write_scene(tmp_path, synthetic.camera("RADIAL"), names=["a.png", "b.png"], pixels=ramps())
+    synthetic.write_image(tmp_path / "images" / "a.png", ramps()[::2, ::2])
+    half, full = undistort_scene(read_scene(tmp_path), tmp_path / "cache").cameras
+    assert (half.fx, full.fx) == pytest.approx((40, 80))
+
+
+@pytest.mark.parametrize(("orientation", "turns"), [(6, 1), (8, 3)])
+def test_photos_that_only_exif_data_turns(tmp_path, orientation, turns):
+    """Each pixel shows the colour of its ray in the upright photo, which the model describes."""
+    lens = synthetic.camera("OPENCV")
+    synthetic.write_scene(tmp_path, lens, names=["a.jpg"], pixels=ramps())
+    upright = read_scene(tmp_path).cameras[0].world_to_camera
+    program = (
+        "import sys; from PIL import Image; image = Image.open(sys.argv[1]); exif = Image.Exif(); "
+        "exif[274] = int(sys.argv[2]); "
+        f"image.rotate({90 * turns}, expand=True).save(sys.argv[1], exif=exif, quality=98, subsampling=0)"
+    )
+    path = tmp_path / "images" / "a.jpg"
+    subprocess.run([sys.executable, "-c", program, path, str(orientation)], check=True)
+    (camera,) = undistort_scene(read_scene(tmp_path), tmp_path / "cache").cameras
+    assert camera.turns == turns and camera.height > camera.width
+    image = load_image(camera.image, camera.width, camera.height)
+    v, u = np.mgrid[4 : camera.height - 4 : 5, 4 : camera.width - 4 : 5]
+    rays = [(u + 0.5 - camera.cx) / camera.fx, (v + 0.5 - camera.cy) / camera.fy, np.ones(u.shape)]
+    rays = np.stack(rays, axis=-1).reshape(-1, 3) @ camera.world_to_camera[:3, :3] @ upright[:3, :3].T
+    expected = lens.img_from_cam(rays)
+    actual = image[v, u].reshape(-1, 3) * [synthetic.WIDTH - 1, synthetic.HEIGHT - 1, 0] + 0.5
+    inside = (expected > 2).all(axis=1) & (expected < [synthetic.WIDTH - 2, synthetic.HEIGHT - 2]).all(axis=1)
+    assert inside.mean() > 0.9
+    error = np.abs(actual[:, :2] - expected)[inside]
+    assert error.mean() < 0.3 and error.max() < 1.5  # the photo is compressed
+
+
+def test_tracks_of_absent_observations_do_not_matter(tmp_path):
+    """pycolmap cannot read such models; programs that write no observations make them."""
     synthetic.write_scene(tmp_path, synthetic.camera("RADIAL"))
-    synthetic.write_image(tmp_path / "images" / "a.png", synthetic.noise(48, 36))
-    with pytest.raises(LodgsError, match="several sizes"):
-        undistort_scene(read_scene(tmp_path), tmp_path / "cache")
-    synthetic.write_image(tmp_path / "images" / "a.png", synthetic.noise())
-    (tmp_path / "sparse" / "0" / "points3D.bin").unlink()
+    model = pycolmap.Reconstruction(tmp_path / "sparse/0")
+    for file in (tmp_path / "sparse/0").iterdir():
+        file.unlink()
+    model.write_text(tmp_path / "sparse/0")
+    lines = (tmp_path / "sparse/0/images.txt").read_text().splitlines()
+    kept = [line if line.endswith(".png") else "" for line in lines if not line.startswith("#")]
+    (tmp_path / "sparse/0/images.txt").write_text("\n".join([*kept, ""]))
+    result = undistort_scene(read_scene(tmp_path), tmp_path / "cache")
+    assert len(result.cameras) == 3 and len(result.points) == 50
+
+
+def test_failures_are_reported_and_leave_no_files(tmp_path, monkeypatch):
+    synthetic.write_scene(tmp_path, synthetic.camera("RADIAL"))
+    scene = read_scene(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "packages"))
+    (tmp_path / "packages").mkdir()
+    (tmp_path / "packages" / "pycolmap.py").write_text("raise ImportError('no library')")
     with pytest.raises(LodgsError, match="Cannot undistort") as error:
-        undistort_scene(read_scene(tmp_path), tmp_path / "cache")
+        undistort_scene(scene, tmp_path / "cache")
     assert "Traceback" not in str(error.value) and error.value.remedy
     assert os.listdir(tmp_path / "cache") == []
     (tmp_path / "file").write_text("in the way")
