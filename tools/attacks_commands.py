@@ -1,0 +1,337 @@
+"""Fill disks and send SIGTERM while every command works: errors are reported, and no file is half written.
+
+    python tools/attacks_commands.py [--disks 20] [--signals 20] [--seed 0] [--only NAME ...]
+
+Each command of COMMANDS runs undisturbed once, on splats of a tiny scene. Then it runs on disks that are too
+small (a tmpfs, which needs root on Linux), and gets SIGTERM at random times. A full disk must end in exit
+code 2 and a message with the name of the file; a signal in exit code 3 without processes left. Every file
+under its final name must be that of the undisturbed command, and the same command must complete it
+afterwards, with enough space. Results are written to build/attacks_commands.json. Needs fork.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from multiprocessing.context import ForkProcess as Process
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+os.environ |= {"LODGS_CHECKPOINT_SECONDS": "0", "OMP_NUM_THREADS": "1", "LODGS_THREADS": "1"}
+
+import numpy as np  # noqa: E402
+import psutil  # noqa: E402
+
+import training.runs.train  # noqa: E402, F401 - loaded once, before forking
+from tests.training.conftest import write_tiny_scene  # noqa: E402
+from tools.attacks import FORK, exit_code  # noqa: E402
+from tools.attacks_blocks import DISK_FULL_MESSAGES, contents, small_disk  # noqa: E402
+from training import __main__  # noqa: E402
+from training.splats.gaussians import Splats  # noqa: E402
+from training.splats.ply import write_ply  # noqa: E402
+from training.splats.splat_transform import PROGRAM  # noqa: E402
+
+FLOD = (
+    "--method", "flod", "--backend", "cpu", "--image-scale", "1", "--test-every", "4", "--set", "levels=2",
+    "--set", "steps=[10,12]", "--set", "footprint=6", "--set", "max_splats=900",
+)  # fmt: skip
+PLAIN = "INPUTS/run", "--plain"
+VIEW = "--view", "00.jpg", "--size", "320x240"
+VIEWS = "--views", "4", "--view-width", "64"
+
+
+class Command(NamedTuple):
+    """A command that writes to DISK, a folder.
+
+    Attributes:
+        arguments: arguments, in which INPUTS and DISK are replaced by folders.
+        copied: input that the command changes: it is copied to DISK first.
+        converts: whether the command needs splat-transform.
+    """
+
+    arguments: tuple[str, ...]
+    copied: str = ""
+    converts: bool = False
+
+
+COMMANDS = {
+    "edit bundle": Command(("edit", "INPUTS/run", "--out", "DISK/edited.ply", "--scale", "2")),
+    "edit folder": Command(("edit", "INPUTS/run", "--folder", "DISK/levels")),
+    "edit ply": Command(("edit", *PLAIN, "DISK/plain.ply")),
+    "edit splat": Command(("edit", *PLAIN, "DISK/plain.splat")),
+    "edit compressed.ply": Command(("edit", *PLAIN, "DISK/plain.compressed.ply"), converts=True),
+    "edit spz": Command(("edit", *PLAIN, "DISK/plain.spz"), converts=True),
+    "edit sog": Command(("edit", *PLAIN, "DISK/plain.sog"), converts=True),
+    "edit streamed": Command(("edit", "INPUTS/run", "--streamed", "DISK/streamed"), converts=True),
+    "render png": Command(("render", "INPUTS/run", *VIEW, "--out", "DISK/view.png")),
+    "render exr": Command(("render", "INPUTS/run", *VIEW, "--out", "DISK/view.exr")),
+    "capture": Command(("capture", "INPUTS/base.ply", "--out", "DISK/captured", *VIEWS)),
+    "scene": Command(("scene", "--from", "INPUTS/export", "--out", "DISK/scene")),
+    "undistort": Command(("undistort", "DISK/distorted"), "distorted"),
+    "model": Command(("model", "DISK/views"), "views"),
+    "evaluate": Command(("evaluate", "DISK/run", "--far", "--picture", "DISK/levels.png"), "run"),
+    "train": Command(("train", "INPUTS/scene", "--out", "DISK/run", *FLOD)),
+    "train distorted": Command(("train", "INPUTS/distorted", "--out", "DISK/run", *FLOD)),
+    "train without points": Command(("train", "INPUTS/export", "--out", "DISK/run", *FLOD)),
+    "train captured": Command(
+        ("train", "--base", "INPUTS/base.ply", "--capture", "dome", *VIEWS, "--method", "lodge",
+         "--set", "tune_steps=4", "--set", "levels=2", "--image-scale", "1", "--out", "DISK/run")
+    ),
+    "train cells": Command(("train", "INPUTS/scene", "--out", "DISK/run", "--cells", "2x1", *FLOD)),
+    "blocks plan": Command(
+        ("blocks", "plan", "INPUTS/scene", "--out", "DISK/blocks", "--cells", "2x1", *FLOD)
+    ),
+}  # fmt: skip
+
+
+class Undisturbed(NamedTuple):
+    """Result of a command without disturbance.
+
+    Attributes:
+        files: contents of its files by name.
+        copied: bytes of its inputs on the disk.
+        written: bytes that it adds.
+        seconds: duration.
+    """
+
+    files: dict[str, bytes]
+    copied: int
+    written: int
+    seconds: float
+
+
+class Attack:
+    """Inputs in a folder, and the files that each undisturbed command writes.
+
+    Args:
+        work: working folder.
+        rng: random generator for the times of signals.
+    """
+
+    def __init__(self, work: Path, rng: random.Random) -> None:
+        self.work = work
+        self.rng = rng
+        self.inputs = work / "inputs"
+        self.disk = work / "disk"
+        self.wrong: list[str] = []
+        self.messages: dict[str, int] = {}
+        write_inputs(self.inputs)
+        for arguments in (
+            ("train", "INPUTS/scene", "--out", "INPUTS/run", *FLOD),
+            ("capture", "INPUTS/base.ply", "--out", "INPUTS/views", *VIEWS),
+        ):
+            if code := exit_code(self._run(arguments)):
+                raise RuntimeError(f"{arguments[0]} ended with {code}: {self._log()}")
+        shutil.rmtree(self.inputs / "views" / "sparse")
+
+    def undisturbed(self, name: str) -> Undisturbed:
+        """Run a command without disturbance."""
+        shutil.rmtree(self.disk, ignore_errors=True)
+        self._prepare(name)
+        copied = disk_usage(self.disk)
+        start = time.monotonic()
+        if code := exit_code(self._start(name)):
+            raise RuntimeError(f"{name}: undisturbed command ended with {code}: {self._log()}")
+        seconds = time.monotonic() - start
+        result = Undisturbed(contents(self.disk), copied, disk_usage(self.disk) - copied, seconds)
+        shutil.rmtree(self.disk)
+        return result
+
+    def fill_disks(self, name: str, disks: int) -> int:
+        """Run a command on disks of several sizes; return the number of disks that were full."""
+        expected, copied, written, _ = self.undisturbed(name)
+        full = 0
+        for number in range(disks):
+            size = copied + int(written * (number + 0.5) / disks) // 4096 * 4096 + 4096
+            with small_disk(self.disk, size):
+                self._prepare(name)
+                code = exit_code(self._start(name))
+                attack = f"{name}, {size - copied} bytes"
+                if code:
+                    full += 1
+                    self._check_message(attack, code)
+                    self._check_files(attack, expected)
+                subprocess.run(["mount", "-o", "remount,size=1g", str(self.disk)], check=True)
+                self._finish(name, attack, expected)
+        return full
+
+    def send_signals(self, name: str, signals: int) -> int:
+        """Send SIGTERM to a command at random times; return the number of commands that it stopped."""
+        expected, _, _, seconds = self.undisturbed(name)
+        stopped = 0
+        for _ in range(signals):
+            shutil.rmtree(self.disk, ignore_errors=True)
+            self._prepare(name)
+            delay = 0.02 + self.rng.uniform(0, seconds)
+            process = self._start(name)
+            time.sleep(delay)
+            children = descendants(process.pid)
+            process.terminate()
+            code = exit_code(process)
+            attack = f"{name}, signal after {delay:.2f} s"
+            if code not in (0, 3) or (code == 3 and "Traceback" in self._log()):
+                self.wrong.append(f"{attack}: exit code {code}: {self._log()[-300:]}")
+            stopped += code == 3
+            _, alive = psutil.wait_procs(children, timeout=10)
+            if alive:
+                self.wrong.append(f"{attack}: processes left: {[child.cmdline() for child in alive]}")
+            self._check_files(attack, expected)
+            self._finish(name, attack, expected)
+        shutil.rmtree(self.disk, ignore_errors=True)
+        return stopped
+
+    def _prepare(self, name: str) -> None:
+        self.disk.mkdir(exist_ok=True)
+        if copied := COMMANDS[name].copied:
+            shutil.copytree(self.inputs / copied, self.disk / copied)
+
+    def _start(self, name: str) -> Process:
+        return self._run(COMMANDS[name].arguments)
+
+    def _run(self, arguments: Sequence[str]) -> Process:
+        """Start a command in a fork, which saves loading torch."""
+        inputs, disk = str(self.inputs), str(self.disk)
+        words = [word.replace("INPUTS", inputs).replace("DISK", disk) for word in arguments]
+        process = FORK.Process(target=run_command, args=(words, self.work / "log"))
+        process.start()
+        return process
+
+    def _log(self) -> str:
+        return (self.work / "log").read_text(errors="replace")
+
+    def _check_message(self, attack: str, code: int | None) -> None:
+        log = self._log()
+        lines = [line for line in log.splitlines() if str(self.disk) in line]
+        reported = [line for line in lines if any(message in line for message in DISK_FULL_MESSAGES)]
+        if code != 2 or not reported or "Traceback" in log:
+            self.wrong.append(f"{attack}: exit code {code}: {log[-400:]}")
+        else:
+            message = (
+                f"{attack.split(',', maxsplit=1)[0]}: {reported[-1].replace(str(self.disk), 'DISK')[:200]}"
+            )
+            self.messages[message] = self.messages.get(message, 0) + 1
+
+    def _check_files(self, attack: str, expected: dict[str, bytes]) -> None:
+        files = contents(self.disk)
+        differing = [name for name, data in files.items() if name in expected and data != expected[name]]
+        if differing:
+            self.wrong.append(f"{attack}: half written: {sorted(differing)}")
+
+    def _finish(self, name: str, attack: str, expected: dict[str, bytes]) -> None:
+        code = exit_code(self._start(name))
+        files = contents(self.disk)
+        differing = [key for key in expected.keys() | files.keys() if expected.get(key) != files.get(key)]
+        if code or differing:
+            log = self._log()[-300:] if code else ""
+            self.wrong.append(f"{attack}: afterwards: code {code} {log}, different: {sorted(differing)[:9]}")
+
+
+def write_inputs(folder: Path) -> None:
+    """Write a scene, the same with a distorted lens and as an export without points, and splats."""
+    scene = write_tiny_scene(folder / "scene")
+    distorted = folder / "distorted"
+    shutil.copytree(scene, distorted)
+    cameras = distorted / "sparse" / "0" / "cameras.txt"
+    number, _, width, height, focal, _, x, y = cameras.read_text().split()
+    cameras.write_text(f"{number} SIMPLE_RADIAL {width} {height} {focal} {x} {y} 0.02\n")
+    export = folder / "export"
+    shutil.copytree(scene / "images", export / "images")
+    frames = []
+    for line in (scene / "sparse" / "0" / "images.txt").read_text().splitlines()[::2]:
+        _, *pose, _, image = line.split()
+        matrix = np.eye(4)
+        w, *axis = map(float, pose[:4])
+        matrix[:3, :3] = rotation(w, *axis)
+        matrix[:3, 3] = [float(value) for value in pose[4:]]
+        camera_to_world = np.linalg.inv(matrix) @ np.diag([1, -1, -1, 1])
+        frames.append({"file_path": f"images/{image}", "transform_matrix": camera_to_world.tolist()})
+    lens = {"fl_x": float(focal), "fl_y": float(focal), "cx": float(x), "cy": float(y)}
+    lens |= {"w": int(width), "h": int(height)}
+    (export / "transforms.json").write_text(json.dumps(lens | {"frames": frames}))
+    write_ply(folder / "base.ply", opaque_sphere())
+
+
+def opaque_sphere() -> Splats:
+    """Return opaque splats on a sphere."""
+    rng = np.random.default_rng(1)
+    means = rng.normal(size=(600, 3))
+    means *= 2 / np.linalg.norm(means, axis=1, keepdims=True)
+    quats, scales = np.tile([1.0, 0, 0, 0], (600, 1)), np.full((600, 3), -1.8)
+    sh = rng.normal(0, 0.5, (600, 1, 3))
+    arrays = (array.astype(np.float32) for array in (means, quats, scales, np.full(600, 6.0), sh))
+    means, quats, scales, logits, sh = arrays
+    return Splats(means, quats, scales, logits, sh)
+
+
+def rotation(w: float, x: float, y: float, z: float) -> np.ndarray:
+    """Return the rotation matrix of a unit quaternion."""
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + 2 * w * cross + 2 * cross @ cross
+
+
+def run_command(arguments: list[str], log: Path) -> None:
+    """Run one command in this process, with its output in a file."""
+    descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    os.dup2(descriptor, 1)
+    os.dup2(descriptor, 2)
+    sys.argv[1:] = arguments
+    __main__.run()
+
+
+def descendants(pid: int | None) -> list[psutil.Process]:
+    """Return the running processes that a process has started."""
+    with suppress(psutil.Error):
+        return psutil.Process(pid).children(recursive=True)
+    return []
+
+
+def disk_usage(folder: Path) -> int:
+    """Return the bytes that a folder takes on a tmpfs."""
+    paths = list(folder.rglob("*"))
+    return sum(-(-path.stat().st_size // 4096) * 4096 for path in paths if path.is_file())
+
+
+def main() -> int:
+    """Run the attacks, print and write results; return 1 if anything went wrong."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--disks", type=int, default=20)
+    parser.add_argument("--signals", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", nargs="+", choices=COMMANDS, default=list(COMMANDS))
+    options = parser.parse_args()
+    may_mount = sys.platform == "linux" and os.geteuid() == 0
+    if not may_mount:
+        print("Skipping full disks: mounting a small tmpfs needs root on Linux.")
+    results = {}
+    with tempfile.TemporaryDirectory(prefix="lodgs-attacks-") as folder:
+        attack = Attack(Path(folder), random.Random(options.seed))
+        for name in options.only:
+            if COMMANDS[name].converts and not shutil.which(PROGRAM):
+                print(f"Skipping {name}: {PROGRAM} is not installed.")
+                continue
+            full = attack.fill_disks(name, options.disks) if may_mount else 0
+            stopped = attack.send_signals(name, options.signals) if options.signals else 0
+            results[name] = {"full disks": full, "stopped": stopped}
+            print(name, results[name], flush=True)
+    report = ROOT / "build" / "attacks_commands.json"
+    report.parent.mkdir(exist_ok=True)
+    figures = {"commands": results, "messages": attack.messages, "wrong": attack.wrong}
+    report.write_text(json.dumps(figures, indent=1))
+    print(json.dumps(figures, indent=1))
+    return int(bool(attack.wrong))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
