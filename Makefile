@@ -39,7 +39,7 @@ help:
 	@echo "make pins       update requirements/*.txt from requirements/*.in (UPGRADE=1 takes the newest allowed versions)"
 	@echo "make window     tour in a real Blender window, with screenshots (METHOD=flod; needs Blender, Xvfb, ImageMagick)"
 	@echo "make interop    other programs read our files; naga translates our shaders (needs Node)"
-	@echo "make attacks    kill trainers, workers and a scheduler at random times; fill disks (half an hour)"
+	@echo "make attacks    kill and stop every program at random times; fill disks (an hour)"
 
 setup:
 	@command -v $(PYTHON) >/dev/null || { echo "setup: Python is missing; install Python 3.11 with pip." >&2; exit 1; }
@@ -127,6 +127,7 @@ interop: setup
 
 attacks: setup
 	$(VENV) tools/attacks.py
+	$(VENV) tools/attacks_commands.py
 	$(VENV) tools/attacks_blocks.py
 
 clean:

@@ -84,7 +84,7 @@ COMMANDS = {
     "evaluate": Command(("evaluate", "DISK/run", "--far", "--picture", "DISK/levels.png"), "run"),
     "train": Command(("train", "INPUTS/scene", "--out", "DISK/run", *FLOD)),
     "train distorted": Command(("train", "INPUTS/distorted", "--out", "DISK/run", *FLOD)),
-    "train without points": Command(("train", "INPUTS/export", "--out", "DISK/run", *FLOD)),
+    "train without points": Command(("train", "INPUTS/bare", "--out", "DISK/run", *FLOD)),
     "train captured": Command(
         ("train", "--base", "INPUTS/base.ply", "--capture", "dome", *VIEWS, "--method", "lodge",
          "--set", "tune_steps=4", "--set", "levels=2", "--image-scale", "1", "--out", "DISK/run")
@@ -239,13 +239,16 @@ class Attack:
 
 
 def write_inputs(folder: Path) -> None:
-    """Write a scene, the same with a distorted lens and as an export without points, and splats."""
+    """Write a scene; the same with a distorted lens, without points and as an export; and splats."""
     scene = write_tiny_scene(folder / "scene")
     distorted = folder / "distorted"
     shutil.copytree(scene, distorted)
     cameras = distorted / "sparse" / "0" / "cameras.txt"
     number, _, width, height, focal, _, x, y = cameras.read_text().split()
     cameras.write_text(f"{number} SIMPLE_RADIAL {width} {height} {focal} {x} {y} 0.02\n")
+    bare = folder / "bare"
+    shutil.copytree(scene, bare)
+    (bare / "sparse" / "0" / "points3D.txt").write_text("")
     export = folder / "export"
     shutil.copytree(scene / "images", export / "images")
     frames = []

@@ -200,6 +200,20 @@ def test_photos_with_another_suffix_and_turned_photos(tmp_path):
     assert [(camera.fx, camera.cx) for camera in result if camera.name == "b.jpg"] == [(82, 47)]
 
 
+def test_tracks_of_absent_observations_do_not_matter(tmp_path):
+    """pycolmap cannot read such models; programs that write no observations make them."""
+    synthetic.write_scene(tmp_path, synthetic.camera("RADIAL"))
+    model = pycolmap.Reconstruction(tmp_path / "sparse/0")
+    for file in (tmp_path / "sparse/0").iterdir():
+        file.unlink()
+    model.write_text(tmp_path / "sparse/0")
+    lines = (tmp_path / "sparse/0/images.txt").read_text().splitlines()
+    kept = [line if line.endswith(".png") else "" for line in lines if not line.startswith("#")]
+    (tmp_path / "sparse/0/images.txt").write_text("\n".join([*kept, ""]))
+    result = undistort_scene(read_scene(tmp_path), tmp_path / "cache")
+    assert len(result.cameras) == 3 and len(result.points) == 50
+
+
 def test_failures_are_reported_and_leave_no_files(tmp_path, monkeypatch):
     synthetic.write_scene(tmp_path, synthetic.camera("RADIAL"))
     with monkeypatch.context() as patch:
