@@ -232,7 +232,7 @@ def test_signals_cancel_the_run(bpy, fake, tmp_path, number):
     fake("slow")
     with _start_command(tmp_path / "run") as process:
         process.send_signal(number)
-        assert process.wait(30) == 3
+        assert process.wait(60) == 3
         assert process.stderr is not None
         output = process.stderr.read()
     assert "Cancelled. The same command resumes." in output and "Traceback" not in output
@@ -260,7 +260,7 @@ def test_sigterm_ends_a_slow_render_with_exit_code_3(bpy, fake, tmp_path):
             time.sleep(0.05)
         process.send_signal(signal.SIGTERM)
         try:
-            assert process.wait(20) == 3
+            assert process.wait(60) == 3
         finally:
             process.kill()
     assert log.read_text().count("Cancelled. The same command resumes.") == 1
@@ -273,10 +273,11 @@ def test_the_trainer_continues_after_blender_is_killed(bpy, lodgs, fake, tmp_pat
         process.kill()
     run = lodgs("training.runs.folder").RunFolder(tmp_path / "run")
     step = run.last_event("progress")["step"]
-    time.sleep(0.5)
-    assert run.state() == "running" and run.last_event("progress")["step"] > step
+    end = time.monotonic() + 60
+    while run.last_event("progress")["step"] <= step:
+        assert run.state() == "running" and time.monotonic() < end
+        time.sleep(0.05)
     run.request_cancel()
-    end = time.monotonic() + 20
     while run.state() != "cancelled":
         assert time.monotonic() < end
         time.sleep(0.05)

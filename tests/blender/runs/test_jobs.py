@@ -48,7 +48,7 @@ def _levels(root) -> dict[int, int]:
     return {item.number: len(item.object.data.points) for item in root.lodgs.levels if item.exists}
 
 
-def _wait(watch, until, seconds=20.0):
+def _wait(watch, until, seconds=60.0):
     """Step a run, as the timer does with a window, until a condition holds."""
     end = time.monotonic() + seconds
     while not until():
@@ -323,7 +323,7 @@ def test_only_the_trainer_of_the_run_is_killed(lodgs, jobs, fake, root, tmp_path
     assert first.process.poll() is None
     lock.write_text(content)
     jobs.cancel(root)
-    assert first.process.wait(20) == -9
+    assert first.process.wait(60) == -9
     _wait(attached, lambda: not attached.running)
 
 
@@ -432,7 +432,7 @@ def test_reopened_file_attaches_to_its_run(bpy, jobs, watch_of, fake, root, tmp_
     fake()
     resumed = jobs.resume(bpy.data.objects["tiny"])
     bpy.ops.wm.read_homefile(use_empty=True)  # closed before the first level
-    resumed.process.wait(20)
+    resumed.process.wait(60)
     bpy.ops.wm.open_mainfile(filepath=blend)
     root = bpy.data.objects["tiny"]
     assert watch_of(root).state == "done" and _levels(root) == COUNTS
@@ -514,7 +514,7 @@ def test_training_continues_after_removing_the_scene(bpy, jobs, fake, root, tmp_
     assert f"its training continues in {tmp_path / 'run'}" in capfd.readouterr().out
     assert not watch.step() and watch.process.poll() is None
     watch.folder.request_cancel()
-    assert watch.process.wait(20) == 3
+    assert watch.process.wait(60) == 3
 
 
 def test_missing_run_folder_is_no_error_on_opening(bpy, jobs, watch_of, root, tmp_path):
@@ -535,7 +535,7 @@ def test_deleting_the_root_ends_only_the_watch(bpy, jobs, lodgs, fake, root, tmp
     assert not watch.step()
     assert lodgs("runs.watch").watches == {} and watch.folder.state() == "running"
     watch.folder.request_cancel()
-    assert watch.process.wait(20) == 3
+    assert watch.process.wait(60) == 3
 
 
 def test_run_with_fewer_levels_removes_the_other_levels(bpy, lodgs, jobs, fake, root, tmp_path):
@@ -568,7 +568,7 @@ def test_run_folders_do_not_collide(lodgs, jobs, fake, root, tmp_path):
         watch = jobs.start(root)
         with pytest.raises(lodgs("training.errors").LodgsError, match="is already being trained"):
             jobs.start(root)
-        watch.process.wait(20)
+        watch.process.wait(60)
         while watch.step():
             pass
         return watch.folder.path

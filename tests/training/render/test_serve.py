@@ -222,7 +222,7 @@ def test_renderer_ends_with_its_client(own_client, make_splats, camera):
     own_client.receive("progress")
     own_client.process.stdin.close()
     started = time.monotonic()
-    assert own_client.process.wait(timeout=10) == 0
+    assert own_client.process.wait(timeout=60) == 0
     assert time.monotonic() - started < 5
     assert not own_client.folder.exists()
 

@@ -186,8 +186,8 @@ def test_killed_run_resumes_to_the_same_bits(uninterrupted, tmp_path, step):
         command(tmp_path / "job.json", keys), cwd=ROOT, env=environment, stdout=subprocess.DEVNULL
     )
     folder = RunFolder(keys["out"])
-    checkpoint = folder.checkpoints / f"step_{step:07d}.pt"
-    while not checkpoint.exists() and process.poll() is None:
+    wanted = f"step_{step:07d}.pt"
+    while process.poll() is None and not any(path.name >= wanted for path in folder.checkpoints.glob("*.pt")):
         time.sleep(0.001)
     process.kill()
     process.wait()

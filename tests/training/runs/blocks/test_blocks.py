@@ -626,7 +626,7 @@ def test_block_trainers_save_and_end_with_their_parent(tiny_scene, tmp_path, num
     while not block.last_event("progress") and time.monotonic() < deadline:
         time.sleep(0.05)
     process.send_signal(number)
-    assert process.wait(30) == code
+    assert process.wait(60) == code
     while block.running and time.monotonic() < deadline:
         time.sleep(0.05)
     assert list(block.checkpoints.glob("*.pt")) and not block.running

@@ -64,12 +64,12 @@ def test_worker_waits_for_the_trainer_of_a_lost_worker(block, monkeypatch):
     def trainer():
         with run.locked():
             started.set()
-            stop.wait(10)
+            stop.wait(60)
             with run.events_file.open("a") as file:
                 file.write(event_line("hello") + "\n" + event_line("cancelled", message="Stopped.") + "\n")
 
     threading.Thread(target=trainer, daemon=True).start()
-    assert started.wait(10)
+    assert started.wait(60)
     assert train_block(str(block.path)) == 3
     assert not block.log.exists(), "no other trainer was started"
 
