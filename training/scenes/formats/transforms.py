@@ -35,6 +35,8 @@ _SUPPORTED_MODELS = (
 _MATRICES = "K", "intrinsics", "intrinsic_matrix", "camera_matrix"
 """Names of camera matrices that some exporters write instead of focal lengths."""
 _ALIASES = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy"}
+_MAX_NORMALISED = 10.0
+"""Maximum focal length in multiples of the photo's size; focal lengths in pixels are larger."""
 _FLAW = "flaw of the camera matrix"
 
 
@@ -93,6 +95,12 @@ def _parse_view(folder: Path, values: Mapping[str, Any], photos: PhotoFinder) ->
         fx = _focal_length(get_number(values, "camera_angle_x"), width)
         fy = _focal_length(get_number(values, "camera_angle_y"), height) if "camera_angle_y" in values else fx
     center = get_number(values, "cx", width / 2), get_number(values, "cy", height / 2)
+    if 0 < center[0] < 1 and 0 < center[1] < 1:  # normalised by the size
+        sides = width, height
+        if fx < _MAX_NORMALISED:
+            sides = _normalising_sides(fx, fy, width, height)
+            fx, fy = fx * sides[0], fy * sides[1]
+        center = center[0] * sides[0], center[1] * sides[1]
     if isinstance(flaw := values.get(_FLAW), str):
         raise LodgsError(flaw)
     model = str(values.get("camera_model", "")).upper()
@@ -135,6 +143,16 @@ def _read_matrix(values: Mapping[str, Any]) -> dict[str, Any]:
         raise LodgsError("its camera matrix is not [fx 0 cx; 0 fy cy; 0 0 1].")
     lens = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
     return dict(zip(_ALIASES, map(float, lens), strict=True))
+
+
+def _normalising_sides(fx: float, fy: float, width: float, height: float) -> tuple[float, float]:
+    """Return the sides that normalised focal lengths are relative to: those of the axes, or the longer one.
+
+    Of these, the sides with more square pixels are returned.
+    """
+    longer = max(width, height)
+    by_axis = abs(fx * width - fy * height) <= abs(fx - fy) * longer
+    return (width, height) if by_axis else (longer, longer)
 
 
 def _focal_length(angle: float, size: float) -> float:
