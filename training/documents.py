@@ -7,6 +7,7 @@ again. Time and memory grow linearly with the length of the text, which is limit
 
 from __future__ import annotations
 
+import codecs
 import json
 import math
 import re
@@ -107,7 +108,7 @@ def parse_json(text: str | bytes, label: str, max_bytes: int = MAX_JSON_BYTES) -
     """Parse a JSON object.
 
     Args:
-        text: bytes are decoded as UTF-8.
+        text: bytes are decoded as UTF-8, or as UTF-16 with a byte-order mark.
         label: subject of error messages, such as "The camera view.json".
         max_bytes: maximum length of the text.
 
@@ -135,7 +136,10 @@ def _read(path: str | Path, max_bytes: int) -> bytes:
 def _decode(text: str | bytes, max_bytes: int) -> str:
     if len(text) > max_bytes:
         raise ValueError(f"it is longer than {max_bytes:,} bytes")
-    return text.decode("utf-8-sig") if isinstance(text, bytes) else text
+    if isinstance(text, str):
+        return text
+    is_utf16 = text.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))  # written by Windows PowerShell
+    return text.decode("utf-16" if is_utf16 else "utf-8-sig")
 
 
 def _check(value: Any, depth: int, key: str = "a value") -> None:

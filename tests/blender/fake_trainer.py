@@ -8,6 +8,7 @@ Cells of a job that has some make half of their steps, and wait for the file ``g
 - ``two halves``  two levels, and done when the file ``go on`` is there
 - ``no_dask``   the check finds Dask missing
 - ``slow``      steps until it is asked to stop
+- ``far``       as ``""``, with the local origin of a georeferenced scene
 - ``killed``    one level, then SIGKILL to itself
 - ``crash``     one level, then a traceback and exit code 1
 - ``garbage``   noise on stdout and between the events, then as ``""``
@@ -43,6 +44,8 @@ COUNTS = {1: 5, 2: 20}
 """Splats by level."""
 STEPS = 20
 """Of a cell."""
+ORIGIN = [500_000.0, 4_200_000.0, 300.0]
+"""Local origin of the levels in the mode ``far``."""
 LEAVES = 3000
 """Of a tree."""
 
@@ -103,6 +106,7 @@ def run(mode: str, job: Job, folder: RunFolder, say: EventWriter) -> int:
         say("cancelled", message="Stopped; the run can be resumed.")
         return 3
     levels, tables = [], {}
+    origin = {"origin": ORIGIN} if mode == "far" else {}
     for number, count in COUNTS.items():
         path = folder.levels_folder / f"level_{number}.ply"
         levels.append(Level(number, splats(count), {"s_min": 0.1 if number == 1 else 0.0}))
@@ -110,7 +114,7 @@ def run(mode: str, job: Job, folder: RunFolder, say: EventWriter) -> int:
         say(
             "level", level=number, path=f"levels/{path.name}", splats=count, psnr=20.0,
             facts=levels[-1].facts, rule="bands", scene_facts={}, controls={"gamma": 2.0},
-            cumulative=False, meta={},
+            cumulative=False, meta=origin,
         )  # fmt: skip
         if mode == "killed":
             os.kill(os.getpid(), signal.SIGKILL)
@@ -135,7 +139,7 @@ def run(mode: str, job: Job, folder: RunFolder, say: EventWriter) -> int:
     while mode == "two halves" and not (folder.path / "go on").exists():
         time.sleep(0.02)
     controls = {"gamma": 2.0} if rule == "bands" else {}
-    meta = {"camera_center": [1.0, 2.0, 3.0], "focal_px": 100.0}
+    meta = {"camera_center": [1.0, 2.0, 3.0], "focal_px": 100.0, **origin}
     write_bundle(folder.bundle, Bundle(job.method, levels, rule, {}, controls, meta=meta, tables=tables))
     say("done", bundle=folder.bundle.name, seconds=1.0, train_psnr=21.5, veil={"mean": 0.01, "max": 0.25},
         oversized=0)  # fmt: skip

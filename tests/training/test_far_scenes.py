@@ -125,6 +125,8 @@ def test_far_scene_trains_as_the_near_one(runs):
     np.testing.assert_allclose(far.levels[0].splats.means, near.levels[0].splats.means, atol=1e-5)
     ends = [json.loads((run / "events.jsonl").read_text().splitlines()[-1]) for run in runs]
     quality = [end["train_psnr"] for end in ends]
+    events = map(json.loads, (runs[1] / "events.jsonl").read_text().splitlines())
+    assert {tuple(e["meta"]["origin"]) for e in events if e["event"] == "level"} == {tuple(OFFSET)}
     assert quality[1] == pytest.approx(quality[0], abs=0.05)
     assert read_header(runs[1] / "levels" / "level_1.ply").origin.tolist() == OFFSET.tolist()
 

@@ -152,12 +152,22 @@ def _parse_cameras_txt(file: IO[bytes]) -> dict[int, Intrinsics]:
     cameras = {}
     for line in _content_lines(file):
         camera_id, model_name, width, height, *parameters = line.split()
-        lens = LENS_BY_NAME.get(model_name)
+        lens = LENS_BY_NAME.get(model_name.upper())
         if lens is None:
             raise ValueError(f"camera model {model_name} is unknown")
-        cameras[int(camera_id)] = intrinsics_of(lens, int(width), int(height), np.array(parameters, float))
+        cameras[int(camera_id)] = intrinsics_of(
+            lens, _side(width), _side(height), np.array(parameters, float)
+        )
     _check_count(len(cameras), file, "cameras")
     return cameras
+
+
+def _side(text: str) -> int:
+    """Return a side in pixels, which other programs may write with a decimal point."""
+    number = float(text)
+    if not number.is_integer():
+        raise ValueError(f"a camera has an invalid size, {text[:20]}")
+    return int(number)
 
 
 def _parse_images_bin(data: mmap.mmap) -> list[Pose]:

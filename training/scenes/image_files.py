@@ -40,8 +40,8 @@ class ImageFiles:
     def find(self, name: str) -> Path | None:
         """Return the file with this name, or None.
 
-        Other Unicode forms (macOS) and backslashes (Windows) match, too. So does another suffix or case if
-        only one file has it; see ``renamed``.
+        Other Unicode forms (macOS) and backslashes (Windows) match, too. So does another case, else another
+        suffix, if only one file has it; see ``renamed``.
 
         Raises:
             LodgsError: if the name is not UTF-8 or leaves the folder. ``what`` continues a sentence such as
@@ -59,8 +59,13 @@ class ImageFiles:
                     if other.lower().endswith((*IMAGE_SUFFIXES, ".exr")):
                         self._by_stem.setdefault(_stem(other), []).append(path)
             file = self._by_normal_name.get(_normalized(str(relative)))
-            if file is None and len(similar := self._by_stem.get(_stem(str(relative)), [])) == 1:
-                file = self.renamed[name] = similar[0]
+            if file is None:
+                similar = self._by_stem.get(_stem(str(relative)), [])
+                same_suffix = [
+                    path for path in similar if path.suffix.lower() == relative.suffix.lower()
+                ] or similar
+                if len(same_suffix) == 1:
+                    file = self.renamed[name] = same_suffix[0]
         return file
 
 

@@ -14,10 +14,10 @@ from training.scenes.write_colmap import write_model
 from training.splats.bundle import read_bundle, write_bundle
 from training.splats.levels import Bundle, Level
 
-from ..fake_trainer import splats
+from ..fake_trainer import COUNTS, ORIGIN, splats
 
 GARDEN = Path(__file__).resolve().parents[3] / "examples" / "lantern_garden"
-OFFSET = np.array([500_000.0, 4_200_000.0, 300.0])
+OFFSET = np.array(ORIGIN)
 META = {"origin": OFFSET.tolist()}
 
 
@@ -71,6 +71,19 @@ def test_levels_of_another_origin_are_rejected(bpy, lodgs, far):
     with pytest.raises(error, match="local origin"):
         scenes.set_bundle_facts(root, Bundle("3dgs", []))
     scenes.set_bundle_facts(root, Bundle("3dgs", [], meta=META))
+
+
+def test_levels_arrive_while_training(bpy, lodgs, far, fake, tmp_path):
+    root = lodgs("data.importing").import_colmap(bpy.context, far, photographs=False)
+    fake("far")
+    assert bpy.ops.lodgs.train(folder=str(tmp_path / "run")) == {"FINISHED"}
+    assert [len(item.object.data.points) for item in root.lodgs.levels] == list(COUNTS.values())
+    np.testing.assert_array_equal(positions(root.lodgs.levels[1].object), splats(COUNTS[2]).means)
+    assert lodgs("data.selection").origin_of(root).tolist() == ORIGIN
+    fake()  # a trainer that ignores the origin
+    with pytest.raises(RuntimeError, match="local origin"):
+        bpy.ops.lodgs.train(folder=str(tmp_path / "other"))
+    assert lodgs("data.selection").origin_of(root).tolist() == ORIGIN
 
 
 def test_exports_name_the_origin_or_add_it(bpy, lodgs, tmp_path, capfd):

@@ -227,6 +227,25 @@ def test_another_program_s_export(bpy, lodgs, tmp_path):
     assert len(read_scene(tmp_path).cameras) == 2
 
 
+def test_long_names(bpy, lodgs, tmp_path):
+    """A photo whose name is longer than Blender's names, and one that no file system can hold."""
+    long, longer = f"{'a' * 150}/{'b' * 146}.png", "c" * 300 + ".png"
+    write_png(tmp_path / "one.png", np.zeros((30, 40, 3), np.uint8))
+    for name in (long, "d.png"):
+        (tmp_path / "images" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "images" / name).hardlink_to(tmp_path / "one.png")
+    (tmp_path / "one.png").unlink()
+    lens = make_intrinsics("PINHOLE", 40, 30, np.array([40.0, 40, 20, 15]))
+    poses = [(name, np.eye(4)) for name in (long, longer, "d.png")]
+    write_model(tmp_path / "sparse" / "0", [lens] * 3, poses, np.ones((4, 3)), np.zeros((4, 3), np.uint8))
+    messages = []
+    root = lodgs("data.importing").import_colmap(bpy.context, tmp_path, warn=messages.append)
+    views = lodgs("data.photographs").views(root)
+    assert len(views) == 2 and sum("ccc" in message for message in messages) == 1
+    for view in views:
+        lodgs("data.photographs").use_view(bpy.context, view)
+
+
 def test_damaged_export_is_rejected(bpy, lodgs, tmp_path):
     (tmp_path / "transforms.json").write_text("{")
     before = _everything(bpy)

@@ -1,8 +1,11 @@
 """Evaluation reports of a run, against images rendered and compared here."""
 
+import errno
 import json
+import os
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -166,6 +169,24 @@ def test_missing_photos_are_reported_and_do_not_change_the_held_out_views(finish
     shutil.rmtree(copy)
     with pytest.raises(LodgsError, match=r"does not exist.*job\.toml"):
         evaluate_run(run)
+
+
+def test_read_only_run_folder_is_named(finished, monkeypatch, capsys):
+    """Denied as by the system; root may write anywhere."""
+    run = finished(test_every=4)
+    write = Path.write_text
+
+    def deny(path, *arguments, **options):
+        if path.parent == run:
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+        return write(path, *arguments, **options)
+
+    monkeypatch.setattr(Path, "write_text", deny)
+    assert main(["evaluate", str(run)]) == 2
+    expected = (
+        f"error: Cannot write {run / 'metrics.json'}: Permission denied. Choose another name or folder.\n"
+    )
+    assert capsys.readouterr().err.endswith(expected)
 
 
 def test_unfinished_run_is_rejected(tmp_path):

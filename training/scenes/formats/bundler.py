@@ -6,6 +6,7 @@ Format: the manual of Bundler v0.4 (https://www.cs.cornell.edu/~snavely/bundler/
 
 from __future__ import annotations
 
+import codecs
 import re
 from array import array
 from collections.abc import Iterable
@@ -18,16 +19,17 @@ from ...documents import open_file, read_lines
 from ...errors import LodgsError
 from ..images import image_size
 from ..lenses import make_intrinsics
-from .exported import OPENGL, ExportedScene, ExportedView, PhotoFinder, invert_pose
+from .exported import OPENGL, ExportedScene, ExportedView, PhotoFinder, find_file, invert_pose
 
 NAME = "Bundler"
 _VERSION = b"# Bundle file v0.3"
+_BOM = codecs.BOM_UTF8
 _MAX_LINE = 1 << 24
 _MAX_LIST = 1 << 26
 """Maximum bytes of a line, and of the list of photos."""
 _NUMBER = re.compile(r"[-+.\deE]+")
-_LISTS = "list.txt", "bundle.out.list.txt", "image_list.txt", "imagelist.lst"
-"""Names of the list; RealityCapture writes the last one."""
+_LISTS = "list.txt", "bundle.out.list.txt", "image_list.txt", "imagelist.lst", "list.rd.txt"
+"""Names of the list; RealityCapture writes imagelist.lst, RadialUndistort list.rd.txt."""
 
 
 def find(folder: Path) -> Path | None:
@@ -36,8 +38,8 @@ def find(folder: Path) -> Path | None:
     Without such a file, the only other Bundler file of these folders with a list is returned.
     """
     folders = folder, folder / "bundle"
-    for path in (parent / "bundle.out" for parent in folders):
-        if path.is_file() and _find_list(path) is not None:
+    for path in (find_file(parent, "bundle.out") for parent in folders):
+        if path is not None and _find_list(path) is not None:
             return path
     others = [path for parent in folders for path in sorted(parent.glob("*.out")) if _is_bundle(path)]
     return others[0] if len(others) == 1 and _find_list(others[0]) is not None else None
@@ -46,7 +48,7 @@ def find(folder: Path) -> Path | None:
 def _is_bundle(path: Path) -> bool:
     try:
         with open_file(path) as file:
-            return file.read(len(_VERSION)) == _VERSION
+            return file.read(len(_BOM + _VERSION)).removeprefix(_BOM).startswith(_VERSION)
     except LodgsError:
         return False
 
@@ -61,7 +63,7 @@ def read(path: Path) -> ExportedScene:
     try:
         with open_file(path) as file:
             lines = filter(None, map(bytes.strip, read_lines(file, _MAX_LINE)))
-            if not next(lines, b"").startswith(_VERSION):
+            if not next(lines, b"").removeprefix(_BOM).startswith(_VERSION):
                 raise ValueError("its version is not 0.3")
             count, points = map(int, next(lines, b"").split())
             cameras = _parse_numbers(islice(lines, 5 * count), (count, 15))
@@ -109,8 +111,7 @@ def _parse_numbers(lines: Iterable[bytes], shape: tuple[int, int]) -> np.ndarray
 
 def _find_list(path: Path) -> Path | None:
     names = *_LISTS, f"{path.name}.list.txt"
-    candidates = (folder / name for folder in (path.parent, path.parent.parent) for name in names)
-    return next((candidate for candidate in candidates if candidate.is_file()), None)
+    return find_file(path.parent, *names) or find_file(path.parent.parent, *names)
 
 
 def _image_root(path: Path) -> Path:
@@ -124,8 +125,8 @@ def _read_names(path: Path) -> list[str]:
     if list_file is None:
         raise LodgsError(f"Cannot read {path}: there is no list of photos.", f"Add {_LISTS[0]} next to it.")
     with open_file(list_file) as file:
-        text = file.read(_MAX_LIST).decode("utf-8", "replace")
-    return [_photo_name(line.strip()) for line in text.splitlines() if line.strip()]
+        text = file.read(_MAX_LIST).decode("utf-8-sig", "replace")
+    return [_photo_name(line.strip()).strip('"') for line in text.splitlines() if line.strip()]
 
 
 def _photo_name(line: str) -> str:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import os
+import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 
@@ -93,13 +96,17 @@ def read_document(path: Path) -> dict:
 
 
 def get_number(values: Mapping[str, Any], name: str, default: float | None = None) -> float:
-    """Return a number by name.
+    """Return a number by name, which may be written as a text.
 
     Raises:
-        LodgsError: there is neither a number nor a default.
+        LodgsError: there is no finite number, and neither null nor nothing with a default.
     """
-    value = values.get(name, default)
-    if isinstance(value, bool) or not isinstance(value, int | float):
+    value = values.get(name)
+    value = default if value is None else value
+    if isinstance(value, str):
+        with suppress(ValueError):
+            value = float(value)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
         raise LodgsError(f"it has no number '{name}'.")
     return float(value)
 
@@ -116,8 +123,25 @@ def parse_array(value: Any, *shape: int) -> np.ndarray:
             raise ValueError
         return array.reshape(shape)
     except (TypeError, ValueError) as error:
-        size = "x".join(map(str, shape))
+        size = "x".join("N" if side < 0 else str(side) for side in shape)
         raise LodgsError(f"it has a value that is not {size} finite numbers.") from error
+
+
+def parse_camera_matrix(value: Any) -> tuple[float, float, float, float]:
+    """Return fx, fy, cx, cy of a camera matrix of 3x3 or 4x4 numbers, nested or flat, by rows or by columns.
+
+    Raises:
+        LodgsError: the value is not such a matrix.
+    """
+    numbers = parse_array(value, -1)
+    if len(numbers) not in (9, 16):
+        raise LodgsError("its camera matrix is not 3x3 or 4x4 numbers.")
+    matrix = numbers.reshape(int(len(numbers) ** 0.5), -1)[:3, :3]
+    if matrix[2, 0] and not matrix[0, 2]:  # stored by columns, as ARKit does
+        matrix = matrix.T
+    if not (np.array_equal(matrix[2], [0, 0, 1]) and matrix[1, 0] == 0 and abs(matrix[0, 1]) < 0.01):
+        raise LodgsError("its camera matrix is not [fx 0 cx; 0 fy cy; 0 0 1].")
+    return float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2])
 
 
 def colmap_lens(
@@ -174,23 +198,46 @@ def invert_pose(camera_to_world: np.ndarray, opengl: bool = False) -> np.ndarray
 def find_image(folder: Path, name: str) -> Path:
     """Find a photo by an exported name.
 
-    The name may lack its suffix, have another one, or start with another computer's path.
+    The name may lack its suffix, have another one, start with another computer's path, be a URL, or have
+    another Unicode form.
 
     Returns:
         A file in the folder or below it, or the expected path if there is no such file.
     """
+    spellings = name, unquote(name), unicodedata.normalize("NFC", name), unicodedata.normalize("NFD", name)
+    for spelling in dict.fromkeys(spellings):
+        for candidate in _candidates(folder, spelling):
+            stem = candidate.stem if candidate.suffix in _SUFFIXES else candidate.name
+            for path in (candidate, *(candidate.with_name(stem + suffix) for suffix in _SUFFIXES)):
+                if os.path.isfile(path):  # Path.is_file raises for long names
+                    return path
+    return _candidates(folder, name)[0]
+
+
+def _candidates(folder: Path, name: str) -> list[Path]:
+    """Return the paths of a name below a folder, with all of its parts and with fewer leading ones."""
     parts = [
         part
         for part in name.replace("\\", "/").split("/")
         if part not in ("", ".", "..") and not Path(part).drive
     ]
-    candidates = [folder.joinpath(*parts[start:]) for start in range(len(parts))] or [folder]
-    for candidate in candidates:
-        stem = candidate.stem if candidate.suffix in _SUFFIXES else candidate.name
-        for path in (candidate, *(candidate.with_name(stem + suffix) for suffix in _SUFFIXES)):
-            if os.path.isfile(path):  # Path.is_file raises for long names
-                return path
-    return candidates[0]
+    return [folder.joinpath(*parts[start:]) for start in range(len(parts))] or [folder]
+
+
+def find_file(folder: Path, *names: str) -> Path | None:
+    """Return the first of the named files that exists in a folder, in any case, or None."""
+    try:
+        entries = {entry.casefold(): entry for entry in sorted(os.listdir(folder), reverse=True)}
+    except OSError:
+        return None
+    candidates = [folder / name for name in names]
+    candidates += [folder / entries[name.casefold()] for name in names if name.casefold() in entries]
+    return next((path for path in candidates if os.path.isfile(path)), None)
+
+
+def visible_files(folder: Path) -> list[Path]:
+    """Return the sorted files of a folder without hidden ones, such as those that macOS adds to archives."""
+    return sorted(path for path in folder.iterdir() if path.name[0] != "." and path.is_file())
 
 
 class PhotoFinder:
@@ -239,8 +286,8 @@ class PhotoFinder:
             claimed = set(map(self._expected, self._names))
             for path in walk_files(self._folder, NO_PHOTOS):
                 if path.suffix in _SUFFIXES and path not in claimed:
-                    self._by_stem.setdefault(path.stem.casefold(), []).append(path)
-        parts = name.replace("\\", "/").casefold().split("/")
+                    self._by_stem.setdefault(_fold(path.stem), []).append(path)
+        parts = _fold(name.replace("\\", "/")).split("/")
         stem = parts[-1] if Path(parts[-1]).suffix not in _SUFFIXES else Path(parts[-1]).stem
         matches = self._by_stem.get(stem, [])
         ranks = [_shared_parts(parts, path) for path in matches]
@@ -261,7 +308,12 @@ def _shared_parts(parts: list[str], path: Path) -> tuple[int, bool]:
     """Return the number of equal parent folders at the end of two paths, and True for equal file names."""
     count = 0
     for part, folder in zip(reversed(parts[:-1]), reversed(path.parts[:-1]), strict=False):
-        if part != folder.casefold():
+        if part != _fold(folder):
             break
         count += 1
-    return count, parts[-1] == path.name.casefold()
+    return count, parts[-1] == _fold(path.name)
+
+
+def _fold(name: str) -> str:
+    """Return a name for comparison in one Unicode form and without case."""
+    return unicodedata.normalize("NFC", name).casefold()

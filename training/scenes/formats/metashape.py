@@ -27,6 +27,7 @@ from .exported import (
     get_number,
     invert_pose,
     parse_array,
+    visible_files,
 )
 
 NAME = "Metashape XML"
@@ -41,7 +42,11 @@ _IMAGES = "images", "photos", "Images", "."
 
 def find(folder: Path) -> Path | None:
     """Return the first XML file with the elements of a Metashape document."""
-    for path in sorted(folder.glob("*.xml")):
+    try:
+        files = visible_files(folder)
+    except OSError:
+        return None
+    for path in (path for path in files if path.suffix.lower() == ".xml"):
         try:
             with open_file(path) as file:
                 if b"<document" in (head := file.read(_HEAD_BYTES)) and b"<chunk" in head:

@@ -20,6 +20,7 @@ from .exported import (
     ExportedView,
     PhotoFinder,
     colmap_lens,
+    find_file,
     get_number,
     invert_pose,
     parse_array,
@@ -31,9 +32,13 @@ _POINTS = "structure"
 
 
 def find(folder: Path) -> Path | None:
-    """Return the path of sfm_data.json in the folder or in one of OpenMVG's output folders."""
-    names = "sfm_data.json", "reconstruction/sfm_data.json", "reconstruction_sequential/sfm_data.json"
-    return next((folder / name for name in names if (folder / name).is_file()), None)
+    """Return sfm_data.json, or the only file sfm_data*.json, of the folder or of OpenMVG's output folders."""
+    folders = folder, folder / "reconstruction", folder / "reconstruction_sequential"
+    for path in folders:
+        others = sorted(path.glob("sfm_data*.json"))
+        if file := find_file(path, "sfm_data.json") or (others[0] if len(others) == 1 else None):
+            return file
+    return None
 
 
 def read(path: Path) -> ExportedScene:

@@ -33,7 +33,7 @@ def find(folder: Path) -> Path | None:
     """Return the folder of the cameras, preferably corrected ones."""
     for keyframes in (folder / "keyframes", folder):
         for cameras, images in _FOLDERS:
-            if (keyframes / images).is_dir() and any((keyframes / cameras).glob("*.json")):
+            if (keyframes / images).is_dir() and any((keyframes / cameras).glob("[!.]*.json")):
                 return keyframes / cameras
     return None
 
@@ -44,7 +44,7 @@ def read(path: Path) -> ExportedScene:
     """
     images = path.parent / dict(_FOLDERS)[path.name]
     views, excluded = [], []
-    for file in sorted(path.glob("*.json")):
+    for file in sorted(path.glob("[!.]*.json")):
         try:
             values = read_document(file)
             if get_number(values, "blur_score", MIN_SHARPNESS) < MIN_SHARPNESS:

@@ -18,10 +18,13 @@ from .exported import (
     ExportedScene,
     ExportedView,
     colmap_lens,
+    find_file,
     get_number,
     invert_pose,
     parse_array,
+    parse_camera_matrix,
     read_document,
+    visible_files,
 )
 
 NAME = "Record3D"
@@ -30,8 +33,8 @@ _PHOTOS = "rgb", "rgbd"
 
 def find(folder: Path) -> Path | None:
     """Return the metadata file if there is a folder of photos next to it."""
-    candidates = (folder / name for name in ("metadata", "metadata.json"))
-    return next((path for path in candidates if path.is_file() and _photo_folder(path)), None)
+    path = find_file(folder, "metadata", "metadata.json")
+    return path if path is not None and _photo_folder(path) else None
 
 
 def read(path: Path) -> ExportedScene:
@@ -47,7 +50,7 @@ def read(path: Path) -> ExportedScene:
     except LodgsError as error:
         raise LodgsError(f"Cannot read {path}: {error.what}", "Export it again.") from error
     folder = _photo_folder(path) or path.parent
-    files = [file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES]
+    files = [file for file in visible_files(folder) if file.suffix.lower() in IMAGE_SUFFIXES]
     files.sort(key=lambda file: (len(file.stem), file.stem))
     by_number = dict(enumerate(files))
     if len(files) != len(poses):
@@ -87,8 +90,7 @@ def _parse_lenses(document: dict, count: int) -> list[Intrinsics]:
     if len(coefficients) not in (0, count):
         raise LodgsError(f"it has {count} poses, but {len(coefficients)} perFrameIntrinsicCoeffs.")
     if not len(coefficients):
-        matrix = parse_array(document.get("K"), 3, 3).T
-        coefficients = np.tile(matrix[[0, 1, 0, 1], [0, 1, 2, 2]], (count, 1))
+        coefficients = np.tile(parse_camera_matrix(document.get("K")), (count, 1))
     return [colmap_lens(*size, (fx, fy), (cx, cy)) for fx, fy, cx, cy in coefficients]
 
 
