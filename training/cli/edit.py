@@ -37,6 +37,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_outputs(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--appearance", nargs="+", default=[], metavar="PHOTO",
+        help="bake the networks of a run of octree_neural again, with the mean appearance of these photos",
+    )  # fmt: skip
     parser.add_argument("--out", type=Path, help="file or folder to write, in the format of the source")
     parser.add_argument(
         "--plain", type=Path, action="append", default=[], metavar="FILE",
@@ -82,6 +86,7 @@ def _add_look(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
     from ..editing.edit import edit
+    from ..runs.finished import bake_again
     from ..runs.folder import find_splats
     from ..splats.formats import open_as_ply
     from ..splats.level_folder import read_origin
@@ -104,7 +109,12 @@ def run(options: argparse.Namespace) -> int:
             "Cannot write the edited splats: no output.", "Add --out, --plain, --folder or --streamed."
         )
     points = None
-    with open_as_ply(find_splats(options.source)) as source:
+    opened = (
+        bake_again(options.source, options.appearance, warn)
+        if options.appearance
+        else open_as_ply(find_splats(options.source))
+    )
+    with opened as source:
         if options.scene is not None:
             from ..scenes.colmap import read_scene
 

@@ -89,6 +89,13 @@ class ImageModel(Protocol):
         """Render the image of a camera, (H, W, 3)."""
         ...
 
+    def use_appearance(self, photos: Sequence[str]) -> None:
+        """Render and bake with the mean appearance of training photos, by file name.
+
+        Raises:
+            LodgsError: the model has no appearances, or a name is unknown.
+        """
+
 
 P = TypeVar("P", bound=Parameters)
 D = TypeVar("D", bound=Drawing)

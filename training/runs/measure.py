@@ -26,14 +26,12 @@ from ..lod.selection import (
     standalone_levels,
     unknown_rule_error,
 )
-from ..methods import create
 from ..rasterize.resident import ResidentBundle
 from ..scenes.offset_views import read_offset_views
 from ..splats.bundle import read_bundle
 from ..splats.dialects import Warn, ignore
 from ..splats.levels import Bundle
-from .arrays import array_error, read_arrays
-from .data import training_data
+from .finished import load_networks, open_finished
 from .folder import RunFolder
 from .job import Job
 
@@ -80,9 +78,7 @@ def evaluate_run(
         LodgsError: the run is not finished or contains a link, the rule has no such control, or a view off
             the path cannot be read.
     """
-    folder = RunFolder(run)
-    job = _finished_job(folder)
-    data = training_data(job, folder, lambda kind, **values: _report_warning(warn, kind, values))
+    folder, job, data = open_finished(run, warn)
     bundle = open_if_large(folder.bundle) or read_bundle(folder.bundle)
     evaluation = Evaluation(data, job.backend, bundle.antialias)
     rule, values = _resolve_rule(bundle, controls or {})
@@ -102,23 +98,6 @@ def evaluate_run(
     return report
 
 
-def _finished_job(folder: RunFolder) -> Job:
-    """Return the job of a finished run whose scene exists."""
-    folder.reject_links()
-    if not folder.bundle.exists():
-        raise LodgsError(
-            f"Cannot evaluate {folder.path}: it is not a finished run (it has no bundle.ply).",
-            "Choose a run folder, and finish training it first.",
-        )
-    job = Job.from_file(folder.job)
-    if not job.capture and not Path(job.scene).is_dir():
-        raise LodgsError(
-            f"Cannot evaluate {folder.path}: its scene {job.scene} does not exist.",
-            f"Restore the scene, or set its new path in {folder.job} (scene = ...).",
-        )
-    return job
-
-
 def _resolve_rule(bundle: Bundle, controls: Values) -> tuple[Rule | None, Values]:
     """Return the rule of a bundle and the values of all its controls; (None, {}) without a rule.
 
@@ -129,11 +108,6 @@ def _resolve_rule(bundle: Bundle, controls: Values) -> tuple[Rule | None, Values
     if rule is None and (controls or bundle.rule):
         raise LodgsError(*unknown_rule_error(bundle.rule))
     return rule, resolve_controls(bundle, controls) if rule else {}
-
-
-def _report_warning(warn: Warn, kind: str, values: dict[str, Any]) -> None:
-    if kind == "warning":
-        warn(values["message"])
 
 
 def _measure_levels(job: Job, evaluation: Evaluation, bundle: Bundle) -> dict:
@@ -194,14 +168,7 @@ def _measure_rule(job: Job, evaluation: Evaluation, bundle: Bundle, rule: Rule, 
 
 def _measure_networks(job: Job, folder: RunFolder, evaluation: Evaluation) -> dict:
     """Return the quality of the run's neural model before baking."""
-    method = create(job.method, evaluation.data, job.resolved_parameters(), job.seed, job.backend)
-    model = method.image_model
-    assert model is not None
-    arrays = read_arrays(folder.model)
-    try:
-        model.load_arrays(arrays)
-    except (KeyError, ValueError) as error:
-        raise array_error(folder.model, error) from error
+    _, model = load_networks(job, folder, evaluation.data)
     return evaluation.measure_images(model.render_image)
 
 

@@ -81,9 +81,13 @@ class Method(SplatMethod):
     def levels_after(self, step: int) -> list[Level]:
         """Return the single level at the end, sorted by mean weight over the training views, so that
         prefixes are coarser.
+
+        It omits splats of σ_d <= 0: Eq. 2 never draws them, and its ReLU gives them no gradient to return.
         """
         if step + 1 != self.steps:
             return []
+        self.model.keep(self.sigma.detach() > 0)
+        require_rows(self.model, step, "lr_sigma")
         splats = self.model.splats()
         far = self.mean_far_distance()
         splats.extras[SIGMA] = (self.sigma.detach() * (far / self.reference)).cpu().numpy()

@@ -7,7 +7,7 @@ for Blender and for files (``optimize.anchors.baking``).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -105,18 +105,25 @@ class Method(method.Method[NeuralOctreeParameters, NeuralDrawing]):
             self.data.near,
             p.antialias,
             self.backend,
-            self._rendered_view(),
         )
+        if p.appearance_of:
+            self.use_appearance([p.appearance_of])
 
-    def _rendered_view(self) -> int | None:
-        """Return the training view whose appearance is rendered, or None for the mean."""
-        name, names = self.parameters.appearance_of, [camera.name for camera in self.data.train]
-        if name and name not in names:
+    def use_appearance(self, photos: Sequence[str]) -> None:
+        """Render and bake with the mean appearance of training photos (Sec. 7.2, Fig. 10)."""
+        names = [camera.name for camera in self.data.train]
+        if not self.parameters.appearance:
             raise LodgsError(
-                f"Cannot use the appearance of {quote(name)}: no training photo has this name.",
-                f"Set appearance_of to the name of one of them, such as {quote(names[0])}.",
+                "Cannot choose an appearance: the photos have no appearance vectors.",
+                "Train again with appearance=32.",
             )
-        return names.index(name) if name else None
+        for name in photos:
+            if name not in names:
+                raise LodgsError(
+                    f"Cannot use the appearance of {quote(name)}: no training photo has this name.",
+                    f"Name one of them, such as {quote(names[0])}.",
+                )
+        self.decoder = replace(self.decoder, rendered_views=tuple(names.index(name) for name in photos))
 
     def _new_model(self, rows: Mapping[str, torch.Tensor], level: torch.Tensor, bias: torch.Tensor) -> Model:
         """Create a model of anchors; gradient statistics are per Gaussian."""

@@ -80,7 +80,7 @@ class AnchorDecoder:
         view_shapes: let opacity and covariance depend on the view direction.
         near: near plane, in scene units.
         antialias, backend: see ``rasterize``.
-        rendered_view: training view whose appearance renders use; None for the mean.
+        rendered_views: training views whose mean appearance renders use; empty for all.
     """
 
     networks: Networks
@@ -89,7 +89,7 @@ class AnchorDecoder:
     near: float
     antialias: bool
     backend: str
-    rendered_view: int | None = None
+    rendered_views: tuple[int, ...] = ()
 
     def decode(
         self, model: Model, camera: Camera, anchors: torch.Tensor, view: int | None = None
@@ -114,8 +114,8 @@ class AnchorDecoder:
 
         looks = self.networks.covariance(static_inputs).view(-1, count, 7) + own_looks[..., 1:8]
         looks = looks[index, offset_index]
-        appearance, view = self.networks.appearance, self.rendered_view if view is None else view
-        appearance = appearance.mean(0) if view is None else appearance[view]
+        views = self.rendered_views if view is None else (view,)
+        appearance = self.networks.appearance[list(views) if views else slice(None)].mean(0)
         color_inputs = torch.cat([inputs, appearance.expand(len(inputs), -1)], 1)
         colors = self.networks.color(color_inputs).view(-1, count, 3) + own_looks[..., 8:]
         anchor = anchors[index]

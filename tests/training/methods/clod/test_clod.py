@@ -245,6 +245,24 @@ def test_published_preset_keeps_undrawn_splats(data):
         assert (len(clod.model) == initial) == remaining
 
 
+def test_splats_that_eq_2_never_draws_are_not_stored(data):
+    """ReLU(σ) = 0 leaves exp(-d'² / ε): such splats vanish at every distance, and get no gradient."""
+    clod = make(data, preset="paper", steps=24, begin=0.5, densify_until=0.0)
+    trained(clod, 22)
+    with torch.no_grad():
+        clod.model["sigma_d"][:5] = -1.0
+    dead, count = clod.model["means"].detach()[:5].clone(), len(clod.model)
+    clod.train_step(22)
+    clod.train_step(23)
+    [level] = clod.levels_after(23)
+    assert level.splats.extras["sigma_d"].min() > 0 and len(level.splats) <= count - 5
+    assert not np.isin(level.splats.means[:, 0], dead[:, 0].numpy()).any()
+    with torch.no_grad():
+        clod.model["sigma_d"].fill_(-1.0)
+    with pytest.raises(LodgsError, match="lr_sigma"):
+        clod.levels_after(23)
+
+
 def test_prefixes_are_coarser_and_counts_fall_with_scale(data):
     clod = make(data)
     [level] = trained(clod)

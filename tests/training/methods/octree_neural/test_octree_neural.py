@@ -308,5 +308,13 @@ def test_appearance_of_a_photo_is_rendered(data):
         method.decoder.decode(method.model, camera, anchors, view).colors for view in (None, 1, 2)
     )
     assert torch.equal(rendered, photo) and not torch.equal(photo, other)
+    method.use_appearance([data.train[2].name, data.train[1].name])
+    mean = method.networks.appearance[1:3].mean(0)
+    mixed = method.decoder.decode(method.model, camera, anchors).colors
+    with torch.no_grad():
+        method.networks.appearance[0] = mean
+    torch.testing.assert_close(mixed, method.decoder.decode(method.model, camera, anchors, 0).colors)
+    with pytest.raises(LodgsError, match=r"no appearance vectors. Train again"):
+        make(data).use_appearance([name])
     with pytest.raises(LodgsError, match=r"appearance of .none\.jpg.: no training photo has"):
         make(data, appearance=8, appearance_of="none.jpg")

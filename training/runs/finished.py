@@ -1,0 +1,85 @@
+"""Finished runs: open them, load their networks, and bake these again with another appearance."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from ..errors import LodgsError
+from ..methods import create
+from ..optimize.method import ImageModel, Method
+from ..optimize.training_data import TrainingData
+from ..splats.bundle import read_bundle, write_bundle
+from ..splats.dialects import Warn, ignore
+from .arrays import array_error, read_arrays
+from .data import training_data
+from .folder import RunFolder
+from .job import Job
+
+
+def open_finished(run: Path, warn: Warn) -> tuple[RunFolder, Job, TrainingData]:
+    """Return the folder, job and training data of a finished run.
+
+    Raises:
+        LodgsError: the run is not finished, contains a link, or has no scene.
+    """
+    folder = RunFolder(run)
+    folder.reject_links()
+    if not folder.bundle.exists():
+        raise LodgsError(
+            f"Cannot evaluate {folder.path}: it is not a finished run (it has no bundle.ply).",
+            "Choose a run folder, and finish training it first.",
+        )
+    job = Job.from_file(folder.job)
+    if not job.capture and not Path(job.scene).is_dir():
+        raise LodgsError(
+            f"Cannot evaluate {folder.path}: its scene {job.scene} does not exist.",
+            f"Restore the scene, or set its new path in {folder.job} (scene = ...).",
+        )
+
+    def report(kind: str, **values) -> None:
+        if kind == "warning":
+            warn(values["message"])
+
+    return folder, job, training_data(job, folder, report)
+
+
+def load_networks(job: Job, folder: RunFolder, data: TrainingData) -> tuple[Method, ImageModel]:
+    """Return the method of a run with its trained networks, and its neural model."""
+    method = create(job.method, data, job.resolved_parameters(), job.seed, job.backend)
+    model = method.image_model
+    assert model is not None
+    arrays = read_arrays(folder.model)
+    try:
+        model.load_arrays(arrays)
+    except (KeyError, ValueError) as error:
+        raise array_error(folder.model, error) from error
+    return method, model
+
+
+@contextmanager
+def bake_again(run: Path, photos: Sequence[str], warn: Warn = ignore) -> Iterator[Path]:
+    """Bake the networks of a finished run with the mean appearance of training photos (Octree-GS, Fig. 10).
+
+    The bundle is temporary. A photo that is named twice has twice the weight.
+
+    Raises:
+        LodgsError: the run is not finished, has no networks or no appearances, or a photo is unknown.
+    """
+    folder, job, data = open_finished(run, warn)
+    if not folder.model.exists():
+        raise LodgsError(
+            f"Cannot choose an appearance: {folder.path} has no networks.",
+            "Choose a run of the method octree_neural that was trained with appearance above 0.",
+        )
+    method, model = load_networks(job, folder, data)
+    model.use_appearance(photos)
+    bundle = read_bundle(folder.bundle)
+    levels = method.levels_after(method.steps - 1)
+    with TemporaryDirectory() as temporary:
+        path = Path(temporary) / "bundle.ply"
+        write_bundle(path, replace(bundle, levels=levels, meta=bundle.meta | {"appearance": list(photos)}))
+        yield path
