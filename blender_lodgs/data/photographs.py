@@ -178,12 +178,14 @@ def look_at_scene(context: bpy.types.Context, root: bpy.types.Object, warn: Warn
     """Show a splat scene in the window's viewports and extend their clip range to its sky.
 
     The viewports take the pose of the photos if it is known; otherwise they keep their direction and frame
-    the scene.
+    the scene. In a file that only has the objects of Blender's startup file, its cube and light are moved to
+    a hidden collection.
 
     Args:
         warn: function that receives a sentence for each mesh that is hidden because it blocks the view from
-            the photos, such as the cube of a new file.
+            the photos.
     """
+    _put_startup_objects_away(context)
     viewpoint = photo_viewpoint(root)
     for obj in _blocking_meshes(context, *viewpoint) if viewpoint is not None else ():
         obj.hide_set(True)
@@ -195,6 +197,30 @@ def look_at_scene(context: bpy.types.Context, root: bpy.types.Object, warn: Warn
     for region in _viewports(context, root):
         region.view_rotation = (position - target).to_track_quat("Z", "Y")
         region.view_location, region.view_distance = target, (position - target).length
+
+
+def _put_startup_objects_away(context: bpy.types.Context) -> None:
+    """Move the cube and light of an unsaved, unchanged startup file to a hidden collection."""
+    names = {obj.name for obj in bpy.data.objects if root_of(obj) is None}
+    if bpy.data.filepath or names != {"Camera", "Cube", "Light"}:
+        return
+    cube, light = bpy.data.objects["Cube"], bpy.data.objects["Light"]
+    if not _is_startup_cube(cube):
+        return
+    collection = bpy.data.collections.new("Startup Objects")
+    context.scene.collection.children.link(collection)
+    for obj in (cube, light):
+        for previous in obj.users_collection:
+            previous.objects.unlink(obj)
+        collection.objects.link(obj)
+    collection.hide_viewport = collection.hide_render = True
+
+
+def _is_startup_cube(obj: bpy.types.Object) -> bool:
+    if obj.type != "MESH" or obj.modifiers or obj.matrix_world != Matrix():
+        return False
+    corners = np.array([vertex.co for vertex in obj.data.vertices[:9]])
+    return corners.shape == (8, 3) and bool((np.abs(corners) == 1).all())
 
 
 def frame_scene(context: bpy.types.Context, root: bpy.types.Object) -> None:

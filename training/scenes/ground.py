@@ -72,43 +72,54 @@ def find_ground(points: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndar
     Raises:
         LodgsError: no plane reaches the minimum score.
     """
+    if (ground := ground_plane(points, up)) is not None:
+        return ground[:2]
+    raise LodgsError(
+        "Cannot find the ground: no plane lies under this scene.",
+        "Select points of the ground in Edit Mode, or empties on it.",
+    )
+
+
+def ground_plane(points: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray, float] | None:
+    """Return normal, point and score of the ground plane, see :func:`find_ground`; None without one.
+
+    The score is a fraction of the points, at least MIN_SHARE.
+    """
     points = np.asarray(points, np.float64).reshape(-1, 3)
     points = points[np.isfinite(points).all(axis=1)]
     rng = np.random.default_rng(0)
     up = np.asarray(up, np.float64) / np.linalg.norm(up)
     if len(points) > MAX_POINTS:
         points = points[rng.choice(len(points), MAX_POINTS, replace=False)]
-    if len(points) >= 3:
-        low, high = np.percentile(points, (5, 95), axis=0)
-        reach = high - low
-        points = points[((points >= low - reach) & (points <= high + reach)).all(axis=1)]
-        thickness = THICKNESS * float(np.linalg.norm(reach))
-        best = None
-        best_score = MIN_SHARE * len(points)
-        for _ in range(TRIES // BATCH):
-            a, b, c = points[rng.integers(len(points), size=(3, BATCH))]
-            normals = np.cross(b - a, c - a)
-            lengths = np.linalg.norm(normals, axis=1)
-            normals = normals / np.maximum(lengths, 1e-300)[:, None]
-            normals *= np.where(normals @ up < 0, -1, 1)[:, None]
-            level = (normals @ up > np.cos(np.radians(MAX_SLOPE))) & (lengths > 0)
-            normals, origins = normals[level], a[level]
-            heights = normals @ points.T - (normals * origins).sum(axis=1)[:, None]
-            on_plane = (np.abs(heights) <= thickness).sum(axis=1)
-            scores = on_plane - BELOW_WEIGHT * (heights < -thickness).sum(axis=1)
-            if len(scores) and scores.max() > best_score:
-                best_score = scores.max()
-                best = normals[scores.argmax()], origins[scores.argmax()]
-        if best is not None:
-            normal, middle = best
-            for _ in range(5):
-                on_plane = np.abs((points - middle) @ normal) <= thickness
-                normal, middle = fit_plane(points[on_plane], up)
-            return normal, middle
-    raise LodgsError(
-        "Cannot find the ground: no plane lies under this scene.",
-        "Select points of the ground in Edit Mode, or empties on it.",
-    )
+    if len(points) < 3:
+        return None
+    low, high = np.percentile(points, (5, 95), axis=0)
+    reach = high - low
+    points = points[((points >= low - reach) & (points <= high + reach)).all(axis=1)]
+    thickness = THICKNESS * float(np.linalg.norm(reach))
+    best = None
+    best_score = MIN_SHARE * len(points)
+    for _ in range(TRIES // BATCH):
+        a, b, c = points[rng.integers(len(points), size=(3, BATCH))]
+        normals = np.cross(b - a, c - a)
+        lengths = np.linalg.norm(normals, axis=1)
+        normals = normals / np.maximum(lengths, 1e-300)[:, None]
+        normals *= np.where(normals @ up < 0, -1, 1)[:, None]
+        level = (normals @ up > np.cos(np.radians(MAX_SLOPE))) & (lengths > 0)
+        normals, origins = normals[level], a[level]
+        heights = normals @ points.T - (normals * origins).sum(axis=1)[:, None]
+        on_plane = (np.abs(heights) <= thickness).sum(axis=1)
+        scores = on_plane - BELOW_WEIGHT * (heights < -thickness).sum(axis=1)
+        if len(scores) and scores.max() > best_score:
+            best_score = scores.max()
+            best = normals[scores.argmax()], origins[scores.argmax()]
+    if best is None:
+        return None
+    normal, middle = best
+    for _ in range(5):
+        on_plane = np.abs((points - middle) @ normal) <= thickness
+        normal, middle = fit_plane(points[on_plane], up)
+    return normal, middle, float(best_score / len(points))
 
 
 def points_near_cameras(points: np.ndarray, center: np.ndarray, depth: float) -> np.ndarray:

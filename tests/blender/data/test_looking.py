@@ -1,5 +1,6 @@
 """Where a viewport begins to look at what was imported, and that a lack of memory leaves nothing behind."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ from training.scenes.colmap import read_scene
 from training.splats.bundle import write_bundle
 from training.splats.gaussians import Splats
 from training.splats.levels import Bundle, Level
+from training.splats.ply import write_ply
 
 GARDEN = Path(__file__).resolve().parents[3] / "examples" / "lantern_garden"
 KINDS = ("objects", "collections", "pointclouds", "cameras", "images", "meshes", "scenes")
@@ -29,7 +31,7 @@ def ball(count: int, outliers: int) -> Splats:
 
 
 def test_framing_ignores_outliers(bpy, lodgs, tmp_path):
-    write_bundle(tmp_path / "b.ply", Bundle("", [Level(1, ball(2000, 40))]))
+    write_bundle(tmp_path / "b.ply", Bundle("", [Level(1, ball(900, 18))]))  # too few to estimate a view
     root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply", upright=False)
     root.scale, root.location = (2, 2, 2), (0, 0, 5)
     assert lodgs("data.photographs").photo_viewpoint(root) is None
@@ -99,6 +101,40 @@ def test_blocking_meshes_are_hidden_and_reported(bpy, lodgs):
     root = lodgs("data.roots").roots(bpy.context.scene)[0]
     lodgs("data.photographs").look_at_scene(bpy.context, root, told.append)
     assert told == ["Hid 'about', which blocks the view of the splats. Press Alt+H to show it."]
+
+
+def test_plain_splats_open_upright_from_a_clear_view(bpy, lodgs, tmp_path):
+    """A round garden with z up, far from the origin, with outliers: no convention says so."""
+    rng = np.random.default_rng(1)
+    means = rng.uniform(-4, 4, (9000, 3)) * (1, 1, 0.1) + (0, 0, 0.4)
+    means[:6000, 2] = 0
+    means[np.hypot(*means[:, :2].T) > 4] *= (0.5, 0.5, 1)
+    means = means.astype(np.float32) + np.float32((300, -200, 50))
+    means[:200] += 1e4
+    splats = replace(ball(9000, 0), means=means, log_scales=np.full((9000, 3), -3, np.float32))
+    write_ply(tmp_path / "garden.ply", splats)
+    told = []
+    root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "garden.ply", warn=told.append)
+    assert told == [line for line in told if line.startswith("200 splats are more than")] and told
+    bpy.context.view_layer.update()
+    level = root.lodgs.levels[0].object
+    np.testing.assert_allclose(level.matrix_world.to_3x3(), np.eye(3), atol=1e-6)
+    eye, target = lodgs("data.photographs").photo_viewpoint(root)
+    np.testing.assert_allclose(target, (300, -200, 50), atol=1)
+    assert eye.z > target.z + 0.5 and 3 < (eye - target).length < 12
+
+
+@pytest.mark.parametrize("touched", [False, True])
+def test_startup_objects_are_put_away(bpy, lodgs, tmp_path, touched):
+    bpy.ops.wm.read_homefile(use_factory_startup=True)
+    if touched:
+        bpy.data.objects["Cube"].location.x = 1
+    write_bundle(tmp_path / "b.ply", Bundle("", [Level(1, ball(2000, 40))]))
+    bpy.ops.lodgs.import_splats(filepath=str(tmp_path / "b.ply"))
+    bpy.context.view_layer.update()
+    visible = [bpy.data.objects[name].visible_get() for name in ("Cube", "Light", "Camera")]
+    assert visible == ([True] * 3 if touched else [False, False, True])
+    assert ("Startup Objects" in bpy.data.collections) != touched
 
 
 def test_invalid_control_changes_nothing(bpy, lodgs, tmp_path):

@@ -1,0 +1,135 @@
+"""Up direction, extent and first view of splats without cameras, on scenes of simple shapes."""
+
+import numpy as np
+import pytest
+
+from training.scenes.overview import (
+    central_ball,
+    choose_view,
+    complete_meta,
+    describe_clutter,
+    guess_up_rotation,
+)
+from training.splats.gaussians import Splats
+from training.splats.levels import Bundle, Level
+
+Y_DOWN = np.float32([(1, 0, 0), (0, 0, -1), (0, 1, 0)])
+"""Rotation of scenes with z up to the convention of 3DGS, -y up."""
+OFFSET = np.float32([300, -200, 50])
+
+
+def splats_at(means: np.ndarray, size: float = 0.02) -> Splats:
+    count = len(means)
+    return Splats(
+        means.astype(np.float32),
+        np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        np.full((count, 3), np.log(size), np.float32),
+        np.full(count, 4, np.float32),
+        np.zeros((count, 1, 3), np.float32),
+    )
+
+
+def box_faces(half: tuple[float, float, float], count: int = 6000) -> np.ndarray:
+    """Return random points on the faces of a box around the origin, in proportion to their area."""
+    rng = np.random.default_rng(0)
+    half = np.float64(half)
+    points = rng.uniform(-1, 1, (count, 3)) * half
+    areas = half.prod() / half
+    axes = rng.choice(3, count, p=areas / areas.sum())
+    points[np.arange(count), axes] = half[axes] * rng.choice([-1, 1], count)
+    return points
+
+
+def garden() -> np.ndarray:
+    """Return a round ground of radius 4 at z = 0 with things up to 1 high."""
+    rng = np.random.default_rng(1)
+    angles, radii = rng.uniform(0, 2 * np.pi, 6000), 4 * np.sqrt(rng.uniform(0, 1, 6000))
+    heights = np.where(rng.uniform(0, 1, 6000) < 0.5, 0, rng.uniform(0, 1, 6000))
+    return np.column_stack([radii * np.cos(angles), radii * np.sin(angles), heights])
+
+
+def facade() -> np.ndarray:
+    """Return a wall of 12 x 6 at y = 0, with things up to 1 before it (y < 0)."""
+    rng = np.random.default_rng(2)
+    depths = np.where(rng.uniform(0, 1, 6000) < 0.6, 0, rng.uniform(-1, 0, 6000))
+    return np.column_stack([rng.uniform(-6, 6, 6000), depths, rng.uniform(-3, 3, 6000)])
+
+
+def test_outliers_do_not_move_the_central_ball():
+    rng = np.random.default_rng(3)
+    directions = rng.normal(size=(1000, 3))
+    means = directions / np.linalg.norm(directions, axis=1, keepdims=True) * rng.uniform(0, 1, (1000, 1))
+    means[:100] = 1e4
+    center, radius = central_ball(means + OFFSET)
+    np.testing.assert_allclose(center, OFFSET, atol=0.1)
+    assert 0.7 < radius < 1.6
+
+
+@pytest.mark.parametrize("points", [garden(), box_faces((3, 2.5, 1.3))], ids=["garden", "room"])
+def test_ground_is_below(points):
+    up = {}
+    for name, turn in {
+        "z": np.eye(3),
+        "-z": np.diag([1, -1, -1]),
+        "-y": Y_DOWN,
+        "y": -Y_DOWN @ np.diag([-1, 1, 1]),
+    }.items():
+        rotation = guess_up_rotation(splats_at(points @ np.float64(turn).T + OFFSET))
+        up[name] = None if rotation is None else rotation[2].tolist()
+    assert up["z"] == [0, 0, 1] and up["-y"] is None
+    if not np.isclose(points[:, 2].min(), -points[:, 2].max(), atol=0.01):  # a room has two grounds
+        assert up["-z"] == [0, 0, -1] and up["y"] == [0, 1, 0]
+
+
+def test_a_wall_is_no_ground():
+    assert guess_up_rotation(splats_at(facade() @ Y_DOWN.T)) is None
+
+
+def test_view_shows_the_background_behind_the_subject():
+    """A ball in front of a large wall at y = 2."""
+    rng = np.random.default_rng(5)
+    ball = rng.normal(size=(4000, 3))
+    ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    wall = np.column_stack([rng.uniform(-5, 5, 2500), np.full(2500, 2), rng.uniform(-3, 3, 2500)])
+    splats = splats_at(np.concatenate([ball, wall]) + OFFSET, 0.1)
+    position, target = choose_view(splats, np.float64([0, 0, 1]))
+    assert position[1] < OFFSET[1] - 1 and position[2] > target[2]
+
+
+def test_view_of_a_room_is_from_inside():
+    half = np.float64([3, 2.5, 1.3])
+    position, _ = choose_view(splats_at(box_faces(tuple(half)), 0.1), np.float64([0, 0, 1]))
+    assert (np.abs(position) < half).all()
+
+
+def test_view_avoids_splats_near_the_eye():
+    """A veil covers one half of the candidates around a ball."""
+    rng = np.random.default_rng(4)
+    ball = rng.normal(size=(4000, 3))
+    ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    veil = splats_at(
+        np.column_stack([rng.uniform(1.2, 3, 60), rng.uniform(-3, 3, 60), rng.uniform(0, 2, 60)]), 0.5
+    )
+    position, _ = choose_view(Splats.concatenated([splats_at(ball, 0.05), veil]), np.float64([0, 0, 1]))
+    assert position[0] < 0
+
+
+def test_clutter_is_counted():
+    means = np.concatenate([box_faces((1, 1, 1), 2000), np.full((7, 3), 1e3)])
+    splats = splats_at(means)
+    splats.log_scales[:3] = np.log(2.0)
+    assert [line.split(" splats ")[0] for line in describe_clutter(splats)] == ["3", "7"]
+    assert describe_clutter(splats_at(box_faces((1, 1, 1), 2000))) == []
+
+
+def test_known_directions_and_views_are_kept():
+    meta = {"up_rotation": np.eye(3).tolist(), "view": [[0, 0, 1], [0, 0, 0]]}
+    bundle = Bundle("", [Level(1, splats_at(garden()))], meta=dict(meta))
+    complete_meta(bundle)
+    assert bundle.meta == meta
+    bundle = Bundle("", [Level(1, splats_at(garden()))])
+    complete_meta(bundle)
+    assert bundle.meta["up_rotation"] == np.eye(3).tolist() and np.shape(bundle.meta["view"]) == (2, 3)
+    few = Bundle("", [Level(1, splats_at(garden()[:100]))])
+    complete_meta(few)
+    assert few.meta == {}

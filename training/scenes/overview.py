@@ -1,0 +1,191 @@
+"""Up direction, extent and first view of splats whose cameras are unknown. numpy only."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..splats.gaussians import Splats
+from ..splats.levels import Bundle
+from .cameras import look_at
+from .ground import ground_plane
+
+MIN_SPLATS = 1000
+"""Minimum number of splats of a scene whose up direction and view are estimated."""
+_MAX_SPLATS = 40_000
+"""Number of splats used; larger sets are sampled at random."""
+_MIN_OPACITY = 0.1
+_MIN_FLATNESS, _MAX_OBLONG, _MIN_GROUND = 2.2, 1.4, 0.1
+"""A ground across another axis than the convention's: the scene is at least this flat (mean spread over the
+spread along the axis), at most this oblong (a wall is wider than high), and has this score as a ground."""
+_CONVENTION = 2.0
+"""Factor by which the ground of an opposite direction must beat that of the usual one."""
+_FAR_FACTOR = 2.5
+"""Splats beyond this multiple of the median distance from the center are background."""
+_HOLLOW = 0.35, 0.06
+"""Scenes with less than this share (second) of their splats within this fraction of the radius (first) of
+the center surround the viewer, such as rooms."""
+_MIN_ROOM_FLATNESS, _MAX_ROOM_OBLONG = 1.3, 2.0
+"""The same for hollow scenes: rooms are higher than gardens, but their walls are beside the viewer."""
+_LARGE, _NEAR, _FAR = 0.5, 2.0, 20.0
+"""Splats larger than the first multiple of the radius, within the second of the center, veil the subject.
+Splats beyond the third are outliers."""
+_MAX_LARGE = 0.05
+"""Share of large splats from which a scene consists of them."""
+_AROUND, _INSIDE = (1.2, 1.6, 2.2), (0.15, 0.4, 0.7)
+"""Distances of candidate viewpoints from the center in radii, outside an object and inside a hollow scene."""
+_ELEVATIONS = np.radians([12.0, 25.0]), np.radians([0.0, 8.0])
+_AZIMUTHS = 24
+_GRID = 32, 18
+_TANGENT = 0.7
+"""Half width of the view at depth 1: the default lens of Blender's viewports."""
+
+
+def central_ball(means: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return center (3,) and radius of a ball around the subject of a scene.
+
+    It holds nine tenths of the splats, or those within 2.5 times the median distance from the median position
+    if that is smaller, as in scenes with a far background.
+
+    Args:
+        means: (N, 3), N > 0.
+    """
+    center = np.median(means, axis=0).astype(np.float64)
+    distances = np.linalg.norm(means - center, axis=1)
+    median, most = np.percentile(distances, (50, 90))
+    near = means[distances <= _FAR_FACTOR * median]
+    center = np.median(near, axis=0).astype(np.float64)
+    return center, float(max(min(most, _FAR_FACTOR * median), 1e-9))
+
+
+def guess_up_rotation(splats: Splats) -> np.ndarray | None:
+    """Return a rotation (3, 3) float64 to z up; None if -y, the convention of 3DGS, is the best guess.
+
+    Another axis (+y, +z or -z) is up if a clear ground lies across it, see ``ground.ground_plane``.
+    """
+    sample = _sample(splats)
+    if sample is None:
+        return None
+    center, radius = central_ball(sample.means)
+    points = sample.means[np.linalg.norm(sample.means - center, axis=1) < 2 * radius].astype(np.float64)
+    spreads = np.maximum(np.ptp(np.percentile(points, (10, 90), axis=0), axis=0), 1e-12)
+    axis = int(spreads.argmin())
+    width, depth = np.delete(spreads, axis)
+    oblong = max(width, depth) / min(width, depth)
+    hollow = _is_hollow(sample.means, center, radius)
+    flatness = _MIN_ROOM_FLATNESS if hollow else _MIN_FLATNESS
+    is_ground = spreads.mean() >= flatness * spreads[axis]
+    if axis == 0 or not is_ground or oblong > (_MAX_ROOM_OBLONG if hollow else _MAX_OBLONG):
+        return None
+    usual = np.eye(3)[axis] * (-1 if axis == 1 else 1)
+    scores = [ground[2] if (ground := ground_plane(points, up)) else 0.0 for up in (usual, -usual)]
+    if max(scores) < _MIN_GROUND:
+        return None
+    is_usual = scores[1] < _CONVENTION * scores[0]
+    if axis == 1:
+        return None if is_usual else np.float64([(1, 0, 0), (0, 0, -1), (0, 1, 0)])
+    return np.eye(3) if is_usual else np.diag([1.0, -1.0, -1.0])
+
+
+def choose_view(splats: Splats, up: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the position (3,) and target (3,) of a view that shows a scene; None for few splats.
+
+    Candidates circle the center of the scene, or are inside a hollow one. The best one sees far, relative to
+    its distance from the center, and through few splats near to it.
+
+    Args:
+        up: (3,) unit up direction.
+    """
+    sample = _sample(splats)
+    if sample is None:
+        return None
+    center, radius = central_ball(sample.means)
+    sizes = np.exp(np.sort(sample.log_scales, axis=1)[:, 1:].mean(axis=1).astype(np.float64))
+    opacities = 1 / (1 + np.exp(-sample.opacity_logits.astype(np.float64)))
+    hollow = _is_hollow(sample.means, center, radius)
+    east = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    east /= np.linalg.norm(east)
+    north = np.cross(up, east)
+    best, best_score = None, -1.0
+    for distance in radius * np.array(_INSIDE if hollow else _AROUND):
+        for elevation in _ELEVATIONS[int(hollow)]:
+            for angle in np.linspace(0, 2 * np.pi, _AZIMUTHS, endpoint=False):
+                across = np.cos(angle) * east + np.sin(angle) * north
+                eye = center + distance * (np.cos(elevation) * across + np.sin(elevation) * up)
+                score = _clarity(sample.means, sizes, opacities, look_at(eye, center, up), distance)
+                if score > best_score:
+                    best, best_score = eye, score
+    assert best is not None
+    return best, center
+
+
+def describe_clutter(splats: Splats) -> list[str]:
+    """Return sentences with the numbers of splats that veil the subject, and of outliers."""
+    if len(splats) < MIN_SPLATS:
+        return []
+    center, radius = central_ball(splats.means[np.isfinite(splats.means).all(axis=1)])
+    distances = np.linalg.norm(splats.means - center, axis=1)
+    visible = splats.opacity_logits > np.log(_MIN_OPACITY / (1 - _MIN_OPACITY))
+    limit = np.log(_LARGE * radius)
+    large = int(((splats.log_scales.max(axis=1) > limit) & (distances < _NEAR * radius) & visible).sum())
+    far = int((distances > _FAR * radius).sum())
+    sentences = []
+    if 0 < large < _MAX_LARGE * len(splats):
+        sentences.append(
+            f"{large:,} splats are larger than {_LARGE * radius:.3g} and can veil the scene. To hide them: "
+            "Clean Up > Large Splats."
+        )
+    if far:
+        sentences.append(
+            f"{far:,} splats are more than {_FAR * radius:.3g} away from the scene. To hide them: Crop "
+            "Splats."
+        )
+    return sentences
+
+
+def complete_meta(bundle: Bundle) -> None:
+    """Estimate ``up_rotation`` and ``view`` of a bundle that lacks them and has no cameras."""
+    levels = bundle.drawn_levels(bundle.levels[-1].number)
+    splats = Splats.concatenated([level.splats for level in levels])
+    if "up_rotation" not in bundle.meta and (rotation := guess_up_rotation(splats)) is not None:
+        bundle.meta["up_rotation"] = rotation.tolist()
+    if "view" not in bundle.meta and (view := choose_view(splats, bundle.up_rotation[2])) is not None:
+        bundle.meta["view"] = [point.tolist() for point in view]
+
+
+def _is_hollow(means: np.ndarray, center: np.ndarray, radius: float) -> bool:
+    """Return whether a scene has few splats (N, 3) near its center."""
+    return bool((np.linalg.norm(means - center, axis=1) < _HOLLOW[0] * radius).mean() < _HOLLOW[1])
+
+
+def _clarity(
+    means: np.ndarray, sizes: np.ndarray, opacities: np.ndarray, pose: np.ndarray, distance: float
+) -> float:
+    """Return the mean depth of the nearest splats over the view, relative to ``distance`` and at most 1.5.
+
+    Splats near the eye reduce it by the share of the view that they cover. Pixels without splats count 0.3.
+    """
+    local = means @ pose[:3, :3].T + pose[:3, 3]
+    x, y, z = local.T
+    width, height = _GRID
+    tangents = _TANGENT, _TANGENT * height / width
+    front = (z > 0.02 * distance) & (np.abs(x) < tangents[0] * z) & (np.abs(y) < tangents[1] * z)
+    x, y, z, sizes, opacities = x[front], y[front], z[front], sizes[front], opacities[front]
+    covered = opacities * np.minimum((2 * sizes / z) ** 2 * np.pi / (4 * tangents[0] * tangents[1]), 1)
+    veil = float(covered[z < 0.4 * distance].sum())
+    column = ((x / z / tangents[0] + 1) / 2 * width).astype(int).clip(0, width - 1)
+    row = ((y / z / tangents[1] + 1) / 2 * height).astype(int).clip(0, height - 1)
+    nearest = np.full(width * height, np.inf)
+    np.minimum.at(nearest, row * width + column, z)
+    ratios = np.where(np.isfinite(nearest), np.minimum(nearest / distance, 1.5), 0.3)
+    return float(ratios.mean() * np.exp(-veil))
+
+
+def _sample(splats: Splats) -> Splats | None:
+    """Return a random sample of the visible splats with finite positions; None if there are few."""
+    opaque = splats.opacity_logits > np.log(_MIN_OPACITY / (1 - _MIN_OPACITY))
+    rows = np.flatnonzero(opaque & np.isfinite(splats.means).all(axis=1))
+    if len(rows) < MIN_SPLATS:
+        return None
+    if len(rows) > _MAX_SPLATS:
+        rows = np.sort(np.random.default_rng(0).choice(rows, _MAX_SPLATS, replace=False))
+    return splats.select(rows)
