@@ -21,7 +21,7 @@ from ...training.scenes.colmap import Scene, read_scene
 from ...training.scenes.formats import ensure_colmap_scene
 from ...training.scenes.triangulate import cached_points
 from ...training.scenes.undistort import cached_undistorted_scene
-from ...training.scenes.view_tables import VIEWS, read_view_tables
+from ...training.scenes.view_tables import read_view_tables
 from ...training.splats.bundle import read_bundle, read_header
 from ...training.splats.formats import is_plain_ply, open_as_ply
 from ...training.splats.level_folder import read_folder
@@ -227,7 +227,7 @@ def read_splats_file(path: Path | str, budget: int = 0) -> SplatsFile:
     else:
         with open_as_ply(path) as file:
             bundle = (read_folder if file.is_dir() else read_bundle)(file, warnings.append)
-        if VIEWS not in bundle.tables and not bundle.on_disk:
+        if not bundle.method and not bundle.on_disk:  # of another program
             overview.complete_meta(bundle)
             warnings += overview.describe_clutter(bundle.levels[-1].splats)
     return SplatsFile(path, bundle, total, budget, warnings)

@@ -1,7 +1,9 @@
 """Other kinds of files out of Blender and in again, through the operators."""
 
+import gzip
 import os
 import shutil
+import struct
 import subprocess
 import sys
 from pathlib import Path
@@ -68,6 +70,9 @@ def test_streamed_levels_round_trip(bpy, lodgs, root, tmp_path, theirs):
             np.testing.assert_allclose(means(obj), means(item.object), atol=0.01)
 
 
+EMPTY_SPZ = gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, 2, 0, 0, 12, 0, 0))
+
+
 def test_missing_program_is_reported(bpy, lodgs, root, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setattr(lodgs("training.splats.splat_transform"), "_FOLDERS", ())
@@ -76,7 +81,7 @@ def test_missing_program_is_reported(bpy, lodgs, root, tmp_path, monkeypatch):
         lambda: bpy.ops.lodgs.export_plain(filepath=str(tmp_path / "a.spz"), source="LEVEL", level=1),
         lambda: bpy.ops.lodgs.import_splats(filepath=str(tmp_path / "b.spz")),
     ):
-        (tmp_path / "b.spz").touch()
+        (tmp_path / "b.spz").write_bytes(EMPTY_SPZ)
         with pytest.raises(RuntimeError, match="npm install --global"):
             export()
     assert {path.name for path in tmp_path.iterdir()} == {"in.ply", "b.spz"}
