@@ -32,8 +32,11 @@ def bpy():
 
 @pytest.fixture(autouse=True)
 def empty_file(bpy):
-    """Open an empty file with one empty scene; extensions stay enabled."""
+    """Open an empty file with one empty scene, and reset the extension's preferences. It stays enabled."""
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    preferences = bpy.context.preferences.addons[EXTENSION].preferences
+    for name in type(preferences).__annotations__:
+        preferences.property_unset(name)
 
 
 @pytest.fixture
@@ -126,6 +129,39 @@ def blender(bpy, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(cache_folder().parent))  # compiled code
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     return program
+
+
+HANG = """
+import sys, time
+
+write = sys.stderr.write
+
+def write_and_hang(text):
+    write(text)
+    sys.stderr.flush()
+    if {text!r} in text:
+        time.sleep(1000)
+
+sys.stderr.write = write_and_hang
+"""
+
+
+@pytest.fixture
+def hanging(tmp_path):
+    """``hanging(path, text, *command)``: write a program whose Python hangs once it reports a text.
+
+    Such a program cannot end before the test cancels it, even on a busy computer.
+    """
+
+    def write(path: Path, text: str, *command) -> None:
+        folder = tmp_path / "hang"
+        folder.mkdir()
+        (folder / "sitecustomize.py").write_text(HANG.format(text=text))
+        words = " ".join(f'"{word}"' for word in command)
+        path.write_text(f'#!/bin/sh\nPYTHONPATH="{folder}" exec {words} "$@"\n')
+        path.chmod(0o755)
+
+    return write
 
 
 @pytest.fixture(scope="session")

@@ -7,8 +7,7 @@ Cells of a job that has some make half of their steps, and wait for the file ``g
 - ``tree``      leaves, then all nodes of a tree
 - ``two halves``  two levels, and done when the file ``go on`` is there
 - ``no_dask``   the check finds Dask missing
-- ``slow``      steps until it is asked to stop
-- ``far``       as ``""``, with the local origin of a georeferenced scene
+- ``slow``      steps until it is asked to stop, at most half an hour
 - ``killed``    one level, then SIGKILL to itself
 - ``crash``     one level, then a traceback and exit code 1
 - ``garbage``   noise on stdout and between the events, then as ``""``
@@ -72,7 +71,7 @@ def main() -> int:
     job = Job.from_file(Path(sys.argv[5], "job.toml") if command == "blocks" else Path(sys.argv[4]))
     folder = RunFolder(job.out)
     if mode == "mute":
-        time.sleep(60)
+        time.sleep(1000)
     if mode == "refused":
         what, remedy = "The run folder belongs to another job.", "Choose another."
         print(json.dumps({"event": "error", "what": what, "remedy": remedy}))
@@ -92,7 +91,7 @@ def run(mode: str, job: Job, folder: RunFolder, say: EventWriter) -> int:
         say("progress", stage="level 1 of 2", step=None)
         say("level", level="one", path=3)
         return 1
-    for step in range(10_000 if mode == "slow" else 2):
+    for step in range(100_000 if mode == "slow" else 2):
         say("progress", stage="level 1 of 2", level=1, levels=2, step=step + 1, of=10_000, loss=0.5,
             psnr=20.0, splats=5, steps_per_s=20.0, eta_s=60.0)  # fmt: skip
         if folder.take_cancel():

@@ -219,7 +219,7 @@ def _start_command(run: Path) -> subprocess.Popen:
         stderr=subprocess.PIPE,
         text=True,
     )
-    end = time.monotonic() + 60
+    end = time.monotonic() + 200
     while not ((run / "events.jsonl").exists() and "progress" in (run / "events.jsonl").read_text()):
         assert time.monotonic() < end and process.poll() is None
         time.sleep(0.05)
@@ -232,7 +232,7 @@ def test_signals_cancel_the_run(bpy, fake, tmp_path, number):
     fake("slow")
     with _start_command(tmp_path / "run") as process:
         process.send_signal(number)
-        assert process.wait(60) == 3
+        assert process.wait(200) == 3
         assert process.stderr is not None
         output = process.stderr.read()
     assert "Cancelled. The same command resumes." in output and "Traceback" not in output
@@ -254,13 +254,13 @@ def test_sigterm_ends_a_slow_render_with_exit_code_3(bpy, fake, tmp_path):
     command = [sys.executable, "-c", COMMAND, *map(str, words)]
     log = tmp_path / "log"
     with open(log, "w") as errors, subprocess.Popen(command, stderr=errors) as process:
-        end = time.monotonic() + 60
+        end = time.monotonic() + 200
         while "View 1 of 4" not in log.read_text():
             assert time.monotonic() < end and process.poll() is None, log.read_text()
             time.sleep(0.05)
         process.send_signal(signal.SIGTERM)
         try:
-            assert process.wait(60) == 3
+            assert process.wait(200) == 3
         finally:
             process.kill()
     assert log.read_text().count("Cancelled. The same command resumes.") == 1
@@ -273,9 +273,9 @@ def test_the_trainer_continues_after_blender_is_killed(bpy, lodgs, fake, tmp_pat
         process.kill()
     run = lodgs("training.runs.folder").RunFolder(tmp_path / "run")
     step = run.last_event("progress")["step"]
-    end = time.monotonic() + 60
-    while run.last_event("progress")["step"] <= step:
-        assert run.state() == "running" and time.monotonic() < end
+    end = time.monotonic() + 200
+    while run.last_event("progress")["step"] == step:
+        assert time.monotonic() < end and run.state() == "running"
         time.sleep(0.05)
     run.request_cancel()
     while run.state() != "cancelled":

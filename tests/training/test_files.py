@@ -160,7 +160,7 @@ def test_blocks_of_one_name_run_in_turn(tmp_path, monkeypatch):
         thread.start()
         thread.join(0.3)
         order.append("first")
-    thread.join(10)
+    thread.join(200)
     assert order == ["first", "second"]
 
 

@@ -27,7 +27,7 @@ def lodgs(tmp_path_factory):
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check"]
     offline = ["--quiet", "--no-deps", "--no-index"]
     wheel = [*pip, "wheel", *offline, "--no-build-isolation", "--wheel-dir", folder, ROOT]
-    subprocess.run(wheel, check=True, timeout=120)
+    subprocess.run(wheel, check=True, timeout=600)
     venv.create(folder / "venv")
     paths = {"base": str(folder / "venv"), "platbase": str(folder / "venv")}
     python = Path(sysconfig.get_path("scripts", "venv", paths)) / "python"
@@ -37,13 +37,13 @@ def lodgs(tmp_path_factory):
     with zipfile.ZipFile(wheel_file) as file:
         data = {"lodgs/rasterize/gpu/shaders/sort.wgsl", "lodgs/py.typed", "lodgs/__init__.pyi"}
         assert data <= set(file.namelist())
-    subprocess.run([*pip, "--python", python, "install", *offline, wheel_file], check=True, timeout=120)
+    subprocess.run([*pip, "--python", python, "install", *offline, wheel_file], check=True, timeout=600)
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
 
     def run(*arguments) -> str:
         process = subprocess.run(
             [python.with_name("lodgs"), *map(str, arguments)],
-            cwd=folder, env=environment, capture_output=True, text=True, timeout=240, check=False,
+            cwd=folder, env=environment, capture_output=True, text=True, timeout=600, check=False,
         )  # fmt: skip
         assert process.returncode == 0, process.stdout + process.stderr
         return process.stdout

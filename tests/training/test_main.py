@@ -73,7 +73,7 @@ def test_mistakes_keep_their_exit_code_if_they_cannot_be_reported(words):
 def test_every_command_is_cancelled_by_signals(number):
     program = (
         "import time, types, training.__main__ as m\n"
-        "def run(options): print('started', flush=True); time.sleep(100)\n"
+        "def run(options): print('started', flush=True); time.sleep(1000)\n"
         "m._module = lambda name: types.SimpleNamespace(run=run, add_arguments=lambda parser: None)\n"
         "import sys; sys.argv[1:] = ['scene']; m.run()"
     )
@@ -82,7 +82,7 @@ def test_every_command_is_cancelled_by_signals(number):
     )
     assert process.stdout is not None and process.stdout.readline() == "started\n"
     process.send_signal(number)
-    assert process.communicate(timeout=60) == ("", "") and process.returncode == 3
+    assert process.communicate(timeout=200) == ("", "") and process.returncode == 3
 
 
 @pytest.mark.parametrize(

@@ -128,7 +128,7 @@ def install(folder: Path, package: str, entries: str, files: dict[str, str]) -> 
 def run_python(folder: Path, *arguments) -> subprocess.CompletedProcess:
     """Run Python with the packages of a folder installed."""
     process = subprocess.run(
-        [sys.executable, *map(str, arguments)], capture_output=True, text=True, timeout=240, check=False,
+        [sys.executable, *map(str, arguments)], capture_output=True, text=True, timeout=600, check=False,
         cwd=ROOT, env=os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(folder)])},
     )  # fmt: skip
     assert process.returncode == 0, process.stdout + process.stderr

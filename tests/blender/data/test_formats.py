@@ -109,7 +109,7 @@ def test_recipe_adds_a_format_to_the_operator(tmp_path):
     (tmp_path / "training/splats/formats/xyz.py").write_text(recipe_code("Add an export format"))
     write_bundle(tmp_path / "in.ply", Bundle("made", [Level(1, splats(40))]))
     process = subprocess.run(
-        [sys.executable, "-c", SCRIPT, tmp_path], capture_output=True, text=True, timeout=240, check=False,
+        [sys.executable, "-c", SCRIPT, tmp_path], capture_output=True, text=True, timeout=600, check=False,
         cwd=ROOT,
     )  # fmt: skip
     assert process.returncode == 0, process.stdout + process.stderr

@@ -42,7 +42,7 @@ def test_finest_level_appears_as_points(bpy, lodgs, tmp_path, cumulative):
     bpy.context.view_layer.update()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "b.blend"))
     command = [sys.executable, "-c", LOOK, str(tmp_path / "b.blend")]
-    out = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout
+    out = subprocess.run(command, capture_output=True, text=True, check=True, timeout=600).stdout
     seen = json.loads(out.rpartition("SEEN")[2])
     assert "extension LODGS" in seen.pop("told")
     shown = COUNTS if cumulative else {3: COUNTS[3]}

@@ -72,7 +72,7 @@ def test_entry_of_the_table_declares_a_choice(tmp_path):
     assert text.count(LAST) == 1
     table.write_text(text.replace(LAST, f"    VIEWPORT,\n{ENTRY})\n"))
     process = subprocess.run(
-        [sys.executable, "-c", SCRIPT, tmp_path], capture_output=True, text=True, timeout=240, check=False,
+        [sys.executable, "-c", SCRIPT, tmp_path], capture_output=True, text=True, timeout=600, check=False,
         cwd=ROOT,
     )  # fmt: skip
     assert process.returncode == 0, process.stdout + process.stderr

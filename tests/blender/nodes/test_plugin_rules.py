@@ -39,7 +39,7 @@ def test_scene_with_a_plugin_rule_shows_one_level(tmp_path):
     entries = "[lodgs.methods]\nmymethod = mymethod\n[lodgs.rules]\nplugged = mymethod.rule\n"
     install(tmp_path, "mymethod", entries, files)
     process = subprocess.run(
-        [sys.executable, "-c", SCRIPT, tmp_path / "bundle.ply"], capture_output=True, text=True, timeout=240,
+        [sys.executable, "-c", SCRIPT, tmp_path / "bundle.ply"], capture_output=True, text=True, timeout=600,
         check=False, cwd=ROOT, env=os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(tmp_path)])},
     )  # fmt: skip
     assert process.returncode == 0, process.stdout + process.stderr

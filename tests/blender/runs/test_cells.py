@@ -35,7 +35,7 @@ def root(bpy):
     return root
 
 
-def _wait(watch, until, seconds=60.0):
+def _wait(watch, until, seconds=200.0):
     end = time.monotonic() + seconds
     while not until():
         assert watch.running, (watch.message, watch.problem)

@@ -162,12 +162,12 @@ def test_cancelled_installation_keeps_the_previous_environment(
     bpy, lodgs, environment_setup, fake, environments
 ):
     assert bpy.ops.lodgs.make_environment() == {"FINISHED"}
-    fake(pip="echo Collecting patience; exec sleep 30")
+    fake(pip="echo Collecting patience; exec sleep 1000")
     work = environment_setup.start()
     with pytest.raises(Exception, match="already being installed"):
         environment_setup.start()
     assert bpy.ops.lodgs.cancel_environment() == {"FINISHED"}
-    work._thread.join(10)
+    work._thread.join(200)
     assert not work.running and work.message == "Cancelled" and work.problem == ""
     assert environments() == ["1"] and lodgs("runs.environment").trainer_python().exists()
 
@@ -201,7 +201,7 @@ def test_environment_of_a_running_program_is_not_removed(
     bpy, lodgs, environment_setup, fake, environments, tmp_path, start
 ):
     processes, environment = lodgs("runs.processes"), lodgs("runs.environment")
-    fake(work="exec sleep 60")
+    fake(work="exec sleep 1000")
     assert bpy.ops.lodgs.make_environment() == {"FINISHED"}
     command, output = [str(environment.trainer_python()), "-m", "training"], {"log": tmp_path / "log"}
     if start == "spawn":

@@ -45,6 +45,6 @@ assert "fog" in [call.args[1] for call in layout.prop.call_args_list]
 def test_new_key_has_a_property_and_is_in_jobs(bpy, tmp_path):
     process = subprocess.run(
         [sys.executable, "-c", SCRIPT], cwd=checkout_with_key(tmp_path / "checkout"), capture_output=True,
-        text=True, check=False, timeout=240,
+        text=True, check=False, timeout=600,
     )  # fmt: skip
     assert process.returncode == 0, process.stdout + process.stderr

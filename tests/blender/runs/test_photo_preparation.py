@@ -1,5 +1,6 @@
 """Preparation of photos: the trainer finds their cameras and Blender imports the scene."""
 
+import os
 import time
 
 import numpy as np
@@ -43,12 +44,14 @@ def test_photos_become_a_scene(bpy, lodgs, photos):
     np.testing.assert_allclose(distances / distances.sum() * expected.sum(), expected, atol=0.05)
 
 
-def test_stopped_preparation_continues(bpy, lodgs, photos, tmp_path):
-    photo_preparation = lodgs("runs.photo_preparation")
+def test_stopped_preparation_continues(bpy, lodgs, photos, hanging, tmp_path, monkeypatch):
+    photo_preparation, trainer = lodgs("runs.photo_preparation"), os.environ["LODGS_TRAINER_PYTHON"]
+    hanging(tmp_path / "trainer", " 1 of 6", trainer)
+    monkeypatch.setenv("LODGS_TRAINER_PYTHON", str(tmp_path / "trainer"))
     work = photo_preparation.find_cameras(photos, tmp_path / "out")
     with pytest.raises(RuntimeError, match="already being prepared"):
         bpy.ops.lodgs.find_cameras(directory=str(photos))
-    end = time.monotonic() + 60
+    end = time.monotonic() + 200
     while work.step() and not work.fraction:
         assert time.monotonic() < end
         time.sleep(0.02)
@@ -57,6 +60,7 @@ def test_stopped_preparation_continues(bpy, lodgs, photos, tmp_path):
         time.sleep(0.02)
     assert "start it again" in work.message and not work.problem
     assert not lodgs("data.roots").roots(bpy.context.scene)
+    monkeypatch.setenv("LODGS_TRAINER_PYTHON", trainer)
     assert bpy.ops.lodgs.find_cameras(directory=str(photos), out=str(tmp_path / "out")) == {"FINISHED"}
 
 

@@ -65,7 +65,7 @@ def test_results_do_not_depend_on_array_addresses(name, make_splats, odd_camera)
 
 def test_sixteen_threads_process_equal_numbers_of_ranges(sixteen_threads):
     """A barrier waits until all threads have a range, so each must process five ranges."""
-    barrier = threading.Barrier(16, timeout=60)
+    barrier = threading.Barrier(16, timeout=200)
     ranges = []
 
     def work(begin, end, width):

@@ -3,7 +3,6 @@
 import json
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -221,9 +220,9 @@ def test_renderer_ends_with_its_client(own_client, make_splats, camera):
     own_client.send(**request(camera.resized(8192, 6144), sets, 1))
     own_client.receive("progress")
     own_client.process.stdin.close()
-    started = time.monotonic()
-    assert own_client.process.wait(timeout=60) == 0
-    assert time.monotonic() - started < 5
+    assert own_client.process.wait(timeout=200) == 0
+    events = [json.loads(line)["event"] for line in own_client.process.stdout]
+    assert set(events) <= {"progress"}, "it finished the frame"
     assert not own_client.folder.exists()
 
 

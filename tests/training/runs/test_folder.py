@@ -18,7 +18,7 @@ from training.runs.folder import RunFolder, find_splats
 ROOT = Path(__file__).resolve().parents[3]
 LOCK_RUN = (
     "import sys, time; from training.runs.folder import RunFolder\n"
-    "with RunFolder(sys.argv[1]).locked(): print('held', flush=True); time.sleep(600)"
+    "with RunFolder(sys.argv[1]).locked(): print('held', flush=True); time.sleep(1000)"
 )
 
 
@@ -105,7 +105,7 @@ def test_lost_lock_is_detected(run):
 def test_kill_ends_the_trainer(run, holder):
     assert run.running
     run.kill()
-    holder.wait(60)
+    holder.wait(200)
     assert not run.running
 
 
@@ -180,7 +180,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)  # shells ignore it for
 stop_with_parent()
 print("ready", flush=True)
 try:
-    time.sleep(60)
+    time.sleep(1000)
 except KeyboardInterrupt:
     print("interrupted", flush=True)
 """
@@ -193,7 +193,7 @@ except KeyboardInterrupt:
             assert child.poll() is None
             parent.kill()
             parent.wait()
-            assert child.communicate(timeout=60)[0] == "interrupted\n"
+            assert child.communicate(timeout=200)[0] == "interrupted\n"
 
 
 @pytest.mark.parametrize("value", [None, "", "1", "x y", "PID elsewhere 1 boot 5"])

@@ -5,7 +5,7 @@ import json
 import os
 import shutil
 import signal
-from pathlib import Path
+import time
 
 import pytest
 
@@ -52,6 +52,7 @@ def test_stop_while_triangulating_then_resume(walls, tmp_path, monkeypatch, requ
         if message.startswith("Comparing pair"):
             if request_stop == "cancel":
                 folder.request_cancel()
+                time.sleep(1000)  # the request interrupts it
             else:
                 os.kill(os.getpid(), signal.SIGTERM)
 

@@ -273,9 +273,9 @@ def test_program_that_hangs_on_a_full_disk_is_killed_and_reported(monkeypatch, t
 
 
 def test_program_stops_when_its_parent_is_killed(tmp_path):
-    names = [f"{number}.png" for number in range(120)]
+    names = [f"{number}.png" for number in range(200)]
     synthetic.write_scene(tmp_path, synthetic.camera("OPENCV"), names=names)
-    large = np.kron(ramps(), np.ones((20, 20, 1), np.uint8))
+    large = np.kron(ramps(), np.ones((40, 40, 1), np.uint8))
     synthetic.write_image(tmp_path / "large.png", large)
     for name in names:
         (tmp_path / "images" / name).unlink()

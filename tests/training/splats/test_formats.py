@@ -277,7 +277,7 @@ def test_recipe_adds_a_format_to_the_command_line(tmp_path):
 
     def run(*arguments):
         command = [sys.executable, "-m", "training", "edit", *arguments]
-        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=100, check=False)
+        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600, check=False)
 
     process = run("in.ply", "--plain", "out.xyz")
     assert process.returncode == 0, process.stderr

@@ -166,7 +166,7 @@ def test_thread_reads_requested_pages(truth, path):
     try:
         for position in EYES[:4]:
             pager.ask(by_values.LodQuery("cut", position, FOCAL, (), (("pixels", 1.0),)))
-            expected, until = truth.cut(position, 1.0), time.monotonic() + 60
+            expected, until = truth.cut(position, 1.0), time.monotonic() + 200
             while not pager.idle and time.monotonic() < until:
                 if (update := pager.take()) is not None:
                     memory.take(update)

@@ -55,8 +55,8 @@ def test_local_cluster_rejects_other_users(count):
             assert not any(b"200 OK" in fetch(server, page) for page in PAGES)
         assert cluster.scheduler_address.startswith("tls://")
         reject_strangers(cluster.scheduler_address)
-        with distributed.Client(cluster, timeout=60) as client:
-            assert client.submit(sum, [1, 2]).result(60) == 3 if count else client.status == "running"
+        with distributed.Client(cluster, timeout=200) as client:
+            assert client.submit(sum, [1, 2]).result(200) == 3 if count else client.status == "running"
 
 
 def test_cluster_with_a_key_file_rejects_clients_without_it(tmp_path):

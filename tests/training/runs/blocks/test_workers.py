@@ -64,12 +64,12 @@ def test_worker_waits_for_the_trainer_of_a_lost_worker(block, monkeypatch):
     def trainer():
         with run.locked():
             started.set()
-            stop.wait(60)
+            stop.wait(200)
             with run.events_file.open("a") as file:
                 file.write(event_line("hello") + "\n" + event_line("cancelled", message="Stopped.") + "\n")
 
     threading.Thread(target=trainer, daemon=True).start()
-    assert started.wait(60)
+    assert started.wait(200)
     assert train_block(str(block.path)) == 3
     assert not block.log.exists(), "no other trainer was started"
 
@@ -111,7 +111,7 @@ import os, sys, time
 if "train" in sys.orig_argv:
     folder = os.path.dirname(__file__)
     open(os.path.join(folder, "card-" + os.environ["CUDA_VISIBLE_DEVICES"]), "w").close()
-    end = time.monotonic() + 30  # the other worker takes the second block
+    end = time.monotonic() + 200  # the other worker takes the second block
     while time.monotonic() < end and sum(name.startswith("card-") for name in os.listdir(folder)) < 2:
         time.sleep(0.05)
     os._exit(0)
@@ -187,7 +187,7 @@ def test_external_scheduler_trains_a_block_and_its_loss_is_reported(block, tmp_p
             assert block.state() == "done"
             scheduler.kill()
             scheduler.wait()
-            deadline = time.monotonic() + 60
+            deadline = time.monotonic() + 200
             while time.monotonic() < deadline:
                 pending = submit(block.path)
                 while not pending.done():
