@@ -394,6 +394,10 @@ def test_folders_without_export_are_rejected(tmp_path):
             "Registration.CSV is a table",
             "Export the cameras for COLMAP or Bundler",
         ),
+        (["IMG_1.HEIC", "IMG_2.HEIC"], "IMG_1.HEIC is a HEIC photo", "Convert the photos to JPEG"),
+        (["clip.MOV"], "clip.MOV is a video", "lodgs frames"),
+        (["poses_bounds.npy", "a.jpg"], "poses_bounds.npy is a file of LLFF", "COLMAP model"),
+        (["frames/a.png"], "it has photos, but no cameras", "lodgs scene --photos"),
         (["project.psx"], "project.psx is a Metashape project", "Export Cameras"),
         (
             ["database.db", "images/a.jpg"],

@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from ..colmap import subfolders
 from ..images import IMAGE_SUFFIXES
 from .exported import visible_files
 
 FIND_CAMERAS = "find the cameras again: lodgs scene --photos DIR --out SCENE"
+_FRAMES = "blender --command lodgs frames VIDEO --out SCENE/images"
 _FILES = {
     ".r3d": ("a packed Record3D file", "Unpack it as a ZIP archive and choose its folder"),
     ".zip": ("an archive", "Unpack it and choose its folder"),
@@ -19,6 +21,11 @@ _FILES = {
     ".csv": ("a table, which LODGS does not read", "Export the cameras for COLMAP or Bundler"),
     ".nvm": ("a VisualSFM file", "Save the model for Bundler (bundle.out)"),
     ".sfm": ("a Meshroom file", "Export the cameras for COLMAP"),
+    "poses_bounds.npy": ("a file of LLFF", "Choose the folder of its COLMAP model"),
+    "cameras_sphere.npz": ("a file of NeuS", "Choose the data set's COLMAP model or transforms.json"),
+    ".heic": ("a HEIC photo, which is not supported", "Convert the photos to JPEG"),
+    ".mp4": ("a video", f"Extract its frames with {_FRAMES}"),
+    ".mov": ("a video", f"Extract its frames with {_FRAMES}"),
     "database.db": ("a COLMAP database without a model", "Choose the folder of the model"),
 }
 """Descriptions and remedies by suffix or name."""
@@ -42,7 +49,7 @@ def describe_foreign(folder: Path) -> tuple[str, str] | None:
         kind, remedy = _FILES.get(name) or _FILES.get(path.suffix.lower()) or ("", "")
         if kind:
             return f"{path.name} is {kind}", f"{remedy}, or {FIND_CAMERAS}."
-    if any(_holds_photos(place) for place in (folder, folder / "images", folder / "input")):
+    if any(map(_holds_photos, (folder, *subfolders(folder)))):
         return "it has photos, but no cameras", f"{FIND_CAMERAS[0].upper()}{FIND_CAMERAS[1:]}."
     return None
 
