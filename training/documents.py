@@ -87,7 +87,7 @@ def read_json(path: str | Path, label: str = "", max_bytes: int = MAX_JSON_BYTES
     Raises:
         LodgsError: the file cannot be read, or as `parse_json`.
     """
-    return parse_json(_read(path, max_bytes), label or printable(path), max_bytes)
+    return parse_json(read_bytes(path, max_bytes), label or printable(path), max_bytes)
 
 
 def read_toml(path: str | Path, label: str = "") -> dict:
@@ -97,7 +97,7 @@ def read_toml(path: str | Path, label: str = "") -> dict:
         LodgsError: the file cannot be read, is not valid TOML, or exceeds a limit of this module.
     """
     try:
-        table = tomllib.loads(_decode(_read(path, MAX_TOML_BYTES), MAX_TOML_BYTES))
+        table = tomllib.loads(_decode(read_bytes(path, MAX_TOML_BYTES), MAX_TOML_BYTES))
         _check(table, MAX_NESTING)
     except (ValueError, RecursionError) as error:
         raise _not_valid(label or printable(path), error) from error
@@ -125,7 +125,12 @@ def parse_json(text: str | bytes, label: str, max_bytes: int = MAX_JSON_BYTES) -
     return values
 
 
-def _read(path: str | Path, max_bytes: int) -> bytes:
+def read_bytes(path: str | Path, max_bytes: int) -> bytes:
+    """Read a regular file, but at most one byte more than the limit.
+
+    Raises:
+        LodgsError: the file cannot be read.
+    """
     with open_file(path) as file:
         try:
             return file.read(max_bytes + 1)

@@ -45,6 +45,13 @@ OPENMVG = {
     "extrinsics": [{"key": 0, "value": {"rotation": np.eye(3).tolist(), "center": [0, 0, 1]}}],
     "structure": [{"key": 0, "value": {"X": [0, 0, 5]}}],
 }
+OPENSFM = [
+    {
+        "cameras": {"c": {"projection_type": "brown", "width": 96, "height": 72, "focal_x": 0.8, "k1": 0.1}},
+        "shots": {"a.png": {"rotation": [0.1, 0, 0], "translation": [0, 0, 1], "camera": "c"}},
+        "points": {"1": {"coordinates": [0, 0, 5], "color": [255, 0, 0]}},
+    }
+]
 BUNDLER = (
     "# Bundle file v0.3\n1 2\n80 0.1 0\n1 0 0\n0 1 0\n0 0 1\n0 0 0\n" + "0 0 -5\n9 8 7\n1 0 1 2.5 3\n" * 2
 )
@@ -62,6 +69,7 @@ EXPORTS = {
     "keyframes/cameras/a.json": json.dumps(POLYCAM),
     "metadata": json.dumps(RECORD3D),
     "sfm_data.json": json.dumps(OPENMVG),
+    "reconstruction.json": json.dumps(OPENSFM),
     "bundle.out": BUNDLER,
     "cameras.xml": METASHAPE,
 }
@@ -70,6 +78,7 @@ JSON = {
     "keyframes/cameras/a.json": POLYCAM,
     "metadata": RECORD3D,
     "sfm_data.json": OPENMVG,
+    "reconstruction.json": OPENSFM,
 }
 
 

@@ -187,18 +187,18 @@ def find_models(folder: Path) -> list[Path]:
     visited.update(str(parent) for parent in Path(real_folder).parents)  # links upwards leave the scene
     for depth in range(5):
         models += [(-count_images(path), depth, path.parts, path) for path in level if model_suffix(path)]
-        subfolders = []
+        next_level = []
         for parent in level if depth < 4 else ():
-            for path in _subfolders(parent):
+            for path in subfolders(parent):
                 real = os.path.realpath(path)
                 if real not in visited and len(visited) < MAX_FOLDERS:
                     visited.add(real)
-                    subfolders.append(path)
-        level = subfolders
+                    next_level.append(path)
+        level = next_level
     return [entry[-1] for entry in sorted(models)]
 
 
-def _subfolders(folder: Path) -> list[Path]:
+def subfolders(folder: Path) -> list[Path]:
     """Return the readable, visible subfolders sorted by name."""
     try:
         with os.scandir(folder) as entries:
@@ -451,7 +451,8 @@ def _choose_model(folder: Path, images: Path | None, warnings: list[str]) -> tup
         raise LodgsError(
             f"Cannot read scene: {folder} holds no COLMAP model.",
             "Choose a folder with sparse/0/cameras.bin, images.bin and points3D.bin (or .txt), or convert "
-            "another program's export: lodgs scene --from DIR --out DIR.",
+            "another program's export (lodgs scene --from DIR --out DIR), or find the cameras of photos "
+            "(lodgs scene --photos DIR --out DIR).",
         )
     counts = [count_images(model) for model in models]
     for model, count in zip(models, counts, strict=True):

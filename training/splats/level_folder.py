@@ -118,6 +118,8 @@ def _write_level(path: Path, bundle: Bundle, number: int, extras: list[str]) -> 
 def read_folder(folder: str | Path, warn: Warn = ignore) -> Bundle:
     """Read the levels of a folder from its manifest, or from one series ``lodN.ply`` or ``NAME_lodN.ply``.
 
+    The output folder of a 3DGS program has one level, the newest ``point_cloud/iteration_N/point_cloud.ply``.
+
     Args:
         warn: as for `read_ply`.
 
@@ -151,6 +153,8 @@ def read_origin(path: str | Path) -> np.ndarray:
 def _find_series(folder: Path) -> list[Path]:
     """Return the files of a folder's only series of levels, from coarse to fine.
 
+    The output folder of a 3DGS program counts as one level.
+
     Raises:
         LodgsError: the folder has no levels, several series or too many levels.
     """
@@ -158,6 +162,8 @@ def _find_series(folder: Path) -> list[Path]:
     for file in folder.glob("*.ply"):
         if match := re.fullmatch(r"(|.+_)lod(\d+)\.ply", file.name):
             series.setdefault(match[1], []).append((int(match[2]), file))
+    if not series and (trained := _last_iteration(folder)):
+        return [trained]
     if len(series) != 1:
         raise LodgsError(
             f"Cannot read {folder}: it has {len(series) or 'no'} series of levels (lod0.ply, lod1.ply, ...).",
@@ -170,6 +176,13 @@ def _find_series(folder: Path) -> list[Path]:
             "Remove files from the series.",
         )
     return files
+
+
+def _last_iteration(folder: Path) -> Path | None:
+    """Return the newest PLY in the output folder of a 3DGS program, or None."""
+    files = folder.glob("point_cloud/iteration_*/point_cloud.ply")
+    numbered = [(int(n), file) for file in files if (n := file.parent.name[len("iteration_") :]).isdecimal()]
+    return max(numbered)[1] if numbered else None
 
 
 def _read_manifest(folder: Path, warn: Warn) -> Bundle:

@@ -367,7 +367,8 @@ def _read_header(file: IO[bytes], path: Path, splats: bool = True) -> tuple[PlyD
         header = PlyData.read(io.BytesIO("\n".join(lines).encode("ascii", "replace")))
     except (PlyParseError, ValueError) as error:
         raise LodgsError(
-            f"Cannot read {path}: its header is corrupt: {str(error)[:300]}.", "Export or copy it again."
+            f"Cannot read {path}: its header is corrupt: {str(error)[:300].rstrip('.')}.",
+            "Export or copy it again.",
         ) from error
     if "vertex" not in header:
         raise LodgsError(
@@ -384,12 +385,22 @@ def _read_header(file: IO[bytes], path: Path, splats: bool = True) -> tuple[PlyD
     return header, counts
 
 
+def _foreign_error(path: Path, start: bytes) -> LodgsError:
+    """Return the error for a file with the first bytes of another format."""
+    problem, remedy = "it is not a PLY file", "Choose a .ply of Gaussian splats."
+    if start.startswith((b"PK\3\4", b"\x1f\x8b", b"7z\xbc\xaf", b"Rar!")):
+        problem, remedy = "it is not a PLY file but an archive", "Unpack it."
+    elif start.lstrip()[:5].lower() in (b"<!doc", b"<html"):
+        problem, remedy = "it is not a PLY file but a web page", "Download it again in a browser."
+    return LodgsError(f"Cannot read {path}: {problem}.", remedy)
+
+
 def _read_header_lines(file: IO[bytes], path: Path) -> list[str]:
     """Read the lines of a header and leave the file at the first row."""
     start = file.read(MAX_HEADER_BYTES)
     begin = re.match(rb"ply[ \t]*(\r\n|\n|\r)", start)
     if begin is None:
-        raise LodgsError(f"Cannot read {path}: it is not a PLY file.", "Choose a .ply of Gaussian splats.")
+        raise _foreign_error(path, start)
     end = re.search(rb"[\r\n]end_header[ \t]*(\r\n|\n|\r)", start)
     if end is None:
         if len(start) == MAX_HEADER_BYTES:
@@ -430,7 +441,7 @@ def _read_text(
             elements[name] = np.asarray(rows, row)
     except (ValueError, OverflowError) as error:
         raise LodgsError(
-            f"Cannot read {path}: it is corrupt: {str(error)[:300]}.", "Export or copy it again."
+            f"Cannot read {path}: it is corrupt: {str(error)[:300].rstrip('.')}.", "Export or copy it again."
         ) from error
     return elements
 

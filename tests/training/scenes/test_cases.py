@@ -48,5 +48,7 @@ def test_case(tmp_path, name):
         )
     if "points" in case:
         np.testing.assert_allclose(scene.points + scene.origin, case["points"], atol=1e-6)
+    if "distorted" in case:
+        assert [Path(name).name for name in scene.distorted] == case["distorted"]
     masked = [Path(camera.name).name for camera in scene.cameras if camera.mask is not None]
     assert masked == case.get("masked", [])

@@ -11,7 +11,7 @@ from training.__main__ import main
 from training.errors import LodgsError
 from training.scenes.colmap import read_scene
 from training.scenes.depths import DepthPriors, add_depth_points
-from training.scenes.formats import convert_export, find_export
+from training.scenes.formats import convert_export, find_exports
 from training.scenes.point_cloud import read_points
 from training.scenes.triangulate import random_start_points
 
@@ -365,11 +365,11 @@ def test_export_in_a_subfolder(tmp_path):
     check(tmp_path / "scan", [pixels(*project(pose)) for pose in poses()], names)
     write_transforms(tmp_path / "two" / "a")
     write_transforms(tmp_path / "two" / "b")
-    assert find_export(tmp_path / "two") is None
+    assert len(find_exports(tmp_path / "two")) == 2
 
 
 def test_folders_without_export_are_rejected(tmp_path):
-    assert find_export(tmp_path) is None
+    assert not find_exports(tmp_path)
     with pytest.raises(LodgsError, match="its format is unknown"):
         convert_export(tmp_path)
     with pytest.raises(LodgsError, match="does not exist"):
@@ -383,6 +383,39 @@ def test_folders_without_export_are_rejected(tmp_path):
     )
     with pytest.raises(LodgsError, match="already is a COLMAP scene"):
         convert_export(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("files", "reason", "remedy"),
+    [
+        (["scan.r3d"], "scan.r3d is a packed Record3D file", "Unpack it"),
+        (
+            ["Registration.CSV", "a.jpg"],
+            "Registration.CSV is a table",
+            "Export the cameras for COLMAP or Bundler",
+        ),
+        (["IMG_1.HEIC", "IMG_2.HEIC"], "IMG_1.HEIC is a HEIC photo", "Convert the photos to JPEG"),
+        (["clip.MOV"], "clip.MOV is a video", "lodgs frames"),
+        (["poses_bounds.npy", "a.jpg"], "poses_bounds.npy is a file of LLFF", "COLMAP model"),
+        (["frames/a.png"], "it has photos, but no cameras", "lodgs scene --photos"),
+        (["project.psx"], "project.psx is a Metashape project", "Export Cameras"),
+        (
+            ["database.db", "images/a.jpg"],
+            "COLMAP database without a model",
+            "Choose the folder of the model",
+        ),
+        (["point_cloud/iteration_7/a.ply"], "output of a 3DGS program", "Choose the scene"),
+        (["images/a.JPG", "Thumbs.db"], "it has photos, but no cameras", "lodgs scene --photos"),
+        ([".hidden.csv"], "its format is unknown", "Choose an export of nerfstudio"),
+    ],
+)
+def test_folders_of_other_programs_get_a_remedy(tmp_path, files, reason, remedy):
+    for name in files:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    with pytest.raises(LodgsError) as error:
+        convert_export(tmp_path)
+    assert reason in error.value.what and remedy in error.value.remedy
 
 
 def test_point_clouds_with_impossible_headers_are_rejected_quickly(tmp_path):

@@ -474,6 +474,15 @@ def test_folder_without_levels_is_refused(tmp_path):
             read_folder(tmp_path)
 
 
+def test_output_folder_of_a_3dgs_program_has_its_newest_splats(tmp_path, make_splats):
+    for number, count in ((7000, 3), (30000, 5), (9999, 4)):
+        folder = tmp_path / "point_cloud" / f"iteration_{number}"
+        folder.mkdir(parents=True)
+        write_ply(folder / "point_cloud.ply", make_splats(count))
+    (tmp_path / "point_cloud" / "iteration_last").mkdir()
+    assert [len(level.splats) for level in read_folder(tmp_path).levels] == [5]
+
+
 def test_info_describes_bundle_folder_and_ply(tmp_path, bundle):
     bundle.levels[2].splats.means[:] = [[-1, 2, 3]]
     bundle.levels[1].splats.means[:] = [[-1, 2, 3]]

@@ -163,7 +163,9 @@ def test_selected_splats_are_written_in_order(tmp_path, make_splats):
         (GOLDEN[:-5], r"a\.ply: it is truncated, 5 of [0-9]+ bytes are missing"),
         (GOLDEN[:100], "truncated, its header has no end"),
         (b"", "it is not a PLY file"),
-        (b"PK\x03\x04 something else", "it is not a PLY file"),
+        (b"PK\x03\x04 something else", r"it is not a PLY file but an archive\. Unpack it"),
+        (b"\x1f\x8b\x08", "it is not a PLY file but an archive"),
+        (b"\r\n<!DOCTYPE html><p>Sign in", "it is not a PLY file but a web page"),
         (
             header(columns=["x", "y", "z", "red"]) + bytes(32),
             r"it has no f_dc_0, f_dc_1, f_dc_2, opacity, scale_0",

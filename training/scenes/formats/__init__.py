@@ -17,16 +17,19 @@ import numpy as np
 
 from ...errors import LodgsError, SystemProblem, system_reason
 from ...files import check_folder, link_or_copy
-from ..colmap import DEPTHS, MASKS, NO_POINTS, find_models, read_scene, scene_lenses
+from ..colmap import DEPTHS, MASKS, NO_POINTS, find_models, read_scene, scene_lenses, subfolders
 from ..image_files import find_image_folder
 from ..images import image_size
 from ..view_selection import exclusion_messages, photo_turns
 from ..write_colmap import write_model
-from . import bundler, metashape, openmvg, polycam, record3d, transforms
+from . import bundler, metashape, openmvg, opensfm, polycam, record3d, transforms
 from .exported import ExportedScene, ExportedView
+from .foreign import describe_foreign
 
-FORMATS = transforms, polycam, record3d, metashape, openmvg, bundler
+FORMATS = transforms, polycam, record3d, metashape, openmvg, opensfm, bundler
 """Supported formats; the first one that recognises a folder is used."""
+MAX_DEPTH, MAX_SUBFOLDERS = 3, 1000
+"""Maximum depth of an export below the given folder, and of subfolders searched at each depth."""
 FORMAT_NAMES = ", ".join(module.NAME for module in FORMATS)
 
 
@@ -50,24 +53,24 @@ class ConvertedScene:
     is_source: bool = False
 
 
-def find_export(folder: Path) -> tuple[ModuleType, Path] | None:
-    """Return the format of a folder or of its only exported subfolder, and the file or folder to read.
+def find_exports(folder: Path) -> list[tuple[ModuleType, Path]]:
+    """Return the format of a folder and the file or folder to read; if it is unknown, those of subfolders.
 
-    Only names and the first bytes of small files are inspected. The result is None for unknown formats.
+    Archives often add folders, so subfolders are searched by depth, until one depth has exports. Only names
+    and the first bytes of small files are inspected.
     """
-    for module in FORMATS:
-        if path := module.find(folder):
-            return module, path
-    try:
-        subfolders = [path for path in sorted(folder.iterdir()) if path.is_dir() and path.name[0] != "."]
-    except OSError:
-        return None
-    # Unpacking an archive often adds a folder level.
-    matches = []
-    for subfolder in subfolders:
-        candidates = ((module, module.find(subfolder)) for module in FORMATS)
-        matches += [(module, path) for module, path in candidates if path][:1]
-    return matches[0] if len(matches) == 1 else None
+    level = [folder]
+    for _ in range(MAX_DEPTH + 1):
+        matches = [match for place in level if (match := _export_in(place))]
+        if matches:
+            return matches
+        level = [path for place in level for path in subfolders(place)][:MAX_SUBFOLDERS]
+    return []
+
+
+def _export_in(folder: Path) -> tuple[ModuleType, Path] | None:
+    candidates = ((module, module.find(folder)) for module in FORMATS)
+    return next(((module, path) for module, path in candidates if path), None)
 
 
 def ensure_colmap_scene(folder: Path, warn: Callable[[str], object]) -> Path:
@@ -76,7 +79,7 @@ def ensure_colmap_scene(folder: Path, warn: Callable[[str], object]) -> Path:
     Raises:
         LodgsError: as :func:`convert_export`.
     """
-    if folder.is_dir() and not find_models(folder) and find_export(folder):
+    if folder.is_dir() and not find_models(folder) and find_exports(folder):
         for message in convert_export(folder).warnings:
             warn(message)
     return folder
@@ -95,26 +98,35 @@ def convert_export(folder: Path, out: Path | None = None) -> ConvertedScene:
     """
     folder = folder.absolute()
     check_folder(folder, "Choose the folder of another program's export.")
-    export = find_export(folder)
-    if export is None and not find_models(folder):
+    exports = find_exports(folder)
+    if len(exports) > 1:
         raise LodgsError(
-            f"Cannot convert {folder}: its format is unknown.",
+            f"Cannot convert {folder}: it has {len(exports)} exports, such as {exports[0][1]} and "
+            f"{exports[1][1]}.",
+            "Choose the folder of one of them.",
+        )
+    if not exports and not find_models(folder):
+        reason, remedy = describe_foreign(folder) or (
+            "its format is unknown",
             f"Choose an export of {FORMAT_NAMES}, or the folder of a COLMAP scene.",
         )
+        raise LodgsError(f"Cannot convert {folder}: {reason}.", remedy)
     scene = folder if out is None else out
     if out is not None and out.is_dir() and find_models(out):
         raise LodgsError(f"Cannot write scene: {out} already holds a COLMAP scene.", "Choose another folder.")
-    if export is None:
+    if not exports:
         name, path, exported = "COLMAP", folder, _read_model_without_points(folder)
         if out is None:
             return ConvertedScene(folder, name, len(exported.views), 0, exported.warnings, is_source=True)
     else:
-        name, path, exported = export[0].NAME, export[1], export[0].read(export[1])
+        module, path = exports[0]
+        name, exported = module.NAME, module.read(path)
     views, excluded = _usable_views(exported)
     if not views:
         reason = f" {excluded[0][0]}: {excluded[0][1]}" if excluded else ""
         raise LodgsError(
-            f"Cannot convert {path}: it has no usable view.{reason}", "Check the photos next to it."
+            f"Cannot convert {path}: it has no usable view.{reason}",
+            "Check its cameras and the photos next to it.",
         )
     warnings = [*exported.warnings, *exclusion_messages(excluded)]
     if missing := [view.mask for view in views if view.mask is not None and not os.path.isfile(view.mask)]:

@@ -198,13 +198,14 @@ def invert_pose(camera_to_world: np.ndarray, opengl: bool = False) -> np.ndarray
 def find_image(folder: Path, name: str) -> Path:
     """Find a photo by an exported name.
 
-    The name may lack its suffix, have another one, start with another computer's path, be a URL, or have
-    another Unicode form.
+    The name may lack its suffix, have another one, start with another computer's path, be a URL, have
+    another Unicode form, or have spaces around it.
 
     Returns:
         A file in the folder or below it, or the expected path if there is no such file.
     """
-    spellings = name, unquote(name), unicodedata.normalize("NFC", name), unicodedata.normalize("NFD", name)
+    forms = (unicodedata.normalize(form, name) for form in ("NFC", "NFD"))
+    spellings = name, unquote(name), name.strip(), *forms
     for spelling in dict.fromkeys(spellings):
         for candidate in _candidates(folder, spelling):
             stem = candidate.stem if candidate.suffix in _SUFFIXES else candidate.name

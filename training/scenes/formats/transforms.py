@@ -40,12 +40,18 @@ _MATRICES = "K", "intrinsics", "intrinsic_matrix", "camera_matrix"
 _ALIASES = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy"}
 _MAX_NORMALISED = 10.0
 """Maximum focal length in multiples of the photo's size; focal lengths in pixels are larger."""
+_POINTS = "sparse_pc.ply"
+"""nerfstudio's name of the point cloud."""
 _FLAW = "flaw of the camera matrix"
 
 
 def find(folder: Path) -> Path | None:
-    """Return the path of the file; for NeRF's synthetic scenes, the file of the training views."""
-    return find_file(folder, *_FILES)
+    """Return the path of the file; for NeRF's synthetic scenes, the file of the training views.
+
+    If no file has a usual name, the only file transforms*.json is returned.
+    """
+    others = sorted(folder.glob("transforms*.json"))
+    return find_file(folder, *_FILES) or (others[0] if len(others) == 1 else None)
 
 
 def read(path: Path) -> ExportedScene:
@@ -74,14 +80,23 @@ def read(path: Path) -> ExportedScene:
             views.append(_parse_view(path.parent, values, photos))
         except LodgsError as error:
             excluded.append((str(values.get("file_path", f"frame {number}")), error.what))
-    point_cloud = document.get("ply_file_path")
-    if isinstance(point_cloud, str):
+    warnings = photos.warnings()
+    if point_cloud := _find_points(path, document.get("ply_file_path"), warnings):
         try:
-            points = read_points(find_image(path.parent, point_cloud))
-            return ExportedScene(views, *points, excluded, photos.warnings())
+            return ExportedScene(views, *read_points(point_cloud), excluded, warnings)
         except LodgsError as error:
-            return ExportedScene(views, excluded=excluded, warnings=[error.what, *photos.warnings()])
-    return ExportedScene(views, excluded=excluded, warnings=photos.warnings())
+            warnings.append(error.what)
+    return ExportedScene(views, excluded=excluded, warnings=warnings)
+
+
+def _find_points(path: Path, name: Any, warnings: list[str]) -> Path | None:
+    """Return the PLY that the file names, or nerfstudio's usual one next to it, with a warning."""
+    if isinstance(name, str):
+        return find_image(path.parent, name)
+    point_cloud = find_file(path.parent, _POINTS)
+    if point_cloud is not None:
+        warnings.append(f"{path} names no ply_file_path; the points are read from {point_cloud}.")
+    return point_cloud
 
 
 def _parse_view(folder: Path, values: Mapping[str, Any], photos: PhotoFinder) -> ExportedView:
@@ -91,9 +106,8 @@ def _parse_view(folder: Path, values: Mapping[str, Any], photos: PhotoFinder) ->
     width, height = get_number(values, "w", 0), get_number(values, "h", 0)
     if not (width > 0 and height > 0):
         width, height = image_size(image)
-    if "fl_x" in values:
-        fx = get_number(values, "fl_x")
-        fy = get_number(values, "fl_y", fx)
+    if fx := get_number(values, "fl_x", 0):  # 0 is unknown
+        fy = get_number(values, "fl_y", 0) or fx
     elif "camera_angle_x" not in values:
         raise LodgsError("it has neither a focal length (fl_x) nor a field of view (camera_angle_x).")
     else:
@@ -111,7 +125,8 @@ def _parse_view(folder: Path, values: Mapping[str, Any], photos: PhotoFinder) ->
     model = str(values.get("camera_model", "")).upper()
     if model not in _SUPPORTED_MODELS:
         raise LodgsError(f"camera model {model} is not supported.")
-    fisheye = model == "OPENCV_FISHEYE" or values.get("is_fisheye") is True
+    is_fisheye = str(values.get("is_fisheye", "")).lower() in ("true", "1", "1.0")
+    fisheye = model == "OPENCV_FISHEYE" or is_fisheye
     radial = tuple(get_number(values, f"k{n}", 0) for n in range(1, 7))
     if not fisheye and model != "FULL_OPENCV" and radial[3] and not any(radial[4:]):
         raise LodgsError("its k4 has no equivalent among COLMAP's lenses.")

@@ -50,10 +50,8 @@ class SplatFile:
         with open_file(path) as file:
             size = os.fstat(file.fileno()).st_size
             if not size or size % _ROW.itemsize:
-                raise LodgsError(
-                    f"Cannot read {path}: {size:,} bytes are not a multiple of {_ROW.itemsize}.",
-                    "Export it again.",
-                )
+                problem = f"{size:,} bytes are not a multiple of {_ROW.itemsize}" if size else "it is empty"
+                raise LodgsError(f"Cannot read {path}: {problem}.", "Export it again.")
             self._rows = np.memmap(file, _ROW, "r")
 
     def __len__(self) -> int:
