@@ -4,7 +4,10 @@ Sources: "Sec.", "A." and "App." are sections of the papers' texts. "program" is
 published program, cited where the text has no number. "not published" marks choices of this project.
 """
 
+import re
+import tomllib
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +15,9 @@ import pytest
 from training.methods import create, method_info
 from training.methods.flod import train as flod_train
 from training.optimize import splat_method
+from training.optimize.parameters import override
+
+OCTREE_PAGE = Path(__file__).parents[3] / "docs/methods/octree-gs.md"
 
 SHARED = {
     "max_splats": (0, "no paper limits the number"),
@@ -299,6 +305,23 @@ def test_octree_initial_level(data, init_level, at_once):
     paper = replace(method_info("octree").preset("paper"), levels=6, init_level=init_level)
     joins = create("octree", data, paper, seed=0, backend="cpu").schedule.join_steps
     assert joins.count(0) == at_once and max(joins) == (10_000 if at_once < 6 else 0)
+
+
+@pytest.mark.parametrize(
+    ("name", "next_level", "bias", "initial"),
+    [  # Octree-GS, Table 5; without progressive training all 6 levels start at once
+        ("M1", False, False, 6), ("M2", False, True, 6), ("M3", True, True, 6), ("M4", True, False, 3),
+        ("M5", True, True, 3), ("M6", True, False, 5), ("M7", True, True, 5),
+    ],
+)  # fmt: skip
+def test_documented_ablations_of_octree_gs(data, name, next_level, bias, initial):
+    [row] = [line for line in OCTREE_PAGE.read_text("utf-8").splitlines() if line.startswith(f"| {name}:")]
+    settings = dict(item.split("=") for item in re.findall("`(.*?)`", row.split("|")[2]))
+    values = {name: tomllib.loads(f"x = {text}")["x"] for name, text in settings.items()}
+    p = override(method_info("octree").preset("paper"), values | {"levels": 6})
+    assert (p.grow_next, p.bias_rate > 0) == (next_level, bias)
+    joins = create("octree", data, p, seed=0, backend="cpu").schedule.join_steps
+    assert joins.count(0) == initial
 
 
 def test_coarse_stage_of_a_lod_of_gaussians_has_no_density_control(data, events):
