@@ -34,9 +34,9 @@ def default_budget() -> int:
 class ImageCache:
     """Training images by view. Keeps the images that are needed soonest and reads them ahead.
 
-    The cache affects only the duration of steps, so a forecast may be wrong. An image counts with the moments
-    that losses keep with it, but without its mask and alpha, which take 4 bytes per pixel each. The budget is
-    exceeded only by an image that does not fit and is in use. One thread may call; reader threads only read.
+    The cache affects only the duration of steps, so a forecast may be wrong. Images count without their
+    mask and alpha, which take 4 bytes per pixel each. The budget is exceeded only by an image that does not
+    fit and is in use. One thread may call; reader threads only read.
 
     Args:
         read: load a view's image. Called in threads, for each view by one thread at a time.

@@ -11,8 +11,8 @@ from pathlib import Path
 
 MAX_BYTES = 2 << 30
 """Upper limit of the default image cache."""
-TARGET_BYTES = 36
-"""Bytes per pixel of a training image: float32 colours and two local moments."""
+TARGET_BYTES = 12
+"""Bytes per pixel of a training image: float32 colours."""
 FALLBACK_BYTES = 4 << 30
 """Memory to assume if the system reports none."""
 

@@ -267,7 +267,7 @@ def photometric_loss(
 
     Args:
         image: (H, W, 3), a rendering.
-        target: the photo. Reuse it between steps, because its local moments are cached in it.
+        target: the photo. Reuse it between steps, because backends cache copies of it.
 
     Returns:
         Scalar, differentiable with respect to the image.

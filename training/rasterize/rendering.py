@@ -216,8 +216,7 @@ class Target:
         alpha: (H, W) in [0, 1], alpha of a transparent photo over black; None means opaque.
         inverse_depth: (H, W), expected ``Rendering.inverse_depth``, NaN in unknown pixels; None if unknown.
 
-    The cpu backend caches 36 bytes a pixel: the photo and its two local moments. If a scene has more views
-    than memory, drop targets and create them again.
+    The cpu backend caches the photo in planes, without memory if ``image.permute(2, 0, 1)`` is contiguous.
     """
 
     def __init__(

@@ -6,7 +6,7 @@ import torch
 from scipy.ndimage import correlate1d
 
 from training.rasterize import Target, photometric_loss
-from training.rasterize.cpu.loss import loss_and_gradient, moments_of
+from training.rasterize.cpu.loss import loss_and_gradient
 
 
 def scipy_loss(image, truth, ssim_weight):
@@ -25,7 +25,7 @@ def scipy_loss(image, truth, ssim_weight):
     return (1 - ssim_weight) * np.abs(image - truth).mean() + ssim_weight * (1 - ssim.mean())
 
 
-@pytest.mark.parametrize("size", [(50, 75), (16, 64), (3, 5), (1, 130)])
+@pytest.mark.parametrize("size", [(50, 75), (90, 108), (3, 5), (1, 230)])
 def test_loss_matches_scipy(backend, size):
     random = np.random.default_rng(0)
     truth = random.random((*size, 3)).astype(np.float32)
@@ -36,7 +36,7 @@ def test_loss_matches_scipy(backend, size):
         assert loss.item() == pytest.approx(expected, rel=2e-5)
 
 
-@pytest.mark.parametrize("size", [(50, 75), (16, 64), (3, 5), (1, 130)])
+@pytest.mark.parametrize("size", [(50, 75), (90, 108), (3, 5), (1, 230)])
 def test_fused_gradient_matches_autograd(kernels, size):
     random = torch.Generator().manual_seed(0)
     truth = torch.rand(*size, 3, generator=random)
@@ -63,7 +63,7 @@ def test_loss_is_bit_identical_for_any_array_address(size):
                 np.empty(length, np.uint8) for length in random.integers(100, 20_000, random.integers(30))
             ]
             arrays.append(array.copy())
-        loss, gradient = loss_and_gradient(*arrays, moments_of(arrays[1]), 0.2)
+        loss, gradient = loss_and_gradient(*arrays, 0.2)
         results.add((loss, gradient.tobytes()))
     assert len(results) == 1
 

@@ -20,7 +20,7 @@ from ..rendering import BackendOutput, KernelCamera, RasterSettings, SideOutputs
 from .bin import TILE, Pairs, bin_splats
 from .blend import blend_backward, blend_backward_absolute, blend_forward, blend_median, blend_weights
 from .compile import Buffers, f32, run_parallel, serialised
-from .loss import loss_and_gradient, moments_of
+from .loss import loss_and_gradient
 from .project import (
     BLUE,
     COLUMNS,
@@ -255,8 +255,7 @@ def contributions(
 def photometric_loss(image: torch.Tensor, target: Target, ssim_weight: float) -> torch.Tensor:
     """See :func:`training.rasterize.photometric_loss`."""
     if "cpu" not in target.cache:
-        truth = np.ascontiguousarray(target.image.permute(2, 0, 1).float().numpy())
-        target.cache["cpu"] = truth, moments_of(truth)
+        target.cache["cpu"] = np.ascontiguousarray(target.image.permute(2, 0, 1).float().numpy())
     return _Photometric.apply(image.permute(2, 0, 1), target, ssim_weight)  # type: ignore[no-any-return]
 
 
@@ -264,8 +263,8 @@ class _Photometric(torch.autograd.Function):
     @staticmethod
     @serialised
     def forward(ctx, planes, target, ssim_weight):
-        truth, moments = target.cache["cpu"]
-        loss, gradient = loss_and_gradient(planes.detach().contiguous().numpy(), truth, moments, ssim_weight)
+        image = planes.detach().contiguous().numpy()
+        loss, gradient = loss_and_gradient(image, target.cache["cpu"], ssim_weight)
         ctx.gradient = torch.from_numpy(gradient)
         return torch.tensor(loss, dtype=torch.float32)
 

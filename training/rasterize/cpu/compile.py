@@ -50,7 +50,6 @@ STRICT = frozenset()
 
 _OPTIONS: dict[str, Any] = {"error_model": "numpy", "no_cfunc_wrapper": True}
 """Division as in C, and no wrapper for calls from C."""
-_HELPER: dict[str, Any] = {**_OPTIONS, "no_cpython_wrapper": True}
 
 
 def kernel(fastmath: frozenset[str]) -> Callable[[Callable], Any]:
@@ -58,18 +57,14 @@ def kernel(fastmath: frozenset[str]) -> Callable[[Callable], Any]:
     return numba.njit(fastmath=set(fastmath), cache=True, nogil=True, **_OPTIONS)
 
 
-def helper(fastmath: frozenset[str]) -> Callable[[Callable], Any]:
-    """Compile a function for use in kernels only. LLVM decides if it is inlined.
-
-    Numba's own ``inline="always"`` copies the source into every caller and repeats type inference there,
-    which takes longer than all other steps.
-    """
-    return numba.njit(**_HELPER, fastmath=set(fastmath))
-
-
 def inlined(fastmath: frozenset[str]) -> Callable[[Callable], Any]:
-    """Compile a :func:`helper` that is always inlined, for use in inner loops."""
-    return numba.njit(**_HELPER, fastmath=set(fastmath), forceinline=True)
+    """Compile a function for use in kernels only. LLVM inlines it.
+
+    A function that is not inlined may round differently in the process that compiled it than in processes
+    that read it from the cache. Numba's own ``inline="always"`` copies the source into every caller and
+    repeats type inference there, which takes longer than all other steps.
+    """
+    return numba.njit(**_OPTIONS, fastmath=set(fastmath), no_cpython_wrapper=True, forceinline=True)
 
 
 def available_threads() -> int:
