@@ -80,10 +80,15 @@ def find_ground(points: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndar
     )
 
 
-def ground_plane(points: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray, float] | None:
+def ground_plane(
+    points: np.ndarray, up: np.ndarray, max_slope: float = MAX_SLOPE
+) -> tuple[np.ndarray, np.ndarray, float] | None:
     """Return normal, point and score of the ground plane, see :func:`find_ground`; None without one.
 
     The score is a fraction of the points, at least MIN_SHARE.
+
+    Args:
+        max_slope: maximum angle between the plane and the horizontal, in degrees.
     """
     points = np.asarray(points, np.float64).reshape(-1, 3)
     points = points[np.isfinite(points).all(axis=1)]
@@ -105,7 +110,7 @@ def ground_plane(points: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.nda
         lengths = np.linalg.norm(normals, axis=1)
         normals = normals / np.maximum(lengths, 1e-300)[:, None]
         normals *= np.where(normals @ up < 0, -1, 1)[:, None]
-        level = (normals @ up > np.cos(np.radians(MAX_SLOPE))) & (lengths > 0)
+        level = (normals @ up > np.cos(np.radians(max_slope))) & (lengths > 0)
         normals, origins = normals[level], a[level]
         heights = normals @ points.T - (normals * origins).sum(axis=1)[:, None]
         on_plane = (np.abs(heights) <= thickness).sum(axis=1)

@@ -14,9 +14,11 @@ MIN_SPLATS = 1000
 _MAX_SPLATS = 40_000
 """Number of splats used; larger sets are sampled at random."""
 _MIN_OPACITY = 0.1
-_MIN_FLATNESS, _MAX_OBLONG, _MIN_GROUND = 2.2, 1.4, 0.1
+_MIN_FLATNESS, _MAX_OBLONG, _MIN_GROUND = 2.2, 1.4, 0.05
 """A ground across another axis than the convention's: the scene is at least this flat (mean spread over the
 spread along the axis), at most this oblong (a wall is wider than high), and has this score as a ground."""
+_MAX_SLOPE = 20.0
+"""Maximum slope of such a ground in degrees."""
 _CONVENTION = 2.0
 """Factor by which the ground of an opposite direction must beat that of the usual one."""
 _FAR_FACTOR = 2.5
@@ -77,7 +79,8 @@ def guess_up_rotation(splats: Splats) -> np.ndarray | None:
     if axis == 0 or not is_ground or oblong > (_MAX_ROOM_OBLONG if hollow else _MAX_OBLONG):
         return None
     usual = np.eye(3)[axis] * (-1 if axis == 1 else 1)
-    scores = [ground[2] if (ground := ground_plane(points, up)) else 0.0 for up in (usual, -usual)]
+    grounds = [ground_plane(points, up, _MAX_SLOPE) for up in (usual, -usual)]
+    scores = [ground[2] if ground else 0.0 for ground in grounds]
     if max(scores) < _MIN_GROUND:
         return None
     is_usual = scores[1] < _CONVENTION * scores[0]
