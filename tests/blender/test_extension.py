@@ -127,7 +127,7 @@ def test_blender_installs_updates_and_removes_from_a_repository(archive, tmp_pat
     extension.write_repository(tmp_path / "next")
     handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=dist)
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
+        threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
         url = f"http://127.0.0.1:{server.server_port}/index.json"
         (tmp_path / "user").mkdir()
         process = subprocess.run(

@@ -96,7 +96,7 @@ def test_cuts_are_complete_while_finer_splats_are_loaded(bpy, lodgs, tree, path,
                 streamed += 1
                 np.testing.assert_array_equal(np.sort(numbers[-1]), truth.cut(position, pixels))
     assert streamed == len(POSITIONS)
-    assert len({len(nodes) for nodes in numbers}) > 12, "all pages arrived at once"
+    assert len({len(nodes) for nodes in numbers}) > 10, "all pages arrived at once"
 
 
 def test_a_resting_view_redraws_until_loading_ends(lodgs, root, draw_from, monkeypatch):
@@ -133,8 +133,12 @@ def test_streamed_image_matches_the_whole_file(bpy, lodgs, path, root, draw_from
 def test_two_viewports_draw_complete_cuts(bpy, lodgs, tree, root, draw_from):
     views, truth = lodgs("viewport.views"), Truth(tree)
     first, second, complete = views.ViewState(), views.ViewState(), set()
+    end = time.monotonic() + 200
     for position in POSITIONS:
-        for _ in range(25):
+        rounds = 0
+        while rounds < 8 or len(complete) < 2:
+            assert time.monotonic() < end
+            rounds += 1
             for view in (first, second):
                 draw_from(root, view, position, 12.0)
                 if 0 < view.count == view.arrangement.count:
@@ -142,7 +146,6 @@ def test_two_viewports_draw_complete_cuts(bpy, lodgs, tree, root, draw_from):
                 if view in complete:
                     truth.require_complete(truth.nodes(drawn_means(view)))
             time.sleep(0.002)
-    assert len(complete) == 2
 
 
 def test_missing_files_leave_the_splats_of_the_scene(bpy, lodgs, path, tree, root, draw_from, tmp_path):
