@@ -68,6 +68,22 @@ class FlodParameters(DensityParameters):
         "paper.",
     )
 
+    levels_from: str = setting(
+        "merged",
+        "Source of the coarser levels. 'merged' trains the finest level first, then merges each coarser "
+        "level from the next finer one and refines it. 'trained' trains from coarse to fine with minimum "
+        "splat sizes, as in the paper, and is always used in runs of only some levels.",
+        choices=("merged", "trained"),
+    )
+    merge_ratio: float = setting(
+        0.5, "Splat count of a merged level, as a fraction of the next finer level's.", above=0, high=1
+    )
+    refine_steps: int = setting(
+        300,
+        "Steps that refine each merged level, taken from those of all levels ('steps'). The finest level "
+        "gets the others.",
+        unit="steps",
+    )
     first_level: int = setting(
         1, "First level to train. Above 1 it needs a base: the level before it.", low=1
     )
@@ -100,8 +116,24 @@ class FlodParameters(DensityParameters):
         return self.last_level or self.levels
 
     @property
+    def merges(self) -> bool:
+        """True if coarser levels are merged from the finest."""
+        complete = (self.first_level, self.end) == (1, self.levels)
+        return complete and self.levels > 1 and self.levels_from == "merged"
+
+    @property
+    def stages(self) -> list[tuple[int, int]]:
+        """Levels in the order of their training, with their numbers of steps."""
+        if not self.merges:
+            numbers = range(self.first_level, self.end + 1)
+            return [(number, self.steps[number - 1]) for number in numbers]
+        refining = min(self.refine_steps, sum(self.steps) // (2 * self.levels))
+        coarser = [(number, refining) for number in range(self.levels - 1, 0, -1)]
+        return [(self.levels, sum(self.steps) - refining * len(coarser)), *coarser]
+
+    @property
     def total_steps(self) -> int:
-        return sum(self.steps[self.first_level - 1 : self.end]) + self.finish_steps
+        return sum(steps for _, steps in self.stages) + self.finish_steps
 
     @property
     def all_steps(self) -> int:
@@ -150,6 +182,7 @@ _STANDARD = replace(
     _DRAFT,
     **STANDARD,
     steps=(2_000, 3_000, 4_000, 6_000, 15_000),
+    refine_steps=1_000,
     densify_interval=(100,) * 5,
 )
 _PAPER = replace(
@@ -160,6 +193,7 @@ _PAPER = replace(
     # the published program leaves out the last step of density control
     densify_until=(0.499, 0.399, 0.399, 0.399, 0.499),
     densify_interval=(2000, 1000, 500, 500, 200),
+    levels_from="trained",
     overlap_interval=1000,
     rejoin_points=False,
     finish_share=0.0,
