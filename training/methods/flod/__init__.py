@@ -1,4 +1,4 @@
-"""FLoD (Seo et al. 2025): independent levels, each with a minimum splat size."""
+"""FLoD (Seo et al. 2025): independent levels, one for each band of camera distances."""
 
 from dataclasses import dataclass, replace
 
@@ -31,8 +31,8 @@ class FlodParameters(DensityParameters):
     )
     footprint: float = setting(
         16.0,
-        "Minimum splat size of level 1, in pixels at the scene's median depth. Sets lambda and the "
-        "screen size (gamma) that selects levels by distance.",
+        "Detail of level 1, in pixels at the scene's median depth: its minimum splat size (FLoD: lambda) if "
+        "it is trained. Sets the distances of all levels.",
         label="Coarsest Detail",
         above=0,
         unit="px",
@@ -51,8 +51,8 @@ class FlodParameters(DensityParameters):
     )
     budget_ratio: float = setting(
         0.6,
-        "Maximum splat count of a level, as a fraction of the next finer level's; below 1 every level "
-        "adds splats. The levels of the paper have about this ratio.",
+        "Maximum splat count of a trained level, as a fraction of the next finer level's; below 1 every "
+        "level adds splats. The levels of the paper have about this ratio.",
         above=0,
         high=1,
     )
@@ -91,14 +91,14 @@ class FlodParameters(DensityParameters):
     finish_share: float = setting(
         0.2,
         "Additional steps at the end that train the three finest levels as blended by distance, as a "
-        "fraction of all levels' steps. Coarser levels with fine detail restart from the most "
+        "fraction of all levels' steps. Trained levels with fine detail restart from the most "
         "important splats of the finest level. Not in the paper.",
         high=1,
     )
     drawn: float = setting(
         0.53,
         "Maximum number of splats drawn by distance in the training views, as a fraction of those of "
-        "the finest level. Sets the size of the levels that the finishing steps restart. Not in the "
+        "the finest level. Sets the size of trained levels that the finishing steps restart. Not in the "
         "paper.",
         above=0,
         high=1,
@@ -154,7 +154,8 @@ class FlodParameters(DensityParameters):
 
     @property
     def max_trained_splats(self) -> int:
-        shares = (self.budget_ratio**n for n in range(min(BLENDED_LEVELS, self.levels)))
+        ratio = self.merge_ratio if self.merges else self.budget_ratio
+        shares = (ratio**n for n in range(min(BLENDED_LEVELS, self.levels)))
         at_end = self.max_splats * self.budget_ratio ** (self.levels - self.end)
         return round(self.max_splats * sum(shares) if self.finish_steps else at_end)
 
@@ -204,7 +205,7 @@ METHOD = MethodInfo(
     name="flod",
     number=0,
     label="FLoD",
-    about="independent levels, each with a minimum splat size",
+    about="complete levels, one for each band of distances",
     parameters=FlodParameters,
     presets={"draft": _DRAFT, "standard": _STANDARD, "paper": _PAPER},
     rule="bands",
