@@ -63,7 +63,7 @@ TINY = {
     "flod": {
         "levels": 3, "steps": [14, 16, 20], "finish_share": 0.4, "footprint": 6.0, "densify_interval": 5,
         "prune_interval": 10, "overlap_interval": 10, "sh_interval": 15, "grad_threshold": 1e-5,
-        "max_splats": 300, "budget_ratio": 0.5, "random_background": False, "margin": 0.0,
+        "max_splats": 300, "merge_ratio": 0.2, "random_background": False, "margin": 0.0,
     },
     "octree": {
         "levels": 3, "steps": 70, "footprint": 6.0, "grow_interval": 5, "far_share": 0.2, "sh_interval": 15,
@@ -129,7 +129,7 @@ def test_run_without_held_out_views_measures_training_views(tiny_scene, tmp_path
     assert "worst" not in events[-1] and 0 <= events[-1]["veil"]["mean"] <= events[-1]["veil"]["max"] <= 1
 
 
-def test_bundle_contains_the_levels_and_their_constraints(uninterrupted):
+def test_bundle_contains_the_levels_and_their_facts(uninterrupted):
     folder = RunFolder(uninterrupted["keys"]["out"])
     bundle = read_bundle(folder.bundle)
     assert [level.number for level in bundle.levels] == [1, 2, 3]
@@ -140,8 +140,6 @@ def test_bundle_contains_the_levels_and_their_constraints(uninterrupted):
         np.testing.assert_array_equal(level.splats.means, stored.means)
         assert level.splats.extras.keys() == stored.extras.keys()
         assert level.facts == event["facts"]
-        if level.facts.get("s_min"):
-            assert np.exp(stored.log_scales).min() >= level.facts["s_min"] * (1 - 1e-5)
     upright = up_rotation(read_scene(Path(uninterrupted["keys"]["scene"])).cameras)
     np.testing.assert_allclose(bundle.meta["up_rotation"], upright, atol=1e-6)
     if bundle.method == "flod":
@@ -165,7 +163,7 @@ def test_bundle_contains_the_cameras(uninterrupted):
 
 
 def test_training_improves_the_images(uninterrupted):
-    """Quality of levels at their first completion; FLoD's finishing steps train coarser ones again."""
+    """Quality of levels at their first completion; FLoD trains coarser ones again after the finest."""
     levels = [json.loads(line) for line in uninterrupted["lines"] if '"level"' in line]
     finished = {e["level"]: e["psnr"] for e in reversed(levels) if e["event"] == "level"}
     quality = [finished[level] for level in sorted(finished)]

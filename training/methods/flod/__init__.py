@@ -1,4 +1,4 @@
-"""FLoD (Seo et al. 2025): independent levels, each with a minimum splat size."""
+"""FLoD (Seo et al. 2025): independent levels, one for each band of camera distances."""
 
 from dataclasses import dataclass, replace
 
@@ -31,8 +31,8 @@ class FlodParameters(DensityParameters):
     )
     footprint: float = setting(
         16.0,
-        "Minimum splat size of level 1, in pixels at the scene's median depth. Sets lambda and the "
-        "screen size (gamma) that selects levels by distance.",
+        "Detail of level 1, in pixels at the scene's median depth: its minimum splat size (FLoD: lambda) if "
+        "it is trained. Sets the distances of all levels.",
         label="Coarsest Detail",
         above=0,
         unit="px",
@@ -51,8 +51,8 @@ class FlodParameters(DensityParameters):
     )
     budget_ratio: float = setting(
         0.6,
-        "Maximum splat count of a level, as a fraction of the next finer level's; below 1 every level "
-        "adds splats. The levels of the paper have about this ratio.",
+        "Maximum splat count of a trained level, as a fraction of the next finer level's; below 1 every "
+        "level adds splats. The levels of the paper have about this ratio.",
         above=0,
         high=1,
     )
@@ -68,6 +68,22 @@ class FlodParameters(DensityParameters):
         "paper.",
     )
 
+    levels_from: str = setting(
+        "merged",
+        "Source of the coarser levels. 'merged' trains the finest level first, then merges each coarser "
+        "level from the next finer one and refines it. 'trained' trains from coarse to fine with minimum "
+        "splat sizes, as in the paper, and is always used in runs of only some levels.",
+        choices=("merged", "trained"),
+    )
+    merge_ratio: float = setting(
+        0.5, "Splat count of a merged level, as a fraction of the next finer level's.", above=0, high=1
+    )
+    refine_steps: int = setting(
+        300,
+        "Steps that refine each merged level, taken from those of all levels ('steps'). The finest level "
+        "gets the others.",
+        unit="steps",
+    )
     first_level: int = setting(
         1, "First level to train. Above 1 it needs a base: the level before it.", low=1
     )
@@ -75,14 +91,14 @@ class FlodParameters(DensityParameters):
     finish_share: float = setting(
         0.2,
         "Additional steps at the end that train the three finest levels as blended by distance, as a "
-        "fraction of all levels' steps. Coarser levels with fine detail restart from the most "
+        "fraction of all levels' steps. Trained levels with fine detail restart from the most "
         "important splats of the finest level. Not in the paper.",
         high=1,
     )
     drawn: float = setting(
         0.53,
         "Maximum number of splats drawn by distance in the training views, as a fraction of those of "
-        "the finest level. Sets the size of the levels that the finishing steps restart. Not in the "
+        "the finest level. Sets the size of trained levels that the finishing steps restart. Not in the "
         "paper.",
         above=0,
         high=1,
@@ -100,8 +116,24 @@ class FlodParameters(DensityParameters):
         return self.last_level or self.levels
 
     @property
+    def merges(self) -> bool:
+        """True if coarser levels are merged from the finest."""
+        complete = (self.first_level, self.end) == (1, self.levels)
+        return complete and self.levels > 1 and self.levels_from == "merged"
+
+    @property
+    def stages(self) -> list[tuple[int, int]]:
+        """Levels in the order of their training, with their numbers of steps."""
+        if not self.merges:
+            numbers = range(self.first_level, self.end + 1)
+            return [(number, self.steps[number - 1]) for number in numbers]
+        refining = min(self.refine_steps, sum(self.steps) // (2 * self.levels))
+        coarser = [(number, refining) for number in range(self.levels - 1, 0, -1)]
+        return [(self.levels, sum(self.steps) - refining * len(coarser)), *coarser]
+
+    @property
     def total_steps(self) -> int:
-        return sum(self.steps[self.first_level - 1 : self.end]) + self.finish_steps
+        return sum(steps for _, steps in self.stages) + self.finish_steps
 
     @property
     def all_steps(self) -> int:
@@ -122,7 +154,8 @@ class FlodParameters(DensityParameters):
 
     @property
     def max_trained_splats(self) -> int:
-        shares = (self.budget_ratio**n for n in range(min(BLENDED_LEVELS, self.levels)))
+        ratio = self.merge_ratio if self.merges else self.budget_ratio
+        shares = (ratio**n for n in range(min(BLENDED_LEVELS, self.levels)))
         at_end = self.max_splats * self.budget_ratio ** (self.levels - self.end)
         return round(self.max_splats * sum(shares) if self.finish_steps else at_end)
 
@@ -150,6 +183,7 @@ _STANDARD = replace(
     _DRAFT,
     **STANDARD,
     steps=(2_000, 3_000, 4_000, 6_000, 15_000),
+    refine_steps=1_000,
     densify_interval=(100,) * 5,
 )
 _PAPER = replace(
@@ -160,6 +194,7 @@ _PAPER = replace(
     # the published program leaves out the last step of density control
     densify_until=(0.499, 0.399, 0.399, 0.399, 0.499),
     densify_interval=(2000, 1000, 500, 500, 200),
+    levels_from="trained",
     overlap_interval=1000,
     rejoin_points=False,
     finish_share=0.0,
@@ -170,7 +205,7 @@ METHOD = MethodInfo(
     name="flod",
     number=0,
     label="FLoD",
-    about="independent levels, each with a minimum splat size",
+    about="complete levels, one for each band of distances",
     parameters=FlodParameters,
     presets={"draft": _DRAFT, "standard": _STANDARD, "paper": _PAPER},
     rule="bands",

@@ -1,4 +1,8 @@
-"""FLoD (Seo et al. 2025): train levels one after another under a decreasing 3D scale constraint."""
+"""FLoD (Seo et al. 2025): train levels one after another, from coarse to fine or from the finest.
+
+The paper trains from coarse to fine, under a decreasing 3D scale constraint. Not in the paper: train the finest
+level first, merge each coarser one from the next finer one, and refine it.
+"""
 
 from __future__ import annotations
 
@@ -22,6 +26,7 @@ from ...optimize.initialize import (
     neighbour_distances,
     sample_points,
 )
+from ...optimize.merging import merge
 from ...optimize.method import Drawing
 from ...optimize.model import Model, splat_rates
 from ...optimize.schedules import due, log_linear, shrink_at
@@ -45,7 +50,8 @@ class Method(method.Method[FlodParameters, Drawing]):
         s_min_1 = p.s_min_1 or p.footprint * data.median_depth / data.focal
         self.s_min = min_scales(s_min_1, p.rho, p.levels)
         self._skipped_steps = sum(p.steps[: p.first_level - 1])
-        self._ends = list(accumulate(p.steps[p.first_level - 1 : p.end]))
+        self._order = [number for number, _ in p.stages]
+        self._ends = list(accumulate(steps for _, steps in p.stages))
         points, colors = drop_duplicates(data.scene.points, data.scene.point_colors)
         self.points, self.colors = sample_points(points, colors, p.splat_limit, self.seed)
         self.completed: dict[int, dict[str, torch.Tensor]] = {}
@@ -53,14 +59,14 @@ class Method(method.Method[FlodParameters, Drawing]):
         if p.levels > 1:
             self.controls = {"gamma": initial_gamma(self.s_min[-2] * data.focal / data.median_depth)}
         if base is None:
-            self.model = self._new_model(self._from_points(1))
+            self.model = self._new_model(self._from_points(self._order[0]))
         else:
             self._store_for_finishing(p.first_level - 1, base)
             tensors = from_splats(base, p.sh_degree, self.device)
             self.model = self._new_model(self._next_level_tensors(tensors, 0.0, p.first_level))
 
     def level_at(self, step: int) -> int:
-        return min(bisect_right(self._ends, step) + self.parameters.first_level, self.parameters.end)
+        return self.parameters.end if self.is_finishing(step) else self._order[self._stage(step)]
 
     def ends_level(self, step: int) -> bool:
         return step + 1 in self._ends or super().ends_level(step)
@@ -76,16 +82,28 @@ class Method(method.Method[FlodParameters, Drawing]):
         if self.is_finishing(step) and step + 1 == self.steps:
             return finish.split_levels(self.model, self.s_min)
         if step + 1 not in self._ends:
-            return []
+            return self._previews(step)
         number = self.level_at(step)
-        s_min = self.s_min[number - 1]
-        finished = Level(number, self.model.splats(s_min), {"s_min": s_min})
+        finished = Level(number, self.model.splats(self._constraint(number)), self._facts(number))
         self._store_for_finishing(number, finished.splats)
-        if number < self.parameters.end:
-            self.start_level(number + 1)
+        if step + 1 < self._ends[-1]:
+            self.start_level(self.level_at(step + 1))
         elif self.completed:
             self.start_finishing()
         return [finished]
+
+    def _previews(self, step: int) -> list[Level]:
+        """Return a coarser level merged from the current splats, at equal intervals before the finest is
+        finished.
+        """
+        p = self.parameters
+        if not p.merges or step >= self._ends[0]:
+            return []
+        number, remainder = divmod((step + 1) * p.levels, self._ends[0])
+        if not 0 < number < p.levels or remainder >= p.levels:
+            return []
+        count = round(len(self.model) * p.merge_ratio ** (p.levels - number))
+        return [Level(number, merge(self.model.splats(), count), self._facts(number))]
 
     def meta(self) -> dict:
         footprint = self.s_min[0] * self.data.focal / self.data.median_depth
@@ -108,7 +126,7 @@ class Method(method.Method[FlodParameters, Drawing]):
             values = self._finishing_values(step)
             return finish.weights(self.model, self.s_min, view.camera, values), 0.0
         dropout = self.dropout.weights(len(self.model), step, self._progress(step))
-        return dropout, self.s_min[self.level_at(step) - 1]
+        return dropout, self._constraint(self.level_at(step))
 
     def collects_stats(self, view: TrainingView, step: int) -> bool:
         return not self.is_finishing(step) and self._level_step(step) < self._densify_until(step)
@@ -119,18 +137,22 @@ class Method(method.Method[FlodParameters, Drawing]):
             share = (step - self._ends[-1]) / p.finish_steps
             self.model.lr = finish.learning_rates(p, self.data.extent, share)
             return
-        share = self._level_step(step) / (p.lr_means_steps or p.steps[self.level_at(step) - 1])
+        steps = p.stages[self._stage(step)][1]
+        if self._refines(step):
+            self.model.lr = finish.learning_rates(p, self.data.extent, self._level_step(step) / steps)
+            return
+        share = self._level_step(step) / (p.lr_means_steps or steps)
         rate = log_linear(p.lr_means, p.lr_means_final, share) * self.data.extent
         self.model.lr["means"] = rate
 
     def control_density(self, step: int) -> None:
         if self.is_finishing(step):
-            finish.raise_to_min_sizes(self.model, self.s_min)
+            self._raise_to_min_sizes()
             return
         p, model, level, local = self.parameters, self.model, self.level_at(step), self._level_step(step) + 1
         if local > self._densify_until(step):
             return
-        old_count, s_min = len(model), self.s_min[level - 1]
+        old_count, s_min = len(model), self._constraint(level)
         if due(p.densify_interval[level - 1], local) and local >= p.densify_from:
             densify(
                 model,
@@ -160,7 +182,7 @@ class Method(method.Method[FlodParameters, Drawing]):
         if self.is_finishing(step) or not local < self._densify_until(step) <= local + 1:
             return
         level = self.level_at(step)
-        s_min = self.s_min[level - 1]
+        s_min = self._constraint(level)
         log_scales = (self.model["log_scales"].detach().exp() + s_min).log()
         gaussians = replace(self.model.gaussians, log_scales=log_scales)
         rows = vars(self.margins.extend(gaussians, self.parameters.margin_room(self.budget(level))))
@@ -178,17 +200,31 @@ class Method(method.Method[FlodParameters, Drawing]):
 
     def _level_step(self, step: int) -> int:
         """Return the number of completed steps of the current level."""
-        index = self.level_at(step) - self.parameters.first_level
+        index = self._stage(step)
         return step - (self._ends[index - 1] if index else 0)
+
+    def _stage(self, step: int) -> int:
+        """Return the index of a step's level in the order of training; finishing steps have the last."""
+        return min(bisect_right(self._ends, step), len(self._ends) - 1)
+
+    def _refines(self, step: int) -> bool:
+        """Return whether a step refines a merged level."""
+        return self.parameters.merges and self._ends[0] <= step < self._ends[-1]
 
     def _densify_until(self, step: int) -> float:
         """Return the number of steps of the current level with density control."""
-        p, level = self.parameters, self.level_at(step)
-        return p.densify_until[level - 1] * p.steps[level - 1]
+        if self._refines(step):
+            return 0.0
+        number, steps = self.parameters.stages[self._stage(step)]
+        return self.parameters.densify_until[number - 1] * steps
 
     def prune_unsupported(self, step: int) -> None:
         super().prune_unsupported(step)
         if self.is_finishing(step):  # minimum sizes take precedence
+            self._raise_to_min_sizes()
+
+    def _raise_to_min_sizes(self) -> None:
+        if not self.parameters.merges:
             finish.raise_to_min_sizes(self.model, self.s_min)
 
     # -- levels ----------------------------------------------------------------------------------------
@@ -198,10 +234,23 @@ class Method(method.Method[FlodParameters, Drawing]):
         p = self.parameters
         return int(p.splat_limit * p.budget_ratio ** (p.levels - level))
 
+    def _constraint(self, level: int) -> float:
+        """Return the minimum standard deviation that training imposes on a level: none on merged ones."""
+        return 0.0 if self.parameters.merges else self.s_min[level - 1]
+
+    def _facts(self, level: int) -> dict[str, float]:
+        return {"s_min": self.s_min[level - 1]}
+
     def start_level(self, level: int) -> None:
-        """Start the next level from the current one: same scales, a smaller constraint, new Adam state (Eq.
-        5).
+        """Start the next level from the current one, with new Adam state.
+
+        A merged level has fewer splats. Otherwise scales stay the same, with a smaller constraint (Eq. 5).
         """
+        p = self.parameters
+        if p.merges:
+            merged = merge(self.model.splats(), round(p.merge_ratio * len(self.model)))
+            self.model = self._new_model(from_splats(merged, p.sh_degree, self.device))
+            return
         tensors = {name: tensor.detach() for name, tensor in self.model.adam.tensors.items()}
         self.model = self._new_model(self._next_level_tensors(tensors, self.s_min[level - 2], level))
 
@@ -237,10 +286,11 @@ class Method(method.Method[FlodParameters, Drawing]):
         """Combine the completed levels into one model for the finishing steps; restart those of fine
         detail.
         """
-        p, data, levels = self.parameters, self.data, self.completed
+        p, data = self.parameters, self.data
+        levels = dict(sorted(self.completed.items()))
         max_size = finish.FINE_PIXELS * data.median_depth / data.focal
         fine = [number for number in levels if 0 < self.s_min[number - 1] <= max_size]
-        if fine:
+        if fine and not p.merges:
             gamma = self.controls["gamma"]
             levels |= finish.restart_levels(levels, fine, self.s_min, data, p, gamma, self.backend)
         self.model = finish.join_levels(levels, finish.learning_rates(p, data.extent, 0.0))

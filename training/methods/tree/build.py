@@ -3,7 +3,7 @@
 A node represents all leaves below it. Its mean, covariance and harmonics are the moments of the leaves, as
 in A LoD of Gaussians, which uses the merge of H3DGS. Weights are optical depth times area; the paper uses
 opacity times area. Not in the paper: opacities stay below 1, as required by files, and a node that hides
-less than its leaves is enlarged instead, up to ``MAX_SPREAD``.
+less than its leaves is enlarged instead (``optimize.merging``).
 """
 
 from __future__ import annotations
@@ -14,13 +14,12 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
-from scipy.special import expit, logit, spence
 
 from ...errors import LodgsError
 from ...lod.blocks import AXIS_BITS, morton_codes
 from ...lod.tree.forest import Piece, max_subtree_leaves, merge_forest, merge_trees, split_tree
-from ...lod.tree.shape import Tree, splat_area
+from ...lod.tree.shape import Tree
+from ...optimize.merging import merge_pairs, shapes_of_moments, splat_moments
 from ...rasterize.cpu.compile import STRICT, inlined, kernel, run_parallel
 from ...splats.gaussians import SH_C0, SplatRows, Splats
 from ...splats.scratch import ScratchFile
@@ -29,20 +28,12 @@ RADIUS = 16
 """Number of candidate partners on either side of a splat along a space-filling curve."""
 COLOR_WEIGHT = 4.0
 """Cost factor for merging colours that differ by 1 (squared distance)."""
-MAX_OPACITY = 0.99
-"""Maximum opacity of a node, the maximum that a rasterizer draws."""
-MAX_SPREAD = 3.0
-"""Maximum area of a node relative to its leaves' moments.
-
-A uniform square has a standard deviation of 0.29 of its side, which leaves gaps to its neighbours; half the
-side closes them.
-"""
 MIN_PAIRED_SHARE = 1 / 16
 """Minimum fraction of splats that must pair up in a round; otherwise neighbours on the curve merge."""
 CELL_LEAVES = 1 << 18
 """Maximum number of leaves whose tree is built at a time."""
 _BATCH_ROWS = 1 << 18
-"""Number of leaves to read, or covariances to decompose, at a time."""
+"""Number of leaves to read at a time."""
 
 
 def build(leaves: Splats) -> tuple[Splats, Tree]:
@@ -182,7 +173,7 @@ def _drop_extras(splats: Splats) -> Splats:
 
 def _build_cell(leaves: Splats) -> tuple[Splats, Tree, np.ndarray]:
     """Build the tree over splats in spatial order; return nodes, tree and the root's moments (13,)."""
-    means, covariances, depths = _splat_moments(leaves)
+    means, covariances, depths = splat_moments(leaves)
     colors = 0.5 + SH_C0 * leaves.sh[:, 0].astype(np.float64)
     moments = np.concatenate([means, covariances, depths[:, None], colors], axis=1)
     above, tree = _merge_to_root(moments)
@@ -207,7 +198,7 @@ def _merge_to_root(moments: np.ndarray) -> tuple[np.ndarray, Tree]:
         count = len(moments)
         run_parallel(_choose_partners, count, 1 << 12, moments, RADIUS, COLOR_WEIGHT, best)
         first, second = _mutual_pairs(best[:count])
-        merged = _merge_pairs(moments[first], moments[second])
+        merged = merge_pairs(moments[first], moments[second])
         children.append(np.stack([numbers[first], numbers[second]], axis=1))
         remaining = np.ones(count, bool)
         remaining[second] = False
@@ -216,29 +207,6 @@ def _merge_to_root(moments: np.ndarray) -> tuple[np.ndarray, Tree]:
         moments[first] = merged
         moments, numbers = moments[remaining], numbers[remaining]
     return np.concatenate(nodes), Tree(np.concatenate(children))
-
-
-def optical_depth(opacities: np.ndarray) -> np.ndarray:
-    """Return Li2(opacity), (N,): the integral of -ln(1 - alpha) over a splat's footprint, per 2π of its area.
-
-    Optical depths add up, for splats side by side and for splats behind one another.
-    """
-    return spence(1 - np.asarray(opacities, np.float64))
-
-
-def _splat_moments(splats: Splats) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return means (N, 3), covariances (N, 6) and optical depth times area (N,), float64."""
-    covariances = np.empty((len(splats), 6))
-    for begin in range(0, len(splats), _BATCH_ROWS):
-        part = slice(begin, begin + _BATCH_ROWS)
-        quats = splats.quats[part].astype(np.float64)
-        matrices = Rotation.from_quat(quats[:, [1, 2, 3, 0]]).as_matrix()
-        matrices *= np.exp(np.minimum(splats.log_scales[part], 40).astype(np.float64))[:, None]
-        squares = matrices @ matrices.swapaxes(1, 2)
-        covariances[part] = squares[:, (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)]
-    depths = optical_depth(np.clip(expit(splats.opacity_logits.astype(np.float64)), 1e-4, MAX_OPACITY))
-    areas = np.maximum(splat_area(splats.log_scales), 1e-60)
-    return splats.means.astype(np.float64), covariances, depths * areas
 
 
 @inlined(STRICT)
@@ -285,36 +253,10 @@ def _mutual_pairs(best: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return first, best[first]
 
 
-def _merge_pairs(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Merge pairs of moments (M, 13): joint means and covariances, weighted by optical depth."""
-    depth = first[:, 9] + second[:, 9]
-    share = (first[:, 9] / depth)[:, None]
-    merged = share * first + (1 - share) * second
-    apart = first[:, :3] - second[:, :3]
-    between = apart[:, (0, 0, 0, 1, 1, 2)] * apart[:, (0, 1, 2, 1, 2, 2)]
-    merged[:, 3:9] += share * (1 - share) * between
-    merged[:, 9] = depth
-    return merged
-
-
 def _node_splats(moments: np.ndarray, tree: Tree, sh: np.ndarray, depths: np.ndarray) -> Splats:
     """Return the splats (M,) of inner nodes with these moments (M, 13)."""
-    count = len(moments)
-    log_scales, quats = np.empty((count, 3), np.float32), np.empty((count, 4), np.float32)
-    for begin in range(0, count, _BATCH_ROWS):
-        part = slice(begin, begin + _BATCH_ROWS)
-        matrices = moments[part, 3:9][:, (0, 1, 2, 1, 3, 4, 2, 4, 5)].reshape(-1, 3, 3)
-        variances, axes = np.linalg.eigh(matrices)
-        variances = np.maximum(variances, np.maximum(1e-12 * variances[:, 2:], 1e-60))
-        log_scales[part] = np.log(variances) / 2
-        axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
-        quats[part] = Rotation.from_matrix(axes).as_quat()[:, [3, 0, 1, 2]]
-    hidden = moments[:, 9] / splat_area(log_scales)  # optical depth before enlarging
-    samples = np.linspace(1e-4, MAX_OPACITY, 4096)
-    opacities = np.interp(hidden, optical_depth(samples), samples)
-    wider = np.clip(hidden / optical_depth(opacities), 1, MAX_SPREAD)
-    log_scales += (np.log(wider) / 2).astype(np.float32)[:, None]
-    harmonics = np.empty((count, *sh.shape[1:]), np.float32)
+    quats, log_scales, logits = shapes_of_moments(moments)
+    harmonics = np.empty((len(moments), *sh.shape[1:]), np.float32)
     depths = np.concatenate([depths, moments[:, 9]])
     for layer in reversed(tree.layers):
         below = tree.children[layer - tree.leaves]
@@ -326,6 +268,4 @@ def _node_splats(moments: np.ndarray, tree: Tree, sh: np.ndarray, depths: np.nda
             harmonics[np.where(of_leaf, 0, below - tree.leaves)],
         )
         harmonics[layer - tree.leaves] = (rate_factors[..., None, None] * parts).sum(axis=1)
-    return Splats(
-        moments[:, :3].astype(np.float32), quats, log_scales, logit(opacities).astype(np.float32), harmonics
-    )
+    return Splats(moments[:, :3].astype(np.float32), quats, log_scales, logits, harmonics)

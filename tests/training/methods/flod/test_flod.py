@@ -23,6 +23,7 @@ from training.splats.levels import Bundle, Level
 
 def make(data, **values) -> Method:
     values = {
+        "levels_from": "trained",
         "finish_share": 0.0,
         "levels": 3,
         "steps": [6, 6, 6],
