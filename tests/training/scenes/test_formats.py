@@ -376,6 +376,8 @@ def test_folders_without_export_are_rejected(tmp_path):
         convert_export(tmp_path / "nowhere")
     write_transforms(tmp_path)
     convert_export(tmp_path)
+    with pytest.raises(LodgsError, match=r"sparse.0 already holds a model\. Use the folder as it is"):
+        convert_export(tmp_path)
     (tmp_path / "transforms.json").unlink()
     (tmp_path / "sparse" / "0" / "points3D.ply").write_text(
         "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
