@@ -8,6 +8,7 @@ files are mapped and text is read by lines, so memory depends on valid records, 
 from __future__ import annotations
 
 import mmap
+import os
 import struct
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
@@ -124,6 +125,8 @@ def _read(model: Path, name: str, parsers: dict) -> Any:
         with open_file(path) as file:
             if suffix == ".txt":
                 return parsers[suffix](file)
+            if not os.fstat(file.fileno()).st_size:
+                raise ValueError("it is empty")
             return parsers[suffix](mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
     except OSError as error:
         raise LodgsError(f"Cannot read {path}: {error.strerror}.", "Check the folder.") from error

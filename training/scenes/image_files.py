@@ -152,6 +152,9 @@ def find_moved_images(folder: Path, names: Iterable[str]) -> Path | None:
     """Return the only folder below a scene that has most of the model's image names, or None.
 
     Names match with any suffix and case.
+
+    Raises:
+        LodgsError: several folders have the same number of names.
     """
     parts_by_stem: dict[str, list[tuple[str, ...]]] = {}
     for name in filter(_is_inside, names):
@@ -163,8 +166,13 @@ def find_moved_images(folder: Path, names: Iterable[str]) -> Path | None:
         for parts in parts_by_stem.get(_stem(path.name), []):
             if not parts or tuple(parents[-len(parts) :]) == parts:
                 counts[path.parents[len(parts)]] += 1
-    best = counts.most_common(2)
-    return best[0][0] if best and (len(best) == 1 or best[0][1] > best[1][1]) else None
+    best = [place for place, count in counts.items() if count == max(counts.values())]
+    if len(best) > 1:
+        raise LodgsError(
+            f"Cannot choose the photos of {folder}: {best[0]} and {best[1]} have the same names.",
+            "Choose the image folder, or rename it to images.",
+        )
+    return best[0] if best else None
 
 
 def walk_files(

@@ -376,12 +376,21 @@ def test_folders_without_export_are_rejected(tmp_path):
         convert_export(tmp_path / "nowhere")
     write_transforms(tmp_path)
     convert_export(tmp_path)
+    with pytest.raises(LodgsError, match=r"sparse.0 already holds a model\. Use the folder as it is"):
+        convert_export(tmp_path)
     (tmp_path / "transforms.json").unlink()
     (tmp_path / "sparse" / "0" / "points3D.ply").write_text(
         "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
         "end_header\n0 0 1\n"
     )
     with pytest.raises(LodgsError, match="already is a COLMAP scene"):
+        convert_export(tmp_path)
+
+
+@pytest.mark.parametrize("content", ["[]", "{}", '[{"shots": 1}]', '[{"shots": {"a.jpg": 1}}]', "7", ""])
+def test_damaged_reconstructions_of_opensfm_are_rejected(tmp_path, content):
+    (tmp_path / "reconstruction.json").write_text(content)
+    with pytest.raises(LodgsError, match=r"reconstruction\.json"):
         convert_export(tmp_path)
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from ...errors import LodgsError, SystemProblem, system_reason
 from ...files import check_folder, link_or_copy
 from ..colmap import DEPTHS, MASKS, NO_POINTS, find_models, read_scene, scene_lenses, subfolders
+from ..colmap_model import model_suffix
 from ..image_files import find_image_folder
 from ..images import image_size
 from ..view_selection import exclusion_messages, photo_turns
@@ -98,29 +99,15 @@ def convert_export(folder: Path, out: Path | None = None) -> ConvertedScene:
     """
     folder = folder.absolute()
     check_folder(folder, "Choose the folder of another program's export.")
-    exports = find_exports(folder)
-    if len(exports) > 1:
-        raise LodgsError(
-            f"Cannot convert {folder}: it has {len(exports)} exports, such as {exports[0][1]} and "
-            f"{exports[1][1]}.",
-            "Choose the folder of one of them.",
-        )
-    if not exports and not find_models(folder):
-        reason, remedy = describe_foreign(folder) or (
-            "its format is unknown",
-            f"Choose an export of {FORMAT_NAMES}, or the folder of a COLMAP scene.",
-        )
-        raise LodgsError(f"Cannot convert {folder}: {reason}.", remedy)
+    export = _choose_export(folder)
     scene = folder if out is None else out
-    if out is not None and out.is_dir() and find_models(out):
-        raise LodgsError(f"Cannot write scene: {out} already holds a COLMAP scene.", "Choose another folder.")
-    if not exports:
+    _check_output(scene, in_place=out is None)
+    if export is None:
         name, path, exported = "COLMAP", folder, _read_model_without_points(folder)
         if out is None:
             return ConvertedScene(folder, name, len(exported.views), 0, exported.warnings, is_source=True)
     else:
-        module, path = exports[0]
-        name, exported = module.NAME, module.read(path)
+        name, path, exported = export[0].NAME, export[1], export[0].read(export[1])
     views, excluded = _usable_views(exported)
     if not views:
         reason = f" {excluded[0][0]}: {excluded[0][1]}" if excluded else ""
@@ -144,6 +131,41 @@ def convert_export(folder: Path, out: Path | None = None) -> ConvertedScene:
             "Choose another output folder (lodgs scene --from DIR --out DIR).",
         ) from error
     return ConvertedScene(scene, name, len(views), len(points), warnings)
+
+
+def _choose_export(folder: Path) -> tuple[ModuleType, Path] | None:
+    """Return the only result of :func:`find_exports`; None for a COLMAP scene.
+
+    Raises:
+        LodgsError: there are several exports, or neither an export nor a COLMAP scene.
+    """
+    exports = find_exports(folder)
+    if len(exports) > 1:
+        raise LodgsError(
+            f"Cannot convert {folder}: it has {len(exports)} exports, such as {exports[0][1]} and "
+            f"{exports[1][1]}.",
+            "Choose the folder of one of them.",
+        )
+    if not exports and not find_models(folder):
+        reason, remedy = describe_foreign(folder) or (
+            "its format is unknown",
+            f"Choose an export of {FORMAT_NAMES}, or the folder of a COLMAP scene.",
+        )
+        raise LodgsError(f"Cannot convert {folder}: {reason}.", remedy)
+    return exports[0] if exports else None
+
+
+def _check_output(scene: Path, in_place: bool) -> None:
+    """Raise LodgsError if the scene's folder has a model; in place, only one that would be overwritten."""
+    if in_place and model_suffix(scene / "sparse" / "0") and find_exports(scene):
+        raise LodgsError(
+            f"Cannot write scene: {scene / 'sparse' / '0'} already holds a model.",
+            "Use the folder as it is, or choose another output folder (--out DIR).",
+        )
+    if not in_place and scene.is_dir() and find_models(scene):
+        raise LodgsError(
+            f"Cannot write scene: {scene} already holds a COLMAP scene.", "Choose another folder."
+        )
 
 
 def _read_model_without_points(folder: Path) -> ExportedScene:

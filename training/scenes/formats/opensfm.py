@@ -47,7 +47,8 @@ def read(path: Path) -> ExportedScene:
     """
     text = read_bytes(path, MAX_BYTES).removeprefix(codecs.BOM_UTF8)
     document = parse_json(b'{"all": %b}' % text, str(path), MAX_BYTES + 16)  # a list at the top
-    parts = [part for part in _list(document["all"]) if isinstance(part, dict) and part.get("shots")]
+    parts = [part for part in _list(document["all"]) if isinstance(part, dict)]
+    parts = [part for part in parts if isinstance(part.get("shots"), dict) and part["shots"]]
     if not parts:
         raise LodgsError(f"Cannot read {path}: it has no reconstruction with photos.", "Reconstruct again.")
     part = max(parts, key=lambda part: len(part["shots"]))
