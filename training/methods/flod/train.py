@@ -1,7 +1,7 @@
 """FLoD (Seo et al. 2025): train levels one after another, from coarse to fine or from the finest.
 
-The paper trains from coarse to fine, under a decreasing 3D scale constraint. Not in the paper: train the finest
-level first, merge each coarser one from the next finer one, and refine it.
+The paper trains from coarse to fine, under a decreasing 3D scale constraint. Not in the paper: train the
+finest level first, merge each coarser one from the next finer one, and refine it.
 """
 
 from __future__ import annotations
