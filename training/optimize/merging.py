@@ -14,9 +14,8 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from scipy.special import expit, logit, spence
 
-from ..lod.tree.shape import splat_area
 from ..rasterize.cpu.compile import STRICT, inlined, kernel, run_parallel
-from ..splats.gaussians import SH_C0, Splats
+from ..splats.gaussians import SH_C0, Splats, splat_area
 
 MAX_OPACITY = 0.99
 """Maximum opacity of a merged splat, the maximum that a rasterizer draws."""

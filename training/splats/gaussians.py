@@ -67,3 +67,9 @@ class Splats:
         return cls(
             **columns, extras={name: np.concatenate([s.extras[name] for s in sets]) for name in shared}
         )
+
+
+def splat_area(log_scales: np.ndarray) -> np.ndarray:
+    """Return s1 s2 + s1 s3 + s2 s3, (N,) float64, about proportional to an ellipsoid's mean shadow."""
+    a, b, c = np.exp(np.minimum(log_scales, 60).T.astype(np.float64))
+    return a * b + a * c + b * c

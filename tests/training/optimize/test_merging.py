@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from scipy.special import expit, logit
 
-from training.lod.tree.shape import splat_area
 from training.optimize.merging import merge, optical_depth
-from training.splats.gaussians import SH_C0, Splats
+from training.splats.gaussians import SH_C0, Splats, splat_area
 
 
 def make(means, log_scales, opacities, colors) -> Splats:

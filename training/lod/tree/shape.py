@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ...splats.gaussians import Splats
+from ...splats.gaussians import Splats, splat_area
 from ...splats.levels import Level
 from .nodes import (
     ABOVE_ROOT,
@@ -172,12 +172,6 @@ class UniqueSizes:
 def splat_size(log_scales: np.ndarray) -> np.ndarray:
     """Return sqrt(s1 s2 + s1 s3 + s2 s3), (N,) float64, of log-scales (N, 3) (A LoD of Gaussians, Eq. 6)."""
     return np.sqrt(splat_area(log_scales))
-
-
-def splat_area(log_scales: np.ndarray) -> np.ndarray:
-    """Return s1 s2 + s1 s3 + s2 s3, (N,) float64, about proportional to an ellipsoid's mean shadow."""
-    a, b, c = np.exp(np.minimum(log_scales, 60).T.astype(np.float64))
-    return a * b + a * c + b * c
 
 
 def leaf_only_columns(count: int) -> Mapping[str, np.ndarray]:

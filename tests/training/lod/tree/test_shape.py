@@ -6,9 +6,9 @@ import pytest
 from training.lod.rule import rules
 from training.lod.selection import resolve_controls, select_levels
 from training.lod.tree.nodes import ABOVE_ROOT, MIN_DETAIL
-from training.lod.tree.shape import leaf_only_columns, splat_area, splat_size
+from training.lod.tree.shape import leaf_only_columns, splat_size
 from training.splats.bundle import read_bundle, write_bundle
-from training.splats.gaussians import Splats
+from training.splats.gaussians import Splats, splat_area
 from training.splats.level_folder import read_folder, write_folder
 from training.splats.levels import Bundle, Level
 

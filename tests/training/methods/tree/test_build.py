@@ -8,12 +8,11 @@ from scipy.spatial.transform import Rotation
 from scipy.special import expit, logit
 
 from training.errors import LodgsError
-from training.lod.tree.shape import splat_area
 from training.methods.tree.build import build
 from training.optimize.merging import MAX_OPACITY, MAX_SPREAD, optical_depth
 from training.rasterize import Gaussians, rasterize
 from training.scenes.cameras import Camera
-from training.splats.gaussians import Splats
+from training.splats.gaussians import Splats, splat_area
 
 
 def scene(count, seed=0, opacity=0.6):
