@@ -140,7 +140,7 @@ class SplatSource(bpy.types.PropertyGroup):
         options={"PATH_SUPPORTS_BLEND_RELATIVE"},
     )
     watch: bpy.props.BoolProperty(
-        name="Reload When File Changes",
+        name="Reload on Change",
         description="Replace the splats when another program has written the file again",
         options=set(),
     )

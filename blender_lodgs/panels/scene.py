@@ -76,10 +76,11 @@ def _draw_source(layout: bpy.types.UILayout, column: bpy.types.UILayout, root: b
     row.operator("lodgs.reload_splats", text="", icon="FILE_REFRESH")
     column.prop(root.lodgs.source, "watch")
     watch = reloading.watch_of(root)
-    for note in watch.notes if watch is not None else ():
-        say(layout, note, "INFO")
     if watch is not None and watch.problem:
         say(layout, watch.problem, "ERROR")
+    elif watch is not None and watch.handled == root.lodgs.source.stamp:  # not undone
+        for note in watch.notes:
+            say(layout, note, "INFO")
 
 
 def _draw_check(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:
