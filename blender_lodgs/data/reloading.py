@@ -86,7 +86,7 @@ def replace_splats(root: bpy.types.Object, file: SplatsFile) -> list[str]:
     if existing and shown_level != finest:
         settings.single_level = shown_level
     _watches[root.session_uid] = FileWatch(file.stamp)
-    return [*file.warnings, *_describe(root, previous, deleted)]
+    return _describe(root, previous, deleted)
 
 
 def _describe(root: bpy.types.Object, previous: int, deleted: int) -> list[str]:
