@@ -7,7 +7,7 @@ handlers, menus and properties. Modules register in the order of ``MODULES`` and
 import bpy
 
 from . import commands, operators, panels, viewport
-from .data import changes, loaded, looks, older_files, paths, properties, removal, scenes, updates
+from .data import changes, loaded, looks, older_files, paths, properties, reloading, removal, scenes, updates
 from .nodes import building
 from .render import compare, engine, renderer
 from .runs import background_capture, jobs, photo_preparation
@@ -25,6 +25,7 @@ MODULES = (
     scenes,
     loaded,
     removal,
+    reloading,
     paths,
     viewport,
     renderer,

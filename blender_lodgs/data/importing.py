@@ -29,6 +29,7 @@ from ...training.splats.levels import Bundle
 from ...training.splats.streamed_levels import STREAMED_FILE
 from ..nodes.camera_choices import VIEWPORT
 from . import objects, scenes, streams
+from .paths import stored_path
 from .photographs import match_render, new_camera, views
 from .placement import axes_of, new_axes
 from .roots import collection_of
@@ -188,6 +189,7 @@ class SplatsFile:
         total: number of splats in such a file; 0 if the bundle has all splats.
         budget: maximum number of splats of such a file in memory.
         warnings: sentences about differences from the display of the original program.
+        stamp: version of the file, see :func:`file_stamp`.
     """
 
     path: Path
@@ -195,6 +197,17 @@ class SplatsFile:
     total: int
     budget: int
     warnings: list[str]
+    stamp: str
+
+
+def file_stamp(path: Path) -> str:
+    """Return a text that changes with the size or time of a file, or of a folder's files; empty if none."""
+    try:
+        files = sorted(path.iterdir()) if path.is_dir() else [path]
+        stats = [file.stat() for file in files]
+    except OSError:
+        return ""
+    return f"{sum(stat.st_size for stat in stats)} {max((stat.st_mtime_ns for stat in stats), default=0)}"
 
 
 def read_splats_file(path: Path | str, budget: int = 0) -> SplatsFile:
@@ -213,6 +226,7 @@ def read_splats_file(path: Path | str, budget: int = 0) -> SplatsFile:
     path, warnings, total = Path(path), [], 0
     if path.name == STREAMED_FILE:
         path = path.resolve().parent
+    stamp = file_stamp(path)  # before reading, so that a later change is noticed
     if budget and not path.is_dir() and is_plain_ply(path) and _is_paged(path):
         paged = open_paged(path)
         total = paged.total
@@ -230,7 +244,7 @@ def read_splats_file(path: Path | str, budget: int = 0) -> SplatsFile:
         if not bundle.method and not bundle.on_disk:  # of another program
             overview.complete_meta(bundle)
             warnings += overview.describe_clutter(bundle.levels[-1].splats)
-    return SplatsFile(path, bundle, total, budget, warnings)
+    return SplatsFile(path, bundle, total, budget, warnings, stamp)
 
 
 def _is_paged(path: Path) -> bool:
@@ -256,6 +270,7 @@ def place_splats(
             if upright:
                 axes_of(root).rotation_quaternion = Matrix(bundle.up_rotation.tolist()).to_quaternion()
             _fill(root, file, level_objects)
+            set_source(root, file)
             if cameras:
                 _add_views(context, root, cameras, camera_extent(cameras) or 1.0, near)
                 for settings in (view.data.lodgs for view in views(root)):
@@ -273,8 +288,15 @@ def place_splats(
 
 def refill(root: bpy.types.Object, file: SplatsFile) -> None:
     """Replace the levels of a splat scene by those of a file."""
-    scenes.prepare_refill(root, file.bundle.levels[-1].number)
+    scenes.prepare_refill(root, [level.number for level in file.bundle.levels])
     _fill(root, file, [None] * len(file.bundle.levels))
+
+
+def set_source(root: bpy.types.Object, file: SplatsFile) -> None:
+    """Store the file that a scene was read from."""
+    source = root.lodgs.source
+    source.file, source.stamp = stored_path(file.path), file.stamp
+    source.count = sum(len(level.splats) for level in file.bundle.levels)
 
 
 def _fill(root: bpy.types.Object, file: SplatsFile, level_objects: Sequence[bpy.types.Object | None]) -> None:

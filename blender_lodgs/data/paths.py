@@ -50,12 +50,21 @@ def automatic_path(value: str, library: bpy.types.Library | None = None) -> Path
     return None if unsafe else Path(path)
 
 
+def stored_path(path: Path) -> str:
+    """Return a path as properties store it: relative to the .blend file if the user prefers that."""
+    absolute = str(path.absolute())
+    if bpy.data.filepath and bpy.context.preferences.filepaths.use_relative_paths:
+        with suppress(ValueError):  # on another drive
+            return bpy.path.relpath(absolute)
+    return absolute
+
+
 def scene_paths() -> Iterator[tuple[bpy.types.bpy_struct, str, str]]:
     """Return the paths of this file's scenes as tuples of owner, property name and value."""
     owners: list[bpy.types.bpy_struct] = []
     for obj in bpy.data.objects:
         if obj.is_editable and obj.lodgs.is_root:
-            owners += [obj.lodgs, obj.lodgs.training, obj.lodgs.stream]
+            owners += [obj.lodgs, obj.lodgs.training, obj.lodgs.stream, obj.lodgs.source]
         elif obj.is_editable and obj.type == "CAMERA" and obj.data.is_editable:
             owners.append(obj.data.lodgs)
     for scene in bpy.data.scenes:

@@ -6,7 +6,7 @@ import bpy
 
 from .. import compat
 from .property_callbacks import look_up, tag_owner
-from .scene_properties import CONTROLS, SplatLevel, SplatScene, SplatStream, SplatTable
+from .scene_properties import CONTROLS, SplatLevel, SplatScene, SplatSource, SplatStream, SplatTable
 from .training import PARAMETERS, TrainingCell, TrainingSettings
 from .viewpoints import ViewsSettings
 
@@ -266,8 +266,8 @@ class RenderSettings(bpy.types.PropertyGroup):
 
 CLASSES = (
     ViewSettings, ViewportSettings, *PARAMETERS.values(), TrainingCell, TrainingSettings, SplatLevel,
-    SplatTable, SplatStream, *CONTROLS.values(), SplatScene, CropSettings, BrushSettings, RenderSettings,
-    CaptureSettings,
+    SplatTable, SplatStream, SplatSource, *CONTROLS.values(), SplatScene, CropSettings, BrushSettings,
+    RenderSettings, CaptureSettings,
 )  # fmt: skip
 
 

@@ -130,6 +130,28 @@ class SplatStream(bpy.types.PropertyGroup):
     )
 
 
+class SplatSource(bpy.types.PropertyGroup):
+    """File from which a splat scene was imported; see ``reloading``."""
+
+    file: bpy.props.StringProperty(
+        name="File",
+        description="File with the splats of the scene",
+        subtype="FILE_PATH",
+        options={"PATH_SUPPORTS_BLEND_RELATIVE"},
+    )
+    watch: bpy.props.BoolProperty(
+        name="Reload on Change",
+        description="Replace the splats when another program has written the file again",
+        options=set(),
+    )
+    stamp: bpy.props.StringProperty(
+        name="Version", description="Size and time of the file when it was read", options={"HIDDEN"}
+    )
+    count: bpy.props.IntProperty(
+        name="Splats in File", description="Number of splats that were read", options={"HIDDEN"}
+    )
+
+
 def _level_callback(rule: Rule, control: Control):
     """Return the update callback of a control that names a level.
 
@@ -276,6 +298,9 @@ class SplatScene(bpy.types.PropertyGroup):
         description="Positions and paint of the finest level before all levels were replaced",
         type=bpy.types.PointCloud,
         options={"HIDDEN"},
+    )
+    source: bpy.props.PointerProperty(
+        name="Source", description="File from which the scene was imported", type=SplatSource
     )
     stream: bpy.props.PointerProperty(
         name="Streaming", description="File with the finer levels of the tree", type=SplatStream

@@ -7,27 +7,47 @@ All other objects are children of its axes, in COLMAP coordinates (see ``placeme
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 
 import bpy
 import numpy as np
 
 from ...training.editing import look, placement
+from ...training.editing.cleaning import same_rows
 from ...training.errors import LodgsError
-from ...training.lod.rule import Tables, find_rule
+from ...training.lod.rule import Rule, Tables, find_rule
 from ...training.lod.selection import check_rule, complete_splats, standalone_error
 from ...training.scenes.view_tables import VIEWS, make_view_tables, transform_views
 from ...training.splats.gaussians import Splats
 from ...training.splats.levels import Bundle, Level
 from ...training.splats.origin import describe_origin
 from .. import compat, extension
+from ..attributes import HIDDEN, write_attribute
 from ..nodes import ellipsoids
 from . import cleaning, crops, looks, objects, painting, selection, streams, tables
 from .controls import changed_controls, update_controls
 from .photographs import camera_of, is_held_out, views, views_with_photo
 from .placement import axes_of, placement_of
 from .roots import collection_of, roots
+
+
+def check_facts(root: bpy.types.Object, bundle: Bundle) -> Rule | None:
+    """Check a bundle's metadata for a scene and return its rule.
+
+    Raises:
+        LodgsError: a recorded value is invalid or contradicts the rule, or the local origin is not that of
+            the scene's views.
+    """
+    rule = check_rule(bundle)
+    if views(root) and not np.array_equal(bundle.origin, selection.origin_of(root)):
+        raise LodgsError(
+            f"Cannot show levels in '{root.name}': their local origin is not that of the scene's cameras.",
+            "Import the splats as a new scene.",
+        )
+    for control in rule.controls if rule else ():
+        control.validate(bundle.controls.get(control.name, control.default))
+    return rule
 
 
 def set_bundle_facts(root: bpy.types.Object, bundle: Bundle) -> None:
@@ -37,17 +57,9 @@ def set_bundle_facts(root: bpy.types.Object, bundle: Bundle) -> None:
     levels or levels without splats.
 
     Raises:
-        LodgsError: a recorded value is invalid or contradicts the rule, or the local origin is not that of
-            the scene's views. Nothing is changed in that case.
+        LodgsError: as :func:`check_facts`. Nothing is changed in that case.
     """
-    settings, rule = root.lodgs, check_rule(bundle)
-    if views(root) and not np.array_equal(bundle.origin, selection.origin_of(root)):
-        raise LodgsError(
-            f"Cannot show levels in '{root.name}': their local origin is not that of the scene's cameras.",
-            "Import the splats as a new scene.",
-        )
-    for control in rule.controls if rule else ():
-        control.validate(bundle.controls.get(control.name, control.default))
+    settings, rule = root.lodgs, check_facts(root, bundle)
     if rule is not None and (rule.weights_full_detail or not rule.complete) and settings.rule != bundle.rule:
         settings.mode = "SELECTIVE"
     settings.method, settings.rule, settings.cumulative = bundle.method, bundle.rule, bundle.cumulative
@@ -107,27 +119,31 @@ def contents(root: bpy.types.Object) -> str:
     return f"{text}. {origin}" if origin else text
 
 
-def prepare_refill(root: bpy.types.Object, number: int) -> None:
-    """Remove tables, streaming and all levels but one, whose object the first new level reuses.
+def prepare_refill(root: bpy.types.Object, numbers: Collection[int]) -> None:
+    """Remove tables, streaming and the levels that new ones do not replace, and stop watching the source.
 
     Args:
-        number: number of that level. If there is none of this number, the finest level takes it.
+        numbers: numbers of the new levels, which reuse the objects of these levels. If none of them exists,
+            the finest level takes the last number.
     """
     tables.remove_tables(root)
     streams.stop_streaming(root)
     painting.save_paint(root)
+    root.lodgs.source.watch = False
     existing = [item for item in root.lodgs.levels if item.exists]
-    reused = next((item for item in existing if item.number == number), existing[-1] if existing else None)
+    reused = [item for item in existing if item.number in numbers] or existing[-1:]
     for item in existing:
-        if item != reused:
+        if item not in reused:
             cloud = item.object.data
             bpy.data.objects.remove(item.object)
             if not cloud.users:
                 bpy.data.pointclouds.remove(cloud)
-    if reused is not None:
-        if reused.object.name == _level_name(root, reused.number):
-            reused.object.name = _level_name(root, number)
-        reused.number = number
+    for item in reused:
+        if item.number not in numbers:
+            number = list(numbers)[-1]
+            if item.object.name == _level_name(root, item.number):
+                item.object.name = _level_name(root, number)
+            item.number = number
     levels_changed(root)
 
 
@@ -374,7 +390,7 @@ def put_level(
         if obj.mode != "OBJECT":  # Blender cannot exchange data in other modes
             with extension.in_window():
                 bpy.ops.object.mode_set(mode="OBJECT")
-        item.lost = int(cleaning.hidden_mask(old_cloud).sum())
+        item.lost = _carry_over(old_cloud, new_object.data)
         obj.data, obj.color = new_object.data, new_object.color
         bpy.data.objects.remove(new_object)
         name = old_cloud.name
@@ -387,6 +403,20 @@ def put_level(
     item.object = new_object
     item.facts = json.dumps(level.facts)
     return new_object
+
+
+def _carry_over(old: bpy.types.PointCloud, new: bpy.types.PointCloud) -> int:
+    """Copy materials and, to the same splats, hidden marks. Return the number of splats shown again."""
+    new.materials.clear()
+    for material in old.materials:
+        new.materials.append(material)
+    hidden = cleaning.hidden_mask(old)
+    if not hidden.any():
+        return 0
+    if not same_rows(cleaning.splat_attribute(old, "position"), cleaning.splat_attribute(new, "position")):
+        return int(hidden.sum())
+    write_attribute(new, HIDDEN, "BOOLEAN", hidden)
+    return 0
 
 
 def _level_name(root: bpy.types.Object, number: int) -> str:

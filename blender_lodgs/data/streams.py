@@ -6,14 +6,13 @@ LODGS draws finer splats from the file as the camera approaches. One budget cove
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import bpy
 
 from ..attributes import HIDDEN
-from .paths import absolute_path, automatic_path
+from .paths import absolute_path, automatic_path, stored_path
 
 RESIDENT_SHARE = 0.25
 """Share of the budget for the scene's own objects."""
@@ -52,11 +51,7 @@ def resident_count(budget: int) -> int:
 def start_streaming(root: bpy.types.Object, path: Path, budget: int, total: int) -> None:
     """Start streaming for a scene that holds the coarsest splats of a file."""
     stream = root.lodgs.stream
-    absolute = str(path.absolute())
-    stream.file = absolute
-    if bpy.data.filepath and bpy.context.preferences.filepaths.use_relative_paths:
-        with suppress(ValueError):  # on another drive
-            stream.file = bpy.path.relpath(absolute)
+    stream.file = stored_path(path)
     stream.budget, stream.total, stream.here = budget, total, _count_splats(root)
     stream.begun += 1
 

@@ -8,9 +8,10 @@ from pathlib import Path
 import bpy
 
 from ...training.splats.formats import FILE_EXTENSIONS, READABLE
-from ..data import importing, photographs, roots, scenes
+from ..data import importing, photographs, reloading, roots, scenes
 from ..data.paths import absolute_path
 from ..runs import photo_preparation
+from .base import SceneOperator
 from .modal import BackgroundOperator
 
 
@@ -89,6 +90,33 @@ class LODGS_OT_import_splats(BackgroundOperator, bpy.types.Operator):
         return f"Reading {', '.join(path.name for path in self.paths())}, Esc to stop"
 
 
+class LODGS_OT_reload_splats(SceneOperator, BackgroundOperator, bpy.types.Operator):
+    """Replace the splats by those that the file has now; placement, crops, looks and materials stay"""
+
+    bl_idname = "lodgs.reload_splats"
+    bl_label = "Reload Splats"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def work(self, context):
+        root = roots.active_root(context)
+        reader = ThreadPoolExecutor(1, "lodgs-reload")
+        self._notes = []
+        try:
+            read = reader.submit(reloading.read_source(root))
+            while self._modal and not read.done():
+                yield
+            self._notes = reloading.replace_splats(root, read.result())
+        finally:
+            reader.shutdown(wait=False, cancel_futures=True)
+        yield
+
+    def result_text(self, count):
+        return " ".join(self._notes)
+
+    def status_text(self, context, count):
+        return "Reading the file, Esc to stop"
+
+
 class LODGS_FH_splats(bpy.types.FileHandler):
     bl_idname = "LODGS_FH_splats"
     bl_label = "Gaussian Splats (LODGS)"
@@ -106,7 +134,7 @@ def _menu(self, context):
     )
 
 
-CLASSES = (LODGS_OT_import_splats, LODGS_FH_splats)
+CLASSES = (LODGS_OT_import_splats, LODGS_OT_reload_splats, LODGS_FH_splats)
 
 
 def register() -> None:

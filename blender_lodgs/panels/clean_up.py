@@ -51,7 +51,7 @@ class LODGS_PT_clean_up(LevelsPanel):
         lost = {item.number: item.lost for item in cleaning.levels(root) if item.lost}
         if lost:
             counts = ", ".join(f"level {number}: {count:,}" for number, count in lost.items())
-            say(column, f"Training replaced these levels and shows their hidden splats ({counts}).", "INFO")
+            say(column, f"These levels were replaced and show their hidden splats again ({counts}).", "INFO")
         column = layout.column(align=True)
         column.operator("lodgs.show_hidden_splats", text="Show All Hidden")
         column.operator("lodgs.delete_left_out", text="Delete Hidden", icon="TRASH")

@@ -6,7 +6,7 @@ import bpy
 
 from ...training.scenes.check import ERROR, INFO, WARNING
 from ...training.splats.origin import format_number
-from ..data import native, photographs, roots, selection
+from ..data import native, photographs, reloading, roots, selection
 from ..runs import photo_preparation, scene_check
 from .parts import Panel, say, split_column
 
@@ -35,6 +35,8 @@ class LODGS_PT_scene(Panel):
         if root.lodgs.scene_folder:
             column.prop(root.lodgs, "scene_folder", text="Folder")
             _draw_check(layout, root)
+        if root.lodgs.source.file:
+            _draw_source(layout, column, root)
         if root.lodgs.levels:
             column.prop(root.lodgs, "antialias")
         origin = selection.origin_of(root)
@@ -65,6 +67,20 @@ def _draw_import(layout: bpy.types.UILayout, another: bool) -> None:
         column.operator("lodgs.find_cameras", text="Import Photos…", icon="IMAGE_DATA")
         column.operator("lodgs.import_colmap", text="Import COLMAP Scene…", icon="CAMERA_DATA")
         column.operator("lodgs.import_splats", text="Import Splats…", icon="POINTCLOUD_DATA")
+
+
+def _draw_source(layout: bpy.types.UILayout, column: bpy.types.UILayout, root: bpy.types.Object) -> None:
+    """Draw the file of imported splats, its reload, and the result of the last automatic reload."""
+    row = column.row(align=True)
+    row.prop(root.lodgs.source, "file")
+    row.operator("lodgs.reload_splats", text="", icon="FILE_REFRESH")
+    column.prop(root.lodgs.source, "watch")
+    watch = reloading.watch_of(root)
+    if watch is not None and watch.problem:
+        say(layout, watch.problem, "ERROR")
+    elif watch is not None and watch.handled == root.lodgs.source.stamp:  # not undone
+        for note in watch.notes:
+            say(layout, note, "INFO")
 
 
 def _draw_check(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:

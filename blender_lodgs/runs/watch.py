@@ -210,7 +210,7 @@ class Watch:
         level = self._read_level(event)
         with extension.in_window():
             if not root.lodgs.training.read:  # never mix levels of two runs
-                scenes.prepare_refill(root, event["level"])
+                scenes.prepare_refill(root, [event["level"]])
             if "meta" in event:
                 scenes.set_bundle_facts(root, self._bundle_facts(event))
             scenes.set_level(root, level)

@@ -28,6 +28,8 @@ MAX_FLOATER_SHARE = 0.001
 """Clusters with at most this fraction of all splats are floaters."""
 GAPS_ACROSS = 48
 """The default gap is the diagonal of the middle 80 % of the splats divided by this number."""
+MAX_SHIFT = 0.01
+"""Maximum median distance between two versions of the same splats, as a fraction of the scene's size."""
 _MAX_CELL = (1 << 20) - 2
 
 
@@ -85,6 +87,19 @@ def find_floaters(means: np.ndarray, gap: float = 0.0, share: float = MAX_FLOATE
     cluster = _clusters(cells)
     counts = np.bincount(cluster[cell_of], minlength=len(cells))
     return (counts <= share * len(means))[cluster][cell_of]
+
+
+def same_rows(previous: np.ndarray, current: np.ndarray) -> bool:
+    """Return whether two sets of means (N, 3) are versions of the same splats in the same order.
+
+    Their numbers are equal, and half of the splats moved by at most MAX_SHIFT of the scene's size: the
+    diagonal of the box around the central nine tenths of the splats.
+    """
+    if len(previous) != len(current) or not len(previous):
+        return False
+    low, high = np.quantile(previous.astype(np.float64), (0.05, 0.95), axis=0)
+    shift = float(np.median(np.linalg.norm(current - previous, axis=1)))
+    return shift <= MAX_SHIFT * float(np.linalg.norm(high - low))
 
 
 def default_gap(means: np.ndarray) -> float:

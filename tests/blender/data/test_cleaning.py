@@ -1,5 +1,6 @@
 """Crops and hiding act on every level, shown, chosen and exported: against numpy, splat by splat."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -298,7 +299,10 @@ def test_hidden_splats_are_saved_undone_exported_and_lost_with_their_level(bpy, 
     bpy.ops.lodgs.export_plain(filepath=str(tmp_path / "shown.ply"), source="SHOWN")
     assert len(read_ply(tmp_path / "shown.ply")) == sum(stay.sum() for stay in stays)
 
-    scenes.set_level(root_now(), bundle.levels[1])
+    scenes.set_level(root_now(), bundle.levels[1])  # the same splats
+    assert left()[1] == stays[1].sum() and not root_now().lodgs.levels[1].lost
+    reordered = bundle.levels[1].splats.select(slice(None, None, -1))
+    scenes.set_level(root_now(), replace(bundle.levels[1], splats=reordered))
     assert root_now().lodgs.levels[1].lost == (~stays[1]).sum()
     assert left()[1] == len(stays[1]) and left()[0] == stays[0].sum()
     bpy.ops.lodgs.show_hidden_splats()

@@ -189,7 +189,7 @@ def test_retrained_levels_take_over_paint_by_position(bpy, lodgs, scene_of, anew
     rng, fresh = np.random.default_rng(5), bundle_of("bands", np.random.default_rng(5)).levels
     finest = bundle.levels[2].splats.means
     if anew:
-        scenes.prepare_refill(root, 1)
+        scenes.prepare_refill(root, [1])
     for level in fresh if anew else fresh[2:]:
         some = rng.integers(len(finest), size=len(level.splats))
         level.splats.means[:] = finest[some] + rng.normal(0, 0.001, (len(some), 3))
@@ -214,13 +214,13 @@ def test_paint_does_not_spread_from_run_to_run(bpy, lodgs, scene_of):  # noqa: F
     painting.write_paint(root, painting.blend(painting.read_paint(root), half, RED))
     before, some = painting.read_paint(root)[3], bundle.levels[2].splats.select(slice(0, 5))
     for levels in ([Level(1, some)], bundle.levels):
-        scenes.prepare_refill(root, 1)
+        scenes.prepare_refill(root, [1])
         for level in levels:
             level.splats.extras = {k: v for k, v in level.splats.extras.items() if k not in COLUMNS}
             scenes.set_level(root, level)
     np.testing.assert_array_equal(painting.read_paint(root)[3], before)
     painting.write_paint(root, painting.blend(painting.read_paint(root), half, BLUE))
-    scenes.prepare_refill(root, 1)
+    scenes.prepare_refill(root, [1])
     blue = painting.paint_of(root.lodgs.painted)[half[3] > 0, :3]
     np.testing.assert_allclose(blue, np.broadcast_to(BLUE, blue.shape), atol=1e-6)
 

@@ -166,7 +166,7 @@ def test_a_deleted_table_is_no_table(bpy, lodgs, root):
 
 
 def test_new_training_has_no_tables(lodgs, root):
-    lodgs("data.scenes").prepare_refill(root, 1)
+    lodgs("data.scenes").prepare_refill(root, [1])
     assert not root.lodgs.tables and lodgs("data.scenes").read_levels(root).tables == {}
 
 

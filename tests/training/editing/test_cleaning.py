@@ -15,6 +15,7 @@ from training.editing.cleaning import (
     find_unseen,
     keep_splats,
     read_relations,
+    same_rows,
 )
 from training.errors import LodgsError
 from training.lod.blocks import BLOCKS, block_table
@@ -360,3 +361,13 @@ def test_tables_of_unknown_rules_are_rejected():
     bundle = Bundle("new", [Level(1, some_splats(np.random.default_rng(0), 9))], "newer", tables={"x": {}})
     with pytest.raises(LodgsError, match="newer"):
         keep_splats(bundle, {1: np.arange(9) < 5})
+
+
+def test_same_rows_are_versions_of_the_same_splats():
+    means = np.random.default_rng(0).uniform(0, 1, (1000, 3))  # the box's diagonal is 0.9 * 3**0.5 = 1.56
+    moved = means + np.float64([0.015, 0, 0])
+    moved[:499] += 100  # fewer than half
+    assert same_rows(means, moved)
+    assert not same_rows(means, means + np.float64([0.0165, 0, 0]))
+    assert not same_rows(means, means[::-1]) and not same_rows(means, means[1:])
+    assert not same_rows(means[:0], means[:0])
