@@ -104,12 +104,24 @@ def _draws(gpu):
     return np.allclose(np.ravel(image.to_list()), (0.25, 0.5, 0.75, 1.0))
 
 
+FAKE = """#!/bin/sh
+case "$3 $LODGS_FAKE" in  # answered by the shell, because Python takes half a second
+    "check no_torch") echo '{"ok": false, "problems": ["The package torch is missing in here."]}'; exit 2;;
+    "check no_dask") echo '{"torch": "2.13.0", "ok": true, "problems": []}'; exit;;
+    "check "*) echo '{"torch": "2.13.0", "distributed": "2026.8.0", "ok": true, "problems": []}'; exit;;
+esac
+"""
+
+
 @pytest.fixture
 def fake(tmp_path, monkeypatch):
-    """``fake("crash")``: set the behaviour of the fake trainer, ``fake_trainer.py``."""
+    """``fake("crash")``: set the behaviour of the fake trainer, ``fake_trainer.py``.
+
+    In the modes ``no_dask`` and ``no_torch``, its check misses these packages.
+    """
     program = tmp_path / "python with a space"
     program.write_text(
-        f'#!/bin/sh\nexec "{sys.executable}" "{Path(__file__).with_name("fake_trainer.py")}" "$@"\n'
+        f'{FAKE}exec "{sys.executable}" "{Path(__file__).with_name("fake_trainer.py")}" "$@"\n'
     )
     program.chmod(0o755)
     monkeypatch.setenv("LODGS_TRAINER_PYTHON", str(program))

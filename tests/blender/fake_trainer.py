@@ -6,7 +6,6 @@ Cells of a job that has some make half of their steps, and wait for the file ``g
 - ``chunks``    two levels of LODGE, which come again with what chunks have of them
 - ``tree``      leaves, then all nodes of a tree
 - ``two halves``  two levels, and done when the file ``go on`` is there
-- ``no_dask``   the check finds Dask missing
 - ``slow``      steps until it is asked to stop, at most half an hour
 - ``killed``    one level, then SIGKILL to itself
 - ``crash``     one level, then a traceback and exit code 1
@@ -15,7 +14,6 @@ Cells of a job that has some make half of their steps, and wait for the file ``g
 - ``mute``      never says anything and ignores being asked
 - ``full``      an ``error`` event, as when the disk is full
 - ``refused``   an ``error`` event on stdout alone, as before a run folder is its own
-- ``no_torch``  the check finds torch missing
 """
 
 import json
@@ -62,11 +60,6 @@ def splats(count: int) -> Splats:
 
 def main() -> int:
     mode, command = os.environ.get("LODGS_FAKE", ""), sys.argv[3]
-    if command == "check":
-        problems = ["The package torch is missing in here."] if mode == "no_torch" else []
-        dask = {} if mode == "no_dask" else {"distributed": "2026.8.0"}
-        print(json.dumps({"torch": "2.13.0", **dask, "ok": not problems, "problems": problems}))
-        return 2 if problems else 0
     METHODS["flod"] = replace(METHODS["flod"], from_base=True)  # as tests of bases have it
     job = Job.from_file(Path(sys.argv[5], "job.toml") if command == "blocks" else Path(sys.argv[4]))
     folder = RunFolder(job.out)

@@ -213,18 +213,20 @@ def test_restricted_rules_are_unknown(run):
 @pytest.mark.slow
 def test_method_of_the_recipe_trains_and_its_rule_selects(run, tiny_scene, tmp_path):
     """Training writes a bundle, and rendering by distance uses the rule."""
-    process = run(
-        "-m", "training", "train", "--scene", tiny_scene, "--out", tmp_path / "run", "--method", "mymethod",
-        "--set", "steps=3", "--set", "interval=2", "--image-scale", "1", "--test-every", "0",
-        "--backend", "cpu",
-    )  # fmt: skip
-    events = [json.loads(line) for line in process.stdout.splitlines()]
+    view = tmp_path / "view.png"
+    train = [
+        "train", "--scene", tiny_scene, "--out", tmp_path / "run", "--method", "mymethod", "--set", "steps=3",
+        "--set", "interval=2", "--image-scale", "1", "--test-every", "0", "--backend", "cpu",
+    ]  # fmt: skip
+    render = ["render", tmp_path / "run", "--view", "00.jpg", "--out", view, "--by-distance"]
+    commands = [list(map(str, train)), list(map(str, render))]
+    code = f"from training.__main__ import main; sys.exit(any(main(words) for words in {commands}))"
+    process = run("-c", f"import sys; {code}")
+    events = [json.loads(line) for line in process.stdout.splitlines() if line.startswith("{")]
     assert events[-1]["event"] == "done" and events[0]["method"] == "mymethod"
     bundle = read_bundle(tmp_path / "run" / "bundle.ply")
     assert (bundle.method, bundle.rule) == ("mymethod", "plugged")
     assert [level.number for level in bundle.levels] == [1] and len(bundle.levels[0].splats) > 10
-    view = tmp_path / "view.png"
-    run("-m", "training", "render", tmp_path / "run", "--view", "00.jpg", "--out", view, "--by-distance")
     assert view.stat().st_size > 100
 
 

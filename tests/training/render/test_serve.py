@@ -187,14 +187,6 @@ def test_foreign_folder_is_refused(tmp_path):
     process = subprocess.run(command, cwd=ROOT, input="", capture_output=True, text=True, check=False)
     assert process.returncode == 2 and "is not empty" in process.stderr and not process.stdout
     assert (tmp_path / "photos" / "a.jpg").read_text() == "dear"
-    process = subprocess.run(
-        [*command[:4], str(tmp_path / "new"), *command[5:]],
-        cwd=ROOT,
-        input="",
-        capture_output=True,
-        check=False,
-    )
-    assert process.returncode == 0 and not (tmp_path / "new").exists()
 
 
 @pytest.mark.slow

@@ -75,7 +75,12 @@ def test_stopped_run_on_a_device_gives_the_same_bits_and_measures(graphics, keys
             "stopped responding",
             "Resume the run",
         ),
-        (RuntimeError("Not enough memory left."), "is out of memory", "on the cpu"),
+        pytest.param(
+            RuntimeError("Not enough memory left."),
+            "is out of memory",
+            "on the cpu",
+            marks=pytest.mark.nightly,
+        ),
     ],
 )
 def test_lost_device_or_low_memory_is_reported_and_the_run_can_be_resumed(
