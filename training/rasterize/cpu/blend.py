@@ -15,7 +15,7 @@ import numpy as np
 from ..rendering import ALPHA_MAX, TRANSMITTANCE_MIN
 from .bin import LOG2_ALPHA_MIN, TILE
 from .compile import FAST, f32, inlined, kernel
-from .fastmath import exp2, prefetch
+from .fastmath import any_positive, exp2, prefetch
 from .project import (
     BLUE,
     CONIC_XX,
@@ -61,6 +61,21 @@ def find_rows(projected, splat, begin, end, left, top, rows, reached):
 
 
 @inlined(FAST)
+def read_lanes(plane, y, x, columns, lanes):
+    """Read a plane's row from column ``x`` on to the first ``columns`` of 16 lanes; others keep their values.
+
+    The compiler does not know that indices such as x + j are positive, and would gather single values.
+    """
+    values = plane[y, x : x + columns]
+    if columns == 16:
+        for j in range(16):
+            lanes[j] = values[j]
+    else:
+        for j in range(columns):
+            lanes[j] = values[j]
+
+
+@inlined(FAST)
 def alpha_of(log2_alpha):
     """Compute alpha with its upper and lower limits."""
     alpha = min(exp2(log2_alpha), CAP)
@@ -82,7 +97,7 @@ def blend_forward(
     """
     height, width = transmittance.shape
     # a row has 16 lanes each for T, red, green, blue and the limits
-    state = np.empty((16, 64 if limit is None else 80), np.float32)
+    state = np.zeros((16, 64 if limit is None else 80), np.float32)
     for tile in range(begin, end):
         x0, y0 = tile % tiles_x * TILE, tile // tiles_x * TILE
         rows, columns = min(TILE, height - y0), min(TILE, width - x0)
@@ -92,14 +107,12 @@ def blend_forward(
                 state[r, j] = ONE if r < rows and j < columns else -ONE
             for j in range(16, 64):
                 state[r, j] = ZERO
-            if limit is not None:
-                for j in range(16):
-                    inside = r < rows and j < columns
-                    state[r, 64 + j] = limit[y0 + r, x0 + j] if inside else ZERO
+            if limit is not None and r < rows:
+                read_lanes(limit, y0 + r, x0, columns, state[r, 64:])
 
         pair = tile_start[tile]
-        lit = 1
-        while lit > 0 and pair < tile_start[tile + 1]:
+        lit = True
+        while lit and pair < tile_start[tile + 1]:
             start, end = pair, min(pair + CHECK_INTERVAL, tile_start[tile + 1])
             find_rows(projected, splat, start, end, left, top, rows, reached)
             for pair in range(start, end):
@@ -127,18 +140,18 @@ def blend_forward(
                         lanes[32 + j] += w * green
                         lanes[48 + j] += w * blue
             pair = end
-            lit = 0
-            for r in range(16):
-                for j in range(16):
-                    lit += state[r, j] > ZERO
+            lit = any_positive(state)
         visited[tile] = pair - tile_start[tile]
 
         for r in range(rows):
-            for j in range(columns):
-                t = abs(state[r, j])
-                transmittance[y0 + r, x0 + j] = t
-                for c in range(3):
-                    image[c, y0 + r, x0 + j] = state[r, 16 + 16 * c + j] + t * background[c]
+            out = transmittance[y0 + r, x0 : x0 + columns]
+            for j in range(min(columns, 16)):
+                state[r, j] = abs(state[r, j])
+                out[j] = state[r, j]
+            for c in range(3):
+                out = image[c, y0 + r, x0 : x0 + columns]
+                for j in range(min(columns, 16)):
+                    out[j] = state[r, 16 + 16 * c + j] + state[r, j] * background[c]
 
 
 @kernel(FAST)
@@ -223,8 +236,8 @@ def blend_weights(begin, end, projected, splat, tile_start, tiles_x, width, heig
             for j in range(16):
                 state[r, j] = ONE if r < rows and j < columns else -ONE
         pair, last_pair = tile_start[tile], tile_start[tile + 1]
-        lit = 1
-        while lit > 0 and pair < last_pair:
+        lit = True
+        while lit and pair < last_pair:
             stop = min(pair + CHECK_INTERVAL, last_pair)
             for k in range(pair, stop):
                 row = projected[splat[k]]
@@ -255,10 +268,7 @@ def blend_weights(begin, end, projected, splat, tile_start, tiles_x, width, heig
                     pixels += lanes[32 + j]
                 pair_weights[k, 0], pair_weights[k, 1], pair_weights[k, 2] = largest, total, pixels
             pair = stop
-            lit = 0
-            for r in range(16):
-                for j in range(16):
-                    lit += state[r, j] > ZERO
+            lit = any_positive(state)
         for k in range(pair, last_pair):
             pair_weights[k, 0], pair_weights[k, 1], pair_weights[k, 2] = ZERO, ZERO, ZERO
 
@@ -288,6 +298,7 @@ def _make_backward(absolute: bool) -> Any:
     ):  # fmt: skip
         """Fill pair_sums; :func:`_make_backward` has the formulas."""
         height, width = transmittance.shape
+        values = np.zeros(16, np.float32)
         state = np.empty(17 * stride, np.float32)  # the row above the first is zero
         for j in range(state.shape[0]):
             state[j] = ZERO
@@ -296,17 +307,19 @@ def _make_backward(absolute: bool) -> Any:
             rows, columns = min(TILE, height - y0), min(TILE, width - x0)
             left, top = f32(x0) + HALF, f32(y0) + HALF
             for r in range(16):
+                row = state[(r + 1) * stride : (r + 2) * stride]
                 for j in range(16):
-                    lane = (r + 1) * stride + j
-                    if r < rows and j < columns:
-                        y, x = y0 + r, x0 + j
-                        q = -by_alpha[y, x] * transmittance[y, x]
-                        for c in range(3):
-                            state[lane + H + 16 * c] = by_image[c, y, x]
-                            q += image[c, y, x] * by_image[c, y, x]
-                        state[lane + T], state[lane + Q] = ONE, q
-                    else:
-                        state[lane + T] = -ONE
+                    row[T + j] = ONE if r < rows and j < columns else -ONE
+                if r < rows:
+                    read_lanes(by_alpha, y0 + r, x0, columns, row[Q:])
+                    read_lanes(transmittance, y0 + r, x0, columns, values)
+                    for j in range(16):
+                        row[Q + j] *= -values[j]
+                    for c in range(3):
+                        read_lanes(by_image[c], y0 + r, x0, columns, row[H + 16 * c :])
+                        read_lanes(image[c], y0 + r, x0, columns, values)
+                        for j in range(16):
+                            row[Q + j] += values[j] * row[H + 16 * c + j]
 
             lit = tile_start[tile] + visited[tile]
             for pair in range(tile_start[tile], lit):

@@ -1,4 +1,4 @@
-"""A vectorisable exp2 and memory prefetching for Numba kernels.
+"""A vectorisable exp2, memory prefetching and a test of SIMD lanes for Numba kernels.
 
 Numba supports SVML only with Intel's LLVM, and libm's exp is scalar.
 """
@@ -66,7 +66,31 @@ def _prefetch(typing_context, array, row, line):
     return types.void(array, types.intp, types.intp), generate
 
 
+@intrinsic
+def _any_positive(typing_context, rows):
+    """Test if any of the first 16 values of 16 rows of a float32 array is positive.
+
+    As a loop, the compiler would gather the values of a column from all rows.
+    """
+
+    def generate(context, builder, signature, args):
+        fields = context.make_array(signature.args[0])(context, builder, args[0])
+        stride = cgutils.unpack_tuple(builder, fields.strides)[0]
+        lanes = ir.VectorType(ir.FloatType(), 16)
+        data = builder.bitcast(fields.data, ir.IntType(8).as_pointer())
+        largest = lanes(None)
+        for row in range(16):
+            address = builder.gep(data, [builder.mul(stride, stride.type(row))])
+            values = builder.load(builder.bitcast(address, lanes.as_pointer()), align=4)
+            largest = builder.select(builder.fcmp_ordered(">", values, largest), values, largest)
+        positive = builder.bitcast(builder.fcmp_ordered(">", largest, lanes(None)), ir.IntType(16))
+        return builder.icmp_unsigned("!=", positive, positive.type(0))
+
+    return types.boolean(rows), generate
+
+
 prefetch: Any = _prefetch  # type checkers do not know that Numba passes the first argument
+any_positive: Any = _any_positive
 
 
 @inlined(FAST)
