@@ -21,11 +21,13 @@ from ..lod.on_disk import open_if_large
 from ..lod.rule import Rule, Values, find_rule
 from ..lod.selection import (
     BundleSelector,
+    complete_splats,
     resolve_controls,
     select,
     standalone_levels,
     unknown_rule_error,
 )
+from ..optimize.merging import merge
 from ..rasterize.resident import ResidentBundle
 from ..scenes.offset_views import read_offset_views
 from ..splats.bundle import read_bundle
@@ -57,6 +59,8 @@ def evaluate_run(
 
         - ``levels``: levels that are complete by themselves, coarse to fine: ``level``, facts, ``splats``,
           ``drawn``, ``psnr``, ``ssim``, ``frame_s``, ``veil``. Cumulative levels include all coarser ones.
+          Coarser levels in memory also have ``merged``, the PSNR of the finest level with neighbours merged
+          to the same number of splats, the baseline that a level must beat.
         - ``train_psnr``, ``veil``, ``oversized``, ``worst``, ``fitted_psnr`` of the finest level
           (``evaluate.summary``)
         - ``aside``, if the scene has views off its path (``scenes.offset_views``): mean ``psnr`` of the
@@ -123,6 +127,8 @@ def _measure_levels(job: Job, evaluation: Evaluation, bundle: Bundle) -> dict:
         {"level": level.number, **level.facts, **evaluation.measure_level(bundle, level), "veil": veil}
         for level, veil in zip(levels, veils, strict=True)
     ]
+    for row, merged in zip(rows, _measure_merges(evaluation, bundle), strict=False):
+        row["merged"] = merged
     report = {
         "scene": job.scene,
         "method": job.method,
@@ -137,6 +143,22 @@ def _measure_levels(job: Job, evaluation: Evaluation, bundle: Bundle) -> dict:
         names = [camera.name for camera in offset_cameras]
         report["aside"] = {"psnr": round(quality, 3), "views": names}
     return report
+
+
+def _measure_merges(evaluation: Evaluation, bundle: Bundle) -> list[float]:
+    """Return the PSNR of merges of the finest level, at the splat count of each coarser level, in dB.
+
+    Empty if the bundle exceeds memory, or the rule weights splats at full detail.
+    """
+    rule = find_rule(bundle.rule)
+    if bundle.on_disk or (rule is not None and rule.weights_full_detail):
+        return []
+    *coarser, merged = [complete_splats(bundle, level) for level in standalone_levels(bundle)]
+    values = []
+    for splats in reversed(coarser):
+        merged = merge(merged, len(splats))
+        values.append(evaluation.measure_splats(merged)[f"{evaluation.prefix}psnr"])
+    return values[::-1]
 
 
 def _measure_rule(job: Job, evaluation: Evaluation, bundle: Bundle, rule: Rule, values: Values) -> dict:
@@ -188,8 +210,8 @@ def _finite(value):
 def format_report(report: dict) -> str:
     """Format the report of :func:`evaluate_run` as text."""
     quality = [f"{'' if report['test_views'] else 'train_'}{name}" for name in ("psnr", "ssim")]
-    measures = ("splats", "drawn", *quality, "frame_s", "veil")
-    lines = [f"{'':>28} {'splats':>9} {'PSNR':>7} {'SSIM':>7} {'ms/frame':>8} {'veiled':>7}"]
+    measures = ("splats", "drawn", *quality, "frame_s", "veil", "merged")
+    lines = [f"{'':>28} {'splats':>9} {'PSNR':>7} {'SSIM':>7} {'ms/frame':>8} {'veiled':>7} {'merged':>7}"]
     rows = []
     for row in report["levels"]:
         facts = "".join(f", {k} {v:.5g}" for k, v in row.items() if k not in ("level", *measures))
@@ -210,8 +232,10 @@ def format_report(report: dict) -> str:
             continue
         psnr, ssim = (row[measure] for measure in quality)
         veil = f" {row['veil']['mean']:>7.1%}" if "veil" in row else ""
+        merged = f" {row['merged']:>7.2f}" if "merged" in row else ""
         lines.append(
             f"{name:<28} {row['splats']:>9,} {psnr:>7.2f} {ssim:>7.4f} {1e3 * row['frame_s']:>8.1f}{veil}"
+            f"{merged}"
         )
     lines += summary_lines(report)
     for row in report.get("farther", []):

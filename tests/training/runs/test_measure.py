@@ -15,6 +15,7 @@ from tests.training.lod.tree.trees import tree_of
 from training.__main__ import main
 from training.errors import LodgsError
 from training.lod import on_disk
+from training.optimize.merging import merge
 from training.rasterize import Gaussians, rasterize
 from training.runs.folder import RunFolder
 from training.runs.job import Job
@@ -116,6 +117,16 @@ def test_report_of_training_views_and_the_worst_held_out_view(finished, scene, s
     assert "aside" not in report
     assert set(report["frame_s"]) == {"by_distance", "full"} and min(report["frame_s"].values()) > 0
     assert f"Training views: {report['train_psnr']:.1f} dB" in format_report(report).splitlines()
+
+
+def test_merge_of_the_finest_level_is_the_baseline_of_a_level(finished, scene, splats):
+    report = evaluate_run(finished(test_every=4))
+    held_out = read_scene(scene).cameras[::4]
+    merged = merge(splats, 20)
+    coarse, finest = report["levels"]
+    expected = np.mean([quality(merged, camera) for camera in held_out])
+    assert coarse["merged"] == pytest.approx(expected, abs=0.02) and "merged" not in finest
+    assert format_report(report).splitlines()[1].endswith(f"{coarse['merged']:>8.2f}")
 
 
 def test_quality_without_held_out_views_is_reported_for_training_views(finished, scene, splats, tmp_path):
