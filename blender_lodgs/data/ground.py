@@ -39,7 +39,7 @@ def align_to_ground(root: bpy.types.Object, positions: np.ndarray | None = None,
     """
     placement, up = placement_of(root), np.array([0.0, 0.0, 1.0])
     if positions is None:
-        normal, center = find_ground(placement.transform_points(_ground_points(root)), up)
+        normal, center = find_ground(placement.transform_points(ground_points(root)), up)
     else:
         normal, center = fit_plane(positions, up)
     _leave_edit_mode()
@@ -121,7 +121,7 @@ def measure_distance(positions: np.ndarray) -> float:
     return distance
 
 
-def _ground_points(root: bpy.types.Object) -> np.ndarray:
+def ground_points(root: bpy.types.Object) -> np.ndarray:
     """Return the points (P, 3) for ground detection, in the scene's own space.
 
     These are COLMAP's points, or the means of the finest level's opaque splats. If the median depth is known,

@@ -223,6 +223,7 @@ class LODGS_MT_clean_up(bpy.types.Menu):
             operator = layout.operator("lodgs.add_crop", text=f"Crop Splats to {shape.title()}", icon=icon)
             operator.shape = shape
         layout.separator()
+        layout.operator("lodgs.find_clutter")
         for test in cleaning.TESTS:
             layout.operator("lodgs.hide_splats", text=f"Hide {test.noun}").test = test.identifier
         layout.separator()

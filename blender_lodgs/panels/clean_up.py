@@ -27,6 +27,7 @@ class LODGS_PT_clean_up(LevelsPanel):
 
         layout.label(text="Select in All Levels")
         column, brush = layout.column(align=True), context.scene.lodgs_brush
+        column.operator("lodgs.find_clutter", icon="VIEWZOOM")
         row = column.row(align=True)
         row.enabled = context.mode == "OBJECT"
         for name, tool in (("Brush", "lodgs.brush"), ("Lasso", "lodgs.lasso")):

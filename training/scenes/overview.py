@@ -28,7 +28,7 @@ _HOLLOW = 0.35, 0.06
 the center surround the viewer, such as rooms."""
 _MIN_ROOM_FLATNESS, _MAX_ROOM_OBLONG = 1.3, 2.0
 """The same for hollow scenes: rooms are higher than gardens, but their walls are beside the viewer."""
-_LARGE, _NEAR, _FAR = 0.5, 2.0, 20.0
+LARGE, NEAR, FAR = 0.5, 2.0, 20.0
 """Splats larger than the first multiple of the radius, within the second of the center, veil the subject.
 Splats beyond the third are outliers."""
 _MAX_LARGE = 0.05
@@ -128,19 +128,19 @@ def describe_clutter(splats: Splats) -> list[str]:
     center, radius = central_ball(splats.means[np.isfinite(splats.means).all(axis=1)])
     distances = np.linalg.norm(splats.means - center, axis=1)
     visible = splats.opacity_logits > np.log(_MIN_OPACITY / (1 - _MIN_OPACITY))
-    limit = np.log(_LARGE * radius)
-    large = int(((splats.log_scales.max(axis=1) > limit) & (distances < _NEAR * radius) & visible).sum())
-    far = int((distances > _FAR * radius).sum())
+    limit = np.log(LARGE * radius)
+    large = int(((splats.log_scales.max(axis=1) > limit) & (distances < NEAR * radius) & visible).sum())
+    far = int((distances > FAR * radius).sum())
     sentences = []
     if 0 < large < _MAX_LARGE * len(splats):
         sentences.append(
-            f"{large:,} splats are larger than {_LARGE * radius:.3g} and can veil the scene. To hide them: "
-            "Clean Up > Large Splats."
+            f"{large:,} splats are larger than {LARGE * radius:.3g} and can veil the scene. To hide them: "
+            "Clean Up > Find Clutter."
         )
     if far:
         sentences.append(
-            f"{far:,} splats are more than {_FAR * radius:.3g} away from the scene. To hide them: Crop "
-            "Splats."
+            f"{far:,} splats are more than {FAR * radius:.3g} away from the scene. To hide them: "
+            "Clean Up > Find Clutter."
         )
     return sentences
 

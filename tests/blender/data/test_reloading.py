@@ -16,7 +16,7 @@ def cube(count: int, seed: int = 0) -> Splats:
     rng = np.random.default_rng(seed)
     return Splats(
         means=rng.uniform(-1, 1, (count, 3)).astype(np.float32),
-        quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
         log_scales=np.full((count, 3), -3, np.float32),
         opacity_logits=np.full(count, 2, np.float32),
         sh=np.zeros((count, 1, 3), np.float32),

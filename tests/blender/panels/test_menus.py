@@ -13,7 +13,7 @@ OTHER_MENUS = {
     # Object and View menus
     "lodgs.set_ground", "lodgs.set_scale", "lodgs.camera_path", "lodgs.turntable", "lodgs.frame_scene",
     "lodgs.add_crop", "lodgs.hide_splats", "lodgs.show_hidden_splats", "lodgs.delete_left_out",
-    "lodgs.select_all_splats",
+    "lodgs.select_all_splats", "lodgs.find_clutter",
     # toolbar tools
     "lodgs.select_splats", "lodgs.paint_splats",
 }  # fmt: skip
