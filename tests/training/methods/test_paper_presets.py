@@ -55,6 +55,17 @@ SINGLE = SPLATS | {
     "densify_until": (0.499, "3DGS program: iteration < densify_until_iter = 15,000"),
     "prune_oversized": (True, "3DGS program: size_threshold after the first reset"),
 }
+FLOD = {
+    "levels": (5, "FLoD, Sec. 6.1.4: L_max"),
+    "rho": (4.0, "FLoD, Sec. 6.1.4"),
+    "steps": ((10_000, 15_000, 20_000, 25_000, 30_000), "FLoD, Sec. 6.1.4"),
+    "budget_ratio": (1.0, "FLoD: none"),
+}
+FLOD_UNTIL = (
+    (0.499, 0.399, 0.399, 0.399, 0.499),
+    "FLoD, Sec. 6.1.4: 5,000, 6,000, 8,000, 10,000, 15,000; program: iteration below it",
+)
+FLOD_INTERVALS = ((2000, 1000, 500, 500, 200), "FLoD, Sec. 6.1.4")
 OCTREE = SHARED | {
     "steps": (40_000, "Octree-GS, Sec. 7.1: 10,000 and 30,000"),
     "levels": (0, "Octree-GS, Eq. 3"),
@@ -84,21 +95,14 @@ OCTREE = SHARED | {
 }
 PUBLISHED = {
     "3dgs": SINGLE,
-    "flod": SPLATS | {
-        "levels": (5, "FLoD, Sec. 6.1.4: L_max"),
-        "rho": (4.0, "FLoD, Sec. 6.1.4"),
+    "flod": SPLATS | FLOD | {
         "footprint": (40.0, "FLoD, Sec. 6.1.4: lambda = 0.2, about 40 pixels at the median depth"),
-        "steps": ((10_000, 15_000, 20_000, 25_000, 30_000), "FLoD, Sec. 6.1.4"),
-        "densify_until": (
-            (0.499, 0.399, 0.399, 0.399, 0.499),
-            "FLoD, Sec. 6.1.4: 5,000, 6,000, 8,000, 10,000, 15,000; program: iteration below it",
-        ),
-        "densify_interval": ((2000, 1000, 500, 500, 200), "FLoD, Sec. 6.1.4"),
+        "densify_until": FLOD_UNTIL,
+        "densify_interval": FLOD_INTERVALS,
         "overlap_interval": (1000, "FLoD, Sec. 6.1.4"),
         "prune_interval": (100, "FLoD program: pruning_interval"),
         "rejoin_points": (False, "FLoD: none"),
         "finish_share": (0.0, "FLoD: none"),
-        "budget_ratio": (1.0, "FLoD: none"),
     },
     "lodge": SPLATS | {
         "steps": (30_000, "LODGE, A.2"),
@@ -145,6 +149,24 @@ PUBLISHED = {
         "lr_means": (1.6e-4, "3DGS program: position_lr_init; anchors have offsets in Octree-AnyGS"),
         "candidates": (1, "Octree-AnyGS program, 3dgs: n_offsets"),
         "volume_weight": (0.0, "Octree-AnyGS program, 3dgs: lambda_dreg"),
+    },
+    "flod_scaffold": SHARED | FLOD | {  # settings of FLoD-3DGS; others are not published
+        "coarsest": (40.0, "FLoD, Sec. 6.1.4: lambda = 0.2, about 40 pixels at the median depth"),
+        "grow_until": FLOD_UNTIL,
+        "grow_interval": FLOD_INTERVALS,
+        "grad_threshold": (2e-4, "Octree-GS, Sec. 5.1: tau_g"),
+        "stats_from": (500, "Octree-GS program: start_stat"),
+        "grow_from": (1500, "Octree-GS program: update_from"),
+        "success_threshold": (0.8, "Octree-GS program: success_threshold"),
+        "offsets": (10, "Octree-GS program: n_offsets"),
+        "features": (32, "Octree-GS program: feat_dim"),
+        "appearance": (0, "FLoD: not published, off"),
+        "volume_weight": (0.01, "Octree-GS, Sec. 7.1: as Scaffold-GS"),
+        "direct": (False, "Octree-GS: networks alone"),
+        "view_shapes": (True, "Octree-GS program: the view direction is an input of all networks"),
+        "least_weight": (0.0, "FLoD: none"),
+        "lr_end": (1.0, "Octree-GS program: scaling_lr and feature_lr are constant"),
+        "scale_offset_rate": (True, "Octree-GS program: offset_lr_init * spatial_lr_scale"),
     },
     "octree_neural": OCTREE | {
         "success_threshold": (0.8, "Octree-GS program: success_threshold"),

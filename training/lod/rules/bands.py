@@ -12,6 +12,9 @@ from ..rule import NO_COLUMNS, NO_TABLES, Control, Rule, Values, distances
 
 MAX_LEVEL = 64
 """Maximum level number of the controls; more than any scene has."""
+PAPER_REACH = 40.0 / 4**3
+"""Reach of the paper's finest of five levels by distance (Eq. 8, gamma 1), in median depths: 5/8. Its lambda
+is about 40 pixels there."""
 
 
 def min_scales(s_min_1: float, rho: float, levels: int) -> list[float]:
@@ -96,3 +99,17 @@ class Bands(Rule):
 
 
 RULE = Bands()
+
+
+def initial_gamma(pixels: float) -> float:
+    """Return the gamma at which the finest level reaches as far as the paper's, in median depths.
+
+    d_proj(l) = s_min(l) / gamma * f (Eq. 8) falls with s_min. With a fixed gamma, the finest level of a
+    smaller footprint, or of more levels, would never be drawn. The maximum is the paper's value, one pixel,
+    so that coarse levels do not appear at distances where their lack of detail is visible.
+
+    Args:
+        pixels: minimum size of the level before the finest, in pixels at the median depth.
+    """
+    value = max(min(pixels / PAPER_REACH, 1.0), RULE.controls[0].low)
+    return float(f"{value:.6g}")  # Blender stores as many digits

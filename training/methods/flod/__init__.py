@@ -14,8 +14,6 @@ BLENDED_LEVELS = 3
 """Number of finest levels that are blended by default (``Bands.defaults``) and that finishing steps train."""
 CELL_LEVELS = 2
 """Number of finest levels that are trained cell by cell in a divided scene."""
-PAPER_REACH = PAPER_FOOTPRINT / 4**3
-"""Reach of the paper's finest of five levels by distance (Eq. 8, gamma 1), in median depths: 5/8."""
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ import torch
 from scipy.spatial import KDTree
 
 from ...errors import LodgsError
-from ...lod.rule import Values, all_controls
-from ...lod.rules.bands import min_scales
+from ...lod.rule import Values
+from ...lod.rules.bands import initial_gamma, min_scales
 from ...optimize import method
 from ...optimize.density_control import constrained_log_scales, densify, prune, reset_opacities
 from ...optimize.initialize import (
@@ -33,7 +33,7 @@ from ...optimize.schedules import due, log_linear, shrink_at
 from ...optimize.training_data import TrainingView
 from ...splats.gaussians import Splats
 from ...splats.levels import Level
-from . import BLENDED_LEVELS, PAPER_REACH, FlodParameters, finish
+from . import BLENDED_LEVELS, FlodParameters, finish
 
 
 class Method(method.Method[FlodParameters, Drawing]):
@@ -311,20 +311,6 @@ class Method(method.Method[FlodParameters, Drawing]):
     def load_state_dict(self, state: dict) -> None:
         super().load_state_dict(state)
         self.completed = state.get("kept", {})
-
-
-def initial_gamma(pixels: float) -> float:
-    """Return the gamma at which the finest level reaches as far as the paper's, in median depths.
-
-    d_proj(l) = s_min(l) / gamma * f (Eq. 8) falls with s_min. With a fixed gamma, the finest level of a
-    smaller footprint, or of more levels, would never be drawn. The maximum is the paper's value, one pixel,
-    so that coarse levels do not appear at distances where their lack of detail is visible.
-
-    Args:
-        pixels: minimum size of the level before the finest, in pixels at the median depth.
-    """
-    value = max(min(pixels / PAPER_REACH, 1.0), all_controls()["gamma"].low)
-    return float(f"{value:.6g}")  # Blender stores as many digits
 
 
 def well_separated(means: torch.Tensor, distance: float) -> torch.Tensor:

@@ -65,17 +65,16 @@ class Method(method.Method[NeuralOctreeParameters, NeuralDrawing]):
         schedule: schedule of levels, with the octree.
         networks: networks shared by all anchors.
         decoder: decoding of anchors with these networks.
+        min_voxel: minimum edge of level 1's voxels, in scene units.
     """
+
+    min_voxel = 0.0
 
     def setup(self, base: Splats | None) -> None:
         p, seed = self.parameters, self.seed
         positions = np.random.default_rng(seed).uniform(-0.5, 0.5, (p.offsets, 3))
         self._spread = torch.from_numpy(positions).float()
         """Initial offsets of new anchors' Gaussians within the voxel, used if they have their own looks."""
-        self._max_anchors = p.growth_limit(p.splat_limit) // p.offsets
-        self.schedule, points, colors, level = growing.create_anchors(self.data, p, seed, self._max_anchors)
-        self.levels = self.schedule.tree.levels
-        self.facts = self.schedule.tree.facts()
         self.image_model = self
         self._rates: dict[str, LearningRate] = {
             "means": 0.0,
@@ -85,19 +84,17 @@ class Method(method.Method[NeuralOctreeParameters, NeuralDrawing]):
         }
         if p.direct:
             self._rates["looks"] = p.lr_looks * torch.tensor([5.0] + [1.0] * 3 + [0.2] * 4 + [1.0] * 3)
-        rows = self._anchors(torch.from_numpy(points).float(), torch.from_numpy(level))
-        rows["log_scales"] = growing.log_spacing(points, level, columns=6)
-        if p.direct:
-            rows["looks"][..., 8:] = torch.from_numpy(colors / 255.0).clamp(0.01, 0.99).logit()[:, None]
-        self.model = self._new_model(rows, torch.from_numpy(level).float(), torch.zeros(len(points)))
+        rows = self.start_anchors()
+        level = rows.pop("level")
+        self.levels = self.schedule.tree.levels
+        self.facts = self.schedule.tree.facts()
+        self.model = self._new_model(rows, level, torch.zeros(len(level)))
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.networks = Networks(p.features, p.offsets, p.appearance, len(self.data.train)).to(
                 self.device
             )
-        names = {name: tensor for name, tensor in self.networks.named_parameters() if tensor.numel()}
-        self._networks_adam = Adam(names, dict.fromkeys(names, 0.0))
-        self.extra_optimizers = [self._networks_adam]
+        self.restart_networks_adam()
         self.decoder = AnchorDecoder(
             self.networks,
             p.direct,
@@ -108,6 +105,12 @@ class Method(method.Method[NeuralOctreeParameters, NeuralDrawing]):
         )
         if p.appearance_of:
             self.use_appearance([p.appearance_of])
+
+    def restart_networks_adam(self) -> None:
+        """Give the networks a new optimizer."""
+        names = {name: tensor for name, tensor in self.networks.named_parameters() if tensor.numel()}
+        self._networks_adam = Adam(names, dict.fromkeys(names, 0.0))
+        self.extra_optimizers = [self._networks_adam]
 
     def use_appearance(self, photos: Sequence[str]) -> None:
         """Render and bake with the mean appearance of training photos (Sec. 7.2, Fig. 10)."""
@@ -124,6 +127,19 @@ class Method(method.Method[NeuralOctreeParameters, NeuralDrawing]):
                     f"Name one of them, such as {quote(names[0])}.",
                 )
         self.decoder = replace(self.decoder, rendered_views=tuple(names.index(name) for name in photos))
+
+    def start_anchors(self) -> dict[str, torch.Tensor]:
+        """Build the octree and its schedule; return anchors at the scene's points, and their ``level``."""
+        p = self.parameters
+        self._max_anchors = p.growth_limit(p.splat_limit) // p.offsets
+        self.schedule, points, colors, level = growing.create_anchors(
+            self.data, p, self.seed, self._max_anchors, self.min_voxel
+        )
+        rows = self._anchors(torch.from_numpy(points).float(), torch.from_numpy(level))
+        rows["log_scales"] = growing.log_spacing(points, level, columns=6)
+        if p.direct:
+            rows["looks"][..., 8:] = torch.from_numpy(colors / 255.0).clamp(0.01, 0.99).logit()[:, None]
+        return rows | {"level": torch.from_numpy(level).float()}
 
     def _new_model(self, rows: Mapping[str, torch.Tensor], level: torch.Tensor, bias: torch.Tensor) -> Model:
         """Create a model of anchors; gradient statistics are per Gaussian."""
@@ -219,7 +235,7 @@ class Method(method.Method[NeuralOctreeParameters, NeuralDrawing]):
         return super().loss(drawings, view, step) + volume
 
     def set_learning_rates(self, step: int) -> None:
-        p, share = self.parameters, step / self.steps
+        p, share = self.parameters, step / self.parameters.steps
         self.model.adam.lr = self.schedule.learning_rates(self._rates, step)
         self.model.adam.lr["offsets"] = log_linear(p.lr_offsets, p.lr_offsets_final, share)
         if p.scale_offset_rate:

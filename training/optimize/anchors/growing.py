@@ -7,6 +7,7 @@ Gaussian of an anchor, (N, n).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -25,12 +26,13 @@ MAX_NEW_LOGIT = float(np.log(0.1 / 0.9))
 
 
 def create_anchors(
-    data: TrainingData, parameters: OctreeParameters, seed: int, max_anchors: int
+    data: TrainingData, parameters: OctreeParameters, seed: int, max_anchors: int, min_voxel: float = 0.0
 ) -> tuple[Schedule, np.ndarray, np.ndarray, np.ndarray]:
     """Build the octree of a scene and choose the initial points.
 
     Args:
         max_anchors: maximum number of anchors.
+        min_voxel: minimum edge of level 1's voxels, in scene units.
 
     Returns:
         The schedule with its tree; points (N, 3), their colours (N, 3) uint8, and their levels (N,).
@@ -42,8 +44,8 @@ def create_anchors(
         all_points, data.full_train, focal_px=data.focal, footprint=p.footprint,
         quantiles=(p.nearest, p.farthest), levels=p.levels, coarser=p.coarser_levels,
     )  # fmt: skip
-    schedule = Schedule(data, p, seed, tree)
-    level = anchor_octree.anchors(points, tree)
+    schedule = Schedule(data, p, seed, replace(tree, voxel=max(tree.voxel, min_voxel)))
+    level = anchor_octree.anchors(points, schedule.tree)
     rows = np.flatnonzero(level > 0)
     rows = rows[needed_by_views(schedule, points[rows], level[rows])]
     if len(rows) > max_anchors:

@@ -80,6 +80,7 @@ class AnchorDecoder:
         view_shapes: let opacity and covariance depend on the view direction.
         near: near plane, in scene units.
         antialias, backend: see ``rasterize``.
+        min_scale: FLoD's minimum standard deviation of Gaussians, added to their scales (FLoD, Eq. 4).
         rendered_views: training views whose mean appearance renders use; empty for all.
     """
 
@@ -89,6 +90,7 @@ class AnchorDecoder:
     near: float
     antialias: bool
     backend: str
+    min_scale: float = 0.0
     rendered_views: tuple[int, ...] = ()
 
     def decode(
@@ -125,16 +127,24 @@ class AnchorDecoder:
             offset_index=offset_index,
             means=positions[index] + model["offsets"][anchor, offset_index] * extents[:, :3],
             quats=looks[:, 3:],
-            scales=extents[:, 3:] * looks[:, :3].sigmoid(),
+            scales=extents[:, 3:] * looks[:, :3].sigmoid() + self.min_scale,
             opacities=opacity[index, offset_index],
             colors=colors.sigmoid()[index, offset_index],
         )
+
+    @torch.no_grad()
+    def relative_scales(self, model: Model) -> torch.Tensor:
+        """Return the scales (N, n, 3) of all Gaussians as fractions of their anchor's, without direction."""
+        features = model["features"]
+        inputs = torch.cat([features, features.new_zeros(len(features), 3)], 1)
+        looks = self.networks.covariance(inputs).view(*model["offsets"].shape[:2], 7)[..., :3]
+        return (looks + model["looks"][..., 1:4] if self.direct else looks).sigmoid()
 
     def visible_anchors(self, model: Model, camera: Camera, weights: torch.Tensor) -> torch.Tensor:
         """Return the anchors (indices) of positive weight whose Gaussians may be in the image."""
         means, extents = model["means"].detach(), model["log_scales"].detach().exp()
         reach = (model["offsets"].detach() * extents[:, None, :3]).norm(dim=2).amax(1)
-        reach = reach + REACH_SIGMAS * extents[:, 3:].amax(1)
+        reach = reach + REACH_SIGMAS * (extents[:, 3:].amax(1) + self.min_scale)
         pose = torch.as_tensor(camera.world_to_camera).to(means)
         x, y, z = (means @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
         visible = (weights > 0) & (z + reach > self.near)
