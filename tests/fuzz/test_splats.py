@@ -14,6 +14,7 @@ from tests.fuzz.entry_points import attempt
 from tests.fuzz.mutations import corrupted, corrupted_value
 from training.cli.info import describe
 from training.splats.bundle import read_bundle, write_bundle
+from training.splats.coding import Codebook
 from training.splats.gaussians import Splats
 from training.splats.level_folder import read_folder, write_folder
 from training.splats.levels import Bundle, Level
@@ -51,12 +52,18 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def files(folder) -> list[bytes]:
-    """Return valid PLY files: bundles, plain files, those of other programs, ASCII, and one with faces."""
+    """Return valid PLY files: bundles, also compressed, plain files, those of other programs, ASCII, and one
+    with faces."""
     contents = []
     for bundle in bundles():
         for order in ("finest_first", "stream"):
             write_bundle(folder / "good.ply", bundle, order)
             contents.append((folder / "good.ply").read_bytes())
+    for bundle in bundles():
+        rest = bundle.levels[0].splats.sh.shape[1] - 1
+        codes = {level.number: np.arange(len(level.splats)) % 2 for level in bundle.levels}
+        write_bundle(folder / "good.ply", bundle, codebook=Codebook(np.ones((2, rest, 3), "f4"), codes))
+        contents.append((folder / "good.ply").read_bytes())
     write_ply(folder / "good.ply", splats(5, 3, filter_3D=np.ones(5, "f4"), id=np.arange(5, dtype="u4")))
     contents.append((folder / "good.ply").read_bytes())
     head, rows = contents[-1].split(b"end_header\n")

@@ -10,7 +10,8 @@ from ..lod.selection import standalone_levels
 from ..runs.folder import find_splats
 from ..splats.bundle import open_bundle
 from ..splats.bundle_header import json_default
-from ..splats.file_rows import DrawableRows
+from ..splats.coding import CodedRows
+from ..splats.file_rows import DrawableRows, FileRows
 from ..splats.level_folder import read_folder
 from ..splats.levels import Bundle, bounding_box
 from ..splats.ply import Element, all_columns
@@ -39,6 +40,7 @@ def describe(path: str | Path) -> str:
         LodgsError: as `read_bundle` and `read_folder`.
     """
     warnings: list[str] = []
+    rows: dict[int, FileRows] = {}
     if Path(path).is_dir():
         bundle = read_folder(path, warnings.append)
     else:
@@ -60,11 +62,15 @@ def describe(path: str | Path) -> str:
     ]
     for level in bundle.levels:
         size = Element.from_splats("", [level.rows], all_columns).size / 1e6
+        if level.number in rows:
+            size = rows[level.number].row_size * len(level.rows) / 1e6
         facts = "".join(
             f"{level.facts[name]:>10.6g}  " if name in level.facts else f"{'-':>10}  " for name in names
         )
         extras = ", ".join(level.rows.select(slice(0, 0)).extras) or "-"
         lines.append(f"{level.number:>5}  {len(level.rows):>10,}  {size:>8.2f}  {facts}{extras}")
+    if compressed := [part.vertices for part in rows.values() if isinstance(part.vertices, CodedRows)]:
+        lines.append(f"compressed: {compressed[0].description}")
     for name, table in bundle.tables.items():
         row_count = len(next(iter(table.values()), ()))
         lines.append(f"table {name}: {row_count:,} rows of {', '.join(table)}")

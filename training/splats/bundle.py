@@ -22,8 +22,10 @@ from .bundle_header import (
     table_elements,
     table_lines,
 )
+from .coding import Codebook, code_elements
 from .dialects import Warn, comments_from_meta, drawable_3dgs, drop_undrawable, ignore, meta_from_comments
 from .file_rows import FileRows
+from .gaussians import Splats
 from .levels import NO_SPLATS, Bundle, Level
 from .origin import FAR_SPLATS, NO_ORIGIN, ORIGIN_SAMPLE, choose_origin
 from .ply import (
@@ -47,13 +49,17 @@ RowSelector = Callable[[Bundle], Mapping[int, np.ndarray]]
 splats. Rows beyond the last one are ignored."""
 
 
-def write_bundle(path: str | Path, bundle: Bundle, order: str = "finest_first") -> None:
+def write_bundle(
+    path: str | Path, bundle: Bundle, order: str = "finest_first", codebook: Codebook | None = None
+) -> None:
     """Write all levels into one PLY whose first element ``vertex`` is a complete, plain 3DGS scene.
 
     Args:
         order: the level of ``vertex``: the finest ("finest_first"), or the coarsest ("stream", so that a
             reader has a complete scene after each level). A cumulative bundle always has one ``vertex`` with
             all levels from coarse to fine.
+        codebook: compress the splats with it (``coding.py``), so that only LODGS reads them. Needs all
+            splats in memory.
 
     Raises:
         LodgsError: the file cannot be written, the levels do not form a bundle (see `Bundle.check`), or the
@@ -65,18 +71,23 @@ def write_bundle(path: str | Path, bundle: Bundle, order: str = "finest_first") 
     levels = list(enumerate(reversed(bundle.levels)))  # lod 0 is the finest
     if order == "stream" or bundle.cumulative:
         levels.reverse()
-    if bundle.cumulative:
-        elements = [Element.from_splats("vertex", [level.rows for _, level in levels], splat_columns)]
-    else:
-        names = ["vertex", *(f"lod_{lod}_vertex" for lod, _ in levels[1:])]
+    sets = {"vertex": [level for _, level in levels]}
+    if not bundle.cumulative:
+        sets = {f"lod_{lod}_vertex" if i else "vertex": [level] for i, (lod, level) in enumerate(levels)}
+    further = []
+    if codebook is None:
         elements = [
-            Element.from_splats(name, [level.rows], splat_columns)
-            for name, (_, level) in zip(names, levels, strict=True)
+            Element.from_splats(name, [level.rows for level in parts], splat_columns)
+            for name, parts in sets.items()
         ]
+    else:
+        elements = _code_levels(sets, codebook)
+        elements, further = elements[: len(sets)], elements[len(sets) :]
+    extra = extra_columns if codebook is None else _all_extras
     extras = {
-        lod: Element.from_splats(f"lod_extra_{lod}", [level.rows], extra_columns)
+        lod: Element.from_splats(f"lod_extra_{lod}", [level.rows], extra)
         for lod, level in levels
-        if extra_columns(level.rows.select(slice(0, 0)))
+        if extra(level.rows.select(slice(0, 0)))
     }
     lines = [bundle_line(bundle, order=order)]
     offset = 0
@@ -93,8 +104,22 @@ def write_bundle(path: str | Path, bundle: Bundle, order: str = "finest_first") 
             f"Cannot write {path}: its description needs more than {_MAX_COMMENTS} bytes of header.",
             "Reduce meta to a few numbers and names.",
         )
-    elements += [*extras.values(), *table_elements(bundle)]
+    elements += [*further, *extras.values(), *table_elements(bundle)]
     write_elements(path, elements, comments + comments_from_meta(bundle.meta))
+
+
+def _code_levels(sets: Mapping[str, list[Level]], codebook: Codebook) -> list[Element]:
+    """Return the compressed elements of levels, and those that decode them."""
+    splats = {}
+    for name, levels in sets.items():
+        rows = Splats.concatenated([level.rows.select(slice(None)) for level in levels])
+        splats[name] = rows, np.concatenate([codebook.codes[level.number] for level in levels])
+    coded = code_elements(splats, codebook.sets)
+    return [Element.from_columns(name, columns) for name, columns in coded.items()]
+
+
+def _all_extras(splats: Splats) -> Columns:
+    return splats.extras
 
 
 def read_bundle(path: str | Path, warn: Warn = ignore, select_rows: RowSelector | None = None) -> Bundle:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .coding import CodedRows
 from .dialects import Warn, drop_undrawable, dropped_message, ignore, to_3dgs
 from .gaussians import Splats
 from .origin import NO_ORIGIN
@@ -28,7 +29,7 @@ class FileRows:
         origin: (3,) local origin that is subtracted from the positions of a file of another program.
     """
 
-    vertices: np.ndarray
+    vertices: np.ndarray | CodedRows
     extras: np.ndarray | None
     path: str | Path
     origin: np.ndarray = field(default_factory=lambda: NO_ORIGIN)
@@ -36,14 +37,25 @@ class FileRows:
     def __len__(self) -> int:
         return len(self.vertices)
 
+    @property
+    def row_size(self) -> int:
+        """Number of bytes of a splat in the file."""
+        vertices = self.vertices.codes if isinstance(self.vertices, CodedRows) else self.vertices
+        return vertices.dtype.itemsize + (0 if self.extras is None else self.extras.dtype.itemsize)
+
     def columns(self, index: slice | np.ndarray, names: Sequence[str]) -> dict[str, np.ndarray]:
         """Read the existing ones of the named columns, (M,) each, and nothing else."""
         columns = {}
         for rows in (self.vertices, self.extras):
-            available = () if rows is None else rows.dtype.names or ()
-            columns |= {name: np.array(rows[name][index]) for name in names if name in available}  # type: ignore[index]
-            if rows is not None:
-                release_pages(rows)
+            if rows is None:
+                continue
+            available = [name for name in names if name in (rows.dtype.names or ())]
+            if isinstance(rows, CodedRows):
+                decoded = np.asarray(rows[index])
+                columns |= {name: decoded[name] for name in available}
+            else:
+                columns |= {name: np.array(rows[name][index]) for name in available}
+            release_pages(rows)
         return columns
 
     def select(self, index: slice | np.ndarray) -> Splats:

@@ -23,6 +23,7 @@ from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 from ..documents import open_file, read_lines
 from ..errors import LodgsError
 from ..files import atomic_write
+from .coding import CODEBOOK, CodedRows, declared_rows, decode_elements, is_coded
 from .dialects import Warn, drawable_3dgs, ignore, reject_unsupported
 from .gaussians import SH_C0, SplatRows, Splats
 from .origin import NO_ORIGIN
@@ -194,6 +195,7 @@ def splats_from_rows(rows: np.ndarray, path: str | Path, origin: np.ndarray = NO
     Raises:
         LodgsError: columns are missing, or the number of f_rest columns fits no SH degree.
     """
+    rows = np.asarray(rows)
     names = rows.dtype.names or ()
     rest_count = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in names)
     degree = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}.get(rest_count)
@@ -266,7 +268,7 @@ def read_elements(path: str | Path, splats: bool = True) -> tuple[dict[str, np.n
                 f"Cannot read {path}: it has lists before its vertices.", "Choose a .ply of Gaussian splats."
             )
         if header.text:
-            return _read_text(file, layout, size - begin, path), _comments(header)
+            return decode_elements(_read_text(file, layout, size - begin, path), path), _comments(header)
         expected = begin + sum(count * row.itemsize for _, row, count in layout)
         if size < expected:
             raise LodgsError(
@@ -278,12 +280,12 @@ def read_elements(path: str | Path, splats: bool = True) -> tuple[dict[str, np.n
             mapped = np.memmap(file, row, "c", begin, (count,)) if count else np.empty(0, row)
             elements[name] = mapped
             begin += count * row.itemsize
-    return elements, _comments(header)
+    return decode_elements(elements, path), _comments(header)
 
 
 def release_pages(rows: np.ndarray) -> None:
     """Release the pages of a mapped file that have been read, which count as memory of the process."""
-    base = rows
+    base = rows.codes if isinstance(rows, CodedRows) else rows
     while isinstance(base, np.ndarray):
         base = base.base
     if isinstance(base, mmap.mmap) and hasattr(base, "madvise"):
@@ -381,7 +383,10 @@ def _read_header(file: IO[bytes], path: Path, splats: bool = True) -> tuple[PlyD
         )
     if splats:
         reject_unsupported([column.name for column in vertex.properties], _comments(header), path)
-        splats_from_rows(vertex.data, path)
+        rows = vertex.data
+        if is_coded(rows):
+            rows = declared_rows(rows, header[CODEBOOK].data if CODEBOOK in header else None, path)
+        splats_from_rows(rows, path)
     return header, counts
 
 
