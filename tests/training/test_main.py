@@ -24,6 +24,7 @@ MISTAKES = {
     "undistort": "missing",
     "model": "missing",
     "edit": "missing.ply --out a.ply",
+    "compress": "missing.ply --out a.ply",
     "info": "missing.ply",
 }
 

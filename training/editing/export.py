@@ -10,6 +10,7 @@ import numpy as np
 
 from ..errors import LodgsError
 from ..settings import setting, settings_of
+from ..splats.coding import MAX_CODES
 from ..splats.dialects import comments_from_meta
 from ..splats.formats import PLY, find_format, write_splats
 from ..splats.gaussians import SplatRows, Splats
@@ -49,6 +50,33 @@ class ExportOptions:
 
 EXPORT_OPTIONS = settings_of(ExportOptions)
 """The settings of exports, by name."""
+
+
+@dataclass(frozen=True)
+class Compression:
+    """Settings of a compression."""
+
+    prune: float = setting(
+        0.3,
+        "Fraction of each level's splats to remove: those of least significance in the training views.",
+        high=0.99,
+    )
+    distill_steps: int = setting(
+        200,
+        "Steps that train each level's remaining splats to show the same images as before. Increase it "
+        "with the removed fraction.",
+        unit="steps",
+    )
+    sh_degree: int = setting(
+        3, "Highest degree of spherical harmonics to keep. Lower ones hardly make the file smaller.", high=4
+    )
+    codes: int = setting(
+        4096, "Number of sets of spherical harmonics that all splats share.", low=1, high=MAX_CODES
+    )
+
+
+COMPRESSION_SETTINGS = settings_of(Compression)
+"""The settings of compressed bundles, by name."""
 
 
 def export_finest_level(

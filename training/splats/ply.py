@@ -185,7 +185,9 @@ def to_records(columns: Columns) -> np.ndarray:
     return records
 
 
-def splats_from_rows(rows: np.ndarray, path: str | Path, origin: np.ndarray = NO_ORIGIN) -> Splats:
+def splats_from_rows(
+    rows: np.ndarray | CodedRows, path: str | Path, origin: np.ndarray = NO_ORIGIN
+) -> Splats:
     """Convert the structured rows of an element with the 3DGS columns to splats.
 
     Args:
@@ -283,7 +285,7 @@ def read_elements(path: str | Path, splats: bool = True) -> tuple[dict[str, np.n
     return decode_elements(elements, path), _comments(header)
 
 
-def release_pages(rows: np.ndarray) -> None:
+def release_pages(rows: np.ndarray | CodedRows) -> None:
     """Release the pages of a mapped file that have been read, which count as memory of the process."""
     base = rows.codes if isinstance(rows, CodedRows) else rows
     while isinstance(base, np.ndarray):
