@@ -9,9 +9,10 @@ import bpy
 from bpy_extras.io_utils import ExportHelper
 
 from ...training.editing.bake_filter import bake_filter
-from ...training.editing.export import EXPORT_OPTIONS, export_finest_level
+from ...training.editing.export import COMPRESSION_SETTINGS, EXPORT_OPTIONS, export_finest_level
 from ...training.errors import LodgsError
 from ...training.lod.rule import resolve_rule
+from ...training.runs.folder import RunFolder
 from ...training.splats.bundle import write_bundle
 from ...training.splats.formats import FORMATS, PLY, find_format
 from ...training.splats.formats.sog import FORMAT as SOG
@@ -24,6 +25,8 @@ from ..data import roots, scenes, selection
 from ..data.objects import megabytes, sh_degree
 from ..data.paths import absolute_path
 from ..data.setting_properties import property_of
+from ..runs.compression import compress_steps
+from ..runs.run_folders import automatic_run
 from .base import ReadLevelsOperator, report_errors
 from .modal import BackgroundOperator
 
@@ -141,6 +144,45 @@ class LODGS_OT_export_bundle(_FileExport, bpy.types.Operator):
         write_bundle(self._path(), bundle, self.order)
         self.report({"INFO"}, f"{_levels(bundle)} written to {self._path()}{_origin_text(bundle)}")
         return {"FINISHED"}
+
+
+class LODGS_OT_export_compressed(_FileExport, _ConvertingExport, bpy.types.Operator):
+    """Export all levels to a file of a tenth of the size, which only LODGS opens; uses the trainer"""
+
+    bl_idname = "lodgs.export_compressed"
+    bl_label = "Export Compressed Bundle"
+    suffix = "_small"
+
+    prune: property_of(COMPRESSION_SETTINGS["prune"])
+    distill_steps: property_of(COMPRESSION_SETTINGS["distill_steps"])
+    sh_degree: property_of(COMPRESSION_SETTINGS["sh_degree"])
+    codes: property_of(COMPRESSION_SETTINGS["codes"])
+
+    def draw(self, context):
+        layout = self.layout
+        layout.use_property_split = True
+        column = layout.column()
+        column.active = self._run(context) is not None
+        column.prop(self, "prune")
+        column.prop(self, "distill_steps")
+        layout.prop(self, "sh_degree")
+        layout.prop(self, "codes")
+        layout.prop(self, "placed")
+        layout.prop(self, "looked")
+
+    def _run(self, context) -> RunFolder | None:
+        """Return the run whose views measure the splats; None if they are not at their trained place."""
+        return None if self.placed else automatic_run(roots.active_root(context))
+
+    def work(self, context):
+        bundle = scenes.read_levels(roots.active_root(context), self.placed, self.looked)
+        settings = {name: getattr(self, name) for name in COMPRESSION_SETTINGS}
+        steps = compress_steps(bundle, self._path(), settings, self._run(context))
+        yield from self.follow(steps)
+        self.written = f"{_levels(bundle)} written to {self.progress}{_origin_text(bundle)}"
+
+    def status_text(self, context, count):
+        return "Compressing, Esc to stop"
 
 
 class LODGS_OT_export_plain(_ForeignExport, _FileExport, _ConvertingExport, bpy.types.Operator):
@@ -307,6 +349,7 @@ def _levels(bundle: Bundle) -> str:
 
 def _menu(self, context):
     self.layout.operator(LODGS_OT_export_bundle.bl_idname, text="Splat Level Bundle (.ply)")
+    self.layout.operator(LODGS_OT_export_compressed.bl_idname, text="Compressed Level Bundle (.ply)")
     self.layout.operator(
         LODGS_OT_export_plain.bl_idname, text=f"Plain Splats ({', '.join(kind.suffix for kind in FORMATS)})"
     )
@@ -314,7 +357,13 @@ def _menu(self, context):
     self.layout.operator(LODGS_OT_export_streamed.bl_idname, text="Splat Levels for the Web (folder)")
 
 
-CLASSES = (LODGS_OT_export_bundle, LODGS_OT_export_plain, LODGS_OT_export_folder, LODGS_OT_export_streamed)
+CLASSES = (
+    LODGS_OT_export_bundle,
+    LODGS_OT_export_compressed,
+    LODGS_OT_export_plain,
+    LODGS_OT_export_folder,
+    LODGS_OT_export_streamed,
+)
 
 
 def register() -> None:

@@ -57,12 +57,12 @@ class Compression:
     """Settings of a compression."""
 
     prune: float = setting(
-        0.3,
+        0.2,
         "Fraction of each level's splats to remove: those of least significance in the training views.",
         high=0.99,
     )
     distill_steps: int = setting(
-        200,
+        100,
         "Steps that train each level's remaining splats to show the same images as before. Increase it "
         "with the removed fraction.",
         unit="steps",

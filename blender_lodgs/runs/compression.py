@@ -1,0 +1,57 @@
+"""Compression of an exported bundle by the trainer in the background."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import bpy
+
+from ...training.errors import LodgsError
+from ...training.files import temporary_folder
+from ...training.runs.folder import RunFolder
+from ...training.splats.bundle import write_bundle
+from ...training.splats.levels import Bundle
+from . import environment, processes
+
+
+def compress_steps(
+    bundle: Bundle, path: Path, settings: dict[str, float], run: RunFolder | None
+) -> Iterator[str]:
+    """Write a compressed bundle; closing the iterator stops the trainer and writes nothing.
+
+    Args:
+        settings: ``editing.export.Compression`` by name.
+        run: finished run with the training views of the splats, if any.
+
+    Yields:
+        Empty texts while the trainer works, then the last line of its report.
+
+    Raises:
+        LodgsError: the trainer is missing or fails.
+    """
+    python = environment.trainer_python()
+    environment.require(python)
+    with temporary_folder() as folder:
+        source, log, output = folder / "levels.ply", folder / "trainer.log", folder / "trainer.out"
+        write_bundle(source, bundle)
+        options = [  # Blender's numbers have single precision
+            f"--{name.replace('_', '-')}={round(value, 6)}" for name, value in settings.items()
+        ]
+        options += [f"--run={run.path}"] if run is not None and run.bundle.exists() else []
+        command = [python, "-m", "training", "compress", source, "--out", path, *options]
+        process = processes.spawn([str(word) for word in command], log, output)
+        try:
+            while (code := process.poll()) is None:
+                if bpy.app.background:
+                    time.sleep(processes.INTERVAL)
+                yield ""
+        finally:
+            with suppress(OSError):
+                process.kill()
+                process.wait()
+        if code:
+            raise LodgsError(processes.failure_reason(log, code))
+        yield processes.last_lines(output)[-1]
