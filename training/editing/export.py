@@ -68,8 +68,9 @@ class Compression:
         unit="steps",
     )
     sh_degree: int = setting(
-        3, "Highest degree of spherical harmonics to keep. Lower ones hardly make the file smaller.", high=4
-    )
+        3, "Highest degree of spherical harmonics to keep. Lower ones hardly make the file smaller.",
+        label="SH Degree", high=4,
+    )  # fmt: skip
     codes: int = setting(
         4096, "Number of sets of spherical harmonics that all splats share.", low=1, high=MAX_CODES
     )
