@@ -83,7 +83,8 @@ def compress(
         folder = RunFolder(run)
         job = Job.from_file(folder.job)
         data = training_data(job, folder, pixels=False)
-        bundle = shrink_levels(bundle, data, settings, job.backend)
+        margin = job.resolved_parameters().margin
+        bundle = shrink_levels(bundle, data, settings, margin, job.backend)
         weights = np.concatenate([level.splats.extras.pop(_SIGNIFICANCE) for level in bundle.levels])
     write_bundle(out, bundle, codebook=make_codebook(bundle, settings.codes, weights))
     size = out.stat().st_size
@@ -102,8 +103,13 @@ def _levels_are_scenes(bundle: Bundle) -> bool:
     return separate and full_detail_controls(bundle) is None
 
 
-def shrink_levels(bundle: Bundle, data: TrainingData, settings: Compression, backend: str) -> Bundle:
+def shrink_levels(
+    bundle: Bundle, data: TrainingData, settings: Compression, margin: float, backend: str
+) -> Bundle:
     """Remove each level's splats of least significance, and distill the remaining ones.
+
+    Args:
+        margin: width of the margin around training views whose splats count, see ``Parameters.margin``.
 
     Returns:
         A bundle whose splats have an extra column with their significance.
@@ -111,7 +117,8 @@ def shrink_levels(bundle: Bundle, data: TrainingData, settings: Compression, bac
     device, masks, levels = tensor_device(backend), {}, []
     options = {"near": data.near, "antialias": bundle.antialias, "backend": backend}
     for level in bundle.levels:
-        total = contributions(Gaussians.of(level.splats, device), data.train, **options).total.cpu().numpy()
+        wide = (camera.widened(margin) for camera in data.train)
+        total = contributions(Gaussians.of(level.splats, device), wide, **options).total.cpu().numpy()
         column = significance(level.splats, total)
         masks[level.number] = np.ones(len(column), bool)
         masks[level.number][np.argsort(column, kind="stable")[: int(settings.prune * len(column))]] = False

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.training.conftest import WIDTH
 from training.__main__ import main
 from training.editing.export import Compression
 from training.rasterize import Gaussians, contributions, rasterize
@@ -103,7 +104,8 @@ def test_pruned_splats_are_the_least_significant_in_the_training_views(run, tmp_
     measured, views = [], []
 
     def spy(gaussians, cameras, **options):
-        views.append([camera.name for camera in cameras])
+        cameras = list(cameras)
+        views.append([(camera.name, camera.width) for camera in cameras])
         measured.append(contributions(gaussians, cameras, **options))
         return measured[-1]
 
@@ -111,7 +113,8 @@ def test_pruned_splats_are_the_least_significant_in_the_training_views(run, tmp_
     report = compress(run, tmp_path / "small.ply", Compression(prune=0.25, distill_steps=0))
     result = read_bundle(tmp_path / "small.ply")
     names = sorted(camera.name for camera in read_scene(tmp_path / "scene").cameras)
-    assert views == [[name for i, name in enumerate(names) if i % 4]] * 2
+    width = WIDTH + 2 * WIDTH // 2  # of a photo with the margins of the draft, half its width each
+    assert views == [[(name, width) for i, name in enumerate(names) if i % 4]] * 2
     assert (result.rule, result.controls) == (bundle.rule, bundle.controls)
     for level, given, measure in zip(result.levels, bundle.levels, measured, strict=True):
         count = len(given.splats) - int(0.25 * len(given.splats))
