@@ -1,6 +1,7 @@
 """Compression of runs: significance worked by hand, the codebook against known clusters, and the command."""
 
 import shutil
+from dataclasses import replace
 from math import pi
 
 import numpy as np
@@ -53,7 +54,7 @@ def run(tmp_path, tiny_scene, splats):
     scene = shutil.copytree(tiny_scene, tmp_path / "scene")
     values = {"scene": str(scene), "out": str(folder.path), "image_scale": 1.0, "test_every": 4}
     Job.from_dict(values | {"backend": "cpu"}).write(folder.job)
-    splats = Splats(**vars(splats) | {"extras": {"row": np.arange(len(splats), dtype="u2")}})
+    splats = replace(splats, extras={"row": np.arange(len(splats), dtype="u2")})
     levels = [Level(1, splats.select(slice(0, 20)), {"s_min": 0.1}), Level(2, splats, {"s_min": 0.0})]
     write_bundle(folder.bundle, Bundle("flod", levels, "bands", controls={"gamma": 2.0}))
     return folder.path
@@ -129,7 +130,7 @@ def test_pruned_splats_are_the_least_significant_in_the_training_views(run, tmp_
 
 def test_distillation_approaches_the_original_and_keeps_minimum_sizes(tiny_scene, splats):
     views = [camera for camera in read_scene(tiny_scene).cameras][:3]
-    student = Splats(**vars(splats) | {"opacity_logits": splats.opacity_logits - 2})
+    student = replace(splats, opacity_logits=splats.opacity_logits - 2)
     student.sh = np.ascontiguousarray(student.sh[:, :1])
     result = distill(student, splats, views, 30, backend="cpu", near=0.01, antialias=False)
     rendered = [
