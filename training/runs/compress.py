@@ -42,7 +42,7 @@ VOLUME_POWER = 0.1
 RATES = {"sh": 2.5e-3, "opacity_logits": 0.025, "log_scales": 5e-3, "quats": 1e-3}
 """Learning rates of the distillation, those of 3DGS. Higher degrees of ``sh`` have a 20th."""
 SAMPLES = 16
-"""Maximum number of splats per set of the codebook that k-means sees."""
+"""Number of splats per set of the codebook that k-means sees."""
 ITERATIONS = 5
 """Iterations of k-means."""
 MIN_SHARED = 32
@@ -66,11 +66,13 @@ def compress(
         A report of the remaining splats and of the size.
 
     Raises:
-        LodgsError: cannot read or write a file, or the source would be overwritten.
+        LodgsError: cannot read or write a file, the source would be overwritten, or ``out`` is no PLY.
     """
     path = find_splats(source)
     if out.resolve() == path.resolve():
         raise LodgsError(f"Cannot overwrite the source {out}.", "Choose another output file.")
+    if out.suffix.lower() != ".ply":
+        raise LodgsError(f"Cannot write {out}: compressed bundles are PLY files.", "End its name with .ply.")
     bundle = read_folder(path, warn) if path.is_dir() else read_bundle(path, warn)
     plain_size = sum(Element.from_splats("", [level.rows], all_columns).size for level in bundle.levels)
     counts = [len(level.rows) for level in bundle.levels]

@@ -196,13 +196,13 @@ def declared_rows(vertex: np.ndarray, codebook: np.ndarray | None, path: str | P
         LodgsError: a coded column is missing, or there is an unknown one.
     """
     rest = 0 if codebook is None else len(codebook.dtype.names or ())
-    expected = {_PREFIX + name: f"u{bits // 8}" for name, bits in _BITS.items()} | (
-        {_INDEX: "u2"} if rest else {}
-    )
-    if {name: vertex.dtype[name].str[1:] for name in vertex.dtype.names or ()} != expected:
+    expected = {_PREFIX + name: f"u{bits // 8}" for name, bits in _BITS.items()}
+    if rest:
+        expected[_INDEX] = "u2"
+    if _types(vertex) != expected:
         raise _inconsistent(path, "it has other columns of compressed splats than this version")
-    return CodedRows(vertex[:0], {name: np.zeros(1 << bits, np.float32) for name, bits in _BITS.items()},
-                     np.zeros((0, rest), np.float32), path)  # fmt: skip
+    tables = {name: np.zeros(1 << bits, np.float32) for name, bits in _BITS.items()}
+    return CodedRows(vertex[:0], tables, np.zeros((0, rest), np.float32), path)
 
 
 def decode_elements(elements: dict[str, np.ndarray], path: str | Path) -> dict[str, np.ndarray]:
@@ -220,17 +220,15 @@ def decode_elements(elements: dict[str, np.ndarray], path: str | Path) -> dict[s
         declared_rows(elements[name], codebook, path)
     rest = () if codebook is None else codebook.dtype.names or ()
     count = len(coded) * len(_BITS) + len(rest)
-    if table is None or table.dtype.names != _RANGE or len(table) != count:
+    if table is None or _types(table) != dict.fromkeys(_RANGE, "f4") or len(table) != count:
         raise _inconsistent(path, f"it should have {count} ranges of its compressed columns")
     ranges = [Range(*row) for row in np.asarray(table).tolist()]
-    numbers = np.array(ranges)
-    if not (
-        np.isfinite(numbers).all() and (numbers[:, 0] <= numbers[:, 1]).all() and (numbers[:, 3] > 0).all()
-    ):
+    low, high, _, width = numbers = np.array(ranges).T
+    if not (np.isfinite(numbers).all() and (low <= high).all() and (width > 0).all()):
         raise _inconsistent(path, "a range of its compressed columns is invalid")
     shared = np.zeros((0, len(rest)), np.float32)
     if codebook is not None:
-        if len(codebook) > MAX_CODES or any(codebook.dtype[name] != np.uint8 for name in rest):
+        if len(codebook) > MAX_CODES or set(_types(codebook).values()) != {"u1"}:
             raise _inconsistent(path, f"its codebook is not one of up to {MAX_CODES} sets of bytes")
         tables = [span.table(8) for span in ranges[len(ranges) - len(rest) :]]
         shared = np.stack([column[codebook[name]] for column, name in zip(tables, rest, strict=True)], axis=1)
@@ -239,6 +237,11 @@ def decode_elements(elements: dict[str, np.ndarray], path: str | Path) -> dict[s
         tables = {column: span.table(bits) for (column, bits), span in zip(_BITS.items(), spans, strict=True)}
         remaining[name] = CodedRows(elements[name], tables, shared, path)  # type: ignore[assignment]
     return remaining
+
+
+def _types(rows: np.ndarray) -> dict[str, str]:
+    """Return the types of columns by name, without their byte order."""
+    return {name: rows.dtype[name].str[1:] for name in rows.dtype.names or ()}
 
 
 def _inconsistent(path: str | Path, reason: str) -> LodgsError:

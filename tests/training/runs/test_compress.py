@@ -167,6 +167,7 @@ def test_command(run, tmp_path, splats, capsys):
     [
         ("run", "run/bundle.ply", (), "Cannot overwrite the source"),
         ("missing", "a.ply", (), "missing"),
+        ("run", "a.spz", (), "compressed bundles are PLY files"),
         ("run", "a.ply", ("--prune", "2"), "prune = 2.0 is invalid"),
     ],
 )
