@@ -1,8 +1,13 @@
 """Compare binning, tile rows and exp2 of the cpu backend with float64 computations."""
 
 import math
+import os
+import platform
+import subprocess
+import sys
 
 import numpy as np
+import pytest
 
 from training.rasterize.cpu.bin import TILE, bin_splats
 from training.rasterize.cpu.compile import Buffers, numba
@@ -129,3 +134,33 @@ def test_exp2_accuracy():
 
     xs = np.linspace(-29.9, 20, 5000).astype(np.float32)
     np.testing.assert_allclose(exp2_array(xs), np.exp2(xs.astype(np.float64)), rtol=4e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.nightly
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="compiles for AVX-512")
+def test_avx512_kernels_read_and_write_whole_vectors(tmp_path):
+    """LLVM gathers single values if it cannot prove that an index is positive."""
+    program = """
+import re
+from functools import partial
+from training import rasterize
+from training.rasterize.cpu import compile
+for kernel, arguments in compile._kernels_of(partial(rasterize._step, "cpu")).items():
+    if kernel.py_func.__name__ in ("blend_forward", "blend_backward", "compare"):
+        kernel.compile(tuple(map(compile.numba.typeof, arguments)))
+        (code,) = kernel.inspect_asm().values()
+        print(kernel.py_func.__name__, "zmm" in code, len(re.findall("v(?:gather|scatter)", code)))
+"""
+    features = "+avx,+avx2,+fma,+f16c,+bmi,+bmi2,+avx512f,+avx512bw,+avx512cd,+avx512dq,+avx512vl"
+    environment = os.environ | {
+        "NUMBA_CPU_NAME": "znver4", "NUMBA_CPU_FEATURES": features, "NUMBA_CACHE_DIR": str(tmp_path)
+    }  # fmt: skip
+    result = subprocess.run(
+        [sys.executable, "-c", program], env=environment, stdout=subprocess.PIPE, text=True, check=True
+    )
+    assert sorted(result.stdout.splitlines()) == [
+        "blend_backward True 0",
+        "blend_forward True 0",
+        "compare True 0",
+    ]
