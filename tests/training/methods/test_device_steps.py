@@ -23,7 +23,7 @@ CASES = {
     "lodge": {"steps": 8, "tune_steps": 2},
     "tree": {"steps": 8, "tune_steps": 4},
 }
-DEVICE_STEPS = {"3dgs": 14, "flod": 15, "octree": 14, "clod": 6, "lodge": 8, "tree": 8}
+DEVICE_STEPS = {"3dgs": 14, "flod": 13, "octree": 14, "clod": 6, "lodge": 8, "tree": 8}
 """Number of steps on the device for each method."""
 
 
@@ -127,9 +127,9 @@ def _flat(state) -> list[torch.Tensor]:
 def test_checkpoint_moves_between_host_and_device(data, device_steps):
     """Checkpoints contain the state on the device, in both directions."""
     full_run, parts, at = make("flod", data, "cpu"), [], 0
-    expected = steps(full_run, 0, 15)
+    expected = steps(full_run, 0, 13)
     file = io.BytesIO()
-    for backend, end in (("cpu", 4), ("gpu", 9), ("cpu", 15)):
+    for backend, end in (("cpu", 4), ("gpu", 9), ("cpu", 13)):
         method = make("flod", data, backend)
         if at:
             file.seek(0)

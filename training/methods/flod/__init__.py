@@ -39,7 +39,7 @@ class FlodParameters(DensityParameters):
         0.0, "Minimum splat size of level 1 in scene units (FLoD: lambda). 0 derives it from 'footprint'."
     )
     steps: tuple[int, ...] = setting(
-        (250, 400, 500, 750, 1250), "Training steps of each level.", above=0, unit="steps"
+        (230, 370, 460, 690, 1150), "Training steps of each level.", above=0, unit="steps"
     )
     densify_until: tuple[float, ...] = setting(
         (0.5,) * 5, "Fraction of a level's steps in which splats are added and removed.", high=1
@@ -89,8 +89,8 @@ class FlodParameters(DensityParameters):
     finish_share: float = setting(
         0.2,
         "Additional steps at the end that train the three finest levels as blended by distance, as a "
-        "fraction of all levels' steps. Trained levels with fine detail restart from the most "
-        "important splats of the finest level. Not in the paper.",
+        "fraction of all levels' steps. Merged levels need at most half of 'refine_steps'. Trained levels "
+        "with fine detail restart from the most important splats of the finest level. Not in the paper.",
         high=1,
     )
     drawn: float = setting(
@@ -125,9 +125,13 @@ class FlodParameters(DensityParameters):
         if not self.merges:
             numbers = range(self.first_level, self.end + 1)
             return [(number, self.steps[number - 1]) for number in numbers]
-        refining = min(self.refine_steps, sum(self.steps) // (2 * self.levels))
-        coarser = [(number, refining) for number in range(self.levels - 1, 0, -1)]
-        return [(self.levels, sum(self.steps) - refining * len(coarser)), *coarser]
+        coarser = [(number, self._refining) for number in range(self.levels - 1, 0, -1)]
+        return [(self.levels, sum(self.steps) - self._refining * len(coarser)), *coarser]
+
+    @property
+    def _refining(self) -> int:
+        """Steps that refine each merged level, together at most half of all."""
+        return min(self.refine_steps, sum(self.steps) // (2 * self.levels))
 
     @property
     def total_steps(self) -> int:
@@ -136,7 +140,8 @@ class FlodParameters(DensityParameters):
     @property
     def all_steps(self) -> int:
         """Steps of a run of all levels; schedules are fractions of them."""
-        return sum(self.steps) + (round(self.finish_share * sum(self.steps)) if self.levels > 1 else 0)
+        finishing = round(self.finish_share * sum(self.steps)) if self.levels > 1 else 0
+        return sum(self.steps) + (min(finishing, self._refining // 2) if self.merges else finishing)
 
     @property
     def finish_steps(self) -> int:

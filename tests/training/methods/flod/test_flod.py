@@ -410,8 +410,10 @@ def test_invalid_level_range_raises(first, last):
 def test_cells_train_the_two_finest_levels():
     coarse, fine = METHOD.split_parameters(METHOD.preset("draft"))
     assert (coarse.first_level, coarse.end, fine.first_level, fine.end) == (1, 3, 4, 5)
-    assert coarse.total_steps + fine.total_steps == METHOD.preset("draft").total_steps
+    trained = replace(METHOD.preset("draft"), levels_from="trained")
+    assert coarse.total_steps + fine.total_steps == trained.total_steps
     assert METHOD.split_parameters(override(METHOD.preset("draft"), {"levels": 2})) is None
     draft = METHOD.preset("draft")
-    assert draft.max_trained_splats == pytest.approx(draft.max_splats * (1 + 0.6 + 0.36))
+    assert draft.max_trained_splats == pytest.approx(draft.max_splats * (1 + 0.5 + 0.25))
+    assert trained.max_trained_splats == pytest.approx(draft.max_splats * (1 + 0.6 + 0.36))
     assert coarse.max_trained_splats == pytest.approx(draft.max_splats * 0.36)
