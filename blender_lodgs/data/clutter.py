@@ -53,7 +53,11 @@ def _find_distant(context: bpy.types.Context, root: bpy.types.Object, distance: 
 
 
 def _find_floaters(context: bpy.types.Context, root: bpy.types.Object, gap: float, share: float) -> Masks:
-    return cleaning.find_floaters(context, root, gap, share / 100)
+    masks, (center, radius) = cleaning.find_floaters(context, root, gap, share / 100), _subject(root)
+    by_cloud = {item.object.data.session_uid: masks[item.number] for item in cleaning.levels(root)}
+    return cleaning.find(
+        root, lambda cloud: by_cloud[cloud.session_uid] & (_distances(cloud, center) < NEAR * radius)
+    )  # a distant background is sparse, too
 
 
 def _find_below(context: bpy.types.Context, root: bpy.types.Object, depth: float) -> Masks:
@@ -79,8 +83,8 @@ KINDS = (
         _find_distant,
     ),
     ClutterKind(
-        "floaters", "Floaters", "Small clusters of splats that are far from others", ("gap", "share"),
-        _find_floaters,
+        "floaters", "Floaters", "Small clusters of splats near the subject that are far from others",
+        ("gap", "share"), _find_floaters,
     ),
     ClutterKind(
         "below", "Below Ground", "Splats deeper than this below the detected ground", ("depth",), _find_below

@@ -18,7 +18,7 @@ def root(bpy, lodgs, tmp_path):
     things = rng.uniform(-2, 2, (REST - len(ground), 3)) * (1, 1, 0.1) + (0, 0, 0.2)
     parts = [
         ground, things, rng.uniform(0, 0.2, (OVERSIZED, 3)), np.full((DISTANT, 3), 1000.0),
-        rng.normal((0, 0, 12), 0.01, (FLOATERS, 3)), rng.uniform(-3, 3, (BELOW, 3)) * (1, 1, 0) - (0, 0, 0.5),
+        rng.normal((0, 0, 7), 0.01, (FLOATERS, 3)), rng.uniform(-3, 3, (BELOW, 3)) * (1, 1, 0) - (0, 0, 0.5),
     ]  # fmt: skip
     means = np.concatenate(parts).astype(np.float32)
     means[:, 2] += 1
@@ -35,12 +35,12 @@ def root(bpy, lodgs, tmp_path):
 
 def test_every_kind_is_counted_selected_and_hidden(bpy, lodgs, root):
     clutter = lodgs("data.clutter")
-    isolated = DISTANT + FLOATERS + BELOW
+    isolated = FLOATERS + BELOW  # distant ones are not near the subject
     kinds = {"oversized": OVERSIZED, "distant": DISTANT, "floaters": isolated, "below": BELOW}
     matches = clutter.find_clutter(bpy.context, root, list(kinds), clutter.suggest_limits(root))
     assert {name: int(masks[1].sum()) for name, masks in matches.items()} == kinds
     assert bpy.ops.lodgs.find_clutter() == {"FINISHED"}
-    count = OVERSIZED + isolated
+    count = OVERSIZED + DISTANT + isolated
     cleaning = lodgs("data.cleaning")
     assert cleaning.count_selected(root) == {1: count, 2: count}
     assert bpy.ops.lodgs.find_clutter(below=True, floaters=False) == {"FINISHED"}
@@ -53,8 +53,8 @@ def test_every_kind_is_counted_selected_and_hidden(bpy, lodgs, root):
 
 
 def test_limits_are_lengths_in_the_world(bpy, lodgs, root):
-    """Splats 11 to 13 above the subject's centre; the root doubles lengths."""
-    for distance, count in ((21, DISTANT + FLOATERS), (25, DISTANT)):
+    """Splats 7 above the ground; the root doubles lengths."""
+    for distance, count in ((13, DISTANT + FLOATERS), (16, DISTANT)):
         assert bpy.ops.lodgs.find_clutter(oversized=False, floaters=False, distance=distance) == {"FINISHED"}
         assert lodgs("data.cleaning").count_selected(root)[2] == count
 
