@@ -50,6 +50,7 @@ STRICT = frozenset()
 
 _OPTIONS: dict[str, Any] = {"error_model": "numpy", "no_cfunc_wrapper": True}
 """Division as in C, and no wrapper for calls from C."""
+_INLINED: dict[str, Any] = {**_OPTIONS, "no_cpython_wrapper": True, "forceinline": True}
 
 
 def kernel(fastmath: frozenset[str]) -> Callable[[Callable], Any]:
@@ -64,7 +65,7 @@ def inlined(fastmath: frozenset[str]) -> Callable[[Callable], Any]:
     that read it from the cache. Numba's own ``inline="always"`` copies the source into every caller and
     repeats type inference there, which takes longer than all other steps.
     """
-    return numba.njit(**_OPTIONS, fastmath=set(fastmath), no_cpython_wrapper=True, forceinline=True)
+    return numba.njit(**_INLINED, fastmath=set(fastmath))
 
 
 def available_threads() -> int:
