@@ -1,7 +1,9 @@
 """The render command: images of views, and its errors."""
 
+import gzip
 import json
 import shutil
+import struct
 from dataclasses import replace
 
 import numpy as np
