@@ -5,7 +5,7 @@ import math
 import numpy as np
 import torch
 
-from training.rasterize import OUTPUTS, Gaussians, contributions, rasterize
+from training.rasterize import OUTPUTS, Gaussians, contributions, rasterize, reference
 
 SH_C0 = 0.28209479177387814
 SCENES = [
@@ -69,6 +69,17 @@ def drawn_and_differentiated(name, make_splats, camera, backend, kind, device="c
     results |= {name: getattr(drawn, name) for name in ("image", "alpha", "depth", "normals", "radii")}
     results |= {name: getattr(drawn, name) for name in ("grad2d", "absgrad2d", "tile_counts")}
     return {name: tensor.detach().cpu().double() for name, tensor in results.items()}
+
+
+_exact: dict[tuple[str, float], dict[str, torch.Tensor]] = {}
+
+
+def exact_results(name, make_splats, camera):
+    """Return ``drawn_and_differentiated`` of the float64 reference, computed once for each scene."""
+    key = name, reference.ALPHA_MAX
+    if key not in _exact:
+        _exact[key] = drawn_and_differentiated(name, make_splats, camera, "reference", torch.float64)
+    return _exact[key]
 
 
 def contributed(name, make_splats, camera, backend, kind, device="cpu"):
