@@ -28,6 +28,12 @@ RADIUS = 16
 """Number of candidate partners on either side of a splat along a space-filling curve."""
 COLOR_WEIGHT = 4.0
 """Cost factor for merging colours that differ by 1 (squared distance)."""
+MAX_SPREAD = 3.0
+"""Maximum area of a node relative to its leaves' moments.
+
+A uniform square has a standard deviation of 0.29 of its side, which leaves gaps to its neighbours; half the
+side closes them.
+"""
 MIN_PAIRED_SHARE = 1 / 16
 """Minimum fraction of splats that must pair up in a round; otherwise neighbours on the curve merge."""
 CELL_LEAVES = 1 << 18
@@ -255,7 +261,7 @@ def _mutual_pairs(best: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _node_splats(moments: np.ndarray, tree: Tree, sh: np.ndarray, depths: np.ndarray) -> Splats:
     """Return the splats (M,) of inner nodes with these moments (M, 13)."""
-    quats, log_scales, logits = shapes_of_moments(moments)
+    quats, log_scales, logits = shapes_of_moments(moments, MAX_SPREAD)
     harmonics = np.empty((len(moments), *sh.shape[1:]), np.float32)
     depths = np.concatenate([depths, moments[:, 9]])
     for layer in reversed(tree.layers):

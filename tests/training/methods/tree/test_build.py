@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 from scipy.special import expit, logit
 
 from training.errors import LodgsError
-from training.methods.tree.build import build
-from training.optimize.merging import MAX_OPACITY, MAX_SPREAD, optical_depth
+from training.methods.tree.build import MAX_SPREAD, build
+from training.optimize.merging import MAX_OPACITY, optical_depth
 from training.rasterize import Gaussians, rasterize
 from training.scenes.cameras import Camera
 from training.splats.gaussians import Splats, splat_area
