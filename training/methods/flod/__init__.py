@@ -39,7 +39,7 @@ class FlodParameters(DensityParameters):
         0.0, "Minimum splat size of level 1 in scene units (FLoD: lambda). 0 derives it from 'footprint'."
     )
     steps: tuple[int, ...] = setting(
-        (230, 370, 460, 690, 1150), "Training steps of each level.", above=0, unit="steps"
+        (250, 400, 500, 750, 1250), "Training steps of each level.", above=0, unit="steps"
     )
     densify_until: tuple[float, ...] = setting(
         (0.5,) * 5, "Fraction of a level's steps in which splats are added and removed.", high=1
@@ -89,7 +89,7 @@ class FlodParameters(DensityParameters):
     finish_share: float = setting(
         0.2,
         "Additional steps at the end that train the three finest levels as blended by distance, as a "
-        "fraction of all levels' steps. Merged levels need at most half of 'refine_steps'. Trained levels "
+        "fraction of all levels' steps. Merged levels need at most 'refine_steps'. Trained levels "
         "with fine detail restart from the most important splats of the finest level. Not in the paper.",
         high=1,
     )
@@ -141,7 +141,7 @@ class FlodParameters(DensityParameters):
     def all_steps(self) -> int:
         """Steps of a run of all levels; schedules are fractions of them."""
         finishing = round(self.finish_share * sum(self.steps)) if self.levels > 1 else 0
-        return sum(self.steps) + (min(finishing, self._refining // 2) if self.merges else finishing)
+        return sum(self.steps) + (min(finishing, self._refining) if self.merges else finishing)
 
     @property
     def finish_steps(self) -> int:

@@ -56,8 +56,8 @@ def test_refined_levels_beat_merge(data):
 def test_finishing_steps_keep_all_merged_splats(data):
     flod = make(data, finish_share=0.2, free_depth=0.0, largest=0.0)
     handed = [(step, level.number, len(level.splats)) for step, _, level in train(flod)]
-    assert flod.steps == 65, "half as many as refine a level"
-    assert [entry[:2] for entry in handed[-3:]] == [(65, 1), (65, 2), (65, 3)]
+    assert flod.steps == 70, "as many as refine a level"
+    assert [entry[:2] for entry in handed[-3:]] == [(70, 1), (70, 2), (70, 3)]
     counts = {number: count for _, number, count in handed[:-3]}
     assert {number: count for _, number, count in handed[-3:]} == counts
 
