@@ -85,7 +85,7 @@ def guess_up_rotation(splats: Splats) -> np.ndarray | None:
         return None
     is_usual = scores[1] < _CONVENTION * scores[0]
     if axis == 1:
-        return None if is_usual else np.float64([(1, 0, 0), (0, 0, -1), (0, 1, 0)])
+        return None if is_usual else np.array([(1, 0, 0), (0, 0, -1), (0, 1, 0)], np.float64)
     return np.eye(3) if is_usual else np.diag([1.0, -1.0, -1.0])
 
 
