@@ -10,11 +10,11 @@ from ..data import cleaning, clutter, roots
 from .base import EditLevelsOperator, report_errors
 
 _LABELS = {
-    "size": ("Size", "Largest standard deviation of splats to keep"),
-    "distance": ("Distance", "Largest distance from the centre of splats to keep"),
-    "gap": ("Gap", "Merge clusters closer than this; 0 uses the density of the splats"),
-    "share": ("Largest Cluster", "Keep clusters with more than this share of all splats"),
-    "depth": ("Depth", "Largest depth below the ground of splats to keep"),
+    "size": ("Size", "Splats with a larger standard deviation are selected"),
+    "distance": ("Distance", "Splats farther than this from the centre of the subject are selected"),
+    "gap": ("Gap", "Clusters closer than this count as one; 0 uses the density of the splats"),
+    "share": ("Largest Cluster", "Clusters with more than this share of all splats are not selected"),
+    "depth": ("Depth", "Splats deeper than this below the ground are selected"),
 }
 
 

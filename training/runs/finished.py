@@ -30,13 +30,13 @@ def open_finished(run: Path, warn: Warn) -> tuple[RunFolder, Job, TrainingData]:
     folder.reject_links()
     if not folder.bundle.exists():
         raise LodgsError(
-            f"Cannot evaluate {folder.path}: it is not a finished run (it has no bundle.ply).",
+            f"Cannot use {folder.path}: it is not a finished run (it has no bundle.ply).",
             "Choose a run folder, and finish training it first.",
         )
     job = Job.from_file(folder.job)
     if not job.capture and not Path(job.scene).is_dir():
         raise LodgsError(
-            f"Cannot evaluate {folder.path}: its scene {job.scene} does not exist.",
+            f"Cannot use {folder.path}: its scene {job.scene} does not exist.",
             f"Restore the scene, or set its new path in {folder.job} (scene = ...).",
         )
 

@@ -13,21 +13,22 @@ MIN_SPLATS = 1000
 """Minimum number of splats of a scene whose up direction and view are estimated."""
 _MAX_SPLATS = 40_000
 """Number of splats used; larger sets are sampled at random."""
-_MIN_OPACITY = 0.1
+_MIN_LOGIT = -2.2
+"""Minimum opacity of a visible splat, 0.1, before the sigmoid."""
+_HOLLOW = 0.35, 0.06
+"""A scene is hollow, such as a room around the viewer, if less than this share of its splats (second) is
+within this fraction of the radius from its center (first)."""
 _MIN_FLATNESS, _MAX_OBLONG, _MIN_GROUND = 2.2, 1.4, 0.05
 """A ground across another axis than the convention's: the scene is at least this flat (mean spread over the
 spread along the axis), at most this oblong (a wall is wider than high), and has this score as a ground."""
+_MIN_ROOM_FLATNESS, _MAX_ROOM_OBLONG = 1.3, 2.0
+"""Flatness and oblong shape of hollow scenes with such a ground: rooms are higher than gardens."""
 _MAX_SLOPE = 20.0
 """Maximum slope of such a ground in degrees."""
 _CONVENTION = 2.0
 """Factor by which the ground of an opposite direction must beat that of the usual one."""
 _FAR_FACTOR = 2.5
 """Splats beyond this multiple of the median distance from the center are background."""
-_HOLLOW = 0.35, 0.06
-"""Scenes with less than this share (second) of their splats within this fraction of the radius (first) of
-the center surround the viewer, such as rooms."""
-_MIN_ROOM_FLATNESS, _MAX_ROOM_OBLONG = 1.3, 2.0
-"""The same for hollow scenes: rooms are higher than gardens, but their walls are beside the viewer."""
 LARGE, NEAR, FAR = 0.5, 2.0, 20.0
 """Splats larger than the first multiple of the radius, within the second of the center, veil the subject.
 Splats beyond the third are outliers."""
@@ -49,14 +50,14 @@ def central_ball(means: np.ndarray) -> tuple[np.ndarray, float]:
     if that is smaller, as in scenes with a far background.
 
     Args:
-        means: (N, 3), N > 0.
+        means: (N, 3) finite positions, N > 0.
     """
-    center = np.median(means, axis=0).astype(np.float64)
+    means = means.astype(np.float64)
+    center = np.median(means, axis=0)
     distances = np.linalg.norm(means - center, axis=1)
     median, most = np.percentile(distances, (50, 90))
     near = means[distances <= _FAR_FACTOR * median]
-    center = np.median(near, axis=0).astype(np.float64)
-    return center, float(max(min(most, _FAR_FACTOR * median), 1e-9))
+    return np.median(near, axis=0), float(max(min(most, _FAR_FACTOR * median), 1e-9))
 
 
 def guess_up_rotation(splats: Splats) -> np.ndarray | None:
@@ -90,7 +91,7 @@ def guess_up_rotation(splats: Splats) -> np.ndarray | None:
 
 
 def choose_view(splats: Splats, up: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the position (3,) and target (3,) of a view that shows a scene; None for few splats.
+    """Return the position (3,) and target (3,) of a view that shows a scene, float64; None for few splats.
 
     Candidates circle the center of the scene, or are inside a hollow one. The best one sees far, relative to
     its distance from the center, and through few splats near to it.
@@ -102,7 +103,8 @@ def choose_view(splats: Splats, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     if sample is None:
         return None
     center, radius = central_ball(sample.means)
-    sizes = np.exp(np.sort(sample.log_scales, axis=1)[:, 1:].mean(axis=1).astype(np.float64))
+    log_sizes = np.minimum(np.sort(sample.log_scales, axis=1)[:, 1:], 80).mean(axis=1)
+    sizes = np.exp(log_sizes.astype(np.float64))
     opacities = 1 / (1 + np.exp(-sample.opacity_logits.astype(np.float64)))
     hollow = _is_hollow(sample.means, center, radius)
     east = np.cross(up, np.eye(3)[np.abs(up).argmin()])
@@ -117,19 +119,19 @@ def choose_view(splats: Splats, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]
                 score = _clarity(sample.means, sizes, opacities, look_at(eye, center, up), distance)
                 if score > best_score:
                     best, best_score = eye, score
-    assert best is not None
-    return best, center
+    return None if best is None else (best, center)
 
 
 def describe_clutter(splats: Splats) -> list[str]:
-    """Return sentences with the numbers of splats that veil the subject, and of outliers."""
-    if len(splats) < MIN_SPLATS:
+    """Return sentences with the numbers of splats that veil the subject, and of outliers; none for few."""
+    rows = _visible_rows(splats)
+    if len(rows) < MIN_SPLATS:
         return []
-    center, radius = central_ball(splats.means[np.isfinite(splats.means).all(axis=1)])
-    distances = np.linalg.norm(splats.means - center, axis=1)
-    visible = splats.opacity_logits > np.log(_MIN_OPACITY / (1 - _MIN_OPACITY))
-    limit = np.log(LARGE * radius)
-    large = int(((splats.log_scales.max(axis=1) > limit) & (distances < NEAR * radius) & visible).sum())
+    means = splats.means[rows].astype(np.float64)
+    center, radius = central_ball(means)
+    distances = np.linalg.norm(means - center, axis=1)
+    is_large = splats.log_scales[rows].max(axis=1) > np.log(LARGE * radius)
+    large = int((is_large & (distances < NEAR * radius)).sum())
     far = int((distances > FAR * radius).sum())
     sentences = []
     if 0 < large < _MAX_LARGE * len(splats):
@@ -184,11 +186,16 @@ def _clarity(
 
 
 def _sample(splats: Splats) -> Splats | None:
-    """Return a random sample of the visible splats with finite positions; None if there are few."""
-    opaque = splats.opacity_logits > np.log(_MIN_OPACITY / (1 - _MIN_OPACITY))
-    rows = np.flatnonzero(opaque & np.isfinite(splats.means).all(axis=1))
+    """Return a random sample of the visible splats; None if there are few."""
+    rows = _visible_rows(splats)
     if len(rows) < MIN_SPLATS:
         return None
     if len(rows) > _MAX_SPLATS:
         rows = np.sort(np.random.default_rng(0).choice(rows, _MAX_SPLATS, replace=False))
     return splats.select(rows)
+
+
+def _visible_rows(splats: Splats) -> np.ndarray:
+    """Return the indices (M,) of the splats with finite positions and sizes that are not transparent."""
+    finite = np.isfinite(splats.means).all(axis=1) & np.isfinite(splats.log_scales).all(axis=1)
+    return np.flatnonzero(finite & (splats.opacity_logits > _MIN_LOGIT))

@@ -133,3 +133,19 @@ def test_known_directions_and_views_are_kept():
     few = Bundle("", [Level(1, splats_at(garden()[:100]))])
     complete_meta(few)
     assert few.meta == {}
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 3e38])
+def test_invalid_values_change_nothing(value):
+    """Files of other programs have such values in some splats; all of them may be invalid."""
+    splats = splats_at(garden())
+    expected = choose_view(splats, np.float64([0, 0, 1]))
+    bad = splats_at(garden()[:300])
+    bad.means[:100], bad.log_scales[100:200], bad.opacity_logits[200:] = value, value, np.nan
+    damaged = Splats.concatenated([splats, bad])
+    position, target = choose_view(damaged, np.float64([0, 0, 1]))
+    np.testing.assert_allclose(target, expected[1], atol=0.5)
+    assert np.isfinite(position).all() and guess_up_rotation(damaged).tolist() == np.eye(3).tolist()
+    describe_clutter(damaged)
+    splats.means[:] = np.nan
+    assert choose_view(splats, np.float64([0, 0, 1])) is None and describe_clutter(splats) == []
