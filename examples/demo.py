@@ -73,9 +73,8 @@ def main() -> int:
     if "curve" in measured:
         report["curve"] = [_splat_count_row(row) for row in measured["curve"]]
     (out / "report.json").write_text(json.dumps(report, indent=1))
-    page = [sys.executable, str(ROOT / "examples" / "demo_page.py"), str(run.path)]
-    page += [str(out / "report.json"), str(out / "index.html")]
-    code = subprocess.run(page, cwd=ROOT, check=False).returncode
+    page = [sys.executable, "-m", "training", "compare", str(run.path), "--out", str(out)]
+    code = subprocess.run(page, cwd=ROOT, stdout=subprocess.DEVNULL, check=False).returncode
     if code:
         return code
     print(f"Finished in {time.monotonic() - started:.0f} seconds. Files in {os.path.relpath(out)}:")

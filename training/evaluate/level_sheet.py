@@ -54,13 +54,14 @@ def write_level_sheet(
     elif rule:
         view = (camera.center, camera.focal, values)
         tiles.append(tile("by distance", *select(bundle, *view)))
-        colored, weights = select(_in_level_colors(bundle), *view)
+        colored, weights = select(in_level_colors(bundle), *view)
         tiles.append(("levels in colours", evaluation.draw(colored, camera, weights)))
     tiles.append(("photo", target.image))
     _write_tiles(path, tiles)
 
 
-def _in_level_colors(bundle: Bundle) -> Bundle:
+def in_level_colors(bundle: Bundle) -> Bundle:
+    """Return a bundle whose splats have the colours of their levels, as light as their own colours."""
     levels = []
     for level in bundle.levels:
         color = np.array(level_color(level.number), np.float32)

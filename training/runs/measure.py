@@ -98,7 +98,7 @@ def evaluate_run(
     if image is not None:
         write_level_sheet(image, bundle, evaluation, middle, values)
     with atomic_write(folder.metrics) as temporary:
-        Path(temporary).write_text(json.dumps(_finite(report), indent=1, allow_nan=False), encoding="utf-8")
+        Path(temporary).write_text(json.dumps(finite(report), indent=1, allow_nan=False), encoding="utf-8")
     return report
 
 
@@ -194,13 +194,13 @@ def _measure_networks(job: Job, folder: RunFolder, evaluation: Evaluation) -> di
     return evaluation.measure_images(model.render_image)
 
 
-def _finite(value):
+def finite(value):
     """Replace numbers that are not finite by None, for JSON."""
     match value:
         case dict():
-            return {key: _finite(item) for key, item in value.items()}
+            return {key: finite(item) for key, item in value.items()}
         case list() | tuple():
-            return [_finite(item) for item in value]
+            return [finite(item) for item in value]
         case float() if not math.isfinite(value):
             return None
         case _:

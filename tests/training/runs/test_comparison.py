@@ -1,0 +1,165 @@
+"""Comparison of runs: measures equal those of evaluate, answers, and the page in a browser."""
+
+import json
+import re
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+
+from training.__main__ import main
+from training.errors import LodgsError
+from training.runs.comparison.measures import ComparedRun, Point, answers, measure_run
+from training.runs.comparison.page import build_page, compare
+from training.runs.folder import RunFolder
+from training.runs.job import Job
+from training.runs.measure import evaluate_run
+from training.scenes.colmap import read_scene
+from training.splats.bundle import write_bundle
+from training.splats.gaussians import SH_C0, Splats
+from training.splats.levels import Bundle, Level
+
+
+@pytest.fixture(scope="module")
+def splats(tiny_scene) -> Splats:
+    """The points of the tiny scene as opaque spheres of the discs' size."""
+    model = read_scene(tiny_scene)
+    count = len(model.points)
+    return Splats(
+        means=model.points,
+        quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        log_scales=np.full((count, 3), np.log(0.12), np.float32),
+        opacity_logits=np.full(count, 3, np.float32),
+        sh=((model.point_colors[:, None] / 255 - 0.5) / SH_C0).astype(np.float32),
+    )
+
+
+@pytest.fixture(scope="module")
+def runs(tiny_scene, splats, tmp_path_factory):
+    """A finished FLoD run of two levels, and a 3DGS run of one."""
+    folder = tmp_path_factory.mktemp("compared")
+    levels = [Level(1, splats.select(slice(0, 20)), {"s_min": 0.1}), Level(2, splats, {"s_min": 0.0})]
+    bundles = {"flod": Bundle("flod", levels, "bands"), "3dgs": Bundle("3dgs", [Level(1, splats)])}
+    for method, bundle in bundles.items():
+        run = RunFolder(folder / method)
+        run.create()
+        values = {"scene": str(tiny_scene), "out": str(run.path), "method": method, "image_scale": 1.0}
+        Job.from_dict(values | {"backend": "cpu", "test_every": 4}).write(run.job)
+        write_bundle(run.bundle, bundle)
+    return [folder / method for method in bundles]
+
+
+@pytest.fixture(scope="module")
+def report(runs, tmp_path_factory):
+    out = tmp_path_factory.mktemp("page")
+    return compare(runs, out), out
+
+
+def test_measures_equal_those_of_evaluate(runs, report):
+    measured = report[0]["runs"][0]
+    expected = evaluate_run(runs[0], far=True)
+    coarse, fine = expected["levels"]
+    assert [point["psnr"] for point in measured["points"]] == [coarse["psnr"], fine["psnr"]]
+    assert [point["ssim"] for point in measured["points"]] == [coarse["ssim"], fine["ssim"]]
+    assert measured["merged"] == [(coarse["splats"], coarse["merged"]), (fine["splats"], fine["psnr"])]
+    assert measured["by_distance"]["psnr"] == expected["selective"][0]["psnr"]
+    assert measured["loaded"] == expected["loaded"]
+
+
+def test_single_level_is_also_compared_with_merged_neighbours(report, splats):
+    _, plain, merged = report[0]["runs"]
+    assert plain["by_distance"] is None and not plain["baseline"]
+    assert merged["baseline"] and merged["label"] == f"{plain['label']}, merged"
+    counts = [round(len(splats) * share) for share in (0.0625, 0.125, 0.25, 0.5, 1)]
+    assert [point["splats"] for point in merged["points"]] == counts
+    assert merged["points"][-1]["psnr"] == plain["points"][-1]["psnr"]
+
+
+def test_report_newer_than_the_bundle_is_not_measured_again(runs, report, monkeypatch):
+    monkeypatch.setattr("training.runs.comparison.measures.evaluate_run", None)
+    measured = measure_run(runs[0], "FLoD")
+    assert measured.finest.psnr == report[0]["runs"][0]["points"][-1]["psnr"]
+
+
+def test_damaged_report_is_measured_again(runs, tmp_path):
+    run = shutil.copytree(runs[1], tmp_path / "run")
+    RunFolder(run).metrics.write_text('{"rule": "", "levels": [{"level": "x"}], "test_views": []}')
+    assert measure_run(run, "3DGS").finest.psnr > 0
+
+
+def test_quality_between_sets_is_interpolated_over_the_logarithm():
+    points = [Point("a", 100, 20.0, 0.5, 0.1), Point("b", 10_000, 30.0, 0.6, 0.1)]
+    run = ComparedRun("run", "", points)
+    assert run.psnr_at(1000) == pytest.approx(25.0)  # halfway between 10^2 and 10^4
+    assert run.psnr_at(99) is None and run.psnr_at(20_000) == 30.0
+    assert run.nearest(900).name == "a" and run.nearest(1100).name == "b"
+
+
+def test_answers_name_the_best_run_and_ignore_baselines():
+    def run(label, splats, psnr, seconds, **values):
+        return ComparedRun(label, "", [Point("", splats, psnr, 0.9, 0.01)], seconds=seconds, **values)
+
+    rows = answers([run("A", 100, 30, 50), run("B", 200, 31, 60), run("C", 200, 40, None, baseline=True)])
+    best = {row["purpose"]: row["best"] for row in rows}
+    assert best["Quality at full detail"] == "B" and best["Short training"] == "A"
+    assert "Speed from far away" not in best  # neither has levels
+
+
+def test_page_loads_nothing_and_escapes_names(report):
+    text = (report[1] / "index.html").read_text()
+    assert not re.search(r"@[A-Z]+@", text)
+    assert not re.search(r"""(?:src|href)=["']http|@import|fetch\(""", text)
+    named = {**report[0], "scene": "<b>&", "views": ["</script><script>alert(1)"]}
+    page = build_page(named, [], [])
+    assert "<b>&" not in page.split("<script>")[0] and page.count("</script>") == 1
+
+
+def test_runs_of_other_scenes_are_refused(runs, tmp_path):
+    other = shutil.copytree(runs[1], tmp_path / "run")
+    job = Job.from_file(RunFolder(other).job)
+    scene = shutil.copytree(job.scene, tmp_path / "scene")
+    text = RunFolder(other).job.read_text().replace(job.scene, str(scene))
+    RunFolder(other).job.write_text(text)
+    with pytest.raises(LodgsError):
+        compare([runs[0], other], tmp_path / "out")
+
+
+def test_command_trains_the_methods_of_a_scene(tiny_scene, runs, tmp_path, capsys, monkeypatch):
+    """A method that fails is left out and named."""
+
+    def train(job, events):
+        if job.method == "tree":
+            events.write('{"event": "error", "what": "Cannot train: no reason."}\n')
+            return 2
+        run = RunFolder(job.out)
+        run.create()
+        job.write(run.job)
+        shutil.copy(RunFolder(runs[1]).bundle, run.bundle)
+        return 0
+
+    monkeypatch.setattr("training.runs.train.train", train)
+    arguments = ["compare", str(tiny_scene), "--out", str(tmp_path), "--methods", "tree", "3dgs"]
+    assert main([*arguments, "--backend", "cpu", "--test-every", "4", "--image-scale", "1"]) == 0
+    output = capsys.readouterr()
+    assert "is left out: Cannot train: no reason." in output.err and "index.html" in output.out
+    run, merged = json.loads((tmp_path / "compare.json").read_text())["runs"]
+    assert Job.from_file(tmp_path / "runs" / "3dgs" / "job.toml").test_every == 4
+    assert run["points"][-1]["splats"] == merged["points"][-1]["splats"]
+
+
+def test_scene_and_run_together_are_refused(tiny_scene, runs, tmp_path, capsys):
+    assert main(["compare", str(tiny_scene), str(runs[0]), "--out", str(tmp_path)]) == 2
+    assert "Name one scene, or runs only." in capsys.readouterr().err
+
+
+@pytest.mark.skipif(not shutil.which("chromium"), reason="needs Chromium")
+def test_page_fills_its_tables_in_a_browser(report):
+    command = ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr"]
+    command += ["--virtual-time-budget=2000", "--dump-dom", (report[1] / "index.html").as_uri()]
+    shown = subprocess.run(command, capture_output=True, text=True, timeout=200, check=True)
+    assert "CONSOLE" not in shown.stderr
+    labels = [run["label"] for run in report[0]["runs"]]
+    table = re.search(r'<table id="table">.*?</table>', shown.stdout, re.S)
+    assert table and all(f'<td class="">{label}</td>' in table[0] for label in labels)
+    assert shown.stdout.count("<circle") == 2 + 1 + 5

@@ -1,0 +1,118 @@
+"""``lodgs compare``: compare methods or runs on one page."""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import sys
+from pathlib import Path
+from typing import IO, Any, cast
+
+from ..errors import LodgsError
+from ..settings import settings_of
+from .options import add_setting, warn
+
+_JOB_KEYS = ("preset", "image_scale", "test_every", "seed", "backend")
+"""Keys of the jobs that the command trains."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    from ..methods import METHODS
+    from ..runs.job import Job
+
+    parser.description = (
+        "Measures finished runs of one scene, and writes a page that compares quality, splats, speed and "
+        "images. For a scene, it first trains each method."
+    )
+    parser.add_argument("sources", type=Path, nargs="+", metavar="SOURCE", help="a scene, or run folders")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR",
+        help="folder of index.html, compare.json and new runs",
+    )  # fmt: skip
+    parser.add_argument(
+        "--methods", nargs="+", choices=list(METHODS), metavar="METHOD",
+        help="methods to train on a scene (default: all)",
+    )  # fmt: skip
+    for name in _JOB_KEYS:
+        add_setting(parser, settings_of(Job)[name])
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the command and return its exit code."""
+    from ..runs.comparison.page import compare, format_comparison
+    from ..runs.folder import RunFolder
+
+    is_run = [RunFolder(source).job.is_file() for source in options.sources]
+    if all(is_run):
+        runs = options.sources
+    elif len(is_run) == 1:
+        runs = _train_methods(options)
+    else:
+        wrong = next(source for source, known in zip(options.sources, is_run, strict=True) if not known)
+        raise LodgsError(f"Cannot compare {wrong}: it is not a run.", "Name one scene, or runs only.")
+    report = compare(runs, options.out, warn, _notify)
+    print(format_comparison(report))
+    print(f"{options.out / 'index.html'}: open it in a browser")
+    return 0
+
+
+def _train_methods(options: argparse.Namespace) -> list[Path]:
+    """Train a scene with each method, or resume, and return the folders of the finished runs.
+
+    A method that fails is reported and left out.
+
+    Raises:
+        LodgsError: every method fails.
+        KeyboardInterrupt: training was cancelled.
+    """
+    from ..methods import METHODS
+    from ..runs.failures import CANCELLED, DONE
+    from ..runs.job import Job
+    from ..runs.train import train
+
+    (scene,) = options.sources
+    keys = {"scene": str(scene)} | {name: vars(options)[name] for name in _JOB_KEYS if name in options}
+    names = options.methods or list(METHODS)
+    runs = []
+    for number, name in enumerate(names, 1):
+        label = METHODS[name].label
+        _notify(f"Training {label} ({number} of {len(names)}).")
+        folder = options.out / "runs" / name
+        events = _Progress(label)
+        code = train(Job.from_dict({**keys, "method": name, "out": str(folder)}), cast("IO[str]", events))
+        if code == CANCELLED:
+            raise KeyboardInterrupt
+        if code == DONE:
+            runs.append(folder)
+        else:
+            warn(f"{label} is left out: {events.last.get('what', 'its training crashed.')}")
+    if not runs:
+        raise LodgsError(f"Cannot compare methods on {scene}: none could be trained.", "Check the scene.")
+    return runs
+
+
+class _Progress(io.TextIOBase):
+    """Stream of a run's events that prints the progress in one line of a terminal.
+
+    Attributes:
+        last: the newest event.
+    """
+
+    def __init__(self, label: str) -> None:
+        self.last: dict[str, Any] = {}
+        self._label = label
+
+    def write(self, text: str, /) -> int:
+        if text.strip():
+            self.last = json.loads(text)
+            if self.last["event"] == "progress" and sys.stderr.isatty():
+                end = "\n" if self.last["step"] == self.last["of"] else "\r"
+                line = f"{self._label}: step {self.last['step']:,} of {self.last['of']:,}"
+                print(line, end=end, file=sys.stderr, flush=True)
+        return len(text)
+
+
+def _notify(sentence: str) -> None:
+    print(sentence, file=sys.stderr, flush=True)

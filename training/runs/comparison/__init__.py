@@ -1,0 +1,1 @@
+"""Comparison of runs of one scene: measures, images and the page of ``lodgs compare``."""

@@ -1,0 +1,264 @@
+"""Measures of finished runs of one scene side by side."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from ...errors import LodgsError
+from ...evaluate.views import Evaluation
+from ...lod.rule import find_rule
+from ...methods import METHODS
+from ...optimize.merging import merge
+from ...splats.dialects import Warn, ignore
+from ...splats.gaussians import Splats
+from ..finished import open_finished
+from ..folder import RunFolder
+from ..job import Job
+from ..measure import evaluate_run
+
+SHARE = 0.25
+"""Share of the splats of finest levels at which methods are compared."""
+MERGED_SHARES = (0.5, 0.25, 0.125, 0.0625)
+"""Shares of a finest level's splats to which the baseline merges neighbours."""
+
+Notify = Callable[[str], object]
+"""Receives a sentence about progress."""
+
+
+@dataclass(frozen=True)
+class Point:
+    """Quality of a set of splats.
+
+    Attributes:
+        name: label of the set, such as "Level 3" or "s_v = 2".
+        splats: mean number of splats with a weight above 0, in view or not.
+        psnr: dB.
+        ssim: structural similarity.
+        frame_s: seconds per frame with selection.
+        level: number of the level, or 0.
+        values: values of the rule's controls, if they select the set.
+    """
+
+    name: str
+    splats: int
+    psnr: float
+    ssim: float
+    frame_s: float
+    level: int = 0
+    values: dict[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, row: dict, name: str, prefix: str, **where: Any) -> Point:
+        """Make a point of a row of ``evaluate_run``'s report, whose quality names have a prefix."""
+        quality = (float(row[f"{prefix}{measure}"]) for measure in ("psnr", "ssim"))
+        return cls(name, int(row["splats"]), *quality, float(row["frame_s"]), **where)
+
+
+@dataclass(frozen=True)
+class ComparedRun:
+    """Measures of a run.
+
+    Attributes:
+        label: name in tables and plots.
+        about: description of the method.
+        points: sets of splats, ascending by ``splats``. The last is the finest level.
+        by_distance: quality with the rule's default controls, or None without a rule.
+        merged: number of splats and PSNR in dB of the finest level with merged neighbours, the baseline.
+        farther: rows of ``evaluate.distance.measure_farther_views``.
+        largest_jump: largest jump of a fly-out relative to full detail, or None without a rule.
+        loaded: mean number of splats that a viewer loads for a view.
+        megabytes: size of all levels in one file.
+        seconds: seconds of training, or None.
+        baseline: the sets are not trained; they are only drawn for comparison.
+    """
+
+    label: str
+    about: str
+    points: list[Point]
+    by_distance: Point | None = None
+    merged: list[tuple[int, float]] = field(default_factory=list)
+    farther: list[dict] = field(default_factory=list)
+    largest_jump: float | None = None
+    loaded: int = 0
+    megabytes: float = 0.0
+    seconds: float | None = None
+    baseline: bool = False
+
+    @property
+    def finest(self) -> Point:
+        """Set of the highest number of splats."""
+        return self.points[-1]
+
+    def psnr_at(self, splats: float) -> float | None:
+        """Return the PSNR with a number of splats in dB; None below the smallest set.
+
+        Between sets it is interpolated over the logarithm of their number of splats.
+        """
+        counts = [point.splats for point in self.points]
+        if splats < min(counts):
+            return None
+        return float(np.interp(np.log(splats), np.log(counts), [point.psnr for point in self.points]))
+
+    def nearest(self, splats: float) -> Point:
+        """Return the set whose number of splats is nearest to a number, as a ratio."""
+        return min(self.points, key=lambda point: abs(np.log(point.splats / splats)))
+
+
+def measure_run(
+    run: Path, label: str, far: bool = True, warn: Warn = ignore, notify: Notify = ignore
+) -> ComparedRun:
+    """Measure a finished run as ``lodgs evaluate`` does, by default with ``--far``.
+
+    A report that is newer than the run's bundle is not measured again.
+
+    Raises:
+        LodgsError: as ``evaluate_run``.
+    """
+    folder = RunFolder(run)
+    job = Job.from_file(folder.job)
+    with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
+        if folder.metrics.stat().st_mtime >= folder.bundle.stat().st_mtime:
+            report = json.loads(folder.metrics.read_text(encoding="utf-8"))
+            if not far or not report["rule"] or "farther" in report:
+                return compared_run(folder, job, report, label)
+    notify(f"Measuring {label}.")
+    return compared_run(folder, job, evaluate_run(run, far=far, warn=warn), label)
+
+
+def compared_run(folder: RunFolder, job: Job, report: dict, label: str) -> ComparedRun:
+    """Make the measures of a run from the report of ``evaluate_run``.
+
+    Raises:
+        KeyError, TypeError, ValueError: the report has another form.
+    """
+    prefix = "" if report["test_views"] else "train_"
+    points = [
+        Point.of(row, f"Level {row['level']}", prefix, level=int(row["level"])) for row in report["levels"]
+    ]
+    rule = find_rule(report["rule"])
+    if rule and rule.sweep:
+        name, _ = rule.sweep
+        points += [
+            Point.of(row, f"{name} = {row[name]:g}", prefix, values={name: float(row[name])})
+            for row in report.get("curve", [])
+        ]
+    points = [point for point in points if point.splats]
+    end = folder.end_event() or {}
+    seconds = end.get("seconds")
+    finest = max(points, key=lambda point: point.splats)
+    merged = [(int(row["splats"]), float(row["merged"])) for row in report["levels"] if "merged" in row]
+    return ComparedRun(
+        label=label,
+        about=METHODS[job.method].about,
+        points=sorted(points, key=lambda point: (point.splats, point.psnr)),
+        by_distance=Point.of(report["selective"][0], "By distance", prefix) if report["selective"] else None,
+        merged=[*merged, (finest.splats, finest.psnr)] if merged else [],
+        farther=[dict(row) for row in report.get("farther", [])],
+        largest_jump=min(map(float, report["jumps"].values())) if report.get("jumps") else None,
+        loaded=int(report.get("loaded", finest.splats)),
+        megabytes=folder.bundle.stat().st_size / 1e6,
+        seconds=float(seconds) if isinstance(seconds, (int, float)) else None,
+    )
+
+
+def merge_baseline(
+    evaluation: Evaluation, splats: Splats, label: str
+) -> tuple[ComparedRun, dict[int, Splats]]:
+    """Measure a complete level with neighbours merged to MERGED_SHARES of its splats.
+
+    Args:
+        splats: the level.
+        label: label of its run.
+
+    Returns:
+        The measures, and the merged splats by their number.
+    """
+    merged, sets = splats, {len(splats): splats}
+    for share in MERGED_SHARES:
+        merged = merge(merged, max(round(len(splats) * share), 1))
+        sets[len(merged)] = merged
+    points = [
+        Point.of(evaluation.measure_splats(part), f"{count:,} splats", evaluation.prefix)
+        for count, part in sorted(sets.items())
+    ]
+    about = f"{label} with neighbours merged, for comparison"
+    size = 4 * len(splats) * (11 + splats.sh[0].size) / 1e6
+    run = ComparedRun(f"{label}, merged", about, points, loaded=len(splats), megabytes=size, baseline=True)
+    return run, sets
+
+
+def compared_count(runs: Sequence[ComparedRun]) -> float:
+    """Return the number of splats at which runs are compared: SHARE of the median finest level."""
+    return SHARE * median(run.finest.splats for run in runs if not run.baseline)
+
+
+def answers(runs: Sequence[ComparedRun]) -> list[dict[str, str]]:
+    """Answer which run is best for a purpose.
+
+    Returns:
+        ``purpose``, ``best`` (label) and ``why``, for each purpose with at least two measured runs that are
+        trained.
+    """
+    runs = [run for run in runs if not run.baseline]
+    count = compared_count(runs)
+    at_count = {run.label: quality for run in runs if (quality := run.psnr_at(count)) is not None}
+    far = {run.label: run.farther[-1] for run in runs if run.farther}
+    trained = [run for run in runs if run.seconds is not None]
+    candidates = [
+        ("Quality at full detail", {run.label: -run.finest.psnr for run in runs},
+         lambda run: f"{run.finest.psnr:.2f} dB with {run.finest.splats:,} splats"),
+        (f"Quality with {count:,.0f} splats", {label: -quality for label, quality in at_count.items()},
+         lambda run: f"{at_count[run.label]:.2f} dB; full detail has {run.finest.psnr:.2f} dB"),
+        ("Speed from far away", {label: row["frame_s"] for label, row in far.items()},
+         lambda run: f"{1e3 * far[run.label]['frame_s']:.1f} ms a frame from {far[run.label]['factor']} "
+                     f"times the distance, with {far[run.label]['drawn']:,} splats in the image"),
+        ("Few splats to load", {run.label: run.loaded for run in runs if run.by_distance},
+         lambda run: f"{run.loaded:,} splats for a view"),
+        ("Smooth changes", {run.label: run.largest_jump for run in runs if run.largest_jump is not None},
+         lambda run: f"largest jump between frames {run.largest_jump:.2f} times that of full detail"),
+        ("Short training", {run.label: run.seconds for run in trained},
+         lambda run: f"{run.seconds:,.0f} s"),
+    ]  # fmt: skip
+    by_label = {run.label: run for run in runs}
+    result = []
+    for purpose, costs, describe in candidates:
+        if len(costs) > 1:
+            best = by_label[min(costs, key=costs.__getitem__)]
+            result.append({"purpose": purpose, "best": best.label, "why": describe(best)})
+    return result
+
+
+def measures(runs: Sequence[ComparedRun]) -> dict:
+    """Return the measures of runs as plain values for JSON."""
+    count = compared_count(runs)
+    rows = [{**asdict(run), "at_share": run.psnr_at(count)} for run in runs]
+    return {"compared_splats": round(count), "runs": rows, "answers": answers(runs)}
+
+
+def label_runs(runs: Sequence[Path]) -> list[str]:
+    """Return labels of finished runs: the method, with the folder's name where methods repeat.
+
+    Raises:
+        LodgsError: a run is not finished, or the runs have different scenes or held-out photos.
+    """
+    jobs = [open_finished(run, ignore)[1] for run in runs]
+    first = jobs[0]
+    for run, job in zip(runs, jobs, strict=True):
+        if (job.scene, job.test_every) != (first.scene, first.test_every):
+            raise LodgsError(
+                f"Cannot compare {run} with {runs[0]}: their scenes or held-out photos differ.",
+                "Choose runs of one scene.",
+            )
+    labels = [METHODS[job.method].label for job in jobs]
+    return [
+        f"{label} ({run.name})" if labels.count(label) > 1 else label
+        for label, run in zip(labels, runs, strict=True)
+    ]

@@ -1,0 +1,108 @@
+"""The page that compares runs of a scene: one HTML file that loads nothing from the network."""
+
+from __future__ import annotations
+
+import html
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from ...evaluate.views import Evaluation
+from ...files import atomic_write
+from ...lod.on_disk import open_if_large
+from ...lod.selection import complete_splats
+from ...splats.bundle import read_bundle
+from ...splats.dialects import Warn, ignore
+from ..finished import open_finished
+from ..measure import finite
+from .images import RunImages, as_plain, compared_views, photos, render_merges, render_run
+from .measures import ComparedRun, Notify, compared_count, label_runs, measure_run, measures, merge_baseline
+
+TEMPLATE = Path(__file__).with_name("page.html")
+
+
+def compare(runs: Sequence[Path], out: Path, warn: Warn = ignore, notify: Notify = ignore) -> dict:
+    """Compare finished runs of a scene and write ``index.html`` and ``compare.json``.
+
+    Args:
+        runs: run folders. A run without levels of detail is also compared with neighbours merged.
+        out: folder of the page. It is created.
+        warn: receives warnings about the scene.
+        notify: receives one sentence for each part of the work.
+
+    Returns:
+        The contents of ``compare.json``: ``scene``, ``views``, ``compared_splats``, ``runs`` (see
+        ``measures.ComparedRun``) and ``answers``.
+
+    Raises:
+        LodgsError: a run is not finished, the runs have different scenes, or a file cannot be written.
+    """
+    labels = label_runs(runs)
+    several = len(runs) > 1
+    measured = [
+        measure_run(run, label, several, warn, notify) for run, label in zip(runs, labels, strict=True)
+    ]
+    count = compared_count(measured)
+    _, first_job, data = open_finished(runs[0], warn)
+    evaluation = Evaluation(data, first_job.backend)
+    cameras = compared_views(evaluation)
+    images: list[RunImages] = []
+    baselines: list[ComparedRun] = []
+    for run, row in zip(runs, list(measured), strict=True):
+        notify(f"Rendering {row.label}.")
+        path = run / "bundle.ply"
+        bundle = open_if_large(path) or read_bundle(path)
+        images.append(render_run(evaluation, bundle, row, cameras, count))
+        if len(bundle.levels) == 1 and not bundle.rule and not bundle.on_disk and not baselines:
+            plain = Evaluation(data, first_job.backend, bundle.antialias)
+            splats = complete_splats(bundle, bundle.levels[0])
+            baseline, sets = merge_baseline(plain, splats, row.label)
+            baselines.append(baseline)
+            images.append(render_merges(plain, baseline, sets, cameras, count))
+            measured.insert(measured.index(row) + 1, baseline)
+    report = {
+        "scene": Path(first_job.scene).name,
+        "held_out": bool(data.test),
+        "views": [camera.name for camera in cameras],
+        **measures(measured),
+    }
+    page = build_page(report, photos(evaluation, cameras), images)
+    out.mkdir(parents=True, exist_ok=True)
+    with atomic_write(out / "compare.json") as temporary:
+        Path(temporary).write_text(json.dumps(finite(report), indent=1), encoding="utf-8")
+    with atomic_write(out / "index.html") as temporary:
+        Path(temporary).write_text(page, encoding="utf-8")
+    return report
+
+
+def build_page(report: dict, photo_addresses: Sequence[str], images: Sequence[RunImages]) -> str:
+    """Return the page as HTML.
+
+    Args:
+        report: contents of ``compare.json``.
+        photo_addresses: addresses of the photos of the views.
+        images: images of the runs, in the order of the report.
+    """
+    content = finite({**report, "photos": list(photo_addresses), "images": [as_plain(run) for run in images]})
+    # "</" would end the script in which the data are
+    data = json.dumps(content, allow_nan=False).replace("</", "<\\/")
+    template = TEMPLATE.read_text(encoding="utf-8")
+    return template.replace("@SCENE@", html.escape(report["scene"])).replace("@DATA@", data)
+
+
+def format_comparison(report: dict) -> str:
+    """Format the contents of ``compare.json`` as text."""
+    count = report["compared_splats"]
+    width = max(len(run["label"]) for run in report["runs"])
+    lines = [f"{'':<{width}} {'splats':>9} {'PSNR':>7} {f'at {count:,}':>10} {'by dist.':>9} {'ms/frame':>9}"]
+    for run in report["runs"]:
+        finest, selected = run["points"][-1], run["by_distance"]
+        at_share = "-" if run["at_share"] is None else f"{run['at_share']:.2f}"
+        distance = f"{selected['psnr']:.2f}" if selected else "-"
+        frame = 1e3 * (selected or finest)["frame_s"]
+        lines.append(
+            f"{run['label']:<{width}} {finest['splats']:>9,} {finest['psnr']:>7.2f} {at_share:>10} "
+            f"{distance:>9} {frame:>9.1f}"
+        )
+    lines += [f"{row['purpose']}: {row['best']} ({row['why']})." for row in report["answers"]]
+    return "\n".join(lines)
