@@ -115,6 +115,14 @@ def test_page_loads_nothing_and_escapes_names(report):
     assert "<b>&" not in page.split("<script>")[0] and page.count("</script>") == 1
 
 
+def test_page_of_one_run_shows_all_of_its_levels(runs, report, tmp_path):
+    compare(runs[:1], tmp_path)
+    data = json.loads(re.findall(r"^const data = (.*);$", (tmp_path / "index.html").read_text(), re.M)[0])
+    (images,) = data["images"]
+    assert list(images["variants"]) == ["Level 2", "Level 1", "By distance", "Level colours"]
+    assert all(len(variant["images"]) == len(data["photos"]) for variant in images["variants"].values())
+
+
 def test_runs_of_other_scenes_are_refused(runs, tmp_path):
     other = shutil.copytree(runs[1], tmp_path / "run")
     job = Job.from_file(RunFolder(other).job)

@@ -52,7 +52,7 @@ class RunImages:
 
     Attributes:
         label: label of the run.
-        variants: images by "Full detail", "Reduced", "By distance" and "Level colours".
+        variants: images by "Full detail", "Reduced", "By distance" and "Level colours", or by names of sets.
         frames: addresses of images of a fly-out, one for FRAMES_PER_IMAGE frames; empty without a rule.
         jumps: change between consecutive frames relative to full detail.
     """
@@ -78,14 +78,18 @@ def photos(evaluation: Evaluation, cameras: Sequence[Camera]) -> list[str]:
 
 
 def render_run(
-    evaluation: Evaluation, bundle: Bundle, run: ComparedRun, cameras: Sequence[Camera], splats: float
+    evaluation: Evaluation,
+    bundle: Bundle,
+    run: ComparedRun,
+    cameras: Sequence[Camera],
+    splats: float | None,
 ) -> RunImages:
     """Render a run's images.
 
     Args:
         evaluation: evaluation of the run's scene.
         cameras: views to render.
-        splats: number of splats of the variant "Reduced".
+        splats: number of splats of the variant "Reduced". None renders a variant for each set of the run.
     """
     evaluation = _with_filter(evaluation, bundle)
     resident = ResidentBundle(bundle, evaluation.backend)
@@ -106,11 +110,11 @@ def render_run(
     def variant(title: str, draw: Callable[[Camera], torch.Tensor]) -> Variant:
         return Variant(title, [encode(draw(camera)) for camera in cameras])
 
-    reduced = run.nearest(splats)
-    variants = {
-        "Full detail": variant(_title(run.finest), draw_point(run.finest)),
-        "Reduced": variant(_title(reduced), draw_point(reduced)),
-    }
+    if splats is None:
+        points = {point.name: point for point in reversed(run.points)}
+    else:
+        points = {"Full detail": run.finest, "Reduced": run.nearest(splats)}
+    variants = {name: variant(_title(point), draw_point(point)) for name, point in points.items()}
     if run.by_distance is None:
         return RunImages(run.label, variants)
     values = resolve_controls(bundle, {})

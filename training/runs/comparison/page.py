@@ -52,7 +52,7 @@ def compare(runs: Sequence[Path], out: Path, warn: Warn = ignore, notify: Notify
         notify(f"Rendering {row.label}.")
         path = run / "bundle.ply"
         bundle = open_if_large(path) or read_bundle(path)
-        images.append(render_run(evaluation, bundle, row, cameras, count))
+        images.append(render_run(evaluation, bundle, row, cameras, count if several else None))
         if len(bundle.levels) == 1 and not bundle.rule and not bundle.on_disk and not baselines:
             plain = Evaluation(data, first_job.backend, bundle.antialias)
             splats = complete_splats(bundle, bundle.levels[0])
