@@ -10,7 +10,7 @@ from . import commands, operators, panels, viewport
 from .data import changes, loaded, looks, older_files, paths, properties, reloading, removal, scenes, updates
 from .nodes import building
 from .render import compare, engine, renderer
-from .runs import background_capture, jobs, photo_preparation
+from .runs import background_capture, jobs, method_comparison, photo_preparation
 from .viewport import wipe
 
 MODULES = (
@@ -35,6 +35,7 @@ MODULES = (
     jobs,
     background_capture,
     photo_preparation,
+    method_comparison,
     commands,
 )
 

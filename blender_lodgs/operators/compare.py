@@ -5,10 +5,11 @@ from __future__ import annotations
 import bpy
 
 from ...training.errors import LodgsError
+from ...training.methods import METHODS
 from ..data import photographs, roots
 from ..render import compare
-from ..runs import processes
-from .base import report_errors
+from ..runs import method_comparison, processes
+from .base import SceneOperator, report_errors
 
 
 class _ViewsOperator:
@@ -108,7 +109,58 @@ class LODGS_OT_compare_worst(_CompareOperator, bpy.types.Operator):
         return compare.worst_view(roots.active_root(context))
 
 
+class LODGS_OT_compare_methods(SceneOperator, bpy.types.Operator):
+    bl_idname = "lodgs.compare_methods"
+    bl_label = "Compare Methods…"
+    bl_description = (
+        "Train several methods on the photos in the background, and open a page that compares their quality, "
+        "splats, speed and images; the same comparison resumes after a cancel"
+    )
+
+    methods: bpy.props.EnumProperty(
+        name="Methods",
+        description="Methods to train with the preset and image scale of the Training panel",
+        items=[(method.name, method.label, method.about) for method in METHODS.values()],
+        options={"ENUM_FLAG"},
+        default={"flod", "octree", "clod", "3dgs"},
+    )
+
+    def invoke(self, context, event):
+        return context.window_manager.invoke_props_dialog(self, confirm_text="Compare")
+
+    def draw(self, context):
+        self.layout.column().prop(self, "methods")
+
+    @report_errors
+    def execute(self, context):
+        names = [name for name in METHODS if name in self.methods]
+        work = method_comparison.compare_methods(roots.active_root(context), names)
+        processes.follow(work.step)
+        if work.problem:
+            self.report({"ERROR"}, work.problem)
+            return {"CANCELLED"}
+        self.report({"INFO"}, work.message)
+        return {"FINISHED"}
+
+
+class LODGS_OT_cancel_comparing_methods(bpy.types.Operator):
+    bl_idname = "lodgs.cancel_comparing_methods"
+    bl_label = "Cancel"
+    bl_description = "Stop the comparison; the same comparison resumes it"
+    bl_options = {"INTERNAL"}
+
+    @classmethod
+    def poll(cls, context):
+        return method_comparison.current is not None and method_comparison.current.running
+
+    def execute(self, context):
+        method_comparison.current.cancel()
+        return {"FINISHED"}
+
+
 CLASSES = (
+    LODGS_OT_compare_methods,
+    LODGS_OT_cancel_comparing_methods,
     LODGS_OT_measure_views,
     LODGS_OT_cancel_measuring,
     LODGS_OT_compare_view,

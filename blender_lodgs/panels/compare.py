@@ -6,6 +6,7 @@ import bpy
 
 from ..data import photographs, roots
 from ..render import compare
+from ..runs import method_comparison
 from ..viewport import wipe
 from .parts import Panel, say
 
@@ -84,6 +85,20 @@ class LODGS_PT_compare(Panel):
             row.prop(settings, "wipe", slider=True)
             if context.scene.camera is None or context.scene.camera.session_uid != comparison.view:
                 say(layout, "Press Compare to compare this view.", "INFO")
+        _draw_methods(layout)
+
+
+def _draw_methods(layout: bpy.types.UILayout) -> None:
+    """Draw the comparison of methods, or its progress."""
+    work = method_comparison.current
+    if work is None or not work.running:
+        layout.operator("lodgs.compare_methods", icon="GRAPH")
+        if work is not None:
+            say(layout, work.problem or work.message, "ERROR" if work.problem else "INFO")
+        return
+    row = layout.row(align=True)
+    row.progress(text=work.message, factor=work.fraction)
+    row.operator("lodgs.cancel_comparing_methods", text="", icon="X")
 
 
 def _draw_means(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import bpy
 
 from .. import extension
-from ..runs import background_capture, environment_setup, photo_preparation
+from ..runs import background_capture, environment_setup, method_comparison, photo_preparation
 from ..runs.watch import root_by_uid, watches
 
 NOTICE = 60.0
@@ -47,7 +47,8 @@ def all_work() -> Iterator[Work]:
         root = root_by_uid(uid)
         name = "Splats" if root is None else root.name
         yield Work(watch, f"{name}: {watch.message}", watch.fraction, watch.running, bool(watch.problem))
-    for job in (background_capture.current, photo_preparation.current, environment_setup.current):
+    modules = (background_capture, photo_preparation, environment_setup, method_comparison)
+    for job in [module.current for module in modules]:
         if job is not None:
             yield Work(job, job.message, job.fraction, job.running, bool(job.problem))
 

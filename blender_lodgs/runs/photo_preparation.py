@@ -5,8 +5,6 @@ Steps: extract frames from a video, find the cameras of the photos, undistort th
 
 from __future__ import annotations
 
-import re
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
@@ -20,83 +18,16 @@ from .. import extension
 from ..data import importing, photographs, roots
 from ..data.paths import absolute_path
 from . import environment, processes
+from .program_sequence import ProgramSequence
 from .watch import root_by_uid
 
-_PROGRESS = re.compile(r"(.*?) (\d+) of (\d+)$")
-
-
-class PhotoPreparation:
-    """A sequence of background programs, with its progress for the panel.
-
-    Attributes:
-        message: current step, or the result.
-        fraction: progress of the current step, 0 to 1.
-        problem: reason of a failure. Empty otherwise.
-        running: whether a program is running.
-        root: scene root that the photos belong to. None until a new scene is imported.
-        warnings: one sentence per warning.
-        results: last output line of each finished program, without the folder name.
-    """
-
-    def __init__(
-        self, log: Path, commands: list[list[str]], finish: Callable[[PhotoPreparation], None], message: str
-    ) -> None:
-        self.message = message
-        self.fraction = 0.0
-        self.problem = ""
-        self.running = True
-        self.warnings: list[str] = []
-        self.results: list[str] = []
-        self.root: bpy.types.Object | None = None
-        self._log = log
-        self._commands = commands
-        self._finish = finish
-        self._cancelled = False
-        self._log.unlink(missing_ok=True)
-        self._process = self._next()
-
-    def cancel(self) -> None:
-        """Stop the current program. Starting the same preparation again continues it."""
-        self._cancelled = True
-        self._process.terminate()
-
-    def step(self) -> bool:
-        """Update the progress. Return whether a program is running, for ``processes.follow``."""
-        code = self._process.poll()
-        last = processes.last_lines(self._log)[-1:]
-        if code == 0:
-            output = processes.last_lines(self._log.with_suffix(".out"))
-            self.results.append(output[-1].partition(": ")[2] if output else "")
-        if code == 0 and self._commands and not self._cancelled:
-            self._process, code = self._next(), None
-        self.running = code is None
-        if code is None and last and (progress := _PROGRESS.match(last[0])):
-            self.message = last[0]
-            self.fraction = int(progress[2]) / max(int(progress[3]), 1)
-        elif code == 0:
-            self.fraction = 1.0
-            try:
-                with extension.in_window():
-                    self._finish(self)
-            except LodgsError as error:
-                self.problem = str(error)
-        elif code is not None:
-            self.message = "Stopped; start it again to continue"
-            self.problem = "" if self._cancelled else processes.failure_reason(self._log, code)
-        extension.redraw()
-        return self.running
-
-    def _next(self) -> subprocess.Popen:
-        return processes.spawn(self._commands.pop(0), self._log, self._log.with_suffix(".out"))
-
-
-current: PhotoPreparation | None = None
+current: ProgramSequence | None = None
 """The running or last preparation."""
 
 
 def find_cameras(
     photos: Path, folder: Path, preset: str = "draft", ordered: bool = False, lens: str = ""
-) -> PhotoPreparation:
+) -> ProgramSequence:
     """Find the cameras of photos, then import the scene. Continue if this was started before.
 
     Args:
@@ -122,7 +53,7 @@ def find_cameras(
     commands.append(["scene", "--photos", str(photos), "--out", str(folder), *options])
     commands.append(["undistort", str(folder)])
 
-    def finish(work: PhotoPreparation) -> None:
+    def finish(work: ProgramSequence) -> None:
         is_first = not roots.roots(bpy.context.scene)
         work.root = importing.import_colmap(bpy.context, folder, warn=work.warnings.append)
         if is_first:  # otherwise keep the view of the scene that is open
@@ -149,7 +80,7 @@ def undistort_photos(root: bpy.types.Object, warn: Warn) -> None:
     options = [text for name, path in paths.items() if path for text in (name, str(absolute_path(path)))]
     log = extension.user_folder("logs") / "undistort.log"
 
-    def finish(work: PhotoPreparation) -> None:
+    def finish(work: ProgramSequence) -> None:
         root = root_by_uid(uid)
         if root is None:  # another file has been opened
             return
@@ -182,8 +113,8 @@ def _read_scene(root: bpy.types.Object) -> Scene:
 
 
 def _start(
-    log: Path, commands: list[list[str]], finish: Callable[[PhotoPreparation], None], message: str
-) -> PhotoPreparation:
+    log: Path, commands: list[list[str]], finish: Callable[[ProgramSequence], None], message: str
+) -> ProgramSequence:
     """Run commands one after the other. Commands that do not start Blender are arguments of the trainer."""
     global current
     if current is not None and current.running:
@@ -194,7 +125,7 @@ def _start(
         programs = [
             command if command[0] == bpy.app.binary_path else [*trainer, *command] for command in commands
         ]
-        current = PhotoPreparation(log, programs, finish, message)
+        current = ProgramSequence(log, programs, finish, message)
     except OSError as error:
         raise LodgsError(
             f"Cannot write to {log.parent}: {error.strerror or error}.", "Choose another folder."

@@ -78,9 +78,10 @@ def _train_methods(options: argparse.Namespace) -> list[Path]:
     runs = []
     for number, name in enumerate(names, 1):
         label = METHODS[name].label
-        _notify(f"Training {label} ({number} of {len(names)}).")
+        text = f"Training {label} ({number} of {len(names)})"
+        _notify(text)
         folder = options.out / "runs" / name
-        events = _Progress(label)
+        events = _Progress(text)
         code = train(Job.from_dict({**keys, "method": name, "out": str(folder)}), cast("IO[str]", events))
         if code == CANCELLED:
             raise KeyboardInterrupt
@@ -94,24 +95,31 @@ def _train_methods(options: argparse.Namespace) -> list[Path]:
 
 
 class _Progress(io.TextIOBase):
-    """Stream of a run's events that prints the progress in one line of a terminal.
+    """Stream of a run's events that prints the steps, in one line of a terminal or in a hundred of a log.
 
     Attributes:
         last: the newest event.
     """
 
-    def __init__(self, label: str) -> None:
+    def __init__(self, text: str) -> None:
         self.last: dict[str, Any] = {}
-        self._label = label
+        self._text = text
+        self._percent = -1
 
     def write(self, text: str, /) -> int:
         if text.strip():
             self.last = json.loads(text)
-            if self.last["event"] == "progress" and sys.stderr.isatty():
-                end = "\n" if self.last["step"] == self.last["of"] else "\r"
-                line = f"{self._label}: step {self.last['step']:,} of {self.last['of']:,}"
-                print(line, end=end, file=sys.stderr, flush=True)
+            if self.last["event"] == "progress":
+                self._print(self.last["step"], self.last["of"])
         return len(text)
+
+    def _print(self, step: int, steps: int) -> None:
+        percent = 100 * step // max(steps, 1)
+        terminal = sys.stderr.isatty()
+        if terminal or percent > self._percent:
+            self._percent = percent
+            end = "\r" if terminal and step < steps else "\n"
+            print(f"{self._text}, step {step} of {steps}", end=end, file=sys.stderr, flush=True)
 
 
 def _notify(sentence: str) -> None:
