@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from ...errors import LodgsError
+from ...files import is_file
 from .. import processes
 from ..failures import CANCELLED
 from ..folder import RunFolder
@@ -125,7 +126,7 @@ def workers(on: str = HERE, resources: dict[str, float] | None = None, tls: bool
         return
     kind, _, count = on.partition(":")
     local = kind == "local" and count.isdecimal() and int(count) > 0
-    if not local and "://" not in on and not os.path.isfile(on):
+    if not local and "://" not in on and not is_file(on):
         raise LodgsError(
             f"Unknown workers '{on}'.",
             "Use here, local:2 (two blocks at a time), or the file that lodgs blocks scheduler has written.",
