@@ -241,17 +241,8 @@ def read_scene(
         images = _find_images(folder, model, [pose.name for pose in poses], warnings)
     images = _absolute(images)
     views = _view_collector(folder, images)
-    for number, pose in enumerate(poses):
-        if progress and number % 50 == 0:
-            progress(0.5 * number / len(poses))
-        views.add(pose, intrinsics[pose.camera_id])
-    if not views.cameras:
-        raise LodgsError(
-            f"Cannot read scene: none of the {len(poses)} views of {model} has a usable photo in {images}."
-            + "".join(f" {quote_name(name)}: {reason}" for name, reason in views.excluded[:1]),
-            "Choose the folder that holds the images under the names used by the model.",
-        )
-
+    views.add_all(poses, intrinsics, lambda share: progress and progress(0.5 * share))
+    views.require_cameras(model, images)
     points, colors, ids = _read_model_points(model, views.cameras, warnings)
     if origin is None:
         origin = choose_origin(np.array([pose.center for pose in poses]), points)

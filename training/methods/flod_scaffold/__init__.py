@@ -16,7 +16,7 @@ from ...settings import setting
 from ..octree_neural import METHOD as NEURAL_OCTREE
 from ..octree_neural import NeuralOctreeParameters
 
-ONE_LEVEL = {
+ONE_LEVEL: dict[str, Any] = {
     "levels": 1,
     "coarser_levels": 0,
     "coarse_share": 0.0,
@@ -73,7 +73,8 @@ class FlodScaffoldParameters(FlodLevels, NeuralOctreeParameters):
         values: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(NeuralOctreeParameters)}
         values |= {name: values[name][number - 1] for name in ("steps", "grow_until", "grow_interval")}
         limit = self.max_splats and int(self.max_splats * self.budget_ratio ** (self.levels - number))
-        return NeuralOctreeParameters(**values | ONE_LEVEL | {"max_splats": limit})
+        values |= ONE_LEVEL | {"max_splats": limit}
+        return NeuralOctreeParameters(**values)
 
 
 def _preset(name: str, **changes: Any) -> FlodScaffoldParameters:
