@@ -21,6 +21,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from multiprocessing import get_context
 from multiprocessing.context import ForkProcess as Process
 from pathlib import Path
@@ -177,10 +178,7 @@ class TrainerAttack:
         return path
 
     def _start(self, job: Path, kind="-", number=0, share=0.0, counts: Path | None = None) -> Process:
-        """Fork a trainer, which saves loading torch."""
-        process = FORK.Process(target=train_until_killed, args=(job, kind, number, share, counts))
-        process.start()
-        return process
+        return start_fork(train_until_killed, job, kind, number, share, counts)
 
     def kill_runs(self, kills: int) -> dict:
         """Kill this many trainers; return the results of their runs."""
@@ -282,6 +280,13 @@ def base_splats() -> Splats:
     arrays = (array.astype(np.float32) for array in (means, quats, log_scales, logits, sh))
     means, quats, log_scales, logits, sh = arrays
     return Splats(means, quats, log_scales, logits, sh)
+
+
+def start_fork(function: Callable[..., object], *arguments: object) -> Process:
+    """Start a function in a fork of this process, which saves loading torch."""
+    process = FORK.Process(target=function, args=arguments)
+    process.start()
+    return process
 
 
 def exit_code(process: Process) -> int | None:

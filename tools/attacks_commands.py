@@ -36,7 +36,7 @@ import psutil  # noqa: E402
 
 import training.runs.train  # noqa: E402, F401 - loaded once, before forking
 from tests.training.conftest import write_tiny_scene  # noqa: E402
-from tools.attacks import FORK, exit_code  # noqa: E402
+from tools.attacks import exit_code, start_fork  # noqa: E402
 from tools.attacks_blocks import DISK_FULL_MESSAGES, contents, small_disk  # noqa: E402
 from training import __main__  # noqa: E402
 from training.splats.gaussians import Splats  # noqa: E402
@@ -201,12 +201,10 @@ class Attack:
         return self._run(COMMANDS[name].arguments)
 
     def _run(self, arguments: Sequence[str]) -> Process:
-        """Start a command in a fork, which saves loading torch."""
+        """Start a command with the folders in place of INPUTS and DISK."""
         inputs, disk = str(self.inputs), str(self.disk)
         words = [word.replace("INPUTS", inputs).replace("DISK", disk) for word in arguments]
-        process = FORK.Process(target=run_command, args=(words, self.work / "log"))
-        process.start()
-        return process
+        return start_fork(run_command, words, self.work / "log")
 
     def _log(self) -> str:
         return (self.work / "log").read_text(errors="replace")

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from typing import NamedTuple
 
 import bpy
 import numpy as np
@@ -30,63 +29,10 @@ Test = Callable[[bpy.types.PointCloud], np.ndarray]
 """Function from a level's point cloud to a mask (N,) bool."""
 
 
-class CleanupTest(NamedTuple):
-    """A test for unwanted splats, for menus and the operator.
-
-    Attributes:
-        identifier, label, about: entry of the enum of tests.
-        noun: the matching splats, in menus.
-        limits: names of its settings in ``cleaning.LIMITS``; empty for the selection.
-        find: function of the context, the root and the limits that returns masks (N,) by level number.
-    """
-
-    identifier: str
-    label: str
-    noun: str
-    about: str
-    limits: tuple[str, ...]
-    find: Callable[..., dict[int, np.ndarray]]
-
-
-TESTS = (
-    CleanupTest(
-        "LARGE", "Large", "Large Splats", "Splats larger than a length, such as fog", ("max_size",),
-        lambda context, root, size: find(root, size_test(root, size)),
-    ),
-    CleanupTest(
-        "FAINT", "Faint", "Faint Splats", "Splats of low opacity", ("min_opacity",),
-        lambda context, root, opacity: find(root, opacity_test(opacity)),
-    ),
-    CleanupTest(
-        "FAR", "Far", "Far Splats", "Splats far from every camera of the photos", ("max_distance",),
-        lambda context, root, distance: find(root, distance_test(context, root, distance)),
-    ),
-    CleanupTest(
-        "UNSEEN", "Few Views", "Rarely Seen Splats", "Splats in the frames of few cameras, occluded or not",
-        ("min_views",), lambda context, root, views: find(root, views_test(context, root, views)),
-    ),
-    CleanupTest(
-        "FLOATERS", "Floaters", "Floaters", "Small clusters of splats that are far from others",
-        ("gap", "share"),
-        lambda context, root, gap, percent: find_floaters(context, root, gap, percent / 100),
-    ),
-    CleanupTest(
-        "SELECTED", "Selected", "Selected Splats",
-        "Splats selected with the brush, the lasso or in Edit Mode", (),
-        lambda context, root: find(root, selected_mask),
-    ),
-)  # fmt: skip
-
-
 _in_stroke: dict[int, np.ndarray] = {}
 """Selection masks of the current stroke, by ``session_uid`` of the point cloud."""
 _counts: dict[int, tuple[tuple, int]] = {}
 """Cache keys and numbers of remaining splats, by ``session_uid`` of the point cloud."""
-
-
-def limit_property(name: str) -> str:
-    """Return the operator property of a limit: ``size`` for ``max_size``."""
-    return name.removeprefix("max_").removeprefix("min_")
 
 
 def size_test(root: bpy.types.Object, max_size: float) -> Test:
@@ -112,7 +58,7 @@ def distance_test(context: bpy.types.Context, root: bpy.types.Object, max_distan
 
 
 def views_test(context: bpy.types.Context, root: bpy.types.Object, min_views: int) -> Test:
-    """Return a test for splats in the frames of fewer than ``least`` cameras.
+    """Return a test for splats in the frames of fewer than ``min_views`` cameras.
 
     Raises:
         LodgsError: as :func:`cameras`.
@@ -326,29 +272,6 @@ def cameras(context: bpy.types.Context, root: bpy.types.Object) -> list[Camera]:
 def unit_length(root: bpy.types.Object) -> float:
     """Return the length of one splat unit in the world."""
     return max(axes_of(root).matrix_world.to_scale()) or 1.0
-
-
-def suggest_limits(context: bpy.types.Context, root: bpy.types.Object) -> dict[str, float]:
-    """Suggest limits by name, as lengths in the world.
-
-    About one splat in a hundred of the finest level is larger than ``size``, and one in twenty is farther
-    from the cameras than ``distance``.
-    """
-    cloud, unit = levels(root)[-1].object.data, unit_length(root)
-    means, scales = splat_attribute(cloud, "position"), splat_attribute(cloud, SCALE)
-    sample = slice(None, None, max(len(means) // 100_000, 1))
-    limits = {
-        "size": float(np.quantile(scales[sample].max(axis=1), 0.99)) * unit,
-        "gap": cleaning.default_gap(means) * unit,
-    }
-    try:
-        positions = np.array([camera.center for camera in cameras(context, root)], np.float32)
-    except LodgsError:
-        return limits
-    distances = np.full(len(means[sample]), np.inf, np.float32)
-    for position in positions:
-        np.minimum(distances, np.linalg.norm(means[sample] - position, axis=1), out=distances)
-    return limits | {"distance": float(np.quantile(distances, 0.95)) * unit}
 
 
 def bounds(root: bpy.types.Object) -> tuple[np.ndarray, np.ndarray]:

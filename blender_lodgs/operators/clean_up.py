@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import bpy
 from mathutils import Matrix
 
-from ...training.editing.cleaning import LIMITS
 from ...training.errors import LodgsError
 from ..data import cleaning, crops, roots, scenes
-from ..data.setting_properties import property_of
+from ..data.cleanup_tests import HIDE_TESTS, find_matches, limit_properties, limit_property, suggest_limits
 from .base import EditLevelsOperator, SceneOperator, report_errors
 from .brush import TOOLS
 
@@ -117,7 +114,7 @@ class LODGS_OT_hide_splats(EditLevelsOperator, bpy.types.Operator):
     test: bpy.props.EnumProperty(
         name="Splats",
         description="Splats to match",
-        items=[(test.identifier, test.label, test.about) for test in cleaning.TESTS],
+        items=[(test.identifier, test.label, test.about) for test in HIDE_TESTS],
     )
     action: bpy.props.EnumProperty(
         name="Action",
@@ -134,11 +131,11 @@ class LODGS_OT_hide_splats(EditLevelsOperator, bpy.types.Operator):
         layout.use_property_split = True
         layout.prop(self, "test")
         for name in self._chosen_test().limits:
-            layout.prop(self, cleaning.limit_property(name))
+            layout.prop(self, limit_property(name))
         layout.prop(self, "action")
 
     def invoke(self, context, event):
-        for name, value in cleaning.suggest_limits(context, roots.active_root(context)).items():
+        for name, value in suggest_limits(context, roots.active_root(context)).items():
             if not self.properties.is_property_set(name):
                 setattr(self, name, value)
         return self.execute(context)
@@ -146,7 +143,7 @@ class LODGS_OT_hide_splats(EditLevelsOperator, bpy.types.Operator):
     @report_errors
     def execute(self, context):
         root = roots.active_root(context)
-        matches = self._matches(context, root)
+        matches = find_matches(self._chosen_test(), context, root, self)
         count = sum(int(mask.sum()) for mask in matches.values())
         by_level = ", ".join(f"level {number} {mask.sum():,}" for number, mask in matches.items())
         if self.action == "SELECT":
@@ -159,27 +156,10 @@ class LODGS_OT_hide_splats(EditLevelsOperator, bpy.types.Operator):
         return {"FINISHED"}
 
     def _chosen_test(self):
-        return next(test for test in cleaning.TESTS if test.identifier == self.test)
-
-    def _matches(self, context, root):
-        test = self._chosen_test()
-        limits = (getattr(self, cleaning.limit_property(name)) for name in test.limits)
-        return test.find(context, root, *limits)
+        return next(test for test in HIDE_TESTS if test.identifier == self.test)
 
 
-def _limit(name: str) -> Any:
-    """Create the operator property of a limit of ``training.editing.cleaning``."""
-    f = LIMITS[name]
-    start = f.metadata["start"]
-    if name == "share":
-        return property_of(f, default=100 * start, max=100.0, precision=2, subtype="PERCENTAGE")
-    options = {"SKIP_SAVE"} if f.metadata["unit"] == "length" else set()  # suggested for each scene
-    return property_of(f, default=start, options=options)
-
-
-LODGS_OT_hide_splats.__annotations__ |= {
-    cleaning.limit_property(name): _limit(name) for test in cleaning.TESTS for name in test.limits
-}
+LODGS_OT_hide_splats.__annotations__ |= limit_properties(HIDE_TESTS)
 
 
 class LODGS_OT_show_hidden_splats(EditLevelsOperator, bpy.types.Operator):
@@ -224,10 +204,10 @@ class LODGS_MT_clean_up(bpy.types.Menu):
             operator.shape = shape
         layout.separator()
         layout.operator("lodgs.find_clutter")
-        for test in cleaning.TESTS:
+        for test in HIDE_TESTS:
             layout.operator("lodgs.hide_splats", text=f"Hide {test.noun}").test = test.identifier
         layout.separator()
-        for test in cleaning.TESTS:
+        for test in HIDE_TESTS:
             if test.limits:
                 operator = layout.operator("lodgs.hide_splats", text=f"Select {test.noun}")
                 operator.test, operator.action = test.identifier, "SELECT"

@@ -6,16 +6,17 @@ from typing import Any
 
 import bpy
 
-from ..data import cleaning, clutter, roots
+from ..data import cleaning, roots
+from ..data.cleanup_tests import (
+    CLUTTER_TESTS,
+    CleanupTest,
+    find_clutter,
+    limit_properties,
+    limit_property,
+    suggest_clutter_limits,
+    union,
+)
 from .base import EditLevelsOperator, report_errors
-
-_LABELS = {
-    "size": ("Size", "Splats with a larger standard deviation are selected"),
-    "distance": ("Distance", "Splats farther than this from the centre of the subject are selected"),
-    "gap": ("Gap", "Clusters closer than this count as one; 0 uses the density of the splats"),
-    "share": ("Largest Cluster", "Clusters with more than this share of all splats are not selected"),
-    "depth": ("Depth", "Splats deeper than this below the ground are selected"),
-}
 
 
 class LODGS_OT_find_clutter(EditLevelsOperator, bpy.types.Operator):
@@ -27,53 +28,51 @@ class LODGS_OT_find_clutter(EditLevelsOperator, bpy.types.Operator):
 
     def draw(self, context):
         layout = self.layout
-        for kind in clutter.KINDS:
+        for test in CLUTTER_TESTS:
             row = layout.row()
-            row.prop(self, kind.identifier)
+            row.prop(self, _use_name(test))
             column = layout.column()
             column.use_property_split = True
-            if getattr(self, kind.identifier):
-                row.label(text=f"{getattr(self, _count_name(kind.identifier)):,} splats")
-                for name in kind.limits:
-                    column.prop(self, name)
+            if getattr(self, _use_name(test)):
+                row.label(text=f"{getattr(self, _count_name(test)):,} splats")
+                for name in test.limits:
+                    column.prop(self, limit_property(name))
 
     @report_errors
     def execute(self, context):
         root = roots.active_root(context)
-        for name, value in clutter.suggest_limits(root).items():
+        for name, value in suggest_clutter_limits(root).items():
             if not self.properties.is_property_set(name):
                 setattr(self, name, value)
-        kinds = [kind.identifier for kind in clutter.KINDS if getattr(self, kind.identifier)]
-        limits = {name: getattr(self, name) for name in _LABELS}
-        matches = clutter.find_clutter(context, root, kinds, limits)
-        counts = {name: sum(int(mask.sum()) for mask in masks.values()) for name, masks in matches.items()}
-        for name, count in counts.items():
-            setattr(self, _count_name(name), count)
-        total = cleaning.select(root, clutter.union(matches, root))
-        labels = {kind.identifier: kind.label.lower() for kind in clutter.KINDS}
-        parts = ", ".join(f"{labels[name]} {count:,}" for name, count in counts.items() if count)
+        tests = [test for test in CLUTTER_TESTS if getattr(self, _use_name(test))]
+        matches = {test.label: find_clutter(test, context, root, self) for test in tests}
+        counts = {label: sum(int(mask.sum()) for mask in masks.values()) for label, masks in matches.items()}
+        for test in tests:
+            setattr(self, _count_name(test), counts[test.label])
+        total = cleaning.select(root, union(matches, root))
+        parts = ", ".join(f"{label.lower()} {count:,}" for label, count in counts.items() if count)
         self.report({"INFO"}, f"{total:,} splats selected{': ' if parts else ''}{parts}")
         return {"FINISHED"}
 
 
-def _count_name(kind: str) -> str:
-    return f"{kind}_count"
+def _use_name(test: CleanupTest) -> str:
+    return test.identifier.lower()
+
+
+def _count_name(test: CleanupTest) -> str:
+    return f"{_use_name(test)}_count"
 
 
 def _properties() -> dict[str, Any]:
-    """Return the operator's properties: use and count of each kind, and the limits."""
+    """Return the operator's properties: use and count of each test, and the limits."""
     result: dict[str, Any] = {}
-    for kind in clutter.KINDS:
-        result[kind.identifier] = bpy.props.BoolProperty(
-            name=kind.label, description=kind.about, default=kind.identifier != "below"
+    for test in CLUTTER_TESTS:
+        about = test.about + (", near the subject only" if test.clutter == "near" else "")
+        result[_use_name(test)] = bpy.props.BoolProperty(
+            name=test.label, description=about, default=test.identifier != "BELOW"
         )
-        result[_count_name(kind.identifier)] = bpy.props.IntProperty(options={"HIDDEN", "SKIP_SAVE"})
-    for name, (label, about) in _LABELS.items():
-        subtype = "PERCENTAGE" if name == "share" else "DISTANCE"
-        result[name] = bpy.props.FloatProperty(
-            name=label, description=about, min=0.0, subtype=subtype, options={"SKIP_SAVE"}
-        )
-    return result
+        result[_count_name(test)] = bpy.props.IntProperty(options={"HIDDEN", "SKIP_SAVE"})
+    return result | limit_properties(CLUTTER_TESTS)
 
 
 LODGS_OT_find_clutter.__annotations__ = _properties()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from ..data import cleaning, crops, roots
+from ..data.cleanup_tests import HIDE_TESTS
 from .parts import LevelsPanel, say
 
 
@@ -43,7 +44,7 @@ class LODGS_PT_clean_up(LevelsPanel):
 
         layout.label(text="Hide in All Levels")
         grid = layout.grid_flow(row_major=True, columns=2, even_columns=True, align=True)
-        for test in cleaning.TESTS:
+        for test in HIDE_TESTS:
             grid.operator("lodgs.hide_splats", text=test.label).test = test.identifier
 
         column = layout.column(align=True)

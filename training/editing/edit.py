@@ -80,19 +80,28 @@ def edit(
             edited.meta["up_rotation"] = np.eye(3)
     if out is not None:
         _write_like(source, bundle, out, edited)
-    report = [
-        f"level {level.number}: {len(result.rows):,} of {len(level.rows):,} splats"
-        for level, result in zip(bundle.levels, edited.levels, strict=True)
-    ]
     for path in plain:
         run_to_end(export_finest_level(path, edited, antialiased, original_place))
     _export_levels(edited, folder, streamed, antialiased)
-    report += [f"{path}: written" for path in outputs]
-    if edited.origin.any() and not (original_place and outputs == list(plain)):
-        report.append(describe_origin(edited.origin))
+    return _report(bundle, edited, outputs, keeps_place=original_place and outputs == list(plain))
+
+
+def _report(bundle: Bundle, edited: Bundle, outputs: Sequence[Path], keeps_place: bool) -> str:
+    """Report the remaining splats, the files, and a change of the origin.
+
+    Args:
+        keeps_place: all files have the original positions.
+    """
+    lines = [
+        f"level {level.number}: {len(result.rows):,} of {len(level.rows):,} splats"
+        for level, result in zip(bundle.levels, edited.levels, strict=True)
+    ]
+    lines += [f"{path}: written" for path in outputs]
+    if edited.origin.any() and not keeps_place:
+        lines.append(describe_origin(edited.origin))
     elif bundle.origin.any() and not edited.origin.any():
-        report.append("The placement drops the local origin: positions are no longer those of the original.")
-    return "\n".join(report)
+        lines.append("The placement drops the local origin: positions are no longer those of the original.")
+    return "\n".join(lines)
 
 
 def _check_outputs(

@@ -89,14 +89,17 @@ def compress(
         bundle = shrink_levels(bundle, data, settings, margin, job.backend)
         weights = np.concatenate([level.splats.extras.pop(_SIGNIFICANCE) for level in bundle.levels])
     write_bundle(out, bundle, codebook=make_codebook(bundle, settings.codes, weights))
-    size = out.stat().st_size
     report = [
         f"level {level.number}: {len(level.rows):,} of {count:,} splats"
         for level, count in zip(bundle.levels, counts, strict=True)
     ]
-    return "\n".join(
-        [*report, f"{out}: {size / 1e6:,.2f} MB, {1 - size / plain_size:.1%} smaller than a PLY"]
-    )
+    return "\n".join([*report, f"{out}: {describe_size(out.stat().st_size, plain_size)}"])
+
+
+def describe_size(size: int, plain_size: int) -> str:
+    """Describe the size of a compressed file, in relation to the same splats in a PLY."""
+    change = f"{abs(1 - size / plain_size):.1%} {'smaller' if size <= plain_size else 'larger'}"
+    return f"{size / 1e6:,.2f} MB, {change} than a PLY"
 
 
 def _levels_are_scenes(bundle: Bundle) -> bool:

@@ -65,14 +65,9 @@ def training_data(
         LodgsError: the scene cannot be read, or has too little data to train on.
     """
     report = report or _ignore
-    model, images = (Path(path) if path else None for path in (job.model, job.images))
-    full_scene = read_scene(
-        _scene_folder(job, folder, report), model=model, images=images, origin=_origin(job, folder)
-    )
     parameters = job.resolved_parameters()
     add_depths = pixels and parameters.depth == "metric" and not job.cell and not job.cells
-    if not (add_depths and all(camera.depth is not None for camera in full_scene.cameras)):
-        full_scene = ensure_points(full_scene, job, folder, report)
+    full_scene = _read_job_scene(job, folder, report, add_depths)
     region = Region.read(Path(job.cell)) if job.cell else None
     scene = full_scene if region is None else region.select_views(full_scene)
     if pixels:
@@ -83,14 +78,13 @@ def training_data(
     if scene.distorted:
         report("status", message=f"Undistorting {len(scene.distorted)} views")
         scene = undistort_scene(scene, undistort_cache(scene, folder.undistorted))
-    depths = None
     if add_depths:
         scene = add_depth_points(scene)
     full_scene = full_scene if job.cells or region is not None else scene
+    depths = gains = None
     if pixels and parameters.depth_weight:
         depths = DepthPriors(scene, parameters.depth)
         scene = replace(scene, warnings=[*scene.warnings, *depths.warnings])
-    gains = None
     if pixels and parameters.match_exposure:
         gains = _match_exposure(job, scene, full_scene, report)
     if job.crop is not None:
@@ -99,18 +93,24 @@ def training_data(
     for warning in warnings:
         report("warning", message=warning)
     if region is not None:
-        inside = region.start_points(full_scene)
-        scene = replace(scene, points=full_scene.points[inside], point_colors=full_scene.point_colors[inside])
+        scene = region.select_points(scene, full_scene)
     return TrainingData(
         scene, job.image_scale, job.test_every, job.exposure, job.validation,
         photo_memory=job.photo_memory * 10**6 or None,
-        splat_memory=job.splat_memory * 10**6 or None,
-        scratch=folder.checkpoints,
-        full_scene=full_scene,
-        depths=depths,
-        region=job.crop,
-        gains=gains,
+        splat_memory=job.splat_memory * 10**6 or None, scratch=folder.checkpoints,
+        full_scene=full_scene, depths=depths, region=job.crop, gains=gains,
     )  # fmt: skip
+
+
+def _read_job_scene(job: Job, folder: RunFolder, report: Callable[..., None], add_depths: bool) -> Scene:
+    """Read a job's scene, with points unless depth maps of all views will add them."""
+    model, images = (Path(path) if path else None for path in (job.model, job.images))
+    scene = read_scene(
+        _scene_folder(job, folder, report), model=model, images=images, origin=_origin(job, folder)
+    )
+    if add_depths and all(camera.depth is not None for camera in scene.cameras):
+        return scene
+    return ensure_points(scene, job, folder, report)
 
 
 def ensure_points(scene: Scene, job: Job, folder: RunFolder, report: Callable[..., None]) -> Scene:

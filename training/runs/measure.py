@@ -50,7 +50,7 @@ def evaluate_run(
     Args:
         run: run folder.
         controls: controls of the run's rule by name (``lod.rule``). Missing ones have their defaults.
-        image: PNG file to write, showing all levels from the middle held-out view.
+        image: PNG file to write, with all levels from the middle held-out view.
         far: also measure the levels from greater distances (``evaluate.distance``).
         warn: called with warnings about the scene, such as missing photos.
 
@@ -59,16 +59,14 @@ def evaluate_run(
 
         - ``levels``: levels that are complete by themselves, coarse to fine: ``level``, facts, ``splats``,
           ``drawn``, ``psnr``, ``ssim``, ``frame_s``, ``veil``. Cumulative levels include all coarser ones.
-          Coarser levels in memory also have ``merged``, the PSNR of the finest level with neighbours merged
-          to the same number of splats, the baseline that a level must beat.
-        - ``train_psnr``, ``veil``, ``oversized``, ``worst``, ``fitted_psnr`` of the finest level
-          (``evaluate.summary``)
+          Coarser levels in memory also have ``merged``, the PSNR of the finest level merged to as many splats
+        - ``train_psnr``, ``veil``, ``oversized``, ``worst``, ``fitted_psnr``: see ``evaluate.summary``
         - ``aside``, if the scene has views off its path (``scenes.offset_views``): mean ``psnr`` of the
           finest level and names of these ``views``
         - ``selective``: quality with the rule, selected per view, and once for the mean training camera
           (not if the bundle exceeds memory), with the rule's controls; empty without a rule
-        - ``loaded``: mean number of splats that a viewer loads for a view: with chunks those of their sets,
-          otherwise all (not if the bundle exceeds memory)
+        - ``loaded``: mean number of splats that a viewer loads for a view, all without chunks (not if the
+          bundle exceeds memory)
         - ``frame_s``: seconds per frame ``by_distance``, including selection, and in ``full`` detail, drawn
           alternately; not for rules that always weight
         - ``curve``: as ``selective``, for each value of the rule's ``sweep``
@@ -87,11 +85,11 @@ def evaluate_run(
     evaluation = Evaluation(data, job.backend, bundle.antialias)
     rule, values = _resolve_rule(bundle, controls or {})
     report = _measure_levels(job, evaluation, bundle)
+    middle = evaluation.cameras[len(evaluation.cameras) // 2]
     if rule:
         report |= _measure_rule(job, evaluation, bundle, rule, values)
     if folder.model.exists():
         report["networks"] = _measure_networks(job, folder, evaluation)
-    middle = evaluation.cameras[len(evaluation.cameras) // 2]
     if far and rule:
         report["farther"] = measure_farther_views(evaluation, bundle, values)
         report["jumps"] = measure_popping(evaluation, bundle, values, middle)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import LodgsError, printable
-from ..files import check_folder
+from ..files import check_folder, is_file
 from ..splats.origin import NO_ORIGIN, choose_origin
 from . import point_cloud
 from .cameras import MAX_COORDINATE, Camera, camera_extent, pick_evenly
@@ -241,17 +241,8 @@ def read_scene(
         images = _find_images(folder, model, [pose.name for pose in poses], warnings)
     images = _absolute(images)
     views = _view_collector(folder, images)
-    for number, pose in enumerate(poses):
-        if progress and number % 50 == 0:
-            progress(0.5 * number / len(poses))
-        views.add(pose, intrinsics[pose.camera_id])
-    if not views.cameras:
-        raise LodgsError(
-            f"Cannot read scene: none of the {len(poses)} views of {model} has a usable photo in {images}."
-            + "".join(f" {quote_name(name)}: {reason}" for name, reason in views.excluded[:1]),
-            "Choose the folder that holds the images under the names used by the model.",
-        )
-
+    views.add_all(poses, intrinsics, lambda share: progress and progress(0.5 * share))
+    views.require_cameras(model, images)
     points, colors, ids = _read_model_points(model, views.cameras, warnings)
     if origin is None:
         origin = choose_origin(np.array([pose.center for pose in poses]), points)
@@ -326,7 +317,7 @@ def _inliers(
 
 def _point_cloud(model: Path) -> Path | None:
     """Return the point cloud in place of a model's points: points3D.ply, or the only PLY of the folder."""
-    clouds = sorted(path for path in model.iterdir() if path.suffix.lower() == ".ply" and path.is_file())
+    clouds = sorted(path for path in model.iterdir() if path.suffix.lower() == ".ply" and is_file(path))
     named = [path for path in clouds if path.stem.lower() == "points3d"]
     return named[0] if named else clouds[0] if len(clouds) == 1 else None
 
@@ -484,7 +475,7 @@ def _require_complete_model(folder: Path) -> None:
     """Raise an error that names the missing file, if a folder has a part of a COLMAP model."""
     for root in (folder, folder / "sparse", folder / "sparse" / "0"):
         for suffix in (".bin", ".txt"):
-            present = {name for name in ("cameras", "images") if (root / f"{name}{suffix}").is_file()}
+            present = {name for name in ("cameras", "images") if is_file(root / f"{name}{suffix}")}
             if len(present) == 1:
                 missing = ({"cameras", "images"} - present).pop()
                 raise LodgsError(

@@ -21,6 +21,7 @@ import numpy as np
 
 from ..documents import open_file, read_lines
 from ..errors import LodgsError, printable
+from ..files import is_file
 from .lenses import LENS_BY_NAME, LENSES, Intrinsics, intrinsics_of
 
 DAMAGED_REMEDY = "Copy the model again, or rewrite it with COLMAP's model_converter."
@@ -51,7 +52,7 @@ class Pose:
 def model_suffix(folder: Path) -> str:
     """Return the suffix of a folder's model files, ".bin" (preferred) or ".txt", or "" without a model."""
     for suffix in (".bin", ".txt"):
-        if (folder / f"cameras{suffix}").is_file() and (folder / f"images{suffix}").is_file():
+        if is_file(folder / f"cameras{suffix}") and is_file(folder / f"images{suffix}"):
             return suffix
     return ""
 
@@ -108,7 +109,7 @@ def read_points(model: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     Raises:
         LodgsError: the file is damaged.
     """
-    if not (model / f"points3D{model_suffix(model)}").is_file():
+    if not is_file(model / f"points3D{model_suffix(model)}"):
         return _NO_POINTS
     return _read(model, "points3D", {".bin": _parse_points_bin, ".txt": _parse_points_txt})
 

@@ -98,7 +98,7 @@ class SidecarFiles:
         Args:
             name: a photo, whose file name serves as an example.
         """
-        if not (self._exists and any(path.is_file() for path in self.folder.rglob("*"))):
+        if not (self._exists and any(is_file(path) for path in self.folder.rglob("*"))):
             return ""
         file = name + self._suffixes[0]
         return f"No file in {self.folder} matches a photo: the file of {name} must be named {file}."
@@ -137,7 +137,7 @@ def find_image_folder(folder: Path, model: Path, names: Sequence[str]) -> tuple[
     for root in roots:
         candidates += [*(root / name for name in _COMMON_NAMES), *sorted(root.glob("images*")), root]
     names = [name for name in names if _is_inside(name)]
-    counts = [sum(os.path.isfile(candidate / name) for name in names) for candidate in candidates]
+    counts = [sum(is_file(candidate / name) for name in names) for candidate in candidates]
     if not any(counts):
         counts = [len(_stems(names) & _stems(_file_names(candidate))) for candidate in candidates]
     return candidates[counts.index(max(counts))], max(counts)

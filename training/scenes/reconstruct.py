@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import LodgsError, SystemProblem, system_reason
-from ..files import atomic_write, check_folder, link_or_copy
+from ..files import atomic_write, check_folder, is_file, link_or_copy
 from . import pycolmap_process
 from .colmap import MASKS, find_models
 from .image_files import MASK_SUFFIXES, SidecarFiles
@@ -275,7 +275,7 @@ def _check_photos(photos: Path, names: Sequence[str], excluded: Sequence[tuple[s
 
 def _check_output(out: Path, work: Path) -> None:
     """Raise LodgsError if the scene's folder contains a scene or files of another program."""
-    if (work / SETTINGS).is_file():
+    if is_file(work / SETTINGS):
         return
     if out.is_dir() and find_models(out):
         raise LodgsError(f"Cannot write scene: {out} already holds a COLMAP scene.", "Choose another folder.")
@@ -304,7 +304,7 @@ def _start_work(work: Path, settings: Mapping[str, object]) -> None:
     """Create the folder of intermediate results, and discard those of other settings."""
     file = work / SETTINGS
     text = json.dumps(settings)
-    if file.is_file() and file.read_text(encoding="utf-8") != text:
+    if is_file(file) and file.read_text(encoding="utf-8") != text:
         shutil.rmtree(work)
     work.mkdir(parents=True, exist_ok=True)
     with atomic_write(file) as temporary:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import LodgsError, system_reason
+from ..files import is_file
 from . import pycolmap_process
 from .cameras import Camera
 from .colmap import DEPTHS, MASKS, Scene, read_scene, scene_lenses
@@ -133,7 +134,7 @@ def _undistort_into(target: Path, scene: Scene) -> None:
 def _reads_photo(scene: Scene, camera: Camera) -> bool:
     """Return False if pycolmap cannot read a photo, clips it, writes a rare variant or misses its file."""
     unsupported = camera.name.lower().endswith((".webp", ".exr", ".tif", ".tiff"))
-    return not unsupported and os.path.isfile(scene.images_folder / camera.name)
+    return not unsupported and is_file(scene.images_folder / camera.name)
 
 
 def _resample_files(scene: Scene, camera: Camera, source: np.ndarray, out: Path) -> None:

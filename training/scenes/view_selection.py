@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +40,15 @@ class ViewCollector:
         self.distorted: list[str] = []
         self.excluded: list[tuple[str, str]] = []
 
+    def add_all(
+        self, poses: Sequence[Pose], lenses: Mapping[int, Intrinsics], progress: Callable[[float], object]
+    ) -> None:
+        """Add views, with the lenses by id; report the fraction of added views now and then."""
+        for number, pose in enumerate(poses):
+            if number % 50 == 0:
+                progress(number / len(poses))
+            self.add(pose, lenses[pose.camera_id])
+
     def add(self, pose: Pose, lens: Intrinsics) -> None:
         """Add a view at the size of its photo, or record the reason for skipping it."""
         name = pose.name.replace("\\", "/")
@@ -74,6 +83,17 @@ class ViewCollector:
         self.cameras.append(camera)
         if lens.distorted:
             self.distorted.append(name)
+
+    def require_cameras(self, model: Path, images: Path) -> None:
+        """Raise LodgsError unless a view is usable."""
+        if self.cameras:
+            return
+        count = len(self.excluded) + len(self._missing)
+        raise LodgsError(
+            f"Cannot read scene: none of the {count} views of {model} has a usable photo in {images}."
+            + "".join(f" {quote_name(name)}: {reason}" for name, reason in self.excluded[:1]),
+            "Choose the folder that holds the images under the names used by the model.",
+        )
 
     def drop_outliers(self, inliers: np.ndarray) -> None:
         """Drop the cameras outside the mask ``inliers`` (V,)."""

@@ -125,7 +125,7 @@ def test_pruned_splats_are_the_least_significant_in_the_training_views(run, tmp_
         assert scores[level.splats.extras["row"]].min() >= np.sort(scores)[-count]
         assert list(level.splats.extras) == ["row"] and len(rows) == count
     assert f"level 1: 15 of 20 splats\nlevel 2: {count} of {len(given.splats)} splats\n" in report
-    assert "smaller than a PLY" in report
+    assert report.endswith("than a PLY")
 
 
 def test_distillation_approaches_the_original_and_keeps_minimum_sizes(tiny_scene, splats):
@@ -175,3 +175,14 @@ def test_mistakes_give_one_sentence(run, tmp_path, capsys, source, out, words, m
     assert main(["compress", str(tmp_path / source), "--out", str(tmp_path / out), *words]) == 2
     error = capsys.readouterr().err
     assert message in error and error.startswith("error: ") and len(error.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("size", "plain", "text"),
+    [
+        (70_000, 1_000_000, "0.07 MB, 93.0% smaller than a PLY"),
+        (16_000, 10_000, "0.02 MB, 60.0% larger than a PLY"),  # the codebook of a tiny file
+    ],
+)
+def test_sizes_are_described_as_smaller_or_larger(size, plain, text):
+    assert module.describe_size(size, plain) == text

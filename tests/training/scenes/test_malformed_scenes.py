@@ -83,10 +83,10 @@ def test_names_that_leave_the_folder_on_any_system(scene, name):
 
 
 def test_search_for_image_folder_stays_inside_the_scene(scene, monkeypatch):
-    checked, isfile = [], os.path.isfile
+    checked, is_file = [], image_files.is_file
     names = ["a.png", "//server/share/a.png", "../../secret.png", "C:/a.png", "\\\\server\\a.png"]
     write_text_model(scene / "sparse" / "0", views(*names), grid())
-    monkeypatch.setattr(image_files.os.path, "isfile", lambda path: checked.append(path) or isfile(path))
+    monkeypatch.setattr(image_files, "is_file", lambda path: checked.append(path) or is_file(path))
     for folder in (scene, scene / "sparse" / "0", scene / "sparse"):
         assert len(read_scene(folder).cameras) == 1
     assert checked

@@ -3,13 +3,18 @@
 from dataclasses import dataclass, replace
 
 from ...errors import LodgsError
+from ...optimize.flod_parameters import (
+    PAPER_FOOTPRINT,
+    PAPER_INTERVALS,
+    PAPER_STEPS,
+    PAPER_UNTIL,
+    STANDARD_STEPS,
+    FlodLevels,
+)
 from ...optimize.method_info import MethodInfo
 from ...optimize.parameters import PAPER, STANDARD, DensityParameters
 from ...settings import setting
-from ...splats.levels import MAX_LEVELS
 
-PAPER_FOOTPRINT = 40.0
-"""Approximate size in pixels of the paper's lambda, 0.2 COLMAP units, at the median depth of its scenes."""
 BLENDED_LEVELS = 3
 """Number of finest levels that are blended by default (``Bands.defaults``) and that finishing steps train."""
 CELL_LEVELS = 2
@@ -17,16 +22,12 @@ CELL_LEVELS = 2
 
 
 @dataclass(frozen=True)
-class FlodParameters(DensityParameters):
+class FlodParameters(FlodLevels, DensityParameters):
     """Parameters of FLoD.
 
     Tuples have one entry per level, coarse to fine. ``max_splats`` limits the last level.
     """
 
-    levels: int = setting(5, "Number of levels (FLoD: L_max).", low=1, high=MAX_LEVELS)
-    rho: float = setting(
-        4.0, "Ratio of the minimum splat sizes of two neighbouring levels (FLoD: rho).", above=1
-    )
     footprint: float = setting(
         16.0,
         "Detail of level 1, in pixels at the scene's median depth: its minimum splat size (FLoD: lambda) if "
@@ -34,9 +35,6 @@ class FlodParameters(DensityParameters):
         label="Coarsest Detail",
         above=0,
         unit="px",
-    )
-    s_min_1: float = setting(
-        0.0, "Minimum splat size of level 1 in scene units (FLoD: lambda). 0 derives it from 'footprint'."
     )
     steps: tuple[int, ...] = setting(
         (250, 400, 500, 750, 1250), "Training steps of each level.", above=0, unit="steps"
@@ -46,13 +44,6 @@ class FlodParameters(DensityParameters):
     )
     densify_interval: tuple[int, ...] = setting(
         (50,) * 5, "Steps between two densifications.", above=0, unit="steps"
-    )
-    budget_ratio: float = setting(
-        0.6,
-        "Maximum splat count of a trained level, as a fraction of the next finer level's; below 1 every "
-        "level adds splats. The levels of the paper have about this ratio.",
-        above=0,
-        high=1,
     )
     overlap_interval: int = setting(
         50,
@@ -185,7 +176,7 @@ _DRAFT = FlodParameters()
 _STANDARD = replace(
     _DRAFT,
     **STANDARD,
-    steps=(2_000, 3_000, 4_000, 6_000, 15_000),
+    steps=STANDARD_STEPS,
     refine_steps=1_000,
     densify_interval=(100,) * 5,
 )
@@ -193,10 +184,9 @@ _PAPER = replace(
     _STANDARD,
     **PAPER,
     footprint=PAPER_FOOTPRINT,
-    steps=(10_000, 15_000, 20_000, 25_000, 30_000),
-    # the published program leaves out the last step of density control
-    densify_until=(0.499, 0.399, 0.399, 0.399, 0.499),
-    densify_interval=(2000, 1000, 500, 500, 200),
+    steps=PAPER_STEPS,
+    densify_until=PAPER_UNTIL,
+    densify_interval=PAPER_INTERVALS,
     levels_from="trained",
     overlap_interval=1000,
     rejoin_points=False,

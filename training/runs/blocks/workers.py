@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from ...errors import LodgsError
+from ...files import is_file
 from .. import processes
 from ..failures import CANCELLED
 from ..folder import RunFolder
@@ -125,16 +126,8 @@ def workers(on: str = HERE, resources: dict[str, float] | None = None, tls: bool
         return
     kind, _, count = on.partition(":")
     local = kind == "local" and count.isdecimal() and int(count) > 0
-    if not local and "://" not in on and not os.path.isfile(on):
-        raise LodgsError(
-            f"Unknown workers '{on}'.",
-            "Use here, local:2 (two blocks at a time), or the file that lodgs blocks scheduler has written.",
-        )
-    if tls and "://" in on and not on.startswith("tls://"):
-        raise LodgsError(
-            f"Cannot use {on}: other users could run programs through its unencrypted connections.",
-            "Start it with lodgs blocks scheduler FILE and use --on FILE, or add --no-tls.",
-        )
+    if not local:
+        _check_scheduler(on, tls)
     distributed = import_dask()
     threads, cards = 0, []
     cluster: Any = on
@@ -172,6 +165,20 @@ def workers(on: str = HERE, resources: dict[str, float] | None = None, tls: bool
         client.close()
         if local:
             cluster.close()
+
+
+def _check_scheduler(on: str, tls: bool) -> None:
+    """Raise an error unless this is a key file or an address that may be used."""
+    if "://" not in on and not is_file(on):
+        raise LodgsError(
+            f"Unknown workers '{on}'.",
+            "Use here, local:2 (two blocks at a time), or the file that lodgs blocks scheduler has written.",
+        )
+    if tls and "://" in on and not on.startswith("tls://"):
+        raise LodgsError(
+            f"Cannot use {on}: other users could run programs through its unencrypted connections.",
+            "Start it with lodgs blocks scheduler FILE and use --on FILE, or add --no-tls.",
+        )
 
 
 def graphics_cards() -> list[str]:

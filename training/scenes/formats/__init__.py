@@ -16,7 +16,7 @@ from types import ModuleType
 import numpy as np
 
 from ...errors import LodgsError, SystemProblem, system_reason
-from ...files import check_folder, link_or_copy
+from ...files import check_folder, is_file, link_or_copy
 from ..colmap import DEPTHS, MASKS, NO_POINTS, find_models, read_scene, scene_lenses, subfolders
 from ..colmap_model import model_suffix
 from ..image_files import find_image_folder
@@ -116,7 +116,7 @@ def convert_export(folder: Path, out: Path | None = None) -> ConvertedScene:
             "Check its cameras and the photos next to it.",
         )
     warnings = [*exported.warnings, *exclusion_messages(excluded)]
-    if missing := [view.mask for view in views if view.mask is not None and not os.path.isfile(view.mask)]:
+    if missing := [view.mask for view in views if view.mask is not None and not is_file(view.mask)]:
         warnings.append(
             f"{len(missing)} masks are missing, such as {missing[0]}. Their photos are not masked."
         )
@@ -236,7 +236,7 @@ def _write(scene: Path, views: list[ExportedView], points: np.ndarray, colors: n
     sparse.mkdir(parents=True, exist_ok=True)
     names = [view.image.relative_to(images).as_posix() for view in views]
     for view, name in zip(views, names, strict=True):
-        if view.mask is not None and os.path.isfile(view.mask):
+        if view.mask is not None and is_file(view.mask):
             link_or_copy(view.mask, scene / MASKS / f"{name}.png")
         if view.depth is not None and view.has_depth:
             link_or_copy(view.depth, scene / DEPTHS / f"{name}{view.depth.suffix.lower()}")

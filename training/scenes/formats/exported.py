@@ -15,6 +15,7 @@ import numpy as np
 
 from ...documents import read_json
 from ...errors import LodgsError
+from ...files import is_file
 from ..cameras import Camera
 from ..colmap import DEPTH_SUFFIXES
 from ..image_files import NO_PHOTOS, walk_files
@@ -50,11 +51,7 @@ class ExportedView:
     @property
     def has_depth(self) -> bool:
         """True if the depth map exists in a supported format."""
-        return (
-            self.depth is not None
-            and self.depth.suffix.lower() in DEPTH_SUFFIXES
-            and os.path.isfile(self.depth)
-        )
+        return self.depth is not None and self.depth.suffix.lower() in DEPTH_SUFFIXES and is_file(self.depth)
 
     def sized(self, width: int, height: int) -> ExportedView:
         """Return the view with the lens scaled to photos of the given size."""
@@ -210,7 +207,7 @@ def find_image(folder: Path, name: str) -> Path:
         for candidate in _candidates(folder, spelling):
             stem = candidate.stem if candidate.suffix in _SUFFIXES else candidate.name
             for path in (candidate, *(candidate.with_name(stem + suffix) for suffix in _SUFFIXES)):
-                if os.path.isfile(path):  # Path.is_file raises for long names
+                if is_file(path):
                     return path
     return _candidates(folder, name)[0]
 
@@ -233,12 +230,12 @@ def find_file(folder: Path, *names: str) -> Path | None:
         return None
     candidates = [folder / name for name in names]
     candidates += [folder / entries[name.casefold()] for name in names if name.casefold() in entries]
-    return next((path for path in candidates if os.path.isfile(path)), None)
+    return next((path for path in candidates if is_file(path)), None)
 
 
 def visible_files(folder: Path) -> list[Path]:
     """Return the sorted files of a folder without hidden ones, such as those that macOS adds to archives."""
-    return sorted(path for path in folder.iterdir() if path.name[0] != "." and path.is_file())
+    return sorted(path for path in folder.iterdir() if path.name[0] != "." and is_file(path))
 
 
 class PhotoFinder:
@@ -266,7 +263,7 @@ class PhotoFinder:
             LodgsError: if several photos match.
         """
         expected = self._expected(name)
-        if os.path.isfile(expected) or (path := self.locate(name)) is None:
+        if is_file(expected) or (path := self.locate(name)) is None:
             return expected
         self._moved.append((expected, path))
         return path
@@ -274,7 +271,7 @@ class PhotoFinder:
     def _expected(self, name: str) -> Path:
         """Return the photo at its exported place, or that place in the preferred folder."""
         places = [find_image(root, name) for root in self._roots]
-        return next((path for path in places if os.path.isfile(path)), places[0])
+        return next((path for path in places if is_file(path)), places[0])
 
     def locate(self, name: str) -> Path | None:
         """Return the photo below the folder that has most of the name's last parts, or None.

@@ -7,7 +7,6 @@ fisheye's x has the length of its angle to the axis.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from xml.etree import ElementTree
@@ -17,6 +16,7 @@ import numpy as np
 
 from ...documents import open_file
 from ...errors import LodgsError
+from ...files import is_file
 from ..lenses import Intrinsics
 from .exported import (
     ExportedScene,
@@ -232,7 +232,7 @@ class _LabelFinder:
         label = camera.get("label", "")
         for name in _IMAGES:
             path = find_image(self._folder / name, label)
-            if os.path.isfile(path):
+            if is_file(path):
                 return path
         # Metashape names groups after their folders.
         return (

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import LodgsError
+from ...files import is_file
 from ..images import image_size
 from .exported import (
     ExportedScene,
@@ -69,7 +70,7 @@ def _photo_size(values: Mapping[str, Any], original: Path, image: Path) -> tuple
 
     Newer versions write no size into corrected cameras.
     """
-    for source in (values, read_document(original) if original.is_file() else {}):
+    for source in (values, read_document(original) if is_file(original) else {}):
         size = get_number(source, "width", 0), get_number(source, "height", 0)
         if min(size) > 0:
             return size

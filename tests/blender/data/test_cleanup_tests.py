@@ -1,5 +1,7 @@
 """All kinds of clutter in one step, planted around a square garden with the ground at z = 1."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -33,12 +35,20 @@ def root(bpy, lodgs, tmp_path):
     return root
 
 
+def clutter_counts(bpy, lodgs, root):
+    """Numbers of matching splats of level 1 by test, with suggested limits."""
+    cleanup_tests = lodgs("data.cleanup_tests")
+    limits = SimpleNamespace(**cleanup_tests.suggest_clutter_limits(root))
+    return {
+        test.identifier: int(cleanup_tests.find_clutter(test, bpy.context, root, limits)[1].sum())
+        for test in cleanup_tests.CLUTTER_TESTS
+    }
+
+
 def test_every_kind_is_counted_selected_and_hidden(bpy, lodgs, root):
-    clutter = lodgs("data.clutter")
     isolated = FLOATERS + BELOW  # distant ones are not near the subject
-    kinds = {"oversized": OVERSIZED, "distant": DISTANT, "floaters": isolated, "below": BELOW}
-    matches = clutter.find_clutter(bpy.context, root, list(kinds), clutter.suggest_limits(root))
-    assert {name: int(masks[1].sum()) for name, masks in matches.items()} == kinds
+    expected = {"LARGE": OVERSIZED, "DISTANT": DISTANT, "FLOATERS": isolated, "BELOW": BELOW}
+    assert clutter_counts(bpy, lodgs, root) == expected
     assert bpy.ops.lodgs.find_clutter() == {"FINISHED"}
     count = OVERSIZED + DISTANT + isolated
     cleaning = lodgs("data.cleaning")
@@ -54,21 +64,20 @@ def test_every_kind_is_counted_selected_and_hidden(bpy, lodgs, root):
 
 def test_limits_are_lengths_in_the_world(bpy, lodgs, root):
     """Splats 7 above the ground; the root doubles lengths."""
-    for distance, count in ((13, DISTANT + FLOATERS), (16, DISTANT)):
-        assert bpy.ops.lodgs.find_clutter(oversized=False, floaters=False, distance=distance) == {"FINISHED"}
+    for reach, count in ((13, DISTANT + FLOATERS), (16, DISTANT)):
+        assert bpy.ops.lodgs.find_clutter(large=False, floaters=False, reach=reach) == {"FINISHED"}
         assert lodgs("data.cleaning").count_selected(root)[2] == count
 
 
 def test_dialog_lists_the_counts(bpy, lodgs, root):
-    from types import SimpleNamespace
-
     texts, operator = [], lodgs("operators.find_clutter").LODGS_OT_find_clutter
 
     class Layout:
         def __getattr__(self, name):
             return lambda *args, **options: texts.append(options.get("text", "")) or self
 
-    values = {kind.identifier: kind.identifier != "below" for kind in lodgs("data.clutter").KINDS}
+    tests = lodgs("data.cleanup_tests").CLUTTER_TESTS
+    values = {test.identifier.lower(): test.identifier != "BELOW" for test in tests}
     counts = {f"{name}_count": 1234 for name in values}
     operator.draw(SimpleNamespace(layout=Layout(), **values, **counts), bpy.context)
     assert texts.count("1,234 splats") == 3
@@ -81,6 +90,14 @@ def test_scene_without_ground_has_nothing_below(bpy, lodgs, tmp_path):
     splats = Splats(means, quats, means * 0 - 4, np.full(len(means), 4, np.float32), means[:, None] * 0)
     write_bundle(tmp_path / "b.ply", Bundle("", [Level(1, splats)]))
     root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply")
-    clutter = lodgs("data.clutter")
-    matches = clutter.find_clutter(bpy.context, root, ["below"], clutter.suggest_limits(root))
-    assert not matches["below"][1].any()
+    assert clutter_counts(bpy, lodgs, root)["BELOW"] == 0
+
+
+def test_large_background_matches_the_test_but_is_no_clutter(bpy, lodgs, root):
+    cloud = root.lodgs.levels[0].object.data
+    scales = np.array(lodgs("attributes").view_attribute(cloud, "scale"))
+    scales[REST + OVERSIZED : REST + OVERSIZED + DISTANT] = 100
+    lodgs("attributes").write_attribute(cloud, "scale", "FLOAT_VECTOR", scales)
+    assert clutter_counts(bpy, lodgs, root)["LARGE"] == OVERSIZED
+    assert bpy.ops.lodgs.hide_splats(test="LARGE", size=1.0, action="SELECT") == {"FINISHED"}
+    assert lodgs("data.cleaning").count_selected(root) == {1: OVERSIZED + DISTANT, 2: OVERSIZED}
