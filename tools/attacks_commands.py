@@ -75,6 +75,7 @@ COMMANDS = {
     "edit spz": Command(("edit", *PLAIN, "DISK/plain.spz"), converts=True),
     "edit sog": Command(("edit", *PLAIN, "DISK/plain.sog"), converts=True),
     "edit streamed": Command(("edit", "INPUTS/run", "--streamed", "DISK/streamed"), converts=True),
+    "compress": Command(("compress", "INPUTS/run", "--out", "DISK/small.ply", "--distill-steps", "4")),
     "render png": Command(("render", "INPUTS/run", *VIEW, "--out", "DISK/view.png")),
     "render exr": Command(("render", "INPUTS/run", *VIEW, "--out", "DISK/view.exr")),
     "capture": Command(("capture", "INPUTS/base.ply", "--out", "DISK/captured", *VIEWS)),
@@ -93,6 +94,7 @@ COMMANDS = {
     "blocks plan": Command(
         ("blocks", "plan", "INPUTS/scene", "--out", "DISK/blocks", "--cells", "2x1", *FLOD)
     ),
+    "blocks run": Command(("blocks", "run", "DISK/blocks"), "blocks"),
 }  # fmt: skip
 
 
@@ -131,6 +133,7 @@ class Attack:
         for arguments in (
             ("train", "INPUTS/scene", "--out", "INPUTS/run", *FLOD),
             ("capture", "INPUTS/base.ply", "--out", "INPUTS/views", *VIEWS),
+            ("blocks", "plan", "INPUTS/scene", "--out", "INPUTS/blocks", "--cells", "2x1", *FLOD),
         ):
             if code := exit_code(self._run(arguments)):
                 raise RuntimeError(f"{arguments[0]} ended with {code}: {self._log()}")

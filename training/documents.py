@@ -7,13 +7,15 @@ again. Time and memory grow linearly with the length of the text, which is limit
 
 from __future__ import annotations
 
-import codecs
+import io
 import json
 import math
 import re
 import reprlib
+import tempfile
 import tomllib
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import IO, Any, AnyStr
 
@@ -31,6 +33,8 @@ MAX_INTEGER = 2**63 - 1
 """Largest integer that 64 bits hold."""
 
 _LFS_POINTER = b"version https://git-lfs.github.com/spec/"
+DECIMAL_COMMAS = "its numbers have decimal commas"
+_DECIMAL_COMMA = re.compile(r"(?<![^\s'\"])[-+]?\d*,\d+(?:[eE][-+]?\d+)?(?![^\s'\"])")
 _UNPRINTABLE = re.compile("[\0\ud800-\udfff]")
 _QUOTES = reprlib.Repr()
 _QUOTES.maxstring = _QUOTES.maxother = 200
@@ -58,6 +62,56 @@ def open_file(path: str | Path) -> IO[bytes]:
         raise LodgsError(
             f"Cannot read {printable(path)}: the name is not a valid file name.", "Check the path."
         ) from None
+
+
+def open_text(path: str | Path) -> IO[bytes]:
+    """Open a text file that starts with ASCII for reading, converted to UTF-8 without byte-order mark.
+
+    Files with the mark or the zero bytes of UTF-16 and UTF-32, which Windows programs write, are converted to
+    a temporary file. Other bytes stay as they are.
+
+    Raises:
+        LodgsError: as :func:`open_file`, or the text is not valid.
+    """
+    file = open_file(path)
+    head = file.read(32)
+    file.seek(0)
+    encoding = json.detect_encoding(head)
+    if encoding == "utf-8" or not re.match(r"[\s!-~]{3}", head.decode(encoding, "ignore")):
+        return file
+    errors = "surrogateescape" if encoding == "utf-8-sig" else "strict"
+    with ExitStack() as stack:
+        converted = stack.enter_context(tempfile.TemporaryFile())
+        try:
+            with io.TextIOWrapper(file, encoding, errors) as text:
+                while block := text.read(1 << 20):
+                    converted.write(block.encode("utf-8", errors))
+        except ValueError as error:
+            raise LodgsError(f"Cannot read {printable(path)}: {error}.", "Save it as UTF-8.") from error
+        converted.seek(0)
+        stack.pop_all()
+    return converted
+
+
+def decode_text(data: bytes) -> str:
+    """Decode a text of another program: UTF-8, UTF-16 or UTF-32, else Windows-1252."""
+    try:
+        return data.decode(json.detect_encoding(data))
+    except UnicodeDecodeError:
+        return data.decode("cp1252", "replace")
+
+
+def damage_error(path: Path, error: Exception, remedy: str) -> LodgsError:
+    """Return the error for a file that cannot be parsed, with the reason of the parser."""
+    reason = f"the file is damaged or truncated ({error})"
+    if has_decimal_commas(str(error)):
+        reason, remedy = DECIMAL_COMMAS, "Export it again with decimal points, such as 0.5."
+    return LodgsError(f"Cannot read {path}: {reason}.", remedy)
+
+
+def has_decimal_commas(text: str) -> bool:
+    """Return True if a text contains a number with a decimal comma, as programs write in some languages."""
+    return _DECIMAL_COMMA.search(text) is not None
 
 
 def read_lines(file: IO[AnyStr], max_length: int) -> Iterator[AnyStr]:
@@ -108,7 +162,7 @@ def parse_json(text: str | bytes, label: str, max_bytes: int = MAX_JSON_BYTES) -
     """Parse a JSON object.
 
     Args:
-        text: bytes are decoded as UTF-8, or as UTF-16 with a byte-order mark.
+        text: bytes are decoded as UTF-8, UTF-16 or UTF-32.
         label: subject of error messages, such as "The camera view.json".
         max_bytes: maximum length of the text.
 
@@ -143,8 +197,7 @@ def _decode(text: str | bytes, max_bytes: int) -> str:
         raise ValueError(f"it is longer than {max_bytes:,} bytes")
     if isinstance(text, str):
         return text
-    is_utf16 = text.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))  # written by Windows PowerShell
-    return text.decode("utf-16" if is_utf16 else "utf-8-sig")
+    return text.decode(json.detect_encoding(text))
 
 
 def _check(value: Any, depth: int, key: str = "a value") -> None:

@@ -257,14 +257,25 @@ def _export_inputs(root: bpy.types.Object, run: RunFolder, job: Job) -> list[str
 def _launch(
     root: bpy.types.Object, run: RunFolder, job: Job, *, write_job: bool, export: bool = False
 ) -> Watch:
-    """Start the trainer, after writing the job and exporting the inputs if asked for."""
+    """Start the trainer, after writing the job and exporting the inputs if asked for.
+
+    Raises:
+        LodgsError: the trainer is missing, or another Blender uses the run.
+    """
     python = environment.trainer_python()
     at_once = root.lodgs.training.at_once if job.cells else 1
     environment.require(python, at_once)
-    warnings = _export_inputs(root, run, job) if export else []
+    state = run_state(run)
     run.create()
-    if write_job:
-        job.resolved().write(run.job)
+    with run.locked():
+        if state == "empty" and run.job.exists():
+            raise LodgsError(
+                f"Cannot train in {run.path}: another Blender has started a run there.",
+                "Open this run, or choose another folder.",
+            )
+        warnings = _export_inputs(root, run, job) if export else []
+        if write_job:
+            job.resolved().write(run.job)
     arguments = ["train", str(run.job), "--out", str(run.path)]
     if job.cells:
         workers = f"local:{at_once}" if at_once > 1 else "here"

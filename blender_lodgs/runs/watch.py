@@ -26,6 +26,9 @@ from ..data import cells, importing, scenes
 UNRESPONSIVE_AFTER = 60.0
 """Seconds without an event after which the panel reports that the trainer does not respond."""
 
+IN_USE = "Another program already trains this run. Its progress and levels appear here."
+"""Warning of a Blender whose own trainer was refused."""
+
 
 @dataclass(frozen=True)
 class RunPart:
@@ -63,7 +66,7 @@ class Watch:
         levels: newest ``level`` event of each level.
         summary: ``done`` event of a finished run, with its quality.
         warnings: warnings of the run.
-        view_warnings: those of them about the views that Blender exported.
+        view_warnings: those of them that Blender added, such as those about exported views.
         cancel_requested: whether the run was asked to stop.
         stopping: (kind, cell number) of parts that were asked to stop.
         method: name of the trained method.
@@ -170,7 +173,12 @@ class Watch:
     def _alive(self) -> bool:
         if self.process is not None and self.process.poll() is None:
             return True
-        return self.folder.running
+        running = self.folder.running
+        if running and self.process is not None and self.process.returncode == 2:
+            self.process = None  # both started at once: another program's trainer has the run's lock
+            self.view_warnings.append(IN_USE)
+            self.warnings.append(IN_USE)
+        return running
 
     def _apply(self, root: bpy.types.Object, event: dict) -> None:
         match event["event"]:

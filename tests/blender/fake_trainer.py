@@ -28,6 +28,7 @@ sys.path.insert(0, os.getcwd())
 
 import numpy as np
 
+from training.errors import LodgsError
 from training.methods import METHODS
 from training.runs.events import PROTOCOL, EventWriter
 from training.runs.folder import RunFolder
@@ -69,8 +70,12 @@ def main() -> int:
         what, remedy = "The run folder belongs to another job.", "Choose another."
         print(json.dumps({"event": "error", "what": what, "remedy": remedy}))
         return 2
-    with folder.locked():
-        return run(mode, job, folder, EventWriter(folder.events_file, folder.reserve, sys.stdout))
+    try:
+        with folder.locked():
+            return run(mode, job, folder, EventWriter(folder.events_file, folder.reserve, sys.stdout))
+    except LodgsError as error:
+        print(json.dumps({"event": "error", "what": error.what, "remedy": error.remedy}))
+        return 2
 
 
 def run(mode: str, job: Job, folder: RunFolder, say: EventWriter) -> int:

@@ -58,14 +58,14 @@ def _convert(options: argparse.Namespace) -> int:
     from ..scenes.formats import convert_export
     from ..scenes.triangulate import triangulate_scene, write_points
 
-    export = convert_export(options.source, options.out)
+    export = convert_export(
+        options.source, options.out, lambda scene, model: write_points(scene, model, _print_progress)
+    )
     warnings, points = export.warnings, export.points
-    scene = None if points else read_scene(export.folder)
-    if scene is not None and any(camera.depth is None for camera in scene.cameras):
-        if export.is_source:
+    if export.is_source:
+        scene = read_scene(export.folder)
+        if any(camera.depth is None for camera in scene.cameras):
             scene = triangulate_scene(scene, export.folder, _print_progress)
-        else:
-            scene = write_points(scene, _print_progress)
         warnings, points = [*warnings, *scene.warnings], len(scene.points)
     for message in warnings:
         warn(message)

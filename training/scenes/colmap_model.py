@@ -11,6 +11,7 @@ import mmap
 import os
 import struct
 from collections.abc import Collection, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
@@ -19,7 +20,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from ..documents import open_file, read_lines
+from ..documents import damage_error, open_file, open_text, read_lines
 from ..errors import LodgsError, printable
 from ..files import is_file
 from .lenses import LENS_BY_NAME, LENSES, Intrinsics, intrinsics_of
@@ -35,7 +36,7 @@ class Pose:
     """One record of images.bin or images.txt, without its 2D points.
 
     Attributes:
-        name: file name, decoded like file system names: bytes that are not UTF-8 become surrogates.
+        name: file name, from UTF-8 or Windows-1252. Other bytes become surrogates.
         world_to_camera: (4, 4) float64 rigid transform.
     """
 
@@ -109,32 +110,33 @@ def read_points(model: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     Raises:
         LodgsError: the file is damaged.
     """
-    if not is_file(model / f"points3D{model_suffix(model)}"):
-        return _NO_POINTS
-    return _read(model, "points3D", {".bin": _parse_points_bin, ".txt": _parse_points_txt})
+    parsers = {".bin": _parse_points_bin, ".txt": _parse_points_txt}
+    for suffix in sorted(parsers, key=lambda suffix: suffix != model_suffix(model)):
+        if is_file(model / f"points3D{suffix}"):  # some programs write points of the other kind
+            return _read(model, "points3D", parsers, suffix)
+    return _NO_POINTS
 
 
-def _read(model: Path, name: str, parsers: dict) -> Any:
-    """Parse a model file with the parser of its suffix.
+def _read(model: Path, name: str, parsers: dict, suffix: str = "") -> Any:
+    """Parse a model file with the parser of its suffix, by default that of the model.
 
     Raises:
         LodgsError: the file is missing or damaged.
     """
-    suffix = model_suffix(model)
+    suffix = suffix or model_suffix(model)
     path = model / f"{name}{suffix}"
     try:
-        with open_file(path) as file:
-            if suffix == ".txt":
+        if suffix == ".txt":
+            with open_text(path) as file:
                 return parsers[suffix](file)
+        with open_file(path) as file:
             if not os.fstat(file.fileno()).st_size:
                 raise ValueError("it is empty")
             return parsers[suffix](mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
     except OSError as error:
         raise LodgsError(f"Cannot read {path}: {error.strerror}.", "Check the folder.") from error
     except (ValueError, IndexError, KeyError, struct.error) as error:
-        raise LodgsError(
-            f"Cannot read {path}: the file is damaged or truncated ({error}).", DAMAGED_REMEDY
-        ) from error
+        raise damage_error(path, error, DAMAGED_REMEDY) from error
 
 
 def _parse_cameras_bin(data: mmap.mmap) -> dict[int, Intrinsics]:
@@ -222,7 +224,8 @@ def _image_lines(file: IO[bytes]) -> Iterator[tuple[bytes, bytes]]:
             image = b""
             continue
         if len(line.split(maxsplit=9)) < 10:
-            raise ValueError(f"line {number} is not an image of 10 values")
+            shortened = printable(line[:60].decode("utf-8", "replace"))
+            raise ValueError(f"line {number} is not an image of 10 values: {shortened}")
         if image:
             yield image, b""
         image = line
@@ -279,13 +282,21 @@ def _valid_ids(ids: np.ndarray) -> np.ndarray:
 
 def _decode_name(name: bytes) -> str:
     """Return the name in the form of ``Camera.name``."""
-    return name.decode("utf-8", "surrogateescape").replace("\\", "/")
+    return _decode(name).replace("\\", "/")
+
+
+def _decode(name: bytes) -> str:
+    """Decode a name as UTF-8, else as Windows-1252; other bytes become surrogates."""
+    for encoding in "utf-8", "cp1252":
+        with suppress(UnicodeDecodeError):
+            return name.decode(encoding)
+    return name.decode("utf-8", "surrogateescape")
 
 
 def _pose(name: bytes, camera_id: int, pose: list[float]) -> Pose:
     """Return a pose from a quaternion (w, x, y, z) and a translation, both world to camera."""
     quaternion = np.array(pose[:4])
-    text = name.decode("utf-8", "surrogateescape")
+    text = _decode(name)
     if not (np.isfinite(pose).all() and quaternion.any()):
         raise ValueError(f"image {printable(text)} has no valid pose")
     world_to_camera = np.eye(4)
@@ -313,7 +324,6 @@ _TRACK_OFFSET = 43
 _BLOCK = 1 << 17
 _NO_POINTS = np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0, np.int64)
 _NUMERIC = b"0123456789.+-eEnaifNAIF"  # characters of numbers, including nan and inf
-_UTF8_MARK = b"\xef\xbb\xbf"  # Windows programs write it at the start of UTF-8 files
 
 
 def _parse_points_bin(data: mmap.mmap) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -373,16 +383,29 @@ def _record_chain(block: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def _parse_points_txt(file: IO[bytes]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    lines = chain(["0 0 0 0 0 0 0"], _content_lines(file))  # numpy warns of a table without lines
-    table = np.loadtxt(lines, usecols=range(7), ndmin=2)[1:]
+    """Parse lines of an id, a position, a colour and further values.
+
+    Files made by hand may have lines without the id, and without colours.
+    """
+    lines = _content_lines(file)
+    first = next(lines, "")
+    columns = min(len(first.split()), 7)
+    if 0 < columns < 3:
+        raise ValueError(f"a point has {columns} instead of at least 3 values")
+    table = np.loadtxt(chain([first], lines), usecols=range(columns), ndmin=2) if first else np.empty((0, 7))
     _check_count(len(table), file, "points")
-    colors = np.nan_to_num(table[:, 4:]).clip(0, 255).astype(np.uint8)
-    return table[:, 1:4], colors, np.nan_to_num(table[:, 0]).astype(np.int64)
+    ids = np.nan_to_num(table[:, :1])
+    start = int(table.shape[1] in (4, 7) and 2 * np.count_nonzero(ids == np.floor(ids)) >= len(ids))
+    positions, colors = table[:, start : start + 3], np.nan_to_num(table[:, start + 3 : start + 6])
+    if colors.shape[1] < 3 or (not start and colors.min(initial=0) < 0):  # negative values are normals
+        colors = np.full(positions.shape, 128)
+    elif colors.max(initial=0) <= 1 and (colors % 1).any():
+        colors *= 255
+    colors = colors.clip(0, 255).astype(np.uint8)
+    return positions, colors, ids[:, 0].astype(np.int64) if start else np.zeros(0, np.int64)
 
 
 def _lines(file: IO[bytes]) -> Iterator[bytes]:
-    if file.read(len(_UTF8_MARK)) != _UTF8_MARK:
-        file.seek(0)
     return read_lines(file, _MAX_LINE)
 
 

@@ -19,10 +19,10 @@ import numpy as np
 
 from ..documents import read_json
 from ..errors import LodgsError, SystemProblem, system_reason
-from ..files import name_errors
+from ..files import name_errors, temporary_folder
 from . import pycolmap_process
 from .cameras import Camera
-from .colmap import NO_POINTS, Scene, scene_lenses
+from .colmap import NO_POINTS, Scene, read_scene, scene_lenses
 from .colmap_model import read_points
 from .images import load_image, load_mask, write_png
 from .scene_cache import remove_abandoned, scene_digest, writable_cache
@@ -115,23 +115,22 @@ def cached_points(scene: Scene, exposure: float = 0.0) -> Scene:
         return scene
 
 
-def write_points(scene: Scene, report: Report) -> Scene:
-    """Add points to the model of a scene without points, as :func:`triangulate_scene`.
+def write_points(folder: Path, model: Path, report: Report) -> Scene:
+    """Add points to an unfinished model without points, as :func:`triangulate_scene`.
+
+    Args:
+        folder: folder of the scene.
+        model: folder of the model, which is replaced.
 
     Raises:
-        LodgsError: if the model cannot be written.
+        OSError: if the model cannot be written.
     """
-    parent = scene.model.parent
-    try:
-        with tempfile.TemporaryDirectory(dir=parent, prefix=f".{_PREFIX}") as work:
-            result = _triangulate(scene, Path(work), report, 0.0)
-            os.replace(scene.model, Path(work) / "previous")
-            os.replace(result / "sparse", scene.model)
-            return replace(_with_points(scene, result, report), point_model=None)
-    except OSError as error:
-        raise LodgsError(
-            f"Cannot write points to {scene.model}: {system_reason(error)}.", "Free disk space."
-        ) from error
+    scene = read_scene(folder, model)
+    with temporary_folder(model.parent) as work:
+        result = _triangulate(scene, work, report, 0.0)
+        os.replace(model, work / "previous")
+        os.replace(result / "sparse", model)
+        return replace(_with_points(scene, result, report), point_model=None)
 
 
 def random_start_points(cameras: list[Camera], count: int = RANDOM_POINTS) -> np.ndarray:

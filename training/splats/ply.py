@@ -20,7 +20,7 @@ from typing import IO, NamedTuple
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 
-from ..documents import open_file, read_lines
+from ..documents import damage_error, has_decimal_commas, open_text, read_lines
 from ..errors import LodgsError
 from ..files import atomic_write
 from .coding import CODEBOOK, CodedRows, declared_rows, decode_elements, is_coded
@@ -254,7 +254,7 @@ def read_elements(path: str | Path, splats: bool = True) -> tuple[dict[str, np.n
         LodgsError: the file is not such a PLY, or is truncated.
     """
     path = Path(path)
-    with open_file(path) as file:
+    with open_text(path) as file:
         header, counts = _read_header(file, path, splats)
         begin = file.tell()
         size = os.fstat(file.fileno()).st_size
@@ -300,7 +300,7 @@ def read_comments(path: str | Path) -> list[str]:
     Raises:
         LodgsError: the file is not a PLY, or has no ``vertex`` of splats or an unsupported dialect.
     """
-    with open_file(path) as file:
+    with open_text(path) as file:
         return _comments(_read_header(file, Path(path))[0])
 
 
@@ -447,6 +447,8 @@ def _read_text(
                 raise ValueError(f"{count - len(rows):,} of {count:,} rows of {name} are missing")
             elements[name] = np.asarray(rows, row)
     except (ValueError, OverflowError) as error:
+        if has_decimal_commas(str(error)):
+            raise damage_error(path, error, "") from error
         raise LodgsError(
             f"Cannot read {path}: it is corrupt: {str(error)[:300].rstrip('.')}.", "Export or copy it again."
         ) from error

@@ -1,7 +1,10 @@
 """Training from Blender with a fake trainer that fails on request, and with the real trainer."""
 
 import os
+import subprocess
+import sys
 import time
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -325,6 +328,85 @@ def test_only_the_trainer_of_the_run_is_killed(lodgs, jobs, fake, root, tmp_path
     jobs.cancel(root)
     assert first.process.wait(200) == -9
     _wait(attached, lambda: not attached.running)
+
+
+SECOND_BLENDER = """
+import sys
+sys.path.insert(0, sys.argv[1])
+from tools.blender_module import EXTENSION, start_blender
+import importlib
+bpy = start_blender()
+jobs = importlib.import_module(f"{EXTENSION}.blender_lodgs.runs.jobs")
+root = bpy.data.objects.new("tiny", None)
+bpy.context.scene.collection.objects.link(root)
+root.lodgs.is_root, root.lodgs.scene_folder = True, sys.argv[2]
+root.lodgs.training.run = sys.argv[2]
+for attempt in jobs.start, jobs.resume:
+    try:
+        attempt(root, *[sys.argv[2]][: attempt is jobs.start])
+    except Exception as error:
+        print("second", type(error).__name__, error, flush=True)
+watch = jobs.attach(root, sys.argv[2])
+jobs.follow(watch)
+print("second", watch.state, [item.number for item in root.lodgs.levels if item.exists], watch.problem)
+"""
+
+
+def test_second_blender_is_refused_and_can_follow_the_run(jobs, fake, root, tmp_path):
+    fake("two halves")
+    run = tmp_path / "run"
+    watch = jobs.start(root, str(run))
+    _wait(watch, lambda: watch.levels)
+    job = (run / "job.toml").read_bytes()
+    command = [sys.executable, "-c", SECOND_BLENDER, str(REPOSITORY), str(run)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as second:
+        printed = (line.removeprefix("second ") for line in second.stdout if line.startswith("second "))
+        lines = [next(printed), next(printed)]
+        (run / "go on").touch()
+        lines += printed
+    assert lines[0].startswith(f"LodgsError Cannot train in {run}: another training is running there.")
+    assert lines[1].startswith(f"LodgsError Cannot resume the run in {run}: it is running.")
+    assert lines[2].split() == ["done", "[1,", "2]"], lines
+    while watch.step():
+        time.sleep(0.02)
+    assert (watch.state, watch.problem, _levels(root)) == ("done", "", COUNTS)
+    assert (run / "job.toml").read_bytes() == job
+
+
+def test_two_trainers_that_start_at_once(lodgs, jobs, fake, root, tmp_path, monkeypatch):
+    """The Blender of the refused trainer follows the other one."""
+    fake("two halves")
+    run = tmp_path / "run"
+    first = jobs.start(root, str(run))
+    _wait(first, lambda: first.levels)
+    folder = lodgs("runs.watch").RunFolder
+    with monkeypatch.context() as patch:
+        patch.setattr(folder, "locked", lambda self: nullcontext())
+        second = jobs._resume(root, folder(run))
+    assert second.process.wait(60) == 2
+    in_use = lodgs("runs.watch").IN_USE
+    _wait(second, lambda: second.process is None)
+    assert second.step() and second.warnings.count(in_use) == 1
+    (run / "go on").touch()
+    assert first.process.wait(60) == 0
+    while second.step():
+        time.sleep(0.02)
+    assert (second.state, second.problem, _levels(root)) == ("done", "", COUNTS)
+
+
+def test_new_run_of_another_blender_is_kept(lodgs, jobs, fake, root, tmp_path, monkeypatch):
+    fake()
+    run = tmp_path / "run"
+    create = lodgs("runs.watch").RunFolder.create
+
+    def create_with_job(self):
+        create(self)
+        (run / "job.toml").write_text("job of another Blender")
+
+    monkeypatch.setattr(lodgs("runs.watch").RunFolder, "create", create_with_job)
+    with pytest.raises(lodgs("training.errors").LodgsError, match="another Blender has started a run"):
+        jobs.start(root, str(run))
+    assert (run / "job.toml").read_text() == "job of another Blender"
 
 
 def test_moved_run_is_resumed(bpy, watch_of, fake, root, tmp_path):

@@ -64,10 +64,10 @@ def test_unusable_photos_are_skipped_with_warnings(scene):
 
 
 def test_names_that_are_not_utf8_are_escaped_in_warnings(scene):
-    name = os.fsdecode(b"\xffoto.png")
+    name = os.fsdecode(b"\x81oto.png")  # invalid in UTF-8 and in Windows-1252
     (scene / "images" / name).write_bytes((scene / "images" / "a.png").read_bytes())
     folder = write_text_model(scene / "sparse", views("a.png"), grid())
-    (folder / "images.txt").write_bytes(views("a.png").encode() + b"9 1 0 0 0 0 0 0 1 \xffoto.png\n\n")
+    (folder / "images.txt").write_bytes(views("a.png").encode() + b"9 1 0 0 0 0 0 0 1 \x81oto.png\n\n")
     result = read_scene(scene)
     assert [camera.name for camera in result.cameras] == ["a.png"]
     (warning,) = result.warnings

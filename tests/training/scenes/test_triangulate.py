@@ -1,5 +1,6 @@
 """Points triangulated with known cameras, compared with the surfaces that were photographed."""
 
+import errno
 import json
 import shutil
 from pathlib import Path
@@ -157,6 +158,21 @@ def test_command_writes_points(walls, tmp_path, capsys):
     assert f"6 views, {len(scene.points):,} points" in printed.out and "Triangulated" in printed.err
     assert np.median(surface_distance(scene.points)) < 0.01 and scene.warnings == []
     assert observations(scene, ["0.png"]) and [p.name for p in (tmp_path / "sparse").iterdir()] == ["0"]
+
+
+def test_command_can_be_repeated_after_a_full_disk(walls, tmp_path, capsys, monkeypatch):
+    source = Path(shutil.copytree(walls, tmp_path / "scene", ignore=shutil.ignore_patterns(".*")))
+    words = ["scene", "--from", str(source), "--out", str(tmp_path / "out")]
+
+    def fill_disk(stage, done, total):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("training.cli.scene._print_progress", fill_disk)
+        assert main(words) == 2
+    assert f"Cannot write COLMAP scene {tmp_path / 'out'}: No space left" in capsys.readouterr().err
+    assert not any((tmp_path / "out" / "sparse").iterdir())
+    assert main(words) == 0 and len(read_scene(tmp_path / "out").points)
 
 
 def test_command_adds_points_to_a_colmap_scene(walls, tmp_path, capsys):

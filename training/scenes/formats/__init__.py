@@ -6,18 +6,15 @@ Each format is a module with ``NAME``, ``find`` and ``read``, and independent of
 from __future__ import annotations
 
 import os
-import tempfile
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 
-import numpy as np
-
 from ...errors import LodgsError, SystemProblem, system_reason
-from ...files import check_folder, is_file, link_or_copy
-from ..colmap import DEPTHS, MASKS, NO_POINTS, find_models, read_scene, scene_lenses, subfolders
+from ...files import check_folder, is_file, link_or_copy, temporary_folder
+from ..colmap import DEPTHS, MASKS, NO_POINTS, Scene, find_models, read_scene, scene_lenses, subfolders
 from ..colmap_model import model_suffix
 from ..image_files import find_image_folder
 from ..images import image_size
@@ -86,13 +83,19 @@ def ensure_colmap_scene(folder: Path, warn: Callable[[str], object]) -> Path:
     return folder
 
 
-def convert_export(folder: Path, out: Path | None = None) -> ConvertedScene:
+def convert_export(
+    folder: Path, out: Path | None = None, add_points: Callable[[Path, Path], Scene] | None = None
+) -> ConvertedScene:
     """Convert another program's export to a COLMAP scene with its model in ``sparse/0``.
+
+    The model appears under its name when it is complete, so that an interrupted conversion can be repeated.
 
     Args:
         folder: folder of the export, or of a COLMAP scene without points.
         out: folder of the scene, which receives links to or copies of the photos. By default, the model is
             written next to the photos, which stay unchanged.
+        add_points: adds points to the model of an export that has neither points nor depth maps, as
+            ``triangulate.write_points``. It receives the folders of the scene and of the unfinished model.
 
     Raises:
         LodgsError: the format is unknown, the export is damaged, or the scene cannot be written.
@@ -120,17 +123,20 @@ def convert_export(folder: Path, out: Path | None = None) -> ConvertedScene:
         warnings.append(
             f"{len(missing)} masks are missing, such as {missing[0]}. Their photos are not masked."
         )
-    points, colors = exported.points, exported.colors
-    if not len(points) and all(view.has_depth for view in views):
+    count = len(exported.points)
+    if not count and all(view.has_depth for view in views):
         warnings.append(f"{name} has no points. Training creates them from the depth maps.")
+        add_points = None
     try:
-        _write(scene, views, points, colors)
+        completed = _write(scene, views, exported, None if count else add_points)
     except OSError as error:
         raise LodgsError(
             f"Cannot write COLMAP scene {scene}: {system_reason(error)}.",
             "Choose another output folder (lodgs scene --from DIR --out DIR).",
         ) from error
-    return ConvertedScene(scene, name, len(views), len(points), warnings)
+    if completed is not None:
+        warnings, count = [*warnings, *completed.warnings], len(completed.points)
+    return ConvertedScene(scene, name, len(views), count, warnings)
 
 
 def _choose_export(folder: Path) -> tuple[ModuleType, Path] | None:
@@ -219,8 +225,17 @@ def _usable_views(exported: ExportedScene) -> tuple[list[ExportedView], list[tup
     return views, excluded
 
 
-def _write(scene: Path, views: list[ExportedView], points: np.ndarray, colors: np.ndarray) -> None:
-    """Link photos outside the scene's folder, then write the model completely or not at all."""
+def _write(
+    scene: Path,
+    views: list[ExportedView],
+    exported: ExportedScene,
+    add_points: Callable[[Path, Path], Scene] | None,
+) -> Scene | None:
+    """Link photos outside the scene's folder, then write the model completely or not at all.
+
+    Returns:
+        The result of ``add_points``, if given.
+    """
     sparse = scene / "sparse"
     try:
         images = Path(os.path.commonpath([view.image.parent for view in views]))
@@ -240,9 +255,11 @@ def _write(scene: Path, views: list[ExportedView], points: np.ndarray, colors: n
             link_or_copy(view.mask, scene / MASKS / f"{name}.png")
         if view.depth is not None and view.has_depth:
             link_or_copy(view.depth, scene / DEPTHS / f"{name}{view.depth.suffix.lower()}")
-    with tempfile.TemporaryDirectory(dir=sparse, prefix=".model-") as work:
-        model = Path(work) / "0"
+    with temporary_folder(sparse) as work:
+        model = work / "0"
         lenses = [view.lens for view in views]
         poses = [(name, view.world_to_camera) for name, view in zip(names, views, strict=True)]
-        write_model(model, lenses, poses, points, colors)
+        write_model(model, lenses, poses, exported.points, exported.colors)
+        completed = add_points(scene, model) if add_points is not None else None
         os.replace(model, sparse / "0")
+    return completed

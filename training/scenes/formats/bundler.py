@@ -6,7 +6,6 @@ Format: the manual of Bundler v0.4 (https://www.cs.cornell.edu/~snavely/bundler/
 
 from __future__ import annotations
 
-import codecs
 import re
 from array import array
 from collections.abc import Iterable
@@ -15,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...documents import open_file, read_lines
+from ...documents import damage_error, decode_text, open_file, open_text, read_lines
 from ...errors import LodgsError
 from ..images import image_size
 from ..lenses import make_intrinsics
@@ -23,7 +22,6 @@ from .exported import OPENGL, ExportedScene, ExportedView, PhotoFinder, find_fil
 
 NAME = "Bundler"
 _VERSION = b"# Bundle file v0.3"
-_BOM = codecs.BOM_UTF8
 _MAX_LINE = 1 << 24
 _MAX_LIST = 1 << 26
 """Maximum bytes of a line, and of the list of photos."""
@@ -47,8 +45,8 @@ def find(folder: Path) -> Path | None:
 
 def _is_bundle(path: Path) -> bool:
     try:
-        with open_file(path) as file:
-            return file.read(len(_BOM + _VERSION)).removeprefix(_BOM).startswith(_VERSION)
+        with open_text(path) as file:
+            return file.read(len(_VERSION)) == _VERSION
     except LodgsError:
         return False
 
@@ -61,9 +59,9 @@ def read(path: Path) -> ExportedScene:
     """
     names = _read_names(path)
     try:
-        with open_file(path) as file:
+        with open_text(path) as file:
             lines = filter(None, map(bytes.strip, read_lines(file, _MAX_LINE)))
-            if not next(lines, b"").removeprefix(_BOM).startswith(_VERSION):
+            if not next(lines, b"").startswith(_VERSION):
                 raise ValueError("its version is not 0.3")
             count, points = map(int, next(lines, b"").split())
             cameras = _parse_numbers(islice(lines, 5 * count), (count, 15))
@@ -72,9 +70,7 @@ def read(path: Path) -> ExportedScene:
             table = _parse_numbers(islice(rows, points + 1), (points, 6))
         positions, colors = table[:, :3], table[:, 3:]
     except (ValueError, IndexError, OverflowError) as error:
-        raise LodgsError(
-            f"Cannot read {path}: the file is damaged or truncated ({error}).", "Export it again."
-        ) from error
+        raise damage_error(path, error, "Export it again.") from error
     if len(names) < count:
         raise LodgsError(
             f"Cannot read {path}: it has {count} cameras, but its list has {len(names)} photos.",
@@ -125,7 +121,7 @@ def _read_names(path: Path) -> list[str]:
     if list_file is None:
         raise LodgsError(f"Cannot read {path}: there is no list of photos.", f"Add {_LISTS[0]} next to it.")
     with open_file(list_file) as file:
-        text = file.read(_MAX_LIST).decode("utf-8-sig", "replace")
+        text = decode_text(file.read(_MAX_LIST))
     return [_photo_name(line.strip()).strip('"') for line in text.splitlines() if line.strip()]
 
 

@@ -13,8 +13,8 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from ...documents import read_json
-from ...errors import LodgsError
+from ...documents import DECIMAL_COMMAS, decode_text, has_decimal_commas, parse_json, read_bytes
+from ...errors import LodgsError, printable
 from ...files import is_file
 from ..cameras import Camera
 from ..colmap import DEPTH_SUFFIXES
@@ -88,8 +88,9 @@ class ExportedScene:
 
 
 def read_document(path: Path) -> dict:
-    """Read a JSON file with thousands of views, see ``read_json``."""
-    return read_json(path, max_bytes=MAX_JSON_BYTES)
+    """Read a JSON file with thousands of views in any encoding, see ``parse_json``."""
+    data = read_bytes(path, MAX_JSON_BYTES)
+    return parse_json(decode_text(data), printable(path), MAX_JSON_BYTES)
 
 
 def get_number(values: Mapping[str, Any], name: str, default: float | None = None) -> float:
@@ -101,6 +102,8 @@ def get_number(values: Mapping[str, Any], name: str, default: float | None = Non
     value = values.get(name)
     value = default if value is None else value
     if isinstance(value, str):
+        if has_decimal_commas(value):
+            raise LodgsError(f"{DECIMAL_COMMAS}, such as {name} = {value[:20]}.")
         with suppress(ValueError):
             value = float(value)
     if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
@@ -120,6 +123,8 @@ def parse_array(value: Any, *shape: int) -> np.ndarray:
             raise ValueError
         return array.reshape(shape)
     except (TypeError, ValueError) as error:
+        if has_decimal_commas(str(error)):
+            raise LodgsError(f"{DECIMAL_COMMAS}.") from error
         size = "x".join("N" if side < 0 else str(side) for side in shape)
         raise LodgsError(f"it has a value that is not {size} finite numbers.") from error
 

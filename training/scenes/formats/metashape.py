@@ -7,6 +7,7 @@ fisheye's x has the length of its angle to the axis.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from xml.etree import ElementTree
@@ -14,7 +15,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from ...documents import open_file
+from ...documents import DECIMAL_COMMAS, has_decimal_commas, open_file, open_text
 from ...errors import LodgsError
 from ...files import is_file
 from ..lenses import Intrinsics
@@ -48,7 +49,7 @@ def find(folder: Path) -> Path | None:
         return None
     for path in (path for path in files if path.suffix.lower() == ".xml"):
         try:
-            with open_file(path) as file:
+            with open_text(path) as file:
                 if b"<document" in (head := file.read(_HEAD_BYTES)) and b"<chunk" in head:
                     return path
         except LodgsError:
@@ -113,9 +114,11 @@ def _parse_xml(path: Path) -> Element:
     with open_file(path) as file:
         data = file.read(MAX_BYTES + 1)
     try:
-        if len(data) > MAX_BYTES or b"<!DOCTYPE" in data or b"<!ENTITY" in data or b"\0" in data:
-            raise ValueError(f"it exceeds {MAX_BYTES:,} bytes, defines entities, or is not UTF-8")
-        return ElementTree.fromstring(data)
+        encoding = json.detect_encoding(data)
+        text = data.decode(encoding, "replace")
+        if len(data) > MAX_BYTES or any(mark in text for mark in ("<!DOCTYPE", "<!ENTITY", "\0")):
+            raise ValueError(f"it exceeds {MAX_BYTES:,} bytes, defines entities, or is not text")
+        return ElementTree.fromstring(data if encoding == "utf-8" else text)
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise LodgsError(
             f"Cannot read {path}: it is not an XML file of Metashape ({error}).", "Export the cameras again."
@@ -138,6 +141,8 @@ def _parse_lens(sensor: Element) -> Intrinsics:
         values = {entry.tag: float(entry.text or "") for entry in calibration if entry.tag != "resolution"}
         width, height = float(size.get("width", 0)), float(size.get("height", 0))
     except ValueError as error:
+        if has_decimal_commas(str(error)):
+            raise LodgsError(f"{DECIMAL_COMMAS}.") from error
         raise LodgsError("its calibration has a value that is not a number.") from error
     fisheye = kind == "fisheye"
     remedy = "has no equivalent among COLMAP's lenses: fix it to 0 in Metashape."

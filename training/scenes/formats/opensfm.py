@@ -7,14 +7,13 @@ from its middle).
 
 from __future__ import annotations
 
-import codecs
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ...documents import parse_json, read_bytes
+from ...documents import decode_text, parse_json, read_bytes
 from ...errors import LodgsError
 from ..lenses import Intrinsics
 from .exported import (
@@ -45,8 +44,8 @@ def read(path: Path) -> ExportedScene:
     Raises:
         LodgsError: the file is damaged.
     """
-    text = read_bytes(path, MAX_BYTES).removeprefix(codecs.BOM_UTF8)
-    document = parse_json(b'{"all": %b}' % text, str(path), MAX_BYTES + 16)  # a list at the top
+    text = decode_text(read_bytes(path, MAX_BYTES))
+    document = parse_json(f'{{"all": {text}}}', str(path), MAX_BYTES + 16)  # a list at the top
     parts = [part for part in _list(document["all"]) if isinstance(part, dict)]
     parts = [part for part in parts if isinstance(part.get("shots"), dict) and part["shots"]]
     if not parts:
