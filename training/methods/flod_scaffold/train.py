@@ -21,6 +21,7 @@ from ...optimize.training_data import TrainingView
 from ...splats.gaussians import Splats
 from ...splats.levels import Level
 from ..octree_neural import train as octree_neural
+from ..octree_neural.train import DISABLED_LOGIT
 from . import FlodScaffoldParameters
 
 
@@ -111,9 +112,12 @@ class Method(octree_neural.Method):
     def start_level(self, number: int) -> None:
         """Start a level from the one before: same scales, a smaller constraint, new optimizers (Eq. 5).
 
-        Its finer voxels get anchors at the scene's points where they have none.
+        Its finer voxels get anchors at the scene's points where they have none. Gaussians that the level
+        before disabled start anew, because their anchor keeps its voxel from others.
         """
         rows = {name: tensor.detach() for name, tensor in self._next_tensors(self.s_min[number - 1]).items()}
+        if self.parameters.direct:
+            self._enable_gaussians(rows)
         self._use_level(number)
         points = self.start_anchors()
         ones = torch.ones(len(rows["means"]))
@@ -123,6 +127,14 @@ class Method(octree_neural.Method):
         self.model.append(growing.limit_growth(self.schedule, self.model, points, 0, self._max_anchors))
         self.restart_networks_adam()
         self._constrain()
+
+    def _enable_gaussians(self, rows: dict[str, torch.Tensor]) -> None:
+        """Give disabled Gaussians the offset and opacity of new ones."""
+        looks = rows["looks"].clone()
+        disabled = looks[..., 0] < DISABLED_LOGIT / 2
+        looks[..., 0][disabled] = growing.MAX_NEW_LOGIT
+        spread = self._spread.to(looks).expand_as(rows["offsets"])
+        rows |= {"looks": looks, "offsets": torch.where(disabled[..., None], spread, rows["offsets"])}
 
     def _next_tensors(self, new_min: float) -> dict[str, torch.Tensor]:
         """Return the model's tensors with scales that a smaller constraint leaves unchanged (FLoD, Eq. 5).

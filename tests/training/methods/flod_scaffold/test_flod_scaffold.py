@@ -50,7 +50,7 @@ def test_smallest_log_scale(s_min):
 
 def test_image_is_continuous_between_levels(data):
     """Eq. 5: with looks of their own, Gaussians keep every scale; new anchors at points are faint."""
-    method = make(data, steps=[6, 4, 4], max_splats=0)
+    method = make(data, steps=[6, 4, 4], max_splats=0, least_weight=0.0)
     trained(method, 5)
     method.train_step(5)
     camera, old = data.train[0], method.model
@@ -66,6 +66,23 @@ def test_image_is_continuous_between_levels(data):
     assert (
         not method.model.adam.state_dict()["step"].any() if "step" in method.model.adam.state_dict() else True
     )
+
+
+def test_disabled_gaussians_start_anew_in_the_next_level(data):
+    """They would otherwise keep the voxel of their anchor from splats of all finer levels."""
+    method = make(data, steps=[6, 4, 4])
+    trained(method, 5)
+    method.train_step(5)
+    looks, offsets = (method.model[name].detach().clone() for name in ("looks", "offsets"))
+    disabled = looks[..., 0] < -15
+    assert disabled.any() and not disabled.all()
+    method.levels_after(5)
+    opacity, new_offsets = method.model["looks"][: len(looks), :, 0], method.model["offsets"][: len(looks)]
+    torch.testing.assert_close(opacity[disabled].sigmoid(), torch.full((int(disabled.sum()),), 0.1))
+    assert torch.equal(opacity[~disabled], looks[..., 0][~disabled])
+    assert torch.equal(new_offsets[~disabled], offsets[~disabled])
+    assert (new_offsets[disabled].abs() <= 0.5).all()
+    assert method.splats >= looks[..., 0].numel()
 
 
 def test_published_networks_keep_the_mean_scale_of_an_anchor(data):
