@@ -22,15 +22,17 @@ HERE = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(HERE))
 
 from training.errors import LodgsError  # noqa: E402
+from training.evaluate.views import REDUCTIONS  # noqa: E402
 from training.methods import METHODS  # noqa: E402
 from training.runs.measure import evaluate_run  # noqa: E402
 
+RUN = ("scene", "method", "version", "share", "seed")
 COLUMNS = ("psnr", "fitted_psnr", "worst", "train_psnr", "veil", "veil_max", "oversized", "splats", "seconds")
 
 
 @dataclass
 class Point:
-    """Settings of a run and the quality of its finest level."""
+    """Settings of a run, the quality of its finest level, and the measures of all levels."""
 
     scene: str
     method: str
@@ -46,6 +48,7 @@ class Point:
     oversized: int
     splats: int
     seconds: float
+    levels: list[dict]
 
 
 def train(checkout: Path, out: Path, scene: Path, method: str, share: float, seed: int, args) -> None:
@@ -106,17 +109,30 @@ def measure(out: Path, **run) -> Point:
         **run, psnr=finest["psnr"], fitted_psnr=report["fitted_psnr"], worst=report["worst"]["psnr"],
         train_psnr=report["train_psnr"], veil=report["veil"]["mean"], veil_max=report["veil"]["max"],
         oversized=report["oversized"], splats=finest["splats"], seconds=events[-1]["seconds"],
+        levels=report["levels"],
     )  # fmt: skip
 
 
 def table(points: Iterable[Point]) -> str:
     """Format points as a Markdown table."""
-    names = ("scene", "method", "version", "share", "seed", *COLUMNS)
-    rows = [
-        [f"{value:.4g}" if isinstance(value, float) else str(value) for value in asdict(p).values()]
-        for p in points
-    ]
-    return "\n".join(" | ".join(row) for row in [names, ["---"] * len(names), *rows])
+    return _markdown([*RUN, *COLUMNS], ([getattr(p, name) for name in (*RUN, *COLUMNS)] for p in points))
+
+
+def level_table(points: Iterable[Point]) -> str:
+    """Format the PSNR of levels by image size, and that of merges of as many splats, as a Markdown table."""
+    sizes = [f"1/{factor}" for factor in REDUCTIONS]
+    rows = []
+    for p in points:
+        for row in p.levels:
+            merged = row.get("merged", [""] * len(sizes))
+            run = [getattr(p, name) for name in RUN]
+            rows.append([*run, row["level"], row["splats"], *row["by_size"], *merged])
+    return _markdown([*RUN, "level", "splats", *sizes, *(f"merged {size}" for size in sizes)], rows)
+
+
+def _markdown(names: list[str], rows: Iterable[list]) -> str:
+    cells = ([f"{cell:.4g}" if isinstance(cell, float) else str(cell) for cell in row] for row in rows)
+    return "\n".join(" | ".join(row) for row in [names, ["---"] * len(names), *cells])
 
 
 def plot(points: list[Point], path: Path) -> None:
@@ -202,7 +218,9 @@ def main(arguments: list[str] | None = None) -> int:
     except LodgsError as error:
         print(error.what, error.remedy, file=sys.stderr)
         return 2
-    (args.out / "quality.md").write_text(table(points) + "\n", encoding="utf-8")
+    tables = f"{table(points)}\n\n{level_table(points)}\n"
+    print(level_table(points))
+    (args.out / "quality.md").write_text(tables, encoding="utf-8")
     (args.out / "quality.json").write_text(
         json.dumps([asdict(p) for p in points], indent=1), encoding="utf-8"
     )

@@ -39,6 +39,17 @@ def test_each_run_gives_a_point_and_is_reused(tiny_scene, tmp_path, monkeypatch)
     assert (run / "events.jsonl").read_bytes() == events
 
 
+def test_levels_are_listed_with_their_merges():
+    rows = [
+        {"level": 1, "splats": 20, "by_size": [20.0, 21.0, 22.0, 23.0], "merged": [19.0, 18.0, 17.0, 16.0]},
+        {"level": 2, "splats": 40, "by_size": [30.0, 31.0, 32.0, 33.0]},
+    ]
+    point = bench_quality.Point("a", "flod", "this", 0.5, 0, *[30.0] * 6, 0, 40, 1.5, rows)
+    names, _, coarse, finest = (line.split(" | ") for line in bench_quality.level_table([point]).splitlines())
+    assert dict(zip(names, coarse, strict=True))["merged 1/8"] == "16"
+    assert dict(zip(names, finest, strict=True))["1/8"] == "33" and finest[-4:] == [""] * 4
+
+
 def test_comparison_with_another_checkout_requires_test_views(tiny_scene, tmp_path, capsys):
     assert bench(tiny_scene, "--base", tmp_path) == 2
     assert "--base requires --report" in capsys.readouterr().err

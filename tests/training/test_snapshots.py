@@ -104,6 +104,8 @@ def test_report_of_evaluate(file_regression):
             "ssim": ssim,
             "frame_s": count / 1e6,
             "veil": {"mean": 0.04 * n, "max": 1.0},
+            "by_size": [psnr, psnr + 1, psnr + 2, psnr + 3],
+            **({"merged": [psnr - 1, psnr, psnr + 1, psnr + 2]} if n < 3 else {}),
         }
         for n, s_min, count, psnr, ssim in numbers
     ]

@@ -22,6 +22,8 @@ from .metrics import psnr, ssim
 
 MAX_TRAINING_VIEWS = 24
 """Maximum number of training views that are measured."""
+REDUCTIONS = (1, 2, 4, 8)
+"""Factors by which the sides of images are reduced to measure levels from afar."""
 REPEATS = 3
 """Repetitions per view and variant when frames are timed."""
 
@@ -62,6 +64,24 @@ def _visible_source(bundle: Bundle, level: Level) -> SplatSource:
         return Splats.concatenated([part for part in parts if part is not None]), None
 
     return read_visible
+
+
+def reduce_view(camera: Camera, target: Target, factor: int) -> tuple[Camera, Target]:
+    """Reduce a view by a box filter; incomplete blocks of pixels are cut off.
+
+    A reduced pixel counts if the mask allows each of its pixels.
+    """
+    width, height = camera.width // factor, camera.height // factor
+    scaled = {name: getattr(camera, name) / factor for name in ("fx", "fy", "cx", "cy")}
+
+    def blocks(pixels: torch.Tensor) -> torch.Tensor:
+        cut = pixels[: height * factor, : width * factor]
+        return cut.reshape(height, factor, width, factor, *pixels.shape[2:])
+
+    mask = None if target.mask is None else blocks(target.mask).amin((1, 3))
+    return replace(camera, width=width, height=height, **scaled), Target(
+        blocks(target.image).mean((1, 3)), mask
+    )
 
 
 class Evaluation:
@@ -130,6 +150,18 @@ class Evaluation:
             target = self.target(camera)
             values.append(measure(self.draw(splats, camera, weights), target.image, target.mask))
         return np.array(values)
+
+    def measure_sizes(self, source: SplatSource) -> list[float]:
+        """Return the mean PSNR of ``cameras`` in dB at each of REDUCTIONS, against box-filtered photos."""
+        values = []
+        for camera in self.cameras:
+            splats, weights = source(camera)
+            gaussians, photo = self.load(splats), self.target(camera)
+            for factor in REDUCTIONS:
+                view, target = reduce_view(camera, photo, factor)
+                values.append(psnr(self.draw(gaussians, view, weights), target.image, target.mask))
+        means = np.reshape(values, (-1, len(REDUCTIONS))).mean(0)
+        return [round(float(value), 3) for value in means]
 
     def measure(self, render: Callable[[Camera], Rendering], count: Callable[[Camera], int]) -> dict:
         """Measure quality, number of splats and seconds per frame over ``cameras``.

@@ -15,7 +15,7 @@ from ..evaluate.level_sheet import write_level_sheet
 from ..evaluate.messages import summary_lines
 from ..evaluate.offset_views import measure_veil
 from ..evaluate.summary import summarize
-from ..evaluate.views import Evaluation, full_detail_source
+from ..evaluate.views import REDUCTIONS, Evaluation, full_detail_source
 from ..files import atomic_write
 from ..lod.on_disk import open_if_large
 from ..lod.rule import Rule, Values, find_rule
@@ -59,7 +59,8 @@ def evaluate_run(
 
         - ``levels``: levels that are complete by themselves, coarse to fine: ``level``, facts, ``splats``,
           ``drawn``, ``psnr``, ``ssim``, ``frame_s``, ``veil``. Cumulative levels include all coarser ones.
-          Coarser levels in memory also have ``merged``, the PSNR of the finest level merged to as many splats
+          ``by_size`` is the PSNR at full, 1/2, 1/4 and 1/8 of the image size. Coarser levels in memory also
+          have ``merged``, the same of the finest level merged to as many splats
         - ``train_psnr``, ``veil``, ``oversized``, ``worst``, ``fitted_psnr``: see ``evaluate.summary``
         - ``aside``, if the scene has views off its path (``scenes.offset_views``): mean ``psnr`` of the
           finest level and names of these ``views``
@@ -117,14 +118,15 @@ def _measure_levels(job: Job, evaluation: Evaluation, bundle: Bundle) -> dict:
     offset_views = read_offset_views(Path(job.scene), bundle.origin)
     offset_cameras = [camera.scaled(job.image_scale) for camera in offset_views]
     levels = standalone_levels(bundle)
-    *coarser, finest = levels
     summary = summarize(evaluation, bundle)
-    veils = [measure_veil(evaluation, full_detail_source(bundle, level)) for level in coarser]
+    sources = [full_detail_source(bundle, level) for level in levels]
+    veils = [measure_veil(evaluation, source) for source in sources[:-1]]
     veils.append(summary["veil"])
     rows = [
-        {"level": level.number, **level.facts, **evaluation.measure_level(bundle, level), "veil": veil}
-        for level, veil in zip(levels, veils, strict=True)
-    ]
+        {"level": level.number, **level.facts, **evaluation.measure_level(bundle, level), "veil": veil,
+         "by_size": evaluation.measure_sizes(source)}
+        for level, source, veil in zip(levels, sources, veils, strict=True)
+    ]  # fmt: skip
     for row, merged in zip(rows, _measure_merges(evaluation, bundle), strict=False):
         row["merged"] = merged
     report = {
@@ -137,14 +139,14 @@ def _measure_levels(job: Job, evaluation: Evaluation, bundle: Bundle) -> dict:
         "selective": [],
     }
     if offset_cameras:
-        quality = float(evaluation.compare_views(offset_cameras, full_detail_source(bundle, finest)).mean())
+        quality = float(evaluation.compare_views(offset_cameras, sources[-1]).mean())
         names = [camera.name for camera in offset_cameras]
         report["aside"] = {"psnr": round(quality, 3), "views": names}
     return report
 
 
-def _measure_merges(evaluation: Evaluation, bundle: Bundle) -> list[float]:
-    """Return the PSNR of merges of the finest level, at the splat count of each coarser level, in dB.
+def _measure_merges(evaluation: Evaluation, bundle: Bundle) -> list[list[float]]:
+    """Measure merges of the finest level at the splat count of each coarser level, as ``measure_sizes``.
 
     Empty if the bundle exceeds memory, or the rule weights splats at full detail.
     """
@@ -155,7 +157,7 @@ def _measure_merges(evaluation: Evaluation, bundle: Bundle) -> list[float]:
     values = []
     for splats in reversed(coarser):
         merged = merge(merged, len(splats))
-        values.append(evaluation.measure_splats(merged)[f"{evaluation.prefix}psnr"])
+        values.append(evaluation.measure_sizes(lambda camera, splats=merged: (splats, None)))
     return values[::-1]
 
 
@@ -205,11 +207,22 @@ def finite(value):
             return value
 
 
+def size_lines(rows: list[dict]) -> list[str]:
+    """Format the PSNR of levels by image size as lines, each with its merge in brackets, if any."""
+    sizes = ["full" if factor == 1 else f"1/{factor}" for factor in REDUCTIONS]
+    lines = [f"{'PSNR by image size (merged)':<28} {'splats':>9}" + "".join(f"{size:>16}" for size in sizes)]
+    for row in rows:
+        merged = [f"({value:.2f})" for value in row.get("merged", [])] or [""] * len(sizes)
+        values = (f"{value:>8.2f} {base:>7}" for value, base in zip(row["by_size"], merged, strict=True))
+        lines.append(f"level {row['level']:<22} {row['splats']:>9,}" + "".join(values))
+    return lines
+
+
 def format_report(report: dict) -> str:
     """Format the report of :func:`evaluate_run` as text."""
     quality = [f"{'' if report['test_views'] else 'train_'}{name}" for name in ("psnr", "ssim")]
-    measures = ("splats", "drawn", *quality, "frame_s", "veil", "merged")
-    lines = [f"{'':>28} {'splats':>9} {'PSNR':>7} {'SSIM':>7} {'ms/frame':>8} {'veiled':>7} {'merged':>7}"]
+    measures = ("splats", "drawn", *quality, "frame_s", "veil", "by_size", "merged")
+    lines = [f"{'':>28} {'splats':>9} {'PSNR':>7} {'SSIM':>7} {'ms/frame':>8} {'veiled':>7}"]
     rows = []
     for row in report["levels"]:
         facts = "".join(f", {k} {v:.5g}" for k, v in row.items() if k not in ("level", *measures))
@@ -230,12 +243,10 @@ def format_report(report: dict) -> str:
             continue
         psnr, ssim = (row[measure] for measure in quality)
         veil = f" {row['veil']['mean']:>7.1%}" if "veil" in row else ""
-        merged = f" {row['merged']:>7.2f}" if "merged" in row else ""
         lines.append(
             f"{name:<28} {row['splats']:>9,} {psnr:>7.2f} {ssim:>7.4f} {1e3 * row['frame_s']:>8.1f}{veil}"
-            f"{merged}"
         )
-    lines += summary_lines(report)
+    lines += [*size_lines(report["levels"]), *summary_lines(report)]
     for row in report.get("farther", []):
         lines.append(
             f"{row['factor']}x the distance: {row['drawn']:,} of {row['drawn_full']:,} splats drawn, "

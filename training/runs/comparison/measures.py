@@ -154,7 +154,7 @@ def compared_run(folder: RunFolder, job: Job, report: dict, label: str) -> Compa
     end = folder.end_event() or {}
     seconds = end.get("seconds")
     finest = max(points, key=lambda point: point.splats)
-    merged = [(int(row["splats"]), float(row["merged"])) for row in report["levels"] if "merged" in row]
+    merged = [(int(row["splats"]), float(row["merged"][0])) for row in report["levels"] if "merged" in row]
     return ComparedRun(
         label=label,
         about=METHODS[job.method].about,
