@@ -5,12 +5,11 @@ import os
 import platform
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from training.rasterize.cpu.bin import TILE, bin_splats, box_sizes
+from training.rasterize.cpu.bin import TILE, bin_splats
 from training.rasterize.cpu.compile import Buffers, numba
 from training.rasterize.cpu.fastmath import exp2
 from training.rasterize.cpu.project import (
@@ -93,13 +92,6 @@ def ellipses(count, random, largest):
     projected[:, SLOPE], projected[:, RISE] = xy / xx, reach * axes[0] * axes[1] / np.sqrt(xx)
     projected[:, X_OF_TOP] = xy / yy * projected[:, HALF_HEIGHT]
     return projected, np.array([[xx, xy], [xy, yy]]).transpose(2, 0, 1), reach
-
-
-def test_copies_of_the_sources_share_compiled_kernels():
-    """Folders are named after modules; those of other packages after paths, as usual."""
-    assert Path(box_sizes.stats.cache_path).name == "training.rasterize.cpu"
-    other = numba.njit(cache=True)(ellipses)
-    assert Path(other.stats.cache_path).name.startswith("rasterize_")
 
 
 @numba.njit

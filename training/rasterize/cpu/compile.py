@@ -39,27 +39,6 @@ os.environ.setdefault("NUMBA_CACHE_DIR", str(_kernels_folder()))
 
 import numba  # noqa: E402
 import numpy as np  # noqa: E402
-from numba.core import caching  # noqa: E402
-
-
-def _share_kernels() -> None:
-    """Let all copies of the same sources share compiled kernels: Numba uses the path of the copy."""
-    locator: Any = getattr(caching, "_CacheLocator", None)
-    subfolder_by_path = getattr(locator, "get_suitable_cache_subpath", None)
-    if subfolder_by_path is None:  # private to Numba; without it, each copy compiles its own kernels
-        return
-    package, root = __name__.removesuffix(".rasterize.cpu.compile"), Path(__file__).resolve().parents[2]
-
-    def subfolder(py_file: str) -> str:
-        folder = Path(py_file).resolve().parent
-        if not folder.is_relative_to(root):
-            return subfolder_by_path(py_file)
-        return ".".join((package, *folder.relative_to(root).parts))
-
-    locator.get_suitable_cache_subpath = staticmethod(subfolder)
-
-
-_share_kernels()
 
 f32 = np.float32
 
