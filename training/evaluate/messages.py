@@ -32,6 +32,9 @@ def summary_lines(measures: dict) -> list[str]:
     match measures.get("loaded"):
         case int() as count if count:
             lines.append(f"Splats loaded by distance: {count:,}")
+    match measures.get("memory"):
+        case int() as size if size:
+            lines.append(f"Memory of the training: {size / 1e9:.1f} GB")
     match measures.get("oversized"):
         case int() as count if count:
             lines.append(f"Oversized opaque splats: {count:,}")

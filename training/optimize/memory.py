@@ -34,6 +34,26 @@ def free_memory() -> int:
     return FALLBACK_BYTES
 
 
+def reset_peak_memory() -> None:
+    """Let :func:`peak_memory` measure from now on; without effect where the system does not allow it."""
+    if sys.platform == "linux":
+        with suppress(OSError):
+            Path("/proc/self/clear_refs").write_text("5")
+
+
+def peak_memory() -> int | None:
+    """Return the largest number of bytes of memory that this process used; None if it is unknown."""
+    if sys.platform == "linux":
+        with suppress(OSError):
+            match = re.search(r"^VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text(), re.MULTILINE)
+            return int(match[1]) << 10 if match else None
+    elif sys.platform != "win32":
+        import resource
+
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # macOS: bytes
+    return None
+
+
 def keep_freed_memory(largest: int | None = None) -> None:
     """Let glibc reuse the memory of freed arrays. Requesting new pages takes about 6 % of a step.
 

@@ -28,7 +28,7 @@ from ..lod.on_disk import MAX_IN_MEMORY, open_if_large, supports_culled_reads
 from ..lod.rule import find_rule
 from ..lod.selection import resolve_controls, standalone_levels
 from ..methods import METHODS, create
-from ..optimize.memory import keep_freed_memory
+from ..optimize.memory import keep_freed_memory, peak_memory, reset_peak_memory
 from ..optimize.method import Method
 from ..optimize.training_data import TrainingData
 from ..rasterize import Gaussians, contributions, cpu_fallback_reason, resolve_backend, tensor_device, warm_up
@@ -123,6 +123,7 @@ def _final_event(error: BaseException) -> tuple[int, dict]:
 
 def _train(job: Job, folder: RunFolder, events: EventWriter, placement: dict[str, Any]) -> int:
     started = time.monotonic()
+    reset_peak_memory()
     events(
         "hello", protocol=PROTOCOL, version=VERSION, method=job.method, preset=job.preset,
         scene=job.scene, out=str(folder.path), pid=os.getpid(),
@@ -169,7 +170,8 @@ def _report_done(
     """Measure the result and write the ``done`` event."""
     seconds = round(time.monotonic() - started, 1)
     events("status", message="Measuring the result")
-    events("done", bundle=folder.bundle.name, seconds=seconds, **summarize(evaluation, bundle))
+    measures = summarize(evaluation, bundle)
+    events("done", bundle=folder.bundle.name, seconds=seconds, memory=peak_memory(), **measures)
 
 
 def _write_merged_levels(

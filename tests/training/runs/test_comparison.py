@@ -12,6 +12,7 @@ from training.__main__ import main
 from training.errors import LodgsError
 from training.runs.comparison.measures import ComparedRun, Point, answers, measure_run
 from training.runs.comparison.page import build_page, compare
+from training.runs.events import event_line
 from training.runs.folder import RunFolder
 from training.runs.job import Job
 from training.runs.measure import evaluate_run
@@ -44,6 +45,7 @@ def runs(tiny_scene, splats, tmp_path_factory):
     for method, bundle in bundles.items():
         run = RunFolder(folder / method)
         run.create()
+        run.events_file.write_text(event_line("done", bundle="bundle.ply", seconds=5.5, memory=10**9) + "\n")
         values = {"scene": str(tiny_scene), "out": str(run.path), "method": method, "image_scale": 1.0}
         Job.from_dict(values | {"backend": "cpu", "test_every": 4}).write(run.job)
         write_bundle(run.bundle, bundle)
@@ -65,6 +67,7 @@ def test_measures_equal_those_of_evaluate(runs, report):
     assert measured["merged"] == [(coarse["splats"], coarse["merged"][0]), (fine["splats"], fine["psnr"])]
     assert measured["by_distance"]["psnr"] == expected["selective"][0]["psnr"]
     assert measured["loaded"] == expected["loaded"]
+    assert (measured["seconds"], measured["memory"]) == (5.5, 10**9)
 
 
 def test_single_level_is_also_compared_with_merged_neighbours(report, splats):

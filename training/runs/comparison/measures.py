@@ -77,6 +77,7 @@ class ComparedRun:
         loaded: mean number of splats that a viewer loads for a view.
         megabytes: size of all levels in one file.
         seconds: seconds of training, or None.
+        memory: most bytes of memory that the training used, or None.
         baseline: the sets are not trained; they are only drawn for comparison.
     """
 
@@ -90,6 +91,7 @@ class ComparedRun:
     loaded: int = 0
     megabytes: float = 0.0
     seconds: float | None = None
+    memory: int | None = None
     baseline: bool = False
 
     @property
@@ -152,7 +154,7 @@ def compared_run(folder: RunFolder, job: Job, report: dict, label: str) -> Compa
         ]
     points = [point for point in points if point.splats]
     end = folder.end_event() or {}
-    seconds = end.get("seconds")
+    seconds, memory = end.get("seconds"), end.get("memory")
     finest = max(points, key=lambda point: point.splats)
     merged = [(int(row["splats"]), float(row["merged"][0])) for row in report["levels"] if "merged" in row]
     return ComparedRun(
@@ -166,6 +168,7 @@ def compared_run(folder: RunFolder, job: Job, report: dict, label: str) -> Compa
         loaded=int(report.get("loaded", finest.splats)),
         megabytes=folder.bundle.stat().st_size / 1e6,
         seconds=float(seconds) if isinstance(seconds, (int, float)) else None,
+        memory=memory if isinstance(memory, int) else None,
     )
 
 
