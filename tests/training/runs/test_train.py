@@ -440,6 +440,7 @@ def test_finished_run_deletes_checkpoints_and_repeats_its_final_event(uninterrup
     assert training_loop.train(Job.from_dict(uninterrupted["keys"]), sys.stdout) == 0
     event = json.loads(capsys.readouterr().out)
     assert event["event"] == "done" and event["bundle"] == "bundle.ply"
+    assert sys.platform != "linux" or event["memory"] > 1e7
     assert folder.events_file.read_bytes() == events
 
 
