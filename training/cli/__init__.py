@@ -11,6 +11,7 @@ COMMANDS = {
     "methods": "list the methods, or the parameters of one",
     "evaluate": "measure a finished run on its held-out views and on views offset from the photos",
     "compare": "compare methods, or runs of one scene, on one page",
+    "reproduce": "measure the tables of a paper on scenes, beside the published values",
     "render": "render one view as a PNG, or as an EXR with depth and levels",
     "capture": "render views of splats that have no photos, as a COLMAP scene to train from",
     "scene": "make a COLMAP scene from photos, or from another program's export",

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import io
-import json
-import sys
 from pathlib import Path
-from typing import IO, Any, cast
 
 from ..errors import LodgsError
 from ..settings import settings_of
 from .options import add_setting, warn
+from .progress import notify, train
 
 _JOB_KEYS = ("preset", "image_scale", "test_every", "seed", "backend")
 """Keys of the jobs that the command trains."""
@@ -52,7 +49,7 @@ def run(options: argparse.Namespace) -> int:
     else:
         wrong = next(source for source, known in zip(options.sources, is_run, strict=True) if not known)
         raise LodgsError(f"Cannot compare {wrong}: it is not a run.", "Name one scene, or runs only.")
-    report = compare(runs, options.out, warn, _notify)
+    report = compare(runs, options.out, warn, notify)
     print(format_comparison(report))
     print(f"{options.out / 'index.html'}: open it in a browser")
     return 0
@@ -68,9 +65,7 @@ def _train_methods(options: argparse.Namespace) -> list[Path]:
         KeyboardInterrupt: training was cancelled.
     """
     from ..methods import METHODS
-    from ..runs.failures import CANCELLED, DONE
     from ..runs.job import Job
-    from ..runs.train import train
 
     (scene,) = options.sources
     keys = {"scene": str(scene)} | {name: vars(options)[name] for name in _JOB_KEYS if name in options}
@@ -79,48 +74,11 @@ def _train_methods(options: argparse.Namespace) -> list[Path]:
     for number, name in enumerate(names, 1):
         label = METHODS[name].label
         text = f"Training {label} ({number} of {len(names)})"
-        _notify(text)
         folder = options.out / "runs" / name
-        events = _Progress(text)
-        code = train(Job.from_dict({**keys, "method": name, "out": str(folder)}), cast("IO[str]", events))
-        if code == CANCELLED:
-            raise KeyboardInterrupt
-        if code == DONE:
-            runs.append(folder)
+        if problem := train(Job.from_dict({**keys, "method": name, "out": str(folder)}), text):
+            warn(f"{label} is left out: {problem}")
         else:
-            warn(f"{label} is left out: {events.last.get('what', 'its training crashed.')}")
+            runs.append(folder)
     if not runs:
         raise LodgsError(f"Cannot compare methods on {scene}: none could be trained.", "Check the scene.")
     return runs
-
-
-class _Progress(io.TextIOBase):
-    """Stream of a run's events that prints the steps, in one line of a terminal or in a hundred of a log.
-
-    Attributes:
-        last: the newest event.
-    """
-
-    def __init__(self, text: str) -> None:
-        self.last: dict[str, Any] = {}
-        self._text = text
-        self._percent = -1
-
-    def write(self, text: str, /) -> int:
-        if text.strip():
-            self.last = json.loads(text)
-            if self.last["event"] == "progress":
-                self._print(self.last["step"], self.last["of"])
-        return len(text)
-
-    def _print(self, step: int, steps: int) -> None:
-        percent = 100 * step // max(steps, 1)
-        terminal = sys.stderr.isatty()
-        if terminal or percent > self._percent:
-            self._percent = percent
-            end = "\r" if terminal and step < steps else "\n"
-            print(f"{self._text}, step {step} of {steps}", end=end, file=sys.stderr, flush=True)
-
-
-def _notify(sentence: str) -> None:
-    print(sentence, file=sys.stderr, flush=True)

@@ -37,6 +37,17 @@ def parse_positive(text: str) -> int:
     raise argparse.ArgumentTypeError(f"{text} is not a whole number from 1 to {2**31 - 1}")
 
 
+def parse_factor(text: str) -> float:
+    """Parse a number above 0 and at most 10."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if 0 < value <= 10:
+        return value
+    raise argparse.ArgumentTypeError(f"{text} is not a number above 0 and at most 10")
+
+
 def parse_numbers(count: int) -> Callable[[str], tuple[float, ...]]:
     """Return a parser of ``count`` numbers separated by commas."""
 

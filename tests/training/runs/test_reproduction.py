@@ -1,0 +1,143 @@
+"""Tables of the papers: declarations, shortened trainings, trends, and the command."""
+
+import json
+
+import numpy as np
+import pytest
+
+from training.__main__ import main
+from training.cli import reproduce as command
+from training.errors import LodgsError
+from training.methods import METHODS
+from training.runs.folder import RunFolder
+from training.runs.job import Job
+from training.runs.reproduction.run import (
+    PAPERS,
+    chosen_tables,
+    load_paper,
+    make_job,
+    reproduce,
+    run_folder,
+    shortened,
+)
+from training.runs.reproduction.tables import PSNR, SPLATS, Training, ascending, format_table, trade
+from training.scenes.colmap import read_scene
+from training.splats.bundle import write_bundle
+from training.splats.gaussians import SH_C0, Splats
+from training.splats.levels import Bundle, Level
+
+TABLES = [(paper, table) for paper in map(load_paper, PAPERS) for table in paper.tables]
+
+
+@pytest.mark.parametrize(("paper", "table"), TABLES, ids=lambda item: getattr(item, "name", item.title[:8]))
+def test_tables_are_complete_and_trends_hold_for_the_papers_values(paper, table):
+    labels = [row.label for row in table.rows]
+    assert len(labels) == len(set(labels))
+    assert all(row.training in paper.trainings for row in table.rows)
+    assert all(len(row.published) <= len(table.columns) for row in table.rows)
+    if all(row.published for row in table.rows):
+        published = {
+            row.label: dict(zip((column.measure for column in table.columns), row.published, strict=False))
+            for row in table.rows
+        }
+        text = format_table(table, published)
+        assert text.count("- Holds") == len(table.trends) and "Does not hold" not in text
+
+
+@pytest.mark.parametrize("name", PAPERS)
+def test_trainings_are_valid_jobs(name, tmp_path):
+    paper = load_paper(name)
+    for training in paper.trainings:
+        job = make_job(paper, training, tmp_path, tmp_path / "out", 0.1, {"image_scale": 0.5})
+        full = METHODS[job.method].preset("paper")
+        assert job.preset == "paper" and job.resolved_parameters().total_steps < 0.2 * full.total_steps
+
+
+def test_effort_multiplies_steps_and_keeps_disabled_intervals():
+    changes = shortened(Training("flod", {"overlap_interval": 0}), 0.1)
+    assert changes["steps"] == [1000, 1500, 2000, 2500, 3000]  # a tenth of the paper's steps
+    assert changes["overlap_interval"] == 0 and changes["sh_interval"] == 100
+    assert "densify_until" not in changes  # a fraction
+    assert shortened(Training("flod"), 1.0) == {}
+
+
+def test_trends_state_our_numbers():
+    values = {("a", "psnr"): 30.0, ("b", "psnr"): 29.5, ("a", "splats"): 100, ("b", "splats"): 40}
+
+    def value(label, column):
+        return values[label, column.measure]
+
+    assert trade("", "a", "b", 0.6, 0.5).test(value) == (True, "0.50 dB at 40% of the splats")
+    assert trade("", "a", "b", 0.4, 0.5).test(value)[0] is False
+    assert ascending("", ("b", "a"), PSNR).test(value) == (True, "29.50, 30.00")
+    assert ascending("", ("a", "b"), SPLATS).test(value) == (False, "100, 40")
+
+
+def test_tables_are_chosen_by_number_or_name():
+    paper = load_paper("clod")
+    assert [table.name for table in chosen_tables(paper, ["2", "Figure 3"])] == ["Table 2", "Figure 3"]
+    assert [table.name for table in chosen_tables(paper, ["3"])] == ["Figure 3"]
+    with pytest.raises(LodgsError, match="7"):
+        chosen_tables(paper, ["7"])
+
+
+@pytest.fixture
+def train(tiny_scene):
+    """Writes a finished FLoD run of five levels in place of a training, and lists the jobs."""
+    model = read_scene(tiny_scene)
+    count = len(model.points)
+    splats = Splats(
+        means=model.points,
+        quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        log_scales=np.full((count, 3), np.log(0.12), np.float32),
+        opacity_logits=np.full(count, 3, np.float32),
+        sh=((model.point_colors[:, None] / 255 - 0.5) / SH_C0).astype(np.float32),
+    )
+    jobs = []
+
+    def write(job: Job, text: str) -> str:
+        jobs.append(text)
+        run = RunFolder(job.out)
+        run.create()
+        job.write(run.job)
+        run.events_file.write_text('{"event": "done"}\n')
+        levels = [
+            Level(number, splats.select(slice(0, count * number // 5)), {"s_min": 0.2 / 4**number})
+            for number in range(1, 6)
+        ]
+        write_bundle(run.bundle, Bundle("flod", levels, "bands"))
+        return ""
+
+    write.jobs = jobs
+    return write
+
+
+KEYS = {"image_scale": 1.0, "test_every": 4, "backend": "cpu"}
+
+
+def test_tables_are_measured_on_each_scene_and_resumed(tiny_scene, train, tmp_path):
+    text = reproduce("flod", [tiny_scene], tmp_path, train, tables=["2", "4"], effort=0.1, keys=KEYS)
+    assert len(train.jobs) == 1 and train.jobs[0].endswith("FLoD (1 of 1)")
+    assert (tmp_path / "tables.md").read_text() == text and "### Table 4" in text
+    rows = json.loads((tmp_path / "tables.json").read_text())
+    assert rows["Table 2"]["5"]["psnr"] > rows["Table 2"]["3"]["psnr"]
+    assert rows["Table 4"]["max level"]["splats"] == len(read_scene(tiny_scene).points)
+    reproduce("flod", [tiny_scene], tmp_path, train, tables=["2"], effort=0.1, keys=KEYS)
+    assert len(train.jobs) == 1
+
+
+def test_failed_training_is_named(tiny_scene, tmp_path):
+    with pytest.raises(LodgsError, match="no reason"):
+        reproduce("clod", [tiny_scene], tmp_path, lambda job, text: "no reason", keys=KEYS)
+
+
+def test_command_prints_the_tables(tiny_scene, train, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(command, "train", train)
+    arguments = ["reproduce", "flod", "--scene", str(tiny_scene), "--out", str(tmp_path), "--tables", "2"]
+    arguments += ["--effort", "0.01", "--image-scale", "1", "--test-every", "4", "--backend", "cpu"]
+    assert main(arguments) == 0
+    assert "| 5-4-3 |" in capsys.readouterr().out
+    job = Job.from_file(RunFolder(run_folder(tmp_path / tiny_scene.name, "FLoD")).job)
+    assert job.resolved_parameters().steps == (100, 150, 200, 250, 300)
+    with pytest.raises(SystemExit):
+        main(["reproduce", "flod", "--out", str(tmp_path), "--effort", "0"])

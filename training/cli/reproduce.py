@@ -1,0 +1,59 @@
+"""``lodgs reproduce``: measure the tables of a paper on scenes."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from ..errors import LodgsError
+from ..settings import settings_of
+from .options import add_setting, parse_factor, warn
+from .progress import notify, train
+
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "lantern_garden"
+"""Example scene of a source folder."""
+
+_JOB_KEYS = ("image_scale", "test_every", "seed", "backend")
+"""Keys of the jobs that the command trains."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    from ..runs.job import Job
+    from ..runs.reproduction.run import PAPERS
+
+    parser.description = (
+        "Trains what the tables of a paper need with the preset paper, prints our values beside those of "
+        "the paper, and says which trends hold. The same command resumes."
+    )
+    parser.add_argument("paper", choices=PAPERS, help="method of the paper")
+    parser.add_argument(
+        "--scene", type=Path, nargs="+", default=[], metavar="DIR", dest="scenes",
+        help="COLMAP scenes; values are means over them (default: the example of a source folder)",
+    )  # fmt: skip
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of tables and runs")
+    parser.add_argument(
+        "--tables", nargs="+", default=(), metavar="N",
+        help="numbers of tables, or names such as 'Figure 3' (default: all)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--effort", type=parse_factor, default=1.0, metavar="N",
+        help="factor on the numbers of steps; trends of short trainings are uncertain (default 1)",
+    )  # fmt: skip
+    for name in _JOB_KEYS:
+        add_setting(parser, settings_of(Job)[name])
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the command and return its exit code."""
+    from ..runs.reproduction.run import reproduce
+
+    scenes = options.scenes or [EXAMPLE]
+    if not scenes[0].is_dir():
+        raise LodgsError(f"Cannot read the scene {scenes[0]}: it does not exist.", "Name one with --scene.")
+    keys = {name: vars(options)[name] for name in _JOB_KEYS if name in options}
+    print(reproduce(
+        options.paper, scenes, options.out, train,
+        tables=options.tables, effort=options.effort, keys=keys, warn=warn, notify=notify,
+    ))  # fmt: skip
+    return 0

@@ -1,0 +1,93 @@
+"""A finished run as the subject of measurements."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+
+from ...editing.export import Compression
+from ...evaluate.views import Evaluation
+from ...lod.on_disk import open_if_large
+from ...lod.selection import resolve_controls, select
+from ...rasterize.resident import ResidentBundle
+from ...scenes.cameras import Camera
+from ...splats.bundle import read_bundle
+from ...splats.dialects import Warn, ignore
+from ...splats.levels import Bundle
+from ..compress import compress
+from ..finished import load_networks, open_finished
+
+
+class Subject:
+    """A finished run, measured on its held-out views, or on training views if none are held out.
+
+    All methods return means over the views: ``psnr`` in dB, ``ssim``, ``fps``, ``ms`` per frame, and, except
+    for networks, ``splats`` (number with a weight above 0, in view or not) and ``drawn`` (number in the
+    image). Levels count from 1; 0 is the finest.
+
+    Raises:
+        LodgsError: the run is not finished, or its scene cannot be read.
+    """
+
+    def __init__(self, run: Path, warn: Warn = ignore) -> None:
+        self.run = run
+        self.folder, self.job, data = open_finished(run, warn)
+        self.bundle = open_if_large(self.folder.bundle) or read_bundle(self.folder.bundle)
+        self.evaluation = Evaluation(data, self.job.backend, self.bundle.antialias)
+
+    @cached_property
+    def _resident(self) -> ResidentBundle:
+        return ResidentBundle(self.bundle, self.job.backend)
+
+    def level(self, number: int = 0) -> dict[str, float]:
+        """Measure a complete level."""
+        return self._level(self.bundle, number)
+
+    def by_distance(self, **controls: float) -> dict[str, float]:
+        """Measure levels selected for each view, with values of the rule's controls."""
+        values = resolve_controls(self.bundle, controls)
+        return self._named(self.evaluation.measure_by_distance(self._resident, values))
+
+    def predetermined(self, **controls: float) -> dict[str, float]:
+        """Measure the levels that the mean training camera selects, for all views (FLoD, Sec. 5.2)."""
+        data = self.evaluation.data
+        values = resolve_controls(self.bundle, controls)
+        splats, weights = select(self.bundle, data.mean_camera, data.focal, values)
+        return self._named(self.evaluation.measure_splats(splats, weights))
+
+    def compressed(self) -> dict[str, float]:
+        """Measure the finest level of the compressed run, with its size as ``megabytes``."""
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder, "compressed.ply")
+            compress(self.run, file, Compression())
+            bundle = read_bundle(file)
+            alone = replace(bundle, levels=bundle.levels[-1:])
+            size = file.stat().st_size * len(alone.levels[0].rows) / sum(len(x.rows) for x in bundle.levels)
+            return {**self._level(alone, 0), "megabytes": size / 1e6}
+
+    def networks(self) -> dict[str, float]:
+        """Measure the images of the networks, before baking."""
+        _, model = load_networks(self.job, self.folder, self.evaluation.data)
+
+        def render(camera: Camera):
+            return model.render_image(camera)
+
+        return self._named(self.evaluation.measure_images(render))
+
+    def sized_level(self) -> dict[str, float]:
+        """Measure the finest level, with its share of the bundle's size as ``megabytes``."""
+        rows = [len(level.rows) for level in self.bundle.levels]
+        size = self.folder.bundle.stat().st_size * rows[-1] / sum(rows)
+        return {**self.level(), "megabytes": size / 1e6}
+
+    def _level(self, bundle: Bundle, number: int) -> dict[str, float]:
+        numbers = {level.number: level for level in bundle.levels}
+        return self._named(self.evaluation.measure_level(bundle, numbers[number or max(numbers)]))
+
+    def _named(self, measures: dict[str, float]) -> dict[str, float]:
+        """Add derived measures, and remove the prefix of measures on training views."""
+        values = {name.removeprefix(self.evaluation.prefix): value for name, value in measures.items()}
+        frame_s = max(values.pop("frame_s"), 1e-6)
+        return {**values, "fps": 1 / frame_s, "ms": 1e3 * frame_s}

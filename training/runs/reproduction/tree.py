@@ -1,0 +1,58 @@
+"""Tables of A LoD of Gaussians (Windisch et al. 2025)."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+from .tables import FPS, PSNR, SPLATS, SSIM, Paper, Row, Table, Training, Trend, Value, ascending
+
+_TREE, _BASE = "A LoD of Gaussians", "3DGS"
+_PIXELS = (0.5, 1, 2, 4, 8, 16)
+
+
+def _label(pixels: float) -> str:
+    return f"cut at {pixels:g} px"
+
+
+def _cut(pixels: float):
+    return lambda subject: subject.by_distance(pixels=pixels)
+
+
+def _halves(value: Value) -> tuple[bool, str]:
+    """Interpolate the loss at half of the splats of the finest cut."""
+    fine = value(_label(_PIXELS[0]), SPLATS)
+    cuts = [(value(_label(p), SPLATS) / fine, value(_label(p), PSNR)) for p in _PIXELS]
+    for (first, quality), (second, coarser) in pairwise(cuts):
+        if second <= 0.5 <= first:
+            part = (first - 0.5) / max(first - second, 1e-9)
+            loss = cuts[0][1] - (quality + part * (coarser - quality))
+            return loss < 0.5, f"{loss:.2f} dB"
+    return False, "no cut has half of the splats"
+
+
+PAPER = Paper(
+    title="A LoD of Gaussians: Unified Training and Rendering for Ultra-Large Scale Reconstruction",
+    trainings={_BASE: Training("3dgs"), _TREE: Training("tree")},
+    tables=(
+        Table(
+            "Figure 18",
+            "Quality and speed of cuts",
+            "five views of each scene",
+            (PSNR, SSIM, FPS, SPLATS),
+            [
+                Row("3DGS", _BASE, lambda subject: subject.level()),
+                *(Row(_label(pixels), _TREE, _cut(pixels)) for pixels in _PIXELS),
+            ],
+            (
+                ascending("Finer cuts have more quality.", [_label(p) for p in reversed(_PIXELS)], PSNR),
+                ascending("Frames of coarser cuts are faster.", [_label(p) for p in _PIXELS], FPS),
+                Trend("Half of the splats lose little quality.", _halves),
+            ),
+        ),
+    ),
+    missing=(
+        "Figure 18: its values are not published as numbers.",
+        "Table 1 compares programs on MatrixCity. Table 3 and Figure 19 measure caching on graphics cards: "
+        "make bench-tree measures cuts and caches of trees with up to 10 million nodes.",
+    ),
+)
