@@ -167,7 +167,6 @@ PAPER = Paper(
         "Tables 1, 2, 5 and 9: LPIPS is not measured.",
         "Tables 3 and 4: graphics memory is not measured. Table 1: Hierarchical-3DGS and Octree-3DGS are not "
         "trained.",
-        "Table 7: it needs a laptop with a graphics card. Table 8: CompactGS and LightGaussian are not part of "
-        "LODGS.",
+        "Table 7: it needs a laptop with a graphics card. Table 8: its methods are not part of LODGS.",
     ),
 )  # fmt: skip
