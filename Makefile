@@ -35,7 +35,7 @@ help:
 	@echo "make bench-tree  cuts of trees with up to 10 million nodes, and training them in 400 MB (first run: an hour, 10 GB)"
 	@echo "make bench-blocks  overhead of distributing blocks, and a plot for 1 to 64 workers (half an hour on an idle machine)"
 	@echo "make extension  dist/lodgs-VERSION.zip, validated by Blender"
-	@echo "make release    dist/: extension, extension repository, Python package, site and checksums"
+	@echo "make release    dist/: extension, its repository, Python package, site, example scene, checksums"
 	@echo "make pins       update requirements/*.txt from requirements/*.in (UPGRADE=1 takes the newest allowed versions)"
 	@echo "make window     tour in a real Blender window, with screenshots (METHOD=flod; needs Blender, Xvfb, ImageMagick)"
 	@echo "make interop    other programs read our files; naga translates our shaders (needs Node)"

@@ -2,7 +2,7 @@
 
 lodgs-VERSION.zip is the extension; repository/ holds it with an index.json that Blender accepts as a remote
 repository; the wheel and the sdist are the Python package; lodgs-VERSION-site.zip is the documentation;
-SHA256SUMS has the checksums.
+lodgs-VERSION-example.zip is the example scene; SHA256SUMS has the checksums.
 """
 
 from __future__ import annotations
@@ -14,12 +14,15 @@ import re
 import shutil
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from tools import extension  # noqa: E402
+
+EXAMPLE = "examples/lantern_garden"
 
 
 def main() -> int:
@@ -43,12 +46,23 @@ def main() -> int:
     shutil.rmtree(site, ignore_errors=True)
     run([sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict"])
     shutil.make_archive(str(out / f"lodgs-{version}-site"), "zip", site)
+    write_example(out / f"lodgs-{version}-example.zip")
     files = sorted(path for path in out.rglob("*") if path.is_file())
     lines = [f"{hashlib.sha256(p.read_bytes()).hexdigest()}  {p.relative_to(out).as_posix()}" for p in files]
     (out / "SHA256SUMS").write_text("\n".join(lines) + "\n", encoding="utf-8")
     for path in files:
         print(f"{path.stat().st_size / 1e6:8.2f} MB  {path.relative_to(out)}")
     return 0
+
+
+def write_example(archive: Path) -> None:
+    """Write the scene of the first steps, in a folder of its name."""
+    names = subprocess.run(
+        ["git", "ls-files", "-z", EXAMPLE], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout
+    with zipfile.ZipFile(archive, "w") as file:  # photos do not shrink
+        for name in filter(None, names.split("\0")):
+            file.write(ROOT / name, Path(name).relative_to("examples"))
 
 
 def check_release(version: str, tag: str | None, dirty: bool) -> None:

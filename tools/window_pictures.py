@@ -197,15 +197,15 @@ def detail() -> Steps:
     yield from show_panels("LODGS_PT_levels", "LODGS_PT_detail")
     yield from settle()
     picture("levels-panel")
-    root.lodgs.mode, root.lodgs.eye = "SELECTIVE", "VIEW"
+    root.lodgs.mode, root.lodgs.camera_choice = "SELECTIVE", "VIEW"
     yield from show_panels("LODGS_PT_detail")
     yield from settle()
     picture("detail-by-distance")
-    root.lodgs.tell = "LEVELS"
+    root.lodgs.colors = "LEVELS"
     yield from show_panels("LODGS_PT_detail", "viewport")
     yield from settle()
     picture("viewport-colours")
-    root.lodgs.tell, root.lodgs.mode, root.lodgs.eye = "OWN", "SINGLE", "CAMERA"
+    root.lodgs.colors, root.lodgs.mode, root.lodgs.camera_choice = "OWN", "SINGLE", "CAMERA"
 
 
 def place_and_clean() -> Steps:

@@ -188,38 +188,38 @@ def distances(root: bpy.types.Object) -> Steps:
     yield from settle()
     assert visible, "No splats are visible with coarser controls."
     screenshot("by-distance-coarser", f"{visible:,} of {total:,} splats")
-    root.lodgs.tell = "LEVELS"
+    root.lodgs.colors = "LEVELS"
     yield from settle()
     screenshot("by-distance-levels")
-    root.lodgs.tell = "OWN"
+    root.lodgs.colors = "OWN"
 
 
 def orbit(root: bpy.types.Object) -> Steps:
-    root.lodgs.eye = "VIEW"
+    root.lodgs.camera_choice = "VIEW"
     leave_camera()
     for angle in (-15, 25, 25):
         press("view3d.view_orbit", angle=math.radians(angle), type="ORBITRIGHT")
         yield from settle()
         yield from settle()
         position = viewport()[1].view_matrix.inverted().translation
-        distance = (root.lodgs.axes.matrix_world @ Vector(root.lodgs.held_eye) - position).length
+        distance = (root.lodgs.axes.matrix_world @ Vector(root.lodgs.stored_position) - position).length
         assert distance < 1e-3, f"The selection uses a position {distance:.3f} from the view's."
         visible, _ = module("data.scenes").count_visible(bpy.context, root)
         screenshot("orbit", f"{visible:,} splats")
 
 
 def freeze(root: bpy.types.Object) -> Steps:
-    root.lodgs.freeze, root.lodgs.tell = True, "BANDS"
-    frozen = tuple(root.lodgs.held_eye)
+    root.lodgs.freeze, root.lodgs.colors = True, "BANDS"
+    frozen = tuple(root.lodgs.stored_position)
     visible = module("data.scenes").count_visible(bpy.context, root)
     press("view3d.view_orbit", angle=math.radians(40), type="ORBITUP")
     viewport()[1].view_distance = 40
     yield from settle()
     yield from settle()
-    assert tuple(root.lodgs.held_eye) == frozen, "A frozen camera position changed."
+    assert tuple(root.lodgs.stored_position) == frozen, "A frozen camera position changed."
     assert module("data.scenes").count_visible(bpy.context, root) == visible, "A frozen selection changed."
     screenshot("freeze", f"{visible[0]:,} splats")
-    root.lodgs.freeze, root.lodgs.tell, root.lodgs.eye = False, "OWN", "CAMERA"
+    root.lodgs.freeze, root.lodgs.colors, root.lodgs.camera_choice = False, "OWN", "CAMERA"
 
 
 def render(root: bpy.types.Object) -> Steps:

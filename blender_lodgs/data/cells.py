@@ -141,7 +141,7 @@ def _plan_key(settings: TrainingSettings, job: Job) -> str:
 def cell_cameras(root: bpy.types.Object, cell: TrainingCell) -> tuple[np.ndarray, np.ndarray]:
     """Return positions (V, 3) and frame corners (V, 4, 3) of a cell's existing cameras, in scene units."""
     view_indices = set(json.loads(cell.view_indices or "[]"))
-    cameras = [view for view in photographs.views(root) if view.data.lodgs.place in view_indices]
+    cameras = [view for view in photographs.views(root) if view.data.lodgs.model_index in view_indices]
     poses = np.array([view.matrix_basis for view in cameras], np.float64).reshape(-1, 4, 4)
     half_sizes = [(v.width / v.fx / 2, v.height / v.fy / 2) for v in (view.data.lodgs for view in cameras)]
     frames = [[(-x, y, -1), (x, y, -1), (x, -y, -1), (-x, -y, -1)] for x, y in half_sizes]

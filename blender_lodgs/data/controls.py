@@ -30,12 +30,12 @@ def update_controls(root: bpy.types.Object, recorded: dict[str, float] | None = 
         LodgsError: a value is invalid.
     """
     settings, rule = root.lodgs, find_rule(root.lodgs.rule)
-    previous = selection.read_facts(settings.recorded)
+    previous = selection.read_facts(settings.recorded_controls)
     recorded = previous if recorded is None else recorded
     if rule is not None:
         numbers = [item.number for item in settings.levels if item.exists]
         defaults = {control.name: control.default for control in rule.controls}
-        old_values = defaults | previous | selection.read_facts(settings.begun)
+        old_values = defaults | previous | selection.read_facts(settings.initial_controls)
         new_values = (rule.defaults(numbers) if numbers else defaults) | recorded
         new_values = {control.name: control.validate(new_values[control.name]) for control in rule.controls}
         unset = [
@@ -47,8 +47,8 @@ def update_controls(root: bpy.types.Object, recorded: dict[str, float] | None = 
         unset.sort(key=lambda control: control.follows != "finest")  # setting it moves the coarsest along
         for control in unset:
             setattr(settings.controls, control.name, new_values[control.name])
-        settings.begun = json.dumps(new_values)
-    settings.recorded = json.dumps(recorded)
+        settings.initial_controls = json.dumps(new_values)
+    settings.recorded_controls = json.dumps(recorded)
 
 
 def _value(root: bpy.types.Object, control: Control) -> float:

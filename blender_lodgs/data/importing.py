@@ -143,7 +143,7 @@ def _add_views(
     index_of = {name: index for index, name in enumerate(names or [camera.name for camera in cameras])}
     for camera in cameras:
         view = new_camera(camera, extent, near, photograph=photographs, distorted=camera.name in distorted)
-        view.parent, view.data.lodgs.place = axes_of(root), index_of[camera.name]
+        view.parent, view.data.lodgs.model_index = axes_of(root), index_of[camera.name]
         root.lodgs.cameras.objects.link(view)
     if context.scene.camera is None and cameras:
         context.scene.camera = root.lodgs.cameras.objects[0]
@@ -274,7 +274,7 @@ def place_splats(
             if cameras:
                 _add_views(context, root, cameras, camera_extent(cameras) or 1.0, near)
                 for settings in (view.data.lodgs for view in views(root)):
-                    settings.held_out = cameras[settings.place].name in held_out
+                    settings.held_out = cameras[settings.model_index].name in held_out
             root.lodgs.training.method = next(
                 info.name for info in METHODS.values() if info.suggested_for_base
             )
@@ -295,7 +295,7 @@ def refill(root: bpy.types.Object, file: SplatsFile) -> None:
 def set_source(root: bpy.types.Object, file: SplatsFile) -> None:
     """Store the file that a scene was read from."""
     source = root.lodgs.source
-    source.file, source.stamp = stored_path(file.path), file.stamp
+    source.file, source.file_version = stored_path(file.path), file.stamp
     source.count = sum(len(level.splats) for level in file.bundle.levels)
 
 
@@ -312,7 +312,7 @@ def _fill(root: bpy.types.Object, file: SplatsFile, level_objects: Sequence[bpy.
     root.lodgs.single_level = file.bundle.levels[-1].number
     if file.total:
         streams.start_streaming(root, file.path, file.budget, file.total)
-        root.lodgs.eye = VIEWPORT.identifier  # stream for the viewport
+        root.lodgs.camera_choice = VIEWPORT.identifier  # stream for the viewport
 
 
 @contextmanager

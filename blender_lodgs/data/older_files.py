@@ -50,9 +50,9 @@ def upgrade_scene(root: bpy.types.Object) -> None:
     if root.lodgs.itself is None:
         root.lodgs.itself = root
     rule, levels = find_rule(root.lodgs.rule), [item.number for item in root.lodgs.levels if item.exists]
-    if rule is not None and levels and not root.lodgs.begun:  # older versions moved the unset control along
+    if rule is not None and levels and not root.lodgs.initial_controls:  # older: unset controls moved along
         finest = {control.name: levels[-1] for control in rule.controls if control.follows == "finest"}
-        root.lodgs.begun = json.dumps(finest)
+        root.lodgs.initial_controls = json.dumps(finest)
     if selection.outdated(root) or looks.outdated(root):
         selection.attach(root)
 

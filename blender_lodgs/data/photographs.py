@@ -74,7 +74,9 @@ def show_undistorted(
     undistorted = {camera.name: camera for camera in scene.cameras}
     for view in views(root):
         settings = view.data.lodgs
-        camera = undistorted.get(names[settings.place]) if 0 <= settings.place < len(names) else None
+        camera = (
+            undistorted.get(names[settings.model_index]) if 0 <= settings.model_index < len(names) else None
+        )
         if camera is None or not settings.distorted:
             continue
         _fit(view.data, camera, distorted=False)
@@ -145,7 +147,7 @@ def is_held_out(root: bpy.types.Object, view: bpy.types.Object) -> bool:
         return settings.held_out
     match selection.read_json(root.lodgs.meta).get("held_out"):
         case [*rests, int(every)] if every > 0:
-            return settings.place % every in rests
+            return settings.model_index % every in rests
     return False
 
 

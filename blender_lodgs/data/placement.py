@@ -3,8 +3,8 @@
 The axes are an empty below the root; its local space has the coordinates of the files, and all parts of the
 scene are its children. The transform of the axes turns a scene upright, aligns it with the ground and scales
 it. The root starts without a transform, so that artists can move, rotate (Euler angles) and scale it, and
-Alt+R resets only their changes. The axes are locked against Alt+R. In files of older versions the axes are
-missing and the root takes their place.
+Alt+R resets only their changes. The axes are locked against Alt+R. If the axes are missing, as for a copy of
+the root alone, the root takes their place.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ DISPLAY_SIZE = 1e-4
 def axes_of(root: bpy.types.Object) -> bpy.types.Object:
     """Return the empty whose local space has the coordinates of a scene's files.
 
-    This is the root itself in older files and for a copy of a root without its children.
+    This is the root itself if the axes are missing.
     """
     axes = root.lodgs.axes
     return axes if isinstance(axes, bpy.types.Object) and axes.parent == root else root

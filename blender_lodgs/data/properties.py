@@ -121,7 +121,7 @@ class ViewSettings(bpy.types.PropertyGroup):
     distorted: bpy.props.BoolProperty(
         name="Distorted", description="The photo has lens distortion, which the camera does not show"
     )
-    place: bpy.props.IntProperty(
+    model_index: bpy.props.IntProperty(
         name="Index", description="Index of the view in the COLMAP model, sorted by name, from 0", default=-1
     )
     held_out: bpy.props.BoolProperty(name="Held Out", description="Training did not use this photo")

@@ -114,7 +114,7 @@ def check_files() -> float:
     """Reload the watched scenes whose files have changed, one step at a time; return INTERVAL."""
     for root in [obj for obj in bpy.data.objects if obj.lodgs.is_root and obj.lodgs.source.watch]:
         if root.is_editable and root.users_scene:
-            _check(root, _watches.setdefault(root.session_uid, FileWatch(root.lodgs.source.stamp)))
+            _check(root, _watches.setdefault(root.session_uid, FileWatch(root.lodgs.source.file_version)))
     return INTERVAL
 
 

@@ -13,8 +13,8 @@ from .selection import read_json
 from .training import TrainingSettings
 
 _view_chosen = look_up("active_view")
-_camera_input_changed = look_up("eye_input")
-_camera_changed = look_up("eye")
+_camera_input_changed = look_up("camera_input")
+_camera_changed = look_up("camera_choice")
 _freeze_changed = look_up("freeze")
 
 
@@ -122,10 +122,10 @@ class SplatStream(bpy.types.PropertyGroup):
         options=set(),
     )
     total: bpy.props.IntProperty(name="Splats", description="Number of splats in the file")
-    here: bpy.props.IntProperty(
+    scene_splats: bpy.props.IntProperty(
         name="Splats in Scene", description="Number of splats of the file in the scene's levels"
     )
-    begun: bpy.props.IntProperty(
+    file_changes: bpy.props.IntProperty(
         name="File Changes", description="Number of times that the file was replaced"
     )
 
@@ -144,7 +144,7 @@ class SplatSource(bpy.types.PropertyGroup):
         description="Replace the splats when another program has written the file again",
         options=set(),
     )
-    stamp: bpy.props.StringProperty(
+    file_version: bpy.props.StringProperty(
         name="Version", description="Size and time of the file when it was read", options={"HIDDEN"}
     )
     count: bpy.props.IntProperty(
@@ -238,12 +238,12 @@ class SplatScene(bpy.types.PropertyGroup):
     meta: bpy.props.StringProperty(
         name="Metadata", description="Metadata of the levels, as JSON", options={"HIDDEN"}
     )
-    recorded: bpy.props.StringProperty(
+    recorded_controls: bpy.props.StringProperty(
         name="Recorded",
         description="Values of the rule's controls that the file or run recorded, as JSON",
         options={"HIDDEN"},
     )
-    begun: bpy.props.StringProperty(
+    initial_controls: bpy.props.StringProperty(
         name="Initial Controls",
         description="Initial values of the rule's controls, as JSON",
         options={"HIDDEN"},
@@ -323,7 +323,7 @@ class SplatScene(bpy.types.PropertyGroup):
         min=1,
         update=_single_changed,
     )
-    eye: bpy.props.EnumProperty(
+    camera_choice: bpy.props.EnumProperty(
         name="Camera",
         description="Camera from which distances are measured",
         items=[(choice.identifier, choice.label, choice.about) for choice in CHOICES],
@@ -335,7 +335,7 @@ class SplatScene(bpy.types.PropertyGroup):
         update=_freeze_changed,
         options=set(),
     )
-    held_eye: bpy.props.FloatVectorProperty(
+    stored_position: bpy.props.FloatVectorProperty(
         name="Frozen Position",
         description="Frozen camera position, or the last one of the viewport, in scene units",
         size=3,
@@ -343,7 +343,7 @@ class SplatScene(bpy.types.PropertyGroup):
         update=_camera_input_changed,
         options={"HIDDEN"},
     )
-    held_focal: bpy.props.FloatProperty(
+    stored_focal: bpy.props.FloatProperty(
         name="Frozen Focal Length", default=1000.0, subtype="PIXEL", update=tag_owner, options={"HIDDEN"}
     )
     focal_px: bpy.props.FloatProperty(
@@ -353,7 +353,7 @@ class SplatScene(bpy.types.PropertyGroup):
         options={"ANIMATABLE"},
     )
 
-    tell: bpy.props.EnumProperty(
+    colors: bpy.props.EnumProperty(
         name="Colours",
         description="Meaning of the splat colours in the viewport",
         items=[
@@ -389,7 +389,7 @@ class SplatScene(bpy.types.PropertyGroup):
     @property
     def follows_viewport(self) -> bool:
         """True if the camera for levels of detail is the viewport's and moves with it."""
-        return find_choice(self.eye).viewport and not self.freeze
+        return find_choice(self.camera_choice).viewport and not self.freeze
 
     @property
     def controls(self) -> bpy.types.PropertyGroup | None:

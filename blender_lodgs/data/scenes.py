@@ -191,7 +191,7 @@ def view_tables(root: bpy.types.Object, placed: bool = False) -> dict[str, dict[
         placed: see :func:`read_levels`.
     """
     cameras = sorted(
-        (view for view in views(root) if view.data.lodgs.width), key=lambda view: view.data.lodgs.place
+        (view for view in views(root) if view.data.lodgs.width), key=lambda view: view.data.lodgs.model_index
     )
     near = min((view.data.clip_start for view in cameras), default=0.0)
     axes = axes_of(root)

@@ -122,7 +122,7 @@ def camera_position(root: bpy.types.Object, scene: bpy.types.Scene) -> tuple[flo
     For the viewport this is the position of the scene camera.
     """
     settings = root.lodgs
-    choice = find_choice(settings.eye)
+    choice = find_choice(settings.camera_choice)
     if choice.position and not choice.viewport:
         return tuple(getattr(settings, choice.position))
     obj = getattr(settings, choice.object) if choice.object else scene.camera
@@ -137,10 +137,10 @@ def store_camera(root: bpy.types.Object, position: tuple[float, float, float], f
     Equal values are not set: setting causes an evaluation.
     """
     settings = root.lodgs
-    if not np.array_equal(np.float32(position), np.float32(settings.held_eye)):
-        settings.held_eye = position
-    if np.float32(focal_px) != np.float32(settings.held_focal):
-        settings.held_focal = focal_px
+    if not np.array_equal(np.float32(position), np.float32(settings.stored_position)):
+        settings.stored_position = position
+    if np.float32(focal_px) != np.float32(settings.stored_focal):
+        settings.stored_focal = focal_px
 
 
 def attach(root: bpy.types.Object) -> None:

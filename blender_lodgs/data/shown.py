@@ -154,7 +154,7 @@ def camera_query(instance: SplatInstance, depsgraph: bpy.types.Depsgraph) -> sel
         return query
     location = camera.evaluated_get(depsgraph).matrix_world.translation
     position = tuple(axes_of(root).evaluated_get(depsgraph).matrix_world.inverted_safe() @ location)
-    return replace(query, eye=position, focal_px=root.evaluated_get(depsgraph).lodgs.focal_px)
+    return replace(query, position=position, focal_px=root.evaluated_get(depsgraph).lodgs.focal_px)
 
 
 def _with_sources(instances: list[SplatInstance], depsgraph: bpy.types.Depsgraph) -> list[SplatInstance]:

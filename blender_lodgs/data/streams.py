@@ -29,18 +29,18 @@ class Source:
         path: bundle.
         total: number of splats in the bundle.
         budget: maximum number of streamed splats in memory, in addition to those of the scene's objects.
-        here: number of splats in the scene's objects.
+        scene_splats: number of splats in the scene's objects.
         level: number of the finest level; streamed splats replace it.
-        begun: counter that changes when the file may have been replaced.
+        file_changes: counter that changes when the file may have been replaced.
     """
 
     scene: int
     path: Path
     total: int
     budget: int
-    here: int
+    scene_splats: int
     level: int
-    begun: int
+    file_changes: int
 
 
 def resident_count(budget: int) -> int:
@@ -52,8 +52,8 @@ def start_streaming(root: bpy.types.Object, path: Path, budget: int, total: int)
     """Start streaming for a scene that holds the coarsest splats of a file."""
     stream = root.lodgs.stream
     stream.file = stored_path(path)
-    stream.budget, stream.total, stream.here = budget, total, _count_splats(root)
-    stream.begun += 1
+    stream.budget, stream.total, stream.scene_splats = budget, total, _count_splats(root)
+    stream.file_changes += 1
 
 
 def stop_streaming(root: bpy.types.Object) -> None:
@@ -84,8 +84,10 @@ def source_of(root: bpy.types.Object) -> Source | None:
         return None
     stream = settings.stream
     finest = max(item.number for item in settings.levels if item.exists)
-    budget = max(stream.budget - stream.here, 0)
-    return Source(root.session_uid, path, stream.total, budget, stream.here, finest, stream.begun)
+    budget = max(stream.budget - stream.scene_splats, 0)
+    return Source(
+        root.session_uid, path, stream.total, budget, stream.scene_splats, finest, stream.file_changes
+    )
 
 
 def is_edited(root: bpy.types.Object) -> bool:
@@ -93,7 +95,7 @@ def is_edited(root: bpy.types.Object) -> bool:
     levels = [item.object.data for item in root.lodgs.levels if item.exists]
     if any(HIDDEN in cloud.attributes for cloud in levels):
         return True
-    return not levels or _count_splats(root) != root.lodgs.stream.here
+    return not levels or _count_splats(root) != root.lodgs.stream.scene_splats
 
 
 def _count_splats(root: bpy.types.Object) -> int:

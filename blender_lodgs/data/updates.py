@@ -30,7 +30,7 @@ def _camera_changed(settings: SplatScene, context: bpy.types.Context) -> None:
 
 def _freeze(settings: SplatScene, context: bpy.types.Context) -> None:
     if (
-        settings.freeze and not find_choice(settings.eye).viewport
+        settings.freeze and not find_choice(settings.camera_choice).viewport
     ):  # focal_px still belongs to the moving camera
         _store_camera(settings, context)
     selection.update_inputs(settings.id_data)
@@ -52,8 +52,8 @@ def register() -> None:
     ON_CHANGE.update(
         redraw=lambda settings, context: extension.redraw(),
         active_view=_active_view,
-        eye_input=lambda settings, context: selection.update_inputs(settings.id_data),
-        eye=_camera_changed,
+        camera_input=lambda settings, context: selection.update_inputs(settings.id_data),
+        camera_choice=_camera_changed,
         freeze=_freeze,
         ellipsoids=_ellipsoids,
     )

@@ -1,4 +1,4 @@
-"""Choices of the camera whose distance selects the level of detail: values of ``SplatScene.eye``.
+"""Choices of the camera whose distance selects the level of detail: values of ``SplatScene.camera_choice``.
 
 The menu, the sockets and drivers of the rules' node groups, and the panel follow from ``CHOICES``.
 """
@@ -12,7 +12,7 @@ class CameraChoice(NamedTuple):
     """A choice of the camera for levels of detail. Without object and position, the active camera.
 
     Attributes:
-        identifier: value of ``SplatScene.eye``.
+        identifier: value of ``SplatScene.camera_choice``.
         label: name in the menu.
         about: tooltip in the menu.
         object: property of ``SplatScene`` with the object whose origin is the camera, created from the table.
@@ -28,7 +28,7 @@ class CameraChoice(NamedTuple):
     viewport: bool = False
 
 
-STORED_POSITION = "held_eye"
+STORED_POSITION = "stored_position"
 """Property of ``SplatScene`` with the position of a frozen camera or of the viewport."""
 VIEWPORT = CameraChoice(
     "VIEW",
@@ -40,7 +40,7 @@ VIEWPORT = CameraChoice(
 )
 CHOICES = (
     CameraChoice("CAMERA", "Scene Camera", "Active camera of the scene"),
-    CameraChoice("OBJECT", "Object", "Origin of an object", object="eye_object"),
+    CameraChoice("OBJECT", "Object", "Origin of an object", object="camera_object"),
     CameraChoice(
         "TRAINING",
         "Training Cameras",
@@ -53,7 +53,7 @@ CHOICES = (
 
 
 def find_choice(identifier: str) -> CameraChoice:
-    """Return the choice with a value of ``SplatScene.eye``; the first one for a value of a newer version."""
+    """Return the choice with this identifier; the first one for an identifier of a newer version."""
     return next((choice for choice in CHOICES if choice.identifier == identifier), CHOICES[0])
 
 

@@ -31,12 +31,12 @@ MATERIAL = "material"
 _HIDE_POINTS = "Hide Points"
 
 
-def display() -> bpy.types.GeometryNodeTree:
+def display_group() -> bpy.types.GeometryNodeTree:
     """Return the group that hides Blender's drawing: plain points, of radius 0 where LODGS draws splats."""
     return ensure_group(NAME, 2 if compat.NATIVE_SPLATS else 1, _build_display)
 
 
-def native() -> bpy.types.GeometryNodeTree:
+def native_group() -> bpy.types.GeometryNodeTree:
     """Return the group that multiplies opacities by level-of-detail weights and the look's opacity."""
     return ensure_group(NATIVE, 1, _build_native)
 
@@ -49,8 +49,8 @@ def attach(obj: bpy.types.Object) -> None:
     """
     is_native = compat.make_native(obj.data)
     _set_material(obj.data, is_native)
-    if _is_outdated(obj, NAME, display):
-        modifier = add_switched_modifier(obj, display(), show_viewport="lodgs_viewport.hides_blender")
+    if _is_outdated(obj, NAME, display_group):
+        modifier = add_switched_modifier(obj, display_group(), show_viewport="lodgs_viewport.hides_blender")
         if is_native:
             compat.set_input(modifier, MATERIAL, points_material())
             driver = replace_driver(obj, compat.input_path(modifier, _HIDE_POINTS), "on")
@@ -59,9 +59,12 @@ def attach(obj: bpy.types.Object) -> None:
             variable.targets[0].context_property = "ACTIVE_SCENE"
             variable.targets[0].data_path = "lodgs_viewport.splats"
             variable.targets[0].use_fallback_value = True
-    if is_native and _is_outdated(obj, NATIVE, native):
+    if is_native and _is_outdated(obj, NATIVE, native_group):
         add_switched_modifier(
-            obj, native(), show_viewport="lodgs_viewport.native", show_render="lodgs_render.draws_points"
+            obj,
+            native_group(),
+            show_viewport="lodgs_viewport.native",
+            show_render="lodgs_render.draws_points",
         )
     elif not is_native and (modifier := obj.modifiers.get(NATIVE)) is not None:
         remove_modifier(obj, modifier)

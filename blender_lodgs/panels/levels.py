@@ -104,9 +104,9 @@ class LODGS_PT_detail(LevelsPanel):
             for reason in dict.fromkeys(idle.values()):
                 say(column, reason, "INFO")
             row = column.row(align=True)
-            row.prop(settings, "eye")
+            row.prop(settings, "camera_choice")
             row.prop(settings, "freeze", text="", icon="FREEZE")
-            camera = find_choice(settings.eye)
+            camera = find_choice(settings.camera_choice)
             if camera.object:
                 column.prop(settings, camera.object)
             elif camera.position and not camera.viewport:
@@ -148,7 +148,7 @@ class LODGS_PT_stream(LevelsPanel):
         root, layout = roots.active_root(context), self.layout
         stream = views.stream(root)
         settings = root.lodgs.stream
-        resident = settings.here + (stream.splats if stream is not None and stream.ready else 0)
+        resident = settings.scene_splats + (stream.splats if stream is not None and stream.ready else 0)
         layout.label(text=f"{_short(resident)} of {_short(settings.total)} splats in memory")
         if streams.is_edited(root):
             say(layout, "These splats no longer match the file, so streaming is off.", "INFO")

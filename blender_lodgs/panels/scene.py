@@ -78,7 +78,7 @@ def _draw_source(layout: bpy.types.UILayout, column: bpy.types.UILayout, root: b
     watch = reloading.watch_of(root)
     if watch is not None and watch.problem:
         say(layout, watch.problem, "ERROR")
-    elif watch is not None and watch.handled == root.lodgs.source.stamp:  # not undone
+    elif watch is not None and watch.handled == root.lodgs.source.file_version:  # not undone
         for note in watch.notes:
             say(layout, note, "INFO")
 

@@ -43,11 +43,11 @@ class LODGS_PT_viewport(Panel):
             column.label(text="Colours")
             row = column.row(align=True)
             rule = resolve_rule(root.lodgs.rule)
-            for tell in ("OWN", "LEVELS", "BANDS", *(["CHUNKS"] if rule.tables else [])):
-                row.prop_enum(root.lodgs, "tell", tell)
-            if root.lodgs.tell in ("LEVELS", "BANDS") and column.active and rule.color_legend:
+            for colors in ("OWN", "LEVELS", "BANDS", *(["CHUNKS"] if rule.tables else [])):
+                row.prop_enum(root.lodgs, "colors", colors)
+            if root.lodgs.colors in ("LEVELS", "BANDS") and column.active and rule.color_legend:
                 say(layout, rule.color_legend, "COLOR")
-            elif root.lodgs.tell in ("LEVELS", "BANDS") and column.active:
+            elif root.lodgs.colors in ("LEVELS", "BANDS") and column.active:
                 _legend(layout, [item.number for item in root.lodgs.levels if item.exists])
         if viewport.problem:
             text = f"Cannot draw splats: {viewport.problem}. Disable Gaussian Splats to draw points."

@@ -114,15 +114,15 @@ def _render_frame(
     height: int,
     window: tuple[int, int, int, int],
     on_progress: renderer.OnProgress,
-    eye: RenderView | None = None,
+    camera: RenderView | None = None,
 ) -> renderer.RenderedFrame:
     """Render like ``engine.render_frame``, but only colour and alpha."""
     scene = depsgraph.scene
     settings = scene.render
-    eye = eye or RenderView.of(scene_camera(scene).evaluated_get(depsgraph))
-    projection = eye.projection(depsgraph, width, height)
+    camera = camera or RenderView.of(scene_camera(scene).evaluated_get(depsgraph))
+    projection = camera.projection(depsgraph, width, height)
     if projection[3][3] == 0:  # perspective: no far clipping, as in F12
-        projection[2][2], projection[2][3] = -1.0, -2.0 * eye.obj.data.clip_start
+        projection[2][2], projection[2][3] = -1.0, -2.0 * camera.obj.data.clip_start
     background = None if settings.film_transparent else tuple(scene.lodgs_render.background)
     result = RenderedImage.empty(width, height, background)
     view = views.ViewState()
@@ -130,7 +130,7 @@ def _render_frame(
     with screen.bind():  # type: ignore[attr-defined]
         gpu.state.active_framebuffer_get().clear(color=(0, 0, 0, 0), depth=1.0)
         views.draw_splats(
-            view, shown.splat_instances(depsgraph), depsgraph, eye.world_to_camera, projection,
+            view, shown.splat_instances(depsgraph), depsgraph, camera.world_to_camera, projection,
             ALL_SPLATS, under_overlays=False, wait=True,
         )  # fmt: skip
     if view.canvas.frame is not None:

@@ -84,7 +84,7 @@ def _points(
     yield settings.points, (0, 0, 0, 0)
     if levels:
         for item in settings.levels:
-            yield item.object, (*level_color(item.number), float(settings.tell in ("LEVELS", "BANDS")))
+            yield item.object, (*level_color(item.number), float(settings.colors in ("LEVELS", "BANDS")))
 
 
 @bpy.app.handlers.persistent

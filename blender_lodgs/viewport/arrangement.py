@@ -146,7 +146,7 @@ class Placement:
         level: 1 is the coarsest; 0 for splats that are no level.
         query: selects and weights the splats; None: all with weight 1.
         scene: number of the splat scene.
-        tell: colour mode, see ``SplatScene.tell``.
+        colors: meaning of the colours, see ``SplatScene.colors``.
         antialias: see ``SplatScene.antialias``.
         arrived: number of updates of paged splats.
         looks: changes of colours and opacities; they change neither selection nor order.
@@ -158,7 +158,7 @@ class Placement:
     level: int
     query: LodQuery | None
     scene: int
-    tell: str
+    colors: str
     antialias: bool = False
     arrived: int = 0
     looks: Looks = field(default=(), compare=False)
@@ -362,14 +362,14 @@ def _color_levels(
     """Return the level that determines the colour of a placement's splats (M,) with these means (M, 3)."""
     query = placement.query
     if query is not None and query.rule:
-        if placement.tell == "LEVELS":
+        if placement.colors == "LEVELS":
             rows = index + placement.first
             names = query.resolved_rule.columns
             return query.splat_level(
                 {name: pool.columns[name][rows] for name in names if name in pool.columns}
             )
-        if placement.tell == "BANDS":
+        if placement.colors == "BANDS":
             return query.target_level(means)
-        if placement.tell == "CHUNKS":
+        if placement.colors == "CHUNKS":
             return query.part_numbers(means)
-    return placement.level if placement.tell in ("LEVELS", "BANDS") else 0
+    return placement.level if placement.colors in ("LEVELS", "BANDS") else 0

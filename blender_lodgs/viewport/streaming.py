@@ -144,7 +144,7 @@ class Stream:
         return (
             self._request is not None
             and self.copied_updates > 0
-            and (pager.idle or pager.splats >= self.source.here)
+            and (pager.idle or pager.splats >= self.source.scene_splats)
         )
 
 

@@ -1,9 +1,10 @@
 """Drawing of splats in viewports.
 
-Splats are read again only if the points of an object change: levels of detail come from the settings of
-modifiers (``selection.evaluated_query``), so time and views do not change splats. Objects with other
-modifiers are read after evaluation. A worker thread selects the splats when a query changes and sorts them
-when the view turns (``arrangement``); ``view_state`` uploads them in small steps.
+All splats to draw are in one pool in memory (``resident``). They are read again only if the points of an
+object change: levels of detail come from the settings of modifiers (``selection.evaluated_query``), so time
+and views do not change splats. Objects with other modifiers are read after evaluation. A worker thread
+selects the splats when a query changes and sorts them when the view turns (``arrangement``); ``view_state``
+uploads them in small steps.
 
 For streamed files (``streaming``), the worker thread also copies new pages, while no viewport uploads them.
 """
@@ -37,7 +38,7 @@ NOT_REQUESTED = -1
 """Value of ``ViewState.arrived`` that makes the viewport redraw until streams are requested."""
 
 reads = 0
-"""Number of times the pool was read since Blender started."""
+"""Number of times the pool was read since Blender started, for tests."""
 
 
 _views: dict[int, ViewState] = {}
@@ -243,7 +244,7 @@ def _direction(
 ) -> Direction | None:
     """Return the view direction in the splats' space; None if the query is for another camera position."""
     camera_to_local = np.linalg.pinv(instance.matrix_world) @ np.array(view_matrix.inverted(), np.float64)
-    distance = np.linalg.norm(camera_to_local[:3, 3] - query.eye)
+    distance = np.linalg.norm(camera_to_local[:3, 3] - query.position)
     if distance > ROUNDING * (1 + np.linalg.norm(camera_to_local[:3, 3])):
         return None
     x, y, z = (-camera_to_local[:3, 2] / max(np.linalg.norm(camera_to_local[:3, 2]), 1e-30)).tolist()
@@ -264,6 +265,7 @@ def _is_streaming() -> bool:
 
 
 def _arrived() -> int:
+    """Return a number that grows whenever streams have brought splats."""
     return sum(stream.ready + stream.arrived for stream in _streams.values())
 
 
@@ -334,6 +336,7 @@ def _placements(
     moving: bool,
     update: bool,
 ) -> tuple[Placement, ...]:
+    """Return the rows of each instance in ``source``, with its transform and query."""
     root_of_level = {item.object: root for root in roots.roots(depsgraph.scene) for item in root.lodgs.levels}
     numbers = {key: number for number, key in enumerate(_versions)}
     placements = []
@@ -349,7 +352,7 @@ def _placements(
                 level=instance.level,
                 query=view_query(instance, depsgraph, moving),
                 scene=(root or instance.object).session_uid,
-                tell=root.lodgs.tell if root else "OWN",
+                colors=root.lodgs.colors if root else "OWN",
                 antialias=instance.antialias,
                 arrived=(paged.arrived if update else paged.copied_updates) if paged else 0,
                 looks=instance.looks,
@@ -375,7 +378,7 @@ def view_query(
     camera = view_camera.current_camera(depsgraph.scene, root) if root is not None else None
     if query is None or not query.rule or camera is None:
         return query
-    return replace(query, eye=camera[0], focal_px=camera[1])
+    return replace(query, position=camera[0], focal_px=camera[1])
 
 
 def _arrange(view: ViewState, source: Resident, request: Request, wait: bool, update: bool) -> bool:

@@ -68,7 +68,7 @@ def test_corrupt_event_files(run, content):
     attempt("events", lambda: follow(run), content)
 
 
-@pytest.mark.cases(short=80, weight=2)
+@pytest.mark.cases(short=40, weight=2)
 @given(values=st.lists(st.sampled_from(EVENTS).flatmap(corrupted_value), min_size=1, max_size=4))
 def test_events_with_unusual_values(run, values):
     run.events_file.write_bytes(lines(values))

@@ -56,6 +56,7 @@ def test_comparison_with_another_checkout_requires_test_views(tiny_scene, tmp_pa
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_error_of_the_trainer_is_reported(tmp_path, capsys):
     assert bench(tmp_path / "missing", "--methods", "3dgs", "--shares", "0.001", "--out", tmp_path) == 2
     errors = capsys.readouterr().err

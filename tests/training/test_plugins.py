@@ -68,9 +68,11 @@ class Rings(Rule):
 
 RULE = Rings()
 """
-EXPORT = """
+EXPORT_AND_SELECT = """
 import sys
 import numpy as np
+import training
+from training.__main__ import main
 from training.splats.bundle import write_bundle
 from training.splats.gaussians import Splats
 from training.splats.levels import Bundle, Level
@@ -81,15 +83,17 @@ def level(number, count, radius):
     splats = Splats(means, rest, means - 2, means[:, 0], means[:, None], importance)
     return Level(number, splats, {"radius": radius})
 
-write_bundle(sys.argv[1], Bundle("", [level(1, 10, 8.0), level(2, 20, 0.0)], "rings"))
-"""
-SELECT = """
-import sys
-import training
+def print_counts(path):
+    for distance in (5, 10, 30, 40):
+        selected = training.select(training.load_bundle(path), (0, 0, distance), 500, {"gain": 1.5})
+        print(*[len(rows) for rows, _ in selected.values()])
 
-for distance in (5, 10, 30, 40):
-    selected = training.select(training.load_bundle(sys.argv[1]), (0, 0, distance), 500, {"gain": 1.5})
-    print(*[len(rows) for rows, _ in selected.values()])
+bundle, larger = sys.argv[1:]
+write_bundle(bundle, Bundle("", [level(1, 10, 8.0), level(2, 20, 0.0)], "rings"))
+print_counts(bundle)
+assert main(["edit", bundle, "--out", larger, "--scale", "2"]) == 0
+print_counts(larger)
+assert main(["info", bundle]) == 0
 """
 BROKEN = {
     "absent_package": ("lodgs.methods", "no_such_package", "No module named 'no_such_package'"),
@@ -195,14 +199,12 @@ def test_recipe_for_a_rule(tmp_path):
     """A new rule needs one module: it selects, and edits scale its lengths."""
     install(tmp_path, "rings", "[lodgs.rules]\nrings = rings\n", {"rings.py": RECIPE})
     bundle, larger = tmp_path / "bundle.ply", tmp_path / "larger.ply"
-    run_python(tmp_path, "-c", EXPORT, bundle)
-    assert "rings" in run_python(tmp_path, "-m", "training", "info", bundle).stdout
+    lines = run_python(tmp_path, "-c", EXPORT_AND_SELECT, bundle, larger).stdout.splitlines()
     # the fine level ends at 12, and at 24 for the important half
-    counts = run_python(tmp_path, "-c", SELECT, bundle).stdout.splitlines()
-    assert counts == ["0 20", "0 20", "10 0", "10 0"]
-    run_python(tmp_path, "-m", "training", "edit", bundle, "--out", larger, "--scale", "2")
-    counts = run_python(tmp_path, "-c", SELECT, larger).stdout.splitlines()
-    assert counts == ["0 20", "0 20", "5 10", "5 10"]
+    assert lines[:4] == ["0 20", "0 20", "10 0", "10 0"]
+    lines = lines[lines.index(f"{larger}: written") + 1 :]
+    assert lines[:4] == ["0 20", "0 20", "5 10", "5 10"]
+    assert "rings" in "".join(lines[4:])
 
 
 def test_restricted_rules_are_unknown(run):

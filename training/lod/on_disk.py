@@ -184,7 +184,7 @@ class CulledReader:
         visible = self._blocks.in_view(camera, 0.0)
         if query is not None and self._rule is not None and query.region() is None:
             band = query.distance_band(self._blocks.columns)
-            visible &= self._blocks.in_band(np.array(query.eye, np.float32), *band)[0]
+            visible &= self._blocks.in_band(np.array(query.position, np.float32), *band)[0]
         limit = max(_MAX_SURPLUS * np.count_nonzero(visible), _BATCH // SIZE)
         in_memory = self._in_memory
         if in_memory is not None and not (visible & ~in_memory).any() and in_memory.sum() <= limit:

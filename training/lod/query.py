@@ -25,7 +25,7 @@ class LodQuery:
 
     Attributes:
         rule: name of the rule.
-        eye: camera position in the splats' space.
+        position: camera position in the splats' space.
         focal_px: focal length of the camera in pixels.
         facts, values: see ``rule.Rule.weights``, as pairs.
         tables: the rule's tables: name, columns by name, each as its dtype and bytes.
@@ -33,7 +33,7 @@ class LodQuery:
     """
 
     rule: str
-    eye: tuple[float, float, float]
+    position: tuple[float, float, float]
     focal_px: float
     facts: tuple[tuple[str, float], ...]
     values: tuple[tuple[str, float], ...]
@@ -122,7 +122,7 @@ class LodQuery:
 
     @property
     def _position(self) -> np.ndarray:
-        return np.array(self.eye, np.float32)
+        return np.array(self.position, np.float32)
 
     def _tables(self) -> Tables:
         return {
@@ -137,7 +137,7 @@ class LodQuery:
             for name, columns in self._tables().items()
         }
         return {
-            "rule": self.rule, "eye": list(self.eye), "focal_px": self.focal_px,
+            "rule": self.rule, "position": list(self.position), "focal_px": self.focal_px,
             "facts": dict(self.facts), "values": dict(self.values), "tables": tables,
             "crops": None if self.crops is None else [crop.as_dict() for crop in self.crops],
         }  # fmt: skip
@@ -342,7 +342,7 @@ class SplatSelector:
         full = np.full(count, query is None)
         if query is not None and not in_region:
             band = query.distance_band(subset.maxima(query.resolved_rule))
-            visible, inside = subset.blocks.in_band(np.array(query.eye, np.float32), *band)
+            visible, inside = subset.blocks.in_band(np.array(query.position, np.float32), *band)
             if query.resolved_rule.fills_band(dict(query.values)) and query.crops is None:
                 full = inside
         return visible, full

@@ -181,7 +181,7 @@ def _query(values: dict) -> LodQuery:
     rule = find_rule(name) if name else NO_RULE
     if rule is None:
         raise _invalid("rule", name)
-    x, y, z = _numbers(values, "eye", 3, MAX_COORDINATE)
+    x, y, z = _numbers(values, "position", 3, MAX_COORDINATE)
     (focal_px,) = _numbers({"focal_px": [values.get("focal_px")]}, "focal_px", 1, MAX_NUMBER)
     controls = _named_numbers(values, "values", [control.name for control in rule.controls])
     for control in rule.controls:  # limits are rounded to single precision, as Blender's sliders do

@@ -19,7 +19,7 @@ others, and ``psnr`` compares it with the image outside the black parts of the m
 with the depth of objects that hide splats, in the size of the camera or the window.
 
 A set is read when its file is first named, and discarded when a frame does not name it. Its file may be
-removed after an answer ``frame``. A choice (``lod.query``: ``rule``, ``eye`` in the set's coordinates,
+removed after an answer ``frame``. A choice (``lod.query``: ``rule``, ``position`` in the set's coordinates,
 ``focal_px``, and ``facts``, ``values`` and ``tables`` by name) weights the splats by a rule, in addition to
 the file's weights. The rule's columns are the file's columns of the same names. Of a paged bundle
 (``lod.query.PagedFile``), only the visible part is read. Looks (``editing.look``) change colours and

@@ -115,10 +115,10 @@ def choose_view(splats: Splats, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]
         for elevation in _ELEVATIONS[int(hollow)]:
             for angle in np.linspace(0, 2 * np.pi, _AZIMUTHS, endpoint=False):
                 across = np.cos(angle) * east + np.sin(angle) * north
-                eye = center + distance * (np.cos(elevation) * across + np.sin(elevation) * up)
-                score = _clarity(sample.means, sizes, opacities, look_at(eye, center, up), distance)
+                position = center + distance * (np.cos(elevation) * across + np.sin(elevation) * up)
+                score = _clarity(sample.means, sizes, opacities, look_at(position, center, up), distance)
                 if score > best_score:
-                    best, best_score = eye, score
+                    best, best_score = position, score
     return None if best is None else (best, center)
 
 
@@ -167,7 +167,8 @@ def _clarity(
 ) -> float:
     """Return the mean depth of the nearest splats over the view, relative to ``distance`` and at most 1.5.
 
-    Splats near the eye reduce it by the share of the view that they cover. Pixels without splats count 0.3.
+    Splats near the camera reduce it by the share of the view that they cover. Pixels without splats count
+    0.3.
     """
     local = means @ pose[:3, :3].T + pose[:3, 3]
     x, y, z = local.T

@@ -55,6 +55,7 @@ _UNSUPPORTED = (
 _TABLES = {"features": "descriptors", "pairs": "two_view_geometries"}
 """Tables of COLMAP's database with one row per completed item, by stage."""
 _POLL_SECONDS = 0.5
+_JOIN_SECONDS = 2.0
 
 Report = Callable[[str, int, int], object]
 """Callback that receives the stage, the number of completed items and their total."""
@@ -197,7 +198,7 @@ class _Progress:
 
     def __exit__(self, *_: object) -> None:
         self._finished.set()
-        self._thread.join()
+        self._thread.join(_JOIN_SECONDS)  # the reader of a report may be stuck
 
     def begin(self, stage: str, done: int, total: int) -> None:
         self._stage = stage

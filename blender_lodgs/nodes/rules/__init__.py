@@ -27,12 +27,12 @@ from ...attributes import COLUMN, OPACITY_LOGIT, WEIGHT
 from ..building import VERSION, Field, Nodes, ensure_group, is_edited
 from ..camera_choices import CHOICES
 
-CAMERA_SOURCE = "eye"
+CAMERA_SOURCE = "camera_choice"
 """Socket and property with the index of the camera choice in ``camera_choices.CHOICES``."""
 FREEZE = "freeze"
-CAMERA_POSITION = "eye_position"
+CAMERA_POSITION = "camera_position"
 FOCAL = "focal_px"
-STORED_FOCAL = "held_focal"
+STORED_FOCAL = "stored_focal"
 MATERIAL = "material"
 RULE = "lodgs_rule"
 """Custom property of these groups: the name of the rule."""
@@ -46,7 +46,7 @@ _SHARED = {
     STORED_FOCAL: "NodeSocketFloat",
     MATERIAL: "NodeSocketMaterial",
 }
-_SHARED_VERSION = 30 + len(CHOICES)  # groups are rebuilt for a new choice
+_SHARED_VERSION = 31 + len(CHOICES)  # groups are rebuilt for a new choice
 
 restrict_rules([module.name for module in iter_modules(__path__)])
 

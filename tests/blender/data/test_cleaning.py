@@ -124,7 +124,7 @@ def test_crops_match_numpy_at_every_level(bpy, lodgs, cropped, name):
 @pytest.mark.parametrize("name", NAMES)
 def test_export_matches_selection_by_distance(bpy, lodgs, cropped, tmp_path, name):
     root, _, stay = cropped(name)
-    root.lodgs.mode, root.lodgs.eye = "SELECTIVE", "TRAINING"
+    root.lodgs.mode, root.lodgs.camera_choice = "SELECTIVE", "TRAINING"
     root.lodgs.camera_center = (1.0, -2.0, 0.5)
     bpy.context.view_layer.update()
     there = [shown_rows(bpy, lodgs, item.object) for item in root.lodgs.levels]
@@ -133,7 +133,7 @@ def test_export_matches_selection_by_distance(bpy, lodgs, cropped, tmp_path, nam
     exported = read_bundle(tmp_path / "out.ply")
     assert [len(level.splats) for level in exported.levels] == [mask.sum() for mask in stay.values()]
     again = lodgs("data.importing").import_splats(bpy.context, tmp_path / "out.ply", upright=False)
-    again.lodgs.mode, again.lodgs.eye = "SELECTIVE", "TRAINING"
+    again.lodgs.mode, again.lodgs.camera_choice = "SELECTIVE", "TRAINING"
     again.lodgs.camera_center = (1.0, -2.0, 0.5)
     bpy.context.view_layer.update()
     assert sum(map(len, there)) > 0
@@ -146,7 +146,7 @@ def test_viewport_draws_remaining_splats(bpy, lodgs, cropped, name):
     root, _, _ = cropped(name)
     cleaning = lodgs("data.cleaning")
     cleaning.hide(root, cleaning.find(root, cleaning.opacity_test(0.3)))
-    root.lodgs.mode, root.lodgs.eye = "SELECTIVE", "TRAINING"
+    root.lodgs.mode, root.lodgs.camera_choice = "SELECTIVE", "TRAINING"
     bpy.context.view_layer.update()
     resident, arrangement = lodgs("viewport.resident"), lodgs("viewport.arrangement")
     selection, depsgraph = lodgs("data.selection"), bpy.context.evaluated_depsgraph_get()
@@ -443,11 +443,11 @@ def test_levels_drop_references_before_undo(bpy, lodgs, scene_of):
     def look(*_):
         seen.append(pointed_at())
 
-    root.lodgs.eye_object = eye = bpy.data.objects.new("Eye", None)
+    root.lodgs.camera_object = eye = bpy.data.objects.new("Eye", None)
     bpy.context.scene.collection.objects.link(eye)
     for each in names:
         bpy.data.objects[each].data.materials.append(material)
-    root.lodgs.eye = "OBJECT"
+    root.lodgs.camera_choice = "OBJECT"
     bpy.ops.ed.undo_push(message="start")
     for keep in ("INSIDE", "ALL"):
         assert bpy.ops.lodgs.add_crop("EXEC_DEFAULT", True, shape="SPHERE", keep=keep) == {"FINISHED"}

@@ -147,7 +147,7 @@ def test_export_one_level_and_visible_splats(bpy, lodgs, bundle, file, tmp_path)
     assert np.array_equal(vertex["rot_0"], splats.quats[:, 0])
     assert np.array_equal(vertex["f_rest_15"], splats.sh[:, 1, 1])
 
-    root.lodgs.mode, root.lodgs.eye, root.lodgs.bands.gamma = "SELECTIVE", "TRAINING", 1.0
+    root.lodgs.mode, root.lodgs.camera_choice, root.lodgs.bands.gamma = "SELECTIVE", "TRAINING", 1.0
     bpy.context.view_layer.update()
     bpy.ops.lodgs.export_plain(filepath=str(out), source="SHOWN")
     f = root.lodgs.focal_px

@@ -235,7 +235,7 @@ def test_blender_or_lodgs_draws_and_both_select_the_same_splats(bpy, lodgs, make
     levels = [files.Level(n, make(100 * n, 1, seed=n), {"s_min": s}) for n, s in ((1, 0.5), (2, 0.0))]
     bundles.write_bundle(tmp_path / "b.ply", files.Bundle("flod", levels, "bands", {}, {"gamma": 1.0}))
     root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply")
-    root.lodgs.mode, root.lodgs.eye, root.lodgs.camera_center = "SELECTIVE", "TRAINING", (0, 0, -1)
+    root.lodgs.mode, root.lodgs.camera_choice, root.lodgs.camera_center = "SELECTIVE", "TRAINING", (0, 0, -1)
     settings = bpy.context.scene.lodgs_viewport
     positions, types = {}, {}
     for drawn_by in ("LODGS", "BLENDER"):

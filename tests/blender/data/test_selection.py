@@ -163,17 +163,17 @@ def test_camera_sources(bpy, root):
     chosen.location = (10, 0, 0)
     bpy.context.scene.camera.location = (0, 5, 0)
     seen = [check(bpy, root, eye=(0, 5, 0))]
-    root.lodgs.eye = "OBJECT"
-    root.lodgs.eye_object = chosen
+    root.lodgs.camera_choice = "OBJECT"
+    root.lodgs.camera_object = chosen
     seen.append(check(bpy, root, eye=(10, 0, 0)))
     chosen.location.x = 5
     seen.append(check(bpy, root, eye=(5, 0, 0)))
-    root.lodgs.eye = "TRAINING"
+    root.lodgs.camera_choice = "TRAINING"
     root.lodgs.camera_center = (0, 0, 20)
     seen.append(check(bpy, root, eye=(0, 0, 20)))
     bpy.context.scene.camera.location = (0, 0, 0)
     assert check(bpy, root, eye=(0, 0, 20)) == seen[-1]
-    root.lodgs.eye = "CAMERA"
+    root.lodgs.camera_choice = "CAMERA"
     seen.append(check(bpy, root, eye=(0, 0, 0)))
     assert len({tuple(counts) for counts in seen}) == len(seen)
 

@@ -176,8 +176,8 @@ def test_tables_of_earlier_versions_load(bpy, lodgs, tmp_path):
     bundle = Bundle("lodge", levels, "chunks", controls={"distance_scale": 2.0})
     write_bundle(tmp_path / "old.ply", bundle)
     root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "old.ply")
-    root.lodgs.begun = json.dumps({"distance_scale": 2.0})
-    root.lodgs.mode, root.lodgs.eye, root.lodgs.camera_center = "SELECTIVE", "TRAINING", (0, 0, 0)
+    root.lodgs.initial_controls = json.dumps({"distance_scale": 2.0})
+    root.lodgs.mode, root.lodgs.camera_choice, root.lodgs.camera_center = "SELECTIVE", "TRAINING", (0, 0, 0)
     for item in root.lodgs.levels:
         lodgs("data.selection").rule_modifier(item.object).node_group["lodgs_version"] = 101
     lodgs("data.older_files").upgrade_scene(root)

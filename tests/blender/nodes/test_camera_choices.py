@@ -10,7 +10,7 @@ from tests.checkout import ROOT, copy_checkout
 pytestmark = pytest.mark.one_blender
 
 
-ENTRY = '    CameraChoice("SECOND", "Second Object", "Another object", object="second_eye"),\n'
+ENTRY = '    CameraChoice("SECOND", "Second Object", "Another object", object="second_camera"),\n'
 LAST = "    VIEWPORT,\n)\n"
 SCRIPT = """
 import importlib, sys
@@ -49,13 +49,13 @@ def visible():
     depsgraph = bpy.context.evaluated_depsgraph_get()
     evaluated = settings.levels[1].object.evaluated_get(depsgraph)
     query = selection.evaluated_query(evaluated, depsgraph)
-    near = 0.01 * settings.focal_px > np.abs(means[:, 0] - query.eye[0])
+    near = 0.01 * settings.focal_px > np.abs(means[:, 0] - query.position[0])
     assert near.any() and len(evaluated.data.points) == near.sum() < n
-    return query.eye
+    return query.position
 
-assert settings.bl_rna.properties["eye"].enum_items["SECOND"].value == 4
+assert settings.bl_rna.properties["camera_choice"].enum_items["SECOND"].value == 4
 assert visible() == (0, 0, 0)
-settings.eye, settings.second_eye = "SECOND", second
+settings.camera_choice, settings.second_camera = "SECOND", second
 np.testing.assert_allclose(visible(), (60, 0, 0), atol=1e-5)
 settings.freeze = True
 second.location = (0, 0, 0)
@@ -79,17 +79,17 @@ def test_entry_of_the_table_declares_a_choice(tmp_path):
 
 
 def test_numbers_of_choices_in_files(bpy, lodgs):
-    items = lodgs("data.scene_properties").SplatScene.bl_rna.properties["eye"].enum_items
+    items = lodgs("data.scene_properties").SplatScene.bl_rna.properties["camera_choice"].enum_items
     numbers = {item.identifier: item.value for item in items}
     assert numbers == {"CAMERA": 0, "OBJECT": 1, "TRAINING": 2, "VIEW": 3}
 
 
 def test_position_drivers_need_no_scripts(bpy, lodgs):
     choices = lodgs("nodes.camera_choices")
-    expression = choices.position_expression("eye", "freeze")
+    expression = choices.position_expression("camera_choice", "freeze")
     for values, expected in (
-        ({"eye": 2, "freeze": 0}, "center"), ({"eye": 3, "freeze": 0}, "held"),
-        ({"eye": 2, "freeze": 1}, "held"), ({"eye": 0, "freeze": 0}, "held"),
+        ({"camera_choice": 2, "freeze": 0}, "center"), ({"camera_choice": 3, "freeze": 0}, "held"),
+        ({"camera_choice": 2, "freeze": 1}, "held"), ({"camera_choice": 0, "freeze": 0}, "held"),
     ):  # fmt: skip
-        values |= {"camera_center": "center", "held_eye": "held"}
+        values |= {"camera_center": "center", "stored_position": "held"}
         assert eval(expression, values) == expected

@@ -31,7 +31,7 @@ def weights(bpy, lodgs):
         scenes.set_bundle_facts(root, bundle)
         scenes.set_tables(root, bundle.tables)
     root.location, root.rotation_euler, root.scale = (5, 6, 7), (1, 2, 3), (2, 3, 4)
-    root.lodgs.mode, root.lodgs.eye = "SELECTIVE", "TRAINING"
+    root.lodgs.mode, root.lodgs.camera_choice = "SELECTIVE", "TRAINING"
 
     def compute(camera, **controls):
         for name, value in {"chunks": True, "fade": True, "distance_scale": 1.0, **controls}.items():
@@ -110,14 +110,14 @@ def test_chunks_are_selected_for_every_camera_source(bpy, weights, source):
     obj.location = root.lodgs.axes.matrix_world @ obj.location.__class__(position)
     if source == "CAMERA":
         bpy.context.scene.camera = obj
-    root.lodgs.eye_object, root.lodgs.held_eye = obj, position
+    root.lodgs.camera_object, root.lodgs.stored_position = obj, position
     if source == "frozen":
-        root.lodgs.eye, root.lodgs.freeze = "OBJECT", True
-        root.lodgs.held_eye = position
+        root.lodgs.camera_choice, root.lodgs.freeze = "OBJECT", True
+        root.lodgs.stored_position = position
         obj.location = (100, 100, 100)
     else:
-        root.lodgs.eye = source
-        root.lodgs.held_eye = position
+        root.lodgs.camera_choice = source
+        root.lodgs.stored_position = position
     assert weights((100, 0, 0)) == pytest.approx([0, 0.75, 0.25, 1], abs=1e-5)
 
 
@@ -131,7 +131,7 @@ def test_animated_camera_works_without_handlers(bpy, lodgs, weights, tmp_path):
     for frame, x in ((1, 0.0), (11, 10.0)):
         camera.location = root.lodgs.axes.matrix_world @ camera.location.__class__((x, 0, 0))
         camera.keyframe_insert("location", frame=frame)
-    root.lodgs.eye = "CAMERA"
+    root.lodgs.camera_choice = "CAMERA"
     path, name = str(tmp_path / "a.blend"), root.lodgs.levels[1].object.name
     bpy.ops.wm.save_as_mainfile(filepath=path)
     handlers = [getattr(bpy.app.handlers, kind) for kind in ("depsgraph_update_post", "load_post")]
@@ -168,7 +168,7 @@ def test_renders_evaluate_the_group(bpy, lodgs, weights):
     camera.location = weights.root.lodgs.axes.matrix_world @ camera.location.__class__((2.5, 3, 0))
     bpy.context.view_layer.update()
     camera.location = weights.root.lodgs.axes.matrix_world @ camera.location.__class__((2.5, 3, 0))
-    weights.root.lodgs.eye = "CAMERA"
+    weights.root.lodgs.camera_choice = "CAMERA"
     bpy.utils.register_class(Recorder)
     try:
         bpy.context.scene.render.engine = Recorder.bl_idname

@@ -193,7 +193,7 @@ def half(bpy, lodgs, splat_scene):
         root = splat_scene(name)
         rule, rng = rules()[name], np.random.default_rng(1)
         _, values = random_arguments(rule, rng)
-        root.lodgs.mode, root.lodgs.eye = "SELECTIVE", "TRAINING"
+        root.lodgs.mode, root.lodgs.camera_choice = "SELECTIVE", "TRAINING"
         camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
         camera.data.clip_start, camera.location = 0.01, (0, 0, 40)
         bpy.context.scene.collection.objects.link(camera)

@@ -47,7 +47,7 @@ def test_every_control_of_a_rule_has_a_property_of_its_type(root, draw, name):
     scene_root = root(name)
     scene_root.lodgs.mode = "SELECTIVE"
     layout, controls = draw(), rules()[name].controls
-    assert layout.properties == ["mode", *(control.name for control in controls), "eye", "freeze"]
+    assert layout.properties == ["mode", *(control.name for control in controls), "camera_choice", "freeze"]
     assert layout.sliders == [control.name for control in controls if control.soft]
     properties = scene_root.lodgs.controls.bl_rna.properties
     for control in controls:
@@ -90,7 +90,7 @@ def town(bpy, lodgs):
             scenes.put_level(root, level)
         scenes.set_bundle_facts(root, Bundle("lodge", levels, "chunks"))
         scenes.set_tables(root, {"chunks": table})
-    root.lodgs.mode, root.lodgs.eye = "SELECTIVE", "TRAINING"
+    root.lodgs.mode, root.lodgs.camera_choice = "SELECTIVE", "TRAINING"
     return root
 
 
@@ -133,8 +133,8 @@ def test_loaded_splats_are_counted_again_when_splats_change(bpy, lodgs, town):
 
 def test_chunks_can_be_shown_as_spheres_and_colours(town, draw, draw_panel, root):
     assert "hide_viewport" in draw().properties
-    assert "tell CHUNKS" in draw_panel("viewport", "LODGS_PT_viewport").properties
-    town.lodgs.tell = "CHUNKS"
+    assert "colors CHUNKS" in draw_panel("viewport", "LODGS_PT_viewport").properties
+    town.lodgs.colors = "CHUNKS"
     assert not draw_panel("viewport", "LODGS_PT_viewport").colors
 
 
@@ -183,7 +183,7 @@ def tree(bpy, lodgs, tmp_path):
 def test_panels_explain_the_coarse_level_of_a_tree(tree, draw_panel):
     texts = draw_panel("levels", "LODGS_PT_levels").texts
     assert any("Only level 2 is a complete scene" in text for text in texts)
-    tree.lodgs.tell = "LEVELS"
+    tree.lodgs.colors = "LEVELS"
     layout = draw_panel("viewport", "LODGS_PT_viewport")
     assert not layout.colors and any("half the size" in text for text in layout.texts)
 

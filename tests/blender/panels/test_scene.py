@@ -57,7 +57,7 @@ def test_result_of_an_import_is_shown_until_the_next_import(bpy, lodgs, draw_pan
 
 def test_colours_have_a_legend(root, draw_panel):
     assert draw_panel("viewport", "LODGS_PT_viewport").colors == []
-    root.lodgs.tell = "LEVELS"
+    root.lodgs.colors = "LEVELS"
     layout = draw_panel("viewport", "LODGS_PT_viewport")
     assert layout.colors == [(*level_color(1), 1), (*level_color(2), 1)] and layout.texts[:3] == [
         "Colours",

@@ -46,14 +46,14 @@ def test_frames_of_a_streamed_tree_are_complete(bpy, lodgs, path, camera, frame)
     importing = lodgs("data.importing")
     root = importing.import_splats(bpy.context, path, budget=BUDGET)
     assert sum(len(item.object.data.points) for item in root.lodgs.levels) <= BUDGET
-    assert root.lodgs.eye == "VIEW"
+    assert root.lodgs.camera_choice == "VIEW"
     lodgs("data.selection").store_camera(root, (500, 500, 500), 20.0)
     streamed = {pixels: frame(root, pixels) for pixels in (1.0, 8.0)}
     root.lodgs.stream.file = ""
     without_file = frame(root, 1.0)
     lodgs("data.removal").remove(root)
     loaded = importing.import_splats(bpy.context, path)
-    assert (loaded.lodgs.eye, loaded.lodgs.stream.file) == ("CAMERA", "")
+    assert (loaded.lodgs.camera_choice, loaded.lodgs.stream.file) == ("CAMERA", "")
     for pixels, image in streamed.items():
         np.testing.assert_allclose(image, frame(loaded, pixels), atol=1e-4)
     assert np.abs(without_file - streamed[1.0]).max() > 0.05
@@ -65,7 +65,7 @@ def test_frozen_camera_selects_the_nodes(bpy, lodgs, path, camera, frame):
     images = []
     for budget in (BUDGET, 0):
         root = importing.import_splats(bpy.context, path, budget=budget)
-        root.lodgs.eye, root.lodgs.freeze = "CAMERA", True
+        root.lodgs.camera_choice, root.lodgs.freeze = "CAMERA", True
         lodgs("data.selection").store_camera(root, (9, 9, 1), 100.0)
         images.append(frame(root, 2.0))
         lodgs("data.removal").remove(root)

@@ -138,7 +138,7 @@ def test_tree_larger_than_the_budget_is_streamed(bpy, lodgs, jobs, fake, root, t
     if not fits:
         source = streams.source_of(root)
         assert source.path == tmp_path / "run" / "bundle.ply" and source.total == 2 * LEAVES - 1
-        assert root.lodgs.eye == "VIEW" and root.lodgs.stream.budget == budget
+        assert root.lodgs.camera_choice == "VIEW" and root.lodgs.stream.budget == budget
         fake("")  # levels of another run replace the streamed file
         assert bpy.ops.object.select_all(action="DESELECT") and not root.select_set(True)
         bpy.context.view_layer.objects.active = root

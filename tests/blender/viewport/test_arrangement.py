@@ -72,13 +72,13 @@ def test_rule_selects_the_splats_of_the_modifiers(bpy, lodgs, make_scene, facts)
         camera.location = (9, -2, 4)
 
     def use_object():
-        settings.eye, settings.eye_object = "OBJECT", target
+        settings.camera_choice, settings.camera_object = "OBJECT", target
 
     def use_training_center():
-        settings.eye, settings.camera_center = "TRAINING", (3, 3, 3)
+        settings.camera_choice, settings.camera_center = "TRAINING", (3, 3, 3)
 
     def freeze():
-        settings.eye, settings.freeze = "CAMERA", True
+        settings.camera_choice, settings.freeze = "CAMERA", True
         camera.location = (-30, 0, 0)
 
     counts = set()
@@ -108,9 +108,11 @@ def make_pool(lodgs, sets):
     return arrangement.Pool(means, areas, opacities, {"lod_bias": np.zeros(len(means), np.float32)}), starts
 
 
-def make_placement(lodgs, first, count, *, matrix=None, level=1, query=None, scene=0, tell="OWN"):
+def make_placement(lodgs, first, count, *, matrix=None, level=1, query=None, scene=0, colors="OWN"):
     matrix = np.eye(4) if matrix is None else matrix
-    return lodgs("viewport.arrangement").Placement(first, count, matrix.tobytes(), level, query, scene, tell)
+    return lodgs("viewport.arrangement").Placement(
+        first, count, matrix.tobytes(), level, query, scene, colors
+    )
 
 
 def make_query(lodgs, rule, focal_px, facts, values):
@@ -182,7 +184,7 @@ def test_cached_selections_match_the_rule(bpy, lodgs, monkeypatch, name):
     within_budget = arrangement.within_budget
     monkeypatch.setattr(arrangement, "within_budget", lambda *a: selections.append(a) or within_budget(*a))
 
-    def request(position, backward, matrix=None, tell="OWN", budget=10**6, **values):
+    def request(position, backward, matrix=None, colors="OWN", budget=10**6, **values):
         placements = []
         for level, (start, part) in enumerate(zip(starts, sets, strict=False), 1):
             facts = rules.collect_facts(rule, scene, levels, level)
@@ -195,7 +197,7 @@ def test_cached_selections_match_the_rule(bpy, lodgs, monkeypatch, name):
                 tuple(values.items()),
                 TABLE if name == "chunks" else (),
             )
-            options = {"matrix": matrix, "level": level, "query": query, "tell": tell}
+            options = {"matrix": matrix, "level": level, "query": query, "colors": colors}
             placements.append(make_placement(lodgs, int(start), len(part[0]), **options))
         return arrangement.Request(tuple(placements), backward, budget)
 
@@ -204,7 +206,7 @@ def test_cached_selections_match_the_rule(bpy, lodgs, monkeypatch, name):
     steps = [
         (request(origin, (1, 0, 0)), True), (request(origin, (0, 1, 0)), False),
         (request(origin, (0, 1, 0), moved), False), (request((0.2, 0.1, 0), (0, 1, 0)), True),
-        (request((0.9, 0.1, 0), (0, 1, 0)), True), (request(origin, (0, 1, 0), tell="BANDS"), True),
+        (request((0.9, 0.1, 0), (0, 1, 0)), True), (request(origin, (0, 1, 0), colors="BANDS"), True),
         (request((-0.9, 0.4, 0), (0, 0, 1)), True), (request((5.0, 4.0, 0), (0, 0, 1)), True),
         (request(origin, (1, 0, 0), budget=200), True), (request(origin, (1, 0, 0)), True),
     ]  # fmt: skip
@@ -322,8 +324,8 @@ def test_colours_show_levels_and_distance_bands(bpy, lodgs):
     query = make_query(lodgs, "octree", 1.0, facts, {"offset": 0.0, "fade": 1})
     distance = np.linalg.norm(part[0], axis=1)
     target = np.clip(np.log2(2.0 / distance), 0, 3) + 1
-    for tell, truth in (("OWN", 0 * target), ("LEVELS", 0 * target + 2), ("BANDS", np.floor(target))):
-        placement = make_placement(lodgs, 0, 400, level=2, query=query, tell=tell)
+    for colors, truth in (("OWN", 0 * target), ("LEVELS", 0 * target + 2), ("BANDS", np.floor(target))):
+        placement = make_placement(lodgs, 0, 400, level=2, query=query, colors=colors)
         result = arrangement.arrange(pool, arrangement.Request((placement,), (0, 0, 1), 10**6))
         index, weight, _, color_level = result.instances[: result.count].T
         index = index.astype(int)
@@ -339,7 +341,7 @@ def test_colours_show_node_sizes(bpy, lodgs):
     pool, _ = make_pool(lodgs, [random_set(rng, 300)])
     pool.columns.update(node_size=sizes, parent_size=np.full(300, 3e38, np.float32))
     query = make_query(lodgs, "cut", 1.0, {"level": 1.0, "levels": 2.0}, {"pixels": 1.0})
-    placement = make_placement(lodgs, 0, 300, level=1, query=query, tell="LEVELS")
+    placement = make_placement(lodgs, 0, 300, level=1, query=query, colors="LEVELS")
     result = arrangement.arrange(pool, arrangement.Request((placement,), (0, 0, 1), 10**6))
     index, _, _, color_level = result.instances[: result.count].T
     sizes = sizes[index.astype(int)]
@@ -360,7 +362,9 @@ def test_colours_show_chunks(bpy, lodgs):
     query = make_query(lodgs, "chunks", 1.0, facts, values)
     nearest = np.linalg.norm(part[0][:, None] - centres, axis=2).argmin(axis=1) + 1
     for tables, truth in (((), 0 * nearest), ((("chunks", table),), nearest)):
-        placement = make_placement(lodgs, 0, 400, level=2, query=replace(query, tables=tables), tell="CHUNKS")
+        placement = make_placement(
+            lodgs, 0, 400, level=2, query=replace(query, tables=tables), colors="CHUNKS"
+        )
         result = arrangement.arrange(pool, arrangement.Request((placement,), (0, 0, 1), 10**6))
         assert result.count == 400
         assert np.array_equal(result.instances[:400, 3], truth[result.instances[:400, 0].astype(int)])
@@ -384,7 +388,7 @@ def test_the_view_as_camera(bpy, lodgs, make_scene):
     """Distances refer to the last stored view and its focal length; freezing stops updates."""
     root = make_scene()
     settings, store_view = root.lodgs, lodgs("viewport.view_camera").store_view
-    settings.eye = "VIEW"
+    settings.camera_choice = "VIEW"
 
     def check(position, focal):
         bpy.context.view_layer.update()

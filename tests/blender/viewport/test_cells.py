@@ -17,7 +17,7 @@ def root(bpy, lodgs):
             view = lodgs("data.photographs").new_camera(
                 camera(f"{index}.jpg", 40, 20, 80, 40, 20, 10, pose), 10.0, 0.1, photograph=False
             )
-            view.parent, view.data.lodgs.place = root, index
+            view.parent, view.data.lodgs.model_index = root, index
             root.lodgs.cameras.objects.link(view)
     settings = root.lodgs.training
     for index, (a, b) in enumerate([(-8.0, 0.0), (0.0, 8.0)]):

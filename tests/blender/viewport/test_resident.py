@@ -24,7 +24,7 @@ def scene(bpy, lodgs):
             )
             lodgs("data.scenes").set_level(root, bundle.Level(number, splats, {"s_min": s_min}))
         lodgs("data.scenes").set_bundle_facts(root, bundle.Bundle("flod", [], "bands"))
-    root.lodgs.mode, root.lodgs.eye = "SELECTIVE", "VIEW"
+    root.lodgs.mode, root.lodgs.camera_choice = "SELECTIVE", "VIEW"
     return root
 
 
@@ -242,9 +242,9 @@ def test_a_moving_view_selects_before_modifiers_update(bpy, lodgs, draw_from, sc
     region_view = SimpleNamespace(view_matrix=matrix, window_matrix=projection, view_distance=1.0)
     view_camera.track(region, bpy.context.scene, region_view, splats=True)
     moved = request()
-    assert np.allclose(moved.placements[0].query.eye, (2.8, -1, 2), atol=1e-6)
+    assert np.allclose(moved.placements[0].query.position, (2.8, -1, 2), atol=1e-6)
     assert moved.placements[0].query.focal_px == 700.0
-    assert tuple(scene.lodgs.held_eye) == (0.0, 0.0, 0.0)
+    assert tuple(scene.lodgs.stored_position) == (0.0, 0.0, 0.0)
     assert view_camera._store_pending() > 0, "the view still moves"
     now += view_camera.REST
     assert (

@@ -297,7 +297,7 @@ def test_cropped_tree_on_disk_can_be_paged(tmp_path):
 
     file = open_paged(out)
     choice = LodQuery("cut", (1.0, 2.0, 3.0), 400.0, (), (("pixels", 2.0),))
-    expected = select_levels(present, np.float32(choice.eye), 400.0, {"pixels": 2.0})
+    expected = select_levels(present, np.float32(choice.position), 400.0, {"pixels": 2.0})
     for first in expected:
         cut = file.visible(choice)[first.number]
         assert sorted(map(tuple, cut.means)) == sorted(map(tuple, first.splats.means))

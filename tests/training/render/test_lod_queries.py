@@ -199,7 +199,8 @@ def too_low(values: dict) -> dict:
 @pytest.mark.parametrize(
     "change",
     [
-        {"rule": "unknown"}, {"rule": None}, {"eye": [0, 0]}, {"eye": [0, 0, 1e20]}, {"eye": None},
+        {"rule": "unknown"}, {"rule": None}, {"position": [0, 0]}, {"position": [0, 0, 1e20]},
+        {"position": None},
         {"focal_px": "1"}, {"focal_px": None}, {"facts": {}}, {"facts": {"level": 1}}, {"facts": []},
         {"values": {"chunks": 1}}, {"tables": []}, {"tables": {"unknown": {}}}, {"tables": {"chunks": [1]}},
         {"tables": {"chunks": {"x": [1], "y": []}}}, {"tables": {"chunks": {"x": 1}}},

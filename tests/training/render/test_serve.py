@@ -9,6 +9,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
+from training.__main__ import main
 from training.lod.query import LodQuery
 from training.lod.rule import rules
 from training.render import wire
@@ -180,12 +181,12 @@ def test_malformed_requests_do_not_end_the_renderer(client, make_splats, camera)
     assert np.ptp(planes[0]) > 0.1
 
 
-def test_foreign_folder_is_refused(tmp_path):
+def test_foreign_folder_is_refused(tmp_path, capsys):
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "a.jpg").write_text("dear")
-    command = [sys.executable, "-m", "training", "serve", str(tmp_path / "photos"), "--backend", "cpu"]
-    process = subprocess.run(command, cwd=ROOT, input="", capture_output=True, text=True, check=False)
-    assert process.returncode == 2 and "is not empty" in process.stderr and not process.stdout
+    assert main(["serve", str(tmp_path / "photos"), "--backend", "cpu"]) == 2
+    output = capsys.readouterr()
+    assert "is not empty" in output.err and not output.out
     assert (tmp_path / "photos" / "a.jpg").read_text() == "dear"
 
 

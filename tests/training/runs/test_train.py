@@ -210,7 +210,7 @@ def test_killed_run_resumes_to_the_same_bits(uninterrupted, tmp_path, step):
     assert folder.bundle.read_bytes() == uninterrupted["bundle"]
 
 
-@pytest.mark.parametrize("last", [7, 33, 58])
+@pytest.mark.parametrize("last", [*(pytest.param(n, marks=pytest.mark.nightly) for n in (7, 58)), 33])
 def test_cancelled_run_resumes_to_the_same_bits(uninterrupted, tmp_path, monkeypatch, last):
     keys = {**uninterrupted["keys"], "out": str(tmp_path / "run")}
     folder = RunFolder(keys["out"])

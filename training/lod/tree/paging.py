@@ -120,7 +120,7 @@ class TreeFile:
 
     def visible(self, query: LodQuery, camera: Camera | None = None, near: float = 0.0) -> dict[int, Splats]:
         """Return the splats that a query selects, see ``query.PagedFile``; needs little more memory."""
-        pages = np.sort(page_order(self.index(), np.array(query.eye, np.float32), query_detail(query)))
+        pages = np.sort(page_order(self.index(), np.array(query.position, np.float32), query_detail(query)))
         parts: dict[int, list[Splats]] = {
             number: [self.read_rows(number, pages[:0])] for number in self._rows
         }
@@ -351,7 +351,7 @@ class TreePager:
         """Request the pages that a query selects, see ``query.Pager``."""
         view = None if direction is None else np.array(direction)
         with self._changed:
-            self._request = np.array(query.eye, np.float64), query_detail(query), view
+            self._request = np.array(query.position, np.float64), query_detail(query), view
             self._changed.notify_all()
 
     def take(self) -> PageUpdate | None:

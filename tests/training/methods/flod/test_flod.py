@@ -216,7 +216,7 @@ def test_finishing_starts_from_completed_levels(data):
 
 def projected_area(scales: np.ndarray) -> np.ndarray:
     """Return the root mean square area (N,) of projections of ellipsoids (N, 3) in all directions."""
-    bases, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(1000, 3, 2)))
+    bases, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(300, 3, 2)))
     squares = [np.linalg.det(np.einsum("mki,k,mkj->mij", bases, first**2, bases)).mean() for first in scales]
     return np.sqrt(squares)
 

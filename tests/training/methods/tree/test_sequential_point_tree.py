@@ -43,7 +43,7 @@ def cut_by_traversal(tree, means, sizes, position, k):
     return sorted(cut)
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=40)
 @given(
     st.integers(0, 2**32), st.integers(2, 80), st.sampled_from([0, 1, 2, 5, 1000]), st.floats(32, 3000),
     st.floats(0.01, 1000),
