@@ -57,6 +57,24 @@ def test_bundle_round_trip_is_identical(bpy, bundle, file, tmp_path):
     assert out.read_bytes() == file.read_bytes()
 
 
+def test_five_levels_of_flod_scaffold(bpy, lodgs, bundle, tmp_path):
+    sizes, files = [0.2, 0.05, 0.0125, 0.003125, 0.0], lodgs("training.splats.bundle")
+    splats = bundle.levels[0].splats
+    splats.extras = {}
+    levels = [files.Level(number, splats, {"s_min": size}) for number, size in enumerate(sizes, 1)]
+    five = files.Bundle("flod_scaffold", levels, "bands", {}, {"gamma": 1.0}, meta=bundle.meta)
+    files.write_bundle(tmp_path / "five.ply", five)
+    assert bpy.ops.lodgs.import_splats(filepath=str(tmp_path / "five.ply")) == {"FINISHED"}
+    settings = the_root(bpy).lodgs
+    assert (settings.method, settings.rule, settings.single_level) == ("flod_scaffold", "bands", 5)
+    assert [json.loads(item.facts)["s_min"] for item in settings.levels] == sizes
+    assert [len(item.object.data.points) for item in settings.levels] == [200] * 5
+    for number in range(1, 6):
+        settings.single_level = number
+        bpy.context.view_layer.update()
+        assert [item.object.visible_get() for item in settings.levels] == [n == number for n in range(1, 6)]
+
+
 def test_first_bundle_sets_the_viewports_to_its_view(bpy, lodgs, bundle, tmp_path):
     """An eye at (1, 0, -5) that looks along +z where -y is up: in Blender along +y from y = -5."""
     bundle.meta |= {"view": [[1, 0, -5], [1, 0, 3]], "up_rotation": [[1, 0, 0], [0, 0, 1], [0, -1, 0]]}

@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 import torch
 
+from training.evaluate.views import Evaluation, full_detail_source
 from training.methods.flod_scaffold import METHOD
 from training.methods.flod_scaffold.train import Method, smallest_log_scale
 from training.optimize.parameters import override
+from training.splats.levels import Bundle
 
 
 def make(data, preset="draft", **values) -> Method:
@@ -38,6 +40,19 @@ def test_no_baked_splat_is_below_the_minimum_of_its_level(data, margin):
         assert np.exp(level.splats.log_scales.astype(np.float64)).min() >= level.facts["s_min"]
     assert np.exp(levels[0].splats.log_scales).min() < 1.3 * method.s_min[0]
     assert np.exp(levels[2].splats.log_scales).min() < method.s_min[1]
+
+
+def test_quality_rises_by_level(data):
+    """Five levels with minimum sizes of 40, 10, 2.5, 0.6 and 0 pixels."""
+    method = make(data, levels=5, steps=[10, 10, 10, 10, 20], grow_interval=5)
+    bundle = Bundle("flod_scaffold", trained(method), "bands", method.facts, method.controls)
+    evaluation = Evaluation(data, "cpu")
+    quality = [
+        evaluation.compare_views(data.train, full_detail_source(bundle, level)).mean()
+        for level in bundle.levels
+    ]
+    assert len(quality) == 5
+    assert quality == sorted(quality) and quality[-1] > quality[0] + 2
 
 
 @pytest.mark.parametrize("s_min", [0.48846706814502583, 1e-7, 3.0, 0.0])
