@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,9 @@ from .finished import load_networks, open_finished
 from .folder import RunFolder
 from .job import Job
 
+MAX_EARLIER_ROWS = 100
+"""Maximum number of rows of earlier evaluations that a report keeps."""
+
 
 def evaluate_run(
     run: Path,
@@ -65,7 +69,8 @@ def evaluate_run(
         - ``aside``, if the scene has views off its path (``scenes.offset_views``): mean ``psnr`` of the
           finest level and names of these ``views``
         - ``selective``: quality with the rule, selected per view, and once for the mean training camera
-          (not if the bundle exceeds memory), with the rule's controls; empty without a rule
+          (not if the bundle exceeds memory), with the rule's controls; empty without a rule. Rows of earlier
+          evaluations with other values of the controls follow
         - ``loaded``: mean number of splats that a viewer loads for a view, all without chunks (not if the
           bundle exceeds memory)
         - ``frame_s``: seconds per frame ``by_distance``, including selection, and in ``full`` detail, drawn
@@ -89,6 +94,7 @@ def evaluate_run(
     middle = evaluation.cameras[len(evaluation.cameras) // 2]
     if rule:
         report |= _measure_rule(job, evaluation, bundle, rule, values)
+        report["selective"] += _earlier_rows(folder, report["selective"][0], values)
     if folder.model.exists():
         report["networks"] = _measure_networks(job, folder, evaluation)
     if far and rule:
@@ -188,6 +194,25 @@ def _measure_rule(job: Job, evaluation: Evaluation, bundle: Bundle, rule: Rule, 
     return report
 
 
+def _earlier_rows(folder: RunFolder, row: dict, values: Values) -> list[dict]:
+    """Return the rows of earlier evaluations of the same bundle with other values of the controls.
+
+    Args:
+        row: a row of this evaluation.
+    """
+    with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
+        if folder.metrics.stat().st_mtime >= folder.bundle.stat().st_mtime:
+            rows = json.loads(folder.metrics.read_text(encoding="utf-8"))["selective"][:MAX_EARLIER_ROWS]
+            return [
+                earlier
+                for earlier in rows
+                if earlier.keys() == row.keys()
+                and all(isinstance(earlier[name], (int, float)) for name in row.keys() - {"set"})
+                and any(earlier[name] != value for name, value in values.items())
+            ]
+    return []
+
+
 def _measure_networks(job: Job, folder: RunFolder, evaluation: Evaluation) -> dict:
     """Return the quality of the run's neural model before baking."""
     _, model = load_networks(job, folder, evaluation.data)
@@ -229,9 +254,9 @@ def format_report(report: dict) -> str:
         rows.append((f"level {row['level']}{facts}", row))
     for row in report["selective"]:
         values = ", ".join(f"{k} {v:g}" for k, v in row.items() if k not in ("set", *measures))
-        rows.append((f"by distance, {row['set']}", row))
-        if row is report["selective"][-1]:
-            rows.append((f"  ({values})", None))
+        if rows[-1] == (f"  ({values})", None):
+            rows.pop()  # of the row before, with the same values
+        rows += [(f"by distance, {row['set']}", row), (f"  ({values})", None)]
     for row in report.get("curve", []):
         (name, value), *_ = row.items()
         rows.append((f"{name} = {value:g}, {row['drawn']:,} drawn", row))

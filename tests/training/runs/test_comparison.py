@@ -81,14 +81,21 @@ def test_single_level_is_also_compared_with_merged_neighbours(report, splats):
 
 def test_report_newer_than_the_bundle_is_not_measured_again(runs, report, monkeypatch):
     monkeypatch.setattr("training.runs.comparison.measures.evaluate_run", None)
-    measured = measure_run(runs[0], "FLoD")
+    measured = measure_run(runs[0], "FLoD", {"gamma": 1.0})
     assert measured.finest.psnr == report[0]["runs"][0]["points"][-1]["psnr"]
+
+
+def test_report_with_other_control_values_is_measured_again(runs, report, tmp_path):
+    run = shutil.copytree(runs[0], tmp_path / "run")
+    evaluate_run(run, {"gamma": 50.0})
+    measured = measure_run(run, "FLoD", {"gamma": 1.0}, far=False)
+    assert measured.by_distance.psnr == report[0]["runs"][0]["by_distance"]["psnr"]
 
 
 def test_damaged_report_is_measured_again(runs, tmp_path):
     run = shutil.copytree(runs[1], tmp_path / "run")
     RunFolder(run).metrics.write_text('{"rule": "", "levels": [{"level": "x"}], "test_views": []}')
-    assert measure_run(run, "3DGS").finest.psnr > 0
+    assert measure_run(run, "3DGS", {}).finest.psnr > 0
 
 
 def test_quality_between_sets_is_interpolated_over_the_logarithm():

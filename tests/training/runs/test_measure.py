@@ -75,6 +75,22 @@ def test_only_the_finest_level_of_a_tree_is_measured(finished, splats, tmp_path)
     assert "level 1" not in format_report(report)
 
 
+def test_rows_of_earlier_evaluations_with_other_controls_are_kept(finished):
+    run = finished(test_every=4)
+    first = evaluate_run(run, {"gamma": 2.0})["selective"]
+    second = evaluate_run(run, {"gamma": 50.0})
+    assert [row["gamma"] for row in second["selective"]] == [50, 50, 2, 2]
+    assert second["selective"][2:] == first
+    assert format_report(second).count("(gamma 2, ") == 1
+    again = evaluate_run(run, {"gamma": 2.0})["selective"]
+    assert [row["gamma"] for row in again] == [2, 2, 50, 50]
+    RunFolder(run).metrics.write_text('{"selective": [{"set": "per view"}, 3]}')
+    assert len(evaluate_run(run, {"gamma": 2.0})["selective"]) == 2
+    bundle = RunFolder(run).bundle
+    os.utime(bundle, (bundle.stat().st_atime, RunFolder(run).metrics.stat().st_mtime + 10))
+    assert len(evaluate_run(run, {"gamma": 50.0})["selective"]) == 2  # of another bundle
+
+
 def test_large_tree_measured_in_parts_gives_the_same_report(finished, splats, tmp_path, monkeypatch):
     run = finished(test_every=4)
     write_bundle(RunFolder(run).bundle, tree_of(splats))

@@ -14,7 +14,7 @@ import numpy as np
 
 from ...errors import LodgsError
 from ...evaluate.views import Evaluation
-from ...lod.rule import find_rule
+from ...lod.rule import Values, find_rule
 from ...methods import METHODS
 from ...optimize.merging import merge
 from ...splats.dialects import Warn, ignore
@@ -115,11 +115,14 @@ class ComparedRun:
 
 
 def measure_run(
-    run: Path, label: str, far: bool = True, warn: Warn = ignore, notify: Notify = ignore
+    run: Path, label: str, values: Values, far: bool = True, warn: Warn = ignore, notify: Notify = ignore
 ) -> ComparedRun:
     """Measure a finished run as ``lodgs evaluate`` does, by default with ``--far``.
 
-    A report that is newer than the run's bundle is not measured again.
+    A report that is newer than the run's bundle and has the same values is not measured again.
+
+    Args:
+        values: values of the controls of the run's rule.
 
     Raises:
         LodgsError: as ``evaluate_run``.
@@ -129,10 +132,12 @@ def measure_run(
     with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
         if folder.metrics.stat().st_mtime >= folder.bundle.stat().st_mtime:
             report = json.loads(folder.metrics.read_text(encoding="utf-8"))
-            if not far or not report["rule"] or "farther" in report:
+            newest = report["selective"][0] if report["selective"] else {}
+            is_same = all(newest[name] == value for name, value in values.items())
+            if is_same and (not far or not report["rule"] or "farther" in report):
                 return compared_run(folder, job, report, label)
     notify(f"Measuring {label}.")
-    return compared_run(folder, job, evaluate_run(run, far=far, warn=warn), label)
+    return compared_run(folder, job, evaluate_run(run, values, far=far, warn=warn), label)
 
 
 def compared_run(folder: RunFolder, job: Job, report: dict, label: str) -> ComparedRun:

@@ -10,10 +10,13 @@ from pathlib import Path
 from ...evaluate.views import Evaluation
 from ...files import atomic_write
 from ...lod.on_disk import open_if_large
-from ...lod.selection import complete_splats
+from ...lod.rule import Values
+from ...lod.selection import complete_splats, resolve_controls
 from ...splats.bundle import read_bundle
 from ...splats.dialects import Warn, ignore
+from ...splats.levels import Bundle
 from ..finished import open_finished
+from ..folder import RunFolder
 from ..measure import finite
 from .images import RunImages, as_plain, compared_views, photos, render_merges, render_run
 from .measures import ComparedRun, Notify, compared_count, label_runs, measure_run, measures, merge_baseline
@@ -40,7 +43,8 @@ def compare(runs: Sequence[Path], out: Path, warn: Warn = ignore, notify: Notify
     labels = label_runs(runs)
     several = len(runs) > 1
     measured = [
-        measure_run(run, label, several, warn, notify) for run, label in zip(runs, labels, strict=True)
+        measure_run(run, label, _default_values(run), several, warn, notify)
+        for run, label in zip(runs, labels, strict=True)
     ]
     count = compared_count(measured)
     _, first_job, data = open_finished(runs[0], warn)
@@ -50,8 +54,7 @@ def compare(runs: Sequence[Path], out: Path, warn: Warn = ignore, notify: Notify
     baselines: list[ComparedRun] = []
     for run, row in zip(runs, list(measured), strict=True):
         notify(f"Rendering {row.label}.")
-        path = run / "bundle.ply"
-        bundle = open_if_large(path) or read_bundle(path)
+        bundle = _read(run)
         images.append(render_run(evaluation, bundle, row, cameras, count if several else None))
         if len(bundle.levels) == 1 and not bundle.rule and not bundle.on_disk and not baselines:
             plain = Evaluation(data, first_job.backend, bundle.antialias)
@@ -73,6 +76,17 @@ def compare(runs: Sequence[Path], out: Path, warn: Warn = ignore, notify: Notify
     with atomic_write(out / "index.html") as temporary:
         Path(temporary).write_text(page, encoding="utf-8")
     return report
+
+
+def _read(run: Path) -> Bundle:
+    path = RunFolder(run).bundle
+    return open_if_large(path) or read_bundle(path)
+
+
+def _default_values(run: Path) -> Values:
+    """Return the values of the controls with which a run's bundle is shown at first."""
+    bundle = _read(run)
+    return resolve_controls(bundle, {}) if bundle.rule else {}
 
 
 def build_page(report: dict, photo_addresses: Sequence[str], images: Sequence[RunImages]) -> str:
