@@ -58,8 +58,8 @@ class Point:
     @classmethod
     def of(cls, row: dict, name: str, prefix: str, **where: Any) -> Point:
         """Make a point of a row of ``evaluate_run``'s report, whose quality names have a prefix."""
-        quality = (float(row[f"{prefix}{measure}"]) for measure in ("psnr", "ssim"))
-        return cls(name, int(row["splats"]), *quality, float(row["frame_s"]), **where)
+        psnr, ssim = (float(row[f"{prefix}{measure}"]) for measure in ("psnr", "ssim"))
+        return cls(name, int(row["splats"]), psnr, ssim, float(row["frame_s"]), **where)
 
 
 @dataclass(frozen=True)
