@@ -2,7 +2,7 @@
 
 lodgs-VERSION.zip is the extension; repository/ holds it with an index.json that Blender accepts as a remote
 repository; the wheel and the sdist are the Python package; lodgs-VERSION-site.zip is the documentation;
-lodgs-VERSION-example.zip is the example scene; SHA256SUMS has the checksums.
+lodgs-VERSION-example.zip is the example scene; README.md lists the files; SHA256SUMS has the checksums.
 """
 
 from __future__ import annotations
@@ -23,6 +23,18 @@ sys.path.insert(0, str(ROOT))
 from tools import extension  # noqa: E402
 
 EXAMPLE = "examples/lantern_garden"
+CONTENTS = """# LODGS {version}
+
+| file | use |
+|---|---|
+| `lodgs-{version}.zip` | extension: drag it into Blender 4.5 or newer, do not unpack it |
+| `lodgs-{version}-site.zip` | documentation: unpack it and open `site/start/install.html` |
+| `lodgs-{version}-example.zip` | example scene of the first steps: unpack it |
+| `lodgs-{version}-py3-none-any.whl` | Python package: `pip install` it in an environment of its own |
+| `lodgs-{version}.tar.gz` | source of the Python package |
+| `repository/` | extension repository for a web server of your own |
+| `SHA256SUMS` | checksums of all files |
+"""
 
 
 def main() -> int:
@@ -45,7 +57,8 @@ def main() -> int:
     os.environ.update(SITE_URL=options.site or "", NO_MKDOCS_2_WARNING="1")
     shutil.rmtree(site, ignore_errors=True)
     run([sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict"])
-    shutil.make_archive(str(out / f"lodgs-{version}-site"), "zip", site)
+    shutil.make_archive(str(out / f"lodgs-{version}-site"), "zip", site.parent, site.name)
+    (out / "README.md").write_text(CONTENTS.format(version=version), encoding="utf-8")
     write_example(out / f"lodgs-{version}-example.zip")
     files = sorted(path for path in out.rglob("*") if path.is_file())
     lines = [f"{hashlib.sha256(p.read_bytes()).hexdigest()}  {p.relative_to(out).as_posix()}" for p in files]

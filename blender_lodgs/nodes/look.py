@@ -163,7 +163,7 @@ def _changed_harmonics(
 
     Args:
         color: view-independent colour with the look applied, in display space.
-        rows: of the look's matrix.
+        rows: rows of the look's matrix.
         higher: number of coefficients above degree 0.
     """
     opacity = nodes.add("FunctionNodeSeparateColor")

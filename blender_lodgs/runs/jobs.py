@@ -10,6 +10,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import bpy
 
@@ -17,8 +18,9 @@ from ...training.errors import LodgsError, system_reason
 from ...training.lod.selection import complete_splats
 from ...training.runs.folder import RunFolder
 from ...training.runs.job import CHANGEABLE, Job
-from ...training.scenes.cameras import write_camera
+from ...training.scenes.cameras import Camera, write_camera
 from ...training.splats.bundle import write_bundle
+from ...training.splats.levels import Bundle
 from .. import extension
 from ..data import cells, scenes, viewpoints
 from ..data.paths import absolute_path, automatic_path
@@ -240,18 +242,27 @@ def follow(watch: Watch, show: Callable[[Watch], None] | None = None) -> None:
         processes.follow(step)
 
 
-def _export_inputs(root: bpy.types.Object, run: RunFolder, job: Job) -> list[str]:
-    """Write the current splats of a root to a run, and the views to render them from. Return warnings."""
-    bundle = scenes.read_levels(root)
-    views, warnings = [], []
-    if job.capture:
-        splats = complete_splats(bundle, bundle.levels[-1])
-        views = viewpoints.training_views(bpy.context, root, splats, warnings.append)
-    run.create()
-    write_bundle(run.base, bundle)
-    for number, (camera, near) in enumerate(views):
-        write_camera(run.cameras / f"{number:04d}.json", camera.moved(bundle.origin), near)
-    return warnings
+class _Inputs(NamedTuple):
+    """Splats to train from, the views to render them from, as (camera, near), and warnings."""
+
+    bundle: Bundle
+    views: list[tuple[Camera, float]]
+    warnings: list[str]
+
+    @classmethod
+    def of(cls, root: bpy.types.Object, job: Job) -> _Inputs:
+        """Return the inputs of a job from the current splats of a root."""
+        inputs = cls(scenes.read_levels(root), [], [])
+        if job.capture:
+            splats = complete_splats(inputs.bundle, inputs.bundle.levels[-1])
+            inputs.views.extend(viewpoints.training_views(bpy.context, root, splats, inputs.warnings.append))
+        return inputs
+
+    def write(self, run: RunFolder) -> None:
+        """Write the splats and the views to a run."""
+        write_bundle(run.base, self.bundle)
+        for number, (camera, near) in enumerate(self.views):
+            write_camera(run.cameras / f"{number:04d}.json", camera.moved(self.bundle.origin), near)
 
 
 def _launch(
@@ -266,6 +277,7 @@ def _launch(
     at_once = root.lodgs.training.at_once if job.cells else 1
     environment.require(python, at_once)
     state = run_state(run)
+    inputs = _Inputs.of(root, job) if export else None  # an error leaves no folder
     run.create()
     with run.locked():
         if state == "empty" and run.job.exists():
@@ -273,7 +285,8 @@ def _launch(
                 f"Cannot train in {run.path}: another Blender has started a run there.",
                 "Open this run, or choose another folder.",
             )
-        warnings = _export_inputs(root, run, job) if export else []
+        if inputs is not None:
+            inputs.write(run)
         if write_job:
             job.resolved().write(run.job)
     arguments = ["train", str(run.job), "--out", str(run.path)]
@@ -290,7 +303,7 @@ def _launch(
             "Check the trainer's Python in the preferences of LODGS.",
         ) from error
     link_run(root, run)
-    offset = root.lodgs.training.read
+    offset, warnings = root.lodgs.training.read, [] if inputs is None else inputs.warnings
     return start_watching(
         Watch(run, root.session_uid, process=process, view_warnings=warnings, offset=offset)
     )

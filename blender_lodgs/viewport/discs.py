@@ -54,7 +54,7 @@ def draw(
 
     Args:
         objects: point clouds with their tints (sRGB); alpha 0 keeps the points' own colours.
-        view, projection: from the world to camera space, and from there to clip space.
+        view, projection: matrices from the world to camera space, and from there to clip space.
         height: height of the framebuffer in pixels.
     """
     shader = _disc_shader()

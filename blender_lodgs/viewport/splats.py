@@ -143,7 +143,7 @@ def draw(
         store: uploaded splats.
         instances, count: see :func:`instances_texture`.
         placements: transforms, filters and looks of the splat sets.
-        view, projection: from the world to camera space, and from there to clip space.
+        view, projection: matrices from the world to camera space, and from there to clip space.
         resolution: resolution of the splats relative to the framebuffer.
         under_overlays: keep contents of the framebuffer with alpha on top; it is stored as sRGB, like a
             viewport's.

@@ -39,8 +39,8 @@ def camera_of_view(view: Matrix, projection: Matrix, width: int, distance: float
     camera behind that point.
 
     Args:
-        view: from the world to camera space.
-        projection: from camera space to clip space.
+        view: matrix from the world to camera space.
+        projection: matrix from camera space to clip space.
         width: width of the region in pixels.
         distance: distance of the camera from the orbit point.
     """
@@ -65,7 +65,7 @@ def camera_frame(
     """Return the left, bottom, right and top of a camera's frame in clip space.
 
     Args:
-        projection: from the world to clip space.
+        projection: matrix from the world to clip space.
     """
     to_clip = projection @ camera.matrix_world.normalized()
     corners = [to_clip @ corner.to_4d() for corner in camera.data.view_frame(scene=scene)]  # type: ignore[union-attr]

@@ -127,7 +127,7 @@ def draw_splats(
 
     Args:
         view: state since the last redraw; updated.
-        view_matrix, projection: from the world to camera space, and from there to clip space.
+        view_matrix, projection: matrices from the world to camera space, and from there to clip space.
         budget, wait, moving: see :func:`prepare`.
         under_overlays, frame: see ``splats.draw``.
     """

@@ -45,7 +45,7 @@ class Comparison:
     Attributes:
         view: ``session_uid`` of the camera object.
         photo, rendered: (H, W, 3) float32, sRGB, top row first.
-        psnr: in dB.
+        psnr: PSNR in dB.
         textures: both images on the graphics card once they are drawn.
     """
 

@@ -167,6 +167,19 @@ def test_files_of_a_package_hardly_import_each_other(package, limit):
     assert 0 < len(inside) <= limit, sorted(inside)
 
 
+KERNELS = ("training/rasterize/cpu/blend.py", "training/rasterize/cpu/project.py")
+"""Files with long numerical kernels."""
+
+
+def test_files_and_functions_are_short():
+    """At most 500 lines a file, 60 lines a function."""
+    for file, tree in parsed().items():
+        assert len((ROOT / file).read_text(encoding="utf-8").splitlines()) <= 500, file
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and file not in KERNELS:
+                assert (node.end_lineno or 0) - node.lineno < 60, f"{file}: {node.name}"
+
+
 TREE = {
     "training/lod/rules/cut.py",
     "training/lod/tree/",

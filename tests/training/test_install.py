@@ -52,7 +52,9 @@ def lodgs(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_installed_command_checks_trains_and_reads(lodgs, tiny_scene, tmp_path):
+@pytest.mark.parametrize("backend", ["reference", pytest.param("auto", marks=pytest.mark.nightly)])
+def test_installed_command_checks_trains_and_reads(lodgs, tiny_scene, tmp_path, backend):
+    """Every new copy of the package compiles its kernels, which takes half a minute: tested nightly."""
     assert lodgs("--version") == f"lodgs {VERSION}\n"
     versions = json.loads(lodgs("check"))
     dependencies = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
@@ -60,7 +62,7 @@ def test_installed_command_checks_trains_and_reads(lodgs, tiny_scene, tmp_path):
     assert versions["ok"] and names <= {name.lower() for name in versions}
     events = lodgs(
         "train", "--scene", tiny_scene, "--out", tmp_path / "run", "--image-scale", 1, "--set", "levels=2",
-        "--set", "steps=5",
+        "--set", "steps=5", "--backend", backend,
     )  # fmt: skip
     assert json.loads(events.splitlines()[-1])["event"] == "done"
     assert lodgs("info", tmp_path / "run" / "bundle.ply").count("\n") > 2

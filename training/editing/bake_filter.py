@@ -55,7 +55,7 @@ class RowsWithBakedFilter:
 
     Attributes:
         rows: splats with unfiltered opacities.
-        views: to average over, at training size.
+        views: cameras to average over, at training size.
         near: depth where rendering begins.
     """
 

@@ -30,7 +30,7 @@ def brush_coverage(
 
     Args:
         path: points (P, 2) in pixels, x and y from the corner of the first pixel.
-        radius: in pixels.
+        radius: radius in pixels.
         size: (W, H).
         hardness: fraction of the radius with coverage 1; outside, coverage falls as 3 t^2 - 2 t^3.
     """

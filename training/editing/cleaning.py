@@ -114,7 +114,7 @@ class Cleaning:
 
     Attributes:
         crops: see ``crop.crop_mask``.
-        cameras: in the splats' space.
+        cameras: cameras in the splats' space.
     """
 
     crops: tuple[Crop, ...] = ()

@@ -193,7 +193,7 @@ class BlockIndex:
         """Compare blocks with the distance band near <= d < far around a position (3,).
 
         Args:
-            near, far: for all blocks, or (B,) of each.
+            near, far: distances for all blocks, or (B,) of each.
 
         Returns:
             (B,) bool: blocks that may have means in the band; and blocks with all means in it, also in single

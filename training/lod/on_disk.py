@@ -51,8 +51,8 @@ def read_part(
     Skips blocks without such splats. Splats keep the file's order; other levels are empty.
 
     Args:
-        numbers: of the levels.
-        region: None: all splats; also if the file has no table of blocks.
+        numbers: numbers of the levels.
+        region: region of the splats; None, or a file without a table of blocks: all splats.
         warn: as for ``read_bundle``.
 
     Returns:
@@ -117,7 +117,7 @@ def open_if_large(path: str | Path, limit: int = 0) -> Bundle | None:
     """Open a bundle with more splats than a limit; its levels stay on disk.
 
     Args:
-        limit: 0: MAX_IN_MEMORY.
+        limit: number of splats; 0: MAX_IN_MEMORY.
 
     Returns:
         The bundle with its tables; None if it has at most ``limit`` splats, is another PLY, or has a rule
@@ -140,9 +140,9 @@ class CulledReader:
     """Reads blocks of a level's splats that a camera can see. Reads all splats once to find their bounds.
 
     Args:
-        rows: sorted by space, or few blocks can be skipped.
-        rule: of the levels, or None.
-        path: of the file, for warnings.
+        rows: rows of the level; blocks can be skipped only if they are sorted by space.
+        rule: rule of the levels, or None.
+        path: file name for warnings.
 
     Attributes:
         splats_read: number of splats read so far.

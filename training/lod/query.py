@@ -165,7 +165,7 @@ class Pager(Protocol):
 
     Attributes:
         rows: number of rows in memory; initially all are empty, and have weight 0.
-        sh_degree: of the splats.
+        sh_degree: degree of the splats.
         arrived: number of updates so far.
         short: whether the camera needs more than the budget.
         problem: error that ended the thread, else "".
@@ -220,7 +220,7 @@ class PagedFile(Protocol):
         """Return by level number the drawable splats that a query selects.
 
         Args:
-            camera: in the splats' space; skip blocks outside its image.
+            camera: camera in the splats' space; skip blocks outside its image.
             near: depth where its image begins, in the splats' units.
         """
         ...

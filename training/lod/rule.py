@@ -1,9 +1,9 @@
 """Level-of-detail rules: a weight for each splat of a level, depending on the camera.
 
 Each module of ``lod.rules`` defines a rule and is discovered automatically. Other packages add rules as entry
-points (``plugins.RULES_GROUP``). A rule declares its inputs (facts
-of the scene and of each level, columns of the splats), its user controls, and the weights. The command line,
-Blender's panels and node groups, evaluation and both renderers use these declarations.
+points (``plugins.RULES_GROUP``). A rule declares its inputs (facts of the scene and of each level, columns of
+the splats), its user controls, and the weights. The command line, Blender's panels and node groups,
+evaluation and both renderers use these declarations.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Control:
     """A user control of a rule: a slider, a command-line option, a number in a bundle.
 
     Attributes:
-        name: in code, sockets, options and files.
+        name: name in code, sockets, options and files.
         default: default value.
         low, high: minimum and maximum.
         soft: range of the slider; None: a checkbox or a number field instead of a slider.
@@ -131,7 +131,7 @@ class Relations:
         """Return the masks of the splats to keep, and their changed columns (M,) by level number.
 
         Args:
-            masks: of the remaining splats; those of dependent splats do not count.
+            masks: masks of the remaining splats; those of dependent splats do not count.
         """
         return masks, {}
 
@@ -196,8 +196,8 @@ class Rule(ABC):
             position: (3,) of the camera, in the same space.
             focal_px: the camera's focal length in pixels (``Camera.focal``: the smaller of fx and fy).
             columns: (N,) of each of the rule's columns.
-            facts: of the scene and of the level, see :func:`collect_facts`.
-            values: of every control.
+            facts: facts of the scene and of the level, see :func:`collect_facts`.
+            values: value of every control.
             tables: at least the rule's tables of the bundle; coordinates are in the same space.
         """
 
@@ -431,7 +431,7 @@ def collect_facts(
     Args:
         scene: facts of the scene, by name.
         levels: number and facts of every level, coarse to fine.
-        number: of the level.
+        number: number of the level.
 
     Returns:
         The rule's facts of the scene and of the level by name; those of the next coarser level as

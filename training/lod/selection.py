@@ -18,7 +18,7 @@ class SelectedLevel:
     """Selected splats of one level.
 
     Attributes:
-        number: of the level.
+        number: number of the level.
         splats: splats with a weight above 0.
         weights: (N,); None if all are 1.
     """
@@ -97,7 +97,7 @@ def select(
     Args:
         position: (3,) world position of the camera.
         focal_px: focal length of the camera in pixels (``Camera.focal``).
-        values: of the rule's controls, see :func:`resolve_controls`.
+        values: values of the rule's controls, see :func:`resolve_controls`.
 
     Raises:
         LodgsError: as :func:`require_rule`, or the rule's facts are incomplete.

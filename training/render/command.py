@@ -172,7 +172,7 @@ def draw_bundle(
     Rules that always apply also weight the finest level.
 
     Args:
-        options: of :func:`.scene.draw`.
+        options: options of :func:`.scene.draw`.
 
     Raises:
         LodgsError: the level or a control does not exist, or as :func:`.scene.draw`.

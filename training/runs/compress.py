@@ -169,7 +169,7 @@ def distill(
 
     Args:
         views: training views and pseudo views.
-        options: for ``rasterize``.
+        options: options of ``rasterize``.
     """
     device = tensor_device(backend)
     original, student = Gaussians.of(teacher, device), vars(Gaussians.of(splats, device))

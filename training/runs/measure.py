@@ -66,8 +66,7 @@ def evaluate_run(
           ``by_size`` is the PSNR at full, 1/2, 1/4 and 1/8 of the image size. Coarser levels in memory also
           have ``merged``, the same of the finest level merged to as many splats
         - ``train_psnr``, ``veil``, ``oversized``, ``worst``, ``fitted_psnr``: see ``evaluate.summary``
-        - ``aside``, if the scene has views off its path (``scenes.offset_views``): mean ``psnr`` of the
-          finest level and names of these ``views``
+        - ``aside``: mean ``psnr`` of the finest level in ``views`` off the path (``scenes.offset_views``)
         - ``selective``: quality with the rule, selected per view, and once for the mean training camera
           (not if the bundle exceeds memory), with the rule's controls; empty without a rule. Rows of earlier
           evaluations with other values of the controls follow

@@ -68,7 +68,7 @@ class Intrinsics:
 
     Attributes:
         width, height: size in pixels of the photos that COLMAP used.
-        parameters: in COLMAP's order for the lens; finite, focal lengths > 0.
+        parameters: lens parameters in COLMAP's order; finite, focal lengths > 0.
     """
 
     lens: Lens

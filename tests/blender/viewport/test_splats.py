@@ -107,15 +107,26 @@ def psnr(image, reference):
     return -10 * np.log10(np.mean((np.clip(image, 0, 1) - np.clip(reference, 0, 1)) ** 2, dtype=np.float64))
 
 
+@pytest.fixture(scope="module")
+def rasterizer():
+    """Start the trainer's rasterizer, which takes seconds: a process that the tests share."""
+    python = os.environ.get("LODGS_TRAINER_PYTHON")
+    if not python:
+        pytest.skip("no trainer; set LODGS_TRAINER_PYTHON")
+    program = Path(__file__).parents[1] / "render_splats.py"
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"} | {"LODGS_THREADS": "1"}
+    with subprocess.Popen(
+        [python, program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
+    ) as process:
+        yield process
+
+
 @pytest.fixture
-def truth(bpy, camera, tmp_path):
+def truth(bpy, camera, rasterizer, tmp_path):
     """``truth([(splats, matrix), ...])``: the trainer's image (SIZE, SIZE, 3) of splats in the world.
 
     ``antialias`` has a flag for each set; ``size`` is the image size in pixels.
     """
-    python = os.environ.get("LODGS_TRAINER_PYTHON")
-    if not python:
-        pytest.skip("no trainer; set LODGS_TRAINER_PYTHON")
 
     def render(sets, keep=None, antialias=(), size=SIZE):
         projection = camera.calc_matrix_camera(bpy.context.evaluated_depsgraph_get(), x=size, y=size)
@@ -135,11 +146,9 @@ def truth(bpy, camera, tmp_path):
             tmp_path / "in.npz", **arrays, size=(size, size), intrinsics=intrinsics,
             world_to_camera=world_to_camera, near=0.01,
         )  # fmt: skip
-        program = Path(__file__).parents[1] / "render_splats.py"
-        environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"} | {"LODGS_THREADS": "1"}
-        subprocess.run(
-            [python, program, tmp_path / "in.npz", tmp_path / "out.npy"], check=True, env=environment
-        )
+        rasterizer.stdin.write(f"{tmp_path / 'in.npz'}\t{tmp_path / 'out.npy'}\n")
+        rasterizer.stdin.flush()
+        assert rasterizer.stdout.readline() == "done\n"
         return np.load(tmp_path / "out.npy")
 
     return render

@@ -136,7 +136,7 @@ def test_two_viewports_draw_complete_cuts(bpy, lodgs, tree, root, draw_from):
     end = time.monotonic() + 200
     for position in POSITIONS:
         rounds = 0
-        while rounds < 8 or len(complete) < 2:
+        while rounds < 4 or len(complete) < 2:
             assert time.monotonic() < end
             rounds += 1
             for view in (first, second):

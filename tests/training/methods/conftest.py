@@ -13,33 +13,45 @@ from training.splats.ply import extra_columns, splat_columns
 
 
 @pytest.fixture
-def check_resumed() -> Callable[[Callable[[], Method], int], None]:
-    """Return check_resumed(make, stop): resume a method after ``stop`` steps from a state file, and require
-    the same bits as from an uninterrupted run.
+def check_resumed() -> Callable[..., None]:
+    """Return check_resumed(make, *stops): resume a method from its states after these numbers of steps, and
+    require the same bits as from the uninterrupted run.
     """
 
-    def check(make: Callable[[], Method], stop: int) -> None:
-        full_run, first, second, file = make(), make(), make(), io.BytesIO()
-        levels, initial = _train(full_run, 0), _train(first, 0, stop)
-        torch.save(first.state_dict(), file)
-        file.seek(0)
-        second.load_state_dict(torch.load(file, weights_only=True))
-        final = initial + _train(second, stop)
-        assert [level.number for level in final] == [level.number for level in levels] != []
-        for one, other in zip(levels, final, strict=True):
-            columns, theirs = (splat_columns(x.splats) | extra_columns(x.splats) for x in (one, other))
-            assert one.facts == other.facts and columns.keys() == theirs.keys()
-            for name, column in columns.items():
-                np.testing.assert_array_equal(column, theirs[name])
-        assert second.meta() == full_run.meta()
+    def check(make: Callable[[], Method], *stops: int) -> None:
+        full_run, states = make(), {}
+        levels: list[Level] = []
+        step = 0
+        while step < full_run.steps:  # some methods learn the number on the way
+            levels += _train(full_run, step)
+            step += 1
+            if step in stops:
+                torch.save(full_run.state_dict(), file := io.BytesIO())
+                states[step] = file, len(levels)
+        assert sorted(states) == sorted(stops)
+        for stop, (file, count) in states.items():
+            resumed, final, step = make(), levels[:count], stop
+            file.seek(0)
+            resumed.load_state_dict(torch.load(file, weights_only=True))
+            while step < resumed.steps:
+                final += _train(resumed, step)
+                step += 1
+            _require_equal(final, levels)
+            assert resumed.meta() == full_run.meta()
 
     return check
 
 
-def _train(method: Method, step: int, until: int | None = None) -> list[Level]:
-    levels = []
-    while step < (until or method.steps):  # which some learn on the way
-        method.train_step(step)
-        levels += method.levels_after(step)
-        step += 1
-    return levels
+def _train(method: Method, step: int) -> list[Level]:
+    """Make a step; return the levels that it completes."""
+    method.train_step(step)
+    return method.levels_after(step)
+
+
+def _require_equal(actual: list[Level], expected: list[Level]) -> None:
+    assert [level.number for level in actual] == [level.number for level in expected] != []
+    for one, other in zip(expected, actual, strict=True):
+        columns, others = (splat_columns(x.splats) | extra_columns(x.splats) for x in (one, other))
+        assert one.facts == other.facts and columns.keys() == others.keys()
+        for name, column in columns.items():
+            np.testing.assert_array_equal(column, others[name])

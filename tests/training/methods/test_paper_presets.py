@@ -17,7 +17,7 @@ from training.methods.flod import train as flod_train
 from training.optimize import splat_method
 from training.optimize.parameters import override
 
-OCTREE_PAGE = Path(__file__).parents[3] / "docs/methods/octree-gs.md"
+OCTREE_PAGE = Path(__file__).parents[3] / "docs/methods/octree-gs-paper.md"
 
 SHARED = {
     "max_splats": (0, "no paper limits the number"),

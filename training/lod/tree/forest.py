@@ -216,7 +216,7 @@ def build_levels(forest: Forest, folder: Path) -> tuple[list[Level], Columns]:
     bytes of memory per node, and up to 45 for the nodes of one level.
 
     Args:
-        folder: for unnamed scratch files, which exist as long as the levels.
+        folder: folder of unnamed scratch files, which exist as long as the levels.
 
     Raises:
         LodgsError: cannot write to the folder.

@@ -107,7 +107,7 @@ def streaming_order(columns: Columns) -> np.ndarray:
     where a splat is needed, so that blocks have similar sizes and positions, and siblings are adjacent.
 
     Args:
-        columns: of the rule, (N,) each.
+        columns: columns of the rule, (N,) each.
     """
     codes = morton_codes(np.stack([columns[name] for name in PARENT], axis=1))
     octaves = -np.floor(np.log2(np.maximum(columns[PARENT_SIZE], 1e-30)))
@@ -126,7 +126,7 @@ class ResidentTree:
     size and position, see ``shape.UniqueSizes``.) Links are cached and updated only where columns change.
 
     Args:
-        columns: of the rule, and x, y, z, (N,) float32 each. Rows with a parent size of 0 are empty.
+        columns: columns of the rule, and x, y, z, (N,) float32 each. Rows with a parent size of 0 are empty.
     """
 
     def __init__(self, columns: Columns) -> None:

@@ -216,7 +216,7 @@ def page_order(
     from MIN_DETAIL on are sorted by size.
 
     Args:
-        index: of the parents, :func:`.nodes.parent_index`.
+        index: index of the parents, :func:`.nodes.parent_index`.
         direction: (3,) of length 1, the view direction: pages outside the view come later, see BEHIND_FACTOR;
             None: the camera looks in all directions.
     """

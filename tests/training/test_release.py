@@ -1,0 +1,19 @@
+"""Files of a release."""
+
+import zipfile
+
+from tools import release
+from training.scenes.colmap import read_scene
+
+
+def test_example_archive_has_the_scene_in_its_folder(tmp_path):
+    release.write_example(tmp_path / "example.zip")
+    with zipfile.ZipFile(tmp_path / "example.zip") as archive:
+        archive.extractall(tmp_path)
+    scene = read_scene(tmp_path / "lantern_garden")
+    assert len(scene.cameras) == 48 and not scene.warnings
+
+
+def test_list_of_files_names_the_version():
+    text = release.CONTENTS.format(version="1.2.3")
+    assert text.startswith("# LODGS 1.2.3\n") and "`lodgs-1.2.3.zip`" in text
