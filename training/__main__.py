@@ -102,7 +102,7 @@ def run() -> NoReturn:
     _open_streams()
     for name in ("SIGINT", "SIGTERM", "SIGBREAK"):  # SIGBREAK: Windows' CTRL_BREAK_EVENT
         if hasattr(signal, name):  # shells start background programs with SIGINT ignored
-            signal.signal(getattr(signal, name), signal.default_int_handler)
+            signal.signal(getattr(signal, name), _interrupt)
     try:
         code = main()
     except SystemExit as stop:  # argparse has printed help or an error
@@ -117,6 +117,12 @@ def run() -> NoReturn:
         with suppress(OSError, AttributeError):  # a full disk, or there is no console
             stream.flush()
     os._exit(code)  # native thread pools can hang a normal exit
+
+
+def _interrupt(number: int, frame: object) -> NoReturn:
+    """Stop the command; libraries that are interrupted in a call print no errors about unfinished objects."""
+    sys.unraisablehook = lambda error: None
+    raise KeyboardInterrupt
 
 
 def _open_streams() -> None:

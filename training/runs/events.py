@@ -20,7 +20,7 @@ from typing import IO
 import numpy as np
 
 from ..errors import LodgsError
-from ..files import open_regular
+from ..files import name_errors, open_regular
 from ..splats.levels import MAX_LEVELS, META_SHAPES
 
 PROTOCOL = 1
@@ -260,7 +260,8 @@ class EventWriter:
         if end := self._file.seek(0, os.SEEK_END):
             self._file.seek(end - 1)
             self._torn = self._file.read(1) != b"\n"  # a killed trainer's last line
-        reserve.write_bytes(os.urandom(_RESERVE))
+        with name_errors(reserve):
+            reserve.write_bytes(os.urandom(_RESERVE))
 
     def __call__(self, kind: str, **values) -> None:
         """Write one event.

@@ -31,7 +31,7 @@ from pathlib import Path
 from typing import IO
 
 from ..errors import LodgsError
-from ..files import open_regular, remove_temporaries, try_lock
+from ..files import name_errors, open_regular, remove_temporaries, try_lock
 from . import processes
 from .events import read_events
 
@@ -251,8 +251,10 @@ class RunFolder:
                     f"Cannot train in {self.path}: another trainer is running there.",
                     "Wait for it, cancel it, or choose another run folder.",
                 )
+            holder = {"pid": os.getpid(), "identity": processes.identity(os.getpid())}
             file.truncate(0)
-            file.write(json.dumps({"pid": os.getpid(), "identity": processes.identity(os.getpid())}).encode())
+            with name_errors(self._lock):
+                file.write(json.dumps(holder).encode())
             self._clean()
             self._lock_file = file
             try:

@@ -277,9 +277,15 @@ def _view_collector(folder: Path, images: Path) -> ViewCollector:
     base = folder if images == folder else images.parent
     return ViewCollector(
         ImageFiles(images),
-        SidecarFiles(base / MASKS, *MASK_SUFFIXES),
-        SidecarFiles(base / DEPTHS, *DEPTH_SUFFIXES),
+        SidecarFiles(_sidecar_folder(base, MASKS), *MASK_SUFFIXES),
+        SidecarFiles(_sidecar_folder(base, DEPTHS), *DEPTH_SUFFIXES),
     )
+
+
+def _sidecar_folder(base: Path, name: str) -> Path:
+    """Return the folder of a name such as "masks", or its singular if only that exists."""
+    singular = base / name.removesuffix("s")
+    return singular if singular.is_dir() and not (base / name).is_dir() else base / name
 
 
 def _read_model_points(
@@ -449,6 +455,8 @@ def _choose_model(folder: Path, images: Path | None, warnings: list[str]) -> tup
     for model, count in zip(models, counts, strict=True):
         if count < counts[0]:
             warnings.append(f"Skipped {model}: a smaller model of {count} views.")
+        elif model != models[0] and (lost := _names(model) - _names(models[0])):
+            warnings.append(f"Skipped {model}: another model, with {len(lost)} views that {models[0]} lacks.")
     for model in models if images is None else ():
         photo_folder, photos = find_image_folder(folder, model, [pose.name for pose in read_poses(model)])
         if photos:
@@ -456,6 +464,10 @@ def _choose_model(folder: Path, images: Path | None, warnings: list[str]) -> tup
                 warnings.append(f"Used {model}: the photos of {models[0]} are missing.")
             return model, photo_folder
     return models[0], images
+
+
+def _names(model: Path) -> set[str]:
+    return {pose.name for pose in read_poses(model)}
 
 
 def _find_images(folder: Path, model: Path, names: Sequence[str], warnings: list[str]) -> Path:

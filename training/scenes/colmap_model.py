@@ -112,8 +112,9 @@ def read_points(model: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
     parsers = {".bin": _parse_points_bin, ".txt": _parse_points_txt}
     for suffix in sorted(parsers, key=lambda suffix: suffix != model_suffix(model)):
-        if is_file(model / f"points3D{suffix}"):  # some programs write points of the other kind
-            return _read(model, "points3D", parsers, suffix)
+        for name in "points3D", "points3d":
+            if is_file(model / f"{name}{suffix}"):  # some programs write points of the other kind
+                return _read(model, name, parsers, suffix)
     return _NO_POINTS
 
 

@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from ..errors import LodgsError
 from ..files import is_file, raise_system_problem
-from .images import IMAGE_SUFFIXES
+from .images import IMAGE_SUFFIXES, UNREADABLE_SUFFIXES
 
 MASK_SUFFIXES = (".png", *(suffix for suffix in IMAGE_SUFFIXES if suffix != ".png"))
 """Suffixes of masks, preferred ones first."""
@@ -48,8 +48,10 @@ class ImageFiles:
                 "Skipped <name>:".
         """
         relative = relative_image_path(name)
-        file = self._folder / name
-        if not is_file(file):
+        file: Path | None = self._folder / name
+        exists = is_file(file)
+        if not exists or relative.suffix.lower() in UNREADABLE_SUFFIXES:
+            original = file if exists else None
             if self._by_normal_name is None:
                 self._by_normal_name = {
                     _normalized(path.relative_to(self._folder).as_posix()): path
@@ -58,7 +60,7 @@ class ImageFiles:
                 for other, path in self._by_normal_name.items():
                     if other.lower().endswith((*IMAGE_SUFFIXES, ".exr")):
                         self._by_stem.setdefault(_stem(other), []).append(path)
-            file = self._by_normal_name.get(_normalized(str(relative)))
+            file = None if exists else self._by_normal_name.get(_normalized(str(relative)))
             if file is None:
                 similar = self._by_stem.get(_stem(str(relative)), [])
                 same_suffix = [
@@ -66,11 +68,12 @@ class ImageFiles:
                 ] or similar
                 if len(same_suffix) == 1:
                     file = self.renamed[name] = same_suffix[0]
+            file = file or original
         return file
 
 
 class SidecarFiles:
-    """Masks or depth maps of photos, named as COLMAP or nerfstudio does.
+    """Masks or depth maps of photos, named as COLMAP or nerfstudio does, in any case.
 
     Args:
         folder: folder of the files; it may not exist.
@@ -81,6 +84,7 @@ class SidecarFiles:
         self.folder = folder
         self._suffixes = suffixes
         self._exists = folder.is_dir()
+        self._by_folded_name: dict[str, Path] | None = None
 
     def find(self, name: str) -> Path | None:
         """Return the file of a photo, or None. Photo ``a/b.jpg`` has ``a/b.jpg.png`` or ``a/b.png``."""
@@ -90,7 +94,12 @@ class SidecarFiles:
             for path in (self.folder / f"{name}{suffix}", (self.folder / name).with_suffix(suffix)):
                 if is_file(path):
                     return path
-        return None
+        if self._by_folded_name is None:
+            files = walk_files(self.folder, onerror=raise_system_problem)
+            self._by_folded_name = {_folded(path.relative_to(self.folder).as_posix()): path for path in files}
+        stem = os.path.splitext(name)[0]
+        names = [_folded(start + suffix) for suffix in self._suffixes for start in (name, stem)]
+        return next((self._by_folded_name[key] for key in names if key in self._by_folded_name), None)
 
     def mismatch_warning(self, name: str) -> str:
         """Return a warning about files without a photo, or "" if the folder is empty.
@@ -208,7 +217,11 @@ def _stems(names: Iterable[str]) -> set[str]:
 
 def _stem(name: str) -> str:
     """Return a name for comparison without its suffix and without regard to case."""
-    return _normalized(os.path.splitext(str(PurePosixPath(name.replace("\\", "/"))))[0]).casefold()
+    return _folded(os.path.splitext(str(PurePosixPath(name.replace("\\", "/"))))[0])
+
+
+def _folded(name: str) -> str:
+    return _normalized(name).casefold()
 
 
 def _is_inside(name: str) -> bool:

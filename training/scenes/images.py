@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 MAX_PIXELS = 178_956_970
 """Maximum number of pixels of an input image: Pillow's own limit, at 4 bytes per pixel."""
 
+UNREADABLE_SUFFIXES = (".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".bmp", ".gif")
+"""Suffixes of photos that LODGS does not read, lower case. Users convert them and keep the model's names."""
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
 """Lower-case file name suffixes of photos, without ``.exr``, which only renderers write."""
 
@@ -85,6 +87,11 @@ def _read_size(path: Path, file: IO[bytes]) -> tuple[int, int]:
         return tags[_WIDTH], tags[_HEIGHT]
     if head[:4] == b"RIFF":
         return _webp_size(file)
+    if head[4:] == b"ftyp":
+        raise LodgsError(
+            f"Cannot read {path}: it is a HEIC or AVIF photo: convert the photos to JPEG.",
+            "Keep their names; the suffix may differ.",
+        )
     raise LodgsError(
         f"Cannot read {path}: it is not a JPEG, PNG, TIFF, WebP or EXR image.", "Convert it to one of these."
     )

@@ -403,6 +403,7 @@ def test_damaged_reconstructions_of_opensfm_are_rejected(tmp_path, content):
             "Registration.CSV is a table",
             "Export the cameras for COLMAP or Bundler",
         ),
+        (["a.jpg", "a.xmp"], "a.xmp is camera data of photos", "Export the cameras for COLMAP or Bundler"),
         (["IMG_1.HEIC", "IMG_2.HEIC"], "IMG_1.HEIC is a HEIC photo", "Convert the photos to JPEG"),
         (["clip.MOV"], "clip.MOV is a video", "lodgs frames"),
         (["poses_bounds.npy", "a.jpg"], "poses_bounds.npy is a file of LLFF", "COLMAP model"),

@@ -8,7 +8,8 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 
@@ -21,7 +22,7 @@ from ..images import image_size
 from ..view_selection import exclusion_messages, photo_turns
 from ..write_colmap import write_model
 from . import bundler, metashape, openmvg, opensfm, polycam, record3d, transforms
-from .exported import ExportedScene, ExportedView
+from .exported import ExportedScene, ExportedView, PhotoFinder
 from .foreign import describe_foreign
 
 FORMATS = transforms, polycam, record3d, metashape, openmvg, opensfm, bundler
@@ -111,6 +112,8 @@ def convert_export(
             return ConvertedScene(folder, name, len(exported.views), 0, exported.warnings, is_source=True)
     else:
         name, path, exported = export[0].NAME, export[1], export[0].read(export[1])
+    if export is not None and path.parent != folder:
+        exported = _find_photos(exported, folder)
     views, excluded = _usable_views(exported)
     if not views:
         reason = f" {excluded[0][0]}: {excluded[0][1]}" if excluded else ""
@@ -192,6 +195,21 @@ def _read_model_without_points(folder: Path) -> ExportedScene:
     ]
     warnings = [warning for warning in scene.warnings if not warning.startswith(NO_POINTS)]
     return ExportedScene(views, warnings=warnings)
+
+
+def _find_photos(exported: ExportedScene, folder: Path) -> ExportedScene:
+    """Return an export from a subfolder with photos of the whole folder for those that are missing."""
+    photos = PhotoFinder(folder)
+    views, warnings = [], list(exported.warnings)
+    for view in exported.views:
+        image = None
+        if not os.path.isfile(view.image):
+            with suppress(LodgsError):  # several photos match; the missing one is reported
+                image = photos.locate(view.image.as_posix())
+        if image is not None and len(warnings) == len(exported.warnings):
+            warnings.append(f"Found photos in another place, such as {image} instead of {view.image}.")
+        views.append(view if image is None else replace(view, image=image))
+    return replace(exported, views=views, warnings=warnings)
 
 
 def _usable_views(exported: ExportedScene) -> tuple[list[ExportedView], list[tuple[str, str]]]:

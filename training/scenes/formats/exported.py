@@ -19,7 +19,7 @@ from ...files import is_file
 from ..cameras import Camera
 from ..colmap import DEPTH_SUFFIXES
 from ..image_files import NO_PHOTOS, walk_files
-from ..images import IMAGE_SUFFIXES
+from ..images import IMAGE_SUFFIXES, UNREADABLE_SUFFIXES
 from ..lenses import Intrinsics, make_intrinsics
 
 MAX_JSON_BYTES = 1 << 26
@@ -27,6 +27,7 @@ MAX_JSON_BYTES = 1 << 26
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Conversion between OpenCV's camera axes and OpenGL's (x right, y up, looking along -z)."""
 _SUFFIXES = *IMAGE_SUFFIXES, ".exr", *(suffix.upper() for suffix in IMAGE_SUFFIXES), ".EXR"
+_OTHER_SUFFIXES = *UNREADABLE_SUFFIXES, *(suffix.upper() for suffix in UNREADABLE_SUFFIXES)
 _NO_POINTS = np.zeros((0, 3))
 
 
@@ -189,6 +190,10 @@ def invert_pose(camera_to_world: np.ndarray, opengl: bool = False) -> np.ndarray
     pose = np.eye(4)
     if len(camera_to_world) < 3:
         raise LodgsError("its pose is not a matrix of 3 or 4 rows.")
+    if len(camera_to_world) == 4 and camera_to_world[3, :3].any():  # stored by columns, as ARKit does
+        if camera_to_world[:3, 3].any():
+            raise LodgsError("its pose is not a rotation and translation.")
+        camera_to_world = camera_to_world.T
     pose[:3] = camera_to_world[:3]
     left, stretch, right = np.linalg.svd(pose[:3, :3])
     if not (stretch[2] > 0 and stretch[0] < 1.02 * stretch[2] and np.linalg.det(left @ right) > 0):
@@ -210,11 +215,18 @@ def find_image(folder: Path, name: str) -> Path:
     spellings = name, unquote(name), name.strip(), *forms
     for spelling in dict.fromkeys(spellings):
         for candidate in _candidates(folder, spelling):
-            stem = candidate.stem if candidate.suffix in _SUFFIXES else candidate.name
-            for path in (candidate, *(candidate.with_name(stem + suffix) for suffix in _SUFFIXES)):
+            stem = candidate.stem if _has_photo_suffix(candidate) else candidate.name
+            paths = [candidate.with_name(stem + suffix) for suffix in _SUFFIXES]
+            # A readable copy precedes the original in a format that LODGS does not read.
+            originals = [candidate.with_name(stem + suffix) for suffix in _OTHER_SUFFIXES]
+            for path in (*[candidate][: candidate.suffix in _SUFFIXES], *paths, candidate, *originals):
                 if is_file(path):
                     return path
     return _candidates(folder, name)[0]
+
+
+def _has_photo_suffix(path: Path) -> bool:
+    return path.suffix in _SUFFIXES or path.suffix.lower() in UNREADABLE_SUFFIXES
 
 
 def _candidates(folder: Path, name: str) -> list[Path]:
@@ -291,7 +303,7 @@ class PhotoFinder:
                 if path.suffix in _SUFFIXES and path not in claimed:
                     self._by_stem.setdefault(_fold(path.stem), []).append(path)
         parts = _fold(name.replace("\\", "/")).split("/")
-        stem = parts[-1] if Path(parts[-1]).suffix not in _SUFFIXES else Path(parts[-1]).stem
+        stem = Path(parts[-1]).stem if _has_photo_suffix(Path(parts[-1])) else parts[-1]
         matches = self._by_stem.get(stem, [])
         ranks = [_shared_parts(parts, path) for path in matches]
         matches = [path for path, rank in zip(matches, ranks, strict=True) if rank == max(ranks)]

@@ -19,6 +19,7 @@ _FILES = {
     ".rcproj": ("a RealityCapture project", "Export its registration for COLMAP or Bundler"),
     ".rsproj": ("a RealityScan project", "Export its registration for COLMAP or Bundler"),
     ".csv": ("a table, which LODGS does not read", "Export the cameras for COLMAP or Bundler"),
+    ".xmp": ("camera data of photos, which LODGS does not read", "Export the cameras for COLMAP or Bundler"),
     ".nvm": ("a VisualSFM file", "Save the model for Bundler (bundle.out)"),
     ".sfm": ("a Meshroom file", "Export the cameras for COLMAP"),
     "poses_bounds.npy": ("a file of LLFF", "Choose the folder of its COLMAP model"),

@@ -58,17 +58,22 @@ def find(folder: Path) -> Path | None:
 
 
 def read(path: Path) -> ExportedScene:
-    """Read the views of the first chunk, in the axes of its largest component, in metres if known.
+    """Read the views of the chunk with most aligned cameras, in metres if known.
 
-    Other components, which Metashape aligned separately, are included if their transform is known. The file
-    has no points. The chunk's position on earth is dropped, because splats need small coordinates.
+    The axes are those of the chunk's largest component. Other components, which Metashape aligned separately,
+    are included if their transform is known. The file has no points. The chunk's position on earth is
+    dropped, because splats need small coordinates.
 
     Raises:
         LodgsError: the file is damaged.
     """
-    chunk = _parse_xml(path).find("chunk")
-    if chunk is None:
+    chunks = _parse_xml(path).findall("chunk")
+    if not chunks:
         raise LodgsError(f"Cannot read {path}: it has no chunk.", "Export the cameras again.")
+    counts = [len(chunk.findall("cameras//transform")) for chunk in chunks]
+    chunk = chunks[counts.index(max(counts))]
+    others = sum(counts) - max(counts)
+    warnings = [f"Skipped {others:,} cameras in other chunks of {path}."] if others else []
     lenses: dict[str, Intrinsics | LodgsError] = {}
     sensors = {sensor.get("id", ""): sensor for sensor in chunk.iterfind("sensors/sensor")}
     for sensor in sensors.values():
@@ -107,7 +112,7 @@ def read(path: Path) -> ExportedScene:
             views.append(ExportedView(files.find(camera), lens, invert_pose(pose)))
         except LodgsError as error:
             excluded.append((label, error.what))
-    return ExportedScene(views, excluded=excluded)
+    return ExportedScene(views, excluded=excluded, warnings=warnings)
 
 
 def _parse_xml(path: Path) -> Element:
@@ -133,7 +138,8 @@ def _parse_lens(sensor: Element) -> Intrinsics:
     calibrations = [entry for entry in sensor.iterfind("calibration") if entry.find("f") is not None]
     if not calibrations:
         raise LodgsError("its lens has no calibration.")
-    calibration = calibrations[-1]
+    adjusted = [entry for entry in calibrations if entry.get("class") == "adjusted"]
+    calibration = (adjusted or calibrations)[-1]
     resolution = calibration.find("resolution")
     size = dict((resolution if resolution is not None else sensor).items())
     values: dict[str, float] = {}

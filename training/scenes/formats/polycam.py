@@ -34,7 +34,8 @@ def find(folder: Path) -> Path | None:
     """Return the folder of the cameras, preferably corrected ones."""
     for keyframes in (folder / "keyframes", folder):
         for cameras, images in _FOLDERS:
-            if (keyframes / images).is_dir() and any((keyframes / cameras).glob("[!.]*.json")):
+            names = [path.name for path in (keyframes / cameras).glob("[!.]*.json")]
+            if (keyframes / images).is_dir() and any(not name.startswith("transforms") for name in names):
                 return keyframes / cameras
     return None
 
@@ -62,7 +63,12 @@ def read(path: Path) -> ExportedScene:
             views.append(ExportedView(image, lens, pose, depth=depth))
         except LodgsError as error:
             excluded.append((file.name, error.what))
-    return ExportedScene(views, excluded=excluded)
+    warnings = []
+    if missing := {file.name for file in (path.parent / "cameras").glob("[!.]*.json")} - {
+        file.name for file in path.glob("*.json")
+    }:
+        warnings.append(f"Skipped {len(missing):,} photos without a corrected camera in {path}.")
+    return ExportedScene(views, excluded=excluded, warnings=warnings)
 
 
 def _photo_size(values: Mapping[str, Any], original: Path, image: Path) -> tuple[float, float]:

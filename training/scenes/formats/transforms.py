@@ -43,6 +43,14 @@ _MAX_NORMALISED = 10.0
 _POINTS = "sparse_pc.ply"
 """nerfstudio's name of the point cloud."""
 _FLAW = "flaw of the camera matrix"
+_NAMES = "file_path", "image_path", "file_name"
+_SIZES = {"w": "width", "h": "height"}
+_DISTORTION = "distortion_params", ("k1", "k2", "k3", "k4", "p1", "p2")
+"""nerfstudio's list of coefficients, and their names."""
+_OTHER_LENSES = "latlong", "equirectangular", "orthographic", "ftheta_p0"
+"""instant-ngp's settings of lenses that COLMAP lacks."""
+_UNNAMED = "distortion", "distortion_coefficients", "dist_coeffs"
+"""Lists of coefficients whose order differs between programs."""
 
 
 def find(folder: Path) -> Path | None:
@@ -64,14 +72,15 @@ def read(path: Path) -> ExportedScene:
     """
     document = read_document(path)
     frames = document.get("frames")
+    frames = list(frames.values()) if isinstance(frames, dict) else frames
     if not isinstance(frames, list) or not frames:
         raise LodgsError(f"Cannot read {path}: it has no frames.", "Export it again.")
-    common = _with_focal_lengths({name: value for name, value in document.items() if name != "frames"})
+    common = _with_usual_names({name: value for name, value in document.items() if name != "frames"})
     views, excluded = [], []
-    names = [frame.get("file_path") for frame in frames if isinstance(frame, dict)]
+    frames = [_with_usual_names(frame) if isinstance(frame, dict) else {} for frame in frames]
+    names = [frame.get(_NAMES[0]) for frame in frames]
     photos = PhotoFinder(path.parent, [name for name in names if isinstance(name, str)])
-    for number, frame in enumerate(frames, 1):
-        own = _with_focal_lengths(frame) if isinstance(frame, dict) else {}
+    for number, own in enumerate(frames, 1):
         # A frame's field of view replaces the common focal length.
         replaced = ("fl_x", "fl_y") if "camera_angle_x" in own else ()
         values = {name: value for name, value in common.items() if name not in replaced} | own
@@ -122,6 +131,10 @@ def _parse_view(folder: Path, values: Mapping[str, Any], photos: PhotoFinder) ->
         center = center[0] * sides[0], center[1] * sides[1]
     if isinstance(flaw := values.get(_FLAW), str):
         raise LodgsError(flaw)
+    if other := next((name for name in _OTHER_LENSES if values.get(name)), ""):
+        raise LodgsError(f"lenses with {other} are not supported.")
+    if other := next((name for name in _UNNAMED if np.any(values.get(name))), ""):
+        raise LodgsError(f"the order of its values '{other}' is unknown: name them k1, k2, p1, p2, ...")
     model = str(values.get("camera_model", "")).upper()
     if model not in _SUPPORTED_MODELS:
         raise LodgsError(f"camera model {model} is not supported.")
@@ -140,12 +153,18 @@ def _parse_view(folder: Path, values: Mapping[str, Any], photos: PhotoFinder) ->
     return ExportedView(image, lens, invert_pose(pose, opengl=True), mask, depth)
 
 
-def _with_focal_lengths(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return values with focal lengths and centre by name, which some exporters give as a camera matrix."""
+def _with_usual_names(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return values by instant-ngp's names, which some exporters give as lists or by other names."""
+    usual = {name: values[other] for name, other in _SIZES.items() if other in values}
+    if names := [values[name] for name in _NAMES if name in values]:
+        usual[_NAMES[0]] = names[0]
     try:
-        return {**_read_matrix(values), **values}
+        name, coefficients = _DISTORTION
+        if values.get(name) is not None:
+            usual |= zip(coefficients, parse_array(values[name], 6).tolist(), strict=True)
+        return {**usual, **_read_matrix(values), **values}
     except LodgsError as error:
-        return {**values, _FLAW: error.what}
+        return {**usual, **values, _FLAW: error.what}
 
 
 def _read_matrix(values: Mapping[str, Any]) -> dict[str, Any]:
