@@ -51,7 +51,7 @@ class FlodScaffoldParameters(NeuralOctreeParameters):
         0.0, "Minimum splat size of level 1 in scene units (FLoD: lambda). 0 derives it from 'coarsest'."
     )
     steps: tuple[int, ...] = setting(
-        (250, 350, 500, 700, 2500), "Training steps of each level.", above=0, unit="steps"
+        (200, 300, 450, 650, 2700), "Training steps of each level.", above=0, unit="steps"
     )
     grow_until: tuple[float, ...] = setting(
         (0.55,) * 5, "Fraction of a level's steps in which anchors are added and removed.", high=1
@@ -94,7 +94,7 @@ _DRAFT = FlodScaffoldParameters(
 )
 _STANDARD = replace(
     _DRAFT,
-    steps=(1_500, 2_500, 3_500, 5_000, 17_500),
+    steps=(1_500, 2_000, 3_000, 4_500, 19_000),
     max_splats=2_000_000,
     offsets=10,
     grow_interval=(100,) * 5,
