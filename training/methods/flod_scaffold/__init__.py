@@ -8,7 +8,6 @@ from ...optimize.flod_parameters import (
     PAPER_INTERVALS,
     PAPER_STEPS,
     PAPER_UNTIL,
-    STANDARD_STEPS,
     FlodLevels,
 )
 from ...optimize.method_info import MethodInfo
@@ -55,7 +54,7 @@ class FlodScaffoldParameters(FlodLevels, NeuralOctreeParameters):
         unit="px",
     )
     steps: tuple[int, ...] = setting(
-        (350, 500, 700, 1000, 1750), "Training steps of each level.", above=0, unit="steps"
+        (200, 300, 450, 650, 2700), "Training steps of each level.", above=0, unit="steps"
     )
     grow_until: tuple[float, ...] = setting(
         (0.55,) * 5, "Fraction of a level's steps in which anchors are added and removed.", high=1
@@ -85,7 +84,9 @@ def _preset(name: str, **changes: Any) -> FlodScaffoldParameters:
 
 
 _DRAFT = _preset("draft")
-_STANDARD = _preset("standard", max_splats=2_000_000, steps=STANDARD_STEPS, grow_interval=(100,) * 5)
+_STANDARD = _preset(
+    "standard", max_splats=2_000_000, steps=(1_500, 2_000, 3_000, 4_500, 19_000), grow_interval=(100,) * 5
+)
 _PAPER = _preset(
     "paper",
     max_splats=0,

@@ -203,7 +203,7 @@ def _find_photos(exported: ExportedScene, folder: Path) -> ExportedScene:
     views, warnings = [], list(exported.warnings)
     for view in exported.views:
         image = None
-        if not os.path.isfile(view.image):
+        if not is_file(view.image):
             with suppress(LodgsError):  # several photos match; the missing one is reported
                 image = photos.locate(view.image.as_posix())
         if image is not None and len(warnings) == len(exported.warnings):
