@@ -15,6 +15,7 @@ from ...training.lod.rule import resolve_rule
 from ...training.runs.folder import RunFolder
 from ...training.splats.bundle import write_bundle
 from ...training.splats.formats import FORMATS, LEVEL_FORMATS, PLY, find_format
+from ...training.splats.formats.glb import FORMAT as GLB
 from ...training.splats.formats.sog import FORMAT as SOG
 from ...training.splats.level_folder import write_folder
 from ...training.splats.levels import Bundle, Level
@@ -378,6 +379,23 @@ class LODGS_OT_export_folder(_FolderExport, bpy.types.Operator):
         return {"FINISHED"}
 
 
+class LODGS_OT_export_tiles(_ForeignExport, _FolderExport, _ConvertingExport, bpy.types.Operator):
+    """Export levels as 3D Tiles for Cesium and other globes; uses the trainer"""
+
+    bl_idname = "lodgs.export_tiles"
+    bl_label = "Export 3D Tiles"
+    kind = GLB
+
+    def work(self, context):
+        bundle = scenes.read_levels(roots.active_root(context), self.placed, self.looked)
+        flags = {"antialiased": self.antialiased}
+        yield from self.follow(convert_steps(bundle, "--tiles", self._folder(), flags))
+        self.written = f"{self._folder()} written. {self.progress}".rstrip()
+
+    def status_text(self, context, count):
+        return "Writing the tiles, Esc to stop"
+
+
 class LODGS_OT_export_streamed(_ForeignExport, _FolderExport, _ConvertingExport, bpy.types.Operator):
     """Export levels for web viewers that stream detail by distance; slow without a GPU"""
 
@@ -408,6 +426,7 @@ def _menu(self, context):
         text=f"Splat Levels ({', '.join(kind.suffix for kind in LEVEL_FORMATS)})",
     )
     self.layout.operator(LODGS_OT_export_folder.bl_idname, text="Splat Level Folder")
+    self.layout.operator(LODGS_OT_export_tiles.bl_idname, text="Splat Levels as 3D Tiles (folder)")
     self.layout.operator(LODGS_OT_export_streamed.bl_idname, text="Splat Levels for the Web (folder)")
 
 
@@ -417,6 +436,7 @@ CLASSES = (
     LODGS_OT_export_plain,
     LODGS_OT_export_levels,
     LODGS_OT_export_folder,
+    LODGS_OT_export_tiles,
     LODGS_OT_export_streamed,
 )
 

@@ -44,7 +44,7 @@ def convert_steps(bundle: Bundle, option: str, path: Path, flags: Mapping[str, b
     """Write a bundle with ``lodgs edit``; closing the iterator stops the trainer and writes nothing.
 
     Args:
-        option: option of the command that takes the file: ``--plain`` or ``--levels``.
+        option: option of the command that takes the file or folder: ``--plain``, ``--levels``, ``--tiles``.
         flags: further options by name.
 
     Yields:

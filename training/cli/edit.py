@@ -54,6 +54,9 @@ def _add_outputs(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--streamed", type=Path, metavar="DIR", help="folder of levels to write for streaming in browsers"
     )
+    parser.add_argument(
+        "--tiles", type=Path, metavar="DIR", help="folder of 3D Tiles to write, for Cesium and other globes"
+    )
     for name in ("antialiased", "original_place"):
         add_setting(parser, EXPORT_OPTIONS[name], value=False)
 
@@ -108,10 +111,11 @@ def run(options: argparse.Namespace) -> int:
         raise LodgsError(
             "Cannot test splats against photos: their scene is missing.", "Add its folder with --scene."
         )
-    if not (options.out or options.plain or options.levels or options.folder or options.streamed):
+    folders = (options.folder, options.streamed, options.tiles)
+    if not (options.out or options.plain or options.levels or any(folders)):
         raise LodgsError(
             "Cannot write the edited splats: no output.",
-            "Add --out, --plain, --levels, --folder or --streamed.",
+            "Add --out, --plain, --levels, --folder, --streamed or --tiles.",
         )
     points = None
     opened = (
@@ -131,7 +135,8 @@ def run(options: argparse.Namespace) -> int:
                 source, options.out, Cleaning(tuple(crops), **limits), warn,
                 placement=placement_of(options), upright=options.upright, ground=options.ground,
                 points=points, looks=[(crop, look) for crop in look_crops] if look else (),
-                plain=options.plain, levels=options.levels, folder=options.folder, streamed=options.streamed,
+                plain=options.plain, levels=options.levels, folder=options.folder,
+                streamed=options.streamed, tiles=options.tiles,
                 antialiased=options.antialiased, original_place=options.original_place,
             )
         )  # fmt: skip

@@ -23,7 +23,7 @@ from ..splats.splat_transform import find_splat_transform
 from ..splats.streamed_levels import write_streamed_levels
 from .bake_filter import bake_filter
 from .cleaning import Cleaning, clean_bundle
-from .export import export_finest_level, export_levels, run_to_end
+from .export import export_finest_level, export_levels, export_tiles, run_to_end
 from .look import Looks, apply_looks_to_levels
 from .placement import transform_bundle, upright_placement
 
@@ -43,6 +43,7 @@ def edit(
     levels: Sequence[Path] = (),
     folder: Path | None = None,
     streamed: Path | None = None,
+    tiles: Path | None = None,
     antialiased: bool = False,
     original_place: bool = False,
 ) -> str:
@@ -61,6 +62,7 @@ def edit(
         levels: files for all levels, in the formats of their names.
         folder: output folder of levels.
         streamed: output folder of levels for streaming in browsers.
+        tiles: output folder of 3D Tiles.
         antialiased: for all outputs but ``out`` and ``folder``, see :class:`.export.ExportOptions`.
         original_place: for ``plain`` and ``levels``, see :class:`.export.ExportOptions`.
 
@@ -70,7 +72,7 @@ def edit(
     Raises:
         LodgsError: cannot read or write a file, the source contradicts its rule, or no splats remain.
     """
-    outputs = [path for path in (out, *plain, *levels, folder, streamed) if path is not None]
+    outputs = [path for path in (out, *plain, *levels, folder, streamed, tiles) if path is not None]
     _check_outputs(source, outputs, plain, levels, streamed)
     bundle = _open(source, warn)
     check_rule(bundle)
@@ -85,6 +87,7 @@ def edit(
     for path in plain:
         run_to_end(export_finest_level(path, edited, antialiased, original_place))
     notes = [note for path in levels for note in export_levels(path, edited, antialiased, original_place)]
+    notes += [] if tiles is None else export_tiles(tiles, edited, antialiased)
     _export_levels(edited, folder, streamed, antialiased)
     keeps_place = original_place and outputs == [*plain, *levels]
     return "\n".join([*notes, *_report(bundle, edited, outputs, keeps_place)])

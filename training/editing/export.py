@@ -12,10 +12,12 @@ from ..settings import setting, settings_of
 from ..splats.coding import MAX_CODES
 from ..splats.dialects import comments_from_meta
 from ..splats.formats import PLY, check_degree, find_format, find_level_format, write_splats
+from ..splats.formats.glb import FORMAT as GLB
 from ..splats.levels import NO_SPLATS, Bundle, Level
 from ..splats.origin import NO_ORIGIN
 from ..splats.ply import write_ply
 from ..splats.portable_levels import ConcatenatedRows
+from ..splats.tiles import write_tiles
 from .bake_filter import bake_filter
 
 
@@ -138,6 +140,18 @@ def export_levels(
     bundle = bundle if antialiased else bake_filter(bundle)
     levels, notes = portable_levels(bundle, original_place)
     kind.write_levels(path, levels)
+    return notes
+
+
+def export_tiles(folder: Path, bundle: Bundle, antialiased: bool = False) -> list[str]:
+    """Write all levels of a bundle as 3D Tiles; arguments and result as for :func:`export_levels`.
+
+    Raises:
+        LodgsError: the folder has other files or cannot be written, or the degree is not supported.
+    """
+    check_degree(GLB, bundle.levels[-1].rows)
+    levels, notes = portable_levels(bundle if antialiased else bake_filter(bundle))
+    write_tiles(folder, levels)
     return notes
 
 

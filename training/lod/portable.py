@@ -12,12 +12,17 @@ from ..scenes.view_tables import read_view_tables
 from ..splats.gaussians import SplatRows
 from ..splats.levels import NO_SPLATS, Bundle, Level
 from ..splats.origin import NO_ORIGIN
-from ..splats.portable_levels import DISTANCE, DISTANCE_RULE, ConcatenatedRows, PortableLevels, PortableView
+from ..splats.portable_levels import (
+    DEFAULT_FOCAL,
+    DISTANCE,
+    DISTANCE_RULE,
+    ConcatenatedRows,
+    PortableLevels,
+    PortableView,
+)
 from .rule import Rule, collect_facts
 from .selection import check_rule, require_rule, standalone_levels
 
-DEFAULT_FOCAL = 1000.0
-"""Focal length in pixels for which distances are computed if the scene has no views."""
 _SAMPLE = 20_000
 """Approximate number of splats whose columns determine the distance of a level."""
 
@@ -64,7 +69,8 @@ def portable_levels(bundle: Bundle, original_place: bool = False) -> tuple[Porta
             for level, distance in zip(levels, distances, strict=True)
         ]
         nested = replace(nested, rule=DISTANCE_RULE, facts={}, controls={}, cumulative=False)
-    return PortableLevels(replace(nested, levels=levels), distances, rule.fade_factor, views, origin), notes
+    nested = replace(nested, levels=levels)
+    return PortableLevels(nested, distances, focal, rule.fade_factor, views, origin), notes
 
 
 def _with_splats(levels: list[Level], distances: Sequence[float]) -> tuple[list[Level], tuple[float, ...]]:

@@ -20,7 +20,7 @@ from ..files import atomic_write
 from .bundle import write_bundle
 from .dialects import drop_undrawable
 from .gaussians import SH_C0, Splats
-from .levels import MAX_READ_LEVELS, Bundle, Level, bounding_box
+from .levels import MAX_READ_LEVELS, Bundle, Level
 from .portable_levels import (
     PortableLevels,
     batches,
@@ -39,6 +39,8 @@ DESCRIPTION = "lodgs"
 _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 _MAX_BYTES = 2**32 - 1
 _MAX_JSON = 1 << 24
+_RESERVE = 256
+"""Bytes of JSON for the bounds of a level, which are known after its splats are written."""
 _MIN_SPLAT = 32
 """Minimum bytes of a splat: position, rotation, scale, opacity and base colour."""
 _VIEW_ANGLE = math.radians(60)
@@ -66,26 +68,36 @@ def write_glb(path: Path, levels: PortableLevels) -> None:
         LodgsError: the file cannot be written or exceeds 4 GiB.
     """
     document, size = _document(levels)
-    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
-    text += b" " * (-len(text) % 4)
-    begin = _HEADER.size + 2 * _CHUNK.size + len(text)
+    text = _padded(document, 0)
+    reserved = len(text) + _RESERVE * len(document["meshes"])
+    begin = _HEADER.size + 2 * _CHUNK.size + reserved
     if begin + size > _MAX_BYTES:
         raise LodgsError(
             f"Cannot write {path}: {(begin + size) / 1e9:.1f} GB exceed the 4 GiB of a .glb file.",
             "Export fewer levels or a lower SH degree, or write USD.",
         )
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
-        file.write(_HEADER.pack(b"glTF", 2, begin + size))
-        file.write(_CHUNK.pack(len(text), b"JSON") + text + _CHUNK.pack(size, b"BIN\0"))
-        views = iter(document["bufferViews"])
-        for level in levels.fine_to_coarse:
-            names = _columns(level.sh_degree)
-            offsets = {name: begin + next(views)["byteOffset"] for name in names}
+        for level, mesh in zip(levels.fine_to_coarse, document["meshes"], strict=True):
+            attributes = mesh["primitives"][0]["attributes"]
+            low, high = np.full(3, np.inf), np.full(3, -np.inf)
             for row, splats in batches(level.rows):
+                low, high = np.minimum(low, splats.means.min(0)), np.maximum(high, splats.means.max(0))
                 for name, column in _values(splats).items():
-                    file.seek(offsets[name] + row * _item_size(name))
+                    offset = document["bufferViews"][attributes[name]]["byteOffset"]
+                    file.seek(begin + offset + row * _item_size(name))
                     file.write(np.ascontiguousarray(column).data)
+            document["accessors"][attributes["POSITION"]] |= {"min": low.tolist(), "max": high.tolist()}
         file.truncate(begin + size)
+        file.seek(0)
+        file.write(_HEADER.pack(b"glTF", 2, begin + size))
+        file.write(_CHUNK.pack(reserved, b"JSON") + _padded(document, reserved))
+        file.write(_CHUNK.pack(size, b"BIN\0"))
+
+
+def _padded(document: dict, size: int) -> bytes:
+    """Return JSON of at least a size that is a multiple of 4."""
+    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+    return text.ljust(max(size, len(text) + -len(text) % 4))
 
 
 def _document(levels: PortableLevels) -> tuple[dict, int]:
@@ -109,8 +121,6 @@ def _document(levels: PortableLevels) -> tuple[dict, int]:
                 "bufferView": attributes[name], "componentType": component, "count": len(level.rows),
                 "type": kind,
             }  # fmt: skip
-            if name == "POSITION":
-                accessor["min"], accessor["max"] = bounding_box([level.rows])
             if name == "COLOR_0":
                 accessor["normalized"] = True
             document["bufferViews"].append(view)

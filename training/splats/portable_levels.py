@@ -20,6 +20,8 @@ from .similarity import Similarity
 
 DISTANCE_RULE, DISTANCE = "chunks", "d_l"
 """Rule of levels that other programs select by distance, and the fact with a level's distance."""
+DEFAULT_FOCAL = 1000.0
+"""Focal length in pixels for which distances are computed if the scene has no views."""
 _NEAR_SHARE = 0.9
 """Fraction of the finest splats inside the radius of a scene; the others are sky and floaters."""
 
@@ -86,6 +88,7 @@ class PortableLevels:
         bundle: levels that are complete scenes and not cumulative.
         distances: camera distances from which on each level replaces the finer ones, coarse to fine, the last
             of them 0; empty without selection by distance.
+        focal: focal length in pixels that the distances are for.
         fade: ratio of the end to the begin of the distances over which two levels fade into each other.
         views: cameras of the scene.
         origin: (3,) float64, added to positions by the transform of the scene.
@@ -93,6 +96,7 @@ class PortableLevels:
 
     bundle: Bundle
     distances: tuple[float, ...] = ()
+    focal: float = DEFAULT_FOCAL
     fade: float = 1.0
     views: Sequence[PortableView] = ()
     origin: np.ndarray = field(default_factory=lambda: NO_ORIGIN)
