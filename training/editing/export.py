@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ..errors import LodgsError
-from ..lod.portable import portable_levels
 from ..settings import setting, settings_of
 from ..splats.coding import MAX_CODES
 from ..splats.dialects import comments_from_meta
@@ -19,6 +18,7 @@ from ..splats.ply import write_ply
 from ..splats.portable_levels import ConcatenatedRows
 from ..splats.tiles import write_tiles
 from .bake_filter import bake_filter
+from .portable import portable_levels
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ import pytest
 
 from tests.training.splats.test_formats import random_splats
 from training.editing.export import export_levels
+from training.editing.portable import level_distances, portable_levels
 from training.errors import LodgsError
-from training.lod.portable import level_distances, portable_levels
 from training.lod.rule import resolve_rule
 from training.lod.selection import select
 from training.scenes.cameras import Camera

@@ -8,6 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from ..errors import LodgsError
+from ..lod.rule import Rule, collect_facts
+from ..lod.selection import check_rule, require_rule, standalone_levels
 from ..scenes.view_tables import read_view_tables
 from ..splats.gaussians import SplatRows
 from ..splats.levels import NO_SPLATS, Bundle, Level
@@ -20,8 +22,6 @@ from ..splats.portable_levels import (
     PortableLevels,
     PortableView,
 )
-from .rule import Rule, collect_facts
-from .selection import check_rule, require_rule, standalone_levels
 
 _SAMPLE = 20_000
 """Approximate number of splats whose columns determine the distance of a level."""
