@@ -34,6 +34,7 @@ from .data import importing, scenes, viewpoints
 from .render.capture import noise_warning, render_views, write_model
 from .render.video import MAX_FRAMES, extract_frames
 from .runs import environment, job_settings, jobs, photo_preparation
+from .runs.compression import convert_steps
 from .runs.messages import format_duration, level_line
 from .runs.watch import Watch
 
@@ -249,6 +250,10 @@ def _export(args: argparse.Namespace) -> int:
     bundle = scenes.read_levels(matches[0], args.placed, args.looked)
     if find_format(args.bundle) is PLY:
         write_bundle(args.bundle, bundle)
+    elif find_format(args.bundle).write_levels:
+        for text in convert_steps(bundle, "--levels", args.bundle.resolve(), {}):
+            if text:
+                _print(text)
     else:
         run_to_end(export_finest_level(args.bundle, bundle))
     _print(f"{args.bundle}: written")

@@ -1,4 +1,4 @@
-"""Export a splat scene as a bundle, a plain splat file, a folder of levels, or levels for the web."""
+"""Export a splat scene as a bundle, a plain splat file, levels of other programs, or levels for the web."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from ...training.errors import LodgsError
 from ...training.lod.rule import resolve_rule
 from ...training.runs.folder import RunFolder
 from ...training.splats.bundle import write_bundle
-from ...training.splats.formats import FORMATS, PLY, find_format
+from ...training.splats.formats import FORMATS, LEVEL_FORMATS, PLY, find_format
+from ...training.splats.formats.glb import FORMAT as GLB
 from ...training.splats.formats.sog import FORMAT as SOG
 from ...training.splats.level_folder import write_folder
 from ...training.splats.levels import Bundle, Level
@@ -25,7 +26,7 @@ from ..data import roots, scenes, selection
 from ..data.objects import megabytes, sh_degree
 from ..data.paths import absolute_path
 from ..data.setting_properties import property_of
-from ..runs.compression import compress_steps
+from ..runs.compression import compress_steps, convert_steps
 from ..runs.run_folders import automatic_run
 from .base import ReadLevelsOperator, report_errors
 from .modal import BackgroundOperator
@@ -221,13 +222,8 @@ class LODGS_OT_export_plain(_ForeignExport, _FileExport, _ConvertingExport, bpy.
 
     def check(self, context):
         """Give the file name the extension of the chosen format."""
-        path = next(
-            (self.filepath[: -len(suffix)] for suffix in _SUFFIXES if self.filepath.endswith(suffix)),
-            self.filepath,
-        )
-        changed = path + self.kind != self.filepath
-        self.filepath = path + self.kind
-        return changed
+        path, self.filepath = self.filepath, _without_suffix(self.filepath) + self.kind
+        return path != self.filepath
 
     def draw(self, context):
         layout = self.layout
@@ -268,12 +264,67 @@ class LODGS_OT_export_plain(_ForeignExport, _FileExport, _ConvertingExport, bpy.
         if self.placed:
             meta.pop("origin", None)
         bundle = Bundle("", [Level(1, splats)], meta=meta, tables=scenes.view_tables(root, self.placed))
-        yield from self.follow(export_finest_level(path, bundle, self.antialiased, self.original_place))
+        flags = {"antialiased": self.antialiased, "original_place": self.original_place}
+        if find_format(path).in_trainer:
+            yield from self.follow(convert_steps(bundle, "--plain", path, flags))
+        else:
+            yield from self.follow(export_finest_level(path, bundle, **flags))
         origin = "" if self.original_place else _origin_text(bundle)
         self.written = f"{len(splats):,} splats written to {path}{origin}"
 
 
+class LODGS_OT_export_levels(_ForeignExport, _FileExport, _ConvertingExport, bpy.types.Operator):
+    """Export all levels to one file of USD or glTF for other programs; uses the trainer"""
+
+    bl_idname = "lodgs.export_levels"
+    bl_label = "Export Levels"
+    suffix = "_levels"
+    filename_ext = LEVEL_FORMATS[0].suffix
+
+    original_place: property_of(EXPORT_OPTIONS["original_place"])
+
+    filter_glob: bpy.props.StringProperty(
+        default=";".join(f"*{kind.suffix}" for kind in LEVEL_FORMATS), options={"HIDDEN"}
+    )
+    kind: bpy.props.EnumProperty(
+        name="Format",
+        description="File format; scripts choose it by the file extension",
+        items=[(kind.suffix, kind.label, kind.about) for kind in LEVEL_FORMATS],
+    )
+
+    def check(self, context):
+        """Give the file name the extension of the chosen format."""
+        path, self.filepath = self.filepath, _without_suffix(self.filepath) + self.kind
+        return path != self.filepath
+
+    def draw(self, context):
+        layout = self.layout
+        layout.use_property_split = True
+        layout.prop(self, "kind")
+        for name in ("placed", "looked", "antialiased"):
+            layout.prop(self, name)
+        if selection.origin_of(roots.active_root(context)).any():
+            row = layout.row()
+            row.active = not self.placed
+            row.prop(self, "original_place")
+        layout.label(text=f"Estimated size: {_size(context, find_format(Path(self.kind)), -1)}")
+
+    def work(self, context):
+        bundle = scenes.read_levels(roots.active_root(context), self.placed, self.looked)
+        flags = {"antialiased": self.antialiased, "original_place": self.original_place}
+        yield from self.follow(convert_steps(bundle, "--levels", self._path(), flags))
+        self.written = f"{self._path()} written. {self.progress}".rstrip()
+
+    def status_text(self, context, count):
+        return "Writing the levels, Esc to stop"
+
+
 _SUFFIXES = sorted((kind.suffix for kind in FORMATS), key=len, reverse=True)
+
+
+def _without_suffix(path: str) -> str:
+    """Return a path without the suffix of a format."""
+    return next((path[: -len(suffix)] for suffix in _SUFFIXES if path.endswith(suffix)), path)
 
 
 class _FolderExport(_ExportOperator):
@@ -328,6 +379,23 @@ class LODGS_OT_export_folder(_FolderExport, bpy.types.Operator):
         return {"FINISHED"}
 
 
+class LODGS_OT_export_tiles(_ForeignExport, _FolderExport, _ConvertingExport, bpy.types.Operator):
+    """Export levels as 3D Tiles for Cesium and other globes; uses the trainer"""
+
+    bl_idname = "lodgs.export_tiles"
+    bl_label = "Export 3D Tiles"
+    kind = GLB
+
+    def work(self, context):
+        bundle = scenes.read_levels(roots.active_root(context), self.placed, self.looked)
+        flags = {"antialiased": self.antialiased}
+        yield from self.follow(convert_steps(bundle, "--tiles", self._folder(), flags))
+        self.written = f"{self._folder()} written. {self.progress}".rstrip()
+
+    def status_text(self, context, count):
+        return "Writing the tiles, Esc to stop"
+
+
 class LODGS_OT_export_streamed(_ForeignExport, _FolderExport, _ConvertingExport, bpy.types.Operator):
     """Export levels for web viewers that stream detail by distance; slow without a GPU"""
 
@@ -353,7 +421,12 @@ def _menu(self, context):
     self.layout.operator(
         LODGS_OT_export_plain.bl_idname, text=f"Plain Splats ({', '.join(kind.suffix for kind in FORMATS)})"
     )
+    self.layout.operator(
+        LODGS_OT_export_levels.bl_idname,
+        text=f"Splat Levels ({', '.join(kind.suffix for kind in LEVEL_FORMATS)})",
+    )
     self.layout.operator(LODGS_OT_export_folder.bl_idname, text="Splat Level Folder")
+    self.layout.operator(LODGS_OT_export_tiles.bl_idname, text="Splat Levels as 3D Tiles (folder)")
     self.layout.operator(LODGS_OT_export_streamed.bl_idname, text="Splat Levels for the Web (folder)")
 
 
@@ -361,7 +434,9 @@ CLASSES = (
     LODGS_OT_export_bundle,
     LODGS_OT_export_compressed,
     LODGS_OT_export_plain,
+    LODGS_OT_export_levels,
     LODGS_OT_export_folder,
+    LODGS_OT_export_tiles,
     LODGS_OT_export_streamed,
 )
 

@@ -7,12 +7,15 @@ from pathlib import Path
 
 import bpy
 
-from ...training.splats.formats import FILE_EXTENSIONS, READABLE
+from ...training.splats.formats import FILE_EXTENSIONS
+from ...training.splats.streamed_levels import STREAMED_FILE
 from ..data import importing, photographs, reloading, roots, scenes
 from ..data.paths import absolute_path
 from ..runs import photo_preparation
 from .base import SceneOperator
 from .modal import BackgroundOperator
+
+_READABLE = (*FILE_EXTENSIONS, STREAMED_FILE)
 
 
 class LODGS_OT_import_splats(BackgroundOperator, bpy.types.Operator):
@@ -24,7 +27,7 @@ class LODGS_OT_import_splats(BackgroundOperator, bpy.types.Operator):
 
     filepath: bpy.props.StringProperty(
         name="File",
-        description="Bundle or splat file: " + ", ".join(READABLE),
+        description="Bundle or splat file: " + ", ".join(_READABLE),
         subtype="FILE_PATH",
         options={"SKIP_SAVE"},
     )
@@ -33,7 +36,7 @@ class LODGS_OT_import_splats(BackgroundOperator, bpy.types.Operator):
         type=bpy.types.OperatorFileListElement, options={"SKIP_SAVE", "HIDDEN"}
     )
     filter_glob: bpy.props.StringProperty(
-        default=";".join(f"*{ending}" for ending in READABLE), options={"HIDDEN"}
+        default=";".join(f"*{ending}" for ending in _READABLE), options={"HIDDEN"}
     )
     upright: bpy.props.BoolProperty(
         name="Upright",
@@ -121,7 +124,8 @@ class LODGS_FH_splats(bpy.types.FileHandler):
     bl_idname = "LODGS_FH_splats"
     bl_label = "Gaussian Splats (LODGS)"
     bl_import_operator = LODGS_OT_import_splats.bl_idname
-    bl_file_extensions = ";".join(FILE_EXTENSIONS)
+    # Blender's own importer opens dropped glTF files
+    bl_file_extensions = ";".join(ending for ending in FILE_EXTENSIONS if ending != ".glb")
 
     @classmethod
     def poll_drop(cls, context):

@@ -15,7 +15,9 @@ class LODGS_PT_export(LevelsPanel):
         column.operator("lodgs.export_bundle", text="Level Bundle…", icon="EXPORT")
         column.operator("lodgs.export_compressed", text="Compressed Bundle…")
         column.operator("lodgs.export_plain", text="Plain Splats…")
+        column.operator("lodgs.export_levels", text="Levels as USD, glTF…")
         column.operator("lodgs.export_folder", text="Level Folder…")
+        column.operator("lodgs.export_tiles", text="Levels as 3D Tiles…")
         column.operator("lodgs.export_streamed", text="Levels for Web…")
 
 

@@ -1,9 +1,9 @@
-"""Compression of an exported bundle by the trainer in the background."""
+"""Exports that the trainer writes in the background."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 
@@ -32,26 +32,50 @@ def compress_steps(
     Raises:
         LodgsError: the trainer is missing or fails.
     """
+    options = [  # Blender's numbers have single precision
+        f"--{name.replace('_', '-')}={round(value, 6)}" for name, value in settings.items()
+    ]
+    options += [f"--run={run.path}"] if run is not None and run.bundle.exists() else []
+    for lines in _trainer_steps(bundle, "compress", "--out", str(path), *options):
+        yield lines[-1] if lines else ""
+
+
+def convert_steps(bundle: Bundle, option: str, path: Path, flags: Mapping[str, bool]) -> Iterator[str]:
+    """Write a bundle with ``lodgs edit``; closing the iterator stops the trainer and writes nothing.
+
+    Args:
+        option: option of the command that takes the file or folder: ``--plain``, ``--levels``, ``--tiles``.
+        flags: further options by name.
+
+    Yields:
+        Empty texts while the trainer works, then its sentences about the file.
+
+    Raises:
+        LodgsError: the trainer is missing or fails.
+    """
+    options = [f"--{name.replace('_', '-')}" for name, value in flags.items() if value]
+    for lines in _trainer_steps(bundle, "edit", option, str(path), *options):
+        yield " ".join(line for line in lines if line.endswith("."))
+
+
+def _trainer_steps(bundle: Bundle, command: str, *arguments: str) -> Iterator[list[str]]:
+    """Run a command of LODGS on a bundle, and yield the lines of its report, at first none."""
     python = environment.trainer_python()
     environment.require(python)
     with temporary_folder() as folder:
         source, log, output = folder / "levels.ply", folder / "trainer.log", folder / "trainer.out"
         write_bundle(source, bundle)
-        options = [  # Blender's numbers have single precision
-            f"--{name.replace('_', '-')}={round(value, 6)}" for name, value in settings.items()
-        ]
-        options += [f"--run={run.path}"] if run is not None and run.bundle.exists() else []
-        command = [python, "-m", "training", "compress", source, "--out", path, *options]
-        process = processes.spawn([str(word) for word in command], log, output)
+        command_line = [python, "-m", "training", command, source, *arguments]
+        process = processes.spawn([str(word) for word in command_line], log, output)
         try:
             while (code := process.poll()) is None:
                 if bpy.app.background:
                     time.sleep(processes.INTERVAL)
-                yield ""
+                yield []
         finally:
             with suppress(OSError):
                 process.kill()
                 process.wait()
         if code:
             raise LodgsError(processes.failure_reason(log, code))
-        yield processes.last_lines(output)[-1]
+        yield processes.last_lines(output)

@@ -14,7 +14,9 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-TRAINER_ONLY = {"torch", "numba", "pycolmap", "PIL", "OpenEXR", "scipy", "torchmetrics", "matplotlib"}
+TRAINER_ONLY = {
+    "torch", "numba", "pycolmap", "PIL", "OpenEXR", "scipy", "torchmetrics", "matplotlib", "pxr",
+}  # fmt: skip
 PROGRAMS = ("sfm", "sfm_known_poses", "undistort", "pycolmap_process")
 """Files that import pycolmap, in processes of their own."""
 BLENDER_ONLY = {"bpy", "bpy_extras", "gpu", "gpu_extras", "mathutils"}

@@ -218,7 +218,7 @@ def test_edits_name_the_origin_or_add_it(tmp_path, capsys):
     x, y, z = (file["vertex"][axis] for axis in "xyz")
     assert x.dtype == np.float64
     np.testing.assert_array_equal(np.stack([x, y, z], axis=1), splats().means + OFFSET)
-    with pytest.raises(LodgsError, match="only PLY"):
+    with pytest.raises(LodgsError, match="no double precision"):
         from training.editing.edit import Cleaning, edit
 
         edit(tmp_path / "b.ply", None, Cleaning(), plain=[tmp_path / "a.splat"], original_place=True)

@@ -10,7 +10,7 @@ from ..editing.export import EXPORT_OPTIONS
 from ..editing.look import LOOK_SETTINGS, Look
 from ..errors import LodgsError
 from ..lod.crop import Crop
-from ..splats.formats import FORMATS, READABLE
+from ..splats.formats import FORMATS, LEVEL_FORMATS, READABLE
 from .options import SOURCE_HELP, add_placement, add_setting, placement_of, setting_values, warn
 
 
@@ -46,9 +46,16 @@ def _add_outputs(parser: argparse.ArgumentParser) -> None:
         "--plain", type=Path, action="append", default=[], metavar="FILE",
         help="file for the finest level only: " + ", ".join(kind.suffix for kind in FORMATS),
     )  # fmt: skip
+    parser.add_argument(
+        "--levels", type=Path, action="append", default=[], metavar="FILE",
+        help="file for all levels, selected by distance: " + ", ".join(kind.suffix for kind in LEVEL_FORMATS),
+    )  # fmt: skip
     parser.add_argument("--folder", type=Path, metavar="DIR", help="folder of levels to write")
     parser.add_argument(
         "--streamed", type=Path, metavar="DIR", help="folder of levels to write for streaming in browsers"
+    )
+    parser.add_argument(
+        "--tiles", type=Path, metavar="DIR", help="folder of 3D Tiles to write, for Cesium and other globes"
     )
     for name in ("antialiased", "original_place"):
         add_setting(parser, EXPORT_OPTIONS[name], value=False)
@@ -104,9 +111,11 @@ def run(options: argparse.Namespace) -> int:
         raise LodgsError(
             "Cannot test splats against photos: their scene is missing.", "Add its folder with --scene."
         )
-    if not (options.out or options.plain or options.folder or options.streamed):
+    folders = (options.folder, options.streamed, options.tiles)
+    if not (options.out or options.plain or options.levels or any(folders)):
         raise LodgsError(
-            "Cannot write the edited splats: no output.", "Add --out, --plain, --folder or --streamed."
+            "Cannot write the edited splats: no output.",
+            "Add --out, --plain, --levels, --folder, --streamed or --tiles.",
         )
     points = None
     opened = (
@@ -126,7 +135,8 @@ def run(options: argparse.Namespace) -> int:
                 source, options.out, Cleaning(tuple(crops), **limits), warn,
                 placement=placement_of(options), upright=options.upright, ground=options.ground,
                 points=points, looks=[(crop, look) for crop in look_crops] if look else (),
-                plain=options.plain, folder=options.folder, streamed=options.streamed,
+                plain=options.plain, levels=options.levels, folder=options.folder,
+                streamed=options.streamed, tiles=options.tiles,
                 antialiased=options.antialiased, original_place=options.original_place,
             )
         )  # fmt: skip

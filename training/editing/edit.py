@@ -13,7 +13,7 @@ from ..lod.selection import check_rule
 from ..splats.bundle import open_bundle, write_bundle
 from ..splats.dialects import Warn, comments_from_meta, ignore, meta_from_comments
 from ..splats.file_rows import DrawableRows
-from ..splats.formats import find_format
+from ..splats.formats import find_format, find_level_format
 from ..splats.level_folder import read_folder, write_folder
 from ..splats.levels import Bundle
 from ..splats.origin import describe_origin
@@ -23,7 +23,7 @@ from ..splats.splat_transform import find_splat_transform
 from ..splats.streamed_levels import write_streamed_levels
 from .bake_filter import bake_filter
 from .cleaning import Cleaning, clean_bundle
-from .export import export_finest_level, run_to_end
+from .export import export_finest_level, export_levels, export_tiles, run_to_end
 from .look import Looks, apply_looks_to_levels
 from .placement import transform_bundle, upright_placement
 
@@ -40,8 +40,10 @@ def edit(
     ground: bool = False,
     points: np.ndarray | None = None,
     plain: Sequence[Path] = (),
+    levels: Sequence[Path] = (),
     folder: Path | None = None,
     streamed: Path | None = None,
+    tiles: Path | None = None,
     antialiased: bool = False,
     original_place: bool = False,
 ) -> str:
@@ -57,10 +59,12 @@ def edit(
             those of the source.
         upright, ground, points: see ``placement.upright_placement``.
         plain: files for the finest level only, in the formats of their names.
+        levels: files for all levels, in the formats of their names.
         folder: output folder of levels.
         streamed: output folder of levels for streaming in browsers.
-        antialiased: for ``plain`` and ``streamed``, see :class:`.export.ExportOptions`.
-        original_place: for ``plain``, see :class:`.export.ExportOptions`.
+        tiles: output folder of 3D Tiles.
+        antialiased: for all outputs but ``out`` and ``folder``, see :class:`.export.ExportOptions`.
+        original_place: for ``plain`` and ``levels``, see :class:`.export.ExportOptions`.
 
     Returns:
         A report of the remaining splats of each level, and of the files.
@@ -68,8 +72,8 @@ def edit(
     Raises:
         LodgsError: cannot read or write a file, the source contradicts its rule, or no splats remain.
     """
-    outputs = [path for path in (out, *plain, folder, streamed) if path is not None]
-    _check_outputs(source, outputs, plain, streamed)
+    outputs = [path for path in (out, *plain, *levels, folder, streamed, tiles) if path is not None]
+    _check_outputs(source, outputs, plain, levels, streamed)
     bundle = _open(source, warn)
     check_rule(bundle)
     edited = apply_looks_to_levels(clean_bundle(bundle, cleaning), looks)
@@ -82,11 +86,14 @@ def edit(
         _write_like(source, bundle, out, edited)
     for path in plain:
         run_to_end(export_finest_level(path, edited, antialiased, original_place))
+    notes = [note for path in levels for note in export_levels(path, edited, antialiased, original_place)]
+    notes += [] if tiles is None else export_tiles(tiles, edited, antialiased)
     _export_levels(edited, folder, streamed, antialiased)
-    return _report(bundle, edited, outputs, keeps_place=original_place and outputs == list(plain))
+    keeps_place = original_place and outputs == [*plain, *levels]
+    return "\n".join([*notes, *_report(bundle, edited, outputs, keeps_place)])
 
 
-def _report(bundle: Bundle, edited: Bundle, outputs: Sequence[Path], keeps_place: bool) -> str:
+def _report(bundle: Bundle, edited: Bundle, outputs: Sequence[Path], keeps_place: bool) -> list[str]:
     """Report the remaining splats, the files, and a change of the origin.
 
     Args:
@@ -101,17 +108,25 @@ def _report(bundle: Bundle, edited: Bundle, outputs: Sequence[Path], keeps_place
         lines.append(describe_origin(edited.origin))
     elif bundle.origin.any() and not edited.origin.any():
         lines.append("The placement drops the local origin: positions are no longer those of the original.")
-    return "\n".join(lines)
+    return lines
 
 
 def _check_outputs(
-    source: Path, outputs: Sequence[Path], plain: Sequence[Path], streamed: Path | None
+    source: Path,
+    outputs: Sequence[Path],
+    plain: Sequence[Path],
+    levels: Sequence[Path],
+    streamed: Path | None,
 ) -> None:
     """Raise an error before minutes of work if an output cannot be written."""
     for path in outputs:
         if path.resolve() == source.resolve():
             raise LodgsError(f"Cannot overwrite the source {path}.", "Choose another output file.")
-    if streamed is not None or any(find_format(path).write is None for path in plain):
+    kinds = [find_format(path) for path in plain] + [find_level_format(path) for path in levels]
+    for kind in kinds:
+        if kind.require is not None:
+            kind.require()
+    if streamed is not None or any(kind.uses_splat_transform for kind in kinds):
         find_splat_transform()
 
 

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
-
-import numpy as np
 
 from ..errors import LodgsError
 from ..settings import setting, settings_of
 from ..splats.coding import MAX_CODES
 from ..splats.dialects import comments_from_meta
-from ..splats.formats import PLY, find_format, write_splats
-from ..splats.gaussians import SplatRows, Splats
-from ..splats.levels import Bundle
+from ..splats.formats import PLY, check_degree, find_format, find_level_format, write_splats
+from ..splats.formats.glb import FORMAT as GLB
+from ..splats.levels import NO_SPLATS, Bundle, Level
 from ..splats.origin import NO_ORIGIN
 from ..splats.ply import write_ply
+from ..splats.portable_levels import ConcatenatedRows
+from ..splats.tiles import write_tiles
 from .bake_filter import bake_filter
+from .portable import portable_levels
 
 
 @dataclass(frozen=True)
@@ -42,8 +43,8 @@ class ExportOptions:
     )
     original_place: bool = setting(
         False,
-        "Write a georeferenced scene at its original place, with positions in double precision; otherwise "
-        "relative to its local origin. PLY only.",
+        "Write a georeferenced scene at its original place, in double precision; otherwise relative to its "
+        "local origin. PLY, USD and glTF only.",
         label="Original Place",
     )
 
@@ -97,12 +98,18 @@ def export_finest_level(
         LodgsError: as :func:`..splats.formats.write_splats`, or the format has no double precision.
     """
     origin = bundle.origin if original_place else NO_ORIGIN
-    if origin.any() and find_format(path) is not PLY:
+    kind = find_format(path)
+    if kind.write_levels is not None:
+        rows = ConcatenatedRows.of_level(bundle, bundle.levels[-1].number)
+        finest = replace(bundle, levels=[Level(1, NO_SPLATS, on_disk=rows)], rule="", cumulative=False)
+        export_levels(path, finest, antialiased, original_place)
+        return
+    if origin.any() and kind is not PLY:
         raise LodgsError(
-            f"Cannot write {path} at the original place: only PLY has positions in double precision.",
-            "Write a PLY, or keep the local origin.",
+            f"Cannot write {path} at the original place: the format has no double precision.",
+            "Write a PLY, USD or glTF, or keep the local origin.",
         )
-    if not (antialiased or find_format(path).antialiased):
+    if not (antialiased or kind.antialiased):
         bundle = bake_filter(bundle)
     rows = ConcatenatedRows.of_level(bundle, bundle.levels[-1].number)
     if origin.any():
@@ -112,32 +119,43 @@ def export_finest_level(
     yield from write_splats(path, rows, bundle.meta)
 
 
+def export_levels(
+    path: Path, bundle: Bundle, antialiased: bool = False, original_place: bool = False
+) -> list[str]:
+    """Write all levels of a bundle, selected by distance, in the format of the file name.
+
+    Args:
+        antialiased: as for :func:`export_finest_level`.
+        original_place: add the local origin, in double precision.
+
+    Returns:
+        A sentence about each difference from the bundle's own selection.
+
+    Raises:
+        LodgsError: the format has no levels or not their degree, or the file cannot be written.
+    """
+    kind = find_level_format(path)
+    assert kind.write_levels is not None, "it is a format of levels"
+    check_degree(kind, bundle.levels[-1].rows)
+    bundle = bundle if antialiased else bake_filter(bundle)
+    levels, notes = portable_levels(bundle, original_place)
+    kind.write_levels(path, levels)
+    return notes
+
+
+def export_tiles(folder: Path, bundle: Bundle, antialiased: bool = False) -> list[str]:
+    """Write all levels of a bundle as 3D Tiles; arguments and result as for :func:`export_levels`.
+
+    Raises:
+        LodgsError: the folder has other files or cannot be written, or the degree is not supported.
+    """
+    check_degree(GLB, bundle.levels[-1].rows)
+    levels, notes = portable_levels(bundle if antialiased else bake_filter(bundle))
+    write_tiles(folder, levels)
+    return notes
+
+
 def run_to_end(steps: Iterator[str]) -> None:
     """Exhaust an iterator of progress messages."""
     for _ in steps:
         pass
-
-
-@dataclass(frozen=True)
-class ConcatenatedRows:
-    """Several sets of splats on disk as one."""
-
-    sets: Sequence[SplatRows]
-
-    @classmethod
-    def of_level(cls, bundle: Bundle, number: int) -> ConcatenatedRows:
-        """Return all splats that are drawn at a level."""
-        return cls([level.rows for level in bundle.drawn_levels(number)])
-
-    def __len__(self) -> int:
-        return sum(map(len, self.sets))
-
-    def select(self, index: slice | np.ndarray, /) -> Splats:
-        """Read a range of all rows."""
-        assert isinstance(index, slice)
-        begin, end, _ = index.indices(len(self))
-        parts, first = [], 0
-        for rows in self.sets:
-            parts.append(rows.select(slice(max(begin - first, 0), max(min(end - first, len(rows)), 0))))
-            first += len(rows)
-        return Splats.concatenated(parts)

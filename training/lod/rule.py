@@ -29,6 +29,9 @@ from ..splats.similarity import AxisNames, Similarity
 STEP = 1.25
 """Factor of one step of :meth:`Rule.raise_control`."""
 
+THINNING, MIN_SPLATS = 4, 500
+"""Ratio of splats of two complete levels that replace a selection of single splats, and their minimum."""
+
 NO_FINER = 1 << 30
 """Value of the fact ``finer`` for the finest level."""
 
@@ -160,6 +163,8 @@ class Rule(ABC):
         relations: relations among splats that edits preserve.
         paged_file: class of files (``query.PagedFile``) of which only a part is in memory; None: files are
             read completely.
+        plain_values: control values with which weights depend on distance alone.
+        fade_factor: ratio of end to begin of the distances over which a level fades; 1 if it switches.
         sweep: a control and values of it that a report measures one by one; None for no such curve.
     """
 
@@ -176,6 +181,8 @@ class Rule(ABC):
     block_bounds: ClassVar[Mapping[str, tuple[str, np.ufunc]]] = {}
     relations: ClassVar[type[Relations]] = Relations
     paged_file: ClassVar[type[Any] | None] = None
+    plain_values: ClassVar[Values] = {}
+    fade_factor: ClassVar[float] = 1.0
     sweep: ClassVar[tuple[str, tuple[float, ...]] | None] = None
 
     @abstractmethod
@@ -272,6 +279,10 @@ class Rule(ABC):
     def complete_levels(self, bundle: Bundle) -> Bundle:
         """Return a bundle whose levels are complete scenes, for programs without this rule."""
         return bundle
+
+    def nested_levels(self, bundle: Bundle) -> Bundle:
+        """Return complete levels for programs that select one level by distance; may load all splats."""
+        return self.complete_levels(bundle)
 
     def full_detail_values(self, levels: Sequence[int], recorded: Values | None = None) -> Values | None:
         """Return control values of the weights without which a single level is not as trained.

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from .gaussians import SplatRows
+from .portable_levels import PortableLevels
 
 
 class SplatFormat(NamedTuple):
@@ -24,6 +25,11 @@ class SplatFormat(NamedTuple):
         antialiased: True if the format stores that splats need Mip-Splatting's 2D filter.
         write: function that writes splats with the meta of their bundle; None for splat-transform.
         read: function that reads a file; None for splat-transform.
+        write_levels: function that writes all levels for selection by distance; None if the format has none.
+            It replaces ``write``.
+        read_levels: function that converts a file with levels to a bundle; it replaces ``read``.
+        require: function that raises a LodgsError without the packages of the format, which Blender lacks;
+            None if it needs none.
         readable: False if files cannot be imported.
     """
 
@@ -36,7 +42,20 @@ class SplatFormat(NamedTuple):
     antialiased: bool = False
     write: Callable[[Path, SplatRows, dict], None] | None = None
     read: Callable[[Path], SplatRows] | None = None
+    write_levels: Callable[[Path, PortableLevels], None] | None = None
+    read_levels: Callable[[Path, Path], None] | None = None
+    require: Callable[[], object] | None = None
     readable: bool = True
+
+    @property
+    def in_trainer(self) -> bool:
+        """True if only the trainer writes and reads the format."""
+        return self.require is not None
+
+    @property
+    def uses_splat_transform(self) -> bool:
+        """True if splat-transform writes the format."""
+        return self.write is None and self.write_levels is None
 
     def size(self, count: int, degree: int) -> float:
         """Estimate the file size of splats in bytes."""

@@ -38,6 +38,7 @@ class Chunks(Rule):
     columns = MEMBER_COLUMNS
     block_bounds = {name: (name, np.bitwise_or) for name in MEMBER_COLUMNS}
     tables = (TABLE,)
+    plain_values = {"chunks": 0}
     lengths = ("d_l", "radius")
     places = (("x", "y", "z"),)
     controls = (

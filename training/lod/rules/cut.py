@@ -14,7 +14,18 @@ from ...splats.levels import MAX_LEVELS, Bundle, Level
 from ...splats.ply import Columns
 from ...splats.similarity import Similarity
 from ..colors import LEVEL_COLORS
-from ..rule import NO_COLUMNS, NO_TABLES, Control, Masks, Relations, Rule, Values, distances
+from ..rule import (
+    MIN_SPLATS,
+    NO_COLUMNS,
+    NO_TABLES,
+    THINNING,
+    Control,
+    Masks,
+    Relations,
+    Rule,
+    Values,
+    distances,
+)
 from ..tree.nodes import (
     ABOVE_ROOT,
     BLOCK_BOUNDS,
@@ -34,10 +45,6 @@ from ..tree.nodes import (
 )
 from ..tree.paging import TreeFile
 
-THINNING = 4
-"""Ratio of splats of two complete levels: half the detail of a surface."""
-MIN_SPLATS = 500
-"""Minimum number of splats of a complete level."""
 _BLOCK = 1 << 14
 """Splats per batch, so that a batch fits into the processor's cache."""
 OCTAVES = len(LEVEL_COLORS) - 1

@@ -3,10 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from ..rule import NO_TABLES, OPACITY, Control, Rule, Values, distances
+from ...splats.levels import MAX_LEVELS, Bundle, Level
+from ...splats.portable_levels import DISTANCE, DISTANCE_RULE, opacities
+from ..rule import (
+    MIN_SPLATS,
+    NO_TABLES,
+    OPACITY,
+    THINNING,
+    Control,
+    Rule,
+    Values,
+    collect_facts,
+    distances,
+)
 
 SIGMA = "sigma_d"
 """Column of each splat's decay rate, the paper's σ_d."""
@@ -100,6 +113,43 @@ class Decay(Rule):
         s_v = self.virtual_scale(normalized, columns, tau, values)
         weight = attenuation(normalized, columns[SIGMA], s_v).astype(np.float32)
         return np.where(columns[OPACITY] * weight > tau * s_v, weight, np.float32(0))
+
+    def nested_levels(self, bundle: Bundle) -> Bundle:
+        """Return the splats with the longest reach as levels of the rule ``chunks``.
+
+        Each coarser level has 1 / THINNING of the finer one's splats, down to MIN_SPLATS, with the opacities
+        at the distance from which on no other splats are visible.
+        """
+        rows = bundle.levels[-1].rows
+        splats = rows.select(slice(0, len(rows)))
+        facts = collect_facts(self, bundle.facts, [(1, {})], 1)
+        s_v = self.resolve_controls({}, [1], bundle.controls)["s_v"]
+        sigma = splats.extras.get(SIGMA, np.zeros(len(splats), np.float32))
+        opacity = opacities(splats)
+        reference = facts["reference"] or float(
+            distances(splats.means, np.median(splats.means, axis=0)).max(initial=1e-20)
+        )
+        # α·attenuation = τ s_v, solved for the normalised distance d′
+        logarithm = np.log(np.maximum(opacity / (facts["tau"] * s_v), 1))
+        reach = np.sqrt((2 * sigma.clip(0) ** 2 + EPSILON) * logarithm) / s_v
+        order = np.argsort(-reach, kind="stable")
+        splats.extras = {name: x for name, x in splats.extras.items() if name != SIGMA}
+        levels, count = [splats], len(splats) // THINNING
+        places = [0.0]
+        while count >= MIN_SPLATS and len(levels) < MAX_LEVELS:
+            part, distance = np.sort(order[:count]), float(reach[order[count]])
+            alphas = opacity[part] * attenuation(np.float32(distance), sigma[part], s_v)
+            alphas = alphas.astype(np.float64).clip(1e-7, 1 - 1e-7)
+            logits = np.log(alphas / (1 - alphas)).astype(np.float32)
+            levels.append(replace(splats.select(part), opacity_logits=logits))
+            places.append(max(distance * reference, places[-1]))
+            count //= THINNING
+        coarse_to_fine = list(enumerate(zip(reversed(levels), reversed(places), strict=True), 1))
+        return replace(
+            bundle,
+            levels=[Level(n, part, {DISTANCE: place}) for n, (part, place) in coarse_to_fine],
+            rule=DISTANCE_RULE, facts={}, controls={},
+        )  # fmt: skip
 
     def full_detail_values(self, levels: Sequence[int], recorded: Values | None = None) -> Values | None:
         return self.resolve_controls({}, levels, recorded)

@@ -55,6 +55,7 @@ class Octree(Rule):
     scene_facts = ("d_max", "d_max_focal")
     lengths = ("d_max",)
     columns = (BIAS,)
+    fade_factor = 2.0**FADE
     controls = (
         Control(
             "offset", 0.0, -16.0, 16.0, "Level Offset",

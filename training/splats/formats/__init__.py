@@ -1,6 +1,7 @@
 """Splat files of other programs. Each module of this package declares one format as ``FORMAT``.
 
-LODGS itself reads and writes PLY and ``.splat``. splat-transform reads and writes the others.
+LODGS itself reads and writes PLY, ``.splat``, glTF and, in the trainer's environment, USD. splat-transform
+reads and writes the others.
 """
 
 from __future__ import annotations
@@ -32,11 +33,17 @@ FORMATS: tuple[SplatFormat, ...] = tuple(
 )
 """Export formats: PLY, then by size, largest first."""
 FILE_EXTENSIONS = (
-    *(kind.suffix for kind in FORMATS if kind.readable and kind.suffix.rfind(".") == 0),
+    *(
+        kind.suffix
+        for kind in FORMATS
+        if kind.readable and not kind.in_trainer and kind.suffix.rfind(".") == 0
+    ),
     ".ksplat",
 )
-"""Last parts of the names of readable files."""
-READABLE = (*FILE_EXTENSIONS, STREAMED_FILE)
+"""Last parts of the names of files that Blender reads."""
+LEVEL_FORMATS = tuple(kind for kind in FORMATS if kind.write_levels)
+"""Formats of all levels in one file."""
+READABLE = (*FILE_EXTENSIONS, *(kind.suffix for kind in FORMATS if kind.in_trainer), STREAMED_FILE)
 """Ends of the names of readable files; :data:`STREAMED_FILE` is a complete name."""
 
 
@@ -56,6 +63,8 @@ def find_format(path: Path) -> SplatFormat:
 def write_splats(path: Path, splats: SplatRows, meta: dict) -> Iterator[str]:
     """Write splats in the format of the file name, and yield while splat-transform runs.
 
+    Formats of levels have a function of their own, ``SplatFormat.write_levels``.
+
     A generator that is closed early leaves no files behind.
 
     Args:
@@ -72,12 +81,7 @@ def write_splats(path: Path, splats: SplatRows, meta: dict) -> Iterator[str]:
     if kind.write is not None:
         kind.write(path, splats, meta)
         return
-    degree = splats.select(slice(0, 0)).sh_degree
-    if degree > kind.max_degree:
-        raise LodgsError(
-            f"Cannot write SH degree {degree} as {kind.label}: it supports degree 0 to {kind.max_degree}.",
-            "Write a PLY instead.",
-        )
+    check_degree(kind, splats)
     find_splat_transform()  # reports a missing program before files are written
     with temporary_folder() as folder:
         plain = folder / "splats.ply"
@@ -92,11 +96,35 @@ def write_splats(path: Path, splats: SplatRows, meta: dict) -> Iterator[str]:
             shutil.copyfileobj(source, target)
 
 
+def check_degree(kind: SplatFormat, splats: SplatRows) -> None:
+    """Raise a LodgsError if a format does not store the degree of spherical harmonics."""
+    degree = splats.select(slice(0, 0)).sh_degree
+    if degree > kind.max_degree:
+        raise LodgsError(
+            f"Cannot write SH degree {degree} as {kind.label}: it supports degree 0 to {kind.max_degree}.",
+            "Write a PLY instead.",
+        )
+
+
+def find_level_format(path: Path) -> SplatFormat:
+    """Return the format of all levels for a file name.
+
+    Raises:
+        LodgsError: no format has the name's suffix.
+    """
+    for kind in LEVEL_FORMATS:
+        if path.name.lower().endswith(kind.suffix):
+            return kind
+    suffixes = ", ".join(kind.suffix for kind in LEVEL_FORMATS)
+    raise LodgsError(f"Cannot write levels as {path.name}: unsupported format.", f"Use one of {suffixes}.")
+
+
 @contextmanager
 def open_as_ply(path: Path) -> Iterator[Path]:
     """Yield a PLY with the splats of a file, or a folder of PLYs with streamed levels.
 
-    A PLY or a folder is yielded unchanged. Other files are converted to a temporary one of the same name.
+    A PLY or a folder is yielded unchanged. Other files are converted to a temporary one of the same name:
+    a bundle if they have levels.
 
     Raises:
         LodgsError: the file cannot be read, or splat-transform is missing or fails.
@@ -116,6 +144,10 @@ def open_as_ply(path: Path) -> Iterator[Path]:
             converted = converted.with_suffix("")
             for lod in range(count_lods(path)):
                 run_splat_transform(["-L", str(lod), str(path), str(converted / f"lod{lod}.ply")])
+        elif level_readers := [
+            kind.read_levels for kind in FORMATS if kind.read_levels and name.endswith(kind.suffix)
+        ]:
+            level_readers[0](path, converted)
         elif readers := [kind.read for kind in FORMATS if kind.read and name.endswith(kind.suffix)]:
             write_ply(converted, readers[0](path))
         else:

@@ -1,0 +1,228 @@
+"""glTF files: the attributes of KHR_gaussian_splatting, levels with MSFT_lod, and read back."""
+
+import json
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.training.splats.test_formats import random_splats
+from tests.training.splats.test_usd import UP, assert_equal, camera, flod, read
+from training.editing.export import export_finest_level, export_levels, run_to_end
+from training.errors import LodgsError
+from training.splats import gltf
+from training.splats.formats import find_format
+from training.splats.gaussians import SH_C0
+from training.splats.levels import Bundle, Level
+
+PREFIX = "KHR_gaussian_splatting:"
+
+
+def parts(path):
+    """Return the JSON document and the binary data of a file, read by the glTF 2.0 specification."""
+    data = path.read_bytes()
+    magic, version, size, length, kind = struct.unpack("<4sIII4s", data[:20])
+    assert (magic, version, size, kind) == (b"glTF", 2, len(data), b"JSON") and length % 4 == 0
+    document = json.loads(data[20 : 20 + length])
+    size, kind = struct.unpack("<I4s", data[20 + length : 28 + length])
+    assert kind == b"BIN\0" and size == document["buffers"][0]["byteLength"] == len(data) - 28 - length
+    return document, data[28 + length :]
+
+
+def assembled(document, data):
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(data), b"BIN\0") + data
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def accessor(document, data, index):
+    entry = document["accessors"][index]
+    view = document["bufferViews"][entry["bufferView"]]
+    assert view["byteOffset"] % 4 == 0
+    kind, size = {5126: ("<f4", 4), 5121: ("u1", 1)}[entry["componentType"]]
+    width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[entry["type"]]
+    assert view["byteLength"] == entry["count"] * width * size
+    return np.frombuffer(data, kind, entry["count"] * width, view["byteOffset"]).reshape(-1, width)
+
+
+def test_attributes_follow_the_extension(tmp_path):
+    bundle = flod()
+    export_levels(tmp_path / "a.glb", bundle)
+    document, data = parts(tmp_path / "a.glb")
+    assert document["extensionsUsed"] == ["KHR_gaussian_splatting", "MSFT_lod"]
+    (primitive,) = document["meshes"][0]["primitives"]
+    assert primitive["mode"] == 0 and primitive["extensions"]["KHR_gaussian_splatting"] == {
+        "kernel": "ellipse", "colorSpace": "srgb_rec709_display",
+    }  # fmt: skip
+    columns = {name: accessor(document, data, index) for name, index in primitive["attributes"].items()}
+    splats = bundle.levels[2].splats
+    assert np.array_equal(columns["POSITION"], splats.means)
+    entry = document["accessors"][primitive["attributes"]["POSITION"]]
+    assert entry["min"] == splats.means.min(0).tolist() and entry["max"] == splats.means.max(0).tolist()
+    np.testing.assert_allclose(columns[f"{PREFIX}SCALE"], np.exp(splats.log_scales), rtol=1e-6)
+    unit = splats.quats / np.linalg.norm(splats.quats, axis=1, keepdims=True)
+    np.testing.assert_allclose(columns[f"{PREFIX}ROTATION"], unit[:, [1, 2, 3, 0]], atol=1e-6)
+    alphas = 1 / (1 + np.exp(-splats.opacity_logits))
+    np.testing.assert_allclose(columns[f"{PREFIX}OPACITY"][:, 0], alphas, atol=1e-6)
+    names = [f"{PREFIX}SH_DEGREE_{n}_COEF_{i}" for n in range(4) for i in range(2 * n + 1)]
+    assert np.array_equal(np.stack([columns[name] for name in names], 1), splats.sh)
+    color = (255 * np.column_stack([0.5 + SH_C0 * splats.sh[:, 0], alphas])).clip(0, 255)
+    assert np.abs(columns["COLOR_0"] - color).max() <= 0.51
+
+
+def test_levels_are_nodes_by_coverage(tmp_path):
+    export_levels(tmp_path / "a.glb", flod())
+    document, _ = parts(tmp_path / "a.glb")
+    nodes = document["nodes"]
+    assert nodes[0]["extensions"]["MSFT_lod"]["ids"] == [1, 2]
+    assert [node["name"] for node in nodes[:3]] == ["Level 3", "Level 2", "Level 1"]
+    shares = nodes[0]["extras"]["MSFT_screencoverage"]
+    assert len(shares) == 3 and 1 > shares[0] > shares[1] > shares[2] == 0
+    assert document["scenes"][0]["nodes"] == [0, 3, 4, 5]  # coarser levels only replace the finest
+    up = np.array(nodes[0]["matrix"]).reshape(4, 4).T[:3, :3] @ np.linalg.inv(UP) @ [0, 0, 1]
+    np.testing.assert_allclose(up, [0, 1, 0], atol=1e-12)
+
+
+def test_cameras_look_as_ours(tmp_path):
+    export_levels(tmp_path / "a.glb", flod())
+    document, _ = parts(tmp_path / "a.glb")
+    node = next(node for node in document["nodes"] if "camera" in node)
+    lens = document["cameras"][node["camera"]]["perspective"]
+    point = np.array([0.4, 0.2, 1.5, 1])
+    splats_to_world = np.array(document["nodes"][0]["matrix"]).reshape(4, 4).T
+    x, y, z, _ = np.linalg.inv(np.array(node["matrix"]).reshape(4, 4).T) @ splats_to_world @ point
+    ours = camera()
+    right, down, ahead, _ = ours.world_to_camera @ point
+    np.testing.assert_allclose([x, y, z], [right, -down, -ahead], atol=1e-12)
+    focal = 1 / np.tan(lens["yfov"] / 2)
+    np.testing.assert_allclose(focal * 240, 520)
+    np.testing.assert_allclose(focal / lens["aspectRatio"] * 320, 500)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_levels_round_trip(tmp_path, degree):
+    bundle = flod(degree)
+    export_levels(tmp_path / "a.glb", bundle)
+    reread = read(tmp_path / "a.glb")
+    assert (reread.method, reread.rule, len(reread.levels)) == ("flod", "bands", 3)
+    for level, original in zip(reread.levels, bundle.levels, strict=True):
+        assert level.facts == original.facts
+        assert_equal(level.splats, original.splats)
+
+
+def test_original_place_survives(tmp_path):
+    origin = [448_250.0, 5_411_900.0, 300.0]
+    bundle = flod(origin=origin)
+    export_levels(tmp_path / "a.glb", bundle, original_place=True)
+    reread = read(tmp_path / "a.glb")
+    expected = bundle.levels[2].splats.means.astype(np.float64) + origin
+    np.testing.assert_allclose(reread.levels[2].splats.means + reread.origin, expected, atol=1e-4)
+    document, data = parts(tmp_path / "a.glb")
+    document["scenes"][0].pop("extras")  # as from another program
+    (tmp_path / "b.glb").write_bytes(assembled(document, data))
+    reread = read(tmp_path / "b.glb")
+    assert reread.origin.any() and not reread.rule and len(reread.levels) == 3
+    actual = (reread.levels[2].splats.means + reread.origin) @ reread.up_rotation.T
+    np.testing.assert_allclose(actual, expected @ np.array(UP).T, atol=1e-3)
+
+
+def test_one_level_has_no_nodes_for_levels(tmp_path):
+    splats = random_splats(50, 1)
+    run_to_end(export_finest_level(tmp_path / "a.glb", Bundle("", [Level(4, splats)])))
+    document, _ = parts(tmp_path / "a.glb")
+    assert document["extensionsUsed"] == ["KHR_gaussian_splatting"] and len(document["nodes"]) == 1
+    assert_equal(read(tmp_path / "a.glb").levels[0].splats, splats)
+    kind = find_format(tmp_path / "a.glb")
+    assert abs((tmp_path / "a.glb").stat().st_size - kind.size(50, 1)) < 4000
+
+
+def test_empty_levels_are_left_out(tmp_path):
+    bundle = flod()
+    empty = bundle.levels[1].splats.select(slice(0, 0))
+    bundle.levels[1] = replace(bundle.levels[1], splats=empty)
+    export_levels(tmp_path / "a.glb", bundle)
+    assert [level.number for level in read(tmp_path / "a.glb").levels] == [1, 3]
+    bundle.levels = [replace(level, splats=empty) for level in bundle.levels]
+    with pytest.raises(LodgsError, match="no splats"):
+        export_levels(tmp_path / "a.glb", bundle)
+
+
+def test_quantised_attributes_of_other_programs(tmp_path):
+    """Normalised integers, an interleaved buffer, and a node with rotation and scale."""
+    fields = [
+        ("mean", "<f4", 3), ("quat", "<i2", 4), ("scale", "<f4", 3), ("alpha", "u1"), ("pad", "u1", 3),
+        ("sh", "<f4", 3),
+    ]  # fmt: skip
+    row = np.zeros(2, fields)
+    row["mean"], row["quat"], row["scale"], row["alpha"] = (1, 2, 3), (0, 0, 0, 32767), 0.5, 51
+    data = row.tobytes()
+    kinds = {"POSITION": ("mean", "VEC3", 5126), f"{PREFIX}ROTATION": ("quat", "VEC4", 5122),
+             f"{PREFIX}SCALE": ("scale", "VEC3", 5126), f"{PREFIX}OPACITY": ("alpha", "SCALAR", 5121),
+             f"{PREFIX}SH_DEGREE_0_COEF_0": ("sh", "VEC3", 5126)}  # fmt: skip
+    document = {
+        "asset": {"version": "2.0"}, "scenes": [{"nodes": [0]}], "buffers": [{"byteLength": len(data)}],
+        "nodes": [{"children": [1], "scale": [2, 2, 2]},
+                  {"mesh": 0, "rotation": [0, 0, 0.5**0.5, 0.5**0.5], "translation": [1, 0, 0]}],
+        "bufferViews": [{"buffer": 0, "byteLength": len(data), "byteStride": row.itemsize}],
+        "accessors": [{"bufferView": 0, "byteOffset": row.dtype.fields[field][1], "componentType": component,
+                       "type": kind, "count": 2, "normalized": component in (5121, 5122)}
+                      for field, kind, component in kinds.values()],
+        "meshes": [{"primitives": [{"mode": 0, "attributes": dict(zip(kinds, range(5), strict=True)),
+                                    "extensions": {"KHR_gaussian_splatting": {"kernel": "ellipse"}}}]}],
+    }  # fmt: skip
+    (tmp_path / "a.glb").write_bytes(assembled(document, data))
+    (level,) = read(tmp_path / "a.glb").levels
+    np.testing.assert_allclose(level.splats.means[0], [-2, 2, 6], atol=1e-6)  # 2 · ((-2, 1, 3) + (1, 0, 0))
+    np.testing.assert_allclose(np.exp(level.splats.log_scales), 1, rtol=1e-6)
+    np.testing.assert_allclose(1 / (1 + np.exp(-level.splats.opacity_logits)), 0.2, rtol=1e-5)
+    np.testing.assert_allclose(np.abs(level.splats.quats[0]), [0.5**0.5, 0, 0, 0.5**0.5], atol=1e-6)
+
+
+def change_buffer(document):
+    document["buffers"][0]["uri"] = "../secret.bin"
+
+
+def change_compression(document):
+    extension = document["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]
+    extension["extensions"] = {"KHR_gaussian_splatting_compression_spz_2": {"bufferView": 0}}
+
+
+def change_count(document):
+    for entry in document["accessors"]:
+        entry["count"] = 2**40
+
+
+def change_node(document):
+    document["nodes"][0]["children"] = [0]
+
+
+def change_index(document):
+    document["nodes"][0]["mesh"] = -1
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (change_buffer, "refers to other files"),
+        (change_compression, "needs? the extension KHR_gaussian_splatting_compression_spz_2"),
+        (change_count, "exceeds its data"),
+        (change_node, "occurs twice"),
+        (change_index, "-1 is not a count"),
+    ],
+)
+def test_unusable_files_raise_one_sentence(tmp_path, change, reason):
+    export_levels(tmp_path / "a.glb", flod())
+    document, data = parts(tmp_path / "a.glb")
+    change(document)
+    (tmp_path / "b.glb").write_bytes(assembled(document, data))
+    with pytest.raises(LodgsError, match=reason):
+        read(tmp_path / "b.glb")
+
+
+def test_files_above_4_gib_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(gltf, "_MAX_BYTES", 1000)
+    with pytest.raises(LodgsError, match="exceed the 4 GiB"):
+        export_levels(tmp_path / "a.glb", flod())
+    assert not list(tmp_path.iterdir())

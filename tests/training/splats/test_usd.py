@@ -1,0 +1,248 @@
+"""USD files: valid for usd-core, with the distances of the rules, and read back."""
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.training.splats.test_formats import random_splats
+from training.editing.export import export_levels
+from training.editing.portable import level_distances, portable_levels
+from training.errors import LodgsError
+from training.lod.rule import resolve_rule
+from training.lod.selection import select
+from training.scenes.cameras import Camera
+from training.scenes.view_tables import make_view_tables
+from training.splats.bundle import read_bundle
+from training.splats.formats import open_as_ply
+from training.splats.levels import Bundle, Level
+from training.splats.usd import load_usd
+
+pxr = pytest.importorskip("pxr.UsdLod", reason="usd-core is not installed")
+UP = [[1.0, 0.0, 0.0], [0.0, 0.6, 0.8], [0.0, -0.8, 0.6]]
+
+
+def camera(name="images/a b.jpg"):
+    pose = np.eye(4)
+    pose[:3, :3] = np.array([[0, -1, 0], [0.6, 0, 0.8], [-0.8, 0, 0.6]])
+    pose[:3, 3] = (0.3, -0.2, 4)
+    return Camera(name, 640, 480, 500.0, 520.0, 300.0, 250.0, pose)
+
+
+def flod(degree=3, **meta):
+    levels = [
+        Level(number, random_splats(20 * number, degree, number), {"s_min": s_min})
+        for number, s_min in ((1, 0.4), (2, 0.1), (3, 0.0))
+    ]
+    tables = make_view_tables([camera(), camera(), camera("c.png")], 0.05)
+    return Bundle("flod", levels, "bands", tables=tables, meta={"up_rotation": UP, **meta})
+
+
+def read(path):
+    with open_as_ply(path) as ply:
+        return read_bundle(ply)
+
+
+def assert_equal(actual, expected, places=1e-5):
+    unit = expected.quats / np.linalg.norm(expected.quats, axis=1, keepdims=True)
+    for one, other, limit in (
+        (actual.means, expected.means, places), (actual.log_scales, expected.log_scales, 1e-5),
+        (actual.quats, unit, 1e-6), (actual.opacity_logits, expected.opacity_logits, 2e-3),
+        (actual.sh, expected.sh, 0),
+    ):  # fmt: skip
+        np.testing.assert_allclose(one, other, atol=limit, rtol=1e-6)
+
+
+@pytest.fixture
+def stage(tmp_path):
+    export_levels(tmp_path / "a.usdc", flod())
+    return load_usd().Usd.Stage.Open(str(tmp_path / "a.usdc"))
+
+
+@pytest.mark.parametrize("ending", [".usdc", ".usdz"])
+def test_usd_validators_accept_files(tmp_path, ending):
+    from pxr import Usd, UsdValidation
+
+    export_levels(tmp_path / f"a{ending}", flod())
+    stage = Usd.Stage.Open(str(tmp_path / f"a{ending}"))
+    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    errors = UsdValidation.ValidationContext(validators).Validate(stage)
+    assert len(validators) >= 30 and not [error.GetMessage() for error in errors]
+    assert {path.name for path in tmp_path.iterdir()} == {f"a{ending}"}
+
+
+def test_usd_selects_the_level_of_the_rule(tmp_path):
+    """A small scene, so that all its splats are at about one distance: usd-core selects as the rule does."""
+    bundle = flod()
+    for level in bundle.levels:
+        level.splats = replace(level.splats, means=level.splats.means * np.float32(1e-4))
+    export_levels(tmp_path / "a.usdc", bundle)
+    usd = load_usd()
+    stage = usd.Usd.Stage.Open(str(tmp_path / "a.usdc"))
+    heuristic = usd.UsdLod.DistanceHeuristic(stage.GetPrimAtPath("/World/SplatDistances"))
+    values = resolve_rule("bands").resolve_controls({"first": 1, "last": 3}, [1, 2, 3], bundle.controls)
+    for distance in (10, 49, 51, 190, 210, 1000):  # s_min · 500 pixels = 50 and 200
+        expected = len(select(bundle, np.array([0, 0, distance], np.float32), 500, values)[0])
+        index = heuristic.ComputeLOD(usd.Gf.Vec3d(0, 0, distance), usd.Gf.Matrix4d(1))
+        assert len(bundle.levels[2 - round(index)].splats) == expected, distance
+
+
+def test_octree_levels_fade_where_their_splats_do(tmp_path):
+    rule = resolve_rule("octree")
+    levels = [Level(number, random_splats(30, 0, number)) for number in (1, 2, 3)]
+    bundle = Bundle("octree", levels, "octree", {"d_max": 8.0, "d_max_focal": 1000.0}, cumulative=True)
+    expected = [8 * 2.0 ** -(n - 1.75) for n in (2, 3)]  # target level n + 1 - 3/4, without bias
+    np.testing.assert_allclose(level_distances(rule, bundle, 1000.0), [*expected, 0], rtol=1e-3)
+    export_levels(tmp_path / "a.usdc", bundle)
+    usd = load_usd()
+    stage = usd.Usd.Stage.Open(str(tmp_path / "a.usdc"))
+    heuristic = usd.UsdLod.DistanceHeuristic(stage.GetPrimAtPath("/World/SplatDistances"))
+    radius = portable_levels(bundle)[0].sphere()[1]
+    np.testing.assert_allclose(
+        np.array(heuristic.GetBlendThresholdsAttr().Get()) - radius, expected[::-1], rtol=1e-2
+    )
+    begins = np.array(heuristic.GetThresholdsAttr().Get()) - radius
+    np.testing.assert_allclose(begins, np.array(expected[::-1]) / 2**0.5, rtol=1e-2)
+    reread = read(tmp_path / "a.usdc")
+    assert [len(level.splats) for level in reread.levels] == [30, 60, 90] and reread.rule == "chunks"
+
+
+def test_single_splats_become_nested_levels():
+    """CLoD-GS: a level holds the splats with the longest reach, and is used where no others are visible."""
+    splats = random_splats(9000, 0)
+    rng = np.random.default_rng(0)
+    splats.extras["sigma_d"] = rng.uniform(0.1, 2, 9000).astype(np.float32)
+    bundle = Bundle("clod", [Level(1, splats)], "decay", {"reference": 10.0, "tau": 0.01})
+    levels, notes = portable_levels(bundle)
+    assert [len(level.rows) for level in levels.bundle.levels] == [562, 2250, 9000]
+    assert "9,000 splats" in notes[0]
+    for level, distance in zip(levels.bundle.levels[:-1], levels.distances[:-1], strict=True):
+        for factor, more in ((0.99, True), (1.01, False)):
+            at = splats.select(slice(None))
+            at.means = np.zeros_like(at.means) + np.float32([distance * factor, 0, 0])
+            visible = len(
+                select(replace(bundle, levels=[Level(1, at)]), np.zeros(3), 500, {"s_v": 1, "at_most": 0})[0]
+            )
+            assert (visible > len(level.rows)) is more
+
+
+def test_cameras_project_as_ours(stage):
+    usd = load_usd()
+    prims = [prim for prim in stage.Traverse() if prim.GetTypeName() == "Camera"]
+    assert [prim.GetName() for prim in prims] == ["a_b", "a_b_2", "c"]
+    assert prims[0].GetDisplayName() == "images/a b.jpg"
+    ours = camera()
+    point = np.array([0.4, 0.2, 1.5])
+    x, y, z = (ours.world_to_camera @ [*point, 1])[:3]
+    pixel = ours.fx * x / z + ours.cx, ours.fy * y / z + ours.cy
+    frustum = usd.UsdGeom.Camera(prims[0]).GetCamera(usd.Usd.TimeCode.Default()).frustum
+    placed = (
+        usd.UsdGeom.XformCache()
+        .GetLocalToWorldTransform(stage.GetPrimAtPath("/World"))
+        .Transform(usd.Gf.Vec3d(*point))
+    )
+    x, y, _ = (frustum.ComputeViewMatrix() * frustum.ComputeProjectionMatrix()).Transform(placed)
+    np.testing.assert_allclose([(x + 1) / 2 * 640, (1 - y) / 2 * 480], pixel, atol=1e-2)
+
+
+@pytest.mark.parametrize("ending", [".usdc", ".usdz"])
+def test_levels_round_trip(tmp_path, ending):
+    bundle = flod(antialias=True)
+    export_levels(tmp_path / f"a{ending}", bundle, antialiased=True)
+    reread = read(tmp_path / f"a{ending}")
+    assert (reread.method, reread.rule, reread.antialias) == ("flod", "bands", True)
+    for level, original in zip(reread.levels, bundle.levels, strict=True):
+        assert level.facts == original.facts
+        assert_equal(level.splats, original.splats)
+
+
+@pytest.mark.parametrize("edited", [False, True])
+def test_original_place_survives(tmp_path, edited):
+    """UTM coordinates return within a tenth of a millimetre, also after another program moved the scene."""
+    origin = [448_250.0, 5_411_900.0, 300.0]
+    bundle = flod(origin=origin)
+    export_levels(tmp_path / "a.usdc", bundle, original_place=True)
+    if edited:
+        usd = load_usd()
+        stage = usd.Usd.Stage.Open(str(tmp_path / "a.usdc"))
+        usd.UsdGeom.Xformable(stage.GetPrimAtPath("/World")).AddTranslateOp(opSuffix="by").Set((1.0, 0, 0))
+        stage.GetRootLayer().customLayerData = {}
+        stage.GetRootLayer().Save()
+        del stage
+    reread = read(tmp_path / "a.usdc")
+    expected = bundle.levels[2].splats.means.astype(np.float64) + origin
+    actual = reread.levels[2].splats.means.astype(np.float64) + reread.origin
+    if edited:
+        expected = (expected + np.array([1.0, 0, 0])) @ np.array(UP).T
+        actual = actual @ reread.up_rotation.T
+    np.testing.assert_allclose(actual, expected, atol=1e-4)
+
+
+def foreign(tmp_path, **attributes):
+    """Write a particle field as another program does: y up, two fields, no levels."""
+    usd = load_usd()
+    stage = usd.Usd.Stage.CreateNew(str(tmp_path / "b.usdc"))
+    usd.UsdGeom.SetStageUpAxis(stage, "Y")
+    values = {
+        "positions": [(0, 1, 0)], "scales": [(0.1, 0.2, 0.3)], "orientations": [(1, 0, 0, 0)],
+        "opacities": [0.5], "radiance:sphericalHarmonicsDegree": 0,
+        "radiance:sphericalHarmonicsCoefficients": [(1, 2, 3)],
+    } | attributes  # fmt: skip
+    for name in "ab":
+        prim = usd.UsdVol.ParticleField3DGaussianSplat.Define(stage, f"/{name}").GetPrim()
+        for key, value in values.items():
+            if key == "orientations":
+                value = [usd.Gf.Quatf(*quat) for quat in value]
+            prim.GetAttribute(key).Set(value)
+    stage.GetRootLayer().Save()
+    return stage
+
+
+def test_files_of_other_programs_are_read(tmp_path):
+    foreign(tmp_path)
+    bundle = read(tmp_path / "b.usdc")
+    (level,) = bundle.levels
+    assert len(level.splats) == 2 and not bundle.rule
+    np.testing.assert_allclose(bundle.up_rotation @ level.splats.means[0], [0, 0, 1])
+    np.testing.assert_allclose(np.exp(level.splats.log_scales[0]), [0.1, 0.2, 0.3], rtol=1e-5)
+    assert level.splats.sh.tolist()[0] == [[1, 2, 3]] and level.splats.opacity_logits[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("attributes", "reason"),
+    [
+        ({"scales": []}, "different lengths"),
+        ({"radiance:sphericalHarmonicsDegree": 9}, "SH degree is 9"),
+        ({"radiance:sphericalHarmonicsDegree": 1}, "different lengths"),
+    ],
+)
+def test_inconsistent_fields_raise_one_sentence(tmp_path, attributes, reason):
+    foreign(tmp_path, **attributes)
+    with pytest.raises(LodgsError, match=reason):
+        read(tmp_path / "b.usdc")
+
+
+def test_other_files_are_not_opened(tmp_path):
+    stage = foreign(tmp_path)
+    stage.GetRootLayer().subLayerPaths.append("../secret.usdc")
+    stage.GetRootLayer().Save()
+    with pytest.raises(LodgsError, match=r"refers to other files \(../secret.usdc\)"):
+        read(tmp_path / "b.usdc")
+
+
+@pytest.mark.parametrize("part", [0, 40, 3000, -100])
+def test_cut_files_raise_one_sentence(tmp_path, part):
+    export_levels(tmp_path / "a.usdc", flod())
+    (tmp_path / "b.usdc").write_bytes((tmp_path / "a.usdc").read_bytes()[:part])
+    with pytest.raises(LodgsError, match="Cannot read"):
+        read(tmp_path / "b.usdc")
+
+
+def test_blender_process_does_not_load_our_usd(tmp_path):
+    code = "import sys, types; sys.modules['bpy'] = types.ModuleType('bpy')\n" \
+        "from training.splats.usd import load_usd\n" \
+        "try: load_usd()\nexcept Exception as error: print(error, 'pxr' in sys.modules)"  # fmt: skip
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert "Blender's own process" in result.stdout and result.stdout.strip().endswith("False"), result

@@ -1,0 +1,123 @@
+"""Check that three.js draws our glTF files as we do. Part of ``make interop``.
+
+Writes the levels of a bundle with views as ``.glb``, draws the first view in Chromium without a window and
+without a graphics card, and compares the image with our own. ``python tools/interop_gltf.py [BUNDLE.ply]``
+uses a given bundle, or that of ``make demo``. Exit code 0: the images agree; 1: they do not; 2: nothing was
+checked.
+"""
+
+from __future__ import annotations
+
+import http.server
+import io
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from tools import interop  # noqa: E402
+from training.api import load_bundle, render_image  # noqa: E402
+from training.editing.bake_filter import bake_filter  # noqa: E402
+from training.editing.export import export_levels  # noqa: E402
+from training.scenes.cameras import Camera  # noqa: E402
+from training.scenes.view_tables import read_view_tables  # noqa: E402
+from training.splats.levels import Bundle  # noqa: E402
+
+PACKAGE, VERSION = "three", "0.187.0"
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+MIN_PSNR = 30.0
+WIDTH = 360
+SECONDS = 180
+DEMO = ROOT / "build" / "demo" / "bundle.ply"
+
+
+def main() -> int:
+    source = Path(sys.argv[1]) if len(sys.argv) > 1 else DEMO
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    problem = interop.node_problem() or ("" if browser else "Chromium is not installed.")
+    problem = problem or ("" if source.exists() else f"{source} does not exist; run make demo.")
+    if problem or not interop.install(PACKAGE, VERSION):
+        print(f"interop: {problem or 'npm cannot install three.js.'} glTF files are not checked.")
+        return 2
+    bundle = load_bundle(source)
+    cameras, _, _ = read_view_tables(bundle.tables)
+    camera = cameras[0].scaled(WIDTH / cameras[0].width)
+    with tempfile.TemporaryDirectory() as folder:
+        scene = Path(folder) / "scene.glb"
+        export_levels(scene, bundle)
+        answer = draw(str(browser), scene, camera)
+    if isinstance(answer, str):
+        print(f"three.js {VERSION}: {answer}")
+        return 1
+    value = psnr(answer, ours(bundle, camera))
+    print(f"three.js {VERSION}: {value:.1f} dB from our image of {source}, at least {MIN_PSNR:g}")
+    return int(value < MIN_PSNR)
+
+
+def ours(bundle: Bundle, camera: Camera) -> np.ndarray:
+    """Return our image (H, W, 3) of the splats in the file."""
+    baked = bake_filter(bundle)
+    for level in baked.levels:
+        level.splats, level.on_disk = level.rows.select(slice(None)), None
+    return render_image(baked, camera, backend="cpu")
+
+
+def psnr(image: np.ndarray, other: np.ndarray) -> float:
+    """Return the PSNR of two images in dB."""
+    return float(-10 * np.log10(np.square(image - other.clip(0, 1)).mean()))
+
+
+def draw(browser: str, scene: Path, camera: Camera) -> np.ndarray | str:
+    """Return the image of the page (H, W, 3), or an error message."""
+    answers: list[tuple[str, bytes]] = []
+    arrived = threading.Event()
+
+    class Handler(http.server.SimpleHTTPRequestHandler):
+        def translate_path(self, path: str) -> str:
+            name = path.partition("?")[0]
+            if name.startswith("/three/"):
+                return str(interop.FOLDER / "node_modules" / name[1:])
+            return str(scene if name == "/scene.glb" else Path(__file__).with_suffix(".html"))
+
+        def do_POST(self) -> None:
+            answers.append((self.path, self.rfile.read(int(self.headers["Content-Length"]))))
+            self.send_response(204)
+            self.end_headers()
+            arrived.set()
+
+        def log_message(self, *_: object) -> None:
+            return
+
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    address = f"http://127.0.0.1:{server.server_port}/?{camera.width}x{camera.height}"
+    with tempfile.TemporaryDirectory() as profile:
+        process = subprocess.Popen(
+            [browser, "--headless=new", "--no-sandbox", "--use-angle=swiftshader",
+             "--enable-unsafe-swiftshader", f"--user-data-dir={profile}", address],
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        arrived.wait(SECONDS)
+        process.kill()
+        process.wait()
+        shutil.rmtree(profile, ignore_errors=True)
+        Path(profile).mkdir(exist_ok=True)
+    server.shutdown()
+    if not answers:
+        return f"no image within {SECONDS} s"
+    path, body = answers[0]
+    if path != "/image":
+        return body.decode("utf-8", "replace")
+    return np.asarray(Image.open(io.BytesIO(body)).convert("RGB"), np.float32) / 255
+
+
+if __name__ == "__main__":
+    sys.exit(main())

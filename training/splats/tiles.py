@@ -1,0 +1,178 @@
+"""Levels of detail as 3D Tiles 1.1: ``tileset.json`` and glTF files, for Cesium and other globes.
+
+The scene is divided into cells. Each cell has a chain of tiles, from the coarsest level to the finest, which
+replace one another (``refine: REPLACE``). Geometric errors make Cesium switch at the rule's distances.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import LodgsError
+from ..files import temporary_folder
+from .gaussians import SplatRows, Splats
+from .gltf import write_glb
+from .levels import Bundle, Level
+from .portable_levels import PortableLevels, batches
+
+TILESET_FILE = "tileset.json"
+MAX_TILE_SPLATS = 200_000
+"""Maximum number of splats in a tile of the finest level."""
+SCREEN_ERROR = 16.0
+"""Cesium's default limit of the error on the screen in pixels."""
+_EARTH = 6.2e6, 6.6e6
+"""Distances in metres from the Earth's centre between which a local origin counts as ECEF."""
+_FAR = 1000.0
+"""Distance up to which a scene is shown, in multiples of its diagonal."""
+_CORE = 3.0
+"""Splats beyond so many radii of the scene, and larger ones than that, are a cell of their own."""
+_SIGMAS = 3.0
+"""Boxes include splats up to so many standard deviations."""
+
+
+def write_tiles(folder: Path, levels: PortableLevels) -> None:
+    """Write a tileset into a folder, and replace an earlier one there.
+
+    A scene whose local origin is in ECEF coordinates is placed on the globe. Other scenes have z up.
+
+    Raises:
+        LodgsError: the folder has other files or cannot be written.
+    """
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / TILESET_FILE).exists():
+        raise LodgsError(f"Cannot export to {folder}: it contains other files.", "Choose an empty folder.")
+    origin = levels.bundle.origin
+    on_globe = _EARTH[0] < np.linalg.norm(origin) < _EARTH[1]
+    if on_globe:
+        meta = levels.bundle.meta | {"up_rotation": np.eye(3).tolist()}
+        levels = replace(levels, bundle=replace(levels.bundle, meta=meta))
+    levels = replace(levels, origin=np.zeros(3), views=())
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with temporary_folder(folder.parent) as temporary:
+            tiles = temporary / "tiles"
+            tiles.mkdir()
+            document = _write_cells(tiles, levels)
+            if on_globe:
+                document["root"]["transform"] = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, *origin.tolist(), 1]
+            (tiles / TILESET_FILE).write_text(json.dumps(document, allow_nan=False), "utf-8")
+            if folder.exists():
+                os.rename(folder, temporary / "previous")
+            os.rename(tiles, folder)
+    except OSError as error:
+        raise LodgsError(f"Cannot write {folder}: {error.strerror}.", "Choose another folder.") from error
+
+
+def _write_cells(folder: Path, levels: PortableLevels) -> dict:
+    """Write the files of all cells, and return the tileset."""
+    used = levels.fine_to_coarse if levels.distances else levels.fine_to_coarse[:1]
+    errors = [SCREEN_ERROR * d / levels.focal for d in reversed(levels.distances)] or [0.0]
+    sphere = levels.sphere()
+    planes: list[tuple[int, int, float]] | None = None
+    cells: list[dict | None] = []
+    boxes: list[np.ndarray] = []
+    for level, error in zip(used, errors, strict=True):
+        means, far = _survey(level.rows, *sphere)
+        if planes is None:
+            planes = _split(means[~far])
+            cells = [None] * (len(planes) + 2)
+            boxes = [np.array([[np.inf] * 3, [-np.inf] * 3]) for _ in cells]
+        numbers = np.where(far, len(planes) + 1, _cell_numbers(means, planes))
+        for cell, inner in enumerate(cells):
+            index = np.flatnonzero(numbers == cell)
+            if not len(index):
+                continue
+            name = f"cell{cell}_level{level.number}.glb"
+            splats = level.rows.select(index)
+            tile = Bundle("", [Level(level.number, splats)], meta=_meta(levels))
+            write_glb(folder / name, PortableLevels(tile))
+            box = _box(splats, levels.bundle.up_rotation)
+            boxes[cell] = np.array([np.minimum(boxes[cell][0], box[0]), np.maximum(boxes[cell][1], box[1])])
+            cells[cell] = {
+                "boundingVolume": _volume(boxes[cell]),
+                "geometricError": error,
+                "refine": "REPLACE",
+                "content": {"uri": name},
+                **({"children": [inner]} if inner else {}),
+            }
+    box = np.array([np.min(boxes, axis=0)[0], np.max(boxes, axis=0)[1]])  # empty cells have none
+    far = SCREEN_ERROR * _FAR * float(np.linalg.norm(box[1] - box[0])) / levels.focal
+    error = max(far, *errors)
+    return {
+        "asset": {"version": "1.1", "generator": "LODGS"},
+        "geometricError": error,
+        "root": {
+            "boundingVolume": _volume(box), "geometricError": error, "refine": "REPLACE",
+            "children": [cell for cell in cells if cell],
+        },
+    }  # fmt: skip
+
+
+def _meta(levels: PortableLevels) -> dict:
+    return {"up_rotation": levels.bundle.up_rotation.tolist()}
+
+
+def _survey(rows: SplatRows, center: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the means (N, 3) of all splats, and whether they are far away or huge (N,) bool.
+
+    The sky and floaters would put every camera inside the boxes of the other splats.
+    """
+    means, far = np.empty((len(rows), 3), np.float32), np.empty(len(rows), bool)
+    for begin, splats in batches(rows):
+        end = begin + len(splats)
+        means[begin:end] = splats.means
+        reach = _SIGMAS * np.exp(splats.log_scales.max(axis=1))
+        far[begin:end] = np.linalg.norm(splats.means - center, axis=1) + reach > _CORE * radius
+    return means, far
+
+
+def _split(means: np.ndarray) -> list[tuple[int, int, float]]:
+    """Divide cells at the median of their longer axis until each has at most MAX_TILE_SPLATS splats.
+
+    Returns:
+        Cell, axis and position of each plane, in order. What lies above the n-th plane becomes cell n + 1.
+    """
+    planes: list[tuple[int, int, float]] = []
+    cells = [means]
+    cell = 0
+    while cell < len(cells):
+        part = cells[cell]
+        if len(part) <= MAX_TILE_SPLATS:
+            cell += 1
+            continue
+        low, high = np.quantile(part, (0.05, 0.95), axis=0)
+        axis = int(np.argmax(high - low))
+        position = float(np.median(part[:, axis]))
+        above = part[:, axis] > position
+        if not above.any():  # all splats are at one place
+            cell += 1
+            continue
+        planes.append((cell, axis, position))
+        cells[cell] = part[~above]
+        cells.append(part[above])
+    return planes
+
+
+def _cell_numbers(means: np.ndarray, planes: list[tuple[int, int, float]]) -> np.ndarray:
+    """Return the cell (N,) of each position."""
+    numbers = np.zeros(len(means), np.int32)
+    for new, (cell, axis, position) in enumerate(planes, 1):
+        numbers[(numbers == cell) & (means[:, axis] > position)] = new
+    return numbers
+
+
+def _box(splats: Splats, rotation: np.ndarray) -> np.ndarray:
+    """Return the lowest and highest corner (2, 3) of turned splats, float64."""
+    reach = _SIGMAS * np.exp(splats.log_scales.astype(np.float64)).max(axis=1, keepdims=True)
+    means = splats.means.astype(np.float64) @ rotation.T
+    return np.array([(means - reach).min(axis=0), (means + reach).max(axis=0)])
+
+
+def _volume(box: np.ndarray) -> dict:
+    """Return a bounding volume: centre and half axes."""
+    center, half = box.mean(axis=0).tolist(), np.diag((box[1] - box[0]) / 2).ravel().tolist()
+    return {"box": [*center, *half]}

@@ -1,0 +1,160 @@
+"""Program that reads the splats of a USD file: ``python -m lodgs.splats.usd_process SCENE BUNDLE``."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+
+from ..errors import LodgsError, printable
+from .bundle import write_bundle
+from .dialects import drop_undrawable
+from .gaussians import Splats
+from .levels import MAX_READ_LEVELS, Bundle, Level
+from .portable_levels import (
+    DISTANCE,
+    DISTANCE_RULE,
+    parse_description,
+    place_splats,
+    splats_from_activated,
+    upright_meta,
+)
+from .sh import MAX_DEGREE, coefficient_count
+from .usd import DESCRIPTION, load_usd, report_error
+
+_MEMORY = 1 << 27
+"""Bytes that a file may unpack to in addition to a multiple of its size."""
+_RATIO = 64
+_SPLAT_BYTES = 56
+"""Bytes of a splat of SH degree 0."""
+
+
+def main() -> int:
+    """Read the file and write the bundle; report errors on standard output."""
+    source, target = (Path(word) for word in sys.argv[1:])
+    usd = load_usd()
+    try:
+        write_bundle(target, read_levels(usd, source))
+    except LodgsError as error:
+        report_error(error)
+    except (usd.Tf.ErrorException, MemoryError, ValueError, RuntimeError, OverflowError) as error:
+        reason = printable((str(error).strip() or type(error).__name__).splitlines()[-1])[:300]
+        report_error(LodgsError(f"Cannot read {source}: it is damaged ({reason}).", "Export it again."))
+    return 0
+
+
+def read_levels(usd: SimpleNamespace, path: Path) -> Bundle:
+    """Return the levels of the first root with splats below it, or all splats as one level.
+
+    Raises:
+        LodgsError: the file has no splats or invalid ones, or refers to other files.
+    """
+    stage = _open(usd, path)
+    fields = [prim for prim in stage.Traverse() if prim.GetTypeName() == "ParticleField3DGaussianSplat"]
+    if not fields:
+        raise LodgsError(f"Cannot read {path}: it has no Gaussian splats.", "Choose another file.")
+    _check_size(path, fields)
+    root = next((prim for prim in stage.Traverse() if prim.HasAPI(usd.UsdLod.RootAPI)), None)
+    below = [] if root is None else [f for f in fields if f.GetPath().HasPrefix(root.GetPath())]
+    items = below or fields
+    if len(below) > MAX_READ_LEVELS:
+        raise LodgsError(f"Cannot read {path}: it has {len(below)} levels.", "Export fewer levels.")
+    cache = usd.UsdGeom.XformCache()
+    matrices = [np.array(cache.GetLocalToWorldTransform(prim)).T for prim in items]
+    up = usd.UsdGeom.GetStageUpAxis(stage)
+    data = stage.GetRootLayer().customLayerData
+    if DESCRIPTION in data and below:
+        bundle, placement = parse_description(data[DESCRIPTION], path)
+        same = all(np.allclose(matrix, placement, rtol=1e-9, atol=1e-9) for matrix in matrices)
+        if same and len(bundle.levels) == len(below):
+            for level, prim in zip(reversed(bundle.levels), below, strict=True):
+                level.splats = drop_undrawable(_read_field(prim, path), path)
+            return bundle
+    placed = [
+        place_splats(_read_field(prim, path), matrix, path)
+        for prim, matrix in zip(items, matrices, strict=True)
+    ]
+    meta, placed = upright_meta(placed, "Z" if up == usd.UsdGeom.Tokens.z else "Y")
+    degree = min(splats.sh_degree for splats in placed)
+    placed = [drop_undrawable(_limited(splats, degree), path) for splats in placed]
+    if not below:
+        return Bundle("", [Level(1, Splats.concatenated(placed))], meta=meta)
+    distances = _thresholds(usd, root, len(placed))
+    levels = [
+        Level(number, splats, {DISTANCE: distance} if distances else {})
+        for number, (splats, distance) in enumerate(
+            zip(reversed(placed), reversed(distances or [0.0] * len(placed)), strict=True), 1
+        )
+    ]
+    return Bundle("", levels, DISTANCE_RULE if distances else "", meta=meta)
+
+
+def _open(usd: SimpleNamespace, path: Path):
+    """Open a file that needs no other one."""
+    layer = usd.Sdf.Layer.FindOrOpen(str(path))
+    if layer is None:
+        raise LodgsError(f"Cannot read {path}: it is not a USD file.", "Choose another file.")
+    others = [printable(name) for name in layer.GetCompositionAssetDependencies()]
+    if others:
+        names = ", ".join(others)[:300]
+        raise LodgsError(f"Cannot read {path}: it refers to other files ({names}).", "Flatten it first.")
+    return usd.Usd.Stage.Open(layer)
+
+
+def _check_size(path: Path, fields: list) -> None:
+    """Refuse a file that declares more splats than it can hold."""
+    limit = _MEMORY + _RATIO * path.stat().st_size
+    count = 0
+    for prim in fields:
+        values = prim.GetAttribute("positions").Get() or prim.GetAttribute("positionsh").Get()
+        count += len(values) if values is not None else 0
+    if count * _SPLAT_BYTES > limit:
+        raise LodgsError(f"Cannot read {path}: it is too short for {count:,} splats.", "Export it again.")
+
+
+def _read_field(prim, path: Path) -> Splats:
+    """Return the splats of a particle field in its own coordinates."""
+
+    def values(name: str, width: int) -> np.ndarray:
+        for attribute in (prim.GetAttribute(name), prim.GetAttribute(f"{name}h")):
+            value = attribute.Get() if attribute else None
+            if value is not None and len(value):
+                return np.array(value, np.float32).reshape(-1, width)
+        return np.zeros((0, width), np.float32)
+
+    means, quats = values("positions", 3), values("orientations", 4)[:, [3, 0, 1, 2]]
+    scales, alphas = values("scales", 3), values("opacities", 1)[:, 0]
+    degree = prim.GetAttribute("radiance:sphericalHarmonicsDegree").Get()
+    sh = values("radiance:sphericalHarmonicsCoefficients", 3)
+    counts = {len(means), len(quats), len(scales), len(alphas)}
+    if type(degree) is not int or not 0 <= degree <= MAX_DEGREE:
+        raise LodgsError(f"Cannot read {path}: its SH degree is {degree}.", "Use degree 0 to 4.")
+    if counts != {len(means)} or len(sh) != len(means) * coefficient_count(degree):
+        raise LodgsError(
+            f"Cannot read {path}: attributes of {printable(prim.GetPath())} have different lengths.",
+            "Export it again.",
+        )
+    return splats_from_activated(means, quats, scales, alphas, sh.reshape(len(means), -1, 3))
+
+
+def _limited(splats: Splats, degree: int) -> Splats:
+    """Return splats with coefficients up to a degree."""
+    splats.sh = np.ascontiguousarray(splats.sh[:, : coefficient_count(degree)])
+    return splats
+
+
+def _thresholds(usd: SimpleNamespace, root, count: int) -> list[float]:
+    """Return the distance from which on each level is drawn, fine to coarse; empty if there are none."""
+    for target in usd.UsdLod.RootAPI(root).GetLodHeuristicsRel().GetTargets():
+        heuristic = usd.UsdLod.DistanceHeuristic(root.GetStage().GetPrimAtPath(target))
+        if heuristic:
+            values = [float(value) for value in heuristic.GetThresholdsAttr().Get() or ()]
+            valid = np.isfinite(values).all() and values == sorted(values) and min(values, default=0) >= 0
+            return [0.0, *values] if len(values) == count - 1 and valid else []
+    return []
+
+
+if __name__ == "__main__":
+    sys.exit(main())
