@@ -55,14 +55,11 @@ def edit(
         out: output in the format of the source; None: none.
         warn: as for ``read_ply``.
         looks: applied to the remaining splats.
-        placement: applied after the upright and ground transforms; crops and lengths of the cleaning are
-            those of the source.
+        placement: applied after upright and ground; crops and lengths of the cleaning are the source's.
         upright, ground, points: see ``placement.upright_placement``.
         plain: files for the finest level only, in the formats of their names.
         levels: files for all levels, in the formats of their names.
-        folder: output folder of levels.
-        streamed: output folder of levels for streaming in browsers.
-        tiles: output folder of 3D Tiles.
+        folder, streamed, tiles: output folders of levels, of levels for browsers, and of 3D Tiles.
         antialiased: for all outputs but ``out`` and ``folder``, see :class:`.export.ExportOptions`.
         original_place: for ``plain`` and ``levels``, see :class:`.export.ExportOptions`.
 

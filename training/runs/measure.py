@@ -68,8 +68,7 @@ def evaluate_run(
         - ``train_psnr``, ``veil``, ``oversized``, ``worst``, ``fitted_psnr``: see ``evaluate.summary``
         - ``aside``: mean ``psnr`` of the finest level in ``views`` off the path (``scenes.offset_views``)
         - ``selective``: quality with the rule, selected per view, and once for the mean training camera
-          (not if the bundle exceeds memory), with the rule's controls; empty without a rule. Rows of earlier
-          evaluations with other values of the controls follow
+          (not if the bundle exceeds memory), with the rule's controls. Earlier rows with others follow
         - ``loaded``: mean number of splats that a viewer loads for a view, all without chunks (not if the
           bundle exceeds memory)
         - ``frame_s``: seconds per frame ``by_distance``, including selection, and in ``full`` detail, drawn
@@ -92,8 +91,7 @@ def evaluate_run(
     report = _measure_levels(job, evaluation, bundle)
     middle = evaluation.cameras[len(evaluation.cameras) // 2]
     if rule:
-        report |= _measure_rule(job, evaluation, bundle, rule, values)
-        report["selective"] += _earlier_rows(folder, report["selective"][0], values)
+        report |= _measure_rule(job, folder, evaluation, bundle, rule, values)
     if folder.model.exists():
         report["networks"] = _measure_networks(job, folder, evaluation)
     if far and rule:
@@ -166,7 +164,9 @@ def _measure_merges(evaluation: Evaluation, bundle: Bundle) -> list[list[float]]
     return values[::-1]
 
 
-def _measure_rule(job: Job, evaluation: Evaluation, bundle: Bundle, rule: Rule, values: Values) -> dict:
+def _measure_rule(
+    job: Job, folder: RunFolder, evaluation: Evaluation, bundle: Bundle, rule: Rule, values: Values
+) -> dict:
     """Return ``selective``, ``curve`` and ``frame_s`` of the report."""
     data = evaluation.data
     resident = ResidentBundle(bundle, job.backend)
@@ -179,6 +179,7 @@ def _measure_rule(job: Job, evaluation: Evaluation, bundle: Bundle, rule: Rule, 
         predetermined = select(bundle, data.mean_camera, data.focal, values)
         quality = evaluation.measure_splats(*predetermined)
         report["selective"].append({"set": "predetermined", **values, **quality})
+    report["selective"] += _earlier_rows(folder, report["selective"][0], values)
     if rule.sweep:
         name, steps = rule.sweep
         report["curve"] = [

@@ -10,8 +10,10 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from ..errors import LodgsError
 from ..files import is_file, raise_system_problem
-from .images import IMAGE_SUFFIXES, UNREADABLE_SUFFIXES
+from .images import IMAGE_SUFFIXES
 
+UNREADABLE_SUFFIXES = (".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".bmp", ".gif")
+"""Suffixes of photos that LODGS does not read, lower case. Users convert them and keep the model's names."""
 MASK_SUFFIXES = (".png", *(suffix for suffix in IMAGE_SUFFIXES if suffix != ".png"))
 """Suffixes of masks, preferred ones first."""
 NO_PHOTOS = ".", "mask", "depth", "normal", "conf", "sparse"

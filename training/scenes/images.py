@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 MAX_PIXELS = 178_956_970
 """Maximum number of pixels of an input image: Pillow's own limit, at 4 bytes per pixel."""
 
-UNREADABLE_SUFFIXES = (".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".bmp", ".gif")
-"""Suffixes of photos that LODGS does not read, lower case. Users convert them and keep the model's names."""
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
 """Lower-case file name suffixes of photos, without ``.exr``, which only renderers write."""
 
@@ -218,14 +216,11 @@ def _check_end(file: IO[bytes], marker: bytes) -> None:
     if file.read() == marker:
         return
     file.seek(position)
-    end = b""
+    end = block = b""
     for _ in range(_MAX_BLOCKS):
-        block = file.read(_BLOCK)
+        end, block = block[-len(marker) :], file.read(_BLOCK)
         if marker in end + block:
             return
-        if not block:
-            break
-        end = block[-len(marker) :]
     raise Truncated
 
 

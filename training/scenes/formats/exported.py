@@ -18,8 +18,8 @@ from ...errors import LodgsError, printable
 from ...files import is_file
 from ..cameras import Camera
 from ..colmap import DEPTH_SUFFIXES
-from ..image_files import NO_PHOTOS, walk_files
-from ..images import IMAGE_SUFFIXES, UNREADABLE_SUFFIXES
+from ..image_files import NO_PHOTOS, UNREADABLE_SUFFIXES, walk_files
+from ..images import IMAGE_SUFFIXES
 from ..lenses import Intrinsics, make_intrinsics
 
 MAX_JSON_BYTES = 1 << 26
