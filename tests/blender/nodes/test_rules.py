@@ -11,7 +11,8 @@ RANGES = {
     "at_most": (-1500, 3000), "d_l": (1, 6), "coarser_d_l": (7, 14), "distance_scale": (0.7, 1.6),
     "chunks_0": (0, 2**24), "chunks_1": (0, 2**24), "chunks_2": (0, 2**24), "chunks_3": (0, 2**24),
     "node_size": (-0.05, 0.1), "parent_size": (0, 1.6), "parent_x": (-8, 8), "parent_y": (-8, 8),
-    "parent_z": (-8, 8),
+    "parent_z": (-8, 8), "share": (0.1, 0.9), "splats": (2000, 4000), "prefix_rank": (0, 4000),
+    "view_distance": (1, 9),
 }  # fmt: skip
 """Value ranges of facts, controls and columns whose default range would show everything or nothing."""
 FOCALS = {"cut": 300.0}

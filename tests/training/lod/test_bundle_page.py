@@ -24,6 +24,7 @@ CHOICES = {
     "chunks": [{}, {"distance_scale": 0.3}, {"distance_scale": 7.7, "chunks": 0}, {"fade": 0}],
     "cut": [{}, {"pixels": 0.2}, {"pixels": 3.7}, {"pixels": 41.5}],
     "decay": [{}, {"s_v": 1.7}, {"s_v": 4}, {"at_most": 120}, {"at_most": 17, "s_v": 2}],
+    "prefix": [{}, {"at_most": 120}, {"at_most": 1700, "distance_scale": 0.3}, {"distance_scale": 2.5}],
     "octree": [{}, {"offset": 1.7}, {"offset": -3.1}, {"fade": 0}, {"fade": 0, "offset": 0.6}],
 }
 
@@ -77,6 +78,7 @@ class Page:
             "decay": (self.decay, {"s_v": 1, "at_most": 0}),
             "chunks": (self.chunks, {"distance_scale": 1, "chunks": 1, "fade": 1}),
             "cut": (self.cut, {"pixels": 1}),
+            "prefix": (self.prefix, {"at_most": 0, "distance_scale": 1}),
         }[self.rule]
         self.position = np.array(position, float)
         values = defaults | self.controls | arguments
@@ -137,6 +139,13 @@ class Page:
             expected = 1 + np.clip(np.log2(reach / d) + bias, 0, self.numbers[-1] - 1)
         w = np.clip(2 * (expected - n + np.float32(0.5)) + np.float32(0.5), 0, 1)
         return w if values["fade"] else (w >= 0.5).astype(float)
+
+    def prefix(self, n: int, d: np.ndarray, f: float, values: dict) -> np.ndarray:
+        factor = self.facts["share"] ** 0.5 * f / self.facts["share_focal"] / values["distance_scale"]
+        rank, reach = self.columns[n]["prefix_rank"], self.columns[n]["view_distance"] * np.float32(factor)
+        with np.errstate(divide="ignore"):
+            length = np.float32(self.facts["splats"]) * np.minimum(reach / d, np.float32(1)) ** 2
+        return (rank < length) & (rank < (values["at_most"] or np.inf))
 
     def decay(self, n: int, d: np.ndarray, f: float, values: dict) -> np.ndarray:
         opacity, sigma = self.opacities[n], np.maximum(self.columns[n]["sigma_d"], 0)
@@ -206,8 +215,16 @@ def write_named(tmp_path):
         columns["parent_size"] = columns["node_size"] + np.float32(its_parent) * abs(columns["parent_size"])
         columns["parent_size"][:1] = 3e38
     tree = Bundle("tree", of_tree, "cut", controls={"pixels": 2.5})
+    of_prefix = levels({n: {} for n in (1, 2, 4)}, ("view_distance",))
+    order = np.random.default_rng(7).permutation(300 * 7).astype(np.float32)
+    for level, ranks in zip(of_prefix, np.split(order, (300, 900)), strict=True):
+        level.splats.extras["prefix_rank"] = ranks
+        level.splats.extras["view_distance"] = np.float32(6) + level.splats.extras["view_distance"]
+    facts = {"share": 0.4, "share_focal": 480.0, "splats": 2100.0}
+    prefix = Bundle("matryoshka", of_prefix, "prefix", facts, cumulative=True)
     bundles = {
         "tree": tree,
+        "prefix": prefix,
         "distances": distances,
         "chunks": chunks,
         "bands": bands,
@@ -233,6 +250,8 @@ BUNDLES = (
     "bands folder",
     "octree",
     "octree folder",
+    "prefix",
+    "prefix folder",
     "distances",
     "distances folder",
     "chunks",

@@ -20,10 +20,11 @@ CASES = {
     "flod": {"levels": 2, "steps": [6, 6], "densify_interval": [4, 4], "finish_share": 0.25},
     "octree": {"steps": 14, "grow_interval": 6, "full_share": 0.0},
     "clod": {"steps": 12, "begin": 0.5},
+    "matryoshka": {"steps": 12, "begin": 0.5},
     "lodge": {"steps": 8, "tune_steps": 2},
     "tree": {"steps": 8, "tune_steps": 4},
 }
-DEVICE_STEPS = {"3dgs": 14, "flod": 13, "octree": 14, "clod": 6, "lodge": 8, "tree": 8}
+DEVICE_STEPS = {"3dgs": 14, "flod": 13, "octree": 14, "clod": 6, "matryoshka": 6, "lodge": 8, "tree": 8}
 """Number of steps on the device for each method."""
 
 

@@ -205,6 +205,14 @@ PUBLISHED = {
         "keep_share": (1.0, "CLoD-GS: none"),
         "random_weight": (1.0, "CLoD-GS, Eq. 4"),
     },
+    "matryoshka": SINGLE | {
+        "base_share": (0.0, "Matryoshka: none"),
+        "begin": (0.0, "Matryoshka, abstract: each iteration samples a budget"),
+        "prefix_weight": (1.0, "Matryoshka, abstract: optimises both the prefix and the full set"),
+        "log_uniform": (False, "Matryoshka: distribution not known to us, uniform"),
+        "min_prefix": (0.01, "Matryoshka: not known to us"),
+        "order_by": ("total", "Matryoshka: ordering not known to us"),
+    },
 }  # fmt: skip
 
 
@@ -237,7 +245,12 @@ def events(monkeypatch):
 
 @pytest.mark.parametrize(
     ("name", "first", "interval", "last"),
-    [("3dgs", 600, 100, 14_900), ("clod", 600, 100, 14_900), ("lodge", 600, 300, 15_000)],
+    [
+        ("3dgs", 600, 100, 14_900),
+        ("clod", 600, 100, 14_900),
+        ("lodge", 600, 300, 15_000),
+        ("matryoshka", 600, 100, 14_900),
+    ],
 )
 def test_steps_of_density_control(data, events, name, first, interval, last):
     method = create(name, data, method_info(name).preset("paper"), seed=0, backend="cpu")
