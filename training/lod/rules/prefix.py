@@ -57,7 +57,7 @@ class Prefix(Rule):
         ),
         Control(
             "at_most", 0, 0, 2**30, "Splat Limit",
-            "Maximum number of splats: draws only the first ones. 0 disables",
+            "Maximum number of splats. 0 disables",
             integer=True, step=1000,
         ),
     )  # fmt: skip
