@@ -11,6 +11,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ...training.errors import LodgsError
+from ...training.render.lens import EQUIRECTANGULAR, ORTHOGRAPHIC, SHARP, Aperture, LensProjection
 from ...training.runs.job import MIN_VIEWS
 from ...training.scenes.cameras import Camera
 from .placement import matrix_of
@@ -89,18 +90,70 @@ class RenderView:
             UnsupportedCameraError: the object is not a perspective camera, or has no size.
         """
         _require_perspective(self.obj)
-        p = self.projection(depsgraph, width, height)
+        camera, deformation, _ = self.lens_camera(depsgraph, width, height)
+        return camera, deformation
+
+    def lens_camera(
+        self, depsgraph: bpy.types.Depsgraph, width: int, height: int
+    ) -> tuple[Camera, np.ndarray | None, LensProjection]:
+        """Convert the view to a camera and a projection, and the transform of :meth:`pinhole`.
+
+        Raises:
+            UnsupportedCameraError: the object is no camera, has no size, or has another lens.
+        """
+        if problem := unsupported_lens(self.obj):
+            raise UnsupportedCameraError(
+                f"Cannot render with LODGS: '{self.obj.name}' is {problem}.",
+                "Set its lens type to Perspective, Orthographic, or Panoramic with the type Equirectangular.",
+            )
         world_to_camera, deformation = _split_pose(self.obj, np.array(self.matrix, np.float64))
-        return Camera(
-            name=self.obj.name,
-            width=width,
-            height=height,
-            fx=p[0][0] * width / 2,
-            fy=p[1][1] * height / 2,
-            cx=(1 - p[0][2]) * width / 2,
-            cy=(1 + p[1][2]) * height / 2,
-            world_to_camera=world_to_camera,
-        ), deformation
+        data, side, projection = self.obj.data, float(max(width, height)), SHARP
+        fx, fy, cx, cy = side, side, width / 2, height / 2
+        if data.type == "PANO":
+            longitude, latitude = (
+                (data.longitude_min, data.longitude_max),
+                (data.latitude_min, data.latitude_max),
+            )
+            projection = LensProjection(EQUIRECTANGULAR, longitude=longitude, latitude=latitude)
+        else:
+            p = self.projection(depsgraph, width, height)
+            fx, fy = p[0][0] * width / 2, p[1][1] * height / 2
+            column, sign = (3, 1) if data.type == "ORTHO" else (2, -1)
+            cx, cy = (1 + sign * p[0][column]) * width / 2, (1 - sign * p[1][column]) * height / 2
+            if data.type == "ORTHO":  # pixels per world unit, times the distance
+                projection = LensProjection(ORTHOGRAPHIC, distance=side / fx)
+                fx, fy = side, fy * side / fx
+        return Camera(self.obj.name, width, height, fx, fy, cx, cy, world_to_camera), deformation, projection
+
+
+def unsupported_lens(obj: bpy.types.Object) -> str:
+    """Return the lens of a camera object that LODGS cannot render, as a noun or an adjective, or ""."""
+    if obj.type != "CAMERA":
+        return "not a camera"
+    if obj.data.type == "PANO" and obj.data.panorama_type != "EQUIRECTANGULAR":
+        return f"a panoramic camera of the type {obj.data.panorama_type.replace('_', ' ').title()}"
+    return "" if obj.data.type in ("PERSP", "ORTHO", "PANO") else f"a {obj.data.type.lower()} camera"
+
+
+def aperture_of(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Aperture | None:
+    """Return the aperture of an evaluated camera object as Cycles uses it, or None without depth of field.
+
+    The aperture of an orthographic camera has a diameter of 1/f-stop units. Panoramas have none.
+    """
+    data, dof = obj.data, obj.data.dof
+    if not dof.use_dof or data.type == "PANO":
+        return None
+    diameter = (1.0 if data.type == "ORTHO" else data.lens / 1000) / max(dof.aperture_fstop, 1e-5)
+    focus = dof.focus_distance
+    if dof.focus_object is not None:
+        matrix = obj.matrix_world.normalized()
+        target = dof.focus_object.evaluated_get(depsgraph).matrix_world
+        bone = dof.focus_object.pose and dof.focus_object.pose.bones.get(dof.focus_subtarget)
+        position = (target @ bone.matrix if bone else target).translation
+        focus = abs(matrix.col[2].xyz @ (matrix.translation - position))
+    return Aperture(
+        diameter / 2, max(focus, 1e-5), dof.aperture_blades, dof.aperture_rotation, dof.aperture_ratio
+    )
 
 
 def _require_perspective(obj: bpy.types.Object) -> None:

@@ -1,13 +1,15 @@
-"""Current camera of a splat scene and the number of splats in its region, for panels."""
+"""Current camera of a splat scene, and the numbers of splats that it shows, loads and saves, for panels."""
 
 from __future__ import annotations
 
 import bpy
 import numpy as np
 
-from ...training.lod.rule import Region
+from ...training.errors import LodgsError
+from ...training.lod.rule import Region, find_rule
+from ...training.lod.selection import unknown_rule_error
 from ..attributes import read_attribute
-from . import objects, selection
+from . import objects, scenes, selection
 
 _counts: dict[tuple[int, Region], int] = {}
 """Number of splats by point cloud (``session_uid``) and region; counting large clouds is slow."""
@@ -40,6 +42,45 @@ def count_loaded(root: bpy.types.Object, query: selection.LodQuery) -> tuple[int
             splats += count
             megabytes += objects.megabytes(cloud) * count / max(len(cloud.points), 1)
     return splats, megabytes
+
+
+def saved_share(context: bpy.types.Context, root: bpy.types.Object) -> float:
+    """Return the share of the finest level's splats that By Distance leaves out at the current camera."""
+    visible, total = scenes.count_visible(context, root)
+    finest = [item for item in root.lodgs.levels if item.exists][-1:]
+    full = total if root.lodgs.cumulative else sum(len(item.object.data.points) for item in finest)
+    return max(1 - visible / full, 0.0) if full else 0.0
+
+
+def reduce_detail(context: bpy.types.Context, root: bpy.types.Object, share: float) -> float:
+    """Change the rule's main control until By Distance leaves out a share of the finest level's splats.
+
+    Returns:
+        The share that is left out.
+
+    Raises:
+        LodgsError: no known rule, or no value of the control saves splats; the controls are then as before.
+    """
+    rule = find_rule(root.lodgs.rule)
+    if rule is None:
+        raise LodgsError(*unknown_rule_error(root.lodgs.rule))
+    numbers = [item.number for item in root.lodgs.levels if item.exists]
+    before = {control.name: getattr(root.lodgs.controls, control.name) for control in rule.controls}
+    values: dict | None = before
+    saved = first = saved_share(context, root)
+    while saved < share and (values := rule.less_detail(values, numbers)) is not None:
+        for name, value in values.items():
+            setattr(root.lodgs.controls, name, value)
+        context.view_layer.update()
+        saved = saved_share(context, root)
+    if saved <= first:
+        for name, value in before.items():
+            setattr(root.lodgs.controls, name, value)
+        raise LodgsError(
+            "Cannot save splats: coarser levels draw as many at this camera.",
+            "Move the camera away from the splats, or train more levels.",
+        )
+    return saved
 
 
 def _count(cloud: bpy.types.PointCloud, query: selection.LodQuery, region: Region) -> int:

@@ -128,13 +128,31 @@ def _on_saved(*_) -> None:
     _previous.clear()
 
 
+@bpy.app.handlers.persistent
+def _on_import(context, *_) -> None:
+    """Let the relative paths of appended scenes lead to the same files as in their own .blend file."""
+    folders = {
+        item.id: os.path.dirname(bpy.path.abspath(item.source_library.filepath))
+        for item in context.import_items
+        if item.id is not None and item.id.library is None and item.source_library is not None
+    }
+    for owner, name, value in list(scene_paths()):
+        folder = folders.get(owner.id_data)
+        if folder and value.startswith("//"):
+            setattr(owner, name, stored_path(Path(os.path.normpath(bpy.path.abspath(value, start=folder)))))
+
+
 def register() -> None:
+    if hasattr(bpy.app.handlers, "blend_import_post"):
+        bpy.app.handlers.blend_import_post.append(_on_import)
     bpy.app.handlers.save_pre.append(_on_save)
     bpy.app.handlers.save_post.append(_on_saved)
     bpy.app.handlers.save_post_fail.append(_on_saved)
 
 
 def unregister() -> None:
+    if hasattr(bpy.app.handlers, "blend_import_post"):
+        bpy.app.handlers.blend_import_post.remove(_on_import)
     bpy.app.handlers.save_pre.remove(_on_save)
     bpy.app.handlers.save_post.remove(_on_saved)
     bpy.app.handlers.save_post_fail.remove(_on_saved)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import bpy
 
+from ...training.optimize.memory import free_memory
+from ...training.render.lens import MAX_SAMPLES
 from .. import compat
 from .property_callbacks import look_up, tag_owner
 from .scene_properties import CONTROLS, SplatLevel, SplatScene, SplatSource, SplatStream, SplatTable
@@ -20,6 +22,15 @@ def _is_native(self) -> bool:
 
 def _hides_blender(self) -> bool:
     return self.splats if compat.NATIVE_SPLATS is None else not _is_native(self)
+
+
+BYTES_PER_SPLAT = 8 << 10
+"""Free memory for each splat of the default budget; a viewport with Blender's own data needs about 1 kB."""
+
+
+def default_budget() -> int:
+    """Return the default splat budget for the free memory of this computer, in steps of 500,000."""
+    return min(max(free_memory() // BYTES_PER_SPLAT // 500_000 * 500_000, 1_000_000), 8_000_000)
 
 
 class ViewportSettings(bpy.types.PropertyGroup):
@@ -68,8 +79,8 @@ class ViewportSettings(bpy.types.PropertyGroup):
     budget: bpy.props.IntProperty(
         name="Splat Budget",
         description="Maximum number of splats that a viewport draws. Beyond it, coarser levels replace finer "
-        "ones, and a single level shows its most visible splats",
-        default=2_000_000,
+        "ones, and a single level shows its most visible splats. The default depends on the memory",
+        default=default_budget(),
         min=1000,
         max=16_000_000,
         step=10_000,
@@ -235,6 +246,15 @@ class RenderSettings(bpy.types.PropertyGroup):
         "behind that depth are not rendered, and the film is transparent there",
         subtype="FILE_PATH",
         options={"PATH_SUPPORTS_BLEND_RELATIVE"},
+    )
+    samples: bpy.props.IntProperty(
+        name="Samples",
+        description="Number of images that depth of field and motion blur average. Raise it if blurred edges "
+        "show copies",
+        default=64,
+        min=1,
+        max=MAX_SAMPLES,
+        soft_max=1024,
     )
     show_comparison: bpy.props.BoolProperty(
         name="Wipe",

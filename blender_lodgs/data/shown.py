@@ -139,22 +139,43 @@ def drop_streamed_levels(instances: list[SplatInstance]) -> list[SplatInstance]:
     ]
 
 
+def rule_query(instance: SplatInstance, depsgraph: bpy.types.Depsgraph) -> selection.LodQuery | None:
+    """Return the rule arguments of an instance at its own distance from the camera; None if all are shown."""
+    query = selection.evaluated_query(instance.evaluated, depsgraph)
+    return query and at_instance(query, instance)
+
+
 def camera_query(instance: SplatInstance, depsgraph: bpy.types.Depsgraph) -> selection.LodQuery | None:
     """Return the rule arguments of an instance for an image of the scene camera; None if all are shown.
 
-    These are the arguments of the modifiers, except for streamed scenes with the viewport as camera: finer
-    splats are then selected for the scene camera itself.
+    These are the arguments of :func:`rule_query`, except for streamed scenes with the viewport as camera:
+    finer splats are then selected for the scene camera itself.
     """
     query = selection.evaluated_query(instance.evaluated, depsgraph)
     root, camera = roots.root_of(instance.object), depsgraph.scene.camera
     if query is None or not query.rule or instance.source is None or root is None or camera is None:
-        return query
+        return query and at_instance(query, instance)
     settings = root.lodgs
-    if not settings.follows_viewport:
+    if settings.follows_viewport:
+        location = camera.evaluated_get(depsgraph).matrix_world.translation
+        position = tuple(axes_of(root).evaluated_get(depsgraph).matrix_world.inverted_safe() @ location)
+        focal_px = root.evaluated_get(depsgraph).lodgs.focal_px
+        query = replace(query, position=position, focal_px=focal_px)
+    return at_instance(query, instance)
+
+
+def at_instance(query: selection.LodQuery, instance: SplatInstance) -> selection.LodQuery:
+    """Move the camera of a query from the space of the original object to the space of an instance of it.
+
+    A camera that is fixed to the splats, such as the mean of the training cameras, stays there.
+    """
+    root = roots.root_of(instance.object)
+    own = np.array(instance.evaluated.matrix_world, np.float64)
+    is_fixed = root is not None and not root.lodgs.freeze and root.lodgs.camera_choice == "TRAINING"
+    if not query.rule or is_fixed or np.array_equal(own, instance.matrix_world):
         return query
-    location = camera.evaluated_get(depsgraph).matrix_world.translation
-    position = tuple(axes_of(root).evaluated_get(depsgraph).matrix_world.inverted_safe() @ location)
-    return replace(query, position=position, focal_px=root.evaluated_get(depsgraph).lodgs.focal_px)
+    x, y, z = np.linalg.solve(instance.matrix_world, own @ (*query.position, 1.0))[:3].tolist()
+    return replace(query, position=(x, y, z))
 
 
 def _with_sources(instances: list[SplatInstance], depsgraph: bpy.types.Depsgraph) -> list[SplatInstance]:

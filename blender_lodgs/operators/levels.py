@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from ..data import roots, scenes
+from ..data import loaded, roots, scenes
 from .base import SceneOperator, report_errors
 
 
@@ -25,4 +25,30 @@ class LODGS_OT_show_only_level(SceneOperator, bpy.types.Operator):
         return {"FINISHED"}
 
 
-CLASSES = (LODGS_OT_show_only_level,)
+class LODGS_OT_reduce_detail(SceneOperator, bpy.types.Operator):
+    """Raise the size of the details that coarser levels may lose, until fewer splats are drawn"""
+
+    bl_idname = "lodgs.reduce_detail"
+    bl_label = "Save Splats"
+    bl_options = {"REGISTER", "UNDO"}
+
+    share: bpy.props.FloatProperty(
+        name="Saved",
+        description="Share of the finest level's splats to leave out at the current camera",
+        default=0.3,
+        min=0.0,
+        max=0.95,
+        subtype="FACTOR",
+    )
+
+    @report_errors
+    def execute(self, context):
+        root = roots.active_root(context)
+        root.lodgs.mode = "SELECTIVE"
+        context.view_layer.update()
+        saved = loaded.reduce_detail(context, root, self.share)
+        self.report({"INFO"}, f"By Distance draws {saved:.0%} fewer splats than the finest level")
+        return {"FINISHED"}
+
+
+CLASSES = (LODGS_OT_show_only_level, LODGS_OT_reduce_detail)

@@ -20,6 +20,10 @@ def _columns(row: bpy.types.UILayout, *texts: str) -> None:
     row.label(text=texts[-1])
 
 
+MIN_SAVED = 0.05
+"""Share of splats below which the panel offers a coarser setting."""
+
+
 def _short(value: float, digits: int = 0) -> str:
     """Format a number for a narrow column: 682,973; 3.97 M; 79.2; 344."""
     if value >= 1e6:
@@ -130,6 +134,12 @@ def _draw_counts(layout: bpy.types.UILayout, context: bpy.types.Context, root: b
     if not root.lodgs.stream.file:  # when streaming, viewports draw more splats than the levels hold
         visible, total = scenes.count_visible(context, root)
         column.label(text=f"{visible:,} of {total:,} splats shown")
+        if choice:
+            saved = loaded.saved_share(context, root)
+            column.label(text=f"{saved:.0%} fewer than the finest level")
+            if saved < MIN_SAVED and len(root.lodgs.levels) > 1:
+                say(column, "By Distance saves almost nothing at this camera.", "INFO")
+                column.operator("lodgs.reduce_detail")
     if choice and position:
         splats, megabytes = loaded.count_loaded(root, choice)
         column.label(text=f"{splats:,} loaded, {megabytes:.1f} MB")

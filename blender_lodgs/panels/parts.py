@@ -36,6 +36,14 @@ def split_column(layout: bpy.types.UILayout, heading: str = "", align: bool = Fa
     return column
 
 
+def short_count(count: int) -> str:
+    """Format a number of splats with at most four characters and a unit, for example "1.2 M"."""
+    for unit, size in (("M", 1_000_000), ("k", 1000)):
+        if count >= 0.9995 * size:
+            return f"{count / size:.{1 if count < 99.95 * size else 0}f} {unit}"
+    return str(count)
+
+
 def say(layout: bpy.types.UILayout, text: str, icon: str) -> None:
     """Draw a text that wraps to the panel's width."""
     column = layout.column(align=True)

@@ -37,6 +37,7 @@ class LODGS_PT_rendering(Panel):
             say(column, "Viewport Quality renders without the trainer.", "INFO")
         else:
             _draw_passes(layout, scene, context.view_layer)
+            _draw_lens(layout, scene)
             column = layout.column(align=True)
             _draw_render(column, "render.render", "Render Image", "RENDER_STILL")
         _draw_render(column, "lodgs.render_quick", "Viewport Quality", "RESTRICT_VIEW_OFF")
@@ -64,6 +65,15 @@ class LODGS_RENDER_PT_film(_Properties):
         missing = _missing_trainer()
         if missing:
             draw_environment(self.layout, missing)
+
+
+class LODGS_RENDER_PT_lens(_Properties):
+    bl_label = "Depth of Field and Motion Blur"
+    bl_context = "render"
+
+    def draw(self, context):
+        _draw_lens(self.layout, context.scene)
+        _draw_shutter(self.layout, context.scene)
 
 
 class LODGS_VIEWLAYER_PT_passes(_Properties):
@@ -124,6 +134,34 @@ def _draw_passes(layout: bpy.types.UILayout, scene: bpy.types.Scene, layer: bpy.
     column.prop(scene.lodgs_render, "use_pass_levels")
 
 
+def _draw_lens(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
+    """Draw the settings of blur, and the settings of camera and scene that LODGS cannot render."""
+    camera = scene.camera if scene.camera and scene.camera.type == "CAMERA" else None
+    column = split_column(layout, heading="Blur")
+    if camera is not None:
+        row = column.row()
+        row.active = camera.data.type != "PANO"
+        row.prop(camera.data.dof, "use_dof", text="Depth of Field")
+        if camera.data.dof.use_dof:
+            column.prop(camera.data.dof, "aperture_fstop")
+            column.prop(camera.data.dof, "focus_object", text="Focus On")
+            if camera.data.dof.focus_object is None:
+                column.prop(camera.data.dof, "focus_distance", text="Distance")
+    column.prop(scene.render, "use_motion_blur", text="Motion Blur")
+    if engine.is_blurred(scene):
+        column.prop(scene.lodgs_render, "samples")
+    for text in engine.limitations(scene):
+        say(layout, text, "ERROR")
+
+
+def _draw_shutter(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
+    column = split_column(layout)
+    column.active = scene.render.use_motion_blur
+    column.prop(scene.render, "motion_blur_position", text="Position")
+    column.prop(scene.render, "motion_blur_shutter")
+    column.prop(scene.eevee, "motion_blur_steps", text="Steps")
+
+
 def _draw_holdout(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
     column = split_column(layout, align=True)
     column.prop(scene.lodgs_render, "holdout")
@@ -132,4 +170,6 @@ def _draw_holdout(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
     row.operator("lodgs.render_mesh_depth", icon="RENDER_ANIMATION", text="").animation = True
 
 
-CLASSES = (LODGS_PT_rendering, LODGS_RENDER_PT_film, LODGS_VIEWLAYER_PT_passes)
+CLASSES = (
+    LODGS_PT_rendering, LODGS_RENDER_PT_film, LODGS_RENDER_PT_lens, LODGS_VIEWLAYER_PT_passes,
+)  # fmt: skip

@@ -9,7 +9,7 @@ from ...training.lod.rule import resolve_rule
 from .. import compat, viewport
 from ..data import roots
 from ..viewport import views
-from .parts import Panel, say, split_column
+from .parts import Panel, say, short_count, split_column
 
 
 class LODGS_PT_viewport(Panel):
@@ -52,9 +52,23 @@ class LODGS_PT_viewport(Panel):
         if viewport.problem:
             text = f"Cannot draw splats: {viewport.problem}. Disable Gaussian Splats to draw points."
             say(layout, text, "ERROR")
-        excluded = views.excluded_count()
-        if settings.splats and not settings.native and excluded:
-            layout.label(text=f"Budget excludes {excluded:,} splats", icon="INFO")
+        counts = views.reduced_counts()
+        if settings.splats and not settings.native and counts:
+            layout.label(text=_budget_text(*counts), icon="INFO")
+
+
+def _budget_text(drawn: int, full: int) -> str:
+    """Return the number of drawn splats, for example "1.2 M of 3.0 M splats (budget)"."""
+    return f"{short_count(drawn)} of {short_count(full)} splats (budget)"
+
+
+def _header(self, context):
+    """Draw the number of splats that the budget leaves, in the header of the viewport."""
+    settings = context.scene.lodgs_viewport
+    regions = [region for region in context.area.regions if region.type == "WINDOW"]
+    counts = views.reduced_counts(regions[-1]) if regions else None
+    if settings.splats and not settings.native and counts:
+        self.layout.label(text=_budget_text(*counts), icon="INFO")
 
 
 def _legend(layout: bpy.types.UILayout, numbers: list[int]) -> None:
@@ -84,7 +98,9 @@ CLASSES = (LODGS_PT_viewport,)
 
 def register() -> None:
     bpy.types.VIEW3D_PT_overlay.append(_overlays)
+    bpy.types.VIEW3D_HT_header.append(_header)
 
 
 def unregister() -> None:
+    bpy.types.VIEW3D_HT_header.remove(_header)
     bpy.types.VIEW3D_PT_overlay.remove(_overlays)

@@ -6,13 +6,16 @@ the compositor combines both images by depth.
 
 from __future__ import annotations
 
+import math
 import re
 import traceback
-from collections.abc import Callable, Iterable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import bpy
 import numpy as np
@@ -21,14 +24,18 @@ from ...training.editing.paint import COLUMNS as PAINT
 from ...training.editing.paint import apply_paint
 from ...training.errors import LodgsError, is_out_of_memory
 from ...training.lod.rule import all_rule_columns
+from ...training.render.lens import LensProjection
+from ...training.scenes.cameras import Camera, camera_to_dict
 from ...training.splats.gaussians import Splats
 from .. import attributes
 from ..data import changes, objects, roots, selection, shown
-from ..data.cameras import RenderView, scene_camera
+from ..data.cameras import RenderView, aperture_of, scene_camera, unsupported_lens
 from ..data.paths import absolute_path
 from . import renderer
 
 ID = "LODGS"
+MAX_KEYS = 63
+"""Maximum number of evaluations of motion per frame."""
 LEVEL, LEVEL_MASK, DEPTH, COMBINED = "Level", "Level {}", "Depth", "Combined"
 
 
@@ -65,6 +72,7 @@ class LodgsEngine(bpy.types.RenderEngine):
         size = self.resolution_x, self.resolution_y
         window = render_border(depsgraph.scene.render, *size)
         names = self._view_names(depsgraph)
+        keys = self._motion_keys(depsgraph, names)
         for index, name in enumerate(names):
             view = self._view(depsgraph, name)
 
@@ -73,7 +81,8 @@ class LodgsEngine(bpy.types.RenderEngine):
                 self.update_stats("", text)
                 return not self.test_break()
 
-            frame = _render_function(depsgraph, *size, window, on_progress, view)
+            motion = [key.of_view(name) for key in keys]
+            frame = _render_function(depsgraph, *size, window, on_progress, view, motion)
             if frame is None or self.test_break():
                 return
             _, _, width, height = window
@@ -89,6 +98,24 @@ class LodgsEngine(bpy.types.RenderEngine):
         names = [view.name for view in result.views]
         self.end_result(result, cancel=True)
         return names or [""]
+
+    def _motion_keys(self, depsgraph: bpy.types.Depsgraph, names: list[str]) -> list[_MotionKey]:
+        """Return the placement of cameras and splats at equal intervals of the shutter time."""
+        now, keys = depsgraph.scene.frame_current_final, []
+        for time in shutter_times(depsgraph.scene):
+            self._set_time(time)
+            cameras = {
+                name: self._view(depsgraph, name).lens_camera(depsgraph, self.resolution_x, self.resolution_y)
+                for name in names
+            }
+            keys.append(_MotionKey(cameras, _matrices(depsgraph)))
+        if keys:
+            self._set_time(now)
+        return keys
+
+    def _set_time(self, time: float) -> None:
+        frame = math.floor(time)
+        self.frame_set(frame, time - frame)
 
     def _view(self, depsgraph: bpy.types.Depsgraph, name: str) -> RenderView:
         """Return the camera of an eye or of a view of a multi-view render."""
@@ -117,6 +144,60 @@ def _unexpected(frame: int, error: Exception) -> str:
     return f"Cannot render frame {frame}: {reason}. Report it with the text in Blender's system console."
 
 
+class MotionKey(NamedTuple):
+    """Placement of a camera and of splats at one time.
+
+    Attributes:
+        camera: camera in Blender's world.
+        deformation: see ``RenderView.pinhole``.
+        matrices: matrices of splat instances, by object and number among its instances.
+    """
+
+    camera: Camera
+    deformation: np.ndarray | None
+    matrices: dict[tuple[int, int], np.ndarray]
+
+
+class _MotionKey(NamedTuple):
+    """Like :class:`MotionKey`, with the cameras of all views of a stereo or multi-view render."""
+
+    cameras: dict[str, tuple[Camera, np.ndarray | None, LensProjection]]
+    matrices: dict[tuple[int, int], np.ndarray]
+
+    def of_view(self, name: str) -> MotionKey:
+        camera, deformation, _ = self.cameras[name]
+        return MotionKey(camera, deformation, self.matrices)
+
+
+def shutter_times(scene: bpy.types.Scene) -> list[float]:
+    """Return the frames, with fractions, at which a scene's motion is evaluated; none without motion blur.
+
+    With the setting *Steps* of EEVEE's motion blur, the motion is straight between 2 * steps + 1 times.
+    """
+    render = scene.render
+    if not render.use_motion_blur or not render.motion_blur_shutter:
+        return []
+    start = {"START": 0.0, "CENTER": -0.5, "END": -1.0}[render.motion_blur_position]
+    count = min(2 * scene.eevee.motion_blur_steps + 1, MAX_KEYS)
+    first = scene.frame_current_final + start * render.motion_blur_shutter
+    return list(np.linspace(first, first + render.motion_blur_shutter, count))
+
+
+def _matrices(depsgraph: bpy.types.Depsgraph) -> dict[tuple[int, int], np.ndarray]:
+    """Return the matrices of the splat instances of :func:`placed_splats`."""
+    instances = shown.drop_streamed_levels(shown.splat_instances(depsgraph))
+    return dict(zip(_identities(instances), (item.matrix_world for item in instances), strict=True))
+
+
+def _identities(instances: Iterable[shown.SplatInstance]) -> Iterator[tuple[int, int]]:
+    """Yield the object of each instance, and the number of its earlier instances."""
+    counts = Counter()
+    for instance in instances:
+        uid = instance.object.session_uid
+        yield uid, counts[uid]
+        counts[uid] += 1
+
+
 def render_frame(
     depsgraph: bpy.types.Depsgraph,
     width: int,
@@ -124,8 +205,12 @@ def render_frame(
     window: tuple[int, int, int, int],
     on_progress: renderer.OnProgress = lambda fraction, text: True,
     view: RenderView | None = None,
+    motion: Sequence[MotionKey] = (),
 ) -> renderer.RenderedFrame | None:
     """Render the splats of a depsgraph from a camera, as Cycles does.
+
+    Splats are selected and adjusted as at the time of the frame; only their placement changes while the
+    shutter is open.
 
     Args:
         depsgraph: evaluated depsgraph.
@@ -134,6 +219,7 @@ def render_frame(
         window: left, bottom, width and height of the rendered part in pixels.
         on_progress: see ``renderer.OnProgress``.
         view: camera, or None for the scene's camera.
+        motion: placement of camera and splats at equal intervals of the shutter time.
 
     Returns:
         The frame with the passes of the view layer, or None if it was cancelled.
@@ -145,10 +231,15 @@ def render_frame(
     scene = depsgraph.scene
     layer = depsgraph.view_layer
     view = view or RenderView.of(scene_camera(scene).evaluated_get(depsgraph))
-    camera, deformation = view.pinhole(depsgraph, width, height)
-    splats = placed_splats(depsgraph)
+    camera, deformation, projection = view.lens_camera(depsgraph, width, height)
+    aperture = aperture_of(view.obj, depsgraph)
+    splats = placed_splats(depsgraph, motion)
     if deformation is not None:
         splats = [replace(item, matrix=deformation @ item.matrix) for item in splats]
+    cameras = tuple(key.camera for key in motion)
+    if all(camera_to_dict(key, 0) == camera_to_dict(camera, 0) for key in cameras):
+        cameras = ()
+    lens = renderer.FrameLens(projection, aperture, cameras, scene.lodgs_render.samples)
     left, bottom, window_width, window_height = window
     settings = scene.lodgs_render
     return renderer.draw_frame(
@@ -161,6 +252,7 @@ def render_frame(
         levels=settings.use_pass_levels,
         window=(left, height - bottom - window_height, window_width, window_height),
         holdout=holdout_file(scene, scene.frame_current),
+        lens=lens,
     )
 
 
@@ -193,6 +285,8 @@ def holdout_file(scene: bpy.types.Scene, frame: int) -> Path | None:
             "Cannot hold out meshes in a stereo or multi-view render.",
             "Clear Hold Out, and use Combine with Meshes.",
         )
+    if problem := holdout_problem(scene):
+        raise LodgsError(f"Cannot hold out meshes: {problem}.", "Clear Hold Out, or disable the setting.")
     path = frame_path(scene.lodgs_render.holdout, scene.original, frame)
     if not path.is_file():
         raise LodgsError(
@@ -200,6 +294,40 @@ def holdout_file(scene: bpy.types.Scene, frame: int) -> Path | None:
             "Press Render Mesh Depth (for all frames, the button next to it), or clear Hold Out.",
         )
     return path
+
+
+def holdout_problem(scene: bpy.types.Scene) -> str:
+    """Return why meshes cannot be held out, as a clause: their depth is sharp and planar. "" if they can."""
+    if scene.camera and scene.camera.type == "CAMERA" and scene.camera.data.type == "PANO":
+        return "the camera is panoramic"
+    return "depth of field or motion blur is enabled" if is_blurred(scene) else ""
+
+
+def is_blurred(scene: bpy.types.Scene) -> bool:
+    """Return whether a scene renders with depth of field or motion blur."""
+    camera = scene.camera
+    focuses = camera and camera.type == "CAMERA" and camera.data.type != "PANO" and camera.data.dof.use_dof
+    return bool(focuses or scene.render.use_motion_blur)
+
+
+def limitations(scene: bpy.types.Scene) -> list[str]:
+    """Return sentences about settings of the camera and the scene that renders refuse or ignore."""
+    texts, camera, settings = [], scene.camera, scene.lodgs_render
+    if camera is None:
+        return ["The scene has no camera."]
+    if problem := unsupported_lens(camera):
+        texts.append(f"'{camera.name}' is {problem}, which LODGS cannot render.")
+    elif camera.data.type == "PANO":
+        if camera.data.dof.use_dof:
+            texts.append("Panoramas have no depth of field.")
+        texts.append("Viewport Quality renders no panoramas.")
+    if is_blurred(scene):
+        texts.append("Viewport Quality renders without blur.")
+    if settings.holdout and (problem := holdout_problem(scene)):
+        texts.append(f"Hold Out does not work: {problem}.")
+    elif settings.meshes is not None and is_blurred(scene):
+        texts.append("The depths of blurred images are sharp, so meshes and splats combine with hard edges.")
+    return texts
 
 
 def frame_path(pattern: str, scene: bpy.types.Scene, frame: int) -> Path:
@@ -214,37 +342,53 @@ def frame_path(pattern: str, scene: bpy.types.Scene, frame: int) -> Path:
     return path.with_name(re.sub(r"#+(?=[^#]*$)", number, path.name))
 
 
-def placed_splats(depsgraph: bpy.types.Depsgraph) -> list[renderer.PlacedSplats | renderer.PlacedFile]:
+def placed_splats(
+    depsgraph: bpy.types.Depsgraph, motion: Sequence[MotionKey] = ()
+) -> list[renderer.PlacedSplats | renderer.PlacedFile]:
     """Return the visible splats of a depsgraph in the form of splat files, so that both render equally.
 
     For an object whose splats are selected only by a rule, all its splats are returned with the arguments of
     the rule. Other objects give the splats that remain after their modifiers.
     """
     placed = []
-    for instance in shown.drop_streamed_levels(shown.splat_instances(depsgraph)):
+    instances = shown.drop_streamed_levels(shown.splat_instances(depsgraph))
+    for identity, instance in zip(_identities(instances), instances, strict=True):
         evaluated, matrix, level = instance.evaluated, instance.matrix_world, instance.level
         placement = (matrix, level, instance.antialias)
+        after = {"looks": instance.looks, "motion": _motion_of(identity, matrix, motion)}
         is_empty = not len(evaluated.data.points)
         if instance.source is not None and (choice := shown.camera_query(instance, depsgraph)):
-            file = instance.source.path, matrix, instance.antialias, choice, instance.looks
-            placed.append(renderer.PlacedFile(*file))
+            file = instance.source.path, matrix, instance.antialias, choice
+            placed.append(renderer.PlacedFile(*file, **after))
             continue
         if not _is_selected_by_rule(instance, depsgraph):
             if not is_empty:
                 read = partial(_read_splats, evaluated.data)
                 uid = instance.object.session_uid
-                placed.append(renderer.PlacedSplats(uid, read, *placement, looks=instance.looks))
+                placed.append(renderer.PlacedSplats(uid, read, *placement, **after))
             continue
         cloud = instance.object.data
         read = partial(_read_splats, cloud.evaluated_get(depsgraph), all_rule_columns())
         version = *changes.version(cloud), *changes.paint_version(cloud)
-        choice = selection.evaluated_query(evaluated, depsgraph)
+        choice = shown.rule_query(instance, depsgraph)
+        is_empty &= np.array_equal(matrix, np.array(evaluated.matrix_world))  # instances have other levels
         placed.append(
-            renderer.PlacedSplats(
-                cloud.session_uid, read, *placement, version, choice, is_empty, instance.looks
-            )
+            renderer.PlacedSplats(cloud.session_uid, read, *placement, version, choice, is_empty, **after)
         )
     return placed
+
+
+def _motion_of(
+    identity: tuple[int, int], matrix: np.ndarray, motion: Sequence[MotionKey]
+) -> tuple[np.ndarray, ...]:
+    """Return the matrices of an instance while the shutter is open; none if it does not move in the image."""
+    if not all(identity in key.matrices for key in motion):
+        return ()  # created while the shutter is open
+    matrices = tuple(
+        key.matrices[identity] if key.deformation is None else key.deformation @ key.matrices[identity]
+        for key in motion
+    )
+    return () if all(np.array_equal(key, matrix) for key in matrices) else matrices
 
 
 def _is_selected_by_rule(instance: shown.SplatInstance, depsgraph: bpy.types.Depsgraph) -> bool:

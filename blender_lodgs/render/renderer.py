@@ -27,6 +27,7 @@ from ...training.editing.look import Looks, looks_as_dicts
 from ...training.errors import LodgsError, system_reason
 from ...training.lod.query import LodQuery
 from ...training.render import wire
+from ...training.render.lens import SHARP, Aperture, LensProjection
 from ...training.scenes.cameras import Camera, camera_to_dict
 from ...training.splats.gaussians import Splats
 from .. import extension
@@ -72,6 +73,7 @@ class PlacedSplats:
         choice: arguments of the rule that selects splats, or None to draw all.
         empty: whether no splat is visible. Empty sets are not read before they become visible.
         looks: adjustments of colours and opacities.
+        motion: the matrix at equal intervals of the shutter time; empty for splats at rest.
     """
 
     key: int
@@ -83,6 +85,7 @@ class PlacedSplats:
     choice: LodQuery | None = None
     empty: bool = False
     looks: Looks = ()
+    motion: tuple[np.ndarray, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -95,6 +98,7 @@ class PlacedFile:
         antialias: see :class:`PlacedSplats`.
         choice: see :class:`PlacedSplats`.
         looks: see :class:`PlacedSplats`.
+        motion: see :class:`PlacedSplats`.
     """
 
     path: Path
@@ -102,6 +106,33 @@ class PlacedFile:
     antialias: bool
     choice: LodQuery
     looks: Looks = ()
+    motion: tuple[np.ndarray, ...] = ()
+
+
+@dataclass(frozen=True)
+class FrameLens:
+    """Lens and samples of a frame, see ``training.render.blur``.
+
+    Attributes:
+        projection: projection of the camera.
+        aperture: opening of the lens, or None for a pinhole.
+        cameras: the camera at equal intervals of the shutter time; empty for a camera at rest.
+        samples: number of averaged images.
+    """
+
+    projection: LensProjection = SHARP
+    aperture: Aperture | None = None
+    cameras: tuple[Camera, ...] = ()
+    samples: int = 1
+
+    def as_dict(self, near: float) -> dict:
+        """Return the keys of a request."""
+        return {
+            "projection": self.projection.as_dict(),
+            "aperture": self.aperture and self.aperture.as_dict(),
+            "cameras": [camera_to_dict(camera, near) for camera in self.cameras],
+            "samples": self.samples,
+        }
 
 
 class _SentSet(NamedTuple):
@@ -162,6 +193,7 @@ class Renderer:
         photograph: Path | None = None,
         mask: Path | None = None,
         holdout: Path | None = None,
+        lens: FrameLens = FrameLens(),
     ) -> RenderedFrame | None:
         """Render a frame.
 
@@ -177,6 +209,7 @@ class Renderer:
             photograph: photo to compare with.
             mask: image that is black where the comparison ignores pixels.
             holdout: EXR file with the depth of objects that occlude splats.
+            lens: lens and samples.
 
         Returns:
             The frame, or None if it was cancelled.
@@ -194,7 +227,7 @@ class Renderer:
                 frame=frame, out=out.name, sets=described, camera=camera_to_dict(camera, near),
                 background=background, depth=depth, levels=levels, window=window,
                 photograph=str(photograph) if photograph else None, mask=str(mask) if mask else None,
-                holdout=str(holdout) if holdout else None,
+                holdout=str(holdout) if holdout else None, **lens.as_dict(near),
             )  # fmt: skip
             response = self._wait(frame, on_progress)
             self._remove_files(previous, all_read=response["event"] == "frame")
@@ -259,6 +292,7 @@ class Renderer:
                     {
                         "paged": str(item.path), "matrix": item.matrix.tolist(), "antialias": item.antialias,
                         "choice": item.choice.as_dict(), "looks": looks_as_dicts(item.looks),
+                        "motion": [matrix.tolist() for matrix in item.motion],
                     }
                 )  # fmt: skip
                 continue
@@ -273,6 +307,7 @@ class Renderer:
                     "matrix": item.matrix.tolist(), "level": item.level, "antialias": item.antialias,
                     "choice": None if item.choice is None else item.choice.as_dict(),
                     "looks": looks_as_dicts(item.looks),
+                    "motion": [matrix.tolist() for matrix in item.motion],
                 }
             )  # fmt: skip
         self._sent = sent

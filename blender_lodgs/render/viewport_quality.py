@@ -5,7 +5,7 @@ These renders need no trainer. They use Blender's render pipeline and the same d
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -39,6 +39,8 @@ def render(context: bpy.types.Context) -> bpy.types.Image:
     scene = context.scene
     scene_camera(scene)
     _require_graphics()
+    if scene.camera.data.type == "PANO":
+        raise LodgsError("Cannot render a panorama in viewport quality.", "Press Render Image.")
     if scene.lodgs_render.holdout:
         raise LodgsError(
             "Cannot render a mesh holdout in viewport quality.", "Clear Hold Out, or press Render Image."
@@ -115,8 +117,9 @@ def _render_frame(
     window: tuple[int, int, int, int],
     on_progress: renderer.OnProgress,
     camera: RenderView | None = None,
+    motion: Sequence[engine.MotionKey] = (),
 ) -> renderer.RenderedFrame:
-    """Render like ``engine.render_frame``, but only colour and alpha."""
+    """Render like ``engine.render_frame``, but only colour and alpha, and without blur."""
     scene = depsgraph.scene
     settings = scene.render
     camera = camera or RenderView.of(scene_camera(scene).evaluated_get(depsgraph))

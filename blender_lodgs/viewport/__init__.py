@@ -101,11 +101,18 @@ def _on_file(*_) -> None:
 
 @bpy.app.handlers.persistent
 def _on_load(*_) -> None:
+    _on_undo()
+    views.clear()
+
+
+@bpy.app.handlers.persistent
+def _on_undo(*_) -> None:
+    """Forget what belongs to datablocks. Viewports draw the previous splats until the new ones are read."""
     global problem
     problem = ""
     coverage.clear()
     discs.clear()
-    views.clear()
+    views.forget_datablocks()
     view_camera.clear()
 
 
@@ -116,8 +123,9 @@ def register() -> None:
     handlers = bpy.app.handlers
     for changes in (handlers.depsgraph_update_post, handlers.frame_change_post):
         changes.append(_on_update)
-    for changes in (handlers.load_post, handlers.undo_post, handlers.redo_post):
-        changes.append(_on_load)
+    handlers.load_post.append(_on_load)
+    for changes in (handlers.undo_post, handlers.redo_post):
+        changes.append(_on_undo)
     handlers.load_pre.append(_on_file)
 
 
@@ -128,8 +136,9 @@ def unregister() -> None:
     handlers = bpy.app.handlers
     for changes in (handlers.depsgraph_update_post, handlers.frame_change_post):
         changes.remove(_on_update)
-    for changes in (handlers.load_post, handlers.undo_post, handlers.redo_post):
-        changes.remove(_on_load)
+    handlers.load_post.remove(_on_load)
+    for changes in (handlers.undo_post, handlers.redo_post):
+        changes.remove(_on_undo)
     handlers.load_pre.remove(_on_file)
     _on_load()
     shaders.clear()

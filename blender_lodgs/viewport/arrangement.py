@@ -177,15 +177,20 @@ class Request:
         placements: coarse levels first.
         backward: direction opposite to the view direction, in the world.
         budget: maximum number of splats.
+        position: position of the view in the world, from which splats beyond the budget are ranked; None if
+            all splats fit.
     """
 
     placements: tuple[Placement, ...]
     backward: tuple[float, float, float]
     budget: int
+    position: tuple[float, float, float] | None = None
 
     @property
     def selection_key(self) -> tuple:
         """The values that determine the selected splats, independent of their order."""
+        if self.position is not None:
+            return self.budget, self.position, *self.placements
         return self.budget, *(replace(placement, matrix=b"") for placement in self.placements)
 
 
@@ -250,7 +255,7 @@ def stable_argsort(values: np.ndarray) -> np.ndarray:
 
 
 def _collect(pool: Pool, request: Request) -> DrawnSplats:
-    selections, excluded = within_budget(pool, request.placements, request.budget)
+    selections, excluded = within_budget(pool, request.placements, request.budget, request.position)
     table = np.empty((sum(len(index) for index, _ in selections), 4), np.float32)
     means: list[np.ndarray] = []
     begin = 0
@@ -265,13 +270,19 @@ def _collect(pool: Pool, request: Request) -> DrawnSplats:
 
 
 def within_budget(
-    pool: Pool, placements: Sequence[Placement], budget: int
+    pool: Pool,
+    placements: Sequence[Placement],
+    budget: int,
+    position: tuple[float, float, float] | None = None,
 ) -> tuple[list[tuple[np.ndarray, np.ndarray]], int]:
     """Select the splats of placements within a budget.
 
     If there are too many, the scene that draws the most splats takes the next coarser query of its rule,
     repeatedly. If no rule can get coarser, the least visible splats are excluded; for levels that add up,
     those of the finest level first.
+
+    Args:
+        position: see :class:`Request`; None ranks splats by their size in the world.
 
     Returns:
         Index and weights of each placement's splats, and the number of excluded splats.
@@ -299,7 +310,7 @@ def within_budget(
         ]  # fmt: skip
         numbers = [max(adding, key=lambda i: placements[i].level)] if adding else range(len(placements))
         candidates = sum(len(selections[i][0]) for i in numbers)
-        _thin(pool, placements, selections, numbers, max(candidates - (total - budget), 0))
+        _thin(pool, placements, selections, numbers, max(candidates - (total - budget), 0), position)
         total = sum(len(index) for index, _ in selections)
     return selections, full_count - sum(len(index) for index, _ in selections)
 
@@ -338,13 +349,24 @@ def _thin(
     selections: list[tuple[np.ndarray, np.ndarray]],
     numbers: Sequence[int],
     keep: int,
+    position: tuple[float, float, float] | None,
 ) -> None:
-    """Keep the ``keep`` most visible splats (opacity times area) of the placements with these numbers."""
+    """Keep the ``keep`` most visible splats (opacity times area in the image) of these placements.
+
+    The direction of the view does not count, so that a turned view is complete.
+    """
     visibility = []
     for i in numbers:
         index, weight = selections[i]
         rows = index + placements[i].first
-        visibility.append(pool.opacities[rows] * weight * pool.areas[rows])
+        world = placements[i].world
+        areas = pool.areas[rows] * np.float32(abs(np.linalg.det(world[:3, :3])) ** (2 / 3))
+        visible = pool.opacities[rows] * weight * areas
+        if position is not None:
+            offsets = pool.means[rows] @ world[:3, :3].T.astype(np.float32)
+            offsets += (world[:3, 3] - position).astype(np.float32)
+            visible /= np.maximum(np.einsum("ij,ij->i", offsets, offsets), areas)
+        visibility.append(visible)
     values = np.concatenate(visibility)
     stays = np.zeros(len(values), bool)
     if keep:

@@ -12,7 +12,7 @@ from ...training.lod.rule import HIDDEN, OPACITY
 from .. import attributes
 from ..data import cleaning, crops, shown
 from ..data.placement import axes_of
-from . import views
+from . import view_camera
 
 
 class StrokeTarget:
@@ -51,7 +51,7 @@ class StrokeTarget:
             reach = 2 * scales.max(axis=1, initial=0)
             self._levels[item.number] = projected, reach, editable, middle_scale(scales)
             if (instance := instances.get(obj)) is not None:
-                query = views.view_query(instance, depsgraph)
+                query = view_camera.view_query(instance, depsgraph)
                 occluders.append((projected, scales, _visible_opacities(cloud, means, query)))
         self._front = OcclusionDepth(occluders)
 

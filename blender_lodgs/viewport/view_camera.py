@@ -9,12 +9,14 @@ millions of splats, follow when the view rests; if points are displayed, they fo
 from __future__ import annotations
 
 import time
+from dataclasses import replace
+from math import inf
 
 import bpy
 import numpy as np
 from mathutils import Matrix, Vector
 
-from ..data import roots, selection
+from ..data import roots, selection, shown
 from ..data.placement import axes_of
 
 Position = tuple[float, float, float]
@@ -114,6 +116,42 @@ def current_camera(scene: bpy.types.Scene, root: bpy.types.Object) -> tuple[Posi
     _, position, focal_px = _pending
     local = axes_of(root).matrix_world.inverted_safe() @ Vector(position)
     return tuple(np.float32(local).tolist()), float(np.float32(focal_px))  # rounded like the properties
+
+
+def view_query(
+    instance: shown.SplatInstance, depsgraph: bpy.types.Depsgraph, moving: bool = True
+) -> selection.LodQuery | None:
+    """Return the query of an instance's splats for the current camera; None if all are drawn.
+
+    Args:
+        moving: see ``views.prepare``.
+    """
+    if not selection.only_lodgs_modifiers(instance.evaluated, depsgraph):
+        return None
+    if not moving:
+        return shown.camera_query(instance, depsgraph)
+    query = selection.evaluated_query(instance.evaluated, depsgraph)
+    root = roots.root_of(instance.object)
+    camera = current_camera(depsgraph.scene, root) if root is not None else None
+    if query is not None and query.rule and camera is not None:
+        query = replace(query, position=camera[0], focal_px=camera[1])
+    return query and shown.at_instance(query, instance)
+
+
+def nearest_streamed(
+    instances: list[shown.SplatInstance], depsgraph: bpy.types.Depsgraph, moving: bool
+) -> list[tuple[shown.SplatInstance, selection.LodQuery | None]]:
+    """Return the nearest instance of each streamed scene with its query; it needs the finest pages."""
+    nearest: dict[int, tuple[float, shown.SplatInstance, selection.LodQuery | None]] = {}
+    for instance in shown.drop_streamed_levels(instances):
+        if instance.source is None:
+            continue
+        query = view_query(instance, depsgraph, moving)
+        centre = np.mean(instance.object.bound_box, axis=0)
+        distance = inf if query is None else float(np.linalg.norm(np.subtract(query.position, centre)))
+        if instance.source.scene not in nearest or distance < nearest[instance.source.scene][0]:
+            nearest[instance.source.scene] = distance, instance, query
+    return [(instance, query) for _, instance, query in nearest.values()]
 
 
 def store_view(scene: bpy.types.Scene, position: Position, focal_px: float) -> None:

@@ -46,6 +46,7 @@ class ViewState:
         resolution: resolution of the splats relative to the viewport.
         selected: drawn selection, see ``resident.Resident``.
         shows_selection: draw selected splats in the selection colour.
+        stated_counts: numbers of splats that header and panel state, see ``views.reduced_counts``.
     """
 
     canvas: splats.Canvas = field(default_factory=splats.Canvas)
@@ -64,6 +65,7 @@ class ViewState:
     resolution: float = 1.0
     selected: np.ndarray | None = None
     shows_selection: bool = False
+    stated_counts: tuple[int, int] | None = None
 
     def reset(self) -> None:
         """Draw nothing from now on."""

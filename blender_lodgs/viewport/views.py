@@ -85,6 +85,11 @@ def draw(context: bpy.types.Context) -> None:
         under_overlays=space.overlay.show_overlays and not _shows_photo(camera),
         frame=frame,
     )  # fmt: skip
+    if (counts := reduced_counts(region)) != view.stated_counts:
+        view.stated_counts = counts
+        for other in context.area.regions:
+            if other.type in ("HEADER", "UI"):
+                other.tag_redraw()
     if _is_loading(view) or view.pending is not None or view.resolution < 1 or _is_streaming():
         _wake_later()
 
@@ -179,6 +184,8 @@ def prepare(
     arrived = _arrived()
     placements = _placements(instances, source, depsgraph, moving, update)
     request = replace(empty, placements=placements)
+    if sum(placement.count for placement in placements) > budget:
+        request = replace(request, position=tuple(view_matrix.inverted().translation))
     is_requested = _arrange(view, source, request, wait, update)
     if view.arrived != NOT_REQUESTED:  # an older value makes the view redraw
         view.arrived = arrived if update and is_requested else previous_arrived
@@ -190,9 +197,19 @@ def prepare(
     return request
 
 
-def excluded_count() -> int:
-    """Return the largest number of splats that the budget excluded in a viewport at its last redraw."""
-    return max((view.arrangement.excluded for view in _views.values() if view.arrangement), default=0)
+def reduced_counts(region: bpy.types.Region | None = None) -> tuple[int, int] | None:
+    """Return the number of drawn splats, and of those without the budget, of a viewport at its last redraw.
+
+    Args:
+        region: region of a viewport; None for the viewport from which the budget excludes the most splats.
+
+    Returns:
+        None if the budget excludes no splats.
+    """
+    views = _views.values() if region is None else filter(None, [_views.get(region.as_pointer())])
+    arrangements = [view.arrangement for view in views if view.arrangement]
+    most = max(arrangements, key=lambda arrangement: arrangement.excluded, default=None)
+    return (most.count, most.count + most.excluded) if most is not None and most.excluded else None
 
 
 def stream(root: bpy.types.Object) -> Stream | None:
@@ -213,15 +230,14 @@ def _with_streams(
     Request the pages that the camera needs, and start missing streams.
     """
     ready = []
-    for instance in shown.drop_streamed_levels(instances):
-        if (source := instance.source) is None:
-            continue
+    for instance, query in view_camera.nearest_streamed(instances, depsgraph, moving):
+        source = instance.source
+        assert source is not None
         current = _streams.get(source.scene)
         if current is None or current.source != source:
             if current is not None:
                 current.stop()
             current = _streams[source.scene] = Stream(source)
-        query = view_query(instance, depsgraph, moving)
         if query is not None and not (current.problem and not current.ready):
             current.request(query, _direction(instance, query, view_matrix))
             while wait and current.busy and not current.problem:
@@ -350,7 +366,7 @@ def _placements(
                 count=source.counts[number],
                 matrix=instance.matrix_world.tobytes(),
                 level=instance.level,
-                query=view_query(instance, depsgraph, moving),
+                query=view_camera.view_query(instance, depsgraph, moving),
                 scene=(root or instance.object).session_uid,
                 colors=root.lodgs.colors if root else "OWN",
                 antialias=instance.antialias,
@@ -359,26 +375,6 @@ def _placements(
             )
         )
     return tuple(placements)
-
-
-def view_query(
-    instance: shown.SplatInstance, depsgraph: bpy.types.Depsgraph, moving: bool = True
-) -> selection.LodQuery | None:
-    """Return the query of an instance's splats for the current camera; None if all are drawn.
-
-    Args:
-        moving: see :func:`prepare`.
-    """
-    if not _is_unmodified(instance, depsgraph):
-        return None
-    if not moving:
-        return shown.camera_query(instance, depsgraph)
-    query = selection.evaluated_query(instance.evaluated, depsgraph)
-    root = roots.root_of(instance.object)
-    camera = view_camera.current_camera(depsgraph.scene, root) if root is not None else None
-    if query is None or not query.rule or camera is None:
-        return query
-    return replace(query, position=camera[0], focal_px=camera[1])
 
 
 def _arrange(view: ViewState, source: Resident, request: Request, wait: bool, update: bool) -> bool:
@@ -464,6 +460,12 @@ def clear() -> None:
     _views.clear()
     active_views.clear()
     _resident, _versions, _reader = None, {}, None
+
+
+def forget_datablocks() -> None:
+    """Drop references to point clouds, which an undo replaces. All splats are read again."""
+    global _reader
+    _reader = None
 
 
 def close_streams(keep: Collection[int] = ()) -> None:

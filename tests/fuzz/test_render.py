@@ -14,8 +14,10 @@ from tests.fuzz.mutations import corrupted, corrupted_value
 from training.editing.look import Look, looks_as_dicts
 from training.lod.crop import Crop
 from training.render import wire
+from training.render.blur import Blur, draw_blurred
+from training.render.lens import ORTHOGRAPHIC, Aperture, LensProjection
 from training.render.requests import FrameRequest, parse_line, parse_request
-from training.render.scene import Instance, SplatSet, draw
+from training.render.scene import Instance, SplatSet
 from training.scenes.cameras import MAX_PIXELS, Camera, camera_to_dict
 from training.splats.dialects import drop_undrawable
 from training.splats.gaussians import Splats
@@ -28,7 +30,13 @@ REQUEST = {
     "frame": 7, "out": "frame-7", "background": [0.1, 0.2, 0.3], "depth": True, "levels": True,
     "camera": camera_to_dict(Camera("", 32, 24, 30.0, 30.0, 16.0, 12.0, POSE), 0.1),
     "window": [2, 3, 20, 16], "photograph": None, "mask": None, "holdout": None,
-    "sets": [ONE | {"looks": LOOKS}, ONE | {"matrix": np.eye(4).tolist(), "level": 0}],
+    "sets": [
+        ONE | {"looks": LOOKS, "motion": [np.eye(4).tolist(), np.diag([1.0, 2.0, 1.0, 1.0]).tolist()]},
+        ONE | {"matrix": np.eye(4).tolist(), "level": 0},
+    ],
+    "projection": LensProjection(ORTHOGRAPHIC, 4.0).as_dict(), "samples": 2,
+    "aperture": Aperture(0.1, 3.0, 5, 0.2, 1.5).as_dict(),
+    "cameras": [camera_to_dict(Camera("", 32, 24, 30.0, 30.0, 16.0, 12.0, POSE), 0.1)] * 2,
 }  # fmt: skip
 
 
@@ -55,11 +63,14 @@ def render(request, splats: Splats) -> None:
         if width * height <= 10_000:
             splat_set = SplatSet(splats, backend="cpu")
             instances = [
-                Instance(splat_set, entry.matrix, entry.level, looks=entry.looks) for entry in request.sets
+                Instance(splat_set, entry.matrix, entry.level, looks=entry.looks, motion=entry.motion)
+                for entry in request.sets
             ]
-            image = draw(
-                instances, request.camera, near=request.near, background=request.background,
-                depth=request.depth, levels=request.levels, window=request.window, backend="cpu",
+            blur = Blur(min(request.samples, 3), request.aperture, request.cameras)
+            image = draw_blurred(
+                instances, request.camera, request.projection, blur, near=request.near,
+                background=request.background, depth=request.depth, levels=request.levels,
+                window=request.window, backend="cpu",
             )  # fmt: skip
             assert image is not None and image.alpha.shape == (height, width)
 

@@ -335,6 +335,14 @@ class Rule(ABC):
         """
         return None
 
+    def less_detail(self, values: Values, levels: Sequence[int]) -> Values | None:
+        """Return control values that draw coarser levels from nearer on, as an artist would set them.
+
+        Args:
+            levels: see :meth:`coarser`.
+        """
+        return self.coarser(values, levels)
+
     def raise_control(self, values: Values, name: str) -> Values | None:
         """Return the values with one control multiplied by STEP; None if that exceeds its range."""
         value = values[name] * STEP

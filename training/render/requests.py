@@ -16,6 +16,7 @@ from ..lod.crop import SHAPES, Crop
 from ..lod.query import LodQuery
 from ..lod.rule import NO_RULE, Rule, fact_names, find_rule
 from ..scenes.cameras import MAX_COORDINATE, Camera, camera_from_dict, check_render_size
+from .lens import MAX_SAMPLES, PROJECTIONS, SHARP, Aperture, LensProjection
 
 MAX_BACKGROUND = 1e6
 """Maximum component of a background colour."""
@@ -29,6 +30,9 @@ MAX_COLUMNS = 32
 MAX_ROWS = 4096
 """Maximum number of rows of a table."""
 MAX_CROPS = 256
+MAX_KEYS = 64
+"""Maximum number of times at which a frame gives moving cameras and sets."""
+MAX_BLADES = 256
 
 _NAME = re.compile(r"[\w-][\w.-]{0,99}", re.ASCII)
 
@@ -54,6 +58,7 @@ class SetRequest:
         query: rule and arguments that weight the splats in addition to the file's weights, or None.
         paged: path of a bundle of which only the splats that the query selects are read; or None.
         looks: see ``scene.Instance``.
+        motion: see ``scene.Instance``.
     """
 
     file: str
@@ -65,11 +70,12 @@ class SetRequest:
     query: LodQuery | None = None
     paged: Path | None = None
     looks: Looks = ()
+    motion: tuple[np.ndarray, ...] = ()
 
 
 @dataclass(frozen=True)
 class FrameRequest:
-    """A request for an image: the arguments of ``scene.draw``, and those below.
+    """A request for an image: the arguments of ``blur.draw_blurred``, and those below.
 
     Attributes:
         frame: number of the frame.
@@ -77,6 +83,7 @@ class FrameRequest:
         photograph: photo to compare with, or None.
         mask: image that excludes black pixels from the comparison, or None.
         holdout: EXR with depths of meshes, or None.
+        samples, aperture, cameras: see ``blur.Blur``.
     """
 
     frame: int
@@ -91,6 +98,16 @@ class FrameRequest:
     mask: Path | None
     holdout: Path | None
     sets: list[SetRequest]
+    projection: LensProjection = SHARP
+    samples: int = 1
+    aperture: Aperture | None = None
+    cameras: tuple[Camera, ...] = ()
+
+    @property
+    def is_one_view(self) -> bool:
+        """Return whether the image is what the camera sees as a pinhole at one time."""
+        moves = self.cameras or any(item.motion for item in self.sets)
+        return self.projection == SHARP and self.aperture is None and not moves
 
 
 def frame_number(values: dict) -> int | None:
@@ -139,18 +156,55 @@ def parse_request(values: dict) -> FrameRequest | CancelRequest:
         mask=_path(values, "mask"),
         holdout=_path(values, "holdout"),
         sets=[_set(item) for item in _typed(values, "sets", list)],
+        projection=_projection(values),
+        samples=_integer({"samples": 1} | values, "samples", 1, MAX_SAMPLES),
+        aperture=_aperture(values),
+        cameras=_cameras(values),
     )
+
+
+def _keys(values: dict, key: str) -> list:
+    """Return the values of the times at which something moves; none for something at rest."""
+    items = _typed({key: []} | values, key, list)
+    if len(items) > MAX_KEYS:
+        raise _invalid(key, f"{len(items)} items")
+    return items
+
+
+def _cameras(values: dict) -> tuple[Camera, ...]:
+    items = [_typed({"cameras": item}, "cameras", dict) for item in _keys(values, "cameras")]
+    return tuple(camera_from_dict(item)[0] for item in items)
+
+
+def _projection(values: dict) -> LensProjection:
+    item = _typed({"projection": SHARP.as_dict()} | values, "projection", dict)
+    (distance,) = _numbers({"distance": [item.get("distance")]}, "distance", 1, MAX_COORDINATE)
+    west, east = _numbers({"longitude": _pair(item, "longitude")}, "longitude", 2, 7)
+    south, north = _numbers({"latitude": _pair(item, "latitude")}, "latitude", 2, 7)
+    if item.get("kind") not in PROJECTIONS or not (distance > 0 and west < east and south < north):
+        raise _invalid("projection", item)
+    return LensProjection(item["kind"], distance, (west, east), (south, north))
+
+
+def _pair(values: dict, key: str) -> list:
+    return list(values[key]) if isinstance(values.get(key), list | tuple) else []
+
+
+def _aperture(values: dict) -> Aperture | None:
+    if values.get("aperture") is None:
+        return None
+    item = _typed(values, "aperture", dict)
+    names = "radius", "focus", "rotation", "ratio"
+    numbers = _numbers({"aperture": [item.get(name) for name in names]}, "aperture", 4, MAX_COORDINATE)
+    radius, focus, rotation, ratio = numbers
+    if not (radius >= 0 and focus > 0 and ratio > 0):
+        raise _invalid("aperture", item)
+    return Aperture(radius, focus, _integer(item, "blades", 0, MAX_BLADES), rotation, ratio)
 
 
 def _set(values: Any) -> SetRequest:
     if not isinstance(values, dict):
         raise _invalid("sets", values)
-    matrix = np.array(_typed(values, "matrix", list), object)
-    if matrix.shape != (4, 4):
-        raise _invalid("matrix", values["matrix"])
-    matrix = np.reshape(_numbers({"matrix": matrix.ravel().tolist()}, "matrix", 16, MAX_COORDINATE), (4, 4))
-    if matrix[3].tolist() != [0, 0, 0, 1]:
-        raise _invalid("matrix", values["matrix"])
     paged = _path(values, "paged")
     query = _query(_typed(values, "choice", dict)) if values.get("choice") is not None else None
     if paged is not None and (query is None or query.resolved_rule.paged_file is None):
@@ -158,14 +212,25 @@ def _set(values: Any) -> SetRequest:
     return SetRequest(
         file="" if paged else _name(values, "file"),
         count=0 if paged else _integer(values, "count", 0, MAX_SPLATS),
-        matrix=matrix,
+        matrix=_matrix(values),
         level=0 if paged else _integer(values, "level", 0, MAX_LEVEL_NUMBER),
         antialias=bool(values.get("antialias")),
         columns=_columns(values),
         query=query,
         paged=paged,
         looks=_looks(values),
+        motion=tuple(_matrix({"matrix": item}) for item in _keys(values, "motion")),
     )
+
+
+def _matrix(values: dict) -> np.ndarray:
+    matrix = np.array(_typed(values, "matrix", list), object)
+    if matrix.shape != (4, 4):
+        raise _invalid("matrix", values["matrix"])
+    matrix = np.reshape(_numbers({"matrix": matrix.ravel().tolist()}, "matrix", 16, MAX_COORDINATE), (4, 4))
+    if matrix[3].tolist() != [0, 0, 0, 1]:
+        raise _invalid("matrix", values["matrix"])
+    return matrix
 
 
 def _columns(values: dict) -> tuple[str, ...]:

@@ -15,6 +15,7 @@ from ..editing.look import Looks
 from ..errors import LodgsError, is_out_of_memory
 from ..lod.query import LodQuery
 from ..rasterize import Gaussians, Rendering, rasterize_strips
+from ..rasterize.features import rotation_matrices
 from ..rasterize.resident import SplatSet, WeightedSet, combine_visible
 from ..scenes.cameras import Camera, check_render_size
 from ..splats.sh import basis, degree_from_count
@@ -39,6 +40,7 @@ class Instance:
         antialias: see ``Bundle.antialias``.
         query: rule and arguments that weight the splats in addition to the set's own weights, or None.
         looks: changes of colours and opacities, in the set's coordinates.
+        motion: the matrix at equal intervals of the shutter time (``blur``); empty for a set at rest.
     """
 
     splats: SplatSet
@@ -47,6 +49,7 @@ class Instance:
     antialias: bool = False
     query: LodQuery | None = None
     looks: Looks = ()
+    motion: tuple[np.ndarray, ...] = ()
 
 
 @dataclass
@@ -82,6 +85,7 @@ def draw(
     levels: bool = False,
     window: tuple[int, int, int, int] | None = None,
     limit: np.ndarray | None = None,
+    orthographic: float | None = None,
     backend: str = "auto",
     progress: Callable[[float], bool] = lambda share: True,
 ) -> RenderedImage | None:
@@ -98,6 +102,8 @@ def draw(
         window: left, top, width and height of the part of the image to draw in pixels; None: all.
         limit: (H, W) of the window, depth of meshes along the camera's z axis in the world, or NO_DEPTH;
             splats and background behind it are held out.
+        orthographic: depth at which an orthographic camera and the pinhole camera show the same scale; None
+            for a pinhole camera.
         backend: rasterizer backend.
         progress: receives the completed share; returning False cancels.
 
@@ -124,7 +130,11 @@ def draw(
             replace(instance, splats=instance.splats.with_looks(instance.looks)) for instance in instances
         ]
         options = {"background": back_color, "window": window, "backend": backend}
-        completed = _draw_strips(image, instances, camera, near, limit, progress, options)
+        if orthographic is None:
+            frame = _common_frame(instances, camera, near)
+        else:
+            frame = _orthographic_frame(instances, camera, near, orthographic)
+        completed = _draw_strips(image, instances, frame, limit, progress, options)
     return image if completed else None
 
 
@@ -146,14 +156,12 @@ def _memory_errors(instances: Sequence[Instance], width: int, height: int) -> It
 def _draw_strips(
     image: RenderedImage,
     instances: list[Instance],
-    camera: Camera,
-    near: float,
+    frame: _Frame,
     limit: np.ndarray | None,
     progress: Callable[[float], bool],
     options: dict[str, Any],
 ) -> bool:
     """Draw an image strip by strip. Return False if ``progress`` cancels it."""
-    frame = _common_frame(instances, camera, near)
     counts = torch.tensor(frame.counts, device=frame.gaussians.means.device)
     for top, strip in rasterize_strips(
         frame.gaussians, frame.camera, rows=frame.rows, weights=frame.weights, near=frame.near,
@@ -226,11 +234,61 @@ def _to_world(instance: Instance, camera: Camera, rows: torch.Tensor) -> Gaussia
     means, sh = own.means[rows], own.sh[rows]
     position = np.linalg.solve(instance.matrix, np.append(camera.center, 1.0))[:3]
     directions = normalize(means - torch.as_tensor(position).to(means), dim=1)
+    return replace(transformed, sh=_colors(sh, directions))
+
+
+def _colors(sh: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
+    """Evaluate harmonics (M, K, 3) in unit directions (M, 3). Return colours (M, 3)."""
     values: list = [None] * sh.shape[1]
     x, y, z = directions.unbind(1)
     basis(x, y, z, degree_from_count(len(values)), values)
-    colors = (0.5 + torch.einsum("kn,nkc->nc", torch.stack(values), sh)).clamp_min(0)
-    return replace(transformed, sh=colors)
+    return (0.5 + torch.einsum("kn,nkc->nc", torch.stack(values), sh)).clamp_min(0)
+
+
+def _orthographic_frame(instances: list[Instance], camera: Camera, near: float, distance: float) -> _Frame:
+    """Move all splats so that the pinhole camera sees the image of the orthographic camera.
+
+    Splats become flat and face the camera. Their projection onto the image plane, depth and colour are exact.
+    """
+    parts, part_weights = [], []
+    for instance in instances:
+        rows, weights = instance.splats.select_visible(instance.query)
+        part, visible = _to_orthographic(instance, camera, torch.from_numpy(rows).long(), near, distance)
+        parts.append(part)
+        part_weights.append(torch.from_numpy(weights).to(part.means)[visible])
+    counts = list(map(len, parts))
+    camera = replace(camera, world_to_camera=np.eye(4))
+    return _Frame(Gaussians.concatenated(parts), None, torch.cat(part_weights), counts, camera, near, 1.0)
+
+
+def _to_orthographic(
+    instance: Instance, camera: Camera, rows: torch.Tensor, near: float, distance: float
+) -> tuple[Gaussians, torch.Tensor]:
+    """Return the flat splats of rows (M,) of a set that lie behind the near plane, and their mask (M,)."""
+    own = instance.splats.gaussians
+    own = own.select(rows.to(own.means.device))
+    to_camera = torch.from_numpy(camera.world_to_camera @ instance.matrix).to(own.means.device)
+    positions = own.means.double() @ to_camera[:3, :3].T + to_camera[:3, 3]
+    visible = positions[:, 2] > near
+    own, positions = own.select(visible), positions[visible]
+    axes = to_camera[:2, :3] @ rotation_matrices(own.quats.double()) * own.log_scales.double().exp()[:, None]
+    covariance = axes @ axes.mT
+    a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    radius = torch.hypot((a - c) / 2, b)
+    variances = torch.stack([(a + c) / 2 + radius, (a + c) / 2 - radius], 1).clamp_min(1e-60)
+    half_angle = torch.atan2(2 * b, a - c) / 4
+    zero = torch.zeros_like(half_angle)
+    share = positions[:, 2:] / distance
+    lengths = torch.cat([variances.sqrt() * share, zero[:, None] + 1e-30], 1)
+    direction = np.linalg.solve(instance.matrix[:3, :3], camera.world_to_camera[2, :3])
+    directions = torch.from_numpy(direction / np.linalg.norm(direction)).to(own.means).expand(len(own), 3)
+    return replace(
+        own,
+        means=torch.cat([positions[:, :2] * share, positions[:, 2:]], 1).float(),
+        quats=torch.stack([half_angle.cos(), zero, zero, half_angle.sin()], 1).float(),
+        log_scales=lengths.log().float(),
+        sh=_colors(own.sh, directions),
+    ), visible
 
 
 def _antialias_flags(instances: list[Instance], counts: torch.Tensor) -> bool | torch.Tensor:

@@ -8,9 +8,12 @@ in it shows. The folder is removed when standard input ends, also if the other p
      "depth": true, "levels": true, "window": [left, top, width, height] or null,
      "photograph": PATH or null, "mask": PATH or null, "holdout": PATH or null,
      "sets": [{"file": NAME, "count": N, "matrix": 4x4, "level": 3,
-               "columns": [NAME, ...], "choice": {...} or null, "looks": [...]},
+               "columns": [NAME, ...], "choice": {...} or null, "looks": [...], "motion": [4x4, ...]},
               {"paged": PATH, "matrix": 4x4, "choice": {...}, "looks": [...]}, ...]}
     {"cancel": 7}
+
+Optional keys of a frame blur it or change the lens: ``projection`` and ``aperture`` (``lens``), ``samples``,
+and ``cameras``, the camera at equal intervals of the shutter time, like ``motion`` of a set.
 
 Answers to a frame are ``progress`` (frame, share) and ``warning`` (frame, message), then ``frame`` (frame,
 passes, height, width, seconds; the planes are in the file OUT), ``cancelled`` (frame) or ``error`` (frame,
@@ -54,9 +57,10 @@ from ..scenes.images import load_image, load_mask
 from ..splats.dialects import drop_undrawable
 from ..splats.similarity import is_similarity
 from . import wire
+from .blur import Blur, draw_blurred
 from .image import read_depth
 from .requests import CancelRequest, FrameRequest, SetRequest, frame_number, parse_line, parse_request
-from .scene import Instance, SplatSet, draw
+from .scene import Instance, SplatSet
 
 MAX_LINE_BYTES = 1 << 20
 """Maximum length of a request."""
@@ -156,8 +160,10 @@ class _Server:
             self.send("progress", frame=frame, share=round(share, 4))
             return frame not in self._cancelled
 
-        image = draw(
-            instances, camera, near=request.near, background=request.background, depth=request.depth,
+        blur = Blur(request.samples, request.aperture, request.cameras)
+        image = draw_blurred(
+            instances, camera, request.projection, blur,
+            near=request.near, background=request.background, depth=request.depth,
             levels=request.levels, window=window, limit=limit, backend=self._backend, progress=progress,
         )  # fmt: skip
         if image is None or frame in self._cancelled:
@@ -193,7 +199,7 @@ class _Server:
                 if key not in self._parts:
                     self._parts[key] = read()
                 instances += [
-                    Instance(splats, item.matrix, level, item.antialias, item.query, item.looks)
+                    Instance(splats, item.matrix, level, item.antialias, item.query, item.looks, item.motion)
                     for level, splats in self._parts[key]
                 ]
                 continue
@@ -203,7 +209,7 @@ class _Server:
                 sets[item.file] = self._read_set(frame, item) if loaded is None else loaded
             splats = sets[item.file]
             instances.append(
-                Instance(splats, item.matrix, item.level, item.antialias, item.query, item.looks)
+                Instance(splats, item.matrix, item.level, item.antialias, item.query, item.looks, item.motion)
             )
         self._sets = sets
         return instances
@@ -230,7 +236,7 @@ class _Server:
             self._files[path] = stamp, open_paged(path)
         file = self._files[path][1]
         camera, unit = None, 1.0
-        if is_similarity(item.matrix):
+        if request.is_one_view and is_similarity(item.matrix):
             camera, unit = request.camera.in_object_space(item.matrix)
         near = request.near / unit
         camera_key = None if camera is None else json.dumps(camera_to_dict(camera, near))

@@ -120,3 +120,21 @@ def test_only_one_module_resolves_paths():
     package = Path(__file__).parents[3] / "blender_lodgs"
     users = [path.name for path in package.rglob("*.py") if "path.abspath(" in path.read_text("utf-8")]
     assert sorted(users) == ["compositing.py", "paths.py"]  # the first only resolves the folder of the .blend
+
+
+@pytest.mark.parametrize("is_saved", [False, True])
+def test_appended_scenes_keep_their_paths(bpy, lodgs, saved, tmp_path, is_saved):
+    """The scene of another folder is appended to a file that is not saved yet, or saved elsewhere."""
+    expected = Path(bpy.path.abspath(saved.lodgs.training.run))
+    bpy.ops.wm.save_mainfile()
+    source, name = bpy.data.filepath, saved.name
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    if is_saved:
+        (tmp_path / "other" / "place").mkdir(parents=True)
+        bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "other" / "place" / "mine.blend"))
+    bpy.ops.wm.append(directory=f"{source}/Object/", filename=name)
+    appended = bpy.data.objects[name]
+    assert appended.library is None and appended.lodgs.is_root
+    run = appended.lodgs.training.run
+    assert lodgs("data.paths").absolute_path(run).resolve() == expected.resolve()
+    assert run.startswith("//") == is_saved and appended.lodgs.training.output == "/elsewhere"

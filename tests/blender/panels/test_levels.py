@@ -213,3 +213,44 @@ def test_state_of_streaming_is_shown(bpy, lodgs, draw, draw_panel, tmp_path, mon
     assert "By Distance" in " ".join(texts())
     bpy.data.objects.remove(root.lodgs.levels[0].object)
     assert "no longer match the file" in " ".join(texts())
+
+
+def test_by_distance_states_its_savings_and_offers_more(bpy, lodgs, draw):
+    """Two levels around the camera: the fine one reaches everywhere until the slider is raised."""
+    rng = np.random.default_rng(0)
+    scenes = lodgs("data.scenes")
+
+    def splats(count):
+        return Splats(
+            means=rng.uniform(-1, 1, (count, 3)).astype(np.float32),
+            quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+            log_scales=np.full((count, 3), -5, np.float32), opacity_logits=np.zeros(count, np.float32),
+            sh=np.zeros((count, 1, 3), np.float32),
+        )  # fmt: skip
+
+    camera = bpy.data.objects.new("eye", bpy.data.cameras.new("eye"))
+    bpy.context.scene.collection.objects.link(camera)
+    bpy.context.scene.camera = camera
+    with lodgs("data.importing").new_scene(bpy.context, "two") as root:
+        for number, count, s_min in ((1, 100, 0.01), (2, 1000, 0.0)):
+            scenes.set_level(root, Level(number, splats(count), {"s_min": s_min}))
+        scenes.set_bundle_facts(root, Bundle("flod", [], "bands"))
+    root.lodgs.mode, root.lodgs.bands.gamma = "SELECTIVE", 1
+    bpy.context.view_layer.update()
+    layout = draw()
+    assert "0% fewer than the finest level" in layout.texts and "lodgs.reduce_detail" in layout.operators
+    assert bpy.ops.lodgs.reduce_detail(share=0.4) == {"FINISHED"}
+    visible, _ = scenes.count_visible(bpy.context, root)
+    saved = 1 - visible / 1000
+    assert root.lodgs.bands.gamma > 2 and 0.4 <= saved < 0.8
+    layout = draw()
+    assert f"{saved:.0%} fewer than the finest level" in layout.texts
+    assert "lodgs.reduce_detail" not in layout.operators
+    camera.location = (0, 0, 1e-3)
+    root.lodgs.levels[0].object.scale = (1, 1, 1)
+    root.lodgs.bands.first = 2  # only the finest level is in use
+    bpy.context.view_layer.update()
+    gamma = root.lodgs.bands.gamma
+    with pytest.raises(RuntimeError, match="Cannot save splats"):
+        bpy.ops.lodgs.reduce_detail()
+    assert root.lodgs.bands.gamma == gamma

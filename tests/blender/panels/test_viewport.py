@@ -1,5 +1,7 @@
 """Errors while drawing the viewport: the panel shows them, and the next redraw tries again."""
 
+from types import SimpleNamespace
+
 import pytest
 
 
@@ -54,3 +56,34 @@ def test_an_aborted_draw_restores_the_gpu_state(bpy, lodgs, frame):
         gpu.state.active_framebuffer_get().clear(color=(0.25, 0.5, 1, 1))
 
     assert frame(8, break_off)[0, 0].tolist() == [0.25, 0.5, 1, 1]
+
+
+def test_panel_and_header_state_what_the_budget_leaves(bpy, lodgs, viewport, draw_panel, monkeypatch):
+    views = lodgs("viewport.views")
+    assert not any("budget" in text for text in draw_panel("viewport", "LODGS_PT_viewport").texts)
+    arrangement = SimpleNamespace(count=1_204_000, excluded=1_800_000)
+    monkeypatch.setattr(views, "_views", {7: SimpleNamespace(arrangement=arrangement)})
+    text = "1.2 M of 3.0 M splats (budget)"
+    assert text in draw_panel("viewport", "LODGS_PT_viewport").texts
+    region = SimpleNamespace(type="WINDOW", as_pointer=lambda: 7)
+    layout = SimpleNamespace(label=lambda text, icon: texts.append(text))
+    for regions, expected in (([region], [text]), ([], [])):
+        texts = []
+        context = SimpleNamespace(scene=bpy.context.scene, area=SimpleNamespace(regions=regions))
+        lodgs("panels.viewport")._header(SimpleNamespace(layout=layout), context)
+        assert texts == expected
+
+
+@pytest.mark.parametrize(
+    ("count", "text"),
+    [(999, "999"), (1000, "1.0 k"), (54_321, "54.3 k"), (999_600, "1.0 M"), (123_456_789, "123 M")],
+)
+def test_counts_are_short(lodgs, count, text):
+    assert lodgs("panels.parts").short_count(count) == text
+
+
+@pytest.mark.parametrize(("gigabytes", "budget"), [(2, 1_000_000), (16, 2_000_000), (500, 8_000_000)])
+def test_default_budget_follows_the_memory(lodgs, monkeypatch, gigabytes, budget):
+    properties = lodgs("data.properties")
+    monkeypatch.setattr(properties, "free_memory", lambda: gigabytes << 30)
+    assert properties.default_budget() == budget

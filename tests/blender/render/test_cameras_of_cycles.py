@@ -102,6 +102,30 @@ def several_cameras(bpy, scene):
     scene.collection.objects.link(other)
 
 
+def orthographic(bpy, scene):
+    data = scene.camera.data
+    data.type, data.ortho_scale, data.shift_x, data.shift_y = "ORTHO", 4.5, 0.1, -0.05
+    scene.render.pixel_aspect_y = 1.3
+
+
+def sheared_orthographic(bpy, scene):
+    shear(bpy, scene)
+    scene.camera.data.type, scene.camera.data.ortho_scale = "ORTHO", 4.5
+
+
+def panorama(bpy, scene):
+    scene.camera.data.type, scene.camera.data.panorama_type = "PANO", "EQUIRECTANGULAR"
+    scene.camera.location = (-0.8, 1.3, 0.9)
+    scene.render.resolution_x, scene.render.resolution_y = 240, 120
+
+
+def part_of_a_panorama(bpy, scene):
+    panorama(bpy, scene)
+    data = scene.camera.data
+    data.longitude_min, data.longitude_max = -1.2, 1.6
+    data.latitude_min, data.latitude_max = -1.0, 0.7
+
+
 def draw(bpy, engine, path: Path) -> dict[str, dict]:
     """Render with an engine. Return the centre of each mark in pixels, by file name."""
     scene = bpy.context.scene
@@ -125,11 +149,17 @@ def centres(bpy, path: Path) -> dict:
     places = {}
     for color in MARKS:
         rows, columns = np.nonzero(((values > 0.4) == np.array(color, bool)).all(-1))
-        places[color] = (columns.mean(), rows.mean()) if len(rows) else None
+        places[color] = (np.median(columns), np.median(rows)) if len(rows) else None
     return places
 
 
-@pytest.mark.parametrize("change", [None, shear, mirror, stereo, toe_in, several_cameras])
+@pytest.mark.parametrize(
+    "change",
+    [
+        None, shear, mirror, stereo, toe_in, several_cameras, orthographic, sheared_orthographic, panorama,
+        part_of_a_panorama,
+    ],
+)  # fmt: skip
 def test_splats_stand_where_cycles_draws_cubes(bpy, scene, root, tmp_path, change):
     if change:
         change(bpy, scene)
@@ -165,6 +195,90 @@ def test_viewport_quality_draws_the_same(bpy, lodgs, scene, root, tmp_path, chan
         for color, place in places.items():
             if place is not None:
                 assert drawn[name][color] == pytest.approx(place, abs=0.5), (name, color)
+
+
+def spread(bpy, engine, path: Path) -> np.ndarray:
+    """Render with an engine. Return the covariance (2, 2) in pixels of the light of the blue mark."""
+    scene = bpy.context.scene
+    scene.render.image_settings.file_format, scene.render.image_settings.color_depth = "OPEN_EXR", "32"
+    draw(bpy, engine, path)
+    (file,) = path.glob("*.exr")
+    image = bpy.data.images.load(str(file))
+    light = np.array(image.pixels[:], np.float32).reshape(image.size[1], image.size[0], 4)[..., 2]
+    bpy.data.images.remove(image)
+    rows, columns = np.mgrid[: light.shape[0], : light.shape[1]]
+    return np.cov(columns.ravel(), rows.ravel(), aweights=light.ravel(), bias=True)
+
+
+def blades(bpy, scene):
+    """The mark is 2 in front of the focus of a wide anamorphic lens with a triangular opening."""
+    dof = scene.camera.data.dof
+    dof.use_dof, dof.focus_distance, dof.aperture_fstop = True, 2.5, 0.05
+    dof.aperture_blades, dof.aperture_rotation, dof.aperture_ratio = 3, 0.4, 1.7
+
+
+def focus_on_object(bpy, scene):
+    blades(bpy, scene)
+    target = bpy.data.objects.new("target", None)
+    scene.collection.objects.link(target)
+    target.location = (-0.6, 1.6, 0.9)
+    scene.camera.data.dof.focus_object = target
+    scene.camera.data.dof.focus_distance, scene.camera.data.dof.aperture_fstop = 0.1, 0.03
+
+
+def focus(bpy, scene):
+    dof = scene.camera.data.dof
+    dof.use_dof, dof.focus_distance, dof.aperture_fstop = True, 2.5, 2.0
+
+
+def moving_marks(bpy, scene):
+    """Marks and splats turn and move while the shutter is open."""
+    scene.render.use_motion_blur, scene.render.motion_blur_shutter = True, 0.8
+    empty = bpy.data.objects.new("empty", None)
+    scene.collection.objects.link(empty)
+    for obj in [obj for obj in scene.objects if obj.type == "MESH"] + [bpy.data.objects["marks"]]:
+        obj.parent = empty
+    for frame, shift in ((0, -2.5), (2, 2.5)):
+        empty.location, empty.rotation_euler = (0, 0.2 * shift, 0.1 * shift), (0, 0, 0.2 * shift)
+        empty.keyframe_insert("location", frame=frame)
+        empty.keyframe_insert("rotation_euler", frame=frame)
+
+
+def moving_camera(bpy, scene):
+    for frame, shift in ((0, -0.6), (2, 0.6)):
+        scene.camera.location.z = 2 + shift
+        scene.camera.keyframe_insert("location", frame=frame)
+        scene.camera.data.lens = 50 - 15 * shift
+        scene.camera.data.keyframe_insert("lens", frame=frame)
+    scene.render.use_motion_blur, scene.render.motion_blur_position = True, "START"
+
+
+@pytest.mark.parametrize(
+    ("lens", "change"),
+    [
+        ("PERSP", blades), ("PERSP", focus_on_object), ("ORTHO", focus), ("PERSP", moving_marks),
+        ("PERSP", moving_camera),
+    ],
+)  # fmt: skip
+def test_light_is_spread_as_in_cycles(bpy, scene, root, tmp_path, lens, change):
+    """Blur adds the same covariance to the light of a mark in both engines."""
+    for obj in scene.objects:
+        if obj.type == "MESH":
+            obj.scale = (0.5,) * 3
+    scene.camera.data.type, scene.camera.data.ortho_scale = lens, 4.5
+    scene.cycles.samples, scene.lodgs_render.samples = 256, 100
+    scene.cycles.use_denoising = scene.cycles.use_adaptive_sampling = False
+    images = {}
+    for name in ("sharp", "blurred"):
+        if name == "blurred":
+            change(bpy, scene)
+        scene.frame_set(1)
+        images[name] = {
+            engine: spread(bpy, engine, tmp_path / name / engine) for engine in ("CYCLES", "LODGS")
+        }
+    cycles, ours = (images["blurred"][engine] - images["sharp"][engine] for engine in ("CYCLES", "LODGS"))
+    assert np.linalg.eigvalsh(cycles)[-1] > 3
+    np.testing.assert_allclose(ours, cycles, atol=0.05 * np.abs(cycles).max())
 
 
 def test_stereo_animation_in_viewport_quality_is_refused(bpy, lodgs, scene, root):

@@ -223,6 +223,27 @@ def test_two_sets_and_an_instance(bpy, lodgs, scene, bundle, tmp_path):
     assert drawn[:, 500:].sum() > alone[:, 500:].sum() + 1000
 
 
+def test_instances_take_the_detail_of_their_own_distance(bpy, lodgs, scene, tmp_path):
+    """An instance is rendered as the original in its place, although the original is far away."""
+    root = lodgs("data.roots").roots(scene)[0]
+    root.lodgs.mode, root.lodgs.bands.gamma = "SELECTIVE", 10
+    root.lodgs.freeze = False
+    expected = f12(bpy, tmp_path)
+    place = root.matrix_world.copy()
+    instance = bpy.data.objects.new("instance", None)
+    instance.instance_type, instance.instance_collection = "COLLECTION", root.users_collection[0]
+    scene.collection.objects.link(instance)
+    root.matrix_world = place.__class__.Translation((0, -40, 90)) @ place  # behind the camera, far away
+    bpy.context.view_layer.update()
+    instance.matrix_world = place @ root.matrix_world.inverted()
+    bpy.context.view_layer.update()
+    drawn = f12(bpy, tmp_path)
+    placed = lodgs("render.engine").placed_splats(bpy.context.evaluated_depsgraph_get())
+    assert len({tuple(np.round(item.choice.position, 2)) for item in placed}) == 2
+    assert bytes_of(expected).max() > 200
+    assert np.abs(bytes_of(drawn).astype(int) - bytes_of(expected)).max() <= 2
+
+
 def test_an_animation_starts_the_renderer_once(bpy, lodgs, scene, tmp_path, monkeypatch):
     renderer, started = lodgs("render.renderer"), []
     renderer.close()
@@ -435,8 +456,8 @@ def test_without_a_trainer_it_says_so(bpy, lodgs, scene, tmp_path, monkeypatch):
 
 
 def test_other_lenses_are_refused(bpy, scene):
-    scene.camera.data.type = "ORTHO"
-    with pytest.raises(RuntimeError, match="'camera' is ortho"):
+    scene.camera.data.type, scene.camera.data.panorama_type = "PANO", "FISHEYE_EQUISOLID"
+    with pytest.raises(RuntimeError, match="'camera' is a panoramic camera of the type Fisheye Equisolid"):
         bpy.ops.render.render()
 
 
@@ -803,3 +824,46 @@ def test_viewport_quality_refuses_to_hold_out(bpy, scene, frame, tmp_path):
     with pytest.raises(RuntimeError, match=r"mesh holdout.*Clear Hold Out"):
         bpy.ops.lodgs.render_quick()
     assert bpy.context.scene.render.engine == "LODGS" and bpy.context.scene.render.use_compositing
+
+
+def test_panel_names_what_renders_ignore(bpy, lodgs, scene):
+    """Before the render: lenses, blur with Hold Out or Viewport Quality, and a missing camera."""
+    limitations, data = lodgs("render.engine").limitations, scene.camera.data
+    assert limitations(scene) == []
+    data.dof.use_dof, scene.lodgs_render.holdout = True, "//depth_####.exr"
+    texts = limitations(scene)
+    assert len(texts) == 2 and "without blur" in texts[0] and "Hold Out does not work: depth of" in texts[1]
+    with pytest.raises(
+        RuntimeError, match="Cannot hold out meshes: depth of field or motion blur is enabled"
+    ):
+        bpy.ops.render.render()
+    data.type, data.panorama_type = "PANO", "EQUIRECTANGULAR"
+    texts = " ".join(limitations(scene))
+    assert "no depth of field" in texts and "no panoramas" in texts and "camera is panoramic" in texts
+    data.panorama_type = "MIRRORBALL"
+    assert "Mirrorball, which LODGS cannot render" in limitations(scene)[0]
+    scene.camera = None
+    assert limitations(scene) == ["The scene has no camera."]
+
+
+def test_the_depth_of_a_blurred_frame_is_that_of_its_time(bpy, lodgs, scene, monkeypatch):
+    """Keys cover the shutter time, and the frame itself is rendered from its own time."""
+    drawn, camera = [], scene.camera
+    for frame, y in ((0, -6.0), (2, -5.0)):
+        camera.location.y = y
+        camera.keyframe_insert("location", frame=frame)
+    scene.render.use_motion_blur, scene.render.motion_blur_shutter = True, 1.0
+    scene.frame_set(1)
+    draw_frame = lodgs("render.renderer").draw_frame
+
+    def record(sets, camera, *args, lens, **options):
+        drawn.append((camera.center[1], [key.center[1] for key in lens.cameras]))
+        return draw_frame(sets, camera, *args, lens=lens, **options)
+
+    monkeypatch.setattr(lodgs("render.renderer"), "draw_frame", record)
+    scene.render.resolution_percentage, scene.lodgs_render.samples = 10, 2
+    bpy.ops.render.render()
+    ((centre, keys),) = drawn
+    assert centre == pytest.approx(-5.5, abs=1e-4) and len(keys) == 3
+    assert keys[0] < -5.6 and keys[1] == pytest.approx(-5.5, abs=1e-4) and keys[2] > -5.4
+    assert scene.frame_current == 1 and scene.frame_subframe == 0

@@ -264,6 +264,32 @@ def test_budget_excludes_the_finest_additive_level_first(bpy, lodgs):
     assert set(selections[0][0]) == set(np.argsort(visible)[-60:])
 
 
+def test_budget_keeps_the_splats_that_are_largest_in_the_image(bpy, lodgs):
+    """Two sets with different transforms share a budget; the view is near the second one."""
+    rng = np.random.default_rng(5)
+    sets = [random_set(rng, n) for n in (400, 600)]
+    pool, starts = make_pool(lodgs, sets)
+    arrangement = lodgs("viewport.arrangement")
+    matrices = [np.diag([3.0, 3, 3, 1]), np.eye(4)]
+    matrices[1][:3, 3] = 20, 0, 0
+    placements = [
+        make_placement(lodgs, int(start), len(part[0]), matrix=matrix, scene=int(start))
+        for start, part, matrix in zip(starts, sets, matrices, strict=False)
+    ]
+    position = (22.0, 1.0, 0.0)
+    request = arrangement.Request(tuple(placements), (0, 0, 1), 300, position)
+    result = arrangement.arrange(pool, request)
+    values = []
+    for (means, scales, opacities, *_), matrix, scale in zip(sets, matrices, (3, 1), strict=True):
+        distance = np.linalg.norm(means @ matrix[:3, :3].T + matrix[:3, 3] - position, axis=1)
+        size = scale**2 * (scales.astype(float) ** 2).sum(1)
+        values.append(opacities * size / np.maximum(distance**2, size))
+    expected = np.argsort(np.concatenate(values))[-300:]
+    assert len(set(result.splats) ^ set(expected)) <= 2 and result.excluded == 700  # rounding
+    moved = arrangement.arrange(pool, replace(request, position=(0.0, 0.0, 5.0)))
+    assert len(set(moved.splats) - set(expected)) > 30
+
+
 def test_budget_replaces_the_finest_level_by_coarser_ones(bpy, lodgs):
     """Levels that replace each other leave no hole: the next coarser one reaches the camera."""
     rng = np.random.default_rng(3)

@@ -203,6 +203,35 @@ def test_each_redraw_reads_an_attribute(bpy, lodgs, draw_from, scene, monkeypatc
     assert not np.array_equal(after, before)
 
 
+@pytest.mark.parametrize("during_loading", [False, True])
+def test_the_old_image_stays_after_an_undo(bpy, lodgs, draw_from, scene, monkeypatch, during_loading):
+    """Undo replaces all datablocks; viewports draw the previous splats until the restored ones are ready."""
+    view, name = lodgs("viewport.views").ViewState(), scene.name
+    bpy.ops.ed.undo_push(message="before")
+    expected = draw_from(view, 0.0)
+    for item in scene.lodgs.levels:
+        item.object.data.attributes["position"].data.foreach_set("vector", np.zeros(3 * COUNT, np.float32))
+        item.object.data.update_tag()
+    before = draw_from(view, 0.0)
+    bpy.ops.ed.undo_push(message="Move")
+    assert not np.array_equal(before, expected)
+    if during_loading:
+        draw_from(view, 3.0, wait=False)
+    assert bpy.ops.ed.undo() == {"FINISHED"}
+    restored = bpy.data.objects[name]
+    monkeypatch.setattr(lodgs("viewport.view_state"), "LOADING", (0.0, 0.0))
+    selection, end = lodgs("data.selection"), time.monotonic() + 100
+    monkeypatch.setattr(selection, "store_camera", lambda root, *a: None)
+    restored.lodgs.stored_position, restored.lodgs.stored_focal = (0, 0, 0), 600.0
+    images = []
+    while not images or not np.array_equal(images[-1], expected):
+        assert time.monotonic() < end
+        images.append(draw_from(view, 0.0, wait=False))
+        time.sleep(0.001)
+    assert len(images) > 4 and min(image[..., 3].sum() for image in images) > 0
+    assert all(np.array_equal(image, before) or np.array_equal(image, expected) for image in images)
+
+
 def test_splats_removed_during_loading(bpy, lodgs, draw_from, scene, monkeypatch):
     views, resident = lodgs("viewport.views"), lodgs("viewport.resident")
     monkeypatch.setattr(resident, "UPLOAD_BATCH", 10)

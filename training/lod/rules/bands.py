@@ -97,6 +97,9 @@ class Bands(Rule):
         in_use = [number for number in levels if values["first"] <= number <= values["last"]]
         return {**values, "last": in_use[-2]} if len(in_use) > 1 else None
 
+    def less_detail(self, values: Values, levels: Sequence[int]) -> Values | None:
+        return self.raise_control(values, "gamma")
+
 
 RULE = Bands()
 
