@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from tests.fuzz.entry_points import attempt
 from tests.fuzz.mutations import corrupted, corrupted_value
+from tests.training.splats.level_files import flod
 from tests.training.splats.test_gltf import assembled, parts
-from tests.training.splats.test_usd import flod
 from training.editing.export import export_levels
 from training.splats.gltf import read_glb
 from training.splats.usd import read_usd
@@ -42,7 +42,7 @@ def test_corrupt_glb_files(folder, glb, data):
     attempt("glTF", lambda: read_glb(folder / "a.glb", folder / "a.ply"), content)
 
 
-@pytest.mark.cases(short=120, weight=1)
+@pytest.mark.cases(short=60, weight=1)
 @given(data=st.data())
 def test_corrupt_glb_documents(folder, glb, data):
     document = data.draw(corrupted_value(glb[1]))
@@ -54,7 +54,7 @@ def test_corrupt_glb_documents(folder, glb, data):
     attempt("glTF document", lambda: read_glb(folder / "a.glb", folder / "a.ply"), document)
 
 
-@pytest.mark.cases(short=8, weight=0.02)
+@pytest.mark.cases(short=4, weight=0.02)
 @given(data=st.data(), ending=st.sampled_from(["usdc", "usdz"]))
 def test_corrupt_usd_files(folder, usd, data, ending):
     """Each file is read in a process of its own, because usd-core may abort it."""

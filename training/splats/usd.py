@@ -33,7 +33,7 @@ _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 _SIGMAS = 3.0
 """Extents of levels include splats up to so many standard deviations."""
 _SECONDS = 600
-_INSTALL = "Install it with: pip install usd-core."
+_INSTALL = "Install it with: pip install usd-core (or lodgs[usd])."
 
 
 def load_usd() -> SimpleNamespace:

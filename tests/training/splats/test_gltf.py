@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.training.splats.level_files import UP, assert_equal, camera, flod, read
 from tests.training.splats.test_formats import random_splats
-from tests.training.splats.test_usd import UP, assert_equal, camera, flod, read
 from training.editing.export import export_finest_level, export_levels, run_to_end
 from training.errors import LodgsError
 from training.splats import gltf

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.training.splats.level_files import UP, flod, read
 from tests.training.splats.test_formats import random_splats
 from tests.training.splats.test_gltf import accessor, parts
-from tests.training.splats.test_usd import UP, flod, read
 from training.editing.export import export_tiles
 from training.errors import LodgsError
 from training.splats import tiles
