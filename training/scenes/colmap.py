@@ -277,15 +277,15 @@ def _view_collector(folder: Path, images: Path) -> ViewCollector:
     base = folder if images == folder else images.parent
     return ViewCollector(
         ImageFiles(images),
-        SidecarFiles(_sidecar_folder(base, MASKS), *MASK_SUFFIXES),
-        SidecarFiles(_sidecar_folder(base, DEPTHS), *DEPTH_SUFFIXES),
+        SidecarFiles(_mask_folder(base), *MASK_SUFFIXES),
+        SidecarFiles(base / DEPTHS, *DEPTH_SUFFIXES),
     )
 
 
-def _sidecar_folder(base: Path, name: str) -> Path:
-    """Return the folder of a name such as "masks", or its singular if only that exists."""
-    singular = base / name.removesuffix("s")
-    return singular if singular.is_dir() and not (base / name).is_dir() else base / name
+def _mask_folder(base: Path) -> Path:
+    """Return the folder "masks", or "mask" if only that exists."""
+    masks, singular = base / MASKS, base / "mask"
+    return singular if singular.is_dir() and not masks.is_dir() else masks
 
 
 def _read_model_points(

@@ -133,7 +133,7 @@ def _parse_view(folder: Path, values: Mapping[str, Any], photos: PhotoFinder) ->
         raise LodgsError(flaw)
     if other := next((name for name in _OTHER_LENSES if values.get(name)), ""):
         raise LodgsError(f"lenses with {other} are not supported.")
-    if other := next((name for name in _UNNAMED if np.any(values.get(name))), ""):
+    if other := next((name for name in _UNNAMED if np.any(values.get(name, 0))), ""):
         raise LodgsError(f"the order of its values '{other}' is unknown: name them k1, k2, p1, p2, ...")
     model = str(values.get("camera_model", "")).upper()
     if model not in _SUPPORTED_MODELS:
