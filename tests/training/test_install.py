@@ -61,8 +61,8 @@ def test_installed_command_checks_trains_and_reads(lodgs, tiny_scene, tmp_path, 
     names = {line.partition(">=")[0].lower() for line in dependencies}
     assert versions["ok"] and names <= {name.lower() for name in versions}
     events = lodgs(
-        "train", "--scene", tiny_scene, "--out", tmp_path / "run", "--image-scale", 1, "--set", "levels=2",
-        "--set", "steps=5", "--backend", backend,
+        "train", "--scene", tiny_scene, "--out", tmp_path / "run", "--image-scale", 1, "--method", "3dgs",
+        "--set", "steps=5", "--set", "margin=0", "--set", "free_depth=0", "--backend", backend,
     )  # fmt: skip
     assert json.loads(events.splitlines()[-1])["event"] == "done"
     assert lodgs("info", tmp_path / "run" / "bundle.ply").count("\n") > 2

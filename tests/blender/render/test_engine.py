@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -18,6 +19,13 @@ from training.splats.levels import Bundle, Level
 
 ROOT = Path(__file__).resolve().parents[3]
 TRAINER = os.environ.get("LODGS_TRAINER_PYTHON", "")
+COMMANDS = """
+import json, sys
+from training.__main__ import main
+for line in sys.stdin:
+    print("exit code", main(json.loads(line)), flush=True)
+"""
+"""Run commands of the trainer, one a line."""
 NOTHING = 1e10
 
 
@@ -87,10 +95,26 @@ def bytes_of(values: np.ndarray) -> np.ndarray:
     return np.round(values * 255).astype(np.uint8)
 
 
-def without_blender(bundle: Path, camera: Path, out: Path, *options: str) -> None:
-    """``python -m training render`` of a camera that Blender has written."""
-    command = [TRAINER, "-m", "training", "render", str(bundle), "--camera", str(camera), "--out", str(out)]
-    subprocess.run([*command, *options], cwd=ROOT, check=True)
+@pytest.fixture(scope="module")
+def without_blender():
+    """Return ``without_blender(bundle, camera, out, *options)``: ``lodgs render`` of Blender's camera file.
+
+    The calls share a process, because it takes seconds to start.
+    """
+    command = [TRAINER, "-c", COMMANDS]
+    with subprocess.Popen(
+        command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+
+        def render(bundle: Path, camera: Path, out: Path, *options: str) -> None:
+            words = ["render", str(bundle), "--camera", str(camera), "--out", str(out), *options]
+            process.stdin.write(json.dumps(words) + "\n")
+            process.stdin.flush()
+            while not (answer := process.stdout.readline()).startswith("exit code"):
+                assert answer, "the program ended"
+            assert answer == "exit code 0\n"
+
+        yield render
 
 
 def passes(bpy, lodgs, **settings):
@@ -106,7 +130,9 @@ def passes(bpy, lodgs, **settings):
 
 
 @pytest.mark.parametrize("transparent", [False, True])
-def test_f12_is_what_training_render_draws_to_the_bit(bpy, scene, bundle, tmp_path, transparent):
+def test_f12_is_what_training_render_draws_to_the_bit(
+    bpy, scene, bundle, tmp_path, transparent, without_blender
+):
     scene.render.film_transparent = transparent
     scene.render.image_settings.color_mode = "RGBA"
     shown = f12(bpy, tmp_path)
@@ -119,7 +145,9 @@ def test_f12_is_what_training_render_draws_to_the_bit(bpy, scene, bundle, tmp_pa
     np.testing.assert_array_equal(bytes_of(shown), bytes_of(expected))
 
 
-def test_f12_of_antialiased_splats_is_what_training_render_draws(bpy, lodgs, scene, bundle, tmp_path):
+def test_f12_of_antialiased_splats_is_what_training_render_draws(
+    bpy, lodgs, scene, bundle, tmp_path, without_blender
+):
     """By what the scene says, which its bundle then says as well."""
     root = lodgs("data.roots").roots(scene)[0]
     for item in root.lodgs.levels:
@@ -137,7 +165,9 @@ def test_f12_of_antialiased_splats_is_what_training_render_draws(bpy, lodgs, sce
     assert difference.max() <= 1 and (difference > 0).mean() < 0.01  # scales were float32's logarithms
 
 
-def test_levels_by_distance_are_what_training_render_chooses(bpy, lodgs, scene, bundle, tmp_path):
+def test_levels_by_distance_are_what_training_render_chooses(
+    bpy, lodgs, scene, bundle, tmp_path, without_blender
+):
     root = lodgs("data.roots").roots(scene)[0]
     root.lodgs.mode, root.lodgs.bands.gamma = "SELECTIVE", 10
     shown = f12(bpy, tmp_path)
@@ -149,7 +179,7 @@ def test_levels_by_distance_are_what_training_render_chooses(bpy, lodgs, scene, 
     assert {1, 2} <= set(np.unique(levels))  # both have their part
 
 
-def test_an_imported_view_is_the_photographs_camera(bpy, lodgs, bundle, tmp_path):
+def test_an_imported_view_is_the_photographs_camera(bpy, lodgs, bundle, tmp_path, without_blender):
     """Rendered from Blender's camera, and from COLMAP's own numbers: but for float32, the same."""
     from training.scenes.cameras import write_camera
     from training.scenes.colmap import read_scene
