@@ -126,9 +126,7 @@ def draw(
             back_color = 0.0, 0.0, 0.0
         if not instances:
             return image
-        instances = [
-            replace(instance, splats=instance.splats.with_looks(instance.looks)) for instance in instances
-        ]
+        instances = [replace(item, splats=item.splats.with_looks(item.looks)) for item in instances]
         options = {"background": back_color, "window": window, "backend": backend}
         if orthographic is None:
             frame = _common_frame(instances, camera, near)
