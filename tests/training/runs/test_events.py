@@ -1,8 +1,10 @@
 """Reading events: any file content yields only well-formed events."""
 
+import errno
 import json
 import math
 import os
+from pathlib import Path
 
 import pytest
 
@@ -137,3 +139,13 @@ def test_writer_starts_a_new_line_after_an_incomplete_one(tmp_path):
     events.close()
     assert [event["event"] for event in read_events(path)[0]] == ["status", "cancelled"]
     assert os.listdir(tmp_path) == ["events.jsonl"]
+
+
+def test_full_disk_at_the_start_names_the_file(tmp_path, monkeypatch):
+    def fail(path, data):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", fail)
+    with pytest.raises(OSError, match="No space left") as error:
+        EventWriter(tmp_path / "events.jsonl", tmp_path / "reserve", None)
+    assert error.value.filename == str(tmp_path / "reserve")
