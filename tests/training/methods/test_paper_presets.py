@@ -211,7 +211,7 @@ PUBLISHED = {
         "prefix_weight": (1.0, "Matryoshka, abstract: optimises both the prefix and the full set"),
         "log_uniform": (False, "Matryoshka: distribution not known to us, uniform"),
         "min_prefix": (0.01, "Matryoshka: not known to us"),
-        "order_by": ("total", "Matryoshka: ordering not known to us"),
+        "order_by": ("largest", "Matryoshka: ordering not known to us"),
     },
 }  # fmt: skip
 

@@ -31,10 +31,10 @@ class MatryoshkaParameters(SplatParameters):
         unit="steps",
     )
     order_by: str = setting(
-        "total",
-        "Importance that orders splats: the sum of their contributions to all pixels of the training views "
-        "(total), their largest contribution to a pixel (largest), or their opacity.",
-        choices=("total", "largest", "opacity"),
+        "largest",
+        "Importance that orders splats: their largest contribution to a pixel of the training views "
+        "(largest), the sum of their contributions to all pixels (total), or their opacity.",
+        choices=("largest", "total", "opacity"),
     )
     min_prefix: float = setting(
         0.05, "Minimum length of a random prefix, as a fraction of all splats.", above=0, high=1
