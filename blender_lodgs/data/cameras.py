@@ -8,7 +8,7 @@ from typing import Any
 
 import bpy
 import numpy as np
-from mathutils import Matrix
+from mathutils import Matrix, Vector
 
 from ...training.errors import LodgsError
 from ...training.render.lens import EQUIRECTANGULAR, ORTHOGRAPHIC, SHARP, Aperture, LensProjection
@@ -147,10 +147,11 @@ def aperture_of(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Apertu
     focus = dof.focus_distance
     if dof.focus_object is not None:
         matrix = obj.matrix_world.normalized()
+        axis = matrix.to_3x3() @ Vector((0, 0, 1))
         target = dof.focus_object.evaluated_get(depsgraph).matrix_world
         bone = dof.focus_object.pose and dof.focus_object.pose.bones.get(dof.focus_subtarget)
         position = (target @ bone.matrix if bone else target).translation
-        focus = abs(matrix.col[2].xyz @ (matrix.translation - position))
+        focus = abs(axis.dot(matrix.translation - position))
     return Aperture(
         diameter / 2, max(focus, 1e-5), dof.aperture_blades, dof.aperture_rotation, dof.aperture_ratio
     )

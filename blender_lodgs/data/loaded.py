@@ -6,7 +6,7 @@ import bpy
 import numpy as np
 
 from ...training.errors import LodgsError
-from ...training.lod.rule import Region, find_rule
+from ...training.lod.rule import Region, Values, find_rule
 from ...training.lod.selection import unknown_rule_error
 from ..attributes import read_attribute
 from . import objects, scenes, selection
@@ -66,7 +66,7 @@ def reduce_detail(context: bpy.types.Context, root: bpy.types.Object, share: flo
         raise LodgsError(*unknown_rule_error(root.lodgs.rule))
     numbers = [item.number for item in root.lodgs.levels if item.exists]
     before = {control.name: getattr(root.lodgs.controls, control.name) for control in rule.controls}
-    values: dict | None = before
+    values: Values | None = before
     saved = first = saved_share(context, root)
     while saved < share and (values := rule.less_detail(values, numbers)) is not None:
         for name, value in values.items():
