@@ -49,6 +49,7 @@ from training.rasterize.cpu.compile import (
     thread_count,
 )
 from training.rasterize.cpu.fastmath import exp2
+from training.rasterize.cpu.lanes import WIDTH
 from training.rasterize.cpu.project import strip_rows
 from training.scenes.cameras import Camera
 
@@ -188,8 +189,11 @@ def count_work(begin, end, projected, splat, tile_start, tiles_x, walked, height
         for pair in range(tile_start[tile], tile_start[tile] + walked[tile]):
             row = projected[splat[pair]]
             x_left, y_top = f32(x0) + f32(0.5), f32(y0) + f32(0.5)
+            for start in range(0, 16, WIDTH):
+                left = x_left + f32(start)
+                first, last = strip_rows(row, left, f32(WIDTH - 1), y_top, min(16, height - y0))
+                lanes[tile] += WIDTH * (last - first)
             first, last = strip_rows(row, x_left, SPAN, y_top, min(16, height - y0))
-            lanes[tile] += 16 * max(0, last - first)
             for r in range(first, last):
                 for j in range(16):
                     dx, dy = f32(j) + x_left - row[0], f32(r) + y_top - row[1]

@@ -1,9 +1,8 @@
 """Blend the splats of every tile front to back, and compute the gradients in the backward pass.
 
 The colour of a pixel is Σ w c with w = alpha T, where T is the transmittance of the splats in front (3DGS,
-Eq. 3). A tile is a block of 16 rows of 16 lanes, which Numba compiles to SIMD; the loop over lanes has no
-branches. All its data is at fixed offsets from one address. Otherwise the compiler would test for overlapping
-arrays in every row, which took longer than the arithmetic.
+Eq. 3). A tile has 16 rows of 16 pixels, in one part of 16 lanes or two parts of 8 lanes. A pair visits only
+the rows of a part that its ellipse reaches.
 """
 
 from __future__ import annotations
@@ -15,64 +14,108 @@ import numpy as np
 from ..rendering import ALPHA_MAX, TRANSMITTANCE_MIN
 from .bin import LOG2_ALPHA_MIN, TILE
 from .compile import FAST, f32, inlined, kernel
-from .fastmath import any_positive, exp2, prefetch
+from .fastmath import any_positive, exp2, exp2_lanes, prefetch
+from .lanes import (
+    WIDTH,
+    any_of,
+    larger,
+    load,
+    magnitude,
+    ramp,
+    select,
+    smaller,
+    spread,
+    store,
+    store_totals,
+    total,
+)
 from .project import (
     BLUE,
     CONIC_XX,
     CONIC_XY,
     CONIC_YY,
     DEPTH,
-    G_BLUE,
     G_DX,
-    G_DXDX,
-    G_DXDY,
-    G_DY,
-    G_DYDY,
-    G_GREEN,
-    G_RED,
     GREEN,
+    HALF_WIDTH,
     LOG2_OPACITY,
     MEAN_X,
     MEAN_Y,
     PREFETCH,
     RED,
+    RISE,
+    SLOPE,
     SUMS,
+    X_OF_TOP,
     G,
+    strip_bounds,
     strip_rows,
 )
 
+ORDERED = FAST - {"reassoc"}
+"""Flags for explicit vectors: the compiler must not move the small terms of sums out of loops."""
 ZERO, HALF, ONE, TWO = f32(0), f32(0.5), f32(1), f32(2)
 CAP, T_MIN = f32(ALPHA_MAX), f32(TRANSMITTANCE_MIN)
 SPAN = f32(TILE - 1)
 """Distance from a tile's first pixel centre to its last."""
+PARTS = TILE // WIDTH
+"""Parts of a tile, side by side."""
+STRIPS = PARTS * TILE
+"""Rows of the first part, then those of the next."""
+FORWARD = 5 * WIDTH
+"""Values of a strip: T, red, green, blue and the limit, of each pixel."""
+BACKWARD = 5 * WIDTH
+"""Values of a strip in the backward pass: T, Q and three channels of h."""
 CHECK_INTERVAL = 16
 """Number of splats after which a tile checks if any pixel is unfinished."""
 
 
-@inlined(FAST)
-def find_rows(projected, splat, begin, end, left, top, rows, reached):
-    """Fill reached (P, 2) with the first and one past the last row of the tile that each pair reaches.
+@inlined(ORDERED)
+def find_rows(projected, splat, begin, end, left, top, rows, spare, reached):
+    """Fill reached (P, 2 · PARTS) with the rows that each pair reaches in each part of the tile.
 
-    It runs before blending, which would otherwise wait for the square roots.
+    A part has the first row and one past the last. Lanes are pairs. This runs before blending, which would
+    otherwise wait for the square roots. ``spare`` (6, WIDTH) is scratch memory.
     """
-    for pair in range(begin, end):
-        first, last = strip_rows(projected[splat[pair]], left, SPAN, top, rows)
-        reached[pair, 0], reached[pair, 1] = first, last
+    for start in range(begin, end, WIDTH):
+        for j in range(WIDTH):
+            row = projected[splat[min(start + j, end - 1)]]
+            spare[0, j], spare[1, j], spare[2, j] = row[MEAN_X], row[MEAN_Y], row[HALF_WIDTH]
+            spare[3, j], spare[4, j], spare[5, j] = row[SLOPE], row[RISE], row[X_OF_TOP]
+        mean_x, mean_y, half_width = load(spare[0], 0), load(spare[1], 0), load(spare[2], 0)
+        slope, rise, x_of_top = load(spare[3], 0), load(spare[4], 0), load(spare[5], 0)
+        for part in range(PARTS):
+            bounds = strip_bounds(
+                mean_x, mean_y, half_width, slope, rise, x_of_top,
+                left + f32(WIDTH * part), f32(WIDTH - 1), top, rows,
+            )  # fmt: skip
+            store(spare[0], 0, bounds[0])
+            store(spare[1], 0, bounds[1])
+            for j in range(min(end - start, WIDTH)):
+                first = int(spare[0, j])
+                reached[start + j, 2 * part] = first
+                reached[start + j, 2 * part + 1] = max(first, int(spare[1, j]))
 
 
-@inlined(FAST)
-def read_lanes(plane, y, x, columns, lanes):
-    """Read a plane's row from column ``x`` on to the first ``columns`` of 16 lanes; others keep their values.
+@inlined(ORDERED)
+def read_lanes(row, x, spare):
+    """Return the values of an image's row from column ``x`` on, and zeros beyond its end."""
+    if x + WIDTH <= row.shape[0]:
+        return load(row, x)
+    for j in range(WIDTH):
+        spare[j] = row[x + j] if x + j < row.shape[0] else ZERO
+    return load(spare, 0)
 
-    The compiler does not know that indices such as x + j are positive, and would gather single values.
-    """
-    values = plane[y, x : x + columns]
-    if columns == 16:
-        for j in range(16):
-            lanes[j] = values[j]
+
+@inlined(ORDERED)
+def write_lanes(row, x, spare, value):
+    """Write values to an image's row from column ``x`` to its end."""
+    if x + WIDTH <= row.shape[0]:
+        store(row, x, value)
     else:
-        for j in range(columns):
-            lanes[j] = values[j]
+        store(spare, 0, value)
+        for j in range(row.shape[0] - x):
+            row[x + j] = spare[j]
 
 
 @inlined(FAST)
@@ -82,76 +125,101 @@ def alpha_of(log2_alpha):
     return alpha if log2_alpha >= LOG2_ALPHA_MIN else ZERO
 
 
-@kernel(FAST)
+@inlined(ORDERED)
+def fill_alphas(row, left, top, rows, alphas):
+    """Compute the alphas of a pair in the rows of the tile that it reaches.
+
+    Blending is a second loop, because processors overlap the iterations of short loops only.
+    """
+    xx, xy, yy, log2_opacity = row[CONIC_XX], row[CONIC_XY], row[CONIC_YY], row[LOG2_OPACITY]
+    offset_x, offset_y = left - row[MEAN_X], top - row[MEAN_Y]
+    for part in range(PARTS):
+        dx = ramp() + (offset_x + f32(WIDTH * part))
+        constant, slope = log2_opacity - xx * dx * dx, xy * dx
+        dy = spread(f32(rows[2 * part]) + offset_y)
+        for strip in range(TILE * part + int(rows[2 * part]), TILE * part + int(rows[2 * part + 1])):
+            log2_alpha = constant - (slope + yy * dy) * dy
+            dy = dy + ONE
+            alpha = smaller(exp2_lanes(log2_alpha), CAP)
+            alpha = select(log2_alpha >= LOG2_ALPHA_MIN, alpha, ZERO)
+            store(alphas, strip * WIDTH, alpha)
+
+
+@inlined(ORDERED)
+def initial_transmittance(x, width, inside):
+    """Return 1 in pixels of the image and -1 outside."""
+    return select(ramp() + f32(x) < f32(width), ONE if inside else -ONE, spread(-ONE))
+
+
+@kernel(ORDERED)
 def blend_forward(
     begin, end, projected, splat, tile_start, tiles_x, background, limit,
     image, transmittance, visited, reached,
 ):  # fmt: skip
     """Fill image (3, H, W) and transmittance (H, W).
 
-    Also fill ``visited`` with the number of pairs blended in each tile, and ``reached`` (P, 2) uint8 with the
-    rows that they reach. A lane's T becomes negative when its pixel is finished, and is
-    negative from the start outside the image. All later splats then fail the test against T_MIN, and |T| is
-    preserved. The first splat deeper than the pixel's ``limit`` (H, W) finishes it too. If ``limit`` is None,
+    Also fill ``visited`` with the number of pairs blended in each tile, and ``reached`` (P, 2 · PARTS) uint8
+    with the rows that they reach. A lane's T becomes negative when its pixel is finished, and is negative
+    from the start outside the image. All later splats then fail the test against T_MIN, and |T| is preserved.
+    The first splat deeper than the pixel's ``limit`` (H, W) finishes it too. If ``limit`` is None,
     Numba compiles a kernel without it.
     """
     height, width = transmittance.shape
-    # a row has 16 lanes each for T, red, green, blue and the limits
-    state = np.zeros((16, 64 if limit is None else 80), np.float32)
+    state, spare = np.empty(STRIPS * FORWARD, np.float32), np.empty(WIDTH, np.float32)
+    alphas, shapes = np.empty(STRIPS * WIDTH, np.float32), np.empty((6, WIDTH), np.float32)
     for tile in range(begin, end):
         x0, y0 = tile % tiles_x * TILE, tile // tiles_x * TILE
-        rows, columns = min(TILE, height - y0), min(TILE, width - x0)
+        rows = min(TILE, height - y0)
         left, top = f32(x0) + HALF, f32(y0) + HALF
-        for r in range(16):
-            for j in range(16):
-                state[r, j] = ONE if r < rows and j < columns else -ONE
-            for j in range(16, 64):
-                state[r, j] = ZERO
+        for strip in range(STRIPS):
+            x, r = x0 + strip // TILE * WIDTH, strip % TILE
+            place = strip * FORWARD
+            store(state, place, initial_transmittance(x, width, r < rows))
+            for c in range(1, 4):
+                store(state, place + WIDTH * c, spread(ZERO))
             if limit is not None and r < rows:
-                read_lanes(limit, y0 + r, x0, columns, state[r, 64:])
+                store(state, place + WIDTH * 4, read_lanes(limit[y0 + r], x, spare))
 
         pair = tile_start[tile]
         lit = True
         while lit and pair < tile_start[tile + 1]:
             start, end = pair, min(pair + CHECK_INTERVAL, tile_start[tile + 1])
-            find_rows(projected, splat, start, end, left, top, rows, reached)
+            find_rows(projected, splat, start, end, left, top, rows, shapes, reached)
             for pair in range(start, end):
                 row = projected[splat[pair]]
-                xx, xy, yy, log2_opacity = row[CONIC_XX], row[CONIC_XY], row[CONIC_YY], row[LOG2_OPACITY]
                 red, green, blue = row[RED], row[GREEN], row[BLUE]
                 depth = row[DEPTH]
-                offset_x, offset_y = left - row[MEAN_X], top - row[MEAN_Y]
-                for r in range(int(reached[pair, 0]), int(reached[pair, 1])):
-                    dy = f32(r) + offset_y
-                    xy_dy, base = xy * dy, log2_opacity - yy * dy * dy
-                    lanes = state[r]
-                    for j in range(16):
-                        dx = f32(j) + offset_x
-                        log2_alpha = base - (xx * dx + xy_dy) * dx
-                        alpha = alpha_of(log2_alpha)
-                        t = lanes[j]
+                fill_alphas(row, left, top, reached[pair], alphas)
+                for part in range(PARTS):
+                    for r in range(int(reached[pair, 2 * part]), int(reached[pair, 2 * part + 1])):
+                        strip = TILE * part + r
+                        place = strip * FORWARD
+                        alpha = load(alphas, strip * WIDTH)
+                        t = load(state, place)
                         t_next = t - alpha * t
                         takes = t_next > T_MIN
                         if limit is not None:
-                            takes = takes and depth <= lanes[64 + j]
-                        w = alpha * t if takes else ZERO
-                        lanes[j] = t_next if takes else -abs(t)
-                        lanes[16 + j] += w * red
-                        lanes[32 + j] += w * green
-                        lanes[48 + j] += w * blue
+                            takes = takes & (load(state, place + WIDTH * 4) >= depth)
+                        w = select(takes, alpha * t, ZERO)
+                        store(state, place, select(takes, t_next, ZERO - magnitude(t)))
+                        store(state, place + WIDTH, load(state, place + WIDTH) + w * red)
+                        store(state, place + 2 * WIDTH, load(state, place + 2 * WIDTH) + w * green)
+                        store(state, place + 3 * WIDTH, load(state, place + 3 * WIDTH) + w * blue)
             pair = end
-            lit = any_positive(state)
+            largest = load(state, 0)
+            for strip in range(1, STRIPS):
+                largest = larger(largest, load(state, strip * FORWARD))
+            lit = any_of(largest > ZERO)
         visited[tile] = pair - tile_start[tile]
 
-        for r in range(rows):
-            out = transmittance[y0 + r, x0 : x0 + columns]
-            for j in range(min(columns, 16)):
-                state[r, j] = abs(state[r, j])
-                out[j] = state[r, j]
-            for c in range(3):
-                out = image[c, y0 + r, x0 : x0 + columns]
-                for j in range(min(columns, 16)):
-                    out[j] = state[r, 16 + 16 * c + j] + state[r, j] * background[c]
+        for strip in range(STRIPS):
+            x, r = x0 + strip // TILE * WIDTH, strip % TILE
+            if r < rows and x < width:
+                t = magnitude(load(state, strip * FORWARD))
+                write_lanes(transmittance[y0 + r], x, spare, t)
+                for c in range(3):
+                    colour = load(state, strip * FORWARD + WIDTH * (c + 1))
+                    write_lanes(image[c, y0 + r], x, spare, colour + t * background[c])
 
 
 @kernel(FAST)
@@ -197,27 +265,6 @@ def blend_median(begin, end, projected, splat, tile_start, tiles_x, visited, lim
             for j in range(columns):
                 if median_splat[16 * r + j] >= 0:
                     median[y0 + r, x0 + j] = median_splat[16 * r + j]
-
-
-@inlined(FAST)
-def add_lanes(sums, offset_x, out):
-    """Sum the lanes of a pair. dx depends only on the lane, so its moments are computed here."""
-    g, g_dx, g_dxdx, g_dy, g_dxdy, g_dydy = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
-    red, green, blue = ZERO, ZERO, ZERO
-    for j in range(16):
-        dx = f32(j) + offset_x
-        g += sums[j]
-        g_dx += sums[j] * dx
-        g_dxdx += sums[j] * dx * dx
-        g_dy += sums[16 + j]
-        g_dxdy += sums[16 + j] * dx
-        g_dydy += sums[32 + j]
-        red += sums[48 + j]
-        green += sums[64 + j]
-        blue += sums[80 + j]
-    out[G], out[G_DX], out[G_DY] = g, g_dx, g_dy
-    out[G_DXDX], out[G_DXDY], out[G_DYDY] = g_dxdx, g_dxdy, g_dydy
-    out[G_RED], out[G_GREEN], out[G_BLUE] = red, green, blue
 
 
 @kernel(FAST)
@@ -282,44 +329,41 @@ def _make_backward(absolute: bool) -> Any:
     and, as sigma = −ln alpha + const,
         g = d loss / d sigma = alpha_i Q_i / (1 − alpha_i) − w_i (c_i·h).
     Q starts as the complete sum, image·h − T_end d loss / d alpha, and is reduced front to back together with
-    T. A splat's sums are accumulated from row to row of its tile.
+    T. A finished pixel has T = 0.
 
     If ``absolute``, pair_sums has two more columns for Σ |d loss / d mean| / ln 2 over pixels, by x and by
     y (AbsGS, Ye et al. 2024).
     """
-    # a row has 16 lanes each for the sums, the three channels of h, T and Q
-    H = 128 if absolute else 96
-    T, Q, stride = H + 48, H + 64, H + 80
 
-    @kernel(FAST)
+    @kernel(ORDERED)
     def blend_backward(
         begin, end, projected, splat, tile_start, tiles_x, visited, reached, image, transmittance,
         by_image, by_alpha, pair_sums,
     ):  # fmt: skip
         """Fill pair_sums; :func:`_make_backward` has the formulas."""
         height, width = transmittance.shape
-        values = np.zeros(16, np.float32)
-        state = np.empty(17 * stride, np.float32)  # the row above the first is zero
-        for j in range(state.shape[0]):
-            state[j] = ZERO
+        state, spare = np.empty(STRIPS * BACKWARD, np.float32), np.empty(WIDTH, np.float32)
+        alphas = np.empty(STRIPS * WIDTH, np.float32)
         for tile in range(begin, end):
             x0, y0 = tile % tiles_x * TILE, tile // tiles_x * TILE
-            rows, columns = min(TILE, height - y0), min(TILE, width - x0)
+            rows = min(TILE, height - y0)
             left, top = f32(x0) + HALF, f32(y0) + HALF
-            for r in range(16):
-                row = state[(r + 1) * stride : (r + 2) * stride]
-                for j in range(16):
-                    row[T + j] = ONE if r < rows and j < columns else -ONE
-                if r < rows:
-                    read_lanes(by_alpha, y0 + r, x0, columns, row[Q:])
-                    read_lanes(transmittance, y0 + r, x0, columns, values)
-                    for j in range(16):
-                        row[Q + j] *= -values[j]
+            for strip in range(STRIPS):
+                x, r = x0 + strip // TILE * WIDTH, strip % TILE
+                place = strip * BACKWARD
+                store(state, place, initial_transmittance(x, width, r < rows))
+                if r < rows and x < width:
+                    q = ZERO - read_lanes(transmittance[y0 + r], x, spare) * read_lanes(
+                        by_alpha[y0 + r], x, spare
+                    )
                     for c in range(3):
-                        read_lanes(by_image[c], y0 + r, x0, columns, row[H + 16 * c :])
-                        read_lanes(image[c], y0 + r, x0, columns, values)
-                        for j in range(16):
-                            row[Q + j] += values[j] * row[H + 16 * c + j]
+                        h = read_lanes(by_image[c, y0 + r], x, spare)
+                        q = q + read_lanes(image[c, y0 + r], x, spare) * h
+                        store(state, place + WIDTH * (2 + c), h)
+                    store(state, place + WIDTH, q)
+                else:
+                    for c in range(1, 5):
+                        store(state, place + WIDTH * c, spread(ZERO))
 
             lit = tile_start[tile] + visited[tile]
             for pair in range(tile_start[tile], lit):
@@ -327,54 +371,55 @@ def _make_backward(absolute: bool) -> Any:
                     for later in range(pair + PREFETCH, min(pair + 2 * PREFETCH, lit)):
                         prefetch(projected, splat[later], 0)
                 row = projected[splat[pair]]
-                xx, xy, yy, log2_opacity = row[CONIC_XX], row[CONIC_XY], row[CONIC_YY], row[LOG2_OPACITY]
+                xx, xy, yy = row[CONIC_XX], row[CONIC_XY], row[CONIC_YY]
                 red, green, blue = row[RED], row[GREEN], row[BLUE]
-                first, last = int(reached[pair, 0]), int(reached[pair, 1])
                 offset_x, offset_y = left - row[MEAN_X], top - row[MEAN_Y]
-                for j in range(first * stride, first * stride + H):
-                    state[j] = ZERO
-                for r in range(first, last):
-                    dy = f32(r) + offset_y
-                    xy_dy, base, dydy = xy * dy, log2_opacity - yy * dy * dy, dy * dy
-                    above = state[r * stride : (r + 2) * stride]
-                    for j in range(16):
-                        dx = f32(j) + offset_x
-                        log2_alpha = base - (xx * dx + xy_dy) * dx
-                        uncapped = exp2(log2_alpha)
-                        alpha = min(uncapped, CAP)
-                        alpha = alpha if log2_alpha >= LOG2_ALPHA_MIN else ZERO
-                        t = above[stride + T + j]
+                fill_alphas(row, left, top, reached[pair], alphas)
+                all_g = all_dx = all_dxdx = all_dy = all_dxdy = all_dydy = spread(ZERO)
+                all_red = all_green = all_blue = all_x = all_y = spread(ZERO)
+                for part in range(PARTS):
+                    first, last = int(reached[pair, 2 * part]), int(reached[pair, 2 * part + 1])
+                    if first == last:
+                        continue
+                    dx = ramp() + (offset_x + f32(WIDTH * part))
+                    sum_g = sum_dy = spread(ZERO)
+                    for r in range(first, last):
+                        strip = TILE * part + r
+                        place = strip * BACKWARD
+                        dy = f32(r) + offset_y
+                        alpha = load(alphas, strip * WIDTH)
+                        t, q = load(state, place), load(state, place + WIDTH)
+                        h_red = load(state, place + 2 * WIDTH)
+                        h_green = load(state, place + 3 * WIDTH)
+                        h_blue = load(state, place + 4 * WIDTH)
                         t_next = t - alpha * t
                         takes = t_next > T_MIN
-                        w = alpha * t if takes else ZERO
-                        above[stride + T + j] = t_next if takes else -abs(t)
-                        h_red, h_green, h_blue = (
-                            above[stride + H + j],
-                            above[stride + H + 16 + j],
-                            above[stride + H + 32 + j],
-                        )
+                        w = select(takes, alpha * t, ZERO)
+                        store(state, place, select(takes, t_next, ZERO))
                         received = w * (red * h_red + green * h_green + blue * h_blue)
-                        q = above[stride + Q + j] - received
-                        above[stride + Q + j] = q
+                        q = q - received
+                        store(state, place + WIDTH, q)
                         g = alpha * q / (ONE - alpha) - received
-                        g = g if takes and uncapped < CAP else ZERO
-                        above[stride + j] = above[j] + g
-                        above[stride + 16 + j] = above[16 + j] + g * dy
-                        above[stride + 32 + j] = above[32 + j] + g * dydy
-                        above[stride + 48 + j] = above[48 + j] + w * h_red
-                        above[stride + 64 + j] = above[64 + j] + w * h_green
-                        above[stride + 80 + j] = above[80 + j] + w * h_blue
+                        g = select(takes & (alpha < CAP), g, ZERO)
+                        sum_g = sum_g + g
+                        sum_dy = sum_dy + g * dy
+                        all_dydy = all_dydy + g * (dy * dy)
+                        all_red = all_red + w * h_red
+                        all_green = all_green + w * h_green
+                        all_blue = all_blue + w * h_blue
                         if absolute:
-                            by_x, by_y = g * (TWO * xx * dx + xy * dy), g * (xy * dx + TWO * yy * dy)
-                            above[stride + 96 + j] = above[96 + j] + abs(by_x)
-                            above[stride + 112 + j] = above[112 + j] + abs(by_y)
-                sums = state[max(first, last) * stride :]
-                add_lanes(sums, offset_x, pair_sums[pair])
+                            all_x = all_x + magnitude(g * (TWO * xx * dx + xy * dy))
+                            all_y = all_y + magnitude(g * (xy * dx + TWO * yy * dy))
+                    sum_dx = sum_g * dx
+                    all_g, all_dx, all_dxdx = all_g + sum_g, all_dx + sum_dx, all_dxdx + sum_dx * dx
+                    all_dy, all_dxdy = all_dy + sum_dy, all_dxdy + sum_dy * dx
+                sums = pair_sums[pair]
+                sums[G] = total(all_g)
+                store_totals(
+                    sums, G_DX, all_dx, all_dy, all_dxdx, all_dxdy, all_dydy, all_red, all_green, all_blue
+                )
                 if absolute:
-                    pair_sums[pair, SUMS], pair_sums[pair, SUMS + 1] = ZERO, ZERO
-                    for j in range(16):
-                        pair_sums[pair, SUMS] += sums[96 + j]
-                        pair_sums[pair, SUMS + 1] += sums[112 + j]
+                    sums[SUMS], sums[SUMS + 1] = total(all_x), total(all_y)
             for pair in range(lit, tile_start[tile + 1]):
                 for k in range(pair_sums.shape[1]):
                     pair_sums[pair, k] = ZERO

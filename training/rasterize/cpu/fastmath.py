@@ -14,6 +14,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from .compile import FAST, f32, inlined
+from .lanes import floor, scaled
 
 LOWEST = f32(-30)
 # minimax polynomial of 2^f on [0, 1), exact at both ends: relative error under 3.5e-6
@@ -101,3 +102,11 @@ def exp2(x):
     f = x - floor
     p = f32(1) + f * (P1 + f * (P2 + f * (P3 + f * P4)))
     return bits_float(float_bits(p) + (truncated(floor) << np.int32(23)))  # pyright: ignore[reportCallIssue]
+
+
+@inlined(FAST - {"reassoc"})
+def exp2_lanes(x):
+    """Compute 2^x for -126 <= x <= 127; other results are undefined."""
+    integer = floor(x)
+    f = x - integer
+    return scaled(f32(1) + f * (P1 + f * (P2 + f * (P3 + f * P4))), integer)

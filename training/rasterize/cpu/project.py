@@ -16,6 +16,7 @@ from ...splats import sh as harmonics
 from ..rendering import ALPHA_MIN, DILATION, KernelCamera
 from .compile import FAST, f32, inlined, kernel
 from .fastmath import prefetch
+from .lanes import larger, root, select, smaller
 
 # Columns of a projected splat, the input of blending.
 MEAN_X, MEAN_Y = 0, 1
@@ -72,27 +73,50 @@ def clamp(value, low, high):
 
 
 @inlined(FAST)
+def strip_bounds(mean_x, mean_y, half_width, slope, rise, x_of_top, left, across, top, rows):
+    """Return the ends of the rows that an ellipse reaches in a strip; see :func:`strip_rows`.
+
+    Takes the columns of a projected splat as numbers, or those of several splats as lanes. The ellipse is
+    convex, so its maximum dy in the strip is at the dx closest to X_OF_TOP, and its minimum at the dx closest
+    to −X_OF_TOP.
+    """
+    half_width = half_width + MARGIN
+    near = left - mean_x
+    far = near + across
+    per_width = ONE / half_width
+    highest = smaller(larger(x_of_top, near), far)
+    lowest = smaller(larger(ZERO - x_of_top, near), far)
+    high, low = highest * per_width, lowest * per_width
+    dy_high = slope * highest + rise * root(larger(ONE - high * high, ZERO))
+    dy_low = slope * lowest - rise * root(larger(ONE - low * low, ZERO))
+    middle = mean_y - top + ONE
+    # clamp before conversion to int: mean and size may be millions of pixels
+    first = smaller(larger(middle + dy_low - MARGIN, ZERO), f32(rows))
+    last = smaller(larger(middle + dy_high + MARGIN, ZERO), f32(rows))
+    outside = (near > half_width) | (far + half_width < ZERO)
+    return select(outside, ZERO, first), select(outside, ZERO, last)
+
+
+@inlined(FAST)
 def strip_rows(row, left, across, top, rows):
     """Return the first row and one past the last that a splat's ellipse reaches in a strip of pixel columns.
 
     The strip's pixel centres lie between x = ``left`` and ``left + across``. Its rows are at y = ``top``,
-    ``top`` + 1, … The ellipse is convex, so its maximum dy in the strip is at the dx closest to X_OF_TOP, and
-    its minimum at the dx closest to −X_OF_TOP.
+    ``top`` + 1, …
     """
-    half_width = row[HALF_WIDTH] + MARGIN
-    near = left - row[MEAN_X]
-    far = near + across
-    if near > half_width or far < -half_width:
-        return 0, 0
-    per_width = ONE / half_width
-    highest, lowest = clamp(row[X_OF_TOP], near, far), clamp(-row[X_OF_TOP], near, far)
-    high, low = highest * per_width, lowest * per_width
-    dy_high = row[SLOPE] * highest + row[RISE] * math.sqrt(max(ONE - high * high, ZERO))
-    dy_low = row[SLOPE] * lowest - row[RISE] * math.sqrt(max(ONE - low * low, ZERO))
-    middle = row[MEAN_Y] - top + ONE
-    # clamp before conversion to int: mean and size may be millions of pixels
-    first = int(clamp(middle + dy_low - MARGIN, ZERO, f32(rows)))
-    last = int(clamp(middle + dy_high + MARGIN, ZERO, f32(rows)))
+    bounds = strip_bounds(
+        row[MEAN_X],
+        row[MEAN_Y],
+        row[HALF_WIDTH],
+        row[SLOPE],
+        row[RISE],
+        row[X_OF_TOP],
+        left,
+        across,
+        top,
+        rows,
+    )
+    first, last = int(bounds[0]), int(bounds[1])
     return first, max(first, last)
 
 
