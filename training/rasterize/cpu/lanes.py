@@ -29,7 +29,10 @@ def _features() -> Mapping[str, bool]:
     """Return the processor's features that Numba compiles for."""
     if numba.config.CPU_FEATURES is not None:  # type: ignore[attr-defined]
         return {name: True for name in re.findall(r"\+([^,]+)", numba.config.CPU_FEATURES)}
-    return llvm.get_host_cpu_features()
+    try:
+        return llvm.get_host_cpu_features()
+    except RuntimeError:  # unknown for this system
+        return {}
 
 
 WIDTH = 16 if _features().get("avx512f") else 8
