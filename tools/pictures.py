@@ -22,7 +22,7 @@ from PIL import Image  # noqa: E402
 from tools import extension, window  # noqa: E402
 
 IMAGES = ROOT / "docs" / "images"
-PARAMETERS = {"max_splats": 60_000, "steps": (150, 250, 300, 450, 1000)}
+PARAMETERS = {"max_splats": 60_000, "steps": (60, 90, 120, 180, 750), "refine_steps": 90}
 
 
 def main() -> int:

@@ -16,7 +16,7 @@ const JOB_TYPE = {
           description: "Number of columns along the longer side of the ground" },
         { key: "rows", type: "int32", default: 2, propargs: { min: 1, max: 64 },
           description: "Number of cells per column" },
-        { key: "method", type: "string", default: "flod", choices: ["flod", "octree", "clod", "lodge", "tree", "3dgs"],
+        { key: "method", type: "string", default: "flod", choices: ["flod", "octree", "clod", "lodge", "tree", "matryoshka", "3dgs"],
           description: "Training method" },
         { key: "preset", type: "string", default: "draft", choices: ["draft", "standard", "paper"],
           description: "Preset: draft trains for minutes, paper for hours" },

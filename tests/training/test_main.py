@@ -18,6 +18,8 @@ MISTAKES = {
     "blocks": "run missing",
     "methods": "unknown",
     "evaluate": "missing",
+    "compare": "missing --out a",
+    "reproduce": "flod --scene missing --out a",
     "render": "missing --view a.jpg --out a.png",
     "capture": "missing.ply --out a",
     "scene": "--from missing",

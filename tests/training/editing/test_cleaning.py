@@ -170,8 +170,9 @@ def test_far_and_unseen_use_every_camera():
         np.testing.assert_array_equal(find_unseen(means, cameras, minimum), visible < minimum)
 
 
-@pytest.mark.parametrize("name", NOT_TREES)
+@pytest.mark.parametrize("name", [name for name in NOT_TREES if name != "prefix"])
 def test_selection_of_remaining_splats_is_unchanged(name):
+    """The rule "prefix" numbers remaining splats again, so that its limits stay exact."""
     rng = np.random.default_rng(3)
     bundle = bundle_of(name, rng)
     crop = Crop.sphere((1, 0, -1), 4.0)

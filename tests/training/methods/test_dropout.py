@@ -8,7 +8,7 @@ from training.methods.flod import finish
 from training.optimize.dropout import END, MAX_VIEWS, Dropout
 from training.optimize.parameters import override
 
-PLAIN = ("3dgs", "flod", "octree", "clod", "lodge", "tree")
+PLAIN = ("3dgs", "flod", "octree", "clod", "lodge", "tree", "matryoshka")
 
 
 def make(data, name="3dgs", **values):

@@ -35,6 +35,7 @@ def query_of(name: str, position, **values) -> LodQuery:
     rule = rules()[name]
     facts = dict.fromkeys(fact_names(rule), 1.0) | {"level": 2, "finer": NO_FINER, "coarser": 1, "levels": 2}
     facts |= {"s_min": 0.3, "coarser_s_min": 0.8, "d_max": 2.5, "tau": 0.01, "d_l": 0.0, "coarser_d_l": 1.0}
+    facts |= {"splats": COUNT}
     facts = {fact: float(facts[fact]) for fact in fact_names(rule)}
     settings = rule.defaults([1, 2]) | values
     return LodQuery(
@@ -52,6 +53,7 @@ def splats(make_splats) -> Splats:
     """Random splats with the columns of all rules."""
     rng = np.random.default_rng(7)
     columns = {"lod_bias": rng.uniform(-1, 1, COUNT), "sigma_d": rng.uniform(0, 1.5, COUNT)}
+    columns |= {"prefix_rank": rng.permutation(COUNT), "view_distance": rng.uniform(0.3, 1.5, COUNT)}
     columns |= {"node_size": rng.uniform(0, 0.08, COUNT), "parent_size": rng.uniform(0, 0.3, COUNT)}
     extras = {name: column.astype(np.float32) for name, column in columns.items()}
     return replace(make_splats(COUNT), extras=extras | member_columns(rng.random((3, COUNT)) < 0.4))
