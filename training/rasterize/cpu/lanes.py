@@ -8,12 +8,16 @@ for narrower registers.
 Arithmetic operators and comparisons apply lane by lane; a number applies to all lanes. The functions below
 are declarations for kernels: Python cannot call them.
 """
+# llvmlite and Numba declare too few types
+# pyright: reportAttributeAccessIssue=false, reportPrivateImportUsage=false, reportOptionalCall=false
+# pyright: reportReturnType=false, reportAssignmentType=false
 
 from __future__ import annotations
 
 import operator
 import re
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import llvmlite.binding as llvm
 from llvmlite import ir
@@ -106,7 +110,7 @@ _define(operator.or_, MASK, (MASK, MASK))(ir.IRBuilder.or_)
 _define(operator.and_, MASK, (MASK, MASK))(ir.IRBuilder.and_)
 
 
-def select(mask, value, other):
+def select(mask, value, other) -> Any:
     """Return ``value`` in lanes where the mask is true, and ``other`` elsewhere."""
 
 
@@ -114,7 +118,7 @@ _define(select, LANES, *((MASK, *pair) for pair in _PAIRS))(ir.IRBuilder.select)
 _define(select, NUMBER, (types.boolean, NUMBER, NUMBER))(ir.IRBuilder.select)
 
 
-def smaller(value, other):
+def smaller(value, other) -> Any:
     """Return the minimum of each lane."""
 
 
@@ -123,7 +127,7 @@ def _build_smaller(builder, value, other):
     return builder.select(builder.fcmp_ordered("<", value, other), value, other)
 
 
-def larger(value, other):
+def larger(value, other) -> Any:
     """Return the maximum of each lane."""
 
 
@@ -136,21 +140,21 @@ for _function, _build in ((smaller, _build_smaller), (larger, _build_larger)):
     _define(_function, NUMBER, (NUMBER, NUMBER))(_build)
 
 
-def spread(number):
+def spread(number) -> Any:
     """Copy a number to all lanes."""
 
 
 _define(spread, LANES, (NUMBER,))(_spread)
 
 
-def ramp():
+def ramp() -> Any:
     """Return 0, 1, 2, ..."""
 
 
 _define(ramp, LANES, ())(lambda builder: FLOATS([float(lane) for lane in range(WIDTH)]))
 
 
-def magnitude(value):
+def magnitude(value) -> Any:
     """Return the absolute value of each lane."""
 
 
@@ -159,7 +163,7 @@ def _build_magnitude(builder, value):
     return _intrinsic_call(builder, "fabs", value)
 
 
-def root(value):
+def root(value) -> Any:
     """Return the square root of each lane."""
 
 
@@ -169,7 +173,7 @@ def _build_root(builder, value):
     return _intrinsic_call(builder, "sqrt", value)
 
 
-def floor(value):
+def floor(value) -> Any:
     """Return the next lower integer of each lane."""
 
 
@@ -186,7 +190,7 @@ def _intrinsic_call(builder: ir.IRBuilder, name: str, value: ir.Value) -> ir.Val
     )
 
 
-def scaled(value, exponent):
+def scaled(value, exponent) -> Any:
     """Multiply by 2 to the power of an integer, if the result is a normal number."""
 
 
@@ -196,7 +200,7 @@ def _build_scaled(builder, value, exponent):
     return builder.bitcast(builder.add(builder.bitcast(value, INTEGERS), shifted), FLOATS)
 
 
-def load(array, index):
+def load(array, index) -> Any:
     """Return the elements from ``index`` on. The index is not checked."""
 
 
@@ -230,7 +234,7 @@ def _fold(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, size: int) -> ir.Valu
     return builder.fadd(_shuffled(builder, a, b, low), _shuffled(builder, a, b, high))
 
 
-def total(value):
+def total(value) -> Any:
     """Return the sum of all lanes."""
 
 
@@ -256,7 +260,7 @@ def _build_store_totals(builder, array, index, *vectors):
     builder.store(sums, builder.bitcast(_address(builder, array, index), sums.type.as_pointer()), align=4)
 
 
-def any_of(mask):
+def any_of(mask) -> Any:
     """Test if any lane is true."""
 
 
