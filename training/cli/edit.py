@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -137,9 +138,9 @@ def _edit(options: argparse.Namespace, source: Path, limits: dict[str, Any]) -> 
     from ..splats.level_folder import read_origin
 
     crops, look, scene = _crops(options), _look(options), None
-    look_crops: list[Crop | None] = [None]
+    look_crops: Sequence[Crop | None] = [None]
     if options.keep == "all":
-        look_crops, crops = [*crops] or [None], []
+        look_crops, crops = crops or [None], []
     if options.scene is not None:
         scene = read_scene(options.scene, origin=read_origin(source))
         limits["cameras"] = tuple(scene.cameras)

@@ -45,7 +45,7 @@ KINDS = {
 """Kinds by test, see ``Cleaning.matches``. A splat of several kinds has the colour of the first."""
 
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-_GREY = 0.08, 0.45
+_GREY = 0.12, 0.55
 """Brightness of the remaining splats: of black ones, and what white ones add."""
 _SIDE = 1280
 """Longer side of the image in pixels."""
