@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.training.conftest import write_tiny_scene
 from tests.training.lod.tree.trees import tree_of
 from training.__main__ import main
 from training.render.preview import KINDS
@@ -120,6 +121,19 @@ def test_views_are_chosen_for_files_without_them(tmp_path, monkeypatch, capsys, 
     assert capsys.readouterr().out.startswith(f"{outside:,} cropped splats (blue)\nout.png: written\n")
     red, _, blue = pixels("out.png").reshape(-1, 3).T
     assert ((blue > 200) & (red < 60)).sum() > 500
+
+
+def test_views_are_those_of_a_scene(bundle, capsys):
+    """The cameras are on an arc of radius 4, and look at the origin."""
+    scene = write_tiny_scene(bundle / "scene")
+    far = [(0, 0.1 * n, -20) for n in range(5)]
+    write_ply("far.ply", red_splats([*wall(0.5), *far]))
+    assert edit("far.ply --preview out.png --max-distance 10 --scene scene") == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "5 far splats (magenta)"
+    assert (scene / "images" / lines[1].removeprefix("out.png: written, as seen in ")).is_file()
+    red, green, blue = pixels("out.png").reshape(-1, 3).T
+    assert ((red > 150) & (green < 60) & (blue > 150)).any()
 
 
 def test_nodes_of_trees_do_not_count(tmp_path, monkeypatch, make_splats, capsys):
