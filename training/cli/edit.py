@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from ..editing.cleaning import LIMITS, Cleaning
 from ..editing.export import EXPORT_OPTIONS
@@ -57,6 +59,11 @@ def _add_outputs(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--tiles", type=Path, metavar="DIR", help="folder of 3D Tiles to write, for Cesium and other globes"
     )
+    parser.add_argument(
+        "--preview", type=Path, metavar="PNG",
+        help="image to write with the splats that the clean-up removes, in one colour for each test; needs "
+        "no other output",
+    )  # fmt: skip
     for name in ("antialiased", "original_place"):
         add_setting(parser, EXPORT_OPTIONS[name], value=False)
 
@@ -92,55 +99,70 @@ def _add_look(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
-    from ..editing.edit import edit
     from ..runs.finished import bake_again
     from ..runs.folder import find_splats
     from ..splats.formats import open_as_ply
-    from ..splats.level_folder import read_origin
 
     limits = setting_values(options, Cleaning)
-    crops = _crops(options)
-    look = _look(options)
-    look_crops: list[Crop | None] = [None]
-    if options.keep == "all":
-        if crops and look is None:
-            raise LodgsError("--keep all removes nothing inside the crops.", "Add a look to apply there.")
-        look_crops = [*crops] or [None]
-        crops = []
+    if options.keep == "all" and (options.crop_box or options.crop_sphere) and _look(options) is None:
+        raise LodgsError("--keep all removes nothing inside the crops.", "Add a look to apply there.")
     if limits.keys() & {"max_distance", "min_views"} and options.scene is None:
         raise LodgsError(
             "Cannot test splats against photos: their scene is missing.", "Add its folder with --scene."
         )
-    folders = (options.folder, options.streamed, options.tiles)
-    if not (options.out or options.plain or options.levels or any(folders)):
+    if not (options.preview or _writes_splats(options)):
         raise LodgsError(
             "Cannot write the edited splats: no output.",
-            "Add --out, --plain, --levels, --folder, --streamed or --tiles.",
+            "Add --out, --plain, --levels, --folder, --streamed, --tiles or --preview.",
         )
-    points = None
     opened = (
         bake_again(options.source, options.appearance, warn)
         if options.appearance
         else open_as_ply(find_splats(options.source))
     )
     with opened as source:
-        if options.scene is not None:
-            from ..scenes.colmap import read_scene
-
-            scene = read_scene(options.scene, origin=read_origin(source))
-            limits["cameras"] = tuple(scene.cameras)
-            points = scene.points
-        print(
-            edit(
-                source, options.out, Cleaning(tuple(crops), **limits), warn,
-                placement=placement_of(options), upright=options.upright, ground=options.ground,
-                points=points, looks=[(crop, look) for crop in look_crops] if look else (),
-                plain=options.plain, levels=options.levels, folder=options.folder,
-                streamed=options.streamed, tiles=options.tiles,
-                antialiased=options.antialiased, original_place=options.original_place,
-            )
-        )  # fmt: skip
+        _edit(options, source, limits)
     return 0
+
+
+def _writes_splats(options: argparse.Namespace) -> bool:
+    """Return whether the command has an output other than the preview."""
+    names = ("out", "plain", "levels", "folder", "streamed", "tiles")
+    return any(getattr(options, name) for name in names)
+
+
+def _edit(options: argparse.Namespace, source: Path, limits: dict[str, Any]) -> None:
+    """Write the preview and the edited splats of a source, whose file may be temporary."""
+    from ..editing.edit import edit
+    from ..scenes.colmap import read_scene
+    from ..splats.level_folder import read_origin
+
+    crops, look, scene = _crops(options), _look(options), None
+    look_crops: Sequence[Crop | None] = [None]
+    if options.keep == "all":
+        look_crops, crops = crops or [None], []
+    if options.scene is not None:
+        scene = read_scene(options.scene, origin=read_origin(source))
+        limits["cameras"] = tuple(scene.cameras)
+    cleaning = Cleaning(tuple(crops), **limits)
+    if options.preview:
+        from ..render.preview import preview
+
+        views = None if scene is None else (scene.cameras, scene.near())
+        print(preview(source, cleaning, options.preview, warn, views=views))
+    if not _writes_splats(options):
+        return
+    print(
+        edit(
+            source, options.out, cleaning, warn,
+            placement=placement_of(options), upright=options.upright, ground=options.ground,
+            points=None if scene is None else scene.points,
+            looks=[(crop, look) for crop in look_crops] if look else (),
+            plain=options.plain, levels=options.levels, folder=options.folder,
+            streamed=options.streamed, tiles=options.tiles,
+            antialiased=options.antialiased, original_place=options.original_place,
+        )
+    )  # fmt: skip
 
 
 def _crops(options: argparse.Namespace) -> list[Crop]:

@@ -148,24 +148,45 @@ class Cleaning:
         label="Largest Cluster", high=1, start=MAX_FLOATER_SHARE,
     )  # fmt: skip
 
-    def keeps(self, splats: Splats) -> np.ndarray:
-        """Return (N,) bool: splats that pass all tests except the one for floaters."""
-        mask = crop_mask(self.crops, splats.means)
+    def matches(self, splats: Splats) -> dict[str, np.ndarray]:
+        """Return (N,) bool of each enabled test except the one for floaters: the splats to remove.
+
+        Names are those of the limits, and ``crops``.
+        """
+        masks = {}
+        if self.crops:
+            masks["crops"] = ~crop_mask(self.crops, splats.means)
         with np.errstate(over="ignore"):
             if self.max_size < inf:
-                mask &= ~find_large(np.exp(splats.log_scales), self.max_size)
+                masks["max_size"] = find_large(np.exp(splats.log_scales), self.max_size)
             if self.min_opacity > 0:
-                mask &= ~find_faint(1 / (1 + np.exp(-splats.opacity_logits)), self.min_opacity)
+                opacities = 1 / (1 + np.exp(-splats.opacity_logits))
+                masks["min_opacity"] = find_faint(opacities, self.min_opacity)
         if self.max_distance < inf:
             positions = np.array([camera.center for camera in self.cameras])
-            mask &= ~find_far(splats.means, positions, self.max_distance)
+            masks["max_distance"] = find_far(splats.means, positions, self.max_distance)
         if self.min_views > 0:
-            mask &= ~find_unseen(splats.means, self.cameras, self.min_views)
-        return mask
+            masks["min_views"] = find_unseen(splats.means, self.cameras, self.min_views)
+        return masks
 
 
 LIMITS = settings_of(Cleaning)
 """The settings of the tests, by name. Blender's tools start with the values ``start``."""
+
+
+@dataclass(frozen=True)
+class Unwanted:
+    """Splats of a bundle to remove.
+
+    Attributes:
+        matches: the splats that each test matches, by its name; without dependent splats.
+        remaining: the splats that no test matches.
+        relations: of the bundle's splats.
+    """
+
+    matches: Mapping[str, Masks]
+    remaining: Masks
+    relations: Relations
 
 
 def clean_bundle(bundle: Bundle, cleaning: Cleaning) -> Bundle:
@@ -176,14 +197,25 @@ def clean_bundle(bundle: Bundle, cleaning: Cleaning) -> Bundle:
     Raises:
         LodgsError: as :func:`keep_splats`.
     """
+    unwanted = find_unwanted(bundle, cleaning)
+    return keep_splats(bundle, unwanted.remaining, unwanted.relations)
+
+
+def find_unwanted(bundle: Bundle, cleaning: Cleaning) -> Unwanted:
+    """Apply all tests to a bundle's splats, which are read once."""
     related = resolve_rule(bundle.rule).relations
-    masks, means, columns = {}, {}, {}
+    matches: dict[str, dict[int, np.ndarray]] = {}
+    remaining, means, columns = {}, {}, {}
     for level in bundle.levels:
         batches = [
-            (cleaning.keeps(splats), splats.means, relation_columns(splats, related))
+            (cleaning.matches(splats), splats.means, relation_columns(splats, related))
             for splats in read_batches(level.rows)
         ]
-        masks[level.number] = np.concatenate([mask for mask, _, _ in batches])
+        remaining[level.number] = np.ones(len(level.rows), bool)
+        for name in batches[0][0]:
+            mask = np.concatenate([matching[name] for matching, _, _ in batches])
+            matches.setdefault(name, {})[level.number] = mask
+            remaining[level.number] &= ~mask
         if cleaning.drop_floaters:
             means[level.number] = np.concatenate([batch_means for _, batch_means, _ in batches])
         columns[level.number] = {
@@ -191,8 +223,11 @@ def clean_bundle(bundle: Bundle, cleaning: Cleaning) -> Bundle:
         }
     relations = related(columns)
     if cleaning.drop_floaters:
-        exclude_floaters(masks, means, relations, cleaning.gap, cleaning.share)
-    return keep_splats(bundle, masks, relations)
+        tested = {number: mask.copy() for number, mask in remaining.items()}
+        exclude_floaters(remaining, means, relations, cleaning.gap, cleaning.share)
+        matches["drop_floaters"] = {number: mask & ~remaining[number] for number, mask in tested.items()}
+    testable = {name: relations.testable(masks) for name, masks in matches.items()}
+    return Unwanted(testable, remaining, relations)
 
 
 def exclude_floaters(

@@ -71,7 +71,7 @@ def edit(
     """
     outputs = [path for path in (out, *plain, *levels, folder, streamed, tiles) if path is not None]
     _check_outputs(source, outputs, plain, levels, streamed)
-    bundle = _open(source, warn)
+    bundle = open_levels(source, warn)
     check_rule(bundle)
     edited = apply_looks_to_levels(clean_bundle(bundle, cleaning), looks)
     if placement is not None or upright or ground:
@@ -137,8 +137,12 @@ def _export_levels(bundle: Bundle, folder: Path | None, streamed: Path | None, a
             run_to_end(write_streamed_levels(streamed, levels if antialiased else bake_filter(levels)))
 
 
-def _open(source: Path, warn: Warn) -> Bundle:
-    """Open a bundle or PLY on disk; read a folder of levels."""
+def open_levels(source: Path, warn: Warn) -> Bundle:
+    """Open a bundle or PLY on disk; read a folder of levels.
+
+    Args:
+        warn: as for ``read_ply``.
+    """
     if source.is_dir():
         return read_folder(source, warn)
     bundle, rows = open_bundle(source)
