@@ -101,7 +101,7 @@ class LodgsEngine(bpy.types.RenderEngine):
 
     def _motion_keys(self, depsgraph: bpy.types.Depsgraph, names: list[str]) -> list[_MotionKey]:
         """Return the placement of cameras and splats at equal intervals of the shutter time."""
-        now, keys = depsgraph.scene.frame_current_final, []
+        now, keys = _frame(depsgraph.scene), []
         for time in shutter_times(depsgraph.scene):
             self._set_time(time)
             cameras = {
@@ -179,8 +179,13 @@ def shutter_times(scene: bpy.types.Scene) -> list[float]:
         return []
     start = {"START": 0.0, "CENTER": -0.5, "END": -1.0}[render.motion_blur_position]
     count = min(2 * scene.eevee.motion_blur_steps + 1, MAX_KEYS)
-    first = scene.frame_current_final + start * render.motion_blur_shutter
+    first = _frame(scene) + start * render.motion_blur_shutter
     return list(np.linspace(first, first + render.motion_blur_shutter, count))
+
+
+def _frame(scene: bpy.types.Scene) -> float:
+    """Return the current frame with its fraction, before time remapping, as ``frame_set`` takes it."""
+    return scene.frame_current + scene.frame_subframe
 
 
 def _matrices(depsgraph: bpy.types.Depsgraph) -> dict[tuple[int, int], np.ndarray]:

@@ -897,3 +897,14 @@ def test_the_depth_of_a_blurred_frame_is_that_of_its_time(bpy, lodgs, scene, mon
     assert centre == pytest.approx(-5.5, abs=1e-4) and len(keys) == 3
     assert keys[0] < -5.6 and keys[1] == pytest.approx(-5.5, abs=1e-4) and keys[2] > -5.4
     assert scene.frame_current == 1 and scene.frame_subframe == 0
+
+
+def test_motion_blur_follows_time_remapping(bpy, lodgs, scene):
+    """As in Cycles, the shutter opens in frames of the video, and the frame stays the current one."""
+    scene.frame_set(5)
+    scene.render.frame_map_old, scene.render.frame_map_new = 100, 50
+    scene.render.use_motion_blur, scene.render.motion_blur_shutter = True, 1.0
+    assert lodgs("render.engine").shutter_times(scene) == pytest.approx([4.5, 5, 5.5])
+    scene.render.resolution_percentage, scene.lodgs_render.samples = 10, 2
+    bpy.ops.render.render()
+    assert scene.frame_current == 5 and scene.frame_subframe == 0
