@@ -31,6 +31,7 @@ from ..training.splats.formats import FORMATS, PLY, find_format
 from ..training.splats.origin import describe_origin
 from . import extension
 from .data import importing, scenes, viewpoints
+from .data.paths import save_file
 from .render.capture import noise_warning, render_views, write_model
 from .render.video import MAX_FRAMES, extract_frames
 from .runs import environment, job_settings, jobs, photo_preparation
@@ -358,7 +359,7 @@ def _save(path: Path) -> None:
             system_remedy(error, "Choose another folder."),
         ) from error
     try:
-        bpy.ops.wm.save_as_mainfile(filepath=str(path.resolve()), check_existing=False)
+        save_file(path.resolve())
     except RuntimeError as error:
         reason = str(error).strip().removeprefix("Error: ").rstrip(".")
         raise LodgsError(

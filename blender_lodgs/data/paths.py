@@ -21,6 +21,8 @@ _previous: list[tuple[bpy.types.bpy_struct, str, str]] = []
 """Owners, property names and values of paths before the file is saved in another folder."""
 _target = ""
 """File that is being saved."""
+_SEEK_TABLE_END = b"\xb1\xea\x92\x8f"
+"""Last bytes of a compressed .blend file, from the seekable format of Zstandard."""
 
 
 def absolute_path(value: str, library: bpy.types.Library | None = None) -> Path:
@@ -48,6 +50,26 @@ def automatic_path(value: str, library: bpy.types.Library | None = None) -> Path
     share = network_share(path)
     unsafe = not value or names_device(path) or (share and share != network_share(bpy.data.filepath))
     return None if unsafe else Path(path)
+
+
+def save_file(path: Path, copy: bool = False) -> None:
+    """Save the .blend file, or a copy of it, under an absolute path.
+
+    Raises:
+        RuntimeError: the file was not saved completely.
+    """
+    bpy.ops.wm.save_as_mainfile(filepath=str(path), check_existing=False, copy=copy)
+    if not is_complete_file(path):  # Blender 5.2 reports no error on a full disk if it compresses
+        path.unlink(missing_ok=True)
+        raise RuntimeError("No space left on device")
+
+
+def is_complete_file(path: Path) -> bool:
+    """Return whether a .blend file has its last block, or its last bytes if it is compressed."""
+    with path.open("rb") as file:
+        file.seek(max(path.stat().st_size - 64, 0))
+        end = file.read()
+    return b"ENDB" in end or end.endswith(_SEEK_TABLE_END)
 
 
 def stored_path(path: Path) -> str:

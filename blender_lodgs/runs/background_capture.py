@@ -12,7 +12,7 @@ from ...training.errors import LodgsError, system_reason
 from ...training.scenes.rendered_views import CAMERAS
 from .. import extension
 from ..data import viewpoints
-from ..data.paths import absolute_path
+from ..data.paths import absolute_path, save_file
 from . import environment, processes
 from .messages import format_duration
 
@@ -118,7 +118,7 @@ def start(context: bpy.types.Context, warn: viewpoints.Warn = print) -> Backgrou
     try:
         folder.mkdir(parents=True, exist_ok=True)
         log.unlink(missing_ok=True)
-        bpy.ops.wm.save_as_mainfile(filepath=str(copy), copy=True, check_existing=False)
+        save_file(copy, copy=True)
         trusted = [] if bpy.app.autoexec_fail else ["--enable-autoexec"]  # as in this Blender
         command = [
             bpy.app.binary_path,

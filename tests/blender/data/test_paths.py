@@ -138,3 +138,15 @@ def test_appended_scenes_keep_their_paths(bpy, lodgs, saved, tmp_path, is_saved)
     run = appended.lodgs.training.run
     assert lodgs("data.paths").absolute_path(run).resolve() == expected.resolve()
     assert run.startswith("//") == is_saved and appended.lodgs.training.output == "/elsewhere"
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_truncated_blend_file_is_noticed(bpy, lodgs, tmp_path, compressed):
+    """Blender 5.2 saves such a file on a full disk, and reports success."""
+    path, is_complete_file = tmp_path / "scene.blend", lodgs("data.paths").is_complete_file
+    bpy.ops.wm.save_as_mainfile(filepath=str(path), compress=compressed)
+    assert is_complete_file(path)
+    content = path.read_bytes()
+    for size in (0, 4096, len(content) - 70):
+        path.write_bytes(content[:size])
+        assert not is_complete_file(path)
