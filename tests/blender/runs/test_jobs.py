@@ -696,7 +696,8 @@ def test_the_real_trainer(bpy, jobs, tmp_path):
     bpy.ops.lodgs.import_colmap(directory=str(REPOSITORY / "examples" / "lantern_garden"), photographs=False)
     (root,) = [obj for obj in bpy.data.objects if obj.lodgs.is_root]
     root.lodgs.training.image_scale = 0.1
-    watch = jobs.start(root, str(tmp_path / "run"), {"levels": 2, "steps": [10, 2000]})
+    settings = {"levels": 2, "steps": [10, 2000], "levels_from": "trained"}
+    watch = jobs.start(root, str(tmp_path / "run"), settings)
     _wait(watch, lambda: watch.progress.get("step", 0) > 12)
     assert list(_levels(root)) == [1]
     jobs.cancel(root)
