@@ -59,7 +59,8 @@ def reduce_detail(context: bpy.types.Context, root: bpy.types.Object, share: flo
         The share that is left out.
 
     Raises:
-        LodgsError: no known rule, or no value of the control saves splats; the controls are then as before.
+        LodgsError: no known rule, or no value of the control saves more splats. The controls are
+            then as before.
     """
     rule = find_rule(root.lodgs.rule)
     if rule is None:
@@ -73,7 +74,7 @@ def reduce_detail(context: bpy.types.Context, root: bpy.types.Object, share: flo
             setattr(root.lodgs.controls, name, value)
         context.view_layer.update()
         saved = saved_share(context, root)
-    if saved <= first:
+    if saved < share and saved <= first:
         for name, value in before.items():
             setattr(root.lodgs.controls, name, value)
         raise LodgsError(

@@ -246,6 +246,9 @@ def test_by_distance_states_its_savings_and_offers_more(bpy, lodgs, draw):
     layout = draw()
     assert f"{saved:.0%} fewer than the finest level" in layout.texts
     assert "lodgs.reduce_detail" not in layout.operators
+    gamma = root.lodgs.bands.gamma
+    assert bpy.ops.lodgs.reduce_detail(share=0.3) == {"FINISHED"}  # already saved
+    assert root.lodgs.bands.gamma == gamma
     camera.location = (0, 0, 1e-3)
     root.lodgs.levels[0].object.scale = (1, 1, 1)
     root.lodgs.bands.first = 2  # only the finest level is in use
