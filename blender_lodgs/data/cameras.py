@@ -11,7 +11,14 @@ import numpy as np
 from mathutils import Matrix, Vector
 
 from ...training.errors import LodgsError
-from ...training.render.lens import EQUIRECTANGULAR, ORTHOGRAPHIC, SHARP, Aperture, LensProjection
+from ...training.render.lens import (
+    EQUIRECTANGULAR,
+    MAX_ANGLE,
+    ORTHOGRAPHIC,
+    SHARP,
+    Aperture,
+    LensProjection,
+)
 from ...training.runs.job import MIN_VIEWS
 from ...training.scenes.cameras import Camera
 from .placement import matrix_of
@@ -132,6 +139,11 @@ def unsupported_lens(obj: bpy.types.Object) -> str:
         return "not a camera"
     if obj.data.type == "PANO" and obj.data.panorama_type != "EQUIRECTANGULAR":
         return f"a panoramic camera of the type {obj.data.panorama_type.replace('_', ' ').title()}"
+    if obj.data.type == "PANO" and not (
+        -MAX_ANGLE <= obj.data.longitude_min < obj.data.longitude_max <= MAX_ANGLE
+        and obj.data.latitude_min < obj.data.latitude_max
+    ):
+        return "a panoramic camera with an empty, inverted or too large range of angles"
     return "" if obj.data.type in ("PERSP", "ORTHO", "PANO") else f"a {obj.data.type.lower()} camera"
 
 

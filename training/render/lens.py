@@ -12,6 +12,8 @@ PERSPECTIVE, ORTHOGRAPHIC, EQUIRECTANGULAR = "perspective", "orthographic", "equ
 PROJECTIONS = PERSPECTIVE, ORTHOGRAPHIC, EQUIRECTANGULAR
 MAX_SAMPLES = 4096
 """Maximum number of samples of an image."""
+MAX_ANGLE = 7.0
+"""Maximum longitude or latitude of a panorama's edges in radians, more than one turn."""
 GOLDEN, PLASTIC = 0.6180339887498949, 0.7548776662466927
 """Inverse golden ratio and plastic number: multiples of them spread evenly modulo 1, independently."""
 

@@ -16,7 +16,7 @@ from ..lod.crop import SHAPES, Crop
 from ..lod.query import LodQuery
 from ..lod.rule import NO_RULE, Rule, fact_names, find_rule
 from ..scenes.cameras import MAX_COORDINATE, Camera, camera_from_dict, check_render_size
-from .lens import MAX_SAMPLES, PROJECTIONS, SHARP, Aperture, LensProjection
+from .lens import MAX_ANGLE, MAX_SAMPLES, PROJECTIONS, SHARP, Aperture, LensProjection
 
 MAX_BACKGROUND = 1e6
 """Maximum component of a background colour."""
@@ -179,8 +179,8 @@ def _cameras(values: dict) -> tuple[Camera, ...]:
 def _projection(values: dict) -> LensProjection:
     item = _typed({"projection": SHARP.as_dict()} | values, "projection", dict)
     (distance,) = _numbers({"distance": [item.get("distance")]}, "distance", 1, MAX_COORDINATE)
-    west, east = _numbers({"longitude": _pair(item, "longitude")}, "longitude", 2, 7)
-    south, north = _numbers({"latitude": _pair(item, "latitude")}, "latitude", 2, 7)
+    west, east = _numbers({"longitude": _pair(item, "longitude")}, "longitude", 2, MAX_ANGLE)
+    south, north = _numbers({"latitude": _pair(item, "latitude")}, "latitude", 2, MAX_ANGLE)
     if item.get("kind") not in PROJECTIONS or not (distance > 0 and west < east and south < north):
         raise _invalid("projection", item)
     return LensProjection(item["kind"], distance, (west, east), (south, north))

@@ -870,6 +870,10 @@ def test_panel_names_what_renders_ignore(bpy, lodgs, scene):
     data.type, data.panorama_type = "PANO", "EQUIRECTANGULAR"
     texts = " ".join(limitations(scene))
     assert "no depth of field" in texts and "no panoramas" in texts and "camera is panoramic" in texts
+    data.longitude_min, data.longitude_max = 1, -1
+    assert "inverted or too large range of angles, which LODGS cannot render" in limitations(scene)[0]
+    with pytest.raises(RuntimeError, match="'camera' is a panoramic camera with an empty, inverted"):
+        bpy.ops.render.render()
     data.panorama_type = "MIRRORBALL"
     assert "Mirrorball, which LODGS cannot render" in limitations(scene)[0]
     scene.camera = None
