@@ -215,6 +215,22 @@ def check_folder(folder: Path, remedy: str) -> None:
         raise LodgsError(f"The folder {folder} does not exist.", remedy)
 
 
+def create_folder(folder: Path) -> None:
+    """Create a folder for output, with its parents.
+
+    Raises:
+        LodgsError: it cannot be created or written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+    except OSError as error:
+        raise LodgsError(
+            f"Cannot write to {folder}: {error.strerror or error}.", "Choose another output folder."
+        ) from error
+
+
 def is_file(path: str | Path) -> bool:
     """Return whether a regular file exists, also for names that are too long or invalid.
 

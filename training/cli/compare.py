@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from ..errors import LodgsError
+from ..files import check_folder, create_folder
 from ..settings import settings_of
 from .options import add_setting, warn
 from .progress import notify, train
@@ -41,6 +42,7 @@ def run(options: argparse.Namespace) -> int:
     from ..runs.comparison.page import compare, format_comparison
     from ..runs.folder import RunFolder
 
+    create_folder(options.out)
     is_run = [RunFolder(source).job.is_file() for source in options.sources]
     if all(is_run):
         runs = options.sources
@@ -68,6 +70,7 @@ def _train_methods(options: argparse.Namespace) -> list[Path]:
     from ..runs.job import Job
 
     (scene,) = options.sources
+    check_folder(scene, "Name a scene, or runs.")
     keys = {"scene": str(scene)} | {name: vars(options)[name] for name in _JOB_KEYS if name in options}
     names = options.methods or list(METHODS)
     runs = []

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ..errors import LodgsError
+from ..files import check_folder, create_folder
 from ..settings import settings_of
 from .options import add_setting, parse_factor, warn
 from .progress import notify, train
@@ -49,8 +49,9 @@ def run(options: argparse.Namespace) -> int:
     from ..runs.reproduction.run import reproduce
 
     scenes = options.scenes or [EXAMPLE]
-    if not scenes[0].is_dir():
-        raise LodgsError(f"Cannot read the scene {scenes[0]}: it does not exist.", "Name one with --scene.")
+    for scene in scenes:
+        check_folder(scene, "Name a scene with --scene.")
+    create_folder(options.out)
     keys = {name: vars(options)[name] for name in _JOB_KEYS if name in options}
     print(reproduce(
         options.paper, scenes, options.out, train,

@@ -171,6 +171,14 @@ def test_scene_and_run_together_are_refused(tiny_scene, runs, tmp_path, capsys):
     assert "Name one scene, or runs only." in capsys.readouterr().err
 
 
+def test_missing_scene_and_unwritable_folder_are_named_before_any_work(runs, tmp_path, capsys):
+    assert main(["compare", str(tmp_path / "none"), "--out", str(tmp_path / "out")]) == 2
+    assert f"The folder {tmp_path / 'none'} does not exist." in capsys.readouterr().err
+    (tmp_path / "file").touch()
+    assert main(["compare", str(runs[0]), "--out", str(tmp_path / "file" / "out")]) == 2
+    assert f"Cannot write to {tmp_path / 'file' / 'out'}: " in capsys.readouterr().err
+
+
 @pytest.mark.skipif(not shutil.which("chromium"), reason="needs Chromium")
 def test_page_fills_its_tables_in_a_browser(report):
     command = ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr"]

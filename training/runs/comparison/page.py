@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ...evaluate.views import Evaluation
-from ...files import atomic_write
+from ...files import atomic_write, create_folder
 from ...lod.on_disk import open_if_large
 from ...lod.rule import Values
 from ...lod.selection import complete_splats, resolve_controls
@@ -70,7 +70,7 @@ def compare(runs: Sequence[Path], out: Path, warn: Warn = ignore, notify: Notify
         **measures(measured),
     }
     page = build_page(report, photos(evaluation, cameras), images)
-    out.mkdir(parents=True, exist_ok=True)
+    create_folder(out)
     with atomic_write(out / "compare.json") as temporary:
         Path(temporary).write_text(json.dumps(finite(report), indent=1), encoding="utf-8")
     with atomic_write(out / "index.html") as temporary:

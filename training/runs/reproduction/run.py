@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import LodgsError
-from ...files import atomic_write
+from ...files import atomic_write, create_folder
 from ...methods import method_info
 from ...splats.dialects import Warn, ignore
 from ..folder import RunFolder
@@ -138,6 +138,7 @@ def reproduce(
         rows = {row.label: _mean(values[table.name, row.label]) for row in table.rows}
         measured[table.name] = rows
     text = format_paper(paper, chosen, measured, scenes, effort)
+    create_folder(out)
     with atomic_write(out / "tables.json") as temporary:
         Path(temporary).write_text(json.dumps(measured, indent=1), encoding="utf-8")
     with atomic_write(out / "tables.md") as temporary:
