@@ -186,14 +186,38 @@ class LODGS_OT_export_compressed(_FileExport, _ConvertingExport, bpy.types.Opera
         return "Compressing, Esc to stop"
 
 
-class LODGS_OT_export_plain(_ForeignExport, _FileExport, _ConvertingExport, bpy.types.Operator):
+class _FormatExport(_ForeignExport, _FileExport, _ConvertingExport):
+    """Base class of exports to one file in a format that the property ``kind`` chooses by its suffix."""
+
+    original_place: property_of(EXPORT_OPTIONS["original_place"])
+
+    def check(self, context):
+        """Give the file name the extension of the chosen format."""
+        path, self.filepath = self.filepath, _without_suffix(self.filepath) + self.kind
+        return path != self.filepath
+
+    def check_place(self) -> None:
+        """Raise LodgsError if two places are chosen."""
+        if self.placed and self.original_place:
+            raise LodgsError(
+                "Cannot export at the original place: As Placed uses the place in Blender.",
+                "Disable one of them.",
+            )
+
+    def draw_original_place(self, context: bpy.types.Context) -> None:
+        """Draw the option of scenes that have a local origin."""
+        if selection.origin_of(roots.active_root(context)).any():
+            row = self.layout.row()
+            row.active = not self.placed
+            row.prop(self, "original_place")
+
+
+class LODGS_OT_export_plain(_FormatExport, bpy.types.Operator):
     """Export one level or the visible splats to a plain splat file for other programs"""
 
     bl_idname = "lodgs.export_plain"
     bl_label = "Export Splats"
     suffix = "_plain"
-
-    original_place: property_of(EXPORT_OPTIONS["original_place"])
 
     filter_glob: bpy.props.StringProperty(
         default=";".join(f"*{kind.suffix}" for kind in FORMATS), options={"HIDDEN"}
@@ -220,11 +244,6 @@ class LODGS_OT_export_plain(_ForeignExport, _FileExport, _ConvertingExport, bpy.
         name="Level", description="Level to export; 1 is the coarsest", default=1, min=1
     )
 
-    def check(self, context):
-        """Give the file name the extension of the chosen format."""
-        path, self.filepath = self.filepath, _without_suffix(self.filepath) + self.kind
-        return path != self.filepath
-
     def draw(self, context):
         layout = self.layout
         layout.use_property_split = True
@@ -237,10 +256,7 @@ class LODGS_OT_export_plain(_ForeignExport, _FileExport, _ConvertingExport, bpy.
         stores_filter = find_format(Path(f"splats{self.kind}")).antialiased
         row.active = roots.active_root(context).lodgs.antialias and not stores_filter
         row.prop(self, "antialiased")
-        if selection.origin_of(roots.active_root(context)).any():
-            row = layout.row()
-            row.active = not self.placed
-            row.prop(self, "original_place")
+        self.draw_original_place(context)
         layout.label(text="Format and Estimated Size")
         column = layout.column(align=True)
         column.use_property_split = False
@@ -250,11 +266,7 @@ class LODGS_OT_export_plain(_ForeignExport, _FileExport, _ConvertingExport, bpy.
 
     def work(self, context):
         root = roots.active_root(context)
-        if self.placed and self.original_place:
-            raise LodgsError(
-                "Cannot export at the original place: As Placed uses the place in Blender.",
-                "Disable one of them.",
-            )
+        self.check_place()
         if self.source == "LEVEL":
             splats = scenes.read_level(root, self.level, self.placed, self.looked)
         else:
@@ -273,15 +285,13 @@ class LODGS_OT_export_plain(_ForeignExport, _FileExport, _ConvertingExport, bpy.
         self.written = f"{len(splats):,} splats written to {path}{origin}"
 
 
-class LODGS_OT_export_levels(_ForeignExport, _FileExport, _ConvertingExport, bpy.types.Operator):
+class LODGS_OT_export_levels(_FormatExport, bpy.types.Operator):
     """Export all levels to one file of USD or glTF for other programs; uses the trainer"""
 
     bl_idname = "lodgs.export_levels"
     bl_label = "Export Levels"
     suffix = "_levels"
     filename_ext = LEVEL_FORMATS[0].suffix
-
-    original_place: property_of(EXPORT_OPTIONS["original_place"])
 
     filter_glob: bpy.props.StringProperty(
         default=";".join(f"*{kind.suffix}" for kind in LEVEL_FORMATS), options={"HIDDEN"}
@@ -292,24 +302,17 @@ class LODGS_OT_export_levels(_ForeignExport, _FileExport, _ConvertingExport, bpy
         items=[(kind.suffix, kind.label, kind.about) for kind in LEVEL_FORMATS],
     )
 
-    def check(self, context):
-        """Give the file name the extension of the chosen format."""
-        path, self.filepath = self.filepath, _without_suffix(self.filepath) + self.kind
-        return path != self.filepath
-
     def draw(self, context):
         layout = self.layout
         layout.use_property_split = True
         layout.prop(self, "kind")
         for name in ("placed", "looked", "antialiased"):
             layout.prop(self, name)
-        if selection.origin_of(roots.active_root(context)).any():
-            row = layout.row()
-            row.active = not self.placed
-            row.prop(self, "original_place")
+        self.draw_original_place(context)
         layout.label(text=f"Estimated size: {_size(context, find_format(Path(self.kind)), -1)}")
 
     def work(self, context):
+        self.check_place()
         bundle = scenes.read_levels(roots.active_root(context), self.placed, self.looked)
         flags = {"antialiased": self.antialiased, "original_place": self.original_place}
         yield from self.follow(convert_steps(bundle, "--levels", self._path(), flags))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bpy
 
+from ...training.errors import LodgsError
 from ..data import loaded, roots, scenes
 from .base import SceneOperator, report_errors
 
@@ -26,7 +27,7 @@ class LODGS_OT_show_only_level(SceneOperator, bpy.types.Operator):
 
 
 class LODGS_OT_reduce_detail(SceneOperator, bpy.types.Operator):
-    """Raise the size of the details that coarser levels may lose, until fewer splats are drawn"""
+    """Select coarser levels by distance until a share of the finest level's splats is left out"""
 
     bl_idname = "lodgs.reduce_detail"
     bl_label = "Save Splats"
@@ -44,9 +45,13 @@ class LODGS_OT_reduce_detail(SceneOperator, bpy.types.Operator):
     @report_errors
     def execute(self, context):
         root = roots.active_root(context)
-        root.lodgs.mode = "SELECTIVE"
+        mode, root.lodgs.mode = root.lodgs.mode, "SELECTIVE"
         context.view_layer.update()
-        saved = loaded.reduce_detail(context, root, self.share)
+        try:
+            saved = loaded.reduce_detail(context, root, self.share)
+        except LodgsError:
+            root.lodgs.mode = mode
+            raise
         self.report({"INFO"}, f"By Distance draws {saved:.0%} fewer splats than the finest level")
         return {"FINISHED"}
 

@@ -37,6 +37,8 @@ def test_levels_leave_blender_and_return(bpy, lodgs, file, tmp_path):
     for ending in (".usdc", ".glb"):
         out = tmp_path / f"out{ending}"
         assert bpy.ops.lodgs.export_levels(filepath=str(out)) == {"FINISHED"} and out.exists()
+    with pytest.raises(RuntimeError, match="original place"):
+        bpy.ops.lodgs.export_levels(filepath=str(out), placed=True, original_place=True)
     assert bpy.ops.lodgs.export_tiles(directory=str(tmp_path / "web")) == {"FINISHED"}
     assert (tmp_path / "web" / "tileset.json").exists()
     back = lodgs("data.importing").import_splats(bpy.context, tmp_path / "out.glb")

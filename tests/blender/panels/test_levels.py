@@ -254,6 +254,7 @@ def test_by_distance_states_its_savings_and_offers_more(bpy, lodgs, draw):
     root.lodgs.bands.first = 2  # only the finest level is in use
     bpy.context.view_layer.update()
     gamma = root.lodgs.bands.gamma
+    root.lodgs.mode = "SINGLE"
     with pytest.raises(RuntimeError, match="Cannot save splats"):
         bpy.ops.lodgs.reduce_detail()
-    assert root.lodgs.bands.gamma == gamma
+    assert root.lodgs.bands.gamma == gamma and root.lodgs.mode == "SINGLE"

@@ -5,35 +5,18 @@ import re
 import shutil
 import subprocess
 
-import numpy as np
 import pytest
 
 from training.__main__ import main
 from training.errors import LodgsError
-from training.runs.comparison.measures import ComparedRun, Point, answers, measure_run
+from training.runs.comparison.measures import ComparedRun, Point, answers, label_runs, measure_run
 from training.runs.comparison.page import build_page, compare
 from training.runs.events import event_line
 from training.runs.folder import RunFolder
 from training.runs.job import Job
 from training.runs.measure import evaluate_run
-from training.scenes.colmap import read_scene
 from training.splats.bundle import write_bundle
-from training.splats.gaussians import SH_C0, Splats
 from training.splats.levels import Bundle, Level
-
-
-@pytest.fixture(scope="module")
-def splats(tiny_scene) -> Splats:
-    """The points of the tiny scene as opaque spheres of the discs' size."""
-    model = read_scene(tiny_scene)
-    count = len(model.points)
-    return Splats(
-        means=model.points,
-        quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
-        log_scales=np.full((count, 3), np.log(0.12), np.float32),
-        opacity_logits=np.full(count, 3, np.float32),
-        sh=((model.point_colors[:, None] / 255 - 0.5) / SH_C0).astype(np.float32),
-    )
 
 
 @pytest.fixture(scope="module")
@@ -141,6 +124,17 @@ def test_runs_of_other_scenes_are_refused(runs, tmp_path):
     RunFolder(other).job.write_text(text)
     with pytest.raises(LodgsError):
         compare([runs[0], other], tmp_path / "out")
+
+
+def test_labels_tell_runs_apart(runs, tmp_path):
+    for parent in ("a", "b"):
+        shutil.copytree(runs[1], tmp_path / parent / "run")
+    copies = [tmp_path / "a" / "run", tmp_path / "b" / "run"]
+    plain = label_runs([runs[1]])[0]
+    assert label_runs([runs[1], copies[0]]) == [f"{plain} (3dgs)", f"{plain} (run)"]
+    assert label_runs(copies) == [f"{plain} ({copies[0]})", f"{plain} ({copies[1]})"]
+    with pytest.raises(LodgsError, match="twice"):
+        label_runs([runs[1], runs[1]])
 
 
 def test_command_trains_the_methods_of_a_scene(tiny_scene, runs, tmp_path, capsys, monkeypatch):

@@ -25,7 +25,7 @@ from training.runs.measure import evaluate_run, format_report, size_lines
 from training.scenes.cameras import Camera, write_camera
 from training.scenes.colmap import read_scene
 from training.splats.bundle import write_bundle
-from training.splats.gaussians import SH_C0, Splats
+from training.splats.gaussians import Splats
 from training.splats.levels import Bundle, Level
 
 
@@ -33,20 +33,6 @@ from training.splats.levels import Bundle, Level
 def scene(tiny_scene, tmp_path_factory):
     """A copy of the tiny scene that tests may modify."""
     return shutil.copytree(tiny_scene, tmp_path_factory.mktemp("measured") / "scene")
-
-
-@pytest.fixture(scope="module")
-def splats(scene) -> Splats:
-    """The points of the tiny scene as opaque spheres of the discs' size."""
-    model = read_scene(scene)
-    count = len(model.points)
-    return Splats(
-        means=model.points,
-        quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
-        log_scales=np.full((count, 3), np.log(0.12), np.float32),
-        opacity_logits=np.full(count, 3, np.float32),
-        sh=((model.point_colors[:, None] / 255 - 0.5) / SH_C0).astype(np.float32),
-    )
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 import json
 
-import numpy as np
 import pytest
 
 from training.__main__ import main
@@ -23,7 +22,6 @@ from training.runs.reproduction.run import (
 from training.runs.reproduction.tables import PSNR, SPLATS, Training, ascending, format_table, trade
 from training.scenes.colmap import read_scene
 from training.splats.bundle import write_bundle
-from training.splats.gaussians import SH_C0, Splats
 from training.splats.levels import Bundle, Level
 
 TABLES = [(paper, table) for paper in map(load_paper, PAPERS) for table in paper.tables]
@@ -82,17 +80,9 @@ def test_tables_are_chosen_by_number_or_name():
 
 
 @pytest.fixture
-def train(tiny_scene):
+def train(splats):
     """Writes a finished FLoD run of five levels in place of a training, and lists the jobs."""
-    model = read_scene(tiny_scene)
-    count = len(model.points)
-    splats = Splats(
-        means=model.points,
-        quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
-        log_scales=np.full((count, 3), np.log(0.12), np.float32),
-        opacity_logits=np.full(count, 3, np.float32),
-        sh=((model.point_colors[:, None] / 255 - 0.5) / SH_C0).astype(np.float32),
-    )
+    count = len(splats)
     jobs = []
 
     def write(job: Job, text: str) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import io
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from dataclasses import replace as replaced
 
 import numpy as np
@@ -182,8 +182,3 @@ def encode(image: torch.Tensor, size: tuple[int, int] | None = None) -> str:
     file = io.BytesIO()
     picture.save(file, "JPEG", quality=QUALITY)
     return "data:image/jpeg;base64," + base64.b64encode(file.getvalue()).decode()
-
-
-def as_plain(images: RunImages) -> dict:
-    """Return images as plain values for JSON."""
-    return asdict(images)

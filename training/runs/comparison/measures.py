@@ -73,7 +73,8 @@ class ComparedRun:
         by_distance: quality with the rule's default controls, or None without a rule.
         merged: number of splats and PSNR in dB of the finest level with merged neighbours, the baseline.
         farther: rows of ``evaluate.distance.measure_farther_views``.
-        largest_jump: largest jump of a fly-out relative to full detail, or None without a rule.
+        largest_jump: largest jump of a fly-out relative to full detail, faded if the rule can fade, or None
+            without a rule.
         loaded: mean number of splats that a viewer loads for a view.
         megabytes: size of all levels in one file.
         seconds: seconds of training, or None.
@@ -169,7 +170,7 @@ def compared_run(folder: RunFolder, job: Job, report: dict, label: str) -> Compa
         by_distance=Point.of(report["selective"][0], "By distance", prefix) if report["selective"] else None,
         merged=[*merged, (finest.splats, finest.psnr)] if merged else [],
         farther=[dict(row) for row in report.get("farther", [])],
-        largest_jump=min(map(float, report["jumps"].values())) if report.get("jumps") else None,
+        largest_jump=float(next(iter(report["jumps"].values()))) if report.get("jumps") else None,
         loaded=int(report.get("loaded", finest.splats)),
         megabytes=folder.bundle.stat().st_size / 1e6,
         seconds=float(seconds) if isinstance(seconds, (int, float)) else None,
@@ -255,7 +256,8 @@ def label_runs(runs: Sequence[Path]) -> list[str]:
     """Return labels of finished runs: the method, with the folder's name where methods repeat.
 
     Raises:
-        LodgsError: a run is not finished, or the runs have different scenes or held-out photos.
+        LodgsError: a run is not finished or named twice, or the runs have different scenes or held-out
+            photos.
     """
     jobs = [open_finished(run, ignore)[1] for run in runs]
     first = jobs[0]
@@ -265,8 +267,12 @@ def label_runs(runs: Sequence[Path]) -> list[str]:
                 f"Cannot compare {run} with {runs[0]}: their scenes or held-out photos differ.",
                 "Choose runs of one scene.",
             )
-    labels = [METHODS[job.method].label for job in jobs]
-    return [
-        f"{label} ({run.name})" if labels.count(label) > 1 else label
-        for label, run in zip(labels, runs, strict=True)
+    methods = [METHODS[job.method].label for job in jobs]
+    names = [run.resolve().name for run in runs]
+    labels = [
+        label if methods.count(label) == 1 else f"{label} ({name if names.count(name) == 1 else run})"
+        for label, name, run in zip(methods, names, runs, strict=True)
     ]
+    if len(set(labels)) < len(labels):
+        raise LodgsError("Cannot compare a run with itself: a run is named twice.", "Name each run once.")
+    return labels

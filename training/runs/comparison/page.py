@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import json
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 
 from ...evaluate.views import Evaluation
@@ -18,7 +19,7 @@ from ...splats.levels import Bundle
 from ..finished import open_finished
 from ..folder import RunFolder
 from ..measure import finite
-from .images import RunImages, as_plain, compared_views, photos, render_merges, render_run
+from .images import RunImages, compared_views, photos, render_merges, render_run
 from .measures import ComparedRun, Notify, compared_count, label_runs, measure_run, measures, merge_baseline
 
 TEMPLATE = Path(__file__).with_name("page.html")
@@ -97,7 +98,7 @@ def build_page(report: dict, photo_addresses: Sequence[str], images: Sequence[Ru
         photo_addresses: addresses of the photos of the views.
         images: images of the runs, in the order of the report.
     """
-    content = finite({**report, "photos": list(photo_addresses), "images": [as_plain(run) for run in images]})
+    content = finite({**report, "photos": list(photo_addresses), "images": [asdict(run) for run in images]})
     # "</" would end the script in which the data are
     data = json.dumps(content, allow_nan=False).replace("</", "<\\/")
     template = TEMPLATE.read_text(encoding="utf-8")

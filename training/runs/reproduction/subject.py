@@ -12,7 +12,6 @@ from ...evaluate.views import Evaluation
 from ...lod.on_disk import open_if_large
 from ...lod.selection import resolve_controls, select
 from ...rasterize.resident import ResidentBundle
-from ...scenes.cameras import Camera
 from ...splats.bundle import read_bundle
 from ...splats.dialects import Warn, ignore
 from ...splats.levels import Bundle
@@ -70,11 +69,7 @@ class Subject:
     def networks(self) -> dict[str, float]:
         """Measure the images of the networks, before baking."""
         _, model = load_networks(self.job, self.folder, self.evaluation.data)
-
-        def render(camera: Camera):
-            return model.render_image(camera)
-
-        return self._named(self.evaluation.measure_images(render))
+        return self._named(self.evaluation.measure_images(model.render_image))
 
     def sized_level(self) -> dict[str, float]:
         """Measure the finest level, with its share of the bundle's size as ``megabytes``."""
