@@ -74,7 +74,7 @@ fuzz: setup
 lint: setup
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
-	.venv/bin/pyright
+	.venv/bin/pyrefly check --min-severity error --output-format min-text
 	$(VENV) tools/prose.py
 
 docs: setup

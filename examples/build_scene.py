@@ -8,7 +8,6 @@ metres, z is up, the table is at the origin, and the arcs of cameras face north 
 """
 
 # Blender's stubs type nodes, sockets, modifiers and object data by their base classes.
-# pyright: reportAttributeAccessIssue=false, reportOptionalMemberAccess=false
 
 from __future__ import annotations
 

@@ -157,7 +157,7 @@ def train(options: argparse.Namespace) -> dict:
         loaded[:] = [load_cut(*arguments)]
         return loaded[0]
 
-    store.load_cut, method.load_cut = timed_take, kept_cut  # pyright: ignore
+    store.load_cut, method.load_cut = timed_take, kept_cut
     resize = store.update_sizes
     resize_times = []
 

@@ -124,7 +124,7 @@ def train_until_killed(job: Path, kind: str, number: int, share: float, counts_f
 
     row_file._write = write_back
     files.os.fsync, files.os.replace = sync, move  # type: ignore[assignment]
-    Method.train_step, EventWriter._append = step, append_event  # pyright: ignore
+    Method.train_step, EventWriter._append = step, append_event
     code = __main__.main(["train", str(job)])
     if counts_file is not None:
         counts_file.write_text(json.dumps(counts))

@@ -3,7 +3,6 @@
 Runs inside Blender. A timer runs one step after the other, so that Blender redraws and handles events between
 steps.
 """
-# pyright: reportAttributeAccessIssue=false, reportGeneralTypeIssues=false
 
 from __future__ import annotations
 
@@ -228,7 +227,7 @@ def screenshot(name: str, fact: str = "", redraw_first: bool = True) -> np.ndarr
 def pixels(path: Path) -> np.ndarray:
     """Read an image file as (H, W, 3) float32 display values, rows from the top."""
     image = bpy.data.images.load(str(path))
-    width, height = image.size
+    width, height = image.size  # pyrefly: ignore[not-iterable]
     values = np.empty(width * height * 4, np.float32)
     image.pixels.foreach_get(values)
     bpy.data.images.remove(image)

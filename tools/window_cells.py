@@ -3,7 +3,6 @@
 ``tools/window.py --cells`` runs it inside Blender: show the plan, train two cells at a time, cancel and
 resume one, reopen the file meanwhile, and import the levels.
 """
-# pyright: reportAttributeAccessIssue=false, reportGeneralTypeIssues=false
 
 from __future__ import annotations
 

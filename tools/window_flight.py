@@ -4,7 +4,6 @@
 and reopen the file, and use a render region and F12. It times all calls from Blender to LODGS in the main
 thread, and Blender's evaluations. Drawing pixels is timed separately: this display uses software rendering.
 """
-# pyright: reportAttributeAccessIssue=false, reportGeneralTypeIssues=false
 
 from __future__ import annotations
 

@@ -3,8 +3,6 @@
 ``tools/pictures.py`` runs it inside Blender. The 3D viewport fills the window. Each picture shows the LODGS
 tab with the panels that its page describes.
 """
-# pyright: reportAttributeAccessIssue=false, reportGeneralTypeIssues=false, reportOptionalMemberAccess=false
-# pyright: reportArgumentType=false
 
 from __future__ import annotations
 

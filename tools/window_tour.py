@@ -3,7 +3,6 @@
 ``tools/window.py`` runs it inside Blender. A timer runs the steps of :func:`tour`, so that Blender redraws,
 handles events and trains between steps.
 """
-# pyright: reportAttributeAccessIssue=false, reportGeneralTypeIssues=false
 
 from __future__ import annotations
 

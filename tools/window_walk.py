@@ -3,8 +3,6 @@
 ``tools/window.py --walk`` runs it inside Blender, as ``window_tour``. All edits of splats are undone step by
 step and redone.
 """
-# pyright: reportAttributeAccessIssue=false, reportGeneralTypeIssues=false, reportOptionalMemberAccess=false
-# pyright: reportArgumentType=false
 
 from __future__ import annotations
 

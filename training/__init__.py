@@ -10,7 +10,7 @@ import re
 from importlib import import_module, metadata
 from pathlib import Path
 
-__all__ = ["VERSION", "LodgsError", "load_bundle", "load_scene", "render_image", "select", "train"]  # pyright: ignore
+__all__ = ["VERSION", "LodgsError", "load_bundle", "load_scene", "render_image", "select", "train"]  # pyrefly: ignore
 
 _MANIFEST = Path(__file__).resolve().parent.parent / "blender_manifest.toml"
 

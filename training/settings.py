@@ -71,7 +71,7 @@ def label_of(f: Field) -> str:
 
 def default_of(f: Field) -> bool | int | float | str:
     """Return the default of a setting, or the first entry of a tuple."""
-    return f.default[0] if isinstance(f.default, tuple) else f.default  # pyright: ignore
+    return f.default[0] if isinstance(f.default, tuple) else f.default  # pyrefly: ignore[bad-return]
 
 
 def describe_values(f: Field) -> str:

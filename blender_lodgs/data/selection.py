@@ -128,7 +128,8 @@ def camera_position(root: bpy.types.Object, scene: bpy.types.Scene) -> tuple[flo
     obj = getattr(settings, choice.object) if choice.object else scene.camera
     if obj is None:
         return (0.0, 0.0, 0.0)  # as in geometry nodes
-    return tuple(axes_of(root).matrix_world.inverted_safe() @ obj.matrix_world.translation)
+    x, y, z = axes_of(root).matrix_world.inverted_safe() @ obj.matrix_world.translation
+    return x, y, z
 
 
 def store_camera(root: bpy.types.Object, position: tuple[float, float, float], focal_px: float) -> None:

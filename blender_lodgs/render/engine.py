@@ -355,7 +355,7 @@ def placed_splats(
     For an object whose splats are selected only by a rule, all its splats are returned with the arguments of
     the rule. Other objects give the splats that remain after their modifiers.
     """
-    placed = []
+    placed: list[renderer.PlacedSplats | renderer.PlacedFile] = []
     instances = shown.drop_streamed_levels(shown.splat_instances(depsgraph))
     for identity, instance in zip(_identities(instances), instances, strict=True):
         evaluated, matrix, level = instance.evaluated, instance.matrix_world, instance.level

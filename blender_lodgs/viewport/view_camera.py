@@ -115,7 +115,8 @@ def current_camera(scene: bpy.types.Scene, root: bpy.types.Object) -> tuple[Posi
         return None
     _, position, focal_px = _pending
     local = axes_of(root).matrix_world.inverted_safe() @ Vector(position)
-    return tuple(np.float32(local).tolist()), float(np.float32(focal_px))  # rounded like the properties
+    x, y, z = map(float, np.float32(local))
+    return (x, y, z), float(np.float32(focal_px))  # rounded like the properties
 
 
 def view_query(

@@ -27,7 +27,7 @@ ARRAYS = {"means": np.arange(60.0, dtype="f4").reshape(20, 3), "network.weight":
 
 def archive() -> bytes:
     file = io.BytesIO()
-    np.savez(file, **ARRAYS)  # pyright: ignore[reportArgumentType]
+    np.savez(file, **ARRAYS)
     return file.getvalue()
 
 

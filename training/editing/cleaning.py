@@ -332,8 +332,8 @@ class RowSubset:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def select(self, index: slice, /) -> Splats:
-        """Read a range of the subset."""
+    def select(self, index: slice | np.ndarray, /) -> Splats:
+        """Read rows of the subset."""
         splats = self.source.select(self.rows[index])
         splats.extras |= {name: column[index] for name, column in self.columns.items()}
         return splats

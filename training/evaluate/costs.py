@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -54,7 +55,7 @@ def cost_curves(meta: dict) -> list[CostCurve]:
     return [curve for curve in curves if curve is not None]
 
 
-def _parse_curve(entry: object) -> CostCurve | None:
+def _parse_curve(entry: Any) -> CostCurve | None:
     match entry:
         case {"level": int(level), "distances": list(distances), "costs": list(costs), **further} if (
             level > 0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 
 from ..scenes.cameras import pick_evenly
@@ -23,7 +25,7 @@ def summarize(evaluation: Evaluation, bundle: Bundle) -> dict:
     data = evaluation.data
     source = full_detail_source(bundle, bundle.levels[-1])
     train_psnr = evaluation.compare_views(pick_evenly(data.train, MAX_TRAINING_VIEWS), source)
-    measures = {
+    measures: dict[str, Any] = {
         "train_psnr": round(float(train_psnr.mean()), 3),
         "veil": measure_veil(evaluation, source),
         "oversized": count_oversized(data, source),

@@ -310,9 +310,11 @@ class ResidentBundle:
         """Render one level; see :meth:`select_level` and :func:`draw`."""
         return self._draw(self.select_level(number, camera), camera, near, options)
 
-    def _draw(self, sets: dict[int, WeightedSet], camera: Camera, near: float, options: dict) -> Rendering:
-        options = {"antialias": self.bundle.antialias, "backend": self._backend} | options
-        return draw(list(sets.values()), camera, near=near, **options)
+    def _draw(
+        self, sets: dict[int, WeightedSet], camera: Camera, near: float, options: dict[str, Any]
+    ) -> Rendering:
+        defaults: dict[str, Any] = {"antialias": self.bundle.antialias, "backend": self._backend}
+        return draw(list(sets.values()), camera, near=near, **(defaults | options))
 
     def _all_facts(self) -> dict[int, tuple[tuple[str, float], ...]]:
         """Return the rule's facts of every level, by number."""

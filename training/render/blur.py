@@ -120,7 +120,8 @@ def _matrix_at(keys: Sequence[np.ndarray], time: float) -> np.ndarray:
     if not share:
         return keys[index]
     first, second = keys[index : index + 2]
-    (turn, size), (next_turn, next_size) = polar(first[:3, :3]), polar(second[:3, :3])
+    turn, size = map(np.asarray, polar(first[:3, :3]))
+    next_turn, next_size = map(np.asarray, polar(second[:3, :3]))
     if np.linalg.det(turn) * np.linalg.det(next_turn) < 0:  # mirrored on the way
         return first if share < 0.5 else second
     matrix = (1 - share) * first + share * second

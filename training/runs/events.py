@@ -113,7 +113,7 @@ def _is_text(value: object) -> bool:
 
 
 def _is_number(value: object) -> bool:
-    return type(value) in (int, float) and -_MAX_NUMBER <= value <= _MAX_NUMBER  # pyright: ignore
+    return type(value) in (int, float) and -_MAX_NUMBER <= value <= _MAX_NUMBER  # pyrefly: ignore[unsupported-operation]
 
 
 def _is_count(value: object) -> bool:

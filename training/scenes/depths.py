@@ -169,6 +169,7 @@ def fit_scale_and_shift(values: np.ndarray, z: np.ndarray, is_depth: bool) -> tu
     rows = np.stack([values * weight, weight], axis=1)
     goal = 1 / z
     inliers = np.ones(len(z), bool)
+    solution, residuals = np.zeros(2), goal
     for _ in range(ROUNDS):
         if inliers.sum() < MIN_POINTS:
             return None

@@ -51,7 +51,7 @@ class ImageFiles:
         """
         relative = relative_image_path(name)
         file: Path | None = self._folder / name
-        exists = is_file(file)
+        exists = is_file(self._folder / name)
         if not exists or relative.suffix.lower() in UNREADABLE_SUFFIXES:
             original = file if exists else None
             if self._by_normal_name is None:

@@ -167,7 +167,7 @@ class CodedRows:
         for name, table in self._tables.items():
             rows[name] = table[self.codes[_PREFIX + name]]
         vectors = np.stack([rows[name] for name in _ROTATION])
-        squares = (vectors**2).sum(axis=0)
+        squares = np.square(vectors).sum(axis=0)
         rows["rot_0"] = (1 - squares) / (1 + squares)
         for name, values in zip(_ROTATION, vectors, strict=True):
             rows[name] = 2 * values / (1 + squares)

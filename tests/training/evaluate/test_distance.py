@@ -41,7 +41,7 @@ def camera() -> Camera:
 @pytest.fixture
 def evaluation(camera) -> Evaluation:
     data = SimpleNamespace(train=[], test=[camera], median_depth=5.0, near=0.01)
-    return Evaluation(data, "cpu")  # pyright: ignore[reportArgumentType]
+    return Evaluation(data, "cpu")
 
 
 def test_pulled_back_camera_multiplies_the_distance(camera):

@@ -45,7 +45,7 @@ def evaluation(*cameras: Camera) -> Evaluation:
         train=list(cameras), test=[], median_depth=MEDIAN_DEPTH, near=0.01 * MEDIAN_DEPTH,
         mean_camera=centers.mean(0), extent=2.0,
     )  # fmt: skip
-    return Evaluation(data, "cpu")  # pyright: ignore[reportArgumentType]
+    return Evaluation(data, "cpu")
 
 
 def test_positions_are_halfway_to_the_first_second_and_fourth_nearest():

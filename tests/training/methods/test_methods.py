@@ -252,7 +252,7 @@ def test_incomplete_method_cannot_be_created(data, tiny):
 
     assert inspect.isabstract(Method)
     with pytest.raises(TypeError, match="levels_after"):
-        Forgetful(data, tiny.preset("draft"), 0, "cpu")  # pyright: ignore[reportAbstractUsage]
+        Forgetful(data, tiny.preset("draft"), 0, "cpu")
 
 
 def test_scene_metadata(data, tiny):

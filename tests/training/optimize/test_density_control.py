@@ -118,13 +118,13 @@ def test_peak_scores_match_equation_6():
     )
     for gradients, radii in views:
         rendering = SimpleNamespace(grad2d=torch.tensor(gradients), radii=torch.tensor(radii))
-        model.accumulate_stats(rendering)  # pyright: ignore[reportArgumentType]
+        model.accumulate_stats(rendering)
     faint = 1 / (1 + np.exp(10.0))
     expected = [5e-4 * 20 * 0.5**0.2, 1e-3 * 15 * 0.5**0.2, 5e-4 * 40 * faint**0.2]
     np.testing.assert_allclose(peak_scores(model), expected, rtol=1e-6)
     # an image of half the side has gradients twice as large, which are scaled down
     shrunk = SimpleNamespace(grad2d=torch.tensor([[0.0, 2e-3]] * 3), radii=torch.tensor([1.0] * 3))
-    model.accumulate_stats(shrunk, shrink=2)  # pyright: ignore[reportArgumentType]
+    model.accumulate_stats(shrunk, shrink=2)
     np.testing.assert_allclose(model.stats["gradient_max"], [1e-3] * 3, rtol=1e-6)
     model.reset_stats()
     assert not peak_scores(model).any()

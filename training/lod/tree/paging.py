@@ -274,8 +274,8 @@ class TreePager:
         self._used, self._tick = np.zeros(len(self.file), np.int64), 0
         self._index: BlockIndex | None = None
         self._request: tuple[np.ndarray, float, np.ndarray | None] | None = None
-        self._current = self._request
-        self._settled = self._request
+        self._current: tuple[np.ndarray, float, np.ndarray | None] | None = None
+        self._settled: tuple[np.ndarray, float, np.ndarray | None] | None = None
         self._changed, self._stopping = threading.Condition(), False
         self._ready: PageUpdate | None = None
         self._thread: threading.Thread | None = None

@@ -60,8 +60,13 @@ def default_budget(device: torch.device | str = "cpu") -> int:
 
 def record_layout(sh_degree: int) -> RowLayout:
     """Return the layout of a node's record, see ``rasterize.records``."""
-    shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "opacity_logits": ()}
-    values: dict[str, tuple[int, ...]] = shapes | {"sh": ((sh_degree + 1) ** 2, 3)}
+    shapes: dict[str, tuple[int, ...]] = {
+        "means": (3,),
+        "quats": (4,),
+        "log_scales": (3,),
+        "opacity_logits": (),
+    }
+    values = shapes | {"sh": ((sh_degree + 1) ** 2, 3)}
     count = sum(map(prod, values.values()))
     moments: dict[str, tuple[int, ...]] = {"first": (count,), "second": (count,)}
     return RowLayout({**values, **moments, "steps": (), "score": (), "seen": ()})

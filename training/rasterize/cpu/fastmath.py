@@ -101,7 +101,7 @@ def exp2(x):
     floor = np.floor(x)
     f = x - floor
     p = f32(1) + f * (P1 + f * (P2 + f * (P3 + f * P4)))
-    return bits_float(float_bits(p) + (truncated(floor) << np.int32(23)))  # pyright: ignore[reportCallIssue]
+    return bits_float(float_bits(p) + (truncated(floor) << np.int32(23)))  # pyrefly: ignore[missing-argument]
 
 
 @inlined(FAST - {"reassoc"})

@@ -9,8 +9,7 @@ Arithmetic operators and comparisons apply lane by lane; a number applies to all
 are declarations for kernels: Python cannot call them.
 """
 # llvmlite and Numba declare too few types
-# pyright: reportAttributeAccessIssue=false, reportPrivateImportUsage=false, reportOptionalCall=false
-# pyright: reportReturnType=false, reportAssignmentType=false
+# pyrefly: ignore-errors
 
 from __future__ import annotations
 

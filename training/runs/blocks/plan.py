@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 from math import ceil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -191,7 +192,8 @@ def plan(job: Job, scene: Scene | None = None) -> list[PlannedCell]:
         share = views / len(training)
         limit = undivided.max_splats
         splats = max(round(limit * points / len(scene.points)), 1) if limit else 0
-        parameters = replace(undivided, steps=_scaled(undivided.steps, share), max_splats=splats)
+        steps: Any = _scaled(undivided.steps, share)  # a tuple in FLoD
+        parameters = replace(undivided, steps=steps, max_splats=splats)
         memory = _memory(parameters, views, pixels, job.photo_memory)
         part = _part_job(job, parameters)
         cells.append(PlannedCell(number, region, part, views, points, parameters.total_steps, splats, memory))
@@ -350,9 +352,9 @@ def _polishes(job: Job) -> bool:
 
 def _seam_job(job: Job) -> Job:
     parameters, _ = _divided(job)
-    common = {field.name: getattr(parameters, field.name) for field in fields(Parameters)}
+    common: dict[str, Any] = {field.name: getattr(parameters, field.name) for field in fields(Parameters)}
     preset = method_info(SEAM_METHOD).preset(job.preset)
-    changes = {**common, "steps": job.polish, **SEAM_PARAMETERS}
+    changes: dict[str, Any] = {**common, "steps": job.polish, **SEAM_PARAMETERS}
     return _part_job(job, replace(preset, **changes), SEAM_METHOD)
 
 

@@ -213,7 +213,7 @@ def test_arrays_restore_the_networks(data, tmp_path):
     method = make(data, appearance=2)
     for step in range(4):
         method.train_step(step)
-    np.savez(tmp_path / "model.npz", **method.arrays())  # pyright: ignore[reportArgumentType]
+    np.savez(tmp_path / "model.npz", **method.arrays())
     second = make(data, appearance=2)
     arrays = read_arrays(tmp_path / "model.npz")
     second.load_arrays(arrays)

@@ -178,7 +178,7 @@ def test_resumed_run_is_bit_identical(tmp_path):
     results = steps(cache, 0, 23)
     state = cache.state_dict()
     steps(cache, 23, 31)  # not saved, lost
-    cache.rows.close()  # pyright: ignore
+    cache.rows.close()
     cache = fresh("parts")
     cache.load_state_dict(state)
     results += steps(cache, 23, 60)

@@ -235,7 +235,7 @@ def intercept_writes(hit) -> None:
         hit(next(counter), lambda: None)
         replace(source, target)
 
-    row_file_module._write, os.fsync, os.replace = writing, syncing, moving  # pyright: ignore
+    row_file_module._write, os.fsync, os.replace = writing, syncing, moving
 
 
 def _killed(folder: RunFolder, at: int, counted) -> None:
