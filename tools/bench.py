@@ -22,7 +22,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import numpy as np
 import torch
 
-from training.lod.blocks import spatial_order
 from training.lod.query import LodQuery, SplatSelector
 from training.lod.rule import collect_facts
 from training.lod.rules.bands import RULE as BANDS
@@ -52,6 +51,7 @@ from training.rasterize.cpu.fastmath import exp2
 from training.rasterize.cpu.lanes import WIDTH
 from training.rasterize.cpu.project import strip_rows
 from training.scenes.cameras import Camera
+from training.splats.morton import spatial_order
 
 ROOT = Path(__file__).resolve().parent.parent
 CASES = [

@@ -8,7 +8,6 @@ from pathlib import Path
 import bpy
 from bpy_extras.io_utils import ExportHelper
 
-from ...training.editing.bake_filter import bake_filter
 from ...training.editing.export import COMPRESSION_SETTINGS, EXPORT_OPTIONS, export_finest_level
 from ...training.errors import LodgsError
 from ...training.lod.rule import resolve_rule
@@ -21,7 +20,7 @@ from ...training.splats.level_folder import write_folder
 from ...training.splats.levels import Bundle, Level
 from ...training.splats.origin import describe_origin
 from ...training.splats.splat_format import SplatFormat
-from ...training.splats.streamed_levels import STREAMED_FILE, write_streamed_levels
+from ...training.splats.streamed_levels import STREAMED_FILE
 from ..data import roots, scenes, selection
 from ..data.objects import megabytes, sh_degree
 from ..data.paths import absolute_path
@@ -400,16 +399,16 @@ class LODGS_OT_export_tiles(_ForeignExport, _FolderExport, _ConvertingExport, bp
 
 
 class LODGS_OT_export_streamed(_ForeignExport, _FolderExport, _ConvertingExport, bpy.types.Operator):
-    """Export levels for web viewers that stream detail by distance; slow without a GPU"""
+    """Export levels for web viewers that stream detail by distance; uses the trainer"""
 
     bl_idname = "lodgs.export_streamed"
     bl_label = "Export for Web"
     kind = SOG
 
     def work(self, context):
-        bundle = self._bundle(context)
-        bundle = bundle if self.antialiased else bake_filter(bundle)
-        yield from self.follow(write_streamed_levels(self._folder(), bundle))
+        bundle = scenes.read_levels(roots.active_root(context), self.placed, self.looked)
+        flags = {"antialiased": self.antialiased}
+        yield from self.follow(convert_steps(bundle, "--streamed", self._folder(), flags))
         self.written = f"{_levels(bundle)} written: {self._folder() / STREAMED_FILE}{_origin_text(bundle)}"
 
 

@@ -19,6 +19,7 @@ from ..splats.levels import Bundle
 from ..splats.origin import describe_origin
 from ..splats.ply import write_ply
 from ..splats.similarity import Similarity
+from ..splats.sog import load_packages
 from ..splats.splat_transform import find_splat_transform
 from ..splats.streamed_levels import write_streamed_levels
 from .bake_filter import bake_filter
@@ -123,7 +124,9 @@ def _check_outputs(
     for kind in kinds:
         if kind.require is not None:
             kind.require()
-    if streamed is not None or any(kind.uses_splat_transform for kind in kinds):
+    if streamed is not None:
+        load_packages()
+    if any(kind.uses_splat_transform for kind in kinds):
         find_splat_transform()
 
 
@@ -134,7 +137,7 @@ def _export_levels(bundle: Bundle, folder: Path | None, streamed: Path | None, a
         if folder is not None:
             write_folder(folder, levels)
         if streamed is not None:
-            run_to_end(write_streamed_levels(streamed, levels if antialiased else bake_filter(levels)))
+            write_streamed_levels(streamed, levels if antialiased else bake_filter(levels))
 
 
 def open_levels(source: Path, warn: Warn) -> Bundle:

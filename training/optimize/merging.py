@@ -15,8 +15,8 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from scipy.special import expit, logit, spence
 
-from ..lod.blocks import spatial_order
 from ..splats.gaussians import SH_C0, Splats, splat_area
+from ..splats.morton import spatial_order
 
 MAX_OPACITY = 0.99
 """Maximum opacity of a merged splat, the maximum that a rasterizer draws."""

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import torch
 
-from ..lod.blocks import spatial_order
 from ..rasterize import Adam, Gaussians
 from ..splats.gaussians import Splats
+from ..splats.morton import spatial_order
 from .initialize import from_splats
 from .splat_method import SplatMethod
 from .training_data import TrainingView

@@ -20,7 +20,7 @@ from torch.nn.functional import pad
 
 from ..editing.look import Looks, change_colors
 from ..errors import LodgsError
-from ..lod.blocks import BLOCKS, SIZE, spatial_order
+from ..lod.blocks import BLOCKS, SIZE
 from ..lod.on_disk import CulledReader, open_if_large, read_header_and_tables, read_part
 from ..lod.query import LodQuery, SplatSelector
 from ..lod.rule import OPACITY, Region, Values, all_rule_columns, collect_facts
@@ -29,6 +29,7 @@ from ..scenes.cameras import Camera
 from ..splats.dialects import Warn, ignore
 from ..splats.gaussians import Splats
 from ..splats.levels import Bundle
+from ..splats.morton import spatial_order
 from ..splats.ply import Element, all_columns
 from . import rasterize, tensor_device
 from .gaussians import Gaussians

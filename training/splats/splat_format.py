@@ -49,8 +49,13 @@ class SplatFormat(NamedTuple):
 
     @property
     def in_trainer(self) -> bool:
-        """True if only the trainer writes and reads the format."""
+        """True if only the trainer writes the format."""
         return self.require is not None
+
+    @property
+    def reads_in_trainer(self) -> bool:
+        """True if only the trainer reads the format."""
+        return self.require is not None and (self.read is not None or self.read_levels is not None)
 
     @property
     def uses_splat_transform(self) -> bool:

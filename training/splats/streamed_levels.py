@@ -1,63 +1,231 @@
-"""Levels that browsers stream by distance, written and read by splat-transform."""
+"""Levels that browsers stream by distance: PlayCanvas' streamed SOG.
+
+A tree divides space. Each leaf has its splats of every level as a range of a file, and a viewer selects a
+level per leaf. Specification: https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
+
+import numpy as np
 
 from ..documents import read_json
 from ..errors import LodgsError
 from ..files import temporary_folder
-from .level_folder import write_folder
+from .gaussians import SplatRows, Splats
 from .levels import MAX_READ_LEVELS, Bundle
-from .splat_transform import FiniteRows, find_splat_transform, splat_transform_steps
+from .morton import spatial_order
+from .ply import BATCH_ROWS
+from .portable_levels import ConcatenatedRows
+from .sh import coefficient_count
+from .sog import MAX_DEGREE, META, encode_sog, load_packages
 
 STREAMED_FILE = "lod-meta.json"
 """Main file of streamed levels, in a folder of their own."""
+SURROUNDINGS = f"env/{META}"
+"""File of the surroundings, which viewers draw at every distance."""
+FAR = 2.0
+"""Distance from the center, or radius of a splat, from which on it belongs to the surroundings.
+
+Unit: the radius that contains 90 % of the finest splats.
+"""
+LEAF_SPLATS = 1 << 14
+"""Maximum number of splats of all levels in a leaf."""
+FILE_SPLATS = 1 << 17
+"""Number of splats from which on a level continues in another SOG."""
+_SIGMAS = 3.0
+"""Bounds of leaves include splats up to so many standard deviations."""
 
 
-def write_streamed_levels(folder: Path, bundle: Bundle) -> Iterator[str]:
+@dataclass
+class _Leaf:
+    """A region of space.
+
+    Attributes:
+        rows: rows (N,) of its splats by level of detail, 0 the finest, in Morton order.
+        ranges: entry of each level of detail in the main file.
+        bounds: (2, 3), minimum and maximum of its splats.
+    """
+
+    rows: dict[int, np.ndarray]
+    ranges: dict[int, dict[str, int]] = field(default_factory=dict)
+    bounds: np.ndarray = field(default_factory=lambda: np.array([[np.inf] * 3, [-np.inf] * 3]))
+
+
+def write_streamed_levels(folder: Path, bundle: Bundle) -> None:
     """Write levels that browsers stream by distance: ``lod-meta.json`` and its files.
 
-    Levels without splats, which crops can leave, are omitted because splat-transform refuses them. An earlier
-    export in the folder is replaced after all files are written.
-
-    Yields:
-        The program's last line of output.
+    Levels without splats, which crops can leave, are omitted. An earlier export in the folder is replaced
+    after all files are written. Memory holds the means of all levels and the splats of one file.
 
     Raises:
-        LodgsError: splat-transform is missing or fails, the folder has other files or cannot be written, or
-            no level has splats.
+        LodgsError: a package is missing, the folder has other files or cannot be written, no level has
+            splats, or the degree of harmonics is too high.
     """
-    levels = [
-        level for level in bundle.levels if any(len(part.rows) for part in bundle.drawn_levels(level.number))
-    ]
+    load_packages()
+    levels = [ConcatenatedRows.of_level(bundle, level.number) for level in reversed(bundle.levels)]
+    levels = [rows for rows in levels if len(rows)]
     if not levels:
         raise LodgsError("Cannot export levels: they contain no splats.", "Make some splats visible.")
-    finite = [replace(level, on_disk=FiniteRows(level.rows)) for level in levels]
-    bundle = replace(bundle, levels=finite)
+    degree = max(rows.select(slice(0, 0)).sh_degree for rows in levels)
+    if degree > MAX_DEGREE:
+        raise LodgsError(
+            f"Cannot write SH degree {degree} for browsers: they support degree 0 to {MAX_DEGREE}.",
+            "Reduce it with lodgs edit --sh-degree.",
+        )
     if folder.is_dir() and any(folder.iterdir()) and not (folder / STREAMED_FILE).exists():
         raise LodgsError(f"Cannot export to {folder}: it contains other files.", "Choose an empty folder.")
-    find_splat_transform()  # reports a missing program before files are written
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
+        with temporary_folder(folder.parent) as temporary:
+            target = temporary / "levels"
+            target.mkdir()
+            _write_files(target, levels, degree)
+            if folder.exists():
+                folder.rename(temporary / "previous")
+            target.rename(folder)
     except OSError as error:
-        raise LodgsError(f"Cannot create {folder}: {error.strerror}.", "Choose another folder.") from error
-    with temporary_folder(folder.parent) as temporary:
-        plain = temporary / "levels"
-        converted = temporary / "converted"
-        write_folder(plain, bundle)
-        arguments = level_arguments(plain, len(bundle.levels))
-        yield from splat_transform_steps([*arguments, str(converted / STREAMED_FILE)])
-        if folder.exists():
-            folder.rename(temporary / "previous")
-        converted.rename(folder)
+        raise LodgsError(
+            f"Cannot write {folder}: {error.strerror}.", "Choose another folder, or free some space."
+        ) from error
 
 
-def level_arguments(folder: Path, count: int) -> list[str]:
-    """Return splat-transform's arguments for the levels of a folder, ``lod0.ply`` the finest."""
-    return [word for lod in range(count) for word in (str(folder / f"lod{lod}.ply"), "-l", str(lod))]
+def _write_files(folder: Path, levels: Sequence[SplatRows], degree: int) -> None:
+    places = np.concatenate([_read_places(rows) for rows in levels])
+    begins = np.cumsum([0, *map(len, levels)])
+    far = _is_surroundings(places, len(levels[0]))
+    leaves: list[_Leaf] = []
+    tree = _divide(np.flatnonzero(~far), places, begins, leaves)
+    surroundings = np.flatnonzero(far[: len(levels[0])])
+    counts = [int((~far[begin:end]).sum()) for begin, end in pairwise(begins)]
+    del places, far
+    names: list[str] = []
+    for lod, rows in enumerate(levels):
+        for number, group in enumerate(_file_groups(leaves, lod)):
+            names.append(f"{lod}_{number}/{META}")
+            _write_sog(folder / names[-1], _read_file(rows, group, lod, len(names) - 1, degree))
+    if len(surroundings):
+        splats = _with_degree(levels[0].select(surroundings), degree)
+        _write_sog(folder / SURROUNDINGS, splats.select(spatial_order(splats.means)))
+    meta = {
+        "version": 1,
+        "asset": {"generator": "LODGS"},
+        "count": sum(counts),
+        "counts": counts,
+        "lodLevels": len(levels),
+        "lodErrors": False,
+        **({"environment": SURROUNDINGS} if len(surroundings) else {}),
+        "filenames": names,
+        "tree": _describe(tree),
+    }
+    (folder / STREAMED_FILE).write_text(json.dumps(meta), "utf-8")
+
+
+def _write_sog(path: Path, splats: Splats) -> None:
+    path.parent.mkdir()
+    for name, data in encode_sog(splats).items():
+        path.with_name(name).write_bytes(data)
+
+
+def _read_places(rows: SplatRows) -> np.ndarray:
+    """Read the means and the radii of splats in batches, (N, 4) float32."""
+    parts = []
+    for begin in range(0, len(rows), BATCH_ROWS):
+        splats = rows.select(slice(begin, begin + BATCH_ROWS))
+        parts.append(np.concatenate([splats.means, _radii(splats)], axis=1))
+    return np.concatenate(parts)
+
+
+def _radii(splats: Splats) -> np.ndarray:
+    """Return the radii (N, 1) that bounds include."""
+    return _SIGMAS * np.exp(splats.log_scales.max(axis=1, keepdims=True))
+
+
+def _is_surroundings(places: np.ndarray, count: int) -> np.ndarray:
+    """Return True (N,) for sky and other far splats; the first ``count`` places are the finest level's.
+
+    They would enlarge the bounds of leaves, which then could not be far from any camera.
+    """
+    finest = places[:count, :3]
+    center = np.median(finest, axis=0)
+    limit = FAR * np.quantile(np.linalg.norm(finest - center, axis=1), 0.9)
+    far = (np.linalg.norm(places[:, :3] - center, axis=1) > limit) | (places[:, 3] > limit)
+    return far if not far[:count].all() else np.zeros(len(places), bool)
+
+
+_Node = _Leaf | tuple["_Node", "_Node"]
+"""A leaf, or two halves of a region."""
+
+
+def _divide(rows: np.ndarray, places: np.ndarray, begins: np.ndarray, leaves: list[_Leaf]) -> _Node:
+    """Divide rows of all levels at medians of the longest axis, and append the leaves in their order."""
+    points = places[rows, :3]
+    if len(rows) > LEAF_SPLATS:
+        axis = int(np.ptp(points, axis=0).argmax())
+        order, middle = np.argpartition(points[:, axis], len(rows) // 2), len(rows) // 2
+        low = _divide(rows[order[:middle]], places, begins, leaves)
+        return low, _divide(rows[order[middle:]], places, begins, leaves)
+    ordered = rows[spatial_order(points)]
+    lods = np.searchsorted(begins, ordered, side="right") - 1
+    leaf = _Leaf({int(lod): ordered[lods == lod] - begins[lod] for lod in np.unique(lods)})
+    leaves.append(leaf)
+    return leaf
+
+
+def _file_groups(leaves: Sequence[_Leaf], lod: int) -> Iterator[list[_Leaf]]:
+    """Yield the leaves with splats of a level that share a file."""
+    group, count = [], 0
+    for leaf in leaves:
+        if lod in leaf.rows:
+            group.append(leaf)
+            count += len(leaf.rows[lod])
+        if count >= FILE_SPLATS:
+            yield group
+            group, count = [], 0
+    if group:
+        yield group
+
+
+def _read_file(rows: SplatRows, leaves: Sequence[_Leaf], lod: int, file: int, degree: int) -> Splats:
+    """Return a level's splats in leaves that share a file, and enter their ranges and bounds."""
+    wanted = np.concatenate([leaf.rows[lod] for leaf in leaves])
+    order = np.argsort(wanted, kind="stable")
+    splats = rows.select(wanted[order]).select(np.argsort(order, kind="stable"))
+    splats, reach, offset = _with_degree(splats, degree), _radii(splats), 0
+    for leaf in leaves:
+        count = len(leaf.rows[lod])
+        part = slice(offset, offset + count)
+        leaf.ranges[lod] = {"file": file, "offset": offset, "count": count}
+        low = (splats.means[part] - reach[part]).min(axis=0)
+        high = (splats.means[part] + reach[part]).max(axis=0)
+        leaf.bounds = np.array([np.minimum(leaf.bounds[0], low), np.maximum(leaf.bounds[1], high)])
+        offset += count
+    return splats
+
+
+def _with_degree(splats: Splats, degree: int) -> Splats:
+    """Return splats with zeros for missing coefficients, because all files must have the same degree."""
+    missing = coefficient_count(degree) - splats.sh.shape[1]
+    return replace(splats, sh=np.pad(splats.sh, ((0, 0), (0, missing), (0, 0))), extras={})
+
+
+def _describe(node: _Node) -> dict:
+    """Return the entry of a node in the main file."""
+    if isinstance(node, _Leaf):
+        low, high = node.bounds.tolist()
+        return {
+            "bound": {"min": low, "max": high},
+            "lods": {str(lod): entry for lod, entry in sorted(node.ranges.items())},
+        }
+    children = [_describe(child) for child in node]
+    low = np.min([child["bound"]["min"] for child in children], axis=0)
+    high = np.max([child["bound"]["max"] for child in children], axis=0)
+    return {"bound": {"min": low.tolist(), "max": high.tolist()}, "children": children}
 
 
 def count_lods(path: Path) -> int:

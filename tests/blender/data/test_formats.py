@@ -77,7 +77,6 @@ def test_missing_program_is_reported(bpy, lodgs, root, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setattr(lodgs("training.splats.splat_transform"), "_FOLDERS", ())
     for export in (
-        lambda: bpy.ops.lodgs.export_streamed(directory=str(tmp_path / "web")),
         lambda: bpy.ops.lodgs.export_plain(filepath=str(tmp_path / "a.spz"), source="LEVEL", level=1),
         lambda: bpy.ops.lodgs.import_splats(filepath=str(tmp_path / "b.spz")),
     ):

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from training.lod.blocks import SIZE, BlockIndex, block_quantiles, spatial_order
+from training.lod.blocks import SIZE, BlockIndex, block_quantiles
 from training.rasterize import Gaussians, rasterize
 from training.scenes.cameras import Camera, look_at
 from training.splats.gaussians import Splats
+from training.splats.morton import spatial_order
 
 COUNT = 40 * SIZE + 7  # of 41 blocks
 

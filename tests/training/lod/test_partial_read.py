@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 from training.errors import LodgsError
-from training.lod.blocks import BLOCKS, SIZE, block_table, spatial_order
+from training.lod.blocks import BLOCKS, SIZE, block_table
 from training.lod.on_disk import read_part
 from training.lod.rule import rules
 from training.lod.rules.chunks import in_chunk, member_columns
 from training.splats.bundle import read_bundle, write_bundle
 from training.splats.gaussians import Splats
 from training.splats.levels import Bundle, Level
+from training.splats.morton import spatial_order
 
 COUNTS = {1: 300, 2: 5 * SIZE, 3: 20 * SIZE + 33}
 BYTES = 4 * (3 + 3 + 3 + 1 + 3 + 4 + 2)

@@ -9,7 +9,7 @@ import torch
 from training.editing.look import Look
 from training.errors import LodgsError
 from training.lod import on_disk
-from training.lod.blocks import BLOCKS, SIZE, block_table, spatial_order
+from training.lod.blocks import BLOCKS, SIZE, block_table
 from training.lod.query import LodQuery, SplatSelector
 from training.lod.rule import HIDDEN, rules
 from training.lod.rules.chunks import member_columns
@@ -21,6 +21,7 @@ from training.scenes.cameras import Camera, look_at
 from training.splats.bundle import read_bundle, write_bundle
 from training.splats.gaussians import Splats
 from training.splats.levels import Bundle, Level
+from training.splats.morton import spatial_order
 
 NEAR = 0.1
 POSITIONS = [(0, 0, 0), (1.0, 0.4, 0), (1.9, 0, 0.2), (4.2, 1, 0), (0, 2.2, 0), (30, 0, 0)]

@@ -14,7 +14,7 @@ from PIL import Image
 from tests.training.conftest import write_tiny_scene
 from tests.training.lod.tree.trees import tree_of
 from training.__main__ import main
-from training.lod.blocks import BLOCKS, block_table, spatial_order
+from training.lod.blocks import BLOCKS, block_table
 from training.lod.rule import rules
 from training.lod.rules.chunks import member_columns
 from training.lod.selection import select
@@ -24,6 +24,7 @@ from training.scenes.cameras import camera_to_dict, read_camera, write_camera
 from training.splats.bundle import write_bundle
 from training.splats.formats.splat import SplatFile, write_splat
 from training.splats.levels import Bundle, Level
+from training.splats.morton import spatial_order
 from training.splats.ply import write_ply
 
 

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..blocks import BOUNDS, BlockIndex, Columns, morton_codes
+from ...splats.morton import morton_codes
+from ..blocks import BOUNDS, BlockIndex, Columns
 from ..rule import axis_distances
 
 NODE_SIZE, PARENT_SIZE = "node_size", "parent_size"

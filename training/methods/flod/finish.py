@@ -16,7 +16,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import torch
 
-from ...lod.blocks import spatial_order
 from ...lod.rule import Values, collect_facts
 from ...lod.rules.bands import RULE
 from ...optimize.model import Model, splat_rates
@@ -27,6 +26,7 @@ from ...rasterize import Gaussians, contributions
 from ...rasterize.adam import LearningRate
 from ...scenes.cameras import Camera, pick_evenly
 from ...splats.levels import Level
+from ...splats.morton import spatial_order
 from . import FlodParameters
 
 LEVEL = "level"

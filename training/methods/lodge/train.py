@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from ...errors import LodgsError
-from ...lod.blocks import BLOCKS, BlockIndex, block_quantiles, block_table, spatial_order
+from ...lod.blocks import BLOCKS, BlockIndex, block_quantiles, block_table
 from ...lod.rules.chunks import RULE, TABLE, member_columns
 from ...optimize.density_control import require_rows
 from ...optimize.method import Drawing, StepResult
@@ -25,6 +25,7 @@ from ...rasterize import Gaussians, photometric_loss
 from ...scenes.cameras import pick_evenly
 from ...splats.gaussians import Splats
 from ...splats.levels import Level
+from ...splats.morton import spatial_order
 from ...splats.ply import Columns
 from . import ROUNDS, LodgeParameters, chunks
 from .composite import (

@@ -16,12 +16,12 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import LodgsError
-from ...lod.blocks import AXIS_BITS, morton_codes
 from ...lod.tree.forest import Piece, max_subtree_leaves, merge_forest, merge_trees, split_tree
 from ...lod.tree.shape import Tree
 from ...optimize.merging import merge_pairs, shapes_of_moments, splat_moments
 from ...rasterize.cpu.compile import STRICT, inlined, kernel, run_parallel
 from ...splats.gaussians import SH_C0, SplatRows, Splats
+from ...splats.morton import AXIS_BITS, morton_codes
 from ...splats.scratch import ScratchFile
 
 RADIUS = 16

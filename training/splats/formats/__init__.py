@@ -1,7 +1,7 @@
 """Splat files of other programs. Each module of this package declares one format as ``FORMAT``.
 
-LODGS itself reads and writes PLY, ``.splat``, glTF and, in the trainer's environment, USD. splat-transform
-reads and writes the others.
+LODGS itself reads and writes PLY, ``.splat``, glTF and, in the trainer's environment, USD; there it also
+writes SOG. splat-transform reads and writes the others.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ FILE_EXTENSIONS = (
     *(
         kind.suffix
         for kind in FORMATS
-        if kind.readable and not kind.in_trainer and kind.suffix.rfind(".") == 0
+        if kind.readable and not kind.reads_in_trainer and kind.suffix.rfind(".") == 0
     ),
     ".ksplat",
 )
 """Last parts of the names of files that Blender reads."""
 LEVEL_FORMATS = tuple(kind for kind in FORMATS if kind.write_levels)
 """Formats of all levels in one file."""
-READABLE = (*FILE_EXTENSIONS, *(kind.suffix for kind in FORMATS if kind.in_trainer), STREAMED_FILE)
+READABLE = (*FILE_EXTENSIONS, *(kind.suffix for kind in FORMATS if kind.reads_in_trainer), STREAMED_FILE)
 """Ends of the names of readable files; :data:`STREAMED_FILE` is a complete name."""
 
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from ..sog import MAX_DEGREE, MAX_PALETTE, load_packages, write_sog
 from ..splat_format import SplatFormat
 
 FORMAT = SplatFormat(
     ".sog",
     "SOG",
-    "PlayCanvas' web format, the smallest. Slow without a graphics card",
+    "PlayCanvas' web format, the smallest",
     (13.0, 14.6, 14.6, 14.6),
-    max_degree=3,
-    palette_size=1 << 16,
+    max_degree=MAX_DEGREE,
+    palette_size=MAX_PALETTE,
+    write=write_sog,
+    require=load_packages,
 )

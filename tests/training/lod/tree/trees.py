@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from training.lod.blocks import BLOCKS, block_table, spatial_order
+from training.lod.blocks import BLOCKS, block_table
 from training.lod.tree.nodes import ABOVE_ROOT, BLOCK_BOUNDS, min_parent_size, streaming_order
 from training.lod.tree.shape import Tree
 from training.splats.bundle import write_bundle
 from training.splats.gaussians import Splats
 from training.splats.levels import Bundle, Level
+from training.splats.morton import spatial_order
 
 
 def random_tree(rng: np.random.Generator, leaves: int) -> Tree:

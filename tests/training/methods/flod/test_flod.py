@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from training.errors import LodgsError
-from training.lod.blocks import SIZE, spatial_order
+from training.lod.blocks import SIZE
 from training.lod.rule import all_controls
 from training.lod.selection import resolve_controls, select
 from training.methods.flod import METHOD, finish
@@ -19,6 +19,7 @@ from training.optimize.training_data import TrainingData
 from training.rasterize import Gaussians, contributions, rasterize
 from training.scenes.colmap import read_scene
 from training.splats.levels import Bundle, Level
+from training.splats.morton import spatial_order
 
 
 def make(data, **values) -> Method:

@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from training.lod.blocks import spatial_order
 from training.lod.rules.chunks import RULE, in_chunk
 from training.lod.selection import BundleSelector, resolve_controls
 from training.methods import create, method_info
@@ -13,6 +12,7 @@ from training.rasterize import Gaussians
 from training.scenes.cameras import Camera, look_at
 from training.splats.gaussians import Splats
 from training.splats.levels import Bundle
+from training.splats.morton import spatial_order
 
 NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh")
 

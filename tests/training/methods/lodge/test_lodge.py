@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from training.errors import LodgsError
-from training.lod.blocks import spatial_order
 from training.lod.selection import resolve_controls, select
 from training.methods import create, method_info
 from training.methods.lodge import ROUNDS, LodgeParameters
@@ -21,6 +20,7 @@ from training.scenes.cameras import Camera
 from training.splats.bundle import read_bundle, write_bundle
 from training.splats.gaussians import Splats
 from training.splats.levels import MAX_LEVELS, Bundle, Level
+from training.splats.morton import spatial_order
 
 
 def make(data, base=None, preset="draft", **values):

@@ -1,0 +1,140 @@
+"""SOG files and streamed levels, decoded as their specification says."""
+
+import io
+import json
+import zipfile
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from training.errors import LodgsError
+from training.splats.gaussians import Splats
+from training.splats.levels import Bundle, Level
+from training.splats.sog import decode_sog, encode_sog, make_palette, write_sog
+from training.splats.streamed_levels import LEAF_SPLATS, STREAMED_FILE, write_streamed_levels
+
+
+def random_splats(count: int, degree: int = 0, seed: int = 0, extent: float = 1.0) -> Splats:
+    rng = np.random.default_rng(seed)
+    return Splats(
+        (extent * rng.normal(size=(count, 3))).astype(np.float32),
+        rng.normal(size=(count, 4)).astype(np.float32),
+        rng.uniform(-6, -2, (count, 3)).astype(np.float32),
+        rng.normal(size=count).astype(np.float32),
+        rng.normal(size=(count, (degree + 1) ** 2, 3)).astype(np.float32),
+    )
+
+
+def pixels(data: bytes) -> np.ndarray:
+    return np.asarray(Image.open(io.BytesIO(data)).convert("RGBA")).reshape(-1, 4)
+
+
+def test_values_are_stored_as_specified():
+    """Worked by hand from the specification of version 2."""
+    e = float(np.e)
+    splats = Splats(
+        np.float32([[0, 0, 0], [e - 1, 1 - e, 0]]),
+        np.float32([[1, 0, 0, 0], [0, 0, -2, 0]]),
+        np.float32([[-3, -3, -3], [-1, -1, -1]]),
+        np.float32([0, np.inf]),
+        np.float32([[[0.25] * 3], [[0.5] * 3]]),
+    )
+    files = encode_sog(splats)
+    meta = json.loads(files["meta.json"])
+    assert (meta["version"], meta["count"]) == (2, 2)
+    np.testing.assert_allclose(meta["means"]["mins"], [0, -1, 0], atol=1e-6)  # sign(x) log(1 + |x|)
+    np.testing.assert_allclose(meta["means"]["maxs"], [1, 0, 0], atol=1e-6)
+    low, high = pixels(files["means_l.webp"]), pixels(files["means_u.webp"])
+    codes = low[:2, :3].astype(int) + 256 * high[:2, :3].astype(int)
+    assert codes.tolist() == [[0, 65535, 0], [65535, 0, 0]]
+    quats = pixels(files["quats.webp"])[:2]
+    assert quats[:, 3].tolist() == [252, 254]  # w and y are the largest
+    np.testing.assert_allclose(quats[:, :3], 127.5, atol=0.51)
+    scales, colors = (np.array(meta[name]["codebook"]) for name in ("scales", "sh0"))
+    np.testing.assert_allclose(scales[pixels(files["scales.webp"])[:2, 0]], [-3, -1], atol=1e-6)
+    assert (np.diff(scales) >= 0).all() and len(scales) == 256
+    values = pixels(files["sh0.webp"])[:2]
+    np.testing.assert_allclose(colors[values[:, 0]], [0.25, 0.5], atol=1e-6)
+    assert values[:, 3].tolist() == [128, 255]
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_splats_round_trip(tmp_path, degree):
+    splats = random_splats(900, degree)
+    write_sog(tmp_path / "a.sog", splats, {})
+    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
+        decoded = decode_sog({name: archive.read(name) for name in archive.namelist()})
+    distances = np.linalg.norm(decoded.means[:, None] - splats.means[None], axis=2)
+    splats = splats.select(distances.argmin(axis=1))
+    assert np.abs(decoded.means - splats.means).max() < 5e-4
+    assert np.abs(decoded.log_scales - splats.log_scales).max() < 0.02
+    unit = splats.quats / np.linalg.norm(splats.quats, axis=1, keepdims=True)
+    assert np.abs((unit * decoded.quats).sum(axis=1)).min() > np.cos(np.radians(0.6))
+    sigmoid = [1 / (1 + np.exp(-x.opacity_logits)) for x in (splats, decoded)]
+    assert np.abs(sigmoid[0] - sigmoid[1]).max() <= 0.51 / 255
+    assert np.sqrt(np.mean((decoded.sh - splats.sh) ** 2)) < 0.02
+
+
+def test_palette_is_near_the_sets():
+    """Two thousand copies of 800 sets need no more than the 1,024 sets of a palette."""
+    rng = np.random.default_rng(0)
+    sets = rng.normal(size=(800, 9)).astype(np.float32)
+    rows = rng.integers(0, 800, 2000)
+    palette, labels = make_palette(sets[rows])
+    assert len(palette) <= 1024
+    error = np.sqrt(np.mean((palette[labels] - sets[rows]) ** 2))
+    assert error < 0.25  # 1 without a palette
+
+
+def leaves(node: dict):
+    for child in node.get("children", ()):
+        yield from leaves(child)
+    if "lods" in node:
+        yield node
+
+
+def test_streamed_levels_hold_every_splat_once(tmp_path):
+    levels = [Level(1, random_splats(9_000, 0, 1)), Level(2, random_splats(30_000, 1, 2))]
+    levels[1].splats.means[:40] += 30  # the surroundings
+    write_streamed_levels(tmp_path / "web", Bundle("flod", levels))
+    meta = json.loads((tmp_path / "web" / STREAMED_FILE).read_text("utf-8"))
+    assert meta["lodLevels"] == 2 and meta["count"] == sum(meta["counts"])
+
+    def read(name: str) -> Splats:
+        folder = (tmp_path / "web" / name).parent
+        return decode_sog({path.name: path.read_bytes() for path in folder.iterdir()})
+
+    files = [read(name) for name in meta["filenames"]]
+    parts: dict[str, list[np.ndarray]] = {"0": [], "1": []}
+    for leaf in leaves(meta["tree"]):
+        assert sum(entry["count"] for entry in leaf["lods"].values()) <= LEAF_SPLATS
+        for lod, entry in leaf["lods"].items():
+            rows = slice(entry["offset"], entry["offset"] + entry["count"])
+            means = files[entry["file"]].means[rows]
+            assert (means >= np.array(leaf["bound"]["min"]) - 1e-3).all()
+            assert (means <= np.array(leaf["bound"]["max"]) + 1e-3).all()
+            parts[lod].append(means)
+    far = read(meta["environment"])
+    assert far.sh_degree == files[0].sh_degree == files[-1].sh_degree == 1  # of all levels
+    finest = np.concatenate([*parts["0"], far.means])
+    assert sorted(map(len, (finest, np.concatenate(parts["1"])))) == [9_000, 30_000]
+    order = [np.lexsort(np.round(means, 2).T) for means in (finest, levels[1].splats.means)]
+    np.testing.assert_allclose(
+        np.sort(finest[order[0]], axis=0), np.sort(levels[1].splats.means[order[1]], axis=0), atol=2e-3
+    )
+
+
+def test_degree_4_is_refused(tmp_path):
+    with pytest.raises(LodgsError, match="degree 4"):
+        write_streamed_levels(tmp_path / "web", Bundle("", [Level(1, random_splats(9, 4))]))
+    assert not list(tmp_path.iterdir())
+
+
+def test_infinite_scales_and_opacities_are_limited(tmp_path):
+    splats = random_splats(50)
+    splats.log_scales[::5, 1], splats.opacity_logits[::7] = -np.inf, np.inf
+    decoded = decode_sog(encode_sog(splats))
+    finite = np.isfinite(splats.log_scales)
+    assert np.abs(decoded.log_scales - splats.log_scales)[finite].max() < 0.2
+    assert (decoded.log_scales[~finite] < -15).all() and np.isfinite(decoded.opacity_logits).all()

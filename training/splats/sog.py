@@ -1,0 +1,248 @@
+"""PlayCanvas' SOG: the values of splats as the pixels of lossless WebP images.
+
+Specification: https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog/ (version 2). Needs
+Pillow and scipy, which Blender lacks; only the process of the trainer or of the command line writes SOG.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import warnings
+import zipfile
+from collections.abc import Mapping
+from math import ceil, sqrt
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from ..errors import LodgsError
+from ..files import atomic_write
+from .coding import MAX_LOGIT
+from .gaussians import SplatRows, Splats
+from .morton import spatial_order
+
+META = "meta.json"
+MAX_DEGREE = 3
+MAX_PALETTE = 1 << 16
+"""Maximum number of sets of SH coefficients that splats share."""
+_MIN_LOG_SCALE = -20.0
+"""Minimum of stored scales; smaller ones would widen the steps of all."""
+_ENTRIES = 256
+"""Entries of a codebook for single values."""
+_ROUNDS = 8
+"""Rounds of k-means for codebooks and palettes."""
+_ROW = 64
+"""Sets of coefficients in a row of their image."""
+_LARGEST = 252
+"""Alpha of a rotation whose largest component is w; 253 to 255 for x, y and z."""
+_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+"""Stored components of a rotation by its largest one."""
+
+
+def load_packages() -> SimpleNamespace:
+    """Return Pillow's image module and scipy's clustering functions.
+
+    Raises:
+        LodgsError: a package is missing.
+    """
+    try:
+        from PIL import Image
+        from scipy.cluster.vq import kmeans2, vq
+    except ImportError as error:
+        raise LodgsError(
+            f"Cannot write SOG: a package of the trainer is missing ({error}).", "Install the trainer."
+        ) from error
+    return SimpleNamespace(Image=Image, kmeans2=kmeans2, vq=vq)
+
+
+def write_sog(path: Path, splats: SplatRows, meta: dict) -> None:
+    """Write splats as one SOG file.
+
+    Args:
+        meta: meta of the splats' bundle; the format stores none of it.
+
+    Raises:
+        LodgsError: the file cannot be written, or a package is missing.
+    """
+    values = splats.select(slice(0, len(splats)))
+    files = encode_sog(values.select(spatial_order(values.means)))
+    with atomic_write(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
+        for name, data in files.items():
+            archive.writestr(name, data)
+
+
+def encode_sog(splats: Splats) -> dict[str, bytes]:
+    """Return the files of a SOG by name; the splats keep their order.
+
+    Neighbours in the order should be neighbours in space, because then images are smaller.
+
+    Args:
+        splats: N >= 1 splats with finite means, of SH degree 0 to :data:`MAX_DEGREE`.
+
+    Raises:
+        LodgsError: a package is missing.
+    """
+    packages = load_packages()
+    count = len(splats)
+    width = 4 * ceil(sqrt(count) / 4)
+    height = 4 * ceil(count / width / 4)
+    files: dict[str, bytes] = {}
+    meta: dict[str, Any] = {"version": 2, "asset": {"generator": "LODGS"}, "count": count}
+
+    def add(name: str, *channels: np.ndarray, size: tuple[int, int] = (width, height)) -> str:
+        pixels = np.zeros((size[0] * size[1], 4), np.uint8)
+        pixels[:, 3] = 255
+        for i, channel in enumerate(channels):
+            pixels[: len(channel), i] = channel
+        target = io.BytesIO()
+        image = packages.Image.fromarray(pixels.reshape(size[1], size[0], 4))
+        image.save(target, "WEBP", lossless=True, exact=True, quality=50, method=3)
+        files[name] = target.getvalue()
+        return name
+
+    stretched = np.sign(splats.means) * np.log1p(np.abs(splats.means.astype(np.float64)))
+    low, high = stretched.min(axis=0), stretched.max(axis=0)
+    codes = np.rint((stretched - low) * (65535 / np.maximum(high - low, 1e-12))).astype(np.uint16)
+    names = [add("means_l.webp", *(codes & 255).T), add("means_u.webp", *(codes >> 8).T)]
+    meta["means"] = {"mins": low.tolist(), "maxs": high.tolist(), "files": names}
+
+    table, scales = _codebook(splats.log_scales.clip(_MIN_LOG_SCALE))
+    meta["scales"] = {"codebook": table.tolist(), "files": [add("scales.webp", *scales.T)]}
+    meta["quats"] = {"files": [add("quats.webp", *_encode_quats(splats.quats).T)]}
+    table, colors = _codebook(splats.sh[:, 0])
+    opacities = 255 / (1 + np.exp(-splats.opacity_logits.clip(-MAX_LOGIT, MAX_LOGIT).astype(np.float64)))
+    meta["sh0"] = {
+        "codebook": table.tolist(),
+        "files": [add("sh0.webp", *colors.T, np.rint(opacities).astype(np.uint8))],
+    }
+    if splats.sh_degree:
+        sets, labels = make_palette(splats.sh[:, 1:].reshape(count, -1))
+        coefficients = splats.sh.shape[1] - 1
+        table, codes = _codebook(sets)
+        size = _ROW * coefficients, ceil(len(sets) / _ROW)
+        names = [
+            add("shN_centroids.webp", *codes.reshape(-1, 3).T, size=size),
+            add("shN_labels.webp", labels & 255, labels >> 8),
+        ]
+        shared = {"count": len(sets), "bands": splats.sh_degree, "codebook": table.tolist()}
+        meta["shN"] = {**shared, "files": names}
+    return {META: json.dumps(meta).encode(), **files}
+
+
+def decode_sog(files: Mapping[str, bytes]) -> Splats:
+    """Return the splats of the files of a SOG of version 2.
+
+    Raises:
+        KeyError, ValueError, TypeError, OSError: the files are damaged.
+        LodgsError: a package is missing.
+    """
+    packages = load_packages()
+    meta = json.loads(files[META])
+    count = int(meta["count"])
+
+    def pixels(part: str, index: int = 0) -> np.ndarray:
+        with packages.Image.open(io.BytesIO(files[meta[part]["files"][index]]), formats=["WEBP"]) as image:
+            return np.asarray(image.convert("RGBA")).reshape(-1, 4)
+
+    def table(part: str) -> np.ndarray:
+        return np.array(meta[part]["codebook"], np.float32)
+
+    low, high = (np.array(meta["means"][end], np.float64) for end in ("mins", "maxs"))
+    codes = pixels("means", 0)[:count, :3] + 256 * pixels("means", 1)[:count, :3].astype(np.int64)
+    stretched = low + codes * ((high - low) / 65535)
+    colors = pixels("sh0")[:count]
+    sh = table("sh0")[colors[:, :3]][:, None]
+    if "shN" in meta:
+        coefficients = (int(meta["shN"]["bands"]) + 1) ** 2 - 1
+        sets = table("shN")[pixels("shN", 0)[:, :3]].reshape(-1, coefficients, 3)
+        labels = pixels("shN", 1)[:count].astype(np.int64)
+        sh = np.concatenate([sh, sets[labels[:, 0] + 256 * labels[:, 1]]], axis=1)
+    opacities = (colors[:, 3] / 255).clip(1 / 1024, 1 - 1 / 1024)
+    return Splats(
+        (np.sign(stretched) * np.expm1(np.abs(stretched))).astype(np.float32),
+        _decode_quats(pixels("quats")[:count]),
+        table("scales")[pixels("scales")[:count, :3]],
+        np.log(opacities / (1 - opacities)).astype(np.float32),
+        sh,
+    )
+
+
+def _codebook(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a table (256,) float32 for values of any shape and the code of each value, uint8.
+
+    k-means of single values: the groups are ranges of the sorted values, so a round needs only their sums.
+    """
+    ordered = np.sort(values, axis=None).astype(np.float64)
+    sums = np.concatenate([[0.0], np.cumsum(ordered)])
+    even = np.linspace(ordered[0], ordered[-1], _ENTRIES)
+    quantiles = ordered[np.linspace(0, len(ordered) - 1, _ENTRIES).astype(int)]
+    table = (even + quantiles) / 2  # the ends of the range stay within reach
+    for _ in range(_ROUNDS):
+        ends = np.searchsorted(ordered, (table[1:] + table[:-1]) / 2)
+        begins, ends = np.concatenate([[0], ends]), np.concatenate([ends, [len(ordered)]])
+        counts = ends - begins
+        means = (sums[ends] - sums[begins]) / np.maximum(counts, 1)
+        table = np.sort(np.where(counts > 0, means, table))
+    table = table.astype(np.float32)
+    return table, np.searchsorted((table[1:] + table[:-1]) / 2, values).astype(np.uint8)
+
+
+def make_palette(sets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return at most :data:`MAX_PALETTE` sets (K, C) for sets (N, C), and the row (N,) uint16 of each.
+
+    Sets are divided into groups by k-means, and each group gets a share of the palette: far fewer distances
+    than with one k-means.
+    """
+    packages, count = load_packages(), len(sets)
+    size = min(64, 1 << max((count // 1024).bit_length() - 1, 0)) * 1024
+    sets = sets.astype(np.float32)
+    if count <= size:
+        return sets, np.arange(count, dtype=np.uint16)
+    groups = _cluster(packages, sets, ceil(sqrt(size)))[1]
+    palette, labels, first = [], np.empty(count, np.uint16), 0
+    order = np.argsort(groups, kind="stable")
+    for rows in np.split(order, np.cumsum(np.bincount(groups))[:-1]):
+        if not len(rows):
+            continue
+        share = max(1, size * len(rows) // count)
+        centers, members = _cluster(packages, sets[rows], share)
+        palette.append(centers)
+        labels[rows] = first + members
+        first += len(centers)
+    return np.concatenate(palette), labels
+
+
+def _cluster(packages: SimpleNamespace, sets: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return at most ``count`` centers (K, C) of sets (N, C), and the center of each set (N,)."""
+    if len(sets) <= count:
+        return sets, np.arange(len(sets))
+    starts = sets[np.linspace(0, len(sets) - 1, count).astype(int)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # an empty cluster keeps its center
+        centers, _ = packages.kmeans2(sets, starts, iter=_ROUNDS, minit="matrix", check_finite=False)
+    return centers, packages.vq(sets, centers, check_finite=False)[0]
+
+
+def _encode_quats(quats: np.ndarray) -> np.ndarray:
+    """Return the three smaller components of rotations (N, 4) wxyz and the index of the largest, uint8."""
+    unit = quats / np.maximum(np.linalg.norm(quats.astype(np.float64), axis=1, keepdims=True), 1e-30)
+    largest = np.abs(unit).argmax(axis=1)
+    rows = np.arange(len(unit))
+    unit *= np.where(unit[rows, largest] < 0, -1.0, 1.0)[:, None]
+    smaller = unit[rows[:, None], _OTHERS[largest]]
+    codes = np.rint((smaller / sqrt(2) + 0.5) * 255).clip(0, 255)
+    return np.concatenate([codes, (_LARGEST + largest)[:, None]], axis=1).astype(np.uint8)
+
+
+def _decode_quats(pixels: np.ndarray) -> np.ndarray:
+    """Return the rotations (N, 4) wxyz float32 of pixels (N, 4)."""
+    largest = (pixels[:, 3].astype(np.int64) - _LARGEST).clip(0, 3)
+    smaller = (pixels[:, :3] / 255.0 - 0.5) * sqrt(2)
+    quats = np.empty((len(pixels), 4), np.float32)
+    rows = np.arange(len(pixels))
+    quats[rows[:, None], _OTHERS[largest]] = smaller
+    quats[rows, largest] = np.sqrt((1 - (smaller**2).sum(axis=1)).clip(0))
+    return quats
