@@ -62,6 +62,15 @@ METASHAPE = """<document version="2.0.0"><chunk><sensors><sensor id="0" type="fr
 <camera id="1" sensor_id="1" master_id="0" label="b"/><camera id="0" sensor_id="0" label="a">
 <transform>1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1</transform>
 </camera></cameras><transform><scale>2</scale></transform></chunk></document>"""
+REALITYCAPTURE = (
+    "#cameras 2\n#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n"
+    "a.png,0,0,3,0,90,0,30,0.01,0,0.1,0,0,0,0.01,0\nb.png,1,0,3,0,90,0,30,0,0,0,0,0,0,0,0\n"
+)
+SIDECAR = """<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
+<rdf:Description xmlns:xcr="http://www.capturingreality.com/ns/xcr/1.1#" xcr:DistortionModel="brown3"
+ xcr:FocalLength35mm="30" xcr:Skew="0"><xcr:Rotation>1 0 0 0 1 0 0 0 1</xcr:Rotation>
+<xcr:Position>0 0 1</xcr:Position><xcr:DistortionCoeficients>0.1 0 0 0 0 0</xcr:DistortionCoeficients>
+</rdf:Description></rdf:RDF></x:xmpmeta>"""
 PLY_HEADER = "ply\nformat ascii 1.0\nelement vertex 2\n"
 PLY_HEADER += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
 EXPORTS = {
@@ -72,6 +81,8 @@ EXPORTS = {
     "reconstruction.json": json.dumps(OPENSFM),
     "bundle.out": BUNDLER,
     "cameras.xml": METASHAPE,
+    "registration.csv": REALITYCAPTURE,
+    "images/a.xmp": SIDECAR,
 }
 JSON = {
     "transforms.json": TRANSFORMS,
