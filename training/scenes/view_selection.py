@@ -69,6 +69,8 @@ class ViewCollector:
         """Add a view at the size of its photo, or record the reason for skipping it."""
         name = pose.name.replace("\\", "/")
         try:
+            if not np.isfinite(pose.world_to_camera).all():
+                raise LodgsError("it has no valid pose.")
             if not lens.lens.focals:
                 raise LodgsError(f"camera model {lens.lens.name} is a panorama, not a perspective view.")
             if self.cameras and self.cameras[-1].name == name:

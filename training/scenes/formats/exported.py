@@ -94,7 +94,7 @@ class ExportedScene:
 def read_document(path: Path) -> dict:
     """Read a JSON file with thousands of views in any encoding, see ``parse_json``."""
     data = read_bytes(path, MAX_BYTES)
-    return parse_json(decode_text(data), printable(path), MAX_BYTES)
+    return parse_json(decode_text(data), printable(path), MAX_BYTES, finite=False)
 
 
 def parse_xml(path: Path, program: str) -> Element:
