@@ -52,6 +52,11 @@ OPENSFM = [
         "points": {"1": {"coordinates": [0, 0, 5], "color": [255, 0, 0]}},
     }
 ]
+SPLAT_CAMERAS = [
+    {"id": 0, "img_name": "a", "width": 96, "height": 72, "position": [0, 0, 1], "fx": 80, "fy": 82,
+     "rotation": np.eye(3).tolist()}
+]  # fmt: skip
+SCANNER_APP = {"cameraPoseARFrame": POSE.ravel().tolist(), "intrinsics": [80, 0, 47, 0, 82, 37, 0, 0, 1]}
 BUNDLER = (
     "# Bundle file v0.3\n1 2\n80 0.1 0\n1 0 0\n0 1 0\n0 0 1\n0 0 0\n" + "0 0 -5\n9 8 7\n1 0 1 2.5 3\n" * 2
 )
@@ -79,6 +84,8 @@ EXPORTS = {
     "metadata": json.dumps(RECORD3D),
     "sfm_data.json": json.dumps(OPENMVG),
     "reconstruction.json": json.dumps(OPENSFM),
+    "cameras.json": json.dumps(SPLAT_CAMERAS),
+    "frame_0.json": json.dumps(SCANNER_APP),
     "bundle.out": BUNDLER,
     "cameras.xml": METASHAPE,
     "registration.csv": REALITYCAPTURE,
@@ -90,6 +97,8 @@ JSON = {
     "metadata": RECORD3D,
     "sfm_data.json": OPENMVG,
     "reconstruction.json": OPENSFM,
+    "cameras.json": SPLAT_CAMERAS,
+    "frame_0.json": SCANNER_APP,
 }
 
 
@@ -100,6 +109,7 @@ def folder(tmp_path_factory):
     for subfolder in ("images", "rgb", "keyframes/images"):
         for name in ("a.png", "b.png"):
             write_image(folder / subfolder / name, noise())
+    write_image(folder / "frame_0.png", noise())
     (folder / "list.txt").write_text("images/a.png\nimages/b.png\n")
     (folder / "points.ply").write_text(PLY_HEADER + "0 0 5\n0 1 5\n")
     return folder

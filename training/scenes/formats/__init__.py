@@ -21,11 +21,25 @@ from ..image_files import find_image_folder
 from ..images import exif_orientation, image_size
 from ..view_selection import STORE_UPRIGHT, exclusion_messages, fits_upright_photos, photo_turns
 from ..write_colmap import write_model
-from . import bundler, metashape, openmvg, opensfm, polycam, realitycapture, record3d, transforms
+from . import (
+    bundler,
+    metashape,
+    openmvg,
+    opensfm,
+    polycam,
+    realitycapture,
+    record3d,
+    scanner_app,
+    splat_cameras,
+    transforms,
+)
 from .exported import ExportedScene, ExportedView, PhotoFinder
 from .foreign import describe_foreign
 
-FORMATS = transforms, polycam, record3d, metashape, openmvg, opensfm, bundler, realitycapture
+FORMATS = (
+    transforms, polycam, record3d, metashape, openmvg, opensfm, bundler, realitycapture, scanner_app,
+    splat_cameras,
+)  # fmt: skip
 """Supported formats; the first one that recognises a folder is used."""
 MAX_DEPTH, MAX_SUBFOLDERS = 3, 1000
 """Maximum depth of an export below the given folder, and of subfolders searched at each depth."""
