@@ -30,7 +30,7 @@ help:
 	@echo "make pictures   retake the pictures of docs/images in a real Blender window (needs Blender, Xvfb, ImageMagick)"
 	@echo "make tables     regenerate the generated pages of docs/"
 	@echo "make bench      speed, as ratios within one run (BASE=old.json compares)"
-	@echo "make bench-quality  PSNR and veil over time, all methods (SCENES=\"DIR ...\", METHODS=\"flod ...\", BASE=other checkout)"
+	@echo "make bench-quality  PSNR and veil over time, all methods (SCENES=\"DIR ...\", METHODS=\"flod ...\", BASE=other checkout, SUBSETS=1 for harder copies)"
 	@echo "make bench-lod  levels and chunks on a town of 3 million splats (first run: over an hour; STAGES=\"town lodge others table\")"
 	@echo "make bench-tree  cuts of trees with up to 10 million nodes, and training them in 400 MB (first run: an hour, 10 GB)"
 	@echo "make bench-blocks  overhead of distributing blocks, and a plot for 1 to 64 workers (half an hour on an idle machine)"
@@ -100,7 +100,7 @@ bench: setup
 	@if [ -x $(BLENDER_5_3) ]; then set -x; $(BLENDER_5_3) tools/bench_blender.py; fi
 
 bench-quality: setup
-	$(VENV) tools/bench_quality.py $(SCENES) $(if $(BASE),--report --base $(BASE)) $(if $(METHODS),--methods $(METHODS))
+	$(VENV) tools/bench_quality.py $(SCENES) $(if $(SUBSETS),--subsets) $(if $(BASE),--report --base $(BASE)) $(if $(METHODS),--methods $(METHODS))
 
 bench-lod: setup
 	$(VENV) lab/bench_lod.py $(STAGES)

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import label, maximum_filter
 from scipy.spatial.transform import Rotation
 
 from training.runs.capture import write_scene
@@ -35,6 +36,7 @@ POINTS = 60_000  # approximate number in the COLMAP scene
 BATCH = 500_000
 JITTER = 0.5  # share of the splats' spacing
 EYE_HEIGHT = 1.65
+GARDEN = 6.0  # half of the side of a block's garden
 
 
 class Discs(NamedTuple):
@@ -377,6 +379,39 @@ def flight(plan: Plan, count: int, phase: float = 0.0) -> list[Camera]:
     )
     poses = enumerate(zip(positions, targets, strict=True))
     return [level_camera(f"flight_{n:03d}", position, target) for n, (position, target) in poses]
+
+
+def courtyard(plan: Plan, count: int) -> list[Camera]:
+    """Return views from the edge of the widest garden between houses, looking across it at eye height.
+
+    Args:
+        plan: the town.
+        count: number of views, in order around the garden.
+    """
+    reach = plan.half + shapes.PITCH
+    axis = (np.arange(len(plan.heights)) + 0.5) * plan.cell - reach
+    x, y = np.meshgrid(axis, axis)
+    in_block = (np.abs((np.stack([x, y]) + plan.half) % shapes.PITCH - shapes.PITCH / 2) < GARDEN).all(0)
+    in_town = np.maximum(np.abs(x), np.abs(y)) < plan.half
+    square = np.maximum(np.abs(x), np.abs(y)) < shapes.PITCH / 2
+    regions, number = label((maximum_filter(plan.heights, 3) < 0.5) & in_block & in_town & ~square)
+    largest = 1 + int(np.bincount(regions.ravel(), minlength=number + 1)[1:].argmax())
+    row, column = np.nonzero(regions == largest)
+    floor = np.stack([axis[column], axis[row]], axis=1)
+    middle = floor.mean(0)
+    out = floor - middle
+    angle = np.arctan2(out[:, 1], out[:, 0])
+    cameras = []
+    for index in range(count):
+        turn = 2 * np.pi * (index + 0.5) / count - np.pi
+        apart = np.abs((angle - turn + np.pi) % (2 * np.pi) - np.pi)
+        distance = np.linalg.norm(out, axis=1)
+        at = floor[np.argmax(np.where(apart < max(np.pi / count, 0.15), distance, 0))]
+        side = 0.6 * np.sin(index * 2.4) * (middle - at)[::-1] * [-1, 1]
+        height = EYE_HEIGHT + 0.15 * np.sin(index * 1.7)
+        target = np.append(middle + side, height + 0.3 + 0.5 * np.sin(index * 0.9))
+        cameras.append(level_camera(f"yard_{index:03d}", np.append(at, height), target))
+    return cameras
 
 
 def main() -> None:

@@ -2,6 +2,7 @@
 
     python tools/bench_quality.py examples/lantern_walk DIR ...      validation views, for choosing settings
     python tools/bench_quality.py --report --base ../other DIR ...   test views, compared with a checkout
+    python tools/bench_quality.py --subsets DIR ...                  also harder copies (quality_scenes.py)
 
 Each point is a complete run, because schedules depend on the number of steps. Runs of two checkouts alternate
 on the same cores; this checkout measures both. Finished runs are reused when the benchmark is repeated.
@@ -21,13 +22,25 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(HERE))
 
+from tools.quality_scenes import SUBSETS, write_courtyard, write_subset  # noqa: E402
 from training.errors import LodgsError  # noqa: E402
 from training.evaluate.views import REDUCTIONS  # noqa: E402
 from training.methods import METHODS  # noqa: E402
 from training.runs.measure import evaluate_run  # noqa: E402
 
 RUN = ("scene", "method", "version", "share", "seed")
-COLUMNS = ("psnr", "fitted_psnr", "worst", "train_psnr", "veil", "veil_max", "oversized", "splats", "seconds")
+COLUMNS = (
+    "psnr",
+    "fitted_psnr",
+    "worst",
+    "train_psnr",
+    "gap",
+    "veil",
+    "veil_max",
+    "oversized",
+    "splats",
+    "seconds",
+)
 
 
 @dataclass
@@ -50,9 +63,37 @@ class Point:
     seconds: float
     levels: list[dict]
 
+    @property
+    def gap(self) -> float:
+        """PSNR of training views minus that of held-out views, in dB."""
+        return self.train_psnr - self.psnr
 
-def train(checkout: Path, out: Path, scene: Path, method: str, share: float, seed: int, args) -> None:
+
+def scenes_to_train(folders: Iterable[Path], subsets: Path | None) -> dict[Path, int]:
+    """Return the scenes and the distance of their held-out views.
+
+    Args:
+        folders: scenes.
+        subsets: folder for harder copies of them, which are written if missing; None for no copies.
+    """
+    scenes = {folder.resolve(): 8 for folder in folders}
+    if subsets is not None:
+        subsets.mkdir(parents=True, exist_ok=True)
+        for folder in list(scenes):
+            for name, subset in SUBSETS.items():
+                copy = write_subset(folder, subsets / f"{folder.name}-{name}", subset)
+                scenes |= {copy: subset.test_every} if copy else {}
+        scenes[write_courtyard(subsets / "courtyard")] = 8
+    return scenes
+
+
+def train(
+    checkout: Path, out: Path, scene: Path, method: str, share: float, seed: int, args, test_every: int = 8
+) -> None:
     """Train with a checkout of the project, unless the run is finished.
+
+    Args:
+        test_every: distance of held-out views.
 
     Raises:
         LodgsError: training failed, or the folder holds another run.
@@ -66,7 +107,7 @@ def train(checkout: Path, out: Path, scene: Path, method: str, share: float, see
     command = [
         sys.executable, "-m", "training", "train", "--scene", str(scene), "--out", str(out),
         "--method", method, "--preset", args.preset, "--seed", str(seed),
-        "--image-scale", str(args.image_scale),
+        "--image-scale", str(args.image_scale), "--test-every", str(test_every),
         *scaled, *(f"--set={assignment}" for assignment in args.set),
         *([] if args.report else ["--validation"]),
     ]  # fmt: skip
@@ -178,6 +219,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--report", action="store_true", help="measure test views instead of validation views"
     )
+    parser.add_argument(
+        "--subsets", action="store_true", help="also measure harder copies of the scenes; implies --report"
+    )
     parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS))
     parser.add_argument("--preset", default="draft")
     parser.add_argument(
@@ -194,6 +238,7 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--out", type=Path, default=HERE / "build" / "quality")
     args = parser.parse_args(arguments)
+    args.report |= args.subsets
     if args.base and not args.report:
         parser.error("--base requires --report: older versions may not support validation views")
     versions = {"this": HERE} | ({"base": args.base.resolve()} if args.base else {})
@@ -202,9 +247,10 @@ def main(arguments: list[str] | None = None) -> int:
     if not all(0 < share <= 10 for share in args.shares):
         parser.error("--shares must be above 0 and at most 10")
     args.out = args.out.resolve()
+    args.subsets = args.out / "scenes" if args.subsets else None
     points = []
     try:
-        for scene in args.scenes:
+        for scene, test_every in scenes_to_train(args.scenes, args.subsets).items():
             for method in args.methods:
                 for share in args.shares:
                     for seed in args.seeds:
@@ -212,7 +258,7 @@ def main(arguments: list[str] | None = None) -> int:
                             run = {"scene": scene.name, "method": method, "version": version}
                             run |= {"share": share, "seed": seed}
                             out = args.out / "-".join(map(str, run.values()))
-                            train(checkout, out, scene.resolve(), method, share, seed, args)
+                            train(checkout, out, scene, method, share, seed, args, test_every)
                             points.append(measure(out, **run))
                             print(table(points[-1:]).splitlines()[-1], flush=True)
     except LodgsError as error:

@@ -158,13 +158,15 @@ def read_toml(path: str | Path, label: str = "") -> dict:
     return table
 
 
-def parse_json(text: str | bytes, label: str, max_bytes: int = MAX_JSON_BYTES) -> dict:
+def parse_json(text: str | bytes, label: str, max_bytes: int = MAX_JSON_BYTES, finite: bool = True) -> dict:
     """Parse a JSON object.
 
     Args:
         text: bytes are decoded as UTF-8, UTF-16 or UTF-32.
         label: subject of error messages, such as "The camera view.json".
         max_bytes: maximum length of the text.
+        finite: refuse NaN and infinity. False for files of other programs, whose numbers are checked one by
+            one.
 
     Raises:
         LodgsError: the text is not valid JSON, is not an object, or exceeds a limit of this module.
@@ -173,7 +175,7 @@ def parse_json(text: str | bytes, label: str, max_bytes: int = MAX_JSON_BYTES) -
         values = json.loads(_decode(text, max_bytes), parse_int=_parse_int)
         if not isinstance(values, dict):
             raise ValueError("it is not an object")
-        _check(values, MAX_NESTING)
+        _check(values, MAX_NESTING, finite=finite)
     except (ValueError, RecursionError) as error:
         raise _not_valid(label, error) from error
     return values
@@ -200,7 +202,7 @@ def _decode(text: str | bytes, max_bytes: int) -> str:
     return text.decode(json.detect_encoding(text))
 
 
-def _check(value: Any, depth: int, key: str = "a value") -> None:
+def _check(value: Any, depth: int, key: str = "a value", finite: bool = True) -> None:
     """Raise ValueError unless this module allows a value, nested at most ``depth`` deep.
 
     Args:
@@ -212,11 +214,11 @@ def _check(value: Any, depth: int, key: str = "a value") -> None:
         case dict():
             for name, item in value.items():
                 _check(name, depth - 1, "a key")
-                _check(item, depth - 1, name)
+                _check(item, depth - 1, name, finite)
         case list():
             for item in value:
-                _check(item, depth - 1, key)
-        case float() if not math.isfinite(value):
+                _check(item, depth - 1, key, finite)
+        case float() if finite and not math.isfinite(value):
             raise ValueError(f"{key[:200]} = {value} is not a finite number")
         case int() if abs(value) > MAX_INTEGER:
             raise ValueError(f"{key[:200]} has too many digits")

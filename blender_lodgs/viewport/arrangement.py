@@ -25,6 +25,8 @@ MIN_SAMPLE = 10_000
 """Smallest sample; smaller sets are counted exactly."""
 ESTIMATE_LIMIT = 1.05
 """Fraction of the budget at which estimates end and exact counts start: a sample may be off by 5 %."""
+FINER_LIMIT = 0.9
+"""Maximum fraction of the budget that a finer query may need to return. A slight motion changes no detail."""
 
 WIDTH = 8192
 """Width in texels of the textures with one texel per item."""
@@ -129,12 +131,14 @@ class DrawnSplats:
         table: (M, 4) float32, the rows of :attr:`Arrangement.instances`.
         means: means of each placement's drawn splats, in its own space.
         excluded: number of splats excluded by the budget.
+        coarsened: see :class:`Arrangement`.
     """
 
     selection_key: tuple
     table: np.ndarray
     means: list[np.ndarray]
     excluded: int
+    coarsened: Counter[int]
 
 
 @dataclass(frozen=True)
@@ -179,12 +183,14 @@ class Request:
         budget: maximum number of splats.
         position: position of the view in the world, from which splats beyond the budget are ranked; None if
             all splats fit.
+        coarsened: that of the view's last arrangement, if its detail should remain after a slight motion.
     """
 
     placements: tuple[Placement, ...]
     backward: tuple[float, float, float]
     budget: int
     position: tuple[float, float, float] | None = None
+    coarsened: Counter[int] = field(default_factory=Counter, compare=False)
 
     @property
     def selection_key(self) -> tuple:
@@ -205,6 +211,7 @@ class Arrangement:
         splats: (M,) int32, the same pool rows.
         excluded: number of splats excluded by the budget.
         serial: the pool's; later versions have other splats in some rows.
+        coarsened: number of coarser queries that the budget demanded, by scene.
     """
 
     request: Request
@@ -212,6 +219,7 @@ class Arrangement:
     splats: np.ndarray
     excluded: int
     serial: int
+    coarsened: Counter[int] = field(default_factory=Counter)
 
     @property
     def count(self) -> int:
@@ -240,7 +248,7 @@ def arrange(pool: Pool, request: Request, update: bool = False) -> Arrangement:
         begin += len(means)
     instances = drawn.table[stable_argsort(depths)]
     rows = instances[:, 0].astype(np.int32)
-    return Arrangement(request, instances, rows, drawn.excluded, pool.serial)
+    return Arrangement(request, instances, rows, drawn.excluded, pool.serial, drawn.coarsened)
 
 
 def stable_argsort(values: np.ndarray) -> np.ndarray:
@@ -255,7 +263,10 @@ def stable_argsort(values: np.ndarray) -> np.ndarray:
 
 
 def _collect(pool: Pool, request: Request) -> DrawnSplats:
-    selections, excluded = within_budget(pool, request.placements, request.budget, request.position)
+    coarsened = request.coarsened.copy()
+    selections, excluded = within_budget(
+        pool, request.placements, request.budget, request.position, coarsened
+    )
     table = np.empty((sum(len(index) for index, _ in selections), 4), np.float32)
     means: list[np.ndarray] = []
     begin = 0
@@ -266,7 +277,7 @@ def _collect(pool: Pool, request: Request) -> DrawnSplats:
         rows[:, 3] = _color_levels(pool, placement, index, selected_means)
         means.append(selected_means)
         begin += len(index)
-    return DrawnSplats(request.selection_key, table, means, excluded)
+    return DrawnSplats(request.selection_key, table, means, excluded, coarsened)
 
 
 def within_budget(
@@ -274,6 +285,7 @@ def within_budget(
     placements: Sequence[Placement],
     budget: int,
     position: tuple[float, float, float] | None = None,
+    coarsened: Counter[int] | None = None,
 ) -> tuple[list[tuple[np.ndarray, np.ndarray]], int]:
     """Select the splats of placements within a budget.
 
@@ -283,6 +295,7 @@ def within_budget(
 
     Args:
         position: see :class:`Request`; None ranks splats by their size in the world.
+        coarsened: number of coarser queries by scene of the last arrangement; replaced by the new ones.
 
     Returns:
         Index and weights of each placement's splats, and the number of excluded splats.
@@ -293,9 +306,13 @@ def within_budget(
 
     placements = list(placements)
     full_count = sum(map(count, placements))
-    if full_count > budget:
-        _coarsen(placements, pool.estimate_count, ESTIMATE_LIMIT * budget)
-        _coarsen(placements, count, budget)
+    previous, steps = coarsened or Counter(), Counter()
+    if full_count > (FINER_LIMIT if previous else 1) * budget:
+        steps += _coarsen(placements, pool.estimate_count, ESTIMATE_LIMIT * budget, previous)
+        steps += _coarsen(placements, count, budget, previous - steps)
+    if coarsened is not None:
+        coarsened.clear()
+        coarsened.update(steps)
     selections = [_select(pool, placement) for placement in placements]
     total = sum(len(index) for index, _ in selections)
     while total > budget:
@@ -315,17 +332,32 @@ def within_budget(
     return selections, full_count - sum(len(index) for index, _ in selections)
 
 
-def _coarsen(placements: list[Placement], count: Callable[[Placement], int], budget: float) -> None:
-    """Replace queries by coarser ones in place until the counts fit into the budget, if possible."""
+def _coarsen(
+    placements: list[Placement], count: Callable[[Placement], int], budget: float, previous: Counter[int]
+) -> Counter[int]:
+    """Replace queries by coarser ones in place until the counts fit into the budget, if possible.
+
+    Scenes that were coarser before (``previous``) stay so unless ``FINER_LIMIT`` of the budget suffices.
+
+    Returns:
+        Number of coarser queries by scene.
+    """
     counts = [count(placement) for placement in placements]
     scenes = {placement.scene for placement in placements if placement.query is not None}
-    while sum(counts) > budget and scenes:
-        scene_counts = dict.fromkeys(scenes, 0)
+    steps: Counter[int] = Counter()
+    while True:
+        total = sum(counts)
+        finer = {scene for scene in scenes if steps[scene] < previous[scene] and total > FINER_LIMIT * budget}
+        candidates = scenes if total > budget else finer
+        if not candidates:
+            return steps
+        scene_counts = dict.fromkeys(candidates, 0)
         for placement, splats in zip(placements, counts, strict=True):
             if placement.scene in scene_counts:
                 scene_counts[placement.scene] += splats
         scene = max(scene_counts, key=lambda number: scene_counts[number])
         levels = sorted({placement.level for placement in placements if placement.scene == scene})
+        steps[scene] += 1
         for i, placement in enumerate(placements):
             if placement.scene == scene and placement.query is not None:
                 coarser = placement.query.coarser(levels)

@@ -397,6 +397,8 @@ def _arrange(view: ViewState, source: Resident, request: Request, wait: bool, up
         return view.pending[1] == request
     if view.loading is not None and not wait:  # load the current one completely first
         return False
+    if current is not None and not wait:  # a waiting render depends on nothing before
+        request = replace(request, coarsened=current.coarsened)
     view.pending = (source, request, _worker().submit(arrange, source.pool, request, update))
     if wait:
         arrangement = view.pending[2].result()

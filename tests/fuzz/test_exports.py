@@ -52,6 +52,11 @@ OPENSFM = [
         "points": {"1": {"coordinates": [0, 0, 5], "color": [255, 0, 0]}},
     }
 ]
+SPLAT_CAMERAS = [
+    {"id": 0, "img_name": "a", "width": 96, "height": 72, "position": [0, 0, 1], "fx": 80, "fy": 82,
+     "rotation": np.eye(3).tolist()}
+]  # fmt: skip
+SCANNER_APP = {"cameraPoseARFrame": POSE.ravel().tolist(), "intrinsics": [80, 0, 47, 0, 82, 37, 0, 0, 1]}
 BUNDLER = (
     "# Bundle file v0.3\n1 2\n80 0.1 0\n1 0 0\n0 1 0\n0 0 1\n0 0 0\n" + "0 0 -5\n9 8 7\n1 0 1 2.5 3\n" * 2
 )
@@ -62,6 +67,15 @@ METASHAPE = """<document version="2.0.0"><chunk><sensors><sensor id="0" type="fr
 <camera id="1" sensor_id="1" master_id="0" label="b"/><camera id="0" sensor_id="0" label="a">
 <transform>1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1</transform>
 </camera></cameras><transform><scale>2</scale></transform></chunk></document>"""
+REALITYCAPTURE = (
+    "#cameras 2\n#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n"
+    "a.png,0,0,3,0,90,0,30,0.01,0,0.1,0,0,0,0.01,0\nb.png,1,0,3,0,90,0,30,0,0,0,0,0,0,0,0\n"
+)
+SIDECAR = """<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
+<rdf:Description xmlns:xcr="http://www.capturingreality.com/ns/xcr/1.1#" xcr:DistortionModel="brown3"
+ xcr:FocalLength35mm="30" xcr:Skew="0"><xcr:Rotation>1 0 0 0 1 0 0 0 1</xcr:Rotation>
+<xcr:Position>0 0 1</xcr:Position><xcr:DistortionCoeficients>0.1 0 0 0 0 0</xcr:DistortionCoeficients>
+</rdf:Description></rdf:RDF></x:xmpmeta>"""
 PLY_HEADER = "ply\nformat ascii 1.0\nelement vertex 2\n"
 PLY_HEADER += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
 EXPORTS = {
@@ -70,8 +84,12 @@ EXPORTS = {
     "metadata": json.dumps(RECORD3D),
     "sfm_data.json": json.dumps(OPENMVG),
     "reconstruction.json": json.dumps(OPENSFM),
+    "cameras.json": json.dumps(SPLAT_CAMERAS),
+    "frame_0.json": json.dumps(SCANNER_APP),
     "bundle.out": BUNDLER,
     "cameras.xml": METASHAPE,
+    "registration.csv": REALITYCAPTURE,
+    "images/a.xmp": SIDECAR,
 }
 JSON = {
     "transforms.json": TRANSFORMS,
@@ -79,6 +97,8 @@ JSON = {
     "metadata": RECORD3D,
     "sfm_data.json": OPENMVG,
     "reconstruction.json": OPENSFM,
+    "cameras.json": SPLAT_CAMERAS,
+    "frame_0.json": SCANNER_APP,
 }
 
 
@@ -89,6 +109,7 @@ def folder(tmp_path_factory):
     for subfolder in ("images", "rgb", "keyframes/images"):
         for name in ("a.png", "b.png"):
             write_image(folder / subfolder / name, noise())
+    write_image(folder / "frame_0.png", noise())
     (folder / "list.txt").write_text("images/a.png\nimages/b.png\n")
     (folder / "points.ply").write_text(PLY_HEADER + "0 0 5\n0 1 5\n")
     return folder

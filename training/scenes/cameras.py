@@ -139,8 +139,12 @@ class Camera:
         )  # fmt: skip
 
     def turned(self, turns: int) -> Camera:
-        """Return an upright view in the axes of its stored photo, 1 or 3 clockwise turns from upright."""
+        """Return an upright view in the axes of its stored photo, 1 to 3 clockwise turns from upright."""
         axes = np.eye(4)
+        if turns == 2:
+            axes[:2, :2] *= -1
+            pose = axes @ self.world_to_camera
+            return replace(self, cx=self.width - self.cx, cy=self.height - self.cy, world_to_camera=pose)
         axes[:2, :2] = ((0, 1), (-1, 0)) if turns == 1 else ((0, -1), (1, 0))
         cx, cy = (self.cy, self.width - self.cx) if turns == 1 else (self.height - self.cy, self.cx)
         return replace(

@@ -245,7 +245,8 @@ def read_scene(
     views.require_cameras(model, images)
     points, colors, ids = _read_model_points(model, views.cameras, warnings)
     if origin is None:
-        origin = choose_origin(np.array([pose.center for pose in poses]), points)
+        centers = np.array([pose.center for pose in poses])
+        origin = choose_origin(centers[np.isfinite(centers).all(axis=1)], points)
     views.cameras = [camera.moved(-origin) for camera in views.cameras]
     with np.errstate(over="ignore"):  # infinite positions are dropped
         points = (points - origin).astype(np.float32)

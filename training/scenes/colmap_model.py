@@ -37,7 +37,7 @@ class Pose:
 
     Attributes:
         name: file name, from UTF-8 or Windows-1252. Other bytes become surrogates.
-        world_to_camera: (4, 4) float64 rigid transform.
+        world_to_camera: (4, 4) float64 rigid transform; NaN if the record has no valid one.
     """
 
     name: str
@@ -298,8 +298,8 @@ def _pose(name: bytes, camera_id: int, pose: list[float]) -> Pose:
     """Return a pose from a quaternion (w, x, y, z) and a translation, both world to camera."""
     quaternion = np.array(pose[:4])
     text = _decode(name)
-    if not (np.isfinite(pose).all() and quaternion.any()):
-        raise ValueError(f"image {printable(text)} has no valid pose")
+    if not (np.isfinite(pose).all() and quaternion.any()):  # some programs write such poses of failed photos
+        return Pose(text, camera_id, np.full((4, 4), np.nan))
     world_to_camera = np.eye(4)
     world_to_camera[:3, :3] = rotation_matrix(quaternion)
     world_to_camera[:3, 3] = pose[4:]

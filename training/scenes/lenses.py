@@ -110,11 +110,13 @@ class Intrinsics:
         return Intrinsics(lens, width, height, np.concatenate([focal, center, distortion]))
 
     def turned(self, turns: int) -> Intrinsics:
-        """Return the lens for photos turned back by clockwise quarter turns.
+        """Return the lens for photos turned back by 1 to 3 clockwise quarter turns.
 
         Raises:
             LodgsError: if the distortion cannot be turned.
         """
+        if turns == 2:
+            return self.turned(1).turned(1)
         lens, (cx, cy) = self.lens, self.pinhole[2:]
         focal = self.parameters[: lens.focals][::-1]
         center = (cy, self.width - cx) if turns == 1 else (self.height - cy, cx)

@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import LodgsError
+from ..splats.colors import color_names, full_intensity
 from ..splats.ply import read_elements
 
 
 def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read the finite points (P, 3) and their colours (P, 3) uint8, grey by default.
+    """Read the finite points (P, 3) and their colours (P, 3) uint8, grey by default; alpha is ignored.
 
     Raises:
         LodgsError: the file is missing or damaged, or has no points.
@@ -24,11 +25,9 @@ def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
     except (KeyError, ValueError, TypeError) as error:
         raise LodgsError(f"Cannot read points from {path}: {error}.", "Export the points again.") from error
     colors = np.full((len(points), 3), 128, np.uint8)
-    names = ("red", "green", "blue")
-    if set(names) <= set(vertices.dtype.names or ()):
-        values = np.stack([vertices[name] for name in names], axis=1)
-        if not np.issubdtype(values.dtype, np.integer):
-            values = 255 * values
-        colors = np.nan_to_num(values).clip(0, 255).astype(np.uint8)
+    if names := color_names(vertices.dtype.names or ()):
+        columns = [vertices[name] for name in names]
+        values = np.stack(columns, axis=1, dtype=np.float64) * (255 / full_intensity(columns))
+        colors = np.nan_to_num(values).clip(0, 255).round().astype(np.uint8)
     finite = np.isfinite(points).all(axis=1)
     return points[finite], colors[finite]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +21,13 @@ MAX_NAMED = 5
 """Maximum number of views named by warnings of one kind; the remaining ones are counted."""
 MAX_STRETCH = 0.02
 """Maximum difference in proportions of a photo and its camera; the camera is scaled along each axis."""
-_UNMIRRORED_TURNS = {6: 1, 8: 3}
-"""Single clockwise quarter turns by EXIF orientation, without mirrored ones."""
+STORE_UPRIGHT = "store its pixels upright (exiftran -a, or mogrify -auto-orient)"
+"""Remedy for photos that EXIF data turns or mirrors."""
+_TURNS = {3: 2, 6: 1, 8: 3}
+"""Clockwise quarter turns by EXIF orientation, without mirrored ones."""
+_MIRRORED = 2, 4, 5, 7
+_SIDEWAYS = 5
+"""First EXIF orientation that exchanges width and height."""
 
 
 class ViewCollector:
@@ -44,15 +50,27 @@ class ViewCollector:
         self, poses: Sequence[Pose], lenses: Mapping[int, Intrinsics], progress: Callable[[float], object]
     ) -> None:
         """Add views, with the lenses by id; report the fraction of added views now and then."""
+        upright = fits_upright_photos(self._photos(poses, lenses)) is True
         for number, pose in enumerate(poses):
             if number % 50 == 0:
                 progress(number / len(poses))
-            self.add(pose, lenses[pose.camera_id])
+            self._add(pose, lenses[pose.camera_id], upright)
 
-    def add(self, pose: Pose, lens: Intrinsics) -> None:
+    def _photos(
+        self, poses: Sequence[Pose], lenses: Mapping[int, Intrinsics]
+    ) -> Iterator[tuple[Path, int, int]]:
+        for pose in poses:
+            with suppress(LodgsError):  # reported for its view
+                if (path := self._files.find(pose.name)) is not None:
+                    lens = lenses[pose.camera_id]
+                    yield path, lens.width, lens.height
+
+    def _add(self, pose: Pose, lens: Intrinsics, upright: bool) -> None:
         """Add a view at the size of its photo, or record the reason for skipping it."""
         name = pose.name.replace("\\", "/")
         try:
+            if not np.isfinite(pose.world_to_camera).all():
+                raise LodgsError("it has no valid pose.")
             if not lens.lens.focals:
                 raise LodgsError(f"camera model {lens.lens.name} is a panorama, not a perspective view.")
             if self.cameras and self.cameras[-1].name == name:
@@ -67,9 +85,9 @@ class ViewCollector:
                 name, lens.width, lens.height, *lens.pinhole, pose.world_to_camera, image, *sidecars,
                 turns=quarter_turns(image),
             )  # fmt: skip
-            if turns := photo_turns(image, width, height, lens.width, lens.height):
+            if turns := photo_turns(image, width, height, lens.width, lens.height, upright):
                 if lens.distorted:
-                    raise LodgsError("only its EXIF data turns it upright: turn its pixels (exiftran -a).")
+                    raise LodgsError(f"only its EXIF data turns it: {STORE_UPRIGHT}.")
                 camera = camera.turned(turns)
             if (width, height) != (camera.width, camera.height):
                 camera = camera.resized(width, height)
@@ -131,26 +149,53 @@ class ViewCollector:
         return messages
 
 
-def photo_turns(path: Path, width: int, height: int, lens_width: int, lens_height: int) -> int:
-    """Return the clockwise quarter turns that make a photo fit a lens of another size: 0, 1 or 3.
+def fits_upright_photos(photos: Iterable[tuple[Path, int, int]]) -> bool | None:
+    """Return True if cameras belong to photos turned by their EXIF orientation, False if to stored ones.
+
+    Photos that a quarter turn makes upright tell it by their sizes. Without any, the result is None.
+
+    Args:
+        photos: (path, width, height) with the size of the lens.
+    """
+    evidence = set()
+    for path, lens_width, lens_height in photos:
+        if exif_orientation(path) >= _SIDEWAYS and min(lens_width, lens_height) > 0:
+            with suppress(LodgsError):
+                width, height = image_size(path)
+                stored = same_proportions(width, height, lens_width, lens_height, MAX_STRETCH)
+                turned = same_proportions(height, width, lens_width, lens_height, MAX_STRETCH)
+                evidence |= {turned} if stored != turned else set()
+    return evidence.pop() if len(evidence) == 1 else None
+
+
+def photo_turns(
+    path: Path, width: int, height: int, lens_width: int, lens_height: int, upright: bool = False
+) -> int:
+    """Return the clockwise quarter turns that make a photo fit a lens of another size: 0 to 3.
 
     Sizes fit if their proportions differ by less than MAX_STRETCH. The turn of a photo comes from its EXIF
     data.
 
     Args:
         width, height: size of the photo as stored.
+        upright: True if the lens belongs to the upright photo, see :func:`fits_upright_photos`. Otherwise a
+            photo is turned only if its size requires it.
 
     Raises:
-        LodgsError: if no turn makes them fit. ``what`` continues a sentence such as "Skipped <name>:".
+        LodgsError: if no turn makes them fit, or EXIF data mirrors the photo. ``what`` continues a sentence
+            such as "Skipped <name>:".
     """
-    if same_proportions(width, height, lens_width, lens_height, MAX_STRETCH):
+    fits = same_proportions(width, height, lens_width, lens_height, MAX_STRETCH)
+    if fits and not upright:
         return 0
-    turns = _UNMIRRORED_TURNS.get(exif_orientation(path), 0)
-    is_turned = same_proportions(height, width, lens_width, lens_height, MAX_STRETCH)
-    if is_turned and turns:
-        return turns
+    turned = same_proportions(height, width, lens_width, lens_height, MAX_STRETCH)
+    orientation = exif_orientation(path)
+    if turned if orientation >= _SIDEWAYS else fits:
+        if orientation in _MIRRORED:
+            raise LodgsError(f"only its EXIF data mirrors it: {STORE_UPRIGHT}.")
+        return _TURNS.get(orientation, 0)
     reason = f"its size {width}x{height} does not match its camera's {lens_width}x{lens_height}"
-    raise LodgsError(f"{reason}: the photo was {'rotated' if is_turned else 'cropped'}.")
+    raise LodgsError(f"{reason}: the photo was {'rotated' if turned else 'cropped'}.")
 
 
 def exclusion_messages(excluded: Sequence[tuple[str, str]]) -> list[str]:

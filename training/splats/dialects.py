@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import LodgsError
+from .colors import color_names
 from .gaussians import Splats
 
 Warn = Callable[[str], object]
@@ -209,7 +210,7 @@ def _find_refusal(columns: set[str], comments: Iterable[str], path: Path) -> tup
             "it holds flat discs of 2D Gaussian Splatting, which need another renderer",
             "Train the photos with a method of LODGS or another 3DGS trainer.",
         )
-    if {"red", "green", "blue"} <= columns and not columns & {"f_dc_0", "scale_0"}:
+    if color_names(columns) and not columns & {"f_dc_0", "scale_0"}:
         return (
             "it is a coloured point cloud or mesh, not Gaussian splats",
             "Choose a PLY from a 3DGS trainer.",

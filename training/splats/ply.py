@@ -24,6 +24,7 @@ from ..documents import damage_error, has_decimal_commas, open_text, read_lines
 from ..errors import LodgsError
 from ..files import atomic_write
 from .coding import CODEBOOK, CodedRows, declared_rows, decode_elements, is_coded
+from .colors import color_names, full_intensity
 from .dialects import Warn, drawable_3dgs, ignore, reject_unsupported
 from .gaussians import SH_C0, SplatRows, Splats
 from .origin import NO_ORIGIN
@@ -47,7 +48,7 @@ _TYPES = {
 }
 # Rows are converted in blocks that fit in the processor's cache.
 _BLOCK = 4096
-_F_DC, _RGB = ["f_dc_0", "f_dc_1", "f_dc_2"], ["red", "green", "blue"]
+_F_DC = ["f_dc_0", "f_dc_1", "f_dc_2"]
 BATCH_ROWS = 1 << 15
 """Rows per batch when splats are larger than memory."""
 
@@ -209,15 +210,15 @@ def splats_from_rows(
     splats = _empty_splats(len(rows), degree)
     columns = {name: column for name, column in splat_columns(splats).items() if name not in NORMALS}
     missing = [name for name in columns if name not in names]
-    if missing == _F_DC and set(_RGB) <= set(names) and rows.dtype["red"].itemsize == 1:
-        missing = []  # nerfstudio's splats without harmonics have 8-bit colours
+    colors = color_names(names) if missing == _F_DC else None  # nerfstudio's splats without harmonics
+    missing = [] if colors else missing
     if missing:
         raise LodgsError(
             f"Cannot read {path}: it is not a PLY of Gaussian splats: it has no {', '.join(missing)}.",
             "Choose a PLY from a 3DGS trainer; other point clouds and meshes contain no splats.",
         )
-    colored = _F_DC[0] not in names
-    sources = dict(zip(_F_DC, _RGB, strict=True)) if colored else {}
+    sources = dict(zip(_F_DC, colors, strict=True)) if colors else {}
+    full = full_intensity([rows[name] for name in sources.values()]) if sources else 1.0
     extras = {
         name: np.empty(len(rows), rows.dtype[name].newbyteorder("="))
         for name in names
@@ -232,8 +233,8 @@ def splats_from_rows(
                 column[block] = source[block]
             for axis in np.flatnonzero(origin):
                 splats.means[block, axis] = rows["xyz"[axis]][block].astype(np.float64) - origin[axis]
-            if colored:
-                splats.sh[block, 0] = (splats.sh[block, 0] / 255 - 0.5) / SH_C0
+            if colors:
+                splats.sh[block, 0] = (splats.sh[block, 0] / full - 0.5) / SH_C0
         has_normals = any(extras[name].any() for name in NORMALS if name in extras)
     if not has_normals:
         extras = {name: column for name, column in extras.items() if name not in NORMALS}

@@ -1,8 +1,8 @@
 """Conversion of splat files by PlayCanvas' splat-transform (MIT, from npm).
 
 SPZ and compressed PLY change with the versions of their programs, so splat-transform reads and writes
-them. It reads SOG and streamed levels, too. The existing Python packages (gaussforge, gsply) do not run in Blender,
-because they are compiled for one version of Python each.
+them. It reads SOG and streamed levels, too. The existing Python packages (gaussforge, gsply) do not run in
+Blender, because they are compiled for one version of Python each.
 """
 
 from __future__ import annotations

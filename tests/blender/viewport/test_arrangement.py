@@ -1,5 +1,6 @@
 """Selection and order of viewport splats, and the view as their camera, compared with numpy and modifiers."""
 
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -316,6 +317,45 @@ def test_budget_replaces_the_finest_level_by_coarser_ones(bpy, lodgs):
     assert np.array_equal(selections[0][0], full[0][0])
     selections, _ = arrangement.within_budget(pool, placements, 300)
     assert [len(index) for index, _ in selections] == [300, 0, 0]
+
+
+def test_slight_motion_keeps_the_detail_of_a_budget(bpy, lodgs):
+    """A camera that moves by 1 % to and fro, where the budget flips the detail, flips it once."""
+    rng, arrangement = np.random.default_rng(5), lodgs("viewport.arrangement")
+    count = 20_000
+    pool, _ = make_pool(lodgs, [random_set(rng, count)])
+    pool.columns.update(
+        node_size=np.zeros(count, np.float32), parent_x=np.zeros(count, np.float32),
+        parent_size=np.float32(rng.uniform(0, 0.01, count)),
+    )  # fmt: skip
+    query = make_query(lodgs, "cut", 1000.0, {"level": 2.0, "levels": 2.0}, {"pixels": 1.0})
+
+    def request(distance, coarsened=None):
+        moved = replace(query, position=(0.0, 0.0, distance))
+        placements = (make_placement(lodgs, 0, count, level=2, query=moved),)
+        position, coarsened = (0.0, 0.0, distance), coarsened or Counter()
+        return arrangement.Request(placements, (0, 0, 1), 5_000, position, coarsened)
+
+    far, near = 3.0, 1.5  # the nearer camera needs more coarsening
+    steps = [arrangement.arrange(pool, request(d)).coarsened[0] for d in (far, near)]
+    assert steps[0] < steps[1]
+    while far - near > 1e-6:
+        middle = (near + far) / 2
+        far, near = (
+            (middle, near)
+            if arrangement.arrange(pool, request(middle)).coarsened[0] == steps[0]
+            else (far, middle)
+        )
+    walk = [far * factor for factor in (1.005, 0.995) * 10]
+    stateless = [arrangement.arrange(pool, request(d)).coarsened[0] for d in walk]
+    assert np.count_nonzero(np.diff(stateless)) == 19
+    coarsened, counts = Counter(), []
+    for distance in walk:
+        result = arrangement.arrange(pool, request(distance, coarsened))
+        coarsened = result.coarsened
+        counts.append((coarsened[0], result.count <= 5_000))
+    assert np.count_nonzero(np.diff([steps for steps, _ in counts])) == 1 and all(fits for _, fits in counts)
+    assert arrangement.arrange(pool, request(2 * far, coarsened)).coarsened[0] <= steps[0]
 
 
 def test_budget_coarsens_queries_with_estimates(bpy, lodgs, monkeypatch):

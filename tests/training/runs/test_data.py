@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lab.jitter import jittered
 from tests.training.conftest import write_tiny_scene
 from tests.training.scenes import synthetic
+from tools.quality_scenes import SUBSETS, write_subset
 from training.errors import LodgsError, SystemProblem
 from training.optimize.training_data import TrainingData
 from training.runs.data import training_data
@@ -123,7 +123,7 @@ def test_scene_without_decodable_photos_is_rejected(tmp_path):
 
 def test_exposure_differences_are_compensated_unless_disabled(tmp_path):
     scene = tmp_path / "copy"
-    jittered(GARDEN, scene, 0.7, 0, 8)
+    write_subset(GARDEN, scene, SUBSETS["jittered"], stops=0.5)
 
     def exposure_error(**parameters):
         job = Job(str(scene), str(tmp_path / "run"), image_scale=0.25, parameters=parameters)

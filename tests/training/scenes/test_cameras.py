@@ -98,6 +98,7 @@ def test_lenses_fit_resized_and_turned_photos(name):
     )
     x, y = pixels.T
     view = Camera("", 72, 96, *lens.pinhole, np.eye(4))
-    for turns, stored in ((1, np.stack([y, 72 - x], axis=1)), (3, np.stack([96 - y, x], axis=1))):
+    for turns, columns in ((1, (y, 72 - x)), (2, (72 - x, 96 - y)), (3, (96 - y, x))):
+        stored = np.stack(columns, axis=1)
         turned_rays = rays @ view.turned(turns).world_to_camera[:3, :3].T
         np.testing.assert_allclose(project_with_colmap(lens.turned(turns), turned_rays), stored, atol=1e-9)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from lab.jitter import exposed
+from tools.quality_scenes import relight
 from training.optimize.training_data import TrainingData
 from training.scenes import exposures
 from training.scenes.colmap import read_scene
@@ -25,7 +25,7 @@ def copy(tmp_path):
         (tmp_path / "sparse").symlink_to(GARDEN / "sparse")
         files = sorted((GARDEN / "images").iterdir())
         for file, change in zip(files, stops(len(files)), strict=True):
-            pixels = exposed(np.asarray(Image.open(file).convert("RGB")), change)
+            pixels = relight(np.asarray(Image.open(file).convert("RGB")), np.full(3, 2.0**change))
             Image.fromarray(pixels).save(tmp_path / "images" / file.name, quality=97)
         return read_scene(tmp_path)
 

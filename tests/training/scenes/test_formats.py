@@ -401,9 +401,9 @@ def test_damaged_reconstructions_of_opensfm_are_rejected(tmp_path, content):
         (
             ["Registration.CSV", "a.jpg"],
             "Registration.CSV is a table",
-            "Export the cameras for COLMAP or Bundler",
+            "Internal/External",
         ),
-        (["a.jpg", "a.xmp"], "a.xmp is camera data of photos", "Export the cameras for COLMAP or Bundler"),
+        (["a.jpg", "a.xmp"], "a.xmp is data of a photo", "Internal/External"),
         (["IMG_1.HEIC", "IMG_2.HEIC"], "IMG_1.HEIC is a HEIC photo", "Convert the photos to JPEG"),
         (["clip.MOV"], "clip.MOV is a video", "lodgs frames"),
         (["poses_bounds.npy", "a.jpg"], "poses_bounds.npy is a file of LLFF", "COLMAP model"),

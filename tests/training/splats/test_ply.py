@@ -253,14 +253,17 @@ def test_unsupported_column_raises_one_sentence(tmp_path, make_splats, name, col
     assert list(tmp_path.iterdir()) == []
 
 
-def test_nerfstudio_splats_with_rgb_colours(tmp_path):
+@pytest.mark.parametrize("kind, full", [("u1", 255), ("u2", 65535), ("f4", 1), ("f4", 255), ("i4", 255)])
+def test_nerfstudio_splats_with_rgb_colours(tmp_path, kind, full):
+    """Colours are relative to 255 as in nerfstudio, to 65535 in 16-bit columns, or to 1 in float ones."""
     names = ["x", "y", "z", "red", "green", "blue", "opacity", *(f"scale_{i}" for i in range(3))]
-    kinds = [(name, "u1" if name in ("red", "green", "blue") else "f4") for name in names]
+    kinds = [(name, kind if name in ("red", "green", "blue") else "f4") for name in names]
     rows = np.zeros(2, [*kinds, *((f"rot_{i}", "f4") for i in range(4))])
-    rows["red"], rows["green"], rows["blue"], rows["rot_0"] = [255, 0], [0, 128], [51, 255], 1
+    red, green, blue = np.array([[1, 0], [0, 0.6], [0.2, 1]]) * full
+    rows["red"], rows["green"], rows["blue"], rows["rot_0"] = red, green, blue, 1
     path = tmp_path / "nerfstudio.ply"
     PlyData([PlyElement.describe(rows, "vertex")]).write(path)
     splats = read_ply(path)
     colors = 0.5 + 0.28209479177387814 * splats.sh[:, 0]  # 1 / (2 sqrt(pi)), of degree 0
-    assert np.allclose(colors, [[1, 0, 0.2], [0, 128 / 255, 1]], atol=1e-6)
+    assert np.allclose(colors, [[1, 0, 0.2], [0, 0.6, 1]], atol=1e-6)
     assert splats.sh.shape == (2, 1, 3) and not splats.extras

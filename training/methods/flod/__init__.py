@@ -17,6 +17,8 @@ from ...settings import setting
 
 BLENDED_LEVELS = 3
 """Number of finest levels that are blended by default (``Bands.defaults``) and that finishing steps train."""
+REFINE_RATIO = 0.6
+"""Steps that refine a merged level relative to those of the next finer one."""
 CELL_LEVELS = 2
 """Number of finest levels that are trained cell by cell in a divided scene."""
 
@@ -68,9 +70,10 @@ class FlodParameters(FlodLevels, DensityParameters):
         0.5, "Splat count of a merged level, as a fraction of the next finer level's.", above=0, high=1
     )
     refine_steps: int = setting(
-        300,
-        "Steps that refine each merged level, taken from those of all levels ('steps'). The finest level "
-        "gets the others.",
+        550,
+        "Steps that refine the merged level before the finest. Each coarser level gets 60 % of the steps of "
+        "the next finer one. They are taken from those of all levels ('steps'), at most half; the finest "
+        "level gets the others.",
         unit="steps",
     )
     first_level: int = setting(
@@ -80,8 +83,9 @@ class FlodParameters(FlodLevels, DensityParameters):
     finish_share: float = setting(
         0.2,
         "Additional steps at the end that train the three finest levels as blended by distance, as a "
-        "fraction of all levels' steps. Merged levels need at most 'refine_steps'. Trained levels "
-        "with fine detail restart from the most important splats of the finest level. Not in the paper.",
+        "fraction of all levels' steps. Merged levels need at most a third of 'refine_steps'. Trained "
+        "levels with fine detail restart from the most important splats of the finest level. Not in the "
+        "paper.",
         high=1,
     )
     drawn: float = setting(
@@ -116,13 +120,11 @@ class FlodParameters(FlodLevels, DensityParameters):
         if not self.merges:
             numbers = range(self.first_level, self.end + 1)
             return [(number, self.steps[number - 1]) for number in numbers]
-        coarser = [(number, self._refining) for number in range(self.levels - 1, 0, -1)]
-        return [(self.levels, sum(self.steps) - self._refining * len(coarser)), *coarser]
-
-    @property
-    def _refining(self) -> int:
-        """Steps that refine each merged level, together at most half of all."""
-        return min(self.refine_steps, sum(self.steps) // (2 * self.levels))
+        shares = [REFINE_RATIO**n for n in range(self.levels - 1)]
+        steps = min(self.refine_steps, sum(self.steps) / (2 * sum(shares)))
+        refining = [max(int(steps * share), 1) for share in shares]
+        coarser = list(zip(range(self.levels - 1, 0, -1), refining, strict=True))
+        return [(self.levels, sum(self.steps) - sum(refining)), *coarser]
 
     @property
     def total_steps(self) -> int:
@@ -132,7 +134,7 @@ class FlodParameters(FlodLevels, DensityParameters):
     def all_steps(self) -> int:
         """Steps of a run of all levels; schedules are fractions of them."""
         finishing = round(self.finish_share * sum(self.steps)) if self.levels > 1 else 0
-        return sum(self.steps) + (min(finishing, self._refining) if self.merges else finishing)
+        return sum(self.steps) + (min(finishing, self.stages[1][1] // 3) if self.merges else finishing)
 
     @property
     def finish_steps(self) -> int:
@@ -177,7 +179,7 @@ _STANDARD = replace(
     _DRAFT,
     **STANDARD,
     steps=STANDARD_STEPS,
-    refine_steps=1_000,
+    refine_steps=1_800,
     densify_interval=(100,) * 5,
 )
 _PAPER = replace(

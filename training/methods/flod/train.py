@@ -31,9 +31,15 @@ from ...optimize.method import Drawing
 from ...optimize.model import Model, splat_rates
 from ...optimize.schedules import due, log_linear, shrink_at
 from ...optimize.training_data import TrainingView
+from ...rasterize import contributions
 from ...splats.gaussians import Splats
 from ...splats.levels import Level
 from . import BLENDED_LEVELS, FlodParameters, finish
+
+LEAST_WEIGHT = 0.05
+"""Minimum share of a pixel of the finest level's splats that are merged; others are dropped."""
+REFINE_RATE = 4.0
+"""Learning rates of merged levels, relative to those of finishing steps."""
 
 
 class Method(method.Method[FlodParameters, Drawing]):
@@ -113,6 +119,9 @@ class Method(method.Method[FlodParameters, Drawing]):
 
     def shrink(self, step: int) -> float:
         p = self.parameters
+        if self._refines(step):
+            progress = self._level_step(step) / p.stages[self._stage(step)][1]
+            return shrink_at(progress, p.first_resolution, p.full_resolution)
         return shrink_at(self._progress(step), p.first_resolution, p.full_resolution)
 
     def sh_degree(self, step: int) -> int:
@@ -139,7 +148,8 @@ class Method(method.Method[FlodParameters, Drawing]):
             return
         steps = p.stages[self._stage(step)][1]
         if self._refines(step):
-            self.model.lr = finish.learning_rates(p, self.data.extent, self._level_step(step) / steps)
+            rates = finish.learning_rates(p, self.data.extent, self._level_step(step) / steps)
+            self.model.lr = {name: REFINE_RATE * rate for name, rate in rates.items()}
             return
         share = self._level_step(step) / (p.lr_means_steps or steps)
         rate = log_linear(p.lr_means, p.lr_means_final, share) * self.data.extent
@@ -248,11 +258,27 @@ class Method(method.Method[FlodParameters, Drawing]):
         """
         p = self.parameters
         if p.merges:
-            merged = merge(self.model.splats(), round(p.merge_ratio * len(self.model)))
+            count = round(p.merge_ratio * len(self.model))
+            splats = self._visible_splats(count) if level == p.levels - 1 else self.model.splats()
+            merged = merge(splats, count)
             self.model = self._new_model(from_splats(merged, p.sh_degree, self.device))
             return
         tensors = {name: tensor.detach() for name, tensor in self.model.adam.tensors.items()}
         self.model = self._new_model(self._next_level_tensors(tensors, self.s_min[level - 2], level))
+
+    @torch.no_grad()
+    def _visible_splats(self, minimum: int) -> Splats:
+        """Return the splats without those of low weight in all training views and margins.
+
+        At least ``minimum`` remain.
+        """
+        p, data = self.parameters, self.data
+        wide = (camera.widened(p.margin) for camera in data.train)
+        largest = contributions(
+            self.model.gaussians, wide, near=data.near, antialias=p.antialias, backend=self.backend
+        ).largest
+        threshold = min(LEAST_WEIGHT, float(largest.topk(minimum).values[-1]))
+        return self.model.splats().select((largest >= threshold).cpu().numpy())
 
     def _next_level_tensors(
         self, tensors: dict[str, torch.Tensor], old_min: float, level: int

@@ -18,14 +18,28 @@ from ...files import check_folder, is_file, link_or_copy, temporary_folder
 from ..colmap import DEPTHS, MASKS, NO_POINTS, Scene, find_models, read_scene, scene_lenses, subfolders
 from ..colmap_model import model_suffix
 from ..image_files import find_image_folder
-from ..images import image_size
-from ..view_selection import exclusion_messages, photo_turns
+from ..images import exif_orientation, image_size
+from ..view_selection import STORE_UPRIGHT, exclusion_messages, fits_upright_photos, photo_turns
 from ..write_colmap import write_model
-from . import bundler, metashape, openmvg, opensfm, polycam, record3d, transforms
+from . import (
+    bundler,
+    metashape,
+    openmvg,
+    opensfm,
+    polycam,
+    realitycapture,
+    record3d,
+    scanner_app,
+    splat_cameras,
+    transforms,
+)
 from .exported import ExportedScene, ExportedView, PhotoFinder
 from .foreign import describe_foreign
 
-FORMATS = transforms, polycam, record3d, metashape, openmvg, opensfm, bundler
+FORMATS = (
+    transforms, polycam, record3d, metashape, openmvg, opensfm, bundler, realitycapture, scanner_app,
+    splat_cameras,
+)  # fmt: skip
 """Supported formats; the first one that recognises a folder is used."""
 MAX_DEPTH, MAX_SUBFOLDERS = 3, 1000
 """Maximum depth of an export below the given folder, and of subfolders searched at each depth."""
@@ -217,6 +231,7 @@ def _usable_views(exported: ExportedScene) -> tuple[list[ExportedView], list[tup
     views, excluded = [], list(exported.excluded)
     unique = {(view.image, view.world_to_camera.tobytes()): view for view in exported.views}
     counts = Counter(image for image, _ in unique)
+    upright = fits_upright_photos((view.image, view.lens.width, view.lens.height) for view in unique.values())
     for view in unique.values():
         name = view.image.name
         if counts[view.image] > 1:
@@ -231,7 +246,7 @@ def _usable_views(exported: ExportedScene) -> tuple[list[ExportedView], list[tup
             continue
         lens = view.lens
         try:
-            turns = photo_turns(view.image, width, height, lens.width, lens.height)
+            turns = photo_turns(view.image, width, height, lens.width, lens.height, upright is True)
             view = (view.turned(turns) if turns else view).sized(width, height)
         except LodgsError as error:
             excluded.append((name, error.what))
@@ -240,6 +255,12 @@ def _usable_views(exported: ExportedScene) -> tuple[list[ExportedView], list[tup
             excluded.append((name, f"{flaw}."))
         else:
             views.append(view)
+    turned = [view.image for view in views if upright is None and exif_orientation(view.image) > 1]
+    if turned:
+        exported.warnings.append(
+            f"EXIF data turns or mirrors {len(turned):,} photos, such as {turned[0]}, but sizes do not show "
+            f"if their cameras are upright. Pixels are used as stored. If that is wrong, {STORE_UPRIGHT}."
+        )
     return views, excluded
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
@@ -10,6 +11,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
@@ -22,8 +25,8 @@ from ..image_files import NO_PHOTOS, UNREADABLE_SUFFIXES, walk_files
 from ..images import IMAGE_SUFFIXES
 from ..lenses import Intrinsics, make_intrinsics
 
-MAX_JSON_BYTES = 1 << 26
-"""Maximum size of a JSON file; 5,000 views take about 4 million bytes."""
+MAX_BYTES = 1 << 26
+"""Maximum size of a JSON or XML file; 5,000 views take about 4 million bytes."""
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Conversion between OpenCV's camera axes and OpenGL's (x right, y up, looking along -z)."""
 _SUFFIXES = *IMAGE_SUFFIXES, ".exr", *(suffix.upper() for suffix in IMAGE_SUFFIXES), ".EXR"
@@ -90,8 +93,27 @@ class ExportedScene:
 
 def read_document(path: Path) -> dict:
     """Read a JSON file with thousands of views in any encoding, see ``parse_json``."""
-    data = read_bytes(path, MAX_JSON_BYTES)
-    return parse_json(decode_text(data), printable(path), MAX_JSON_BYTES)
+    data = read_bytes(path, MAX_BYTES)
+    return parse_json(decode_text(data), printable(path), MAX_BYTES, finite=False)
+
+
+def parse_xml(path: Path, program: str) -> Element:
+    """Return the root of an XML file in any encoding.
+
+    Raises:
+        LodgsError: the file is damaged, too large, or defines entities.
+    """
+    try:
+        data = read_bytes(path, MAX_BYTES)
+        encoding = json.detect_encoding(data)
+        text = data.decode(encoding, "replace")
+        if len(data) > MAX_BYTES or any(mark in text for mark in ("<!DOCTYPE", "<!ENTITY", "\0")):
+            raise ValueError(f"it exceeds {MAX_BYTES:,} bytes, defines entities, or is not text")
+        return ElementTree.fromstring(data if encoding == "utf-8" else text)
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise LodgsError(
+            f"Cannot read {path}: it is not an XML file of {program} ({error}).", "Export the cameras again."
+        ) from error
 
 
 def get_number(values: Mapping[str, Any], name: str, default: float | None = None) -> float:

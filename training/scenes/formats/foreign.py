@@ -11,15 +11,16 @@ from .exported import visible_files
 
 FIND_CAMERAS = "find the cameras again: lodgs scene --photos DIR --out SCENE"
 _FRAMES = "blender --command lodgs frames VIDEO --out SCENE/images"
+_REGISTRATION = "registration as Internal/External Camera Parameters (CSV)"
 _FILES = {
     ".r3d": ("a packed Record3D file", "Unpack it as a ZIP archive and choose its folder"),
     ".zip": ("an archive", "Unpack it and choose its folder"),
     ".psx": ("a Metashape project", "Export its cameras with File > Export > Export Cameras (XML)"),
     ".psz": ("a Metashape project", "Export its cameras with File > Export > Export Cameras (XML)"),
-    ".rcproj": ("a RealityCapture project", "Export its registration for COLMAP or Bundler"),
-    ".rsproj": ("a RealityScan project", "Export its registration for COLMAP or Bundler"),
-    ".csv": ("a table, which LODGS does not read", "Export the cameras for COLMAP or Bundler"),
-    ".xmp": ("camera data of photos, which LODGS does not read", "Export the cameras for COLMAP or Bundler"),
+    ".rcproj": ("a RealityCapture project", f"Export its {_REGISTRATION}"),
+    ".rsproj": ("a RealityScan project", f"Export its {_REGISTRATION}"),
+    ".csv": ("a table without lenses", f"Export the {_REGISTRATION}"),
+    ".xmp": ("data of a photo without a camera", f"Export the {_REGISTRATION}"),
     ".nvm": ("a VisualSFM file", "Save the model for Bundler (bundle.out)"),
     ".sfm": ("a Meshroom file", "Export the cameras for COLMAP"),
     "poses_bounds.npy": ("a file of LLFF", "Choose the folder of its COLMAP model"),

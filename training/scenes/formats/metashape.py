@@ -7,15 +7,13 @@ fisheye's x has the length of its angle to the axis.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
-from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from ...documents import DECIMAL_COMMAS, has_decimal_commas, open_file, open_text
+from ...documents import DECIMAL_COMMAS, has_decimal_commas, open_text
 from ...errors import LodgsError
 from ...files import is_file
 from ..lenses import Intrinsics
@@ -28,12 +26,11 @@ from .exported import (
     get_number,
     invert_pose,
     parse_array,
+    parse_xml,
     visible_files,
 )
 
 NAME = "Metashape XML"
-MAX_BYTES = 1 << 26
-"""Maximum size of an input file."""
 MAX_SKEW = 0.5
 """Maximum b2 in pixels that is ignored; larger values are an error."""
 _HEAD_BYTES = 4096
@@ -67,7 +64,7 @@ def read(path: Path) -> ExportedScene:
     Raises:
         LodgsError: the file is damaged.
     """
-    chunks = _parse_xml(path).findall("chunk")
+    chunks = parse_xml(path, "Metashape").findall("chunk")
     if not chunks:
         raise LodgsError(f"Cannot read {path}: it has no chunk.", "Export the cameras again.")
     counts = [len(chunk.findall("cameras//transform")) for chunk in chunks]
@@ -113,21 +110,6 @@ def read(path: Path) -> ExportedScene:
         except LodgsError as error:
             excluded.append((label, error.what))
     return ExportedScene(views, excluded=excluded, warnings=warnings)
-
-
-def _parse_xml(path: Path) -> Element:
-    with open_file(path) as file:
-        data = file.read(MAX_BYTES + 1)
-    try:
-        encoding = json.detect_encoding(data)
-        text = data.decode(encoding, "replace")
-        if len(data) > MAX_BYTES or any(mark in text for mark in ("<!DOCTYPE", "<!ENTITY", "\0")):
-            raise ValueError(f"it exceeds {MAX_BYTES:,} bytes, defines entities, or is not text")
-        return ElementTree.fromstring(data if encoding == "utf-8" else text)
-    except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise LodgsError(
-            f"Cannot read {path}: it is not an XML file of Metashape ({error}).", "Export the cameras again."
-        ) from error
 
 
 def _parse_lens(sensor: Element) -> Intrinsics:

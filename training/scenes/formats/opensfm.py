@@ -45,7 +45,7 @@ def read(path: Path) -> ExportedScene:
         LodgsError: the file is damaged.
     """
     text = decode_text(read_bytes(path, MAX_BYTES))
-    document = parse_json(f'{{"all": {text}}}', str(path), MAX_BYTES + 16)  # a list at the top
+    document = parse_json(f'{{"all": {text}}}', str(path), MAX_BYTES + 16, finite=False)  # a list at the top
     parts = [part for part in _list(document["all"]) if isinstance(part, dict)]
     parts = [part for part in parts if isinstance(part.get("shots"), dict) and part["shots"]]
     if not parts:

@@ -39,8 +39,8 @@ def error(flod, splats) -> float:
 def test_finest_level_is_first_after_previews(data):
     flod = make(data, free_depth=0.0, largest=0.0)
     handed = [(step, trained, level.number, len(level.splats)) for step, trained, level in train(flod)]
-    # the finest has 60 - 2 x 10 steps; a third and two thirds of them
-    assert [entry[:3] for entry in handed] == [(14, 3, 1), (27, 3, 2), (40, 3, 3), (50, 2, 2), (60, 1, 1)]
+    # the finest has 60 - 10 - 6 steps; a third and two thirds of them
+    assert [entry[:3] for entry in handed] == [(15, 3, 1), (30, 3, 2), (44, 3, 3), (54, 2, 2), (60, 1, 1)]
     finest, middle, coarse = (entry[3] for entry in handed[2:])
     assert middle == round(finest / 2) and coarse == round(middle / 2)
 
@@ -53,11 +53,32 @@ def test_refined_levels_beat_merge(data):
         assert error(flod, levels[number]) < 0.97 * error(flod, merge(levels[3], len(levels[number])))
 
 
+def test_merge_drops_invisible_splats(data):
+    """Splats that no training view sees take no room in the second finest level."""
+    flod = make(data, margin=0.0, steps=[2, 2, 2], refine_steps=1)
+    rows = flod.model.read_rows(torch.arange(20))
+    behind = torch.tensor(
+        np.mean([c.center - 50 * c.world_to_camera[2, :3] for c in flod.data.train], axis=0)
+    )
+    flod.model.append(rows | {"means": rows["means"] * 0.01 + behind.float()})
+    count = len(flod.model)
+    flod.start_level(2)
+    assert len(flod.model) == round(count / 2)
+    assert (flod.model["means"] - behind).norm(dim=1).min() > 1
+
+
+def test_refinement_starts_with_small_images(data):
+    """Images of each merged level grow from ``first_resolution`` to full size."""
+    flod = make(data, first_resolution=0.5, full_resolution=0.5)
+    assert [flod.shrink(step) for step in (44, 49, 53)] == [2, 1, 1]
+    assert [flod.shrink(step) for step in (54, 57, 59)] == [2, 1, 1]
+
+
 def test_finishing_steps_keep_all_merged_splats(data):
     flod = make(data, finish_share=0.2, free_depth=0.0, largest=0.0)
     handed = [(step, level.number, len(level.splats)) for step, _, level in train(flod)]
-    assert flod.steps == 70, "as many as refine a level"
-    assert [entry[:2] for entry in handed[-3:]] == [(70, 1), (70, 2), (70, 3)]
+    assert flod.steps == 63, "a third as many as refine the second finest level"
+    assert [entry[:2] for entry in handed[-3:]] == [(63, 1), (63, 2), (63, 3)]
     counts = {number: count for _, number, count in handed[:-3]}
     assert {number: count for _, number, count in handed[-3:]} == counts
 
