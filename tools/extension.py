@@ -16,6 +16,10 @@ import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+
+from tools.viewer import FOLDER as VIEWER  # noqa: E402
+from tools.viewer import fetch  # noqa: E402
 
 
 def read_manifest() -> dict:
@@ -71,7 +75,8 @@ def build(folder: Path, version: str | None = None, website: str | None = None) 
     folder.mkdir(parents=True, exist_ok=True)
     archive = folder / f"{manifest['id']}-{version or manifest['version']}.zip"
     with tempfile.TemporaryDirectory() as work:
-        for name in [*tracked_files(), *manifest["wheels"]]:
+        viewer = [path.relative_to(ROOT).as_posix() for path in VIEWER.glob("*")] if fetch() else []
+        for name in [*tracked_files(), *viewer, *manifest["wheels"]]:
             target = Path(work, name)
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(ROOT / name, target)

@@ -20,6 +20,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
+from tools import viewer  # noqa: E402
 from training import packages  # noqa: E402
 
 
@@ -158,6 +159,7 @@ def main() -> int:
             make(".venv-blender-5.3", newer, "blender-5.3.txt")
         elif not (ROOT / ".venv-blender-5.3").exists():
             print("setup: Python 3.13 not found; tests in Blender 5.3 will be skipped.", file=sys.stderr)
+        viewer.fetch()
         if sys.platform.startswith("linux") and not ctypes.util.find_library("vulkan"):
             print(
                 "setup: Vulkan not found; tests of the gpu backend will be skipped. On Debian, install",

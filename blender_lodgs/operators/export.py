@@ -25,7 +25,7 @@ from ..data import roots, scenes, selection
 from ..data.objects import megabytes, sh_degree
 from ..data.paths import absolute_path
 from ..data.setting_properties import property_of
-from ..runs.compression import compress_steps, convert_steps
+from ..runs.compression import compress_steps, convert_steps, page_steps
 from ..runs.run_folders import automatic_run
 from .base import ReadLevelsOperator, report_errors
 from .modal import BackgroundOperator
@@ -412,6 +412,23 @@ class LODGS_OT_export_streamed(_ForeignExport, _FolderExport, _ConvertingExport,
         self.written = f"{_levels(bundle)} written: {self._folder() / STREAMED_FILE}{_origin_text(bundle)}"
 
 
+class LODGS_OT_export_page(_FolderExport, _ConvertingExport, bpy.types.Operator):
+    """Export a page that shows the levels in a browser, with a viewer and the cameras; uses the trainer"""
+
+    bl_idname = "lodgs.export_page"
+    bl_label = "Export Page"
+    kind = SOG
+
+    def work(self, context):
+        root = roots.active_root(context)
+        bundle = scenes.read_levels(root, self.placed, self.looked)
+        yield from self.follow(page_steps(bundle, self._folder(), root.name))
+        self.written = f"{self._folder()} written. Upload the folder, or open it with a local server"
+
+    def status_text(self, context, count):
+        return "Writing the page, Esc to stop"
+
+
 def _levels(bundle: Bundle) -> str:
     count = len(bundle.levels)
     return f"{count} level{'s' * (count != 1)}"
@@ -430,6 +447,7 @@ def _menu(self, context):
     self.layout.operator(LODGS_OT_export_folder.bl_idname, text="Splat Level Folder")
     self.layout.operator(LODGS_OT_export_tiles.bl_idname, text="Splat Levels as 3D Tiles (folder)")
     self.layout.operator(LODGS_OT_export_streamed.bl_idname, text="Splat Levels for the Web (folder)")
+    self.layout.operator(LODGS_OT_export_page.bl_idname, text="Page with Splat Levels (folder)")
 
 
 CLASSES = (
@@ -440,6 +458,7 @@ CLASSES = (
     LODGS_OT_export_folder,
     LODGS_OT_export_tiles,
     LODGS_OT_export_streamed,
+    LODGS_OT_export_page,
 )
 
 

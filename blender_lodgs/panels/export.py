@@ -19,6 +19,7 @@ class LODGS_PT_export(LevelsPanel):
         column.operator("lodgs.export_folder", text="Level Folder…")
         column.operator("lodgs.export_tiles", text="Levels as 3D Tiles…")
         column.operator("lodgs.export_streamed", text="Levels for Web…")
+        column.operator("lodgs.export_page", text="Page to Share…")
 
 
 CLASSES = (LODGS_PT_export,)

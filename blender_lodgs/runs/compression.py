@@ -58,6 +58,19 @@ def convert_steps(bundle: Bundle, option: str, path: Path, flags: Mapping[str, b
         yield " ".join(line for line in lines if line.endswith("."))
 
 
+def page_steps(bundle: Bundle, folder: Path, title: str) -> Iterator[str]:
+    """Write a page with ``lodgs page``; closing the iterator stops the trainer and writes nothing.
+
+    Yields:
+        Empty texts while the trainer works.
+
+    Raises:
+        LodgsError: the trainer is missing or fails.
+    """
+    for _ in _trainer_steps(bundle, "page", "--out", str(folder), f"--title={title}"):
+        yield ""
+
+
 def _trainer_steps(bundle: Bundle, command: str, *arguments: str) -> Iterator[list[str]]:
     """Run a command of LODGS on a bundle, and yield the lines of its report, at first none."""
     python = environment.trainer_python()

@@ -96,6 +96,9 @@ def test_zip_contains_only_the_packages_and_their_files(archive):
     data = {"__init__.py", "blender_manifest.toml", "LICENSE"}
     data |= {"pyproject.toml", *(f"requirements/{name}.txt" for name in _LOCKS)}
     data |= {p.relative_to(REPOSITORY).as_posix() for p in (REPOSITORY / "farm").rglob("*.js")}
+    data |= {
+        path.relative_to(REPOSITORY).as_posix() for path in (REPOSITORY / "training" / "viewer").glob("*")
+    }
     wheels = set(tomllib.loads((REPOSITORY / "blender_manifest.toml").read_text())["wheels"])
     assert {n for n in names if not n.endswith("/")} == code | data | {w.removeprefix("./") for w in wheels}
 

@@ -27,6 +27,7 @@ MISTAKES = {
     "model": "missing",
     "edit": "missing.ply --out a.ply",
     "compress": "missing.ply --out a.ply",
+    "page": "missing.ply --out a",
     "info": "missing.ply",
 }
 

@@ -19,6 +19,7 @@ COMMANDS = {
     "model": "write the COLMAP model of a folder of views that Blender captured",
     "serve": "render frames for Blender",
     "edit": "write a copy that is cleaned up, recoloured, or turned, scaled and moved",
+    "page": "write a page that shows levels in a browser",
     "compress": "write a copy of a run or bundle that is a tenth of its size or smaller",
     "info": "describe a run, a bundle or any 3DGS PLY",
     "check": "print as JSON whether this Python can train",

@@ -70,6 +70,17 @@ def test_streamed_levels_round_trip(bpy, lodgs, root, tmp_path, theirs):
             np.testing.assert_allclose(means(obj), means(item.object), atol=0.01)
 
 
+@pytest.mark.skipif(
+    not (Path(__file__).parents[3] / "training/viewer").is_dir(),
+    reason="tools/viewer.py has not downloaded the viewer",
+)
+def test_page_has_the_levels(bpy, lodgs, root, tmp_path):
+    assert bpy.ops.lodgs.export_page(directory=str(tmp_path / "page")) == {"FINISHED"}
+    text = (tmp_path / "page" / "index.html").read_text("utf-8")
+    assert f"<title>{root.name}</title>" in text
+    assert (tmp_path / "page" / "levels" / "lod-meta.json").is_file()
+
+
 EMPTY_SPZ = gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, 2, 0, 0, 12, 0, 0))
 
 

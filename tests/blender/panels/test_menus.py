@@ -10,7 +10,7 @@ OTHER_MENUS = {
     # File menu
     "lodgs.import_colmap", "lodgs.find_cameras", "lodgs.import_splats", "lodgs.export_bundle",
     "lodgs.export_compressed", "lodgs.export_plain", "lodgs.export_folder", "lodgs.export_streamed",
-    "lodgs.export_levels", "lodgs.export_tiles",
+    "lodgs.export_levels", "lodgs.export_tiles", "lodgs.export_page",
     # Object and View menus
     "lodgs.set_ground", "lodgs.set_scale", "lodgs.camera_path", "lodgs.turntable", "lodgs.frame_scene",
     "lodgs.add_crop", "lodgs.hide_splats", "lodgs.show_hidden_splats", "lodgs.delete_left_out",

@@ -1,0 +1,1 @@
+"""A page to share: levels in a browser, with PlayCanvas' viewer (``tools/viewer.py``)."""
