@@ -76,7 +76,7 @@ def test_folder_has_levels_viewer_and_cameras(bundle, tmp_path):
     np.testing.assert_allclose(pose["position"], [0, 5, -3], atol=1e-6)
     forward = np.subtract(pose["target"], pose["position"])
     np.testing.assert_allclose(forward / np.linalg.norm(forward), [0, 0, 1], atol=1e-6)
-    assert pose["fov"] == pytest.approx(degrees(2 * atan(24 / 60)))
+    assert pose["fov"] == pytest.approx(degrees(2 * atan(32 / 60)))
     assert page["settings"]["annotations"][0]["title"] == "<first>.jpg" and "<first>" not in text
     write_page(bundle, tmp_path / "out", backend="cpu")  # replaces it
     assert {path.name for path in tmp_path.iterdir()} == {"garden", "out", "viewer"}

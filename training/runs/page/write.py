@@ -155,13 +155,16 @@ def _describe(bundle: Bundle, cameras: list[Camera]) -> dict:
 
 
 def _pose(camera: Camera, center: np.ndarray, radius: float) -> dict:
-    """Return a camera's position, target and vertical field of view in degrees, in the viewer's axes."""
+    """Return a camera's position, target and field of view in degrees, in the viewer's axes.
+
+    The viewer applies the field of view to the larger side of its window, whatever its documentation says.
+    """
     forward = camera.world_to_camera[2, :3]
     distance = max(float((center - camera.center) @ forward), 0.2 * radius)
     return {
         "position": (camera.center * _VIEWER).tolist(),
         "target": ((camera.center + distance * forward) * _VIEWER).tolist(),
-        "fov": degrees(2 * atan(camera.height / 2 / camera.fy)),
+        "fov": degrees(2 * atan(max(camera.width / camera.fx, camera.height / camera.fy) / 2)),
     }
 
 
