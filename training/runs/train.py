@@ -268,15 +268,9 @@ class _TrainingRun:
         method = self.method
         self._started, self._started_step = time.monotonic(), self.step
         last_checkpoint = last_progress = self._started
-        while self.step < method.steps:
-            self.folder.require_lock()
-            if received or processes.parent_ended.is_set() or self.folder.take_cancel():
-                self._save()
-                if processes.parent_ended.is_set():
-                    raise KeyboardInterrupt
-                message = f"Stopped at step {self.step} of {method.steps}. The run can be resumed."
-                self.events("cancelled", step=self.step, message=message)
-                return False
+        while not self._stopped(received):
+            if self.step == method.steps:
+                return True
             loss, image, target = method.train_step(self.step)
             if not math.isfinite(loss):
                 raise LodgsError(
@@ -297,6 +291,18 @@ class _TrainingRun:
             if levels or time.monotonic() - last_checkpoint >= CHECKPOINT_SECONDS:
                 self._save()
                 last_checkpoint = time.monotonic()
+        return False
+
+    def _stopped(self, received: list) -> bool:
+        """Save, report and return True on a stop signal or a cancel request, also after the last step."""
+        self.folder.require_lock()
+        if not (received or processes.parent_ended.is_set() or self.folder.take_cancel()):
+            return False
+        self._save()
+        if processes.parent_ended.is_set():
+            raise KeyboardInterrupt
+        message = f"Stopped at step {self.step} of {self.method.steps}. The run can be resumed."
+        self.events("cancelled", step=self.step, message=message)
         return True
 
     def write_bundle(self) -> Bundle:

@@ -302,6 +302,26 @@ def test_stop_signal_saves_a_checkpoint(uninterrupted, tmp_path, number):
     assert folder.state() == "cancelled" and list(folder.checkpoints.glob("*.pt"))
 
 
+@pytest.mark.skipif(os.name == "nt", reason="Windows cancels with a file")
+@one_method_by_default
+def test_stop_signal_after_the_last_step(uninterrupted, tmp_path, monkeypatch):
+    """Commands that train several runs would otherwise go on with the next one."""
+    write_levels = training_loop._TrainingRun._write_levels
+
+    def write_levels_and_stop(run, levels):
+        write_levels(run, levels)
+        if run.step == run.method.steps:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    keys = {**uninterrupted["keys"], "out": str(tmp_path / "run")}
+    with monkeypatch.context() as patch:
+        patch.setattr(training_loop._TrainingRun, "_write_levels", write_levels_and_stop)
+        assert run_in_process(keys)[0] == 3
+    assert RunFolder(keys["out"]).state() == "cancelled"
+    assert run_in_process(keys)[0] == 0
+    assert RunFolder(keys["out"]).bundle.read_bytes() == uninterrupted["bundle"]
+
+
 def test_second_trainer_in_a_run_folder_is_rejected(uninterrupted, tmp_path, capsys):
     keys = {**uninterrupted["keys"], "out": str(tmp_path / "run")}
     folder = RunFolder(keys["out"])
