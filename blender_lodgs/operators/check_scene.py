@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor, wait
 
 import bpy
 
-from ...training.scenes.check import Finding
+from ...training.scenes.check import INFO, Finding
 from .. import extension
 from ..data import roots
 from ..runs import scene_check
@@ -44,7 +44,10 @@ class LODGS_OT_check_scene(SceneOperator, SteppedOperator, bpy.types.Operator):
     def result_text(self, count):
         if self._findings is None:
             return "Scene not checked"
-        return "\n".join(map(str, self._findings)) or "Nothing found that lowers the quality"
+        lines = [str(finding) for finding in self._findings]
+        if all(finding.severity == INFO for finding in self._findings):
+            lines.append("Nothing found that lowers the quality")
+        return "\n".join(lines)
 
 
 CLASSES = (LODGS_OT_check_scene,)

@@ -87,7 +87,7 @@ def _draw_check(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:
     """Draw the button of the check before training, and the findings of the last check."""
     layout.operator("lodgs.check_scene", icon="VIEWZOOM")
     findings = scene_check.last_findings(root)
-    if findings == []:
+    if findings is not None and all(finding.severity == INFO for finding in findings):
         layout.label(text="Nothing found that lowers the quality", icon="CHECKMARK")
     for finding in findings or ():
         say(layout, str(finding), _ICONS[finding.severity])

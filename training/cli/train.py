@@ -37,7 +37,7 @@ def run(options: argparse.Namespace) -> int:
 
 def check_job(options: argparse.Namespace) -> int:
     """Print the findings about the scene of a job and return the exit code."""
-    from ..scenes.check import ERROR, check_folder
+    from ..scenes.check import ERROR, INFO, check_folder
 
     if not (options.job and options.job.is_file()):
         vars(options).setdefault("out", "run")  # nothing is written
@@ -49,7 +49,7 @@ def check_job(options: argparse.Namespace) -> int:
     findings = check_folder(Path(job.scene), model, images, image_scale=job.image_scale)
     for finding in findings:
         print(f"{finding.severity}: {finding}")
-    if not findings:
+    if all(finding.severity == INFO for finding in findings):
         print("Nothing found that lowers the quality.")
     return 2 if any(finding.severity == ERROR for finding in findings) else 0
 

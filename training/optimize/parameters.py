@@ -94,7 +94,8 @@ class Parameters:
     match_exposure: bool = setting(
         True,
         "Before training, correct photos whose exposure or white balance differs from their neighbours, by "
-        "shared scene points. Smooth changes along the sequence remain.",
+        "shared scene points, or by their EXIF data if they share too few. Smooth changes along the sequence "
+        "remain.",
     )
     lr_exposure: float = setting(
         0.0,

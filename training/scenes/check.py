@@ -11,6 +11,7 @@ import numpy as np
 from ..errors import LodgsError
 from ..splats.origin import describe_origin
 from .colmap import NO_POINTS, Progress, Scene, observations, read_scene
+from .evidence import MIN_PARALLAX, MIN_PHOTOS, measure_evidence
 from .triangulate import cached_points
 
 MIN_VIEWS = 2
@@ -21,6 +22,8 @@ SMALL_SIDE = 200
 """Longer side of a photo, in pixels at the trained scale, below which details are lost."""
 MIN_SHARED = 20
 """Number of points that a view must share with other views to overlap them."""
+WEAK_SHARE = 0.2
+"""Share of a scene with weak evidence that is worth a warning."""
 ERROR, WARNING, INFO = SEVERITIES = "error", "warning", "info"
 
 
@@ -72,7 +75,11 @@ def check_folder(
 
 def check_scene(scene: Scene, image_scale: float = 1.0) -> list[Finding]:
     """Return the findings of which reading the scene does not warn, without decoding its photos."""
-    return [*_views(scene), *_sizes(scene, image_scale), *_origin(scene), *_overlap(scene)]
+    observed = observations(scene, [camera.name for camera in scene.cameras])
+    return [
+        *_views(scene), *_sizes(scene, image_scale), *_origin(scene),
+        *_overlap(scene, observed), *_coverage(scene, observed),
+    ]  # fmt: skip
 
 
 def _views(scene: Scene) -> Iterator[Finding]:
@@ -123,10 +130,9 @@ def _origin(scene: Scene) -> Iterator[Finding]:
         yield Finding(INFO, f"The scene lies far from 0. {describe_origin(scene.origin)}")
 
 
-def _overlap(scene: Scene) -> Iterator[Finding]:
+def _overlap(scene: Scene, observed: dict[str, np.ndarray]) -> Iterator[Finding]:
     """Find views that share too few points with other views, and groups of views without common points."""
     names = [camera.name for camera in scene.cameras]
-    observed = observations(scene, names)
     if not observed or len(names) < MIN_VIEWS:
         return
     view = np.repeat(np.arange(len(names)), [len(observed.get(name, ())) for name in names])
@@ -149,6 +155,35 @@ def _overlap(scene: Scene) -> Iterator[Finding]:
             f"The views form {len(groups)} groups without common points, the largest of {sizes} views. "
             "Their parts of the scene may not fit together.",
             "Take photos that connect the groups, or train each group on its own.",
+        )
+
+
+def _coverage(scene: Scene, observed: dict[str, np.ndarray]) -> Iterator[Finding]:
+    """Report how many photos see each region, and find parts with weak evidence."""
+    evidence = measure_evidence(scene.cameras, scene.points, observed)
+    if not len(evidence.points):
+        return
+    photos, few = (evidence.quantile(evidence.photos, share) for share in (0.5, 0.1))
+    parallax = evidence.quantile(evidence.parallax, 0.5)
+    weak, flat = evidence.weak_share, evidence.flat_share
+    yield Finding(
+        INFO,
+        f"Coverage: half of the scene is seen by {photos:.0f} photos or more, a tenth by {few:.0f} or fewer; "
+        f"median angle between the outermost photos of a part: {parallax:.0f}°.",
+    )
+    if weak > WEAK_SHARE:
+        yield Finding(
+            WARNING,
+            f"{weak:.0%} of the scene is seen by fewer than {MIN_PHOTOS} photos. "
+            "Expect blur and floaters there.",
+            "Take more photos of these parts, from several sides.",
+        )
+    if flat > WEAK_SHARE:
+        yield Finding(
+            WARNING,
+            f"{flat:.0%} of the scene is seen within {MIN_PARALLAX:.0f}° only, so its depth is uncertain. "
+            "Expect good images near the photos only.",
+            "Take photos from other positions.",
         )
 
 

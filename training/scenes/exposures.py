@@ -1,5 +1,7 @@
 """Detect photos with an exposure or white balance unlike their neighbours', by the points that they share.
 
+Photos that share too few points are compared by the exposure time, aperture and ISO in their EXIF data.
+
 Splats can represent brightness that changes smoothly with position or time, and rendered views should contain
 it. A deviation of a single photo, in contrast, makes training add fog in front of its camera.
 """
@@ -8,8 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
+from PIL import Image
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 
@@ -29,6 +33,10 @@ DARKEST, BRIGHTEST = 0.04, 0.95
 """Range of display-coded values in which a change of exposure is approximately a factor."""
 MIN_DEVIATION = 0.1
 """Logarithm of the smallest factor worth correcting; if no photo deviates by more, none is corrected."""
+CODED_STOP = float(np.log(2) / 2.2)
+"""Logarithmic change of display-coded values by a stop of light."""
+EXIF_FOLDER, EXPOSURE_TIME, F_NUMBER, ISO = 0x8769, 0x829A, 0x829D, 0x8827
+"""EXIF tags."""
 ROUNDS = 60
 """Number of alternating estimates of point colours and photo gains."""
 ROUGHNESS = 0.03
@@ -45,7 +53,7 @@ def exposure_gains(scene: Scene, cameras: Sequence[Camera], exposure: float = 0.
 
     Returns:
         Factors (3,) of display-coded red, green and blue by view name. The dict is empty if no photo deviates
-        by MIN_DEVIATION, the model has no observations, or there are more than MAX_PHOTOS photos.
+        by MIN_DEVIATION, fewer than three can be compared, or there are more than MAX_PHOTOS photos.
 
     Raises:
         LodgsError: a photo cannot be read.
@@ -66,12 +74,18 @@ def exposure_gains(scene: Scene, cameras: Sequence[Camera], exposure: float = 0.
     shared = np.bincount(point, minlength=len(scene.points))[point] > 1
     compared = np.bincount(view[shared], minlength=len(cameras)) >= MIN_SHARED
     shared &= compared[view]
+    gains = np.full((len(cameras), 3), np.nan)
+    if compared.sum() > 2:
+        _, rows = np.unique(view[shared], return_inverse=True)
+        _, point = np.unique(point[shared], return_inverse=True)
+        gains[compared] = relative_gains(rows, point, values[shared])
+    stops = [np.nan if camera.image is None else stated_stops(camera.image) for camera in cameras]
+    gains = complete_gains(gains, np.array(stops))
+    compared = np.isfinite(gains).all(1)
     compared_views = [cameras[i] for i in np.flatnonzero(compared)]
     if len(compared_views) < 3:
         return {}
-    _, view = np.unique(view[shared], return_inverse=True)
-    _, point = np.unique(point[shared], return_inverse=True)
-    gains = relative_gains(view, point, values[shared])
+    gains = gains[compared]
     deviations = gains - smooth_gains(
         gains,
         np.array([camera.center for camera in compared_views]) / scene.extent(),
@@ -89,6 +103,31 @@ def remove_gain(image: np.ndarray, gain: np.ndarray) -> np.ndarray:
     white = np.clip((image - BRIGHTEST) / (1 - BRIGHTEST), 0, 1)
     corrected = image / gain.astype(np.float32)
     return np.minimum(corrected + white * np.maximum(1 - corrected, 0), 1)
+
+
+def stated_stops(path: Path) -> float:
+    """Return the exposure of a photo in stops, up to a constant, from its EXIF data.
+
+    Aperture and ISO count if stated. Without a valid exposure time, the result is NaN.
+    """
+    try:
+        with Image.open(path) as image:
+            tags = image.getexif().get_ifd(EXIF_FOLDER)
+        time = float(tags[EXPOSURE_TIME])
+        light = time * float(tags.get(ISO) or 1) / float(tags.get(F_NUMBER) or 1) ** 2
+    except Exception:  # Pillow raises many types for damaged data; the photo itself is read elsewhere
+        return np.nan
+    return float(np.log2(light)) if 0 < light < np.inf else np.nan
+
+
+def complete_gains(gains: np.ndarray, stops: np.ndarray) -> np.ndarray:
+    """Fill in missing log gains (V, 3), NaN, from stated exposures (V,), NaN if unknown."""
+    stated = CODED_STOP * stops[:, None]
+    missing = np.isnan(gains).any(1)
+    both = ~missing & np.isfinite(stops)
+    reference = stated[both] - gains[both] if both.any() else stated[missing & np.isfinite(stops)]
+    offset = np.median(reference, axis=0) if len(reference) else 0.0
+    return np.where(missing[:, None], stated - offset, gains)
 
 
 def relative_gains(view: np.ndarray, point: np.ndarray, values: np.ndarray) -> np.ndarray:

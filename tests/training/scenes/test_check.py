@@ -25,9 +25,10 @@ def texts(findings):
 
 
 def test_good_scene_has_no_findings(capsys):
-    assert check_folder(GARDEN) == []
+    (coverage,) = check_folder(GARDEN)
+    assert coverage.severity == "info" and "half of the scene is seen by" in coverage.what
     assert main(["train", str(GARDEN), "--check"]) == 0
-    assert capsys.readouterr().out == "Nothing found that lowers the quality.\n"
+    assert capsys.readouterr().out == f"info: {coverage}\nNothing found that lowers the quality.\n"
 
 
 def test_missing_photos_are_counted(copy, capsys):
@@ -67,7 +68,7 @@ def test_views_without_overlap(monkeypatch):
     rows = {name: np.arange(100) + 200 * (number >= half) for number, name in enumerate(names)}
     rows[names[-1]] = np.arange(19)
     monkeypatch.setattr("training.scenes.check.observations", lambda scene, names: rows)
-    isolated, groups = check_scene(scene)
+    isolated, groups = [finding for finding in check_scene(scene) if "views" in finding.what]
     assert f"1 of {len(names)} views share fewer" in isolated.what and names[-1] in isolated.what
     assert f"2 groups without common points, the largest of {half} and {rest} views" in groups.what
 
@@ -78,3 +79,18 @@ def test_photos_of_other_exposure(copy):
     Image.fromarray((pixels * 0.6).astype(np.uint8)).save(file, quality=97)
     found = texts(check_folder(copy))
     assert "Exposure or white balance differs" in found and file.name in found and "match_exposure" in found
+
+
+def test_parts_that_few_photos_see(monkeypatch):
+    scene = read_scene(GARDEN)
+    names = [camera.name for camera in scene.cameras]
+    count = len(scene.points)
+    rows = {name: np.arange(count // 2) for name in names}
+    rows[names[0]] = rows[names[-1]] = np.arange(count)  # two photos see the second half
+    monkeypatch.setattr("training.scenes.check.observations", lambda scene, names: rows)
+    coverage, weak = check_scene(scene)
+    assert "a tenth by 2 or fewer" in coverage.what and coverage.severity == "info"
+    assert "seen by fewer than 3 photos" in weak.what and weak.severity == "warning"
+    close = {name: np.arange(count) for name in names[:3]}
+    monkeypatch.setattr("training.scenes.check.observations", lambda scene, names: close)
+    assert "within 5° only" in texts(check_scene(scene))

@@ -6,11 +6,19 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tools import quality_scenes
 from tools.quality_scenes import relight
 from training.optimize.training_data import TrainingData
 from training.scenes import exposures
 from training.scenes.colmap import read_scene
-from training.scenes.exposures import exposure_gains, relative_gains, remove_gain, smooth_gains
+from training.scenes.exposures import (
+    complete_gains,
+    exposure_gains,
+    relative_gains,
+    remove_gain,
+    smooth_gains,
+    stated_stops,
+)
 from training.scenes.images import load_image
 
 GARDEN = Path(__file__).resolve().parents[3] / "examples" / "lantern_garden"
@@ -119,3 +127,47 @@ def test_only_training_photos_are_corrected():
     for camera in data.test:
         assert (data.images.target(camera).image == plain.images.target(camera).image).all()
     assert (data.target(4).image == plain.target(4).image).all()
+
+
+def with_exif(path, seconds=None, aperture=None, iso=None):
+    exif = Image.Exif()
+    values = {0x829A: seconds, 0x829D: aperture, 0x8827: iso}
+    exif.get_ifd(0x8769).update({tag: value for tag, value in values.items() if value is not None})
+    Image.new("RGB", (8, 8)).save(path, exif=exif)
+    return path
+
+
+def test_stated_stops_follow_exposure_time_aperture_and_iso(tmp_path):
+    stops = stated_stops(with_exif(tmp_path / "a.jpg", 1 / 100, 4.0, 100))
+    assert stated_stops(with_exif(tmp_path / "b.jpg", 1 / 50, 4.0, 100)) == pytest.approx(stops + 1)
+    assert stated_stops(with_exif(tmp_path / "c.jpg", 1 / 100, 5.6, 100)) == pytest.approx(
+        stops - 0.97, abs=0.01
+    )
+    assert stated_stops(with_exif(tmp_path / "d.jpg", 1 / 100, 4.0, 800)) == pytest.approx(stops + 3)
+    assert np.isnan(stated_stops(with_exif(tmp_path / "e.jpg", iso=100)))
+    assert np.isnan(stated_stops(with_exif(tmp_path / "f.jpg", 0.0, 4.0, 100)))
+    (tmp_path / "g.jpg").write_bytes(b"no image")
+    assert np.isnan(stated_stops(tmp_path / "g.jpg"))
+
+
+def test_stated_exposures_fill_in_missing_gains_relative_to_the_compared_photos():
+    gains = np.array([[0.1, 0.2, 0.3], [-0.1, -0.2, -0.3], [np.nan] * 3, [np.nan] * 3])
+    filled = complete_gains(gains, np.array([1.0, 1.0, 3.2, np.nan]))
+    np.testing.assert_allclose(filled[:2], gains[:2])
+    np.testing.assert_allclose(filled[2], 2.2 * np.log(2) / 2.2)
+    assert np.isnan(filled[3]).all()
+    alone = complete_gains(np.full((3, 3), np.nan), np.array([-1.1, 0, 1.1]))
+    np.testing.assert_allclose(alone[:, 0], np.log(2) / 2 * np.array([-1, 0, 1]))
+
+
+def test_photos_without_shared_points_are_matched_by_exif(copy, tmp_path):
+    changes = np.random.default_rng(1).uniform(-0.7, 0.7, 48)
+    scene = copy(lambda count: changes[:count])
+    scene.point_ids.resize(0, refcheck=False)  # no tracks
+    for camera, change in zip(scene.cameras, changes, strict=False):
+        exif = quality_scenes.exposure_tags(2.0**change)
+        Image.open(camera.image).save(camera.image, exif=exif, quality=97)
+    gains = exposure_gains(scene, scene.cameras)
+    sample = scene.cameras[::4]
+    error = np.mean([log_error(camera) for camera in sample])
+    assert np.mean([log_error(camera, gains[camera.name]) for camera in sample]) < error / 3
