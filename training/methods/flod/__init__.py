@@ -17,7 +17,7 @@ from ...settings import setting
 
 BLENDED_LEVELS = 3
 """Number of finest levels that are blended by default (``Bands.defaults``) and that finishing steps train."""
-REFINE_RATIO = 0.6
+REFINE_RATIO = 0.8
 """Steps that refine a merged level relative to those of the next finer one."""
 CELL_LEVELS = 2
 """Number of finest levels that are trained cell by cell in a divided scene."""
@@ -39,7 +39,7 @@ class FlodParameters(FlodLevels, DensityParameters):
         unit="px",
     )
     steps: tuple[int, ...] = setting(
-        (250, 400, 500, 750, 1250), "Training steps of each level.", above=0, unit="steps"
+        (250, 400, 500, 750, 1400), "Training steps of each level.", above=0, unit="steps"
     )
     densify_until: tuple[float, ...] = setting(
         (0.5,) * 5, "Fraction of a level's steps in which splats are added and removed.", high=1
@@ -70,8 +70,8 @@ class FlodParameters(FlodLevels, DensityParameters):
         0.5, "Splat count of a merged level, as a fraction of the next finer level's.", above=0, high=1
     )
     refine_steps: int = setting(
-        550,
-        "Steps that refine the merged level before the finest. Each coarser level gets 60 % of the steps of "
+        450,
+        "Steps that refine the merged level before the finest. Each coarser level gets 80 % of the steps of "
         "the next finer one. They are taken from those of all levels ('steps'), at most half; the finest "
         "level gets the others.",
         unit="steps",
@@ -179,7 +179,7 @@ _STANDARD = replace(
     _DRAFT,
     **STANDARD,
     steps=STANDARD_STEPS,
-    refine_steps=1_800,
+    refine_steps=1_400,
     densify_interval=(100,) * 5,
 )
 _PAPER = replace(

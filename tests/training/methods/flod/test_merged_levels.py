@@ -39,8 +39,8 @@ def error(flod, splats) -> float:
 def test_finest_level_is_first_after_previews(data):
     flod = make(data, free_depth=0.0, largest=0.0)
     handed = [(step, trained, level.number, len(level.splats)) for step, trained, level in train(flod)]
-    # the finest has 60 - 10 - 6 steps; a third and two thirds of them
-    assert [entry[:3] for entry in handed] == [(15, 3, 1), (30, 3, 2), (44, 3, 3), (54, 2, 2), (60, 1, 1)]
+    # the finest has 60 - 10 - 8 steps; a third and two thirds of them
+    assert [entry[:3] for entry in handed] == [(14, 3, 1), (28, 3, 2), (42, 3, 3), (52, 2, 2), (60, 1, 1)]
     finest, middle, coarse = (entry[3] for entry in handed[2:])
     assert middle == round(finest / 2) and coarse == round(middle / 2)
 
@@ -70,8 +70,8 @@ def test_merge_drops_invisible_splats(data):
 def test_refinement_starts_with_small_images(data):
     """Images of each merged level grow from ``first_resolution`` to full size."""
     flod = make(data, first_resolution=0.5, full_resolution=0.5)
-    assert [flod.shrink(step) for step in (44, 49, 53)] == [2, 1, 1]
-    assert [flod.shrink(step) for step in (54, 57, 59)] == [2, 1, 1]
+    assert [flod.shrink(step) for step in (42, 47, 51)] == [2, 1, 1]
+    assert [flod.shrink(step) for step in (52, 56, 59)] == [2, 1, 1]
 
 
 def test_finishing_steps_keep_all_merged_splats(data):
