@@ -57,7 +57,7 @@ def main(arguments: list[str]) -> int:
         An exit code. Input errors print one sentence to standard error.
     """
     try:
-        args = _parser().parse_args(arguments)
+        args = _parser().parse_args(arguments or ["--help"])
     except SystemExit as stop:  # argparse has printed help or an error
         return int(stop.code or 0)
     try:

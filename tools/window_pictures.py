@@ -105,11 +105,10 @@ def show_panels(*names: str) -> Steps:
 
 
 def unregister_panels() -> list[type[bpy.types.Panel]]:
-    """Unregister all panels of the tab and their copies; return the panels, subpanels last."""
+    """Unregister all panels of the tab and their copies; return the panels in the order of registration."""
     parts = module("panels.parts")
-    panels = [*parts.Panel.__subclasses__(), *parts.LevelsPanel.__subclasses__()]
-    panels = [cls for cls in panels if hasattr(cls, "bl_label")]
-    panels.sort(key=lambda cls: hasattr(cls, "bl_parent_id"))
+    classes = [cls for part in module("panels").MODULES for cls in getattr(part, "CLASSES", ())]
+    panels = [cls for cls in classes if issubclass(cls, (parts.Panel, parts.LevelsPanel))]
     for cls in reversed(panels):  # subpanels first
         for registered in (cls, *cls.__subclasses__()):
             if registered.is_registered:

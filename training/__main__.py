@@ -57,7 +57,7 @@ def _run_command(arguments: list[str]) -> int:
         code = check.run()
     else:
         processes.stop_with_parent()
-        options = _parser(arguments).parse_args(arguments)
+        options = _parser(arguments).parse_args(arguments or ["--help"])
         code = _module(options.command).run(options)
         if options.command in ("train", "blocks"):  # their output is in the run folder, too
             return code

@@ -202,9 +202,12 @@ def look_at_scene(context: bpy.types.Context, root: bpy.types.Object, warn: Warn
 
 
 def _put_startup_objects_away(context: bpy.types.Context) -> None:
-    """Move the cube and light of an unsaved, unchanged startup file to a hidden collection."""
+    """Move the cube and light of an unchanged startup file to a hidden collection.
+
+    The file may be saved: users save it first, because runs are written next to it.
+    """
     names = {obj.name for obj in bpy.data.objects if root_of(obj) is None}
-    if bpy.data.filepath or names != {"Camera", "Cube", "Light"}:
+    if names != {"Camera", "Cube", "Light"}:
         return
     cube, light = bpy.data.objects["Cube"], bpy.data.objects["Light"]
     if not _is_startup_cube(cube):

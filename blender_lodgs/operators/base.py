@@ -11,14 +11,17 @@ from ..data import roots
 
 
 def report_errors(execute):
-    """Wrap an operator's method to report a LodgsError or MemoryError and cancel the operator."""
+    """Wrap an operator's method to report a LodgsError or MemoryError and cancel the operator.
+
+    The remedy gets a line of its own, because Blender cuts off messages that are wider than the window.
+    """
 
     @functools.wraps(execute)
     def wrapper(self, context, *event):
         try:
             return execute(self, context, *event)
         except LodgsError as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, f"{error.what} \n{error.remedy}".strip())
         except MemoryError:
             self.report({"ERROR"}, "Out of memory. Close other files and programs.")
         return {"CANCELLED"}

@@ -44,19 +44,24 @@ MODULES = (
 )  # fmt: skip
 """Modules that a new environment must import before it is used."""
 
+CONNECTION_PROBLEMS = {
+    "CERTIFICATE_VERIFY_FAILED": "the certificate of the package index or of a proxy is not trusted",
+    "connection broken by": "no connection to the package index",
+}
+"""Causes by a text in pip's output, the more exact ones first."""
+
 
 class EnvironmentSetup:
     """A thread that runs venv and pip, with its progress for the preferences.
 
     Attributes:
-        message: current step, or the result.
+        message: current step with the time, or the result.
         fraction: estimated progress, 0 to 1 (pip does not report the number of packages in advance).
         problem: reason of a failure. Empty otherwise.
         running: whether the thread is running.
     """
 
     def __init__(self, base: Path, parent: Path, requirements: Path) -> None:
-        self.message = "Creating the environment"
         self.fraction = 0.0
         self.problem = ""
         self.running = True
@@ -67,11 +72,20 @@ class EnvironmentSetup:
         self._inherited: tuple[int, ...] = ()
         self._cancelled = False
         self._started = time.monotonic()
+        self._task = "Creating the environment"
         # bpy is not thread-safe: read everything that needs it here
         self._variables = processes.environment()
         self._previous = environment.ready_environments()[:1]
         self._thread = threading.Thread(target=self._install, daemon=True)
         self._thread.start()
+
+    @property
+    def message(self) -> str:
+        if not self.running:
+            return self._task
+        minutes, seconds = divmod(int(time.monotonic() - self._started), 60)
+        task = "Cancelling" if self._cancelled else self._task
+        return f"{task}, {minutes}:{seconds:02d} min"
 
     def cancel(self) -> None:
         """Stop and remove the incomplete environment."""
@@ -94,14 +108,14 @@ class EnvironmentSetup:
                 except BaseException:
                     shutil.rmtree(folder, ignore_errors=True)
                     raise
-            self.message = "The trainer is ready"
+            self._task = "The trainer is ready"
             self.fraction = 1.0
             if not self._remove_all_but([folder]):
-                self.message += "; running programs keep the previous environment"
+                self._task += "; running programs keep the previous environment"
         except (LodgsError, OSError) as error:
             note = " The previous environment is still in use." if self._previous else ""
             self.problem = "" if self._cancelled else f"{error}{note}"
-            self.message = "Cancelled" if self._cancelled else "The trainer was not installed"
+            self._task = "Cancelled" if self._cancelled else "The trainer was not installed"
         finally:
             self.running = False
 
@@ -119,7 +133,7 @@ class EnvironmentSetup:
                 lock.write_text(packages.without_cuda(self._requirements.read_text("utf-8")), "utf-8")
                 options.append("--no-deps")
             self._run("pip install", [*pip, *options, f"--requirement={lock}"])
-        self.message = "Testing the environment"
+        self._task = "Testing the environment"
         self._run("import of the packages", [python, "-c", f"import {', '.join(MODULES)}"])
         with atomic_write(folder / environment.READY) as file:
             file.write_text(json.dumps({"base": str(self._base)}), encoding="utf-8")
@@ -156,25 +170,19 @@ class EnvironmentSetup:
                 self._stop()
             for line in filter(None, map(str.strip, self._process.stdout)):
                 if line.startswith("Progress "):
-                    self.message = f"{download} {format_progress(line)}, {self._elapsed()}"
+                    self._task = f"{download} {format_progress(line)}"
                     continue
                 lines.append(line)
                 if line.startswith(("Collecting ", "Downloading ", "Installing ")):
-                    download = shorten_pip_line(line)
-                    self.message = f"{download}, {self._elapsed()}"
-                    download = download.partition(" (")[0]
+                    self._task = shorten_pip_line(line)
+                    download = self._task.partition(" (")[0]
                     self.fraction += (0.95 - self.fraction) * 0.03
         if self._cancelled or self._process.returncode:
-            errors = [line for line in lines if line.lower().startswith(("error", "fatal"))] or lines
-            reason = " ".join(errors[-1:]).rstrip(".")
+            reason = failure_reason(lines)
             raise LodgsError(
                 f"Cannot install the trainer: {task} failed{f': {reason}' if reason else ''}.",
                 "Check the network and the free disk space, then try again.",
             )
-
-    def _elapsed(self) -> str:
-        minutes, seconds = divmod(int(time.monotonic() - self._started), 60)
-        return f"{minutes}:{seconds:02d} min"
 
     def _remove_all_but(self, keep: list[Path]) -> bool:
         """Remove older and incomplete environments. Return False if one is in use and stays."""
@@ -271,6 +279,20 @@ def format_progress(line: str) -> str:
     """Format a line of pip's raw progress, "Progress 96000000 of 192000000", as "96 of 192 MB"."""
     done, _, total = (line.split() + ["0"] * 4)[1:4]
     return f"{int(done) / 1e6:.0f} of {int(total) / 1e6:.0f} MB"
+
+
+def failure_reason(lines: list[str]) -> str:
+    """Return the cause of a failure, without a final period, from a program's output. Empty without output.
+
+    Without a connection, pip's last error only says that there is no such package.
+    """
+    errors = [line for line in lines if line.lower().startswith(("error", "fatal"))] or lines
+    reason = " ".join(errors[-1:]).rstrip(".")
+    if "No matching distribution" in reason:
+        output = "\n".join(lines)
+        causes = (cause for mark, cause in CONNECTION_PROBLEMS.items() if mark in output)
+        reason = next(causes, reason)
+    return reason
 
 
 def _new_folder(parent: Path) -> Path:

@@ -23,6 +23,10 @@ def lodgs_command(lodgs):
     return lambda *arguments: lodgs("commands").main([str(a) for a in arguments])
 
 
+def test_help_is_printed_without_a_command(lodgs_command, capsys):
+    assert lodgs_command() == 0 and "\n    capture " in capsys.readouterr().out
+
+
 def test_train_saves_and_exports(bpy, lodgs, lodgs_command, fake, tmp_path, capfd):
     fake()
     run, blend, bundle = tmp_path / "run", tmp_path / "made" / "out.blend", tmp_path / "made" / "bundle.ply"

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -43,6 +44,13 @@ def shell(command: str) -> subprocess.CompletedProcess[str]:
         text=True,
         check=False,
     )
+
+
+def test_help_is_printed_without_a_command(capsys):
+    with pytest.raises(SystemExit) as end:
+        __main__.main([])
+    printed = capsys.readouterr().out
+    assert end.value.code == 0 and all(re.search(rf"^    {name}\b", printed, re.M) for name in COMMANDS)
 
 
 @pytest.mark.parametrize("command", MISTAKES)

@@ -192,7 +192,7 @@ def test_failed_import_leaves_no_data(bpy, lodgs, tmp_path, mini, monkeypatch):
         raise lodgs("training.errors").LodgsError("No room.", "Make some.")
 
     monkeypatch.setattr(lodgs("data.objects"), "new_points", fail)
-    with pytest.raises(RuntimeError, match=r"No room\. Make some\."):
+    with pytest.raises(RuntimeError, match=r"No room\. \nMake some\."):
         bpy.ops.lodgs.import_colmap(directory=str(mini))
     assert _everything(bpy) == before
     assert bpy.context.scene.camera is None

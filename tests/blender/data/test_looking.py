@@ -124,9 +124,11 @@ def test_plain_splats_open_upright_from_a_clear_view(bpy, lodgs, tmp_path):
     assert eye.z > target.z + 0.5 and 3 < (eye - target).length < 12
 
 
-@pytest.mark.parametrize("touched", [False, True])
-def test_startup_objects_are_put_away(bpy, lodgs, tmp_path, touched):
+@pytest.mark.parametrize(("touched", "saved"), [(False, False), (False, True), (True, False)])
+def test_startup_objects_are_put_away(bpy, lodgs, tmp_path, touched, saved):
     bpy.ops.wm.read_homefile(use_factory_startup=True)
+    if saved:
+        bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
     if touched:
         bpy.data.objects["Cube"].location.x = 1
     write_bundle(tmp_path / "b.ply", Bundle("", [Level(1, ball(2000, 40))]))

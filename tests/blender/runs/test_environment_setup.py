@@ -112,12 +112,25 @@ def test_packages_must_match_the_lock_file(
     assert environments() == ["1"] and lodgs("runs.environment").trainer_python() == python
 
 
+NO_PACKAGE = "; echo ERROR: No matching distribution found for pip==26.3; exit 1"
 FAILURES = {
     "network": ({"pip": "echo 'ERROR: No matching distribution found for torch'; exit 1"}, "No matching"),
     "disk": ({"pip": "echo 'ERROR: [Errno 28] No space left on device'; exit 1"}, "No space left on device"),
     "import": (
         {"imports": "echo 'ImportError: libcudart.so.13' >&2; exit 1"},
         "packages failed: Imp",
+    ),
+    "offline": (
+        {"pip": "echo WARNING: Retrying after connection broken by OSError" + NO_PACKAGE},
+        "pip install failed: no connection to the package index. Check the network",
+    ),
+    "proxy": (
+        {"pip": "echo connection broken by CERTIFICATE_VERIFY_FAILED" + NO_PACKAGE},
+        "the certificate of the package index or of a proxy is not trusted",
+    ),
+    "unstable": (
+        {"pip": "echo connection broken by OSError; echo ERROR: Disk is full; exit 1"},
+        "ERROR: Disk is full",
     ),
     "silent": ({"pip": "kill -9 $$"}, "pip install failed. Check the network"),
 }
@@ -160,15 +173,20 @@ def test_new_environment_replaces_the_previous_one(
 
 
 def test_cancelled_installation_keeps_the_previous_environment(
-    bpy, lodgs, environment_setup, fake, environments
+    bpy, lodgs, environment_setup, fake, environments, monkeypatch
 ):
     assert bpy.ops.lodgs.make_environment() == {"FINISHED"}
     fake(pip="echo Collecting patience; exec sleep 1000")
     work = environment_setup.start()
     with pytest.raises(Exception, match="already being installed"):
         environment_setup.start()
+    remove, messages = environment_setup.shutil.rmtree, []
+    monkeypatch.setattr(
+        environment_setup.shutil, "rmtree", lambda *a, **k: messages.append(work.message) or remove(*a, **k)
+    )
     assert bpy.ops.lodgs.cancel_environment() == {"FINISHED"}
     work._thread.join(200)
+    assert messages[0].startswith("Cancelling, 0:")  # removing a gigabyte takes seconds
     assert not work.running and work.message == "Cancelled" and work.problem == ""
     assert environments() == ["1"] and lodgs("runs.environment").trainer_python().exists()
 
@@ -246,13 +264,21 @@ def test_cpu_build_of_torch_replaces_the_cuda_build(bpy, environment_setup, fake
 
 
 def test_progress_shows_size_and_time(bpy, environment_setup, fake, monkeypatch):
+    now = iter(range(1000))
+    monkeypatch.setattr(environment_setup.time, "monotonic", lambda: next(now))
     messages = []
-    message = property(lambda self: messages[-1], lambda self, text: messages.append(text))
-    monkeypatch.setattr(environment_setup.EnvironmentSetup, "message", message, raising=False)
-    fake(pip="echo 'Downloading torch-2.13.0-cp311.whl (191.8 MB)'; echo Progress 96000000 of 191800000")
+    monkeypatch.setattr(
+        environment_setup.EnvironmentSetup,
+        "step",
+        lambda self: messages.append(self.message) or self.running,
+    )
+    lines = ("'Downloading torch-2.13.0-cp311.whl (191.8 MB)'", "Progress 96000000 of 191800000")
+    fake(pip="".join(f"echo {line}; sleep 0.4; " for line in lines))
     assert bpy.ops.lodgs.make_environment() == {"FINISHED"}
-    assert "Downloading torch (191.8 MB), 0:00 min" in messages
-    assert "Downloading torch 96 of 192 MB, 0:00 min" in messages
+    assert any(text.startswith("Downloading torch (191.8 MB), 0:") for text in messages)
+    repeated = [text for text in messages if text.startswith("Downloading torch 96 of 192 MB, 0:")]
+    assert len(set(repeated)) == len(repeated) > 1  # the time goes on while pip is silent
+    assert messages[-1] == "The trainer is ready"
 
 
 def test_oldest_supported_python_is_preferred(lodgs, environment_setup, monkeypatch):
