@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from ..data import cleaning, crops, roots
-from ..data.cleanup_tests import HIDE_TESTS
-from .parts import LevelsPanel, say
+import bpy
+
+from ..data import cleaning, clutter, crops, roots
+from ..data.cleanup_tests import CLUTTER_TESTS, HIDE_TESTS, limit_property
+from .parts import LevelsPanel, say, split_column
 
 
 class LODGS_PT_clean_up(LevelsPanel):
@@ -26,9 +28,9 @@ class LODGS_PT_clean_up(LevelsPanel):
             row.prop(crop.lodgs_crop, "keep", text="")
             row.operator("lodgs.remove_crop", text="", icon="X").name = crop.name
 
+        _draw_clutter(layout, root)
         layout.label(text="Select in All Levels")
         column, brush = layout.column(align=True), context.scene.lodgs_brush
-        column.operator("lodgs.find_clutter", icon="VIEWZOOM")
         row = column.row(align=True)
         row.enabled = context.mode == "OBJECT"
         for name, tool in (("Brush", "lodgs.brush"), ("Lasso", "lodgs.lasso")):
@@ -57,6 +59,36 @@ class LODGS_PT_clean_up(LevelsPanel):
         column = layout.column(align=True)
         column.operator("lodgs.show_hidden_splats", text="Show All Hidden")
         column.operator("lodgs.delete_left_out", text="Delete Hidden", icon="TRASH")
+
+
+def _draw_clutter(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:
+    """Draw the preview of clutter: colour, count and limits of each kind, and the buttons that end it."""
+    settings = root.lodgs_clutter
+    if not settings.preview:
+        layout.operator("lodgs.find_clutter", icon="VIEWZOOM")
+        return
+    counts = clutter.counts(root)
+    if counts is None:
+        clutter.refresh_later()
+    box = layout.box()
+    for test in CLUTTER_TESTS:
+        used = getattr(settings, clutter.use_property(test))
+        row = box.row()
+        row.prop(settings, clutter.use_property(test))
+        count = row.row()
+        count.alignment = "RIGHT"
+        if used and counts is not None:
+            count.label(text=f"{counts[test.identifier]:,}")
+        swatch = row.row()
+        swatch.ui_units_x = 1.2
+        swatch.prop(settings, clutter.color_property(test), text="")
+        if used:
+            column = split_column(box, align=True)
+            for name in test.limits:
+                column.prop(settings, limit_property(name))
+    row = box.row(align=True)
+    row.operator("lodgs.hide_clutter", text="Hide", icon="HIDE_ON")
+    row.operator("lodgs.cancel_clutter", text="Keep", icon="X")
 
 
 CLASSES = (LODGS_PT_clean_up,)
