@@ -180,8 +180,8 @@ def preview_selection(root: bpy.types.Object | None, masks: Mapping[int, np.ndar
 
 
 def mark_of(kind: str) -> int:
-    """Return the mark of a kind of clutter."""
-    return 2 + list(KINDS).index(kind)
+    """Return the mark of a kind of clutter, or of other splats with ""."""
+    return 2 + [*KINDS, ""].index(kind)
 
 
 def show_marks(marks: Mapping[int, np.ndarray]) -> None:

@@ -217,7 +217,7 @@ def suggest_clutter_limits(root: bpy.types.Object) -> dict[str, float]:
     }
 
 
-def subject_of(root: bpy.types.Object) -> clutter.Subject:
+def subject_of(root: bpy.types.Object) -> clutter.SceneSubject:
     """Return the subject of the finest level, in the scene's own space; the last result is cached."""
     cloud = cleaning.levels(root)[-1].object.data
     up = placement_of(root).rotation.T @ (0.0, 0.0, 1.0)

@@ -10,7 +10,6 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ...training.editing.clutter import KINDS
 from ...training.lod.rule import Masks
 from .. import extension
 from . import changes, cleaning, roots
@@ -45,27 +44,12 @@ def use_property(test: CleanupTest) -> str:
     return f"use_{test.identifier.lower()}"
 
 
-def color_property(test: CleanupTest) -> str:
-    """Return the property with the colour of a test."""
-    return f"color_{test.identifier.lower()}"
-
-
-def _color(test: CleanupTest) -> Any:
-    """Return the read-only colour property of a test."""
-    color = KINDS[test.kind].color
-    return bpy.props.FloatVectorProperty(
-        name="Colour", description=f"Colour of {test.label} in the preview", size=3, subtype="COLOR_GAMMA",
-        get=lambda _: color,
-    )  # fmt: skip
-
-
 def _properties() -> dict[str, Any]:
     result: dict[str, Any] = {}
     for test in CLUTTER_TESTS:
         result[use_property(test)] = bpy.props.BoolProperty(
             name=test.label, description=test.about, default=test.identifier != "BELOW", update=_changed
         )
-        result[color_property(test)] = _color(test)
     return result | limit_properties(CLUTTER_TESTS, update=_changed, options=set())
 
 
@@ -121,6 +105,12 @@ def counts(root: bpy.types.Object) -> dict[str, int] | None:
     return {name: sum(int(mask.sum()) for mask in masks.values()) for name, (_, masks) in current.items()}
 
 
+def total(root: bpy.types.Object) -> int:
+    """Return the number of coloured splats in all levels."""
+    marks = [cleaning.displayed_marks(item.object.data) for item in cleaning.levels(root)]
+    return sum(int(np.count_nonzero((mark > 1) & (mark != cleaning.mark_of("")))) for mark in marks)
+
+
 def refresh_later() -> None:
     """Refresh the preview of every scene that has one as soon as possible, for use while drawing."""
     if not bpy.app.timers.is_registered(_refresh_all):
@@ -144,13 +134,13 @@ def _key(root: bpy.types.Object, test: CleanupTest) -> tuple:
 
 
 def _show() -> None:
-    """Show the matching splats of all scenes in the viewports."""
+    """Show the matching splats of all scenes in the viewports, and the others in grey."""
     marks: dict[int, np.ndarray] = {}
     for root in roots.roots(bpy.context.scene):
         matches = _matches.get(root.session_uid, {}) if root.lodgs_clutter.preview else {}
         for item in cleaning.levels(root) if matches else ():
             cloud = item.object.data
-            mark = marks[cloud.session_uid] = np.zeros(len(cloud.points), np.uint8)
+            mark = marks[cloud.session_uid] = np.full(len(cloud.points), cleaning.mark_of(""), np.uint8)
             for test in reversed(CLUTTER_TESTS):
                 mask = matches[test.identifier][1].get(item.number) if test.identifier in matches else None
                 if mask is not None and len(mask) == len(mark):

@@ -4,9 +4,16 @@ from __future__ import annotations
 
 import bpy
 
+from ...training.editing.clutter import KINDS
 from ..data import cleaning, clutter, crops, roots
 from ..data.cleanup_tests import CLUTTER_TESTS, HIDE_TESTS, limit_property
 from .parts import LevelsPanel, say, split_column
+
+_ICONS = {
+    "orange": "COLLECTION_COLOR_02", "yellow": "COLLECTION_COLOR_03", "pink": "COLLECTION_COLOR_07",
+    "violet": "COLLECTION_COLOR_06", "red": "COLLECTION_COLOR_01",
+}  # fmt: skip
+"""Icons by colour of clutter."""
 
 
 class LODGS_PT_clean_up(LevelsPanel):
@@ -77,17 +84,14 @@ def _draw_clutter(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:
         row.prop(settings, clutter.use_property(test))
         count = row.row()
         count.alignment = "RIGHT"
-        if used and counts is not None:
-            count.label(text=f"{counts[test.identifier]:,}")
-        swatch = row.row()
-        swatch.ui_units_x = 1.2
-        swatch.prop(settings, clutter.color_property(test), text="")
+        text = f"{counts[test.identifier]:,}" if used and counts is not None else ""
+        count.label(text=text, icon=_ICONS[KINDS[test.kind].tint])
         if used:
             column = split_column(box, align=True)
             for name in test.limits:
                 column.prop(settings, limit_property(name))
     row = box.row(align=True)
-    row.operator("lodgs.hide_clutter", text="Hide", icon="HIDE_ON")
+    row.operator("lodgs.hide_clutter", text=f"Hide {clutter.total(root):,}", icon="HIDE_ON")
     row.operator("lodgs.cancel_clutter", text="Keep", icon="X")
 
 

@@ -13,8 +13,8 @@ from ...training.lod.colors import LEVEL_COLORS
 from ...training.lod.crop import FACE_SQUARED
 from .arrangement import WIDTH
 
-MARK_COLORS = ((1.0, 0.45, 0.05), *(kind.color for kind in KINDS.values()))
-"""Colours of marked splats, sRGB, see ``cleaning.displayed_marks``: of selected ones, then of clutter."""
+MARK_COLORS = ((1.0, 0.45, 0.05), *(kind.color for kind in KINDS.values()), (0.5, 0.5, 0.5))
+"""Colours of marked splats, sRGB, see ``cleaning.displayed_marks``: selected ones, clutter, other splats."""
 
 MAX_TEXTURES = 8
 """Maximum number of textures for records: some drivers take long to create a single large one."""

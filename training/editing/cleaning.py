@@ -24,7 +24,7 @@ from ..settings import setting, settings_of
 from ..splats.gaussians import SplatRows, Splats
 from ..splats.levels import Bundle, Level
 from ..splats.ply import Columns, read_batches
-from .clutter import HALO_OPACITY, Subject, subject_of
+from .clutter import HALO_OPACITY, SceneSubject, subject_of
 
 MAX_FLOATER_SHARE = 0.001
 """Clusters with at most this fraction of all splats are floaters."""
@@ -122,7 +122,7 @@ class Cleaning:
 
     crops: tuple[Crop, ...] = ()
     cameras: tuple[Camera, ...] = ()
-    subject: Subject | None = None
+    subject: SceneSubject | None = None
     clutter: bool = setting(
         False,
         "Match all kinds of clutter around the subject, with limits that suit its size: large splats, halos, "

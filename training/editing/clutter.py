@@ -45,7 +45,7 @@ KINDS = {
 
 
 @dataclass(frozen=True)
-class Subject:
+class SceneSubject:
     """The subject of a scene.
 
     Attributes:
@@ -92,7 +92,7 @@ class Subject:
         }  # fmt: skip
 
 
-def find_subject(means: np.ndarray, up: np.ndarray, ground_points: np.ndarray) -> Subject:
+def find_subject(means: np.ndarray, up: np.ndarray, ground_points: np.ndarray) -> SceneSubject:
     """Return the subject of splats.
 
     Args:
@@ -103,10 +103,10 @@ def find_subject(means: np.ndarray, up: np.ndarray, ground_points: np.ndarray) -
     means = means[np.isfinite(means).all(axis=1)]
     center, radius = central_ball(means) if len(means) else (np.zeros(3), 1.0)
     ground = ground_plane(ground_points, up)
-    return Subject(center, radius, None if ground is None else ground[:2])
+    return SceneSubject(center, radius, None if ground is None else ground[:2])
 
 
-def subject_of(bundle: Bundle) -> Subject:
+def subject_of(bundle: Bundle) -> SceneSubject:
     """Return the subject of a bundle, whose finest level is read once."""
     batches = [(splats.means, splats.opacity_logits > 0) for splats in read_batches(bundle.levels[-1].rows)]
     means = np.concatenate([part for part, _ in batches])

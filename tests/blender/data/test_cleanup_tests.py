@@ -59,8 +59,8 @@ def test_every_kind_is_counted_coloured_and_hidden(bpy, lodgs, root):
     assert clutter.counts(root) == {name: 2 * count for name, count in kinds.items()}
     cloud = root.lodgs.levels[1].object.data
     marks = cleaning.displayed_marks(cloud)
-    names = ("max_size", "max_reach", "drop_floaters", "drop_floaters", "halo_opacity")
-    expected = np.repeat([0, *map(cleaning.mark_of, names)], COUNTS)
+    names = ("", "max_size", "max_reach", "drop_floaters", "drop_floaters", "halo_opacity")
+    expected = np.repeat(list(map(cleaning.mark_of, names)), COUNTS)
     np.testing.assert_array_equal(marks, expected)
     root.lodgs_clutter.use_below, root.lodgs_clutter.use_floaters = True, False
     assert cleaning.displayed_marks(cloud)[-HALOS - 1] == cleaning.mark_of("min_depth")
@@ -97,7 +97,7 @@ def test_changed_splats_are_found_again(bpy, lodgs, root):
     assert clutter.counts(root) is None
     clutter.refresh(bpy.context, root)
     assert clutter.counts(root)["LARGE"] == 0
-    assert cleaning.displayed_marks(root.lodgs.levels[1].object.data)[REST] == 0
+    assert cleaning.displayed_marks(root.lodgs.levels[1].object.data)[REST] == cleaning.mark_of("")
 
 
 def test_scene_without_ground_has_nothing_below(bpy, lodgs, tmp_path):
