@@ -18,7 +18,7 @@ from ..data.training import (
     level_distances,
     panel_parameters,
 )
-from ..runs import environment, job_settings, run_folders
+from ..runs import environment, job_settings, run_folders, scene_check
 from ..runs.messages import measured_on, progress_facts, short_level_line
 from ..runs.watch import Watch, watch_of
 from .parts import Panel, draw_environment, draw_views, say, scene_length, split_column
@@ -146,6 +146,11 @@ def _draw_choices(
     if not bpy.data.is_saved and not settings.output:
         text = f"This file is not saved. The run is written to {run_folders.runs_parent(root)}."
         say(layout, text, "INFO")
+    if root.lodgs.scene_folder:
+        if estimate := scene_check.last_estimate(root):
+            say(layout, estimate, "TIME")
+        else:
+            layout.operator("lodgs.check_scene", text="Estimate Time and Memory", icon="TIME")
     if resumable:
         layout.operator("lodgs.train", text="Train Again", icon="FILE_REFRESH")
     else:

@@ -22,6 +22,8 @@ SMALL_SIDE = 200
 MIN_SHARED = 20
 """Number of points that a view must share with other views to overlap them."""
 ERROR, WARNING, INFO = SEVERITIES = "error", "warning", "info"
+ESTIMATE = "estimate"
+"""Severity of the expected costs, which ``runs.estimate`` finds."""
 
 
 class Finding(NamedTuple):
