@@ -12,7 +12,7 @@ import bpy
 
 from ...training.errors import LodgsError
 from ...training.runs.job import Job
-from ...training.scenes.check import ESTIMATE, INFO, SEVERITIES, Finding, check_folder
+from ...training.scenes.check import ESTIMATE, SEVERITIES, Finding, check_folder
 from ..data.paths import absolute_path
 from . import environment, job_settings, run_folders
 
@@ -56,7 +56,7 @@ def _ask_trainer(python: Path, job: Job, check: Callable[[], list[Finding]]) -> 
         except (OSError, subprocess.TimeoutExpired):
             answer = None
     if answer is None or answer.returncode not in (0, 2):
-        return [*check(), Finding(INFO, "No estimate: the trainer did not answer.")]
+        return [*check(), Finding(ESTIMATE, "No estimate: the trainer did not answer.")]
     lines = [line.partition(": ") for line in answer.stdout.splitlines()]
     return [Finding(kind, text) for kind, _, text in lines if kind in (*SEVERITIES, ESTIMATE)]
 
@@ -76,12 +76,12 @@ def last_findings(root: bpy.types.Object) -> list[Finding] | None:
     return None if findings is None else [finding for finding in findings if finding.severity != ESTIMATE]
 
 
-def last_estimate(root: bpy.types.Object) -> str:
-    """Return the estimate for the current settings of a scene; empty if they changed since the check."""
+def last_estimate(root: bpy.types.Object) -> list[str]:
+    """Return the estimate and suggestions for the current settings; none if they changed since the check."""
     key, findings = _findings.get(root.session_uid, ("", []))
     if key != settings_key(root):
-        return ""
-    return next((str(finding) for finding in findings if finding.severity == ESTIMATE), "")
+        return []
+    return [str(finding) for finding in findings if finding.severity == ESTIMATE]
 
 
 def settings_key(root: bpy.types.Object) -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import LodgsError
-from ..scenes.check import ERROR, INFO, Finding
+from ..scenes.check import ERROR, ESTIMATE, Finding
 from . import check
 from .job_options import add_options, job_from_options
 
@@ -63,7 +63,7 @@ def estimate_lines(job: Job) -> list[Finding]:
     """Return the expected costs of a job, if this Python can train."""
     problems = check.environment()["problems"]
     if problems:
-        return [Finding(INFO, f"No estimate: {problems[0]}", check.INSTALL)]
+        return [Finding(ESTIMATE, f"No estimate: {problems[0]}", check.INSTALL)]
     from ..runs.estimate import estimate_findings
 
     return estimate_findings(job)

@@ -20,7 +20,7 @@ from ..optimize.method import Method
 from ..optimize.parameters import Parameters
 from ..optimize.training_data import TrainingData
 from ..rasterize import resolve_backend, warm_up
-from ..scenes.check import ESTIMATE, INFO, WARNING, Finding
+from ..scenes.check import ESTIMATE, Finding
 from ..scenes.colmap import Scene, read_scene
 from ..scenes.triangulate import cached_points
 from .blocks.plan import PROGRAM_BYTES, SPLAT_BYTES, choose_cells
@@ -78,13 +78,13 @@ def estimate_findings(job: Job) -> list[Finding]:
     Takes some seconds, and up to a minute more if the kernels are not compiled yet.
     """
     if job.base or job.cells or job.region:
-        return [Finding(INFO, "There is no estimate for training from splats, in cells or of a region.")]
+        return [Finding(ESTIMATE, "There is no estimate for training from splats, in cells or of a region.")]
     try:
         with tempfile.TemporaryDirectory(prefix="lodgs-") as scratch:
             costs = estimate(job, Path(scratch))
         return [Finding(ESTIMATE, str(costs)), *suggestions(job.resolved(), costs)]
     except LodgsError as error:
-        return [Finding(INFO, f"No estimate: {error.what}", error.remedy)]
+        return [Finding(ESTIMATE, f"No estimate: {error.what}", error.remedy)]
 
 
 def estimate(job: Job, scratch: Path) -> Estimate:
@@ -127,26 +127,26 @@ def estimate(job: Job, scratch: Path) -> Estimate:
 
 def suggestions(job: Job, costs: Estimate) -> list[Finding]:
     """Return settings to change, with their reason."""
-    found = []
+    lines = []
     longer = max(costs.size)
     if costs.memory > FULL * costs.free_memory:
         what = f"Training needs more than {FULL:.0%} of the free memory."
-        found.append(Finding(WARNING, what, _less_memory(job, costs)))
+        lines.append(Finding(ESTIMATE, what, _less_memory(job, costs)))
     if costs.disk > FULL * costs.free_disk:
         what = f"The run may need more than {FULL:.0%} of the free disk space."
-        found.append(Finding(WARNING, what, "Choose a run folder on another disk."))
+        lines.append(Finding(ESTIMATE, what, "Choose a run folder on another disk."))
     if longer > LARGE_SIDE:
         scale = job.image_scale * LARGE_SIDE / longer
         what = f"Training images are {longer} pixels wide; the papers use at most {LARGE_SIDE}."
-        found.append(Finding(INFO, what, f"Set image_scale to {scale:.2g} to train faster."))
+        lines.append(Finding(ESTIMATE, what, f"Set image_scale to {scale:.2g} to train faster."))
     elif longer < SMALL_SIDE and job.image_scale < 1:
         scale = min(job.image_scale * SMALL_SIDE / longer, 1.0)
         what = f"Training images are only {longer} pixels wide, which loses details."
-        found.append(Finding(INFO, what, f"Set image_scale to {scale:.2g}."))
+        lines.append(Finding(ESTIMATE, what, f"Set image_scale to {scale:.2g}."))
     if costs.seconds > LONG and job.preset != "draft":
         what = f"Training takes more than {LONG // 3600} hours on this computer."
-        found.append(Finding(INFO, what, "Train the preset draft first to check the scene."))
-    return found
+        lines.append(Finding(ESTIMATE, what, "Train the preset draft first to check the scene."))
+    return lines
 
 
 def _less_memory(job: Job, costs: Estimate) -> str:

@@ -23,7 +23,7 @@ MIN_SHARED = 20
 """Number of points that a view must share with other views to overlap them."""
 ERROR, WARNING, INFO = SEVERITIES = "error", "warning", "info"
 ESTIMATE = "estimate"
-"""Severity of the expected costs, which ``runs.estimate`` finds."""
+"""Severity of the expected costs and of suggested settings, see ``runs.estimate``."""
 
 
 class Finding(NamedTuple):

@@ -67,7 +67,7 @@ def test_finding_has_the_costs_in_one_sentence(job):
 
 def test_cells_have_no_estimate(job):
     (finding,) = estimate_findings(replace(job, cells="2x1"))
-    assert finding.severity == "info" and "in cells" in finding.what
+    assert finding.severity == "estimate" and "in cells" in finding.what
 
 
 @pytest.mark.parametrize(
