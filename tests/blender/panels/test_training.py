@@ -238,7 +238,7 @@ def test_results_after_training(bpy, lodgs, root, draw, watch, fake):
     layout = draw()
     assert "The trainer was killed." in layout.texts
     assert layout.operators == ["lodgs.resume_training", "lodgs.show_log", "lodgs.train", "lodgs.check_scene"]
-    assert layout.buttons[-1] == "Train Again", "distinct from Resume"
+    assert layout.buttons[-2] == "Train Again", "distinct from Resume"
 
 
 def test_an_unsaved_file_shows_the_folder_of_its_runs(bpy, root, draw, fake, tmp_path):
