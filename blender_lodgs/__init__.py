@@ -7,7 +7,19 @@ handlers, menus and properties. Modules register in the order of ``MODULES`` and
 import bpy
 
 from . import commands, operators, panels, viewport
-from .data import changes, loaded, looks, older_files, paths, properties, reloading, removal, scenes, updates
+from .data import (
+    changes,
+    clutter,
+    loaded,
+    looks,
+    older_files,
+    paths,
+    properties,
+    reloading,
+    removal,
+    scenes,
+    updates,
+)
 from .nodes import building
 from .render import compare, engine, renderer
 from .runs import background_capture, jobs, method_comparison, photo_preparation
@@ -19,6 +31,7 @@ MODULES = (
     building,
     updates,
     changes,
+    clutter,
     *operators.MODULES,
     *panels.MODULES,
     older_files,

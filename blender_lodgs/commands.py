@@ -21,7 +21,7 @@ from ..training.cli.methods import describe_method, describe_methods
 from ..training.cli.options import add_setting, parse_size
 from ..training.editing.export import EXPORT_OPTIONS, export_finest_level, run_to_end
 from ..training.errors import LodgsError, describe_system_error, system_remedy
-from ..training.evaluate.messages import summary_lines
+from ..training.evaluate.messages import format_duration, summary_lines
 from ..training.runs.folder import RunFolder, find_splats
 from ..training.runs.job import KEYS, Job
 from ..training.settings import check_value
@@ -36,7 +36,7 @@ from .render.capture import noise_warning, render_views, write_model
 from .render.video import MAX_FRAMES, extract_frames
 from .runs import environment, job_settings, jobs, photo_preparation
 from .runs.compression import convert_steps
-from .runs.messages import format_duration, level_line
+from .runs.messages import level_line
 from .runs.watch import Watch
 
 DONE, CRASHED, BAD_INPUT, CANCELLED = 0, 1, 2, 3

@@ -22,11 +22,13 @@ class PreferenceValues(Protocol):
         python: path of the trainer's Python; empty for the installed environment.
         backend: name of the rasterizer backend, or "auto".
         flamenco: address of the Flamenco Manager; empty without a render farm.
+        notices: show a notice of the operating system when a training ends.
     """
 
     python: str
     backend: str
     flamenco: str
+    notices: bool
 
 
 def user_folder(name: str = "") -> Path:

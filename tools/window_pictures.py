@@ -241,6 +241,13 @@ def place_and_clean() -> Steps:
     yield from drag([(x + offset, y) for offset in (-30, -10, 10, 30)])
     yield from settle()
     picture("clean-up-brush")
+    press("lodgs.find_clutter")
+    root = scene_root()
+    root.lodgs_clutter.size = 0.5 * scene_scale()
+    overview()
+    yield from settle()
+    picture("clean-up-clutter")
+    press("lodgs.cancel_clutter")
     press("lodgs.select_all_splats", action="DESELECT")
     press("wm.tool_set_by_id", mode="EXEC_DEFAULT", name="builtin.select_box")
     crop.lodgs_crop.use = False

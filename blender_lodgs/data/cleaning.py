@@ -14,6 +14,7 @@ import bpy
 import numpy as np
 
 from ...training.editing import cleaning
+from ...training.editing.clutter import KINDS
 from ...training.errors import LodgsError
 from ...training.lod.crop import crop_mask
 from ...training.lod.rule import Relations, resolve_rule
@@ -31,6 +32,8 @@ Test = Callable[[bpy.types.PointCloud], np.ndarray]
 
 _in_stroke: dict[int, np.ndarray] = {}
 """Selection masks of the current stroke, by ``session_uid`` of the point cloud."""
+_marks: dict[int, np.ndarray] = {}
+"""Marks of previewed clutter, by ``session_uid`` of the point cloud."""
 _counts: dict[int, tuple[tuple, int]] = {}
 """Cache keys and numbers of remaining splats, by ``session_uid`` of the point cloud."""
 
@@ -176,10 +179,24 @@ def preview_selection(root: bpy.types.Object | None, masks: Mapping[int, np.ndar
     changes.report_selected()
 
 
-def displayed_selection(cloud: bpy.types.PointCloud) -> np.ndarray:
-    """Return the (N,) bool mask of splats that viewports display as selected."""
-    preview = _in_stroke.get(cloud.session_uid)
-    return selected_mask(cloud) if preview is None or len(preview) != len(cloud.points) else preview
+def mark_of(kind: str) -> int:
+    """Return the mark of a kind of clutter, or of other splats with ""."""
+    return 2 + [*KINDS, ""].index(kind)
+
+
+def show_marks(marks: Mapping[int, np.ndarray]) -> None:
+    """Display the marks (N,) uint8 of point clouds, by ``session_uid``, in place of their selection."""
+    _marks.clear()
+    _marks.update(marks)
+    changes.report_selected()
+
+
+def displayed_marks(cloud: bpy.types.PointCloud) -> np.ndarray:
+    """Return the marks (N,) uint8 that viewports display: 0 none, 1 selected, else :func:`mark_of` a kind."""
+    for values in (_in_stroke.get(cloud.session_uid), _marks.get(cloud.session_uid)):
+        if values is not None and len(values) == len(cloud.points):
+            return values.astype(np.uint8)
+    return selected_mask(cloud).astype(np.uint8)
 
 
 def count_selected(root: bpy.types.Object) -> dict[int, int]:

@@ -3,40 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import bpy
 import numpy as np
 
-from ...training.editing.cleaning import LIMITS, MAX_FLOATER_SHARE, default_gap
+from ...training.editing import clutter
+from ...training.editing.cleaning import LIMITS, default_gap
+from ...training.editing.clutter import KINDS
 from ...training.errors import LodgsError
 from ...training.lod.rule import Masks
-from ...training.scenes.ground import ground_plane
-from ...training.scenes.overview import FAR, LARGE, NEAR, central_ball
-from ...training.settings import setting, settings_of
-from ..attributes import SCALE
-from . import cleaning
+from ..attributes import BASE, SCALE
+from . import changes, cleaning
 from .ground import ground_points
 from .placement import placement_of
 from .setting_properties import property_of
-
-_DEPTH = 0.05
-"""Suggested minimum depth of splats below the ground, as a fraction of the subject's radius."""
-
-
-@dataclass(frozen=True)
-class _SubjectLimits:
-    """Limits of the tests that need no cameras, in addition to ``cleaning.LIMITS``."""
-
-    max_reach: float = setting(
-        10.0, "Match splats farther than this from the centre of the subject.",
-        label="Distance", unit="length", start=10.0,
-    )  # fmt: skip
-    min_depth: float = setting(
-        1.0, "Match splats deeper than this below the detected ground.",
-        label="Depth", unit="length", start=1.0,
-    )  # fmt: skip
 
 
 class CleanupTest(NamedTuple):
@@ -47,7 +28,7 @@ class CleanupTest(NamedTuple):
         noun: the matching splats, in menus; "" for tests of *Find Clutter* alone.
         limits: names of its settings; empty for the selection.
         find: function of the context, the root and the limits that returns masks by level number.
-        clutter: "all" or, without a distant background, "near" in *Find Clutter*; "" if it lacks the test.
+        kind: its entry of ``clutter.KINDS`` in *Find Clutter*; "" if it lacks the test.
     """
 
     identifier: str
@@ -56,26 +37,41 @@ class CleanupTest(NamedTuple):
     about: str
     limits: tuple[str, ...]
     find: Callable[..., Masks]
-    clutter: str = ""
+    kind: str = ""
+
+
+def _find_halos(context: bpy.types.Context, root: bpy.types.Object, opacity: float) -> Masks:
+    """Find large and faint splats near the subject."""
+    subject = subject_of(root)
+    return cleaning.find(
+        root,
+        lambda cloud: subject.find_halos(
+            cleaning.splat_attribute(cloud, "position"), cleaning.splat_attribute(cloud, SCALE),
+            cleaning.splat_attribute(cloud, BASE)[:, 3], opacity,
+        ),
+    )  # fmt: skip
+
+
+def _find_distant(context: bpy.types.Context, root: bpy.types.Object, limit: float) -> Masks:
+    """Find splats farther than a length in the world from the centre of the subject."""
+    subject, limit = subject_of(root), limit / cleaning.unit_length(root)
+    return cleaning.find(
+        root, lambda cloud: subject.distances(cleaning.splat_attribute(cloud, "position")) > limit
+    )
 
 
 def _find_below(context: bpy.types.Context, root: bpy.types.Object, depth: float) -> Masks:
     """Find splats below the detected ground; none without a ground."""
-    up = placement_of(root).rotation.T @ (0.0, 0.0, 1.0)
-    ground = ground_plane(ground_points(root), up)
-    if ground is None:
-        return {item.number: np.zeros(len(item.object.data.points), bool) for item in cleaning.levels(root)}
-    normal, middle, _ = ground
-    limit = depth / cleaning.unit_length(root)
+    subject, limit = subject_of(root), depth / cleaning.unit_length(root)
     return cleaning.find(
-        root, lambda cloud: (cleaning.splat_attribute(cloud, "position") - middle) @ normal < -limit
+        root, lambda cloud: subject.find_below(cleaning.splat_attribute(cloud, "position"), limit)
     )
 
 
 TESTS = (
     CleanupTest(
         "LARGE", "Large", "Large Splats", "Splats larger than a length, such as fog", ("max_size",),
-        lambda context, root, size: cleaning.find(root, cleaning.size_test(root, size)), clutter="near",
+        lambda context, root, size: cleaning.find(root, cleaning.size_test(root, size)), kind="max_size",
     ),
     CleanupTest(
         "FAINT", "Faint", "Faint Splats", "Splats of low opacity", ("min_opacity",),
@@ -87,7 +83,7 @@ TESTS = (
     ),
     CleanupTest(
         "DISTANT", "Far Away", "", "Splats far from the centre of the subject", ("max_reach",),
-        lambda context, root, limit: cleaning.find(root, _reach_test(root, limit)), clutter="all",
+        _find_distant, kind="max_reach",
     ),
     CleanupTest(
         "UNSEEN", "Few Views", "Rarely Seen Splats", "Splats in the frames of few cameras, occluded or not",
@@ -98,11 +94,15 @@ TESTS = (
         "FLOATERS", "Floaters", "Floaters", "Small clusters of splats that are far from others",
         ("gap", "share"),
         lambda context, root, gap, percent: cleaning.find_floaters(context, root, gap, percent / 100),
-        clutter="near",
+        kind="drop_floaters",
     ),
     CleanupTest(
         "BELOW", "Below Ground", "", "Splats below the detected ground", ("min_depth",), _find_below,
-        clutter="all",
+        kind="min_depth",
+    ),
+    CleanupTest(
+        "HALOS", "Halos", "", "Large and faint splats around the subject", ("halo_opacity",), _find_halos,
+        kind="halo_opacity",
     ),
     CleanupTest(
         "SELECTED", "Selected", "Selected Splats",
@@ -112,8 +112,10 @@ TESTS = (
 )  # fmt: skip
 HIDE_TESTS = tuple(test for test in TESTS if test.noun)
 """Tests of *Hide Splats* and of menus."""
-CLUTTER_TESTS = tuple(test for test in TESTS if test.clutter)
-"""Tests of *Find Clutter*, which runs them together."""
+CLUTTER_TESTS = tuple(test for name in KINDS for test in TESTS if test.kind == name)
+"""Tests of *Find Clutter*, which runs them together. A splat has the colour of the first one."""
+_SPARES_BACKGROUND = "max_size", "drop_floaters"
+"""Kinds of clutter that are only near the subject: a distant background is large and sparse, too."""
 
 
 def limit_property(name: str) -> str:
@@ -121,17 +123,21 @@ def limit_property(name: str) -> str:
     return name.removeprefix("max_").removeprefix("min_")
 
 
-def limit_properties(tests: Iterable[CleanupTest]) -> dict[str, Any]:
-    """Return the operator properties of the limits of tests."""
-    result, settings = {}, LIMITS | settings_of(_SubjectLimits)
+def limit_properties(tests: Iterable[CleanupTest], **common: Any) -> dict[str, Any]:
+    """Return the properties of the limits of tests.
+
+    Args:
+        common: arguments of all properties, see ``property_of``.
+    """
+    result: dict[str, Any] = {}
     for name in (name for test in tests for name in test.limits):
-        f = settings[name]
+        f = LIMITS[name]
         start, options = f.metadata["start"], {}
         if name == "share":
             options = {"default": 100 * start, "max": 100.0, "precision": 2, "subtype": "PERCENTAGE"}
         elif f.metadata["unit"] == "length":  # suggested for each scene
             options = {"options": {"SKIP_SAVE"}}
-        result[limit_property(name)] = property_of(f, **{"default": start} | options)
+        result[limit_property(name)] = property_of(f, **{"default": start} | options | common)
     return result
 
 
@@ -157,13 +163,16 @@ def find_clutter(
 ) -> Masks:
     """Find the visible splats of a kind of clutter: as :func:`find_matches`, or only near the subject."""
     masks = find_matches(test, context, root, limits)
-    if test.clutter != "near":
+    if test.kind not in _SPARES_BACKGROUND:
         return masks
-    (center, radius), numbers = _subject(root), _numbers(root)
+    subject = subject_of(root)
+    numbers = {item.object.data.session_uid: item.number for item in cleaning.levels(root)}
     return cleaning.find(
         root,
-        lambda cloud: masks[numbers[cloud.session_uid]] & (_distances(cloud, center) < NEAR * radius),
-    )  # a distant background is large and sparse, too
+        lambda cloud: (
+            masks[numbers[cloud.session_uid]] & subject.near(cleaning.splat_attribute(cloud, "position"))
+        ),
+    )
 
 
 def union(masks: Mapping[str, Masks], root: bpy.types.Object) -> Masks:
@@ -200,33 +209,24 @@ def suggest_limits(context: bpy.types.Context, root: bpy.types.Object) -> dict[s
 
 
 def suggest_clutter_limits(root: bpy.types.Object) -> dict[str, float]:
-    """Suggest limits for *Find Clutter* from the size of the subject, see ``overview.central_ball``."""
-    _, radius = _subject(root)
-    size = radius * cleaning.unit_length(root)
+    """Suggest limits for *Find Clutter* from the size of the subject, as lengths in the world."""
+    unit, limits = cleaning.unit_length(root), subject_of(root).limits()
     return {
-        "size": LARGE * size, "reach": FAR * size, "gap": 0.0, "share": 100 * MAX_FLOATER_SHARE,
-        "depth": _DEPTH * size,
-    }  # fmt: skip
+        limit_property(name): value * (unit if LIMITS[name].metadata["unit"] == "length" else 1)
+        for name, value in limits.items()
+    }
 
 
-def _reach_test(root: bpy.types.Object, limit: float) -> cleaning.Test:
-    """Return a test for splats farther than a length in the world from the centre of the subject."""
-    center, _ = _subject(root)
-    limit /= cleaning.unit_length(root)
-    return lambda cloud: _distances(cloud, center) > limit
+def subject_of(root: bpy.types.Object) -> clutter.SceneSubject:
+    """Return the subject of the finest level, in the scene's own space; the last result is cached."""
+    cloud = cleaning.levels(root)[-1].object.data
+    up = placement_of(root).rotation.T @ (0.0, 0.0, 1.0)
+    key = cloud.session_uid, len(cloud.points), changes.version(cloud), tuple(up)
+    if not _subject or _subject[0] != key:
+        means = cleaning.splat_attribute(cloud, "position")
+        _subject[:] = [key, clutter.find_subject(means, up, ground_points(root))]
+    return _subject[1]
 
 
-def _subject(root: bpy.types.Object) -> tuple[np.ndarray, float]:
-    """Return center (3,) and radius of the finest level's subject, in the scene's own space."""
-    means = cleaning.splat_attribute(cleaning.levels(root)[-1].object.data, "position")
-    means = means[np.isfinite(means).all(axis=1)]
-    return central_ball(means) if len(means) else (np.zeros(3), 1.0)
-
-
-def _numbers(root: bpy.types.Object) -> dict[int, int]:
-    """Return the level number of each point cloud, by ``session_uid``."""
-    return {item.object.data.session_uid: item.number for item in cleaning.levels(root)}
-
-
-def _distances(cloud: bpy.types.PointCloud, center: np.ndarray) -> np.ndarray:
-    return np.linalg.norm(cleaning.splat_attribute(cloud, "position") - center, axis=1)
+_subject: list[Any] = []
+"""Key and subject of the last scene."""

@@ -28,7 +28,7 @@ from ...training.splats.level_folder import read_folder
 from ...training.splats.levels import Bundle
 from ...training.splats.streamed_levels import STREAMED_FILE
 from ..nodes.camera_choices import VIEWPORT
-from . import objects, scenes, streams
+from . import objects, scenes, streams, viewpoints
 from .paths import stored_path
 from .photographs import match_render, new_camera, views
 from .placement import axes_of, new_axes
@@ -275,6 +275,8 @@ def place_splats(
                 _add_views(context, root, cameras, camera_extent(cameras) or 1.0, near)
                 for settings in (view.data.lodgs for view in views(root)):
                     settings.held_out = cameras[settings.model_index].name in held_out
+            if viewpoints.has_cameras(context.scene):
+                root.lodgs.training.views_from = "CAMERAS"  # those that the artist uses
             root.lodgs.training.method = next(
                 info.name for info in METHODS.values() if info.suggested_for_base
             )

@@ -19,6 +19,7 @@ from ...training.scenes.viewpoints import (
     aerial_views,
     dome_views_around,
     opaque_means,
+    surrounding_views,
     views_along,
     walk_views,
 )
@@ -79,7 +80,8 @@ VIEW_PATTERNS = (
     ViewPattern(
         "DOME",
         "All Around",
-        "Dome of cameras around the splats or the selected objects, for an object seen from outside",
+        "Dome of cameras around the splats or the selected objects. For splats, half of the cameras are "
+        "close to their surface",
         "around",
     ),
     ViewPattern(
@@ -348,7 +350,7 @@ def preview_dome(root: bpy.types.Object) -> tuple[list[Camera], tuple[float, flo
     """
     count = root.lodgs.training.views
     views, near = _cached(
-        "dome", (*_finest_cloud(root)[1:], count), lambda: dome_views_around(_sample_positions(root), count)
+        "dome", (*_finest_cloud(root)[1:], count), lambda: surrounding_views(_sample_positions(root), count)
     )
     return views, (DOMES[0] * near / NEAR_SHARE, DOMES[1] * near / NEAR_SHARE)
 
@@ -407,6 +409,11 @@ def _cameras(scene: bpy.types.Scene) -> list[bpy.types.Object]:
 def _count(cameras: Iterable[bpy.types.Object]) -> int:
     """Return the number of perspective cameras."""
     return sum(camera.data.type == "PERSP" for camera in cameras)
+
+
+def has_cameras(scene: bpy.types.Scene) -> bool:
+    """Return True if a scene has enough perspective cameras to train on their views."""
+    return _count(_cameras(scene)) >= MIN_VIEWS
 
 
 def _require_two(cameras: list[bpy.types.Object]) -> list[bpy.types.Object]:

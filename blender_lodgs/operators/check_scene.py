@@ -10,6 +10,7 @@ from ...training.scenes.check import INFO, Finding
 from .. import extension
 from ..data import roots
 from ..runs import scene_check
+from ..runs.watch import root_by_uid
 from .base import SceneOperator
 from .modal import SteppedOperator
 
@@ -17,7 +18,10 @@ from .modal import SteppedOperator
 class LODGS_OT_check_scene(SceneOperator, SteppedOperator, bpy.types.Operator):
     bl_idname = "lodgs.check_scene"
     bl_label = "Check Scene"
-    bl_description = "Look for facts about the photos and cameras that lower the quality of training"
+    bl_description = (
+        "Look for facts about the photos and cameras that lower the quality of training, and estimate its "
+        "time, memory and disk space"
+    )
 
     _findings: list[Finding] | None = None
 
@@ -26,7 +30,7 @@ class LODGS_OT_check_scene(SceneOperator, SteppedOperator, bpy.types.Operator):
 
     def work(self, context):
         root = roots.active_root(context)
-        uid = root.session_uid
+        uid, key = root.session_uid, scene_check.settings_key(root)
         reader = ThreadPoolExecutor(1, "lodgs-check")
         try:
             reading = reader.submit(scene_check.read_findings(root))
@@ -35,7 +39,9 @@ class LODGS_OT_check_scene(SceneOperator, SteppedOperator, bpy.types.Operator):
         finally:
             reader.shutdown(wait=False)
         self._findings = reading.result()
-        scene_check.store_findings(uid, self._findings)
+        root = root_by_uid(uid)
+        if root is not None:  # undo may have replaced it
+            scene_check.store_findings(root, key, self._findings)
         extension.redraw()
 
     def status_text(self, context, count):

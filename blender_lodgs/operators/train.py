@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor, wait
+from pathlib import Path
 
 import bpy
 
@@ -190,10 +191,31 @@ class LODGS_OT_show_costs(SceneOperator, bpy.types.Operator):
             raise LodgsError(
                 "Cannot show the cost curve: the open run has none.", "Open the run of these levels."
             )
-        image = bpy.data.images.load(str(plot), check_existing=True)
-        image.reload()  # a running training updates the plot
-        show_image(context, image)
+        _show_file(context, plot)
         return {"FINISHED"}
+
+
+class LODGS_OT_show_levels(SceneOperator, bpy.types.Operator):
+    bl_idname = "lodgs.show_levels"
+    bl_label = "Show Image of Levels"
+    bl_description = "Show all levels of the finished run from a held-out view in an Image Editor"
+
+    @report_errors
+    def execute(self, context):
+        sheet = run_folders.level_sheet(roots.active_root(context))
+        if sheet is None:
+            raise LodgsError(
+                "Cannot show the levels: the open run has no image of them.", "Finish the training first."
+            )
+        _show_file(context, sheet)
+        return {"FINISHED"}
+
+
+def _show_file(context: bpy.types.Context, path: Path) -> None:
+    """Show an image file, read anew: a training may have replaced it."""
+    image = bpy.data.images.load(str(path), check_existing=True)
+    image.reload()
+    show_image(context, image)
 
 
 CLASSES = (
@@ -206,4 +228,5 @@ CLASSES = (
     LODGS_OT_open_run,
     LODGS_OT_show_log,
     LODGS_OT_show_costs,
+    LODGS_OT_show_levels,
 )

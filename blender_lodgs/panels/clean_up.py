@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
-from ..data import cleaning, crops, roots
-from ..data.cleanup_tests import HIDE_TESTS
-from .parts import LevelsPanel, say
+import bpy
+
+from ...training.editing.clutter import KINDS
+from ..data import cleaning, clutter, crops, roots
+from ..data.cleanup_tests import CLUTTER_TESTS, HIDE_TESTS, limit_property
+from .parts import LevelsPanel, say, split_column
+
+_ICONS = {
+    "orange": "COLLECTION_COLOR_02", "yellow": "COLLECTION_COLOR_03", "pink": "COLLECTION_COLOR_07",
+    "violet": "COLLECTION_COLOR_06", "red": "COLLECTION_COLOR_01",
+}  # fmt: skip
+"""Icons by colour of clutter."""
 
 
 class LODGS_PT_clean_up(LevelsPanel):
@@ -26,9 +35,9 @@ class LODGS_PT_clean_up(LevelsPanel):
             row.prop(crop.lodgs_crop, "keep", text="")
             row.operator("lodgs.remove_crop", text="", icon="X").name = crop.name
 
+        _draw_clutter(layout, root)
         layout.label(text="Select in All Levels")
         column, brush = layout.column(align=True), context.scene.lodgs_brush
-        column.operator("lodgs.find_clutter", icon="VIEWZOOM")
         row = column.row(align=True)
         row.enabled = context.mode == "OBJECT"
         for name, tool in (("Brush", "lodgs.brush"), ("Lasso", "lodgs.lasso")):
@@ -57,6 +66,33 @@ class LODGS_PT_clean_up(LevelsPanel):
         column = layout.column(align=True)
         column.operator("lodgs.show_hidden_splats", text="Show All Hidden")
         column.operator("lodgs.delete_left_out", text="Delete Hidden", icon="TRASH")
+
+
+def _draw_clutter(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:
+    """Draw the preview of clutter: colour, count and limits of each kind, and the buttons that end it."""
+    settings = root.lodgs_clutter
+    if not settings.preview:
+        layout.operator("lodgs.find_clutter", icon="VIEWZOOM")
+        return
+    counts = clutter.counts(root)
+    if counts is None:
+        clutter.refresh_later()
+    box = layout.box()
+    for test in CLUTTER_TESTS:
+        used = getattr(settings, clutter.use_property(test))
+        row = box.row()
+        row.prop(settings, clutter.use_property(test))
+        count = row.row()
+        count.alignment = "RIGHT"
+        text = f"{counts[test.identifier]:,}" if used and counts is not None else ""
+        count.label(text=text, icon=_ICONS[KINDS[test.kind].tint])
+        if used:
+            column = split_column(box, align=True)
+            for name in test.limits:
+                column.prop(settings, limit_property(name))
+    row = box.row(align=True)
+    row.operator("lodgs.hide_clutter", text=f"Hide {clutter.total(root):,}", icon="HIDE_ON")
+    row.operator("lodgs.cancel_clutter", text="Keep", icon="X")
 
 
 CLASSES = (LODGS_PT_clean_up,)

@@ -11,7 +11,7 @@ from ..runs import run_folders
 OPERATORS = (
     ("lodgs.check_scene", "lodgs.train", "lodgs.resume_training", "lodgs.cancel_training", "lodgs.open_run",
      "lodgs.add_region", "lodgs.plan_cells", "lodgs.submit_to_flamenco", "lodgs.show_log",
-     "lodgs.show_costs", "lodgs.reduce_detail"),
+     "lodgs.show_costs", "lodgs.show_levels", "lodgs.reduce_detail"),
     ("lodgs.look_through", "lodgs.compare_view", "lodgs.compare_worst", "lodgs.measure_views",
      "lodgs.cancel_measuring", "lodgs.compare_methods"),
     ("lodgs.use_engine", "lodgs.render_quick", "lodgs.combine_with_meshes", "lodgs.separate_meshes",

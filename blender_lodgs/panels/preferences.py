@@ -51,12 +51,19 @@ class LodgsPreferences(bpy.types.AddonPreferences):
         "without a render farm",
     )
 
+    notices: bpy.props.BoolProperty(
+        name="System Notices",
+        description="Show a notice of the operating system when a training ends; never in background mode",
+        default=False,
+    )
+
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
         layout.use_property_split = True
         layout.prop(self, "python")
         layout.prop(self, "backend")
         layout.prop(self, "flamenco")
+        layout.prop(self, "notices")
         draw_environment(layout)
         layout.operator("lodgs.check_environment", icon="CHECKMARK")
         report = environment.report

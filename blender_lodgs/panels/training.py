@@ -18,7 +18,7 @@ from ..data.training import (
     level_distances,
     panel_parameters,
 )
-from ..runs import environment, job_settings, run_folders
+from ..runs import environment, job_settings, run_folders, scene_check
 from ..runs.messages import measured_on, progress_facts, short_level_line
 from ..runs.watch import Watch, watch_of
 from .parts import Panel, draw_environment, draw_views, say, scene_length, split_column
@@ -146,10 +146,16 @@ def _draw_choices(
     if not bpy.data.is_saved and not settings.output:
         text = f"This file is not saved. The run is written to {run_folders.runs_parent(root)}."
         say(layout, text, "INFO")
+    estimate = scene_check.last_estimate(root)
+    for number, line in enumerate(estimate):
+        say(layout, line, "INFO" if number else "TIME")
+    row = layout.row(align=True)
     if resumable:
-        layout.operator("lodgs.train", text="Train Again", icon="FILE_REFRESH")
+        row.operator("lodgs.train", text="Train Again", icon="FILE_REFRESH")
     else:
-        layout.operator("lodgs.train", text="Train", icon="PLAY")
+        row.operator("lodgs.train", text="Train", icon="PLAY")
+    if root.lodgs.scene_folder and not estimate:
+        row.operator("lodgs.check_scene", text="", icon="TIME")
 
 
 def _draw_views(column: bpy.types.UILayout, context: bpy.types.Context, root: bpy.types.Object) -> None:
@@ -164,7 +170,10 @@ def _draw_views(column: bpy.types.UILayout, context: bpy.types.Context, root: bp
             say(column, str(error), "ERROR")
             return
         near, far = (scene_length(context, root, radius) for radius in radii)
-        say(column, f"Half the views are {near} from the centre of the splats, half {far}.", "INFO")
+        text = (
+            f"Half the views are {near} or {far} from the centre of the splats, half close to their surface."
+        )
+        say(column, text, "INFO")
 
 
 def _draw_parameter(layout: bpy.types.UILayout, group: bpy.types.PropertyGroup, name: str) -> None:
@@ -229,6 +238,8 @@ def _draw_ended(layout: bpy.types.UILayout, watch: Watch, root: bpy.types.Object
         load.directory = str(watch.folder.path)
     for line in summary_lines(watch.summary):
         say(box, line, "BLANK1")
+    if watch.folder.sheet.is_file():
+        box.operator("lodgs.show_levels", icon="IMAGE_DATA")
     if watch.problem:
         say(box, watch.problem, "ERROR")
     for warning in watch.warnings[-3:]:

@@ -57,6 +57,11 @@ class LODGS_PT_viewport(Panel):
             layout.label(text=_budget_text(*counts), icon="INFO")
 
 
+def _header_text(drawn: int, full: int) -> str:
+    """Return the number of drawn splats so that it fits into the header of a small window."""
+    return f"Budget: {short_count(drawn)} of {short_count(full)}"
+
+
 def _budget_text(drawn: int, full: int) -> str:
     """Return the number of drawn splats, for example "1.2 M of 3.0 M splats (budget)"."""
     return f"{short_count(drawn)} of {short_count(full)} splats (budget)"
@@ -68,7 +73,7 @@ def _header(self, context):
     regions = [region for region in context.area.regions if region.type == "WINDOW"]
     counts = views.reduced_counts(regions[-1]) if regions else None
     if settings.splats and not settings.native and counts:
-        self.layout.label(text=_budget_text(*counts), icon="INFO")
+        self.layout.label(text=_header_text(*counts))
 
 
 def _legend(layout: bpy.types.UILayout, numbers: list[int]) -> None:

@@ -9,12 +9,12 @@ from pathlib import Path
 import bpy
 
 from ...training.errors import LodgsError, system_reason
+from ...training.evaluate.messages import format_duration
 from ...training.scenes.rendered_views import CAMERAS
 from .. import extension
 from ..data import viewpoints
 from ..data.paths import absolute_path, save_file
 from . import environment, processes
-from .messages import format_duration
 
 
 class BackgroundCapture:

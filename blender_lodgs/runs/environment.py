@@ -93,7 +93,7 @@ def check(python: Path) -> EnvironmentReport:
     """Check whether a Python can train (``python -m training check``). Takes about half a second."""
     report = EnvironmentReport(str(python))
     try:
-        process = _run(python, "-m", "training", "check")
+        process = run_module(python, "check")
         answer = json.loads(process.stdout.strip().splitlines()[-1])
         report.problems = [str(problem) for problem in answer.pop("problems")]
         report.versions = {k: v for k, v in answer.items() if isinstance(v, str)}
@@ -149,7 +149,7 @@ def check_current() -> EnvironmentReport:
 def _add_devices(report: EnvironmentReport) -> None:
     """Add the devices that train (``python -m training devices --json``). Takes some seconds."""
     with suppress(OSError, ValueError, IndexError, AttributeError, subprocess.TimeoutExpired):
-        process = _run(Path(report.python), "-m", "training", "devices", "--json")
+        process = run_module(Path(report.python), "devices", "--json")
         answer = json.loads(process.stdout.strip().splitlines()[-1])
         report.graphics = str(answer.get("graphics", ""))
         report.devices = str(answer.get("sentence", ""))
@@ -162,7 +162,16 @@ def python_of(environment: Path) -> Path:
     return environment / "bin" / "python"
 
 
-def _run(python: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+def run_module(python: Path, *arguments: str, timeout: float = TIMEOUT) -> subprocess.CompletedProcess[str]:
+    """Run a command of the trainer and return its output.
+
+    Raises:
+        OSError, subprocess.TimeoutExpired: the program does not start, or does not end in time.
+    """
+    return _run(python, "-m", "training", *arguments, timeout=timeout)
+
+
+def _run(python: Path, *arguments: str, timeout: float = TIMEOUT) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [str(python), *arguments],
         cwd=extension.FOLDER,
@@ -172,7 +181,7 @@ def _run(python: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
         text=True,
         encoding="utf-8",
         errors="replace",
-        timeout=TIMEOUT,
+        timeout=timeout,
         check=False,
         creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
     )

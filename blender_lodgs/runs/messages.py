@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from ...training.evaluate.messages import format_duration
+
 
 def progress_facts(progress: dict) -> dict[str, str]:
     """Return the figures of a ``progress`` event by label. An empty event gives no figures."""
@@ -44,11 +46,3 @@ def measured_on(event: dict) -> str:
 
 
 _MEASURED = {"held-out views": "psnr", "training views": "train_psnr"}
-
-
-def format_duration(seconds: float) -> str:
-    """Format seconds for reading: 40 s, 3 min, 2 h 05 min."""
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    minutes = round(seconds / 60)
-    return f"{minutes} min" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02d} min"

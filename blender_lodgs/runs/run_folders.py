@@ -49,6 +49,12 @@ def cost_plot(root: bpy.types.Object) -> Path | None:
     return run.costs if run is not None and run.costs.is_file() else None
 
 
+def level_sheet(root: bpy.types.Object) -> Path | None:
+    """Return the image of all levels of the root's finished run, if it exists."""
+    run = automatic_run(root)
+    return run.sheet if run is not None and run.sheet.is_file() else None
+
+
 def log_text(root: bpy.types.Object) -> bpy.types.Text:
     """Return the last lines of the trainer's log as a text block.
 

@@ -1,22 +1,32 @@
-"""Check of scenes before training, and its last findings for the panel."""
+"""Check of scenes before training by the trainer, with an estimate of its costs; last findings for panels."""
 
 from __future__ import annotations
 
+import subprocess
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import bpy
 
 from ...training.errors import LodgsError
-from ...training.scenes.check import Finding, check_folder
+from ...training.runs.job import Job
+from ...training.scenes.check import ESTIMATE, SEVERITIES, Finding, check_folder
 from ..data.paths import absolute_path
+from . import environment, job_settings, run_folders
 
-_findings: dict[int, list[Finding]] = {}
-"""Findings by the session uid of the scene root."""
+TIMEOUT = 600.0
+"""Seconds after which a check is abandoned. The kernels may have to be compiled first."""
+
+_findings: dict[int, tuple[str, list[Finding]]] = {}
+"""Settings of the training and findings of the last check, by the session uid of the scene root."""
 
 
 def read_findings(root: bpy.types.Object) -> Callable[[], list[Finding]]:
-    """Return a function that checks the photos of a scene root. It does not use Blender's data.
+    """Return a function that checks the photos of a scene root and estimates the costs of training them.
+
+    It does not use Blender's data. Without a trainer, it only checks the photos.
 
     Raises:
         LodgsError: the root has no COLMAP folder.
@@ -28,14 +38,54 @@ def read_findings(root: bpy.types.Object) -> Callable[[], list[Finding]]:
         absolute_path(path) if path else None
         for path in (settings.scene_folder, settings.training.model, settings.training.images)
     )
-    return partial(check_folder, folder, model, images, image_scale=settings.training.image_scale)
+    check = partial(check_folder, folder, model, images, image_scale=settings.training.image_scale)
+    try:
+        job = job_settings.make_job(root, run_folders.runs_parent(root) / "estimate", {})
+        return partial(_ask_trainer, environment.trainer_python(), job, check)
+    except LodgsError:
+        return check
 
 
-def store_findings(uid: int, findings: list[Finding]) -> None:
-    """Keep the findings about the scene root with a session uid for the panel."""
-    _findings[uid] = findings
+def _ask_trainer(python: Path, job: Job, check: Callable[[], list[Finding]]) -> list[Finding]:
+    """Run ``lodgs train --check`` and return the findings that it prints; without an answer, check here."""
+    with TemporaryDirectory(prefix="lodgs-") as folder:
+        file = Path(folder, "job.toml")
+        job.write(file)
+        try:
+            answer = environment.run_module(python, "train", str(file), "--check", timeout=TIMEOUT)
+        except (OSError, subprocess.TimeoutExpired):
+            answer = None
+    if answer is None or answer.returncode not in (0, 2):
+        return [*check(), Finding(ESTIMATE, "No estimate: the trainer did not answer.")]
+    lines = [line.partition(": ") for line in answer.stdout.splitlines()]
+    return [Finding(kind, text) for kind, _, text in lines if kind in (*SEVERITIES, ESTIMATE)]
+
+
+def store_findings(root: bpy.types.Object, key: str, findings: list[Finding]) -> None:
+    """Keep the findings about a scene root for the panels.
+
+    Args:
+        key: :func:`settings_key` at the start of the check.
+    """
+    _findings[root.session_uid] = key, findings
 
 
 def last_findings(root: bpy.types.Object) -> list[Finding] | None:
-    """Return the findings of the last check of a scene; None if it was not checked."""
-    return _findings.get(root.session_uid)
+    """Return the findings of the last check of a scene, without the estimate; None if it was not checked."""
+    _, findings = _findings.get(root.session_uid, ("", None))
+    return None if findings is None else [finding for finding in findings if finding.severity != ESTIMATE]
+
+
+def last_estimate(root: bpy.types.Object) -> list[str]:
+    """Return the estimate and suggestions for the current settings; none if they changed since the check."""
+    key, findings = _findings.get(root.session_uid, ("", []))
+    if key != settings_key(root):
+        return []
+    return [str(finding) for finding in findings if finding.severity == ESTIMATE]
+
+
+def settings_key(root: bpy.types.Object) -> str:
+    """Return a text that changes with the settings of the training."""
+    settings = root.lodgs.training
+    changed = sorted(job_settings.changed_parameters(settings).items())
+    return repr((settings.method, settings.preset, settings.image_scale, settings.start_from, changed))

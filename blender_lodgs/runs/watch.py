@@ -22,6 +22,7 @@ from ...training.splats.levels import Bundle, Level
 from ...training.splats.ply import read_ply
 from .. import extension
 from ..data import cells, importing, scenes
+from . import notices
 
 UNRESPONSIVE_AFTER = 60.0
 """Seconds without an event after which the panel reports that the trainer does not respond."""
@@ -147,6 +148,8 @@ class Watch:
                 return True
             if not alive:
                 self._set_end()
+                if self.process is not None:  # this Blender started it
+                    notices.notify(f"{root.name}: {self.problem or self.message}")
             if events or not alive:
                 extension.redraw()
         except Exception as error:

@@ -51,7 +51,7 @@ class Resident:
         starts, counts: first splat and number of splats of each cloud.
         higher: largest number of SH coefficients beyond the first, of whole degrees up to 4.
         store: splats on the graphics card; None before the first drawing.
-        selected: (N,) bool, see :meth:`update_selection`; None if no splat is selected.
+        marks: (N,) uint8, see ``cleaning.displayed_marks``; None if no splat is marked.
         painted: version and paint (N, 4) of each cloud at the last :meth:`update_paint`, by cloud number.
     """
 
@@ -60,7 +60,7 @@ class Resident:
     counts: list[int]
     higher: int
     store: Store | None = None
-    selected: np.ndarray | None = None
+    marks: np.ndarray | None = None
     painted: dict[int, tuple[changes.Version, np.ndarray | None]] = field(default_factory=dict)
     _selection: changes.Version | None = None
 
@@ -84,17 +84,17 @@ class Resident:
         self.store.keep(used)
         return self.store
 
-    def update_selection(self, clouds: Sequence[Cloud | None]) -> None:
-        """Update the selected splats if the selection has changed."""
+    def update_marks(self, clouds: Sequence[Cloud | None]) -> None:
+        """Update the marks if the displayed selection or clutter has changed."""
         version = changes.selection_version()
         if self._selection == version:
             return
         self._selection = version
-        selected = np.zeros(self.total, bool)
+        marks = np.zeros(self.total, np.uint8)
         for start, count, cloud in zip(self.starts, self.counts, clouds, strict=True):
             if isinstance(cloud, bpy.types.PointCloud) and len(cloud.points) == count:
-                selected[start : start + count] = cleaning.displayed_selection(cloud)
-        self.selected = selected if selected.any() else None
+                marks[start : start + count] = cleaning.displayed_marks(cloud)
+        self.marks = marks if marks.any() else None
 
     def update_paint(self, clouds: Sequence[Cloud | None]) -> None:
         """Upload paint that has changed since the last call."""

@@ -8,12 +8,13 @@ from typing import Any
 import gpu
 import numpy as np
 
+from ...training.editing.clutter import KINDS
 from ...training.lod.colors import LEVEL_COLORS
 from ...training.lod.crop import FACE_SQUARED
 from .arrangement import WIDTH
 
-SELECTED = (1.0, 0.45, 0.05)
-"""Colour of selected splats, sRGB."""
+MARK_COLORS = ((1.0, 0.45, 0.05), *(kind.color for kind in KINDS.values()), (0.5, 0.5, 0.5))
+"""Colours of marked splats, sRGB, see ``cleaning.displayed_marks``: selected ones, clutter, other splats."""
 
 MAX_TEXTURES = 8
 """Maximum number of textures for records: some drivers take long to create a single large one."""
@@ -90,7 +91,7 @@ void main()
   position_in_sigmas = vec2(0.0);
   color_opacity = vec4(0.0);
 
-  // slot, weight, placement, level for the colour (0: own colour, -1: selected)
+  // slot, weight, placement, level for the colour (0: own colour, below 0: mark)
   vec4 instance = texel(instances, gl_InstanceID);
   int slot = int(instance.x), row = int(instance.z) * 5;
   ivec2 record = ivec2(slot / part_size, slot % part_size * texels);
@@ -163,8 +164,8 @@ void main()
   vec3 color = max(look * view_color(record, base, normalize(mean.xyz * camera.w - camera.xyz)), 0.0);
   if (instance.w != 0.0) {  // keep the lightness to keep the scene readable
     float lightness = 0.35 + 0.65 * min(dot(color, vec3(1.0 / 3.0)), 1.0);
-    color = lightness * (instance.w < 0.0
-      ? SELECTED : texelFetch(palette, ivec2(int(instance.w - 1.0) % PALETTE, 0), 0).rgb);
+    int entry = instance.w < 0.0 ? PALETTE - 1 - int(instance.w) : int(instance.w - 1.0) % PALETTE;
+    color = lightness * texelFetch(palette, ivec2(entry, 0), 0).rgb;
   }
   color_opacity = vec4(color, opacity);
 }
@@ -289,13 +290,13 @@ def copy_shader() -> gpu.types.GPUShader:
 
 
 def palette() -> gpu.types.GPUTexture:
-    """Return the cached texture of level colours."""
+    """Return the cached texture of level colours and then of marks."""
 
     def create() -> gpu.types.GPUTexture:
-        colors = np.ones((len(LEVEL_COLORS), 4), np.float32)
-        colors[:, :3] = LEVEL_COLORS
+        colors = np.ones((len(LEVEL_COLORS) + len(MARK_COLORS), 4), np.float32)
+        colors[:, :3] = *LEVEL_COLORS, *MARK_COLORS
         data = gpu.types.Buffer("FLOAT", colors.size, colors.reshape(-1))
-        return gpu.types.GPUTexture((len(LEVEL_COLORS), 1), format="RGBA32F", data=data)
+        return gpu.types.GPUTexture((len(colors), 1), format="RGBA32F", data=data)
 
     return cached("palette", create)
 
@@ -332,7 +333,6 @@ def _splat_shader() -> gpu.types.GPUShader:
     info.define("WIDTH", str(WIDTH))
     info.define("PALETTE", str(len(LEVEL_COLORS)))
     info.define("FACE", repr(FACE_SQUARED))
-    info.define("SELECTED", f"vec3{SELECTED}")
     info.push_constant("MAT4", "projection")
     info.push_constant("VEC4", "frame")
     info.push_constant("VEC2", "size")

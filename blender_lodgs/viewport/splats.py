@@ -38,13 +38,13 @@ class UploadedSplats(Protocol):
 
 
 def instances_texture(
-    arrangement: Arrangement, slots: np.ndarray, selected: np.ndarray | None = None
+    arrangement: Arrangement, slots: np.ndarray, marks: np.ndarray | None = None
 ) -> tuple[gpu.types.GPUTexture, int]:
     """Upload the list of an arrangement's uploaded splats.
 
     Args:
         slots: see ``resident.Store``.
-        selected: see ``resident.Resident``; these splats get the selection colour.
+        marks: see ``resident.Resident``; marked splats get the colours of their marks.
 
     Returns:
         The texture, and the number of splats in it.
@@ -57,8 +57,10 @@ def instances_texture(
     table = np.frombuffer(data, np.float32).reshape(-1, 4)[: len(rows)]  # type: ignore[arg-type]
     table[:] = rows
     table[:, 0] = splat_slots[uploaded]
-    if selected is not None:
-        table[selected[arrangement.splats[uploaded]], 3] = -1
+    if marks is not None:
+        drawn = marks[arrangement.splats[uploaded]]
+        marked = drawn > 0
+        table[marked, 3] = -drawn[marked].astype(np.float32)
     return gpu.types.GPUTexture((WIDTH, height), format="RGBA32F", data=data), len(rows)
 
 

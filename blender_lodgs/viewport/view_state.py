@@ -44,8 +44,8 @@ class ViewState:
         moved: time of the last movement.
         arrived: number of updates of streams that the last requested arrangement contains.
         resolution: resolution of the splats relative to the viewport.
-        selected: drawn selection, see ``resident.Resident``.
-        shows_selection: draw selected splats in the selection colour.
+        marks: drawn marks, see ``resident.Resident``.
+        shows_marks: draw selected splats and previewed clutter in their colours.
         stated_counts: numbers of splats that header and panel state, see ``views.reduced_counts``.
     """
 
@@ -63,8 +63,8 @@ class ViewState:
     moved: float = 0.0
     arrived: int = 0
     resolution: float = 1.0
-    selected: np.ndarray | None = None
-    shows_selection: bool = False
+    marks: np.ndarray | None = None
+    shows_marks: bool = False
     stated_counts: tuple[int, int] | None = None
 
     def reset(self) -> None:
@@ -162,14 +162,12 @@ class ViewState:
     def list_instances(self) -> None:
         """Upload the list of drawn splats."""
         assert self.arrangement is not None and self.store is not None
-        self.selected = self.displayed_selection()
-        self.instances, self.count = splats.instances_texture(
-            self.arrangement, self.store.slots, self.selected
-        )
+        self.marks = self.displayed_marks()
+        self.instances, self.count = splats.instances_texture(self.arrangement, self.store.slots, self.marks)
 
-    def displayed_selection(self) -> np.ndarray | None:
-        """Return the selection mask to draw; None if it is hidden or empty."""
-        return self.resident.selected if self.resident is not None and self.shows_selection else None
+    def displayed_marks(self) -> np.ndarray | None:
+        """Return the marks to draw; None if they are hidden or there are none."""
+        return self.resident.marks if self.resident is not None and self.shows_marks else None
 
 
 active_views: weakref.WeakSet[ViewState] = weakref.WeakSet()

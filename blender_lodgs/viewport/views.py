@@ -74,7 +74,7 @@ def draw(context: bpy.types.Context) -> None:
     view.matrix = matrix
     settings = context.scene.lodgs_viewport
     view.resolution = settings.moving / 100 if now - view.moved < REST else 1.0
-    view.shows_selection = space.overlay.show_overlays
+    view.shows_marks = space.overlay.show_overlays
     camera = view_camera.active_camera(context)
     frame = splats.FULL_FRAME
     if camera is not None:
@@ -189,10 +189,10 @@ def prepare(
     is_requested = _arrange(view, source, request, wait, update)
     if view.arrived != NOT_REQUESTED:  # an older value makes the view redraw
         view.arrived = arrived if update and is_requested else previous_arrived
-    source.update_selection(clouds)
+    source.update_marks(clouds)
     source.update_paint(clouds)
     view.load(source, clouds, wait)
-    if view.arrangement is not None and view.selected is not view.displayed_selection():
+    if view.arrangement is not None and view.marks is not view.displayed_marks():
         view.list_instances()
     return request
 

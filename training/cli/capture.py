@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ..runs.job import DOME, KEYS
+from ..runs.job import AUTO, KEYS
 from ..settings import check_value
 from .options import BACKEND_HELP, SOURCE_HELP, add_setting, warn
 
@@ -16,7 +16,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, help="new folder for the scene")
     parser.add_argument(
         "--cameras", type=Path, metavar="DIR",
-        help="folder of camera files (*.json) to render (default: cameras all around)",
+        help="folder of camera files (*.json) to render (default: cameras of the source, else all around and "
+        "close to the surface)",
     )  # fmt: skip
     for name in ("views", "view_width"):
         add_setting(parser, KEYS[name], KEYS[name].default)
@@ -30,7 +31,7 @@ def run(options: argparse.Namespace) -> int:
     for name in ("views", "view_width"):
         check_value(KEYS[name], getattr(options, name))
     views, points = capture(
-        options.source, options.out, options.cameras or DOME, options.views, options.view_width,
+        options.source, options.out, options.cameras or AUTO, options.views, options.view_width,
         backend=options.backend, warn=warn,
     )  # fmt: skip
     print(f"{options.out}: {views} views, {points:,} points")

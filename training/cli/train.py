@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import LodgsError
+from ..scenes.check import ERROR, ESTIMATE, INFO, Finding
 from . import check
 from .job_options import add_options, job_from_options
 
@@ -23,8 +24,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_options(parser)
     parser.add_argument(
         "--check", action="store_true",
-        help="check the scene instead, and print findings that lower the quality, with their remedies; "
-        "exit code 2 if training is impossible",
+        help="check the scene instead, and print findings that lower the quality, with their remedies, and "
+        "the expected time, memory and disk space; exit code 2 if training is impossible",
     )  # fmt: skip
 
 
@@ -37,7 +38,7 @@ def run(options: argparse.Namespace) -> int:
 
 def check_job(options: argparse.Namespace) -> int:
     """Print the findings about the scene of a job and return the exit code."""
-    from ..scenes.check import ERROR, INFO, check_folder
+    from ..scenes.check import check_folder
 
     if not (options.job and options.job.is_file()):
         vars(options).setdefault("out", "run")  # nothing is written
@@ -50,8 +51,22 @@ def check_job(options: argparse.Namespace) -> int:
     for finding in findings:
         print(f"{finding.severity}: {finding}")
     if all(finding.severity == INFO for finding in findings):
-        print("Nothing found that lowers the quality.")
-    return 2 if any(finding.severity == ERROR for finding in findings) else 0
+        print("Nothing found that lowers the quality.", flush=True)
+    if any(finding.severity == ERROR for finding in findings):
+        return 2
+    for finding in estimate_lines(job):
+        print(f"{finding.severity}: {finding}")
+    return 0
+
+
+def estimate_lines(job: Job) -> list[Finding]:
+    """Return the expected costs of a job, if this Python can train."""
+    problems = check.environment()["problems"]
+    if problems:
+        return [Finding(ESTIMATE, f"No estimate: {problems[0]}", check.INSTALL)]
+    from ..runs.estimate import estimate_findings
+
+    return estimate_findings(job)
 
 
 def train_job(make_job: Callable[[], Job], **placement: Any) -> int:

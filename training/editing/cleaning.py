@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import inf
+from typing import Any
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from ..settings import setting, settings_of
 from ..splats.gaussians import SplatRows, Splats
 from ..splats.levels import Bundle, Level
 from ..splats.ply import Columns, read_batches
+from .clutter import HALO_OPACITY, SceneSubject, subject_of
 
 MAX_FLOATER_SHARE = 0.001
 """Clusters with at most this fraction of all splats are floaters."""
@@ -115,10 +117,17 @@ class Cleaning:
     Attributes:
         crops: see ``crop.crop_mask``.
         cameras: cameras in the splats' space.
+        subject: subject of the scene; None: :func:`.clutter.subject_of` the bundle.
     """
 
     crops: tuple[Crop, ...] = ()
     cameras: tuple[Camera, ...] = ()
+    subject: SceneSubject | None = None
+    clutter: bool = setting(
+        False,
+        "Match all kinds of clutter around the subject, with limits that suit its size: large splats, halos, "
+        "floaters, distant splats. A distant background and the ground's underside stay.",
+    )
     max_size: float = setting(
         inf,
         "Match splats whose largest standard deviation exceeds this.",
@@ -131,6 +140,20 @@ class Cleaning:
         inf,
         "Match splats farther than this from every camera.",
         label="Distance", unit="length", start=10.0,
+    )  # fmt: skip
+    max_reach: float = setting(
+        inf,
+        "Match splats farther than this from the centre of the subject.",
+        label="Distance", unit="length", start=10.0,
+    )  # fmt: skip
+    halo_opacity: float = setting(
+        0.0, "Match large splats near the subject that are less opaque than this.",
+        label="Opacity", high=1, start=HALO_OPACITY,
+    )  # fmt: skip
+    min_depth: float = setting(
+        inf,
+        "Match splats deeper than this below the detected ground.",
+        label="Depth", unit="length", start=1.0,
     )  # fmt: skip
     min_views: int = setting(
         0, "Match splats inside the frames of fewer cameras than this.", label="Views", start=3
@@ -159,15 +182,42 @@ class Cleaning:
         with np.errstate(over="ignore"):
             if self.max_size < inf:
                 masks["max_size"] = find_large(np.exp(splats.log_scales), self.max_size)
+                if self.clutter and self.subject is not None:
+                    masks["max_size"] &= self.subject.near(splats.means)
             if self.min_opacity > 0:
-                opacities = 1 / (1 + np.exp(-splats.opacity_logits))
-                masks["min_opacity"] = find_faint(opacities, self.min_opacity)
+                masks["min_opacity"] = find_faint(_opacities(splats), self.min_opacity)
+            if self.halo_opacity > 0 and self.subject is not None:
+                masks["halo_opacity"] = self.subject.find_halos(
+                    splats.means, np.exp(splats.log_scales), _opacities(splats), self.halo_opacity
+                )
+        if self.max_reach < inf and self.subject is not None:
+            masks["max_reach"] = self.subject.distances(splats.means) > self.max_reach
+        if self.min_depth < inf and self.subject is not None:
+            masks["min_depth"] = self.subject.find_below(splats.means, self.min_depth)
         if self.max_distance < inf:
             positions = np.array([camera.center for camera in self.cameras])
             masks["max_distance"] = find_far(splats.means, positions, self.max_distance)
         if self.min_views > 0:
             masks["min_views"] = find_unseen(splats.means, self.cameras, self.min_views)
         return masks
+
+    def for_bundle(self, bundle: Bundle) -> Cleaning:
+        """Return the tests with the bundle's subject, and its limits for clutter, where they need them."""
+        needs = self.clutter or self.halo_opacity > 0 or min(self.max_reach, self.min_depth) < inf
+        if self.subject is not None or not needs:
+            return self
+        subject = subject_of(bundle)
+        values: dict[str, Any] = {}
+        if self.clutter:
+            limits = subject.limits() | {"min_depth": inf, "drop_floaters": True}
+            values = {
+                name: value for name, value in limits.items() if getattr(self, name) == LIMITS[name].default
+            }
+        return replace(self, subject=subject, **values)
+
+
+def _opacities(splats: Splats) -> np.ndarray:
+    return 1 / (1 + np.exp(-splats.opacity_logits))
 
 
 LIMITS = settings_of(Cleaning)
@@ -202,7 +252,8 @@ def clean_bundle(bundle: Bundle, cleaning: Cleaning) -> Bundle:
 
 
 def find_unwanted(bundle: Bundle, cleaning: Cleaning) -> Unwanted:
-    """Apply all tests to a bundle's splats, which are read once."""
+    """Apply all tests to a bundle's splats, which are read once; the finest level twice for clutter."""
+    cleaning = cleaning.for_bundle(bundle)
     related = resolve_rule(bundle.rule).relations
     matches: dict[str, dict[int, np.ndarray]] = {}
     remaining, means, columns = {}, {}, {}
@@ -225,6 +276,9 @@ def find_unwanted(bundle: Bundle, cleaning: Cleaning) -> Unwanted:
     if cleaning.drop_floaters:
         tested = {number: mask.copy() for number, mask in remaining.items()}
         exclude_floaters(remaining, means, relations, cleaning.gap, cleaning.share)
+        if cleaning.clutter and cleaning.subject is not None:
+            for number, mask in remaining.items():
+                mask |= tested[number] & ~cleaning.subject.near(means[number])
         matches["drop_floaters"] = {number: mask & ~remaining[number] for number, mask in tested.items()}
     testable = {name: relations.testable(masks) for name, masks in matches.items()}
     return Unwanted(testable, remaining, relations)

@@ -41,3 +41,11 @@ def summary_lines(measures: dict) -> list[str]:
     if lines and "worst" not in measures:
         lines.append(NOT_HELD_OUT)
     return lines
+
+
+def format_duration(seconds: float) -> str:
+    """Format seconds for reading: 40 s, 3 min, 2 h 05 min."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02d} min"

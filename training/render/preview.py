@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from ..editing.cleaning import Cleaning, find_unwanted
+from ..editing.clutter import KINDS, Kind
 from ..editing.edit import open_levels
 from ..errors import LodgsError
 from ..lod.rule import Masks
@@ -24,25 +24,6 @@ from ..splats.levels import Bundle, Level
 from ..splats.ply import read_batches
 from .command import draw_bundle
 from .image import write_image
-
-
-class Kind(NamedTuple):
-    """Splats that a test matches: their name in the singular, and their colour in the image."""
-
-    noun: str
-    tint: str
-    color: tuple[float, float, float]
-
-
-KINDS = {
-    "drop_floaters": Kind("floater", "orange", (1.0, 0.45, 0.0)),
-    "max_size": Kind("large splat", "yellow", (1.0, 0.95, 0.1)),
-    "min_opacity": Kind("faint splat", "cyan", (0.0, 0.9, 1.0)),
-    "max_distance": Kind("far splat", "magenta", (1.0, 0.1, 0.9)),
-    "min_views": Kind("rarely seen splat", "green", (0.2, 1.0, 0.2)),
-    "crops": Kind("cropped splat", "blue", (0.15, 0.35, 1.0)),
-}
-"""Kinds by test, see ``Cleaning.matches``. A splat of several kinds has the colour of the first."""
 
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 _GREY = 0.12, 0.55

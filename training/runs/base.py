@@ -10,7 +10,9 @@ import numpy as np
 from ..errors import LodgsError
 from ..lod.rule import Values
 from ..lod.selection import complete_splats, full_detail_controls, select
-from ..splats.bundle import open_bundle, read_bundle, read_header
+from ..scenes.cameras import Camera
+from ..scenes.view_tables import read_view_tables
+from ..splats.bundle import open_bundle, read_bundle, read_header, read_tables
 from ..splats.dialects import Warn, ignore
 from ..splats.file_rows import DrawableRows
 from ..splats.gaussians import SplatRows, Splats
@@ -62,6 +64,16 @@ def read_base_origin(path: str | Path) -> np.ndarray:
         LodgsError: as :func:`open_base`.
     """
     return read_origin(_base_file(Path(path)))
+
+
+def read_base_cameras(path: str | Path) -> tuple[list[Camera], float]:
+    """Return the cameras that a base has in its tables, and their near depth; none in most PLY files.
+
+    Raises:
+        LodgsError: as :func:`open_base`.
+    """
+    path = _base_file(Path(path))
+    return ([], 0.0) if path.is_dir() else read_view_tables(read_tables(path))[:2]
 
 
 def base_origin(job: Job) -> np.ndarray | None:

@@ -13,16 +13,16 @@ from PIL import Image
 
 from ..errors import LodgsError, system_reason
 from ..rasterize import Gaussians, cpu_fallback_reason, rasterize
-from ..scenes.cameras import Camera, read_camera_folder
+from ..scenes.cameras import Camera, pick_evenly, read_camera_folder
 from ..scenes.colmap import read_scene
 from ..scenes.images import check_image
-from ..scenes.viewpoints import dome_views
+from ..scenes.viewpoints import opaque_means, surrounding_views
 from ..scenes.write_colmap import write_visible_points
 from ..splats.dialects import Warn, ignore
 from ..splats.gaussians import Splats
 from ..splats.origin import NO_ORIGIN
-from .base import read_base, read_base_origin
-from .job import DOME
+from .base import read_base, read_base_cameras, read_base_origin
+from .job import AUTO, DOME, MIN_VIEWS
 
 POINTS = 60_000
 """Approximate number of points in a captured scene, including those that only one view sees."""
@@ -47,8 +47,8 @@ def capture(
     Args:
         base: splats that ``read_base`` reads.
         scene: new folder.
-        source: DOME, or a folder of camera files.
-        views, width: number of views of a dome, and their image width in pixels.
+        source: AUTO (the base's own cameras, else as DOME), DOME, or a folder of camera files.
+        views, width: maximum number of views without camera files, and their image width in pixels.
         backend: rasterizer.
         report, warn: as for :func:`write_scene` and ``read_base``.
 
@@ -62,14 +62,21 @@ def capture(
         warn(problem)
     splats, antialias = read_base(base, warn)
     origin = read_base_origin(base)
-    if source == DOME:
-        cameras, near = dome_views(splats, views, width, round(width * 2 / 3))
-    else:
+    cameras, near = _own_cameras(base, views, width) if source == AUTO else ([], 0.0)
+    if len(cameras) < MIN_VIEWS and source in (AUTO, DOME):
+        cameras, near = surrounding_views(opaque_means(splats), views, width, round(width * 2 / 3))
+    elif source != AUTO:
         cameras, near = read_camera_folder(Path(source))
         cameras = [camera.moved(-origin) for camera in cameras]
     return len(cameras), write_scene(
         scene, splats, cameras, near, backend=backend, antialias=antialias, report=report, origin=origin
     )
+
+
+def _own_cameras(base: str | Path, count: int, width: int) -> tuple[list[Camera], float]:
+    """Return at most ``count`` evenly spaced cameras that a base has in its tables, and their near depth."""
+    cameras, near = read_base_cameras(base)
+    return [camera.scaled(width / camera.width) for camera in pick_evenly(cameras, count)], near
 
 
 def write_scene(

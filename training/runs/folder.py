@@ -1,6 +1,7 @@
 """Run folders: paths, state and events, readable at any time. Imports no torch: Blender polls runs.
 
     run/  job.toml  events.jsonl  checkpoints/  levels/level_1.ply ..  bundle.ply  metrics.json
+          levels.png (image of all levels from a held-out view)
           costs.png (plot of the costs measured to choose the levels' distances)
           model.npz (networks of a method that has them)
           views.json (views and photo sizes with which the run began)
@@ -54,6 +55,7 @@ class RunFolder:
         self.metrics = self.path / "metrics.json"
         self.model = self.path / "model.npz"
         self.costs = self.path / "costs.png"
+        self.sheet = self.path / "levels.png"
         self.log = self.path / "trainer.log"
         self.output = self.path / "trainer.out"
         self.views = self.path / "views.json"

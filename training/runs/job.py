@@ -17,7 +17,7 @@ from ..settings import check_value, setting, settings_of
 from .folder import RunFolder
 
 BACKENDS = ("auto", "cpu", "cuda", "gpu", "reference")
-DOME = "dome"
+AUTO, DOME = "auto", "dome"
 """Value of ``capture`` for views from all directions."""
 MIN_VIEWS = 2
 """Minimum number of views to train on."""
@@ -60,11 +60,11 @@ class Job:
     )
     capture: str = setting(
         "",
-        "Views of the base to render and to train on instead of a scene: dome (from all sides), or a folder "
-        "of camera files.",
+        "Views of the base to render and to train on instead of a scene: auto (the base's own cameras, else "
+        "as dome), dome (from all sides and close to the surface), or a folder of camera files.",
         path="folder",
-        metavar="dome|DIR",
-        unless=lambda text: text == DOME,
+        metavar="auto|dome|DIR",
+        unless=lambda text: text in (AUTO, DOME),
     )
     views: int = setting(64, "Number of views to render.", low=MIN_VIEWS, high=2000)
     view_width: int = setting(
@@ -317,7 +317,7 @@ class Job:
         if Path(self.out) == path.parent:
             values["out"] = "."
             for key in ("base", "capture", "region"):
-                if values[key] != DOME and path.parent in Path(values[key]).parents:
+                if values[key] not in (AUTO, DOME) and path.parent in Path(values[key]).parents:
                     values[key] = f"./{Path(values[key]).relative_to(path.parent).as_posix()}"
             if self.cell and Path(self.base).parent == path.parent.parent:  # both belong to one run
                 values["base"] = f"../{Path(self.base).name}"

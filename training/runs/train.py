@@ -20,6 +20,7 @@ import torch
 from .. import VERSION
 from ..errors import LodgsError
 from ..evaluate.costs import cost_curves, write_cost_plot
+from ..evaluate.level_sheet import write_level_sheet
 from ..evaluate.metrics import psnr
 from ..evaluate.summary import summarize
 from ..evaluate.views import Evaluation
@@ -171,6 +172,9 @@ def _report_done(
     seconds = round(time.monotonic() - started, 1)
     events("status", message="Measuring the result")
     measures = summarize(evaluation, bundle)
+    middle = evaluation.cameras[len(evaluation.cameras) // 2]
+    controls = resolve_controls(bundle, {}) if find_rule(bundle.rule) else {}
+    write_level_sheet(folder.sheet, bundle, evaluation, middle, controls)
     events("done", bundle=folder.bundle.name, seconds=seconds, memory=peak_memory(), **measures)
 
 

@@ -25,6 +25,8 @@ MIN_SHARED = 20
 WEAK_SHARE = 0.2
 """Share of a scene with weak evidence that is worth a warning."""
 ERROR, WARNING, INFO = SEVERITIES = "error", "warning", "info"
+ESTIMATE = "estimate"
+"""Severity of the expected costs and of suggested settings, see ``runs.estimate``."""
 
 
 class Finding(NamedTuple):

@@ -14,6 +14,14 @@ OPAQUE = 0.5
 """Minimum opacity of the splats that determine the views."""
 DOMES = (1.1, 2.2)
 """Radii of the dome's two shells, in multiples of the distance at which the splats fill the image."""
+CLOSE = (0.25, 0.5, 1.0)
+"""Distances of close views from the splats' surface, in multiples of the diameter of the ball around them."""
+CLOSE_SAMPLE, DIRECTIONS = 5000, 64
+"""Number of splats and of directions from which the free view of a close camera is found."""
+CLOSE_ELEVATIONS = -0.2, 0.9
+"""Sines of the lowest and highest elevation of a close camera above its target."""
+CONE = 0.1
+"""Splats within this fraction of their depth from the axis of a close view hide its target."""
 UP = (0.0, -1.0, 0.0)
 """Up direction of most COLMAP worlds."""
 NEAR_SHARE = 0.01
@@ -31,13 +39,62 @@ TURNS = (0, 60, -60, 180, 120, -120)
 def dome_views(splats: Splats, count: int, width: int = 960, height: int = 640) -> tuple[list[Camera], float]:
     """Return views of splats from all directions on two shells, and their near depth.
 
-    The up direction is assumed, and the views look from outside. For a room or a street, use a path or custom
-    cameras.
+    The up direction is assumed, and the views look from outside.
 
     Raises:
         LodgsError: there is no opaque splat.
     """
     return dome_views_around(opaque_means(splats), count, width, height)
+
+
+def surrounding_views(
+    points: np.ndarray, count: int, width: int = 960, height: int = 640
+) -> tuple[list[Camera], float]:
+    """Return views of points (N, 3) float64 without cameras, and their near depth.
+
+    Half of them are on a dome (:func:`dome_views_around`); the others are close to the surface, also inside
+    (:func:`close_views`). The up direction is assumed.
+
+    Raises:
+        LodgsError: there is no point.
+    """
+    around, near = dome_views_around(points, count - count // 2, width, height)
+    return around + close_views(points, count // 2, width, height), near
+
+
+def close_views(points: np.ndarray, count: int, width: int = 960, height: int = 640) -> list[Camera]:
+    """Return views that look at points (N, 3) from the distances CLOSE in turn, where few points hide them.
+
+    Of free directions, they take outward and inward ones in turn, so that some are inside rooms. Without
+    such views, levels would lose the detail of surfaces that a camera approaches.
+    """
+    rng = np.random.default_rng(0)
+    middle = np.median(points, axis=0)
+    distances = np.linalg.norm(points - middle, axis=1)
+    radius = max(float(np.quantile(distances, INSIDE)), 1e-6)
+    inner = points[distances <= radius]
+    sample = inner[rng.choice(len(inner), min(len(inner), CLOSE_SAMPLE), replace=False)]
+    up = np.array(UP)
+    east = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    number = np.arange(DIRECTIONS)
+    low, high = CLOSE_ELEVATIONS
+    sine = low + (high - low) * (number + 0.5) / DIRECTIONS
+    azimuth = number * 2.399963  # golden angle: an even spiral
+    level = np.cos(azimuth)[:, None] * east + np.sin(azimuth)[:, None] * np.cross(up, east)
+    directions = sine[:, None] * up + np.sqrt(1 - sine**2)[:, None] * level
+    lens, views = _lens(width, height), []
+    for number, target in enumerate(sample[rng.integers(len(sample), size=count)]):
+        distance = 2 * radius * CLOSE[number % len(CLOSE)]
+        offsets = sample - target
+        along = offsets @ directions.T
+        aside = np.einsum("ij,ij->i", offsets, offsets)[:, None] - along**2
+        hides = (along > 0.1 * distance) & (along < 1.1 * distance) & (aside < (CONE * along) ** 2)
+        outward = directions @ (target - middle) / radius
+        side = 1 if number // len(CLOSE) % 2 == 0 else -1
+        direction = directions[(hides.sum(axis=0) - 0.1 * side * outward).argmin()]
+        pose = look_at(target + distance * direction, target, UP)
+        views.append(Camera(f"close_{number:04d}", *lens, pose))
+    return views
 
 
 def dome_views_around(

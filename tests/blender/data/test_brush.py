@@ -190,8 +190,8 @@ def test_selecting_is_no_change_of_the_splats_and_viewports_see_it(bpy, lodgs, s
     root, _ = scene_of(bundle_of("bands", np.random.default_rng(4)))
     clouds = [item.object.data for item in root.lodgs.levels]
     of, changes = lodgs("viewport.resident").read_pool(clouds), lodgs("data.changes")
-    of.update_selection(clouds)
-    assert of.selected is None
+    of.update_marks(clouds)
+    assert of.marks is None
     _, size = viewport
     stroke(bpy, (1, 1), radius=1)
     bpy.context.view_layer.update()
@@ -201,8 +201,8 @@ def test_selecting_is_no_change_of_the_splats_and_viewports_see_it(bpy, lodgs, s
     assert (
         versions == [changes.version(cloud) for cloud in clouds] and selection != changes.selection_version()
     )
-    of.update_selection(clouds)
-    np.testing.assert_array_equal(of.selected, np.concatenate(list(selected(lodgs, root).values())))
+    of.update_marks(clouds)
+    np.testing.assert_array_equal(of.marks, np.concatenate(list(selected(lodgs, root).values())))
 
 
 def test_strokes_ask_for_levels_and_tools_are_there(bpy, lodgs, viewport):

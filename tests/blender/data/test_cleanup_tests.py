@@ -9,7 +9,7 @@ from training.splats.bundle import write_bundle
 from training.splats.gaussians import Splats
 from training.splats.levels import Bundle, Level
 
-REST, OVERSIZED, DISTANT, FLOATERS, BELOW = 6000, 5, 6, 4, 8
+COUNTS = REST, OVERSIZED, DISTANT, FLOATERS, BELOW, HALOS = 6000, 5, 6, 4, 8, 3
 
 
 @pytest.fixture
@@ -21,13 +21,17 @@ def root(bpy, lodgs, tmp_path):
     parts = [
         ground, things, rng.uniform(0, 0.2, (OVERSIZED, 3)), np.full((DISTANT, 3), 1000.0),
         rng.normal((0, 0, 7), 0.01, (FLOATERS, 3)), rng.uniform(-3, 3, (BELOW, 3)) * (1, 1, 0) - (0, 0, 0.5),
+        rng.uniform(0, 0.2, (HALOS, 3)),
     ]  # fmt: skip
     means = np.concatenate(parts).astype(np.float32)
     means[:, 2] += 1
     log_scales = np.full((len(means), 3), -3, np.float32)
     log_scales[REST : REST + OVERSIZED, 1] = np.log(5)
+    log_scales[-HALOS:] = np.log(0.4)
     quats = np.tile(np.array([1, 0, 0, 0], np.float32), (len(means), 1))
-    splats = Splats(means, quats, log_scales, np.full(len(means), 4, np.float32), means[:, None] * 0)
+    logits = np.full(len(means), 4, np.float32)
+    logits[-HALOS:] = -3
+    splats = Splats(means, quats, log_scales, logits, means[:, None] * 0)
     write_bundle(tmp_path / "b.ply", Bundle("", [Level(1, splats), Level(2, splats)]))
     root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply", upright=False)
     root.scale = 2, 2, 2
@@ -38,49 +42,62 @@ def root(bpy, lodgs, tmp_path):
 def clutter_counts(bpy, lodgs, root):
     """Numbers of matching splats of level 1 by test, with suggested limits."""
     cleanup_tests = lodgs("data.cleanup_tests")
-    limits = SimpleNamespace(**cleanup_tests.suggest_clutter_limits(root))
+    limits = SimpleNamespace(gap=0.0, share=0.1, **cleanup_tests.suggest_clutter_limits(root))
     return {
         test.identifier: int(cleanup_tests.find_clutter(test, bpy.context, root, limits)[1].sum())
         for test in cleanup_tests.CLUTTER_TESTS
     }
 
 
-def test_every_kind_is_counted_selected_and_hidden(bpy, lodgs, root):
+def test_every_kind_is_counted_coloured_and_hidden(bpy, lodgs, root):
     isolated = FLOATERS + BELOW  # distant ones are not near the subject
-    expected = {"LARGE": OVERSIZED, "DISTANT": DISTANT, "FLOATERS": isolated, "BELOW": BELOW}
-    assert clutter_counts(bpy, lodgs, root) == expected
+    kinds = {"LARGE": OVERSIZED, "DISTANT": DISTANT, "FLOATERS": isolated, "BELOW": BELOW, "HALOS": HALOS}
+    assert clutter_counts(bpy, lodgs, root) == kinds
     assert bpy.ops.lodgs.find_clutter() == {"FINISHED"}
-    count = OVERSIZED + DISTANT + isolated
-    cleaning = lodgs("data.cleaning")
-    assert cleaning.count_selected(root) == {1: count, 2: count}
-    assert bpy.ops.lodgs.find_clutter(below=True, floaters=False) == {"FINISHED"}
-    assert cleaning.count_selected(root)[2] == OVERSIZED + DISTANT + BELOW
-    assert bpy.ops.lodgs.hide_splats(test="SELECTED") == {"FINISHED"}
-    hidden = np.flatnonzero(cleaning.hidden_mask(root.lodgs.levels[1].object.data))
-    begin = REST + OVERSIZED + DISTANT
-    expected = [*range(REST, begin), *range(begin + FLOATERS, begin + FLOATERS + BELOW)]
-    np.testing.assert_array_equal(hidden, expected)
+    cleaning, clutter = lodgs("data.cleaning"), lodgs("data.clutter")
+    del kinds["BELOW"]  # disabled at first
+    assert clutter.counts(root) == {name: 2 * count for name, count in kinds.items()}
+    cloud = root.lodgs.levels[1].object.data
+    marks = cleaning.displayed_marks(cloud)
+    names = ("", "max_size", "max_reach", "drop_floaters", "drop_floaters", "halo_opacity")
+    expected = np.repeat(list(map(cleaning.mark_of, names)), COUNTS)
+    np.testing.assert_array_equal(marks, expected)
+    root.lodgs_clutter.use_below, root.lodgs_clutter.use_floaters = True, False
+    assert cleaning.displayed_marks(cloud)[-HALOS - 1] == cleaning.mark_of("min_depth")
+    assert bpy.ops.lodgs.hide_clutter() == {"FINISHED"}
+    hidden = np.repeat([False, True, True, False, True, True], COUNTS)
+    np.testing.assert_array_equal(cleaning.hidden_mask(cloud), hidden)
+    assert not root.lodgs_clutter.preview and not cleaning.displayed_marks(cloud).any()
 
 
 def test_limits_are_lengths_in_the_world(bpy, lodgs, root):
-    """Splats 7 above the ground; the root doubles lengths."""
+    """Floaters 7 above the ground; the root doubles lengths."""
+    assert bpy.ops.lodgs.find_clutter() == {"FINISHED"}
     for reach, count in ((13, DISTANT + FLOATERS), (16, DISTANT)):
-        assert bpy.ops.lodgs.find_clutter(large=False, floaters=False, reach=reach) == {"FINISHED"}
-        assert lodgs("data.cleaning").count_selected(root)[2] == count
+        root.lodgs_clutter.reach = reach
+        assert lodgs("data.clutter").counts(root)["DISTANT"] == 2 * count
 
 
-def test_dialog_lists_the_counts(bpy, lodgs, root):
-    texts, operator = [], lodgs("operators.find_clutter").LODGS_OT_find_clutter
+def test_limits_of_the_user_stay_and_cancelling_hides_nothing(bpy, lodgs, root):
+    root.lodgs_clutter.size = 1000
+    assert bpy.ops.lodgs.find_clutter() == {"FINISHED"}
+    assert root.lodgs_clutter.size == 1000 and lodgs("data.clutter").counts(root)["LARGE"] == 0
+    assert bpy.ops.lodgs.cancel_clutter() == {"FINISHED"}
+    cloud = root.lodgs.levels[1].object.data
+    assert not lodgs("data.cleaning").displayed_marks(cloud).any()
+    assert not lodgs("data.cleaning").hidden_mask(cloud).any()
+    assert not bpy.ops.lodgs.hide_clutter.poll()
 
-    class Layout:
-        def __getattr__(self, name):
-            return lambda *args, **options: texts.append(options.get("text", "")) or self
 
-    tests = lodgs("data.cleanup_tests").CLUTTER_TESTS
-    values = {test.identifier.lower(): test.identifier != "BELOW" for test in tests}
-    counts = {f"{name}_count": 1234 for name in values}
-    operator.draw(SimpleNamespace(layout=Layout(), **values, **counts), bpy.context)
-    assert texts.count("1,234 splats") == 3
+def test_changed_splats_are_found_again(bpy, lodgs, root):
+    cleaning, clutter = lodgs("data.cleaning"), lodgs("data.clutter")
+    assert bpy.ops.lodgs.find_clutter() == {"FINISHED"}
+    bpy.ops.lodgs.hide_splats(test="LARGE", size=8.0)
+    bpy.context.view_layer.update()
+    assert clutter.counts(root) is None
+    clutter.refresh(bpy.context, root)
+    assert clutter.counts(root)["LARGE"] == 0
+    assert cleaning.displayed_marks(root.lodgs.levels[1].object.data)[REST] == cleaning.mark_of("")
 
 
 def test_scene_without_ground_has_nothing_below(bpy, lodgs, tmp_path):

@@ -1,5 +1,6 @@
 """The Scene, Compare, Viewport and Rendering panels."""
 
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -140,7 +141,36 @@ def test_panels_for_splats_are_hidden_until_a_scene_has_levels(bpy, lodgs):
     assert all(panel.poll(bpy.context) for panel in panels)
 
 
-def test_check_lists_its_findings(bpy, lodgs, root, draw_panel, tmp_path, capfd):
+def test_estimate_is_above_train_until_settings_change(bpy, lodgs, root, draw_panel, monkeypatch):
+    lines = "warning: Two photos are missing. Add them.\nestimate: About 3 min.\nestimate: Use draft.\n"
+    commands = []
+
+    def answer(python, *arguments, timeout):
+        commands.append((arguments[0], arguments[2], Path(arguments[1]).read_text()))
+        return SimpleNamespace(returncode=0, stdout=lines)
+
+    monkeypatch.setattr(lodgs("runs.environment"), "run_module", answer)
+    root.lodgs.training.image_scale = 0.25
+    draw_training = partial(draw_panel, "training", "LODGS_PT_training")
+    assert "lodgs.check_scene" in draw_training().operators
+    assert bpy.ops.lodgs.check_scene() == {"FINISHED"}
+    ((command, option, job),) = commands
+    assert (command, option) == ("train", "--check") and "image_scale = 0.25" in job
+    texts = " ".join(draw_training().texts)
+    assert "About 3 min." in texts and "Use draft." in texts
+    texts = " ".join(draw_panel("scene", "LODGS_PT_scene").texts)
+    assert "Two photos are missing. Add them." in texts and "About 3 min." not in texts
+    root.lodgs.training.preset = "standard"
+    assert "About 3 min." not in draw_training().texts and "lodgs.check_scene" in draw_training().operators
+
+
+def test_check_lists_its_findings(bpy, lodgs, root, draw_panel, tmp_path, monkeypatch):
+    environment, errors = lodgs("runs.environment"), lodgs("training.errors")
+
+    def no_trainer():
+        raise errors.LodgsError("No trainer.")
+
+    monkeypatch.setattr(environment, "trainer_python", no_trainer)
     assert "Nothing found that lowers the quality" not in draw_panel("scene", "LODGS_PT_scene").texts
     assert bpy.ops.lodgs.check_scene() == {"FINISHED"}
     assert "Nothing found that lowers the quality" in draw_panel("scene", "LODGS_PT_scene").texts

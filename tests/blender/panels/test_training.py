@@ -33,7 +33,7 @@ def watch(lodgs, root, tmp_path):
 
 def test_settings_before_training(root, draw, fake):
     layout = draw()
-    assert (layout.operators, layout.buttons) == (["lodgs.train"], ["Train"])
+    assert (layout.operators, layout.buttons) == (["lodgs.train", "lodgs.check_scene"], ["Train", ""])
     assert layout.properties == ["method", "preset", "image_scale"]
     assert "3,450 steps in 5 levels" in layout.texts
     assert NONE_HELD_OUT in layout.texts
@@ -53,7 +53,7 @@ def test_flamenco_is_offered_if_the_preferences_name_a_manager(lodgs, root, draw
     preferences = lodgs("extension").preferences()
     preferences.flamenco = "http://farm:8080"
     try:
-        assert draw().operators == ["lodgs.train", "lodgs.submit_to_flamenco"]
+        assert draw().operators == ["lodgs.train", "lodgs.check_scene", "lodgs.submit_to_flamenco"]
         root.lodgs.scene_folder = ""
         assert "lodgs.submit_to_flamenco" not in draw().operators
     finally:
@@ -206,12 +206,12 @@ def test_results_after_training(bpy, lodgs, root, draw, watch, fake):
     layout = draw()
     first = "Level 1: 1,234 splats, 20.0 dB"
     assert {"Finished", "Quality on held-out views", first, "Level 2: 5 splats"} <= set(layout.texts)
-    assert layout.operators == ["lodgs.train"]
+    assert layout.operators == ["lodgs.train", "lodgs.check_scene"]
     bpy.data.objects.remove(root.lodgs.levels[0].object)
     layout = draw()
     assert first not in layout.texts and "Level 2: 5 splats" in layout.texts
     assert "Levels not loaded: 1" in layout.texts
-    assert layout.operators == ["lodgs.open_run", "lodgs.train"]
+    assert layout.operators == ["lodgs.open_run", "lodgs.train", "lodgs.check_scene"]
     lodgs("data.scenes").set_level(root, levels.Level(1, levels.NO_SPLATS))
     watch.summary = {
         "train_psnr": 35.8, "veil": {"mean": 0.1234, "max": 1.0}, "oversized": 1234,
@@ -237,8 +237,8 @@ def test_results_after_training(bpy, lodgs, root, draw, watch, fake):
     watch.state, watch.problem = "interrupted", "The trainer was killed."
     layout = draw()
     assert "The trainer was killed." in layout.texts
-    assert layout.operators == ["lodgs.resume_training", "lodgs.show_log", "lodgs.train"]
-    assert layout.buttons[-1] == "Train Again", "distinct from Resume"
+    assert layout.operators == ["lodgs.resume_training", "lodgs.show_log", "lodgs.train", "lodgs.check_scene"]
+    assert layout.buttons[-2] == "Train Again", "distinct from Resume"
 
 
 def test_an_unsaved_file_shows_the_folder_of_its_runs(bpy, root, draw, fake, tmp_path):
@@ -252,4 +252,4 @@ def test_an_unsaved_file_shows_the_folder_of_its_runs(bpy, root, draw, fake, tmp
 
 def test_a_previous_run_can_be_opened(root, draw, fake):
     root.lodgs.training.run = "/somewhere/run"
-    assert draw().operators == ["lodgs.open_run", "lodgs.train"]
+    assert draw().operators == ["lodgs.open_run", "lodgs.train", "lodgs.check_scene"]

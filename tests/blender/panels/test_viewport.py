@@ -66,8 +66,8 @@ def test_panel_and_header_state_what_the_budget_leaves(bpy, lodgs, viewport, dra
     text = "1.2 M of 3.0 M splats (budget)"
     assert text in draw_panel("viewport", "LODGS_PT_viewport").texts
     region = SimpleNamespace(type="WINDOW", as_pointer=lambda: 7)
-    layout = SimpleNamespace(label=lambda text, icon: texts.append(text))
-    for regions, expected in (([region], [text]), ([], [])):
+    layout = SimpleNamespace(label=lambda text: texts.append(text))
+    for regions, expected in (([region], ["Budget: 1.2 M of 3.0 M"]), ([], [])):
         texts = []
         context = SimpleNamespace(scene=bpy.context.scene, area=SimpleNamespace(regions=regions))
         lodgs("panels.viewport")._header(SimpleNamespace(layout=layout), context)

@@ -7,7 +7,7 @@ from PIL import Image
 from tests.training.conftest import write_tiny_scene
 from tests.training.lod.tree.trees import tree_of
 from training.__main__ import main
-from training.render.preview import KINDS
+from training.editing.clutter import KINDS
 from training.scenes.cameras import Camera, look_at
 from training.scenes.view_tables import make_view_tables
 from training.splats.bundle import read_bundle, write_bundle
@@ -143,6 +143,30 @@ def test_nodes_of_trees_do_not_count(tmp_path, monkeypatch, make_splats, capsys)
     assert edit("in.ply --preview out.png --crop-sphere 0 0 0 1") == 0
     outside = int((np.linalg.norm(leaves.means, axis=1) > 1).sum())
     assert capsys.readouterr().out.startswith(f"{outside:,} cropped splats")
+
+
+def test_clutter_is_found_in_one_step(tmp_path, monkeypatch, capsys):
+    """A ground of 8 x 8 units with planted clutter; a large distant background stays."""
+    monkeypatch.chdir(tmp_path)
+    ground = [(x, 0, z) for x in np.arange(-4, 4, 0.1) for z in np.arange(-4, 4, 0.1)]
+    large, halos = [(0.5, -0.1, 0), (0, -0.1, 0.5)], [(1, -0.2, 1), (1, -0.2, 0), (0, -0.2, 1)]
+    background, distant, floaters = [(30, 0, 0)], [(900, 0, 0)], [(0, -5, 0), (0, -5.01, 0)]
+    below = [(x, 2, 0) for x in np.arange(-2, 2, 0.1)]
+    means = [*ground, *large, *halos, *background, *distant, *floaters, *below]
+    splats = red_splats(means)
+    sizes = {mean: 4.0 for mean in [*large, *background]} | dict.fromkeys(halos, 0.8)
+    splats.log_scales[:] = np.log([[sizes.get(mean, 0.05)] for mean in means])
+    splats.opacity_logits[[mean in halos for mean in means]] = -4
+    write_ply("in.ply", splats)
+    assert edit("in.ply --preview out.png --out out.ply --clutter") == 0
+    assert capsys.readouterr().out.splitlines()[:4] == [
+        "2 floaters (orange)", "2 large splats (yellow)", "3 halos (pink)", "1 distant splat (violet)",
+    ]  # fmt: skip
+    remaining = len(ground) + len(background) + len(below)
+    assert len(read_bundle("out.ply").levels[0].splats) == remaining
+    assert edit("in.ply --preview out.png --clutter --min-depth 1 --max-reach 1000") == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[3:5] == ["0 distant splats (violet)", f"{len(below)} buried splats (red)"]
 
 
 @pytest.mark.parametrize(

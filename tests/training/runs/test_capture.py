@@ -19,9 +19,17 @@ from training.runs.job import Job
 from training.scenes.cameras import read_camera_folder, write_camera
 from training.scenes.colmap import read_scene
 from training.scenes.images import load_image
-from training.scenes.viewpoints import aerial_views, dome_views, walk_views
-from training.splats.bundle import read_bundle
+from training.scenes.view_tables import make_view_tables
+from training.scenes.viewpoints import (
+    aerial_views,
+    close_views,
+    dome_views,
+    surrounding_views,
+    walk_views,
+)
+from training.splats.bundle import read_bundle, write_bundle
 from training.splats.gaussians import Splats
+from training.splats.levels import Bundle, Level
 from training.splats.ply import write_ply
 
 
@@ -46,6 +54,49 @@ def test_dome_views_surround_all_splats_except_outliers(ball):
     for view in views:
         assert view.sees(ball.means[1:], near=near).all()
     assert 0 < near < np.linalg.norm(centers, axis=1).min() - 2
+
+
+def test_close_views_see_free_surfaces_at_their_distances():
+    """A room with walls of 4 x 4 x 4 units and a ball in the middle; walls hide no target."""
+    rng = np.random.default_rng(2)
+    walls = rng.uniform(-2, 2, (6000, 3))
+    walls[np.arange(6000), rng.integers(3, size=6000)] = rng.choice([-2, 2], 6000)
+    ball = rng.normal(size=(3000, 3))
+    ball *= 0.5 / np.linalg.norm(ball, axis=1, keepdims=True)
+    points = np.concatenate([walls, ball])
+    views = close_views(points, 24)
+    diameter = 2 * np.quantile(np.linalg.norm(points - np.median(points, axis=0), axis=1), 0.9)
+    inside = hidden = 0
+    for number, view in enumerate(views):
+        distance = diameter * (0.25, 0.5, 1.0)[number % 3]
+        target = view.center + distance * view.world_to_camera[2, :3]
+        assert np.linalg.norm(points - target, axis=1).min() < 1e-6
+        inside += bool((np.abs(view.center) < 2).all())
+        if number % 3 == 0:
+            offsets = points - view.center
+            along = offsets @ view.world_to_camera[2, :3]
+            aside = np.linalg.norm(offsets - along[:, None] * view.world_to_camera[2, :3], axis=1)
+            hidden += ((along > 0.1 * distance) & (along < 0.85 * distance) & (aside < 0.05)).any()
+    assert inside >= 6 and hidden <= 1
+    views, _ = surrounding_views(points, 9)
+    assert [view.name.split("_")[0] for view in views] == ["dome"] * 5 + ["close"] * 4
+
+
+@pytest.mark.parametrize("count", [4, 0])
+def test_own_cameras_of_a_bundle_are_used(ball, tmp_path, count):
+    views, near = dome_views(ball, count or 2, 96, 64)
+    views = [replace(view, name=f"view_{number}.jpg") for number, view in enumerate(views)]
+    tables = make_view_tables(views, near) if count else {}
+    write_bundle(tmp_path / "b.ply", Bundle("", [Level(1, ball)], tables=tables))
+    number = 2 if count else 12
+    count, _ = capture.capture(tmp_path / "b.ply", tmp_path / "scene", "auto", number, 48, backend="cpu")
+    scene = read_scene(tmp_path / "scene")
+    assert count == len(scene.cameras) == number and {camera.width for camera in scene.cameras} == {48}
+    if tables:
+        placed = [view.center for view in views]
+        assert all(np.isclose(camera.center, placed, atol=1e-6).all(axis=1).any() for camera in scene.cameras)
+    else:
+        assert [camera.name.split("_")[0] for camera in scene.cameras] == ["close"] * 6 + ["dome"] * 6
 
 
 def test_captured_images_and_points_match_the_splats(ball, tmp_path):
@@ -101,7 +152,7 @@ def test_capture_overwrites_nothing_and_leaves_no_partial_scene(ball, tmp_path):
         dome_views(faint, 4)
 
 
-@pytest.mark.parametrize("damaged", ["sparse/0/images.bin", "sparse/0/points3D.bin", "images/dome_0002.jpg"])
+@pytest.mark.parametrize("damaged", ["sparse/0/images.bin", "sparse/0/points3D.bin", "images/dome_0001.jpg"])
 def test_damaged_captured_views_are_rendered_again(ball, tmp_path, damaged):
     run = RunFolder(tmp_path / "run")
     run.create()

@@ -15,6 +15,12 @@ from training.scenes.colmap import read_scene
 GARDEN = Path(__file__).resolve().parents[3] / "examples" / "lantern_garden"
 
 
+@pytest.fixture(autouse=True)
+def no_estimate(monkeypatch):
+    """Leave out the estimate, which takes seconds; ``runs/test_estimate.py`` tests it."""
+    monkeypatch.setattr("training.cli.train.estimate_lines", lambda job: [])
+
+
 @pytest.fixture
 def copy(tmp_path):
     return Path(shutil.copytree(GARDEN, tmp_path / "scene"))

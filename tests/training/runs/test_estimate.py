@@ -1,0 +1,93 @@
+"""Estimate of a training: counts, costs measured by real steps, and suggested settings."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.training.conftest import write_tiny_scene
+from training.runs import estimate as module
+from training.runs.estimate import Estimate, estimate, estimate_findings, suggestions
+from training.runs.job import Job
+from training.scenes.colmap import read_scene
+
+COSTS = Estimate(600, 10**9, 8 * 10**9, 10**9, 50 * 10**9, 60_000, 1000, 42, (960, 640))
+
+
+@pytest.fixture
+def job(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "SECONDS", 0.0)
+    scene = write_tiny_scene(tmp_path / "scene")
+    parameters = {"max_splats": 3000, "levels": 2, "steps": 40}
+    return Job(
+        scene=str(scene), out=str(tmp_path / "run"), backend="cpu", image_scale=1.0, parameters=parameters
+    )
+
+
+def test_estimate_measures_real_steps_at_the_final_size(job, tmp_path, monkeypatch):
+    """Steps take 0.1 s with the scene's points and 0.3 s at the limit: the mean is 0.25 s."""
+    counts = []
+
+    def time_steps(method, last):
+        counts.append(method.splats)
+        method.train_step(0)
+        return 0.3 if last else 0.1
+
+    monkeypatch.setattr(module, "_time_steps", time_steps)
+    costs = estimate(job, tmp_path)
+    points = len(read_scene(Path(job.scene)).points)
+    assert counts == [min(points, 3000), 3000] and costs.splats == 3000
+    assert costs.seconds == pytest.approx(0.25 * costs.steps)
+    assert costs.steps == job.resolved_parameters().total_steps
+    assert 10**8 < costs.memory < 10**10 and costs.free_memory > 0
+    bytes_per_splat = 4 * (3 + 3 + 4 + 1 + 3 * 16)
+    assert costs.disk > 3000 * 2 * bytes_per_splat and costs.free_disk > 0
+    assert not (tmp_path / "run").exists()
+
+
+def test_points_of_the_final_size_are_near_the_scene(job):
+    scene = read_scene(Path(job.scene))
+    dense = module._with_points(scene, 5000)
+    assert len(dense.points) == len(dense.point_colors) == 5000
+    low, high = np.percentile(scene.points, (1, 99), axis=0)
+    margin = 0.5 * (high - low).max()
+    inside = ((dense.points > low - margin) & (dense.points < high + margin)).all(axis=1)
+    assert inside.mean() > 0.95
+
+
+def test_finding_has_the_costs_in_one_sentence(job):
+    first = estimate_findings(job)[0]
+    assert first.severity == "estimate"
+    assert str(COSTS) == (
+        "About 10 min, 1.0 of 8.0 GB memory, 1.0 of 50.0 GB disk, up to 60,000 splats (1,000 steps on 42 "
+        "views of 960x640 pixels)."
+    )
+
+
+def test_cells_have_no_estimate(job):
+    (finding,) = estimate_findings(replace(job, cells="2x1"))
+    assert finding.severity == "estimate" and "in cells" in finding.what
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({}, ""),
+        ({"memory": 7 * 10**9}, "more than 80% of the free memory"),
+        ({"disk": 45 * 10**9}, "more than 80% of the free disk space"),
+        ({"size": (3200, 2400)}, "Set image_scale to 0.25"),
+        ({"size": (320, 200)}, "only 320 pixels wide, which loses details. Set image_scale to 1."),
+        ({"seconds": 9000}, "more than 2 hours on this computer. Train the preset draft first"),
+    ],
+)
+def test_settings_are_suggested_with_their_reason(job, changes, text):
+    job = replace(job, preset="standard", image_scale=0.5, parameters={}).resolved()
+    texts = " ".join(map(str, suggestions(job, replace(COSTS, **changes))))
+    assert text in texts if text else not texts
+
+
+def test_cells_are_offered_if_memory_is_short(job, monkeypatch):
+    monkeypatch.setattr(module, "choose_cells", lambda job, memory: f"2x{memory // 10**9}")
+    (finding,) = suggestions(replace(job, image_scale=1.0), replace(COSTS, memory=20 * 10**9))
+    assert finding.remedy.startswith("Train in 2x6 cells")

@@ -1,0 +1,224 @@
+"""Estimate of a training before it starts: time, memory and disk, measured by real steps on this computer."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ..errors import LodgsError
+from ..evaluate.messages import format_duration
+from ..methods import METHODS, create
+from ..optimize.initialize import neighbour_scale
+from ..optimize.memory import MAX_BYTES, TARGET_BYTES, free_memory, peak_memory, reset_peak_memory
+from ..optimize.method import Method
+from ..optimize.parameters import Parameters
+from ..optimize.training_data import TrainingData
+from ..rasterize import resolve_backend, warm_up
+from ..scenes.check import ESTIMATE, Finding
+from ..scenes.colmap import Scene, read_scene
+from ..scenes.triangulate import cached_points
+from .blocks.plan import PROGRAM_BYTES, SPLAT_BYTES, choose_cells
+from .job import Job
+
+UNLIMITED = 1_000_000
+"""Assumed number of splats of a run without a limit."""
+SECONDS = 2.0
+"""Approximate seconds of measured steps per size."""
+GROWTH = 0.5
+"""Share of the first level's steps in which the number of splats grows to the limit."""
+FULL = 0.8
+"""Share of the free memory or disk that a training may use."""
+LONG = 2 * 3600
+"""Seconds from which a preset of less effort is suggested."""
+LARGE_SIDE, SMALL_SIDE = 1600, 640
+"""Longer sides of training images in pixels: above the first, papers reduce photos; below the second, details
+are lost."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Expected costs of a training.
+
+    Attributes:
+        seconds: duration.
+        memory, free_memory: bytes at the peak, and those available now; of the GPU if it has its own.
+        disk, free_disk: bytes of the run folder, and those available there.
+        splats: maximum number of splats of the finest level.
+        steps, views: number of steps and training views.
+        size: width and height of a training image in pixels.
+    """
+
+    seconds: float
+    memory: int
+    free_memory: int
+    disk: int
+    free_disk: int
+    splats: int
+    steps: int
+    views: int
+    size: tuple[int, int]
+
+    def __str__(self) -> str:
+        return (
+            f"About {format_duration(self.seconds)}, {self.memory / 1e9:.1f} of {self.free_memory / 1e9:.1f} "
+            f"GB memory, {self.disk / 1e9:.1f} of {self.free_disk / 1e9:.1f} GB disk, up to {self.splats:,} "
+            f"splats ({self.steps:,} steps on {self.views} views of {self.size[0]}x{self.size[1]} pixels)."
+        )
+
+
+def estimate_findings(job: Job) -> list[Finding]:
+    """Return the estimate of a job as a finding, and settings to change with their reason.
+
+    Takes some seconds, and up to a minute more if the kernels are not compiled yet.
+    """
+    if job.base or job.cells or job.region:
+        return [Finding(ESTIMATE, "There is no estimate for training from splats, in cells or of a region.")]
+    try:
+        with tempfile.TemporaryDirectory(prefix="lodgs-") as scratch:
+            costs = estimate(job, Path(scratch))
+        return [Finding(ESTIMATE, str(costs)), *suggestions(job.resolved(), costs)]
+    except LodgsError as error:
+        return [Finding(ESTIMATE, f"No estimate: {error.what}", error.remedy)]
+
+
+def estimate(job: Job, scratch: Path) -> Estimate:
+    """Estimate a job on photos by real steps with the initial and the final number of splats.
+
+    Args:
+        scratch: folder for files of methods with splats on disk.
+
+    Raises:
+        LodgsError: the scene cannot be read or trained.
+    """
+    job = job.resolved()
+    parameters = job.resolved_parameters()
+    model, images = (Path(path) if path else None for path in (job.model, job.images))
+    scene = cached_points(read_scene(Path(job.scene), model, images))
+    backend = resolve_backend(job.backend)
+    torch.set_num_threads(1)  # as in training
+    warm_up(backend)
+    splats = parameters.max_splats or max(UNLIMITED, len(scene.points))
+    early, _ = _measure(job, parameters, scene, backend, scratch, last=False)
+    if backend == "cuda":
+        torch.cuda.reset_peak_memory_stats()
+    reset_peak_memory()
+    late, data = _measure(job, parameters, _with_points(scene, splats), backend, scratch, last=True)
+    width, height = data.train[0].width, data.train[0].height
+    photos = sum(TARGET_BYTES * camera.width * camera.height for camera in data.train)
+    photos = max(min(photos, job.photo_memory * 10**6 or MAX_BYTES) - data.images.held_bytes, 0)
+    if backend == "cuda":
+        memory, available = torch.cuda.max_memory_allocated(), torch.cuda.mem_get_info()[0]
+    else:
+        memory = (peak_memory() or round(PROGRAM_BYTES + SPLAT_BYTES * splats)) + photos
+        available = free_memory()
+    steps = parameters.total_steps
+    seconds = steps * (GROWTH * (early + late) / 2 + (1 - GROWTH) * late)
+    return Estimate(
+        seconds, memory, available, _disk(parameters, splats), _free_disk(Path(job.out)), splats, steps,
+        len(data.train), (width, height),
+    )  # fmt: skip
+
+
+def suggestions(job: Job, costs: Estimate) -> list[Finding]:
+    """Return settings to change, with their reason."""
+    lines = []
+    longer = max(costs.size)
+    if costs.memory > FULL * costs.free_memory:
+        what = f"Training needs more than {FULL:.0%} of the free memory."
+        lines.append(Finding(ESTIMATE, what, _less_memory(job, costs)))
+    if costs.disk > FULL * costs.free_disk:
+        what = f"The run may need more than {FULL:.0%} of the free disk space."
+        lines.append(Finding(ESTIMATE, what, "Choose a run folder on another disk."))
+    if longer > LARGE_SIDE:
+        scale = job.image_scale * LARGE_SIDE / longer
+        what = f"Training images are {longer} pixels wide; the papers use at most {LARGE_SIDE}."
+        lines.append(Finding(ESTIMATE, what, f"Set image_scale to {scale:.2g} to train faster."))
+    elif longer < SMALL_SIDE and job.image_scale < 1:
+        scale = min(job.image_scale * SMALL_SIDE / longer, 1.0)
+        what = f"Training images are only {longer} pixels wide, which loses details."
+        lines.append(Finding(ESTIMATE, what, f"Set image_scale to {scale:.2g}."))
+    if costs.seconds > LONG and job.preset != "draft":
+        what = f"Training takes more than {LONG // 3600} hours on this computer."
+        lines.append(Finding(ESTIMATE, what, "Train the preset draft first to check the scene."))
+    return lines
+
+
+def _less_memory(job: Job, costs: Estimate) -> str:
+    """Return the remedy for too little memory: cells if the method has them, else fewer splats."""
+    if METHODS[job.method].cell_method:
+        try:
+            grid = choose_cells(job, memory=int(FULL * costs.free_memory))
+            if grid != "1x1":
+                return f"Train in {grid} cells, which need memory one after the other."
+        except LodgsError:
+            pass
+    return "Lower max_splats or image_scale, or close other programs."
+
+
+def _measure(
+    job: Job, parameters: Parameters, scene: Scene, backend: str, scratch: Path, *, last: bool
+) -> tuple[float, TrainingData]:
+    """Return the median seconds of a step from the points of a scene, and its data.
+
+    Args:
+        last: measure the last steps of the first level, else its first ones.
+    """
+    data = TrainingData(
+        scene, job.image_scale, job.test_every, job.exposure, job.validation,
+        photo_memory=job.photo_memory * 10**6 or None, splat_memory=job.splat_memory * 10**6 or None,
+        scratch=scratch,
+    )  # fmt: skip
+    method = create(job.method, data, parameters, job.seed, backend, None)
+    try:
+        return _time_steps(method, last), data
+    finally:
+        method.close()
+
+
+def _time_steps(method: Method, last: bool) -> float:
+    """Return the median seconds of a step after a first one."""
+    end = next(
+        (step for step in range(method.steps) if method.level_at(step) != method.level_at(0)), method.steps
+    )
+    step = max(end - 50, 0) if last else 0
+    method.train_step(step)
+    begin, times = time.monotonic(), []
+    while len(times) < 2 or time.monotonic() - begin < SECONDS:
+        step = min(step + 1, max(end - 2, 0))
+        started = time.monotonic()
+        method.train_step(step)
+        times.append(time.monotonic() - started)
+    return float(np.median(times))
+
+
+def _with_points(scene: Scene, count: int) -> Scene:
+    """Return a scene with ``count`` points, at random positions near its points."""
+    rng = np.random.default_rng(0)
+    rows = rng.integers(len(scene.points), size=count)
+    sizes = np.minimum(neighbour_scale(scene.points), np.percentile(neighbour_scale(scene.points), 90))
+    points = scene.points[rows] + rng.normal(size=(count, 3)) * sizes[rows, None]
+    return replace(
+        scene, points=points.astype(scene.points.dtype), point_colors=scene.point_colors[rows],
+        point_ids=np.zeros(0, scene.point_ids.dtype),
+    )  # fmt: skip
+
+
+def _disk(parameters: Parameters, splats: int) -> int:
+    """Return the bytes of a run: its levels as files and in the bundle, and two checkpoints with moments."""
+    row = 4 * (11 + 3 * (parameters.sh_degree + 1) ** 2)
+    levels = 1 if parameters.levels == 1 else 2  # coarser levels have at most as many splats together
+    return splats * row * (2 * levels + 2 * 3)
+
+
+def _free_disk(folder: Path) -> int:
+    """Return the free bytes on the disk of a folder that may not exist yet."""
+    folder = folder.absolute()
+    while not folder.exists():
+        folder = folder.parent
+    return shutil.disk_usage(folder).free
