@@ -40,6 +40,7 @@ from tools.attacks import exit_code, start_fork  # noqa: E402
 from tools.attacks_blocks import DISK_FULL_MESSAGES, contents, small_disk  # noqa: E402
 from training import __main__  # noqa: E402
 from training.errors import LodgsError  # noqa: E402
+from training.runs.page.write import VIEWER  # noqa: E402
 from training.splats.gaussians import Splats  # noqa: E402
 from training.splats.ply import read_ply, write_ply  # noqa: E402
 from training.splats.splat_transform import PROGRAM  # noqa: E402
@@ -61,12 +62,14 @@ class Command(NamedTuple):
         copied: input that the command changes: it is copied to DISK first.
         converts: whether the command needs splat-transform.
         timed: names of files whose contents depend on the time; they are only checked for completeness.
+        viewer: whether the command needs the viewer of pages.
     """
 
     arguments: tuple[str, ...]
     copied: str = ""
     converts: bool = False
     timed: tuple[str, ...] = ()
+    viewer: bool = False
 
 
 COMMANDS = {
@@ -89,6 +92,10 @@ COMMANDS = {
     "scene": Command(("scene", "--from", "INPUTS/export", "--out", "DISK/scene")),
     "undistort": Command(("undistort", "DISK/distorted"), "distorted"),
     "model": Command(("model", "DISK/views"), "views"),
+    "page": Command(("page", "INPUTS/run", "--out", "DISK/page"), viewer=True),
+    "page single": Command(
+        ("page", "INPUTS/run", "--single", "--out", "DISK/page.html"), timed=("page.html",), viewer=True
+    ),
     "compare": Command(
         ("compare", "INPUTS/run", "INPUTS/second", "--out", "DISK/page"),
         timed=("page/index.html", "page/compare.json"),
@@ -365,6 +372,9 @@ def main() -> int:
         for name in options.only:
             if COMMANDS[name].converts and not shutil.which(PROGRAM):
                 print(f"Skipping {name}: {PROGRAM} is not installed.")
+                continue
+            if COMMANDS[name].viewer and not VIEWER.is_dir():
+                print(f"Skipping {name}: the viewer is not installed (tools/viewer.py).")
                 continue
             full = attack.fill_disks(name, options.disks) if may_mount else 0
             stopped = attack.send_signals(name, options.signals) if options.signals else 0
