@@ -184,7 +184,7 @@ def test_alphas_of_successive_rows():
     )
     visible = expected >= 1 / 255
     assert 0.01 < visible.mean() < 0.5
-    np.testing.assert_allclose(actual[visible], expected[visible], rtol=5e-5)
+    np.testing.assert_allclose(actual[visible], expected[visible], rtol=2e-4)  # terms of needles cancel
     assert actual[expected < 0.999 / 255].max() < 1 / 255
 
 
