@@ -10,13 +10,16 @@ import numpy as np
 import pytest
 
 from training.rasterize.cpu.bin import TILE, bin_splats
+from training.rasterize.cpu.blend import GROUP, REACHED, find_rows, first_alphas
 from training.rasterize.cpu.compile import Buffers, numba
 from training.rasterize.cpu.fastmath import exp2
+from training.rasterize.cpu.lanes import WIDTH, ramp, spread, store
 from training.rasterize.cpu.project import (
     COLUMNS,
     CONIC_XX,
     CONIC_XY,
     CONIC_YY,
+    FALLOFF,
     HALF_HEIGHT,
     HALF_WIDTH,
     LOG2_OPACITY,
@@ -133,7 +136,56 @@ def test_exp2_accuracy():
         return np.array([exp2(x) for x in xs])
 
     xs = np.linspace(-29.9, 20, 5000).astype(np.float32)
-    np.testing.assert_allclose(exp2_array(xs), np.exp2(xs.astype(np.float64)), rtol=4e-6)
+    np.testing.assert_allclose(exp2_array(xs), np.exp2(xs.astype(np.float64)), rtol=4e-7)
+
+
+@numba.njit
+def alphas_of_rows(projected, left, alphas):
+    """Fill alphas (N, 16, WIDTH) row by row, and return the smallest number on the way."""
+    shapes, reached = np.empty((7, WIDTH), np.float32), np.zeros((len(projected), REACHED), np.uint8)
+    splats = np.arange(len(projected), dtype=np.int32)
+    find_rows(projected, splats, 0, len(splats), np.float32(0.5), np.float32(0.5), 16, shapes, reached)
+    smallest = np.inf
+    for i in range(len(projected)):
+        row = projected[i]
+        dx = ramp() + (left - row[0])
+        constant, slope = row[LOG2_OPACITY] - row[CONIC_XX] * dx * dx, row[CONIC_XY] * dx
+        for r in range(16):
+            if r % reached[i, GROUP] == 0:
+                dy = spread(np.float32(r) + np.float32(0.5) - row[1])
+                alpha, ratio = first_alphas(constant, slope, row[CONIC_YY], dy)
+            store(alphas[i, r], 0, ratio)
+            smallest = min(smallest, alphas[i, r].min())
+            store(alphas[i, r], 0, alpha)
+            smallest = min(smallest, alphas[i, r].min())
+            alpha, ratio = alpha * ratio, ratio * row[FALLOFF]
+    return smallest
+
+
+def test_alphas_of_successive_rows():
+    """Compare with the exponential in float64, for steep to flat ellipses; no number becomes denormal."""
+    random = np.random.default_rng(5)
+    count = 3000
+    projected, covariance, _ = ellipses(count, random, 60.0)
+    conic = np.linalg.inv(covariance + 0.1 * np.eye(2)) * math.log2(math.e) / 2
+    projected[:, :2] = random.uniform(-30, 46, (count, 2))
+    projected[:, CONIC_XX], projected[:, CONIC_YY] = conic[:, 0, 0], conic[:, 1, 1]
+    projected[:, CONIC_XY], projected[:, LOG2_OPACITY] = 2 * conic[:, 0, 1], random.uniform(-7, 0, count)
+    projected[:, FALLOFF] = np.exp2(-2 * projected[:, CONIC_YY].astype(np.float64))
+    actual = np.empty((count, 16, WIDTH), np.float32)
+    assert alphas_of_rows(projected, np.float32(0.5), actual) > np.finfo(np.float32).tiny
+    row = projected.astype(np.float64)[:, :, None, None]
+    dx, dy = np.arange(WIDTH) + 0.5 - row[:, 0], np.arange(16)[:, None] + 0.5 - row[:, 1]
+    expected = np.exp2(
+        row[:, LOG2_OPACITY]
+        - row[:, CONIC_XX] * dx**2
+        - row[:, CONIC_XY] * dx * dy
+        - row[:, CONIC_YY] * dy**2
+    )
+    visible = expected >= 1 / 255
+    assert 0.01 < visible.mean() < 0.5
+    np.testing.assert_allclose(actual[visible], expected[visible], rtol=2e-4)  # terms of needles cancel
+    assert actual[expected < 0.999 / 255].max() < 1 / 255
 
 
 @pytest.mark.slow

@@ -18,7 +18,14 @@ import torch
 from ..gaussians import Gaussians
 from ..rendering import BackendOutput, KernelCamera, RasterSettings, SideOutputs, Target, require_plain
 from .bin import TILE, Pairs, bin_splats
-from .blend import PARTS, blend_backward, blend_backward_absolute, blend_forward, blend_median, blend_weights
+from .blend import (
+    REACHED,
+    blend_backward,
+    blend_backward_absolute,
+    blend_forward,
+    blend_median,
+    blend_weights,
+)
 from .compile import Buffers, f32, run_parallel, serialised
 from .loss import loss_and_gradient
 from .project import (
@@ -126,7 +133,7 @@ class _Rasterize(torch.autograd.Function):
         tiles = pairs.splat, pairs.tile_start, counts.shape[1]
         transmittance = buffers.take("transmittance", np.float32, view.height, view.width)
         visited = np.empty(counts.size, np.int64)
-        reached = buffers.take("reached", np.uint8, len(pairs.splat), 2 * PARTS)
+        reached = buffers.take("reached", np.uint8, len(pairs.splat), REACHED)
         feature_array = features.detach().numpy()
         passes = [projected]
         if feature_array.shape[1]:

@@ -14,7 +14,7 @@ import numpy as np
 from ..rendering import ALPHA_MAX, TRANSMITTANCE_MIN
 from .bin import LOG2_ALPHA_MIN, TILE
 from .compile import FAST, f32, inlined, kernel
-from .fastmath import any_positive, exp2, exp2_lanes, prefetch
+from .fastmath import any_positive, exp2, exp2_lanes, prefetch, read_lanes, write_lanes
 from .lanes import (
     WIDTH,
     any_of,
@@ -22,6 +22,7 @@ from .lanes import (
     load,
     magnitude,
     ramp,
+    root,
     select,
     smaller,
     spread,
@@ -30,11 +31,13 @@ from .lanes import (
     total,
 )
 from .project import (
+    ALPHA_MIN32,
     BLUE,
     CONIC_XX,
     CONIC_XY,
     CONIC_YY,
     DEPTH,
+    FALLOFF,
     G_DX,
     GREEN,
     HALF_WIDTH,
@@ -62,28 +65,40 @@ PARTS = TILE // WIDTH
 """Parts of a tile, side by side."""
 STRIPS = PARTS * TILE
 """Rows of the first part, then those of the next."""
+GROUP = 2 * PARTS
+REACHED = GROUP + 1
+"""Values of a pair; see :func:`find_rows`."""
 FORWARD = 5 * WIDTH
 """Values of a strip: T, red, green, blue and the limit, of each pixel."""
 BACKWARD = 5 * WIDTH
 """Values of a strip in the backward pass: T, Q and three channels of h."""
+REACHABLE, FAINTEST, INVISIBLE = f32(37), f32(-85), f32(-30)
+"""In n rows with CONIC_YY n² < REACHABLE, no alpha rises from 2^FAINTEST to ALPHA_MIN, or falls from one of
+these to a denormal number."""
 CHECK_INTERVAL = 16
 """Number of splats after which a tile checks if any pixel is unfinished."""
 
 
 @inlined(ORDERED)
 def find_rows(projected, splat, begin, end, left, top, rows, spare, reached):
-    """Fill reached (P, 2 · PARTS) with the rows that each pair reaches in each part of the tile.
+    """Fill reached (P, REACHED) with the rows that each pair reaches in each part of the tile.
 
-    A part has the first row and one past the last. Lanes are pairs. This runs before blending, which would
-    otherwise wait for the square roots. ``spare`` (6, WIDTH) is scratch memory.
+    A part has the first row and one past the last. The column GROUP is the number of rows for which
+    :func:`first_alphas` is valid. Lanes are pairs. This runs before blending, which would otherwise wait for
+    the square roots. ``spare`` (7, WIDTH) is scratch memory.
     """
     for start in range(begin, end, WIDTH):
         for j in range(WIDTH):
             row = projected[splat[min(start + j, end - 1)]]
             spare[0, j], spare[1, j], spare[2, j] = row[MEAN_X], row[MEAN_Y], row[HALF_WIDTH]
             spare[3, j], spare[4, j], spare[5, j] = row[SLOPE], row[RISE], row[X_OF_TOP]
+            spare[6, j] = row[CONIC_YY]
         mean_x, mean_y, half_width = load(spare[0], 0), load(spare[1], 0), load(spare[2], 0)
         slope, rise, x_of_top = load(spare[3], 0), load(spare[4], 0), load(spare[5], 0)
+        group = root(REACHABLE / larger(load(spare[6], 0), f32(0.01)))
+        store(spare[6], 0, larger(smaller(group, f32(TILE)), ONE))
+        for j in range(min(end - start, WIDTH)):
+            reached[start + j, GROUP] = int(spare[6, j])
         for part in range(PARTS):
             bounds = strip_bounds(
                 mean_x, mean_y, half_width, slope, rise, x_of_top,
@@ -97,27 +112,6 @@ def find_rows(projected, splat, begin, end, left, top, rows, spare, reached):
                 reached[start + j, 2 * part + 1] = max(first, int(spare[1, j]))
 
 
-@inlined(ORDERED)
-def read_lanes(row, x, spare):
-    """Return the values of an image's row from column ``x`` on, and zeros beyond its end."""
-    if x + WIDTH <= row.shape[0]:
-        return load(row, x)
-    for j in range(WIDTH):
-        spare[j] = row[x + j] if x + j < row.shape[0] else ZERO
-    return load(spare, 0)
-
-
-@inlined(ORDERED)
-def write_lanes(row, x, spare, value):
-    """Write values to an image's row from column ``x`` to its end."""
-    if x + WIDTH <= row.shape[0]:
-        store(row, x, value)
-    else:
-        store(spare, 0, value)
-        for j in range(row.shape[0] - x):
-            row[x + j] = spare[j]
-
-
 @inlined(FAST)
 def alpha_of(log2_alpha):
     """Compute alpha with its upper and lower limits."""
@@ -126,23 +120,21 @@ def alpha_of(log2_alpha):
 
 
 @inlined(ORDERED)
-def fill_alphas(row, left, top, rows, alphas):
-    """Compute the alphas of a pair in the rows of the tile that it reaches.
+def first_alphas(constant, slope, yy, dy):
+    """Return the alphas of a row at ``dy``, and their ratios to those of the next row.
 
-    Blending is a second loop, because processors overlap the iterations of short loops only.
+    The logarithm of alpha is a parabola along a column of pixels, so alpha(row + 1) = alpha(row) ratio(row)
+    and ratio(row + 1) = ratio(row) FALLOFF. Lanes that stay invisible for the next GROUP rows get a small
+    alpha and the ratio 1. Otherwise numbers could become denormal, which is slow.
     """
-    xx, xy, yy, log2_opacity = row[CONIC_XX], row[CONIC_XY], row[CONIC_YY], row[LOG2_OPACITY]
-    offset_x, offset_y = left - row[MEAN_X], top - row[MEAN_Y]
-    for part in range(PARTS):
-        dx = ramp() + (offset_x + f32(WIDTH * part))
-        constant, slope = log2_opacity - xx * dx * dx, xy * dx
-        dy = spread(f32(rows[2 * part]) + offset_y)
-        for strip in range(TILE * part + int(rows[2 * part]), TILE * part + int(rows[2 * part + 1])):
-            log2_alpha = constant - (slope + yy * dy) * dy
-            dy = dy + ONE
-            alpha = smaller(exp2_lanes(log2_alpha), CAP)
-            alpha = select(log2_alpha >= LOG2_ALPHA_MIN, alpha, ZERO)
-            store(alphas, strip * WIDTH, alpha)
+    line = slope + yy * dy
+    log2_alpha = constant - line * dy
+    log2_ratio = ZERO - line - yy * (dy + ONE)
+    invisible = (log2_alpha < FAINTEST) | ((log2_alpha < LOG2_ALPHA_MIN) & (log2_ratio < ZERO))
+    return (
+        exp2_lanes(select(invisible, INVISIBLE, log2_alpha)),
+        exp2_lanes(select(invisible, ZERO, log2_ratio)),
+    )
 
 
 @inlined(ORDERED)
@@ -158,15 +150,18 @@ def blend_forward(
 ):  # fmt: skip
     """Fill image (3, H, W) and transmittance (H, W).
 
-    Also fill ``visited`` with the number of pairs blended in each tile, and ``reached`` (P, 2 · PARTS) uint8
-    with the rows that they reach. A lane's T becomes negative when its pixel is finished, and is negative
+    Also fill ``visited`` with the number of pairs blended in each tile, and ``reached`` (P, REACHED) uint8;
+    see :func:`find_rows`. A lane's T becomes negative when its pixel is finished, and is negative
     from the start outside the image. All later splats then fail the test against T_MIN, and |T| is preserved.
     The first splat deeper than the pixel's ``limit`` (H, W) finishes it too. If ``limit`` is None,
     Numba compiles a kernel without it.
     """
     height, width = transmittance.shape
+    colours, transmittances = image.reshape(-1), transmittance.reshape(-1)
+    if limit is not None:
+        limits = limit.reshape(-1)
     state, spare = np.empty(STRIPS * FORWARD, np.float32), np.empty(WIDTH, np.float32)
-    alphas, shapes = np.empty(STRIPS * WIDTH, np.float32), np.empty((6, WIDTH), np.float32)
+    shapes = np.empty((7, WIDTH), np.float32)
     for tile in range(begin, end):
         x0, y0 = tile % tiles_x * TILE, tile // tiles_x * TILE
         rows = min(TILE, height - y0)
@@ -178,7 +173,7 @@ def blend_forward(
             for c in range(1, 4):
                 store(state, place + WIDTH * c, spread(ZERO))
             if limit is not None and r < rows:
-                store(state, place + WIDTH * 4, read_lanes(limit[y0 + r], x, spare))
+                store(state, place + WIDTH * 4, read_lanes(limits, y0 + r, x, width, spare))
 
         pair = tile_start[tile]
         lit = True
@@ -189,22 +184,30 @@ def blend_forward(
                 row = projected[splat[pair]]
                 red, green, blue = row[RED], row[GREEN], row[BLUE]
                 depth = row[DEPTH]
-                fill_alphas(row, left, top, reached[pair], alphas)
+                xx, xy, yy, log2_opacity = row[CONIC_XX], row[CONIC_XY], row[CONIC_YY], row[LOG2_OPACITY]
+                falloff, group = row[FALLOFF], int(reached[pair, GROUP])
+                offset_x, offset_y = left - row[MEAN_X], top - row[MEAN_Y]
                 for part in range(PARTS):
-                    for r in range(int(reached[pair, 2 * part]), int(reached[pair, 2 * part + 1])):
-                        strip = TILE * part + r
-                        place = strip * FORWARD
-                        alpha = load(alphas, strip * WIDTH)
-                        t = load(state, place)
-                        t_next = t - alpha * t
-                        takes = t_next > T_MIN
-                        if limit is not None:
-                            takes = takes & (load(state, place + WIDTH * 4) >= depth)
-                        w = select(takes, alpha * t, ZERO)
-                        store(state, place, select(takes, t_next, ZERO - magnitude(t)))
-                        store(state, place + WIDTH, load(state, place + WIDTH) + w * red)
-                        store(state, place + 2 * WIDTH, load(state, place + 2 * WIDTH) + w * green)
-                        store(state, place + 3 * WIDTH, load(state, place + 3 * WIDTH) + w * blue)
+                    dx = ramp() + (offset_x + f32(WIDTH * part))
+                    constant, slope = log2_opacity - xx * dx * dx, xy * dx
+                    first, last = int(reached[pair, 2 * part]), int(reached[pair, 2 * part + 1])
+                    while first < last:
+                        power, ratio = first_alphas(constant, slope, yy, spread(f32(first) + offset_y))
+                        for r in range(first, min(first + group, last)):
+                            place = (TILE * part + r) * FORWARD
+                            alpha = select(power >= ALPHA_MIN32, smaller(power, CAP), ZERO)
+                            power, ratio = power * ratio, ratio * falloff
+                            t = load(state, place)
+                            t_next = t - alpha * t
+                            takes = t_next > T_MIN
+                            if limit is not None:
+                                takes = takes & (load(state, place + WIDTH * 4) >= depth)
+                            w = select(takes, alpha * t, ZERO)
+                            store(state, place, select(takes, t_next, ZERO - magnitude(t)))
+                            store(state, place + WIDTH, load(state, place + WIDTH) + w * red)
+                            store(state, place + 2 * WIDTH, load(state, place + 2 * WIDTH) + w * green)
+                            store(state, place + 3 * WIDTH, load(state, place + 3 * WIDTH) + w * blue)
+                        first += group
             pair = end
             largest = load(state, 0)
             for strip in range(1, STRIPS):
@@ -216,10 +219,10 @@ def blend_forward(
             x, r = x0 + strip // TILE * WIDTH, strip % TILE
             if r < rows and x < width:
                 t = magnitude(load(state, strip * FORWARD))
-                write_lanes(transmittance[y0 + r], x, spare, t)
+                write_lanes(transmittances, y0 + r, x, width, spare, t)
                 for c in range(3):
                     colour = load(state, strip * FORWARD + WIDTH * (c + 1))
-                    write_lanes(image[c, y0 + r], x, spare, colour + t * background[c])
+                    write_lanes(colours, c * height + y0 + r, x, width, spare, colour + t * background[c])
 
 
 @kernel(FAST)
@@ -342,8 +345,9 @@ def _make_backward(absolute: bool) -> Any:
     ):  # fmt: skip
         """Fill pair_sums; :func:`_make_backward` has the formulas."""
         height, width = transmittance.shape
+        colours, transmittances = image.reshape(-1), transmittance.reshape(-1)
+        gradients, alpha_gradients = by_image.reshape(-1), by_alpha.reshape(-1)
         state, spare = np.empty(STRIPS * BACKWARD, np.float32), np.empty(WIDTH, np.float32)
-        alphas = np.empty(STRIPS * WIDTH, np.float32)
         for tile in range(begin, end):
             x0, y0 = tile % tiles_x * TILE, tile // tiles_x * TILE
             rows = min(TILE, height - y0)
@@ -353,12 +357,12 @@ def _make_backward(absolute: bool) -> Any:
                 place = strip * BACKWARD
                 store(state, place, initial_transmittance(x, width, r < rows))
                 if r < rows and x < width:
-                    q = ZERO - read_lanes(transmittance[y0 + r], x, spare) * read_lanes(
-                        by_alpha[y0 + r], x, spare
-                    )
+                    t = read_lanes(transmittances, y0 + r, x, width, spare)
+                    q = ZERO - t * read_lanes(alpha_gradients, y0 + r, x, width, spare)
                     for c in range(3):
-                        h = read_lanes(by_image[c, y0 + r], x, spare)
-                        q = q + read_lanes(image[c, y0 + r], x, spare) * h
+                        line = c * height + y0 + r
+                        h = read_lanes(gradients, line, x, width, spare)
+                        q = q + read_lanes(colours, line, x, width, spare) * h
                         store(state, place + WIDTH * (2 + c), h)
                     store(state, place + WIDTH, q)
                 else:
@@ -374,7 +378,8 @@ def _make_backward(absolute: bool) -> Any:
                 xx, xy, yy = row[CONIC_XX], row[CONIC_XY], row[CONIC_YY]
                 red, green, blue = row[RED], row[GREEN], row[BLUE]
                 offset_x, offset_y = left - row[MEAN_X], top - row[MEAN_Y]
-                fill_alphas(row, left, top, reached[pair], alphas)
+                falloff, group = row[FALLOFF], int(reached[pair, GROUP])
+                log2_opacity = row[LOG2_OPACITY]
                 all_g = all_dx = all_dxdx = all_dy = all_dxdy = all_dydy = spread(ZERO)
                 all_red = all_green = all_blue = all_x = all_y = spread(ZERO)
                 for part in range(PARTS):
@@ -382,37 +387,45 @@ def _make_backward(absolute: bool) -> Any:
                     if first == last:
                         continue
                     dx = ramp() + (offset_x + f32(WIDTH * part))
-                    sum_g = sum_dy = spread(ZERO)
-                    for r in range(first, last):
-                        strip = TILE * part + r
-                        place = strip * BACKWARD
-                        dy = f32(r) + offset_y
-                        alpha = load(alphas, strip * WIDTH)
-                        t, q = load(state, place), load(state, place + WIDTH)
-                        h_red = load(state, place + 2 * WIDTH)
-                        h_green = load(state, place + 3 * WIDTH)
-                        h_blue = load(state, place + 4 * WIDTH)
-                        t_next = t - alpha * t
-                        takes = t_next > T_MIN
-                        w = select(takes, alpha * t, ZERO)
-                        store(state, place, select(takes, t_next, ZERO))
-                        received = w * (red * h_red + green * h_green + blue * h_blue)
-                        q = q - received
-                        store(state, place + WIDTH, q)
-                        g = alpha * q / (ONE - alpha) - received
-                        g = select(takes & (alpha < CAP), g, ZERO)
-                        sum_g = sum_g + g
-                        sum_dy = sum_dy + g * dy
-                        all_dydy = all_dydy + g * (dy * dy)
-                        all_red = all_red + w * h_red
-                        all_green = all_green + w * h_green
-                        all_blue = all_blue + w * h_blue
-                        if absolute:
-                            all_x = all_x + magnitude(g * (TWO * xx * dx + xy * dy))
-                            all_y = all_y + magnitude(g * (xy * dx + TWO * yy * dy))
-                    sum_dx = sum_g * dx
-                    all_g, all_dx, all_dxdx = all_g + sum_g, all_dx + sum_dx, all_dxdx + sum_dx * dx
+                    constant, slope = log2_opacity - xx * dx * dx, xy * dx
+                    once = twice = thrice = spread(ZERO)
+                    while first < last:
+                        power, ratio = first_alphas(constant, slope, yy, spread(f32(first) + offset_y))
+                        for r in range(first, min(first + group, last)):
+                            place = (TILE * part + r) * BACKWARD
+                            alpha = select(power >= ALPHA_MIN32, smaller(power, CAP), ZERO)
+                            power, ratio = power * ratio, ratio * falloff
+                            t, q = load(state, place), load(state, place + WIDTH)
+                            h_red = load(state, place + 2 * WIDTH)
+                            h_green = load(state, place + 3 * WIDTH)
+                            h_blue = load(state, place + 4 * WIDTH)
+                            t_next = t - alpha * t
+                            takes = t_next > T_MIN
+                            w = select(takes, alpha * t, ZERO)
+                            store(state, place, select(takes, t_next, ZERO))
+                            received = w * (red * h_red + green * h_green + blue * h_blue)
+                            q = q - received
+                            store(state, place + WIDTH, q)
+                            g = alpha / (ONE - alpha) * q - received
+                            g = select(takes & (alpha < CAP), g, ZERO)
+                            once = once + g
+                            twice = twice + once
+                            thrice = thrice + twice
+                            all_red = all_red + w * h_red
+                            all_green = all_green + w * h_green
+                            all_blue = all_blue + w * h_blue
+                            if absolute:
+                                dy = f32(r) + offset_y
+                                all_x = all_x + magnitude(g * (TWO * xx * dx + xy * dy))
+                                all_y = all_y + magnitude(g * (xy * dx + TWO * yy * dy))
+                        first += group
+                    # with m = last - r: sum of g, of g m and of g m (m + 1) / 2
+                    beyond = f32(last) + offset_y
+                    sum_dy = once * beyond - twice
+                    sum_dx = once * dx
+                    all_g, all_dx, all_dxdx = all_g + once, all_dx + sum_dx, all_dxdx + sum_dx * dx
                     all_dy, all_dxdy = all_dy + sum_dy, all_dxdy + sum_dy * dx
+                    all_dydy = all_dydy + (sum_dy * beyond - twice * (beyond + ONE) + TWO * thrice)
                 sums = pair_sums[pair]
                 sums[G] = total(all_g)
                 store_totals(

@@ -226,11 +226,26 @@ def _shuffled(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, lanes: list[int])
     return builder.shuffle_vector(a, b, ir.VectorType(ir.IntType(32), len(lanes))(lanes))
 
 
-def _fold(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, size: int) -> ir.Value:
-    """Add the halves of each group of ``size`` lanes; return the groups of ``a``, then those of ``b``."""
-    low = [lane for lane in range(2 * WIDTH) if lane % size < size // 2]
-    high = [lane + size // 2 for lane in low]
-    return builder.fadd(_shuffled(builder, a, b, low), _shuffled(builder, a, b, high))
+def _fold(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, distance: int) -> ir.Value:
+    """In each group of four lanes, add those at this distance, first of ``a``, then of ``b``.
+
+    Processors shuffle lanes within such groups faster than across them.
+    """
+    first = (0, 1) if distance == 2 else (0, 2)
+    low = [i + lane for group in range(0, WIDTH, 4) for i in (group, group + WIDTH) for lane in first]
+    return builder.fadd(
+        _shuffled(builder, a, b, low), _shuffled(builder, a, b, [lane + distance for lane in low])
+    )
+
+
+def _group_total(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
+    """Add all groups of four lanes."""
+    size = WIDTH
+    while size > 4:
+        size //= 2
+        halves = [_shuffled(builder, value, value, list(range(i, i + size))) for i in (0, size)]
+        value = builder.fadd(*halves)
+    return value
 
 
 def total(value) -> Any:
@@ -239,9 +254,9 @@ def total(value) -> Any:
 
 @_define(total, NUMBER, (LANES,))
 def _build_total(builder, value):
-    size = WIDTH
-    while size > 1:
-        value, size = _fold(builder, value, value, size), size // 2
+    value = _group_total(builder, value)
+    for lanes in ([2, 3, 2, 3], [1, 1, 1, 1]):
+        value = builder.fadd(value, _shuffled(builder, value, value, lanes))
     return builder.extract_element(value, ir.IntType(32)(0))
 
 
@@ -251,11 +266,10 @@ def store_totals(array, index, a, b, c, d, e, f, g, h):
 
 @_define(store_totals, types.void, (ARRAY, INDEX, *(LANES,) * 8))
 def _build_store_totals(builder, array, index, *vectors):
-    size = WIDTH
-    while size > 1:
-        pairs = zip(vectors[::2], vectors[1::2], strict=True) if len(vectors) > 1 else [vectors * 2]
-        vectors, size = [_fold(builder, a, b, size) for a, b in pairs], size // 2
-    sums = _shuffled(builder, vectors[0], vectors[0], list(range(8)))
+    for distance in (2, 1):
+        pairs = zip(vectors[::2], vectors[1::2], strict=True)
+        vectors = [_fold(builder, a, b, distance) for a, b in pairs]
+    sums = _shuffled(builder, *(_group_total(builder, vector) for vector in vectors), list(range(8)))
     builder.store(sums, builder.bitcast(_address(builder, array, index), sums.type.as_pointer()), align=4)
 
 

@@ -31,6 +31,8 @@ SLOPE, RISE, X_OF_TOP = 11, 12, 13
 HALF_HEIGHT, is at dx = X_OF_TOP."""
 DEPTH = 14
 """Along the camera's z axis."""
+FALLOFF = 15
+"""2^(−2 CONIC_YY); see ``blend.first_alphas``."""
 COLUMNS = 16
 """A row is one cache line of 64 bytes."""
 
@@ -239,6 +241,7 @@ def project_forward(
             blue += basis[k] * sh[i, k, 2]
         row[RED], row[GREEN], row[BLUE] = max(red, ZERO), max(green, ZERO), max(blue, ZERO)
         row[DEPTH] = z
+        row[FALLOFF] = math.exp(-TWO * LN2 * row[CONIC_YY])
 
 
 @kernel(FAST)
