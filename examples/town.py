@@ -13,7 +13,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 from scipy.ndimage import label, maximum_filter
@@ -394,7 +394,8 @@ def courtyard(plan: Plan, count: int) -> list[Camera]:
     in_block = (np.abs((np.stack([x, y]) + plan.half) % shapes.PITCH - shapes.PITCH / 2) < GARDEN).all(0)
     in_town = np.maximum(np.abs(x), np.abs(y)) < plan.half
     square = np.maximum(np.abs(x), np.abs(y)) < shapes.PITCH / 2
-    regions, number = label((maximum_filter(plan.heights, 3) < 0.5) & in_block & in_town & ~square)
+    free = (maximum_filter(plan.heights, 3) < 0.5) & in_block & in_town & ~square
+    regions, number = cast(tuple[np.ndarray, int], label(free))
     largest = 1 + int(np.bincount(regions.ravel(), minlength=number + 1)[1:].argmax())
     row, column = np.nonzero(regions == largest)
     floor = np.stack([axis[column], axis[row]], axis=1)

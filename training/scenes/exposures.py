@@ -81,8 +81,8 @@ def exposure_gains(scene: Scene, cameras: Sequence[Camera], exposure: float = 0.
         gains[compared] = relative_gains(rows, point, values[shared])
     stops = [np.nan if camera.image is None else stated_stops(camera.image) for camera in cameras]
     gains = complete_gains(gains, np.array(stops))
-    compared = np.isfinite(gains).all(1)
-    compared_views = [cameras[i] for i in np.flatnonzero(compared)]
+    compared = np.isfinite(gains[:, 0])
+    compared_views = [camera for camera, known in zip(cameras, compared, strict=True) if known]
     if len(compared_views) < 3:
         return {}
     gains = gains[compared]
@@ -123,11 +123,11 @@ def stated_stops(path: Path) -> float:
 def complete_gains(gains: np.ndarray, stops: np.ndarray) -> np.ndarray:
     """Fill in missing log gains (V, 3), NaN, from stated exposures (V,), NaN if unknown."""
     stated = CODED_STOP * stops[:, None]
-    missing = np.isnan(gains).any(1)
+    missing = np.isnan(gains[:, 0])
     both = ~missing & np.isfinite(stops)
     reference = stated[both] - gains[both] if both.any() else stated[missing & np.isfinite(stops)]
     offset = np.median(reference, axis=0) if len(reference) else 0.0
-    return np.where(missing[:, None], stated - offset, gains)
+    return np.where(np.isnan(gains), stated - offset, gains)
 
 
 def relative_gains(view: np.ndarray, point: np.ndarray, values: np.ndarray) -> np.ndarray:
