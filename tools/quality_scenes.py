@@ -134,8 +134,7 @@ def write_subset(folder: Path, out: Path, subset: Subset, stops: float = 1.0) ->
         photo = np.asarray(Image.open(camera.image).convert("RGB"))
         changed = Image.fromarray(relight(photo, gain**stops, vignette))
         exif = exposure_tags(float(gain[1]) ** stops) if subset.exif else Image.Exif()
-        options = {"quality": 97} if path.suffix.lower() in (".jpg", ".jpeg") else {}
-        changed.save(path, exif=exif, **options)
+        changed.save(path, exif=exif, quality=97)  # formats without loss ignore the quality
     _write_model(scene, cameras, temporary)
     temporary.rename(out)
     return out
