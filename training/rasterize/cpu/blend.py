@@ -173,7 +173,7 @@ def blend_forward(
             for c in range(1, 4):
                 store(state, place + WIDTH * c, spread(ZERO))
             if limit is not None and r < rows:
-                store(state, place + WIDTH * 4, read_lanes(limits, y0 + r, x, width, spare))
+                store(state, place + WIDTH * 4, read_lanes(limits, y0 + r, x, width, spare))  # pyrefly: ignore[unbound-name]
 
         pair = tile_start[tile]
         lit = True
