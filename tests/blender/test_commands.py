@@ -144,7 +144,6 @@ def test_train_has_the_trainers_options(lodgs, lodgs_command, capfd):
         (["export", "nothing.blend", "x.ply"], "nothing.blend"),
         (["info", "nothing.ply"], "nothing.ply"),
         (["dance"], "dance"),
-        ([], "required"),
     ],
 )
 def test_input_errors_print_one_sentence_and_exit_with_2(

@@ -305,7 +305,7 @@ def test_depth_of_a_sheared_camera_is_that_of_cycles(bpy, lodgs, scene, root):
 def test_export_of_a_deformed_camera_names_the_scale(bpy, scene, root, tmp_path, change):
     change(bpy, scene)
     bpy.context.view_layer.objects.active = root
-    with pytest.raises(RuntimeError, match=r"Cannot use camera 'cam': its scale .* Apply the scale"):
+    with pytest.raises(RuntimeError, match=r"Cannot use camera 'cam': its scale .*\s+Apply the scale"):
         bpy.ops.lodgs.export_camera(filepath=str(tmp_path / "camera.json"))
     assert not (tmp_path / "camera.json").exists()
 

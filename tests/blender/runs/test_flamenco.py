@@ -176,7 +176,7 @@ def test_submit_returns_the_url_of_the_job(flamenco, lodgs, manager, root, tmp_p
 REJECTIONS = {
     "unknown type": (
         {"type": (404, {"code": 404, "message": "no such job type known"})},
-        "has no job type lodgs-blocks. Copy .*lodgs_blocks.js to the scripts folder",
+        r"has no job type lodgs-blocks\.\s+Copy .*lodgs_blocks.js to the scripts folder",
     ),
     "an older type": (
         {"type": (200, {**TYPE, "settings": SETTINGS[:-1]})},
@@ -184,7 +184,7 @@ REJECTIONS = {
     ),
     "rejected": (
         {"job": (400, {"code": 400, "message": "uncaught exception: not so."})},
-        "reports: uncaught exception: not so. See the log",
+        r"reports: uncaught exception: not so\.\s+See the log",
     ),
     "outdated": (
         {"job": (412, {"code": 412, "message": "rejecting job because its settings are outdated"})},
