@@ -198,7 +198,8 @@ def test_meshes_hold_out_splats_behind_them(camera, background, scale):
     assert image.depth[left] == pytest.approx(2) and image.depth[right] == pytest.approx(6)
     assert image.masks[:, 24, 31] == pytest.approx([0.25, 0], abs=2e-3)
     window = draw(walls, camera, limit=limit[10:44, 20:50], window=(20, 10, 30, 34), background=background)
-    np.testing.assert_allclose(window.image, image.image[10:44, 20:50], atol=1e-6)
+    # alphas are computed row by row from the top of a tile, so rounding depends on the window
+    np.testing.assert_allclose(window.image, image.image[10:44, 20:50], atol=4e-6)
     empty = draw([], camera, limit=limit, background=background)
     assert empty.alpha[left] == 0 and empty.alpha[24, 40] == (background is not None)
 
