@@ -851,7 +851,7 @@ def test_viewport_quality_looks_beyond_the_clip_end(bpy, scene, frame, tmp_path)
 
 def test_viewport_quality_refuses_to_hold_out(bpy, scene, frame, tmp_path):
     scene.lodgs_render.holdout = str(tmp_path / "depth_####.exr")
-    with pytest.raises(RuntimeError, match=r"mesh holdout.*Clear Hold Out"):
+    with pytest.raises(RuntimeError, match=r"mesh holdout.*\s+Clear Hold Out"):
         bpy.ops.lodgs.render_quick()
     assert bpy.context.scene.render.engine == "LODGS" and bpy.context.scene.render.use_compositing
 
