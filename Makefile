@@ -11,10 +11,10 @@ LOCK := .venv/bin/uv pip compile --quiet --universal --generate-hashes --no-buil
 PYTEST := -m pytest -n auto
 # Containers often forbid Python to keep compiled files; then each process compiles all packages again, in seconds.
 export PYTHONDONTWRITEBYTECODE :=
-quick test test-trainer test-blender test-5.0 test-5.2 nightly fuzz: export OMP_NUM_THREADS := 1  # the workers already use every core
+quick test test-5.0 test-5.2 nightly fuzz: export OMP_NUM_THREADS := 1  # the workers already use every core
 export LODGS_TRAINER_PYTHON := $(CURDIR)/$(VENV)
 
-.PHONY: help setup demo check quick test test-trainer test-blender test-5.0 test-5.2 nightly fuzz attacks lint docs pictures tables bench bench-quality bench-lod bench-tree bench-blocks extension release pins \
+.PHONY: help setup demo check quick test test-5.0 test-5.2 nightly fuzz attacks lint docs pictures tables bench bench-quality bench-lod bench-tree bench-blocks extension release pins \
 	window interop clean
 
 help:
@@ -54,17 +54,10 @@ check: setup
 quick: setup
 	$(VENV) $(PYTEST) -q -m "not slow and not blender and not nightly"
 
-# Tests of the trainer and of Blender run beside each other, because many wait for files and other processes.
 test: setup
-	@$(MAKE) --no-print-directory --jobs=2 test-trainer test-blender
-
-test-trainer:
 	$(VENV) $(PYTEST) -m "not nightly" tests/training tests/fuzz
-
-test-blender:
 	$(VENV) $(PYTEST) -m "not nightly" tests/blender
-	@if [ -x $(BLENDER_5_3) ]; then set -x; \
-		$(BLENDER_5_3) $(PYTEST) -m "not nightly and not one_blender" tests/blender; fi
+	@if [ -x $(BLENDER_5_3) ]; then set -x; $(BLENDER_5_3) $(PYTEST) -m "not nightly and not one_blender" tests/blender; fi
 
 test-5.0 test-5.2: test-%: setup
 	@$(PYTHON) tools/setup.py $*
