@@ -65,8 +65,17 @@ def write_sog(path: Path, splats: SplatRows, meta: dict) -> None:
         meta: meta of the splats' bundle; the format stores none of it.
 
     Raises:
-        LodgsError: the file cannot be written, or a package is missing.
+        LodgsError: there are no splats, their SH degree is too high, the file cannot be written, or a package
+            is missing.
     """
+    if not len(splats):
+        raise LodgsError("Cannot write SOG: there are no splats.", "Make some splats visible.")
+    degree = splats.select(slice(0, 0)).sh_degree
+    if degree > MAX_DEGREE:
+        raise LodgsError(
+            f"Cannot write SH degree {degree} as SOG: it supports degree 0 to {MAX_DEGREE}.",
+            "Write a PLY instead.",
+        )
     values = splats.select(slice(0, len(splats)))
     files = encode_sog(values.select(spatial_order(values.means)))
     with atomic_write(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
@@ -197,17 +206,18 @@ def make_palette(sets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     than with one k-means.
     """
     packages, count = load_packages(), len(sets)
-    size = min(64, 1 << max((count // 1024).bit_length() - 1, 0)) * 1024
+    size = min(MAX_PALETTE, 1024 << max((count // 1024).bit_length() - 1, 0))
     sets = sets.astype(np.float32)
     if count <= size:
         return sets, np.arange(count, dtype=np.uint16)
-    groups = _cluster(packages, sets, ceil(sqrt(size)))[1]
+    group_count = ceil(sqrt(size))
+    groups = _cluster(packages, sets, group_count)[1]
     palette, labels, first = [], np.empty(count, np.uint16), 0
     order = np.argsort(groups, kind="stable")
     for rows in np.split(order, np.cumsum(np.bincount(groups))[:-1]):
         if not len(rows):
             continue
-        share = max(1, size * len(rows) // count)
+        share = 1 + (size - group_count) * (len(rows) - 1) // count  # together at most ``size``
         centers, members = _cluster(packages, sets[rows], share)
         palette.append(centers)
         labels[rows] = first + members

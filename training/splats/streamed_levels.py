@@ -78,6 +78,8 @@ def write_streamed_levels(folder: Path, bundle: Bundle) -> None:
             f"Cannot write SH degree {degree} for browsers: they support degree 0 to {MAX_DEGREE}.",
             "Reduce it with lodgs edit --sh-degree.",
         )
+    if folder.exists() and not folder.is_dir():
+        raise LodgsError(f"Cannot export to {folder}: it is not a folder.", "Choose an empty folder.")
     if folder.is_dir() and any(folder.iterdir()) and not (folder / STREAMED_FILE).exists():
         raise LodgsError(f"Cannot export to {folder}: it contains other files.", "Choose an empty folder.")
     try:

@@ -100,6 +100,12 @@ def test_errors_name_the_cause_and_leave_nothing(bundle, tmp_path, viewer, monke
     (tmp_path / "other" / "thesis.txt").touch()
     with pytest.raises(LodgsError, match="other files"):
         write_page(bundle, tmp_path / "other")
+    (tmp_path / "other" / "index.html").touch()  # a page of somebody else
+    with pytest.raises(LodgsError, match="other files"):
+        write_page(bundle, tmp_path / "other")
+    with pytest.raises(LodgsError, match="not a folder"):
+        write_page(bundle, tmp_path / "other" / "thesis.txt")
+    assert {path.name for path in (tmp_path / "other").iterdir()} == {"index.html", "thesis.txt"}
     monkeypatch.setattr(write, "MAX_SINGLE", 10)
     with pytest.raises(LodgsError, match="more than 10"):
         write_page(bundle, tmp_path / "page.html", single=True, backend="cpu")

@@ -87,6 +87,25 @@ def test_palette_is_near_the_sets():
     assert error < 0.25  # 1 without a palette
 
 
+def test_palette_of_many_small_groups_keeps_its_limit():
+    """63 sets far from the others are groups of their own; all labels are rows of the palette."""
+    sets = np.random.default_rng(0).normal(size=(5000, 3)).astype(np.float32)
+    rows = np.linspace(0, 4999, 64).astype(int)[:63]
+    sets[rows] += 1000 * np.arange(1, 64)[:, None]
+    palette, labels = make_palette(sets)
+    assert len(palette) <= 4096 and labels.max() < len(palette)
+    np.testing.assert_allclose(palette[labels[rows]], sets[rows], atol=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("splats", "message"), [(random_splats(9, 4), "degree 4"), (random_splats(0), "no splats")]
+)
+def test_splats_that_sog_cannot_store_are_refused(tmp_path, splats, message):
+    with pytest.raises(LodgsError, match=message):
+        write_sog(tmp_path / "a.sog", splats, {})
+    assert not list(tmp_path.iterdir())
+
+
 def leaves(node: dict):
     for child in node.get("children", ()):
         yield from leaves(child)
@@ -129,6 +148,13 @@ def test_degree_4_is_refused(tmp_path):
     with pytest.raises(LodgsError, match="degree 4"):
         write_streamed_levels(tmp_path / "web", Bundle("", [Level(1, random_splats(9, 4))]))
     assert not list(tmp_path.iterdir())
+
+
+def test_file_is_not_replaced_by_levels(tmp_path):
+    (tmp_path / "web").write_text("thesis")
+    with pytest.raises(LodgsError, match="not a folder"):
+        write_streamed_levels(tmp_path / "web", Bundle("", [Level(1, random_splats(9))]))
+    assert (tmp_path / "web").read_text() == "thesis"
 
 
 def test_infinite_scales_and_opacities_are_limited(tmp_path):

@@ -30,12 +30,15 @@ from ...splats.streamed_levels import STREAMED_FILE, write_streamed_levels
 from ..folder import find_splats
 
 VIEWER = Path(__file__).resolve().parents[2] / "viewer"
-PAGE = "index.html"
+PAGE, LEVELS, POSTER = "index.html", "levels", "poster.png"
+"""Parts of a page in a folder, in addition to the viewer."""
 MAX_CAMERAS = 12
 """Maximum number of cameras in the list; views are selected evenly."""
 MAX_SINGLE = 200_000
 """Maximum number of splats of a page in one file."""
 POSTER_WIDTH = 960
+SAMPLE = 100_000
+"""Approximate number of splats that determine the center of a scene."""
 BUDGETS = 0.1, 0.25, 0.5, 1.0
 """Offered splat budgets, as fractions of the finest level."""
 _DOWN = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
@@ -65,10 +68,7 @@ def write_page(
         LodgsError: the viewer is missing, the source cannot be read, or the page cannot be written.
     """
     viewer = _read_viewer()
-    if single and out.suffix.lower() != ".html":
-        raise LodgsError(f"Cannot write {out}: a page in one file is HTML.", "End its name with .html.")
-    if not single and out.is_dir() and any(out.iterdir()) and not (out / PAGE).is_file():
-        raise LodgsError(f"Cannot write a page to {out}: it contains other files.", "Choose an empty folder.")
+    _check_place(out, single)
     path = find_splats(source)
     title = title or (path.resolve().parent.name if path.stem == "bundle" else path.stem)
     bundle = open_levels(path, warn)
@@ -82,7 +82,7 @@ def write_page(
             target = temporary / "page"
             target.mkdir()
             if cameras:
-                _write_poster(target / "poster.png", placed, cameras[0], near, backend)
+                _write_poster(target / POSTER, placed, cameras[0], near, backend)
             page = _describe(placed, cameras)
             if single:
                 _write_single(target, shown, page, viewer, title)
@@ -98,6 +98,21 @@ def write_page(
         ) from error
     remedy = "" if single else f" Browsers need a server: python -m http.server --directory {out}"
     return f"{out}: written.{remedy}"
+
+
+def _check_place(out: Path, single: bool) -> None:
+    """Raise a LodgsError if the page would replace anything but an earlier page."""
+    if single:
+        if out.suffix.lower() != ".html":
+            raise LodgsError(f"Cannot write {out}: a page in one file is HTML.", "End its name with .html.")
+        if out.is_dir():
+            raise LodgsError(f"Cannot write {out}: it is a folder.", "Choose another name.")
+        return
+    if out.exists() and not out.is_dir():
+        raise LodgsError(f"Cannot write a page to {out}: it is not a folder.", "Choose an empty folder.")
+    names = {path.name for path in out.iterdir()} if out.is_dir() else set()
+    if names and not ({PAGE, LEVELS} <= names <= {PAGE, LEVELS, VIEWER.name, POSTER}):
+        raise LodgsError(f"Cannot write a page to {out}: it contains other files.", "Choose an empty folder.")
 
 
 def _read_viewer() -> dict[str, str]:
@@ -118,13 +133,14 @@ def _read_viewer() -> dict[str, str]:
 
 def _describe(bundle: Bundle, cameras: list[Camera]) -> dict:
     """Return the page's settings: budgets, cameras and the background."""
-    means = bundle.levels[-1].rows.select(slice(0, 100_000)).means
+    rows = bundle.levels[-1].rows
+    means = rows.select(np.arange(0, len(rows), max(1, len(rows) // SAMPLE))).means
     center = np.median(means, axis=0)
     radius = float(np.quantile(np.linalg.norm(means - center, axis=1), 0.9))
     poses = [(camera.name, _pose(camera, center, radius)) for camera in pick_evenly(cameras, MAX_CAMERAS)]
     away = (center * _VIEWER + np.array([0, 0.5, 1.5]) * radius).tolist()
     first = {"position": away, "target": (center * _VIEWER).tolist(), "fov": 60.0}
-    count = len(bundle.levels[-1].rows)
+    count = len(rows)
     settings = {
         "version": 2,
         "tonemapping": "none",
@@ -176,13 +192,13 @@ def _write_poster(path: Path, bundle: Bundle, camera: Camera, near: float, backe
 
 
 def _write_folder(folder: Path, bundle: Bundle, page: dict, viewer: Mapping[str, str], title: str) -> None:
-    write_streamed_levels(folder / "levels", bundle)
-    (folder / "viewer").mkdir()
+    write_streamed_levels(folder / LEVELS, bundle)
+    (folder / VIEWER.name).mkdir()
     for name, text in viewer.items():
-        (folder / "viewer" / name).write_text(text, "utf-8")
-    page |= {"streamed": True, "content": f"./levels/{STREAMED_FILE}"}
-    if (folder / "poster.png").is_file():
-        page["poster"] = "./poster.png"
+        (folder / VIEWER.name / name).write_text(text, "utf-8")
+    page |= {"streamed": True, "content": f"./{LEVELS}/{STREAMED_FILE}"}
+    if (folder / POSTER).is_file():
+        page["poster"] = f"./{POSTER}"
     style = '<link rel="stylesheet" href="./viewer/index.css">'
     script = 'import { createViewer } from "./viewer/index.js";'
     _write_html(folder / PAGE, page, title, style, script)
@@ -198,8 +214,8 @@ def _write_single(folder: Path, bundle: Bundle, page: dict, viewer: Mapping[str,
     write_sog(folder / "splats.sog", small[-1].rows, {})
     page |= {"streamed": False, "name": "splats.sog", "levels": [len(small[-1].rows)]}
     page["content"] = _data_address(folder / "splats.sog", "application/zip")
-    if (folder / "poster.png").is_file():
-        page["poster"] = _data_address(folder / "poster.png", "image/png")
+    if (folder / POSTER).is_file():
+        page["poster"] = _data_address(folder / POSTER, "image/png")
     script = viewer["index.js"].replace("export { createViewer };", "").rsplit("//# sourceMappingURL", 1)[0]
     notice = viewer["LICENSE"].replace("*/", "")
     _write_html(
