@@ -39,12 +39,13 @@ def merge(splats: Splats, count: int) -> Splats:
 
     Args:
         splats: N splats.
-        count: number of splats of the result, at least 1.
+        count: number of splats of the result; one remains for less.
 
     Returns:
-        ``min(count, N)`` splats in the order of their first members. Unmerged ones are unchanged; a merged
-            one has the extras of its heaviest member.
+        ``min(max(count, 1), N)`` splats in the order of their first members. Unmerged ones are unchanged; a
+            merged one has the extras of its heaviest member.
     """
+    count = max(count, 1)
     if len(splats) <= count:
         return splats
     means, covariances, masses = splat_moments(splats)
