@@ -63,7 +63,7 @@ TINY = {
     "flod": {
         "levels": 3, "steps": [19, 21, 27], "refine_steps": 10, "footprint": 6.0, "densify_interval": 5,
         "prune_interval": 10, "overlap_interval": 10, "sh_interval": 15, "grad_threshold": 1e-5,
-        "max_splats": 300, "merge_ratio": 0.1, "random_background": False, "margin": 0.0,
+        "max_splats": 300, "merge_ratio": 0.05, "random_background": False, "margin": 0.0,
     },
     "octree": {
         "levels": 3, "steps": 70, "footprint": 6.0, "grow_interval": 5, "far_share": 0.2, "sh_interval": 15,
@@ -171,7 +171,7 @@ def test_training_improves_the_images(uninterrupted):
     if uninterrupted["keys"]["method"] != "flod":
         quality = newest  # levels are written again at the end
     assert quality == sorted(quality) and quality[-1] > quality[0] + 0.5
-    assert newest[-1] > newest[0]
+    assert newest[-1] > newest[0] + 0.25
 
 
 KILLED = """
