@@ -15,8 +15,8 @@ from ..errors import LodgsError
 from ..lod.rule import Masks
 from ..lod.selection import check_rule
 from ..rasterize.resident import ResidentBundle
-from ..scenes.cameras import Camera, look_at, pick_evenly
-from ..scenes.overview import central_ball, complete_meta
+from ..scenes.cameras import Camera, pick_evenly
+from ..scenes.overview import overview_camera
 from ..scenes.view_tables import read_view_tables
 from ..splats.dialects import Warn, ignore
 from ..splats.gaussians import SH_C0, SplatRows, Splats
@@ -30,10 +30,6 @@ _GREY = 0.12, 0.55
 """Brightness of the remaining splats: of black ones, and what white ones add."""
 _SIDE = 1280
 """Longer side of the image in pixels."""
-_TANGENT = 0.7
-"""Half width of a view without a stored camera, at depth 1: the default lens of Blender's viewports."""
-_NEAR = 0.01
-"""Near depth of such a view, relative to the distance of its target."""
 _MAX_POINTS, _MAX_VIEWS = 20_000, 200
 """Numbers of splats and views from which the view is chosen."""
 
@@ -117,7 +113,7 @@ def _choose_view(
     """Return the camera and near depth of the image."""
     cameras, near = views
     if not cameras:
-        return _overview(bundle)
+        return overview_camera(bundle, _SIDE)
     drawn = bundle.drawn_levels(bundle.levels[-1].number)
     removed = [np.logical_or.reduce([masks[level.number] for masks in unwanted.values()]) for level in drawn]
     points = np.concatenate(
@@ -125,20 +121,3 @@ def _choose_view(
     )[:: max(sum(mask.sum() for mask in removed) // _MAX_POINTS, 1)]  # fmt: skip
     camera = max(pick_evenly(cameras, _MAX_VIEWS), key=lambda camera: int(camera.sees(points, near).sum()))
     return camera.scaled(_SIDE / max(camera.width, camera.height)), near
-
-
-def _overview(bundle: Bundle) -> tuple[Camera, float]:
-    """Return a camera that shows splats without known views, and its near depth."""
-    complete_meta(bundle)
-    up = bundle.up_rotation[2]
-    if "view" in bundle.meta:
-        position, target = np.asarray(bundle.meta["view"], np.float64)
-    else:
-        means = bundle.levels[-1].splats.means
-        target, radius = central_ball(means) if len(means) else (np.zeros(3), 1.0)
-        position = target + 3 * radius * bundle.up_rotation.T @ (0.0, -1.0, 0.3)
-    width, height = _SIDE, _SIDE * 9 // 16
-    focal = width / 2 / _TANGENT
-    pose = look_at(position, target, up)
-    camera = Camera("", width, height, focal, focal, width / 2, height / 2, pose)
-    return camera, _NEAR * float(np.linalg.norm(target - position))

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..splats.gaussians import Splats
 from ..splats.levels import Bundle
-from .cameras import look_at
+from .cameras import Camera, look_at
 from .ground import ground_plane
 
 MIN_SPLATS = 1000
@@ -29,6 +29,10 @@ _CONVENTION = 2.0
 """Factor by which the ground of an opposite direction must beat that of the usual one."""
 _FAR_FACTOR = 2.5
 """Splats beyond this multiple of the median distance from the center are background."""
+_TANGENT = 0.7
+"""Half width of an overview at depth 1: the default lens of Blender's viewports."""
+_NEAR_DEPTH = 0.01
+"""Near depth of an overview, relative to the distance of its target."""
 LARGE, NEAR, FAR = 0.5, 2.0, 20.0
 """Splats larger than the first multiple of the radius, within the second of the center, veil the subject.
 Splats beyond the third are outliers."""
@@ -155,6 +159,28 @@ def complete_meta(bundle: Bundle) -> None:
         bundle.meta["up_rotation"] = rotation.tolist()
     if "view" not in bundle.meta and (view := choose_view(splats, bundle.up_rotation[2])) is not None:
         bundle.meta["view"] = [point.tolist() for point in view]
+
+
+def overview_camera(bundle: Bundle, width: int) -> tuple[Camera, float]:
+    """Return a camera that shows splats without known views, 16:9, and its near depth.
+
+    Complete the bundle's meta, see :func:`complete_meta`. The camera's name is empty.
+
+    Args:
+        bundle: in memory.
+        width: image width in pixels.
+    """
+    complete_meta(bundle)
+    if "view" in bundle.meta:
+        position, target = np.asarray(bundle.meta["view"], np.float64)
+    else:
+        means = bundle.levels[-1].splats.means
+        target, radius = central_ball(means) if len(means) else (np.zeros(3), 1.0)
+        position = target + 3 * radius * bundle.up_rotation.T @ (0.0, -1.0, 0.3)
+    height, focal = width * 9 // 16, width / 2 / _TANGENT
+    pose = look_at(position, target, bundle.up_rotation[2])
+    camera = Camera("", width, height, focal, focal, width / 2, height / 2, pose)
+    return camera, _NEAR_DEPTH * float(np.linalg.norm(target - position))
 
 
 def _is_hollow(means: np.ndarray, center: np.ndarray, radius: float) -> bool:

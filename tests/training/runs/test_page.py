@@ -9,6 +9,7 @@ from math import atan, degrees
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from training.errors import LodgsError
 from training.runs.page import write
@@ -76,10 +77,27 @@ def test_folder_has_levels_viewer_and_cameras(bundle, tmp_path):
     np.testing.assert_allclose(pose["position"], [0, 5, -3], atol=1e-6)
     forward = np.subtract(pose["target"], pose["position"])
     np.testing.assert_allclose(forward / np.linalg.norm(forward), [0, 0, 1], atol=1e-6)
-    assert pose["fov"] == pytest.approx(degrees(2 * atan(32 / 60)))
+    assert pose["fov"] == pytest.approx(degrees(2 * atan(16 / 9 * 24 / 60)))
     assert page["settings"]["annotations"][0]["title"] == "<first>.jpg" and "<first>" not in text
     write_page(bundle, tmp_path / "out", backend="cpu")  # replaces it
     assert {path.name for path in tmp_path.iterdir()} == {"garden", "out", "viewer"}
+
+
+def test_splats_without_cameras_have_an_overview(tmp_path):
+    """The start view sees most splats of a scene far from the origin, and so does the poster."""
+    far = splats(2000)
+    far.means += 50
+    far.opacity_logits[:] = 3
+    write_bundle(tmp_path / "far.ply", Bundle("", [Level(1, far)]))
+    write_page(tmp_path / "far.ply", tmp_path / "out", backend="cpu")
+    page = page_of((tmp_path / "out" / "index.html").read_text("utf-8"))
+    (entry,) = page["settings"]["annotations"]
+    assert entry["title"] == "Overview"
+    pose = page["settings"]["cameras"][0]["initial"]
+    distance = np.linalg.norm(np.subtract(pose["position"], pose["target"]))
+    assert 1 < distance < 20 and np.linalg.norm(pose["target"]) > 50
+    assert np.asarray(Image.open(tmp_path / "out" / "poster.png")).std() > 10
+    assert (tmp_path / "out" / "levels" / STREAMED_FILE).is_file()
 
 
 def test_single_file_contains_everything(bundle, tmp_path):

@@ -6,6 +6,7 @@ import base64
 import html
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from math import atan, degrees
 from pathlib import Path
 from string import Template
@@ -15,15 +16,16 @@ import numpy as np
 from ...editing.bake_filter import bake_filter
 from ...editing.edit import open_levels
 from ...editing.placement import transform_bundle, upright_placement
+from ...editing.portable import portable_levels
 from ...errors import LodgsError
 from ...files import temporary_folder
-from ...lod.selection import resolve_rule
 from ...rasterize.resident import ResidentBundle
 from ...scenes.cameras import Camera, pick_evenly
 from ...scenes.images import write_png
-from ...scenes.view_tables import read_view_tables
+from ...scenes.overview import central_ball, overview_camera
+from ...scenes.view_tables import make_view_tables, read_view_tables
 from ...splats.dialects import Warn, ignore
-from ...splats.levels import Bundle
+from ...splats.levels import Bundle, Level
 from ...splats.similarity import Similarity
 from ...splats.sog import write_sog
 from ...splats.streamed_levels import STREAMED_FILE, write_streamed_levels
@@ -37,6 +39,8 @@ MAX_CAMERAS = 12
 MAX_SINGLE = 200_000
 """Maximum number of splats of a page in one file."""
 POSTER_WIDTH = 960
+WINDOW = 16 / 9
+"""Assumed width of a browser's window, relative to its height."""
 SAMPLE = 100_000
 """Approximate number of splats that determine the center of a scene."""
 BUDGETS = 0.1, 0.25, 0.5, 1.0
@@ -72,23 +76,28 @@ def write_page(
     path = find_splats(source)
     title = title or (path.resolve().parent.name if path.stem == "bundle" else path.stem)
     bundle = open_levels(path, warn)
+    levels, _ = portable_levels(bake_filter(bundle))
+    cameras, near, _ = read_view_tables(bundle.tables)
+    if not cameras:
+        finest = bundle.levels[-1]
+        loaded = Level(finest.number, finest.rows.select(slice(0, len(finest.rows))))
+        camera, near = overview_camera(replace(bundle, levels=[loaded]), POSTER_WIDTH)  # completes the meta
+        cameras = [replace(camera, name="Overview")]
     placement = Similarity(_DOWN, 1.0, np.zeros(3)).compose(upright_placement(bundle, upright=True))
-    placed = transform_bundle(resolve_rule(bundle.rule).complete_levels(bundle), placement)
-    cameras, near, _ = read_view_tables(placed.tables)
-    shown = bake_filter(placed)
+    viewed = replace(levels.bundle, tables=make_view_tables(pick_evenly(cameras, MAX_CAMERAS), near))
+    placed = transform_bundle(viewed, placement)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         with temporary_folder(out.parent) as temporary:
             target = temporary / "page"
             target.mkdir()
-            if cameras:
-                _write_poster(target / POSTER, placed, cameras[0], near, backend)
-            page = _describe(placed, cameras)
+            _write_poster(target / POSTER, bundle, cameras[0], near, backend)
+            page = _describe(placed)
             if single:
-                _write_single(target, shown, page, viewer, title)
+                _write_single(target, placed, page, viewer, title)
                 (target / PAGE).replace(out)
             else:
-                _write_folder(target, shown, page, viewer, title)
+                _write_folder(target, placed, page, viewer, title)
                 if out.exists():
                     out.rename(temporary / "previous")
                 target.rename(out)
@@ -131,15 +140,13 @@ def _read_viewer() -> dict[str, str]:
         ) from error
 
 
-def _describe(bundle: Bundle, cameras: list[Camera]) -> dict:
+def _describe(bundle: Bundle) -> dict:
     """Return the page's settings: budgets, cameras and the background."""
     rows = bundle.levels[-1].rows
     means = rows.select(np.arange(0, len(rows), max(1, len(rows) // SAMPLE))).means
-    center = np.median(means, axis=0)
-    radius = float(np.quantile(np.linalg.norm(means - center, axis=1), 0.9))
-    poses = [(camera.name, _pose(camera, center, radius)) for camera in pick_evenly(cameras, MAX_CAMERAS)]
-    away = (center * _VIEWER + np.array([0, 0.5, 1.5]) * radius).tolist()
-    first = {"position": away, "target": (center * _VIEWER).tolist(), "fov": 60.0}
+    center, radius = central_ball(means)
+    cameras, _, _ = read_view_tables(bundle.tables)
+    poses = [(camera.name, _pose(camera, center, radius)) for camera in cameras]
     count = len(rows)
     settings = {
         "version": 2,
@@ -156,7 +163,7 @@ def _describe(bundle: Bundle, cameras: list[Camera]) -> dict:
             "fringing": {"enabled": False, "intensity": 0.5},
         },
         "animTracks": [],
-        "cameras": [{"initial": poses[0][1] if poses else first}],
+        "cameras": [{"initial": poses[0][1]}],
         "annotations": [
             {"position": pose["target"], "title": name, "text": "", "camera": {"initial": pose}}
             for name, pose in poses
@@ -173,14 +180,16 @@ def _describe(bundle: Bundle, cameras: list[Camera]) -> dict:
 def _pose(camera: Camera, center: np.ndarray, radius: float) -> dict:
     """Return a camera's position, target and field of view in degrees, in the viewer's axes.
 
-    The viewer applies the field of view to the larger side of its window, whatever its documentation says.
+    The viewer applies the field of view to the larger side of its window, whatever its documentation says. In
+    a window of the proportions WINDOW, the whole image is visible.
     """
+    half_width, half_height = camera.width / camera.fx / 2, camera.height / camera.fy / 2
     forward = camera.world_to_camera[2, :3]
     distance = max(float((center - camera.center) @ forward), 0.2 * radius)
     return {
         "position": (camera.center * _VIEWER).tolist(),
         "target": ((camera.center + distance * forward) * _VIEWER).tolist(),
-        "fov": degrees(2 * atan(max(camera.width / camera.fx, camera.height / camera.fy) / 2)),
+        "fov": degrees(2 * atan(max(half_width, WINDOW * half_height))),
     }
 
 
@@ -197,8 +206,7 @@ def _write_folder(folder: Path, bundle: Bundle, page: dict, viewer: Mapping[str,
     for name, text in viewer.items():
         (folder / VIEWER.name / name).write_text(text, "utf-8")
     page |= {"streamed": True, "content": f"./{LEVELS}/{STREAMED_FILE}"}
-    if (folder / POSTER).is_file():
-        page["poster"] = f"./{POSTER}"
+    page["poster"] = f"./{POSTER}"
     style = '<link rel="stylesheet" href="./viewer/index.css">'
     script = 'import { createViewer } from "./viewer/index.js";'
     _write_html(folder / PAGE, page, title, style, script)
@@ -214,8 +222,7 @@ def _write_single(folder: Path, bundle: Bundle, page: dict, viewer: Mapping[str,
     write_sog(folder / "splats.sog", small[-1].rows, {})
     page |= {"streamed": False, "name": "splats.sog", "levels": [len(small[-1].rows)]}
     page["content"] = _data_address(folder / "splats.sog", "application/zip")
-    if (folder / POSTER).is_file():
-        page["poster"] = _data_address(folder / POSTER, "image/png")
+    page["poster"] = _data_address(folder / POSTER, "image/png")
     script = viewer["index.js"].replace("export { createViewer };", "").rsplit("//# sourceMappingURL", 1)[0]
     notice = viewer["LICENSE"].replace("*/", "")
     _write_html(
