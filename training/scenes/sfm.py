@@ -35,18 +35,22 @@ _VOCABULARY_SAMPLES = 60_000
 
 def _main() -> None:
     request = pycolmap_process.read_request()
-    pycolmap_process.load_pycolmap().set_random_seed(0)
+    pycolmap = pycolmap_process.load_pycolmap()
+    pycolmap.set_random_seed(0)
     work = Path(request["work"])
     database = work / "database.db"
-    send(stage="features", done=0, total=len(request["names"]))
-    _extract(request, database)
-    _match(request, work, database)
-    model = _map(request, work, database)
-    shutil.rmtree(work / "model", ignore_errors=True)
-    if model is not None:
-        (work / "model").mkdir()
-        model.write_binary(work / "model")
-    _report(database, model)
+    # One connection stays open from before the first message, when the parent process begins to poll: whoever opens
+    # a database without connections locks it for a moment, and COLMAP does not wait for locks.
+    with closing(pycolmap.Database.open(database)):
+        send(stage="features", done=0, total=len(request["names"]))
+        _extract(request, database)
+        _match(request, work, database)
+        model = _map(request, work, database)
+        shutil.rmtree(work / "model", ignore_errors=True)
+        if model is not None:
+            (work / "model").mkdir()
+            model.write_binary(work / "model")
+        _report(database, model)
 
 
 def _extract(request: dict, database: Path) -> None:
@@ -56,7 +60,7 @@ def _extract(request: dict, database: Path) -> None:
     if request["masks"]:
         reader.mask_path = request["masks"]
     mode = {"one": "SINGLE", "folder": "PER_FOLDER", "each": "PER_IMAGE"}[request["lens"]]
-    if mode == "SINGLE" and database.exists():
+    if mode == "SINGLE":
         with closing(pycolmap.Database.open(database)) as existing:
             if existing.num_cameras():
                 reader.existing_camera_id = min(camera.camera_id for camera in existing.read_all_cameras())

@@ -3,7 +3,9 @@
 import json
 import shutil
 import sqlite3
-from contextlib import closing
+import threading
+import time
+from contextlib import closing, suppress
 from pathlib import Path
 
 import numpy as np
@@ -194,6 +196,28 @@ def test_exr_files_without_other_photos_are_photos(photos, tmp_path):
         )
     result = reconstruct(tmp_path / "exr", tmp_path / "out", lens="one")
     assert result.placed == sorted(f"{path.stem}.exr" for path in photos.iterdir())
+
+
+def test_readers_cannot_lock_the_database_between_stages(tmp_path):
+    for number in range(4):
+        write_png(tmp_path / f"{number}.png", np.full((100, 100, 3), 90, np.uint8))
+    begun, ended = threading.Event(), threading.Event()
+
+    def lock() -> None:
+        begun.wait()
+        database = next(tmp_path.rglob("database.db"))
+        while not ended.is_set():
+            with closing(sqlite3.connect(database, timeout=0)) as reader, suppress(sqlite3.OperationalError):
+                reader.execute("pragma locking_mode=exclusive")
+                reader.execute("select count(*) from images").fetchone()
+                time.sleep(0.01)
+
+    reader = threading.Thread(target=lock, daemon=True)
+    reader.start()
+    with pytest.raises(LodgsError, match="have almost no features"):
+        reconstruct(tmp_path, tmp_path / "out", report=lambda *_: begun.set())
+    ended.set()
+    reader.join()
 
 
 def test_unsupported_files_are_named(tmp_path, capsys):
