@@ -39,8 +39,8 @@ def _main() -> None:
     pycolmap.set_random_seed(0)
     work = Path(request["work"])
     database = work / "database.db"
-    # One connection stays open from before the first message, when the parent process begins to poll: whoever opens
-    # a database without connections locks it for a moment, and COLMAP does not wait for locks.
+    # One connection stays open, from before the first message, when the parent process begins to poll: the first
+    # connection to a database locks it for a moment, and COLMAP does not wait for locks.
     with closing(pycolmap.Database.open(database)):
         send(stage="features", done=0, total=len(request["names"]))
         _extract(request, database)

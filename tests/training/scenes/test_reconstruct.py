@@ -135,8 +135,8 @@ def test_photos_without_a_mask_are_used_unmasked(tmp_path):
 @pytest.mark.slow
 def test_folders_of_a_rig_have_one_lens_each(tmp_path):
     """Twelve positions give each lens as many photos as in the other tests."""
-    for number, time in enumerate(np.linspace(0, 5, 12)):
-        position = [np.interp(time, range(6), axis) for axis in CAMERA_POSITIONS.T]
+    for number, moment in enumerate(np.linspace(0, 5, 12)):
+        position = [np.interp(moment, range(6), axis) for axis in CAMERA_POSITIONS.T]
         file = tmp_path / "photos" / ("left" if number % 2 else "right") / f"{number}.png"
         file.parent.mkdir(parents=True, exist_ok=True)
         write_png(file, render_photo(np.array(position)))
