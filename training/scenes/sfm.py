@@ -39,7 +39,7 @@ def _main() -> None:
     pycolmap.set_random_seed(0)
     work = Path(request["work"])
     database = work / "database.db"
-    # One connection stays open, from before the first message, when the parent process begins to poll: the first
+    # One connection stays open from before the first message, which starts the parent's polling: the first
     # connection to a database locks it for a moment, and COLMAP does not wait for locks.
     with closing(pycolmap.Database.open(database)):
         send(stage="features", done=0, total=len(request["names"]))
