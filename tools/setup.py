@@ -15,6 +15,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -154,12 +155,14 @@ def main() -> int:
                 return 1
             make(".venv-blender-5.2", newer, "blender-5.2.txt")
             return 0
-        make(".venv", python, "develop.txt")
-        if newer is not None:
-            make(".venv-blender-5.3", newer, "blender-5.3.txt")
-        elif not (ROOT / ".venv-blender-5.3").exists():
-            print("setup: Python 3.13 not found; tests in Blender 5.3 will be skipped.", file=sys.stderr)
-        viewer.fetch()
+        with ThreadPoolExecutor() as pool:  # the network is the limit
+            tasks = [pool.submit(make, ".venv", python, "develop.txt"), pool.submit(viewer.fetch)]
+            if newer is not None:
+                tasks.append(pool.submit(make, ".venv-blender-5.3", newer, "blender-5.3.txt"))
+            elif not (ROOT / ".venv-blender-5.3").exists():
+                print("setup: Python 3.13 not found; tests in Blender 5.3 will be skipped.", file=sys.stderr)
+            for task in tasks:
+                task.result()
         if sys.platform.startswith("linux") and not ctypes.util.find_library("vulkan"):
             print(
                 "setup: Vulkan not found; tests of the gpu backend will be skipped. On Debian, install",

@@ -1,6 +1,6 @@
-"""Who may import whom: only the extension knows Blender, what Blender loads needs no trainer, arrows go down.
+"""Import rules: only the extension imports bpy, Blender needs no package of the trainer, imports go down.
 
-Every relative import is an arrow from a file to a file, also a late one and one that only annotates.
+Every relative import counts, also one inside a function or for annotations.
 """
 
 from __future__ import annotations
@@ -11,7 +11,10 @@ import sys
 from functools import cache
 from pathlib import Path
 
+import numpy as np
 import pytest
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
 
 ROOT = Path(__file__).resolve().parents[2]
 TRAINER_ONLY = {
@@ -21,7 +24,7 @@ PROGRAMS = ("sfm", "sfm_known_poses", "undistort", "pycolmap_process")
 """Files that import pycolmap, in processes of their own."""
 BLENDER_ONLY = {"bpy", "bpy_extras", "gpu", "gpu_extras", "mathutils"}
 
-FLOORS = {
+LAYERS = {
     "blender_lodgs": (
         ("__init__",),
         ("operators", "panels", "commands"),
@@ -50,122 +53,115 @@ FLOORS = {
         ("errors", "packages", "plugins", "__init__"),
     ),
 }
-"""The rooms of both packages, from the top: each may import those on the floors below it, and itself."""
+"""Layers of both packages, from the top. Each part imports only parts of lower layers, and itself."""
 
-Arrow = tuple[str, str]
+Import = tuple[str, str]
+"""Importing file and imported file."""
 
 
 @cache
 def parsed() -> dict[str, ast.Module]:
-    """The packages' files by their path from the root."""
-    paths = (path for package in FLOORS for path in sorted((ROOT / package).rglob("*.py")))
+    """Return the packages' syntax trees by path relative to the root."""
+    paths = (path for package in LAYERS for path in sorted((ROOT / package).rglob("*.py")))
     return {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text(encoding="utf-8")) for path in paths}
 
 
+@cache
+def import_nodes(file: str) -> list[ast.Import | ast.ImportFrom]:
+    return [node for node in ast.walk(parsed()[file]) if isinstance(node, ast.Import | ast.ImportFrom)]
+
+
 def absolute_imports(file: str) -> set[str]:
-    """Top-level packages that a file imports absolutely, anywhere in it."""
-    found = set()
-    for node in ast.walk(parsed()[file]):
+    """Return the names of top-level packages that a file imports absolutely."""
+    names = set()
+    for node in import_nodes(file):
         if isinstance(node, ast.Import):
-            found |= {alias.name.split(".")[0] for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
-            found.add(node.module.split(".")[0])
-    return found
+            names |= {alias.name.split(".")[0] for alias in node.names}
+        elif node.level == 0 and node.module:
+            names.add(node.module.split(".")[0])
+    return names
 
 
 def file_of(module: tuple[str, ...]) -> str | None:
-    """The file of a module of ours; None where there is no such module."""
+    """Return the file of a module of these packages, or None."""
     path = "/".join(module)
     return next((file for file in (f"{path}.py", f"{path}/__init__.py") if file in parsed()), None)
 
 
 @cache
-def arrows() -> frozenset[Arrow]:
-    """(importing file, imported file) for each relative import."""
-    found = set()
-    for file, tree in parsed().items():
-        for node in ast.walk(tree):
+def relative_imports() -> frozenset[Import]:
+    imports = set()
+    for file in parsed():
+        for node in import_nodes(file):
             if not isinstance(node, ast.ImportFrom) or not node.level:
                 continue
             package = Path(file).parts[: -node.level]
             source = (*package, *(node.module or "").split(".")) if node.module else package
             for alias in node.names:
                 target = file_of((*source, alias.name)) or file_of(source)
-                assert target, f"{file}:{node.lineno} imports what is not there"
-                found.add((file, target))
-    return frozenset(found)
+                assert target, f"{file}:{node.lineno} imports a missing module"
+                imports.add((file, target))
+    return frozenset(imports)
 
 
-def room(file: str) -> tuple[str, str]:
-    """The package and the room that a file is in: a folder, or a file that stands in the package itself."""
-    package, inside = Path(file).parts[:2]
-    return package, inside.removesuffix(".py")
+def part_of(file: str) -> tuple[str, str]:
+    """Return the package of a file, and its folder or module directly inside the package."""
+    package, name = Path(file).parts[:2]
+    return package, name.removesuffix(".py")
 
 
-def floor(file: str) -> int:
-    """On which floor of its package a file's room is, counted from the top."""
-    package, name = room(file)
-    for number, rooms in enumerate(FLOORS[package]):
-        if name in rooms:
+def layer(file: str) -> int:
+    """Return the number of a file's layer in its package, counted from the top."""
+    package, name = part_of(file)
+    for number, parts in enumerate(LAYERS[package]):
+        if name in parts:
             return number
-    raise AssertionError(f"{file} is in no room that FLOORS knows")
+    raise AssertionError(f"{file} is in no layer of LAYERS")
 
 
-def climbs(arrow: Arrow) -> bool:
-    importing, imported = arrow
-    if room(importing) == room(imported):
+def goes_up(imported: Import) -> bool:
+    """Return whether an import breaks the order of layers, or is one of Blender's side by the trainer."""
+    source, target = imported
+    if part_of(source) == part_of(target):
         return False
-    if room(importing)[0] != room(imported)[0]:
-        return room(importing)[0] == "training"  # the trainer knows nothing of Blender
-    return floor(imported) <= floor(importing)
+    if part_of(source)[0] != part_of(target)[0]:
+        return part_of(source)[0] == "training"
+    return layer(target) <= layer(source)
 
 
-def circles(graph: frozenset[Arrow]) -> list[list[str]]:
-    """The groups of files of which each is reached from each other."""
-
-    def reached(start: str) -> set[str]:
-        found, ahead = set(), [start]
-        while ahead:
-            here = ahead.pop()
-            new = {target for source, target in graph if source == here} - found
-            found |= new
-            ahead += new
-        return found
-
-    beyond = {file: reached(file) for file in {source for source, _ in graph}}
-    groups = {
-        frozenset(other for other in beyond[file] if file in beyond.get(other, ()))
-        for file in beyond
-        if file in beyond[file]
-    }
-    return [sorted(group) for group in groups]
+def cycles(imports: frozenset[Import]) -> list[list[str]]:
+    """Return the groups of files that import each other, directly or through others."""
+    files = sorted({file for pair in imports for file in pair})
+    numbers = {file: number for number, file in enumerate(files)}
+    rows, columns = zip(*((numbers[source], numbers[target]) for source, target in imports), strict=True)
+    graph = csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(len(files), len(files)))
+    _, labels = connected_components(graph, connection="strong")
+    groups = [
+        [file for file, own in zip(files, labels, strict=True) if own == label] for label in set(labels)
+    ]
+    return sorted(group for group in groups if len(group) > 1 or (group[0], group[0]) in imports)
 
 
-def test_every_file_is_in_a_room():
+def test_every_file_is_in_a_layer():
     assert len(parsed()) > 80
-    assert {floor(file) for file in parsed() if file.startswith("training")} == set(
-        range(len(FLOORS["training"]))
-    )
+    layers = {layer(file) for file in parsed() if file.startswith("training")}
+    assert layers == set(range(len(LAYERS["training"])))
 
 
-def test_no_arrow_climbs():
-    climbing = {arrow for arrow in arrows() if climbs(arrow)}
-    assert not climbing, "\n".join(f"{a} imports {b}" for a, b in sorted(climbing))
+def test_no_import_goes_up():
+    upward = sorted(pair for pair in relative_imports() if goes_up(pair))
+    assert not upward, "\n".join(f"{source} imports {target}" for source, target in upward)
 
 
-def test_there_is_no_circle_of_files():
-    for group in circles(arrows()):
-        inside = sorted(arrow for arrow in arrows() if {*arrow} <= {*group})
-        raise AssertionError("a circle:\n" + "\n".join(f"{a} imports {b}" for a, b in inside))
-
-
-def arrows_inside(package: str) -> set[Arrow]:
-    return {arrow for arrow in arrows() if all(file.startswith(f"{package}/") for file in arrow)}
+def test_there_is_no_cycle():
+    for group in cycles(relative_imports()):
+        inside = sorted(pair for pair in relative_imports() if {*pair} <= {*group})
+        raise AssertionError("a cycle:\n" + "\n".join(f"{a} imports {b}" for a, b in inside))
 
 
 @pytest.mark.parametrize(("package", "limit"), [("training/methods", 21), ("training/lod", 26)])
-def test_files_of_a_package_hardly_import_each_other(package, limit):
-    inside = arrows_inside(package)
+def test_imports_inside_a_package_are_few(package, limit):
+    inside = [pair for pair in relative_imports() if all(file.startswith(f"{package}/") for file in pair)]
     assert 0 < len(inside) <= limit, sorted(inside)
 
 
@@ -188,16 +184,18 @@ TREE = {
     "training/methods/tree/",
     "blender_lodgs/nodes/rules/cut.py",
 }
-"""Files that know the tree of splats; all others use it through ``Rule`` and ``MethodInfo``."""
+"""Files that may import the tree of splats; all others use it through ``Rule`` and ``MethodInfo``."""
 
 
 def test_only_its_own_files_import_the_tree():
-    importing = {a for a, b in arrows() if b.startswith(tuple(TREE)) and not a.startswith(tuple(TREE))}
+    importing = {
+        a for a, b in relative_imports() if b.startswith(tuple(TREE)) and not a.startswith(tuple(TREE))
+    }
     assert not importing, sorted(importing)
 
 
 @pytest.mark.parametrize(
-    ("arrow", "answer"),
+    ("pair", "expected"),
     [
         (("blender_lodgs/render/engine.py", "blender_lodgs/runs/processes.py"), False),
         (("blender_lodgs/data/scenes.py", "blender_lodgs/data/objects.py"), False),
@@ -207,14 +205,14 @@ def test_only_its_own_files_import_the_tree():
         (("training/errors.py", "blender_lodgs/compat.py"), True),
     ],
 )
-def test_what_climbing_is(arrow, answer):
-    assert climbs(arrow) is answer
+def test_goes_up(pair, expected):
+    assert goes_up(pair) is expected
 
 
-def test_circles_are_found():
+def test_cycles():
     graph = frozenset({("a", "b"), ("b", "c"), ("c", "a"), ("c", "d"), ("e", "a")})
-    assert circles(graph) == [["a", "b", "c"]]
-    assert circles(graph - {("c", "a")}) == []
+    assert cycles(graph) == [["a", "b", "c"]]
+    assert cycles(graph - {("c", "a")}) == []
 
 
 def test_only_the_extension_imports_bpy():
@@ -224,7 +222,7 @@ def test_only_the_extension_imports_bpy():
     assert "bpy" in absolute_imports("blender_lodgs/__init__.py")
 
 
-def test_the_extension_never_imports_the_trainers_packages():
+def test_extension_imports_no_package_of_the_trainer():
     for file in parsed():
         if file.startswith("blender_lodgs/"):
             assert not absolute_imports(file) & TRAINER_ONLY, file
@@ -235,27 +233,29 @@ def test_imports_inside_the_packages_are_relative():
         assert not absolute_imports(file) & {"training", "blender_lodgs", "bl_ext"}, file
 
 
-def test_what_blender_loads_works_without_the_trainer():
-    """All modules of the trainer's that the extension imports, where its packages are missing."""
-    loaded = {b for a, b in arrows() if a.startswith("blender_lodgs/") and b.startswith("training/")}
+def test_modules_for_blender_need_no_package_of_the_trainer():
+    """Import all modules that the extension uses, with the trainer's packages blocked."""
+    loaded = {
+        b for a, b in relative_imports() if a.startswith("blender_lodgs/") and b.startswith("training/")
+    }
     modules = sorted(file.removesuffix(".py").removesuffix("/__init__").replace("/", ".") for file in loaded)
     assert len(modules) > 10
     blocked = f"""
 import importlib, sys
-class Absent:
+class Blocker:
     def find_spec(self, name, path=None, target=None):
         if name.split('.')[0] in {TRAINER_ONLY!r}:
             raise ModuleNotFoundError(name)
-sys.meta_path.insert(0, Absent())
+sys.meta_path.insert(0, Blocker())
 for name in {modules!r}:
     importlib.import_module(name)
 """
-    done = subprocess.run([sys.executable, "-c", blocked], cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    process = subprocess.run([sys.executable, "-c", blocked], cwd=ROOT, capture_output=True, text=True)
+    assert process.returncode == 0, process.stderr
 
 
 def test_pycolmap_runs_only_in_processes_of_its_own():
-    """It replaces the handler of SIGTERM, so that a trainer that imports it cannot save and stop."""
+    """pycolmap replaces the handler of SIGTERM, so a trainer that imports it could not save and stop."""
     programs = {f"training/scenes/{name}.py" for name in PROGRAMS}
     for file in [file for file in parsed() if "pycolmap" in absolute_imports(file)]:
         assert file in programs, file

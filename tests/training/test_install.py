@@ -66,4 +66,3 @@ def test_installed_command_checks_trains_and_reads(lodgs, tiny_scene, tmp_path, 
     )  # fmt: skip
     assert json.loads(events.splitlines()[-1])["event"] == "done"
     assert lodgs("info", tmp_path / "run" / "bundle.ply").count("\n") > 2
-    assert "Automatic trains on" in json.loads(lodgs("devices", "--json"))["sentence"]

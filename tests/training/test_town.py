@@ -23,6 +23,7 @@ def test_town_is_reproducible_and_has_the_requested_number_of_splats(plan):
             assert np.array_equal(values, getattr(second, name)), name
 
 
+@pytest.mark.nightly
 def test_large_numbers_of_splats_give_more_blocks(plan):
     assert plan.blocks == 3 == town.plan_for(1_000_000).blocks
     assert town.plan_for(10_000_000).blocks > 3

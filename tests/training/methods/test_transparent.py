@@ -76,7 +76,7 @@ def test_photos_are_composited_over_black(scene):
     assert opaque.over((1.0, 0.0, 0.0)) is opaque
 
 
-@pytest.mark.parametrize("method", ["3dgs", "octree"])
+@pytest.mark.parametrize("method", ["3dgs", pytest.param("octree", marks=pytest.mark.nightly)])
 @pytest.mark.slow
 def test_trained_object_is_as_transparent(scene, tmp_path, method, capsys):
     parameters = {"steps": 400, "max_splats": 1500}

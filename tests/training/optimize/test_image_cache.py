@@ -195,7 +195,9 @@ def equal(first, second) -> bool:
     return first == second
 
 
-@pytest.mark.parametrize("name", ["3dgs", "octree", "flod"])
+@pytest.mark.parametrize(
+    "name", ["flod", *(pytest.param(name, marks=pytest.mark.nightly) for name in ("3dgs", "octree"))]
+)
 def test_training_is_bit_identical_for_any_cache_size_and_timing(scene, name, monkeypatch):
     """Includes runs that resume with another budget, and steps with reduced images."""
     image_bytes = TARGET_BYTES * 64 * 48

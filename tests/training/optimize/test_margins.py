@@ -121,7 +121,15 @@ def test_blur_preserves_known_values_and_has_limited_reach():
     assert blurred[reached] == pytest.approx(7.0)
 
 
-@pytest.mark.parametrize("name", sorted(METHODS))
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(
+            name, marks=[pytest.mark.nightly] * (name in ("flod_scaffold", "matryoshka", "octree_neural"))
+        )
+        for name in sorted(METHODS)
+    ],
+)
 def test_every_method_adds_margins(data, name):
     """Margins are outside the photos, in the final levels, and have the columns of the rule."""
     steps = {"steps": [6, 6], "levels": 2} if name in ("flod", "flod_scaffold") else {"steps": 12}

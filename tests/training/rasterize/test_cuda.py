@@ -61,9 +61,13 @@ def device(request) -> str:
     return request.param
 
 
+RARE = ("degree 1", "degree 2", "one", "antialiased some", "screen-filling", "crowd")
+"""Scenes that are compared nightly."""
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.nightly] * (name == "crowd")) for name in SCENES]
+    "name", [pytest.param(name, marks=[pytest.mark.nightly] * (name in RARE)) for name in SCENES]
 )
 def test_results_match_reference(name, device, make_splats, odd_camera, monkeypatch):
     """Relative L2 errors of all outputs and gradients are at most 5e-4, on GPUs with fast exp 2e-3."""

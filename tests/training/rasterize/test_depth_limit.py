@@ -43,8 +43,8 @@ def test_splats_behind_limit_are_hidden(backend, axis_camera):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
-    ["degree 3", "antialiased", "needles", "screen-filling", "caps",
-     pytest.param("crowd", marks=pytest.mark.nightly)],
+    ["degree 3", "antialiased", "caps",
+     *(pytest.param(name, marks=pytest.mark.nightly) for name in ("needles", "screen-filling", "crowd"))],
 )  # fmt: skip
 def test_limits_match_reference(name, backend, make_splats, odd_camera):
     """With a different limit in every pixel, relative L2 errors are at most 5e-4."""

@@ -93,6 +93,7 @@ def test_adapters_are_sorted_and_opened_by_part_of_their_name(graphics):
         open_device("Voodoo 2")
 
 
+@pytest.mark.nightly
 def test_small_bindings_do_not_change_results(graphics, make_splats, odd_camera, monkeypatch):
     """2600 splats touch 20 tiles; bindings of 140 KB hold 3258 pairs and the harmonics of 704 splats."""
     results = []

@@ -52,6 +52,7 @@ def test_run_changes_between_backends(graphics, fake_card, keys, monkeypatch):
     assert [message.split()[3] for message in resumed] == ["4", "8", "13"]
 
 
+@pytest.mark.nightly
 def test_stopped_run_on_a_device_gives_the_same_bits_and_measures(graphics, keys, monkeypatch, tmp_path):
     code, _ = run_in_process(keys)
     assert code == 0

@@ -44,7 +44,7 @@ def train(scene, out, on_message=lambda message: None):
     return training_loop.train(job, Stream()), messages
 
 
-@pytest.mark.parametrize("request_stop", ["cancel", "SIGTERM"])
+@pytest.mark.parametrize("request_stop", [pytest.param("cancel", marks=pytest.mark.nightly), "SIGTERM"])
 def test_stop_while_triangulating_then_resume(walls, tmp_path, monkeypatch, request_stop):
     scene = shutil.copytree(walls, tmp_path / "scene", ignore=shutil.ignore_patterns(".*"))
     folder = RunFolder(tmp_path / "run")

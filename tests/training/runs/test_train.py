@@ -86,7 +86,9 @@ one_method_by_default = pytest.mark.parametrize(
 """Run a test that starts processes with one method, with the others only nightly."""
 
 
-@pytest.fixture(scope="module", params=TINY)
+@pytest.fixture(
+    scope="module", params=["flod", "octree", pytest.param("octree_neural", marks=pytest.mark.nightly)]
+)
 def uninterrupted(request, tiny_scene, tmp_path_factory) -> dict:
     """Keys, output lines and bundle of an uninterrupted run of the tiny job."""
     out = tmp_path_factory.mktemp("uninterrupted")

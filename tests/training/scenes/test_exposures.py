@@ -74,6 +74,7 @@ def test_single_deviating_photo_is_corrected(copy):
     assert np.median(remaining) < 0.01
 
 
+@pytest.mark.nightly
 def test_smooth_exposure_changes_stay(copy):
     scene = copy(lambda count: np.linspace(-0.7, 0.7, count))
     assert all(np.abs(np.log(gain)).max() < 0.02 for gain in exposure_gains(scene, scene.cameras).values())

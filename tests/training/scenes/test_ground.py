@@ -33,7 +33,7 @@ def scene(seed: int, size: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndar
     return size * rng.permutation(points), tilt @ UP, size * shift
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("size", [1e-3, 1.0, 1e4])
 def test_ground_plane_of_synthetic_scenes(seed, size):
     points, expected, point = scene(seed, size)

@@ -38,7 +38,7 @@ def window(left: int, top: int, right: int, bottom: int):
     return np.array([left, top], np.int32), np.array([right, bottom], np.int32)
 
 
-@pytest.mark.parametrize("size", [(1000, 500), (999, 777), (400, 300), (150, 3000)])
+@pytest.mark.parametrize("size", [(999, 777), (150, 3000)])
 def test_memory_of_large_images_is_limited(tmp_path, size):
     """Arrays of float32 values and sums for 24 million pixels would take more than a gigabyte."""
     write_flat_png(tmp_path / "a.png", 4000, 6000)

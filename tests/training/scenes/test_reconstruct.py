@@ -98,7 +98,7 @@ def test_masks_restart_the_reconstruction_and_exclude_features(photos, tmp_path)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("subfolder", ["", "scene"])
+@pytest.mark.parametrize("subfolder", [pytest.param("", marks=pytest.mark.nightly), "scene"])
 def test_scene_inside_its_photo_folder_resumes(photos, tmp_path, subfolder):
     folder = shutil.copytree(photos, tmp_path / "photos")
     first = reconstruct(folder, folder / subfolder)

@@ -90,6 +90,7 @@ def test_result_is_cached(result, walls, tmp_path, monkeypatch):
     assert len(cached_points(read_scene(shutil.copytree(walls / "..", tmp_path / "copy") / "scene")).points)
 
 
+@pytest.mark.nightly
 def test_repeated_triangulation_has_the_same_bits(result, walls, tmp_path):
     scene, _ = result
     copy = shutil.copytree(walls, tmp_path / "copy", ignore=shutil.ignore_patterns(".*"))
@@ -160,6 +161,7 @@ def test_command_writes_points(walls, tmp_path, capsys):
     assert observations(scene, ["0.png"]) and [p.name for p in (tmp_path / "sparse").iterdir()] == ["0"]
 
 
+@pytest.mark.nightly
 def test_command_can_be_repeated_after_a_full_disk(walls, tmp_path, capsys, monkeypatch):
     source = Path(shutil.copytree(walls, tmp_path / "scene", ignore=shutil.ignore_patterns(".*")))
     words = ["scene", "--from", str(source), "--out", str(tmp_path / "out")]

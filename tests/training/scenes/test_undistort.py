@@ -65,7 +65,9 @@ def test_ideal_fisheye_is_undistorted(tmp_path):
     assert abs(80 * (tangent - np.arctan(tangent))) > 1
 
 
-@pytest.mark.parametrize("suffix", ["webp", "exr", "tif", "tiff"])
+@pytest.mark.parametrize(
+    "suffix", ["exr", "tiff", *(pytest.param(name, marks=pytest.mark.nightly) for name in ("tif", "webp"))]
+)
 def test_unsupported_formats_are_undistorted_like_a_png(tmp_path, suffix):
     """EXR keeps floats above 1; a TIFF of grey floats equals the grey PNG."""
     grey = np.repeat(ramps()[..., :1], 3, axis=2)

@@ -46,7 +46,7 @@ def render(splats: Splats, camera: Camera, near: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3, 4])
-@pytest.mark.parametrize("scale", [1.0, 0.37, 12.5])
+@pytest.mark.parametrize("scale", [0.37, 12.5])
 def test_transformed_scene_matches_transformed_camera(degree, scale):
     """At least 50 dB; unrotated harmonics stay below 30."""
     splats, placement = random_splats(300, degree), Similarity.from_matrix(matrix_of(degree, scale))

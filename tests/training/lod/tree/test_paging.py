@@ -118,7 +118,7 @@ def test_sufficient_budget_gives_the_full_cut(truth, path):
             np.testing.assert_array_equal(np.sort(drawn), truth.cut(position, pixels))
 
 
-@pytest.mark.parametrize("budget", [SIZE, 5000, 20_000])
+@pytest.mark.parametrize("budget", [SIZE, pytest.param(5000, marks=pytest.mark.nightly), 20_000])
 def test_cuts_are_complete_within_a_budget(truth, path, budget, monkeypatch):
     """Also while pages arrive, and for other cameras."""
     monkeypatch.setattr(paging, "PAGES_PER_UPDATE", 3)
@@ -189,7 +189,7 @@ def test_thread_reports_errors(path, monkeypatch):
     pager.stop()
 
 
-@pytest.mark.parametrize("budget", [SIZE, 5000, 10**6])
+@pytest.mark.parametrize("budget", [SIZE, pytest.param(5000, marks=pytest.mark.nightly), 10**6])
 def test_budgeted_read_gives_a_smaller_tree(truth, path, budget, tmp_path):
     file = open_paged(path)
     bundle = file.top(budget)
@@ -316,7 +316,7 @@ def test_other_rules_and_small_budgets_are_reported(truth, tmp_path):
     assert [len(level.splats) for level in bundle.levels] == [0, 1]
 
 
-@pytest.mark.parametrize("pixels", [1.0, 6.0, 30.0])
+@pytest.mark.parametrize("pixels", [1.0, pytest.param(6.0, marks=pytest.mark.nightly), 30.0])
 def test_cut_is_read_from_disk(truth, path, pixels):
     """Complete without a camera; with a camera, all visible splats and few others."""
     file, shares = TreeFile(path), []

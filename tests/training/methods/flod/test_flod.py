@@ -250,6 +250,7 @@ def test_fine_levels_restart_from_important_splats(data):
     assert first == pytest.approx(0.8 * two, abs=1)
 
 
+@pytest.mark.nightly
 def test_enlarged_splats_become_fainter(data):
     """Applies to the antialiasing filter; without it small splats are already drawn enlarged."""
     flod, handed = is_finishing(data, footprint=1.0, drawn=0.6)

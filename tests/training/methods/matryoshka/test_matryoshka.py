@@ -152,7 +152,7 @@ def test_base_is_ordered_at_once(data):
     assert len(method.model) == len(base)
 
 
-@pytest.mark.parametrize("stop", [7, 15, 23])
+@pytest.mark.parametrize("stop", [15, *(pytest.param(step, marks=pytest.mark.nightly) for step in (7, 23))])
 def test_resume_is_bit_identical(data, stop, check_resumed):
     check_resumed(lambda: make(data), stop)
 

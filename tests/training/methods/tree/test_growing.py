@@ -94,7 +94,9 @@ def test_levels_contain_all_nodes(tmp_path):
     assert (sizes["parent_size"] > sizes["node_size"]).all() and (sizes["node_size"] > 0).all()
 
 
-@pytest.mark.parametrize(("cell", "subtree_leaves"), [(1, 1), (7, 3), (60, 200)])
+@pytest.mark.parametrize(
+    ("cell", "subtree_leaves"), [pytest.param(1, 1, marks=pytest.mark.nightly), (7, 3), (60, 200)]
+)
 def test_cuts_of_cells_are_proper(tmp_path, cell, subtree_leaves):
     """Every path from a leaf to the root has one node of the cut, for any camera."""
     leaves = scene(500)

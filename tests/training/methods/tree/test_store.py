@@ -48,7 +48,10 @@ def read_means(store):
     return store.layout.split(store.rows.read(np.arange(len(store))))["means"].numpy()
 
 
-@pytest.mark.parametrize("subtree_leaves", [1, 7, 0, 10_000])
+@pytest.mark.parametrize(
+    "subtree_leaves",
+    [pytest.param(1, marks=pytest.mark.nightly), 7, pytest.param(0, marks=pytest.mark.nightly), 10_000],
+)
 def test_new_cut_equals_hspt_in_memory(town, tmp_path, subtree_leaves, monkeypatch):
     monkeypatch.setattr(store_module, "BATCH_NODES", 300)  # many parts of everything
     nodes, tree = town
@@ -169,7 +172,7 @@ def test_small_budget_gives_identical_bits(town, tmp_path):
     assert small_store.cache.loaded > 2 * needed
 
 
-@pytest.mark.parametrize("stop", [3, 14, 29])
+@pytest.mark.parametrize("stop", [14, *(pytest.param(step, marks=pytest.mark.nightly) for step in (3, 29))])
 def test_resume_is_bit_identical(town, tmp_path, stop):
     """Uses reused cuts and a small budget, so that the content of the cache matters."""
     budget = 3500 * RECORD + TABLE

@@ -265,7 +265,9 @@ def test_view_of_nothing_completes_its_step(data, base):
     assert np.isfinite(tree.train_step(1)[0])
 
 
-@pytest.mark.parametrize("stop", [11, 12, 13, 16])
+@pytest.mark.parametrize(
+    "stop", [12, *(pytest.param(step, marks=pytest.mark.nightly) for step in (11, 13, 16))]
+)
 def test_resume_is_bit_identical(data, stop):
     """Stops in the 3DGS steps, at their end, before the first step of the tree, and between size updates."""
     values = {"resize_interval": 3, "lr_scales": 0.1}

@@ -269,7 +269,7 @@ def _full(folder: RunFolder, at: int, counted) -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="processes do not fork")
-@pytest.mark.parametrize(("end", "code"), [(_killed, 9), (_full, 8)])
+@pytest.mark.parametrize(("end", "code"), [(_killed, 9), pytest.param(_full, 8, marks=pytest.mark.nightly)])
 def test_run_resumes_after_a_crash_at_any_write(tmp_path, uninterrupted, monkeypatch, end, code):
     monkeypatch.setattr(os, "fsync", lambda _: None)  # only needed for power cuts, and slow
     fork = multiprocessing.get_context("fork")
