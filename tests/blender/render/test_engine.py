@@ -274,6 +274,7 @@ def test_instances_take_the_detail_of_their_own_distance(bpy, lodgs, scene, tmp_
     assert np.abs(bytes_of(drawn).astype(int) - bytes_of(expected)).max() <= 2
 
 
+@pytest.mark.one_blender
 def test_an_animation_starts_the_renderer_once(bpy, lodgs, scene, tmp_path, monkeypatch):
     renderer, started = lodgs("render.renderer"), []
     renderer.close()
@@ -449,6 +450,7 @@ def test_cancel(bpy, lodgs, scene, monkeypatch):
     assert lodgs("render.renderer")._renderer.process is process
 
 
+@pytest.mark.one_blender
 def test_a_killed_renderer_is_started_again(bpy, lodgs, scene, tmp_path, capsys):
     before = f12(bpy, tmp_path)
     process = lodgs("render.renderer")._renderer.process
@@ -461,6 +463,7 @@ def test_a_killed_renderer_is_started_again(bpy, lodgs, scene, tmp_path, capsys)
     assert "The renderer was killed (signal 9)" in capsys.readouterr().out
 
 
+@pytest.mark.one_blender
 def test_a_renderer_that_always_dies_is_reported(bpy, lodgs, scene, tmp_path, monkeypatch):
     lodgs("render.renderer").close()
     program = tmp_path / "dies"
