@@ -73,14 +73,21 @@ def main() -> int:
     if "curve" in measured:
         report["curve"] = [_splat_count_row(row) for row in measured["curve"]]
     (out / "report.json").write_text(json.dumps(report, indent=1))
-    page = [sys.executable, "-m", "training", "compare", str(run.path), "--out", str(out)]
-    code = subprocess.run(page, cwd=ROOT, stdout=subprocess.DEVNULL, check=False).returncode
-    if code:
-        return code
+    title = options.scene.resolve().name.replace("_", " ").capitalize()
+    pages = [
+        ["compare", str(run.path), "--out", str(out)],
+        ["page", str(run.path), "--out", str(out / "page"), "--title", title],
+    ]
+    for arguments in pages:
+        command = [sys.executable, "-m", "training", *arguments]
+        code = subprocess.run(command, cwd=ROOT, stdout=subprocess.DEVNULL, check=False).returncode
+        if code:
+            return code
     print(f"Finished in {time.monotonic() - started:.0f} seconds. Files in {os.path.relpath(out)}:")
     print("  index.html   compare the levels in a browser: open this next")
     print("  scene.blend  the scene in Blender, with levels by distance")
     print("  bundle.ply   all levels in one file, which ordinary viewers open at the finest")
+    print("  page         all levels for any browser, to upload; python -m http.server shows it here")
     print("  levels.png   comparison of the levels; report.json has the numbers")
     if run.costs.exists():
         print(f"In {os.path.relpath(run.path)}: costs.png (costs measured to choose the levels' distances)")

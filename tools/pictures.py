@@ -1,7 +1,8 @@
-"""Take all of the documentation's pictures that show panels: ``make pictures``.
+"""Take all of the documentation's pictures that show panels and pages: ``make pictures``.
 
-Opens a real Blender window on a virtual display (see ``window.py``) and runs ``window_pictures.py`` in it.
-Writes docs/images/<page>-<subject>.jpg, and the layouts of all panels to docs/images/panels.json.
+Opens a real Blender window on a virtual display (see ``window.py``), runs ``window_pictures.py`` in it, and
+opens the pages of its run in Chromium. Writes docs/images/<page>-<subject>.jpg, and the layouts of all panels
+to docs/images/panels.json.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -20,8 +22,10 @@ sys.path.insert(0, str(ROOT))
 from PIL import Image  # noqa: E402
 
 from tools import extension, window  # noqa: E402
+from tools.interop_gltf import BROWSERS  # noqa: E402
 
 IMAGES = ROOT / "docs" / "images"
+PAGE = ("page", "--single", "--title", "Lantern garden")
 PARAMETERS = {"max_splats": 60_000, "steps": (60, 90, 120, 180, 750), "refine_steps": 90}
 
 
@@ -49,6 +53,8 @@ def main() -> int:
         }  # fmt: skip
         with window.display(x_server) as os.environ["DISPLAY"]:
             problem = window.run_script(blender, plan, out / "blender.log")
+            if not problem:
+                take_pages(Path(plan["run"]), Path(work), out, camera)
     if problem:
         print(f"pictures: {problem}", file=sys.stderr)
         return 1
@@ -60,6 +66,47 @@ def main() -> int:
     if not options.keep:
         subprocess.run([sys.executable, str(ROOT / "tools" / "panel_layouts.py")], check=True)
     return 0
+
+
+def take_pages(run: Path, work: Path, out: Path, camera: str) -> None:
+    """Take pictures of a run's page to share and of its comparison, if Chromium is installed."""
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if browser is None:
+        print("pictures: Chromium not found; export-page and compare-page are not retaken.", file=sys.stderr)
+        return
+    for name, arguments, page in (
+        ("90-export-page", [*PAGE, str(run), "--out", str(work / "page.html")], "page.html"),
+        (
+            "91-compare-page",
+            ["compare", str(run), "--out", str(work / "comparison")],
+            "comparison/index.html",
+        ),
+    ):
+        subprocess.run([sys.executable, "-m", "training", *arguments], cwd=ROOT, check=True)
+        process = subprocess.Popen(
+            [browser, "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--kiosk",
+             "--no-first-run", "--window-position=0,0", f"--window-size={window.SIZE[0]},{window.SIZE[1]}",
+             f"--user-data-dir={work / 'profile'}", (work / page).as_uri()],
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        try:
+            photograph(camera, out / f"{name}.png")
+        finally:
+            process.kill()
+            process.wait()
+
+
+def photograph(camera: str, path: Path) -> None:
+    """Take a picture of the display once it has not changed for 15 seconds; at most after 3 minutes."""
+    previous = None
+    for _ in range(12):
+        time.sleep(15)
+        subprocess.run([camera, "-window", "root", str(path)], check=True)
+        image = Image.open(path).convert("L")
+        low, high = image.getextrema()
+        if previous == image.tobytes() and low < high:
+            return
+        previous = image.tobytes()
 
 
 if __name__ == "__main__":
