@@ -273,7 +273,7 @@ class LODGS_OT_export_plain(_FormatExport, bpy.types.Operator):
         path = self._path()
         meta = selection.read_json(root.lodgs.meta)
         if self.placed:
-            meta.pop("origin", None)
+            meta = {name: value for name, value in meta.items() if name not in ("origin", "georeference")}
         bundle = Bundle("", [Level(1, splats)], meta=meta, tables=scenes.view_tables(root, self.placed))
         flags = {"antialiased": self.antialiased, "original_place": self.original_place}
         if find_format(path).in_trainer:

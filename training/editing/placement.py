@@ -14,6 +14,7 @@ from ..lod.selection import unknown_rule_error
 from ..scenes import view_tables
 from ..scenes.ground import find_ground, ground_placement, points_near_cameras
 from ..splats.gaussians import SplatRows, Splats
+from ..splats.georeference import Georeference
 from ..splats.levels import META_LENGTHS, NO_SPLATS, Bundle, Level
 from ..splats.ply import read_batches
 from ..splats.similarity import Similarity, TransformedRows
@@ -61,7 +62,7 @@ def transform_bundle(bundle: Bundle, placement: Similarity) -> Bundle:
         tables[view_tables.VIEWS] = view_tables.transform_views(tables[view_tables.VIEWS], placement)
     if rule and new_columns and BLOCKS in tables:
         tables[BLOCKS] = block_table(rule.block_bounds, new_columns.items())
-    meta = _transform_meta(bundle.meta, placement)
+    meta = _transform_meta(bundle.meta, placement, bundle.georeference)
     return replace(bundle, levels=levels, facts=scale(bundle.facts), tables=tables, meta=meta)
 
 
@@ -102,13 +103,16 @@ def _opaque_means(rows: SplatRows) -> np.ndarray:
     return np.concatenate([splats.means[splats.opacity_logits > 0] for splats in read_batches(rows)])
 
 
-def _transform_meta(meta: dict, placement: Similarity) -> dict:
+def _transform_meta(meta: dict, placement: Similarity, place: Georeference | None) -> dict:
     """Return a bundle's metadata with transformed positions, directions and lengths.
 
-    The result has other coordinates than the original scene, so it has no local origin.
+    The result has other coordinates than the original scene, so it has no local origin. Its georeference
+    leads from the new coordinates to the same place.
     """
     transformed = dict(meta) if placement.scale == 1 else _scale_lengths(meta, placement.scale)
     transformed.pop("origin", None)
+    if place is not None:
+        transformed["georeference"] = place.after(np.linalg.inv(placement.matrix)).to_json()
     for name in ("camera_center", "view"):
         if name in meta:
             points = placement.transform_points(np.asarray(meta[name], np.float64).reshape(-1, 3))

@@ -213,6 +213,7 @@ class Method(ABC, Generic[P, D]):
         data = self.data
         central = min(data.full_train, key=lambda camera: np.linalg.norm(camera.center - data.mean_camera))
         target = central.center + data.median_depth * central.world_to_camera[2, :3]
+        place = data.scene.georeference
         return {
             "camera_center": data.mean_camera.tolist(),
             "view": [central.center.tolist(), target.tolist()],
@@ -221,6 +222,7 @@ class Method(ABC, Generic[P, D]):
             "median_depth": data.median_depth,
             **({"antialias": True} if self.parameters.antialias else {}),
             **({"origin": data.scene.origin.tolist()} if data.scene.origin.any() else {}),
+            **({"georeference": place.to_json()} if place is not None else {}),
         }
 
     # -- parts of a step, to override ------------------------------------------------------------------

@@ -21,6 +21,7 @@ import numpy as np
 
 from ..errors import LodgsError
 from ..files import name_errors, open_regular
+from ..splats.georeference import Georeference
 from ..splats.levels import MAX_LEVELS, META_SHAPES
 
 PROTOCOL = 1
@@ -175,6 +176,10 @@ def _is_plain(value: object, depth: int = 0) -> bool:
 
 def _is_meta(value: object) -> bool:
     if not isinstance(value, dict) or not _is_plain(value):
+        return False
+    try:
+        Georeference.from_json(value.get("georeference", {"crs": "-"}))
+    except ValueError:
         return False
     return all(_has_shape(value[name], shape) for name, shape in META_SHAPES.items() if name in value)
 

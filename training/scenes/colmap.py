@@ -12,6 +12,7 @@ import numpy as np
 
 from ..errors import LodgsError, printable
 from ..files import check_folder, is_file
+from ..splats.georeference import Georeference, read_georeference
 from ..splats.origin import NO_ORIGIN, choose_origin
 from . import point_cloud
 from .cameras import MAX_COORDINATE, Camera, camera_extent, pick_evenly
@@ -67,6 +68,7 @@ class Scene:
         names: names of all views of the model, sorted, with or without a photo. Default: the cameras' names.
         point_model: folder of the model that records the points' observations. Default: ``model``.
         origin: (3,) float64 position of the scene's (0, 0, 0) in COLMAP's world; zeros if that is precise.
+        georeference: place of COLMAP's world on Earth, or None.
     """
 
     folder: Path
@@ -81,6 +83,7 @@ class Scene:
     names: Sequence[str] = ()
     point_model: Path | None = None
     origin: np.ndarray = field(default_factory=lambda: NO_ORIGIN)
+    georeference: Georeference | None = None
 
     def split(self, test_every: int, validation: bool = False) -> tuple[list[Camera], list[Camera]]:
         """Split the cameras into training cameras and held-out cameras.
@@ -263,6 +266,7 @@ def read_scene(
         point_colors=colors[kept],
         point_ids=ids[kept] if len(ids) else ids,
         origin=origin,
+        georeference=read_georeference(folder, warnings.append),
         names=list(dict.fromkeys(pose.name.replace("\\", "/") for pose in poses)),
         distorted=views.distorted,
         warnings=[*warnings, *views.warnings(images)],
@@ -478,8 +482,7 @@ def _find_images(folder: Path, model: Path, names: Sequence[str], warnings: list
         return images
     is_model = "sparse" in (folder.name, folder.parent.name)
     scene = folder.parents[0 if folder.name == "sparse" else 1] if is_model else folder
-    moved = find_moved_images(scene, names)
-    if moved is not None:
+    if (moved := find_moved_images(scene, names)) is not None:
         warnings.append(f"Found the photos in {moved}.")
     return moved or images
 

@@ -11,6 +11,7 @@ import numpy as np
 from ..documents import parse_json, quote
 from ..errors import LodgsError
 from .dialects import MAX_COORDINATE
+from .georeference import Georeference
 from .levels import MAX_READ_LEVELS, META_SHAPES, NO_SPLATS, Bundle, Level
 from .ply import Columns, Element
 
@@ -168,6 +169,8 @@ def _check_meta(meta: dict) -> None:
             if not is_numeric or (np.abs(values) > MAX_COORDINATE).any():
                 raise ValueError(f"{name} does not have {shape} numbers")
     check_type(meta.get("antialias", False), bool, "antialias")
+    if "georeference" in meta:
+        Georeference.from_json(meta["georeference"])
 
 
 def _check_count(value: int, name: str) -> int:

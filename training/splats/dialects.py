@@ -5,6 +5,7 @@ A table in ``docs/reference/bundle.md`` lists the programs, their columns and th
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable, Collection, Iterable
 from contextlib import suppress
@@ -13,9 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
+from ..documents import parse_json
 from ..errors import LodgsError
 from .colors import color_names
 from .gaussians import Splats
+from .georeference import Georeference
 
 Warn = Callable[[str], object]
 """Receives one sentence for each omission and for each deviation from the look in the original program."""
@@ -32,6 +35,7 @@ _ANCHOR_SCALES = ("scale_3", "scale_4", "scale_5")
 _TEMPORAL = {"trbf_center", "trbf_scale", "motion_0", "scale_t", "scale_t_0", "t_scale", "rot_r_0"}
 _MIP = "SplatRenderMode: mip"
 _ORIGIN = "lodgs origin "
+_GEOREFERENCE = "lodgs georeference "
 
 
 def ignore(message: str) -> None:
@@ -139,10 +143,10 @@ def _apply_filter_3d(
 
 
 def meta_from_comments(comments: Iterable[str]) -> dict:
-    """Return a bundle's meta for the render mode and the local origin in the comments of a plain PLY.
+    """Return a bundle's meta for the render mode, local origin and georeference in the comments of a PLY.
 
-    ``antialias`` is True for splats trained with Mip-Splatting's 2D filter (Brush, Postshot). ``origin`` is
-    that of :func:`comments_from_meta`.
+    ``antialias`` is True for splats trained with Mip-Splatting's 2D filter (Brush, Postshot). The others are
+    those of :func:`comments_from_meta`.
     """
     comments = list(comments)
     meta: dict = {"antialias": True} if _render_mode(comments) == "mip" else {}
@@ -152,14 +156,20 @@ def meta_from_comments(comments: Iterable[str]) -> dict:
                 origin = [float(number) for number in comment.removeprefix(_ORIGIN).split()]
                 if len(origin) == 3 and max(map(abs, origin)) <= MAX_COORDINATE:
                     meta["origin"] = origin
+        elif comment.startswith(_GEOREFERENCE):
+            with suppress(ValueError, LodgsError):
+                values = parse_json(comment.removeprefix(_GEOREFERENCE), "The comment")
+                meta["georeference"] = Georeference.from_json(values).to_json()
     return meta
 
 
 def comments_from_meta(meta: dict) -> list[str]:
-    """Return the comments about the render mode and the local origin in a bundle's meta."""
+    """Return the comments about the render mode, local origin and georeference in a bundle's meta."""
     comments = [_MIP] if meta.get("antialias") else []
     if any(origin := meta.get("origin", ())):
         comments.append(_ORIGIN + " ".join(repr(float(number)) for number in origin))
+    if "georeference" in meta:
+        comments.append(_GEOREFERENCE + json.dumps(meta["georeference"]))
     return comments
 
 

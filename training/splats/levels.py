@@ -14,6 +14,7 @@ import numpy as np
 
 from ..errors import LodgsError
 from .gaussians import SplatRows, Splats
+from .georeference import Georeference
 from .origin import NO_ORIGIN
 from .ply import BATCH_ROWS, Columns
 
@@ -99,6 +100,16 @@ class Bundle:
     def origin(self) -> np.ndarray:
         """Local origin (``origin.py``): the original place of the splats' (0, 0, 0), (3,) float64."""
         return np.array(self.meta.get("origin", NO_ORIGIN), np.float64)
+
+    @property
+    def georeference(self) -> Georeference | None:
+        """Place of the splats' coordinates, relative to the local origin, on Earth; None if unknown."""
+        values = self.meta.get("georeference")
+        if values is None:
+            return None
+        shift = np.eye(4)
+        shift[:3, 3] = self.origin
+        return Georeference.from_json(values).after(shift)
 
     @property
     def on_disk(self) -> bool:

@@ -16,6 +16,7 @@ import numpy as np
 from ..errors import LodgsError
 from ..files import temporary_folder
 from .gaussians import SplatRows, Splats
+from .georeference import ECEF
 from .gltf import write_glb
 from .levels import Bundle, Level
 from .portable_levels import PortableLevels, batches
@@ -38,16 +39,16 @@ _SIGMAS = 3.0
 def write_tiles(folder: Path, levels: PortableLevels) -> None:
     """Write a tileset into a folder, and replace an earlier one there.
 
-    A scene whose local origin is in ECEF coordinates is placed on the globe. Other scenes have z up.
+    A scene whose georeference, or else its local origin, is in ECEF coordinates is placed on the globe. Other
+    scenes have z up.
 
     Raises:
         LodgsError: the folder has other files or cannot be written.
     """
     if folder.is_dir() and any(folder.iterdir()) and not (folder / TILESET_FILE).exists():
         raise LodgsError(f"Cannot export to {folder}: it contains other files.", "Choose an empty folder.")
-    origin = levels.bundle.origin
-    on_globe = _EARTH[0] < np.linalg.norm(origin) < _EARTH[1]
-    if on_globe:
+    transform = _earth_transform(levels.bundle)
+    if transform is not None:
         meta = levels.bundle.meta | {"up_rotation": np.eye(3).tolist()}
         levels = replace(levels, bundle=replace(levels.bundle, meta=meta))
     levels = replace(levels, origin=np.zeros(3), views=())
@@ -57,14 +58,26 @@ def write_tiles(folder: Path, levels: PortableLevels) -> None:
             tiles = temporary / "tiles"
             tiles.mkdir()
             document = _write_cells(tiles, levels)
-            if on_globe:
-                document["root"]["transform"] = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, *origin.tolist(), 1]
+            if transform is not None:
+                document["root"]["transform"] = transform.T.reshape(-1).tolist()
             (tiles / TILESET_FILE).write_text(json.dumps(document, allow_nan=False), "utf-8")
             if folder.exists():
                 os.rename(folder, temporary / "previous")
             os.rename(tiles, folder)
     except OSError as error:
         raise LodgsError(f"Cannot write {folder}: {error.strerror}.", "Choose another folder.") from error
+
+
+def _earth_transform(bundle: Bundle) -> np.ndarray | None:
+    """Return the transform (4, 4) from a bundle's coordinates to ECEF, or None if it is unknown."""
+    place = bundle.georeference
+    if place is not None and place.crs == ECEF:
+        return place.matrix
+    if not _EARTH[0] < np.linalg.norm(bundle.origin) < _EARTH[1]:
+        return None
+    transform = np.eye(4)
+    transform[:3, 3] = bundle.origin
+    return transform
 
 
 def _write_cells(folder: Path, levels: PortableLevels) -> dict:

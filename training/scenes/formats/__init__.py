@@ -15,6 +15,7 @@ from types import ModuleType
 
 from ...errors import LodgsError, SystemProblem, system_reason
 from ...files import check_folder, is_file, link_or_copy, temporary_folder
+from ...splats.georeference import write_georeference
 from ..colmap import DEPTHS, MASKS, NO_POINTS, Scene, find_models, read_scene, scene_lenses, subfolders
 from ..colmap_model import model_suffix
 from ..image_files import find_image_folder
@@ -294,6 +295,8 @@ def _write(
             link_or_copy(view.mask, scene / MASKS / f"{name}.png")
         if view.depth is not None and view.has_depth:
             link_or_copy(view.depth, scene / DEPTHS / f"{name}{view.depth.suffix.lower()}")
+    if exported.georeference is not None:
+        write_georeference(scene, exported.georeference)
     with temporary_folder(sparse) as work:
         model = work / "0"
         lenses = [view.lens for view in views]

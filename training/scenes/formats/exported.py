@@ -19,6 +19,7 @@ import numpy as np
 from ...documents import DECIMAL_COMMAS, decode_text, has_decimal_commas, parse_json, read_bytes
 from ...errors import LodgsError, printable
 from ...files import is_file
+from ...splats.georeference import Georeference
 from ..cameras import Camera
 from ..colmap import DEPTH_SUFFIXES
 from ..image_files import NO_PHOTOS, UNREADABLE_SUFFIXES, walk_files
@@ -82,6 +83,7 @@ class ExportedScene:
         colors: (P, 3) uint8.
         excluded: (name, sentence) for each unusable view.
         warnings: further sentences.
+        georeference: place of the views' world on Earth, or None.
     """
 
     views: list[ExportedView]
@@ -89,6 +91,7 @@ class ExportedScene:
     colors: np.ndarray = field(default_factory=lambda: _NO_POINTS.astype(np.uint8))
     excluded: list[tuple[str, str]] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
+    georeference: Georeference | None = None
 
 
 def read_document(path: Path) -> dict:

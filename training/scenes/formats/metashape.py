@@ -16,6 +16,7 @@ import numpy as np
 from ...documents import DECIMAL_COMMAS, has_decimal_commas, open_text
 from ...errors import LodgsError
 from ...files import is_file
+from ...splats.georeference import ECEF, Georeference
 from ..lenses import Intrinsics
 from .exported import (
     ExportedScene,
@@ -35,6 +36,8 @@ MAX_SKEW = 0.5
 """Maximum b2 in pixels that is ignored; larger values are an error."""
 _HEAD_BYTES = 4096
 _COMPONENT = "component_id"
+_LOCAL = "LOCAL_CS", "ENGCRS", "Local"
+"""First words of WKT for coordinates without a place on Earth."""
 _IMAGES = "images", "photos", "Images", "."
 
 
@@ -58,8 +61,8 @@ def read(path: Path) -> ExportedScene:
     """Read the views of the chunk with most aligned cameras, in metres if known.
 
     The axes are those of the chunk's largest component. Other components, which Metashape aligned separately,
-    are included if their transform is known. The file has no points. The chunk's position on earth is
-    dropped, because splats need small coordinates.
+    are included if their transform is known. The file has no points. The chunk's transform into geocentric
+    coordinates, if it is georeferenced, is the georeference, because splats need small coordinates.
 
     Raises:
         LodgsError: the file is damaged.
@@ -109,7 +112,11 @@ def read(path: Path) -> ExportedScene:
             views.append(ExportedView(files.find(camera), lens, invert_pose(pose)))
         except LodgsError as error:
             excluded.append((label, error.what))
-    return ExportedScene(views, excluded=excluded, warnings=warnings)
+    system = (chunk.findtext("reference") or "").strip()
+    place = None
+    if aligned and system and not system.startswith(_LOCAL):
+        place = Georeference(ECEF, base @ np.diag([1 / scale] * 3 + [1.0]))
+    return ExportedScene(views, excluded=excluded, warnings=warnings, georeference=place)
 
 
 def _parse_lens(sensor: Element) -> Intrinsics:

@@ -15,6 +15,7 @@ import numpy as np
 
 from ...documents import decode_text, parse_json, read_bytes
 from ...errors import LodgsError
+from ...splats.georeference import Georeference, local_tangent_plane
 from ..lenses import Intrinsics
 from .exported import (
     ExportedScene,
@@ -24,11 +25,13 @@ from .exported import (
     find_file,
     get_number,
     parse_array,
+    read_document,
 )
 
 NAME = "OpenSfM"
 MAX_BYTES = 1 << 28
 """Maximum size of the file, which holds all points as text."""
+_REFERENCE = "latitude", "longitude", "altitude"
 _FISHEYES = "fisheye", "fisheye_opencv"
 _LENSES = "perspective", "simple_radial", "radial", "brown", *_FISHEYES
 
@@ -78,7 +81,20 @@ def read(path: Path) -> ExportedScene:
     if len(parts) > 1:
         others = sum(len(other["shots"]) for other in parts) - len(part["shots"])
         warnings.append(f"Skipped {others:,} photos of {len(parts) - 1} separate reconstructions in {path}.")
-    return ExportedScene(views, positions, colors.clip(0, 255).astype(np.uint8), excluded, warnings)
+    colors = colors.clip(0, 255).astype(np.uint8)
+    return ExportedScene(views, positions, colors, excluded, warnings, _georeference(path, part))
+
+
+def _georeference(path: Path, part: Mapping) -> Georeference | None:
+    """Return the place of the topocentric coordinates, from the reconstruction or reference_lla.json."""
+    values = part.get("reference_lla")
+    file = find_file(path.parent, "reference_lla.json")
+    try:
+        if values is None and file is not None:
+            values = read_document(file)
+        return local_tangent_plane(*(get_number(values, name) for name in _REFERENCE))
+    except (LodgsError, AttributeError, TypeError):
+        return None
 
 
 def _list(value: Any) -> list:

@@ -1,0 +1,113 @@
+"""Places of scenes on Earth: a coordinate reference system and the transform into it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..documents import decode_text, parse_json, read_bytes
+from ..errors import LodgsError
+from ..files import atomic_write
+
+ECEF = "EPSG:4978"
+"""WGS 84 with geocentric coordinates in metres."""
+FILE = "georeference.json"
+"""File of a scene's folder with the values of :meth:`Georeference.to_json`."""
+_MAX_TEXT = 8192
+"""Maximum length of a WKT text."""
+_EQUATOR, _FLATTENING = 6_378_137.0, 1 / 298.257223563
+"""Semi-major axis in metres and flattening of WGS 84."""
+
+
+@dataclass(frozen=True)
+class Georeference:
+    """Place of a scene on Earth.
+
+    Attributes:
+        crs: coordinate reference system: "EPSG:" and a code, or WKT.
+        matrix: (4, 4) float64 transform from the scene's original coordinates to those of the system.
+    """
+
+    crs: str
+    matrix: np.ndarray
+
+    @staticmethod
+    def from_json(values: Any) -> Georeference:
+        """Return the georeference of JSON values; without a matrix, the coordinates are those of the system.
+
+        Raises:
+            ValueError: they are no georeference.
+        """
+        crs = values.get("crs") if isinstance(values, dict) else None
+        if not isinstance(crs, str) or not 0 < len(crs.strip()) <= _MAX_TEXT:
+            raise ValueError("it names no coordinate reference system")
+        matrix = np.array(values.get("matrix", np.eye(4).tolist()), object)
+        if matrix.shape != (4, 4) or any(type(value) not in (int, float) for value in matrix.flat):
+            raise ValueError("its matrix does not have 4 x 4 numbers")
+        matrix = matrix.astype(np.float64)
+        is_affine = np.array_equal(matrix[3], (0, 0, 0, 1)) and np.isfinite(matrix).all()
+        if not is_affine or not 1e-12 < abs(np.linalg.det(matrix[:3, :3])) < 1e12:
+            raise ValueError("its matrix is no transform of space")
+        return Georeference(" ".join(crs.split()), matrix)
+
+    def to_json(self) -> dict:
+        """Return JSON values."""
+        return {"crs": self.crs, "matrix": self.matrix.tolist()}
+
+    def after(self, matrix: np.ndarray) -> Georeference:
+        """Return the georeference of coordinates that a matrix (4, 4) maps to the present ones."""
+        return Georeference(self.crs, self.matrix @ matrix)
+
+
+def read_georeference(folder: Path, warn: Callable[[str], object]) -> Georeference | None:
+    """Return the georeference of a scene's folder, from georeference.json or a .prj file with WKT.
+
+    Args:
+        warn: receives a sentence about a damaged file, which counts as none.
+    """
+    path = folder / FILE
+    try:
+        projections = [] if path.is_file() else sorted(folder.glob("*.prj"))
+        if not path.is_file() and not projections:
+            return None
+        path = projections[0] if projections else path
+        text = decode_text(read_bytes(path, 2 * _MAX_TEXT))
+        values = {"crs": text} if projections else parse_json(text, FILE, 2 * _MAX_TEXT)
+        return Georeference.from_json(values)
+    except (LodgsError, OSError, ValueError) as error:
+        reason = error.what if isinstance(error, LodgsError) else f"{error}."
+        warn(f"Ignored the place on Earth in {path}: {reason}")
+        return None
+
+
+def write_georeference(folder: Path, place: Georeference) -> None:
+    """Write georeference.json into a scene's folder."""
+    with atomic_write(folder / FILE) as temporary:
+        temporary.write_text(json.dumps(place.to_json(), indent=1), "utf-8")
+
+
+def local_tangent_plane(latitude: float, longitude: float, altitude: float) -> Georeference:
+    """Return the georeference of coordinates in metres east, north and up of a place on WGS 84.
+
+    Source: EPSG guidance note 7-2, conversions of geographic, geocentric and topocentric coordinates.
+
+    Args:
+        latitude: degrees north.
+        longitude: degrees east.
+        altitude: metres above the ellipsoid.
+    """
+    phi, lam = np.radians((latitude, longitude))
+    eccentricity2 = _FLATTENING * (2 - _FLATTENING)
+    normal = _EQUATOR / np.sqrt(1 - eccentricity2 * np.sin(phi) ** 2)
+    up = np.array([np.cos(phi) * np.cos(lam), np.cos(phi) * np.sin(lam), np.sin(phi)])
+    east = np.array([-np.sin(lam), np.cos(lam), 0.0])
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.stack([east, np.cross(up, east), up], axis=1)
+    matrix[:3, 3] = (normal + altitude) * up
+    matrix[2, 3] -= normal * eccentricity2 * np.sin(phi)
+    return Georeference(ECEF, matrix)
