@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.training.splats.test_formats import random_splats
+from training.editing.export import export_levels
 from training.editing.placement import transform_bundle
 from training.errors import LodgsError
 from training.methods import create, resolve_parameters
@@ -13,6 +14,7 @@ from training.optimize.training_data import TrainingData
 from training.scenes.colmap import read_scene
 from training.splats.bundle import read_bundle, write_bundle
 from training.splats.dialects import comments_from_meta
+from training.splats.formats import open_as_ply
 from training.splats.georeference import (
     ECEF,
     FILE,
@@ -113,3 +115,11 @@ def test_hostile_georeference_of_a_bundle_is_one_message(bundle, tmp_path):
 def test_plain_ply_keeps_the_georeference(bundle, tmp_path):
     write_ply(tmp_path / "plain.ply", bundle.levels[0].splats, comments_from_meta(bundle.meta))
     np.testing.assert_array_equal(on_earth(read_bundle(tmp_path / "plain.ply")), on_earth(bundle))
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".usdc"])
+def test_level_formats_keep_the_georeference(bundle, tmp_path, suffix):
+    path = tmp_path / f"levels{suffix}"
+    export_levels(path, bundle)
+    with open_as_ply(path) as copy:
+        np.testing.assert_allclose(on_earth(read_bundle(copy)), on_earth(bundle), atol=1e-4)

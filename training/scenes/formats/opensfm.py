@@ -92,8 +92,10 @@ def _georeference(path: Path, part: Mapping) -> Georeference | None:
     try:
         if values is None and file is not None:
             values = read_document(file)
+        if not isinstance(values, Mapping):
+            return None
         return local_tangent_plane(*(get_number(values, name) for name in _REFERENCE))
-    except (LodgsError, AttributeError, TypeError):
+    except LodgsError:
         return None
 
 
