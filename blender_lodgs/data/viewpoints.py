@@ -17,6 +17,7 @@ from ...training.scenes.viewpoints import (
     NEAR_SHARE,
     OPAQUE,
     aerial_views,
+    ball_of_corners,
     dome_views_around,
     opaque_means,
     surrounding_views,
@@ -33,7 +34,6 @@ from .setting_properties import property_of
 
 SAMPLE = 100_000
 """Approximate number of splats for the preview of a dome."""
-
 UP = (0.0, 0.0, 1.0)
 """Up axis of a Blender scene."""
 MIN_ELEVATION = 0.0
@@ -44,7 +44,6 @@ _SOLID = {"MESH", "CURVE", "SURFACE", "FONT", "META", "VOLUME", "POINTCLOUD", "C
 
 Shot = bpy.types.Object | int | tuple[Camera, float]
 """Camera of an image: a camera object, a frame of the active camera, or a placed view and its near depth."""
-
 Warn = Callable[[str], object]
 """Function called with a sentence about the views."""
 
@@ -247,7 +246,8 @@ def placed_capture_views(
     settings = context.scene.lodgs_capture
     match settings.views_from:
         case "DOME":
-            return dome_views_around(_corners(context), settings.views, width, height, UP, MIN_ELEVATION)
+            ball = ball_of_corners(_corners(context))
+            return dome_views_around(ball, settings.views, width, height, UP, MIN_ELEVATION)
         case "GRID":
             return aerial_views(_corners(context), settings.views, width, height, settings.height)
         case "CURVE":

@@ -7,9 +7,10 @@ import numpy as np
 from ..errors import LodgsError
 from ..splats.gaussians import Splats
 from .cameras import Camera, look_at
+from .overview import central_ball
 
 INSIDE = 0.9
-"""Fraction of the opaque splats that each dome view contains."""
+"""Fraction of the corners of objects that each dome view contains, and of an area that aerial views cover."""
 OPAQUE = 0.5
 """Minimum opacity of the splats that determine the views."""
 DOMES = (1.1, 2.2)
@@ -44,7 +45,7 @@ def dome_views(splats: Splats, count: int, width: int = 960, height: int = 640) 
     Raises:
         LodgsError: there is no opaque splat.
     """
-    return dome_views_around(opaque_means(splats), count, width, height)
+    return dome_views_around(central_ball(opaque_means(splats)), count, width, height)
 
 
 def surrounding_views(
@@ -58,7 +59,9 @@ def surrounding_views(
     Raises:
         LodgsError: there is no point.
     """
-    around, near = dome_views_around(points, count - count // 2, width, height)
+    if not len(points):
+        raise _no_splats_error()
+    around, near = dome_views_around(central_ball(points), count - count // 2, width, height)
     return around + close_views(points, count // 2, width, height), near
 
 
@@ -69,10 +72,8 @@ def close_views(points: np.ndarray, count: int, width: int = 960, height: int = 
     such views, levels would lose the detail of surfaces that a camera approaches.
     """
     rng = np.random.default_rng(0)
-    middle = np.median(points, axis=0)
-    distances = np.linalg.norm(points - middle, axis=1)
-    radius = max(float(np.quantile(distances, INSIDE)), 1e-6)
-    inner = points[distances <= radius]
+    middle, radius = central_ball(points)
+    inner = points[np.linalg.norm(points - middle, axis=1) <= radius]
     sample = inner[rng.choice(len(inner), min(len(inner), CLOSE_SAMPLE), replace=False)]
     up = np.array(UP)
     east = np.cross(up, np.eye(3)[np.abs(up).argmin()])
@@ -97,28 +98,28 @@ def close_views(points: np.ndarray, count: int, width: int = 960, height: int = 
     return views
 
 
+def ball_of_corners(corners: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return center (3,) and radius of a ball around most corners (N, 3) of objects, N > 0."""
+    center = np.median(corners, axis=0)
+    return center, max(float(np.quantile(np.linalg.norm(corners - center, axis=1), INSIDE)), 1e-6)
+
+
 def dome_views_around(
-    points: np.ndarray,
+    ball: tuple[np.ndarray, float],
     count: int,
     width: int = 960,
     height: int = 640,
     up: tuple[float, float, float] = UP,
     lowest: float = -1.0,
 ) -> tuple[list[Camera], float]:
-    """Return views of points (N, 3) float64 as :func:`dome_views`, and their near depth.
+    """Return views of a ball as :func:`dome_views`, and their near depth.
 
     Args:
-        points: means of opaque splats, a sample of them, or corners of an object.
+        ball: center (3,) float64 and radius, see ``overview.central_ball`` and :func:`ball_of_corners`.
         up: up direction of the images, along an axis.
         lowest: sine of the dome's lowest elevation: 0 is level, -1 straight below.
-
-    Raises:
-        LodgsError: there is no point.
     """
-    if not len(points):
-        raise _no_splats_error()
-    middle = np.median(points, axis=0)
-    radius = max(float(np.quantile(np.linalg.norm(points - middle, axis=1), INSIDE)), 1e-6)
+    middle, radius = ball
     fill_distance = radius * np.hypot(1, 2 * FOCAL)  # a ball of this radius touches the top and bottom edges
     number = np.arange(count)
     elevation_sine = lowest + (1 - lowest) * (number + 0.5) / count

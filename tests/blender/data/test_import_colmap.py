@@ -1,6 +1,8 @@
 """COLMAP scenes in Blender, against the cameras' own projection and Blender's."""
 
 import json
+import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -273,3 +275,40 @@ def test_scene_without_points_shows_cameras_then_triangulated_points(bpy, lodgs,
     told.clear()
     root = import_colmap(bpy.context, folder, warn=told.append)
     assert told == [] and len(root.lodgs.points.data.points) == 50
+
+
+def _drop(bpy, path):
+    """Drop a file into a 3D viewport, as a window does."""
+    area = next(area for area in bpy.context.screen.areas if area.type == "VIEW_3D")
+    with bpy.context.temp_override(area=area):
+        return bpy.ops.wm.drop_import_file(
+            "INVOKE_DEFAULT", directory=f"{path.parent}{os.sep}", files=[{"name": path.name}]
+        )
+
+
+@pytest.mark.parametrize("name", ["sparse/0/cameras.txt", "sparse/0/extra.bin", "transforms.json"])
+def test_dropped_file_imports_its_scene(bpy, tmp_path, name):
+    write_walls(tmp_path)
+    frames = [{"file_path": "images/0.png", "transform_matrix": np.eye(4).tolist(), "fl_x": 90}]
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
+    (tmp_path / "sparse/0/extra.bin").touch()
+    _drop(bpy, tmp_path / name)
+    (root,) = (obj for obj in bpy.data.objects if obj.lodgs.is_root)
+    assert root.lodgs.scene_folder == str(tmp_path)
+    assert root.lodgs.training.model == ""
+
+
+def test_dropped_file_selects_its_model(bpy, tmp_path):
+    write_walls(tmp_path)
+    shutil.copytree(tmp_path / "sparse/0", tmp_path / "sparse/1")
+    _drop(bpy, tmp_path / "sparse/1/images.txt")
+    (root,) = (obj for obj in bpy.data.objects if obj.lodgs.is_root)
+    assert root.lodgs.scene_folder == str(tmp_path)
+    assert root.lodgs.training.model == str(tmp_path / "sparse/1")
+
+
+def test_dropped_file_of_no_scene_is_rejected(bpy, tmp_path):
+    write_walls(tmp_path / "scene")  # in a subfolder: it is not what was dropped
+    (tmp_path / "notes.txt").write_text("notes")
+    with pytest.raises(RuntimeError, match=r"notes.txt: its folder has neither"):
+        bpy.ops.lodgs.drop_photo_scene(filepath=str(tmp_path / "notes.txt"))

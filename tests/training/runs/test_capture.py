@@ -56,6 +56,18 @@ def test_dome_views_surround_all_splats_except_outliers(ball):
     assert 0 < near < np.linalg.norm(centers, axis=1).min() - 2
 
 
+def test_far_background_does_not_push_views_away():
+    """A subject of radius 2 within a fifth of the splats at 100 to 200 units, as a sky or hills."""
+    rng = np.random.default_rng(3)
+    directions = rng.normal(size=(5000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    points = directions * np.where(np.arange(5000) % 5, 2, rng.uniform(100, 200, 5000))[:, None]
+    views, _ = surrounding_views(points, 20)
+    distances = np.linalg.norm([view.center for view in views], axis=1)
+    assert distances.max() < 30
+    assert all(view.sees(2 * np.eye(3)).all() for view in views if view.name.startswith("dome"))
+
+
 def test_close_views_see_free_surfaces_at_their_distances():
     """A room with walls of 4 x 4 x 4 units and a ball in the middle; walls hide no target."""
     rng = np.random.default_rng(2)

@@ -87,6 +87,27 @@ def _export_in(folder: Path) -> tuple[ModuleType, Path] | None:
     return next(((module, path) for module, path in candidates if path), None)
 
 
+def scene_of_file(path: Path) -> tuple[Path, Path | None]:
+    """Return the folder of the scene that a file belongs to, and its model if the scene has several.
+
+    Raises:
+        LodgsError: the file's folder has neither a COLMAP model nor an export.
+    """
+    model = folder = path.absolute().parent
+    if not model_suffix(model):
+        if _export_in(folder):
+            return folder, None
+        raise LodgsError(
+            f"Cannot import {path}: its folder has neither a COLMAP model nor a known export.",
+            f"Choose a file of a COLMAP model, such as cameras.bin, or of an export of {FORMAT_NAMES}.",
+        )
+    if folder.name.isdigit() and folder.parent.name == "sparse":
+        folder = folder.parent
+    if folder.name == "sparse":
+        folder = folder.parent
+    return folder, model if len(find_models(folder)) > 1 else None
+
+
 def ensure_colmap_scene(folder: Path, warn: Callable[[str], object]) -> Path:
     """Convert another program's export in place unless the folder is a COLMAP scene, and return the folder.
 
