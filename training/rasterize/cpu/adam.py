@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .compile import STRICT, f32, inlined, kernel, run_parallel, serialised
+from .lanes import WIDTH, load, magnitude, root, select, store
 
 ROW = 1024
 VALUES = 1 << 16
@@ -28,6 +29,30 @@ def adam_change(i, g, m, v, rate, keep_m, keep_v, scale_v, eps):
     return rate * first / (math.sqrt(second * scale_v) + eps)
 
 
+@inlined(STRICT)
+def adam_values(parameter, start, count, gradient, place, m, v, lr, keep_m, keep_v, scale_v, eps):
+    """Update ``count`` values of flat arrays from ``start`` on; their gradient begins at ``place``.
+
+    Args:
+        lr: (count,) learning rates with the first moment's bias correction.
+    """
+    whole = count // WIDTH * WIDTH
+    for j in range(0, whole, WIDTH):
+        g = load(gradient, place + j)
+        first = keep_m * load(m, start + j) + (f32(1) - keep_m) * g
+        second = keep_v * load(v, start + j) + (f32(1) - keep_v) * (g * g)
+        first = select(magnitude(first) > M_TINY, first, f32(0))
+        second = select(second > V_TINY, second, f32(0))
+        store(m, start + j, first)
+        store(v, start + j, second)
+        change = load(lr, j) * first / (root(second * scale_v) + eps)
+        store(parameter, start + j, load(parameter, start + j) - change)
+    for j in range(whole, count):
+        i = start + j
+        g = gradient[place + j]
+        parameter[i] -= adam_change(i, g, m, v, lr[j], keep_m, keep_v, scale_v, eps)
+
+
 @kernel(STRICT)
 def _update(begin, end, parameter, gradient, m, v, lr, keep_m, keep_v, scale_v, eps):
     """Update flat arrays. ``lr`` (width,) repeats along them and includes the first moment's bias correction.
@@ -39,9 +64,8 @@ def _update(begin, end, parameter, gradient, m, v, lr, keep_m, keep_v, scale_v, 
     total = parameter.shape[0]
     for row in range(begin, end):
         start = row * width
-        for j in range(min(width, total - start)):
-            i = start + j
-            parameter[i] -= adam_change(i, gradient[i], m, v, lr[j], keep_m, keep_v, scale_v, eps)
+        count = min(width, total - start)
+        adam_values(parameter, start, count, gradient, start, m, v, lr, keep_m, keep_v, scale_v, eps)
 
 
 @kernel(STRICT)
@@ -50,9 +74,15 @@ def _update_rows(begin, end, parameter, rows, gradient, m, v, lr, keep_m, keep_v
     width = lr.shape[0]
     for k in range(begin, end):
         start = rows[k] * width
-        for j in range(width):
-            i = start + j
-            parameter[i] -= adam_change(i, gradient[k * width + j], m, v, lr[j], keep_m, keep_v, scale_v, eps)
+        adam_values(parameter, start, width, gradient, k * width, m, v, lr, keep_m, keep_v, scale_v, eps)
+
+
+def rate_rows(
+    lr: ArrayLike, shape: tuple[int, ...], betas: tuple[float, float], step: int, count: int
+) -> np.ndarray:
+    """Return the rates of ``count`` rows of this shape, flat, with the first moment's bias correction."""
+    rate = np.asarray(lr, np.float32) / np.float32(1 - betas[0] ** step)
+    return np.tile(np.broadcast_to(rate, shape).reshape(-1), count)
 
 
 @serialised
@@ -70,8 +100,7 @@ def update_rows(
     """Make one Adam step in place for ``rows`` (M,) int64; ``lr`` is a number or broadcasts against one
     row."""
     width = int(np.prod(parameter.shape[1:], dtype=int))
-    rate = np.asarray(lr, np.float32) / np.float32(1 - betas[0] ** step)
-    row = np.ascontiguousarray(np.broadcast_to(rate, parameter.shape[1:])).reshape(-1)
+    row = rate_rows(lr, parameter.shape[1:], betas, step, 1)
     run_parallel(
         _update_rows, len(rows), max(VALUES // width, 1),
         parameter.reshape(-1), rows, gradient.reshape(-1), m.reshape(-1), v.reshape(-1), row,
@@ -91,12 +120,10 @@ def update(
     step: int,
 ) -> None:
     """Make one Adam step in place; ``lr`` is a number or broadcasts against one row of ``parameter``."""
-    correction = 1 - betas[0] ** step
-    rate = np.asarray(lr, np.float32) / np.float32(correction)
-    if rate.size == 1:
-        lr_row = np.full(ROW, rate.item(), np.float32)
-    else:
-        lr_row = np.ascontiguousarray(np.broadcast_to(rate, parameter.shape[1:])).reshape(-1)
+    if not parameter.size:
+        return
+    width = parameter.size // len(parameter)
+    lr_row = rate_rows(lr, parameter.shape[1:], betas, step, max(ROW // width, 1))
     run_parallel(
         _update, -(-parameter.size // len(lr_row)), -(-VALUES // len(lr_row)),
         parameter.reshape(-1), gradient.reshape(-1), m.reshape(-1), v.reshape(-1), lr_row,
