@@ -32,8 +32,8 @@ class FlodParameters(FlodLevels, DensityParameters):
 
     footprint: float = setting(
         16.0,
-        "Detail of level 1, in pixels at the scene's median depth: its minimum splat size (FLoD: lambda) if "
-        "it is trained. Sets the distances of all levels.",
+        "Detail of level 1, in pixels at the scene's median depth: its minimum splat size (FLoD: lambda). "
+        "Sets the distances of trained levels; those of merged levels follow from 'drawn'.",
         label="Coarsest Detail",
         above=0,
         unit="px",
@@ -89,10 +89,10 @@ class FlodParameters(FlodLevels, DensityParameters):
         high=1,
     )
     drawn: float = setting(
-        0.53,
+        0.45,
         "Maximum number of splats drawn by distance in the training views, as a fraction of those of "
-        "the finest level. Sets the size of trained levels that the finishing steps restart. Not in the "
-        "paper.",
+        "the finest level. Sets the distances of merged levels, and the size of trained levels that the "
+        "finishing steps restart. Not in the paper.",
         above=0,
         high=1,
     )

@@ -7,6 +7,7 @@ finest level first, merge each coarser one from the next finer one, and refine i
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections.abc import Mapping
 from dataclasses import replace
 from itertools import accumulate
 
@@ -26,12 +27,13 @@ from ...optimize.initialize import (
     neighbour_distances,
     sample_points,
 )
+from ...optimize.level_distances import measure_distances
 from ...optimize.merging import merge
 from ...optimize.method import Drawing
 from ...optimize.model import Model, splat_rates
 from ...optimize.schedules import due, log_linear, shrink_at
 from ...optimize.training_data import TrainingView
-from ...rasterize import contributions
+from ...rasterize import Gaussians, contributions
 from ...splats.gaussians import Splats
 from ...splats.levels import Level
 from . import BLENDED_LEVELS, FlodParameters, finish
@@ -40,6 +42,9 @@ LEAST_WEIGHT = 0.05
 """Minimum share of a pixel of the finest level's splats that are merged; others are dropped."""
 REFINE_RATE = 4.0
 """Learning rates of merged levels, relative to those of finishing steps."""
+SMALL_IMAGES, SMALL_SHARE = (2, 4), 0.25
+"""Additional reductions of images while a merged level is refined, and the share of steps with one of them.
+Otherwise the merge alone is the better small image."""
 
 
 class Method(method.Method[FlodParameters, Drawing]):
@@ -48,7 +53,7 @@ class Method(method.Method[FlodParameters, Drawing]):
     Attributes:
         s_min: minimum standard deviation of each level, coarse to fine, in scene units.
         points, colors: initial points of the scene, (P, 3) both.
-        completed: completed levels for the finishing steps, as tensors by name.
+        completed: completed levels for the end of the run, as tensors by name.
     """
 
     def setup(self, base: Splats | None) -> None:
@@ -60,14 +65,14 @@ class Method(method.Method[FlodParameters, Drawing]):
         self._ends = list(accumulate(steps for _, steps in p.stages))
         points, colors = drop_duplicates(data.scene.points, data.scene.point_colors)
         self.points, self.colors = sample_points(points, colors, p.splat_limit, self.seed)
-        self.completed: dict[int, dict[str, torch.Tensor]] = {}
+        self.completed: dict[int, Mapping[str, torch.Tensor]] = {}
         self.levels = p.levels
         if p.levels > 1:
             self.controls = {"gamma": initial_gamma(self.s_min[-2] * data.focal / data.median_depth)}
         if base is None:
             self.model = self._new_model(self._from_points(self._order[0]))
         else:
-            self._store_for_finishing(p.first_level - 1, base)
+            self._store(p.first_level - 1, base)
             tensors = from_splats(base, p.sh_degree, self.device)
             self.model = self._new_model(self._next_level_tensors(tensors, 0.0, p.first_level))
 
@@ -82,21 +87,25 @@ class Method(method.Method[FlodParameters, Drawing]):
         return step >= self._ends[-1]
 
     def levels_after(self, step: int) -> list[Level]:
-        """Return the level that the step completes, and start the next one; at the end, the finished
-        levels.
+        """Return the level that the step completes, and start the next one; all merged levels once their
+        distances are known; at the end, the finished levels.
         """
         if self.is_finishing(step) and step + 1 == self.steps:
-            return finish.split_levels(self.model, self.s_min)
+            return [*self._completed_levels(), *finish.split_levels(self.model, self.s_min)]
         if step + 1 not in self._ends:
             return self._previews(step)
         number = self.level_at(step)
-        finished = Level(number, self.model.splats(self._constraint(number)), self._facts(number))
-        self._store_for_finishing(number, finished.splats)
+        levels = [Level(number, self.model.splats(self._constraint(number)), self._facts(number))]
+        self._store(number, levels[0].splats)
         if step + 1 < self._ends[-1]:
             self.start_level(self.level_at(step + 1))
-        elif self.completed:
+            return levels
+        if self.parameters.merges:
+            self._set_distances()
+            levels = self._completed_levels()
+        if self.parameters.finish_steps and self.completed:
             self.start_finishing()
-        return [finished]
+        return levels
 
     def _previews(self, step: int) -> list[Level]:
         """Return a coarser level merged from the current splats, at equal intervals before the finest is
@@ -119,10 +128,13 @@ class Method(method.Method[FlodParameters, Drawing]):
 
     def shrink(self, step: int) -> float:
         p = self.parameters
-        if self._refines(step):
-            progress = self._level_step(step) / p.stages[self._stage(step)][1]
-            return shrink_at(progress, p.first_resolution, p.full_resolution)
-        return shrink_at(self._progress(step), p.first_resolution, p.full_resolution)
+        if not self._refines(step):
+            return shrink_at(self._progress(step), p.first_resolution, p.full_resolution)
+        rng = np.random.default_rng([self.seed, step, 21])
+        if rng.random() < SMALL_SHARE:
+            return float(rng.choice(SMALL_IMAGES))
+        progress = self._level_step(step) / p.stages[self._stage(step)][1]
+        return shrink_at(progress, p.first_resolution, p.full_resolution)
 
     def sh_degree(self, step: int) -> int:
         return super().sh_degree(self._skipped_steps + step)
@@ -134,6 +146,8 @@ class Method(method.Method[FlodParameters, Drawing]):
         if self.is_finishing(step):
             values = self._finishing_values(step)
             return finish.weights(self.model, self.s_min, view.camera, values), 0.0
+        if self._refines(step):  # dropout would make few splats even fewer
+            return None, 0.0
         dropout = self.dropout.weights(len(self.model), step, self._progress(step))
         return dropout, self._constraint(self.level_at(step))
 
@@ -303,24 +317,43 @@ class Method(method.Method[FlodParameters, Drawing]):
             tensors = {name: torch.cat([tensor, points[name][free]]) for name, tensor in tensors.items()}
         return tensors
 
-    def _store_for_finishing(self, level: int, splats: Splats) -> None:
+    def _store(self, level: int, splats: Splats) -> None:
         p = self.parameters
-        if p.finish_steps and level > p.levels - BLENDED_LEVELS:
+        if p.merges or (p.finish_steps and level > p.levels - BLENDED_LEVELS):
             self.completed[level] = from_splats(splats, p.sh_degree, self.device)
+
+    def _completed_levels(self) -> list[Level]:
+        """Return the completed levels that finishing steps do not train, coarse to fine."""
+        arrays = {
+            number: {name: tensor.cpu().numpy() for name, tensor in tensors.items()}
+            for number, tensors in sorted(self.completed.items())
+        }
+        return [Level(number, Splats(**columns), self._facts(number)) for number, columns in arrays.items()]
+
+    def _set_distances(self) -> None:
+        """Measure the distances of the finest levels. Coarser ones follow at the ratio ``rho``."""
+        p = self.parameters
+        numbers = range(max(p.levels - BLENDED_LEVELS, 0) + 1, p.levels + 1)
+        levels = {number: Gaussians(**self.completed[number]) for number in numbers}
+        distances = measure_distances(levels, self.data, p.drawn, p.antialias, self.backend)
+        for number, distance in distances.items():
+            self.s_min[number - 1] = distance * self.controls["gamma"] / self.data.focal
+        for number in range(numbers[0] - 1, 0, -1):
+            self.s_min[number - 1] = p.rho * self.s_min[number]
 
     def start_finishing(self) -> None:
         """Combine the completed levels into one model for the finishing steps; restart those of fine
         detail.
         """
         p, data = self.parameters, self.data
-        levels = dict(sorted(self.completed.items()))
+        in_use = sorted(self.completed)[-BLENDED_LEVELS:]
+        levels = {number: self.completed.pop(number) for number in in_use}
         max_size = finish.FINE_PIXELS * data.median_depth / data.focal
         fine = [number for number in levels if 0 < self.s_min[number - 1] <= max_size]
         if fine and not p.merges:
             gamma = self.controls["gamma"]
             levels |= finish.restart_levels(levels, fine, self.s_min, data, p, gamma, self.backend)
         self.model = finish.join_levels(levels, finish.learning_rates(p, data.extent, 0.0))
-        self.completed = {}
 
     def _from_points(self, level: int) -> dict[str, torch.Tensor]:
         s_min = self.s_min[level - 1]
@@ -332,11 +365,13 @@ class Method(method.Method[FlodParameters, Drawing]):
     # -- checkpoints -----------------------------------------------------------------------------------
 
     def state_dict(self) -> dict:
-        return {**super().state_dict(), "kept": self.completed}
+        s_min = torch.tensor(self.s_min, dtype=torch.float64)
+        return {**super().state_dict(), "kept": self.completed, "s_min": s_min}
 
     def load_state_dict(self, state: dict) -> None:
         super().load_state_dict(state)
-        self.completed = state.get("kept", {})
+        self.completed = state["kept"]
+        self.s_min = state["s_min"].tolist()
 
 
 def well_separated(means: torch.Tensor, distance: float) -> torch.Tensor:

@@ -1,15 +1,19 @@
-"""Tests of FLoD's merged levels: order, counts, previews and gain by refinement."""
+"""Tests of FLoD's merged levels: order, counts, previews, gain by refinement and distances."""
 
 from dataclasses import replace
 
 import numpy as np
 import torch
 
+from training.evaluate.views import reduce_view
+from training.lod.selection import resolve_controls, select
 from training.methods.flod import METHOD
 from training.methods.flod.train import Method
+from training.optimize.level_distances import choose_switches
 from training.optimize.merging import merge
 from training.optimize.parameters import override
 from training.rasterize import Gaussians, rasterize
+from training.splats.levels import Bundle
 
 
 def make(data, **values) -> Method:
@@ -26,13 +30,14 @@ def train(flod):
             yield step + 1, level, finished
 
 
-def error(flod, splats) -> float:
-    """Return the mean squared error over the training views."""
+def error(flod, splats, factor: int = 1) -> float:
+    """Return the mean squared error over the training views, reduced by a factor."""
     errors = []
     for camera in flod.data.train:
+        view, target = reduce_view(camera, flod.data.images.target(camera), factor)
         with torch.no_grad():
-            image = rasterize(Gaussians.of(splats), camera, near=flod.data.near, antialias=True).image
-        errors.append(float(((image - flod.data.images.target(camera).image) ** 2).mean()))
+            image = rasterize(Gaussians.of(splats), view, near=flod.data.near, antialias=True).image
+        errors.append(float(((image - target.image) ** 2).mean()))
     return float(np.mean(errors))
 
 
@@ -40,8 +45,11 @@ def test_finest_level_is_first_after_previews(data):
     flod = make(data, free_depth=0.0, largest=0.0)
     handed = [(step, trained, level.number, len(level.splats)) for step, trained, level in train(flod)]
     # the finest has 60 - 10 - 8 steps; a third and two thirds of them
-    assert [entry[:3] for entry in handed] == [(14, 3, 1), (28, 3, 2), (42, 3, 3), (52, 2, 2), (60, 1, 1)]
-    finest, middle, coarse = (entry[3] for entry in handed[2:])
+    assert [entry[:3] for entry in handed] == [
+        *((14, 3, 1), (28, 3, 2), (42, 3, 3), (52, 2, 2)),
+        *((60, 1, number) for number in (1, 2, 3)),  # again, with their distances
+    ]
+    coarse, middle, finest = (entry[3] for entry in handed[4:])
     assert middle == round(finest / 2) and coarse == round(middle / 2)
 
 
@@ -50,7 +58,9 @@ def test_refined_levels_beat_merge(data):
     levels = {level.number: level.splats for _, _, level in train(flod)}
     assert len(levels) == 3
     for number in (1, 2):
-        assert error(flod, levels[number]) < 0.97 * error(flod, merge(levels[3], len(levels[number])))
+        merged = merge(levels[3], len(levels[number]))
+        for factor in (1, 2, 4):
+            assert error(flod, levels[number], factor) < 0.97 * error(flod, merged, factor)
 
 
 def test_merge_drops_invisible_splats(data):
@@ -68,10 +78,20 @@ def test_merge_drops_invisible_splats(data):
 
 
 def test_refinement_starts_with_small_images(data):
-    """Images of each merged level grow from ``first_resolution`` to full size."""
-    flod = make(data, first_resolution=0.5, full_resolution=0.5)
-    assert [flod.shrink(step) for step in (42, 47, 51)] == [2, 1, 1]
-    assert [flod.shrink(step) for step in (52, 56, 59)] == [2, 1, 1]
+    """Images of each merged level grow from ``first_resolution`` to full size; some remain small."""
+    flod = make(data, steps=[400] * 3, refine_steps=300, first_resolution=0.5, full_resolution=0.5)
+    for begin, end in zip(flod._ends, flod._ends[1:], strict=False):
+        middle = (begin + end) // 2
+        factors, counts = np.unique([flod.shrink(step) for step in range(middle, end)], return_counts=True)
+        np.testing.assert_array_equal(factors, [1, 2, 4])
+        np.testing.assert_allclose(counts / (end - middle), [0.75, 0.125, 0.125], atol=0.08)
+        assert min(flod.shrink(step) for step in range(begin, begin + 20)) > 1.4
+
+
+def test_refinement_has_no_dropout(data):
+    flod = make(data, dropout=0.5)
+    weights = [flod.render_weights(flod.data.view(0), step)[0] is None for step in (0, 42, 52)]
+    assert weights == [False, True, True]
 
 
 def test_finishing_steps_keep_all_merged_splats(data):
@@ -81,6 +101,48 @@ def test_finishing_steps_keep_all_merged_splats(data):
     assert [entry[:2] for entry in handed[-3:]] == [(63, 1), (63, 2), (63, 3)]
     counts = {number: count for _, number, count in handed[:-3]}
     assert {number: count for _, number, count in handed[-3:]} == counts
+
+
+def test_switches_have_least_error_within_the_budget():
+    rng = np.random.default_rng(1)
+    errors = np.sort(rng.uniform(1, 2, (5, 3)))[:, ::-1]
+    counts = np.sort(rng.uniform(0, 1, (5, 3)))
+    least, *_, most = counts.sum(0)
+    for limit in np.linspace(least, most, 6):
+        choices = {}
+        for fine in range(6):
+            for coarse in range(fine, 6):
+                levels = [0 if b >= coarse else 1 if b >= fine else 2 for b in range(5)]
+                error, splats = (sum(a[b, level] for b, level in enumerate(levels)) for a in (errors, counts))
+                if splats <= limit + 1e-9:
+                    choices[coarse, fine] = error
+        assert tuple(choose_switches(errors, counts, limit + 1e-9)) == min(choices, key=choices.__getitem__)
+    assert choose_switches(errors, counts, least) == [0, 0] and choose_switches(errors, counts, most) == [
+        5,
+        5,
+    ]
+
+
+def test_distances_draw_at_most_the_share_of_splats(data):
+    """The bundle's own rule counts the splats."""
+    shares = []
+    for drawn in (0.35, 0.6):
+        flod = make(data, margin=0.0, merge_ratio=0.4, drawn=drawn, levels=4, steps=[15] * 4)
+        levels = {level.number: level for _, _, level in train(flod)}
+        bundle = Bundle("flod", [levels[number] for number in (1, 2, 3, 4)], "bands", controls=flod.controls)
+        sizes = [level.facts["s_min"] for level in bundle.levels]
+        assert sizes == flod.s_min and sizes == sorted(sizes, reverse=True) and sizes[2] > 0 == sizes[3]
+        values = resolve_controls(bundle, flod.controls)
+        counts = np.zeros(2)
+        for camera in data.train:
+            selected, _ = select(bundle, camera.center, camera.focal, values)
+            counts += [camera.sees(s.means, data.near).sum() for s in (selected, levels[4].splats)]
+        shares.append(counts[0] / counts[1])
+    assert 0.16 < shares[0] < 0.38 < shares[1] < 0.65
+
+
+def test_resumed_run_keeps_distances(data, check_resumed):
+    check_resumed(lambda: make(data, levels=4, steps=[9] * 4, finish_share=0.2), 28, 38)
 
 
 def test_paper_trains_coarse_levels_first(data):
