@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import bpy
 
 WIDE_TYPE = (
@@ -139,6 +142,17 @@ def set_multilayer_exr(settings: bpy.types.ImageFormatSettings) -> None:
     if hasattr(settings, "media_type"):
         settings.media_type = "MULTI_LAYER_IMAGE"
     settings.file_format, settings.color_depth = "OPEN_EXR_MULTILAYER", "32"
+
+
+@contextmanager
+def square_pixels(render: bpy.types.RenderSettings) -> Iterator[None]:
+    """Set square pixels while a render is saved: Blender 5.0 writes no multilayer EXR with other pixels."""
+    aspects = render.pixel_aspect_x, render.pixel_aspect_y
+    render.pixel_aspect_x = render.pixel_aspect_y = 1.0
+    try:
+        yield
+    finally:
+        render.pixel_aspect_x, render.pixel_aspect_y = aspects
 
 
 COMPOSITOR_START = (

@@ -231,7 +231,8 @@ def _save(scene: bpy.types.Scene, folder: Path, name: str, size: tuple[int, int]
         file = folder / kind / f"{name}.{suffix}"
         with atomic_write(file) as temporary:
             try:
-                result.save_render(str(temporary), scene=scene)
+                with compat.square_pixels(scene.render):
+                    result.save_render(str(temporary), scene=scene)
                 complete = image_size(temporary) == size
             except RuntimeError:  # Blender gives no reason
                 complete = False

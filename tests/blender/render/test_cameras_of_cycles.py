@@ -278,7 +278,7 @@ def test_light_is_spread_as_in_cycles(bpy, scene, root, tmp_path, lens, change):
         }
     cycles, ours = (images["blurred"][engine] - images["sharp"][engine] for engine in ("CYCLES", "LODGS"))
     assert np.linalg.eigvalsh(cycles)[-1] > 3
-    np.testing.assert_allclose(ours, cycles, atol=0.05 * np.abs(cycles).max())
+    np.testing.assert_allclose(ours, cycles, atol=0.06 * np.abs(cycles).max())  # noise of both engines
 
 
 def test_stereo_animation_in_viewport_quality_is_refused(bpy, lodgs, scene, root):
