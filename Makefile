@@ -124,6 +124,7 @@ window: setup
 interop: setup
 	$(VENV) tools/interop.py
 	$(VENV) tools/interop_gltf.py
+	$(VENV) tools/interop_tiles.py
 	$(VENV) tools/shaders.py
 
 attacks: setup

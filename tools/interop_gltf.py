@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,6 @@ sys.path.insert(0, str(ROOT))
 from tools import interop  # noqa: E402
 from training.api import load_bundle, render_image  # noqa: E402
 from training.editing.export import export_levels  # noqa: E402
-from training.scenes.cameras import Camera  # noqa: E402
 from training.scenes.view_tables import read_view_tables  # noqa: E402
 
 PACKAGE, VERSION = "three", "0.187.0"
@@ -51,7 +51,9 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         scene = Path(folder) / "scene.glb"
         export_levels(scene, bundle, antialiased=True)
-        answer = draw(str(browser), scene, camera)
+        mounts = {"/three": interop.FOLDER / "node_modules" / "three", "/scene.glb": scene}
+        page = Path(__file__).with_suffix(".html")
+        answer = draw(str(browser), page, mounts, f"{camera.width}x{camera.height}")
     if isinstance(answer, str):
         print(f"three.js {VERSION}: {answer}")
         return 1
@@ -65,17 +67,25 @@ def psnr(image: np.ndarray, other: np.ndarray) -> float:
     return float(-10 * np.log10(np.square(image - other.clip(0, 1)).mean()))
 
 
-def draw(browser: str, scene: Path, camera: Camera) -> np.ndarray | str:
-    """Return the image of the page (H, W, 3), or an error message."""
+def draw(browser: str, page: Path, mounts: Mapping[str, Path], query: str) -> np.ndarray | str:
+    """Return the image (H, W, 3) that a page sends, or an error message.
+
+    Args:
+        browser: path of Chromium.
+        page: the page; it sends its image to /image, or an error message to /error.
+        mounts: files and folders that the page loads, by the begin of their path on the server.
+        query: query string of the page's address.
+    """
     answers: list[tuple[str, bytes]] = []
     arrived = threading.Event()
 
     class Handler(http.server.SimpleHTTPRequestHandler):
         def translate_path(self, path: str) -> str:
             name = path.partition("?")[0]
-            if name.startswith("/three/"):
-                return str(interop.FOLDER / "node_modules" / name[1:])
-            return str(scene if name == "/scene.glb" else Path(__file__).with_suffix(".html"))
+            for prefix, target in mounts.items():
+                if name.startswith(prefix):
+                    return f"{target}{name.removeprefix(prefix)}"
+            return str(page)
 
         def do_POST(self) -> None:
             answers.append((self.path, self.rfile.read(int(self.headers["Content-Length"]))))
@@ -88,7 +98,7 @@ def draw(browser: str, scene: Path, camera: Camera) -> np.ndarray | str:
 
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
     threading.Thread(target=server.serve_forever, daemon=True).start()
-    address = f"http://127.0.0.1:{server.server_port}/?{camera.width}x{camera.height}"
+    address = f"http://127.0.0.1:{server.server_port}/?{query}"
     with tempfile.TemporaryDirectory() as profile:
         process = subprocess.Popen(
             [browser, "--headless=new", "--no-sandbox", "--use-angle=swiftshader",

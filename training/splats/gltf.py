@@ -31,9 +31,11 @@ from .portable_levels import (
     upright_meta,
 )
 from .sh import coefficient_count
+from .spz import pack_spz, unpack_spz
 
 MAX_DEGREE = 3
 SPLATS, LOD, COVERAGE = "KHR_gaussian_splatting", "MSFT_lod", "MSFT_screencoverage"
+COMPRESSION = "KHR_gaussian_splatting_compression_spz_2"
 DESCRIPTION = "lodgs"
 """Key of the scene's extras with the levels' rule and meta, as JSON."""
 _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
@@ -43,6 +45,10 @@ _RESERVE = 256
 """Bytes of JSON for the bounds of a level, which are known after its splats are written."""
 _MIN_SPLAT = 32
 """Minimum bytes of a splat: position, rotation, scale, opacity and base colour."""
+_SPZ_SPLAT = 19
+"""Minimum bytes of a splat of SPZ before compression."""
+_MAX_RATIO = 200
+"""Maximum ratio of compression that is read; equal splats are compressed best."""
 _VIEW_ANGLE = math.radians(60)
 """Vertical field of view for which distances are converted to covered shares of the screen."""
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -92,6 +98,33 @@ def write_glb(path: Path, levels: PortableLevels) -> None:
         file.write(_HEADER.pack(b"glTF", 2, begin + size))
         file.write(_CHUNK.pack(reserved, b"JSON") + _padded(document, reserved))
         file.write(_CHUNK.pack(size, b"BIN\0"))
+
+
+def write_compressed_glb(path: Path, levels: PortableLevels) -> None:
+    """Write a ``.glb`` file of one level with its splats as SPZ, which is what CesiumJS reads.
+
+    Raises:
+        LodgsError: the file cannot be written.
+    """
+    (level,) = levels.bundle.levels
+    splats = level.splats
+    data = pack_spz(splats, levels.bundle.antialias)
+    document, _ = _document(levels)
+    for accessor in document["accessors"]:
+        del accessor["bufferView"]
+    position = document["accessors"][document["meshes"][0]["primitives"][0]["attributes"]["POSITION"]]
+    position |= {"min": splats.means.min(0).tolist(), "max": splats.means.max(0).tolist()}
+    splatting = document["meshes"][0]["primitives"][0]["extensions"][SPLATS]
+    splatting["extensions"] = {COMPRESSION: {"bufferView": 0}}
+    document["extensionsUsed"].append(COMPRESSION)
+    document["extensionsRequired"] = [SPLATS, COMPRESSION]
+    document["bufferViews"] = [{"buffer": 0, "byteOffset": 0, "byteLength": len(data)}]
+    data = data.ljust(len(data) + -len(data) % 4, b"\0")
+    document["buffers"] = [{"byteLength": len(data)}]
+    text = _padded(document, 0)
+    with atomic_write(path) as temporary, open(temporary, "wb") as file:
+        file.write(_HEADER.pack(b"glTF", 2, _HEADER.size + 2 * _CHUNK.size + len(text) + len(data)))
+        file.write(_CHUNK.pack(len(text), b"JSON") + text + _CHUNK.pack(len(data), b"BIN\0") + data)
 
 
 def _padded(document: dict, size: int) -> bytes:
@@ -317,7 +350,10 @@ class _GlbReader:
 
     def _primitive(self, primitive: dict) -> Splats:
         extension = primitive["extensions"][SPLATS]
-        if inner := list(extension.get("extensions", {})):
+        inner = list(extension.get("extensions", {}))
+        if inner == [COMPRESSION]:
+            return self._compressed(extension["extensions"][COMPRESSION]["bufferView"])
+        if inner:
             raise LodgsError(
                 f"Cannot read {self._path}: its splats need the extension {printable(inner[0])}.",
                 "Export it without compression.",
@@ -336,15 +372,30 @@ class _GlbReader:
             raise ValueError(f"it is too short for {self._splats:,} splats")
         return splats_from_activated(means, quats, scales, alphas, np.stack(sh, axis=1))
 
-    def _accessor(self, index: object, width: int) -> np.ndarray:
-        """Return the values (N, width) float32 of an accessor."""
-        accessor = self._item("accessors", index)
-        view = self._item("bufferViews", accessor["bufferView"])
+    def _compressed(self, index: object) -> Splats:
+        view = self._view(index)
+        begin = _natural(view.get("byteOffset", 0))
+        data = self._data[begin : begin + _natural(view["byteLength"])].tobytes()
+        splats = unpack_spz(data, len(data) * _MAX_RATIO // _SPZ_SPLAT)
+        self._splats += len(splats)
+        if self._splats * _SPZ_SPLAT > self._size * _MAX_RATIO:
+            raise ValueError(f"it is too short for {self._splats:,} splats")
+        return splats
+
+    def _view(self, index: object) -> dict:
+        """Return a buffer view of the file's own data."""
+        view = self._item("bufferViews", index)
         buffer = self._item("buffers", view["buffer"])
         if view["buffer"] != 0 or "uri" in buffer:
             raise LodgsError(
                 f"Cannot read {self._path}: it refers to other files.", "Export it as one .glb file."
             )
+        return view
+
+    def _accessor(self, index: object, width: int) -> np.ndarray:
+        """Return the values (N, width) float32 of an accessor."""
+        accessor = self._item("accessors", index)
+        view = self._view(accessor["bufferView"])
         if _WIDTHS[accessor["type"]] != width or "sparse" in accessor:
             raise ValueError(f"accessor {index} is not supported")
         kind = np.dtype(_COMPONENTS[accessor["componentType"]])

@@ -17,7 +17,7 @@ from ..errors import LodgsError
 from ..files import temporary_folder
 from .gaussians import SplatRows, Splats
 from .georeference import ECEF
-from .gltf import write_glb
+from .gltf import COMPRESSION, SPLATS, write_compressed_glb
 from .levels import Bundle, Level
 from .portable_levels import PortableLevels, batches
 
@@ -102,7 +102,7 @@ def _write_cells(folder: Path, levels: PortableLevels) -> dict:
             name = f"cell{cell}_level{level.number}.glb"
             splats = level.rows.select(index)
             tile = Bundle("", [Level(level.number, splats)], meta=_meta(levels))
-            write_glb(folder / name, PortableLevels(tile))
+            write_compressed_glb(folder / name, PortableLevels(tile))
             box = _box(splats, levels.bundle.up_rotation)
             boxes[cell] = np.array([np.minimum(boxes[cell][0], box[0]), np.maximum(boxes[cell][1], box[1])])
             cells[cell] = {
@@ -115,8 +115,11 @@ def _write_cells(folder: Path, levels: PortableLevels) -> dict:
     box = np.array([np.min(boxes, axis=0)[0], np.max(boxes, axis=0)[1]])  # empty cells have none
     far = SCREEN_ERROR * _FAR * float(np.linalg.norm(box[1] - box[0])) / levels.focal
     error = max(far, *errors)
+    extensions = {name: [SPLATS, COMPRESSION] for name in ("extensionsUsed", "extensionsRequired")}
     return {
         "asset": {"version": "1.1", "generator": "LODGS"},
+        "extensionsUsed": ["3DTILES_content_gltf"],
+        "extensions": {"3DTILES_content_gltf": extensions},
         "geometricError": error,
         "root": {
             "boundingVolume": _volume(box), "geometricError": error, "refine": "REPLACE",

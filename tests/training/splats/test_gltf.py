@@ -14,7 +14,9 @@ from training.errors import LodgsError
 from training.splats import gltf
 from training.splats.formats import find_format
 from training.splats.gaussians import SH_C0
+from training.splats.gltf import write_compressed_glb
 from training.splats.levels import Bundle, Level
+from training.splats.portable_levels import PortableLevels
 
 PREFIX = "KHR_gaussian_splatting:"
 
@@ -186,7 +188,7 @@ def change_buffer(document):
 
 def change_compression(document):
     extension = document["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]
-    extension["extensions"] = {"KHR_gaussian_splatting_compression_spz_2": {"bufferView": 0}}
+    extension["extensions"] = {"KHR_gaussian_splatting_compression_other": {"bufferView": 0}}
 
 
 def change_count(document):
@@ -206,7 +208,7 @@ def change_index(document):
     ("change", "reason"),
     [
         (change_buffer, "refers to other files"),
-        (change_compression, "needs? the extension KHR_gaussian_splatting_compression_spz_2"),
+        (change_compression, "needs? the extension KHR_gaussian_splatting_compression_other"),
         (change_count, "exceeds its data"),
         (change_node, "occurs twice"),
         (change_index, "-1 is not a count"),
@@ -226,3 +228,17 @@ def test_files_above_4_gib_are_refused(tmp_path, monkeypatch):
     with pytest.raises(LodgsError, match="exceed the 4 GiB"):
         export_levels(tmp_path / "a.glb", flod())
     assert not list(tmp_path.iterdir())
+
+
+def test_compressed_level_is_read_within_the_steps_of_spz(tmp_path):
+    bundle = flod(2)
+    del bundle.levels[:-1]
+    write_compressed_glb(tmp_path / "a.glb", PortableLevels(bundle))
+    document, _ = parts(tmp_path / "a.glb")
+    extension = "KHR_gaussian_splatting_compression_spz_2"
+    assert document["extensionsRequired"] == ["KHR_gaussian_splatting", extension]
+    reread = read(tmp_path / "a.glb").levels[-1].splats
+    expected = bundle.levels[-1].splats
+    np.testing.assert_allclose(reread.means, expected.means, atol=1e-5)
+    np.testing.assert_allclose(reread.log_scales, expected.log_scales, atol=0.5 / 16 + 1e-5)
+    assert reread.sh.shape == expected.sh.shape

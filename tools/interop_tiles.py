@@ -1,0 +1,66 @@
+"""Check that CesiumJS draws our 3D Tiles as we do. Part of ``make interop``.
+
+Writes the levels of a bundle with views as 3D Tiles, draws the first view in Chromium without a window and
+without a graphics card, and compares the image with our own. ``python tools/interop_tiles.py [BUNDLE.ply]``
+uses a given bundle, or that of ``make demo``. Exit code 0: the images agree; 1: they do not; 2: nothing was
+checked.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import sys
+import tempfile
+import urllib.parse
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from tools import interop  # noqa: E402
+from tools.interop_gltf import BROWSERS, DEMO, draw, psnr  # noqa: E402
+from training.api import load_bundle, render_image  # noqa: E402
+from training.editing.export import export_tiles  # noqa: E402
+from training.scenes.view_tables import read_view_tables  # noqa: E402
+
+PACKAGE, VERSION = "cesium", "1.145.0"
+MIN_PSNR = 28.0
+"""Minimum likeness of the compressed splats to our image, dB."""
+WIDTH = 480
+
+
+def main() -> int:
+    source = Path(sys.argv[1]) if len(sys.argv) > 1 else DEMO
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    problem = interop.node_problem() or ("" if browser else "Chromium is not installed.")
+    problem = problem or ("" if source.exists() else f"{source} does not exist; run make demo.")
+    if problem or not interop.install(PACKAGE, VERSION):
+        print(f"interop: {problem or 'npm cannot install CesiumJS.'} 3D Tiles are not checked.")
+        return 2
+    bundle = load_bundle(source)
+    cameras, _, _ = read_view_tables(bundle.tables)
+    camera = cameras[0].scaled(WIDTH / cameras[0].width)
+    axes = bundle.up_rotation @ camera.world_to_camera[:3, :3].T  # right, down and forward, with z up
+    view = {
+        "eye": (bundle.up_rotation @ camera.center).tolist(), "up": (-axes[:, 1]).tolist(),
+        "direction": axes[:, 2].tolist(), "angle": 2 * math.atan(camera.width / 2 / camera.fx),
+        "size": [camera.width, camera.height],
+    }  # fmt: skip
+    with tempfile.TemporaryDirectory() as folder:
+        export_tiles(Path(folder) / "tiles", bundle)
+        build = interop.FOLDER / "node_modules" / PACKAGE / "Build" / "Cesium"
+        mounts = {"/cesium": build, "/tiles": Path(folder) / "tiles"}
+        page, query = Path(__file__).with_suffix(".html"), urllib.parse.quote(json.dumps(view))
+        answer = draw(str(browser), page, mounts, query)
+    if isinstance(answer, str):
+        print(f"CesiumJS {VERSION}: {answer}")
+        return 1
+    value = psnr(answer, render_image(bundle, camera, backend="cpu"))
+    print(f"CesiumJS {VERSION}: {value:.1f} dB from our image of {source}, at least {MIN_PSNR:g}")
+    return int(value < MIN_PSNR)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
