@@ -8,7 +8,7 @@ from ..splat_format import SplatFormat
 FORMAT = SplatFormat(
     ".glb",
     "glTF",
-    "glTF for Cesium, Babylon.js and three.js; all levels in one file",
+    "glTF for Babylon.js and three.js; all levels in one file",
     tuple(48.0 + 12 * (degree + 1) ** 2 for degree in range(MAX_DEGREE + 1)),
     max_degree=MAX_DEGREE,
     write_levels=write_glb,
