@@ -144,6 +144,11 @@ class Parameters:
         """Maximum number of splats trained at the same time; 0 is unlimited."""
         return self.max_splats
 
+    @property
+    def growth_rounds(self) -> float | None:
+        """Number of densifications of the finest level, the same as 3DGS's; None if splats grow otherwise."""
+        return None
+
     def threshold_factor(self, image_factor: float) -> float:
         """Return the factor on gradient thresholds, given that of the image size."""
         return image_factor if self.scale_threshold else 1.0
@@ -232,6 +237,10 @@ class SplatParameters(DensityParameters):
         "At each densification after the first opacity reset, remove splats with a radius above 20 pixels or "
         "a standard deviation above a tenth of the scene extent, as 3DGS does.",
     )
+
+    @property
+    def growth_rounds(self) -> float | None:
+        return self.densify_until * self.steps / self.densify_interval
 
 
 STANDARD: dict[str, Any] = {

@@ -19,14 +19,14 @@ COSTS = Estimate(600, 10**9, 8 * 10**9, 10**9, 50 * 10**9, 60_000, 1000, 42, (96
 def job(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "SECONDS", 0.0)
     scene = write_tiny_scene(tmp_path / "scene")
-    parameters = {"max_splats": 3000, "levels": 2, "steps": 40}
+    parameters = {"max_splats": 90, "levels": 2, "steps": 40, "densify_interval": [1, 1]}
     return Job(
         scene=str(scene), out=str(tmp_path / "run"), backend="cpu", image_scale=1.0, parameters=parameters
     )
 
 
 def test_estimate_measures_real_steps_at_the_final_size(job, tmp_path, monkeypatch):
-    """Steps take 0.1 s with the scene's points and 0.3 s at the limit: the mean is 0.25 s."""
+    """Steps take 0.1 s with the scene's points and 0.3 s at the end: their mean is 0.25 s."""
     counts = []
 
     def time_steps(method, last):
@@ -37,13 +37,27 @@ def test_estimate_measures_real_steps_at_the_final_size(job, tmp_path, monkeypat
     monkeypatch.setattr(module, "_time_steps", time_steps)
     costs = estimate(job, tmp_path)
     points = len(read_scene(Path(job.scene)).points)
-    assert counts == [min(points, 3000), 3000] and costs.splats == 3000
-    assert costs.seconds == pytest.approx(0.25 * costs.steps)
+    assert counts == [points, 90] and costs.splats == 90
+    assert module.START_SECONDS < costs.seconds - 0.25 * costs.steps < module.START_SECONDS + 60
     assert costs.steps == job.resolved_parameters().total_steps
     assert 10**8 < costs.memory < 10**10 and costs.free_memory > 0
     bytes_per_splat = 4 * (3 + 3 + 4 + 1 + 3 * 16)
-    assert costs.disk > 3000 * 2 * bytes_per_splat and costs.free_disk > 0
+    assert costs.disk > 90 * 2 * bytes_per_splat and costs.free_disk > 0
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("method", "parameters", "count"),
+    [
+        ("3dgs", {"steps": 300, "max_splats": 5000}, 1300),  # 3 rounds of 10 %
+        ("3dgs", {"steps": 300, "max_splats": 1200}, 1200),
+        ("flod", {"steps": [100] * 5, "refine_steps": 100, "densify_interval": [20] * 5}, 1630),  # 252 steps
+        ("octree", {"max_splats": 5000}, 5000),
+    ],
+)
+def test_splats_grow_with_densifications(job, method, parameters, count):
+    parameters = replace(job, method=method, parameters=parameters).resolved().resolved_parameters()
+    assert module._expected_splats(parameters, 1000) == pytest.approx(count, abs=1)
 
 
 def test_points_of_the_final_size_are_near_the_scene(job):
@@ -60,7 +74,7 @@ def test_finding_has_the_costs_in_one_sentence(job):
     first = estimate_findings(job)[0]
     assert first.severity == "estimate"
     assert str(COSTS) == (
-        "About 10 min, 1.0 of 8.0 GB memory, 1.0 of 50.0 GB disk, up to 60,000 splats (1,000 steps on 42 "
+        "About 10 min, 1.0 of 8.0 GB memory, 1.0 of 50.0 GB disk, about 60,000 splats (1,000 steps on 42 "
         "views of 960x640 pixels)."
     )
 

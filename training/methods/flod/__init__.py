@@ -155,6 +155,14 @@ class FlodParameters(FlodLevels, DensityParameters):
         at_end = self.max_splats * self.budget_ratio ** (self.levels - self.end)
         return round(self.max_splats * sum(shares) if self.finish_steps else at_end)
 
+    @property
+    def growth_rounds(self) -> float | None:
+        growing = self.stages[:1] if self.merges else self.stages
+        return sum(
+            self.densify_until[number - 1] * steps / self.densify_interval[number - 1]
+            for number, steps in growing
+        )
+
     def check(self) -> None:
         if not self.first_level <= self.end <= self.levels:
             raise LodgsError(

@@ -85,6 +85,10 @@ class TreeParameters(SplatParameters):
     def base_steps(self) -> int:
         return 1 + self.tune_steps
 
+    @property
+    def growth_rounds(self) -> float | None:
+        return None  # leaves grow, too
+
 
 _DRAFT = TreeParameters()
 _STANDARD = replace(
