@@ -17,7 +17,7 @@ COMPARED_VIEWS = 8
 MAX_ANGLE = np.radians(60)
 """Maximum angle between the view directions of compared views."""
 TOLERANCE = 3.0
-"""Difference of colours, of 255, up to which two depths are similar. The larger one is used: it hides nothing."""
+"""Difference of colours, of 255, of similar depths. The largest one is used: a point there hides nothing."""
 
 
 class PixelCamera(Protocol):
