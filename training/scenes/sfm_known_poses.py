@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from . import pycolmap_process
+from .fill_points import CellView, cell_colors, fill_cells
 from .pycolmap_process import ask, send
 
 if TYPE_CHECKING:
@@ -48,10 +49,12 @@ def _main() -> None:
     request = pycolmap_process.read_request()
     pycolmap_process.load_pycolmap().set_random_seed(0)
     work = Path(request["work"])
-    start = time.monotonic()
-    colors, extracted = _extract(request, work, start + request["seconds"] / 2)
-    matched = _match(work, start + request["seconds"])
-    result = _write(_triangulate(work), request, work, colors)
+    deadline = time.monotonic() + request["seconds"]
+    colors, cells, extracted = _extract(request, work, deadline - request["seconds"] / 2)
+    matched = _match(work, deadline)
+    reduced = _triangulate(work)
+    estimated = _estimate(reduced, cells, deadline) if reduced is not None else None
+    result = _write(reduced, estimated, request, work, colors)
     send(result={**result, "features": len(colors), "in_time": extracted and matched})
 
 
@@ -117,11 +120,14 @@ def epipolar_errors(first: np.ndarray, second: np.ndarray, relative: np.ndarray)
     return np.abs((lines * second).sum(axis=1)) / np.sqrt(squares).clip(1e-30)
 
 
-def _extract(request: dict, work: Path, deadline: float) -> tuple[dict[int, np.ndarray], bool]:
+def _extract(
+    request: dict, work: Path, deadline: float
+) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray], bool]:
     """Extract the features of the photos.
 
     Returns:
-        Colours (N, 3) uint8 of the features by number of the photo, and False if time ran out.
+        Colours (N, 3) uint8 of the features and colours of the cells by number of the photo, and False if
+        time ran out.
     """
     import pycolmap
 
@@ -133,10 +139,11 @@ def _extract(request: dict, work: Path, deadline: float) -> tuple[dict[int, np.n
     arguments = {"camera_mode": pycolmap.CameraMode.PER_IMAGE, "image_path": work / "photos"}
     pycolmap.Database.open(work / DATABASE).close()  # creates the file
     colors: dict[int, np.ndarray] = {}
+    cells: dict[int, np.ndarray] = {}
     done, total = 0, len(request["scales"])
     for group in _groups(total):
         if time.monotonic() > deadline:
-            return colors, False
+            return colors, cells, False
         send(stage="features", done=done, total=total)
         done += len(group)
         names = [photo_name(number) for number in ask(photos=group)["photos"]]
@@ -152,14 +159,16 @@ def _extract(request: dict, work: Path, deadline: float) -> tuple[dict[int, np.n
             for name in names:
                 image = database.read_image_with_name(name)
                 photo = pycolmap.Bitmap.read(work / "photos" / name, as_rgb=True)
-                assert image is not None and photo is not None
+                mask = pycolmap.Bitmap.read(work / "masks" / f"{name}.png", as_rgb=False)
+                assert image is not None and photo is not None and mask is not None
                 pixels = photo.to_array()
+                cells[photo_number(name)] = cell_colors(pixels, mask.to_array() > 0)
                 x, y = database.read_keypoints(image.image_id)[:, :2].astype(int).T
                 height, width = pixels.shape[:2]
                 colors[photo_number(name)] = pixels[y.clip(0, height - 1), x.clip(0, width - 1)]
                 (work / "photos" / name).unlink()
                 (work / "masks" / f"{name}.png").unlink()
-    return colors, True
+    return colors, cells, True
 
 
 def _groups(total: int) -> Iterator[list[int]]:
@@ -245,10 +254,31 @@ def _triangulate(work: Path) -> pycolmap.Reconstruction | None:
     )
 
 
+def _estimate(
+    model: pycolmap.Reconstruction, cells: dict[int, np.ndarray], deadline: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return points (N, 3) where photos have no triangulated ones, and their colours (N, 3) uint8."""
+    indices = {point: index for index, point in enumerate(model.points3D)}
+    positions = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
+    views = []
+    for image in sorted(model.images.values(), key=lambda image: image.name):
+        observed = [indices[point.point3D_id] for point in image.points2D if point.has_point3D()]
+        pose, colors = image.cam_from_world().matrix(), cells[photo_number(image.name)]
+        views.append(CellView(model.cameras[image.camera_id], pose, colors, np.array(observed, int)))
+    return fill_cells(views, positions, deadline)
+
+
 def _write(
-    reduced: pycolmap.Reconstruction | None, request: dict, work: Path, colors: dict[int, np.ndarray]
+    reduced: pycolmap.Reconstruction | None,
+    estimated: tuple[np.ndarray, np.ndarray] | None,
+    request: dict,
+    work: Path,
+    colors: dict[int, np.ndarray],
 ) -> dict:
-    """Write the points into the model of the photos at full size, and return their numbers."""
+    """Write the points into the model of the photos at full size, and return their numbers.
+
+    Points without observations are estimated.
+    """
     import pycolmap
 
     model = pycolmap.Reconstruction(work / "full")
@@ -266,17 +296,21 @@ def _write(
                 samples.append(colors[number][element.point2D_idx])
             model.add_point3D(point.xyz, track, np.rint(np.mean(samples, axis=0)).astype(np.uint8))
         model.update_point_3d_errors()
+    counts = {
+        "points": model.num_points3D(),
+        "photos": sum(image.num_points3D > 0 for image in model.images.values()),
+        "error": model.compute_mean_reprojection_error() if model.num_points3D() else 0.0,
+        "estimated": 0 if estimated is None else len(estimated[0]),
+    }
+    for position, color in zip(*(estimated or ((), ())), strict=True):
+        model.add_point3D(position, pycolmap.Track(), color)
     if any(request["origin"]):  # an identity would change the last bits
         model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), np.array(request["origin"])))
     (work / "sparse").mkdir()
     model.write_binary(work / "sparse")
     for extra in ("rigs.bin", "frames.bin"):  # readers recreate trivial rigs
         (work / "sparse" / extra).unlink(missing_ok=True)
-    return {
-        "points": model.num_points3D(),
-        "photos": sum(image.num_points3D > 0 for image in model.images.values()),
-        "error": model.compute_mean_reprojection_error() if model.num_points3D() else 0.0,
-    }
+    return counts
 
 
 if __name__ == "__main__":

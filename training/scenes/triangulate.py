@@ -55,7 +55,7 @@ DECODERS = 4
 """Number of photos decoded at a time."""
 
 _PREFIX = "triangulating-"
-_VERSION = b"1"  # of the cached files
+_VERSION = b"2"  # of the cached files
 _SUMMARY = "summary.json"
 _NO_POINTS = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
 
@@ -304,7 +304,7 @@ def _summarize(scene: Scene, result: Mapping, problem: str) -> dict:
     else:
         message = (
             f"Triangulated {result['points']:,} points from {result['photos']:,} photos, "
-            f"{result['error']:.2f} px"
+            f"{result['error']:.2f} px; estimated {result['estimated']:,} in parts without features"
         )
     if not problem and not result["in_time"]:
         warnings.append(

@@ -12,7 +12,7 @@ from PIL import Image
 from training.__main__ import main
 from training.scenes import triangulate
 from training.scenes.cameras import look_at
-from training.scenes.colmap import observations, read_scene, scene_lenses
+from training.scenes.colmap import Scene, observations, read_scene, scene_lenses
 from training.scenes.images import write_png
 from training.scenes.sfm_known_poses import choose_pairs, epipolar_errors, match_descriptors, relative_pose
 from training.scenes.triangulate import cached_points, triangulate_scene
@@ -52,17 +52,34 @@ def result(walls, tmp_path_factory):
     ), reports
 
 
+def triangulated_points(scene: Scene) -> np.ndarray:
+    """Points (N, 3) with observations; the other ones are estimated."""
+    observed = observations(scene, [camera.name for camera in scene.cameras])
+    return scene.points[np.unique(np.concatenate(list(observed.values())))]
+
+
 def test_points_lie_on_the_surfaces(result):
     scene, _ = result
-    assert len(scene.points) > 300 and scene.warnings == []
-    errors = surface_distance(scene.points)  # a pixel is 1 cm wide at the distance of 3
+    points = triangulated_points(scene)
+    assert len(points) > 300 and scene.warnings == []
+    errors = surface_distance(points)  # a pixel is 1 cm wide at the distance of 3
     assert np.median(errors) < 0.01 and np.quantile(errors, 0.9) < 0.05
+
+
+def test_estimated_points_fill_the_photos(result):
+    scene, (*_, (message, _, _)) = result
+    count = int(message.split("estimated ")[1].split()[0].replace(",", ""))
+    assert len(scene.points) - len(triangulated_points(scene)) == pytest.approx(count, abs=count // 100)
+    for camera in scene.cameras:
+        pixels = camera.project(scene.points[camera.sees(scene.points)])[0]
+        assert len(np.unique(pixels // 20, axis=0)) == (WIDTH // 20) * (HEIGHT // 20)
+    assert np.median(surface_distance(scene.points)) < 0.1
 
 
 def test_observations_are_at_the_projections_of_the_points(result):
     scene, _ = result
     observed = observations(scene, [camera.name for camera in scene.cameras])
-    assert sum(map(len, observed.values())) >= 2 * len(scene.points)
+    assert sum(map(len, observed.values())) >= 2 * len(triangulated_points(scene))
     for camera in scene.cameras:
         assert camera.sees(scene.points[observed[camera.name]]).all()
         pixels, _ = camera.project(scene.points[observed[camera.name]])
@@ -76,7 +93,7 @@ def test_progress_and_result_are_reported(result, walls):
     scene, reports = result
     *stages, (message, _, _) = reports
     assert list(dict.fromkeys(stage for stage, *_ in stages)) == list(triangulate.STAGES.values())
-    count = len(read_scene(walls, model=scene.point_model).points)
+    count = len(triangulated_points(read_scene(walls, model=scene.point_model)))
     assert message.startswith(f"Triangulated {count:,} points from 6 photos, 0.")
 
 
@@ -109,8 +126,9 @@ def test_distorted_lens_and_masks(tmp_path):
     for number in range(len(photos)):
         write_png(folder / "masks" / f"{number}.png", mask)
     scene = triangulate_scene(read_scene(folder), tmp_path, lambda *values: None)
-    assert len(scene.points) > 100
-    assert np.median(surface_distance(scene.points)) < 0.01
+    points = triangulated_points(scene)
+    assert len(points) > 100
+    assert np.median(surface_distance(points)) < 0.01
     for camera in scene.cameras:
         rows = observations(scene, [camera.name])[camera.name]
         assert camera.project(scene.points[rows])[0][:, 0].min() > WIDTH / 2 - 3
@@ -157,7 +175,7 @@ def test_command_writes_points(walls, tmp_path, capsys):
     printed = capsys.readouterr()
     scene = read_scene(tmp_path)
     assert f"6 views, {len(scene.points):,} points" in printed.out and "Triangulated" in printed.err
-    assert np.median(surface_distance(scene.points)) < 0.01 and scene.warnings == []
+    assert np.median(surface_distance(triangulated_points(scene))) < 0.01 and scene.warnings == []
     assert observations(scene, ["0.png"]) and [p.name for p in (tmp_path / "sparse").iterdir()] == ["0"]
 
 
@@ -185,7 +203,7 @@ def test_command_adds_points_to_a_colmap_scene(walls, tmp_path, capsys):
     printed = capsys.readouterr()
     assert f"out: 6 views, {len(scene.points):,} points, from COLMAP" in printed.out
     assert "no points" not in printed.err
-    assert np.median(surface_distance(scene.points)) < 0.01 and scene.warnings == []
+    assert np.median(surface_distance(triangulated_points(scene))) < 0.01 and scene.warnings == []
     assert main(["scene", "--from", str(source)]) == 0
     assert {path.name: path.read_bytes() for path in (source / "sparse" / "0").iterdir()} == model
     np.testing.assert_array_equal(cached_points(read_scene(source)).points, scene.points)
