@@ -1,4 +1,4 @@
-"""Base class of methods that refine a trained model: a base, or the result of 3DGS steps."""
+"""Refinement of a trained model: a base, the result of 3DGS steps, or a level merged from a finer one."""
 
 from __future__ import annotations
 
@@ -6,12 +6,47 @@ from dataclasses import replace
 
 import torch
 
-from ..rasterize import Adam, Gaussians
+from ..rasterize import Adam, Gaussians, contributions, tensor_device
+from ..rasterize.adam import LearningRate
 from ..splats.gaussians import Splats
 from ..splats.morton import spatial_order
 from .initialize import from_splats
+from .model import splat_rates
+from .parameters import DensityParameters
+from .schedules import log_linear
 from .splat_method import SplatMethod
-from .training_data import TrainingView
+from .training_data import TrainingData, TrainingView
+
+MEANS_RATE, FINAL_RATE = 3.0, 0.1
+"""Initial rate of positions relative to the final one of 3DGS, and final rates relative to initial ones."""
+MERGED_RATE = 4.0
+"""Factor on the rates of merged levels, which have more to learn."""
+LEAST_WEIGHT = 0.05
+"""Minimum share of a pixel of splats that are merged; others are dropped."""
+
+
+def refining_rates(
+    parameters: DensityParameters, extent: float, fraction: float, factor: float = 1.0
+) -> dict[str, LearningRate]:
+    """Return the learning rates after a fraction of the steps that refine a level."""
+    lr = splat_rates(parameters, extent) | {"means": MEANS_RATE * parameters.lr_means_final * extent}
+    return {name: rate * factor * log_linear(1.0, FINAL_RATE, fraction) for name, rate in lr.items()}
+
+
+@torch.no_grad()
+def drop_invisible(
+    splats: Splats, minimum: int, data: TrainingData, parameters: DensityParameters, backend: str
+) -> Splats:
+    """Drop splats of low weight in all training views and margins, before a merge.
+
+    At least ``minimum`` remain.
+    """
+    p = parameters
+    wide = (camera.widened(p.margin) for camera in data.train)
+    gaussians = Gaussians.of(splats, tensor_device(backend))
+    largest = contributions(gaussians, wide, near=data.near, antialias=p.antialias, backend=backend).largest
+    threshold = min(LEAST_WEIGHT, float(largest.topk(minimum).values[-1]))
+    return splats.select((largest >= threshold).cpu().numpy())
 
 
 class RowOptimizer:

@@ -4,6 +4,12 @@ from __future__ import annotations
 
 from math import ceil, sqrt
 
+import numpy as np
+
+SMALL_IMAGES, SMALL_SHARE = (2, 4), 0.25
+"""Reductions of images while a merged level is refined, and the share of steps with one of them. On full-size
+images alone, a level becomes worse than its merge at small sizes."""
+
 
 def log_linear(first: float, last: float, share: float) -> float:
     """Interpolate geometrically between two values; a ``share`` above 1 gives the last value."""
@@ -14,6 +20,12 @@ def log_linear(first: float, last: float, share: float) -> float:
 def due(interval: int, step: int) -> bool:
     """Return True every ``interval`` steps, counting from step 1. The interval 0 disables."""
     return interval > 0 and step % interval == 0
+
+
+def random_reduction(seed: int, step: int) -> float:
+    """Draw the factor by which the image of a step that refines a merged level is reduced, mostly 1."""
+    rng = np.random.default_rng([seed, step, 21])
+    return float(rng.choice(SMALL_IMAGES)) if rng.random() < SMALL_SHARE else 1.0
 
 
 def shrink_at(share: float, first: float, full: float) -> float:

@@ -18,9 +18,8 @@ import torch
 
 from ...lod.rule import Values, collect_facts
 from ...lod.rules.bands import RULE
-from ...optimize.model import Model, splat_rates
+from ...optimize.model import Model
 from ...optimize.pruning import importance_threshold, log_scale_gain
-from ...optimize.schedules import log_linear
 from ...optimize.training_data import TrainingData
 from ...rasterize import Gaussians, contributions
 from ...rasterize.adam import LearningRate
@@ -44,10 +43,6 @@ MAX_GAMMA_FACTOR = 1.3
 """Maximum random factor on the screen size, up or down."""
 FINEST_WEIGHT = 2.0
 """Relative frequency of the finest level in steps that render a single level."""
-MEANS_RATE = 3.0
-"""Initial learning rate of positions, relative to the final one of a level."""
-FINAL_RATE = 0.1
-"""Final learning rates as a fraction of the initial ones."""
 
 
 def join_levels(levels: Mapping[int, Mapping[str, torch.Tensor]], lr: Mapping[str, LearningRate]) -> Model:
@@ -138,12 +133,6 @@ def scale_opacities(logits: torch.Tensor, fraction: torch.Tensor) -> torch.Tenso
     """Multiply opacities (N,), given as logits, by factors (N,) in (0, 1]."""
     fraction = fraction.to(logits)
     return torch.where(fraction < 1, torch.logit((logits.sigmoid() * fraction).clamp_min(1e-6)), logits)
-
-
-def learning_rates(parameters: FlodParameters, extent: float, fraction: float) -> dict[str, LearningRate]:
-    """Return the learning rates after a fraction of the finishing steps."""
-    lr = splat_rates(parameters, extent) | {"means": MEANS_RATE * parameters.lr_means_final * extent}
-    return {name: rate * log_linear(1.0, FINAL_RATE, fraction) for name, rate in lr.items()}
 
 
 def random_values(rng: np.random.Generator, gamma: float, model: Model, single_share: float) -> Values:

@@ -31,20 +31,13 @@ from ...optimize.level_distances import measure_distances
 from ...optimize.merging import merge
 from ...optimize.method import Drawing
 from ...optimize.model import Model, splat_rates
-from ...optimize.schedules import due, log_linear, shrink_at
+from ...optimize.refining import MERGED_RATE, drop_invisible, refining_rates
+from ...optimize.schedules import due, log_linear, random_reduction, shrink_at
 from ...optimize.training_data import TrainingView
-from ...rasterize import Gaussians, contributions
+from ...rasterize import Gaussians
 from ...splats.gaussians import Splats
 from ...splats.levels import Level
 from . import BLENDED_LEVELS, FlodParameters, finish
-
-LEAST_WEIGHT = 0.05
-"""Minimum share of a pixel of the finest level's splats that are merged; others are dropped."""
-REFINE_RATE = 4.0
-"""Learning rates of merged levels, relative to those of finishing steps."""
-SMALL_IMAGES, SMALL_SHARE = (2, 4), 0.25
-"""Additional reductions of images while a merged level is refined, and the share of steps with one of them.
-Otherwise the merge alone is the better small image."""
 
 
 class Method(method.Method[FlodParameters, Drawing]):
@@ -130,9 +123,8 @@ class Method(method.Method[FlodParameters, Drawing]):
         p = self.parameters
         if not self._refines(step):
             return shrink_at(self._progress(step), p.first_resolution, p.full_resolution)
-        rng = np.random.default_rng([self.seed, step, 21])
-        if rng.random() < SMALL_SHARE:
-            return float(rng.choice(SMALL_IMAGES))
+        if (factor := random_reduction(self.seed, step)) > 1:
+            return factor
         progress = self._level_step(step) / p.stages[self._stage(step)][1]
         return shrink_at(progress, p.first_resolution, p.full_resolution)
 
@@ -158,12 +150,11 @@ class Method(method.Method[FlodParameters, Drawing]):
         p = self.parameters
         if self.is_finishing(step):
             share = (step - self._ends[-1]) / p.finish_steps
-            self.model.lr = finish.learning_rates(p, self.data.extent, share)
+            self.model.lr = refining_rates(p, self.data.extent, share)
             return
         steps = p.stages[self._stage(step)][1]
         if self._refines(step):
-            rates = finish.learning_rates(p, self.data.extent, self._level_step(step) / steps)
-            self.model.lr = {name: REFINE_RATE * rate for name, rate in rates.items()}
+            self.model.lr = refining_rates(p, self.data.extent, self._level_step(step) / steps, MERGED_RATE)
             return
         share = self._level_step(step) / (p.lr_means_steps or steps)
         rate = log_linear(p.lr_means, p.lr_means_final, share) * self.data.extent
@@ -273,26 +264,14 @@ class Method(method.Method[FlodParameters, Drawing]):
         p = self.parameters
         if p.merges:
             count = round(p.merge_ratio * len(self.model))
-            splats = self._visible_splats(count) if level == p.levels - 1 else self.model.splats()
+            splats = self.model.splats()
+            if level == p.levels - 1:
+                splats = drop_invisible(splats, count, self.data, p, self.backend)
             merged = merge(splats, count)
             self.model = self._new_model(from_splats(merged, p.sh_degree, self.device))
             return
         tensors = {name: tensor.detach() for name, tensor in self.model.adam.tensors.items()}
         self.model = self._new_model(self._next_level_tensors(tensors, self.s_min[level - 2], level))
-
-    @torch.no_grad()
-    def _visible_splats(self, minimum: int) -> Splats:
-        """Return the splats without those of low weight in all training views and margins.
-
-        At least ``minimum`` remain.
-        """
-        p, data = self.parameters, self.data
-        wide = (camera.widened(p.margin) for camera in data.train)
-        largest = contributions(
-            self.model.gaussians, wide, near=data.near, antialias=p.antialias, backend=self.backend
-        ).largest
-        threshold = min(LEAST_WEIGHT, float(largest.topk(minimum).values[-1]))
-        return self.model.splats().select((largest >= threshold).cpu().numpy())
 
     def _next_level_tensors(
         self, tensors: dict[str, torch.Tensor], old_min: float, level: int
@@ -353,7 +332,7 @@ class Method(method.Method[FlodParameters, Drawing]):
         if fine and not p.merges:
             gamma = self.controls["gamma"]
             levels |= finish.restart_levels(levels, fine, self.s_min, data, p, gamma, self.backend)
-        self.model = finish.join_levels(levels, finish.learning_rates(p, data.extent, 0.0))
+        self.model = finish.join_levels(levels, refining_rates(p, data.extent, 0.0))
 
     def _from_points(self, level: int) -> dict[str, torch.Tensor]:
         s_min = self.s_min[level - 1]

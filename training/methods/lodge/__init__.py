@@ -11,6 +11,8 @@ from ...splats.levels import MAX_LEVELS
 
 ROUNDS = (0.2, 0.6, 1.0)
 """Fractions of the pruning threshold in the rounds that prune and tune a level (LODGE, A.2)."""
+MERGED_ROUNDS = 2
+"""Number of rounds that refine a merged level."""
 
 
 @dataclass(frozen=True)
@@ -25,6 +27,13 @@ class LodgeParameters(SplatParameters):
         (0.0,) * 3,
         "Distance from which each level is drawn, in median depths of the scene, falling to 0 for the "
         "finest (LODGE: d_l). 0 for another level chooses the distance that draws the fewest splats.",
+    )
+    levels_from: str = setting(
+        "merged",
+        "Start of a coarser level. 'merged' merges the next finer level to the number of splats that pruning "
+        "would keep, and refines it for all image sizes. 'pruned' smooths and prunes a copy of the finest "
+        "level, as in the paper.",
+        choices=("merged", "pruned"),
     )
     min_ratio: float = setting(
         2.0,
@@ -47,15 +56,17 @@ class LodgeParameters(SplatParameters):
         high=1,
     )
     keep: float = setting(
-        1.0,
-        "Maximum splat count of a level, as a fraction of the next finer level's; remaining splats "
-        "grow to fill the gaps. Use 0.3 to 0.4 in scenes of many small splats that all matter to some "
-        "pixel. Not in the paper.",
+        0.5,
+        "Maximum splat count of a level, as a fraction of the next finer level's; the remaining splats "
+        "of a pruned level grow to fill the gaps. Not in the paper.",
         above=0,
         high=1,
     )
     tune_steps: int = setting(
-        400, "Steps after each of the three prunings of a level.", above=0, unit="steps"
+        300,
+        "Steps after each of the three prunings of a level; a merged level is refined for twice as many.",
+        above=0,
+        unit="steps",
     )
     tune_range: float = setting(
         0.3, "Random variation of distances while a level is tuned, as a fraction of the distance.", high=0.9
@@ -66,9 +77,9 @@ class LodgeParameters(SplatParameters):
         "Otherwise all distances have the same factor.",
     )
     tune_alone: float = setting(
-        0.25,
-        "Fraction of the tuning steps that render the level alone, on images downscaled for its "
-        "distance. Trains levels that no training view is far enough to show. Not in the paper.",
+        0.5,
+        "Fraction of the tuning steps that render a level alone, a pruned one on images downscaled for its "
+        "distance, as far as training views are too near to show it. Not in the paper.",
         high=1,
     )
     chunks: int = setting(
@@ -105,7 +116,12 @@ class LodgeParameters(SplatParameters):
     @property
     def level_steps(self) -> int:
         """Number of steps that tune one level."""
-        return len(ROUNDS) * self.tune_steps
+        return (MERGED_ROUNDS if self.merges else len(ROUNDS)) * self.tune_steps
+
+    @property
+    def merges(self) -> bool:
+        """True if coarser levels are merged."""
+        return self.levels_from == "merged"
 
     def check(self) -> None:
         fixed = [distance for distance in self.distances[:-1] if distance]
@@ -125,6 +141,8 @@ _PAPER = replace(
     prune_oversized=True,
     densify_by="max",
     least_weight=0.02,
+    levels_from="pruned",
+    keep=1.0,
     tune_each=True,
     tune_alone=0.0,
     min_ratio=1.3,

@@ -1,7 +1,8 @@
 """LODGE (2025): train levels, finest first, each from a copy of the finest; then compute chunks.
 
-A level is smoothed for its distance, pruned of unimportant splats, and tuned while blended with the finer
-levels, which are frozen (Sec. 3, A.2). The finest level is a base, or the result of 3DGS in the first
+In the paper, a level is smoothed for its distance, pruned of unimportant splats, and tuned while blended with
+the finer levels, which are frozen (Sec. 3, A.2). Not in the paper: merge each level from the next finer one,
+and refine it alone and blended. The finest level is a base, or the result of 3DGS in the first
 steps. The last steps compute the splat sets of chunks, one per step.
 """
 
@@ -16,10 +17,13 @@ from ...errors import LodgsError
 from ...lod.blocks import BLOCKS, BlockIndex, block_quantiles, block_table
 from ...lod.rules.chunks import RULE, TABLE, member_columns
 from ...optimize.density_control import require_rows
+from ...optimize.initialize import from_splats
+from ...optimize.merging import merge
 from ...optimize.method import Drawing, StepResult
 from ...optimize.model import NAMES
 from ...optimize.pruning import importance_threshold, log_scale_gain
-from ...optimize.refining import RefiningMethod
+from ...optimize.refining import MERGED_RATE, RefiningMethod, drop_invisible, refining_rates
+from ...optimize.schedules import random_reduction
 from ...optimize.training_data import TrainingView
 from ...rasterize import Gaussians, photometric_loss
 from ...scenes.cameras import pick_evenly
@@ -135,15 +139,31 @@ class Method(RefiningMethod):
     # -- steps -----------------------------------------------------------------------------------------
 
     def shrink(self, step: int) -> float:
-        single = self.refines(step) and self._renders_single(step)
-        return self._distance_ratio(self.level_at(step)) if single else super().shrink(step)
+        if not (self.refines(step) and self._renders_single(step)):
+            return super().shrink(step)
+        merges = self.parameters.merges
+        return random_reduction(self.seed, step) if merges else self._distance_ratio(self.level_at(step))
+
+    def set_learning_rates(self, step: int) -> None:
+        p = self.parameters
+        if not (p.merges and self.refines(step)):
+            super().set_learning_rates(step)
+            return
+        progress = self._level_step(step) / p.level_steps
+        self.model.lr = refining_rates(p, self.data.extent, progress, MERGED_RATE)
 
     def begin_step(self, step: int) -> StepResult | None:
         """Compute a chunk, or prune the level if a round begins."""
         if step >= self.tuned_steps:
             return self._chunk_step(step)
-        if step >= self.finest_steps and self._level_step(step) % self.parameters.tune_steps == 0:
-            self.begin_round(step)
+        if step >= self.finest_steps:
+            local, p = self._level_step(step), self.parameters
+            if local == 0:
+                self._begin_level(self.level_at(step))
+                if p.merges:
+                    self._merge_level(step)
+            if not p.merges and local % p.tune_steps == 0:
+                self.begin_round(step)
         return None
 
     def view_index(self, step: int) -> int | None:
@@ -161,7 +181,7 @@ class Method(RefiningMethod):
             rows = visible_rows(levels, d_l, view.camera, near, self.random_scale(step))
         trained_rows = torch.from_numpy(rows[number]).long().to(self.device)
         optimizer = self.select_rows(trained_rows)
-        parts = [smooth(optimizer.gaussians, self._std(self.d_l[number]))]
+        parts = [self._smooth(optimizer.gaussians, number)]
         if len(rows) > 1:
             parts.insert(
                 0,
@@ -192,24 +212,46 @@ class Method(RefiningMethod):
     # -- levels ----------------------------------------------------------------------------------------
 
     def begin_round(self, step: int) -> None:
-        """Prune the level before a step; a new level starts as a copy of the finest."""
+        """Prune the level before a step."""
         p, number, local = self.parameters, self.level_at(step), self._level_step(step)
-        if local == 0:
-            self._begin_level(number)
         importance, previous = self.importance(number), (0.0, *ROUNDS)[local // p.tune_steps]
-        part = ROUNDS[local // p.tune_steps]
-        # per spatial block; all rounds together reach the level's fraction of the finest level's splats
-        share = p.keep ** ((self.levels - number) * (part - previous))
-        threshold = torch.from_numpy(block_quantiles(importance.numpy(), 1 - share))
-        weight = max(p.prune_weight * part, self._budget_threshold(number, importance, part))
-        thinned = threshold > weight
-        keep = importance >= threshold.clamp_min(weight)
+        keep, thinned = self._select_important(number, importance, previous, ROUNDS[local // p.tune_steps])
         with torch.no_grad():
             log_scales = self.model["log_scales"].cpu().numpy()
             gain = log_scale_gain(log_scales, importance.numpy(), keep.numpy())
             self.model["log_scales"].add_((torch.from_numpy(gain) * thinned).to(self.device)[:, None])
         self.model.keep(keep)
         require_rows(self.model, step, "prune_weight")
+        self._blocks = self._smoothed_level(number).blocks
+
+    def _select_important(
+        self, number: int, importance: torch.Tensor, previous: float, part: float
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the splats (N,) to keep in a round, and those in blocks that are thinned.
+
+        Args:
+            previous, part: fractions of the pruning threshold of the round before and of this one.
+        """
+        p = self.parameters
+        # per spatial block; all rounds together reach the level's fraction of the finest level's splats
+        share = p.keep ** ((self.levels - number) * (part - previous))
+        threshold = torch.from_numpy(block_quantiles(importance.numpy(), 1 - share))
+        weight = max(p.prune_weight * part, self._budget_threshold(number, importance, part))
+        return importance >= threshold.clamp_min(weight), threshold > weight
+
+    def _merge_level(self, step: int) -> None:
+        """Replace the copy of the finest level by a merge of the next finer level.
+
+        The merge has as many splats as pruning in one round would keep, and at most ``keep`` of that level's.
+        """
+        p, number = self.parameters, self.level_at(step)
+        keep, _ = self._select_important(number, self.importance(number), 0.0, 1.0)
+        finer = self._make_level(number + 1).splats
+        finer.extras = {}
+        count = max(min(int(keep.sum()), round(p.keep * len(finer))), 1)
+        merged = merge(drop_invisible(finer, count, self.data, p, self.backend), count)
+        tensors = from_splats(merged.select(spatial_order(merged.means)), p.sh_degree, self.device)
+        self.model = self.new_model(tensors)
         self._blocks = self._smoothed_level(number).blocks
 
     def _budget_threshold(self, number: int, importance: torch.Tensor, part: float) -> float:
@@ -265,7 +307,7 @@ class Method(RefiningMethod):
         if number == self.levels - 1:
             self._place_chunks()
         well_seen = seen_from_distance(finest, data.train, data.near, self.d_l[number], FAR_VIEWS)
-        self._single_share = p.tune_alone * float((~well_seen).mean())
+        self._single_share = p.tune_alone * (1.0 if p.merges else float((~well_seen).mean()))
         tensors = {name: getattr(finest.gaussians, name).clone() for name in NAMES}
         self.model = self.new_model(tensors)
 
@@ -284,8 +326,12 @@ class Method(RefiningMethod):
         """Return the model as a level, with the filter for its distance (Eq. 3), which training cannot
         undo.
         """
-        gaussians, d_l = self.model.gaussians.detach(), self.d_l[number]
-        return IndexedLevel.of(smooth(gaussians, self._std(d_l)) if d_l else gaussians)
+        return IndexedLevel.of(self._smooth(self.model.gaussians.detach(), number))
+
+    def _smooth(self, gaussians: Gaussians, number: int) -> Gaussians:
+        """Apply the filter of a level to its splats; merged levels are not smoothed."""
+        d_l = self.d_l[number]
+        return gaussians if self.parameters.merges or not d_l else smooth(gaussians, self._std(d_l))
 
     @torch.no_grad()
     def importance(self, number: int) -> torch.Tensor:

@@ -97,9 +97,9 @@ def trained(lodge, begin=0, until=None):
 
 def test_last_steps_compute_chunks_and_return_all_levels(data):
     lodge = make(data)
-    assert lodge.steps == 8 + 2 * 3 * 2  # until it is known where the chunks are
+    assert lodge.steps == 8 + 2 * 2 * 2  # until it is known where the chunks are
     levels = trained(lodge)
-    assert lodge.steps == 20 + 3 and lodge.stage(21) == "chunk 2 of 3"
+    assert lodge.steps == 16 + 3 and lodge.stage(17) == "chunk 2 of 3"
     assert [level.number for level in levels] == [3, 2, 1, 1, 2, 3]
     table = lodge.tables()["chunks"]
     assert {len(column) for column in table.values()} == {3} and list(table) == ["x", "y", "z", "radius"]
@@ -155,4 +155,4 @@ def test_loaded_splats_are_those_of_the_sets_of_near_chunks(data):
 
 
 def test_resume_in_chunks_is_bit_identical(data, check_resumed):
-    check_resumed(lambda: make(data), 19, 20, 21, 22)
+    check_resumed(lambda: make(data), 15, 16, 17, 18)

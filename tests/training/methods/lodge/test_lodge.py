@@ -8,11 +8,13 @@ import pytest
 import torch
 
 from training.errors import LodgsError
+from training.evaluate.views import reduce_view
 from training.lod.selection import resolve_controls, select
 from training.methods import create, method_info
 from training.methods.lodge import ROUNDS, LodgeParameters
 from training.methods.lodge.composite import IndexedLevel, LevelStack, gather_rows, visible_rows
 from training.methods.lodge.thresholds import CANDIDATES, MAX_CURVES, Thresholds
+from training.optimize.merging import merge
 from training.optimize.parameters import override
 from training.optimize.splat_method import PRUNE_AT
 from training.rasterize import Gaussians, contributions, rasterize
@@ -30,6 +32,8 @@ def make(data, base=None, preset="draft", **values):
         "prune_interval": 6,
         "tune_steps": 3,
         "margin": 0.0,
+        "levels_from": "pruned",
+        "keep": 1.0,
         **values,
     }
     return create("lodge", data, override(method_info("lodge").preset(preset), values), 0, "cpu", base)
@@ -312,3 +316,51 @@ def test_few_chunks_of_equation_5_are_made_in_preset_paper(data, base):
         lodge.d_l = {3: 0.0, 2: 4 * reach / 2.9}
         lodge._place_chunks()
         assert len(lodge.centres) == count
+
+
+# -- merged levels ----------------------------------------------------------
+
+
+def error(data, splats: Splats, factor: int) -> float:
+    """Return the mean squared error over the training views, reduced by a factor."""
+    errors = []
+    for camera in data.train:
+        view, target = reduce_view(camera, data.images.target(camera), factor)
+        with torch.no_grad():
+            image = rasterize(Gaussians.of(splats), view, near=data.near, antialias=True).image
+        errors.append(float(((image - target.image) ** 2).mean()))
+    return float(np.mean(errors))
+
+
+def test_merged_levels_beat_merge_at_all_sizes(data, base):
+    lodge = make(data, base, levels_from="merged", keep=0.5, tune_steps=15)
+    assert lodge.steps == lodge.parameters.base_steps == 2 * 2 * 15
+    levels = {level.number: level.splats for level in trained(lodge)}
+    assert same(levels[3], base.select(spatial_order(base.means)))
+    merged = base
+    for number in (2, 1):
+        assert 0 < len(levels[number]) <= len(levels[number + 1]) * 0.55
+        merged = merge(merged, len(levels[number]))
+        for factor in (1, 2, 4):
+            assert error(data, levels[number], factor) < 0.97 * error(data, merged, factor)
+
+
+def test_merged_levels_follow_the_rule_unsmoothed(data, base):
+    lodge = make(data, base, levels_from="merged", distances=[1.3, 0.8, 0.0])
+    coarse, middle, _ = sorted(trained(lodge), key=lambda level: level.number)
+    d_l = [coarse.facts["d_l"], middle.facts["d_l"]]
+    assert d_l == pytest.approx([1.3 * data.median_depth, 0.8 * data.median_depth])
+    assert torch.equal(lodge._smoothed_level(1).gaussians.log_scales, lodge.model["log_scales"])
+    assert len(coarse.splats) <= len(middle.splats) < len(base)
+
+
+def test_merged_levels_train_on_all_sizes(data, base):
+    lodge = make(data, base, levels_from="merged", tune_steps=200, tune_alone=0.6)
+    lodge.train_step(0)
+    factors, counts = np.unique([lodge.shrink(step) for step in range(400)], return_counts=True)
+    np.testing.assert_array_equal(factors, [1, 2, 4])
+    np.testing.assert_allclose(counts / 400, [0.85, 0.075, 0.075], atol=0.05)
+
+
+def test_resumed_merged_levels_are_bit_identical(data, check_resumed):
+    check_resumed(lambda: make(data, levels_from="merged", keep=0.5), 12, 14, 18)
