@@ -1,4 +1,4 @@
-"""SPZ, a compressed format of splats: version 3 is written, 2 and 3 are read.
+"""SPZ, a compressed format of splats: version 2 is written, 2 and 3 are read.
 
 https://github.com/nianticlabs/spz: a gzip stream with a header and one array per attribute. Coordinates stay
 as they are; their axes are those of the surrounding file.
@@ -17,7 +17,7 @@ from .portable_levels import opacities, splats_from_activated
 
 MAX_DEGREE = 3
 _HEADER = struct.Struct("<IIIBBBB")
-_MAGIC, _VERSION = 0x5053474E, 3
+_MAGIC, _VERSION = 0x5053474E, 2
 _FIXED_BITS = 23
 """Bits of a coordinate without its sign."""
 _COLOR_SCALE = 0.15
@@ -83,15 +83,9 @@ def unpack_spz(data: bytes, max_splats: int) -> Splats:
 
 
 def _rotation_codes(quats: np.ndarray) -> np.ndarray:
-    """Return the codes (N,) uint32 of quats (N, 4), wxyz, that :func:`_smallest_three` reads."""
-    xyzw = quats[:, [1, 2, 3, 0]] / np.linalg.norm(quats, axis=1, keepdims=True)
-    largest = np.abs(xyzw).argmax(axis=1)
-    xyzw *= np.where(np.take_along_axis(xyzw, largest[:, None], 1) < 0, -1, 1)
-    values = np.rint(511 * np.sqrt(2) * np.abs(xyzw)).clip(0, 511).astype("<u4") | (xyzw < 0) * np.uint32(512)
-    codes = largest.astype("<u4")
-    for index in range(4):
-        codes = np.where(largest == index, codes, codes << 10 | values[:, index])
-    return codes
+    """Return the codes (N, 3) uint8 of quats (N, 4), wxyz, that :func:`_rotations` reads."""
+    unit = quats / np.linalg.norm(quats, axis=1, keepdims=True)
+    return _byte(127.5 * np.where(unit[:, :1] < 0, -1, 1) * unit[:, 1:] + 127.5)
 
 
 def _rotations(codes: np.ndarray) -> np.ndarray:
