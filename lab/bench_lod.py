@@ -55,7 +55,7 @@ FRAMES = 6
 
 DISTANCES = (24.0, 10.0)
 """Distances in metres beyond which LODGE's coarser levels are used. Its automatic choice is 32 and 16."""
-LODGE = {"chunks": 64, "keep": 0.35, "prune_weight": 0.03, "tune_steps": 240}
+LODGE = {"levels_from": "pruned", "chunks": 64, "keep": 0.35, "prune_weight": 0.03, "tune_steps": 240}
 """Other parameters of LODGE, for 3 million splats at 11 cm spacing that each cover part of a pixel."""
 OTHER_METHODS = {
     "flod": {"steps": [400, 600, 800, 1200, 2000], "max_splats": 300_000},

@@ -62,6 +62,7 @@ class Point:
     splats: int
     seconds: float
     levels: list[dict]
+    curve: list[dict]
 
     @property
     def gap(self) -> float:
@@ -150,7 +151,7 @@ def measure(out: Path, **run) -> Point:
         **run, psnr=finest["psnr"], fitted_psnr=report["fitted_psnr"], worst=report["worst"]["psnr"],
         train_psnr=report["train_psnr"], veil=report["veil"]["mean"], veil_max=report["veil"]["max"],
         oversized=report["oversized"], splats=finest["splats"], seconds=events[-1]["seconds"],
-        levels=report["levels"],
+        levels=report["levels"], curve=report.get("curve", []),
     )  # fmt: skip
 
 
@@ -205,6 +206,44 @@ def plot(points: list[Point], path: Path) -> None:
                     )
                     style = {"color": f"C{color}", "linestyle": ["-", "--", ":"][dash % 3], "marker": "o"}
                     axis.plot(x, y, label=f"{method}, {version}", **style)
+    axes[0, 0].legend(fontsize="small")
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+
+
+def sizes_and_quality(point: Point) -> tuple[list[tuple[int, float]], list[tuple[int, float]]]:
+    """Return splat counts and dB at full size, ascending: of levels and selections, and of merges."""
+    rows = [(row["splats"], row["by_size"][0], row.get("merged", [None])[0]) for row in point.levels]
+    rows += [(row["splats"], row["psnr"], row.get("merged")) for row in point.curve if "psnr" in row]
+    rows.sort(key=lambda row: row[0])
+    return [row[:2] for row in rows], [(row[0], row[2]) for row in rows if row[2] is not None]
+
+
+def plot_levels(points: Iterable[Point], path: Path) -> None:
+    """Plot PSNR over splats: a panel per scene, a colour per method, merges of the finest level dashed.
+
+    Points are the longest runs of this checkout with the first seed.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    longest: dict[tuple[str, str], Point] = {}
+    for p in sorted(points, key=lambda p: (-p.share, p.seed)):
+        if p.version == "this":
+            longest.setdefault((p.scene, p.method), p)
+    scenes, methods = (list(dict.fromkeys(key)) for key in zip(*longest, strict=True))
+    figure, axes = pyplot.subplots(1, len(scenes), figsize=(6.5 * len(scenes), 4.5), squeeze=False)
+    for axis, scene in zip(axes[0], scenes, strict=True):
+        for color, method in enumerate(methods):
+            if (scene, method) in longest:
+                levels, merges = sizes_and_quality(longest[scene, method])
+                axis.plot(*zip(*levels, strict=True), color=f"C{color}", marker="o", ms=4, label=method)
+                if merges:
+                    axis.plot(*zip(*merges, strict=True), color=f"C{color}", linestyle="--", lw=1)
+        axis.set(title=scene, xlabel="splats (dashed: merged)", ylabel="PSNR (dB)", xscale="log")
+        axis.grid(alpha=0.3)
     axes[0, 0].legend(fontsize="small")
     figure.tight_layout()
     figure.savefig(path, dpi=110)
@@ -271,7 +310,8 @@ def main(arguments: list[str] | None = None) -> int:
         json.dumps([asdict(p) for p in points], indent=1), encoding="utf-8"
     )
     plot(points, args.out / "quality.png")
-    print(f"Wrote {args.out / 'quality.md'} and quality.png.")
+    plot_levels(points, args.out / "levels.png")
+    print(f"Wrote {args.out / 'quality.md'}, quality.png and levels.png.")
     return 0
 
 

@@ -31,6 +31,7 @@ def test_each_run_gives_a_point_and_is_reused(tiny_scene, tmp_path, monkeypatch)
     ]  # fmt: skip
     assert all(p["psnr"] > 3 and p["seconds"] > 0 and 0 <= p["veil"] <= 1 for p in points)
     assert (tmp_path / "quality.png").read_bytes()[:4] == b"\x89PNG"
+    assert (tmp_path / "levels.png").read_bytes()[:4] == b"\x89PNG"
     run = next(tmp_path.glob("tiny-3dgs-this-0.001-*"))
     job = (run / "job.toml").read_text()
     assert "validation = true" in job and "steps = 3\n" in job
@@ -44,10 +45,23 @@ def test_levels_are_listed_with_their_merges():
         {"level": 1, "splats": 20, "by_size": [20.0, 21.0, 22.0, 23.0], "merged": [19.0, 18.0, 17.0, 16.0]},
         {"level": 2, "splats": 40, "by_size": [30.0, 31.0, 32.0, 33.0]},
     ]
-    point = bench_quality.Point("a", "flod", "this", 0.5, 0, *[30.0] * 6, 0, 40, 1.5, rows)
+    point = bench_quality.Point("a", "flod", "this", 0.5, 0, *[30.0] * 6, 0, 40, 1.5, rows, [])
     names, _, coarse, finest = (line.split(" | ") for line in bench_quality.level_table([point]).splitlines())
     assert dict(zip(names, coarse, strict=True))["merged 1/8"] == "16"
     assert dict(zip(names, finest, strict=True))["1/8"] == "33" and finest[-4:] == [""] * 4
+
+
+def test_plot_has_levels_selections_and_merges(tmp_path):
+    levels = [
+        {"splats": 40, "by_size": [30.0, 31.0, 32.0, 33.0]},
+        {"splats": 20, "by_size": [20.0, 21.0, 22.0, 23.0], "merged": [19.0, 18.0, 17.0, 16.0]},
+    ]
+    curve = [{"pixels": 2.0, "splats": 30, "psnr": 25.0, "merged": 24.0}]
+    point = bench_quality.Point("a", "tree", "this", 1.0, 0, *[30.0] * 6, 0, 40, 1.5, levels, curve)
+    curves = bench_quality.sizes_and_quality(point)
+    assert curves == ([(20, 20.0), (30, 25.0), (40, 30.0)], [(20, 19.0), (30, 24.0)])
+    bench_quality.plot_levels([point], tmp_path / "levels.png")
+    assert (tmp_path / "levels.png").read_bytes()[:4] == b"\x89PNG"
 
 
 def test_comparison_with_another_checkout_requires_test_views(tiny_scene, tmp_path, capsys):

@@ -73,7 +73,8 @@ def evaluate_run(
           bundle exceeds memory)
         - ``frame_s``: seconds per frame ``by_distance``, including selection, and in ``full`` detail, drawn
           alternately; not for rules that always weight
-        - ``curve``: as ``selective``, for each value of the rule's ``sweep``
+        - ``curve``: as ``selective``, for each value of the rule's ``sweep``. Bundles in memory also have
+          ``merged``, the PSNR of the finest level merged to as many splats
         - ``networks``: quality of a neural model before baking
         - ``farther`` and ``jumps`` (of the middle view), if ``far``
 
@@ -185,6 +186,8 @@ def _measure_rule(
         report["curve"] = [
             {name: step, **evaluation.measure_by_distance(resident, {**values, name: step})} for step in steps
         ]
+        if not bundle.on_disk:
+            _add_merges(evaluation, bundle, report["curve"])
     if not rule.weights_full_detail:
         finest = standalone_levels(bundle)[-1]
         report["frame_s"] = evaluation.frame_times({
@@ -192,6 +195,15 @@ def _measure_rule(
             "full": lambda camera: resident.draw_level(finest.number, camera, near=data.near),
         })  # fmt: skip
     return report
+
+
+def _add_merges(evaluation: Evaluation, bundle: Bundle, rows: list[dict]) -> None:
+    """Add the PSNR of merges of the finest level, at the splat counts of the rows, as ``merged``."""
+    merged = complete_splats(bundle, standalone_levels(bundle)[-1])
+    for row in sorted(rows, key=lambda row: -row["splats"]):
+        merged = merge(merged, row["splats"])
+        quality = evaluation.compare_views(evaluation.cameras, lambda camera, splats=merged: (splats, None))
+        row["merged"] = round(float(quality.mean()), 3)
 
 
 def _earlier_rows(folder: RunFolder, row: dict, values: Values) -> list[dict]:

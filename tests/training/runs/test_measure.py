@@ -58,6 +58,7 @@ def test_only_the_finest_level_of_a_tree_is_measured(finished, splats, tmp_path)
     (row,) = report["levels"]
     assert (row["level"], row["splats"]) == (2, len(splats)) and row["veil"] == report["veil"]
     assert [row["pixels"] for row in report["curve"]] == [0.5, 1, 2, 4, 8, 16]
+    assert all(0 < row["merged"] < 60 for row in report["curve"])
     assert "level 1" not in format_report(report)
 
 
