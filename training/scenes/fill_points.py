@@ -78,7 +78,7 @@ def fill_cells(
         points: (N, 3) triangulated points.
         deadline: time of ``time.monotonic`` after which no view is filled.
     """
-    from scipy.spatial import cKDTree  # Blender lacks scipy
+    from scipy.spatial import KDTree  # Blender lacks scipy
 
     new, colors = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     for view in views:
@@ -97,7 +97,7 @@ def fill_cells(
         y, x = np.nonzero(empty)
         if not len(x) or len(known) < NEIGHBOURS:
             continue
-        nearest = cKDTree(known).query(np.stack([x, y], axis=1) + 0.5, k=NEIGHBOURS)[1]
+        nearest = KDTree(known).query(np.stack([x, y], axis=1) + 0.5, k=NEIGHBOURS)[1]
         candidates = _lift(view, np.stack([x, y], axis=1) + 0.5, np.sort(depths[nearest], axis=1))
         costs = _color_costs(candidates, view.colors[y, x], _close_views(view, views))
         similar = costs <= costs.min(axis=1, keepdims=True) + TOLERANCE

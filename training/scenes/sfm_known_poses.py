@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -264,7 +264,8 @@ def _estimate(
     for image in sorted(model.images.values(), key=lambda image: image.name):
         observed = [indices[point.point3D_id] for point in image.points2D if point.has_point3D()]
         pose, colors = image.cam_from_world().matrix(), cells[photo_number(image.name)]
-        views.append(CellView(model.cameras[image.camera_id], pose, colors, np.array(observed, int)))
+        camera: Any = model.cameras[image.camera_id]
+        views.append(CellView(camera, pose, colors, np.array(observed, int)))
     return fill_cells(views, positions, deadline)
 
 

@@ -10,6 +10,7 @@ from bisect import bisect_right
 from collections.abc import Mapping
 from dataclasses import replace
 from itertools import accumulate
+from typing import Any
 
 import numpy as np
 import torch
@@ -303,7 +304,7 @@ class Method(method.Method[FlodParameters, Drawing]):
 
     def _completed_levels(self) -> list[Level]:
         """Return the completed levels that finishing steps do not train, coarse to fine."""
-        arrays = {
+        arrays: dict[int, dict[str, Any]] = {
             number: {name: tensor.cpu().numpy() for name, tensor in tensors.items()}
             for number, tensors in sorted(self.completed.items())
         }
