@@ -62,11 +62,12 @@ class StepResult(NamedTuple):
     """Result of a step, valid until the next one.
 
     Attributes:
+        loss: return the loss, read from the device on demand.
         image: return the first rendered image (H, W, 3) over black, read from the device on demand.
         target: training image.
     """
 
-    loss: float
+    loss: Callable[[], float]
     image: Callable[[], torch.Tensor]
     target: Target
 
@@ -370,7 +371,7 @@ class Method(ABC, Generic[P, D]):
             optimizer.zero_grad()
         rendering = drawings[0].rendering
         image = self.background.remove(rendering.image, rendering.alpha, step)
-        return StepResult(float(loss.detach()), lambda: image, view.target)
+        return StepResult(lambda: float(loss.detach()), lambda: image, view.target)
 
     def _step_on_device(self, view: TrainingView, step: int) -> StepResult | None:
         """Make the step entirely on the backend's device. Return None if it cannot."""

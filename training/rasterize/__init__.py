@@ -9,7 +9,7 @@ reference's signatures. It is imported on first use.
 from __future__ import annotations
 
 import gc
-from collections.abc import Collection, Iterable, Iterator, Mapping, MutableMapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, MutableMapping, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
@@ -302,8 +302,11 @@ class DeviceModel(Protocol):
         weights: torch.Tensor | None = None,
         min_scale: float = 0.0,
         shrink: float | None = None,
-    ) -> float:
-        """Make one Adam step with :func:`photometric_loss` of one image, and return the loss.
+    ) -> Callable[[], float]:
+        """Make one Adam step with :func:`photometric_loss` of one image.
+
+        Return a function that returns the loss. It waits for the device, so call it rarely. If the loss of
+        any step was not finite, it returns that loss from then on.
 
         Args:
             target: opaque photo without a mask.

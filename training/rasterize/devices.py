@@ -153,9 +153,10 @@ def step_seconds(backend: str) -> float:
 
     def step() -> None:
         if device_model is not None:
-            device_model.step(
+            loss = device_model.step(
                 camera, target, near=0.01, sh_degree=3, background=(0.0, 0.0, 0.0), ssim_weight=0.2
             )
+            loss()
             return
         rendering = rasterize(Gaussians(**leaves), camera, backend=backend)
         photometric_loss(rendering.image, target, backend=backend).backward()

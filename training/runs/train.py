@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 import traceback
+from collections.abc import Callable
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -276,26 +277,34 @@ class _TrainingRun:
             if self.step == method.steps:
                 return True
             loss, image, target = method.train_step(self.step)
-            if not math.isfinite(loss):
-                raise LodgsError(
-                    f"Training diverged at step {self.step + 1}: the loss is {loss}.",
-                    "Train again with lower learning rates.",
-                )
             level = method.level_at(self.step)
             levels = method.levels_after(self.step)
             self.step += 1
             now = time.monotonic()
             interval = min(max(PROGRESS_SECONDS[0], (now - self._started) / 1000), PROGRESS_SECONDS[1])
             if now - last_progress >= interval or self.step == method.steps:
+                self._require_finite(loss)
                 quality = psnr(image().cpu(), target.image.cpu(), target.mask)
-                self._report_progress(level, loss, quality)
+                self._report_progress(level, loss(), quality)
                 last_progress = now
             del image, target  # frees memory for the next step's photo
+            saves = levels or time.monotonic() - last_checkpoint >= CHECKPOINT_SECONDS
+            if saves:
+                self._require_finite(loss)
             self._write_levels(levels)
-            if levels or time.monotonic() - last_checkpoint >= CHECKPOINT_SECONDS:
+            if saves:
                 self._save()
                 last_checkpoint = time.monotonic()
         return False
+
+    def _require_finite(self, loss: Callable[[], float]) -> None:
+        """Raise LodgsError if the loss is not finite. Reading it waits for the device, so this is rare."""
+        value = loss()
+        if not math.isfinite(value):
+            raise LodgsError(
+                f"Training diverged by step {self.step}: the loss is {value}.",
+                "Train again with lower learning rates.",
+            )
 
     def _stopped(self, received: list) -> bool:
         """Save, report and return True on a stop signal or a cancel request, also after the last step."""

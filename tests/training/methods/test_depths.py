@@ -51,7 +51,9 @@ def create_method(name: str, data: TrainingData, weight: float):
 
 @pytest.mark.parametrize("name", METHODS)
 def test_every_method_uses_depth_loss(name, data):
-    none, half, full_run = (create_method(name, data, weight).train_step(0)[0] for weight in (0.0, 0.5, 1.0))
+    none, half, full_run = (
+        create_method(name, data, weight).train_step(0).loss() for weight in (0.0, 0.5, 1.0)
+    )
     assert full_run - none > 0.01
     assert half - none == pytest.approx((full_run - none) / 2, rel=1e-3)
 

@@ -37,7 +37,7 @@ def steps(method, begin: int, end: int) -> list[float]:
     """Return the losses of these steps."""
     losses = []
     for step in range(begin, end):
-        losses.append(method.train_step(step).loss)
+        losses.append(method.train_step(step).loss())
         method.levels_after(step)
     return losses
 

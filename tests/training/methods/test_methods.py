@@ -139,7 +139,7 @@ def test_two_drawings_train_extra_weights_and_columns(tiny, data):
     method = methods.create("tiny", data, tiny.preset("draft"), seed=0, backend="cpu")
     initial, count = method.model["decay"].detach().clone(), len(method.model)
     loss, image, target = method.train_step(0)
-    assert loss > 0 and image().shape == target.image.shape
+    assert loss() > 0 and image().shape == target.image.shape
     learned = (method.model["decay"].detach() - initial).abs()
     assert (learned > 0).sum() > count / 2
     assert learned.max() == pytest.approx(0.1, rel=1e-3)  # Adam's first step is the rate

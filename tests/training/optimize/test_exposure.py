@@ -71,7 +71,7 @@ def test_every_method_trains_and_resumes_exposure(data, name):
     assert (learned > 0).sum() == 2  # only of the two photos used
     resumed.load_state_dict(deepcopy(method.state_dict()))
     assert torch.equal(resumed.exposure.table, method.exposure.table)
-    losses = [m.train_step(2)[0] for m in (method, resumed)]
+    losses = [m.train_step(2).loss() for m in (method, resumed)]
     assert losses[0] == losses[1] and torch.equal(resumed.exposure.table, method.exposure.table)
 
 

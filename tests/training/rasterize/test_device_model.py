@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from training.rasterize import Adam, Gaussians, Target, make_device_model, photometric_loss, rasterize
+from training.rasterize.gpu import device_model, recording
 
 RATES = {
     "means": 1e-3,
@@ -63,7 +64,7 @@ def test_steps_match_torch(graphics, make_splats, odd_camera, photo, backend):
     model = make_device_model("gpu", device_adam, device_stats, antialias=True)
     assert model is not None
     for step_weights in (weights, None, weights):
-        loss = model.step(odd_camera, photo, ssim_weight=0.2, weights=step_weights, shrink=2, **VIEW)
+        loss = model.step(odd_camera, photo, ssim_weight=0.2, weights=step_weights, shrink=2, **VIEW)()
         expected = torch_step(torch_adam, stats, odd_camera, photo, step_weights, backend)
         assert loss == pytest.approx(expected, rel=1e-4)
     torch.testing.assert_close(model.read("means"), torch_adam.tensors["means"].detach(), atol=2e-4, rtol=0)
@@ -90,7 +91,7 @@ def test_small_bindings_do_not_change_training(graphics, make_splats, odd_camera
         assert model is not None
         weights = torch.linspace(0, 1, 1500)
         losses = [
-            model.step(odd_camera, photo, ssim_weight=0.2, weights=w, shrink=1, **VIEW)
+            model.step(odd_camera, photo, ssim_weight=0.2, weights=w, shrink=1, **VIEW)()
             for w in (None, weights)
         ]
         model.raise_log_scales(torch.linspace(-4, -2, 1500))
@@ -144,10 +145,91 @@ def test_steps_transfer_little_data(graphics, make_splats, odd_camera, photo):
     assert max(transferred) < 20_000
 
 
+def test_steps_wait_for_the_device_once_in_many(graphics, make_splats, odd_camera, photo):
+    """A step replays its recording; it creates nothing and reads nothing until its loss is read."""
+    model = make_device_model("gpu", adam_of(make_splats(300)), zero_stats(300))
+    assert model is not None
+    losses = [model.step(odd_camera, photo, ssim_weight=0.2, shrink=1, **VIEW)]
+    before = graphics.counts.copy()
+    losses += [
+        model.step(odd_camera, photo, ssim_weight=0.2, shrink=1, **VIEW) for _ in range(device_model.PENDING)
+    ]
+    spent = graphics.counts - before
+    assert spent["reads"] == 1 and not spent["buffers"] and not spent["bind_groups"]
+    assert spent["submissions"] == device_model.PENDING
+    values = [loss() for loss in losses]
+    assert graphics.counts["reads"] == before["reads"] + 2
+    assert all(np.diff(values) < 0)
+
+
+@pytest.mark.parametrize("capacity", [64, 1000, None])
+def test_too_many_pairs_repeat_steps_with_the_same_bits(graphics, make_splats, odd_camera, photo, capacity):
+    """The 300 splats have about 1400 pairs. Steps that overflow, and those after them, are repeated."""
+    results = []
+    for first_capacity in (1 << 14, capacity):
+        adam, stats = adam_of(make_splats(300)), zero_stats(300)
+        model = make_device_model("gpu", adam, stats)
+        assert model is not None
+        model._capacity = first_capacity
+        weights = torch.linspace(0, 1, 300)
+        options = [
+            {"weights": w, "shrink": s, **VIEW, "background": (0.1 * k, 0.0, 0.0)}
+            for k, (w, s) in enumerate([(None, 1), (weights, None), (weights, 2), (None, 1)])
+        ]
+        losses = [model.step(odd_camera, photo, ssim_weight=0.2, **option) for option in options]
+        image, _ = model.last_image()
+        if capacity is not None and first_capacity == capacity:
+            assert capacity < model._capacity < 1 << 14
+        model.copy_to_host()
+        moments = [moment for state in adam.state.values() for moment in state]
+        tensors = [tensor.detach() for tensor in adam.tensors.values()]
+        losses = torch.tensor([loss() for loss in losses])
+        results.append([*tensors, *moments, *stats.values(), image, losses])
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+
+
+def test_recorded_steps_do_not_depend_on_dispatch_size(graphics, make_splats, odd_camera, photo, monkeypatch):
+    """Dispatches of at most seven workgroups are submitted separately."""
+    results = []
+    for max_groups in (graphics.max_groups, 7):
+        monkeypatch.setattr(graphics, "max_groups", max_groups)
+        model = make_device_model("gpu", adam_of(make_splats(50)), {})
+        assert model is not None
+        for _ in range(2):
+            model.step(odd_camera, photo, ssim_weight=0.2, **VIEW)
+        results.append(model.read("means"))
+    assert torch.equal(*results)
+
+
+def test_recorded_steps_need_no_private_functions(graphics, make_splats, odd_camera, photo, monkeypatch):
+    """A version of wgpu-py that hides wgpu-native gives the same bits."""
+
+    def trained() -> torch.Tensor:
+        model = make_device_model("gpu", adam_of(make_splats(50)), {})
+        assert model is not None
+        model.step(odd_camera, photo, ssim_weight=0.2, **VIEW)
+        return model.read("means")
+
+    assert recording._native() is not None
+    expected = trained()
+    monkeypatch.setattr(recording, "_native", lambda: None)
+    assert torch.equal(trained(), expected)
+
+
+def test_lost_losses_are_reported_later(graphics, make_splats, odd_camera, photo):
+    """A loss that is not finite is returned by all later steps, whose own loss may be finite again."""
+    adam = adam_of(make_splats(50))
+    model = make_device_model("gpu", adam, {})
+    assert model is not None
+    model.step(odd_camera, photo, ssim_weight=float("nan"), **VIEW)
+    assert np.isnan(model.step(odd_camera, photo, ssim_weight=0.2, **VIEW)())
+
+
 def test_steps_do_not_depend_on_uniform_buffer_size(graphics, make_splats, odd_camera, photo, monkeypatch):
     def trained() -> torch.Tensor:
         model = make_device_model("gpu", adam_of(make_splats(300)), zero_stats(300))
         assert model is not None
+        model._capacity = None  # steps are not recorded
         for _ in range(2):
             model.step(odd_camera, photo, ssim_weight=0.2, shrink=1, **VIEW)
         return torch.cat([model.read(name).reshape(300, -1) for name in ("means", "sh", "gradient_sum")], 1)

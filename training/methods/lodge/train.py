@@ -389,7 +389,7 @@ class Method(RefiningMethod):
         view = data.view(data.train.index(nearest))
         rendering = self.rasterize_model(view.camera, step, gaussians=gather_rows(levels, rows))
         loss = photometric_loss(rendering.image, view.target, p.ssim_weight, backend=self.backend)
-        return StepResult(float(loss), lambda: rendering.image, view.target)
+        return StepResult(lambda: float(loss), lambda: rendering.image, view.target)
 
     # -- levels ----------------------------------------------------------------------------------------
 

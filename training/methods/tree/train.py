@@ -269,7 +269,7 @@ class Method(RefiningMethod):
         rendering = self.rasterize_model(view.camera, step, gaussians=gaussians)
         loss = self.loss([Drawing(rendering)], view, step)
         return StepResult(
-            float(loss),
+            lambda: float(loss),
             partial(self.background.remove, rendering.image, rendering.alpha, step),
             view.target,
         )

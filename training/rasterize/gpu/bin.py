@@ -27,6 +27,7 @@ class Band:
         spans: (M, 2), first pair and number of pairs of each splat.
         sorted_pairs: (P,), pairs tile by tile, front to back in each tile.
         owners: (P,), splats of the sorted pairs.
+        starts: (M + 1,), first pair of each splat by depth, and the number of pairs without a limit.
     """
 
     tiles: range
@@ -34,6 +35,7 @@ class Band:
     spans: Buffer
     sorted_pairs: Buffer
     owners: Buffer
+    starts: Buffer
 
 
 def group_count(count: int, size: int = LANES) -> int:
@@ -48,32 +50,44 @@ def exclusive_scan(device: Device, values: Buffer) -> None:
         device.run("scan", "scan_all", 1, (count,), values=values)
         return
     blocks = group_count(count, BLOCK)
-    totals = device.empty(np.uint32, blocks)
+    totals = device.scratch(np.uint32, blocks)
     device.run("scan", "total", blocks, (count,), values=values, totals=totals)
     exclusive_scan(device, totals)
     device.run("scan", "scan_blocks", blocks, (count,), values=values, starts=totals)
 
 
-def sort(device: Device, keys: Buffer, values: Buffer, bits: int) -> tuple[Buffer, Buffer]:
-    """Sort keys of ``bits`` bits and their values in ascending order, stably; the inputs are overwritten."""
+def sort(
+    device: Device, keys: Buffer, values: Buffer, bits: int, totals: Buffer | None = None, slot: int = 0
+) -> tuple[Buffer, Buffer]:
+    """Sort keys of ``bits`` bits and their values in ascending order, stably; the inputs are overwritten.
+
+    Only the first ``totals[slot]`` keys are sorted; None sorts all.
+    """
     (count,) = keys.shape
+    totals = totals or device.upload(np.array([count], np.uint32))
     blocks = group_count(count, BLOCK)
-    target = device.empty(np.uint32, count), device.empty(np.uint32, count)
+    target = device.scratch(np.uint32, count), device.scratch(np.uint32, count)
     for shift in range(0, bits, DIGIT_BITS):
-        places = device.empty(np.uint32, (1 << DIGIT_BITS) * blocks)
-        numbers = count, shift, blocks
-        device.run("sort", "count", blocks, numbers, keys=keys, places=places)
+        places = device.scratch(np.uint32, (1 << DIGIT_BITS) * blocks)
+        numbers = count, shift, blocks, slot
+        device.run("sort", "count", blocks, numbers, keys=keys, places=places, totals=totals)
         exclusive_scan(device, places)
         device.run(
             "sort", "scatter", blocks, numbers, keys=keys, values=values, places=places,
-            sorted_keys=target[0], sorted_values=target[1],
+            sorted_keys=target[0], sorted_values=target[1], totals=totals,
         )  # fmt: skip
         (keys, values), target = target, (keys, values)
     return keys, values
 
 
 def bin_splats(
-    device: Device, rows: Buffer, depths: Buffer, width: int, height: int, max_pairs: int
+    device: Device,
+    rows: Buffer,
+    depths: Buffer,
+    width: int,
+    height: int,
+    max_pairs: int,
+    capacity: int | None = None,
 ) -> tuple[list[Band], Buffer]:
     """Bin projected splats.
 
@@ -82,6 +96,8 @@ def bin_splats(
         depths: (M,) uint32, bits of the depths, which have the order of the depths; the maximum value for
             splats that are not drawn. Overwritten.
         max_pairs: maximum number of pairs in a band of more than one tile.
+        capacity: maximum number of pairs in a single band, whose number of pairs is not read from the device.
+            ``starts`` of the band has it, so the caller can test if pairs were left out. None counts them.
 
     Returns:
         Bands that cover all tiles, found by bisection, and ranges (tiles, 2) of each tile's pairs in its
@@ -90,30 +106,31 @@ def bin_splats(
     count = rows.shape[0]
     across = -(-width // TILE)
     down = -(-height // TILE)
-    order, ranges = device.empty(np.uint32, count), device.empty(np.uint32, across * down, 2)
-    device.run("bin", "number", group_count(count), (count, across, 0, 0), pairs=order)
+    order, ranges = device.scratch(np.uint32, count), device.empty(np.uint32, across * down, 2)
+    device.run("bin", "number", group_count(count), (count, across, 0, 0, 0), pairs=order)
     _, order = sort(device, depths, order, DEPTH_BITS)
 
     def bands(tiles: range) -> list[Band]:
         numbers = count, across, tiles.start, tiles.stop
-        starts = device.empty(np.uint32, count + 1)
-        device.run("bin", "count", group_count(count), numbers, rows=rows, order=order, counts=starts)
+        starts = device.scratch(np.uint32, count + 1)
+        device.run("bin", "count", group_count(count), (*numbers, 0), rows=rows, order=order, counts=starts)
         exclusive_scan(device, starts)
-        total = int(device.read(starts, count)[0])
+        total = int(device.read(starts, count)[0]) if capacity is None else capacity
         middle = len(tiles) // 2
-        if total > max_pairs and middle:
+        if capacity is None and total > max_pairs and middle:
             return bands(tiles[:middle]) + bands(tiles[middle:])
-        spans = device.empty(np.uint32, count, 2)
-        owners, tile_of, pairs, sorted_owners = (device.empty(np.uint32, total) for _ in range(4))
+        numbers = *numbers, total
+        spans = device.scratch(np.uint32, count, 2)
+        owners, tile_of, pairs, sorted_owners = (device.scratch(np.uint32, total) for _ in range(4))
         device.run(
             "bin", "make_pairs", group_count(count), numbers, rows=rows, order=order, starts=starts,
             spans=spans, owners=owners, tiles=tile_of, pairs=pairs,
         )  # fmt: skip
-        sorted_tiles, sorted_pairs = sort(device, tile_of, pairs, tiles.stop.bit_length())
+        sorted_tiles, sorted_pairs = sort(device, tile_of, pairs, tiles.stop.bit_length(), starts, count)
         device.run(
-            "bin", "find_ranges", group_count(total), (total, *numbers[1:]), sorted_tiles=sorted_tiles,
+            "bin", "find_ranges", group_count(total), numbers, sorted_tiles=sorted_tiles, starts=starts,
             sorted_pairs=sorted_pairs, owner_of=owners, sorted_owners=sorted_owners, ranges=ranges,
         )  # fmt: skip
-        return [Band(tiles, total, spans, sorted_pairs, sorted_owners)]
+        return [Band(tiles, total, spans, sorted_pairs, sorted_owners, starts)]
 
     return bands(range(across * down)), ranges

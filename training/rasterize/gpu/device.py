@@ -1,7 +1,7 @@
 """Compute on graphics devices through wgpu, with Vulkan, D3D12 (Windows) or Metal (macOS).
 
 A device records dispatches of compute shaders (:meth:`Device.run`) until data is read back. Buffers are bound
-by their names in the shader.
+by their names in the shader. Dispatches that repeat are prepared once (:meth:`Device.record`).
 """
 
 from __future__ import annotations
@@ -10,7 +10,8 @@ import math
 import re
 import sys
 import threading
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cache
@@ -20,6 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...errors import LodgsError
+from .recording import Dispatch, Recording, encode
 from .source import source_of
 
 KINDS = {"DiscreteGPU": "discrete", "IntegratedGPU": "integrated", "CPU": "software"}
@@ -164,6 +166,7 @@ class Device:
         buffer_bytes: maximum size of a buffer.
         max_groups: maximum number of workgroups per dispatch.
         transferred: bytes copied to and from the device so far.
+        counts: number of dispatches, buffers, bind groups, submissions and blocking reads so far.
         lost: true after the device stopped responding; :func:`open_device` then opens it again.
         lock: held while recording, so that threads do not mix their dispatches.
     """
@@ -181,6 +184,7 @@ class Device:
         self.binding_bytes = min(self.limits["max-storage-buffer-binding-size"], self.buffer_bytes)
         self.max_groups = self.limits["max-compute-workgroups-per-dimension"]
         self.transferred = 0
+        self.counts: Counter[str] = Counter()
         self._first_groups: dict[int, Any] = {}
         flags = _wgpu().BufferUsage
         self._uniforms = self._device.create_buffer(size=UNIFORM_BYTES, usage=flags.UNIFORM | flags.COPY_DST)
@@ -189,30 +193,57 @@ class Device:
         self._pipelines: dict[tuple[str, str], tuple[Any, Any, dict[str, int]]] = {}
         self._encoder: Any = None
         self._pass: Any = None
+        self._recording: Recording | None = None
 
     def empty(self, kind: type, *shape: int) -> Buffer:
         """Create a buffer of zeros of type np.float32, np.uint32 or np.int32.
 
+        A buffer that is created in :meth:`record` is cleared before each replay.
+
         Raises:
             LodgsError: it exceeds the device's maximum or its memory.
         """
+        buffer = self.scratch(kind, *shape)
+        if self._recording is not None:
+            self._recording.cleared.append(buffer)
+        return buffer
+
+    def scratch(self, kind: type, *shape: int) -> Buffer:
+        """Create a buffer of any content, for shaders that write all of it; LodgsError as in `empty`."""
         flags = _wgpu().BufferUsage
         usage = flags.STORAGE | flags.COPY_SRC | flags.COPY_DST
         size = max(int(np.prod(shape, dtype=np.int64)) * 4, MIN_BUFFER_BYTES)
         self._require(size, self.buffer_bytes)
         with self._translate_errors():
             handle = self._device.create_buffer(size=size, usage=usage)
+        self.counts["buffers"] += 1
         return Buffer(handle, shape, np.dtype(kind))
 
     def upload(self, array: np.ndarray) -> Buffer:
         """Copy an array of 4-byte numbers to the device; LodgsError as in :meth:`empty`."""
         array = np.ascontiguousarray(array)
-        buffer = self.empty(array.dtype.type, *array.shape)
+        buffer = self.scratch(array.dtype.type, *array.shape)
         if array.size:
-            self.transferred += array.nbytes
-            with self._translate_errors():
-                self._device.queue.write_buffer(buffer.handle, 0, array.reshape(-1))
+            self._write(buffer.handle, array)
         return buffer
+
+    def write(self, buffer: Buffer, array: np.ndarray) -> None:
+        """Replace a buffer's content after all recorded dispatches; LodgsError as in :meth:`read`."""
+        self.submit()
+        self._write(buffer.handle, np.ascontiguousarray(array))
+
+    def clear(self, buffer: Buffer) -> None:
+        """Set a buffer to zeros after all recorded dispatches; LodgsError as in :meth:`read`."""
+        self.submit()
+        with self._translate_errors():
+            encoder = self._device.create_command_encoder()
+            encoder.clear_buffer(buffer.handle)
+            self._device.queue.submit([encoder.finish()])
+
+    def _write(self, handle: Any, array: np.ndarray) -> None:
+        self.transferred += array.nbytes
+        with self._translate_errors():
+            self._device.queue.write_buffer(handle, 0, array.reshape(-1))
 
     def extended(self, buffer: Buffer, count: int, rows: np.ndarray | None = None) -> Buffer:
         """Copy a buffer and append ``count`` rows: ``rows`` or zeros; LodgsError as in :meth:`empty`."""
@@ -268,26 +299,66 @@ class Device:
                 bindings[name]: {"buffer": buffer.handle, "offset": buffer.offset, "size": buffer.size}
                 for name, buffer in buffers.items()
             }
-            chunk = min(chunk, self.max_groups)
+            chunk = self.max_groups if self.adapter.kind == "discrete" else min(chunk, self.max_groups)
+            uniform = None
             for first in range(begin, begin + groups, chunk):
-                if numbers:
-                    bound[bindings["u"]] = self._uniform(*numbers)
-                if first not in self._first_groups:
-                    usage = _wgpu().BufferUsage.UNIFORM
-                    self._first_groups[first] = self._device.create_buffer_with_data(
-                        data=_words((first,)), usage=usage
-                    )
-                bound[bindings["first_group"]] = {"buffer": self._first_groups[first]}
-                entries = [{"binding": at, "resource": resource} for at, resource in bound.items()]
-                group = self._device.create_bind_group(layout=layout, entries=entries)
-                if self._pass is None:
-                    self._encoder = self._device.create_command_encoder()
-                    self._pass = self._encoder.begin_compute_pass()
-                self._pass.set_pipeline(pipeline)
-                self._pass.set_bind_group(0, group)
-                self._pass.dispatch_workgroups(min(chunk, begin + groups - first))
+                if self._recording is None:
+                    if numbers and (first == begin or not self._number_count):
+                        bound[bindings["u"]] = self._uniform(*numbers)
+                elif numbers and first == begin:
+                    uniform = bindings["u"], *self._recording.add_numbers(numbers, _words(numbers))
+                bound[bindings["first_group"]] = self._first_group(first)
+                self._dispatch(
+                    Dispatch(pipeline, layout, dict(bound), uniform, min(chunk, begin + groups - first))
+                )
                 if groups > chunk:
                     self.submit()
+
+    @contextmanager
+    def record(self) -> Iterator[Recording]:
+        """Prepare the dispatches of a block for :meth:`replay` instead of running them.
+
+        Buffers that the block creates with :meth:`empty` are cleared before each replay. It cannot read.
+        """
+        self.submit()
+        aligned = self.limits["min-uniform-buffer-offset-alignment"] // 4
+        recording = self._recording = Recording(aligned)
+        try:
+            yield recording
+        finally:
+            self._recording = None
+        usage = _wgpu().BufferUsage.UNIFORM | _wgpu().BufferUsage.COPY_DST
+        with self._translate_errors():
+            recording.finish(
+                lambda size: self._device.create_buffer(size=size, usage=usage),
+                self._device.create_bind_group,
+            )
+        self.counts["bind_groups"] += len(recording)
+
+    def replay(self, recording: Recording, copies: Iterable[tuple[Buffer, Buffer]] = ()) -> None:
+        """Submit recorded dispatches, after copies of buffers (source, target) of the same size.
+
+        Raises:
+            LodgsError: the device was lost.
+        """
+        self.submit()
+        self._write(recording.uniforms, recording.numbers())
+        with self._translate_errors():
+            encoder = self._device.create_command_encoder()
+            for source, target in copies:
+                encoder.copy_buffer_to_buffer(
+                    source.handle, source.offset, target.handle, target.offset, source.size
+                )
+            for buffer in recording.cleared:
+                encoder.clear_buffer(buffer.handle)
+            for part in recording.parts:
+                encoder = encoder or self._device.create_command_encoder()
+                compute_pass = encoder.begin_compute_pass()
+                encode(compute_pass, part)
+                compute_pass.end()
+                self._device.queue.submit([encoder.finish()])
+                encoder = None
+        self.counts.update(dispatches=len(recording), submissions=len(recording.parts))
 
     def read(self, buffer: Buffer, begin: int = 0) -> np.ndarray:
         """Run all recorded dispatches, and copy a buffer's rows from ``begin`` on to the host.
@@ -302,6 +373,7 @@ class Device:
         if not size:
             return np.zeros(shape, buffer.kind)
         self.transferred += size
+        self.counts["reads"] += 1
         with self._translate_errors():
             data = self._device.queue.read_buffer(buffer.handle, buffer.offset + begin * row_size, size)
         return np.frombuffer(data, buffer.kind).reshape(shape)
@@ -312,6 +384,8 @@ class Device:
 
     def submit(self) -> None:
         """Submit all recorded dispatches; LodgsError if the device was lost."""
+        if self._recording is not None:
+            self._recording.divide()
         if self._pass is None:
             return
         with self._translate_errors():
@@ -325,6 +399,29 @@ class Device:
                 self.transferred += numbers.nbytes
                 self._device.queue.write_buffer(self._uniforms, 0, numbers)
             self._device.queue.submit([encoder.finish()])
+        self.counts["submissions"] += 1
+
+    def _dispatch(self, dispatch: Dispatch) -> None:
+        """Add a dispatch to the recording or to the next submission."""
+        if self._recording is not None:
+            self._recording.add(dispatch)
+            return
+        entries = [{"binding": at, "resource": resource} for at, resource in dispatch.bound.items()]
+        group = self._device.create_bind_group(layout=dispatch.layout, entries=entries)
+        self.counts.update(dispatches=1, bind_groups=1)
+        if self._pass is None:
+            self._encoder = self._device.create_command_encoder()
+            self._pass = self._encoder.begin_compute_pass()
+        encode(self._pass, [(dispatch.pipeline, group, dispatch.groups)])
+
+    def _first_group(self, first: int) -> dict[str, Any]:
+        """Return the binding of ``first_group`` with this value."""
+        if first not in self._first_groups:
+            usage = _wgpu().BufferUsage.UNIFORM
+            self._first_groups[first] = self._device.create_buffer_with_data(
+                data=_words((first,)), usage=usage
+            )
+        return {"buffer": self._first_groups[first]}
 
     def _require(self, size: int, limit: int) -> None:
         """Raise LodgsError if a buffer or binding exceeds the device's limit in bytes."""

@@ -2,6 +2,11 @@
 
 A device model stores parameters, moments and density statistics on the device. Photos stay there too, with
 eight bits per value, as long as their ``Target`` exists.
+
+The dispatches of a step are recorded once per image size and number of splats, and replayed. The host does
+not wait for them: it reads losses when they are asked for, or after PENDING steps. Buffers for pairs of
+splats and tiles have a capacity. A step with more pairs changes nothing, nor do the steps after it. The host
+notices when it reads losses, enlarges the buffers and repeats these steps, with the same bits.
 """
 
 from __future__ import annotations
@@ -17,7 +22,8 @@ from ..rendering import KernelCamera, RasterSettings, Target
 from .bin import group_count
 from .device import Buffer, Device
 from .loss import combine_loss, sums_and_gradient
-from .scene import BY_SPLAT, SPLAT, SUMS, ProjectedScene
+from .scene import BY_SPLAT, PAIR_SUMS, SPLAT, SUMS, ProjectedScene
+from .steps import Inputs, Step
 
 COLUMNS = {
     "means": slice(0, 3),
@@ -32,6 +38,15 @@ STATS = ("gradient_sum", "seen", "gradient_max", "radius_max", "opacity_sum")
 """Statistics that a device collects (train.wgsl)."""
 STATE = ("_splats", "_sh", "_splat_moments", "_sh_moments", "_stat_sums")
 """Attributes with buffers that persist between steps."""
+
+LOSSES = 2
+"""Index of the first loss in the report (train.wgsl)."""
+PENDING = 32
+"""Maximum number of steps whose losses the host has not read."""
+RECORDINGS = 2
+"""Maximum number of recorded steps, which differ in image size or degree. Each has buffers of its own."""
+PAIRS_PER_SPLAT, MIN_PAIRS, GROWTH = 4, 1 << 14, 1.5
+"""Initial capacity for pairs, and its growth over the number of pairs of a step that has more."""
 
 
 def pack_splats(
@@ -90,7 +105,14 @@ class GpuModel:
             self._sh_moments = device.upload(np.stack(moments["sh"], -1))
             self._stat_sums = device.upload(stat_sums)
             self._allocate_gradients()
+            self._rates = device.empty(np.float32, TRAINED + 3 * self._sh.shape[1], 2)
+            self._report = device.empty(np.uint32, LOSSES + 2 * PENDING)
         self.drawn = device.empty(np.float32, 0, 0, 4)
+        self._pending: list[Step] = []
+        self._recorded: dict[tuple, Inputs] = {}
+        self._diverged: float | None = None
+        self._max_pairs = device.binding_bytes // (4 * PAIR_SUMS)
+        self._capacity: int | None = min(max(PAIRS_PER_SPLAT * count, MIN_PAIRS), self._max_pairs)
 
     def __len__(self) -> int:
         return self._splats.shape[0]
@@ -107,8 +129,8 @@ class GpuModel:
         weights: torch.Tensor | None = None,
         min_scale: float = 0.0,
         shrink: float | None = None,
-    ) -> float:
-        """Make one step with the photometric loss, and return the loss.
+    ) -> Callable[[], float]:
+        """Make one step with the photometric loss; return a function that reads the loss from the device.
 
         Args:
             target: opaque photo without a mask.
@@ -119,46 +141,127 @@ class GpuModel:
         Raises:
             LodgsError: the device was lost or has too little memory. The splats are lost with it.
         """
-        device = self.device
-        count = len(self)
         settings = RasterSettings(
             KernelCamera.of(camera, near), min_scale, self._antialias, background, sh_degree
         )
-        with device.lock:
-            self._set_weights(weights)
-            scene = ProjectedScene.of(device, self._splats, self._sh, settings)
-            size = camera.height, camera.width
-            self.drawn = device.empty(np.float32, *size, 4)
-            visited = device.empty(np.uint32, *scene.ranges.shape)
-            scene.draw(
-                background, False, colours=scene.colours, visited=visited, drawn=self.drawn,
-                limit=device.empty(np.float32, 1), median=device.empty(np.int32, *size),
+        array = None if weights is None else weights.numpy().astype(np.float32)
+        with self.device.lock:
+            if len(self._pending) == PENDING:
+                self._settle()
+            photo = _upload_photo(self.device, target)
+            step = Step(settings, photo, ssim_weight, array, shrink, self._next_rates())
+            self._start(step)
+
+        def loss() -> float:
+            with self.device.lock:
+                if step.loss is None:
+                    self._settle()
+            assert step.loss is not None
+            return step.loss if self._diverged is None else self._diverged
+
+        return loss
+
+    def _start(self, step: Step) -> None:
+        """Submit a step, whose loss is then pending."""
+        device = self.device
+        self._set_weights(step.weights)
+        device.write(self._rates, step.rates)
+        if self._capacity is None:  # the pairs are counted in the middle of the step
+            inputs = self._dispatch(step, None)
+            device.submit()
+        else:
+            inputs = self._recorded.pop(step.key, None) or self._record(step)
+            self._recorded[step.key] = inputs
+            inputs.set(step, len(self._pending))
+            assert inputs.recording is not None
+            device.replay(inputs.recording, [(step.photo, inputs.photo)])
+        self.drawn = inputs.drawn
+        self._pending.append(step)
+
+    def _record(self, step: Step) -> Inputs:
+        """Prepare the dispatches of a step."""
+        if len(self._recorded) == RECORDINGS:
+            self._recorded.pop(next(iter(self._recorded)))
+        with self.device.record() as recording:
+            inputs = self._dispatch(step, self._capacity)
+        inputs.recording = recording
+        return inputs
+
+    def _dispatch(self, step: Step, capacity: int | None) -> Inputs:
+        """Run or record the dispatches of a step.
+
+        Args:
+            capacity: maximum number of pairs; None counts them, which cannot be recorded.
+        """
+        device = self.device
+        count = len(self)
+        view = step.settings.view
+        size = view.height, view.width
+        photo = step.photo if capacity is None else device.scratch(np.uint32, *size)
+        scene = ProjectedScene.of(device, self._splats, self._sh, step.settings, capacity)
+        inputs = Inputs(
+            photo, scene.lens, np.zeros(3, np.float32), np.ones(1, np.float32),
+            (np.zeros(1, np.uint32), np.zeros(1, np.uint32)), device.scratch(np.float32, *size, 4),
+        )  # fmt: skip
+        inputs.set(step, len(self._pending))
+        pairs = (1 << 32) - 1 if capacity is None else capacity
+        device.run(
+            "train", "check", 1, _numbers(count, width=pairs), starts=scene.bands[0].starts,
+            report=self._report,
+        )  # fmt: skip
+        visited = device.scratch(np.uint32, *scene.ranges.shape)
+        scene.draw(
+            inputs.background, False, colours=scene.colours, visited=visited, drawn=inputs.drawn,
+            limit=device.scratch(np.float32, 1), median=device.scratch(np.int32, *size),
+        )  # fmt: skip
+        by_image = self._loss(inputs, step.ssim_weight)
+        sums, by_colours = device.empty(np.float32, count, SUMS), device.empty(np.float32, count, 3)
+        scene.differentiate(
+            SUMS, False, sums, by_colours, visited, colours=scene.colours, image=inputs.drawn,
+            by_image=by_image,
+        )  # fmt: skip
+        scene.backward(sums, by_colours, self._by_splats, self._by_sh)
+        if step.shrink is not None:
+            self._run(
+                "collect_stats", {"shrink": inputs.shrink}, {"report": self._report}, radii=scene.radii,
+                by_rows=self._by_splats, stats=self._stat_sums, values=self._splats,
             )  # fmt: skip
-            sums_of_loss, by_image = self._loss(target, ssim_weight)
-            sums, by_colours = device.empty(np.float32, count, SUMS), device.empty(np.float32, count, 3)
-            scene.differentiate(
-                SUMS, False, sums, by_colours, visited, colours=scene.colours, image=self.drawn,
-                by_image=by_image,
-            )  # fmt: skip
-            scene.backward(sums, by_colours, self._by_splats, self._by_sh)
-            if shrink is not None:
-                self._run(
-                    "collect_stats", {"shrink": shrink}, radii=scene.radii, by_rows=self._by_splats,
-                    stats=self._stat_sums, values=self._splats,
-                )  # fmt: skip
-            self._adam_step(scene.radii, 3 * (sh_degree + 1) ** 2)
-            l1, ssim = device.read(sums_of_loss)
-        return combine_loss(l1, ssim, 3 * size[0] * size[1], ssim_weight)
+        self._adam_step(scene.radii, 3 * (step.settings.degree + 1) ** 2)
+        return inputs
+
+    def _settle(self) -> None:
+        """Wait for all pending steps and read their losses; repeat steps that had too many pairs."""
+        while self._pending:
+            report = self.device.read(self._report)
+            needed, completed = report[:LOSSES].tolist()
+            losses = report[LOSSES:].view(np.float32).reshape(-1, 2)
+            steps, repeated = self._pending[:completed], self._pending[completed:]
+            self._pending = []
+            for step, (l1, ssim) in zip(steps, losses, strict=False):
+                size = 3 * step.photo.shape[0] * step.photo.shape[1]
+                step.loss = combine_loss(l1, ssim, size, step.ssim_weight)
+                if self._diverged is None and not np.isfinite(step.loss):
+                    self._diverged = step.loss
+            self.device.write(self._report, np.zeros(LOSSES, np.uint32))
+            if needed:
+                fits = needed <= self._max_pairs
+                self._capacity = min(int(GROWTH * needed), self._max_pairs) if fits else None
+                self._recorded.clear()
+            for step in repeated:
+                self._start(step)
 
     def last_image(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the last step's image (H, W, 3) and alpha (H, W)."""
-        drawn = torch.from_numpy(self.device.read(self.drawn))
+        with self.device.lock:
+            self._settle()
+            drawn = torch.from_numpy(self.device.read(self.drawn))
         return drawn[..., :3], 1 - drawn[..., 3]
 
     def read(self, name: str) -> torch.Tensor:
         """Copy the current values of a tensor or statistic to the host."""
         device = self.device
         with device.lock:
+            self._settle()
             if name == "sh":
                 return torch.from_numpy(device.read(self._sh))
             values = self._splats
@@ -174,6 +277,7 @@ class GpuModel:
     def read_rows(self, index: torch.Tensor) -> dict[str, torch.Tensor]:
         """Copy the tensors' values at indices (M,) to the host, by name."""
         with self.device.lock:
+            self._settle()
             rows = self.device.upload(index.numpy().astype(np.uint32))
             splats = self.device.read(self._select_rows(self._splats, rows))
             sh = self.device.read(self._select_rows(self._sh, rows))
@@ -199,8 +303,10 @@ class GpuModel:
         """Replace a tensor's values and reset its moments to zero."""
         device = self.device
         with device.lock:
+            self._settle()
             uploaded = device.upload(values.numpy())
             if name == "sh":
+                self._recorded.clear()
                 self._sh = uploaded
                 self._sh_moments = device.empty(np.float32, *self._sh_moments.shape)
                 return
@@ -213,17 +319,21 @@ class GpuModel:
 
     def reset_stats(self) -> None:
         """Reset all statistics to zero."""
-        self._stat_sums = self.device.empty(np.float32, *self._stat_sums.shape)
+        with self.device.lock:
+            self._settle()
+            self.device.clear(self._stat_sums)
 
     def raise_log_scales(self, minimum: torch.Tensor) -> None:
         """Raise every log-scale of a splat to at least its minimum (N,)."""
         lowest = minimum.numpy().clip(np.finfo(np.float32).min)  # not every device supports infinity
         with self.device.lock:
+            self._settle()
             self._run("raise_log_scales", {}, parts=self.device.upload(lowest), values=self._splats)
 
     def copy_to_host(self) -> None:
         """Replace the host's tensors, moments and statistics by the device's values."""
         with self.device.lock:
+            self._settle()
             splats, sh, splat_moments, sh_moments, stat_sums = (
                 self.device.read(getattr(self, name)) for name in STATE
             )
@@ -245,6 +355,8 @@ class GpuModel:
 
     def _replace_state(self, make: Callable[[str, Buffer], Buffer]) -> None:
         """Replace the buffers of STATE one by one, so that at most one exists twice."""
+        self._settle()
+        self._recorded.clear()
         del self._by_splats, self._by_sh
         for name in STATE:
             setattr(self, name, make(name, getattr(self, name)))
@@ -266,57 +378,61 @@ class GpuModel:
                 device.run("gather", "select_rows", group_count(count), numbers, **source, **part)
         return selected
 
-    def _set_weights(self, weights: torch.Tensor | None) -> None:
+    def _set_weights(self, weights: np.ndarray | None) -> None:
         """Set the splats' weights; None sets 1."""
         if weights is None and not self._weighted:
             return
-        if weights is None:
-            array = np.ones(len(self), np.float32)
-        else:
-            array = weights.numpy().astype(np.float32, copy=False)
+        array = np.ones(len(self), np.float32) if weights is None else weights
         self._weighted = weights is not None
         self._run("write_columns", {"slot": TRAINED}, parts=self.device.upload(array), values=self._splats)
 
-    def _loss(self, target: Target, ssim_weight: float) -> tuple[Buffer, Buffer]:
-        """Compute the sums of L1 and SSIM (2,), and the gradient (H, W, 4) by the image."""
+    def _loss(self, inputs: Inputs, ssim_weight: float) -> Buffer:
+        """Compute the gradient (H, W, 4) by the image, and write the sums of L1 and SSIM to the report."""
         device = self.device
-        height, width, _ = self.drawn.shape
-        image, truth = (device.empty(np.float32, 3, height, width) for _ in range(2))
+        height, width, _ = inputs.drawn.shape
+        image, truth = (device.scratch(np.float32, 3, height, width) for _ in range(2))
         groups = group_count(height * width)
         numbers = _numbers(height * width)
         device.run(
-            "train", "unpack", groups, numbers, photo=_upload_photo(device, target), drawn=self.drawn,
-            image=image, truth=truth,
+            "train", "unpack", groups, numbers, photo=inputs.photo, drawn=inputs.drawn, image=image,
+            truth=truth,
         )  # fmt: skip
         *sums, gradient = sums_and_gradient(device, image, truth, ssim_weight)
-        by_image = device.empty(np.float32, height, width, 4)
-        totals = device.empty(np.float32, 2)
+        by_image = device.scratch(np.float32, height, width, 4)
         device.run("train", "pack", groups, numbers, gradient=gradient, by_image=by_image)
-        for slot, parts in enumerate(sums):
-            device.run("train", "total", 1, _numbers(parts.shape[0], slot=slot), parts=parts, totals=totals)
-        return totals, by_image
+        for slot, parts in zip(inputs.slots, sums, strict=True):
+            numbers = _numbers(parts.shape[0], slot=slot)
+            device.run("train", "total", 1, numbers, parts=parts, report=self._report)
+        return by_image
 
-    def _adam_step(self, radii: Buffer, harmonics: int) -> None:
-        """Make the Adam step; ``harmonics`` is the number of active numbers in a splat's harmonics."""
+    def _next_rates(self) -> np.ndarray:
+        """Count a step of Adam; return learning rates and scales of second moments (TRAINED + 3 K, 2)."""
         adam = self._adam
-        coefficients = self._sh.shape[1]
-        rates = {}
-        for name in (*COLUMNS, "sh"):
+        rates = np.empty(self._rates.shape, np.float32)
+        for name, columns in (*COLUMNS.items(), ("sh", slice(TRAINED, None))):
             adam.steps[name] += 1
             first, second = (1 - beta ** adam.steps[name] for beta in adam.betas)
-            shape = (coefficients, 3) if name == "sh" else (_width(COLUMNS[name]),)
-            rate = np.broadcast_to(np.asarray(adam.lr[name], np.float32) / np.float32(first), shape)
-            rates[name] = np.stack([rate.ravel(), np.full(rate.size, 1 / second, np.float32)], 1)
-        splat_rates = np.concatenate([rates[name] for name in COLUMNS])
-        for values, moments, gradient, stride, by_stride, trained, rate in (
-            (self._splats, self._splat_moments, self._by_splats, SPLAT, BY_SPLAT, TRAINED, splat_rates),
-            (self._sh, self._sh_moments, self._by_sh, *[3 * coefficients] * 2, harmonics, rates["sh"]),
+            rate = np.asarray(adam.lr[name], np.float32) / np.float32(first)
+            of_name = rates[columns]
+            if name == "sh":
+                of_name.reshape(-1, 3, 2)[..., 0] = rate
+            else:
+                of_name[:, 0] = rate
+            of_name[:, 1] = 1 / second
+        return rates
+
+    def _adam_step(self, radii: Buffer, harmonics: int) -> None:
+        """Record the Adam step; ``harmonics`` is the number of active numbers in a splat's harmonics."""
+        numbers_of_sh = 3 * self._sh.shape[1]
+        shared = {"rates": self._rates, "report": self._report}
+        for values, moments, gradient, stride, by_stride, width, trained, slot in (
+            (self._splats, self._splat_moments, self._by_splats, SPLAT, BY_SPLAT, TRAINED, TRAINED, 0),
+            (self._sh, self._sh_moments, self._by_sh, *[numbers_of_sh] * 3, harmonics, TRAINED),
         ):
             numbers = {
-                "width": len(rate), "stride": stride, "by_stride": by_stride, "trained": trained,
-                "adam": (*adam.betas, adam.eps),
+                "width": width, "stride": stride, "by_stride": by_stride, "trained": trained, "slot": slot,
+                "adam": (*self._adam.betas, self._adam.eps),
             }  # fmt: skip
-            shared = {"rates": self.device.upload(rate)}
             self._run("adam", numbers, shared, radii=radii, by_rows=gradient, values=values, moments=moments)
 
     def _run(
@@ -335,12 +451,12 @@ def _numbers(
     stride: int = SPLAT,
     by_stride: int = BY_SPLAT,
     trained: int = 0,
-    slot: int = 0,
+    slot: int | np.ndarray = 0,
     adam: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    shrink: float = 1.0,
+    shrink: float | np.ndarray = 1.0,
 ) -> tuple:
     """Return the uniform of train.wgsl."""
-    return count, width, stride, by_stride, trained, slot, *adam, float(shrink)
+    return count, width, stride, by_stride, trained, slot, *adam, shrink
 
 
 def _as_tensor(values: np.ndarray) -> torch.Tensor:

@@ -31,8 +31,8 @@ def sums_and_gradient(
     """Compute partial sums of L1 and SSIM over SUM_LENGTH values of images (3, H, W), and the gradient."""
     channels, height, width = image.shape
     size = channels * height * width
-    lines, slopes = (device.empty(np.float32, height, width, 4) for _ in range(2))
-    similar, different, gradient = (device.empty(np.float32, *image.shape) for _ in range(3))
+    lines, slopes = (device.scratch(np.float32, height, width, 4) for _ in range(2))
+    similar, different, gradient = (device.scratch(np.float32, *image.shape) for _ in range(3))
     weights = (1 - ssim_weight) / size, ssim_weight / size
     for channel in range(channels):
         launch = group_count(height * width), (*weights, width, height, channel)
@@ -43,7 +43,7 @@ def sums_and_gradient(
             "loss", "finish", *launch, across=lines, image=image, truth=truth, gradient=gradient,
             different=different,
         )  # fmt: skip
-    l1, ssim = (device.empty(np.float32, group_count(size, SUM_LENGTH)) for _ in range(2))
+    l1, ssim = (device.scratch(np.float32, group_count(size, SUM_LENGTH)) for _ in range(2))
     for values, totals in ((different, l1), (similar, ssim)):
         numbers = *weights, width, height, 0
         device.run("loss", "add", group_count(totals.shape[0]), numbers, values=values, totals=totals)

@@ -21,6 +21,7 @@ GEOMETRY = 6
 TILES = 1024
 """Tiles per dispatch, so that the device can do other work in between."""
 
+Background = tuple[float, float, float] | np.ndarray
 BLACK = 0.0, 0.0, 0.0
 """Background of passes without one."""
 
@@ -52,26 +53,35 @@ class ProjectedScene:
     ranges: Buffer
 
     @classmethod
-    def of(cls, device: Device, splats: Buffer, sh: Buffer, settings: RasterSettings) -> ProjectedScene:
-        """Project and bin splats; LodgsError if the device was lost or has too little memory."""
+    def of(
+        cls,
+        device: Device,
+        splats: Buffer,
+        sh: Buffer,
+        settings: RasterSettings,
+        capacity: int | None = None,
+    ) -> ProjectedScene:
+        """Project and bin splats; LodgsError if the device was lost or has too little memory.
+
+        Args:
+            capacity: see ``bin_splats``.
+        """
         view = settings.view
         count = splats.shape[0]
-        lens = np.append(_lens(view), np.float32(settings.min_scale))
-        rows, colours = device.empty(np.float32, count, ROW), device.empty(np.float32, count, 4)
-        depths, radii = device.empty(np.uint32, count), device.empty(np.float32, count)
+        lens = lens_of(settings)
+        rows, colours = device.scratch(np.float32, count, ROW), device.scratch(np.float32, count, 4)
+        depths, radii = device.scratch(np.uint32, count), device.scratch(np.float32, count)
         _project(
             device, "forward", lens, settings.degree, splats=splats, sh=sh, rows=rows, colours=colours,
             depths=depths, radii=radii,
         )  # fmt: skip
         max_pairs = device.binding_bytes // (4 * PAIR_SUMS)
-        bands, ranges = bin_splats(device, rows, depths, view.width, view.height, max_pairs)
+        bands, ranges = bin_splats(device, rows, depths, view.width, view.height, max_pairs, capacity)
         return cls(
             device, view, count, lens, settings.degree, splats, sh, rows, colours, radii, bands, ranges
         )
 
-    def draw(
-        self, background: tuple[float, float, float], limited: bool, colours: Buffer, **buffers: Buffer
-    ) -> None:
+    def draw(self, background: Background, limited: bool, colours: Buffer, **buffers: Buffer) -> None:
         """Record the function ``forward`` of blend.wgsl."""
         for band in self.bands:
             self._blend("forward", band, background, limited, colours=colours, ranges=self.ranges, **buffers)
@@ -123,14 +133,14 @@ class ProjectedScene:
         self,
         entry: str,
         band: Band,
-        background: tuple[float, float, float] = BLACK,
+        background: Background = BLACK,
         limited: bool = False,
         absolute: bool = False,
         /,
         **buffers: Buffer,
     ) -> None:
         size = self.view.width, self.view.height, -(-self.view.width // TILE)
-        numbers = (*background, 0.0, *size, int(limited), int(absolute))
+        numbers = (np.asarray(background, np.float32), 0.0, *size, int(limited), int(absolute))
         self.device.run(
             "blend", entry, len(band.tiles), numbers, TILES, band.tiles.start, rows=self.rows,
             owners=band.owners, **buffers,
@@ -144,9 +154,11 @@ def _project(device: Device, entry: str, lens: np.ndarray, degree: int, **buffer
         device.run("project", entry, group_count(count), (lens, count, degree, terms), **part)
 
 
-def _lens(view: KernelCamera) -> np.ndarray:
-    """Convert a view to the first numbers of project.wgsl's uniform, up to ``near``."""
+def lens_of(settings: RasterSettings) -> np.ndarray:
+    """Convert a view to the first numbers of project.wgsl's uniform, up to ``min_scale``."""
+    view = settings.view
     pose = np.column_stack([view.rotation, view.translation])
     limits = np.array([view.x_limits, view.y_limits]).T
-    numbers = 0, view.fx, view.fy, view.cx, view.cy, *limits.flat, view.width, view.height, view.near
+    size = view.width, view.height
+    numbers = 0, view.fx, view.fy, view.cx, view.cy, *limits.flat, *size, view.near, settings.min_scale
     return np.concatenate([pose.flat, view.position, numbers], dtype=np.float32)

@@ -40,7 +40,7 @@ def test_steps_before_the_order_equal_3dgs(data):
     plain = create("3dgs", data, override(method_info("3dgs").preset("draft"), values), 0, "cpu")
     method = make(data)
     for step in range(12):
-        assert method.train_step(step).loss == plain.train_step(step).loss
+        assert method.train_step(step).loss() == plain.train_step(step).loss()
     assert torch.equal(method.model["means"], plain.model["means"])
     assert not method.model.columns["importance"].any()
     method.train_step(12)

@@ -2,7 +2,13 @@
 // then lists the splats of every tile front to back. Tiles are in row-major order, and one band of tiles is binned at a
 // time.
 
-struct Parameters { count: u32, across: u32, first: u32, end: u32 }
+struct Parameters {
+    count: u32,  // of splats
+    across: u32,
+    first: u32,
+    end: u32,
+    capacity: u32,  // maximum number of pairs; further pairs are left out
+}
 @group(0) @binding(0) var<uniform> u: Parameters;
 @group(0) @binding(1) var<storage, read> rows: array<Row>;
 @group(0) @binding(2) var<storage, read> order: array<u32>;  // splats by depth
@@ -70,8 +76,8 @@ fn make_pairs(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_ind
     let k = group_of(group) * LANES + lane;
     if (k >= u.count) { return; }
     let splat = order[k];
-    let end = starts[k + 1u];
-    var at = starts[k];
+    let end = min(starts[k + 1u], u.capacity);
+    var at = min(starts[k], u.capacity);
     spans[splat] = vec2u(at, end - at);
     let row = rows[splat];
     if (row.radius > 0.0) {
@@ -99,10 +105,11 @@ fn make_pairs(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_ind
 @compute @workgroup_size(LANES)
 fn find_ranges(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
     let at = group_of(group) * LANES + lane;
-    if (at >= u.count) { return; }
+    let total = min(starts[u.count], u.capacity);
+    if (at >= total) { return; }
     sorted_owners[at] = owner_of[sorted_pairs[at]];
     let tile = sorted_tiles[at];
     if (tile == u.end) { return; }
     if (at == 0u || sorted_tiles[at - 1u] != tile) { ranges[tile].x = at; }
-    if (at + 1u == u.count || sorted_tiles[at + 1u] != tile) { ranges[tile].y = at + 1u; }
+    if (at + 1u == total || sorted_tiles[at + 1u] != tile) { ranges[tile].y = at + 1u; }
 }

@@ -101,6 +101,8 @@ fn forward(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index)
     let i = group_of(group) * LANES + lane;
     if (i >= u.count) { return; }
     depths[i] = 0xffffffffu;
+    rows[i].radius = 0.0;
+    radii[i] = 0.0;
     let first = i * SPLAT;
     let mean = triple(first);
     let p = to_camera(mean);

@@ -1,13 +1,19 @@
 // One pass of a stable radix sort of keys with values, by four bits. Blocks of 1024 pairs count their digits, the
 // shader `scan` sums the counts by digit and block, and every pair is copied to its position.
 
-struct Parameters { count: u32, shift: u32, blocks: u32 }
+struct Parameters {
+    count: u32,  // maximum number of pairs
+    shift: u32,
+    blocks: u32,
+    slot: u32,  // of the number of pairs in totals
+}
 @group(0) @binding(0) var<uniform> u: Parameters;
 @group(0) @binding(1) var<storage, read> keys: array<u32>;
 @group(0) @binding(2) var<storage, read> values: array<u32>;
 @group(0) @binding(3) var<storage, read_write> places: array<u32>;  // (16, blocks)
 @group(0) @binding(4) var<storage, read_write> sorted_keys: array<u32>;
 @group(0) @binding(5) var<storage, read_write> sorted_values: array<u32>;
+@group(0) @binding(6) var<storage, read> totals: array<u32>;
 
 const DIGITS: u32 = 16;
 const PER_LANE: u32 = 16;  // consecutive pairs per invocation, which makes the sort stable
@@ -17,9 +23,13 @@ fn digit_of(key: u32) -> u32 {
     return (key >> u.shift) % DIGITS;
 }
 
+fn pair_count() -> u32 {
+    return min(u.count, totals[u.slot]);
+}
+
 fn count_digits(first: u32, lane: u32) {
     for (var digit = 0u; digit < DIGITS; digit++) { tally[digit * LANES + lane] = 0u; }
-    for (var k = first; k < min(first + PER_LANE, u.count); k++) {
+    for (var k = first; k < min(first + PER_LANE, pair_count()); k++) {
         tally[digit_of(keys[k]) * LANES + lane] += 1u;
     }
 }
@@ -51,7 +61,7 @@ fn scatter(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index)
         }
     }
     workgroupBarrier();
-    for (var k = first; k < min(first + PER_LANE, u.count); k++) {
+    for (var k = first; k < min(first + PER_LANE, pair_count()); k++) {
         let place = digit_of(keys[k]) * LANES + lane;
         let at = tally[place];
         tally[place] = at + 1u;

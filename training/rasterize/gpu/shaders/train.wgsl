@@ -6,7 +6,7 @@ struct Parameters {
     stride: u32,  // from one row of values to the next
     by_stride: u32,  // from one row of gradients to the next
     trained: u32,  // first numbers of a row, which have a gradient
-    slot: u32,  // first column, or index of the total
+    slot: u32,  // first column, first rate, or index of the total
     keep_m: f32,  // Adam's betas
     keep_v: f32,
     eps: f32,
@@ -26,7 +26,7 @@ struct Parameters {
 @group(0) @binding(11) var<storage, read_write> stats: array<f32>;  // (N, STATS)
 @group(0) @binding(12) var<storage, read_write> values: array<f32>;  // (N, stride)
 @group(0) @binding(13) var<storage, read_write> moments: array<vec2f>;  // (N, width): first and second
-@group(0) @binding(14) var<storage, read> rates: array<vec2f>;  // (width): learning rates and scales of second moments
+@group(0) @binding(14) var<storage, read> rates: array<vec2f>;  // learning rates and scales of second moments
 
 // Columns of stats, in the order of STATS in device_model.py.
 const GRADIENT_SUM: u32 = 0;
@@ -42,6 +42,13 @@ const BY_MEAN2D: u32 = 12;
 // Smaller moments are set to zero, as on the CPU.
 const M_TINY: f32 = 1e-30;
 const V_TINY: f32 = 1e-36;
+
+@group(0) @binding(16) var<storage, read_write> report: array<u32>;  // NEEDED, COMPLETED, and losses of steps
+@group(0) @binding(17) var<storage, read> starts: array<u32>;  // first pair of each splat, and number of pairs
+
+const NEEDED: u32 = 0;  // number of pairs of the first step that had too many; zero without one
+const COMPLETED: u32 = 1;  // number of steps before it
+const LOSSES: u32 = 2;
 
 var<workgroup> lane_sums: array<f32, LANES>;
 
@@ -76,8 +83,16 @@ fn total(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) l
     if (lane == 0u) {
         sum = 0.0;
         for (var k = 0u; k < LANES; k++) { sum += lane_sums[k]; }
-        totals[u.slot] = sum;
+        report[LOSSES + u.slot] = bitcast<u32>(sum);
     }
+}
+
+// Check if the pairs of a step fit into `width`. If not, this step and all later steps change no splats.
+@compute @workgroup_size(LANES)
+fn check(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+    if (group_of(group) * LANES + lane > 0u || report[NEEDED] != 0u) { return; }
+    let total = starts[u.count];
+    if (total > u.width) { report[NEEDED] = total; } else { report[COMPLETED] += 1u; }
 }
 
 // Copy parts to columns of values, from column slot on.
@@ -109,7 +124,7 @@ fn read_columns(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_i
 @compute @workgroup_size(LANES)
 fn collect_stats(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
     let i = group_of(group) * LANES + lane;
-    if (i >= u.count || radii[i] == 0.0) { return; }
+    if (i >= u.count || radii[i] == 0.0 || report[NEEDED] != 0u) { return; }
     let by = i * u.by_stride + BY_MEAN2D;
     let norm = length(vec2f(by_rows[by], by_rows[by + 1u])) / u.shrink;
     let at = i * STATS;
@@ -125,7 +140,7 @@ fn collect_stats(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_
 @compute @workgroup_size(LANES)
 fn adam(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
     let k = group_of(group) * LANES + lane;
-    if (k >= u.count) { return; }
+    if (k >= u.count || report[NEEDED] != 0u) { return; }
     let i = k / u.width;
     let j = k % u.width;
     var g = 0.0;
@@ -135,5 +150,5 @@ fn adam(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) la
     m = select(0.0, m, abs(m) > M_TINY);
     v = select(0.0, v, v > V_TINY);
     moments[k] = vec2f(m, v);
-    values[i * u.stride + j] -= rates[j].x * m / (sqrt(v * rates[j].y) + u.eps);
+    values[i * u.stride + j] -= rates[u.slot + j].x * m / (sqrt(v * rates[u.slot + j].y) + u.eps);
 }

@@ -1,0 +1,57 @@
+"""Inputs of training steps in device memory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..rendering import RasterSettings
+from .device import Buffer
+from .recording import Recording
+from .scene import lens_of
+
+
+@dataclass
+class Step:
+    """Inputs of a step, to repeat it, and its loss.
+
+    Attributes:
+        photo: (H, W), photo on the device.
+        rates: (trained numbers of a splat, 2), learning rates and scales of second moments.
+        loss: None until it is read from the device.
+    """
+
+    settings: RasterSettings
+    photo: Buffer
+    ssim_weight: float
+    weights: np.ndarray | None
+    shrink: float | None
+    rates: np.ndarray
+    loss: float | None = None
+
+    @property
+    def key(self) -> tuple:
+        """Properties that decide which dispatches make the step."""
+        return (*self.photo.shape, self.settings.degree, self.ssim_weight, self.shrink is None)
+
+
+@dataclass
+class Inputs:
+    """Numbers and buffers of recorded dispatches that change between steps."""
+
+    photo: Buffer
+    lens: np.ndarray
+    background: np.ndarray
+    shrink: np.ndarray
+    slots: tuple[np.ndarray, np.ndarray]
+    drawn: Buffer
+    recording: Recording | None = None
+
+    def set(self, step: Step, index: int) -> None:
+        """Set the numbers of a step, whose losses have the given index in the report."""
+        self.lens[:] = lens_of(step.settings)
+        self.background[:] = step.settings.background
+        self.shrink[:] = step.shrink or 1.0
+        for k, slot in enumerate(self.slots):
+            slot[:] = 2 * index + k
