@@ -3,16 +3,23 @@
 Measures in one run: a training step on the device and its stages, a step through copies, and a step on the
 cpu; the share of the device's measured peak of multiply-adds and copies; and bytes transferred per step.
 Writes build/bench/gpu.json. Results of a software device are only sanity checks.
+
+``--all`` measures everything in less than ten minutes on a card that is at hand for a short time: the above,
+steps of ``cuda`` and of gsplat where they are installed, the first step in a new process, and trainings of
+``examples/lantern_garden``. The file is written after each part. ``--tiny`` tries the script.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import subprocess
 import sys
+import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +41,7 @@ from training.rasterize import (  # noqa: E402
     Adam,
     Gaussians,
     Target,
+    cuda,
     make_device_model,
     photometric_loss,
     rasterize,
@@ -43,8 +51,9 @@ from training.rasterize import (  # noqa: E402
 from training.rasterize.gpu import scene  # noqa: E402
 from training.rasterize.gpu.default_device import open_default_device  # noqa: E402
 from training.rasterize.gpu.device import LANES, Device  # noqa: E402
+from training.rasterize.gpu.device_model import GpuModel  # noqa: E402
 
-CASES = [(50_000, 640, 426), (200_000, 960, 540), (1_000_000, 1920, 1080)]
+CASES = [(50_000, 640, 426), (200_000, 960, 540), (1_000_000, 1920, 1080), (3_000_000, 1920, 1080)]
 """Splats, width and height. A software device runs only the first case."""
 STAGES = {
     "project forward": "project", "project backward": "project_backward", "blend forward": "blend",
@@ -55,6 +64,15 @@ STAGES = {
 SHADERS = {"sort": "sort", "scan": "sort", "bin": "bin", "loss": "loss", "train": "loss"}
 WORDS, ROUNDS, GROUPS = 1 << 24, 4096, 1024
 """Sizes of the measurements of copies and multiply-adds."""
+TINY = [(2_000, 160, 120)]
+"""Cases of ``--tiny``."""
+EXAMPLE = ROOT / "examples" / "lantern_garden"
+TRAINING_SECONDS = 150
+"""Time limit of a training of ``--all``."""
+STEPS = 16
+"""Steps between two reads of the loss."""
+COUNTS = "dispatches", "buffers", "bind_groups", "submissions", "reads"
+"""Numbers per step that :func:`recording_of` returns."""
 MULTIPLY_ADDS = 4
 """Multiply-adds of four-component vectors per round."""
 BYTES_PER_NUMBER = 24
@@ -94,11 +112,11 @@ def peaks(device: Device, fastest: Fastest) -> tuple[float, float]:
 class Case:
     """Training steps of one scene."""
 
-    def __init__(self, count: int, width: int, height: int) -> None:
+    def __init__(self, count: int, width: int, height: int, device: str = "cpu") -> None:
         self.camera, self.size = synthetic_camera(width, height), (count, width, height)
         photograph = np.random.default_rng(1).integers(0, 256, (height, width, 3)) / np.float32(255)
-        self.target = Target(photograph)
-        splats = synthetic_splats(count).map(lambda tensor: tensor.requires_grad_())
+        self.target = Target(torch.from_numpy(photograph).to(device))
+        splats = synthetic_splats(count).map(lambda tensor: tensor.to(device).requires_grad_())
         self.adam = Adam(vars(splats), dict.fromkeys(vars(splats), 1e-7))
         self.stats = {name: torch.zeros(count) for name in ("gradient_sum", "seen")}
 
@@ -108,10 +126,12 @@ class Case:
         photometric_loss(rendering.image, self.target, backend=backend).backward()
         self.adam.step()
 
-    def on_device(self) -> Callable[[], object]:
-        """Return a step that stays on the device."""
+    def on_device(self, recorded: bool = True) -> Callable[[], Callable[[], float]]:
+        """Return a step that stays on the device and returns its loss on demand."""
         model = make_device_model("gpu", self.adam, self.stats)
-        assert model is not None
+        assert isinstance(model, GpuModel)
+        if not recorded:
+            model._capacity = None
         options = {"near": 0.01, "sh_degree": 3, "background": (0.0, 0.0, 0.0), "ssim_weight": 0.2}
         return lambda: model.step(self.camera, self.target, shrink=1, **options)
 
@@ -122,6 +142,36 @@ def transferred_bytes(device: Device, step: Callable[[], object]) -> int:
     previous = device.transferred
     step()
     return device.transferred - previous
+
+
+def recording_of(device: Device, step: Callable[[], object], steps: int = 20) -> dict[str, float]:
+    """Return the counts of a step, and the milliseconds of CPU time that record it.
+
+    Blocking reads wait for the device. Their time is excluded.
+    """
+    read, waited = device.read, 0.0
+
+    def timed_read(*arguments):
+        nonlocal waited
+        begin = time.thread_time()
+        try:
+            return read(*arguments)
+        finally:
+            waited += time.thread_time() - begin
+
+    step()
+    counts, transferred, times = device.counts.copy(), device.transferred, []
+    device.read = timed_read  # type: ignore[method-assign]
+    try:
+        for _ in range(steps):
+            begin, waited = time.thread_time(), 0.0
+            step()
+            times.append(time.thread_time() - begin - waited)
+    finally:
+        del device.read
+    result = {name: round((device.counts[name] - counts[name]) / steps, 2) for name in COUNTS}
+    transferred = (device.transferred - transferred) / steps
+    return result | {"bytes": transferred, "cpu_ms": round(1e3 * float(np.median(times)), 2)}
 
 
 def stages_of(device: Device, step: Callable[[], object]) -> dict[str, float]:
@@ -144,20 +194,27 @@ def stages_of(device: Device, step: Callable[[], object]) -> dict[str, float]:
     return {stage: round(ms, 2) for stage, ms in spent.items()}
 
 
-def bench(seconds: float) -> dict:
+def bench(seconds: float, cases: list[tuple[int, int, int]] | None = None) -> dict:
+    """Measure cases; None measures CASES, but only the first on a software device."""
     device, fastest = open_default_device(), Fastest(seconds)
     warm_up("gpu")
     flops, bandwidth = peaks(device, fastest)
     print(f"{device.adapter.name}: {flops:.0f} GFLOP/s of multiply-adds, copies {bandwidth:.1f} GB/s")
-    cases = []
-    for size in CASES[: 1 if device.adapter.software else None]:
+    sizes, cases = cases or CASES[: 1 if device.adapter.software else None], []
+    for size in sizes:
         case = Case(*size)
         copied = fastest(lambda case=case: case.through_torch("gpu"))
         cpu = fastest(lambda case=case: case.through_torch("cpu"))
         copied_bytes = transferred_bytes(device, lambda case=case: case.through_torch("gpu"))
         step = case.on_device()
-        device_seconds, bytes_moved = fastest(step), transferred_bytes(device, step)
-        stages = stages_of(device, step)
+
+        def many_steps(step: Callable[[], Callable[[], float]] = step) -> None:
+            for loss in [step() for _ in range(STEPS)][-1:]:
+                loss()
+
+        device_seconds, bytes_moved = fastest(many_steps) / STEPS, transferred_bytes(device, step)
+        recording = recording_of(device, step)
+        stages = stages_of(device, case.on_device(recorded=False))
         numbers = size[0] * (scene.SPLAT - 2 + 48)
         adam_bandwidth = BYTES_PER_NUMBER * numbers / (stages["adam"] / 1e3) / 1e9
         lanes, _ = work(Step(*size))
@@ -167,7 +224,8 @@ def bench(seconds: float) -> dict:
             "splats": size[0], "width": size[1], "height": size[2],
             "step_ms": round(1e3 * device_seconds, 2), "copied_step_ms": round(1e3 * copied, 2),
             "cpu_step_ms": round(1e3 * cpu, 2), "over_cpu": round(device_seconds / cpu, 2),
-            "stages_ms": stages, "bytes_moved": bytes_moved, "copied_bytes_moved": copied_bytes,
+            "recording": recording, "stages_ms": stages, "bytes_moved": bytes_moved,
+            "copied_bytes_moved": copied_bytes,
             "blending_share_of_peak": round(blended / flops, 3),
             "adam_share_of_copies": round(adam_bandwidth / bandwidth, 3),
         }  # fmt: skip
@@ -182,16 +240,120 @@ def bench(seconds: float) -> dict:
     }
 
 
+def cuda_seconds(size: tuple[int, int, int], fastest: Fastest) -> dict[str, float]:
+    """Measure a step of cuda, and one of gsplat with a torch SSIM and torch's fused Adam.
+
+    This part has not run yet: it needs an NVIDIA GPU and gsplat.
+    """
+    rasterization = import_module("gsplat").rasterization
+    case = Case(*size, device="cuda")
+    leaves = case.adam.tensors
+    adam = torch.optim.Adam(list(leaves.values()), lr=1e-7, fused=True)
+    camera = case.camera
+    intrinsics = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
+    pose, intrinsics = (
+        torch.as_tensor(x, dtype=torch.float32, device="cuda")[None]
+        for x in (camera.world_to_camera, intrinsics)
+    )
+
+    def step_cuda() -> None:
+        case.through_torch("cuda")
+        torch.cuda.synchronize()
+
+    def step_gsplat() -> None:
+        image, _, _ = rasterization(
+            leaves["means"], leaves["quats"], leaves["log_scales"].exp(), leaves["opacity_logits"].sigmoid(),
+            leaves["sh"], pose, intrinsics, *size[1:], sh_degree=3,
+        )  # fmt: skip
+        photometric_loss(image[0], case.target, backend="reference").backward()
+        adam.step()
+        adam.zero_grad(set_to_none=True)
+        torch.cuda.synchronize()
+
+    steps = {"cuda_step_ms": step_cuda, "gsplat_step_ms": step_gsplat}
+    return {name: round(1e3 * fastest(step), 2) for name, step in steps.items()}
+
+
+def first_step_seconds(backend: str) -> float:
+    """Measure a new process until the end of its first step."""
+    code = f"from training.rasterize import warm_up; warm_up({backend!r})"
+    begin = time.perf_counter()
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, timeout=TRAINING_SECONDS)
+    return round(time.perf_counter() - begin, 1)
+
+
+def training(backend: str, options: list[str]) -> dict:
+    """Train the example; return the last values of its events."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = [
+            sys.executable,
+            "-m",
+            "training",
+            "train",
+            "--scene",
+            str(EXAMPLE),
+            "--out",
+            f"{folder}/run",
+        ]
+        begin = time.perf_counter()
+        ended = subprocess.run(
+            [*command, "--backend", backend, *options], cwd=ROOT, capture_output=True, text=True,
+            timeout=TRAINING_SECONDS,
+        )  # fmt: skip
+    events = [json.loads(line) for line in ended.stdout.splitlines() if line.startswith("{")]
+    kinds = {event["event"]: event for event in events}
+    progress, done = kinds.get("progress", {}), kinds.get("done", {})
+    result = {name: progress.get(name) for name in ("step", "splats", "steps_per_s", "psnr")}
+    result |= {"seconds": round(time.perf_counter() - begin, 1), "code": ended.returncode, "done": done}
+    return result | ({"error": kinds["error"]} if "error" in kinds else {})
+
+
+def measure_all(seconds: float, tiny: bool, out: Path) -> dict:
+    """Measure all parts of ``--all``, and write the results so far after each."""
+    backends = ["gpu"] if cuda.problem() else ["gpu", "cuda"]
+    jobs = {
+        "flod draft, half size": ["--method", "flod"],
+        "3dgs draft, full size": ["--method", "3dgs", "--image-scale", "1"],
+    }
+    if tiny:
+        jobs = {"3dgs, tiny": ["--method", "3dgs", "--image-scale", "0.1", "--set", "steps=20"]}
+    parts: dict[str, Callable[[], object]] = {
+        f"first step, {name}": lambda name=name: first_step_seconds(name) for name in backends
+    }
+    parts["steps, gpu"] = lambda: bench(seconds, TINY if tiny else None)
+    for size in CASES if "cuda" in backends else []:
+        label = f"steps, cuda, {size[0]:,} splats, {size[1]}x{size[2]}"
+        parts[label] = lambda size=size: cuda_seconds(size, Fastest(seconds))
+    for job, options in jobs.items():
+        for name in backends:
+            parts[f"training, {name}, {job}"] = lambda name=name, options=options: training(name, options)
+    results: dict[str, object] = {"torch": torch.__version__, "cuda": torch.version.cuda}
+    for name, measure in parts.items():
+        try:
+            results[name] = measure()
+        except Exception as error:  # the other parts are measured
+            results[name] = f"{type(error).__name__}: {error}"
+        print(f"{name}: {results[name]}", flush=True)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(json.dumps(results, indent=1) + "\n")
+    return results
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=3.0, help="time limit per measurement")
+    parser.add_argument("--all", action="store_true", help="measure everything, also trainings")
+    parser.add_argument("--tiny", action="store_true", help="try the script with tiny sizes")
     parser.add_argument("--out", type=Path, default=Path("build/bench/gpu.json"))
     options = parser.parse_args()
     torch.set_num_threads(1)
     try:
         if resolve_backend("gpu") != "gpu":
             raise LodgsError("The graphics device renders incorrectly.")
-        result = bench(options.seconds)
+        if options.all:
+            measure_all(options.seconds, options.tiny, options.out)
+            return
+        result = bench(options.seconds, TINY if options.tiny else None)
     except LodgsError as problem:
         print(f"gpu: not measured. {problem}")
         return
