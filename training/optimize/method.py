@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -10,6 +11,7 @@ from typing import Generic, NamedTuple, Protocol, TypeVar, cast
 import numpy as np
 import torch
 
+from ..errors import LodgsError
 from ..rasterize import Gaussians, Rendering, Target, photometric_loss, rasterize, tensor_device
 from ..scenes.cameras import Camera
 from ..splats.gaussians import Splats
@@ -70,6 +72,16 @@ class StepResult(NamedTuple):
     loss: Callable[[], float]
     image: Callable[[], torch.Tensor]
     target: Target
+
+
+def require_finite(loss: Callable[[], float], step: int) -> None:
+    """Raise LodgsError if the loss of a step is not finite. Reading it waits for the device."""
+    value = loss()
+    if not math.isfinite(value):
+        raise LodgsError(
+            f"Training diverged by step {step}: the loss is {value}.",
+            "Train again with lower learning rates.",
+        )
 
 
 class ImageModel(Protocol):

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
 import os
 import signal
 import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -31,7 +29,7 @@ from ..lod.rule import find_rule
 from ..lod.selection import resolve_controls, standalone_levels
 from ..methods import METHODS, create
 from ..optimize.memory import keep_freed_memory, peak_memory, reset_peak_memory
-from ..optimize.method import Method
+from ..optimize.method import Method, require_finite
 from ..optimize.training_data import TrainingData
 from ..rasterize import Gaussians, contributions, cpu_fallback_reason, resolve_backend, tensor_device, warm_up
 from ..rasterize.gpu.default_device import default_adapter as graphics_device
@@ -283,28 +281,19 @@ class _TrainingRun:
             now = time.monotonic()
             interval = min(max(PROGRESS_SECONDS[0], (now - self._started) / 1000), PROGRESS_SECONDS[1])
             if now - last_progress >= interval or self.step == method.steps:
-                self._require_finite(loss)
+                require_finite(loss, self.step)
                 quality = psnr(image().cpu(), target.image.cpu(), target.mask)
                 self._report_progress(level, loss(), quality)
                 last_progress = now
             del image, target  # frees memory for the next step's photo
             saves = levels or time.monotonic() - last_checkpoint >= CHECKPOINT_SECONDS
             if saves:
-                self._require_finite(loss)
+                require_finite(loss, self.step)
             self._write_levels(levels)
             if saves:
                 self._save()
                 last_checkpoint = time.monotonic()
         return False
-
-    def _require_finite(self, loss: Callable[[], float]) -> None:
-        """Raise LodgsError if the loss is not finite. Reading it waits for the device, so this is rare."""
-        value = loss()
-        if not math.isfinite(value):
-            raise LodgsError(
-                f"Training diverged by step {self.step}: the loss is {value}.",
-                "Train again with lower learning rates.",
-            )
 
     def _stopped(self, received: list) -> bool:
         """Save, report and return True on a stop signal or a cancel request, also after the last step."""

@@ -205,7 +205,7 @@ class Device:
         """
         buffer = self.scratch(kind, *shape)
         if self._recording is not None:
-            self._recording.cleared.append(buffer)
+            self._recording.cleared.append(buffer.handle)
         return buffer
 
     def scratch(self, kind: type, *shape: int) -> Buffer:
@@ -349,8 +349,8 @@ class Device:
                 encoder.copy_buffer_to_buffer(
                     source.handle, source.offset, target.handle, target.offset, source.size
                 )
-            for buffer in recording.cleared:
-                encoder.clear_buffer(buffer.handle)
+            for handle in recording.cleared:
+                encoder.clear_buffer(handle)
             for part in recording.parts:
                 encoder = encoder or self._device.create_command_encoder()
                 compute_pass = encoder.begin_compute_pass()

@@ -9,12 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from functools import cache
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from .device import Buffer
 
 
 class Dispatch(NamedTuple):
@@ -40,13 +37,13 @@ class Recording:
     Arrays among the numbers are read again before each replay, so their owner changes them in place.
 
     Attributes:
-        cleared: buffers to clear.
+        cleared: wgpu's buffers to clear.
         parts: pipelines, bind groups and numbers of workgroups, by submission.
         uniforms: wgpu's buffer of all numbers.
     """
 
     def __init__(self, alignment: int) -> None:
-        self.cleared: list[Buffer] = []
+        self.cleared: list[Any] = []
         self.parts: list[list[tuple[Any, Any, int]]] = []
         self.uniforms: Any = None
         self._alignment = alignment
