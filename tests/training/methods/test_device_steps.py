@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 import torch
 
+from training.errors import LodgsError
 from training.methods import METHODS, create
 from training.optimize.density_control import densify, prune, reset_opacities
 from training.optimize.initialize import from_points
+from training.optimize.method import require_finite
 from training.optimize.model import Model
 from training.optimize.parameters import override
 from training.rasterize import Target
@@ -155,3 +157,9 @@ def test_device_image_is_read_lazily(data, graphics):
     assert (
         graphics.transferred - initial == 16 * created.target.image.shape[0] * created.target.image.shape[1]
     )
+
+
+def test_loss_that_is_not_finite_ends_the_training():
+    require_finite(lambda: 0.1, 7)
+    with pytest.raises(LodgsError, match="diverged by step 7: the loss is nan"):
+        require_finite(lambda: float("nan"), 7)
