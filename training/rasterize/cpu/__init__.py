@@ -204,15 +204,19 @@ class _Rasterize(torch.autograd.Function):
             by_features[index, 3 * k : 3 * k + 3] = sums[:, G_RED:]
             pair_sums[:, :G_RED] += feature_sums[:, :G_RED]
 
-        # kernels do not write the gradients of unselected splats
-        empty = torch.empty_like if count == len(side.radii) else torch.zeros_like
-        gradients = [empty(tensor, requires_grad=False) for tensor in tensors]
+        # kernels do not write the gradients of unselected splats; numpy's memory has large pages
+        empty = np.empty if count == len(side.radii) else np.zeros
+        gradients = [empty(tensor.shape, np.float32) for tensor in tensors]
         run_parallel(
             project_backward, count, GRAIN, *(tensor.detach().numpy() for tensor in tensors), *settings,
             index, passes[0], *pair_arrays, pair_sums,
-            *(gradient.numpy() for gradient in gradients), side.grad2d.numpy(),
+            *gradients, side.grad2d.numpy(),
         )  # fmt: skip
-        return *gradients, torch.from_numpy(by_features[:, : len(by_blended)]), *(None,) * 6
+        return (
+            *map(torch.from_numpy, gradients),
+            torch.from_numpy(by_features[:, : len(by_blended)]),
+            *(None,) * 6,
+        )
 
 
 def _as_colours(features: np.ndarray, projected: np.ndarray) -> list[np.ndarray]:

@@ -79,8 +79,8 @@ def sort_by_depth(keys, splats, spare_keys, target_splats):
 @inlined(STRICT)
 def tile_range(middle, reach, tiles):
     """Return the first tile and one past the last with pixel centres within ``reach`` of ``middle``."""
-    low = math.floor((middle - reach - HALF) / f32(TILE))
-    high = math.floor((middle + reach - HALF) / f32(TILE)) + 1
+    low = int(np.floor((middle - reach - HALF) / f32(TILE)))  # math.floor would call the C library
+    high = int(np.floor((middle + reach - HALF) / f32(TILE))) + 1
     return max(0, min(low, tiles)), max(0, min(high, tiles))
 
 

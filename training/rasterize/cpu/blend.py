@@ -179,6 +179,8 @@ def blend_forward(
         lit = True
         while lit and pair < tile_start[tile + 1]:
             start, end = pair, min(pair + CHECK_INTERVAL, tile_start[tile + 1])
+            for later in range(end, min(end + CHECK_INTERVAL, tile_start[tile + 1])):
+                prefetch(projected, splat[later], 0)
             find_rows(projected, splat, start, end, left, top, rows, shapes, reached)
             for pair in range(start, end):
                 row = projected[splat[pair]]

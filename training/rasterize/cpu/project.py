@@ -266,6 +266,19 @@ def gather_sums(begin, end, first_pair, pair_count, pair_row, pair_sums, sums):
 
 
 @inlined(FAST)
+def add_pairs(first, count, pair_row, pair_sums, sums):
+    """Fill sums (SUMS,) with the sums of a splat's pairs, in registers."""
+    s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = ZERO
+    for pair in range(first, first + count):
+        row = pair_row[pair]
+        s0, s1, s2 = s0 + pair_sums[row, 0], s1 + pair_sums[row, 1], s2 + pair_sums[row, 2]
+        s3, s4, s5 = s3 + pair_sums[row, 3], s4 + pair_sums[row, 4], s5 + pair_sums[row, 5]
+        s6, s7, s8 = s6 + pair_sums[row, 6], s7 + pair_sums[row, 7], s8 + pair_sums[row, 8]
+    sums[0], sums[1], sums[2], sums[3], sums[4] = s0, s1, s2, s3, s4
+    sums[5], sums[6], sums[7], sums[8] = s5, s6, s7, s8
+
+
+@inlined(FAST)
 def covariance_gradient(row, sums):
     """Compute d loss / d (xx, xy, yy) of cov; the two off-diagonal entries are one variable.
 
@@ -347,6 +360,7 @@ def project_backward(
         ahead = min(s + PREFETCH, count - 1)
         for pair in range(first_pair[ahead], first_pair[ahead] + pair_count[ahead]):
             prefetch(pair_sums, pair_row[pair], 0)
+            prefetch(pair_sums, pair_row[pair] + 1, 0)  # a row may end in the next cache line
         if pair_count[s] == 0:
             for k in range(3):
                 by_means[i, k], by_log_scales[i, k] = ZERO, ZERO
@@ -359,11 +373,7 @@ def project_backward(
             if by_weights.shape[0] > 0:
                 by_weights[i] = ZERO
             continue
-        for k in range(SUMS):
-            sums[k] = ZERO
-        for pair in range(first_pair[s], first_pair[s] + pair_count[s]):
-            for k in range(SUMS):
-                sums[k] += pair_sums[pair_row[pair], k]
+        add_pairs(first_pair[s], pair_count[s], pair_row, pair_sums, sums)
 
         mean, row = means[i], projected[s]
         x, y, z = to_camera(pose, 0, mean), to_camera(pose, 1, mean), to_camera(pose, 2, mean)
