@@ -73,8 +73,7 @@ def evaluate_run(
           bundle exceeds memory)
         - ``frame_s``: seconds per frame ``by_distance``, including selection, and in ``full`` detail, drawn
           alternately; not for rules that always weight
-        - ``curve``: as ``selective``, for each value of the rule's ``sweep``. Bundles in memory also have
-          ``merged``, the PSNR of the finest level merged to as many splats
+        - ``curve``: as ``selective``, for each value of the rule's ``sweep``; in memory also PSNR ``merged``
         - ``networks``: quality of a neural model before baking
         - ``farther`` and ``jumps`` (of the middle view), if ``far``
 

@@ -145,7 +145,8 @@ def test_bundle_contains_the_levels_and_their_facts(uninterrupted):
     upright = up_rotation(read_scene(Path(uninterrupted["keys"]["scene"])).cameras)
     np.testing.assert_allclose(bundle.meta["up_rotation"], upright, atol=1e-6)
     if bundle.method == "flod":
-        assert bundle.meta["footprint_px"] == pytest.approx(6.0)
+        detail = bundle.levels[0].facts["s_min"] * bundle.meta["focal_px"] / bundle.meta["median_depth"]
+        assert bundle.meta["footprint_px"] == pytest.approx(detail) and 0 < detail < 100
     else:
         assert bundle.cumulative and bundle.rule == "octree"
         d_max, focal_px = bundle.facts["d_max"], bundle.facts["d_max_focal"]
