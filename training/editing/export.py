@@ -58,7 +58,7 @@ class Compression:
     """Settings of a compression."""
 
     prune: float = setting(
-        0.2,
+        0.1,
         "Fraction of each level's splats to remove: those of least significance in the training views.",
         high=0.99,
     )

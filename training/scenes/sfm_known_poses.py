@@ -53,6 +53,7 @@ def _main() -> None:
     colors, cells, extracted = _extract(request, work, deadline - request["seconds"] / 2)
     matched = _match(work, deadline)
     reduced = _triangulate(work)
+    deadline = time.monotonic() + request["seconds"] / 10  # also where features and matches took all time
     estimated = _estimate(reduced, cells, deadline) if reduced is not None else None
     result = _write(reduced, estimated, request, work, colors)
     send(result={**result, "features": len(colors), "in_time": extracted and matched})
