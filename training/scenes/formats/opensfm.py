@@ -137,7 +137,8 @@ def _parse_lens(values: Any) -> Intrinsics:
 
 def _rotation(vector: np.ndarray) -> np.ndarray:
     """Return the rotation matrix (3, 3) about a vector (3,) by its length in radians (Rodrigues' formula)."""
-    angle = np.linalg.norm(vector)
+    if not np.isfinite(angle := np.linalg.norm(vector)):
+        raise LodgsError("its rotation is not finite.")
     if angle == 0:
         return np.eye(3)
     x, y, z = vector / angle
