@@ -424,7 +424,8 @@ def _parse_points_txt(file: IO[bytes]) -> tuple[np.ndarray, np.ndarray, np.ndarr
     elif colors.max(initial=0) <= 1 and (colors % 1).any():
         colors *= 255
     colors = colors.clip(0, 255).astype(np.uint8)
-    return positions, colors, ids[:, 0].astype(np.int64) if start else np.zeros(0, np.int64)
+    with np.errstate(invalid="ignore"):  # ids that are not finite match no observation
+        return positions, colors, ids[:, 0].astype(np.int64) if start else np.zeros(0, np.int64)
 
 
 def _lines(file: IO[bytes]) -> Iterator[bytes]:
