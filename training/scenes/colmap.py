@@ -239,7 +239,7 @@ def read_scene(
     if model is None:
         model, images = _choose_model(folder, images, warnings)
     model = _absolute(model)
-    intrinsics, poses = _read_registered(model)
+    intrinsics, poses = _read_registered(model, warnings)
     if images is None:
         images = _find_images(folder, model, [pose.name for pose in poses], warnings)
     images = _absolute(images)
@@ -333,7 +333,7 @@ def _point_cloud(model: Path) -> Path | None:
     return named[0] if named else clouds[0] if len(clouds) == 1 else None
 
 
-def _read_registered(model: Path) -> tuple[dict[int, Intrinsics], list[Pose]]:
+def _read_registered(model: Path, warnings: list[str]) -> tuple[dict[int, Intrinsics], list[Pose]]:
     """Return the lenses by id and the poses sorted by name.
 
     Raises:
@@ -345,8 +345,8 @@ def _read_registered(model: Path) -> tuple[dict[int, Intrinsics], list[Pose]]:
             f"Cannot read COLMAP model: {model} has no cameras and images files.",
             "Choose the folder of a COLMAP model.",
         )
-    intrinsics = read_cameras(model)
     poses = sorted(read_poses(model), key=lambda pose: pose.name)
+    intrinsics = read_cameras(model, {pose.camera_id for pose in poses}, warnings.append)
     if not poses:
         raise LodgsError(
             f"Cannot read COLMAP model: {model} has no registered images.",
@@ -389,8 +389,8 @@ def exclude_views(scene: Scene, reasons: dict[str, str]) -> Scene:
 
 def scene_lenses(scene: Scene) -> list[Intrinsics]:
     """Return the lens of each camera, with its distortion, at the size of its photo."""
-    lenses = read_cameras(scene.model)
-    lens_of = {pose.name.replace("\\", "/"): lenses[pose.camera_id] for pose in read_poses(scene.model)}
+    lenses, poses = _read_registered(scene.model, [])
+    lens_of = {pose.name.replace("\\", "/"): lenses[pose.camera_id] for pose in poses}
     distorted = set(scene.distorted)
     return [
         lens_of[camera.name].resized(camera.width, camera.height)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import mmap
 import os
 import struct
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -27,6 +27,8 @@ from .lenses import LENS_BY_NAME, LENSES, Intrinsics, intrinsics_of
 
 DAMAGED_REMEDY = "Copy the model again, or rewrite it with COLMAP's model_converter."
 
+_Cameras = tuple[dict[int, Intrinsics], dict[int, Exception]]
+"""Valid cameras, and the flaws of invalid ones, by COLMAP's id."""
 _MAX_NAME = 1 << 16
 _MAX_LINE = 1 << 26  # bytes of a million 2D points
 
@@ -71,13 +73,27 @@ def count_images(model: Path) -> int:
         return 0
 
 
-def read_cameras(model: Path) -> dict[int, Intrinsics]:
-    """Read the cameras of a model by COLMAP's id.
+def read_cameras(
+    model: Path, used: Collection[int] | None = None, warn: Callable[[str], object] = str
+) -> dict[int, Intrinsics]:
+    """Read the valid cameras of a model by COLMAP's id.
+
+    Args:
+        used: ids of the cameras of images. Default: all.
+        warn: called with a sentence about invalid cameras that no image uses.
 
     Raises:
-        LodgsError: the file is missing or damaged.
+        LodgsError: the file is missing or damaged, or a used camera is invalid.
     """
-    return _read(model, "cameras", {".bin": _parse_cameras_bin, ".txt": _parse_cameras_txt})
+    cameras, flaws = _read(model, "cameras", {".bin": _parse_cameras_bin, ".txt": _parse_cameras_txt})
+    path = model / f"cameras{model_suffix(model)}"
+    for camera_id, error in flaws.items():
+        if used is None or camera_id in used:
+            raise damage_error(path, error, DAMAGED_REMEDY)
+    if flaws:
+        error = next(iter(flaws.values()))
+        warn(f"Skipped {len(flaws):,} cameras of {path} that no image uses: {error}.")
+    return cameras
 
 
 def read_poses(model: Path) -> list[Pose]:
@@ -140,10 +156,10 @@ def _read(model: Path, name: str, parsers: dict, suffix: str = "") -> Any:
         raise damage_error(path, error, DAMAGED_REMEDY) from error
 
 
-def _parse_cameras_bin(data: mmap.mmap) -> dict[int, Intrinsics]:
+def _parse_cameras_bin(data: mmap.mmap) -> _Cameras:
     count = _record_count(data, 48)
     offset = 8
-    cameras = {}
+    cameras, flaws = {}, {}
     for _ in range(count):
         camera_id, model_id, width, height = struct.unpack_from("<iiQQ", data, offset)
         lens = LENSES.get(model_id)
@@ -151,22 +167,27 @@ def _parse_cameras_bin(data: mmap.mmap) -> dict[int, Intrinsics]:
             raise ValueError(f"camera model {model_id} is unknown")
         parameters = np.frombuffer(data, "<f8", lens.parameters, offset + 24).copy()
         offset += 24 + 8 * lens.parameters
-        cameras[camera_id] = intrinsics_of(lens, width, height, parameters)
-    return cameras
+        try:
+            cameras[camera_id] = intrinsics_of(lens, width, height, parameters)
+        except ValueError as error:
+            flaws[camera_id] = error
+    return cameras, flaws
 
 
-def _parse_cameras_txt(file: IO[bytes]) -> dict[int, Intrinsics]:
-    cameras = {}
+def _parse_cameras_txt(file: IO[bytes]) -> _Cameras:
+    cameras, flaws = {}, {}
     for line in _content_lines(file):
         camera_id, model_name, width, height, *parameters = line.split()
-        lens = LENS_BY_NAME.get(model_name.upper())
-        if lens is None:
-            raise ValueError(f"camera model {model_name} is unknown")
-        cameras[int(camera_id)] = intrinsics_of(
-            lens, _side(width), _side(height), np.array(parameters, float)
-        )
-    _check_count(len(cameras), file, "cameras")
-    return cameras
+        number = int(camera_id)
+        try:
+            if (lens := LENS_BY_NAME.get(model_name.upper())) is None:
+                raise ValueError(f"camera model {model_name} is unknown")
+            size = _side(width), _side(height)
+            cameras[number] = intrinsics_of(lens, *size, np.array(parameters, float))
+        except (ValueError, OverflowError) as error:
+            flaws[number] = error
+    _check_count(len(cameras.keys() | flaws.keys()), file, "cameras")
+    return cameras, flaws
 
 
 def _side(text: str) -> int:
@@ -403,7 +424,8 @@ def _parse_points_txt(file: IO[bytes]) -> tuple[np.ndarray, np.ndarray, np.ndarr
     elif colors.max(initial=0) <= 1 and (colors % 1).any():
         colors *= 255
     colors = colors.clip(0, 255).astype(np.uint8)
-    return positions, colors, ids[:, 0].astype(np.int64) if start else np.zeros(0, np.int64)
+    with np.errstate(invalid="ignore"):  # ids that are not finite match no observation
+        return positions, colors, ids[:, 0].astype(np.int64) if start else np.zeros(0, np.int64)
 
 
 def _lines(file: IO[bytes]) -> Iterator[bytes]:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from training.__main__ import main
 from training.errors import LodgsError
 from training.runs.page import write
 from training.runs.page.write import write_page
@@ -131,3 +132,49 @@ def test_errors_name_the_cause_and_leave_nothing(bundle, tmp_path, viewer, monke
     with pytest.raises(LodgsError, match="no viewer"):
         write_page(bundle, tmp_path / "page")
     assert {path.name for path in tmp_path.iterdir()} == {"garden", "other", "viewer"}
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("missing.ply", None),
+        ("empty.ply", b""),
+        ("text.ply", b"hello"),
+        ("photo.jpg", b"\xff\xd8\xff"),
+        (
+            "cut.ply",
+            b"ply\nformat binary_little_endian 1.0\nelement vertex 9\nproperty float x\nend_header\n",
+        ),
+        ("empty.spz", b""),
+        ("empty.sog", b""),
+        ("empty.splat", b""),
+        ("unknown.xyz", b"0 0 0"),
+        ("x" * 300 + ".ply", None),
+        ("folder", "folder"),
+        ("loop.ply", "link"),
+    ],
+)
+def test_wrong_inputs_end_with_a_message(tmp_path, capsys, name, content):
+    path = tmp_path / name
+    if content == "folder":
+        path.mkdir()
+    elif content == "link":
+        path.symlink_to(path)
+    elif content is not None:
+        path.write_bytes(content)
+    assert main(["page", str(path), "--out", str(tmp_path / "out")]) == 2
+    assert capsys.readouterr().err.startswith("error: Cannot ") and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("out", ["file", "file/below", "n" * 300, "loop"])
+def test_unusable_places_end_with_a_message(bundle, tmp_path, capsys, out):
+    (tmp_path / "file").touch()
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    before = sorted(tmp_path.iterdir())
+    assert main(["page", str(bundle), "--out", str(tmp_path / out)]) == 2
+    assert capsys.readouterr().err.startswith("error: Cannot ") and sorted(tmp_path.iterdir()) == before
+
+
+def test_title_that_is_not_utf8(bundle, tmp_path):
+    write_page(bundle, tmp_path / "out", title="caf\udce9", backend="cpu")
+    assert "caf\\xdce9" in (tmp_path / "out" / "index.html").read_text("utf-8")

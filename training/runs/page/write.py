@@ -17,7 +17,7 @@ from ...editing.bake_filter import bake_filter
 from ...editing.edit import open_levels
 from ...editing.placement import transform_bundle, upright_placement
 from ...editing.portable import portable_levels
-from ...errors import LodgsError
+from ...errors import LodgsError, printable
 from ...files import temporary_folder
 from ...rasterize.resident import ResidentBundle
 from ...scenes.cameras import Camera, pick_evenly
@@ -74,7 +74,7 @@ def write_page(
     viewer = _read_viewer()
     _check_place(out, single)
     path = find_splats(source)
-    title = title or (path.resolve().parent.name if path.stem == "bundle" else path.stem)
+    title = printable(title or (path.resolve().parent.name if path.stem == "bundle" else path.stem))
     bundle = open_levels(path, warn)
     levels, _ = portable_levels(bake_filter(bundle))
     cameras, near, _ = read_view_tables(bundle.tables)

@@ -137,15 +137,18 @@ def get_number(values: Mapping[str, Any], name: str, default: float | None = Non
     return float(value)
 
 
-def parse_array(value: Any, *shape: int) -> np.ndarray:
+def parse_array(value: Any, *shape: int, finite: bool = True) -> np.ndarray:
     """Return nested or flat lists of numbers as an array of the given shape.
 
+    Args:
+        finite: reject infinite numbers, NaN and null; otherwise null is NaN.
+
     Raises:
-        LodgsError: the value has another shape, or contains anything but finite numbers.
+        LodgsError: the value has another shape, or contains anything but such numbers.
     """
     try:
         array = np.array(value, np.float64)
-        if not np.isfinite(array).all():
+        if finite and not np.isfinite(array).all():
             raise ValueError
         return array.reshape(shape)
     except (TypeError, ValueError) as error:

@@ -31,6 +31,7 @@ from .exported import (
 NAME = "OpenSfM"
 MAX_BYTES = 1 << 28
 """Maximum size of the file, which holds all points as text."""
+_NO_POINTS = np.zeros((0, 3))
 _REFERENCE = "latitude", "longitude", "altitude"
 _FISHEYES = "fisheye", "fisheye_opencv"
 _LENSES = "perspective", "simple_radial", "radial", "brown", *_FISHEYES
@@ -56,10 +57,10 @@ def read(path: Path) -> ExportedScene:
     part = max(parts, key=lambda part: len(part["shots"]))
     try:
         cameras, shots, points = part["cameras"], part["shots"].items(), part.get("points") or {}
-        positions = parse_array(
-            [point["coordinates"] for point in points.values()] or np.zeros((0, 3)), -1, 3
+        positions, colors = (
+            parse_array([point[key] for point in points.values()] or _NO_POINTS, -1, 3, finite=False)
+            for key in ("coordinates", "color")
         )
-        colors = parse_array([point["color"] for point in points.values()] or np.zeros((0, 3)), -1, 3)
     except (KeyError, TypeError, AttributeError, LodgsError) as error:
         raise LodgsError(
             f"Cannot read {path}: it is not a reconstruction of OpenSfM (missing or invalid: {error}).",
@@ -81,8 +82,13 @@ def read(path: Path) -> ExportedScene:
     if len(parts) > 1:
         others = sum(len(other["shots"]) for other in parts) - len(part["shots"])
         warnings.append(f"Skipped {others:,} photos of {len(parts) - 1} separate reconstructions in {path}.")
-    colors = colors.clip(0, 255).astype(np.uint8)
-    return ExportedScene(views, positions, colors, excluded, warnings, _georeference(path, part))
+    valid = np.isfinite(positions).all(axis=1)
+    if not valid.all():
+        warnings.append(f"Skipped {np.sum(~valid):,} points of {path}: their position is not finite.")
+    colors = np.nan_to_num(colors.clip(0, 255)).astype(np.uint8)
+    return ExportedScene(
+        views, positions[valid], colors[valid], excluded, warnings, _georeference(path, part)
+    )
 
 
 def _georeference(path: Path, part: Mapping) -> Georeference | None:
@@ -131,7 +137,8 @@ def _parse_lens(values: Any) -> Intrinsics:
 
 def _rotation(vector: np.ndarray) -> np.ndarray:
     """Return the rotation matrix (3, 3) about a vector (3,) by its length in radians (Rodrigues' formula)."""
-    angle = np.linalg.norm(vector)
+    if not np.isfinite(angle := np.linalg.norm(vector)):
+        raise LodgsError("its rotation is not finite.")
     if angle == 0:
         return np.eye(3)
     x, y, z = vector / angle

@@ -45,7 +45,7 @@ def read(path: Path) -> ExportedScene:
     """
     document = read_document(path)
     try:
-        poses = parse_array(document.get("poses"), -1, 7)
+        poses = parse_array(document.get("poses"), -1, 7, finite=False)
         lenses = _parse_lenses(document, len(poses))
     except LodgsError as error:
         raise LodgsError(f"Cannot read {path}: {error.what}", "Export it again.") from error
@@ -67,7 +67,8 @@ def read(path: Path) -> ExportedScene:
             excluded.append((f"frame {number}", "it has no photo."))
             continue
         try:
-            views.append(ExportedView(file, lenses[number], invert_pose(_pose_matrix(pose), opengl=True)))
+            lens = _parse_lens(document, lenses[number])
+            views.append(ExportedView(file, lens, invert_pose(_pose_matrix(pose), opengl=True)))
         except LodgsError as error:
             excluded.append((file.name, error.what))
     return ExportedScene(views, excluded=excluded)
@@ -78,20 +79,29 @@ def _photo_folder(path: Path) -> Path | None:
     return next((path.parent / name for name in _PHOTOS if (path.parent / name).is_dir()), None)
 
 
-def _parse_lenses(document: dict, count: int) -> list[Intrinsics]:
-    """Return the lens of each frame; frames without own values have the common lens.
+def _parse_lenses(document: dict, count: int) -> np.ndarray:
+    """Return fx, fy, cx, cy of each frame (count, 4), possibly not finite; by default those of all frames.
+
+    Raises:
+        LodgsError: if values are missing.
+    """
+    frames = document.get("perFrameIntrinsicCoeffs") or []
+    coefficients = [frame[:4] for frame in frames] if _is_table(frames) else []
+    if len(coefficients) not in (0, count):
+        raise LodgsError(f"it has {count} poses, but {len(coefficients)} perFrameIntrinsicCoeffs.")
+    if coefficients:
+        return parse_array(coefficients, count, 4, finite=False)
+    return np.tile(parse_camera_matrix(document.get("K")), (count, 1))
+
+
+def _parse_lens(document: dict, coefficients: np.ndarray) -> Intrinsics:
+    """Return the lens of one frame.
 
     Raises:
         LodgsError: if a value is missing or invalid.
     """
-    size = get_number(document, "w"), get_number(document, "h")
-    frames = document.get("perFrameIntrinsicCoeffs") or []
-    coefficients = parse_array([frame[:4] for frame in frames], -1, 4) if _is_table(frames) else []
-    if len(coefficients) not in (0, count):
-        raise LodgsError(f"it has {count} poses, but {len(coefficients)} perFrameIntrinsicCoeffs.")
-    if not len(coefficients):
-        coefficients = np.tile(parse_camera_matrix(document.get("K")), (count, 1))
-    return [colmap_lens(*size, (fx, fy), (cx, cy)) for fx, fy, cx, cy in coefficients]
+    fx, fy, cx, cy = coefficients.tolist()
+    return colmap_lens(get_number(document, "w"), get_number(document, "h"), (fx, fy), (cx, cy))
 
 
 def _is_table(frames: object) -> bool:
@@ -105,8 +115,8 @@ def _pose_matrix(pose: np.ndarray) -> np.ndarray:
     """Return the matrix (3, 4) of qx, qy, qz, qw and a position.
 
     Raises:
-        LodgsError: the quaternion is 0.
+        LodgsError: the quaternion is 0, or a value is not finite.
     """
-    if not pose[:4].any():
+    if not (pose[:4].any() and np.isfinite(pose).all()):
         raise LodgsError("its pose is not a rotation and translation.")
     return np.column_stack([rotation_matrix(pose[[3, 0, 1, 2]]), pose[4:]])
