@@ -26,9 +26,13 @@ class PixelCamera(Protocol):
     width: int
     height: int
 
-    def img_from_cam(self, points: np.ndarray, /) -> np.ndarray: ...
+    def img_from_cam(self, points: np.ndarray, /) -> np.ndarray:
+        """Project points of the camera's space to pixels."""
+        ...
 
-    def cam_from_img(self, pixels: np.ndarray, /) -> np.ndarray: ...
+    def cam_from_img(self, pixels: np.ndarray, /) -> np.ndarray:
+        """Return points at depth 1 from pixels, without their depth."""
+        ...
 
 
 class CellView(NamedTuple):
