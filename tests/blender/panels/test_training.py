@@ -72,7 +72,7 @@ def test_splats_without_photos_need_settings_of_views(bpy, lodgs, root, draw, fa
     assert draw().properties == [*first, "views", "view_width", "show_views"]
     assert draw().operators == ["lodgs.train"]
     assert any("opaque splat" in text for text in draw().texts)
-    assert "2,400 steps in 3 levels" in draw().texts  # the finest level takes no steps
+    assert "1,200 steps in 3 levels" in draw().texts  # the finest level takes no steps
     settings.views_from = "CURVE"
     assert draw().properties == [*first, "curve", "views", "view_width", "show_views"]
     settings.views_from = "CAMERAS"
