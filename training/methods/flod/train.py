@@ -95,7 +95,8 @@ class Method(method.Method[FlodParameters, Drawing]):
             self.start_level(self.level_at(step + 1))
             return levels
         if self.parameters.merges:
-            self._set_distances()
+            if self.data.region is None:  # the cells of a scene share the distances of the footprint
+                self._set_distances()
             levels = self._completed_levels()
         if self.parameters.finish_steps and self.completed:
             self.start_finishing()
