@@ -53,9 +53,8 @@ def test_workflow_from_photos_to_exported_files(bpy, lodgs, tmp_path, monkeypatc
 
     undo_counts = [workflow.step_until(bpy.ops.ed.undo, state) for state in states[-2::-1]]
     levels = undo_counts.pop(-2)  # training: each level one to three times, the end, and Train
-    expected = (
-        [1] * 3 + [1 if workflow.ground_found else 2] + [1] * 4
-    )  # a picked ground adds its empties first
+    # picking the ground adds empties in a step of its own
+    expected = [1] * 3 + [1 if workflow.ground_found else 2] + [1] * 4
     assert undo_counts == expected and len(counts) + 2 <= levels <= 3 * len(counts) + 2
     for state in states[1:]:
         workflow.step_until(bpy.ops.ed.redo, state)
