@@ -1,4 +1,4 @@
-"""``python as_blender.py --command lodgs ...``: what ``blender`` does with that, by Blender's module."""
+"""Run ``blender --command lodgs ...`` with Blender's module: ``python as_blender.py --command lodgs ...``."""
 
 import importlib
 import os

@@ -54,7 +54,7 @@ def lodgs(bpy):
 def frame(bpy):
     """``frame(size, draw)``: call ``draw()``, return the linear image (size, size, 4), bottom row first.
 
-    ``frame(size, draw, before)`` draws into an 8-bit sRGB framebuffer, as in viewports with ``before``.
+    ``frame(size, draw, background)`` draws over an image in an 8-bit sRGB framebuffer, as in viewports.
     Tests are skipped if this Blender has no graphics in background mode.
     """
     import gpu
@@ -64,14 +64,14 @@ def frame(bpy):
     try:
         gpu.init()
     except Exception as error:
-        pytest.skip(f"no graphics here: {error}")
+        pytest.skip(f"no graphics: {error}")
     if not _draws(gpu):
-        pytest.skip("no graphics here: a cleared framebuffer stays empty; install mesa-vulkan-drivers")
+        pytest.skip("no graphics: a cleared framebuffer stays empty; install mesa-vulkan-drivers")
 
-    def draw_frame(size, draw, before=None):
+    def draw_frame(size, draw, background=None):
         kind, data = "RGBA32F", np.zeros((size, size, 4), np.float32)
-        if before is not None:
-            kind, data = "SRGB8_A8", before.copy()
+        if background is not None:
+            kind, data = "SRGB8_A8", background.copy()
             data[..., :3] = np.where(
                 data[..., :3] <= 0.0031308, 12.92 * data[..., :3], 1.055 * data[..., :3] ** (1 / 2.4) - 0.055
             )
@@ -86,7 +86,7 @@ def frame(bpy):
             buffer = frame.read_color(0, 0, size, size, 4, 0, "FLOAT")
         buffer.dimensions = size * size * 4
         image = np.array(buffer, np.float32).reshape(size, size, 4)
-        if before is not None:
+        if background is not None:
             code = image[..., :3]
             image[..., :3] = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
         return image

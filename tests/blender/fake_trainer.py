@@ -1,19 +1,20 @@
-"""Stands in for the trainer's Python: speaks the protocol of a run, and goes wrong as $LODGS_FAKE says.
+"""A replacement for the trainer's Python. It writes the events of a run; $LODGS_FAKE selects a failure.
 
-Cells of a job that has some make half of their steps, and wait for the file ``go on``.
+Cells train half of their steps, then wait for the file ``go on``.
 
-- ``""``        two levels and done
-- ``chunks``    two levels of LODGE, which come again with what chunks have of them
+- ``""``        two levels, then ``done``
+- ``chunks``    two levels of LODGE, sent a second time with their chunk columns
+- ``far``       two levels with the local origin ORIGIN
 - ``tree``      leaves, then all nodes of a tree
-- ``two halves``  two levels, and done when the file ``go on`` is there
-- ``slow``      steps until it is asked to stop, at most half an hour
+- ``two halves``  two levels, then ``done`` once the file ``go on`` exists
+- ``slow``      steps until it is cancelled, at most half an hour
 - ``killed``    one level, then SIGKILL to itself
 - ``crash``     one level, then a traceback and exit code 1
 - ``garbage``   noise on stdout and between the events, then as ``""``
-- ``odd``       an event with a field of the wrong kind
-- ``mute``      never says anything and ignores being asked
-- ``full``      an ``error`` event, as when the disk is full
-- ``refused``   an ``error`` event on stdout alone, as before a run folder is its own
+- ``odd``       an event with a field of the wrong type
+- ``mute``      no event, and cancelling has no effect
+- ``full``      an ``error`` event, as with a full disk
+- ``refused``   an ``error`` event on stdout only, as for a run folder of another job
 """
 
 import json
@@ -41,11 +42,11 @@ from training.splats.ply import write_ply
 COUNTS = {1: 5, 2: 20}
 """Splats by level."""
 STEPS = 20
-"""Of a cell."""
+"""Steps of a cell."""
 ORIGIN = [500_000.0, 4_200_000.0, 300.0]
 """Local origin of the levels in the mode ``far``."""
 LEAVES = 3000
-"""Of a tree."""
+"""Leaves of a tree."""
 
 
 def splats(count: int) -> Splats:
@@ -61,7 +62,7 @@ def splats(count: int) -> Splats:
 
 def main() -> int:
     mode, command = os.environ.get("LODGS_FAKE", ""), sys.argv[3]
-    METHODS["flod"] = replace(METHODS["flod"], from_base=True)  # as tests of bases have it
+    METHODS["flod"] = replace(METHODS["flod"], from_base=True)  # tests of bases train it
     job = Job.from_file(Path(sys.argv[5], "job.toml") if command == "blocks" else Path(sys.argv[4]))
     folder = RunFolder(job.out)
     if mode == "mute":
@@ -78,29 +79,31 @@ def main() -> int:
         return 2
 
 
-def run(mode: str, job: Job, folder: RunFolder, say: EventWriter) -> int:
-    say("hello", protocol=PROTOCOL, version="0", method=job.method, preset=job.preset, scene=job.scene,
+def run(mode: str, job: Job, folder: RunFolder, emit: EventWriter) -> int:
+    emit("hello", protocol=PROTOCOL, version="0", method=job.method, preset=job.preset, scene=job.scene,
         out=job.out, pid=os.getpid())  # fmt: skip
-    say("warning", message="One photograph is missing.")
+    emit("warning", message="One photograph is missing.")
     if mode == "full":
-        say("error", what="The disk is full; training stopped.", remedy="Free some space and resume the run.")
+        emit(
+            "error", what="The disk is full; training stopped.", remedy="Free some space and resume the run."
+        )
         return 2
     if mode == "odd":
-        say("progress", stage="level 1 of 2", step=None)
-        say("level", level="one", path=3)
+        emit("progress", stage="level 1 of 2", step=None)
+        emit("level", level="one", path=3)
         return 1
     for step in range(100_000 if mode == "slow" else 2):
-        say("progress", stage="level 1 of 2", level=1, levels=2, step=step + 1, of=10_000, loss=0.5,
+        emit("progress", stage="level 1 of 2", level=1, levels=2, step=step + 1, of=10_000, loss=0.5,
             psnr=20.0, splats=5, steps_per_s=20.0, eta_s=60.0)  # fmt: skip
         if folder.take_cancel():
-            say("cancelled", step=step, message="Stopped.")
+            emit("cancelled", step=step, message="Stopped.")
             return 3
         if mode == "slow":
             time.sleep(0.02)
     if mode == "tree":
-        return tree(folder, say)
-    if job.cells and not cells(job, folder, say, sys.argv[6:]):
-        say("cancelled", message="Stopped; the run can be resumed.")
+        return train_tree(folder, emit)
+    if job.cells and not train_cells(job, folder, emit, sys.argv[6:]):
+        emit("cancelled", message="Stopped; the run can be resumed.")
         return 3
     levels, tables = [], {}
     origin = {"origin": ORIGIN} if mode == "far" else {}
@@ -108,7 +111,7 @@ def run(mode: str, job: Job, folder: RunFolder, say: EventWriter) -> int:
         path = folder.levels_folder / f"level_{number}.ply"
         levels.append(Level(number, splats(count), {"s_min": 0.1 if number == 1 else 0.0}))
         write_ply(path, levels[-1].splats)
-        say(
+        emit(
             "level", level=number, path=f"levels/{path.name}", splats=count, psnr=20.0,
             facts=levels[-1].facts, rule="bands", scene_facts={}, controls={"gamma": 2.0},
             cumulative=False, meta=origin,
@@ -129,7 +132,7 @@ def run(mode: str, job: Job, folder: RunFolder, say: EventWriter) -> int:
             level.splats.extras["chunks_0"] = np.arange(len(level.splats), dtype=np.float32)
             path = folder.levels_folder / f"level_{level.number}.ply"
             write_ply(path, level.splats)
-            say(
+            emit(
                 "level", level=level.number, path=f"levels/{path.name}", splats=len(level.splats), again=True,
                 facts=level.facts, rule=rule, scene_facts={}, controls={}, cumulative=False, meta={},
             )  # fmt: skip
@@ -138,14 +141,14 @@ def run(mode: str, job: Job, folder: RunFolder, say: EventWriter) -> int:
     controls = {"gamma": 2.0} if rule == "bands" else {}
     meta = {"camera_center": [1.0, 2.0, 3.0], "focal_px": 100.0, **origin}
     write_bundle(folder.bundle, Bundle(job.method, levels, rule, {}, controls, meta=meta, tables=tables))
-    say("done", bundle=folder.bundle.name, seconds=1.0, train_psnr=21.5, veil={"mean": 0.01, "max": 0.25},
+    emit("done", bundle=folder.bundle.name, seconds=1.0, train_psnr=21.5, veil={"mean": 0.01, "max": 0.25},
         oversized=0)  # fmt: skip
     return 0
 
 
 @dataclass
 class Cell:
-    """A block that is trained without a trainer: a step a look, half of them until ``go on`` is there."""
+    """A simulated cell: one step per update, half of the steps until ``go on`` exists."""
 
     number: int
     folder: RunFolder
@@ -153,65 +156,65 @@ class Cell:
 
     @property
     def step(self) -> int:
-        made = self.folder.path / "made"
-        return len(made.read_bytes()) if made.exists() else 0
+        steps = self.folder.path / "steps"
+        return len(steps.read_bytes()) if steps.exists() else 0
 
-    def look(self, most: int) -> None:
+    def update(self, limit: int) -> None:
         if self.state == "running" and self.folder.take_cancel():
             self.state = "cancelled"
         if self.state == "cancelled" and self.folder.take_resume():
             self.state = "running"
-        if self.state == "running" and self.step < most:
-            with (self.folder.path / "made").open("ab") as made:
-                made.write(b".")
+        if self.state == "running" and self.step < limit:
+            with (self.folder.path / "steps").open("ab") as steps:
+                steps.write(b".")
         if self.step == STEPS:
             self.state = "done"
 
 
-def cells(job: Job, folder: RunFolder, say: EventWriter, options: list[str]) -> bool:
-    """Trains cells as ``train_blocks`` does; whether all are done."""
+def train_cells(job: Job, folder: RunFolder, emit: EventWriter, options: list[str]) -> bool:
+    """Train cells like ``train_blocks``; return True if all are done."""
     print(*options, file=sys.stderr)  # for the log
     columns, rows = job.grid
     blocks = [Cell(n, RunFolder(folder.blocks / str(n))) for n in range(1, columns * rows + 1)]
     for block in blocks:
         block.folder.path.mkdir(parents=True, exist_ok=True)
         block.folder.take_cancel()
-    if asked := [block for block in blocks if block.folder.take_resume()]:
+    if resumed := [block for block in blocks if block.folder.take_resume()]:
         for block in blocks:
-            block.state = "running" if block in asked else "cancelled"
+            block.state = "running" if block in resumed else "cancelled"
     while any(block.state == "running" for block in blocks):
         if folder.take_cancel():
             return False
         for block in blocks:
-            block.look(STEPS if (folder.path / "go on").exists() else STEPS // 2)
-        told = [
+            block.update(STEPS if (folder.path / "go on").exists() else STEPS // 2)
+        states = [
             {"block": b.number, "kind": "block", "state": b.state, "step": b.step, "of": STEPS}
             for b in blocks
         ]
-        say("progress", stage="training blocks", level=1, levels=1, step=sum(b.step for b in blocks),
+        emit("progress", stage="training blocks", level=1, levels=1, step=sum(b.step for b in blocks),
             of=STEPS * len(blocks), loss=0.5, psnr=20.0, splats=5, steps_per_s=20.0, eta_s=60.0,
-            blocks=told)  # fmt: skip
+            blocks=states)  # fmt: skip
         time.sleep(0.02)
     return all(block.state == "done" for block in blocks)
 
 
-def tree(folder: RunFolder, say: EventWriter) -> int:
-    """As the method has it: its leaves when they are there, and all at the end."""
+def train_tree(folder: RunFolder, emit: EventWriter) -> int:
+    """Write the leaves, then all levels, like the method ``tree``."""
     from tests.training.lod.tree.trees import random_leaves, tree_of, write_in_pages
 
-    whole = tree_of(random_leaves(LEAVES, np.random.default_rng(5)))
+    bundle = tree_of(random_leaves(LEAVES, np.random.default_rng(5)))
     for numbers in ((2,), (1, 2)):
-        for level in whole.levels:
+        for level in bundle.levels:
             if level.number in numbers:
                 path = folder.levels_folder / f"level_{level.number}.ply"
                 write_ply(path, level.splats)
-                say(
+                emit(
                     "level", level=level.number, path=f"levels/{path.name}", splats=len(level.splats),
                     facts={}, rule="cut", scene_facts={}, controls={}, cumulative=False, meta={},
                     more=level.number < 2,
                 )  # fmt: skip
-    write_in_pages(folder.bundle, whole)
-    say("done", bundle=folder.bundle.name, seconds=1.0)
+    write_in_pages(folder.bundle, bundle)
+    emit("done", bundle=folder.bundle.name, seconds=1.0)
     return 0
 
 

@@ -36,27 +36,30 @@ def test_workflow_from_photos_to_exported_files(bpy, lodgs, tmp_path, monkeypatc
         pytest.skip("no trainer; set LODGS_TRAINER_PYTHON")
     monkeypatch.setenv("PATH", f"{ROOT / 'build/interop/node_modules/.bin'}{os.pathsep}{os.environ['PATH']}")
     streams = shutil.which(PROGRAM) is not None
-    way = Way(bpy, lodgs, tmp_path)
+    workflow = Workflow(bpy, lodgs, tmp_path)
     bpy.ops.ed.undo_push(message="Start")
-    states = [way.state()]
-    for step in (way.import_photos, way.train, way.crop, way.fit_crop, way.hide_floaters, way.ground,
-                 way.add_scale_marks, way.scale, way.tint):  # fmt: skip
+    states = [workflow.state()]
+    for step in (
+        workflow.import_photos, workflow.train, workflow.crop, workflow.fit_crop, workflow.hide_floaters,
+        workflow.ground, workflow.add_scale_marks, workflow.scale, workflow.tint,
+    ):  # fmt: skip
         step()
-        states.append(way.state())
+        states.append(workflow.state())
         assert states[-1] != states[-2], step.__name__
-    counts = way.assert_cropped()
-    way.export(streams)
-    way.assert_equal_to_one_command(python, streams, counts)
-    assert way.state() == states[-1], "exports change nothing"
+    counts = workflow.assert_cropped()
+    workflow.export(streams)
+    workflow.assert_equal_to_one_command(python, streams, counts)
+    assert workflow.state() == states[-1], "exports change nothing"
 
-    undo_counts = [way.step_until(bpy.ops.ed.undo, state) for state in states[-2::-1]]
+    undo_counts = [workflow.step_until(bpy.ops.ed.undo, state) for state in states[-2::-1]]
     levels = undo_counts.pop(-2)  # training: each level one to three times, the end, and Train
-    expected = [1] * 3 + [1 if way.ground_found else 2] + [1] * 4  # a picked ground adds its empties first
+    # picking the ground adds empties in a step of its own
+    expected = [1] * 3 + [1 if workflow.ground_found else 2] + [1] * 4
     assert undo_counts == expected and len(counts) + 2 <= levels <= 3 * len(counts) + 2
     for state in states[1:]:
-        way.step_until(bpy.ops.ed.redo, state)
-    assert way.assert_cropped() == counts
-    way.assert_reimported(streams, counts)
+        workflow.step_until(bpy.ops.ed.redo, state)
+    assert workflow.assert_cropped() == counts
+    workflow.assert_reimported(streams, counts)
     if OWN:
         with capfd.disabled():
             print(
@@ -66,7 +69,7 @@ def test_workflow_from_photos_to_exported_files(bpy, lodgs, tmp_path, monkeypatc
             )
 
 
-class Way:
+class Workflow:
     """The workflow's steps, each of which Blender can undo."""
 
     def __init__(self, bpy, lodgs, folder: Path):
@@ -117,16 +120,16 @@ class Way:
     def fit_crop(self):
         """Move the crop to the photographed subject and scale it."""
         camera, target = self.lodgs("data.photographs").photo_viewpoint(self.root)
-        to_own = np.linalg.inv(self.to_world())
-        centre = to_own[:3, :3] @ target + to_own[:3, 3]
-        radius = self.between_splats(centre, 0.5 * (camera - target).length)
+        to_scene = np.linalg.inv(self.to_world())
+        centre = to_scene[:3, :3] @ target + to_scene[:3, 3]
+        radius = self.radius_between_splats(centre, 0.5 * (camera - target).length)
         self.crop_object.location, self.crop_object.scale = target, [radius] * 3
         self.bpy.context.view_layer.update()
         self.sphere = centre, radius
         self.push("Scale")
 
-    def between_splats(self, centre, radius: float) -> float:
-        """Return a similar radius with a gap between the sphere and the splats, against rounding."""
+    def radius_between_splats(self, centre, radius: float) -> float:
+        """Return a similar radius without splats close to the sphere, so that rounding has no effect."""
         means = np.concatenate([level.splats.means for level in self.trained().levels])
         distances = np.sort(np.linalg.norm(means - centre, axis=1))
         distances = distances[np.abs(distances - radius) < 0.02 * radius]
@@ -150,13 +153,13 @@ class Way:
         inside = finest[np.linalg.norm(finest - self.sphere[0], axis=1) < self.sphere[1]]
         to_world = self.to_world()
         lowest = np.percentile(inside @ to_world[2, :3] + to_world[2, 3], 1)
-        middle = to_world[:3, :3] @ self.sphere[0] + to_world[:3, 3]
+        center = to_world[:3, :3] @ self.sphere[0] + to_world[:3, 3]
         for x, y in ((0, 0), (1, 0), (0, 1)):
-            self.add_mark("ground", (middle[0] + x, middle[1] + y, lowest))
+            self.add_mark("ground", (center[0] + x, center[1] + y, lowest))
         self.select("ground")
         self.push("Add Empties")
         assert self.bpy.ops.lodgs.set_ground("EXEC_DEFAULT", True, by="SELECTION") == {"FINISHED"}
-        assert abs(self.to_world() @ [*self.sphere[0], 1] - [*middle[:2], middle[2] - lowest, 1]).max() < 1e-4
+        assert abs(self.to_world() @ [*self.sphere[0], 1] - [*center[:2], center[2] - lowest, 1]).max() < 1e-4
 
     def add_scale_marks(self):
         """Add two empties at a distance of 2."""
@@ -270,15 +273,18 @@ class Way:
         assert process.returncode == 0, process.stderr
         for number, (visible, total) in counts.items():
             assert f"level {number}: {visible:,} of {total:,} splats" in process.stdout
-        ours, theirs = read_bundle(self.folder / "out.ply"), read_bundle(self.folder / "edited.ply")
-        pairs = [(a.splats, b.splats) for a, b in zip(ours.levels, theirs.levels, strict=True)]
+        from_blender, from_command = (
+            read_bundle(self.folder / "out.ply"),
+            read_bundle(self.folder / "edited.ply"),
+        )
+        pairs = [(a.splats, b.splats) for a, b in zip(from_blender.levels, from_command.levels, strict=True)]
         pairs.append((read_ply(self.folder / "plain.ply"), read_ply(self.folder / "edited_plain.ply")))
-        for blenders, edited in pairs:
+        for blender_splats, edited_splats in pairs:
             for name in ("means", "log_scales", "opacity_logits", "sh"):
                 np.testing.assert_allclose(
-                    getattr(blenders, name), getattr(edited, name), rtol=1e-3, atol=1e-3
+                    getattr(blender_splats, name), getattr(edited_splats, name), rtol=1e-3, atol=1e-3
                 )
-            dots = np.abs((_unit(blenders.quats) * _unit(edited.quats)).sum(axis=1))
+            dots = np.abs((_unit(blender_splats.quats) * _unit(edited_splats.quats)).sum(axis=1))
             assert dots.min() > 1 - 1e-5
 
     def assert_reimported(self, streams: bool, counts: dict):

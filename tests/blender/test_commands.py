@@ -1,4 +1,4 @@
-"""``blender --command lodgs``: its main function, called as Blender calls it."""
+"""The main function of ``blender --command lodgs``."""
 
 import json
 import signal
@@ -96,10 +96,10 @@ def test_splats_without_photos_are_trained_in_one_command(bpy, lodgs, lodgs_comm
     assert {i.number: len(i.object.data.points) for i in root.lodgs.levels} == COUNTS
     assert (root.lodgs.training.views, root.lodgs.training.views_from) == (5, "DOME")
     train = ("train", "--base", tmp_path / "run", "--capture", "dome", "--method", "lodge")
-    assert lodgs_command(*train, "--out", tmp_path / "next") == 0, "a finished run's finest level"
+    assert lodgs_command(*train, "--out", tmp_path / "next") == 0, "a base may be a finished run"
 
 
-def test_the_same_command_resumes_a_stopped_run(lodgs_command, fake, tmp_path, capfd):
+def test_same_command_resumes_a_stopped_run(lodgs_command, fake, tmp_path, capfd):
     train = ("train", "--scene", SCENE, "--out", tmp_path / "run")
     fake("killed")
     assert lodgs_command(*train, "--blend", tmp_path / "part.blend") == 1
@@ -270,7 +270,7 @@ def test_sigterm_ends_a_slow_render_with_exit_code_3(bpy, fake, tmp_path):
     assert not [path for path in out.rglob("*") if path.is_file()]
 
 
-def test_the_trainer_continues_after_blender_is_killed(bpy, lodgs, fake, tmp_path):
+def test_trainer_continues_after_blender_is_killed(bpy, lodgs, fake, tmp_path):
     fake("slow")
     with _start_command(tmp_path / "run") as process:
         process.kill()

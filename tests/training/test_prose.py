@@ -28,7 +28,7 @@ def test_function_words_as_names_are_counted():
     assert "found 1" in problems(module("found = 1\n"))[0]
 
 
-def test_a_class_name_with_two_meanings_is_reported():
+def test_class_name_with_two_meanings_is_reported():
     sources = {"a.py": "class View: ...\n", "b.py": "class View: ...\n"}
     assert problems(sources) == ["class View is defined 2 times"]
     assert problems({"a.py": "class Method: ...\n", "b.py": "class Method: ...\n"}) == []

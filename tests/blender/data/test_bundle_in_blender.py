@@ -1,6 +1,6 @@
-"""Blender's own PLY importer reads the finest level out of our files.
+"""Blender's own PLY importer reads the finest level of LODGS files.
 
-Before Blender 5.3 it makes a mesh with the file's columns as attributes; from then on a cloud of splats.
+Before Blender 5.3 it creates a mesh with the file's columns as attributes, since 5.3 a point cloud of splats.
 """
 
 import numpy as np
@@ -11,7 +11,7 @@ from tests.blender.fake_trainer import splats
 
 @pytest.fixture
 def bundle(lodgs):
-    """Two levels with an extra each; the finest has 700 splats."""
+    """Two levels with an extra column; the finest has 700 splats."""
     files, gaussians = lodgs("training.splats.bundle"), lodgs("training.splats.gaussians")
     random = np.random.default_rng(3)
 
@@ -25,12 +25,12 @@ def bundle(lodgs):
     )
 
 
-def imported(bpy, path):
-    """The data of the one object that Blender makes of a PLY, and a reader of its float attributes."""
+def import_with_blender(bpy, path):
+    """Import a PLY with Blender; return positions and a reader of float attributes of its one object."""
     before = set(bpy.data.objects)
     assert bpy.ops.wm.ply_import(filepath=str(path), import_attributes=True) == {"FINISHED"}
-    (made,) = set(bpy.data.objects) - before
-    attributes = made.data.attributes
+    (obj,) = set(bpy.data.objects) - before
+    attributes = obj.data.attributes
 
     def values(name):
         column = np.empty(len(attributes[name].data), np.float32)
@@ -43,15 +43,15 @@ def imported(bpy, path):
 
 
 @pytest.mark.parametrize("order,number", [("finest_first", 2), ("stream", 1)])
-def test_bundle(bpy, lodgs, tmp_path, bundle, order, number):
+def test_blender_imports_the_first_level_of_a_bundle(bpy, lodgs, tmp_path, bundle, order, number):
     lodgs("training.splats.bundle").write_bundle(tmp_path / "bundle.ply", bundle, order)
-    positions, values = imported(bpy, tmp_path / "bundle.ply")
+    positions, values = import_with_blender(bpy, tmp_path / "bundle.ply")
     check(bpy, lodgs, positions, values, bundle.levels[number - 1].splats)
 
 
-def test_plain(bpy, lodgs, tmp_path, bundle):
+def test_blender_imports_a_plain_file(bpy, lodgs, tmp_path, bundle):
     lodgs("training.splats.ply").write_ply(tmp_path / "plain.ply", bundle.levels[1].splats)
-    positions, values = imported(bpy, tmp_path / "plain.ply")
+    positions, values = import_with_blender(bpy, tmp_path / "plain.ply")
     check(bpy, lodgs, positions, values, bundle.levels[1].splats)
     np.testing.assert_array_equal(values("decay"), np.arange(700))
 
@@ -67,9 +67,9 @@ def check(bpy, lodgs, positions, values, splats):
         unit = splats.quats / np.linalg.norm(splats.quats, axis=1, keepdims=True)
         np.testing.assert_allclose(read.quats, unit, atol=1e-6)
         return
-    # The importer turns the file's axes; as a set of numbers the positions stay what they are.
-    turned = np.sort(np.abs(positions), axis=1)
-    np.testing.assert_allclose(turned, np.sort(np.abs(splats.means), axis=1), rtol=1e-6)
+    # The importer rotates the axes, so compare sorted absolute coordinates.
+    coordinates = np.sort(np.abs(positions), axis=1)
+    np.testing.assert_allclose(coordinates, np.sort(np.abs(splats.means), axis=1), rtol=1e-6)
     np.testing.assert_array_equal(values("rot_3"), splats.quats[:, 3])
     np.testing.assert_array_equal(values("f_rest_16"), splats.sh[:, 2, 1])
     np.testing.assert_array_equal(values("opacity"), splats.opacity_logits)
@@ -81,8 +81,8 @@ def test_new_level_replaces_an_object_in_edit_mode(bpy, lodgs):
 
     def level(count):
         names = ("means", "quats", "log_scales", "opacity_logits", "sh")
-        made = {name: getattr(splats(count), name) for name in names}
-        return bundles.Level(1, lodgs("training.splats.gaussians").Splats(**made))
+        arrays = {name: getattr(splats(count), name) for name in names}
+        return bundles.Level(1, lodgs("training.splats.gaussians").Splats(**arrays))
 
     obj = scenes.set_level(root, level(5)) or root.lodgs.levels[0].object
     bpy.context.view_layer.objects.active = obj

@@ -1,4 +1,4 @@
-"""All kinds of clutter in one step, planted around a square garden with the ground at z = 1."""
+"""Find all kinds of clutter in one step. A square garden with its ground at z = 1 contains known clutter."""
 
 from types import SimpleNamespace
 
@@ -17,9 +17,9 @@ def root(bpy, lodgs, tmp_path):
     """A scene with two levels; the coarse one has the same splats as the fine one."""
     rng = np.random.default_rng(0)
     ground = np.stack(np.meshgrid(np.linspace(-4, 4, 64), np.linspace(-4, 4, 64), [0.0]), -1).reshape(-1, 3)
-    things = rng.uniform(-2, 2, (REST - len(ground), 3)) * (1, 1, 0.1) + (0, 0, 0.2)
+    objects = rng.uniform(-2, 2, (REST - len(ground), 3)) * (1, 1, 0.1) + (0, 0, 0.2)
     parts = [
-        ground, things, rng.uniform(0, 0.2, (OVERSIZED, 3)), np.full((DISTANT, 3), 1000.0),
+        ground, objects, rng.uniform(0, 0.2, (OVERSIZED, 3)), np.full((DISTANT, 3), 1000.0),
         rng.normal((0, 0, 7), 0.01, (FLOATERS, 3)), rng.uniform(-3, 3, (BELOW, 3)) * (1, 1, 0) - (0, 0, 0.5),
         rng.uniform(0, 0.2, (HALOS, 3)),
     ]  # fmt: skip
@@ -49,14 +49,14 @@ def clutter_counts(bpy, lodgs, root):
     }
 
 
-def test_every_kind_is_counted_coloured_and_hidden(bpy, lodgs, root):
+def test_all_kinds_of_clutter_are_counted_coloured_and_hidden(bpy, lodgs, root):
     isolated = FLOATERS + BELOW  # distant ones are not near the subject
-    kinds = {"LARGE": OVERSIZED, "DISTANT": DISTANT, "FLOATERS": isolated, "BELOW": BELOW, "HALOS": HALOS}
-    assert clutter_counts(bpy, lodgs, root) == kinds
+    counts = {"LARGE": OVERSIZED, "DISTANT": DISTANT, "FLOATERS": isolated, "BELOW": BELOW, "HALOS": HALOS}
+    assert clutter_counts(bpy, lodgs, root) == counts
     assert bpy.ops.lodgs.find_clutter() == {"FINISHED"}
     cleaning, clutter = lodgs("data.cleaning"), lodgs("data.clutter")
-    del kinds["BELOW"]  # disabled at first
-    assert clutter.counts(root) == {name: 2 * count for name, count in kinds.items()}
+    del counts["BELOW"]  # disabled at first
+    assert clutter.counts(root) == {name: 2 * count for name, count in counts.items()}
     cloud = root.lodgs.levels[1].object.data
     marks = cleaning.displayed_marks(cloud)
     names = ("", "max_size", "max_reach", "drop_floaters", "drop_floaters", "halo_opacity")
@@ -71,14 +71,14 @@ def test_every_kind_is_counted_coloured_and_hidden(bpy, lodgs, root):
 
 
 def test_limits_are_lengths_in_the_world(bpy, lodgs, root):
-    """Floaters 7 above the ground; the root doubles lengths."""
+    """Floaters are 7 above the ground; the root doubles lengths."""
     assert bpy.ops.lodgs.find_clutter() == {"FINISHED"}
     for reach, count in ((13, DISTANT + FLOATERS), (16, DISTANT)):
         root.lodgs_clutter.reach = reach
         assert lodgs("data.clutter").counts(root)["DISTANT"] == 2 * count
 
 
-def test_limits_of_the_user_stay_and_cancelling_hides_nothing(bpy, lodgs, root):
+def test_limits_of_the_user_are_kept_and_cancelling_hides_nothing(bpy, lodgs, root):
     root.lodgs_clutter.size = 1000
     assert bpy.ops.lodgs.find_clutter() == {"FINISHED"}
     assert root.lodgs_clutter.size == 1000 and lodgs("data.clutter").counts(root)["LARGE"] == 0
@@ -89,7 +89,7 @@ def test_limits_of_the_user_stay_and_cancelling_hides_nothing(bpy, lodgs, root):
     assert not bpy.ops.lodgs.hide_clutter.poll()
 
 
-def test_changed_splats_are_found_again(bpy, lodgs, root):
+def test_clutter_is_searched_again_after_splats_change(bpy, lodgs, root):
     cleaning, clutter = lodgs("data.cleaning"), lodgs("data.clutter")
     assert bpy.ops.lodgs.find_clutter() == {"FINISHED"}
     bpy.ops.lodgs.hide_splats(test="LARGE", size=8.0)
@@ -110,7 +110,7 @@ def test_scene_without_ground_has_nothing_below(bpy, lodgs, tmp_path):
     assert clutter_counts(bpy, lodgs, root)["BELOW"] == 0
 
 
-def test_large_background_matches_the_test_but_is_no_clutter(bpy, lodgs, root):
+def test_large_background_matches_the_size_test_but_is_no_clutter(bpy, lodgs, root):
     cloud = root.lodgs.levels[0].object.data
     scales = np.array(lodgs("attributes").view_attribute(cloud, "scale"))
     scales[REST + OVERSIZED : REST + OVERSIZED + DISTANT] = 100

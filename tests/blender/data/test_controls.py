@@ -9,12 +9,12 @@ from training.lod.rule import rules
 
 
 @pytest.fixture
-def made(bpy, lodgs, tmp_path):
-    """``made(rule, controls)``: a scene of two levels, imported from a bundle that records such values."""
+def import_scene(bpy, lodgs, tmp_path):
+    """``import_scene(rule, controls)``: import a bundle of two levels with these controls."""
     files, gaussians = lodgs("training.splats.bundle"), lodgs("training.splats.gaussians")
-    one = np.zeros((1, 3), np.float32)
+    zeros = np.zeros((1, 3), np.float32)
     splats = gaussians.Splats(
-        one, np.float32([[1, 0, 0, 0]]), one, one[:, 0], np.zeros((1, 1, 3), np.float32)
+        zeros, np.float32([[1, 0, 0, 0]]), zeros, zeros[:, 0], np.zeros((1, 1, 3), np.float32)
     )
 
     def make(rule, controls):
@@ -27,8 +27,8 @@ def made(bpy, lodgs, tmp_path):
     return make
 
 
-def other_than_default(control):
-    """A value that is possible, but not what the control begins with."""
+def changed_value(control):
+    """Return a valid value other than the control's default."""
     if control.flag:
         return not control.default
     if control.follows:
@@ -38,24 +38,24 @@ def other_than_default(control):
 
 @pytest.mark.parametrize(
     ("rule", "control"), [(rule, control) for rule in rules().values() for control in rule.controls],
-    ids=lambda each: each.name,
+    ids=lambda value: value.name,
 )  # fmt: skip
-def test_bundle_restores_controls(lodgs, made, rule, control):
-    root = made(rule, {})
-    setattr(root.lodgs.controls, control.name, other_than_default(control))
-    set_ = lodgs("data.scenes").read_levels(root).controls
-    assert set_[control.name] == other_than_default(control)
-    again = made(rule, json.loads(json.dumps(set_)))
-    assert getattr(again.lodgs.controls, control.name) == other_than_default(control)
+def test_bundle_restores_controls(lodgs, import_scene, rule, control):
+    root = import_scene(rule, {})
+    setattr(root.lodgs.controls, control.name, changed_value(control))
+    controls = lodgs("data.scenes").read_levels(root).controls
+    assert controls[control.name] == changed_value(control)
+    reimported = import_scene(rule, json.loads(json.dumps(controls)))
+    assert getattr(reimported.lodgs.controls, control.name) == changed_value(control)
 
 
 @pytest.fixture
-def some(lodgs, tmp_path):
-    """``some(count, controls)``: a bundle of so many levels, numbered with a gap, that records controls."""
+def bundle_of(lodgs, tmp_path):
+    """``bundle_of(count, controls)``: a bundle with some levels, numbered with a gap, and controls."""
     files, gaussians = lodgs("training.splats.bundle"), lodgs("training.splats.gaussians")
-    one = np.zeros((1, 3), np.float32)
+    zeros = np.zeros((1, 3), np.float32)
     splats = gaussians.Splats(
-        one, np.float32([[1, 0, 0, 0]]), one, one[:, 0], np.zeros((1, 1, 3), np.float32)
+        zeros, np.float32([[1, 0, 0, 0]]), zeros, zeros[:, 0], np.zeros((1, 1, 3), np.float32)
     )
 
     def make(count, controls):
@@ -66,7 +66,7 @@ def some(lodgs, tmp_path):
     return make
 
 
-def in_use(root):
+def current_controls(root):
     return {name: getattr(root.lodgs.bands, name) for name in ("gamma", "first", "last")}
 
 
@@ -75,47 +75,50 @@ RECORDED = [{}, {"gamma": 2.0}, {"first": 1}, {"first": 2, "last": 3}]
 
 @pytest.mark.parametrize("count", [1, 3, 5])
 @pytest.mark.parametrize("controls", RECORDED, ids=str)
-def test_initial_controls_match_the_trainer(bpy, lodgs, some, tmp_path, count, controls):
-    """Imported at once, or level by level as they are trained."""
-    scenes, bundle = lodgs("data.scenes"), some(count, controls)
+def test_initial_controls_match_the_trainer(bpy, lodgs, bundle_of, tmp_path, count, controls):
+    """After an import, and after levels arrive one by one while training."""
+    scenes, bundle = lodgs("data.scenes"), bundle_of(count, controls)
     if any(not bundle.levels[0].number <= controls.get(name, 2) <= count + 1 for name in ("first", "last")):
-        pytest.skip("there are no such levels")
-    wanted = lodgs("training.lod.selection").resolve_controls(bundle, {})
+        pytest.skip("the bundle has no such levels")
+    expected = lodgs("training.lod.selection").resolve_controls(bundle, {})
     lodgs("training.splats.bundle").write_bundle(tmp_path / "b.ply", bundle)
-    assert in_use(lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply")) == wanted
+    assert (
+        current_controls(lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply")) == expected
+    )
 
     with lodgs("data.importing").new_scene(bpy.context, "trained") as root:
         for level in bundle.levels:
             scenes.set_level(root, level)
         scenes.set_bundle_facts(root, bundle)
-    assert in_use(root) == wanted
-    plain = lodgs("training.lod.selection").resolve_controls(some(count, {}), {})
-    said = {name: value for name, value in controls.items() if value != plain[name]}
-    assert scenes.read_levels(root).controls == said
+    assert current_controls(root) == expected
+    defaults = lodgs("training.lod.selection").resolve_controls(bundle_of(count, {}), {})
+    changed = {name: value for name, value in controls.items() if value != defaults[name]}
+    assert scenes.read_levels(root).controls == changed
 
 
-def test_level_controls_follow_until_set(bpy, lodgs, some):
-    scenes, bundle = lodgs("data.scenes"), some(6, {})
+def test_level_controls_follow_until_set(bpy, lodgs, bundle_of):
+    scenes, bundle = lodgs("data.scenes"), bundle_of(6, {})
     with lodgs("data.importing").new_scene(bpy.context, "trained") as root:
         scenes.set_bundle_facts(root, lodgs("training.splats.levels").Bundle("flod", [], "bands"))
         for level in bundle.levels[:4]:
             scenes.set_level(root, level)
-    assert in_use(root) == {"gamma": 1, "first": 2, "last": 4}
+    assert current_controls(root) == {"gamma": 1, "first": 2, "last": 4}
     root.lodgs.bands.first = 1
     for level in bundle.levels[4:]:
         scenes.set_level(root, level)
-    assert in_use(root) == {"gamma": 1, "first": 1, "last": 7}
+    assert current_controls(root) == {"gamma": 1, "first": 1, "last": 7}
     assert scenes.read_levels(root).controls == {"first": 1}
     root.lodgs.bands.first = 4
     for item in list(root.lodgs.levels)[3:]:
         bpy.data.objects.remove(item.object)
     scenes.levels_changed(root)
-    assert in_use(root) == {"gamma": 1, "first": 1, "last": 3}  # which was the rule's own again
+    assert current_controls(root) == {"gamma": 1, "first": 1, "last": 3}  # 1 was the default again
 
 
 @pytest.mark.parametrize("rule", rules().values(), ids=lambda rule: rule.name)
-def test_levels_that_contradict_their_rule_are_rejected(bpy, lodgs, made, rule, tmp_path):
-    files, made = lodgs("training.splats.bundle"), made(rule, {})
+def test_levels_that_contradict_their_rule_are_rejected(bpy, lodgs, import_scene, rule, tmp_path):
+    files = lodgs("training.splats.bundle")
+    import_scene(rule, {})
     bundle = files.read_bundle(tmp_path / "b.ply")
     bundle.cumulative = not rule.cumulative
     files.write_bundle(tmp_path / "other.ply", bundle)
@@ -125,8 +128,8 @@ def test_levels_that_contradict_their_rule_are_rejected(bpy, lodgs, made, rule, 
     assert len(bpy.data.objects) == before
 
 
-def test_invalid_value_is_rejected(bpy, lodgs, made):
+def test_invalid_value_is_rejected(bpy, lodgs, import_scene):
     before = len(bpy.data.objects)
     with pytest.raises(lodgs("training.errors").LodgsError, match="offset = 99 is invalid"):
-        made(rules()["octree"], {"offset": 99})
+        import_scene(rules()["octree"], {"offset": 99})
     assert len(bpy.data.objects) == before

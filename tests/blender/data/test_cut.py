@@ -1,4 +1,4 @@
-"""A tree of splats in Blender: a cut by distance, the finest level alone, no coarser one by itself."""
+"""Trees of splats in Blender: cuts by distance, and the finest level alone. Other levels are incomplete."""
 
 from functools import partial
 
@@ -22,64 +22,67 @@ def root(bpy, lodgs, tree, tmp_path):
 
 
 def shown_rows(bpy, lodgs, root):
-    """Which splats of each level are shown, by their places in the level: none repeats in these scenes."""
+    """Return the rows of the visible splats of each level. All positions in these scenes differ."""
     bpy.context.view_layer.update()
-    depsgraph, found = bpy.context.evaluated_depsgraph_get(), []
+    depsgraph, visible_rows = bpy.context.evaluated_depsgraph_get(), []
     read = lodgs("attributes").read_attribute
     for item in root.lodgs.levels:
         if not item.object.visible_get():
-            found.append(np.zeros(0, int))
+            visible_rows.append(np.zeros(0, int))
             continue
-        places = read(item.object.evaluated_get(depsgraph).data, "position")
-        places = np.zeros((0, 3)) if places is None else places
-        rows = {tuple(place): row for row, place in enumerate(read(item.object.data, "position"))}
-        found.append(np.sort([rows[tuple(place)] for place in places]).astype(int))
-    return found
+        positions = read(item.object.evaluated_get(depsgraph).data, "position")
+        positions = np.zeros((0, 3)) if positions is None else positions
+        rows = {tuple(position): row for row, position in enumerate(read(item.object.data, "position"))}
+        visible_rows.append(np.sort([rows[tuple(position)] for position in positions]).astype(int))
+    return visible_rows
 
 
-def wanted_rows(lodgs, tree, eye, focal, pixels):
-    choice = lodgs("training.lod.selection").BundleSelector(tree)
-    return [np.flatnonzero(w) for w in choice.level_weights(np.float32(eye), focal, {"pixels": pixels})]
+def expected_rows(lodgs, tree, camera_center, focal, pixels):
+    selector = lodgs("training.lod.selection").BundleSelector(tree)
+    weights = selector.level_weights(np.float32(camera_center), focal, {"pixels": pixels})
+    return [np.flatnonzero(level) for level in weights]
 
 
 def test_distances_are_measured_in_scene_space(bpy, lodgs, tree, root):
-    """Wherever the root stands, and by the focal length of the camera in pixels of the render."""
+    """The root's transform has no effect; the focal length is in pixels of the render."""
     assert (root.lodgs.mode, root.lodgs.single_level) == ("SELECTIVE", 2)
     root.location, root.rotation_euler, root.scale = (5, 6, 7), (1, 2, 3), (3, 3, 3)
-    camera = bpy.data.objects.new("eye", bpy.data.cameras.new("eye"))
+    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     bpy.context.scene.collection.objects.link(camera)
     bpy.context.scene.camera = camera
     bpy.context.view_layer.update()
     counts = []
-    for eye, lens, pixels in (
+    for center, lens, pixels in (
         ((0, 0, 20), 50, 20),
         ((0, 0, 20), 50, 60),
         ((0, 0, 20), 25, 30),
         ((60, 3, 9), 50, 20),
     ):
-        camera.location = root.lodgs.axes.matrix_world @ camera.location.__class__(eye)
+        camera.location = root.lodgs.axes.matrix_world @ camera.location.__class__(center)
         camera.data.lens, root.lodgs.controls.pixels = lens, pixels
         bpy.context.view_layer.update()
-        found = shown_rows(bpy, lodgs, root)
+        visible = shown_rows(bpy, lodgs, root)
         focal = lens * bpy.context.scene.render.resolution_x / 36
-        own = root.lodgs.axes.matrix_world.inverted() @ camera.matrix_world.translation
-        wanted = wanted_rows(lodgs, tree, own, focal, pixels)
-        # a splat on a border may fall on its other side, where numbers are rounded elsewhere
-        assert sum(len(np.setxor1d(a, b)) for a, b in zip(found, wanted, strict=True)) <= 4
-        counts.append([len(rows) for rows in found])
+        local_center = root.lodgs.axes.matrix_world.inverted() @ camera.matrix_world.translation
+        expected = expected_rows(lodgs, tree, local_center, focal, pixels)
+        # rounding may move a splat on a border to its other side
+        assert sum(len(np.setxor1d(a, b)) for a, b in zip(visible, expected, strict=True)) <= 4
+        counts.append([len(rows) for rows in visible])
     assert counts[0][1] > counts[1][1] and counts[1] == pytest.approx(counts[2], abs=4)
-    assert counts[3][1] < counts[0][1] and all(0 < sum(each) < LEAVES for each in counts)
+    assert counts[3][1] < counts[0][1] and all(
+        0 < sum(counts_of_levels) < LEAVES for counts_of_levels in counts
+    )
 
 
-def test_incomplete_level_is_neither_shown_nor_exported_alone(bpy, lodgs, root, tmp_path):
+def test_incomplete_level_cannot_be_shown_or_exported_alone(bpy, lodgs, root, tmp_path):
     scenes, LodgsError = lodgs("data.scenes"), lodgs("training.errors").LodgsError
     root.lodgs.single_level = 1
     assert root.lodgs.single_level == 2
     root.lodgs.mode = "SINGLE"
     assert [len(rows) for rows in shown_rows(bpy, lodgs, root)] == [0, LEAVES]
-    for refused in (scenes.show_only, scenes.read_level):
+    for function in (scenes.show_only, scenes.read_level):
         with pytest.raises(LodgsError, match=r"Cannot use level 1 on its own.* Choose level 2"):
-            refused(root, 1)
+            function(root, 1)
     scenes.show_only(root, 2)
     assert len(scenes.read_level(root, 2)) == LEAVES
     with pytest.raises(RuntimeError, match="level 1 on its own"):
@@ -93,50 +96,50 @@ def test_incomplete_level_is_neither_shown_nor_exported_alone(bpy, lodgs, root, 
 
 def test_folder_has_complete_levels(bpy, lodgs, tree, root, tmp_path):
     assert bpy.ops.lodgs.export_folder(directory=str(tmp_path / "levels")) == {"FINISHED"}
-    again = lodgs("training.splats.level_folder").read_folder(tmp_path / "levels")
-    counts = [len(level.splats) for level in again.levels]
-    assert again.rule == "bands" and counts[-1] == LEAVES and 500 <= counts[0] <= LEAVES / 4
+    exported = lodgs("training.splats.level_folder").read_folder(tmp_path / "levels")
+    counts = [len(level.splats) for level in exported.levels]
+    assert exported.rule == "bands" and counts[-1] == LEAVES and 500 <= counts[0] <= LEAVES / 4
     levels = lodgs("data.importing").import_splats(bpy.context, tmp_path / "levels").lodgs.levels
     assert len(levels) == len(counts) == 2
 
 
 def test_bundle_round_trip_keeps_the_tree(bpy, lodgs, tree, root, tmp_path):
     bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "again.ply"))
-    again = lodgs("training.splats.bundle").read_bundle(tmp_path / "again.ply")
-    assert (again.rule, again.method) == ("cut", "tree")
-    for one, other in zip(tree.levels, again.levels, strict=True):
-        for name, column in one.splats.extras.items():
-            np.testing.assert_array_equal(other.splats.extras[name], column)
-        np.testing.assert_array_equal(other.splats.means, one.splats.means)
+    exported = lodgs("training.splats.bundle").read_bundle(tmp_path / "again.ply")
+    assert (exported.rule, exported.method) == ("cut", "tree")
+    for level, exported_level in zip(tree.levels, exported.levels, strict=True):
+        for name, column in level.splats.extras.items():
+            np.testing.assert_array_equal(exported_level.splats.extras[name], column)
+        np.testing.assert_array_equal(exported_level.splats.means, level.splats.means)
 
 
-def test_the_top_of_a_tree_can_be_imported(bpy, lodgs, tree, root, tmp_path):
-    """As a smaller tree: of each leaf and the nodes above it one is there, whatever the eye."""
-    said, budget = [], 2000
+def test_coarse_nodes_of_a_tree_are_imported_within_a_budget(bpy, lodgs, tree, root, tmp_path):
+    """The imported nodes are a smaller tree with complete cuts."""
+    messages, budget = [], 2000
     root = lodgs("data.importing").import_splats(
-        bpy.context, tmp_path / "tree.ply", budget=budget, warn=said.append
+        bpy.context, tmp_path / "tree.ply", budget=budget, warn=messages.append
     )
     counts = [len(item.object.data.points) for item in root.lodgs.levels]
     assert 400 < sum(counts) <= budget / 4 and counts[1] == counts[0] + 1  # a binary tree
-    assert said == [
+    assert messages == [
         f"Imported the coarsest {sum(counts):,} of {2 * LEAVES - 1:,} splats. Viewports and renders of LODGS "
         "stream finer ones from tree.ply."
     ]
     root.lodgs.mode = "SINGLE"
     assert [len(rows) for rows in shown_rows(bpy, lodgs, root)] == [0, counts[1]]
     bpy.ops.lodgs.import_splats(filepath=str(tmp_path / "tree.ply"), budget=budget)
-    again = lodgs("data.roots").active_root(bpy.context)
-    assert [len(item.object.data.points) for item in again.lodgs.levels] == counts
-    everything = lodgs("data.importing").import_splats(bpy.context, tmp_path / "tree.ply", budget=10**6)
-    assert [len(item.object.data.points) for item in everything.lodgs.levels] == [LEAVES - 1, LEAVES]
+    second_root = lodgs("data.roots").active_root(bpy.context)
+    assert [len(item.object.data.points) for item in second_root.lodgs.levels] == counts
+    full_root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "tree.ply", budget=10**6)
+    assert [len(item.object.data.points) for item in full_root.lodgs.levels] == [LEAVES - 1, LEAVES]
 
 
 def test_colours_show_node_sizes(bpy, lodgs):
-    """Each colour is an octave of what a splat stands for, leaves have the last."""
+    """Colours are numbered by octaves of node size. Leaves have the last number."""
     rule = lodgs("training.lod.rule").rules()["cut"]
-    told = partial(rule.splat_level, facts={"level": 1.0})
+    splat_level = partial(rule.splat_level, facts={"level": 1.0})
     sizes = np.float32([0, 1, 1.9, 2, 4, 0.5, 0.3, 2.0**10, 2.0**11])
-    assert told({"node_size": sizes}).tolist() == [12, 1, 1, 11, 10, 2, 3, 2, 1]
+    assert splat_level({"node_size": sizes}).tolist() == [12, 1, 1, 11, 10, 2, 3, 2, 1]
     means = np.float32([[0, 0, d] for d in (31.9, 32, 64, 128)])
-    wanted = rule.target_level(means, np.zeros(3, np.float32), 64.0, {"level": 1.0}, {"pixels": 2.0})
-    assert wanted.tolist() == [2, 1, 11, 10]
+    target_levels = rule.target_level(means, np.zeros(3, np.float32), 64.0, {"level": 1.0}, {"pixels": 2.0})
+    assert target_levels.tolist() == [2, 1, 11, 10]

@@ -90,15 +90,15 @@ def test_exports_name_the_origin_or_add_it(bpy, lodgs, tmp_path, capfd):
     write_bundle(tmp_path / "b.ply", Bundle("", [Level(1, splats(50))], meta=META))
     root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply")
     assert json.loads(root.lodgs.meta)["origin"] == OFFSET.tolist()
-    local, there, placed = (tmp_path / f"{name}.ply" for name in ("local", "there", "placed"))
+    local, original, placed = (tmp_path / f"{name}.ply" for name in ("local", "there", "placed"))
     assert bpy.ops.lodgs.export_plain(filepath=str(local)) == {"FINISHED"}
     assert "relative to the local origin" in capfd.readouterr().out
     assert read_bundle(local).origin.tolist() == OFFSET.tolist()
-    assert bpy.ops.lodgs.export_plain(filepath=str(there), original_place=True) == {"FINISHED"}
-    vertex = PlyData.read(there)["vertex"]
+    assert bpy.ops.lodgs.export_plain(filepath=str(original), original_place=True) == {"FINISHED"}
+    vertex = PlyData.read(original)["vertex"]
     expected = splats(50).means.astype(np.float64) + OFFSET
     np.testing.assert_array_equal(np.stack([vertex[axis] for axis in "xyz"], axis=1), expected)
     assert bpy.ops.lodgs.export_bundle(filepath=str(placed), placed=True) == {"FINISHED"}
     assert not read_bundle(placed).origin.any()
     with pytest.raises(RuntimeError, match="As Placed"):
-        bpy.ops.lodgs.export_plain(filepath=str(there), original_place=True, placed=True)
+        bpy.ops.lodgs.export_plain(filepath=str(original), original_place=True, placed=True)

@@ -1,4 +1,4 @@
-"""Cameras that move: along the example's photographs, and around it."""
+"""Animated cameras: a path through the example's photos, and a turntable."""
 
 from pathlib import Path
 
@@ -14,38 +14,40 @@ def root(bpy, lodgs):
     return lodgs("data.importing").import_colmap(bpy.context, GARDEN, photographs=False)
 
 
-def seen_from(bpy, camera, frames):
-    found = []
+def animated_poses(bpy, camera, frames):
+    poses = []
     for frame in frames:
         bpy.context.scene.frame_set(frame)
-        found.append(np.array(camera.evaluated_get(bpy.context.evaluated_depsgraph_get()).matrix_world))
-    return np.array(found)
+        poses.append(np.array(camera.evaluated_get(bpy.context.evaluated_depsgraph_get()).matrix_world))
+    return np.array(poses)
 
 
 def test_path_runs_from_first_to_last_photo(bpy, lodgs, root):
     assert bpy.ops.lodgs.camera_path() == {"FINISHED"}
     camera, views = bpy.context.scene.camera, lodgs("data.photographs").views(root)
-    poses = seen_from(bpy, camera, range(1, 49))
+    poses = animated_poses(bpy, camera, range(1, 49))
     np.testing.assert_allclose(poses[0], views[0].matrix_world, atol=1e-4)
     np.testing.assert_allclose(poses[-1], views[-1].matrix_world, atol=1e-4)
-    places = np.array([view.matrix_world.translation for view in views])
-    across = np.linalg.norm(np.ptp(places, axis=0))
-    apart = np.linalg.norm(poses[:, None, :3, 3] - places, axis=2).min(axis=1)
-    assert apart.max() < 0.2 * across
+    centers = np.array([view.matrix_world.translation for view in views])
+    extent = np.linalg.norm(np.ptp(centers, axis=0))
+    distances = np.linalg.norm(poses[:, None, :3, 3] - centers, axis=2).min(axis=1)
+    assert distances.max() < 0.2 * extent
     assert camera.data.lens == pytest.approx(views[0].data.lens) and not camera.data.background_images
     assert camera not in views and camera.parent == root.lodgs.axes
 
 
 def test_turntable_circles_the_center_evenly(bpy, lodgs, root):
-    middle, size = lodgs("data.photographs").central_bounds(root)
+    center, size = lodgs("data.photographs").central_bounds(root)
     assert bpy.ops.lodgs.turntable() == {"FINISHED"}
-    poses = seen_from(bpy, bpy.context.scene.camera, range(1, 50))
-    to = np.array(middle) - poses[:, :3, 3]
-    away = np.linalg.norm(to, axis=1)
-    np.testing.assert_allclose(np.einsum("ij,ij->i", to / away[:, None], -poses[:, :3, 2]), 1, atol=1e-5)
-    np.testing.assert_allclose(away, away[0], rtol=1e-4)
-    assert away[0] > size / 2 and (poses[:, 1 + 1, 1] > 0.9).all()  # upright
-    angles = np.unwrap(np.arctan2(-to[:, 1], -to[:, 0]))
+    poses = animated_poses(bpy, bpy.context.scene.camera, range(1, 50))
+    to_center = np.array(center) - poses[:, :3, 3]
+    distances = np.linalg.norm(to_center, axis=1)
+    np.testing.assert_allclose(
+        np.einsum("ij,ij->i", to_center / distances[:, None], -poses[:, :3, 2]), 1, atol=1e-5
+    )
+    np.testing.assert_allclose(distances, distances[0], rtol=1e-4)
+    assert distances[0] > size / 2 and (poses[:, 1 + 1, 1] > 0.9).all()  # upright
+    angles = np.unwrap(np.arctan2(-to_center[:, 1], -to_center[:, 0]))
     np.testing.assert_allclose(np.diff(angles), 2 * np.pi / 48, atol=1e-3)
 
 
@@ -55,8 +57,8 @@ def test_new_path_is_evaluated_at_the_current_frame(bpy, lodgs, root, verb):
     getattr(bpy.ops.lodgs, verb)()
     camera = bpy.context.scene.camera
     bpy.context.view_layer.update()
-    made = np.array(camera.matrix_world)
-    np.testing.assert_allclose(made, seen_from(bpy, camera, [21, 20])[1], atol=1e-5)
+    pose = np.array(camera.matrix_world)
+    np.testing.assert_allclose(pose, animated_poses(bpy, camera, [21, 20])[1], atol=1e-5)
 
 
 @pytest.mark.parametrize("verb", ["camera_path", "turntable"])

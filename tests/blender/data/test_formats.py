@@ -1,4 +1,4 @@
-"""Other kinds of files out of Blender and in again, through the operators."""
+"""Export and import of other file formats by operators."""
 
 import gzip
 import os
@@ -20,7 +20,7 @@ from training.splats.splat_transform import PROGRAM
 pytestmark = pytest.mark.one_blender
 
 
-HERE = Path(__file__).parents[3] / "build" / "interop" / "node_modules" / ".bin"
+PROGRAMS = Path(__file__).parents[3] / "build" / "interop" / "node_modules" / ".bin"
 
 
 @pytest.fixture
@@ -33,19 +33,19 @@ def root(bpy, lodgs, tmp_path):
 
 
 @pytest.fixture
-def theirs(monkeypatch):
-    monkeypatch.setenv("PATH", f"{HERE}{os.pathsep}{os.environ['PATH']}")
+def splat_transform(monkeypatch):
+    monkeypatch.setenv("PATH", f"{PROGRAMS}{os.pathsep}{os.environ['PATH']}")
     if not shutil.which(PROGRAM):
-        pytest.skip("splat-transform is not installed; make interop installs it, where Node.js is")
+        pytest.skip("splat-transform is not installed; make interop installs it with Node.js")
 
 
 def means(obj):
-    found = np.empty((len(obj.data.points), 3), np.float32)
-    obj.data.attributes["position"].data.foreach_get("vector", found.reshape(-1))
-    return found[np.lexsort(found.round(2).T)]
+    positions = np.empty((len(obj.data.points), 3), np.float32)
+    obj.data.attributes["position"].data.foreach_get("vector", positions.reshape(-1))
+    return positions[np.lexsort(positions.round(2).T)]
 
 
-def back(bpy, lodgs, path):
+def import_levels(bpy, lodgs, path):
     root = lodgs("data.importing").import_splats(bpy.context, path)
     return [item.object for item in root.lodgs.levels]
 
@@ -53,19 +53,19 @@ def back(bpy, lodgs, path):
 @pytest.mark.parametrize("ending", [".splat", ".spz", ".compressed.ply"])
 def test_level_round_trip(bpy, lodgs, root, tmp_path, request, ending):
     if ending != ".splat":
-        request.getfixturevalue("theirs")
+        request.getfixturevalue("splat_transform")
     path = tmp_path / f"out{ending}"
-    done = bpy.ops.lodgs.export_plain(filepath=str(path), source="LEVEL", level=1)
-    assert done == {"FINISHED"} and path.exists()
-    (obj,) = back(bpy, lodgs, path)
+    result = bpy.ops.lodgs.export_plain(filepath=str(path), source="LEVEL", level=1)
+    assert result == {"FINISHED"} and path.exists()
+    (obj,) = import_levels(bpy, lodgs, path)
     np.testing.assert_allclose(means(obj), means(root.lodgs.levels[0].object), atol=0.01)
     assert obj.name.startswith("out level 1")
 
 
-def test_streamed_levels_round_trip(bpy, lodgs, root, tmp_path, theirs):
+def test_streamed_levels_round_trip(bpy, lodgs, root, tmp_path, splat_transform):
     assert bpy.ops.lodgs.export_streamed(directory=str(tmp_path / "web")) == {"FINISHED"}
     for path in (tmp_path / "web", tmp_path / "web" / "lod-meta.json"):
-        objects = back(bpy, lodgs, path)
+        objects = import_levels(bpy, lodgs, path)
         for obj, item in zip(objects, root.lodgs.levels, strict=True):
             np.testing.assert_allclose(means(obj), means(item.object), atol=0.01)
 

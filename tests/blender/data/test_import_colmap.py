@@ -1,4 +1,4 @@
-"""COLMAP scenes in Blender, against the cameras' own projection and Blender's."""
+"""Import of COLMAP scenes, compared with projections by COLMAP's and by Blender's cameras."""
 
 import json
 import os
@@ -20,7 +20,7 @@ def mini(shared_scenes) -> Path:
     return shared_scenes / "variants" / "mini_saharov"
 
 
-def _everything(bpy) -> dict[str, int]:
+def count_data(bpy) -> dict[str, int]:
     names = [
         "objects", "cameras", "images", "pointclouds", "meshes", "collections", "materials", "node_groups"
     ]  # fmt: skip
@@ -42,16 +42,18 @@ def test_cameras_project_points_as_colmap(bpy, lodgs, mini):
         for point in scene.points[::197].astype(np.float64):
             x, y, z = camera.world_to_camera[:3, :3] @ point + camera.world_to_camera[:3, 3]
             u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-            seen = world_to_camera_view(bpy.context.scene, obj, root.lodgs.axes.matrix_world @ Vector(point))
+            projected = world_to_camera_view(
+                bpy.context.scene, obj, root.lodgs.axes.matrix_world @ Vector(point)
+            )
             if z > 0 and 0 < u < camera.width and 0 < v < camera.height:
                 inside += 1
-                assert seen.x * camera.width == pytest.approx(u, abs=0.01)
-                assert (1 - seen.y) * camera.height == pytest.approx(v, abs=0.01)
+                assert projected.x * camera.width == pytest.approx(u, abs=0.01)
+                assert (1 - projected.y) * camera.height == pytest.approx(v, abs=0.01)
         assert inside > 10
 
 
 def test_shifted_and_stretched_pixels(bpy, lodgs):
-    """Principal points off the middle and unequal focal lengths, wide and tall, by Blender's own matrix."""
+    """Shifted principal points and unequal focal lengths, compared with Blender's projection matrix."""
     from training.scenes.cameras import Camera
 
     for width, height in ((640, 480), (480, 640)):
@@ -74,7 +76,7 @@ def test_shifted_and_stretched_pixels(bpy, lodgs):
         assert v == pytest.approx(550 * -0.1 + 260, abs=1e-3)
 
 
-def test_operator_imports_everything_upright(bpy, mini):
+def test_operator_imports_cameras_photos_and_points_upright(bpy, mini):
     scene = read_scene(mini)
     assert bpy.ops.lodgs.import_colmap(directory=str(mini)) == {"FINISHED"}
     (root,) = [o for o in bpy.data.objects if o.lodgs.is_root]
@@ -82,8 +84,8 @@ def test_operator_imports_everything_upright(bpy, mini):
 
     cameras = [o for o in root.children_recursive if o.type == "CAMERA"]
     assert sorted(o.name for o in cameras) == [c.name for c in scene.cameras]
-    pictures = [o.data.background_images[0].image for o in cameras]
-    assert all(Path(p.filepath).is_file() for p in pictures)
+    photos = [o.data.background_images[0].image for o in cameras]
+    assert all(Path(photo.filepath).is_file() for photo in photos)
     up = np.mean([np.array(o.matrix_world)[:3, 1] for o in cameras], axis=0)
     assert up[2] > 0.9 * np.linalg.norm(up)
 
@@ -102,8 +104,8 @@ def test_operator_imports_everything_upright(bpy, mini):
     assert tuple(root.lodgs.camera_center) == pytest.approx(centers, abs=1e-5)
 
 
-def test_looking_through_the_views(bpy, lodgs, shared_scenes):
-    """One after the other by name, around the end, and the selected one; the render takes each one's size."""
+def test_look_through_cycles_through_views_by_name(bpy, lodgs, shared_scenes):
+    """It wraps around, starts at the selected view, and sets the size of renders."""
     scene = read_scene(shared_scenes / "variants" / "multicam_subfolders")
     lodgs("data.importing").import_colmap(bpy.context, scene.folder, photographs=False)
     sizes = {camera.name: (camera.width, camera.height) for camera in scene.cameras}
@@ -143,28 +145,28 @@ def test_first_level_hides_points(bpy, lodgs, mini):
     assert obj.visible_get() and not points.visible_get()
     points.hide_viewport = False
     lodgs("data.scenes").set_level(root, level)
-    assert not points.hide_viewport  # the artist's choice stays
+    assert not points.hide_viewport  # the user's setting is kept
 
 
-def test_training_takes_the_model_and_photographs_of_the_import(bpy, lodgs, mini, tmp_path):
-    found = read_scene(mini)
+def test_training_uses_the_model_and_photos_of_the_import(bpy, lodgs, mini, tmp_path):
+    scene = read_scene(mini)
     root = lodgs("data.importing").import_colmap(bpy.context, mini)
     job = lodgs("runs.job_settings").make_job(root, tmp_path, {})
     assert (job.model, job.images) == ("", "")
     root = lodgs("data.importing").import_colmap(
-        bpy.context, mini, model=found.model, images=str(found.images_folder), photographs=False
+        bpy.context, mini, model=scene.model, images=str(scene.images_folder), photographs=False
     )
     job = lodgs("runs.job_settings").make_job(root, tmp_path, {})
-    assert (Path(job.model), Path(job.images)) == (found.model, found.images_folder)
+    assert (Path(job.model), Path(job.images)) == (scene.model, scene.images_folder)
 
 
 def test_existing_camera_stays_active(bpy, lodgs, mini):
-    mine = bpy.data.objects.new("mine", bpy.data.cameras.new("mine"))
-    bpy.context.scene.collection.objects.link(mine)
-    bpy.context.scene.camera = mine
+    camera = bpy.data.objects.new("mine", bpy.data.cameras.new("mine"))
+    bpy.context.scene.collection.objects.link(camera)
+    bpy.context.scene.camera = camera
     size = bpy.context.scene.render.resolution_x
     lodgs("data.importing").import_colmap(bpy.context, mini, upright=False, photographs=False)
-    assert bpy.context.scene.camera == mine and bpy.context.scene.render.resolution_x == size
+    assert bpy.context.scene.camera == camera and bpy.context.scene.render.resolution_x == size
     assert not bpy.data.images
 
 
@@ -175,20 +177,20 @@ def test_existing_camera_stays_active(bpy, lodgs, mini):
 )  # fmt: skip
 def test_irregular_scenes_import(bpy, lodgs, shared_scenes, name):
     folder = shared_scenes / "variants" / name
-    scene, told = read_scene(folder), []
-    root = lodgs("data.importing").import_colmap(bpy.context, folder, warn=told.append)
+    scene, messages = read_scene(folder), []
+    root = lodgs("data.importing").import_colmap(bpy.context, folder, warn=messages.append)
     assert len([o for o in root.children_recursive if o.type == "CAMERA"]) == len(scene.cameras) > 0
     assert bool([o for o in root.children_recursive if o.type == "POINTCLOUD"]) == bool(len(scene.points))
-    assert all(message in told for message in scene.warnings)
+    assert all(message in messages for message in scene.warnings)
     views = lodgs("data.photographs").views(root)
     assert bool(scene.distorted) == any(view.data.lodgs.distorted for view in views)
 
 
 def test_failed_import_leaves_no_data(bpy, lodgs, tmp_path, mini, monkeypatch):
-    before = _everything(bpy)
+    before = count_data(bpy)
     with pytest.raises(RuntimeError, match="no COLMAP model"):
         bpy.ops.lodgs.import_colmap(directory=str(tmp_path))
-    assert _everything(bpy) == before
+    assert count_data(bpy) == before
 
     def fail(*args, **kwargs):
         raise lodgs("training.errors").LodgsError("No room.", "Make some.")
@@ -196,21 +198,21 @@ def test_failed_import_leaves_no_data(bpy, lodgs, tmp_path, mini, monkeypatch):
     monkeypatch.setattr(lodgs("data.objects"), "new_points", fail)
     with pytest.raises(RuntimeError, match=r"No room\. \nMake some\."):
         bpy.ops.lodgs.import_colmap(directory=str(mini))
-    assert _everything(bpy) == before
+    assert count_data(bpy) == before
     assert bpy.context.scene.camera is None
 
 
 def test_undo_removes_the_import(bpy, mini):
     bpy.ops.ed.undo_push(message="before")
-    before = _everything(bpy)
+    before = count_data(bpy)
     bpy.ops.lodgs.import_colmap("EXEC_DEFAULT", True, directory=str(mini))  # True: one undo step, as by hand
-    assert _everything(bpy)["cameras"] > before["cameras"]
+    assert count_data(bpy)["cameras"] > before["cameras"]
     bpy.ops.ed.undo()
-    assert _everything(bpy) == before
+    assert count_data(bpy) == before
 
 
-def test_another_program_s_export(bpy, lodgs, tmp_path):
-    """Cameras stand as nerfstudio's own matrices say; the folder is a COLMAP scene from then on."""
+def test_export_of_another_program_is_imported(bpy, lodgs, tmp_path):
+    """Cameras have the matrices of nerfstudio's file, and the folder becomes a COLMAP scene."""
     poses = [np.eye(4), np.eye(4)]
     poses[1][:3, 3] = 1, 2, 3
     frames = []
@@ -218,19 +220,19 @@ def test_another_program_s_export(bpy, lodgs, tmp_path):
         write_png(tmp_path / f"{number}.png", np.zeros((30, 40, 3), np.uint8))
         frames.append({"file_path": f"{number}.png", "transform_matrix": pose.tolist()})
     (tmp_path / "transforms.json").write_text(json.dumps({"camera_angle_x": 1.0, "frames": frames}))
-    said = []
-    root = lodgs("data.importing").import_colmap(bpy.context, tmp_path, upright=False, warn=said.append)
-    assert "Training creates them from the photos" in said[0]
+    messages = []
+    root = lodgs("data.importing").import_colmap(bpy.context, tmp_path, upright=False, warn=messages.append)
+    assert "Training creates them from the photos" in messages[0]  # points
     bpy.context.view_layer.update()
     for number, pose in enumerate(poses):
-        camera = next(each for each in root.lodgs.cameras.objects if each.name == f"{number}.png")
-        np.testing.assert_allclose(camera.matrix_world, pose, atol=1e-5)  # Blender's cameras look so, too
+        camera = next(obj for obj in root.lodgs.cameras.objects if obj.name == f"{number}.png")
+        np.testing.assert_allclose(camera.matrix_world, pose, atol=1e-5)  # both look along -z
         assert camera.data.angle_x == pytest.approx(1.0, abs=1e-4)
     assert len(read_scene(tmp_path).cameras) == 2
 
 
-def test_long_names(bpy, lodgs, tmp_path):
-    """A photo whose name is longer than Blender's names, and one that no file system can hold."""
+def test_long_photo_names_are_supported_or_reported(bpy, lodgs, tmp_path):
+    """One name exceeds Blender's limit; the other exceeds the file system's, so its photo is missing."""
     long, longer = f"{'a' * 150}/{'b' * 146}.png", "c" * 300 + ".png"
     write_png(tmp_path / "one.png", np.zeros((30, 40, 3), np.uint8))
     for name in (long, "d.png"):
@@ -250,19 +252,19 @@ def test_long_names(bpy, lodgs, tmp_path):
 
 def test_damaged_export_is_rejected(bpy, lodgs, tmp_path):
     (tmp_path / "transforms.json").write_text("{")
-    before = _everything(bpy)
+    before = count_data(bpy)
     with pytest.raises(RuntimeError, match=r"transforms\.json is not valid"):
         bpy.ops.lodgs.import_colmap(directory=str(tmp_path))
-    assert _everything(bpy) == before and [each.name for each in tmp_path.iterdir()] == ["transforms.json"]
+    assert count_data(bpy) == before and [path.name for path in tmp_path.iterdir()] == ["transforms.json"]
 
 
 def test_scene_without_points_shows_cameras_then_triangulated_points(bpy, lodgs, tmp_path):
-    """Blender reads the points that the trainer cached; it has no pycolmap to triangulate them."""
-    folder, told = write_walls(tmp_path / "walls"), []
+    """Blender reads the points from the trainer's cache, as it has no pycolmap."""
+    folder, messages = write_walls(tmp_path / "walls"), []
     import_colmap = lodgs("data.importing").import_colmap
-    root = import_colmap(bpy.context, folder, warn=told.append)
+    root = import_colmap(bpy.context, folder, warn=messages.append)
     assert len(lodgs("data.photographs").views(root)) == 6 and root.lodgs.points is None
-    (message,) = told
+    (message,) = messages
     assert "has no points" in message and "Training creates them from the photos." in message
     triangulate = lodgs("training.scenes.triangulate")
     scene = read_scene(folder)
@@ -272,9 +274,9 @@ def test_scene_without_points_shows_cameras_then_triangulated_points(bpy, lodgs,
     points = np.random.default_rng(0).normal(size=(50, 3))
     write_model(cached / "sparse", [lens] * 6, poses, points, np.full((50, 3), 99, np.uint8))
     (cached / "summary.json").write_text('{"message": "Triangulated 50 points.", "warnings": []}')
-    told.clear()
-    root = import_colmap(bpy.context, folder, warn=told.append)
-    assert told == [] and len(root.lodgs.points.data.points) == 50
+    messages.clear()
+    root = import_colmap(bpy.context, folder, warn=messages.append)
+    assert messages == [] and len(root.lodgs.points.data.points) == 50
 
 
 def _drop(bpy, path):
@@ -308,7 +310,7 @@ def test_dropped_file_selects_its_model(bpy, tmp_path):
 
 
 def test_dropped_file_of_no_scene_is_rejected(bpy, tmp_path):
-    write_walls(tmp_path / "scene")  # in a subfolder: it is not what was dropped
+    write_walls(tmp_path / "scene")  # scenes in subfolders do not count
     (tmp_path / "notes.txt").write_text("notes")
     with pytest.raises(RuntimeError, match=r"notes.txt: its folder has neither"):
         bpy.ops.lodgs.drop_photo_scene(filepath=str(tmp_path / "notes.txt"))

@@ -1,4 +1,4 @@
-"""Bundles and plain files in and out of Blender, through the operators, judged by plyfile and the bytes."""
+"""Operators that import and export bundles and plain files. Plyfile and file contents are the reference."""
 
 import json
 from types import SimpleNamespace
@@ -10,8 +10,8 @@ import pytest
 
 @pytest.fixture
 def bundle(lodgs):
-    """Three FLoD-like levels with an extra column, out to 20 units."""
-    rng, made = np.random.default_rng(3), lodgs("training.splats.bundle")
+    """Three FLoD-like levels with an extra column, within 20 units of the origin."""
+    rng, bundles = np.random.default_rng(3), lodgs("training.splats.bundle")
 
     def level(number: int, count: int, s_min: float):
         splats = lodgs("training.splats.gaussians").Splats(
@@ -22,11 +22,11 @@ def bundle(lodgs):
             sh=rng.standard_normal((count, 16, 3)).astype(np.float32),
             extras={"sigma": rng.random(count, np.float32)},
         )
-        return made.Level(number, splats, {"s_min": s_min})
+        return bundles.Level(number, splats, {"s_min": s_min})
 
     meta = {"camera_center": [1.0, 2.0, 3.0], "focal_px": 500.0, "seed": 4}
     levels = [level(1, 200, 0.02), level(2, 500, 0.005), level(3, 1500, 0.0)]
-    return made.Bundle("flod", levels, "bands", {}, {"gamma": 1.5}, meta=meta)
+    return bundles.Bundle("flod", levels, "bands", {}, {"gamma": 1.5}, meta=meta)
 
 
 @pytest.fixture
@@ -36,14 +36,14 @@ def file(lodgs, bundle, tmp_path):
     return path
 
 
-def the_root(bpy):
+def only_root(bpy):
     (root,) = [o for o in bpy.data.objects if o.lodgs.is_root]
     return root
 
 
 def test_bundle_round_trip_is_identical(bpy, bundle, file, tmp_path):
     assert bpy.ops.lodgs.import_splats(filepath=str(file)) == {"FINISHED"}
-    settings = the_root(bpy).lodgs
+    settings = only_root(bpy).lodgs
     assert [(i.number, len(i.object.data.points), json.loads(i.facts)) for i in settings.levels] == [
         (1, 200, {"s_min": 0.02}), (2, 500, {"s_min": 0.005}), (3, 1500, {"s_min": 0.0})
     ]  # fmt: skip
@@ -65,7 +65,7 @@ def test_five_levels_of_flod_scaffold(bpy, lodgs, bundle, tmp_path):
     five = files.Bundle("flod_scaffold", levels, "bands", {}, {"gamma": 1.0}, meta=bundle.meta)
     files.write_bundle(tmp_path / "five.ply", five)
     assert bpy.ops.lodgs.import_splats(filepath=str(tmp_path / "five.ply")) == {"FINISHED"}
-    settings = the_root(bpy).lodgs
+    settings = only_root(bpy).lodgs
     assert (settings.method, settings.rule, settings.single_level) == ("flod_scaffold", "bands", 5)
     assert [json.loads(item.facts)["s_min"] for item in settings.levels] == sizes
     assert [len(item.object.data.points) for item in settings.levels] == [200] * 5
@@ -76,27 +76,27 @@ def test_five_levels_of_flod_scaffold(bpy, lodgs, bundle, tmp_path):
 
 
 def test_first_bundle_sets_the_viewports_to_its_view(bpy, lodgs, bundle, tmp_path):
-    """An eye at (1, 0, -5) that looks along +z where -y is up: in Blender along +y from y = -5."""
+    """A camera at (1, 0, -5) looks along +z with -y up. In Blender, it looks along +y from y = -5."""
     bundle.meta |= {"view": [[1, 0, -5], [1, 0, 3]], "up_rotation": [[1, 0, 0], [0, 0, 1], [0, -1, 0]]}
-    path = tmp_path / "seen.ply"
+    path = tmp_path / "view.ply"
     lodgs("training.splats.bundle").write_bundle(path, bundle)
-    looks = [area.spaces.active.region_3d for area in bpy.context.screen.areas if area.type == "VIEW_3D"]
-    assert looks
+    views = [area.spaces.active.region_3d for area in bpy.context.screen.areas if area.type == "VIEW_3D"]
+    assert views
     assert bpy.ops.lodgs.import_splats(filepath=str(path)) == {"FINISHED"}
-    for look in looks:
-        assert tuple(look.view_location) == pytest.approx((1, 3, 0), abs=1e-5)
-        assert look.view_distance == pytest.approx(8)
-        toward = look.view_rotation.to_matrix() @ type(look.view_location)((0, 0, -1))
-        assert tuple(toward) == pytest.approx((0, 1, 0), abs=1e-5)
-        look.view_distance = 1.0
+    for view in views:
+        assert tuple(view.view_location) == pytest.approx((1, 3, 0), abs=1e-5)
+        assert view.view_distance == pytest.approx(8)
+        direction = view.view_rotation.to_matrix() @ type(view.view_location)((0, 0, -1))
+        assert tuple(direction) == pytest.approx((0, 1, 0), abs=1e-5)
+        view.view_distance = 1.0
     bpy.ops.lodgs.import_splats(filepath=str(path))
-    assert [look.view_distance for look in looks] == [1.0] * len(looks)
+    assert [view.view_distance for view in views] == [1.0] * len(views)
 
 
 @pytest.mark.parametrize("view", [[[0, 0, 0]], "far", [[0, 0, None], [0, 0, 1]]])
 def test_invalid_view_is_rejected(bpy, lodgs, bundle, tmp_path, view):
     bundle.meta |= {"view": view}
-    path = tmp_path / "seen.ply"
+    path = tmp_path / "view.ply"
     lodgs("training.splats.bundle").write_bundle(path, bundle)
     with pytest.raises(RuntimeError, match="is inconsistent"):
         bpy.ops.lodgs.import_splats(filepath=str(path))
@@ -129,9 +129,9 @@ def test_several_dropped_files_import(bpy, lodgs, bundle, tmp_path):
 def test_foreign_2d_filter_round_trip(bpy, lodgs, bundle, tmp_path):
     splats = bundle.levels[0].splats
     lodgs("training.splats.ply").write_ply(tmp_path / "mip.ply", splats, ["SplatRenderMode: mip"])
-    said = []
-    root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "mip.ply", warn=said.append)
-    assert said == [] and root.lodgs.antialias
+    messages = []
+    root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "mip.ply", warn=messages.append)
+    assert messages == [] and root.lodgs.antialias
     bpy.context.view_layer.objects.active = bpy.data.objects["mip"]
     for source in ("SHOWN", "LEVEL"):
         bpy.ops.lodgs.export_plain(filepath=str(tmp_path / "out.ply"), source=source)
@@ -145,17 +145,17 @@ def test_upright_turns_minus_y_up(bpy, lodgs, file):
 
 
 def test_upright_uses_the_bundles_rotation(bpy, lodgs, bundle, tmp_path):
-    turned = np.array([[0, 0.6, 0.8], [1, 0, 0], [0, 0.8, -0.6]])  # a rotation
-    bundle.meta["up_rotation"] = turned
+    rotation = np.array([[0, 0.6, 0.8], [1, 0, 0], [0, 0.8, -0.6]])
+    bundle.meta["up_rotation"] = rotation
     lodgs("training.splats.bundle").write_bundle(tmp_path / "b.ply", bundle)
     root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply")
     bpy.context.view_layer.update()
-    assert np.array(root.lodgs.axes.matrix_world)[:3, :3] == pytest.approx(turned, abs=1e-6)
+    assert np.array(root.lodgs.axes.matrix_world)[:3, :3] == pytest.approx(rotation, abs=1e-6)
 
 
-def test_export_one_level_and_visible_splats(bpy, lodgs, bundle, file, tmp_path):
+def test_one_level_and_visible_splats_are_exported(bpy, lodgs, bundle, file, tmp_path):
     bpy.ops.lodgs.import_splats(filepath=str(file))
-    root, out = the_root(bpy), tmp_path / "out.ply"
+    root, out = only_root(bpy), tmp_path / "out.ply"
     bpy.ops.lodgs.export_plain(filepath=str(out), source="LEVEL", level=2)
     vertex = plyfile.PlyData.read(out)["vertex"]
     splats = bundle.levels[1].splats
@@ -169,17 +169,17 @@ def test_export_one_level_and_visible_splats(bpy, lodgs, bundle, file, tmp_path)
     bpy.context.view_layer.update()
     bpy.ops.lodgs.export_plain(filepath=str(out), source="SHOWN")
     f = root.lodgs.focal_px
-    wanted = []
+    expected = []
     for level, near, far in zip(
         bundle.levels, [0.02 * f, 0.005 * f, 0], [np.inf, 0.02 * f, 0.005 * f], strict=True
     ):
         distance = np.linalg.norm(level.splats.means.astype(float) - [1, 2, 3], axis=1)
-        wanted.append(level.splats.select((distance >= near) & (distance < far)))
-    assert all(len(part) for part in wanted[1:])
+        expected.append(level.splats.select((distance >= near) & (distance < far)))
+    assert all(len(part) for part in expected[1:])
     vertex = plyfile.PlyData.read(out)["vertex"]
-    assert np.array_equal(vertex["scale_2"], np.concatenate([part.log_scales[:, 2] for part in wanted]))
-    assert np.array_equal(vertex["f_rest_44"], np.concatenate([part.sh[:, 15, 2] for part in wanted]))
-    assert lodgs("data.scenes").count_visible(bpy.context, root) == (sum(map(len, wanted)), 2200)
+    assert np.array_equal(vertex["scale_2"], np.concatenate([part.log_scales[:, 2] for part in expected]))
+    assert np.array_equal(vertex["f_rest_44"], np.concatenate([part.sh[:, 15, 2] for part in expected]))
+    assert lodgs("data.scenes").count_visible(bpy.context, root) == (sum(map(len, expected)), 2200)
 
     for item in root.lodgs.levels:
         item.show = False
@@ -190,9 +190,9 @@ def test_export_one_level_and_visible_splats(bpy, lodgs, bundle, file, tmp_path)
 
 
 def test_visible_export_covers_the_scene_only(bpy, lodgs, file, tmp_path):
-    """A level that is moved and turned, and a copy of it, are drawn there; the export says that it is not."""
+    """A moved level and a copy of it are drawn, but the export ignores both. Its tooltip says so."""
     bpy.ops.lodgs.import_splats(filepath=str(file))
-    root, out = the_root(bpy), [tmp_path / "before.ply", tmp_path / "after.ply"]
+    root, out = only_root(bpy), [tmp_path / "before.ply", tmp_path / "after.ply"]
     bpy.ops.lodgs.export_plain(filepath=str(out[0]))
     obj = root.lodgs.levels[2].object
     obj.location, obj.rotation_euler, root.scale = (1, 2, 3), (0, 1, 0), (2, 2, 2)
@@ -205,9 +205,9 @@ def test_visible_export_covers_the_scene_only(bpy, lodgs, file, tmp_path):
     assert "COLMAP's coordinates" in placed.description and not placed.default
 
 
-def test_export_only_the_active_level(bpy, file):
+def test_show_only_level_hides_other_levels(bpy, file):
     bpy.ops.lodgs.import_splats(filepath=str(file))
-    settings = the_root(bpy).lodgs
+    settings = only_root(bpy).lodgs
     settings.mode, settings.levels[0].show = "SELECTIVE", False
     bpy.ops.lodgs.show_only_level(level=1)
     bpy.context.view_layer.update()
@@ -216,7 +216,7 @@ def test_export_only_the_active_level(bpy, file):
 
 def test_deleted_level_is_not_exported(bpy, bundle, file, tmp_path):
     bpy.ops.lodgs.import_splats(filepath=str(file))
-    root = the_root(bpy)
+    root = only_root(bpy)
     bpy.data.objects.remove(root.lodgs.levels[1].object)
     bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "out.ply"))
     elements = plyfile.PlyData.read(tmp_path / "out.ply").elements
@@ -225,7 +225,7 @@ def test_deleted_level_is_not_exported(bpy, bundle, file, tmp_path):
         bpy.ops.lodgs.export_plain(filepath=str(tmp_path / "x.ply"), source="LEVEL", level=2)
 
 
-def test_folder(bpy, bundle, file, tmp_path):
+def test_export_folder_writes_levels_and_replaces_on_request(bpy, bundle, file, tmp_path):
     bpy.ops.lodgs.import_splats(filepath=str(file))
     folder = tmp_path / "new" / "levels"
     assert bpy.ops.lodgs.export_folder(directory=str(folder)) == {"FINISHED"}
@@ -256,7 +256,7 @@ def test_unwritable_path_is_rejected(bpy, file, tmp_path):
         bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "blocked" / "out.ply"))
 
 
-def test_undo_of_an_import(bpy, file):
+def test_undo_removes_an_import(bpy, file):
     bpy.ops.ed.undo_push(message="before")
     bpy.ops.lodgs.import_splats("EXEC_DEFAULT", True, filepath=str(file))
     assert len(bpy.data.pointclouds) == 3
@@ -271,50 +271,50 @@ def test_menus_list_import_and_export(bpy):
 
 
 def test_all_properties_have_tooltips(bpy):
-    """Operators, their options and the settings of a scene: short names, and a sentence each."""
+    """Operators, their options and scene settings have short names and descriptions."""
     names = [n for n in dir(bpy.ops.lodgs) if not n.startswith("_")]
-    shown = [getattr(bpy.ops.lodgs, name).get_rna_type() for name in names]
-    assert len(shown) > 5 and all(kind.description for kind in shown)
-    shown += [bpy.types.Object.bl_rna.properties["lodgs"].fixed_type]
-    for kind in shown:
-        for prop in kind.properties:
-            ours = prop.identifier not in {"rna_type", "name", "levels", "training", "files", "directory"}
-            if ours and not prop.is_hidden and "filter" not in prop.identifier:
-                assert prop.description, (kind.identifier, prop.identifier)
-                assert len(prop.name) <= 24, (kind.identifier, prop.name)
+    types = [getattr(bpy.ops.lodgs, name).get_rna_type() for name in names]
+    assert len(types) > 5 and all(rna_type.description for rna_type in types)
+    types += [bpy.types.Object.bl_rna.properties["lodgs"].fixed_type]
+    for rna_type in types:
+        for prop in rna_type.properties:
+            is_lodgs = prop.identifier not in {"rna_type", "name", "levels", "training", "files", "directory"}
+            if is_lodgs and not prop.is_hidden and "filter" not in prop.identifier:
+                assert prop.description, (rna_type.identifier, prop.identifier)
+                assert len(prop.name) <= 24, (rna_type.identifier, prop.name)
 
 
 def test_stepwise_import_can_be_cancelled(bpy, lodgs, bundle, tmp_path):
-    """As a window does it, which goes on between two pieces: the same scene, or nothing."""
-    path, scenes, told = tmp_path / "b.ply", lodgs("data.scenes"), []
+    """Windows import in steps. Cancelling leaves no data; all steps together equal a direct import."""
+    path, scenes, messages = tmp_path / "b.ply", lodgs("data.scenes"), []
     lodgs("training.splats.bundle").write_bundle(path, bundle)
     operator = lodgs("operators.import_splats").LODGS_OT_import_splats
 
-    def there():
+    def data_counts():
         return [len(kind) for kind in (bpy.data.objects, bpy.data.pointclouds, bpy.data.collections)]
 
-    def begun():
-        pressed = SimpleNamespace(
-            paths=lambda: [path], report=lambda kind, text: told.append(text), budget=0, upright=True,
+    def start_import():
+        options = SimpleNamespace(
+            paths=lambda: [path], report=lambda kind, text: messages.append(text), budget=0, upright=True,
             _modal=True,
         )  # fmt: skip
-        return operator.work(pressed, bpy.context)
+        return operator.work(options, bpy.context)
 
-    nothing, most = there(), 0
+    before, max_levels = data_counts(), 0
     for level in range(4):
-        work = begun()
-        while there()[1] - nothing[1] < level:
+        work = start_import()
+        while data_counts()[1] - before[1] < level:
             next(work)
-        most = max(most, there()[1] - nothing[1])
+        max_levels = max(max_levels, data_counts()[1] - before[1])
         work.close()
-        assert there() == nothing and not lodgs("data.roots").roots(bpy.context.scene)
-    assert most == 3 and sum(1 for _ in begun()) > 3
+        assert data_counts() == before and not lodgs("data.roots").roots(bpy.context.scene)
+    assert max_levels == 3 and sum(1 for _ in start_import()) > 3
     (root,) = lodgs("data.roots").roots(bpy.context.scene)
     assert root.name == "b" and [item.object.name for item in root.lodgs.levels] == [
         f"b level {number}" for number in (1, 2, 3)
     ]
-    whole = scenes.read_levels(lodgs("data.importing").import_splats(bpy.context, path))
-    for one, other in zip(scenes.read_levels(root).levels, whole.levels, strict=True):
-        np.testing.assert_array_equal(one.splats.means, other.splats.means)
-        np.testing.assert_array_equal(one.splats.extras["sigma"], other.splats.extras["sigma"])
-    assert not told
+    expected = scenes.read_levels(lodgs("data.importing").import_splats(bpy.context, path))
+    for level, expected_level in zip(scenes.read_levels(root).levels, expected.levels, strict=True):
+        np.testing.assert_array_equal(level.splats.means, expected_level.splats.means)
+        np.testing.assert_array_equal(level.splats.extras["sigma"], expected_level.splats.extras["sigma"])
+    assert not messages

@@ -1,4 +1,4 @@
-"""All levels out of Blender as USD and glTF by the trainer, and into Blender's own importer."""
+"""The trainer exports all levels as USD and glTF. LODGS and Blender's own importer read them."""
 
 import os
 import subprocess
@@ -32,7 +32,7 @@ def positions(obj):
 
 @pytest.mark.slow
 @pytest.mark.one_blender
-def test_levels_leave_blender_and_return(bpy, lodgs, file, tmp_path):
+def test_levels_round_trip_as_usd_and_gltf(bpy, lodgs, file, tmp_path):
     root = lodgs("data.importing").import_splats(bpy.context, file)
     for ending in (".usdc", ".glb"):
         out = tmp_path / f"out{ending}"
@@ -41,9 +41,9 @@ def test_levels_leave_blender_and_return(bpy, lodgs, file, tmp_path):
         bpy.ops.lodgs.export_levels(filepath=str(out), placed=True, original_place=True)
     assert bpy.ops.lodgs.export_tiles(directory=str(tmp_path / "web")) == {"FINISHED"}
     assert (tmp_path / "web" / "tileset.json").exists()
-    back = lodgs("data.importing").import_splats(bpy.context, tmp_path / "out.glb")
-    assert back.lodgs.rule == "bands" and len(back.lodgs.levels) == 2
-    for item, original in zip(back.lodgs.levels, root.lodgs.levels, strict=True):
+    reimported = lodgs("data.importing").import_splats(bpy.context, tmp_path / "out.glb")
+    assert reimported.lodgs.rule == "bands" and len(reimported.lodgs.levels) == 2
+    for item, original in zip(reimported.lodgs.levels, root.lodgs.levels, strict=True):
         assert np.array_equal(positions(item.object), positions(original.object))
 
 

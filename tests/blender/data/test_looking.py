@@ -1,4 +1,4 @@
-"""Where a viewport begins to look at what was imported, and that a lack of memory leaves nothing behind."""
+"""The viewport's view of imported scenes, and imports that run out of memory."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -16,8 +16,12 @@ GARDEN = Path(__file__).resolve().parents[3] / "examples" / "lantern_garden"
 KINDS = ("objects", "collections", "pointclouds", "cameras", "images", "meshes", "scenes")
 
 
+def data_names(bpy) -> dict[str, list[str]]:
+    return {kind: sorted(data.name for data in getattr(bpy.data, kind)) for kind in KINDS}
+
+
 def ball(count: int, outliers: int) -> Splats:
-    """Splats within 2 of (10, 20, 30), and far outliers."""
+    """Return splats within 2 of (10, 20, 30), and far outliers."""
     rng = np.random.default_rng(0)
     means = np.float32((10, 20, 30)) + rng.uniform(-1, 1, (count, 3))
     means[:outliers] = rng.uniform(1e3, 1e6, (outliers, 3))
@@ -35,8 +39,8 @@ def test_framing_ignores_outliers(bpy, lodgs, tmp_path):
     root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply", upright=False)
     root.scale, root.location = (2, 2, 2), (0, 0, 5)
     assert lodgs("data.photographs").photo_viewpoint(root) is None
-    middle, size = lodgs("data.photographs").central_bounds(root)
-    np.testing.assert_allclose(middle, (20, 40, 65), atol=0.3)
+    center, size = lodgs("data.photographs").central_bounds(root)
+    np.testing.assert_allclose(center, (20, 40, 65), atol=0.3)
     assert size == pytest.approx(2 * 2 * 0.9 * 3**0.5, rel=0.1)
     empty = bpy.data.objects.new("nothing", None)
     assert lodgs("data.photographs").central_bounds(empty) is None
@@ -51,60 +55,60 @@ def test_framing_ignores_cropped_and_hidden_splats(bpy, lodgs, tmp_path):
     corner = Matrix.Translation((9.5, 19.5, 29.5)) @ Matrix.Diagonal((0.5, 0.5, 0.5, 1))
     crop = lodgs("data.crops").new_crop(root, "BOX", corner)
     bpy.context.view_layer.update()
-    middle, size = bounds(root)
-    np.testing.assert_allclose(middle, (9.5, 19.5, 29.5), atol=0.1)
+    center, size = bounds(root)
+    np.testing.assert_allclose(center, (9.5, 19.5, 29.5), atol=0.1)
     assert size == pytest.approx(0.9 * 3**0.5, rel=0.1)
     means = ball(2000, 40).means
     cleaning.hide(root, {1: means[:, 0] < 9.5})
     np.testing.assert_allclose(bounds(root)[0], (9.75, 19.5, 29.5), atol=0.1)
     crop.location.x += 1e4
     bpy.context.view_layer.update()
-    assert bounds(root)[1] == pytest.approx(2 * 0.9 * 3**0.5, rel=0.1), "of nothing left all counts"
+    assert bounds(root)[1] == pytest.approx(2 * 0.9 * 3**0.5, rel=0.1), "all splats count if none remain"
 
 
-def test_viewports_take_the_central_view(bpy, lodgs):
+def test_viewports_start_at_the_central_photo(bpy, lodgs):
     root = lodgs("data.importing").import_colmap(bpy.context, GARDEN, photographs=False)
     root.location = (1, 2, 3)
     bpy.context.view_layer.update()
-    eye, target = lodgs("data.photographs").photo_viewpoint(root)
+    position, target = lodgs("data.photographs").photo_viewpoint(root)
     scene = read_scene(GARDEN)
-    middle = min(scene.cameras, key=lambda camera: float(np.linalg.norm(camera.center - scene.center)))
-    points = (middle.world_to_camera[:3, :3] @ scene.points.T).T + middle.world_to_camera[:3, 3]
-    view = bpy.data.objects[middle.name]
-    np.testing.assert_allclose(eye, view.matrix_world.translation, atol=1e-4)
-    assert (target - eye).length == pytest.approx(np.median(points[points[:, 2] > 0, 2]), rel=1e-4)
-    ahead = np.array(view.matrix_world)[:3, 2] * -1
-    np.testing.assert_allclose((target - eye).normalized(), ahead, atol=1e-4)
+    central = min(scene.cameras, key=lambda camera: float(np.linalg.norm(camera.center - scene.center)))
+    points = (central.world_to_camera[:3, :3] @ scene.points.T).T + central.world_to_camera[:3, 3]
+    view = bpy.data.objects[central.name]
+    np.testing.assert_allclose(position, view.matrix_world.translation, atol=1e-4)
+    assert (target - position).length == pytest.approx(np.median(points[points[:, 2] > 0, 2]), rel=1e-4)
+    direction = np.array(view.matrix_world)[:3, 2] * -1
+    np.testing.assert_allclose((target - position).normalized(), direction, atol=1e-4)
 
 
 def test_blocking_meshes_are_hidden_and_reported(bpy, lodgs):
-    """A new file's cube, in which some scenes were photographed, and before which others."""
-    eye, target = lodgs("data.photographs").photo_viewpoint(
+    """Like the cube of a new file, which may enclose the camera or occlude the scene."""
+    camera, target = lodgs("data.photographs").photo_viewpoint(
         lodgs("data.importing").import_colmap(bpy.context, GARDEN, photographs=False)
     )
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
-    ahead = target - eye
-    aside = ahead.cross((0, 0, 1)).normalized()
-    places = {
-        "about": eye, "before": eye + 0.6 * ahead, "behind": eye - ahead.normalized(),
-        "beyond": eye + 1.4 * ahead, "aside": eye + 0.5 * ahead + aside,
+    forward = target - camera
+    side = forward.cross((0, 0, 1)).normalized()
+    locations = {
+        "around camera": camera, "in front": camera + 0.6 * forward, "behind": camera - forward.normalized(),
+        "beyond": camera + 1.4 * forward, "beside": camera + 0.5 * forward + side,
     }  # fmt: skip
-    for name, place in places.items():
-        bpy.ops.mesh.primitive_cube_add(location=place, size=0.4, rotation=(0.3, 0.2, 0.1))
+    for name, location in locations.items():
+        bpy.ops.mesh.primitive_cube_add(location=location, size=0.4, rotation=(0.3, 0.2, 0.1))
         bpy.context.object.name = name
     bpy.ops.lodgs.import_colmap(directory=str(GARDEN), photographs=False)
     cubes = bpy.data.objects
-    assert [name for name in places if not cubes[name].visible_get()] == ["about", "before"]
-    assert not cubes["about"].hide_render and not cubes["about"].hide_viewport
-    told = []
-    cubes["about"].hide_set(False)
+    assert [name for name in locations if not cubes[name].visible_get()] == ["around camera", "in front"]
+    assert not cubes["around camera"].hide_render and not cubes["around camera"].hide_viewport
+    messages = []
+    cubes["around camera"].hide_set(False)
     root = lodgs("data.roots").roots(bpy.context.scene)[0]
-    lodgs("data.photographs").look_at_scene(bpy.context, root, told.append)
-    assert told == ["Hid 'about', which blocks the view of the splats. Press Alt+H to show it."]
+    lodgs("data.photographs").look_at_scene(bpy.context, root, messages.append)
+    assert messages == ["Hid 'around camera', which blocks the view of the splats. Press Alt+H to show it."]
 
 
 def test_plain_splats_open_upright_from_a_clear_view(bpy, lodgs, tmp_path):
-    """A round garden with z up, far from the origin, with outliers: no convention says so."""
+    """A round garden, z up and far from the origin, with outliers. Its file names no up axis."""
     rng = np.random.default_rng(1)
     means = rng.uniform(-4, 4, (9000, 3)) * (1, 1, 0.1) + (0, 0, 0.4)
     means[:6000, 2] = 0
@@ -113,65 +117,65 @@ def test_plain_splats_open_upright_from_a_clear_view(bpy, lodgs, tmp_path):
     means[:200] += 1e4
     splats = replace(ball(9000, 0), means=means, log_scales=np.full((9000, 3), -3, np.float32))
     write_ply(tmp_path / "garden.ply", splats)
-    told = []
-    root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "garden.ply", warn=told.append)
-    assert told == [line for line in told if line.startswith("200 splats are more than")] and told
+    messages = []
+    root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "garden.ply", warn=messages.append)
+    assert messages == [line for line in messages if line.startswith("200 splats are more than")] and messages
     bpy.context.view_layer.update()
     level = root.lodgs.levels[0].object
     np.testing.assert_allclose(level.matrix_world.to_3x3(), np.eye(3), atol=1e-6)
-    eye, target = lodgs("data.photographs").photo_viewpoint(root)
+    camera, target = lodgs("data.photographs").photo_viewpoint(root)
     np.testing.assert_allclose(target, (300, -200, 50), atol=1)
-    assert eye.z > target.z + 0.5 and 3 < (eye - target).length < 12
+    assert camera.z > target.z + 0.5 and 3 < (camera - target).length < 12
 
 
-@pytest.mark.parametrize(("touched", "saved"), [(False, False), (False, True), (True, False)])
-def test_startup_objects_are_put_away(bpy, lodgs, tmp_path, touched, saved):
+@pytest.mark.parametrize(("edited", "saved"), [(False, False), (False, True), (True, False)])
+def test_unchanged_startup_objects_are_hidden(bpy, lodgs, tmp_path, edited, saved):
     bpy.ops.wm.read_homefile(use_factory_startup=True)
     if saved:
         bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
-    if touched:
+    if edited:
         bpy.data.objects["Cube"].location.x = 1
     write_bundle(tmp_path / "b.ply", Bundle("", [Level(1, ball(2000, 40))]))
     bpy.ops.lodgs.import_splats(filepath=str(tmp_path / "b.ply"))
     bpy.context.view_layer.update()
     visible = [bpy.data.objects[name].visible_get() for name in ("Cube", "Light", "Camera")]
-    assert visible == ([True] * 3 if touched else [False, False, True])
-    assert ("Startup Objects" in bpy.data.collections) != touched
+    assert visible == ([True] * 3 if edited else [False, False, True])
+    assert ("Startup Objects" in bpy.data.collections) != edited
 
 
 def test_invalid_control_changes_nothing(bpy, lodgs, tmp_path):
     write_bundle(tmp_path / "b.ply", Bundle("mine", [Level(1, ball(5, 0))]))
     root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply")
-    odd = Bundle("flod", [], "bands", controls={"gamma": -1.0}, meta={"a": 1})
+    invalid = Bundle("flod", [], "bands", controls={"gamma": -1.0}, meta={"a": 1})
     before = {name: getattr(root.lodgs, name) for name in ("method", "rule", "cumulative", "meta", "mode")}
     with pytest.raises(lodgs("training.errors").LodgsError, match="gamma = -1"):
-        lodgs("data.scenes").set_bundle_facts(root, odd)
+        lodgs("data.scenes").set_bundle_facts(root, invalid)
     assert {name: getattr(root.lodgs, name) for name in before} == before
 
 
 @pytest.mark.parametrize("fails_at", [1, 4])
-@pytest.mark.parametrize("what", ["splats", "colmap", "level"])
-def test_out_of_memory_leaves_no_data(bpy, lodgs, monkeypatch, tmp_path, what, fails_at):
-    """One sentence, and no half of a scene or of a level, whichever array is one too many."""
+@pytest.mark.parametrize("operation", ["splats", "colmap", "level"])
+def test_out_of_memory_leaves_no_data(bpy, lodgs, monkeypatch, tmp_path, operation, fails_at):
+    """Memory runs out at the first or a later array."""
     write_bundle(tmp_path / "b.ply", Bundle("", [Level(1, ball(5, 0))]))
     root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply")
-    before = {kind: sorted(one.name for one in getattr(bpy.data, kind)) for kind in KINDS}
+    before = data_names(bpy)
     objects, written = lodgs("data.objects"), []
     write = objects.write_attribute
 
-    def too_much(*given):
-        written.append(given)
-        if len(written) >= min(fails_at, 3 if what == "colmap" else fails_at):
+    def write_or_fail(*arguments):
+        written.append(arguments)
+        if len(written) >= min(fails_at, 3 if operation == "colmap" else fails_at):
             raise MemoryError
-        write(*given)
+        write(*arguments)
 
-    monkeypatch.setattr(objects, "write_attribute", too_much)
-    if what == "level":
+    monkeypatch.setattr(objects, "write_attribute", write_or_fail)
+    if operation == "level":
         with pytest.raises(MemoryError):
             lodgs("data.scenes").set_level(root, Level(2, ball(7, 0)))
     else:
-        given = {"directory": str(GARDEN)} if what == "colmap" else {"filepath": str(tmp_path / "b.ply")}
+        path = {"directory": str(GARDEN)} if operation == "colmap" else {"filepath": str(tmp_path / "b.ply")}
         with pytest.raises(RuntimeError, match="Out of memory"):
-            getattr(bpy.ops.lodgs, f"import_{what}")(**given)
-    assert {kind: sorted(one.name for one in getattr(bpy.data, kind)) for kind in KINDS} == before
+            getattr(bpy.ops.lodgs, f"import_{operation}")(**path)
+    assert data_names(bpy) == before
     assert [item.number for item in root.lodgs.levels] == [1] and bpy.context.scene.camera is None

@@ -1,9 +1,9 @@
-"""Looks act on every level, as points, ellipsoids and exports show them: against numpy, splat by splat."""
+"""Looks change colours and opacities of every level, in Blender and in exports. Numpy is the reference."""
 
 import numpy as np
 import pytest
 
-from tests.blender.data.test_cleaning import PLACE, blender, inside, placed, scene_of  # noqa: F401
+from tests.blender.data.test_cleaning import ROOT_MATRIX, inside, scene_of, to_blender, transform  # noqa: F401
 from tests.training.editing.test_cleaning import bundle_of
 from training.editing.look import Look
 from training.scenes.color import linear_from_srgb
@@ -13,49 +13,49 @@ from training.splats.ply import read_ply
 
 EVERYWHERE = Look(0.4, 5000, (1.0, 0.9, 0.7), 0.6, 0.8)
 REGIONS = (
-    (placed((3, 0, 2), (0.2, 0.5, 0.9), (6, 5, 7)), "BOX", Look(saturation=0.0, opacity=0.5)),
-    (placed((2, -1, 3), (0, 1, 0), (3, 4, 3)), "SPHERE", Look(-1.0, 9000, (0.3, 1.0, 1.0), 1.5)),
+    (transform((3, 0, 2), (0.2, 0.5, 0.9), (6, 5, 7)), "BOX", Look(saturation=0.0, opacity=0.5)),
+    (transform((2, -1, 3), (0, 1, 0), (3, 4, 3)), "SPHERE", Look(-1.0, 9000, (0.3, 1.0, 1.0), 1.5)),
 )
 
 
-def give(settings, look):
+def apply_look(settings, look):
     for name, value in vars(look).items():
         setattr(settings, name, value)
 
 
-def wanted(means, sh):
-    """(N, 3) display-coded colours without view dependence, and (N,) factors on opacities."""
+def expected_look(means, sh):
+    """Return sRGB colours (N, 3) without view dependence, and factors (N,) of opacities."""
     color, factor = 0.5 + SH_C0 * sh[:, 0].astype(np.float64), np.full(len(means), EVERYWHERE.opacity)
     color = color @ EVERYWHERE.matrix.T
     for matrix, shape, look in REGIONS:
-        held, clear = inside(matrix, means, shape == "SPHERE")
-        held ^= shape == "SPHERE"  # outside of it
-        assert clear.all() and 0 < held.sum() < len(held)
-        color[held] = color[held] @ look.matrix.T
-        factor[held] *= look.opacity
+        mask, clear = inside(matrix, means, shape == "SPHERE")
+        mask ^= shape == "SPHERE"  # the region is outside the sphere
+        assert clear.all() and 0 < mask.sum() < len(mask)
+        color[mask] = color[mask] @ look.matrix.T
+        factor[mask] *= look.opacity
     return color, factor
 
 
 @pytest.fixture
-def looking(bpy, lodgs, scene_of):  # noqa: F811
-    """``looking(name)``: a scene of that rule with a look everywhere and two regions; and the bundle."""
+def scene_with_look(bpy, lodgs, scene_of):  # noqa: F811
+    """``scene_with_look(rule)``: return root and bundle of a scene with a look and two regions."""
 
     def make(name):
         root, bundle = scene_of(bundle_of(name, np.random.default_rng(3)))
-        give(root.lodgs_look, EVERYWHERE)
+        apply_look(root.lodgs_look, EVERYWHERE)
         for matrix, shape, look in REGIONS:
-            obj = lodgs("data.crops").new_crop(root, shape, blender(matrix))
+            obj = lodgs("data.crops").new_crop(root, shape, to_blender(matrix))
             obj.lodgs_crop.keep = "ALL"
             obj.lodgs_look.outside = shape == "SPHERE"
-            give(obj.lodgs_look, look)
+            apply_look(obj.lodgs_look, look)
         bpy.context.view_layer.update()
         return root, bundle
 
     return make
 
 
-def shown(bpy, lodgs, obj):
-    """Rows, colours (N, 3) linear and opacity factors of a level as Blender evaluates it."""
+def evaluated_look(bpy, lodgs, obj):
+    """Return rows, linear colours (N, 3) and opacity factors of a level as Blender evaluates it."""
     cloud = obj.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
     attributes = lodgs("attributes")
     color = attributes.read_attribute(cloud, attributes.COLOR)[:, :3]
@@ -66,17 +66,17 @@ def shown(bpy, lodgs, obj):
 
 
 def check(bpy, lodgs, obj, splats):
-    rows, color, factor = shown(bpy, lodgs, obj)
-    place = {row: i for i, row in enumerate(splats.extras["row"].tolist())}
-    some = [place[row] for row in rows.tolist()]
-    display, opacity = wanted(splats.means[some], splats.sh[some])
+    rows, color, factor = evaluated_look(bpy, lodgs, obj)
+    index_of_row = {row: i for i, row in enumerate(splats.extras["row"].tolist())}
+    indices = [index_of_row[row] for row in rows.tolist()]
+    display, opacity = expected_look(splats.means[indices], splats.sh[indices])
     np.testing.assert_allclose(color, linear_from_srgb(display.clip(0, 1)), atol=2e-5)
     np.testing.assert_allclose(factor, opacity, rtol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["bands", "octree", "chunks", "decay"])
-def test_node_groups_match_numpy_at_every_level(bpy, lodgs, looking, name):
-    root, bundle = looking(name)
+def test_node_groups_match_numpy_at_every_level(bpy, lodgs, scene_with_look, name):
+    root, bundle = scene_with_look(name)
     bpy.context.scene.lodgs_viewport.splats = False  # points, which Blender draws
     root.lodgs.mode = "SINGLE"
     for item, level in zip(root.lodgs.levels, bundle.levels, strict=True):
@@ -85,18 +85,18 @@ def test_node_groups_match_numpy_at_every_level(bpy, lodgs, looking, name):
         check(bpy, lodgs, item.object, level.splats)
         depsgraph = bpy.context.evaluated_depsgraph_get()
         assert lodgs("data.selection").only_lodgs_modifiers(item.object.evaluated_get(depsgraph), depsgraph)
-    bpy.context.scene.lodgs_viewport.splats = True  # what LODGS draws has its look without them
+    bpy.context.scene.lodgs_viewport.splats = True  # LODGS applies the look itself
     bpy.context.view_layer.update()
     obj = root.lodgs.levels[2].object
-    assert shown(bpy, lodgs, obj)[2] is None
+    assert evaluated_look(bpy, lodgs, obj)[2] is None
     for engine in ("CYCLES", "LODGS"):
         bpy.context.scene.render.engine = engine
         bpy.context.view_layer.update()
         assert lodgs("data.looks").modifier_of(obj).show_render == (engine == "CYCLES")
 
 
-def test_look_is_animated_and_applies_to_new_levels(bpy, lodgs, looking):
-    root, bundle = looking("bands")
+def test_look_is_animated_and_applies_to_new_levels(bpy, lodgs, scene_with_look):
+    root, bundle = scene_with_look("bands")
     bpy.context.scene.lodgs_viewport.splats = False
     root.lodgs.single_level = 3
     look, obj = root.lodgs_look, root.lodgs.levels[2].object
@@ -104,81 +104,83 @@ def test_look_is_animated_and_applies_to_new_levels(bpy, lodgs, looking):
         look.exposure = exposure
         look.keyframe_insert("exposure", frame=frame)
     bpy.context.scene.frame_set(11)
-    dark = shown(bpy, lodgs, obj)[1]
+    dark_colors = evaluated_look(bpy, lodgs, obj)[1]
     bpy.context.scene.frame_set(1)
     check(bpy, lodgs, obj, bundle.levels[2].splats)
-    assert dark.mean() < 0.5 * shown(bpy, lodgs, obj)[1].mean()
+    assert dark_colors.mean() < 0.5 * evaluated_look(bpy, lodgs, obj)[1].mean()
 
-    fresh = bundle_of("bands", np.random.default_rng(6)).levels[2]
-    lodgs("data.scenes").set_level(root, fresh)
+    new_level = bundle_of("bands", np.random.default_rng(6)).levels[2]
+    lodgs("data.scenes").set_level(root, new_level)
     bpy.context.view_layer.update()
-    check(bpy, lodgs, root.lodgs.levels[2].object, fresh.splats)
+    check(bpy, lodgs, root.lodgs.levels[2].object, new_level.splats)
 
 
-@pytest.mark.parametrize("placed_too", [False, True])
-def test_exported_look_round_trip(bpy, lodgs, looking, tmp_path, placed_too):
-    root, bundle = looking("bands")
-    bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "out.ply"), placed=placed_too)
-    found = read_bundle(tmp_path / "out.ply")
-    for level, before in zip(found.levels, bundle.levels, strict=True):
-        color, factor = wanted(before.splats.means, before.splats.sh)
+@pytest.mark.parametrize("placed", [False, True])
+def test_exported_look_round_trip(bpy, lodgs, scene_with_look, tmp_path, placed):
+    root, bundle = scene_with_look("bands")
+    bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "out.ply"), placed=placed)
+    exported = read_bundle(tmp_path / "out.ply")
+    for level, original in zip(exported.levels, bundle.levels, strict=True):
+        color, factor = expected_look(original.splats.means, original.splats.sh)
         np.testing.assert_allclose(0.5 + SH_C0 * level.splats.sh[:, 0], color, atol=2e-5)
-        there, then = (1 / (1 + np.exp(-s.opacity_logits)) for s in (level.splats, before.splats))
-        np.testing.assert_allclose(there, factor * then, rtol=1e-4, atol=1e-6)
-        assert level.splats.extras.keys() == before.splats.extras.keys()
-    again = lodgs("data.importing").import_splats(bpy.context, tmp_path / "out.ply", upright=False)
-    for level, back in zip(
-        found.levels, lodgs("data.scenes").read_levels(again, looked=True).levels, strict=True
+        opacity, original_opacity = (
+            1 / (1 + np.exp(-s.opacity_logits)) for s in (level.splats, original.splats)
+        )
+        np.testing.assert_allclose(opacity, factor * original_opacity, rtol=1e-4, atol=1e-6)
+        assert level.splats.extras.keys() == original.splats.extras.keys()
+    reimported = lodgs("data.importing").import_splats(bpy.context, tmp_path / "out.ply", upright=False)
+    for level, exported_again in zip(
+        exported.levels, lodgs("data.scenes").read_levels(reimported, looked=True).levels, strict=True
     ):
-        for part in ("means", "quats", "log_scales", "opacity_logits", "sh"):
-            np.testing.assert_array_equal(getattr(back.splats, part), getattr(level.splats, part))
+        for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
+            np.testing.assert_array_equal(getattr(exported_again.splats, name), getattr(level.splats, name))
     bpy.context.view_layer.objects.active = root
     bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "trained.ply"), looked=False)
-    for level, before in zip(read_bundle(tmp_path / "trained.ply").levels, bundle.levels, strict=True):
-        np.testing.assert_array_equal(level.splats.sh, before.splats.sh)
+    for level, original in zip(read_bundle(tmp_path / "trained.ply").levels, bundle.levels, strict=True):
+        np.testing.assert_array_equal(level.splats.sh, original.splats.sh)
 
 
 @pytest.mark.parametrize("points", [False, True])
-def test_visible_export_applies_the_look_once(bpy, lodgs, looking, tmp_path, points):
-    root, bundle = looking("bands")
+def test_visible_export_applies_the_look_once(bpy, lodgs, scene_with_look, tmp_path, points):
+    root, bundle = scene_with_look("bands")
     bpy.context.scene.lodgs_viewport.splats = not points
     root.lodgs.single_level = 2
     bpy.context.view_layer.update()
     splats = bundle.levels[1].splats
-    color, factor = wanted(splats.means, splats.sh)
+    color, factor = expected_look(splats.means, splats.sh)
     for source in ({"source": "SHOWN"}, {"source": "LEVEL", "level": 2}):
         bpy.ops.lodgs.export_plain(filepath=str(tmp_path / "plain.ply"), **source)
-        found = read_ply(tmp_path / "plain.ply")
-        np.testing.assert_allclose(0.5 + SH_C0 * found.sh[:, 0], color, atol=2e-5)
-        there, then = (1 / (1 + np.exp(-s.opacity_logits)) for s in (found, splats))
-        np.testing.assert_allclose(there, factor * then, rtol=1e-4, atol=2e-6)
-        assert found.extras.keys() == splats.extras.keys()
+        exported = read_ply(tmp_path / "plain.ply")
+        np.testing.assert_allclose(0.5 + SH_C0 * exported.sh[:, 0], color, atol=2e-5)
+        opacity, original_opacity = (1 / (1 + np.exp(-s.opacity_logits)) for s in (exported, splats))
+        np.testing.assert_allclose(opacity, factor * original_opacity, rtol=1e-4, atol=2e-6)
+        assert exported.extras.keys() == splats.extras.keys()
 
 
-def test_a_look_is_undone_saved_duplicated_and_reset(bpy, lodgs, looking, tmp_path):
-    root, bundle = looking("octree")
+def test_look_survives_undo_saving_and_duplication(bpy, lodgs, scene_with_look, tmp_path):
+    root, bundle = scene_with_look("octree")
     looks, name = lodgs("data.looks"), root.name
     scene = bpy.context.scene
     scene.lodgs_viewport.splats = False
     root.lodgs.single_level = 1
 
-    def everywhere():
+    def evaluated_looks():
         root = bpy.data.objects[name]
         bpy.context.view_layer.update()
-        found = looks.looks_of(root, bpy.context.evaluated_depsgraph_get(), blender(np.eye(4)))
-        return [look for _, look in found]
+        looks_of_root = looks.looks_of(root, bpy.context.evaluated_depsgraph_get(), to_blender(np.eye(4)))
+        return [look for _, look in looks_of_root]
 
-    before = everywhere()
+    before = evaluated_looks()
     assert len(before) == 3
     np.testing.assert_allclose(before[0].matrix, EVERYWHERE.matrix, atol=1e-5)
     bpy.ops.ed.undo_push(message="before")
     bpy.ops.lodgs.reset_look("EXEC_DEFAULT", True)
-    assert everywhere() == before[1:]
+    assert evaluated_looks() == before[1:]
     bpy.ops.ed.undo()
-    assert everywhere() == before
+    assert evaluated_looks() == before
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "saved.blend"))
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "saved.blend"))
-    assert everywhere() == before
+    assert evaluated_looks() == before
     root = bpy.data.objects[name]
     check(bpy, lodgs, root.lodgs.levels[0].object, bundle.levels[0].splats)
 
@@ -188,7 +190,7 @@ def test_a_look_is_undone_saved_duplicated_and_reset(bpy, lodgs, looking, tmp_pa
     bpy.ops.object.duplicate()
     copy = next(obj for obj in bpy.context.selected_objects if obj.lodgs.is_root)
     copy.location.x += 5
-    give(bpy.data.objects[name].lodgs_look, Look(exposure=-2.0))
+    apply_look(bpy.data.objects[name].lodgs_look, Look(exposure=-2.0))
     bpy.context.view_layer.update()
     bpy.context.view_layer.update()
     splats, obj = bundle.levels[0].splats, copy.lodgs.levels[0].object
@@ -199,7 +201,7 @@ def test_a_look_is_undone_saved_duplicated_and_reset(bpy, lodgs, looking, tmp_pa
     regions = looks.regions_of(copy)
     bpy.ops.lodgs.reset_look()
     bpy.ops.lodgs.reset_look(name=regions[0].name)
-    assert looks.modifier_of(obj)  # a region is there that could have a look
+    assert looks.modifier_of(obj)  # regions may get a look
     for region in regions:
         bpy.ops.lodgs.remove_crop(name=region.name)
     bpy.context.view_layer.update()
@@ -208,8 +210,8 @@ def test_a_look_is_undone_saved_duplicated_and_reset(bpy, lodgs, looking, tmp_pa
         bpy.ops.lodgs.reset_look(name="nobody")
 
 
-def test_look_of_a_crop_survives_deletion(bpy, lodgs, looking):
-    root, _ = looking("bands")
+def test_look_of_a_crop_survives_deletion(bpy, lodgs, scene_with_look):
+    root, _ = scene_with_look("bands")
     root.lodgs.single_level = 3
     bpy.ops.lodgs.add_crop(shape="BOX", keep="INSIDE")
     crop = bpy.context.active_object
@@ -218,10 +220,10 @@ def test_look_of_a_crop_survives_deletion(bpy, lodgs, looking):
     depsgraph, crops = bpy.context.evaluated_depsgraph_get(), lodgs("data.crops")
     assert crops.removing_crops(root) == [crop] and len(crops.crops_of(root)) == 3
     assert len(crops.evaluated_crops(root, depsgraph)) == 1
-    assert len(lodgs("data.looks").looks_of(root, depsgraph, blender(np.eye(4)))) == 4
+    assert len(lodgs("data.looks").looks_of(root, depsgraph, to_blender(np.eye(4)))) == 4
     bpy.ops.lodgs.delete_left_out()
     assert crop.lodgs_crop.keep == "ALL" and not crops.removing_crops(root)
     crop.lodgs_crop.use = False
     bpy.context.view_layer.update()
     depsgraph = bpy.context.evaluated_depsgraph_get()
-    assert len(lodgs("data.looks").looks_of(root, depsgraph, blender(np.eye(4)))) == 3
+    assert len(lodgs("data.looks").looks_of(root, depsgraph, to_blender(np.eye(4)))) == 3

@@ -1,7 +1,7 @@
-"""Blender 5.3's own Gaussian splats: the same names, bits and levels as LODGS has.
+"""Blender 5.3's own Gaussian splats have the same attribute names, values and levels as those of LODGS.
 
-The tests of attribute names, of old files and of *Add to LODGS Scene* run in every Blender, on clouds made
-like those of Blender's importer. What Blender itself draws is tested where it has splats.
+The tests of attribute names, of old files and of *Add to LODGS Scene* run in every Blender, on clouds like
+those of Blender's importer. The tests of Blender's drawing need Blender 5.3.
 """
 
 import numpy as np
@@ -11,14 +11,15 @@ from training.splats.gaussians import SH_C0
 from training.splats.ply import read_ply, write_ply
 
 HIGHER = {0: 0, 1: 3, 2: 8, 3: 15, 4: 24}
+"""Coefficients above degree 0 by degree."""
 
 
 @pytest.fixture
 def make(lodgs):
-    """``make(count, degree)``: random splats with a column of their own."""
+    """``make(count, degree)``: return random splats with an extra column."""
     Splats = lodgs("training.splats.gaussians").Splats
 
-    def made(count=300, degree=3, seed=0):
+    def make_splats(count=300, degree=3, seed=0):
         random = np.random.default_rng(seed)
 
         def normal(*shape):
@@ -29,14 +30,14 @@ def make(lodgs):
             0.3 * normal(count, (degree + 1) ** 2, 3), {"confidence": np.arange(count, dtype="f4")},
         )  # fmt: skip
 
-    return made
+    return make_splats
 
 
 @pytest.fixture
 def native(bpy, lodgs):
-    """``native(splats)``: an object with just the attributes that Blender 5.3's importer makes."""
+    """``native(splats)``: return an object with the attributes of Blender 5.3's importer only."""
 
-    def made(splats, first=0, name="cloud"):
+    def make_object(splats, first=0, name="cloud"):
         attributes, compat = lodgs("attributes"), lodgs("compat")
         cloud = compat.new_point_cloud(name, len(splats))
         base = np.column_stack([splats.sh[:, 0], 1 / (1 + np.exp(-splats.opacity_logits))])
@@ -51,19 +52,19 @@ def native(bpy, lodgs):
         compat.make_native(cloud)
         obj = bpy.data.objects.new(name, cloud)
         bpy.context.scene.collection.objects.link(obj)
-        for other in bpy.context.selected_objects:
-            other.select_set(False)
+        for selected in bpy.context.selected_objects:
+            selected.select_set(False)
         bpy.context.view_layer.objects.active = obj
         obj.select_set(True)
         bpy.context.view_layer.update()
         return obj
 
-    return made
+    return make_object
 
 
 @pytest.fixture
 def with_splats(lodgs):
-    """Skips a test where this Blender has no splats of its own."""
+    """Skip a test if this Blender has no native splats."""
     if lodgs("compat").NATIVE_SPLATS is None:
         pytest.skip("no native splats before Blender 5.3")
 
@@ -78,7 +79,7 @@ def evaluated(bpy, obj):
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
-def test_coefficients_count_from_0_as_in_blender(lodgs, make, degree):
+def test_coefficients_are_numbered_from_0_as_in_blender(lodgs, make, degree):
     splats = make(20, degree)
     obj = lodgs("data.objects").new_splats("s", splats)
     names = {a.name for a in obj.data.attributes if a.name.startswith("radiance:sh_")}
@@ -104,7 +105,7 @@ def test_both_coefficient_namings_are_read(lodgs, make, native, first, degree):
     )
 
 
-def test_files_with_the_old_names_open_with_blenders(bpy, lodgs, make, native, tmp_path):
+def test_opening_old_files_renames_coefficients(bpy, lodgs, make, native, tmp_path):
     splats = make(30, 3)
     native(splats, first=1)
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "old.blend"))
@@ -116,7 +117,7 @@ def test_files_with_the_old_names_open_with_blenders(bpy, lodgs, make, native, t
         np.testing.assert_array_equal(attribute(lodgs, obj, f"radiance:sh_{k}"), splats.sh[:, k + 1])
 
 
-def test_levels_of_another_blender_get_this_ones_modifiers(bpy, lodgs, make, tmp_path):
+def test_levels_of_another_blender_get_current_modifiers(bpy, lodgs, make, tmp_path):
     """A file saved before Blender 5.3 has plain clouds, the points' material and one display modifier."""
     write_ply(tmp_path / "s.ply", make(40, 1))
     root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "s.ply")
@@ -138,7 +139,7 @@ def test_levels_of_another_blender_get_this_ones_modifiers(bpy, lodgs, make, tmp
         assert [material.name for material in obj.data.materials] == ["LODGS Points"]
 
 
-def test_a_loose_cloud_becomes_a_scene_in_place(bpy, lodgs, make, native, tmp_path):
+def test_loose_cloud_becomes_a_scene_in_place(bpy, lodgs, make, native, tmp_path):
     splats = make(60, 3)
     obj = native(splats)
     obj.location, obj.rotation_euler, obj.scale = (1, 2, 3), (0.1, 0.2, 0.3), (2, 2, 2)
@@ -150,19 +151,19 @@ def test_a_loose_cloud_becomes_a_scene_in_place(bpy, lodgs, make, native, tmp_pa
     assert [item.object for item in root.lodgs.levels] == [obj] and obj.data == cloud
     np.testing.assert_allclose(np.array(obj.matrix_world), world, atol=1e-6)
     np.testing.assert_allclose(np.array(root.matrix_world), world, atol=1e-6)
-    assert root.lodgs.training.method in ("lodge", "tree")  # which train from splats alone
+    assert root.lodgs.training.method in ("lodge", "tree")  # these train from splats without photos
     assert not bpy.ops.lodgs.add_to_scene.poll()
 
     bpy.ops.lodgs.export_plain(filepath=str(tmp_path / "out.ply"), source="LEVEL", level=1)
-    back = read_ply(tmp_path / "out.ply")
-    np.testing.assert_array_equal(back.means, splats.means)
-    np.testing.assert_array_equal(back.sh, splats.sh)
-    np.testing.assert_allclose(back.log_scales, splats.log_scales, atol=1e-6)
-    np.testing.assert_allclose(back.opacity_logits, splats.opacity_logits, atol=1e-5)
-    np.testing.assert_array_equal(back.extras["confidence"], splats.extras["confidence"])
+    exported = read_ply(tmp_path / "out.ply")
+    np.testing.assert_array_equal(exported.means, splats.means)
+    np.testing.assert_array_equal(exported.sh, splats.sh)
+    np.testing.assert_allclose(exported.log_scales, splats.log_scales, atol=1e-6)
+    np.testing.assert_allclose(exported.opacity_logits, splats.opacity_logits, atol=1e-5)
+    np.testing.assert_array_equal(exported.extras["confidence"], splats.extras["confidence"])
 
 
-def test_several_clouds_become_levels_by_their_number_of_splats(bpy, lodgs, make, native):
+def test_several_clouds_become_levels_ordered_by_splat_count(bpy, lodgs, make, native):
     fine, coarse = native(make(90), name="fine"), native(make(30), name="coarse")
     fine.select_set(True)
     assert bpy.ops.lodgs.add_to_scene(as_levels=True) == {"FINISHED"}
@@ -183,26 +184,26 @@ def test_unsuitable_cloud_stays_unchanged(bpy, lodgs, make, native):
     assert good.parent is None and "log_scale" not in good.data.attributes
 
 
-def test_importing_with_blender_and_exporting_keeps_the_files_values(bpy, lodgs, make, with_splats, tmp_path):
+def test_import_by_blender_and_export_keep_values(bpy, lodgs, make, with_splats, tmp_path):
     splats = make(200, 3)
     write_ply(tmp_path / "in.ply", splats)
     bpy.ops.wm.ply_import(filepath=str(tmp_path / "in.ply"))
     assert bpy.ops.lodgs.add_to_scene() == {"FINISHED"}
     bpy.ops.lodgs.export_plain(filepath=str(tmp_path / "out.ply"), source="LEVEL", level=1)
-    back = read_ply(tmp_path / "out.ply")
-    np.testing.assert_array_equal(back.means, splats.means)
-    np.testing.assert_array_equal(back.sh, splats.sh)
-    np.testing.assert_allclose(back.log_scales, splats.log_scales, atol=1e-6)
-    np.testing.assert_allclose(back.opacity_logits, splats.opacity_logits, atol=1e-5)
+    exported = read_ply(tmp_path / "out.ply")
+    np.testing.assert_array_equal(exported.means, splats.means)
+    np.testing.assert_array_equal(exported.sh, splats.sh)
+    np.testing.assert_allclose(exported.log_scales, splats.log_scales, atol=1e-6)
+    np.testing.assert_allclose(exported.opacity_logits, splats.opacity_logits, atol=1e-5)
     unit = splats.quats / np.linalg.norm(splats.quats, axis=1, keepdims=True)
-    np.testing.assert_allclose(back.quats, unit, atol=1e-6)
+    np.testing.assert_allclose(exported.quats, unit, atol=1e-6)
 
 
-def test_cycles_draws_a_level_as_blenders_own_import(bpy, lodgs, make, with_splats, tmp_path):
-    """To the bit, with the same seed and samples: values, names and material are Blender's."""
+def test_cycles_draws_a_level_like_blenders_own_import(bpy, lodgs, make, with_splats, tmp_path):
+    """Images are equal to the bit, as attributes and material are Blender's."""
     write_ply(tmp_path / "s.ply", make(300, 3))
 
-    def rendered(load):
+    def render_import(load):
         bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
         load()
         scene = bpy.context.scene
@@ -223,17 +224,21 @@ def test_cycles_draws_a_level_as_blenders_own_import(bpy, lodgs, make, with_spla
         return pixels.reshape(64, 96, 4)
 
     path = str(tmp_path / "s.ply")
-    theirs = rendered(lambda: bpy.ops.wm.ply_import(filepath=path))
-    ours = rendered(lambda: lodgs("data.importing").import_splats(bpy.context, path, upright=False))
-    assert theirs[..., :3].std() > 0.1
-    np.testing.assert_array_equal(ours, theirs)
+    blender_image = render_import(lambda: bpy.ops.wm.ply_import(filepath=path))
+    lodgs_image = render_import(
+        lambda: lodgs("data.importing").import_splats(bpy.context, path, upright=False)
+    )
+    assert blender_image[..., :3].std() > 0.1
+    np.testing.assert_array_equal(lodgs_image, blender_image)
 
 
-def test_blender_or_lodgs_draws_and_both_select_the_same_splats(bpy, lodgs, make, with_splats, tmp_path):
+def test_blender_and_lodgs_draw_the_same_selection(bpy, lodgs, make, with_splats, tmp_path):
     bundles = lodgs("training.splats.bundle")
-    files = lodgs("training.splats.levels")
-    levels = [files.Level(n, make(100 * n, 1, seed=n), {"s_min": s}) for n, s in ((1, 0.5), (2, 0.0))]
-    bundles.write_bundle(tmp_path / "b.ply", files.Bundle("flod", levels, "bands", {}, {"gamma": 1.0}))
+    levels_module = lodgs("training.splats.levels")
+    levels = [levels_module.Level(n, make(100 * n, 1, seed=n), {"s_min": s}) for n, s in ((1, 0.5), (2, 0.0))]
+    bundles.write_bundle(
+        tmp_path / "b.ply", levels_module.Bundle("flod", levels, "bands", {}, {"gamma": 1.0})
+    )
     root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply")
     root.lodgs.mode, root.lodgs.camera_choice, root.lodgs.camera_center = "SELECTIVE", "TRAINING", (0, 0, -1)
     settings = bpy.context.scene.lodgs_viewport
@@ -245,13 +250,13 @@ def test_blender_or_lodgs_draws_and_both_select_the_same_splats(bpy, lodgs, make
         clouds = [instance.evaluated.data for instance in visible]
         types[drawn_by] = {cloud.type for cloud in clouds if len(cloud.points)}
         positions[drawn_by] = [lodgs("attributes").read_attribute(cloud, "position") for cloud in clouds]
-        by_blender = {lodgs("nodes.display").is_drawn_by_blender(each.evaluated) for each in visible}
+        by_blender = {lodgs("nodes.display").is_drawn_by_blender(instance.evaluated) for instance in visible}
         assert by_blender == {drawn_by == "BLENDER"}
     assert types == {"LODGS": {"POINTS"}, "BLENDER": {"GAUSSIAN_SPLAT"}}
     counts = [0 if values is None else len(values) for values in positions["LODGS"]]
     assert 0 < sum(counts) < 300
-    for one, other in zip(positions["LODGS"], positions["BLENDER"], strict=True):
-        np.testing.assert_array_equal(one, other)
+    for by_lodgs, by_blender in zip(positions["LODGS"], positions["BLENDER"], strict=True):
+        np.testing.assert_array_equal(by_lodgs, by_blender)
     settings.splats = False
     bpy.context.view_layer.update()
     obj = root.lodgs.levels[1].object
@@ -260,7 +265,7 @@ def test_blender_or_lodgs_draws_and_both_select_the_same_splats(bpy, lodgs, make
 
 
 def test_blender_draws_looks_paint_and_weights(bpy, lodgs, make, with_splats, tmp_path):
-    """Blender draws the look of ``training.editing.look``, and export has it once."""
+    """Blender draws the look of ``training.editing.look``, and exports apply it once."""
     splats = make(80, 3)
     write_ply(tmp_path / "s.ply", splats)
     root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "s.ply", upright=False)
@@ -277,24 +282,24 @@ def test_blender_draws_looks_paint_and_weights(bpy, lodgs, make, with_splats, tm
     assert names.index("LODGS Native Splats") > next(i for i, name in enumerate(names) if "Look" in name)
     lodgs("data.selection").follow_crops(root)
     bpy.context.scene.lodgs_viewport.drawn_by = "BLENDER"
-    shown = evaluated(bpy, obj)
+    drawn_object = evaluated(bpy, obj)
 
     Look = lodgs("training.editing.look").Look
     matrix = Look(exposure=look.exposure, tint=tuple(look.tint), saturation=look.saturation).matrix
     amount = paint[:, 3, None].astype(float)
     base = (1 - amount) * (0.5 + SH_C0 * splats.sh[:, 0].astype(float)) + paint[:, :3]
     higher = (1 - amount[..., None]) * splats.sh[:, 1:]
-    drawn = attribute(lodgs, obj, "radiance:base", shown)
+    drawn = attribute(lodgs, obj, "radiance:base", drawn_object)
     np.testing.assert_allclose(0.5 + SH_C0 * drawn[:, :3], base @ matrix.T, atol=1e-5)
     opacity = 0.5 * weights / (1 + np.exp(-splats.opacity_logits.astype(float)))
     np.testing.assert_allclose(drawn[:, 3], opacity, atol=1e-6)
     for k in range(15):
         np.testing.assert_allclose(
-            attribute(lodgs, obj, f"radiance:sh_{k}", shown), higher[:, k] @ matrix.T, atol=1e-5
+            attribute(lodgs, obj, f"radiance:sh_{k}", drawn_object), higher[:, k] @ matrix.T, atol=1e-5
         )
 
     bpy.ops.lodgs.export_plain(filepath=str(tmp_path / "out.ply"), source="SHOWN")
-    back = read_ply(tmp_path / "out.ply")
-    np.testing.assert_allclose(0.5 + SH_C0 * back.sh[:, 0], base @ matrix.T, atol=1e-5)
-    np.testing.assert_allclose(1 / (1 + np.exp(-back.opacity_logits)), opacity, atol=1e-6)
+    exported = read_ply(tmp_path / "out.ply")
+    np.testing.assert_allclose(0.5 + SH_C0 * exported.sh[:, 0], base @ matrix.T, atol=1e-5)
+    np.testing.assert_allclose(1 / (1 + np.exp(-exported.opacity_logits)), opacity, atol=1e-6)
     assert bpy.context.scene.lodgs_viewport.drawn_by == "BLENDER"

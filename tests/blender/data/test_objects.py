@@ -1,4 +1,4 @@
-"""Splats to point clouds and back: bit for bit where nobody touched them, and with what artists change."""
+"""Splats round trip through point clouds: unchanged values to the bit, and edits by artists."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ def make(lodgs):
 
         return lodgs("training.splats.gaussians").Splats(
             means=normal(count, 3, spread=3),
-            quats=normal(count, 4),  # of any length, as files have them
+            quats=normal(count, 4),  # not normalized, as in files
             log_scales=normal(count, 3, spread=2) - 2,
             opacity_logits=normal(count, spread=4),
             sh=normal(count, (degree + 1) ** 2, 3),
@@ -41,7 +41,7 @@ def test_round_trip_is_bit_exact(lodgs, make, degree):
         500,
         degree,
         sigma=rng.random(500, np.float32),
-        scale=rng.random(500, np.float32),  # a name that means something else to a point cloud
+        scale=rng.random(500, np.float32),  # point clouds have another attribute of this name
         label=rng.integers(0, 255, 500).astype(np.uint8),
         key=rng.integers(0, 2**32, 500).astype(np.uint32),
         time=rng.random(500),
@@ -52,14 +52,14 @@ def test_round_trip_is_bit_exact(lodgs, make, degree):
     assert same_bits(splats, objects.read_splats(obj))
 
 
-def test_no_splats_and_one(lodgs, make):
+def test_round_trip_of_no_splats_and_of_one(lodgs, make):
     objects = lodgs("data.objects")
     for count in (0, 1):
         splats = make(count, 1)
         assert same_bits(splats, objects.read_splats(objects.new_splats("s", splats)))
 
 
-def test_attributes_are_those_of_native_splats(lodgs, make):
+def test_attributes_match_native_splats(lodgs, make):
     objects, attributes, splats = lodgs("data.objects"), lodgs("attributes"), make(50, 2)
     cloud = objects.new_splats("s", splats).data
     base = attributes.read_attribute(cloud, "radiance:base")
@@ -76,14 +76,14 @@ def test_attributes_are_those_of_native_splats(lodgs, make):
     assert cloud.attributes["rotation"].data_type == "QUATERNION"
 
 
-def test_display_colour(lodgs, make):
+def test_display_colour_matches_sh(lodgs, make):
     objects, attributes, splats = lodgs("data.objects"), lodgs("attributes"), make(50, 0)
     obj = objects.new_splats("s", splats)
-    shown = attributes.read_attribute(obj.data, "display_color")[:, :3].astype(float)
-    srgb = np.where(shown <= 0.0031308, shown * 12.92, 1.055 * shown ** (1 / 2.4) - 0.055)
+    linear = attributes.read_attribute(obj.data, "display_color")[:, :3].astype(float)
+    srgb = np.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear ** (1 / 2.4) - 0.055)
     truth = np.clip(0.5 + splats.sh[:, 0] / (2 * np.sqrt(np.pi)), 0, 1)
     assert srgb == pytest.approx(truth, abs=0.5 / 255 + 1e-4)
-    assert tuple(obj.color[:3]) == pytest.approx(shown.mean(axis=0), abs=1e-5)
+    assert tuple(obj.color[:3]) == pytest.approx(linear.mean(axis=0), abs=1e-5)
 
 
 def test_edits_take_precedence(lodgs, make):
@@ -97,23 +97,23 @@ def test_edits_take_precedence(lodgs, make):
     base[20:, 3] = 0.25
     attributes.write_attribute(cloud, "radiance:base", cloud.attributes["radiance:base"].data_type, base)
 
-    back = objects.read_splats(obj)
-    changed = splats.log_scales[:10].astype(float) + np.log(2)
-    assert back.log_scales[:10] == pytest.approx(changed, abs=1e-5)
-    assert np.array_equal(back.log_scales[10:], splats.log_scales[10:])
-    assert np.array_equal(back.opacity_logits[:20], splats.opacity_logits[:20])
-    assert back.opacity_logits[20:] == pytest.approx(np.log(0.25 / 0.75), abs=1e-6)
-    assert np.array_equal(back.quats, splats.quats)
+    edited = objects.read_splats(obj)
+    expected = splats.log_scales[:10].astype(float) + np.log(2)
+    assert edited.log_scales[:10] == pytest.approx(expected, abs=1e-5)
+    assert np.array_equal(edited.log_scales[10:], splats.log_scales[10:])
+    assert np.array_equal(edited.opacity_logits[:20], splats.opacity_logits[:20])
+    assert edited.opacity_logits[20:] == pytest.approx(np.log(0.25 / 0.75), abs=1e-6)
+    assert np.array_equal(edited.quats, splats.quats)
 
 
-def test_deleted_points_stay_away(bpy, lodgs, make):
-    """By a modifier, as its evaluated points; the others are still theirs to the bit."""
+def test_points_deleted_by_a_modifier_are_not_read(bpy, lodgs, make):
+    """The remaining splats are unchanged to the bit."""
     objects, splats = lodgs("data.objects"), make(60, 1, label=np.arange(60, dtype=np.uint8))
     obj = objects.new_splats("s", splats)
     bpy.context.scene.collection.objects.link(obj)
     group = bpy.data.node_groups.new("crop", "GeometryNodeTree")
-    for way in ("INPUT", "OUTPUT"):
-        group.interface.new_socket("Geometry", in_out=way, socket_type="NodeSocketGeometry")
+    for direction in ("INPUT", "OUTPUT"):
+        group.interface.new_socket("Geometry", in_out=direction, socket_type="NodeSocketGeometry")
     nodes = [
         group.nodes.new(kind) for kind in ("NodeGroupInput", "GeometryNodeDeleteGeometry", "NodeGroupOutput")
     ]
@@ -126,8 +126,8 @@ def test_deleted_points_stay_away(bpy, lodgs, make):
     group.links.new(nodes[0].outputs[0], nodes[1].inputs["Geometry"])
     group.links.new(nodes[1].outputs[0], nodes[2].inputs[0])
     obj.modifiers.new("crop", "NODES").node_group = group
-    left = objects.read_splats(obj, bpy.context.evaluated_depsgraph_get())
-    assert same_bits(splats.select(slice(25, None)), left)
+    remaining = objects.read_splats(obj, bpy.context.evaluated_depsgraph_get())
+    assert same_bits(splats.select(slice(25, None)), remaining)
 
 
 def test_object_without_splats_is_rejected(lodgs):
@@ -137,7 +137,7 @@ def test_object_without_splats_is_rejected(lodgs):
         objects.read_splats(obj)
 
 
-def test_megabytes_are_those_of_the_file(bpy, lodgs, make, tmp_path):
+def test_megabytes_match_the_file(bpy, lodgs, make, tmp_path):
     splats = make(2000, 3)
     lodgs("training.splats.ply").write_ply(tmp_path / "a.ply", splats)
     size = (tmp_path / "a.ply").stat().st_size / 1e6

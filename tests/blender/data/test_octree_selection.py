@@ -1,4 +1,4 @@
-"""Octree-GS in Blender: what the modifiers show of levels that add up, against the rule in numpy."""
+"""Modifiers of cumulative levels of Octree-GS, compared with the rule in numpy."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ LEVELS, COUNT, D_MAX, FOCAL = 4, 5_000, 16.0, 700.0
 
 @pytest.fixture
 def root(bpy, lodgs, tmp_path):
-    """Four levels of points out to 40 units, from a bundle, with a scene camera."""
+    """Import four levels of points within 40 units of the scene camera."""
     scene, rng = bpy.context.scene, np.random.default_rng(7)
     scene.lodgs_viewport.splats = False  # points keep their radius
     bundles = lodgs("training.splats.bundle")
@@ -30,7 +30,7 @@ def root(bpy, lodgs, tmp_path):
     facts = {"d_max": D_MAX, "d_max_focal": FOCAL}
     bundle = bundles.Bundle("octree", levels, "octree", facts, cumulative=True)
     bundles.write_bundle(tmp_path / "b.ply", bundle)
-    camera = bpy.data.objects.new("eye", bpy.data.cameras.new("eye"))
+    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     scene.collection.objects.link(camera)
     scene.camera = camera
     root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply")
@@ -38,58 +38,60 @@ def root(bpy, lodgs, tmp_path):
     return root
 
 
-def expected(root, eye, focal, offset=0.0):
-    """Each level's weights by the rule."""
-    found = []
+def expected_weights(root, camera_center, focal, offset=0.0):
+    """Return the weights of each level according to the rule."""
+    weights = []
     for item in root.lodgs.levels:
         cloud = item.object.data
         means, bias = np.empty(3 * COUNT, np.float32), np.empty(COUNT, np.float32)
         cloud.attributes["position"].data.foreach_get("vector", means)
         cloud.attributes["lod_bias"].data.foreach_get("value", bias)
-        distances = np.linalg.norm(means.reshape(-1, 3) - np.float32(eye), axis=1) * (FOCAL / focal)
-        found.append(fade_weights(target_level(distances, bias + offset, D_MAX, LEVELS), item.number))
-    return found
+        distances = np.linalg.norm(means.reshape(-1, 3) - np.float32(camera_center), axis=1) * (FOCAL / focal)
+        weights.append(fade_weights(target_level(distances, bias + offset, D_MAX, LEVELS), item.number))
+    return weights
 
 
-def shown(bpy, root):
-    """Each level's weights and radii, of the points that are left."""
+def evaluated_points(bpy, root):
+    """Return weights and radii of the remaining points of each level."""
     depsgraph = bpy.context.evaluated_depsgraph_get()
-    found = []
+    points_of_levels = []
     for item in root.lodgs.levels:
         cloud = item.object.evaluated_get(depsgraph).data
         weights, radii = np.empty(len(cloud.points), np.float32), np.empty(len(cloud.points), np.float32)
         if len(weights):
             cloud.attributes["lod_weight"].data.foreach_get("value", weights)
             cloud.attributes["radius"].data.foreach_get("value", radii)
-        found.append((weights, radii))
-    return found
+        points_of_levels.append((weights, radii))
+    return points_of_levels
 
 
 @pytest.mark.parametrize("offset", [0.0, -1.3, 0.7])
-def test_levels_fade_in_as_the_rule_says(bpy, root, offset):
+def test_levels_fade_in_according_to_the_rule(bpy, root, offset):
     settings = root.lodgs
     settings.octree.offset = offset
     bpy.context.scene.camera.location = (3, -2, 1)
     bpy.context.scene.camera.data.lens = 35
     bpy.context.view_layer.update()
-    eye = root.lodgs.axes.matrix_world.inverted() @ bpy.context.scene.camera.matrix_world.translation
-    rule = expected(root, eye, settings.focal_px, offset)
+    center = root.lodgs.axes.matrix_world.inverted() @ bpy.context.scene.camera.matrix_world.translation
+    expected = expected_weights(root, center, settings.focal_px, offset)
     counts = []
-    for item, wanted, (weights, radii) in zip(settings.levels, rule, shown(bpy, root), strict=True):
-        some = wanted > 1e-5
-        assert abs(len(weights) - some.sum()) <= 2  # the last bits of the logarithm at weight 0
-        if len(weights) == some.sum():
-            assert np.abs(weights - wanted[some]).max(initial=0) < 1e-4
-            before = np.empty(COUNT, np.float32)
-            item.object.data.attributes["radius"].data.foreach_get("value", before)
-            assert np.allclose(radii, before[some] * weights, rtol=1e-5)
-        counts.append(int(some.sum()))
-    assert counts[0] == COUNT  # level 1 is always there
+    for item, level_weights, (weights, radii) in zip(
+        settings.levels, expected, evaluated_points(bpy, root), strict=True
+    ):
+        visible = level_weights > 1e-5
+        assert abs(len(weights) - visible.sum()) <= 2  # the last bits of the logarithm at weight 0
+        if len(weights) == visible.sum():
+            assert np.abs(weights - level_weights[visible]).max(initial=0) < 1e-4
+            original_radii = np.empty(COUNT, np.float32)
+            item.object.data.attributes["radius"].data.foreach_get("value", original_radii)
+            assert np.allclose(radii, original_radii[visible] * weights, rtol=1e-5)
+        counts.append(int(visible.sum()))
+    assert counts[0] == COUNT  # level 1 is always visible
     assert counts == sorted(counts, reverse=True)
     assert any(0 < n < COUNT for n in counts)
 
 
-def test_one_level_means_all_up_to_it(bpy, root):
+def test_single_cumulative_level_shows_coarser_levels(bpy, root):
     root.lodgs.mode, root.lodgs.single_level = "SINGLE", 2
     bpy.context.view_layer.update()
     assert [item.object.visible_get() for item in root.lodgs.levels] == [True, True, False, False]
@@ -122,8 +124,8 @@ def names_of(obj):
     return [modifier.name for modifier in obj.modifiers if not is_display(modifier.name)]
 
 
-def test_another_method_leaves_no_driver_of_the_first(bpy, lodgs, root):
-    """Trained again with FLoD and back: each level has one modifier, with the drivers of its rule only."""
+def test_changing_the_method_replaces_modifiers_and_drivers(bpy, lodgs, root):
+    """After FLoD and octree in turn, each level has one modifier, with the drivers of its rule only."""
     Bundle = lodgs("training.splats.levels").Bundle
     for item in root.lodgs.levels:
         item.facts = '{"s_min": 0.5}'
@@ -136,25 +138,27 @@ def test_another_method_leaves_no_driver_of_the_first(bpy, lodgs, root):
         bundle = Bundle("", [], rule, facts, cumulative=rule == "octree")
         lodgs("data.scenes").set_bundle_facts(root, bundle)
         for item in root.lodgs.levels:
-            assert [other for other in names_of(item.object) if other != "mine"] == [name]
+            assert [modifier for modifier in names_of(item.object) if modifier != "mine"] == [name]
             drivers = item.object.animation_data.drivers
             paths = [driver.data_path for driver in drivers]
             assert len(paths) == len({(driver.data_path, driver.array_index) for driver in drivers})
-            own = [path for path in paths if path.startswith("modifiers") and not is_display(path)]
-            assert own and all(name in path for path in own)
+            rule_paths = [path for path in paths if path.startswith("modifiers") and not is_display(path)]
+            assert rule_paths and all(name in path for path in rule_paths)
             assert all(driver.driver.is_valid for driver in item.object.animation_data.drivers)
-        assert names_of(obj) == [name, "mine"], "in its old place"
+        assert names_of(obj) == [name, "mine"], "order of modifiers"
     bpy.context.view_layer.update()
-    assert sum(len(weights) for weights, _ in shown(bpy, root)) > COUNT
+    assert sum(len(weights) for weights, _ in evaluated_points(bpy, root)) > COUNT
 
 
 def test_visible_export_keeps_fading(bpy, lodgs, root):
     bpy.context.scene.camera.location = (3, -2, 1)
     bpy.context.view_layer.update()
     splats = lodgs("data.scenes").visible_splats(bpy.context, root)
-    eye = root.lodgs.axes.matrix_world.inverted() @ bpy.context.scene.camera.matrix_world.translation
+    center = root.lodgs.axes.matrix_world.inverted() @ bpy.context.scene.camera.matrix_world.translation
     opacities = []
-    for item, weights in zip(root.lodgs.levels, expected(root, eye, root.lodgs.focal_px), strict=True):
+    for item, weights in zip(
+        root.lodgs.levels, expected_weights(root, center, root.lodgs.focal_px), strict=True
+    ):
         logits = np.empty(COUNT, np.float32)
         item.object.data.attributes["opacity_logit"].data.foreach_get("value", logits)
         opacities.append((weights / (1 + np.exp(-logits)))[weights > 0])

@@ -1,4 +1,4 @@
-"""Strokes paint every level as a formula by hand has it, beside the splats' own colours: against numpy."""
+"""Brush strokes paint every level and keep the trained colours. Numpy is the reference."""
 
 from itertools import pairwise
 
@@ -7,7 +7,7 @@ import pytest
 
 from tests.blender.data.test_brush import (
     NAMES,
-    pixels_of,
+    project,
     scene_of,  # noqa: F401
     viewport,  # noqa: F401
 )
@@ -25,24 +25,25 @@ RED, BLUE = (0.9, 0.2, 0.1), (0.1, 0.3, 0.8)
 
 
 def stroke(bpy, *path, **options):
-    path = [{"name": "", "loc": place, "time": 0.0} for place in path]
+    path = [{"name": "", "loc": pixel, "time": 0.0} for pixel in path]
     return bpy.ops.lodgs.paint_splats(path=path, through=True, **options)
 
 
-def strength(looks, size, means, place, radius, hardness):
-    """(N,) how strongly a dab hits means, by the distance of the middles of pixels; NaN between two."""
-    pixels, depth = pixels_of(looks, size, means)
-    t = np.linalg.norm(np.floor(pixels) + 0.5 - place, axis=1) / radius
-    rest = ((1 - t) / (1 - hardness)).clip(0, 1)
-    found = np.where(t <= hardness, 1, 3 * rest**2 - 2 * rest**3)
-    found[(np.abs(pixels - np.round(pixels)) < 1e-3).any(axis=1)] = np.nan
-    return found * (depth > 0.1)
+def dab_weights(view, size, means, center, radius, hardness):
+    """Return the weights (N,) of a dab by distances of pixel centres; NaN near the border of a pixel."""
+    pixels, depth = project(view, size, means)
+    t = np.linalg.norm(np.floor(pixels) + 0.5 - center, axis=1) / radius
+    falloff = ((1 - t) / (1 - hardness)).clip(0, 1)
+    weights = np.where(t <= hardness, 1, 3 * falloff**2 - 2 * falloff**3)
+    weights[(np.abs(pixels - np.round(pixels)) < 1e-3).any(axis=1)] = np.nan
+    return weights * (depth > 0.1)
 
 
-def check(found, colors, atol=5e-5):
-    clear = ~np.isnan(colors).any(axis=1)
+def check(actual, expected, atol=5e-5):
+    """Compare colours, except for splats on the border of a pixel."""
+    clear = ~np.isnan(expected).any(axis=1)
     assert clear.mean() > 0.98
-    np.testing.assert_allclose(found[clear], colors[clear], atol=atol)
+    np.testing.assert_allclose(actual[clear], expected[clear], atol=atol)
 
 
 def colors_of(splats):
@@ -55,43 +56,47 @@ def mix(color, share, new):
 
 @pytest.fixture
 def painted(bpy, lodgs, scene_of, viewport):  # noqa: F811
-    """``painted(bundle)``: a scene with two soft dabs and one erased, its bundle, and what numpy makes of the
-    colours of each level without view dependence."""
+    """``painted(bundle)``: a scene with two soft dabs and one erased dab.
+
+    Return its root, the bundle, and the expected colours of each level without view dependence.
+    """
 
     def make(bundle):
         for level in bundle.levels:
-            level.splats.log_scales -= 12  # far below a pixel: hit by their means
+            level.splats.log_scales -= 12  # smaller than a pixel, so only means count
         root, bundle = scene_of(bundle)
-        looks, size = viewport
+        view, size = viewport
         middle = np.array(size) / 2
         stroke(bpy, tuple(middle), radius=180, color=RED, strength=0.8, hardness=0.3)
         stroke(bpy, (middle[0] + 60, middle[1]), radius=120, color=BLUE, strength=1.0, hardness=0.5)
         stroke(bpy, tuple(middle - (40, 30)), radius=60, strength=1.0, hardness=0.0, action="ERASE")
         colors = {}
         for level in bundle.levels:
-            means, own = level.splats.means, colors_of(level.splats)
-            one = 0.8 * strength(looks, size, means, middle, 180, 0.3)
-            two = strength(looks, size, means, (middle[0] + 60, middle[1]), 120, 0.5)
-            three = strength(looks, size, means, middle - (40, 30), 60, 0.0)
-            colors[level.number] = mix(mix(own, one, RED), two, BLUE)
-            colors[level.number] = mix(colors[level.number], three, (0, 0, 0)) + three[:, None] * own
-            assert 10 < np.count_nonzero(one) < len(one) and two.any() and three.any()
+            means, trained = level.splats.means, colors_of(level.splats)
+            red = 0.8 * dab_weights(view, size, means, middle, 180, 0.3)
+            blue = dab_weights(view, size, means, (middle[0] + 60, middle[1]), 120, 0.5)
+            erased = dab_weights(view, size, means, middle - (40, 30), 60, 0.0)
+            colors[level.number] = mix(mix(trained, red, RED), blue, BLUE)
+            colors[level.number] = mix(colors[level.number], erased, (0, 0, 0)) + erased[:, None] * trained
+            assert 10 < np.count_nonzero(red) < len(red) and blue.any() and erased.any()
         return root, bundle, colors
 
     return make
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_stroke_paints_every_level_as_points_and_exports_show_it(bpy, lodgs, painted, tmp_path, name):
+def test_strokes_paint_points_and_exports_of_every_level(bpy, lodgs, painted, tmp_path, name):
     root, bundle, colors = painted(bundle_of(name, np.random.default_rng(0)))
     root.lodgs_look.exposure, root.lodgs_look.tint = 0.3, (1.0, 0.8, 0.9)
     matrix = Look(0.3, tint=(1.0, 0.8, 0.9)).matrix
     bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "out.ply"))
-    for level, before in zip(read_bundle(tmp_path / "out.ply").levels, bundle.levels, strict=True):
+    for level, original in zip(read_bundle(tmp_path / "out.ply").levels, bundle.levels, strict=True):
         check(colors_of(level.splats), colors[level.number] @ matrix.T)
-        assert level.splats.extras.keys() == before.splats.extras.keys()
-        for part in ("means", "quats", "log_scales"):
-            np.testing.assert_array_equal(getattr(level.splats, part), getattr(before.splats, part))
+        assert level.splats.extras.keys() == original.splats.extras.keys()
+        for name_of_array in ("means", "quats", "log_scales"):
+            np.testing.assert_array_equal(
+                getattr(level.splats, name_of_array), getattr(original.splats, name_of_array)
+            )
     bpy.context.scene.lodgs_viewport.splats = False  # points, which Blender draws
     root.lodgs.mode = "SINGLE"
     attributes = lodgs("attributes")
@@ -101,27 +106,27 @@ def test_a_stroke_paints_every_level_as_points_and_exports_show_it(bpy, lodgs, p
         depsgraph = bpy.context.evaluated_depsgraph_get()
         evaluated = item.object.evaluated_get(depsgraph)
         rows = attributes.read_attribute(evaluated.data, "row")
-        place = {row: i for i, row in enumerate(level.splats.extras["row"].tolist())}
-        some = [place[row] for row in rows.tolist()]
-        wanted = linear_from_srgb((colors[item.number][some] @ matrix.T).clip(0, 1))
-        found = attributes.read_attribute(evaluated.data, attributes.COLOR)[:, :3]
-        check(found, wanted)
+        index_of_row = {row: i for i, row in enumerate(level.splats.extras["row"].tolist())}
+        indices = [index_of_row[row] for row in rows.tolist()]
+        expected = linear_from_srgb((colors[item.number][indices] @ matrix.T).clip(0, 1))
+        actual = attributes.read_attribute(evaluated.data, attributes.COLOR)[:, :3]
+        check(actual, expected)
         assert lodgs("data.selection").only_lodgs_modifiers(evaluated, depsgraph)
 
 
 def test_exports_without_look_keep_paint_columns(bpy, lodgs, painted, tmp_path):
     root, bundle, colors = painted(bundle_of("bands", np.random.default_rng(1)))
     bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "trained.ply"), looked=False)
-    for level, before in zip(read_bundle(tmp_path / "trained.ply").levels, bundle.levels, strict=True):
-        np.testing.assert_array_equal(level.splats.sh, before.splats.sh)
+    for level, original in zip(read_bundle(tmp_path / "trained.ply").levels, bundle.levels, strict=True):
+        np.testing.assert_array_equal(level.splats.sh, original.splats.sh)
     scenes = lodgs("data.scenes")
-    again = lodgs("data.importing").import_splats(bpy.context, tmp_path / "trained.ply", upright=False)
-    assert lodgs("data.looks").modifier_of(again.lodgs.levels[0].object) is not None
-    for one in (root, again):
-        for level in scenes.read_levels(one, looked=True).levels:
+    reimported = lodgs("data.importing").import_splats(bpy.context, tmp_path / "trained.ply", upright=False)
+    assert lodgs("data.looks").modifier_of(reimported.lodgs.levels[0].object) is not None
+    for scene_root in (root, reimported):
+        for level in scenes.read_levels(scene_root, looked=True).levels:
             check(colors_of(level.splats), colors[level.number])
     for source in ({"source": "SHOWN"}, {"source": "LEVEL", "level": 3}):
-        again.lodgs.mode, again.lodgs.single_level = "SINGLE", 3
+        reimported.lodgs.mode, reimported.lodgs.single_level = "SINGLE", 3
         bpy.ops.lodgs.export_plain(filepath=str(tmp_path / "plain.ply"), **source)
         check(colors_of(read_ply(tmp_path / "plain.ply")), colors[3])
 
@@ -141,10 +146,10 @@ def test_strokes_are_undone_one_by_one_saved_and_removed(bpy, lodgs, scene_of, v
         stroke(bpy, (size[0] * x, size[1] / 2), radius=60, color=RED)
         bpy.ops.ed.undo_push(message="stroke")
         states.append(colors())
-    assert all((one != other).any() for one, other in pairwise(states))
-    for wanted in states[-2::-1]:
+    assert all((state != next_state).any() for state, next_state in pairwise(states))
+    for expected in states[-2::-1]:
         bpy.ops.ed.undo()
-        np.testing.assert_array_equal(colors(), wanted)
+        np.testing.assert_array_equal(colors(), expected)
     bpy.ops.ed.redo()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "saved.blend"))
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "saved.blend"))
@@ -162,7 +167,9 @@ def test_paint_stays_with_remaining_splats(bpy, lodgs, painted):
     root, bundle, colors = painted(bundle_of("bands", np.random.default_rng(3)))
     clouds = [item.object.data for item in root.lodgs.levels]
     bpy.context.view_layer.update()
-    versions, paint = [list(map(each, clouds)) for each in (changes.version, changes.paint_version)]
+    versions, paint = [
+        list(map(version_of, clouds)) for version_of in (changes.version, changes.paint_version)
+    ]
     stroke(bpy, (3, 3), radius=2, color=RED)
     bpy.context.view_layer.update()
     assert versions == list(map(changes.version, clouds)) and paint != list(
@@ -171,49 +178,49 @@ def test_paint_stays_with_remaining_splats(bpy, lodgs, painted):
 
     bpy.ops.lodgs.hide_splats(test="FAINT", opacity=0.4)
     bpy.ops.lodgs.delete_left_out()
-    for level, now in zip(
+    for level, current in zip(
         bundle.levels, lodgs("data.scenes").read_levels(root, looked=True).levels, strict=True
     ):
-        stays = 1 / (1 + np.exp(-level.splats.opacity_logits)) >= 0.4
-        assert 0 < stays.sum() < len(stays)
-        check(colors_of(now.splats), colors[level.number][stays])
+        remaining = 1 / (1 + np.exp(-level.splats.opacity_logits)) >= 0.4
+        assert 0 < remaining.sum() < len(remaining)
+        check(colors_of(current.splats), colors[level.number][remaining])
 
 
-@pytest.mark.parametrize("anew", [False, True])
-def test_retrained_levels_take_over_paint_by_position(bpy, lodgs, scene_of, anew):  # noqa: F811
-    """One level in the place of another, or all of another run: a painted half stays painted."""
+@pytest.mark.parametrize("all_levels", [False, True])
+def test_retrained_levels_take_over_paint_by_position(bpy, lodgs, scene_of, all_levels):  # noqa: F811
+    """Half of the scene is painted, then one level or all levels are replaced."""
     scenes, painting = lodgs("data.scenes"), lodgs("data.painting")
     root, bundle = scene_of(bundle_of("bands", np.random.default_rng(4)))
     half = {level.number: (level.splats.means[:, 0] > 0).astype(np.float32) for level in bundle.levels}
     painting.write_paint(root, painting.blend(painting.read_paint(root), half, RED))
-    rng, fresh = np.random.default_rng(5), bundle_of("bands", np.random.default_rng(5)).levels
+    rng, new_levels = np.random.default_rng(5), bundle_of("bands", np.random.default_rng(5)).levels
     finest = bundle.levels[2].splats.means
-    if anew:
+    if all_levels:
         scenes.prepare_refill(root, [1])
-    for level in fresh if anew else fresh[2:]:
-        some = rng.integers(len(finest), size=len(level.splats))
-        level.splats.means[:] = finest[some] + rng.normal(0, 0.001, (len(some), 3))
+    for level in new_levels if all_levels else new_levels[2:]:
+        rows = rng.integers(len(finest), size=len(level.splats))
+        level.splats.means[:] = finest[rows] + rng.normal(0, 0.001, (len(rows), 3))
         scenes.set_level(root, level)
-    found = scenes.read_levels(root, looked=True).levels
-    for level in found if anew else found[2:]:
-        x, before = level.splats.means[:, 0], colors_of(fresh[level.number - 1].splats)
-        wanted = np.where((x > 0)[:, None], RED, before)
+    levels = scenes.read_levels(root, looked=True).levels
+    for level in levels if all_levels else levels[2:]:
+        x, trained = level.splats.means[:, 0], colors_of(new_levels[level.number - 1].splats)
+        expected = np.where((x > 0)[:, None], RED, trained)
         clear = np.abs(x) > 0.1
         assert 20 < (x > 0.1).sum() < len(x) - 20
-        np.testing.assert_allclose(colors_of(level.splats)[clear], wanted[clear], atol=1e-4)
-    assert (root.lodgs.painted is not None) == anew
+        np.testing.assert_allclose(colors_of(level.splats)[clear], expected[clear], atol=1e-4)
+    assert (root.lodgs.painted is not None) == all_levels
     bpy.ops.lodgs.remove_paint()
     assert root.lodgs.painted is None and not any(" paint" in cloud.name for cloud in bpy.data.pointclouds)
 
 
-def test_paint_does_not_spread_from_run_to_run(bpy, lodgs, scene_of):  # noqa: F811
-    """Coarse levels in between, and the fine ones come back as they were painted."""
+def test_paint_does_not_spread_between_runs(bpy, lodgs, scene_of):  # noqa: F811
+    """A run with few splats follows, then one with the original levels."""
     scenes, painting = lodgs("data.scenes"), lodgs("data.painting")
     root, bundle = scene_of(bundle_of("bands", np.random.default_rng(4)))
     half = {level.number: (level.splats.means[:, 0] > 0).astype(np.float32) for level in bundle.levels}
     painting.write_paint(root, painting.blend(painting.read_paint(root), half, RED))
-    before, some = painting.read_paint(root)[3], bundle.levels[2].splats.select(slice(0, 5))
-    for levels in ([Level(1, some)], bundle.levels):
+    before, coarse = painting.read_paint(root)[3], bundle.levels[2].splats.select(slice(0, 5))
+    for levels in ([Level(1, coarse)], bundle.levels):
         scenes.prepare_refill(root, [1])
         for level in levels:
             level.splats.extras = {k: v for k, v in level.splats.extras.items() if k not in COLUMNS}
@@ -225,7 +232,7 @@ def test_paint_does_not_spread_from_run_to_run(bpy, lodgs, scene_of):  # noqa: F
     np.testing.assert_allclose(blue, np.broadcast_to(BLUE, blue.shape), atol=1e-6)
 
 
-def test_a_tree_is_painted_node_by_node_and_half_a_tree_is_not(bpy, lodgs, painted, tmp_path, viewport):  # noqa: F811
+def test_tree_is_painted_unless_it_is_partial(bpy, lodgs, painted, tmp_path, viewport):  # noqa: F811
     root, _, colors = painted(tree_of(random_leaves(2000, np.random.default_rng(6))))
     for level in lodgs("data.scenes").read_levels(root, looked=True).levels:
         check(colors_of(level.splats), colors[level.number])

@@ -19,34 +19,34 @@ def saved(bpy, lodgs, tmp_path):
     return root
 
 
-def told(bpy, root):
+def resolved_paths(bpy, root):
     run, holdout = root.lodgs.training.run, bpy.context.scene.lodgs_render.holdout
     return [os.path.normpath(bpy.path.abspath(path)) for path in (run, holdout)]
 
 
 def test_paths_stay_valid_after_saving_in_another_folder(bpy, saved, tmp_path):
-    before, name = told(bpy, saved), saved.name
+    before, name = resolved_paths(bpy, saved), saved.name
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "b" / "file.blend"))
-    assert told(bpy, saved) == before and saved.lodgs.training.run.startswith("//")
+    assert resolved_paths(bpy, saved) == before and saved.lodgs.training.run.startswith("//")
     assert saved.lodgs.training.output == "/elsewhere"
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "b" / "file.blend"))
-    assert told(bpy, bpy.data.objects[name]) == before
+    assert resolved_paths(bpy, bpy.data.objects[name]) == before
 
 
 def test_saved_copy_leaves_the_open_file_unchanged(bpy, saved, tmp_path):
-    before, name, run = told(bpy, saved), saved.name, saved.lodgs.training.run
+    before, name, run = resolved_paths(bpy, saved), saved.name, saved.lodgs.training.run
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "b" / "copy.blend"), copy=True)
-    assert saved.lodgs.training.run == run and told(bpy, saved) == before
+    assert saved.lodgs.training.run == run and resolved_paths(bpy, saved) == before
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "b" / "copy.blend"))
-    assert told(bpy, bpy.data.objects[name]) == before
+    assert resolved_paths(bpy, bpy.data.objects[name]) == before
 
 
-@pytest.mark.parametrize("place", ["beside the scene", "in another folder"])
-def test_project_can_be_moved(bpy, lodgs, tmp_path, place):
-    """A .blend beside its scene needs nothing else; elsewhere, Make Paths Relative is enough."""
+@pytest.mark.parametrize("blend_folder", ["beside the scene", "in another folder"])
+def test_project_can_be_moved(bpy, lodgs, tmp_path, blend_folder):
+    """A .blend beside its scene needs no preparation; elsewhere, Make Paths Relative is enough."""
     project, moved = tmp_path / "project", tmp_path / "moved"
     shutil.copytree("examples/lantern_garden", project / "scene")
-    blend = Path("scene.blend" if place == "beside the scene" else "blend/scene.blend")
+    blend = Path("scene.blend" if blend_folder == "beside the scene" else "blend/scene.blend")
     (project / blend).parent.mkdir(exist_ok=True)
     root = lodgs("data.importing").import_colmap(bpy.context, str(project / "scene"))
     root.lodgs.training.output = "/elsewhere"
@@ -124,7 +124,7 @@ def test_only_one_module_resolves_paths():
 
 @pytest.mark.parametrize("is_saved", [False, True])
 def test_appended_scenes_keep_their_paths(bpy, lodgs, saved, tmp_path, is_saved):
-    """The scene of another folder is appended to a file that is not saved yet, or saved elsewhere."""
+    """A scene of another folder is appended to an unsaved file and to a saved file."""
     expected = Path(bpy.path.abspath(saved.lodgs.training.run))
     bpy.ops.wm.save_mainfile()
     source, name = bpy.data.filepath, saved.name

@@ -1,4 +1,4 @@
-"""Placement of scenes: the root is the artist's, the axes carry what turns, grounds and scales the scene."""
+"""Placement of scenes: artists move the root; operators set ground and scale on its child, the axes."""
 
 import re
 from pathlib import Path
@@ -17,7 +17,7 @@ from training.splats.similarity import Similarity
 GARDEN = Path(__file__).resolve().parents[3] / "examples" / "lantern_garden"
 
 
-def some_splats(count: int, seed: int) -> Splats:
+def random_splats(count: int, seed: int) -> Splats:
     rng = np.random.default_rng(seed)
     return Splats(
         means=rng.normal(0, 2, (count, 3)).astype(np.float32),
@@ -28,10 +28,10 @@ def some_splats(count: int, seed: int) -> Splats:
     )
 
 
-def lodge() -> Bundle:
-    """Two levels by chunks: facts, columns and a table with lengths and places."""
+def lodge_bundle() -> Bundle:
+    """Return a bundle of two levels with chunks. Facts and tables contain lengths and positions."""
     rng = np.random.default_rng(5)
-    levels = [Level(1, some_splats(40, 1), {"d_l": 4.0}), Level(2, some_splats(90, 2), {"d_l": 0.0})]
+    levels = [Level(1, random_splats(40, 1), {"d_l": 4.0}), Level(2, random_splats(90, 2), {"d_l": 0.0})]
     for level in levels:
         level.splats.extras |= member_columns(rng.random((3, len(level.splats))) < 0.5)
     table = {name: rng.uniform(1, 3, 3).astype(np.float32) for name in ("x", "y", "z", "radius")}
@@ -41,13 +41,13 @@ def lodge() -> Bundle:
 
 @pytest.fixture
 def root(bpy, lodgs, tmp_path):
-    write_bundle(tmp_path / "in.ply", lodge())
-    found = lodgs("data.importing").import_splats(bpy.context, tmp_path / "in.ply")
+    write_bundle(tmp_path / "in.ply", lodge_bundle())
+    root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "in.ply")
     bpy.context.view_layer.update()
-    return found
+    return root
 
 
-def world(root) -> np.ndarray:
+def level_matrix(root) -> np.ndarray:
     return np.array(root.lodgs.levels[-1].object.matrix_world, np.float64)
 
 
@@ -57,20 +57,20 @@ def select(bpy, *objects):
     bpy.context.view_layer.objects.active = objects[-1]
 
 
-def empties(bpy, root, places):
-    """Empties at places in the world, selected, with the root active."""
-    made = [bpy.data.objects.new("mark", None) for _ in places]
-    for obj, place in zip(made, places, strict=True):
-        obj.location = place
+def select_empties(bpy, root, locations):
+    """Select new empties at world locations and the root, which is active."""
+    marks = [bpy.data.objects.new("mark", None) for _ in locations]
+    for obj, location in zip(marks, locations, strict=True):
+        obj.location = location
         bpy.context.scene.collection.objects.link(obj)
     bpy.context.view_layer.update()
-    select(bpy, *made, root)
-    return made
+    select(bpy, *marks, root)
+    return marks
 
 
-@pytest.mark.parametrize("what", ["splats", "colmap"])
-def test_a_roots_transform_is_clean_and_clearing_it_takes_nothing_else(bpy, lodgs, root, what):
-    if what == "colmap":
+@pytest.mark.parametrize("source", ["splats", "colmap"])
+def test_root_starts_without_a_transform_and_can_be_cleared(bpy, lodgs, root, source):
+    if source == "colmap":
         root = lodgs("data.importing").import_colmap(bpy.context, GARDEN, photographs=False)
     assert root.rotation_mode == "XYZ" and np.array_equal(np.array(root.matrix_basis), np.eye(4))
     bpy.context.view_layer.update()
@@ -91,20 +91,20 @@ def test_a_roots_transform_is_clean_and_clearing_it_takes_nothing_else(bpy, lodg
     np.testing.assert_allclose(part.matrix_world, upright, atol=1e-6)
 
 
-def test_applying_the_roots_transform_leaves_everything_where_it_is(bpy, lodgs, root):
+def test_applying_the_roots_transform_keeps_the_placement(bpy, lodgs, root):
     root.location, root.rotation_euler, root.scale = (1, 2, 3), (0.1, 0.2, 0.5), (2, 2, 2)
     bpy.context.view_layer.update()
-    before = world(root)
+    before = level_matrix(root)
     select(bpy, root)
     bpy.ops.object.transform_apply(location=True, rotation=True, scale=True)
     bpy.context.view_layer.update()
-    np.testing.assert_allclose(world(root), before, atol=1e-6)
+    np.testing.assert_allclose(level_matrix(root), before, atol=1e-6)
     np.testing.assert_allclose(lodgs("data.placement").placement_of(root).matrix, before, atol=1e-5)
 
 
-def test_a_copied_hierarchy_has_axes_of_its_own(bpy, lodgs, root):
+def test_duplicated_hierarchy_has_its_own_axes(bpy, lodgs, root):
     levels = [item.object for item in root.lodgs.levels]
-    root.lodgs.mode = "SELECTIVE"  # both are there
+    root.lodgs.mode = "SELECTIVE"  # both levels are visible
     bpy.context.view_layer.update()
     select(bpy, *levels, root.lodgs.axes, root)
     bpy.ops.object.duplicate()
@@ -117,32 +117,32 @@ def test_a_copied_hierarchy_has_axes_of_its_own(bpy, lodgs, root):
     np.testing.assert_allclose(placement_of(copy).translation - placement_of(root).translation, (9, 0, 0))
 
 
-def test_the_ground_through_three_empties_is_at_zero(bpy, root):
+def test_ground_through_three_empties_is_at_zero(bpy, root):
     root.location, root.rotation_euler = (1, 1, 1), (0, 0, 0.7)
-    places = np.array([[0, 0, 1.0], [2, 0, 1.5], [0, 2, 0.8]])
-    marks = empties(bpy, root, places)
-    before, clean = world(root), np.array(root.matrix_basis)
-    on_it = (np.linalg.inv(before) @ np.column_stack([places, np.ones(3)]).T)[:3].T
+    locations = np.array([[0, 0, 1.0], [2, 0, 1.5], [0, 2, 0.8]])
+    marks = select_empties(bpy, root, locations)
+    before, root_matrix = level_matrix(root), np.array(root.matrix_basis)
+    local = (np.linalg.inv(before) @ np.column_stack([locations, np.ones(3)]).T)[:3].T
     bpy.ops.ed.undo_push(message="before")
     assert bpy.ops.lodgs.set_ground() == {"FINISHED"}
     bpy.context.view_layer.update()
-    after = world(root)
-    there = on_it @ after[:3, :3].T + after[:3, 3]
-    np.testing.assert_allclose(there[:, 2], 0, atol=1e-5)
-    np.testing.assert_allclose(there.mean(axis=0)[:2], places.mean(axis=0)[:2], atol=1e-5)
-    np.testing.assert_allclose(np.linalg.norm(np.diff(there, axis=0), axis=1),
-                               np.linalg.norm(np.diff(places, axis=0), axis=1), atol=1e-5)  # fmt: skip
-    np.testing.assert_array_equal(np.array(root.matrix_basis), clean)
-    assert [tuple(mark.location) for mark in marks] == [tuple(np.float32(place)) for place in places]
+    after = level_matrix(root)
+    moved = local @ after[:3, :3].T + after[:3, 3]
+    np.testing.assert_allclose(moved[:, 2], 0, atol=1e-5)
+    np.testing.assert_allclose(moved.mean(axis=0)[:2], locations.mean(axis=0)[:2], atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(np.diff(moved, axis=0), axis=1),
+                               np.linalg.norm(np.diff(locations, axis=0), axis=1), atol=1e-5)  # fmt: skip
+    np.testing.assert_array_equal(np.array(root.matrix_basis), root_matrix)
+    assert [tuple(mark.location) for mark in marks] == [tuple(np.float32(location)) for location in locations]
     up = after[:3, :3] @ np.linalg.inv(before[:3, :3]) @ [0, 0, 1]
     assert up[2] > 0.9
     bpy.ops.lodgs.set_ground(flip=True)
     bpy.context.view_layer.update()
-    flipped = world(root)[:3, :3] @ np.linalg.inv(after[:3, :3]) @ [0, 0, 1]
+    flipped = level_matrix(root)[:3, :3] @ np.linalg.inv(after[:3, :3]) @ [0, 0, 1]
     assert flipped[2] < -0.9
 
 
-def test_the_ground_through_points_that_are_selected_in_edit_mode(bpy, lodgs):
+def test_ground_fits_points_selected_in_edit_mode(bpy, lodgs):
     root = lodgs("data.importing").import_colmap(bpy.context, GARDEN, photographs=False)
     bpy.context.view_layer.update()
     cloud = root.lodgs.points
@@ -151,44 +151,47 @@ def test_the_ground_through_points_that_are_selected_in_edit_mode(bpy, lodgs):
     bpy.ops.pointcloud.select_all(action="DESELECT")
     with pytest.raises(RuntimeError, match="0 selected points"):
         bpy.ops.lodgs.set_ground()
-    places = np.empty((len(cloud.data.points), 3), np.float32)
-    cloud.data.attributes["position"].data.foreach_get("vector", places.reshape(-1))
-    some = np.zeros(len(places), bool)
-    some[[10, 200, 500, 900]] = True
-    cloud.data.attributes[".selection"].data.foreach_set("value", some)
-    assert bpy.context.mode == "EDIT_POINTCLOUD"  # no refusal leaves it
+    positions = np.empty((len(cloud.data.points), 3), np.float32)
+    cloud.data.attributes["position"].data.foreach_get("vector", positions.reshape(-1))
+    selection = np.zeros(len(positions), bool)
+    selection[[10, 200, 500, 900]] = True
+    cloud.data.attributes[".selection"].data.foreach_set("value", selection)
+    assert bpy.context.mode == "EDIT_POINTCLOUD"  # also after the error
     assert bpy.ops.lodgs.set_ground() == {"FINISHED"}
     assert bpy.context.mode == "OBJECT"
     bpy.context.view_layer.update()
     matrix = np.array(cloud.matrix_world)
-    there = places @ matrix[:3, :3].T + matrix[:3, 3]
-    apart = there[some][:, 2]
-    assert abs(apart.mean()) < 1e-5
-    assert np.square(apart).sum() < np.square(np.linalg.svd(there[some] - there[some].mean(0))[1][2]) + 1e-6
+    moved = positions @ matrix[:3, :3].T + matrix[:3, 3]
+    heights = moved[selection][:, 2]
+    assert abs(heights.mean()) < 1e-5
+    assert (
+        np.square(heights).sum()
+        < np.square(np.linalg.svd(moved[selection] - moved[selection].mean(0))[1][2]) + 1e-6
+    )
 
 
-def test_the_ground_is_found(bpy, lodgs, capfd):
-    """The example's, which is z = 0 in its own coordinates; the root has been turned and moved away."""
+def test_ground_is_detected(bpy, lodgs, capfd):
+    """The ground of the example is z = 0 in scene coordinates. The root is rotated and moved."""
     root = lodgs("data.importing").import_colmap(bpy.context, GARDEN, photographs=False)
     root.rotation_euler, root.location = (0.2, -0.1, 1.0), (0, 0, 5)
     bpy.context.view_layer.update()
     up = lodgs("data.placement").placement_of(root).rotation[:, 2]
     bpy.ops.lodgs.set_ground(by="FOUND")
-    told = re.search(r"rotated by ([\d.]+)°", capfd.readouterr().out)
-    assert told and float(told[1]) == pytest.approx(np.degrees(np.arccos(up[2])), abs=0.6)
+    rotated = re.search(r"rotated by ([\d.]+)°", capfd.readouterr().out)
+    assert rotated and float(rotated[1]) == pytest.approx(np.degrees(np.arccos(up[2])), abs=0.6)
     bpy.context.view_layer.update()
     placement = lodgs("data.placement").placement_of(root)
-    np.testing.assert_allclose(placement.rotation[2], (0, 0, 1), atol=0.01)  # in which z is up already
+    np.testing.assert_allclose(placement.rotation[2], (0, 0, 1), atol=0.01)  # z is up in the scene
     assert abs(placement.translation[2]) < 0.05
 
 
-def test_the_scale_by_a_length_between_two_empties(bpy, lodgs):
+def test_scale_follows_a_length_between_two_empties(bpy, lodgs):
     root = lodgs("data.importing").import_colmap(bpy.context, GARDEN, photographs=False)
     bpy.ops.lodgs.set_ground(by="FOUND")
     bpy.context.view_layer.update()
     view = root.lodgs.cameras.objects[0]
     before, near = np.array(root.lodgs.points.matrix_world), view.data.clip_start
-    empties(bpy, root, [(1, 0, 0), (1, 2, 0)])
+    select_empties(bpy, root, [(1, 0, 0), (1, 2, 0)])
     assert bpy.ops.lodgs.set_scale(length=5.0) == {"FINISHED"}
     bpy.context.view_layer.update()
     after = np.array(root.lodgs.points.matrix_world)
@@ -198,95 +201,97 @@ def test_the_scale_by_a_length_between_two_empties(bpy, lodgs):
 
 
 @pytest.mark.parametrize(
-    "places,words",
+    "locations,message",
     [([(0, 0, 0)], "1 points"), ([(1, 1, 1)] * 2, "same position"), ([(0, 0, 0)] * 3, "3 points")],
 )
-def test_a_selection_that_is_no_length_is_refused(bpy, root, places, words):
-    empties(bpy, root, places)
-    with pytest.raises(RuntimeError, match=words):
+def test_selection_without_a_length_is_rejected(bpy, root, locations, message):
+    select_empties(bpy, root, locations)
+    with pytest.raises(RuntimeError, match=message):
         bpy.ops.lodgs.set_scale(length=1.0)
 
 
-def test_a_stretched_root_is_refused(bpy, lodgs, root, tmp_path):
+def test_stretched_root_is_rejected(bpy, lodgs, root, tmp_path):
     root.scale = (1, 1, 2)
     bpy.context.view_layer.update()
-    for verb in (
+    for operation in (
         lambda: bpy.ops.lodgs.set_ground(by="FOUND"),
         lambda: bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "no.ply"), placed=True),
     ):
         with pytest.raises(RuntimeError, match="stretched"):
-            verb()
+            operation()
     assert not (tmp_path / "no.ply").exists()
 
 
-@pytest.mark.parametrize("undone", [False, True])
-def test_each_step_is_undone(bpy, root, undone):
+def test_setting_the_ground_is_undone(bpy, root):
     name = root.name
-    empties(bpy, root, [(0, 0, 0), (2, 0, 1), (0, 2, 0)])
+    select_empties(bpy, root, [(0, 0, 0), (2, 0, 1), (0, 2, 0)])
     bpy.ops.ed.undo_push(message="start")
-    before = world(root)
+    before = level_matrix(root)
     bpy.ops.lodgs.set_ground()
     bpy.ops.ed.undo_push(message="ground")
     bpy.context.view_layer.update()
-    assert not np.allclose(world(root), before)
+    assert not np.allclose(level_matrix(root), before)
     bpy.ops.ed.undo()
     bpy.context.view_layer.update()
-    np.testing.assert_allclose(world(bpy.data.objects[name]), before, atol=1e-6)
+    np.testing.assert_allclose(level_matrix(bpy.data.objects[name]), before, atol=1e-6)
 
 
-def stand_somewhere(bpy, root):
+def place_root(bpy, root):
     root.location, root.rotation_euler, root.scale = (1, -2, 3), (0.4, -0.2, 0.9), (2.5, 2.5, 2.5)
     bpy.context.view_layer.update()
 
 
-def test_a_bundle_as_placed_stands_there_when_it_is_imported(bpy, lodgs, root, tmp_path):
-    stand_somewhere(bpy, root)
-    there = world(root)
+def test_bundle_exported_as_placed_keeps_its_place(bpy, lodgs, root, tmp_path):
+    place_root(bpy, root)
+    matrix = level_matrix(root)
     bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "out.ply"), placed=True)
-    found, wanted = read_bundle(tmp_path / "out.ply"), transform_bundle(lodge(), Similarity.from_matrix(
-        lodgs("data.placement").placement_of(root).matrix))  # fmt: skip
-    assert found.meta["up_rotation"] == np.eye(3).tolist()
-    np.testing.assert_allclose(found.meta["camera_center"], wanted.meta["camera_center"])
-    for one, level in zip(found.levels, wanted.levels, strict=True):  # processors differ in the last bits
-        assert one.facts == pytest.approx(level.facts, rel=1e-12)
+    exported = read_bundle(tmp_path / "out.ply")
+    placement = lodgs("data.placement").placement_of(root)
+    expected = transform_bundle(lodge_bundle(), Similarity.from_matrix(placement.matrix))
+    assert exported.meta["up_rotation"] == np.eye(3).tolist()
+    np.testing.assert_allclose(exported.meta["camera_center"], expected.meta["camera_center"])
+    for exported_level, level in zip(exported.levels, expected.levels, strict=True):
+        assert exported_level.facts == pytest.approx(level.facts, rel=1e-12)  # last bits depend on the CPU
     for column in ("x", "radius"):
-        np.testing.assert_allclose(found.tables["chunks"][column], wanted.tables["chunks"][column], rtol=1e-6)
-    again = lodgs("data.importing").import_splats(bpy.context, tmp_path / "out.ply")
-    bpy.context.view_layer.update()
-    np.testing.assert_allclose(world(again), np.eye(4), atol=1e-6)
-    for one, before in zip(found.levels, lodge().levels, strict=True):
         np.testing.assert_allclose(
-            one.splats.means, before.splats.means @ there[:3, :3].T + there[:3, 3], atol=1e-5
+            exported.tables["chunks"][column], expected.tables["chunks"][column], rtol=1e-6
+        )
+    reimported = lodgs("data.importing").import_splats(bpy.context, tmp_path / "out.ply")
+    bpy.context.view_layer.update()
+    np.testing.assert_allclose(level_matrix(reimported), np.eye(4), atol=1e-6)
+    for exported_level, original in zip(exported.levels, lodge_bundle().levels, strict=True):
+        np.testing.assert_allclose(
+            exported_level.splats.means, original.splats.means @ matrix[:3, :3].T + matrix[:3, 3], atol=1e-5
         )
     bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "plain.ply"))
-    as_is = read_bundle(tmp_path / "plain.ply")
-    np.testing.assert_allclose(as_is.levels[1].splats.means, found.levels[1].splats.means)
+    unplaced = read_bundle(tmp_path / "plain.ply")
+    np.testing.assert_allclose(unplaced.levels[1].splats.means, exported.levels[1].splats.means)
 
 
-def test_plain_plys_and_folders_as_placed(bpy, lodgs, root, tmp_path):
-    stand_somewhere(bpy, root)
+def test_plain_files_and_folders_are_exported_as_placed(bpy, lodgs, root, tmp_path):
+    place_root(bpy, root)
     placement = lodgs("data.placement").placement_of(root)
-    wanted = transform_bundle(lodge(), Similarity.from_matrix(placement.matrix)).levels[1].splats
+    expected = transform_bundle(lodge_bundle(), Similarity.from_matrix(placement.matrix)).levels[1].splats
     bpy.ops.lodgs.export_plain(filepath=str(tmp_path / "p.ply"), source="LEVEL", level=2, placed=True)
     bpy.ops.lodgs.export_folder(directory=str(tmp_path / "f"), placed=True)
     root.lodgs.mode, root.lodgs.single_level = "SINGLE", 2
     bpy.ops.lodgs.export_plain(filepath=str(tmp_path / "s.ply"), source="SHOWN", placed=True)
-    for found in (
+    for exported in (
         read_bundle(tmp_path / "p.ply").levels[0].splats,
         read_bundle(tmp_path / "s.ply").levels[0].splats,
         read_folder(tmp_path / "f").levels[1].splats,
     ):
         for name in ("means", "quats", "log_scales", "sh"):
-            np.testing.assert_allclose(getattr(found, name), getattr(wanted, name), atol=1e-5)
+            np.testing.assert_allclose(getattr(exported, name), getattr(expected, name), atol=1e-5)
 
 
-def test_the_command_exports_as_placed(bpy, lodgs, root, tmp_path):
-    stand_somewhere(bpy, root)
-    there = world(root)
+def test_export_command_exports_as_placed(bpy, lodgs, root, tmp_path):
+    place_root(bpy, root)
+    matrix = level_matrix(root)
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"), check_existing=False)
     out = tmp_path / "out.ply"
     assert lodgs("commands").main(["export", str(tmp_path / "scene.blend"), str(out), "--placed"]) == 0
-    means = lodge().levels[1].splats.means @ there[:3, :3].T + there[:3, 3]
+    means = lodge_bundle().levels[1].splats.means @ matrix[:3, :3].T + matrix[:3, 3]
     np.testing.assert_allclose(read_bundle(out).levels[1].splats.means, means, atol=1e-5)
 
 

@@ -1,4 +1,4 @@
-"""Levels of an ordered set in Blender: one level, budgets, clean-up, and files that keep the order."""
+"""Levels that are prefixes of an ordered set: single levels, budgets, and saved files that keep the order."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ def root(bpy, lodgs, tmp_path):
 
 
 def drawn_ranks(bpy, root):
-    """Return the ranks of all points that the node groups leave."""
+    """Return the ranks of all points that the node groups keep."""
     bpy.context.view_layer.update()
     depsgraph, ranks = bpy.context.evaluated_depsgraph_get(), []
     for item in root.lodgs.levels:

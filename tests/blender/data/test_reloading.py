@@ -1,4 +1,4 @@
-"""Reload of splats whose file another program has written again."""
+"""Reload of splats after another program replaces their file."""
 
 import os
 from pathlib import Path
@@ -69,7 +69,7 @@ def test_reload_keeps_placement_edits_and_material(bpy, lodgs, root, path):
 
 
 @pytest.mark.parametrize("newer", [cube(60), cube(50, seed=1)], ids=["more", "others"])
-def test_other_splats_are_all_shown_and_counted(lodgs, root, path, newer):
+def test_replaced_splats_lose_hiding_with_a_note(lodgs, root, path, newer):
     hide(lodgs, root, slice(0, 7))
     write_ply(path, newer)
     reloading = lodgs("data.reloading")
@@ -136,7 +136,7 @@ def test_watched_file_is_reloaded_once_it_is_complete(bpy, lodgs, root, path):
     assert len(positions(root)) == 70 and not reloading.watch_of(root).problem
 
 
-def test_undo_of_a_reload_stays(bpy, lodgs, root, path):
+def test_undone_reload_is_not_repeated(bpy, lodgs, root, path):
     reloading = lodgs("data.reloading")
     root.lodgs.source.watch = True
     bpy.ops.ed.undo_push(message="before")

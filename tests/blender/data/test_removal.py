@@ -1,4 +1,4 @@
-"""Splat scenes that are deleted leave nothing behind, and nothing of the artist's goes with them."""
+"""Deleting a splat scene removes all of its data, and nothing of the user."""
 
 from pathlib import Path
 
@@ -11,14 +11,14 @@ from training.splats.levels import Bundle, Level
 KINDS = ("objects", "collections", "pointclouds", "cameras", "images", "meshes", "scenes")
 
 
-def everything(bpy) -> dict[str, list[str]]:
-    return {kind: sorted(one.name for one in getattr(bpy.data, kind)) for kind in KINDS}
+def data_names(bpy) -> dict[str, list[str]]:
+    return {kind: sorted(data.name for data in getattr(bpy.data, kind)) for kind in KINDS}
 
 
 @pytest.fixture
 def root(bpy, lodgs):
-    """The example's views and points with two levels by distance, in a file with an object of its own."""
-    bpy.context.scene.collection.objects.link(bpy.data.objects.new("the artist's", None))
+    """The example's views and points with two levels, in a file with an object of the user."""
+    bpy.context.scene.collection.objects.link(bpy.data.objects.new("user object", None))
     garden = Path(__file__).resolve().parents[3] / "examples" / "lantern_garden"
     scenes = lodgs("data.scenes")
     root = lodgs("data.importing").import_colmap(bpy.context, garden)
@@ -34,7 +34,8 @@ def root(bpy, lodgs):
     return root
 
 
-def press_x(bpy, *names):
+def delete_objects(bpy, *names):
+    """Delete objects of these names, or all visible ones, as the key X does."""
     for obj in bpy.context.view_layer.objects:
         obj.select_set(not names or obj.name in names)
     assert bpy.ops.object.delete("EXEC_DEFAULT", True) == {"FINISHED"}  # True: one undo step, as by hand
@@ -49,76 +50,76 @@ def drivers(bpy):
     ]
 
 
-def all_valid(bpy) -> bool:
-    sources = [target.id for one in drivers(bpy) for v in one.variables for target in v.targets
+def all_drivers_valid(bpy) -> bool:
+    sources = [target.id for driver in drivers(bpy) for v in driver.variables for target in v.targets
                if v.type == "SINGLE_PROP"]  # fmt: skip
-    return None not in sources and all(one.is_valid for one in drivers(bpy))
+    return None not in sources and all(driver.is_valid for driver in drivers(bpy))
 
 
-@pytest.mark.parametrize("selected", ["the root", "all that can be selected"])
-def test_a_deleted_scene_leaves_nothing(bpy, lodgs, root, selected):
+@pytest.mark.parametrize("selected", ["root", "all"])
+def test_deleted_scene_leaves_no_data(bpy, lodgs, root, selected):
     removal = lodgs("data.removal")
-    name, before = root.name, everything(bpy)
+    name, before = root.name, data_names(bpy)
     bpy.ops.ed.undo_push(message="before")
-    press_x(bpy, *([name] if selected == "the root" else []))
-    assert drivers(bpy) and all_valid(bpy)
+    delete_objects(bpy, *([name] if selected == "root" else []))
+    assert drivers(bpy) and all_drivers_valid(bpy)
     assert bpy.app.timers.is_registered(removal.remove_deleted)  # background runs no timers
     removal.remove_deleted()
     bpy.context.view_layer.update()
-    bpy.data.orphans_purge(
-        do_recursive=True
-    )  # what Blender itself deletes leaves its data until the file is saved
-    kept = ["the artist's"] if selected == "the root" else []
-    assert everything(bpy) == {kind: [] for kind in KINDS} | {"objects": kept, "scenes": ["Scene"]}
+    bpy.data.orphans_purge(do_recursive=True)  # Blender keeps unused data until the file is saved
+    remaining = ["user object"] if selected == "root" else []
+    assert data_names(bpy) == {kind: [] for kind in KINDS} | {"objects": remaining, "scenes": ["Scene"]}
     bpy.ops.ed.undo()
-    assert everything(bpy) == before and all_valid(bpy)
+    assert data_names(bpy) == before and all_drivers_valid(bpy)
     assert bpy.data.objects[name].users_collection
     removal.remove_deleted()
-    assert everything(bpy) == before
+    assert data_names(bpy) == before
 
 
-def test_a_file_is_never_saved_with_half_a_scene(bpy, root, tmp_path):
-    press_x(bpy, root.name)
+def test_saving_removes_the_rest_of_a_deleted_scene(bpy, root, tmp_path):
+    delete_objects(bpy, root.name)
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
-    assert [obj.name for obj in bpy.data.objects] == ["the artist's"] and not bpy.data.pointclouds
+    assert [obj.name for obj in bpy.data.objects] == ["user object"] and not bpy.data.pointclouds
 
 
-def test_the_operator_removes_and_undo_brings_back(bpy, root):
-    name, before = root.name, everything(bpy)
+def test_operator_removes_the_scene_and_undo_restores_it(bpy, root):
+    name, before = root.name, data_names(bpy)
     bpy.context.view_layer.objects.active = root.lodgs.levels[0].object
     bpy.ops.ed.undo_push(message="before")
     assert bpy.ops.lodgs.remove_scene("EXEC_DEFAULT", True) == {"FINISHED"}
-    assert everything(bpy)["objects"] == ["the artist's"] and not bpy.data.collections
+    assert data_names(bpy)["objects"] == ["user object"] and not bpy.data.collections
     bpy.ops.ed.undo()
-    assert everything(bpy) == before and len(bpy.data.objects[name].lodgs.levels) == 2
+    assert data_names(bpy) == before and len(bpy.data.objects[name].lodgs.levels) == 2
     bpy.ops.ed.redo()
-    assert everything(bpy)["objects"] == ["the artist's"]
+    assert data_names(bpy)["objects"] == ["user object"]
     assert not bpy.ops.lodgs.remove_scene.poll()
 
 
-def test_children_of_a_removed_scene_stay(bpy, root):
-    mine = bpy.data.objects["the artist's"]
-    mine.parent, mine.location = root, (1, 0, 0)
-    root.users_collection[0].objects.link(mine)
+def test_children_and_copies_of_a_removed_scene_keep_their_place(bpy, root):
+    user_object = bpy.data.objects["user object"]
+    user_object.parent, user_object.location = root, (1, 0, 0)
+    root.users_collection[0].objects.link(user_object)
     copy = root.lodgs.levels[1].object.copy()
     bpy.context.scene.collection.objects.link(copy)
     bpy.context.view_layer.update()
-    places = [np.array(obj.matrix_world) for obj in (mine, copy)]
-    assert np.linalg.norm(places[0][:3, 3]) > 1
+    matrices = [np.array(obj.matrix_world) for obj in (user_object, copy)]
+    assert np.linalg.norm(matrices[0][:3, 3]) > 1
     assert bpy.ops.lodgs.remove_scene() == {"FINISHED"}
     bpy.context.view_layer.update()
-    assert sorted(obj.name for obj in bpy.data.objects) == sorted([mine.name, copy.name])
+    assert sorted(obj.name for obj in bpy.data.objects) == sorted([user_object.name, copy.name])
     assert bpy.data.collections[:] == [
-        part for part in mine.users_collection if part != bpy.context.scene.collection
+        collection
+        for collection in user_object.users_collection
+        if collection != bpy.context.scene.collection
     ]
-    for obj, place in zip((mine, copy), places, strict=True):
-        np.testing.assert_allclose(np.array(obj.matrix_world), place, atol=1e-5)
-    assert len(copy.data.points) == 2 and all_valid(bpy)
+    for obj, matrix in zip((user_object, copy), matrices, strict=True):
+        np.testing.assert_allclose(np.array(obj.matrix_world), matrix, atol=1e-5)
+    assert len(copy.data.points) == 2 and all_drivers_valid(bpy)
 
 
-def test_a_copy_of_a_scene_is_removed_for_itself(bpy, lodgs, root):
-    before = everything(bpy)
+def test_duplicate_root_is_removed_without_the_original(bpy, lodgs, root):
+    before = data_names(bpy)
     for item in root.lodgs.levels:
         item.object.hide_viewport = False
     for obj in bpy.context.view_layer.objects:
@@ -127,23 +128,22 @@ def test_a_copy_of_a_scene_is_removed_for_itself(bpy, lodgs, root):
     bpy.ops.object.duplicate()
     copy = bpy.context.view_layer.objects.active
     assert copy.lodgs.is_root and copy.lodgs.itself == copy
-    press_x(bpy, copy.name)
+    delete_objects(bpy, copy.name)
     lodgs("data.removal").remove_deleted()
-    left = everything(bpy)
-    assert left["objects"] == before["objects"]
+    assert data_names(bpy)["objects"] == before["objects"]
 
 
-def test_a_root_of_an_older_file_holds_on_to_itself(lodgs, root):
+def test_root_of_an_older_file_refers_to_itself(lodgs, root):
     root.lodgs.itself = None
     lodgs("data.older_files").upgrade_scene(root)
     assert root.lodgs.itself == root
 
 
 def test_animated_cameras_are_removed_with_their_scene(bpy, lodgs, root):
-    """The artist's own things stay, and so does what moves about another scene."""
-    there = everything(bpy)["objects"]
+    """Objects of the user are kept."""
+    before = data_names(bpy)["objects"]
     assert bpy.ops.lodgs.camera_path() == {"FINISHED"} and bpy.ops.lodgs.turntable() == {"FINISHED"}
-    added = set(everything(bpy)["objects"]) - set(there)
+    added = set(data_names(bpy)["objects"]) - set(before)
     assert len(added) == 3
     lodgs("data.removal").remove(root)
-    assert everything(bpy)["objects"] == ["the artist's"] and bpy.context.scene.camera is None
+    assert data_names(bpy)["objects"] == ["user object"] and bpy.context.scene.camera is None

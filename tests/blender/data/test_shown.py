@@ -1,4 +1,4 @@
-"""Which splats a scene shows, and how much of each: against the arrays that the splats were made of."""
+"""Visible splats and their weights, compared with the arrays of the imported splats."""
 
 import json
 
@@ -22,9 +22,9 @@ def make_splats(lodgs, seed=0, count=COUNT, degree=1, **extras):
 
 @pytest.fixture
 def two_levels(bpy, lodgs):
-    """A splat scene of two levels, side by side: root and the two levels' splats."""
+    """Return the root of a scene and the splats of its two levels."""
     level = lodgs("training.splats.levels").Level
-    camera = bpy.data.objects.new("eye", bpy.data.cameras.new("eye"))
+    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     bpy.context.scene.collection.objects.link(camera)
     bpy.context.scene.camera = camera
     splats = [make_splats(lodgs, seed) for seed in range(2)]
@@ -38,18 +38,18 @@ def two_levels(bpy, lodgs):
     return root, splats
 
 
-def sets(bpy, lodgs):
+def visible_sets(bpy, lodgs):
     return lodgs("data.shown").visible_splats(bpy.context.evaluated_depsgraph_get())
 
 
-def test_arrays_are_activated_and_in_the_splats_own_space(bpy, lodgs, two_levels):
+def test_arrays_have_activated_values_in_scene_space(bpy, lodgs, two_levels):
     root, splats = two_levels
     root.lodgs.single_level = 2
     bpy.context.view_layer.update()
-    [(shown, arrays)] = sets(bpy, lodgs)
+    [(visible, arrays)] = visible_sets(bpy, lodgs)
     truth = splats[1]
-    assert shown.level == 2 and shown.object == root.lodgs.levels[1].object
-    assert np.allclose(shown.matrix_world, np.array(root.lodgs.axes.matrix_world), atol=1e-6)
+    assert visible.level == 2 and visible.object == root.lodgs.levels[1].object
+    assert np.allclose(visible.matrix_world, np.array(root.lodgs.axes.matrix_world), atol=1e-6)
     assert np.array_equal(arrays.means, truth.means)
     assert np.allclose(arrays.scales, np.exp(truth.log_scales.astype(float)), rtol=1e-6)
     assert np.allclose(arrays.opacities, 1 / (1 + np.exp(-truth.opacity_logits.astype(float))), atol=1e-6)
@@ -60,40 +60,40 @@ def test_arrays_are_activated_and_in_the_splats_own_space(bpy, lodgs, two_levels
     assert all(a.dtype == np.float32 for a in (arrays.means, arrays.quats, arrays.scales, arrays.sh))
 
 
-def test_distance_bands_count(bpy, lodgs, two_levels):
+def test_bands_select_splats_by_distance(bpy, lodgs, two_levels):
     root, splats = two_levels
     settings = root.lodgs
     settings.mode, s_min = "SELECTIVE", json.loads(settings.levels[0].facts)["s_min"]
     bpy.context.scene.camera.location = (3, 2, 3)
-    settings.bands.gamma = s_min * 1777.7 / 0.8  # near the middle of the splats
+    settings.bands.gamma = s_min * 1777.7 / 0.8  # a border near the centre of the splats
     bpy.context.view_layer.update()
     border = s_min / settings.bands.gamma * settings.focal_px
-    world = np.append(bpy.context.scene.camera.location, 1)
-    eye = np.linalg.solve(np.array(root.lodgs.axes.matrix_world, float), world)[:3]
-    found = sets(bpy, lodgs)
-    assert [shown.level for shown, _ in found] == [1, 2]
-    for (shown, arrays), truth in zip(found, splats, strict=True):
-        near = np.linalg.norm(truth.means - eye, axis=1) < border
-        assert np.array_equal(arrays.means, truth.means[near if shown.level == 2 else ~near])
+    world_position = np.append(bpy.context.scene.camera.location, 1)
+    center = np.linalg.solve(np.array(root.lodgs.axes.matrix_world, float), world_position)[:3]
+    sets = visible_sets(bpy, lodgs)
+    assert [visible.level for visible, _ in sets] == [1, 2]
+    for (visible, arrays), truth in zip(sets, splats, strict=True):
+        near = np.linalg.norm(truth.means - center, axis=1) < border
+        assert np.array_equal(arrays.means, truth.means[near if visible.level == 2 else ~near])
 
 
-def test_octree_weights_are_beside_the_opacities(bpy, lodgs, two_levels):
+def test_octree_weights_do_not_change_opacities(bpy, lodgs, two_levels):
     root, splats = two_levels
     Bundle, facts = lodgs("training.splats.levels").Bundle, {"d_max": 1.2, "d_max_focal": 1000.0}
     lodgs("data.scenes").set_bundle_facts(root, Bundle("", [], "octree", facts, cumulative=True))
     root.lodgs.mode = "SELECTIVE"
     bpy.context.view_layer.update()
-    found = sets(bpy, lodgs)
-    assert [len(arrays) for _, arrays in found] != [COUNT, COUNT]
-    assert (found[0][1].weights == 1).all()
-    fading = found[1][1].weights
+    sets = visible_sets(bpy, lodgs)
+    assert [len(arrays) for _, arrays in sets] != [COUNT, COUNT]
+    assert (sets[0][1].weights == 1).all()
+    fading = sets[1][1].weights
     assert ((fading > 0) & (fading <= 1)).all() and (fading < 1).any()
     opacities = 1 / (1 + np.exp(-splats[1].opacity_logits))
-    nearest = np.abs(found[1][1].opacities[:, None] - opacities).min(axis=1)
+    nearest = np.abs(sets[1][1].opacities[:, None] - opacities).min(axis=1)
     assert nearest.max() < 1e-6
 
 
-def test_hidden_objects_are_not_shown_and_instances_are(bpy, lodgs, two_levels):
+def test_instances_are_visible_and_hidden_objects_are_not(bpy, lodgs, two_levels):
     root, _ = two_levels
     loose = lodgs("data.objects").new_splats("loose", make_splats(lodgs, 5, 7))
     points = lodgs("data.objects").new_points("points", np.zeros((3, 3)), np.zeros((3, 3), np.uint8), 1.0)
@@ -104,28 +104,29 @@ def test_hidden_objects_are_not_shown_and_instances_are(bpy, lodgs, two_levels):
     carrier.location = (10, 0, 0)
     bpy.context.scene.collection.objects.link(carrier)
     bpy.context.view_layer.update()
-    found = sets(bpy, lodgs)
-    assert [(shown.level, len(arrays)) for shown, arrays in found] == [(0, 7), (2, COUNT), (2, COUNT)]
-    first, second = (shown.matrix_world[:3, 3] for shown, _ in found[1:])
+    sets = visible_sets(bpy, lodgs)
+    assert [(visible.level, len(arrays)) for visible, arrays in sets] == [(0, 7), (2, COUNT), (2, COUNT)]
+    first, second = (visible.matrix_world[:3, 3] for visible, _ in sets[1:])
     assert sorted(np.abs(first - second).round(5)) == [0, 0, 10]
     loose.hide_set(True)
     carrier.hide_viewport = True
     bpy.context.view_layer.update()
-    assert [shown.level for shown, _ in sets(bpy, lodgs)] == [2]
+    assert [visible.level for visible, _ in visible_sets(bpy, lodgs)] == [2]
     root.users_collection[0].hide_viewport = True
     bpy.context.view_layer.update()
-    assert sets(bpy, lodgs) == []
+    assert visible_sets(bpy, lodgs) == []
 
 
-def test_renders_and_viewports_hide_by_themselves(bpy, lodgs, two_levels):
-    """A render engine sees what is hidden in viewports alone, and not what is hidden in renders alone."""
-    seen = []
+def test_renders_and_viewports_have_separate_visibility(bpy, lodgs, two_levels):
+    """Renders include objects hidden in viewports only, and exclude objects hidden in renders only."""
+    rendered = []
 
     class Engine(bpy.types.RenderEngine):
         bl_idname, bl_label = "LODGS_TEST", "Test"
 
         def render(self, depsgraph):
-            seen.extend(shown.object.name for shown in lodgs("data.shown").splat_instances(depsgraph))
+            instances = lodgs("data.shown").splat_instances(depsgraph)
+            rendered.extend(instance.object.name for instance in instances)
 
     for name in ("a", "b"):
         bpy.context.scene.collection.objects.link(
@@ -143,12 +144,12 @@ def test_renders_and_viewports_hide_by_themselves(bpy, lodgs, two_levels):
         bpy.context.scene.render.engine = "BLENDER_WORKBENCH"
         bpy.utils.unregister_class(Engine)
     depsgraph = bpy.context.evaluated_depsgraph_get()
-    shown = [shown.object.name for shown in lodgs("data.shown").splat_instances(depsgraph)]
-    assert seen == ["b", "scene level 2"] and shown == ["a", "scene level 2"]
+    visible = [instance.object.name for instance in lodgs("data.shown").splat_instances(depsgraph)]
+    assert rendered == ["b", "scene level 2"] and visible == ["a", "scene level 2"]
 
 
 def test_splats_removed_by_modifiers_are_not_read(bpy, lodgs):
-    """Blender drops all attributes with the last point: nothing is shown, and nothing breaks."""
+    """Blender drops all attributes with the last point. The scene then has no visible splats."""
     obj = lodgs("data.objects").new_splats("obj", make_splats(lodgs))
     bpy.context.scene.collection.objects.link(obj)
     group = bpy.data.node_groups.new("nothing", "GeometryNodeTree")
@@ -157,4 +158,4 @@ def test_splats_removed_by_modifiers_are_not_read(bpy, lodgs):
     group.nodes.new("NodeGroupOutput")
     obj.modifiers.new("nothing", "NODES").node_group = group
     bpy.context.view_layer.update()
-    assert sets(bpy, lodgs) == []
+    assert visible_sets(bpy, lodgs) == []

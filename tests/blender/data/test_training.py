@@ -1,4 +1,4 @@
-"""The training panel's properties come from what methods declare."""
+"""Properties of the training panel follow the declarations of methods."""
 
 from dataclasses import dataclass
 
@@ -6,73 +6,74 @@ import pytest
 
 
 @pytest.fixture
-def made_up(bpy, lodgs, monkeypatch):
-    """The group of a method that nobody knew, on an object."""
+def object_with_method(bpy, lodgs, monkeypatch):
+    """An object with the property group of a new method."""
     parameters, methods = lodgs("training.optimize.parameters"), lodgs("training.methods")
     setting = lodgs("training.settings").setting
 
     @dataclass(frozen=True)
-    class Made(parameters.Parameters):
+    class NewParameters(parameters.Parameters):
         decay: float = setting(0.25, "Share that decays.", label="Faintness", high=1)
         width: float = setting(3.0, "Width.", above=0, unit="px")
         turns: int = setting(2, "Turns.", above=1, high=7)
-        fast: bool = setting(True, "Whether it hurries.")
+        fast: bool = setting(True, "Train fast.")
         kind: str = setting("far_off", "Kind.", choices=("near", "far_off"))
         shares: tuple[float, ...] = setting((0.5, 0.5), "Shares.")
 
     offered = ("decay", "width", "turns", "fast", "kind", "shares")
-    presets = {"draft": Made(), "standard": Made(width=4.5, kind="near"), "paper": Made()}
-    info = methods.MethodInfo("made", 98, "Made", "up", Made, presets, panel_parameters=offered)
-    monkeypatch.setitem(methods.METHODS, "made", info)
+    presets = {
+        "draft": NewParameters(),
+        "standard": NewParameters(width=4.5, kind="near"),
+        "paper": NewParameters(),
+    }
+    info = methods.MethodInfo("new", 98, "New", "a method", NewParameters, presets, panel_parameters=offered)
+    monkeypatch.setitem(methods.METHODS, "new", info)
     group = lodgs("data.training")._parameters_of(info)
     bpy.utils.register_class(group)
-    bpy.types.Object.made = bpy.props.PointerProperty(type=group)
-    obj = bpy.data.objects.new("made", None)
+    bpy.types.Object.new_method = bpy.props.PointerProperty(type=group)
+    obj = bpy.data.objects.new("object", None)
     yield obj
     bpy.data.objects.remove(obj)
-    del bpy.types.Object.made
+    del bpy.types.Object.new_method
     bpy.utils.unregister_class(group)
 
 
-def test_a_method_that_is_added_brings_its_parameters(made_up):
-    group, known = made_up.made, made_up.made.bl_rna.properties
-    names = [name for name in known.keys() if name not in ("rna_type", "name")]  # noqa: SIM118
+def test_new_method_has_properties(object_with_method):
+    group, properties = object_with_method.new_method, object_with_method.new_method.bl_rna.properties
+    names = [name for name in properties.keys() if name not in ("rna_type", "name")]  # noqa: SIM118
     assert names == [
         f"{kind}{name}"
-        for name in (  # one number for each level has no place
-            "decay",
-            "width",
-            "turns",
-            "fast",
-            "kind",
-            "depth_weight",
-            "depth",
-        )
+        # lists of numbers have no property
+        for name in ("decay", "width", "turns", "fast", "kind", "depth_weight", "depth")
         for kind in ("", "use_", "preset_")
     ]
-    assert not any(known[name].is_animatable for name in names)
-    assert (known["decay"].name, known["decay"].description) == ("Faintness", "Share that decays")
-    assert (known["decay"].hard_min, known["decay"].hard_max, known["decay"].subtype) == (0, 1, "FACTOR")
-    assert 0 < known["width"].hard_min < 1e-5 and known["width"].subtype == "PIXEL"
-    assert (known["turns"].hard_min, known["turns"].hard_max) == (2, 7)
-    made_up.lodgs.training.preset = "standard"
-    shown = [getattr(group, f"preset_{name}") for name in ("decay", "width", "turns", "fast", "kind")]
-    assert shown == [0.25, 4.5, 2, True, "near"]
+    assert not any(properties[name].is_animatable for name in names)
+    assert (properties["decay"].name, properties["decay"].description) == ("Faintness", "Share that decays")
+    assert (properties["decay"].hard_min, properties["decay"].hard_max, properties["decay"].subtype) == (
+        0,
+        1,
+        "FACTOR",
+    )
+    assert 0 < properties["width"].hard_min < 1e-5 and properties["width"].subtype == "PIXEL"
+    assert (properties["turns"].hard_min, properties["turns"].hard_max) == (2, 7)
+    object_with_method.lodgs.training.preset = "standard"
+    values = [getattr(group, f"preset_{name}") for name in ("decay", "width", "turns", "fast", "kind")]
+    assert values == [0.25, 4.5, 2, True, "near"]
 
 
-def test_ticking_begins_with_the_presets_value_and_unticking_forgets(made_up):
-    group = made_up.made
-    made_up.lodgs.training.preset = "standard"
+def test_override_starts_with_the_presets_value(object_with_method):
+    group = object_with_method.new_method
+    object_with_method.lodgs.training.preset = "standard"
     assert not group.use_width and not group.use_kind
     group.use_width = group.use_kind = True
     assert (group.width, group.kind, group.use_decay) == (4.5, "near", False)
     group.width = 6
-    group.use_width = True  # it is
+    group.use_width = True  # without effect
     assert group.width == 6
     group.use_width = False
     group.use_width = True
     assert group.width == 4.5
-    group.turns = 5  # a script's value counts without a tick
+    group.turns = 5  # setting a value enables the override
     assert group.use_turns
 
 
@@ -82,14 +83,14 @@ def test_every_method_has_a_group(bpy, lodgs):
         settings.method = name
         for preset in lodgs("training.methods").PRESETS:
             settings.preset = preset
-            shown = {name: getattr(settings.parameters, f"preset_{name}") for name in info.panel_parameters}
-            wanted = {name: getattr(info.preset(preset), name) for name in info.panel_parameters}
-            assert shown == pytest.approx(wanted)  # Blender's numbers are float32
+            values = {name: getattr(settings.parameters, f"preset_{name}") for name in info.panel_parameters}
+            expected = {name: getattr(info.preset(preset), name) for name in info.panel_parameters}
+            assert values == pytest.approx(expected)  # Blender's numbers are float32
 
 
 @pytest.fixture
-def photographed(bpy):
-    """``photographed(40)``: a scene root with so many photographs."""
+def scene_with_photos(bpy):
+    """``scene_with_photos(40)``: return the root of a scene with this number of photos."""
 
     def make(count):
         root = bpy.data.objects.new("root", None)
@@ -102,25 +103,25 @@ def photographed(bpy):
     return make
 
 
-@pytest.mark.parametrize(("count", "every"), [(0, 0), (2, 0), (39, 0), (40, 8), (48, 8)])
-def test_photographs_are_held_out_where_there_are_enough(lodgs, photographed, count, every):
-    root, training = photographed(count), lodgs("data.training")
+@pytest.mark.parametrize(("count", "interval"), [(0, 0), (2, 0), (39, 0), (40, 8), (48, 8)])
+def test_photos_are_held_out_if_there_are_enough(lodgs, scene_with_photos, count, interval):
+    root, training = scene_with_photos(count), lodgs("data.training")
     settings = root.lodgs.training
     assert (
-        training.hold_out_interval(root) == settings.preset_test_every == every
+        training.hold_out_interval(root) == settings.preset_test_every == interval
         and not settings.use_test_every
     )
     settings.use_test_every = True
-    assert training.hold_out_interval(root) == settings.test_every == every
-    for own in (5, 0):
-        settings.test_every = own
-        assert training.hold_out_interval(root) == own and settings.preset_test_every == every
+    assert training.hold_out_interval(root) == settings.test_every == interval
+    for value in (5, 0):
+        settings.test_every = value
+        assert training.hold_out_interval(root) == value and settings.preset_test_every == interval
     settings.use_test_every = False
-    assert training.hold_out_interval(root) == every
+    assert training.hold_out_interval(root) == interval
 
 
-def test_held_out_views_follow_the_job(lodgs, photographed, tmp_path):
-    root = photographed(40)
+def test_held_out_views_follow_the_job(lodgs, scene_with_photos, tmp_path):
+    root = scene_with_photos(40)
     job_settings = lodgs("runs.job_settings")
     root.lodgs.scene_folder = str(tmp_path)
     assert job_settings.make_job(root, tmp_path, {}).test_every == 8

@@ -1,4 +1,4 @@
-"""A file that is opened where LODGS is not installed shows the finest level as points, not nothing."""
+"""Without the extension, Blender shows the finest level of a file as points."""
 
 import json
 import subprocess
@@ -11,20 +11,20 @@ from training.splats.bundle import write_bundle
 from training.splats.levels import Bundle, Level
 
 COUNTS = {1: 5, 2: 20, 3: 9}
-LOOK = """
+LIST_CLOUDS = """
 import bpy, json, sys
 import numpy as np
 bpy.ops.wm.open_mainfile(filepath=sys.argv[1])
-depsgraph, seen = bpy.context.evaluated_depsgraph_get(), {}
+depsgraph, result = bpy.context.evaluated_depsgraph_get(), {}
 for obj in bpy.data.objects:
     if obj.type == "POINTCLOUD" and obj.visible_get():
         cloud = obj.evaluated_get(depsgraph).data
         radii = np.zeros(len(cloud.points), np.float32)
         cloud.attributes["radius"].data.foreach_get("value", radii)
-        seen[obj.name] = [len(radii), float(radii.min()), obj.hide_render]
+        result[obj.name] = [len(radii), float(radii.min()), obj.hide_render]
 assert not hasattr(bpy.types.Object, "lodgs")
-seen["told"] = bpy.data.texts["About these splats"].as_string()
-sys.stdout.write("\\nSEEN" + json.dumps(seen))
+result["text"] = bpy.data.texts["About these splats"].as_string()
+sys.stdout.write("\\nRESULT" + json.dumps(result))
 sys.stdout.flush()
 import os
 os._exit(0)
@@ -41,12 +41,12 @@ def test_finest_level_appears_as_points(bpy, lodgs, tmp_path, cumulative):
     root.lodgs.mode, root.lodgs.levels[2].show = "SELECTIVE", False
     bpy.context.view_layer.update()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "b.blend"))
-    command = [sys.executable, "-c", LOOK, str(tmp_path / "b.blend")]
+    command = [sys.executable, "-c", LIST_CLOUDS, str(tmp_path / "b.blend")]
     out = subprocess.run(command, capture_output=True, text=True, check=True, timeout=600).stdout
-    seen = json.loads(out.rpartition("SEEN")[2])
-    assert "extension LODGS" in seen.pop("told")
-    shown = COUNTS if cumulative else {3: COUNTS[3]}
-    assert {name: found[0] for name, found in seen.items()} == {
-        f"b level {number}": count for number, count in shown.items()
+    clouds = json.loads(out.rpartition("RESULT")[2])
+    assert "extension LODGS" in clouds.pop("text")
+    expected = COUNTS if cumulative else {3: COUNTS[3]}
+    assert {name: cloud[0] for name, cloud in clouds.items()} == {
+        f"b level {number}": count for number, count in expected.items()
     }
-    assert all(radius > 0 and not hidden for _, radius, hidden in seen.values())
+    assert all(radius > 0 and not hidden for _, radius, hidden in clouds.values())

@@ -1,4 +1,4 @@
-"""Camera choices: stored numbers, and a choice that only its entry in the table declares."""
+"""Camera choices: stored numbers, and a new choice that is declared by one entry of the table."""
 
 import subprocess
 import sys

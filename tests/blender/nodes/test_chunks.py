@@ -13,7 +13,7 @@ CHUNKS = {"x": [0, 10], "y": [0, 0], "z": [0, 0], "radius": [10, 10]}
 
 @pytest.fixture
 def weights(bpy, lodgs):
-    """``weights(camera, **controls)`` returns the weights of four splats at the origin.
+    """``weights(camera, **controls)``: return the weights of four splats at the origin.
 
     The level of these splats is visible below distance 20.
     ``weights.root`` is their scene. It has a transform, and a second level for larger distances.
@@ -43,12 +43,12 @@ def weights(bpy, lodgs):
         if len(evaluated.data.points):
             read = lodgs("attributes").read_attribute
             weights[read(evaluated.data, "row")] = read(evaluated.data, "lod_weight")
-        choice = lodgs("data.selection").evaluated_query(evaluated, depsgraph)
-        np.testing.assert_allclose(choice.weights(fine.means, fine.extras), weights, atol=1e-6)
+        query = lodgs("data.selection").evaluated_query(evaluated, depsgraph)
+        np.testing.assert_allclose(query.weights(fine.means, fine.extras), weights, atol=1e-6)
         repeated = lodgs("data.selection").evaluated_query(evaluated, depsgraph)
-        assert choice == repeated and hash(choice) == hash(repeated)
-        region = choice.region()
-        assert region is None or (choice.visible_in_region(fine.extras) >= (weights > 0)).all()
+        assert query == repeated and hash(query) == hash(repeated)
+        region = query.region()
+        assert region is None or (query.visible_in_region(fine.extras) >= (weights > 0)).all()
         return weights.tolist()
 
     compute.root = root
@@ -86,7 +86,7 @@ def test_weights_by_distance_outside_the_chunks(weights):
     assert weights((0, 9, 0), chunks=False) == [1, 1, 1, 1]
 
 
-def test_single_chunk(bpy, lodgs, weights):
+def test_single_chunk_fades_to_all_splats(bpy, lodgs, weights):
     chunk = {name: np.float32(values[1:]) for name, values in CHUNKS.items()}
     lodgs("data.scenes").set_tables(weights.root, {"chunks": chunk})
     assert weights((2.5, 0, 0)) == [0, 1, 0, 1]
@@ -104,7 +104,7 @@ def test_weights_by_distance_without_a_table(bpy, lodgs, weights):
 @pytest.mark.parametrize("source", ["CAMERA", "OBJECT", "VIEW", "frozen"])
 def test_chunks_are_selected_for_every_camera_source(bpy, weights, source):
     root, position = weights.root, (2.5, 3, 0)
-    obj = bpy.data.objects.new("eye", bpy.data.cameras.new("eye") if source == "CAMERA" else None)
+    obj = bpy.data.objects.new("camera", bpy.data.cameras.new("camera") if source == "CAMERA" else None)
     bpy.context.scene.collection.objects.link(obj)
     bpy.context.view_layer.update()
     obj.location = root.lodgs.axes.matrix_world @ obj.location.__class__(position)
@@ -124,7 +124,7 @@ def test_chunks_are_selected_for_every_camera_source(bpy, weights, source):
 def test_animated_camera_works_without_handlers(bpy, lodgs, weights, tmp_path):
     """Background renders evaluate only the node groups and drivers of the file."""
     root = weights.root
-    camera = bpy.data.objects.new("eye", bpy.data.cameras.new("eye"))
+    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     bpy.context.scene.collection.objects.link(camera)
     bpy.context.scene.camera = camera
     bpy.context.view_layer.update()
@@ -162,7 +162,7 @@ def test_renders_evaluate_the_group(bpy, lodgs, weights):
             read = lodgs("attributes").read_attribute
             records.append((depsgraph.mode, read(cloud, "row").tolist(), read(cloud, "lod_weight").tolist()))
 
-    camera = bpy.data.objects.new("eye", bpy.data.cameras.new("eye"))
+    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     bpy.context.scene.collection.objects.link(camera)
     bpy.context.scene.camera = camera
     camera.location = weights.root.lodgs.axes.matrix_world @ camera.location.__class__((2.5, 3, 0))

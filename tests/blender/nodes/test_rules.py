@@ -45,7 +45,7 @@ def random_tables(rule, rng, count):
 
 @pytest.fixture
 def level(bpy, lodgs):
-    """``level(rule, count, facts, values, rng, tables)`` returns an object, its modifier and its splats."""
+    """``level(rule, count, facts, values, rng, tables)``: return an object, its modifier and its splats."""
     from training.splats.gaussians import Splats
 
     objects, groups, compat = lodgs("data.objects"), lodgs("nodes.rules"), lodgs("compat")
@@ -130,7 +130,7 @@ def test_node_group_gives_the_weights_of_the_rule(bpy, lodgs, level, name, count
 
 @pytest.fixture
 def splat_scene(bpy, lodgs):
-    """``splat_scene(name)`` returns the root of a scene whose levels are selected by a rule."""
+    """``splat_scene(name)``: return the root of a scene with levels of a rule."""
     from training.splats.gaussians import Splats
     from training.splats.levels import Bundle, Level
 
@@ -174,8 +174,8 @@ def test_older_group_is_replaced_for_all_users(bpy, lodgs, splat_scene, name):
 
 
 @pytest.fixture
-def change(bpy):
-    """``change(group)`` edits a group as a user might: it inverts the selection."""
+def edit_group(bpy):
+    """``edit_group(group)``: invert the selection of a group, as a user might."""
 
     def invert(group):
         keep = next(node for node in group.nodes if node.bl_idname == "GeometryNodeSeparateGeometry")
@@ -187,8 +187,8 @@ def change(bpy):
 
 
 @pytest.fixture
-def half(bpy, lodgs, splat_scene):
-    """``half(name)`` returns a scene with levels by distance, about half of which is visible."""
+def half_visible(bpy, lodgs, splat_scene):
+    """``half_visible(name)``: return the root of a scene by distance that shows about half of its splats."""
 
     def make(name):
         root = splat_scene(name)
@@ -211,12 +211,12 @@ def half(bpy, lodgs, splat_scene):
 
 
 @pytest.mark.parametrize("name", RULES)
-def test_edited_group_is_used_everywhere(bpy, lodgs, half, change, frame, name):
-    """Viewport, F12 and exports show the same splats, with an original and with an edited group."""
-    views, root = lodgs("viewport.views"), half(name)
+def test_edited_group_is_used_everywhere(bpy, lodgs, half_visible, edit_group, frame, name):
+    """Viewports, renders and exports have the same splats with an original and with an edited group."""
+    views, root = lodgs("viewport.views"), half_visible(name)
     views.clear()
 
-    def agree():
+    def compare_counts():
         depsgraph = bpy.context.evaluated_depsgraph_get()
         exported = sum(
             len(item.object.evaluated_get(depsgraph).data.points) for item in root.lodgs.levels
@@ -242,24 +242,24 @@ def test_edited_group_is_used_everywhere(bpy, lodgs, half, change, frame, name):
         columns = splats.extras | {"opacity": 1 / (1 + np.exp(-splats.opacity_logits))}
         return len(lodgs("training.lod.query").SplatSelector(splats.means, columns).select(placed.choice)[0])
 
-    def everything():
+    def count_all():
         return sum(len(item.object.data.points) for item in root.lodgs.levels if item.object.visible_get())
 
-    original = agree()
+    original = compare_counts()
     group = next(m.node_group for m in root.lodgs.levels[0].object.modifiers if "lodgs_rule" in m.node_group)
     assert not lodgs("nodes.building").is_edited(group)
-    change(group)
+    edit_group(group)
     assert lodgs("nodes.building").is_edited(group)
-    assert agree() == everything() - original
-    assert 0 < original < everything()
+    assert compare_counts() == count_all() - original
+    assert 0 < original < count_all()
     views.clear()
 
 
 @pytest.mark.parametrize("name", RULES)
-def test_edited_group_stays_in_use_and_is_kept_when_replaced(lodgs, splat_scene, change, name):
+def test_edited_group_stays_in_use_and_is_kept_when_replaced(lodgs, splat_scene, edit_group, name):
     selection, root = lodgs("data.selection"), splat_scene(name)
     used = lodgs("data.selection").rule_modifier(root.lodgs.levels[0].object).node_group
-    change(used)
+    edit_group(used)
     selection.attach(root)
     assert not selection.outdated(root)
     assert {lodgs("data.selection").rule_modifier(item.object).node_group for item in root.lodgs.levels} == {
@@ -274,20 +274,20 @@ def test_edited_group_stays_in_use_and_is_kept_when_replaced(lodgs, splat_scene,
 
 
 @pytest.mark.parametrize("name", RULES)
-def test_edits_are_recognized_after_saving(bpy, lodgs, splat_scene, change, tmp_path, name):
+def test_edits_are_recognized_after_saving(bpy, lodgs, splat_scene, edit_group, tmp_path, name):
     splat_scene(name)
     path, group = str(tmp_path / "a.blend"), f"LODGS {name.title()}"
     for edited in (False, True):
         if edited:
-            change(bpy.data.node_groups[group])
+            edit_group(bpy.data.node_groups[group])
         bpy.ops.wm.save_as_mainfile(filepath=path, check_existing=False)
         bpy.ops.wm.open_mainfile(filepath=path)
         assert lodgs("nodes.building").is_edited(bpy.data.node_groups[group]) == edited
 
 
 @pytest.mark.parametrize("name", RULES)
-def test_empty_group_causes_no_errors(bpy, lodgs, half, name, capfd):
-    root = half(name)
+def test_empty_group_causes_no_errors(bpy, lodgs, half_visible, name, capfd):
+    root = half_visible(name)
     group = lodgs("data.selection").rule_modifier(root.lodgs.levels[0].object).node_group
     group.interface.clear()
     group.nodes.clear()
@@ -339,4 +339,4 @@ def test_unknown_rule_shows_the_finest_level_with_a_warning(bpy, lodgs, splat_sc
     scenes.set_bundle_facts(root, bundle)
     bpy.context.view_layer.update()
     assert [item.object.visible_get() for item in root.lodgs.levels] == [False, False, True]
-    assert scenes.read_levels(root).rule == "telepathy"  # the name is kept for exports
+    assert scenes.read_levels(root).rule == "telepathy"  # exports keep the name

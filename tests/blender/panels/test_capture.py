@@ -33,7 +33,7 @@ def test_import_is_offered_once_the_folder_holds_a_model(bpy, draw, tmp_path):
     assert any("not saved" in text for text in draw().texts)
 
 
-def test_the_hint_counts_the_captured_objects(bpy, draw):
+def test_hint_counts_the_captured_objects(bpy, draw):
     settings = bpy.context.scene.lodgs_capture
     bpy.ops.mesh.primitive_cube_add()
     bpy.ops.object.light_add(type="SUN")  # the only selected object, without a surface
@@ -74,7 +74,7 @@ def test_progress_and_result_of_a_capture_are_shown(bpy, lodgs, draw, monkeypatc
     assert "The disk is full." in draw().texts and "lodgs.capture_scene" in draw().operators
 
 
-def test_the_panel_is_hidden_while_a_splat_scene_is_active(bpy, lodgs, draw):
+def test_panel_is_hidden_while_a_splat_scene_is_active(bpy, lodgs, draw):
     panel = lodgs("panels.capture").LODGS_PT_capture
     assert panel.poll(bpy.context)
     with lodgs("data.importing").new_scene(bpy.context, "scene"):

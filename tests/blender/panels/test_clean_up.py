@@ -6,7 +6,7 @@ from tests.training.editing.test_cleaning import bundle_of
 from training.splats.bundle import write_bundle
 
 
-def test_crops_hiding_and_counts(bpy, lodgs, draw_panel, tmp_path):
+def test_panel_shows_crops_selection_and_counts(bpy, lodgs, draw_panel, tmp_path):
     write_bundle(tmp_path / "in.ply", bundle_of("bands", np.random.default_rng(0)))
     root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "in.ply")
     layout = draw_panel("clean_up", "LODGS_PT_clean_up")

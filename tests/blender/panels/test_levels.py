@@ -29,8 +29,10 @@ def root(bpy, lodgs, tmp_path):
             if rule
             else ({}, {})
         )
-        adds = bool(rule and rule.cumulative)
-        bundle = bundles.Bundle("any", [bundles.Level(1, splats, facts[1])], name, facts[0], cumulative=adds)
+        cumulative = bool(rule and rule.cumulative)
+        bundle = bundles.Bundle(
+            "any", [bundles.Level(1, splats, facts[1])], name, facts[0], cumulative=cumulative
+        )
         bundles.write_bundle(tmp_path / "b.ply", bundle)
         return lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply")
 
@@ -123,12 +125,12 @@ def test_chunk_of_the_camera_and_loaded_splats_are_shown(bpy, lodgs, town, draw)
 def test_loaded_splats_are_counted_again_when_splats_change(bpy, lodgs, town):
     loaded, cloud = lodgs("data.loaded"), town.lodgs.levels[1].object.data
     bpy.context.view_layer.update()
-    choice = loaded.current_query(bpy.context, town)
-    assert loaded.count_loaded(town, choice)[0] == 110
+    query = loaded.current_query(bpy.context, town)
+    assert loaded.count_loaded(town, query)[0] == 110
     lodgs("attributes").write_attribute(cloud, "chunks_0", "FLOAT", np.ones(1000, np.float32))
     cloud.update_tag()
     bpy.context.view_layer.update()
-    assert loaded.count_loaded(town, choice)[0] == 1010
+    assert loaded.count_loaded(town, query)[0] == 1010
 
 
 def test_chunks_can_be_shown_as_spheres_and_colours(town, draw, draw_panel, root):
@@ -215,8 +217,8 @@ def test_state_of_streaming_is_shown(bpy, lodgs, draw, draw_panel, tmp_path, mon
     assert "no longer match the file" in " ".join(texts())
 
 
-def test_by_distance_states_its_savings_and_offers_more(bpy, lodgs, draw):
-    """Two levels around the camera: the fine one reaches everywhere until the slider is raised."""
+def test_by_distance_shows_its_savings_and_offers_to_reduce_detail(bpy, lodgs, draw):
+    """Two levels surround the camera. The fine one covers all distances until gamma is increased."""
     rng = np.random.default_rng(0)
     scenes = lodgs("data.scenes")
 
@@ -228,7 +230,7 @@ def test_by_distance_states_its_savings_and_offers_more(bpy, lodgs, draw):
             sh=np.zeros((count, 1, 3), np.float32),
         )  # fmt: skip
 
-    camera = bpy.data.objects.new("eye", bpy.data.cameras.new("eye"))
+    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     bpy.context.scene.collection.objects.link(camera)
     bpy.context.scene.camera = camera
     with lodgs("data.importing").new_scene(bpy.context, "two") as root:
@@ -241,10 +243,10 @@ def test_by_distance_states_its_savings_and_offers_more(bpy, lodgs, draw):
     assert "0% fewer than the finest level" in layout.texts and "lodgs.reduce_detail" in layout.operators
     assert bpy.ops.lodgs.reduce_detail(share=0.4) == {"FINISHED"}
     visible, _ = scenes.count_visible(bpy.context, root)
-    saved = 1 - visible / 1000
-    assert root.lodgs.bands.gamma > 2 and 0.4 <= saved < 0.8
+    savings = 1 - visible / 1000
+    assert root.lodgs.bands.gamma > 2 and 0.4 <= savings < 0.8
     layout = draw()
-    assert f"{saved:.0%} fewer than the finest level" in layout.texts
+    assert f"{savings:.0%} fewer than the finest level" in layout.texts
     assert "lodgs.reduce_detail" not in layout.operators
     gamma = root.lodgs.bands.gamma
     assert bpy.ops.lodgs.reduce_detail(share=0.3) == {"FINISHED"}  # already saved

@@ -7,7 +7,7 @@ from training.editing.look import LOOK_SETTINGS
 from training.splats.bundle import write_bundle
 
 
-def test_looks_of_the_scene_of_regions_and_of_a_selected_crop(bpy, lodgs, draw_panel, tmp_path):
+def test_panel_shows_looks_of_scene_regions_and_selected_crop(bpy, lodgs, draw_panel, tmp_path):
     write_bundle(tmp_path / "in.ply", bundle_of("bands", np.random.default_rng(0)))
     root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "in.ply")
     layout = draw_panel("look", "LODGS_PT_look")

@@ -97,16 +97,16 @@ def test_panels_of_the_current_step_are_open(bpy, lodgs, draw_panel, tmp_path, f
     assert draw_panel("scene", "LODGS_PT_scene").collapsed == ["LODGS_import_another"]
 
 
-def test_the_status_bar_shows_work_and_a_notice_of_its_end(bpy, lodgs, work, monkeypatch):
+def test_status_bar_shows_work_and_a_notice_of_its_end(bpy, lodgs, work, monkeypatch):
     status, timers = lodgs("panels.status"), []
     monkeypatch.setattr(
         bpy.app.timers, "register", lambda do, first_interval, persistent: timers.append((do, first_interval))
     )
-    (now,) = status.visible_work(100.0)
-    assert now.running and (now.text, now.share) == ("Photos placed: 3 of 6", 0.5)
+    (running,) = status.visible_work(100.0)
+    assert running.running and (running.text, running.share) == ("Photos placed: 3 of 6", 0.5)
     work.running, work.message = False, "All 6 photos placed."
-    for now in (110.0, 111.0, 110.0 + status.NOTICE - 1):
-        assert [ended.text for ended in status.visible_work(now)] == [work.message]
+    for time in (110.0, 111.0, 110.0 + status.NOTICE - 1):
+        assert [ended.text for ended in status.visible_work(time)] == [work.message]
     assert timers == [(status.extension.redraw, status.NOTICE)], "a timer removes the notice"
     assert not status.visible_work(110.0 + status.NOTICE + 1)
     work.running, work.message, work.fraction = True, "Again", 0.1

@@ -12,20 +12,20 @@ ROOT = Path(__file__).resolve().parents[3]
 
 
 @pytest.mark.slow
-def test_panels_look_as_in_their_pictures(bpy, tmp_path):
+def test_layouts_match_the_pictures_of_panels(bpy, tmp_path):
     if bpy.app.version[:2] != (4, 5):
         pytest.skip("layouts are recorded in Blender 4.5")
     current = tmp_path / "panels.json"
     tool = [sys.executable, str(ROOT / "tools" / "panel_layouts.py"), str(current)]
     subprocess.run(tool, check=True, capture_output=True, timeout=600)
-    pictured = json.loads((ROOT / "docs" / "images" / "panels.json").read_text())
+    recorded = json.loads((ROOT / "docs" / "images" / "panels.json").read_text())
     digests = json.loads(current.read_text())
-    changed = sorted(name for name in digests | pictured if digests.get(name) != pictured.get(name))
+    changed = sorted(name for name in digests | recorded if digests.get(name) != recorded.get(name))
     assert not changed, f"{changed} changed after their pictures: run make pictures"
 
 
-def test_every_picture_is_shown_and_exists():
+def test_all_pictures_exist_and_are_linked():
     pages = [*(ROOT / "docs").rglob("*.md"), ROOT / "README.md", ROOT / "examples" / "README.md"]
-    shown = {name for page in pages for name in re.findall(r"images/([\w-]+\.\w+)", page.read_text("utf-8"))}
-    present = {path.name for path in (ROOT / "docs" / "images").iterdir()} - {"panels.json"}
-    assert present == {name for name in shown if (ROOT / "docs" / "images" / name).exists()}
+    linked = {name for page in pages for name in re.findall(r"images/([\w-]+\.\w+)", page.read_text("utf-8"))}
+    files = {path.name for path in (ROOT / "docs" / "images").iterdir()} - {"panels.json"}
+    assert files == {name for name in linked if (ROOT / "docs" / "images" / name).exists()}

@@ -90,7 +90,7 @@ def test_combining_with_meshes_is_shown_and_can_be_removed(bpy, lodgs, root, dra
 
 
 @pytest.mark.parametrize("instance", [True, False])
-def test_a_linked_scene_can_be_rendered_but_not_changed(bpy, lodgs, root, draw_panel, tmp_path, instance):
+def test_linked_scene_can_be_rendered_but_not_changed(bpy, lodgs, root, draw_panel, tmp_path, instance):
     name = root.users_collection[0].name
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "garden.blend"))
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
@@ -116,7 +116,7 @@ def test_a_linked_scene_can_be_rendered_but_not_changed(bpy, lodgs, root, draw_p
     assert "splats" in draw_panel("viewport", "LODGS_PT_viewport").properties
 
 
-def test_a_local_scene_has_no_hint_about_linking(lodgs, root, draw_panel):
+def test_local_scene_has_no_hint_about_linking(lodgs, root, draw_panel):
     layout = draw_panel("scene", "LODGS_PT_scene")
     assert lodgs("data.roots").LINKED not in layout.texts and "lodgs.remove_scene" in layout.operators
 

@@ -24,7 +24,7 @@ def draw(draw_panel):
 
 @pytest.fixture
 def watch(lodgs, root, tmp_path):
-    """The watch of a run that the panel shows."""
+    """The watch of the run in the panel."""
     module, folder = lodgs("runs.watch"), lodgs("training.runs.folder")
     watch = module.Watch(folder.RunFolder(tmp_path), root.session_uid)
     module.watches[root.session_uid] = watch
@@ -93,7 +93,7 @@ def test_depth_loss_is_a_parameter_of_every_method(lodgs, root):
         assert job_settings.current_parameters(settings).depth_weight == 0.3
 
 
-def test_a_parameter_shows_the_presets_value_until_it_is_set(root, draw):
+def test_parameter_shows_the_presets_value_until_it_is_set(root, draw):
     settings = root.lodgs.training
     common = ["region", "seed", "use_test_every", "preset_test_every", "model", "images", "output"]
     depth = ["use_depth_weight", "preset_depth_weight", "use_depth", "preset_depth"]
@@ -139,7 +139,7 @@ def test_level_distances_can_be_set(bpy, lodgs, root, draw, fake):
     assert lodgs("runs.job_settings").current_parameters(settings).distances == (12.0, 6.0, 2.6, 0.0)
     settings.distances[1] = 30.0
     assert any("Give decreasing numbers" in text for text in draw().texts)
-    settings.distances[1] = 0.0  # found by training
+    settings.distances[1] = 0.0  # 0: training determines it
     assert not any("Give decreasing numbers" in text for text in draw().texts)
 
 
@@ -241,7 +241,7 @@ def test_results_after_training(bpy, lodgs, root, draw, watch, fake):
     assert layout.buttons[-2] == "Train Again", "distinct from Resume"
 
 
-def test_an_unsaved_file_shows_the_folder_of_its_runs(bpy, root, draw, fake, tmp_path):
+def test_unsaved_file_shows_the_folder_of_its_runs(bpy, root, draw, fake, tmp_path):
     assert any(f"not saved. The run is written to {tmp_path}" in text for text in draw().texts)
     root.lodgs.training.output = str(tmp_path)
     assert not any("not saved" in text for text in draw().texts)
@@ -250,6 +250,6 @@ def test_an_unsaved_file_shows_the_folder_of_its_runs(bpy, root, draw, fake, tmp
     assert not any("not saved" in text for text in draw().texts)
 
 
-def test_a_previous_run_can_be_opened(root, draw, fake):
+def test_previous_run_can_be_opened(root, draw, fake):
     root.lodgs.training.run = "/somewhere/run"
     assert draw().operators == ["lodgs.open_run", "lodgs.train", "lodgs.check_scene"]

@@ -42,7 +42,7 @@ def draw_line(bpy, lodgs, root):
 
 @pytest.fixture
 def watch(lodgs, root, tmp_path):
-    """The watch of a run of two cells that the panel shows."""
+    """The watch of a run of two cells in the panel."""
     module = lodgs("runs.watch")
     watch = module.Watch(lodgs("training.runs.folder").RunFolder(tmp_path), root.session_uid)
     module.watches[root.session_uid] = watch
@@ -76,11 +76,11 @@ def test_planning_is_offered_for_several_cells(bpy, root, draw, draw_line):
 
 def test_limits_of_splats_and_memory_determine_the_grid(bpy, lodgs, root, draw, monkeypatch):
     cells, settings, calls = lodgs("data.cells"), root.lodgs.training, []
-    real = cells.choose_cells
+    original = cells.choose_cells
 
     def choose_cells(job, splats, memory, scene):
         calls.append((job.cells, splats, memory))
-        return grid or real(job, splats, memory, scene)
+        return grid or original(job, splats, memory, scene)
 
     monkeypatch.setattr(cells, "choose_cells", choose_cells)
     settings.divide_by, settings.cell_splats, grid = "SPLATS", settings.parameters.preset_max_splats, ""

@@ -14,13 +14,13 @@ def viewport(bpy, lodgs, monkeypatch):
     module.problem = ""
 
 
-def fails(context):
+def fail(context):
     raise RuntimeError("no more memory on the card")
 
 
-def test_an_error_is_shown_until_the_next_redraw_succeeds(bpy, viewport, draw_panel, monkeypatch, capsys):
+def test_error_is_shown_until_the_next_redraw_succeeds(bpy, viewport, draw_panel, monkeypatch, capsys):
     second_scene = bpy.data.scenes.new("other")
-    monkeypatch.setattr(viewport, "_draw_view", fails)
+    monkeypatch.setattr(viewport, "_draw_view", fail)
     for _ in range(3):
         viewport._draw()
     messages = [text for text in draw_panel("viewport", "LODGS_PT_viewport").texts if "memory" in text]
@@ -35,17 +35,17 @@ def test_an_error_is_shown_until_the_next_redraw_succeeds(bpy, viewport, draw_pa
     assert not any("memory" in text for text in draw_panel("viewport", "LODGS_PT_viewport").texts)
 
 
-def test_a_new_file_has_no_error(bpy, viewport, monkeypatch):
-    monkeypatch.setattr(viewport, "_draw_view", fails)
+def test_new_file_has_no_error(bpy, viewport, monkeypatch):
+    monkeypatch.setattr(viewport, "_draw_view", fail)
     viewport._draw()
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     assert viewport.problem == ""
 
 
-def test_an_aborted_draw_restores_the_gpu_state(bpy, lodgs, frame):
+def test_aborted_draw_restores_the_gpu_state(bpy, lodgs, frame):
     import gpu
 
-    def break_off():
+    def abort_draw():
         gpu.state.depth_test_set("ALWAYS")
         gpu.state.depth_mask_set(True)
         gpu.state.blend_set("ALPHA_PREMULT")
@@ -55,10 +55,10 @@ def test_an_aborted_draw_restores_the_gpu_state(bpy, lodgs, frame):
         assert gpu.state.blend_get() == "NONE"
         gpu.state.active_framebuffer_get().clear(color=(0.25, 0.5, 1, 1))
 
-    assert frame(8, break_off)[0, 0].tolist() == [0.25, 0.5, 1, 1]
+    assert frame(8, abort_draw)[0, 0].tolist() == [0.25, 0.5, 1, 1]
 
 
-def test_panel_and_header_state_what_the_budget_leaves(bpy, lodgs, viewport, draw_panel, monkeypatch):
+def test_panel_and_header_show_the_splats_within_the_budget(bpy, lodgs, viewport, draw_panel, monkeypatch):
     views = lodgs("viewport.views")
     assert not any("budget" in text for text in draw_panel("viewport", "LODGS_PT_viewport").texts)
     arrangement = SimpleNamespace(count=1_204_000, excluded=1_800_000)

@@ -37,8 +37,8 @@ def scene(bpy):
     render.image_settings.file_format = "PNG"
     scene.view_settings.view_transform = "Standard"
     scene.cycles.samples = 1
-    for color, place in MARKS.items():
-        bpy.ops.mesh.primitive_cube_add(size=0.15, location=place)
+    for color, position in MARKS.items():
+        bpy.ops.mesh.primitive_cube_add(size=0.15, location=position)
         material = bpy.data.materials.new("mark")
         material.use_nodes = True
         tree = material.node_tree
@@ -97,9 +97,9 @@ def several_cameras(bpy, scene):
     for view, suffix in zip(scene.render.views, ("_L", "_R"), strict=True):
         view.camera_suffix = suffix
     scene.camera.name = "cam_L"
-    other = scene.camera.copy()
-    other.name, other.location = "cam_R", (-3.5, 3.6, 2)
-    scene.collection.objects.link(other)
+    right_camera = scene.camera.copy()
+    right_camera.name, right_camera.location = "cam_R", (-3.5, 3.6, 2)
+    scene.collection.objects.link(right_camera)
 
 
 def orthographic(bpy, scene):
@@ -146,11 +146,11 @@ def centres(bpy, path: Path) -> dict:
     image.colorspace_settings.name = "Non-Color"
     values = np.array(image.pixels[:], np.float32).reshape(image.size[1], image.size[0], 4)[::-1, :, :3]
     bpy.data.images.remove(image)
-    places = {}
+    pixels = {}
     for color in MARKS:
         rows, columns = np.nonzero(((values > 0.4) == np.array(color, bool)).all(-1))
-        places[color] = (np.median(columns), np.median(rows)) if len(rows) else None
-    return places
+        pixels[color] = (np.median(columns), np.median(rows)) if len(rows) else None
+    return pixels
 
 
 @pytest.mark.parametrize(
@@ -170,10 +170,10 @@ def test_splats_stand_where_cycles_draws_cubes(bpy, scene, root, tmp_path, chang
     views = 2 if scene.render.use_multiview else 1
     assert images["CYCLES"].keys() == images["LODGS"].keys() and len(images["CYCLES"]) == views
     for name, expected in images["CYCLES"].items():
-        assert sum(place is not None for place in expected.values()) >= 3
-        for color, place in expected.items():
-            if place is not None:
-                assert images["LODGS"][name][color] == pytest.approx(place, abs=1), (name, color)
+        assert sum(pixel is not None for pixel in expected.values()) >= 3
+        for color, pixel in expected.items():
+            if pixel is not None:
+                assert images["LODGS"][name][color] == pytest.approx(pixel, abs=1), (name, color)
     if views == 2:
         left, right = images["LODGS"].values()
         assert abs(left[1, 0, 0][0] - right[1, 0, 0][0]) > 0.3 or left[0, 0, 1] != right[0, 0, 1]
@@ -191,10 +191,10 @@ def test_viewport_quality_draws_the_same(bpy, lodgs, scene, root, tmp_path, chan
     with lodgs("render.engine").use_renderer(quality._render_frame):
         drawn = draw(bpy, "LODGS", tmp_path)
     assert expected.keys() == drawn.keys()
-    for name, places in expected.items():
-        for color, place in places.items():
-            if place is not None:
-                assert drawn[name][color] == pytest.approx(place, abs=0.5), (name, color)
+    for name, pixels in expected.items():
+        for color, pixel in pixels.items():
+            if pixel is not None:
+                assert drawn[name][color] == pytest.approx(pixel, abs=0.5), (name, color)
 
 
 def spread(bpy, engine, path: Path) -> np.ndarray:
@@ -276,18 +276,20 @@ def test_light_is_spread_as_in_cycles(bpy, scene, root, tmp_path, lens, change):
         images[name] = {
             engine: spread(bpy, engine, tmp_path / name / engine) for engine in ("CYCLES", "LODGS")
         }
-    cycles, ours = (images["blurred"][engine] - images["sharp"][engine] for engine in ("CYCLES", "LODGS"))
+    cycles, lodgs_blur = (
+        images["blurred"][engine] - images["sharp"][engine] for engine in ("CYCLES", "LODGS")
+    )
     assert np.linalg.eigvalsh(cycles)[-1] > 3
-    np.testing.assert_allclose(ours, cycles, atol=0.06 * np.abs(cycles).max())  # noise of both engines
+    np.testing.assert_allclose(lodgs_blur, cycles, atol=0.06 * np.abs(cycles).max())  # noise of both engines
 
 
-def test_stereo_animation_in_viewport_quality_is_refused(bpy, lodgs, scene, root):
+def test_stereo_animation_in_viewport_quality_is_rejected(bpy, lodgs, scene, root):
     stereo(bpy, scene)
     with pytest.raises(lodgs("training.errors").LodgsError, match="stereo or multi-view animation"):
         next(lodgs("render.viewport_quality").render_animation(bpy.context, [1]))
 
 
-def test_depth_of_a_sheared_camera_is_that_of_cycles(bpy, lodgs, scene, root):
+def test_depth_of_a_sheared_camera_matches_cycles(bpy, lodgs, scene, root):
     """Combine with Meshes compares both depths."""
     shear(bpy, scene)
     bpy.context.view_layer.update()
@@ -311,14 +313,14 @@ def test_export_of_a_deformed_camera_names_the_scale(bpy, scene, root, tmp_path,
 
 
 @pytest.mark.parametrize("scale", [(0, 0, 0), (1, 1, 0)])
-def test_camera_of_no_size_is_reported(bpy, scene, root, tmp_path, scale):
+def test_camera_with_scale_0_is_reported(bpy, scene, root, tmp_path, scale):
     scene.camera.scale = scale
     with pytest.raises(RuntimeError, match="the scale of camera 'cam' or of a parent is 0"):
         draw(bpy, "LODGS", tmp_path)
     assert not list(tmp_path.glob("*.png"))
 
 
-def test_splats_may_grow_from_nothing(bpy, scene, root, tmp_path):
+def test_root_with_scale_0_renders_no_splats(bpy, scene, root, tmp_path):
     for frame, scale in ((1, 0), (3, 1)):
         root.scale = (scale,) * 3
         root.keyframe_insert("scale", frame=frame)
@@ -331,7 +333,7 @@ def test_splats_may_grow_from_nothing(bpy, scene, root, tmp_path):
     assert [any(centres(bpy, file).values()) for file in files] == [False, True, True]
 
 
-def test_flat_splats_are_drawn(bpy, scene, root, tmp_path):
+def test_splats_of_a_flattened_root_are_drawn(bpy, scene, root, tmp_path):
     root.scale = (1, 0, 1)
     assert any(draw(bpy, "LODGS", tmp_path)["image.png"].values())
 
@@ -346,14 +348,14 @@ def test_unexpected_error_is_reported(bpy, lodgs, scene, root, tmp_path, monkeyp
     assert not list(tmp_path.glob("*.png"))
 
 
-def test_holdout_in_stereo_is_refused(bpy, scene, root, tmp_path):
+def test_holdout_in_stereo_is_rejected(bpy, scene, root, tmp_path):
     stereo(bpy, scene)
     scene.lodgs_render.holdout = str(tmp_path / "depth_####.exr")
     with pytest.raises(RuntimeError, match="Cannot hold out meshes in a stereo"):
         draw(bpy, "LODGS", tmp_path)
 
 
-def test_folder_as_holdout_is_refused(bpy, scene, root, tmp_path):
+def test_folder_as_holdout_is_rejected(bpy, scene, root, tmp_path):
     scene.lodgs_render.holdout = os.sep
     with pytest.raises(RuntimeError, match="Cannot use the depth files"):
         draw(bpy, "LODGS", tmp_path)

@@ -45,9 +45,9 @@ def select(bpy, *names):
         obj.select_set(obj.name in names)
 
 
-def new_camera(bpy, location, turn, **data):
+def new_camera(bpy, location, rotation, **data):
     camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
-    camera.location, camera.rotation_euler = location, [radians(angle) for angle in turn]
+    camera.location, camera.rotation_euler = location, [radians(angle) for angle in rotation]
     for name, value in data.items():
         setattr(camera.data, name, value)
     bpy.context.scene.collection.objects.link(camera)
@@ -180,8 +180,8 @@ def test_imported_points_lie_on_the_surfaces(bpy, scene, capture, tmp_path):
     points = points.reshape(-1, 3).astype(float)
     assert len(points) > 1000
     boxes = [
-        np.abs(points - middle) - half
-        for middle, half in (((0, 0, 1), 1.0), ((2.5, 1.5, 1), 1.0), ((0, 0, 0), (6, 6, 0)))
+        np.abs(points - center) - half_size
+        for center, half_size in (((0, 0, 1), 1.0), ((2.5, 1.5, 1), 1.0), ((0, 0, 0), (6, 6, 0)))
     ]
     distances = [
         np.linalg.norm(np.maximum(box, 0), axis=1) + np.abs(box.max(axis=1).clip(max=0)) for box in boxes
@@ -373,7 +373,7 @@ def test_transparent_film_gives_images_with_alpha(bpy, scene, capture, tmp_path)
         (lambda bpy: None, ["--around", "--size", "0x5"], "not WIDTHxHEIGHT"),
     ],
 )  # fmt: skip
-def test_mistakes_are_reported(bpy, scene, capture, tmp_path, capfd, change, arguments, message):
+def test_wrong_options_are_reported(bpy, scene, capture, tmp_path, capfd, change, arguments, message):
     change(bpy)
     bpy.context.view_layer.update()
     assert capture("--range", "1-2", *arguments) == 2
@@ -440,31 +440,31 @@ def test_capture_beside_a_georeferenced_scene_has_the_original_place(bpy, lodgs,
     importing, origin = lodgs("data.importing"), np.array([500_000.0, 4_200_000.0, 300.0])
     with importing.new_scene(bpy.context, "survey") as root:
         root.lodgs.meta = json.dumps({"origin": origin.tolist()})
-    turn = Matrix.Rotation(radians(30), 4, "Z") @ Matrix.Rotation(radians(-90), 4, "X")
-    root.matrix_basis = Matrix.Translation((5, -3, 2)) @ turn
-    rotation, location = np.array(turn)[:3, :3], np.array([5, -3, 2])
+    rotation_matrix = Matrix.Rotation(radians(30), 4, "Z") @ Matrix.Rotation(radians(-90), 4, "X")
+    root.matrix_basis = Matrix.Translation((5, -3, 2)) @ rotation_matrix
+    rotation, location = np.array(rotation_matrix)[:3, :3], np.array([5, -3, 2])
     cameras = [new_camera(bpy, (x, -9, 3), (75, 0, 0)) for x in (0, 1, 2)]
-    places = [np.array(camera.location) for camera in cameras]
+    positions = [np.array(camera.location) for camera in cameras]
     assert capture("--cameras", "--range", "1-1") == 0
     assert capture("--cameras") == 0, "the first view is recognised"
     views, _ = read_camera_folder(tmp_path / "out" / "cameras")
-    for view, place in zip(views, places, strict=True):
-        expected = rotation.T @ (place - location) + origin
+    for view, position in zip(views, positions, strict=True):
+        expected = rotation.T @ (position - location) + origin
         np.testing.assert_allclose(view.center, expected, rtol=0, atol=1e-5)
     points, _, _ = read_points(tmp_path / "out" / "sparse" / "0")
     in_blender = (points - origin) @ rotation.T + location
     on_ground = np.abs(in_blender[:, 2]) < 1e-3
-    on_a_cube = (in_blender[:, 2] > 0) & (np.abs(in_blender[:, :2] - (1.25, 0.75)) < 2.3).all(axis=1)
+    on_cubes = (in_blender[:, 2] > 0) & (np.abs(in_blender[:, :2] - (1.25, 0.75)) < 2.3).all(axis=1)
     is_sky = np.linalg.norm(in_blender, axis=1) > 20
-    assert 0.9 <= (on_ground | on_a_cube).mean() < 1 and (on_ground | on_a_cube | is_sky).all()
+    assert 0.9 <= (on_ground | on_cubes).mean() < 1 and (on_ground | on_cubes | is_sky).all()
 
     bpy.context.scene.lodgs_capture.folder = str(tmp_path / "out")
     assert bpy.ops.lodgs.import_capture() == {"FINISHED"}
     imported = lodgs("data.roots").active_root(bpy.context)
     assert lodgs("data.selection").origin_of(imported).any()
     bpy.context.view_layer.update()
-    for view, place in zip(lodgs("data.photographs").views(imported), places, strict=True):
-        np.testing.assert_allclose(view.matrix_world.translation, place, atol=1e-4)
+    for view, position in zip(lodgs("data.photographs").views(imported), positions, strict=True):
+        np.testing.assert_allclose(view.matrix_world.translation, position, atol=1e-4)
 
 
 def test_capture_beside_a_scaled_georeferenced_scene_keeps_the_place(
@@ -488,7 +488,7 @@ def test_nothing_is_rendered_without_a_trainer(bpy, scene, capture, tmp_path, ca
 
 
 @needs_trainer
-def test_the_operator_captures_the_current_scene(bpy, lodgs, scene, blender, tmp_path):
+def test_operator_captures_the_current_scene(bpy, lodgs, scene, blender, tmp_path):
     settings, background_capture = scene.lodgs_capture, lodgs("runs.background_capture")
     with pytest.raises(RuntimeError, match="not saved"):
         bpy.ops.lodgs.capture_scene()

@@ -1,4 +1,4 @@
-"""F12 with the engine LODGS and the real renderer: pixels, passes, animations, and what can go wrong."""
+"""Renders with the engine LODGS and the real renderer: pixels, passes, animations and errors."""
 
 from __future__ import annotations
 
@@ -25,8 +25,9 @@ from training.__main__ import main
 for line in sys.stdin:
     print("exit code", main(json.loads(line)), flush=True)
 """
-"""Run commands of the trainer, one a line."""
+"""Program that runs commands of the trainer, one per line."""
 NOTHING = 1e10
+"""Depth of pixels without splats."""
 
 
 pytestmark = pytest.mark.usefixtures("renderer")
@@ -56,7 +57,7 @@ def bundle(tmp_path) -> Path:
 
 @pytest.fixture
 def scene(bpy, lodgs, bundle):
-    """A bundle, turned and moved and scaled, and a camera before it; LODGS renders it to PNG."""
+    """A scene with a rotated, moved and scaled bundle and a camera, rendered by LODGS as PNG."""
     scene = bpy.context.scene
     root = lodgs("data.importing").import_splats(bpy.context, bundle, upright=False)
     root.location, root.scale = (1, 2, -0.5), (1.7,) * 3
@@ -72,15 +73,15 @@ def scene(bpy, lodgs, bundle):
     return scene
 
 
-def f12(bpy, tmp_path, name="f12.png") -> np.ndarray:
-    """Renders; the file's values (H, W, 4) as they lie in it, rows from the top."""
+def render_file(bpy, tmp_path, name="render.png") -> np.ndarray:
+    """Render to a file; return its values (H, W, 4), rows from the top."""
     path = tmp_path / name
     bpy.context.scene.render.filepath = str(path)
     assert bpy.ops.render.render(write_still=True) == {"FINISHED"}
-    return pixels(bpy, path)
+    return read_pixels(bpy, path)
 
 
-def pixels(bpy, path: Path) -> np.ndarray:
+def read_pixels(bpy, path: Path) -> np.ndarray:
     image = bpy.data.images.load(str(path))
     image.colorspace_settings.name = "Non-Color"
     image.alpha_mode = "CHANNEL_PACKED"
@@ -91,13 +92,13 @@ def pixels(bpy, path: Path) -> np.ndarray:
     return values
 
 
-def bytes_of(values: np.ndarray) -> np.ndarray:
+def to_bytes(values: np.ndarray) -> np.ndarray:
     return np.round(values * 255).astype(np.uint8)
 
 
 @pytest.fixture(scope="module")
-def without_blender():
-    """Return ``without_blender(bundle, camera, out, *options)``: ``lodgs render`` of Blender's camera file.
+def render_command():
+    """``render_command(bundle, camera, out, *options)``: run ``lodgs render`` with a camera file.
 
     The calls share a process, because it takes seconds to start.
     """
@@ -117,8 +118,8 @@ def without_blender():
         yield render
 
 
-def passes(bpy, lodgs, **settings):
-    """The planes that the engine draws of the scene as it is."""
+def render_passes(bpy, lodgs, **settings):
+    """Return the passes of the current scene by name; None if the render is cancelled."""
     engine, scene = lodgs("render.engine"), bpy.context.scene
     scene.view_layers[0].use_pass_z = scene.lodgs_render.use_pass_levels = True
     width, height = engine.render_size(scene.render)
@@ -130,115 +131,111 @@ def passes(bpy, lodgs, **settings):
 
 
 @pytest.mark.parametrize("transparent", [False, True])
-def test_f12_is_what_training_render_draws_to_the_bit(
-    bpy, scene, bundle, tmp_path, transparent, without_blender
+def test_render_matches_the_render_command_to_the_bit(
+    bpy, scene, bundle, tmp_path, transparent, render_command
 ):
     scene.render.film_transparent = transparent
     scene.render.image_settings.color_mode = "RGBA"
-    shown = f12(bpy, tmp_path)
+    image = render_file(bpy, tmp_path)
     camera = tmp_path / "camera.json"
     assert bpy.ops.lodgs.export_camera(filepath=str(camera)) == {"FINISHED"}
     options = ["--background", "transparent"] if transparent else []
-    without_blender(bundle, camera, tmp_path / "trainer.png", *options)
-    expected = pixels(bpy, tmp_path / "trainer.png")
-    assert shown.shape == (480, 640, 4) and bytes_of(shown[..., :3]).max() > 200
-    np.testing.assert_array_equal(bytes_of(shown), bytes_of(expected))
+    render_command(bundle, camera, tmp_path / "trainer.png", *options)
+    expected = read_pixels(bpy, tmp_path / "trainer.png")
+    assert image.shape == (480, 640, 4) and to_bytes(image[..., :3]).max() > 200
+    np.testing.assert_array_equal(to_bytes(image), to_bytes(expected))
 
 
-def test_f12_of_antialiased_splats_is_what_training_render_draws(
-    bpy, lodgs, scene, bundle, tmp_path, without_blender
-):
-    """By what the scene says, which its bundle then says as well."""
+def test_antialiased_render_matches_the_render_command(bpy, lodgs, scene, bundle, tmp_path, render_command):
+    """The scene's setting is exported with the bundle."""
     root = lodgs("data.roots").roots(scene)[0]
     for item in root.lodgs.levels:
         for value in item.object.data.attributes["scale"].data:
             value.vector = [x / 10 for x in value.vector]
-    before = f12(bpy, tmp_path)
+    before = render_file(bpy, tmp_path)
     root.lodgs.antialias = True
-    shown, camera = f12(bpy, tmp_path), tmp_path / "camera.json"
-    assert np.abs(bytes_of(before).astype(int) - bytes_of(shown)).max() > 20
+    image, camera = render_file(bpy, tmp_path), tmp_path / "camera.json"
+    assert np.abs(to_bytes(before).astype(int) - to_bytes(image)).max() > 20
     bpy.ops.lodgs.export_camera(filepath=str(camera))
     bpy.context.view_layer.objects.active = root
     assert bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "small.ply")) == {"FINISHED"}
-    without_blender(tmp_path / "small.ply", camera, tmp_path / "trainer.png")
-    difference = np.abs(bytes_of(shown).astype(int) - bytes_of(pixels(bpy, tmp_path / "trainer.png")))
-    assert difference.max() <= 1 and (difference > 0).mean() < 0.01  # scales were float32's logarithms
+    render_command(tmp_path / "small.ply", camera, tmp_path / "trainer.png")
+    difference = np.abs(to_bytes(image).astype(int) - to_bytes(read_pixels(bpy, tmp_path / "trainer.png")))
+    assert difference.max() <= 1 and (difference > 0).mean() < 0.01  # scales are rounded to float32
 
 
-def test_levels_by_distance_are_what_training_render_chooses(
-    bpy, lodgs, scene, bundle, tmp_path, without_blender
-):
+def test_levels_by_distance_match_the_render_command(bpy, lodgs, scene, bundle, tmp_path, render_command):
     root = lodgs("data.roots").roots(scene)[0]
     root.lodgs.mode, root.lodgs.bands.gamma = "SELECTIVE", 10
-    shown = f12(bpy, tmp_path)
+    image = render_file(bpy, tmp_path)
     camera = tmp_path / "camera.json"
     bpy.ops.lodgs.export_camera(filepath=str(camera))
-    without_blender(bundle, camera, tmp_path / "trainer.png", "--gamma", "10", "--first", "1", "--last", "2")
-    np.testing.assert_array_equal(bytes_of(shown), bytes_of(pixels(bpy, tmp_path / "trainer.png")))
-    levels = passes(bpy, lodgs)["Level.X"]
-    assert {1, 2} <= set(np.unique(levels))  # both have their part
+    render_command(bundle, camera, tmp_path / "trainer.png", "--gamma", "10", "--first", "1", "--last", "2")
+    np.testing.assert_array_equal(to_bytes(image), to_bytes(read_pixels(bpy, tmp_path / "trainer.png")))
+    levels = render_passes(bpy, lodgs)["Level.X"]
+    assert {1, 2} <= set(np.unique(levels))  # both levels are visible
 
 
-def test_an_imported_view_is_the_photographs_camera(bpy, lodgs, bundle, tmp_path, without_blender):
-    """Rendered from Blender's camera, and from COLMAP's own numbers: but for float32, the same."""
+def test_imported_view_matches_the_camera_of_its_photo(bpy, lodgs, bundle, tmp_path, render_command):
+    """Images from Blender's camera and from COLMAP's camera differ only by float32 rounding."""
     from training.scenes.cameras import write_camera
     from training.scenes.colmap import read_scene
 
     folder = ROOT / "examples" / "lantern_garden"
-    photographed = lodgs("data.importing").import_colmap(bpy.context, folder, photographs=False)
-    photographed.lodgs.points.hide_render = True
+    scene_root = lodgs("data.importing").import_colmap(bpy.context, folder, photographs=False)
+    scene_root.lodgs.points.hide_render = True
     root = lodgs("data.importing").import_splats(bpy.context, bundle, upright=False)
     bpy.context.view_layer.update()
-    root.lodgs.axes.matrix_world = photographed.lodgs.axes.matrix_world
+    root.lodgs.axes.matrix_world = scene_root.lodgs.axes.matrix_world
     bpy.context.scene.render.dither_intensity = 0
     lodgs("render.engine").use(bpy.context.scene)
-    shown = f12(bpy, tmp_path)
+    image = render_file(bpy, tmp_path)
     view = next(c for c in read_scene(folder).cameras if c.name == bpy.context.scene.camera.name)
     write_camera(tmp_path / "camera.json", view, bpy.context.scene.camera.data.clip_start)
-    without_blender(bundle, tmp_path / "camera.json", tmp_path / "trainer.png")
-    difference = np.abs(bytes_of(shown).astype(int) - bytes_of(pixels(bpy, tmp_path / "trainer.png")))
+    render_command(bundle, tmp_path / "camera.json", tmp_path / "trainer.png")
+    difference = np.abs(to_bytes(image).astype(int) - to_bytes(read_pixels(bpy, tmp_path / "trainer.png")))
     assert difference.max() <= 1 and (difference > 0).mean() < 0.01
 
 
-def test_depth_and_levels(bpy, lodgs, scene):
-    planes = passes(bpy, lodgs)
+def test_depth_and_level_passes_cover_the_splats(bpy, lodgs, scene):
+    planes = render_passes(bpy, lodgs)
     covered = planes["Level.X"] > 0
     assert 0.1 < covered.mean() < 0.9
     depth = planes["Depth.Z"]
     assert (depth[~covered] == NOTHING).all()
-    assert depth[covered].min() > 1 and depth[covered].max() < 15  # the set is 7.5 away and 5 deep
+    assert depth[covered].min() > 1 and depth[covered].max() < 15  # splats are at 7.5 +- 2.5
     np.testing.assert_array_equal(planes["Level.X"][covered], 2)
     assert planes["Level 2.X"].max() > 0.9
     assert planes["Combined.A"].min() == 1
 
 
-def test_border_and_percentage(bpy, scene, tmp_path):
-    whole = f12(bpy, tmp_path)
+def test_border_and_percentage_match_the_full_image(bpy, scene, tmp_path):
+    full = render_file(bpy, tmp_path)
     scene.render.use_border = scene.render.use_crop_to_border = True
     scene.render.border_min_x, scene.render.border_max_x = 0.31, 0.66
     scene.render.border_min_y, scene.render.border_max_y = 0.2, 0.81
-    cropped = f12(bpy, tmp_path)
-    part = whole[480 - 388 : 480 - 96, 198:422]
-    assert cropped.shape == part.shape == (292, 224, 4)
-    assert np.abs(cropped - part).max() <= 1.001 / 255
+    cropped = render_file(bpy, tmp_path)
+    expected = full[480 - 388 : 480 - 96, 198:422]
+    assert cropped.shape == expected.shape == (292, 224, 4)
+    assert np.abs(cropped - expected).max() <= 1.001 / 255
     scene.render.use_crop_to_border = False
-    framed = f12(bpy, tmp_path)
-    assert framed.shape == whole.shape
-    np.testing.assert_array_equal(framed[480 - 388 : 480 - 96, 198:422], cropped)
+    with_border = render_file(bpy, tmp_path)
+    assert with_border.shape == full.shape
+    np.testing.assert_array_equal(with_border[480 - 388 : 480 - 96, 198:422], cropped)
     scene.render.use_border, scene.render.resolution_percentage = False, 50
-    small = f12(bpy, tmp_path)
-    assert small.shape == (240, 320, 4)
-    assert np.abs(small - whole.reshape(240, 2, 320, 2, 4).mean((1, 3))).mean() < 0.02
+    half_size = render_file(bpy, tmp_path)
+    assert half_size.shape == (240, 320, 4)
+    assert np.abs(half_size - full.reshape(240, 2, 320, 2, 4).mean((1, 3))).mean() < 0.02
 
 
 def test_background_colour(bpy, scene, tmp_path):
     scene.lodgs_render.background = (1, 0.5, 0)
-    assert bytes_of(f12(bpy, tmp_path))[0, 0].tolist() == [255, 128, 0, 255]
+    assert to_bytes(render_file(bpy, tmp_path))[0, 0].tolist() == [255, 128, 0, 255]
 
 
-def test_two_sets_and_an_instance(bpy, lodgs, scene, bundle, tmp_path):
-    """A second import and a copy of a collection, each elsewhere: all are in the picture."""
-    alone = passes(bpy, lodgs)["Level.X"] > 0
+def test_second_scene_and_its_instance_are_rendered(bpy, lodgs, scene, bundle, tmp_path):
+    """The second scene is on the left of the image and its instance on the right."""
+    before = render_passes(bpy, lodgs)["Level.X"] > 0
     left = lodgs("data.importing").import_splats(bpy.context, bundle)
     left.location = (-1.5, 2, 0)
     instance = bpy.data.objects.new("instance", None)
@@ -247,35 +244,35 @@ def test_two_sets_and_an_instance(bpy, lodgs, scene, bundle, tmp_path):
     instance.location = (5, 0, 0)
     scene.collection.objects.link(instance)
     bpy.context.view_layer.update()
-    drawn = passes(bpy, lodgs)["Level.X"] > 0
+    drawn = render_passes(bpy, lodgs)["Level.X"] > 0
     assert len(lodgs("render.engine").placed_splats(bpy.context.evaluated_depsgraph_get())) == 3
-    assert drawn[:, :150].sum() > alone[:, :150].sum() + 1000
-    assert drawn[:, 500:].sum() > alone[:, 500:].sum() + 1000
+    assert drawn[:, :150].sum() > before[:, :150].sum() + 1000
+    assert drawn[:, 500:].sum() > before[:, 500:].sum() + 1000
 
 
-def test_instances_take_the_detail_of_their_own_distance(bpy, lodgs, scene, tmp_path):
-    """An instance is rendered as the original in its place, although the original is far away."""
+def test_instances_have_the_detail_of_their_own_distance(bpy, lodgs, scene, tmp_path):
+    """An instance looks like the original in the same place, although the original is far away."""
     root = lodgs("data.roots").roots(scene)[0]
     root.lodgs.mode, root.lodgs.bands.gamma = "SELECTIVE", 10
     root.lodgs.freeze = False
-    expected = f12(bpy, tmp_path)
-    place = root.matrix_world.copy()
+    expected = render_file(bpy, tmp_path)
+    matrix = root.matrix_world.copy()
     instance = bpy.data.objects.new("instance", None)
     instance.instance_type, instance.instance_collection = "COLLECTION", root.users_collection[0]
     scene.collection.objects.link(instance)
-    root.matrix_world = place.__class__.Translation((0, -40, 90)) @ place  # behind the camera, far away
+    root.matrix_world = matrix.__class__.Translation((0, -40, 90)) @ matrix  # behind the camera, far away
     bpy.context.view_layer.update()
-    instance.matrix_world = place @ root.matrix_world.inverted()
+    instance.matrix_world = matrix @ root.matrix_world.inverted()
     bpy.context.view_layer.update()
-    drawn = f12(bpy, tmp_path)
+    drawn = render_file(bpy, tmp_path)
     placed = lodgs("render.engine").placed_splats(bpy.context.evaluated_depsgraph_get())
     assert len({tuple(np.round(item.choice.position, 2)) for item in placed}) == 2
-    assert bytes_of(expected).max() > 200
-    assert np.abs(bytes_of(drawn).astype(int) - bytes_of(expected)).max() <= 2
+    assert to_bytes(expected).max() > 200
+    assert np.abs(to_bytes(drawn).astype(int) - to_bytes(expected)).max() <= 2
 
 
 @pytest.mark.one_blender
-def test_an_animation_starts_the_renderer_once(bpy, lodgs, scene, tmp_path, monkeypatch):
+def test_animation_starts_the_renderer_once(bpy, lodgs, scene, tmp_path, monkeypatch):
     renderer, started = lodgs("render.renderer"), []
     renderer.close()
     spawn_piped = lodgs("runs.processes").spawn_piped
@@ -295,13 +292,13 @@ def test_an_animation_starts_the_renderer_once(bpy, lodgs, scene, tmp_path, monk
     assert bpy.ops.render.render(animation=True) == {"FINISHED"}
     frames = sorted(tmp_path.glob("frame_*.png"))
     assert len(frames) == 24 and len(started) == 1 and len(written) == 1
-    first, middle, last = (pixels(bpy, frames[i]) for i in (0, 12, 23))
+    first, middle, last = (read_pixels(bpy, frames[i]) for i in (0, 12, 23))
     assert np.abs(first - middle).max() > 0.2 and np.abs(middle - last).max() > 0.2
     assert started[0].poll() is None
 
 
-def test_what_changes_is_handed_over(bpy, lodgs, scene, tmp_path):
-    before = f12(bpy, tmp_path)
+def test_changed_attributes_are_sent_to_the_renderer(bpy, lodgs, scene, tmp_path):
+    before = render_file(bpy, tmp_path)
     cloud = lodgs("data.roots").roots(scene)[0].lodgs.levels[1].object.data
     base = lodgs("attributes").read_attribute(cloud, "radiance:base")
     base[:, :3] = 0
@@ -309,13 +306,13 @@ def test_what_changes_is_handed_over(bpy, lodgs, scene, tmp_path):
         cloud, "radiance:base", cloud.attributes["radiance:base"].data_type, base
     )
     cloud.update_tag()
-    after = f12(bpy, tmp_path)
+    after = render_file(bpy, tmp_path)
     assert np.abs(before - after).mean() > 0.01
 
 
 @pytest.fixture
-def written(lodgs, monkeypatch):
-    """What the renderer has been handed so far, a list of calls."""
+def sent_sets(lodgs, monkeypatch):
+    """Record the calls that send splats to the renderer."""
     renderer, calls = lodgs("render.renderer"), []
     write_set = renderer.wire.write_set
     monkeypatch.setattr(renderer.wire, "write_set", lambda *a: calls.append(a) or write_set(*a))
@@ -324,33 +321,33 @@ def written(lodgs, monkeypatch):
 
 @pytest.fixture
 def by_distance(bpy, lodgs, scene, tmp_path):
-    """``by_distance(rule)``: levels that this rule chooses from the camera's place, about half of them."""
+    """``by_distance(rule)``: import levels of a rule that selects about half of their splats."""
 
-    def made(name):
+    def make(name):
         scene.render.resolution_percentage = 25
         bpy.context.view_layer.update()
         before = lodgs("data.roots").roots(scene)[0]
-        middle = (before.lodgs.axes.matrix_world.inverted() @ scene.camera.matrix_world.translation).length
+        distance = (before.lodgs.axes.matrix_world.inverted() @ scene.camera.matrix_world.translation).length
         focal = before.lodgs.focal_px
-        of_scene, coarse, fine = {
-            "bands": ({}, {"s_min": middle / focal}, {"s_min": 0.0}),
-            "octree": ({"d_max": 2**-0.25 * middle, "d_max_focal": focal}, {}, {}),
-            "chunks": ({}, {"d_l": middle}, {"d_l": 0.0}),
-            "decay": ({"reference": 2 * middle, "tau": 0.01}, {}, {}),
+        scene_facts, coarse, fine = {
+            "bands": ({}, {"s_min": distance / focal}, {"s_min": 0.0}),
+            "octree": ({"d_max": 2**-0.25 * distance, "d_max_focal": focal}, {}, {}),
+            "chunks": ({}, {"d_l": distance}, {"d_l": 0.0}),
+            "decay": ({"reference": 2 * distance, "tau": 0.01}, {}, {}),
             "cut": ({}, {}, {}),
         }[name]
         levels = [Level(1, random_splats(400, 1), coarse), Level(2, random_splats(1500, 1, 1), fine)]
         for level in levels:
             rng = np.random.default_rng(level.number)
-            size = 2 * middle / max(focal, 32)
-            for column, most in (
+            size = 2 * distance / max(focal, 32)
+            for column, upper in (
                 ("lod_bias", 1),
                 ("sigma_d", 0.6),
                 ("node_size", size),
                 ("parent_size", size),
             ):
-                level.splats.extras[column] = rng.uniform(0, most, len(level.splats)).astype(np.float32)
-        bundle = Bundle("any", levels, name, facts=of_scene, cumulative=name == "octree")
+                level.splats.extras[column] = rng.uniform(0, upper, len(level.splats)).astype(np.float32)
+        bundle = Bundle("any", levels, name, facts=scene_facts, cumulative=name == "octree")
         write_bundle(tmp_path / "levels.ply", bundle)
         bpy.data.batch_remove([obj for obj in bpy.data.objects if obj.type == "POINTCLOUD"])
         root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "levels.ply")
@@ -359,82 +356,84 @@ def by_distance(bpy, lodgs, scene, tmp_path):
         bpy.context.view_layer.update()
         return root
 
-    return made
+    return make
 
 
 @pytest.mark.parametrize("rule", ["bands", "octree", "chunks", "decay", "cut"])
-def test_it_is_chosen_as_node_groups_choose(bpy, lodgs, scene, by_distance, written, monkeypatch, rule):
-    """The renderer is handed every level once, and then a choice with each frame; pictures are those of what
-    Blender's evaluation leaves, but for a splat on a border where float32 numbers are rounded otherwise."""
+def test_renderer_selects_like_node_groups(bpy, lodgs, scene, by_distance, sent_sets, monkeypatch, rule):
+    """The renderer receives each level once, and a query with each frame.
+
+    Its images match those of splats that Blender selects and sends with each frame. Rounding may move a splat
+    on a border.
+    """
     root, engine = by_distance(rule), lodgs("render.engine")
-    told, pictures = [], {}
-    for whole in (True, False):
-        written.clear()
-        if not whole:
+    counts_sent, images = [], {}
+    for by_renderer in (True, False):
+        sent_sets.clear()
+        if not by_renderer:
             monkeypatch.setattr(engine, "_is_selected_by_rule", lambda *args: False)
         for x in (1.3, 2.0, 0.4):
             scene.camera.location.x = x
             bpy.context.view_layer.update()
-            planes = passes(bpy, lodgs)
-            pictures.setdefault(x, []).append([planes[f"Combined.{channel}"] for channel in "RGBA"])
-        told.append(len(written))
-    assert told[0] <= 2 < told[1]
-    for new, old in pictures.values():
-        assert np.abs(np.float32(new) - np.float32(old)).max() <= 1 / 255
-        assert np.ptp(new[:3]) > 0.1
-    first, last = pictures[1.3][0], pictures[0.4][0]
+            planes = render_passes(bpy, lodgs)
+            images.setdefault(x, []).append([planes[f"Combined.{channel}"] for channel in "RGBA"])
+        counts_sent.append(len(sent_sets))
+    assert counts_sent[0] <= 2 < counts_sent[1]
+    for image, expected in images.values():
+        assert np.abs(np.float32(image) - np.float32(expected)).max() <= 1 / 255
+        assert np.ptp(image[:3]) > 0.1
+    first, last = images[1.3][0], images[0.4][0]
     assert np.abs(np.float32(first) - np.float32(last)).max() > 0.1
     counts = [len(item.object.evaluated_get(bpy.context.evaluated_depsgraph_get()).data.points)
               for item in root.lodgs.levels]  # fmt: skip
     assert 0 < sum(counts) < 1900
 
 
-def test_what_modifiers_change_is_handed_over_as_they_leave_it(bpy, lodgs, scene, by_distance, written):
-    """An artist's own modifier on a level; taken away again, the level is chosen from again."""
+def test_modifiers_of_the_user_are_rendered(bpy, lodgs, scene, by_distance, sent_sets):
+    """After removing the modifier, the renderer selects splats of the level again."""
     root = by_distance("bands")
-    plain = passes(bpy, lodgs)["Combined.R"]
+    original = render_passes(bpy, lodgs)["Combined.R"]
     level = root.lodgs.levels[1].object
     group = bpy.data.node_groups.new("shift", "GeometryNodeTree")
     group.interface.new_socket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
     group.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
-    begin, move = group.nodes.new("NodeGroupInput"), group.nodes.new("GeometryNodeSetPosition")
+    source, move = group.nodes.new("NodeGroupInput"), group.nodes.new("GeometryNodeSetPosition")
     move.inputs["Offset"].default_value = (0.3, 0, 0)
-    group.links.new(begin.outputs[0], move.inputs[0])
+    group.links.new(source.outputs[0], move.inputs[0])
     group.links.new(move.outputs[0], group.nodes.new("NodeGroupOutput").inputs[0])
     modifier = level.modifiers.new("shift", "NODES")
     modifier.node_group = group
     bpy.context.view_layer.update()
-    assert np.abs(passes(bpy, lodgs)["Combined.R"] - plain).max() > 0.1
+    assert np.abs(render_passes(bpy, lodgs)["Combined.R"] - original).max() > 0.1
     level.modifiers.remove(modifier)
     bpy.context.view_layer.update()
-    np.testing.assert_array_equal(passes(bpy, lodgs)["Combined.R"], plain)
+    np.testing.assert_array_equal(render_passes(bpy, lodgs)["Combined.R"], original)
 
 
-def test_what_no_viewport_shows_is_read_at_every_frame(bpy, lodgs, scene, tmp_path, written):
-    """Blender does not tell when it changes."""
+def test_splats_hidden_in_viewports_are_read_at_every_frame(bpy, lodgs, scene, tmp_path, sent_sets):
+    """Blender does not report changes of hidden objects."""
     level = lodgs("data.roots").roots(scene)[0].lodgs.levels[1].object
     level.driver_remove("hide_viewport")
     level.hide_viewport = True
-    before = f12(bpy, tmp_path)
+    before = render_file(bpy, tmp_path)
     cloud, attributes = level.data, lodgs("attributes")
     base = attributes.read_attribute(cloud, "radiance:base")
     base[:, :3] = 0
     attributes.write_attribute(cloud, "radiance:base", cloud.attributes["radiance:base"].data_type, base)
     cloud.update_tag()
-    assert np.abs(f12(bpy, tmp_path) - before).mean() > 0.01 and len(written) == 2
+    assert np.abs(render_file(bpy, tmp_path) - before).mean() > 0.01 and len(sent_sets) == 2
 
 
-def test_undo_has_all_be_compared_and_nothing_sent_again(bpy, lodgs, scene, written):
-    before = passes(bpy, lodgs)["Combined.R"]
-    count = len(written)
+def test_undo_does_not_send_unchanged_splats_again(bpy, lodgs, scene, sent_sets):
+    before = render_passes(bpy, lodgs)["Combined.R"]
+    count = len(sent_sets)
     lodgs("data.changes")._on_load()
-    np.testing.assert_array_equal(passes(bpy, lodgs)["Combined.R"], before)
-    assert len(written) == count == 1
+    np.testing.assert_array_equal(render_passes(bpy, lodgs)["Combined.R"], before)
+    assert len(sent_sets) == count == 1
 
 
-def test_cancel(bpy, lodgs, scene, monkeypatch):
-    """Asked to stop, it stops soon and without a picture; the renderer is the same and draws on."""
-    passes(bpy, lodgs)
+def test_cancelled_render_gives_no_image_and_keeps_the_renderer(bpy, lodgs, scene, monkeypatch):
+    render_passes(bpy, lodgs)
     process = lodgs("render.renderer")._renderer.process
     scene.render.resolution_x, scene.render.resolution_y = 6000, 4500
     fractions = []
@@ -443,28 +442,28 @@ def test_cancel(bpy, lodgs, scene, monkeypatch):
         fractions.append(fraction)
         return not fraction > 0
 
-    assert passes(bpy, lodgs, on_progress=on_progress) is None
-    assert fractions[-1] < 0.5, "it went on drawing"
+    assert render_passes(bpy, lodgs, on_progress=on_progress) is None
+    assert fractions[-1] < 0.5, "rendering stops soon"
     scene.render.resolution_x, scene.render.resolution_y = 64, 48
-    assert passes(bpy, lodgs)["Combined.R"].shape == (48, 64)
+    assert render_passes(bpy, lodgs)["Combined.R"].shape == (48, 64)
     assert lodgs("render.renderer")._renderer.process is process
 
 
 @pytest.mark.one_blender
-def test_a_killed_renderer_is_started_again(bpy, lodgs, scene, tmp_path, capsys):
-    before = f12(bpy, tmp_path)
+def test_renderer_restarts_after_a_kill(bpy, lodgs, scene, tmp_path, capsys):
+    before = render_file(bpy, tmp_path)
     process = lodgs("render.renderer")._renderer.process
     folder = lodgs("render.renderer")._renderer._folder
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
-    np.testing.assert_array_equal(f12(bpy, tmp_path), before)
+    np.testing.assert_array_equal(render_file(bpy, tmp_path), before)
     assert lodgs("render.renderer")._renderer.process is not process
     assert not folder.exists()
     assert "The renderer was killed (signal 9)" in capsys.readouterr().out
 
 
 @pytest.mark.one_blender
-def test_a_renderer_that_always_dies_is_reported(bpy, lodgs, scene, tmp_path, monkeypatch):
+def test_renderer_that_fails_twice_is_reported(bpy, lodgs, scene, tmp_path, monkeypatch):
     lodgs("render.renderer").close()
     program = tmp_path / "dies"
     program.write_text(
@@ -479,7 +478,7 @@ def test_a_renderer_that_always_dies_is_reported(bpy, lodgs, scene, tmp_path, mo
     assert lodgs("render.renderer")._renderer is None
 
 
-def test_without_a_trainer_it_says_so(bpy, lodgs, scene, tmp_path, monkeypatch):
+def test_render_without_a_trainer_is_reported(bpy, lodgs, scene, tmp_path, monkeypatch):
     lodgs("render.renderer").close()
     monkeypatch.delenv("LODGS_TRAINER_PYTHON")
     scene.render.filepath = str(tmp_path / "none.png")
@@ -488,22 +487,22 @@ def test_without_a_trainer_it_says_so(bpy, lodgs, scene, tmp_path, monkeypatch):
     assert not (tmp_path / "none.png").exists()
 
 
-def test_other_lenses_are_refused(bpy, scene):
+def test_unsupported_lenses_are_rejected(bpy, scene):
     scene.camera.data.type, scene.camera.data.panorama_type = "PANO", "FISHEYE_EQUISOLID"
     with pytest.raises(RuntimeError, match="'camera' is a panoramic camera of the type Fisheye Equisolid"):
         bpy.ops.render.render()
 
 
-def test_nothing_to_see_is_the_background(bpy, lodgs, scene, tmp_path):
+def test_scene_without_visible_splats_renders_the_background(bpy, lodgs, scene, tmp_path):
     for obj in bpy.data.objects:
         obj.hide_render = obj.type != "CAMERA"
     lodgs("data.roots").roots(scene)[0].lodgs.levels[1].show = False
-    assert f12(bpy, tmp_path)[..., :3].max() == 0
+    assert render_file(bpy, tmp_path)[..., :3].max() == 0
 
 
 @pytest.mark.nightly
-def test_no_program_outlives_blender(bundle, tmp_path):
-    """A Blender that renders and is then killed: its renderer ends, and takes its files along."""
+def test_renderer_ends_after_blender_is_killed(bundle, tmp_path):
+    """The renderer also removes its files."""
     script = tmp_path / "script.py"
     script.write_text(f"""
 import importlib, os, signal, sys, tempfile
@@ -523,8 +522,8 @@ renderer = load("render.renderer")._renderer
 print("RENDERER", renderer.process.pid, renderer._folder, flush=True)
 os.kill(os.getpid(), signal.SIGKILL)
 """)
-    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=600)
-    line = next(line for line in done.stdout.splitlines() if line.startswith("RENDERER"))
+    process = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=600)
+    line = next(line for line in process.stdout.splitlines() if line.startswith("RENDERER"))
     _, pid, folder = line.split(" ", 2)
     for _ in range(2000):
         if not Path(folder).exists() and not Path(f"/proc/{pid}").exists():
@@ -536,7 +535,7 @@ os.kill(os.getpid(), signal.SIGKILL)
 
 
 def flat_wall(y: float, color: tuple[float, float, float], logit: float = 10.0) -> Splats:
-    """Splats side by side in the plane y, opaque from a distance, in COLMAP's axes (y is depth)."""
+    """Return splats that form a wall in a plane of constant y, which is the depth."""
     x, z = np.meshgrid(np.linspace(-4, 4, 81), np.linspace(-4, 4, 81))
     means = np.stack([x.ravel(), np.full(x.size, y), z.ravel()], 1)
     return Splats(
@@ -554,7 +553,7 @@ def import_wall(bpy, lodgs, path: Path, *wall):
 
 
 def add_red_cube(bpy):
-    """A red cube, turned, six units before a camera of 320x240 pixels."""
+    """Add a rotated red cube, and a camera of 320x240 pixels at a distance of 6."""
     scene = bpy.context.scene
     camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     camera.location, camera.rotation_euler = (0, -6, 0), (np.pi / 2, 0, 0)
@@ -576,57 +575,58 @@ def add_red_cube(bpy):
     return cube
 
 
-def depths_of(cube, eye=(0, -6, 0)) -> tuple[np.ndarray, np.ndarray]:
-    """Where the ray through each pixel's centre enters and leaves the cube, along the camera's axis: worked
-    out in the cube's own space. It meets the cube where it enters before it leaves."""
+def ray_depths(cube, camera_center=(0, -6, 0)) -> tuple[np.ndarray, np.ndarray]:
+    """Return the depths where rays through pixel centres enter and leave the cube.
+
+    A ray hits the cube if it enters before it leaves.
+    """
     focal = 320 * 50 / 36
     x, y = np.meshgrid((np.arange(320) + 0.5 - 160) / focal, (120 - np.arange(240) - 0.5) / focal)
     directions = np.stack([x, np.ones_like(x), y], 2)
     to_cube = np.linalg.inv(np.array(cube.matrix_world, float))
-    origin = to_cube @ (*eye, 1)
+    origin = to_cube @ (*camera_center, 1)
     local = directions @ to_cube[:3, :3].T
     first, last = (np.sort([(s - origin[:3]) / local for s in (-1, 1)], axis=0)[i] for i in (0, 1))
     return first.max(2), last.min(2)
 
 
-def test_a_cube_of_cycles_stands_in_the_splats(bpy, lodgs, tmp_path):
-    """A red cube, turned, sticks out of a green wall of splats: each pixel shows what analysis says is
-    nearer, but for a seam of a pixel or two."""
+def test_splats_and_meshes_of_cycles_occlude_each_other(bpy, lodgs, tmp_path):
+    """A red cube intersects a green wall of splats. Ray depths are the reference, except at outlines."""
     scene = bpy.context.scene
     import_wall(bpy, lodgs, tmp_path / "wall.ply", 0.0, (0.1, 0.8, 0.2))
     cube = add_red_cube(bpy)
     assert bpy.ops.lodgs.combine_with_meshes() == {"FINISHED"}
     meshes = scene.lodgs_render.meshes
     meshes.cycles.samples, meshes.cycles.device = 4, "CPU"
-    shown = f12(bpy, tmp_path)
+    image = render_file(bpy, tmp_path)
 
-    enters, leaves = depths_of(cube)
+    enters, leaves = ray_depths(cube)
     red = (enters < leaves) & (enters < 6)  # the wall is at 6
     assert 0.02 < red.mean() < 0.5
     assert ((enters < leaves) & (enters > 6)).sum() > 500  # parts of the cube are behind the wall
-    clear = ~edge(red, 2)
+    clear = ~near_outline(red, 2)
     assert clear.mean() > 0.9
-    is_red = shown[..., 0] > 0.5
+    is_red = image[..., 0] > 0.5
     np.testing.assert_array_equal(is_red[clear], red[clear])
-    assert np.abs(shown[clear & ~red][:, :3] - (0.1, 0.8, 0.2)).max() < 0.03
-    # pressed again after a change of size, both scenes have it
+    assert np.abs(image[clear & ~red][:, :3] - (0.1, 0.8, 0.2)).max() < 0.03
+    # a second call copies a changed image size to the mesh scene
     scene.render.resolution_x = 200
     assert bpy.ops.lodgs.combine_with_meshes() == {"FINISHED"}
     assert meshes.render.resolution_x == 200 and len(bpy.data.scenes) == 2
 
 
-def edge(mask: np.ndarray, reach: int) -> np.ndarray:
-    """Pixels that have one of the other kind within reach."""
-    found = np.zeros_like(mask)
+def near_outline(mask: np.ndarray, reach: int) -> np.ndarray:
+    """Return the pixels near the outline of a mask."""
+    result = np.zeros_like(mask)
     for dy in range(-reach, reach + 1):
         for dx in range(-reach, reach + 1):
-            found |= np.roll(mask, (dy, dx), (0, 1)) != mask
-    return found
+            result |= np.roll(mask, (dy, dx), (0, 1)) != mask
+    return result
 
 
 @pytest.fixture
 def fog_and_wall(bpy, lodgs, tmp_path):
-    """Thin blue fog at 3 before a red cube, and behind it, at 9, a green wall; the wall and the cube."""
+    """Blue fog at depth 3 in front of a red cube, and a green wall at 9 behind it. Return wall and cube."""
     cube = add_red_cube(bpy)
     import_wall(bpy, lodgs, tmp_path / "fog.ply", -3.0, (0.1, 0.2, 0.8), -3.0)
     wall = import_wall(bpy, lodgs, tmp_path / "wall.ply", 3.0, (0.1, 0.8, 0.2))
@@ -635,62 +635,64 @@ def fog_and_wall(bpy, lodgs, tmp_path):
     return wall, cube
 
 
-def test_a_cube_holds_out_the_splats_behind_it(bpy, lodgs, fog_and_wall, tmp_path):
-    """In every pixel whose centre the cube covers there is the fog alone, with its own alpha; in every other
-    one fog and wall. Combined with the meshes, fog lies over the cube."""
+def test_meshes_hold_out_splats_behind_them(bpy, lodgs, fog_and_wall, tmp_path):
+    """Pixels of the cube contain only the fog with its alpha, others fog and wall.
+
+    Combined with the meshes, the fog is in front of the cube.
+    """
     scene, (wall, cube) = bpy.context.scene, fog_and_wall
-    free = f12(bpy, tmp_path, "free.png")
+    without_holdout = render_file(bpy, tmp_path, "without_holdout.png")
     wall.lodgs.levels[0].show = False
-    fog = f12(bpy, tmp_path, "fog.png")
+    fog = render_file(bpy, tmp_path, "fog.png")
     wall.lodgs.levels[0].show = True
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "garden.blend"))
     assert bpy.ops.lodgs.render_mesh_depth() == {"FINISHED"}
     assert scene.lodgs_render.holdout == "//garden_depth/Scene_####.exr" and len(bpy.data.scenes) == 1
     assert (tmp_path / "garden_depth" / "Scene_0001.exr").exists()
-    held = f12(bpy, tmp_path, "held.png")
+    with_holdout = render_file(bpy, tmp_path, "held.png")
 
-    enters, leaves = depths_of(cube)
+    enters, leaves = ray_depths(cube)
     covered = enters < leaves
     assert 0.05 < covered.mean() < 0.5
-    assert fog[..., 3].min() > 0.15 and fog[..., 3].max() < 0.45 and free[..., 3].min() > 0.95
-    same_to_the_pixel(held[..., 3] < 0.5, covered)
-    clear = ~edge(covered, 1)
-    np.testing.assert_array_equal(held[covered & clear], fog[covered & clear])
-    np.testing.assert_array_equal(held[~covered & clear], free[~covered & clear])
-    planes = passes(bpy, lodgs)
+    assert fog[..., 3].min() > 0.15 and fog[..., 3].max() < 0.45 and without_holdout[..., 3].min() > 0.95
+    compare_masks(with_holdout[..., 3] < 0.5, covered)
+    clear = ~near_outline(covered, 1)
+    np.testing.assert_array_equal(with_holdout[covered & clear], fog[covered & clear])
+    np.testing.assert_array_equal(with_holdout[~covered & clear], without_holdout[~covered & clear])
+    planes = render_passes(bpy, lodgs)
     np.testing.assert_allclose(planes["Depth.Z"][covered & clear], 3, atol=1e-4)
     np.testing.assert_allclose(planes["Depth.Z"][~covered & clear], 9, atol=1e-4)
 
-    scene.render.use_border = True  # a part of the picture takes a part of the depth
+    scene.render.use_border = True  # depth is cropped like the image
     scene.render.border_min_x, scene.render.border_max_x = 0.25, 0.75
     scene.render.border_min_y, scene.render.border_max_y = 0.1, 0.6
-    part = f12(bpy, tmp_path, "part.png")
-    assert np.abs(part[96:216, 80:240] - held[96:216, 80:240]).max() <= 1.001 / 255
+    cropped = render_file(bpy, tmp_path, "part.png")
+    assert np.abs(cropped[96:216, 80:240] - with_holdout[96:216, 80:240]).max() <= 1.001 / 255
     scene.render.use_border = False
 
     assert bpy.ops.lodgs.combine_with_meshes() == {"FINISHED"}
-    assert joins(lodgs, scene) == ["CompositorNodeAlphaOver"]
+    assert merging_nodes(lodgs, scene) == ["CompositorNodeAlphaOver"]
     meshes = scene.lodgs_render.meshes
     meshes.cycles.samples, meshes.cycles.use_denoising = 4, False
-    both = f12(bpy, tmp_path, "both.png")
-    inside = covered & ~edge(covered, 2)
+    combined = render_file(bpy, tmp_path, "both.png")
+    inside = covered & ~near_outline(covered, 2)
     alpha = fog[inside][:, 3:]
-    over = srgb_to_linear(fog[inside][:, :3]) * alpha + (1 - alpha) * np.float32([1, 0, 0])
-    np.testing.assert_allclose(srgb_to_linear(both[inside][:, :3]), over, atol=0.02)
-    outside = ~covered & ~edge(covered, 2)
-    np.testing.assert_allclose(both[outside], free[outside], atol=0.02)
+    expected = srgb_to_linear(fog[inside][:, :3]) * alpha + (1 - alpha) * np.float32([1, 0, 0])
+    np.testing.assert_allclose(srgb_to_linear(combined[inside][:, :3]), expected, atol=0.02)
+    outside = ~covered & ~near_outline(covered, 2)
+    np.testing.assert_allclose(combined[outside], without_holdout[outside], atol=0.02)
     scene.lodgs_render.holdout = ""
     assert bpy.ops.lodgs.combine_with_meshes() == {"FINISHED"}
-    assert joins(lodgs, scene) == ["CompositorNodeZcombine"]
+    assert merging_nodes(lodgs, scene) == ["CompositorNodeZcombine"]
     wall.lodgs.levels[0].show = False
-    nearer = f12(bpy, tmp_path, "nearer.png")
-    np.testing.assert_allclose(srgb_to_linear(nearer[inside][:, :3]), over, atol=0.02)
+    by_depth = render_file(bpy, tmp_path, "nearer.png")
+    np.testing.assert_allclose(srgb_to_linear(by_depth[inside][:, :3]), expected, atol=0.02)
     assert bpy.ops.lodgs.render_mesh_depth() == {"FINISHED"}
-    assert joins(lodgs, scene) == ["CompositorNodeAlphaOver"]
+    assert merging_nodes(lodgs, scene) == ["CompositorNodeAlphaOver"]
     assert bpy.data.scenes[:] == [scene, meshes]
 
 
-def test_depth_stopped_after_a_frame_leaves_the_scene_as_it_was(bpy, lodgs, fog_and_wall, tmp_path):
+def test_cancelled_mesh_depth_restores_the_scene(bpy, lodgs, fog_and_wall, tmp_path):
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "garden.blend"))
     scene = bpy.context.scene
     work = lodgs("render.compositing").render_mesh_depth(scene, range(1, 4))
@@ -700,14 +702,14 @@ def test_depth_stopped_after_a_frame_leaves_the_scene_as_it_was(bpy, lodgs, fog_
     assert bpy.data.scenes[:] == [scene] and scene.lodgs_render.holdout == ""
 
 
-def same_to_the_pixel(found: np.ndarray, expected: np.ndarray) -> None:
-    """But for a pixel or two whose centre lies on the very edge."""
-    differ = found != expected
-    assert differ.sum() <= 3 and not (differ & ~edge(expected, 1)).any()
+def compare_masks(mask: np.ndarray, expected: np.ndarray) -> None:
+    """Compare masks; up to 3 pixels may differ at the outline."""
+    differ = mask != expected
+    assert differ.sum() <= 3 and not (differ & ~near_outline(expected, 1)).any()
 
 
-def joins(lodgs, scene) -> list[str]:
-    """The compositor's nodes that join two pictures."""
+def merging_nodes(lodgs, scene) -> list[str]:
+    """Return the types of compositor nodes that merge two images."""
     nodes = lodgs("compat").compositor_tree(scene).nodes
     return [node.bl_idname for node in nodes if node.bl_idname.endswith(("Zcombine", "AlphaOver"))]
 
@@ -716,8 +718,8 @@ def srgb_to_linear(coded: np.ndarray) -> np.ndarray:
     return np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4)
 
 
-def test_a_moving_cube_holds_out_frame_by_frame(bpy, lodgs, fog_and_wall, tmp_path):
-    """Before the file is saved, in the temporary folder; a frame without its depth is no picture."""
+def test_animated_mesh_holds_out_splats_in_each_frame(bpy, lodgs, fog_and_wall, tmp_path):
+    """Depth of an unsaved file is in the temporary folder. A frame without depth is an error."""
     scene, (_, cube) = bpy.context.scene, fog_and_wall
     for frame, x in ((1, -1.0), (3, 1.0)):
         cube.location.x = x
@@ -727,9 +729,9 @@ def test_a_moving_cube_holds_out_frame_by_frame(bpy, lodgs, fog_and_wall, tmp_pa
     assert scene.frame_current == 1
     for frame in (1, 3):
         scene.frame_set(frame)
-        enters, leaves = depths_of(cube)
-        held = f12(bpy, tmp_path, f"{frame}.png")
-        same_to_the_pixel(held[..., 3] < 0.5, enters < leaves)
+        enters, leaves = ray_depths(cube)
+        with_holdout = render_file(bpy, tmp_path, f"{frame}.png")
+        compare_masks(with_holdout[..., 3] < 0.5, enters < leaves)
     scene.frame_set(2)
     scene.render.filepath = str(tmp_path / "none.png")
     with pytest.raises(RuntimeError, match=r"depth file of frame 2 is missing: .*Scene_0002\.exr"):
@@ -741,7 +743,7 @@ def test_a_moving_cube_holds_out_frame_by_frame(bpy, lodgs, fog_and_wall, tmp_pa
         bpy.ops.render.render(write_still=True)
     assert not (tmp_path / "none.png").exists()
     scene.lodgs_render.holdout = ""
-    assert f12(bpy, tmp_path, "none.png")[..., 3].min() > 0.95
+    assert render_file(bpy, tmp_path, "none.png")[..., 3].min() > 0.95
 
 
 @pytest.mark.parametrize(
@@ -749,13 +751,13 @@ def test_a_moving_cube_holds_out_frame_by_frame(bpy, lodgs, fog_and_wall, tmp_pa
     [("/d/a_####.exr", 7, "a_0007.exr"), ("/d/##a#.exr", 12, "##a12.exr"), ("/d/a.exr", 3, "a.exr"),
      ("/d/a_####.exr", -7, "a_-0007.exr"), ("/d##/a_##.exr", 123, "a_123.exr")],
 )  # fmt: skip
-def test_frames_have_their_numbers(bpy, lodgs, pattern, frame, name):
+def test_path_of_a_frame_contains_its_number(bpy, lodgs, pattern, frame, name):
     scene = bpy.context.scene
     path = lodgs("render.engine").frame_path(pattern, scene, frame)
     assert path.name == name and str(path.parent) == pattern.rpartition("/")[0]
 
 
-def test_an_artists_compositor_is_left_alone(bpy, lodgs, scene):
+def test_compositor_nodes_of_the_user_are_not_changed(bpy, lodgs, scene):
     tree = lodgs("compat").compositor_tree(scene)
     tree.nodes.new("CompositorNodeBlur")
     with pytest.raises(RuntimeError, match="has compositor nodes"):
@@ -764,39 +766,41 @@ def test_an_artists_compositor_is_left_alone(bpy, lodgs, scene):
 
 
 @pytest.mark.parametrize("transparent", [False, True])
-def test_viewport_quality_is_nearly_the_same(bpy, lodgs, scene, tmp_path, frame, transparent):
-    """``frame`` skips where there are no graphics in background."""
+def test_viewport_quality_is_similar_to_a_render(bpy, lodgs, scene, tmp_path, frame, transparent):
+    """``frame`` skips without graphics in background mode."""
     scene.render.resolution_percentage = 50
     scene.render.film_transparent = transparent
     scene.render.image_settings.color_mode = "RGBA"
-    shown = f12(bpy, tmp_path)
+    image = render_file(bpy, tmp_path)
     scene.frame_end = 2
     scene.render.filepath = str(tmp_path / "quick_")
     assert bpy.ops.lodgs.render_quick(animation=True) == {"FINISHED"}
     files = sorted(tmp_path.glob("quick_*.png"))
     assert len(files) == 2
-    quick = pixels(bpy, files[1])
-    seen = shown[..., 3:] > 0
-    error = (((quick - shown)[..., :3] * seen).astype(float) ** 2).mean()
+    quick = read_pixels(bpy, files[1])
+    covered = image[..., 3:] > 0
+    error = (((quick - image)[..., :3] * covered).astype(float) ** 2).mean()
     assert -10 * np.log10(error) > 35
-    np.testing.assert_allclose(quick[..., 3], shown[..., 3], atol=0.03)
+    np.testing.assert_allclose(quick[..., 3], image[..., 3], atol=0.03)
 
 
-def quickly(bpy, path: Path) -> np.ndarray:
-    """Viewport Quality's picture, as it is saved."""
+def render_quick(bpy, path: Path) -> np.ndarray:
+    """Render in Viewport Quality, save the image and return it."""
     assert bpy.ops.lodgs.render_quick() == {"FINISHED"}
     bpy.data.images["Render Result"].save_render(str(path), scene=bpy.context.scene)
-    return pixels(bpy, path)
+    return read_pixels(bpy, path)
 
 
-def alike(one: np.ndarray, other: np.ndarray) -> bool:
-    """More than 35 dB."""
-    return one.shape == other.shape and ((one - other).astype(float)[..., :3] ** 2).mean() < 10**-3.5
+def is_similar(image: np.ndarray, expected: np.ndarray) -> bool:
+    """Return True if the PSNR is above 35 dB."""
+    if image.shape != expected.shape:
+        return False
+    return ((image - expected).astype(float)[..., :3] ** 2).mean() < 10**-3.5
 
 
 @pytest.fixture
 def two_walls(bpy, lodgs, tmp_path, frame):
-    """A green and a red wall beside each other before a camera; skipped where there are no graphics."""
+    """The roots of a green and a red wall side by side in front of the camera. Skip without graphics."""
     add_red_cube(bpy).hide_render = True
     lodgs("render.engine").use(bpy.context.scene)
     green = import_wall(bpy, lodgs, tmp_path / "green.ply", 1.0, (0.1, 0.8, 0.2))
@@ -805,33 +809,33 @@ def two_walls(bpy, lodgs, tmp_path, frame):
     return green, red
 
 
-@pytest.mark.parametrize("of", ["object", "collection", "eye", "modifier"])
-def test_viewport_quality_shows_what_f12_shows_not_what_viewports_hide(bpy, two_walls, tmp_path, of):
-    before = f12(bpy, tmp_path)
+@pytest.mark.parametrize("hidden", ["object", "collection", "view layer", "modifier"])
+def test_viewport_quality_has_the_visibility_of_renders(bpy, two_walls, tmp_path, hidden):
+    before = render_file(bpy, tmp_path)
     for root, viewport, render in zip(two_walls, (True, False), (False, True), strict=True):
         obj = root.lodgs.levels[0].object
-        if of == "object":
+        if hidden == "object":
             root.animation_data_clear()
             obj.animation_data_clear()
             obj.hide_viewport, obj.hide_render = viewport, render
-        elif of == "collection":
+        elif hidden == "collection":
             collection = root.users_collection[0]
             collection.hide_viewport, collection.hide_render = viewport, render
-        elif of == "eye":
+        elif hidden == "view layer":
             obj.hide_set(viewport)
         else:
             group = bpy.data.node_groups.get("nothing") or bpy.data.node_groups.new(
                 "nothing", "GeometryNodeTree"
             )
             if not group.interface.items_tree:
-                for way in ("INPUT", "OUTPUT"):
-                    group.interface.new_socket("Geometry", in_out=way, socket_type="NodeSocketGeometry")
+                for direction in ("INPUT", "OUTPUT"):
+                    group.interface.new_socket("Geometry", in_out=direction, socket_type="NodeSocketGeometry")
             modifier = obj.modifiers.new("nothing", "NODES")
             modifier.node_group = group
             modifier.show_viewport, modifier.show_render = viewport, render
-    shown = f12(bpy, tmp_path)
-    assert alike(shown, before) == (of == "eye")
-    assert alike(quickly(bpy, tmp_path / "quick.png"), shown)
+    image = render_file(bpy, tmp_path)
+    assert is_similar(image, before) == (hidden == "view layer")
+    assert is_similar(render_quick(bpy, tmp_path / "quick.png"), image)
 
 
 def test_viewport_quality_draws_the_border(bpy, scene, frame, tmp_path):
@@ -841,26 +845,26 @@ def test_viewport_quality_draws_the_border(bpy, scene, frame, tmp_path):
     scene.render.border_min_y, scene.render.border_max_y = 0.2, 0.81
     for crop in (True, False):
         scene.render.use_crop_to_border = crop
-        assert alike(quickly(bpy, tmp_path / "quick.png"), f12(bpy, tmp_path))
+        assert is_similar(render_quick(bpy, tmp_path / "quick.png"), render_file(bpy, tmp_path))
 
 
-def test_viewport_quality_looks_beyond_the_clip_end(bpy, scene, frame, tmp_path):
+def test_viewport_quality_ignores_the_clip_end(bpy, scene, frame, tmp_path):
     scene.render.resolution_percentage = 50
     scene.camera.data.clip_end = 4
-    shown = f12(bpy, tmp_path)
-    assert shown[..., :3].max() > 0.5
-    assert alike(quickly(bpy, tmp_path / "quick.png"), shown)
+    image = render_file(bpy, tmp_path)
+    assert image[..., :3].max() > 0.5
+    assert is_similar(render_quick(bpy, tmp_path / "quick.png"), image)
 
 
-def test_viewport_quality_refuses_to_hold_out(bpy, scene, frame, tmp_path):
+def test_viewport_quality_rejects_holdout(bpy, scene, frame, tmp_path):
     scene.lodgs_render.holdout = str(tmp_path / "depth_####.exr")
     with pytest.raises(RuntimeError, match=r"mesh holdout.*\s+Clear Hold Out"):
         bpy.ops.lodgs.render_quick()
     assert bpy.context.scene.render.engine == "LODGS" and bpy.context.scene.render.use_compositing
 
 
-def test_panel_names_what_renders_ignore(bpy, lodgs, scene):
-    """Before the render: lenses, blur with Hold Out or Viewport Quality, and a missing camera."""
+def test_panel_lists_limitations_of_renders(bpy, lodgs, scene):
+    """Limitations concern lenses, blur with Hold Out or Viewport Quality, and a missing camera."""
     limitations, data = lodgs("render.engine").limitations, scene.camera.data
     assert limitations(scene) == []
     data.dof.use_dof, scene.lodgs_render.holdout = True, "//depth_####.exr"
@@ -883,8 +887,8 @@ def test_panel_names_what_renders_ignore(bpy, lodgs, scene):
     assert limitations(scene) == ["The scene has no camera."]
 
 
-def test_the_depth_of_a_blurred_frame_is_that_of_its_time(bpy, lodgs, scene, monkeypatch):
-    """Keys cover the shutter time, and the frame itself is rendered from its own time."""
+def test_motion_blur_has_cameras_of_the_shutter_time(bpy, lodgs, scene, monkeypatch):
+    """The depth pass is rendered at the time of the frame."""
     drawn, camera = [], scene.camera
     for frame, y in ((0, -6.0), (2, -5.0)):
         camera.location.y = y
@@ -907,7 +911,7 @@ def test_the_depth_of_a_blurred_frame_is_that_of_its_time(bpy, lodgs, scene, mon
 
 
 def test_motion_blur_follows_time_remapping(bpy, lodgs, scene):
-    """As in Cycles, the shutter opens in frames of the video, and the frame stays the current one."""
+    """As in Cycles, shutter times are in frames of the video. Rendering does not change the frame."""
     scene.frame_set(5)
     scene.render.frame_map_old, scene.render.frame_map_new = 100, 50
     scene.render.use_motion_blur, scene.render.motion_blur_shutter = True, 1.0

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.blender.data.test_looks import give
+from tests.blender.data.test_looks import apply_look
 from tests.blender.render.test_crops import camera  # noqa: F401
 from tests.training.editing.test_cleaning import bundle_of
 from tests.training.lod.tree.trees import random_leaves, tree_of, write_in_pages
@@ -17,7 +17,7 @@ LOCAL_LOOK = Look(-0.8, tint=(0.3, 1.0, 1.0), opacity=0.7)
 
 @pytest.fixture
 def image(bpy, lodgs):
-    """``image()`` renders with F12, (64, 96, 3) sRGB. ``image(function)`` renders with another function."""
+    """``image()`` renders an sRGB image (64, 96, 3); ``image(function)`` renders with another function."""
 
     def render(draw=None):
         bpy.context.view_layer.update()
@@ -37,13 +37,13 @@ def write_splats(tmp_path, name="bands"):
     return tmp_path / "in.ply"
 
 
-def with_looks(bpy, root):
+def add_looks(bpy, root):
     """Set a global look, and a local one in a sphere that crops nothing. Return the sphere."""
-    give(root.lodgs_look, GLOBAL_LOOK)
+    apply_look(root.lodgs_look, GLOBAL_LOOK)
     bpy.ops.lodgs.add_crop(shape="SPHERE", keep="ALL")
     sphere = bpy.context.active_object
     sphere.location, sphere.scale = (1, -1, 0.5), (4, 5, 3)
-    give(sphere.lodgs_look, LOCAL_LOOK)
+    apply_look(sphere.lodgs_look, LOCAL_LOOK)
     return sphere
 
 
@@ -63,7 +63,7 @@ def test_frames_equal_those_of_the_export(bpy, lodgs, image, tmp_path, mode, mov
 
     root = imported(write_splats(tmp_path))
     original = image()
-    sphere = with_looks(bpy, root)
+    sphere = add_looks(bpy, root)
     looked = image()
     sphere.lodgs_crop.use = False
     without = image()
@@ -82,7 +82,7 @@ def test_frames_equal_those_of_the_export(bpy, lodgs, image, tmp_path, mode, mov
 def test_look_maps_the_colours_of_the_frame(bpy, lodgs, image, tmp_path):
     root = lodgs("data.importing").import_splats(bpy.context, write_splats(tmp_path), upright=False)
     original, look = image(), Look(0.3, 5000, (1.0, 0.9, 0.7), 0.6)
-    give(root.lodgs_look, look)
+    apply_look(root.lodgs_look, look)
     np.testing.assert_allclose(image(), original @ look.matrix.T, atol=2e-4)
 
 
@@ -93,7 +93,7 @@ def test_viewports_equal_the_export(bpy, lodgs, image, tmp_path):
     root = importing.import_splats(bpy.context, write_splats(tmp_path), upright=False)
     root.location, root.rotation_euler = (1, 2, 0), (0.1, 0.2, 0.7)
     original = image(viewport_quality)
-    sphere, views = with_looks(bpy, root), lodgs("viewport.views")
+    sphere, views = add_looks(bpy, root), lodgs("viewport.views")
     looked = image(viewport_quality)
     read = views.reads
     assert np.abs(original - looked).max() > 0.05
@@ -158,7 +158,7 @@ def test_frames_with_paint_equal_those_of_the_export(bpy, lodgs, image, tmp_path
 
 @pytest.mark.usefixtures("camera", "frame")
 @pytest.mark.parametrize("modifier", [False, True])
-def test_viewports_show_paint_without_reading_splats_again(bpy, lodgs, image, tmp_path, modifier):
+def test_painting_does_not_read_splats_again_in_viewports(bpy, lodgs, image, tmp_path, modifier):
     """Splats with a modifier of the user are read again."""
     viewport_quality = lodgs("render.viewport_quality")._render_frame
     importing = lodgs("data.importing")
@@ -211,7 +211,7 @@ def test_streamed_tree_has_its_look(bpy, lodgs, image, tmp_path):
         assert bool(lodgs("data.streams").file_of(root)) == bool(budget)
         root.lodgs.controls.pixels = 0.1  # leaves
         original = image()
-        with_looks(bpy, root)
+        add_looks(bpy, root)
         images.append(image())
         assert np.abs(original - images[-1]).max() > 0.05
         lodgs("data.removal").remove(root)
@@ -240,7 +240,7 @@ def test_ellipsoids_have_the_colour_and_opacity_of_the_look(bpy, lodgs, tmp_path
             write_bundle(path, Bundle("", [Level(1, splats())]))
         root = lodgs("data.importing").import_splats(bpy.context, path, upright=False)
         if first:
-            give(root.lodgs_look, GLOBAL_LOOK)
+            apply_look(root.lodgs_look, GLOBAL_LOOK)
         images.append(rendered(bpy, tmp_path / "image.png"))
         if first:
             bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "out.ply"))

@@ -66,15 +66,13 @@ def video(bpy, lodgs, frames, tmp_path) -> Path:
     return encode(bpy, lodgs, frames, tmp_path / "walk.mkv", "MKV", "FFV1")
 
 
-def test_rotated_video_of_a_phone(bpy, lodgs, frames, tmp_path):
+def test_frames_of_a_rotated_video_are_upright(bpy, lodgs, frames, tmp_path):
     """The track header has the rotation matrix (ISO/IEC 14496-12)."""
     path = encode(bpy, lodgs, frames[:3], tmp_path / "phone.mp4", "MPEG4", "H264")
     data = bytearray(path.read_bytes())
     offset = data.index(b"tkhd") + 44
     assert struct.unpack_from(">9i", data, offset) == (65536, 0, 0, 0, 65536, 0, 0, 0, 1 << 30)
-    struct.pack_into(
-        ">9i", data, offset, 0, -65536, 0, 65536, 0, 0, 0, 0, 1 << 30
-    )  # a quarter turn to the left
+    struct.pack_into(">9i", data, offset, 0, -65536, 0, 65536, 0, 0, 0, 0, 1 << 30)  # 90 degrees to the left
     path.write_bytes(data)
     lodgs("render.video").extract_frames(path, tmp_path / "out", 3)
     for number in range(3):
@@ -113,7 +111,7 @@ def test_existing_frames_are_kept(lodgs, video, tmp_path):
     assert first.read_bytes() == b"unchanged" and last.is_file()
 
 
-def test_all_frames_of_a_short_video(lodgs, video, tmp_path):
+def test_short_video_gives_all_its_frames(lodgs, video, tmp_path):
     assert lodgs("render.video").extract_frames(video, tmp_path / "out", 500) == 12
     assert len(list((tmp_path / "out").iterdir())) == 12
 
@@ -129,13 +127,13 @@ def test_unreadable_videos_are_reported(lodgs, tmp_path, content, capfd):
     assert not (tmp_path / "out").exists()
 
 
-def test_folder_that_is_not_writable(lodgs, video, tmp_path, capfd):
+def test_folder_that_is_not_writable_is_reported(lodgs, video, tmp_path, capfd):
     (tmp_path / "out").write_text("no folder")
     assert lodgs("commands").main(["frames", str(video), "--out", str(tmp_path / "out")]) == 2
     assert "out: File exists. Choose another folder." in capfd.readouterr().err
 
 
-def test_a_video_becomes_a_scene(bpy, lodgs, video, blender, tmp_path):
+def test_video_becomes_a_scene(bpy, lodgs, video, blender, tmp_path):
     assert bpy.ops.lodgs.find_cameras(filepath=str(video)) == {"FINISHED"}
     work = lodgs("runs.photo_preparation").current
     assert work.root.lodgs.scene_folder == str(tmp_path / "walk_scene")

@@ -51,7 +51,7 @@ def _states(watch):
 # -- plan --------------------------------------------------------------------------------------------------
 
 
-def test_plan_matches_the_trainers(bpy, lodgs, job_settings, root):
+def test_plan_matches_the_plan_of_the_trainer(bpy, lodgs, job_settings, root):
     settings = root.lodgs.training
     settings.rows, settings.method, settings.test_every = 2, "3dgs", 4
     assert bpy.ops.lodgs.plan_cells() == {"FINISHED"}
@@ -68,11 +68,11 @@ def test_plan_matches_the_trainers(bpy, lodgs, job_settings, root):
         )  # fmt: skip
         assert cell.points == region.start_points(scene).sum()
         assert cell.megabytes == pytest.approx(planned.memory / 1e6)
-        assert [names[place] for place in json.loads(cell.view_indices)] == list(region.views)
-        eyes, frames = lodgs("data.cells").cell_cameras(root, cell)
+        assert [names[index] for index in json.loads(cell.view_indices)] == list(region.views)
+        centers_in_blender, frames = lodgs("data.cells").cell_cameras(root, cell)
         centers = [camera.center for camera in scene.cameras if camera.name in region.views]
-        np.testing.assert_allclose(eyes, centers, atol=1e-4)
-        assert frames.shape == (len(eyes), 4, 3)
+        np.testing.assert_allclose(centers_in_blender, centers, atol=1e-4)
+        assert frames.shape == (len(centers_in_blender), 4, 3)
 
 
 def test_outlines_lie_on_the_ground_and_contain_their_cameras(bpy, lodgs, root):

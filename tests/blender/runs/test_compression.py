@@ -14,11 +14,11 @@ TRAINER = os.environ.get("LODGS_TRAINER_PYTHON", "")
 
 @pytest.fixture
 def file(bpy, lodgs, tmp_path):
-    """A bundle of two levels, imported."""
-    made = lodgs("training.splats.bundle")
-    levels = [made.Level(1, splats(300), {"s_min": 0.1}), made.Level(2, splats(900), {"s_min": 0.0})]
+    """Import a bundle of two levels; return its path."""
+    bundles = lodgs("training.splats.bundle")
+    levels = [bundles.Level(1, splats(300), {"s_min": 0.1}), bundles.Level(2, splats(900), {"s_min": 0.0})]
     path = tmp_path / "levels.ply"
-    made.write_bundle(path, made.Bundle("flod", levels, "bands", controls={"gamma": 2.0}))
+    bundles.write_bundle(path, bundles.Bundle("flod", levels, "bands", controls={"gamma": 2.0}))
     bpy.ops.lodgs.import_splats(filepath=str(path))
     return path
 
@@ -45,7 +45,7 @@ def commands(lodgs, monkeypatch):
 def test_trainer_writes_a_file_that_blender_opens(bpy, file, tmp_path):
     out = tmp_path / "small.ply"
     assert bpy.ops.lodgs.export_compressed(filepath=str(out)) == {"FINISHED"}
-    assert out.stat().st_size < 0.35 * file.stat().st_size  # of splats without harmonics
+    assert out.stat().st_size < 0.35 * file.stat().st_size  # splats have no spherical harmonics
     assert bpy.ops.lodgs.import_splats(filepath=str(out)) == {"FINISHED"}
     root = bpy.context.view_layer.objects.active
     first, finest = (item.object.data for item in root.lodgs.levels)
@@ -56,7 +56,7 @@ def test_trainer_writes_a_file_that_blender_opens(bpy, file, tmp_path):
     np.testing.assert_allclose(positions.reshape(-1, 3), splats(900).means, atol=1e-3)
 
 
-def test_views_of_the_run_measure_splats_at_their_trained_place(bpy, lodgs, file, tmp_path, commands):
+def test_compression_uses_views_of_the_run_unless_splats_are_moved(bpy, lodgs, file, tmp_path, commands):
     root, out = bpy.context.view_layer.objects.active, str(tmp_path / "small.ply")
     run = tmp_path / "run"
     run.mkdir()
@@ -72,7 +72,7 @@ def test_views_of_the_run_measure_splats_at_their_trained_place(bpy, lodgs, file
     assert not Path(trained[4]).exists(), "temporary files are removed"
 
 
-def test_failures_are_one_sentence(bpy, file, tmp_path, commands, monkeypatch):
+def test_error_of_the_trainer_is_reported(bpy, file, tmp_path, commands, monkeypatch):
     program = "import sys; sys.exit('error: Cannot write small.ply: no space. Free some.')"
     monkeypatch.setenv("COMPRESSION", program)
     with pytest.raises(RuntimeError, match=r"Error: Cannot write small.ply: no space. Free some.\n$"):

@@ -108,7 +108,7 @@ def test_job_has_the_settings(bpy, lodgs, jobs, fake, root, tmp_path):
     assert job.parameters["footprint"] == 16.0  # not set: value of the preset
 
 
-def test_numbers_are_as_typed(job_settings, root):
+def test_float32_properties_give_rounded_numbers(job_settings, root):
     settings = root.lodgs.training
     settings.image_scale, settings.parameters.footprint = 0.3, 8.3
     assert job_settings.changed_parameters(settings) == {"footprint": 8.3}
@@ -263,7 +263,7 @@ def test_dead_trainer_is_reported_and_resumed(
     assert watch_of(root).problem == "" and _levels(root) == COUNTS
 
 
-def test_garbage_is_ignored(bpy, jobs, fake, root, tmp_path):
+def test_invalid_events_are_ignored(bpy, jobs, fake, root, tmp_path):
     fake("garbage")
     assert bpy.ops.lodgs.train(folder=str(tmp_path / "run")) == {"FINISHED"}
     assert _levels(root) == COUNTS
@@ -373,7 +373,7 @@ def test_second_blender_is_refused_and_can_follow_the_run(jobs, fake, root, tmp_
     assert (run / "job.toml").read_bytes() == job
 
 
-def test_two_trainers_that_start_at_once(lodgs, jobs, fake, root, tmp_path, monkeypatch):
+def test_blender_follows_the_first_of_two_trainers(lodgs, jobs, fake, root, tmp_path, monkeypatch):
     """The Blender of the refused trainer follows the other one."""
     fake("two halves")
     run = tmp_path / "run"
@@ -661,7 +661,7 @@ def test_run_folders_do_not_collide(lodgs, jobs, fake, root, tmp_path):
     assert train() == tmp_path / "mine" / "tiny"
 
 
-def test_mistakes_are_reported(bpy, jobs, fake, root, tmp_path, monkeypatch):
+def test_wrong_settings_are_reported(bpy, jobs, fake, root, tmp_path, monkeypatch):
     fake()
     with pytest.raises(RuntimeError, match="'tiny' has no run"):
         bpy.ops.lodgs.resume_training()
@@ -689,7 +689,7 @@ def test_mistakes_are_reported(bpy, jobs, fake, root, tmp_path, monkeypatch):
 
 
 @pytest.mark.nightly
-def test_the_real_trainer(bpy, jobs, tmp_path):
+def test_real_trainer_is_cancelled_and_resumed(bpy, jobs, tmp_path):
     """Train levels from small images in a few steps, cancel and resume."""
     if not TRAINER:
         pytest.skip("no trainer; set LODGS_TRAINER_PYTHON")

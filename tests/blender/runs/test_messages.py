@@ -1,4 +1,4 @@
-"""Readable texts for events."""
+"""Texts of durations."""
 
 import pytest
 

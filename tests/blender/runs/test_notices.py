@@ -26,7 +26,7 @@ def test_notices_need_a_window_the_preference_and_a_program(
 @pytest.mark.parametrize(
     ("platform", "program"), [("linux", "notify-send"), ("darwin", "osascript"), ("win32", "powershell")]
 )
-def test_texts_are_no_code(lodgs, monkeypatch, platform, program):
+def test_texts_are_not_executed(lodgs, monkeypatch, platform, program):
     """The text is an argument or an environment variable, never a part of a script."""
     monkeypatch.setattr(sys, "platform", platform)
     first, *arguments = lodgs("runs.notices").notice_command('"; rm -rf ~')

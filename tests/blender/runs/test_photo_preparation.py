@@ -21,8 +21,8 @@ pytestmark = pytest.mark.one_blender
 def photos(tmp_path_factory):
     folder = tmp_path_factory.mktemp("walk") / "photos"
     folder.mkdir()
-    for number, eye in enumerate(CAMERA_POSITIONS):
-        write_png(folder / f"{number}.png", render_photo(eye))
+    for number, position in enumerate(CAMERA_POSITIONS):
+        write_png(folder / f"{number}.png", render_photo(position))
     return folder
 
 
@@ -79,10 +79,10 @@ def distorted(tmp_path):
     lens = make_intrinsics(
         "OPENCV", 320, 240, np.array([260.0, 262.0, 158.0, 121.0, 0.1, -0.02, 0.005, -0.004])
     )
-    poses = [look_at(eye, np.array([0.0, 0.6, 0.4]), (0, 0, 1)) for eye in CAMERA_POSITIONS]
+    poses = [look_at(position, np.array([0.0, 0.6, 0.4]), (0, 0, 1)) for position in CAMERA_POSITIONS]
     (tmp_path / "distorted" / "images").mkdir(parents=True)
-    for name, eye in zip(names, CAMERA_POSITIONS, strict=False):
-        write_png(tmp_path / "distorted" / "images" / name, render_photo(eye))
+    for name, position in zip(names, CAMERA_POSITIONS, strict=False):
+        write_png(tmp_path / "distorted" / "images" / name, render_photo(position))
     write_model(
         tmp_path / "distorted" / "sparse" / "0", [lens] * 3, list(zip(names, poses, strict=False)),
         random.normal(size=(50, 3)), np.full((50, 3), 99, np.uint8),
@@ -95,11 +95,11 @@ def test_distorted_scene_shows_undistorted_photos(bpy, lodgs, distorted):
         assert bpy.ops.lodgs.import_colmap(directory=str(distorted), upright=False) == {"FINISHED"}
         root = lodgs("data.roots").active_root(bpy.context)
         scene = read_scene(distorted)
-        straight = cached_undistorted_scene(scene)
-        assert scene.distorted and straight is not None and not straight.distorted
+        undistorted = cached_undistorted_scene(scene)
+        assert scene.distorted and undistorted is not None and not undistorted.distorted
         views = lodgs("data.photographs").views(root)
-        assert len(views) == len(straight.cameras) == 3
-        for view, camera in zip(views, straight.cameras, strict=True):
+        assert len(views) == len(undistorted.cameras) == 3
+        for view, camera in zip(views, undistorted.cameras, strict=True):
             facts = view.data.lodgs
             assert not facts.distorted and facts.photograph == str(camera.image)
             assert (facts.width, facts.height) == (camera.width, camera.height)
@@ -109,7 +109,7 @@ def test_distorted_scene_shows_undistorted_photos(bpy, lodgs, distorted):
             assert tuple(background.image.size) == (camera.width, camera.height)
         assert root.lodgs.scene_folder == str(distorted)
         assert len(lodgs("render.compare").measurable_views(root)) == 3
-        first = straight.cameras[0]
+        first = undistorted.cameras[0]
         assert bpy.context.scene.render.resolution_x == first.width
         bpy.ops.lodgs.remove_scene()
     assert not [image for image in bpy.data.images if not image.users]

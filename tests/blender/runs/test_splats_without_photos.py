@@ -32,7 +32,7 @@ def ball(count: int = 400) -> Splats:
 
 @pytest.fixture
 def root(bpy, tmp_path):
-    """The imported ball with a transform."""
+    """Import the ball and transform its root."""
     write_bundle(tmp_path / "ball.ply", Bundle("", [Level(1, ball())]))
     bpy.ops.lodgs.import_splats(filepath=str(tmp_path / "ball.ply"))
     (root,) = [obj for obj in bpy.data.objects if obj.lodgs.is_root]
@@ -93,7 +93,7 @@ def test_current_splats_are_exported_to_the_run(bpy, lodgs, fake, root, tmp_path
     assert levels[1] == finest, "the object stays with its modifiers and children"
 
 
-def test_views_of_all_cameras(bpy, fake, root, tmp_path):
+def test_views_match_all_cameras(bpy, fake, root, tmp_path):
     fake()
     root.lodgs.training.views_from = "CAMERAS"
     with pytest.raises(RuntimeError, match="has 0 camera"):
@@ -110,7 +110,7 @@ def test_views_of_all_cameras(bpy, fake, root, tmp_path):
         assert_matches_blender(bpy, root, camera, view, near)
 
 
-def test_views_of_an_animated_camera(bpy, fake, root, tmp_path):
+def test_views_match_an_animated_camera(bpy, fake, root, tmp_path):
     fake()
     camera = bpy.context.scene.camera = new_camera(bpy, (0, -9, 4))
     scene, training = bpy.context.scene, root.lodgs.training
@@ -128,7 +128,7 @@ def test_views_of_an_animated_camera(bpy, fake, root, tmp_path):
         assert_matches_blender(bpy, root, camera, view, near)
 
 
-def test_views_along_a_curve(bpy, fake, root, tmp_path):
+def test_views_are_evenly_spaced_on_a_curve(bpy, fake, root, tmp_path):
     fake()
     training = root.lodgs.training
     training.views_from, training.views = "CURVE", 30
@@ -172,7 +172,7 @@ def test_training_with_photos_starts_from_the_current_splats(bpy, lodgs, fake, r
     np.testing.assert_array_equal(read_bundle(job.base).levels[-1].splats.means, ball().means)
 
 
-def test_the_real_trainer_adds_levels_to_splats_without_photos(bpy, lodgs, root, tmp_path):
+def test_real_trainer_adds_levels_to_splats_without_photos(bpy, lodgs, root, tmp_path):
     if not TRAINER:
         pytest.skip("no trainer; set LODGS_TRAINER_PYTHON")
     jobs, training = lodgs("runs.jobs"), root.lodgs.training

@@ -53,11 +53,11 @@ def visible_splats(bpy, lodgs):
 def select_by_rule(bpy, lodgs, item):
     """Return the splat means and weights of a level as viewports select them."""
     depsgraph = bpy.context.evaluated_depsgraph_get()
-    own = lodgs("data.shown").read(item.object.data)
+    splats = lodgs("data.shown").read(item.object.data)
     query = lodgs("data.selection").evaluated_query(item.object.evaluated_get(depsgraph), depsgraph)
     columns = {"lod_bias": lodgs("attributes").read_attribute(item.object.data, "lod_bias")}
-    weights = np.ones(len(own)) if query is None else query.weights(own.means, columns).astype(float)
-    return own.means[weights > 0], weights[weights > 0]
+    weights = np.ones(len(splats)) if query is None else query.weights(splats.means, columns).astype(float)
+    return splats.means[weights > 0], weights[weights > 0]
 
 
 @pytest.mark.parametrize("facts", [None, OCTREE])
@@ -450,7 +450,7 @@ def test_freeze_keeps_the_selection_while_the_camera_moves(bpy, lodgs, make_scen
     assert [len(a) for _, a in visible_splats(bpy, lodgs)] != [len(m) for m in frozen_means]
 
 
-def test_the_view_as_camera(bpy, lodgs, make_scene):
+def test_view_as_camera_selects_by_stored_views(bpy, lodgs, make_scene):
     """Distances refer to the last stored view and its focal length; freezing stops updates."""
     root = make_scene()
     settings, store_view = root.lodgs, lodgs("viewport.view_camera").store_view
@@ -461,8 +461,8 @@ def test_the_view_as_camera(bpy, lodgs, make_scene):
         local = np.linalg.solve(np.array(root.lodgs.axes.matrix_world, float), np.append(position, 1))[:3]
         borders = [1e30, *(s / settings.bands.gamma * focal for s in S_MIN[:2]), 0]
         for (_, arrays), far, near in zip(visible_splats(bpy, lodgs), borders, borders[1:], strict=False):
-            own = lodgs("data.shown").read(root.lodgs.levels[borders.index(far)].object.data).means
-            distance = np.linalg.norm(own - local, axis=1)
+            means = lodgs("data.shown").read(root.lodgs.levels[borders.index(far)].object.data).means
+            distance = np.linalg.norm(means - local, axis=1)
             assert abs(len(arrays) - ((distance >= near) & (distance < far)).sum()) <= 1
 
     for position, focal in (((5, 5, 5), 900.0), ((-9, 0, 2), 2000.0)):

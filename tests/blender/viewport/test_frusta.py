@@ -30,10 +30,10 @@ def test_preview_matches_the_training_dome(lodgs, root):
     placed, _ = module.surrounding_views(module.opaque_means(splats), 10)
     assert len(views) == 10
     means = splats.means[splats.opacity_logits > 0]
-    middle, _ = lodgs("training.scenes.overview").central_ball(means)
+    center, _ = lodgs("training.scenes.overview").central_ball(means)
     for number, (view, truth) in enumerate(zip(views, placed, strict=True)):
         np.testing.assert_allclose(view.world_to_camera, truth.world_to_camera, atol=1e-6)
-        assert number >= 5 or np.isclose(np.linalg.norm(view.center - middle), shells, rtol=1e-5).any()
+        assert number >= 5 or np.isclose(np.linalg.norm(view.center - center), shells, rtol=1e-5).any()
     settings.views = 12
     assert len(viewpoints.preview_dome(root)[0]) == 12
 
@@ -62,7 +62,7 @@ def test_pyramids_match_the_views(lodgs, root):
         np.testing.assert_allclose(edges[4:, 1], np.roll(edges[:4, 1], -1, axis=0))
 
 
-def test_they_are_drawn(bpy, lodgs, root, frame):
+def test_frusta_of_previewed_views_are_drawn(bpy, lodgs, root, frame):
     import gpu
     from mathutils import Matrix
 

@@ -1,4 +1,4 @@
-"""Splats on the graphics card: exactly the drawn ones."""
+"""Splats in the memory of the graphics card: only drawn splats are uploaded."""
 
 import time
 from types import SimpleNamespace
@@ -42,9 +42,9 @@ def draw_from(bpy, lodgs, frame, scene):
         bpy.context.view_layer.update()
         depsgraph = bpy.context.evaluated_depsgraph_get()
         instances = lodgs("data.shown").splat_instances(depsgraph)
-        look = Matrix.Translation((-x, 0, -6))
+        view_matrix = Matrix.Translation((-x, 0, -6))
         return frame(96, lambda: views.draw_splats(
-            view, instances, depsgraph, look, projection, 10**6, wait=wait, under_overlays=False,
+            view, instances, depsgraph, view_matrix, projection, 10**6, wait=wait, under_overlays=False,
         ))  # fmt: skip
 
     yield draw
@@ -122,20 +122,20 @@ def test_slots_are_reused(lodgs, frame):
 
 
 def test_viewports_share_the_store(lodgs, draw_from, monkeypatch):
-    """Viewports draw as if alone; unused slots are freed."""
+    """Each viewport draws the same image as without the other; unused slots are freed."""
     views, resident = lodgs("viewport.views"), lodgs("viewport.resident")
     monkeypatch.setattr(resident, "MIN_SLOTS", 1)
     positions = (-9.0, -3.0, 0.0, 3.0, 9.0, -3.0, 0.0)
-    alone = []
+    expected_images = []
     for x in positions:
         views.clear()
-        alone.append(draw_from(views.ViewState(), x))
+        expected_images.append(draw_from(views.ViewState(), x))
     views.clear()
     first, second, stores = views.ViewState(), views.ViewState(), set()
-    for x, expected in zip(positions, alone, strict=True):
+    for x, expected in zip(positions, expected_images, strict=True):
         np.testing.assert_array_equal(draw_from(first, x), expected)
         stores.add(first.resident.store)
-        np.testing.assert_array_equal(draw_from(second, 0.0), alone[2])
+        np.testing.assert_array_equal(draw_from(second, 0.0), expected_images[2])
     assert len(stores) > 1, "no store was too small"
     assert len(first.resident.reserve([np.arange(10)]).owners) < 100
 
@@ -204,7 +204,7 @@ def test_each_redraw_reads_an_attribute(bpy, lodgs, draw_from, scene, monkeypatc
 
 
 @pytest.mark.parametrize("during_loading", [False, True])
-def test_the_old_image_stays_after_an_undo(bpy, lodgs, draw_from, scene, monkeypatch, during_loading):
+def test_old_image_stays_after_an_undo(bpy, lodgs, draw_from, scene, monkeypatch, during_loading):
     """Undo replaces all datablocks; viewports draw the previous splats until the restored ones are ready."""
     view, name = lodgs("viewport.views").ViewState(), scene.name
     bpy.ops.ed.undo_push(message="before")
@@ -232,7 +232,7 @@ def test_the_old_image_stays_after_an_undo(bpy, lodgs, draw_from, scene, monkeyp
     assert all(np.array_equal(image, before) or np.array_equal(image, expected) for image in images)
 
 
-def test_splats_removed_during_loading(bpy, lodgs, draw_from, scene, monkeypatch):
+def test_splats_can_be_removed_during_loading(bpy, lodgs, draw_from, scene, monkeypatch):
     views, resident = lodgs("viewport.views"), lodgs("viewport.resident")
     monkeypatch.setattr(resident, "UPLOAD_BATCH", 10)
     monkeypatch.setattr(lodgs("viewport.view_state"), "LOADING", (0.0, 0.0))
@@ -249,7 +249,7 @@ def test_splats_removed_during_loading(bpy, lodgs, draw_from, scene, monkeypatch
     assert view.loading is None and (view.arrangement.splats < COUNT).all()
 
 
-def test_a_moving_view_selects_before_modifiers_update(bpy, lodgs, draw_from, scene, monkeypatch):
+def test_moving_view_selects_before_modifiers_update(bpy, lodgs, draw_from, scene, monkeypatch):
     """Nothing is evaluated while a view moves, and nothing changes when it rests."""
     from mathutils import Matrix
 

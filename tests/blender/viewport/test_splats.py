@@ -63,7 +63,7 @@ def add(bpy, lodgs):
 def draw_view(bpy, lodgs, frame, camera):
     """``draw_view(**options)``: linear image (SIZE, SIZE, 4) of all splats from the camera, top row first.
 
-    ``before`` draws into the framebuffer first; ``view`` is a viewport's state; ``coded`` is the initial
+    ``draw_first`` draws into the framebuffer before; ``view`` is a viewport's state; ``coded`` is the initial
     content of an sRGB framebuffer; ``zoom`` is the size of the camera frame relative to the viewport.
     """
     from mathutils import Matrix
@@ -72,7 +72,7 @@ def draw_view(bpy, lodgs, frame, camera):
     views.clear()
 
     def draw_splats(
-        before=None, view=None, budget=10**6, under_overlays=False, wait=True, coded=None, zoom=None
+        draw_first=None, view=None, budget=10**6, under_overlays=False, wait=True, coded=None, zoom=None
     ):
         depsgraph = bpy.context.evaluated_depsgraph_get()
         matrix = camera.matrix_world.inverted()
@@ -85,8 +85,8 @@ def draw_view(bpy, lodgs, frame, camera):
             )
 
         def draw():
-            if before is not None:
-                before(projection @ matrix)
+            if draw_first is not None:
+                draw_first(projection @ matrix)
             views.draw_splats(
                 view or views.ViewState(), instances, depsgraph, matrix, projection, budget,
                 under_overlays=under_overlays, wait=wait, **options,
@@ -192,7 +192,7 @@ def _quaternions(rotations):
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
-def test_one_set_matches_the_rasterizer(bpy, lodgs, add, draw_view, truth, degree):
+def test_single_set_matches_the_rasterizer(bpy, lodgs, add, draw_view, truth, degree):
     splats = make_splats(lodgs, degree=degree)
     add(splats)
     image, expected = displayed(draw_view()), truth([(splats, np.eye(4))])
@@ -201,7 +201,7 @@ def test_one_set_matches_the_rasterizer(bpy, lodgs, add, draw_view, truth, degre
 
 
 @pytest.mark.parametrize("degree", [0, 4])
-def test_overlapping_sets_with_general_transforms(bpy, lodgs, add, draw_view, truth, degree):
+def test_overlapping_transformed_sets_match_the_rasterizer(bpy, lodgs, add, draw_view, truth, degree):
     from mathutils import Euler, Matrix
 
     sets = []
@@ -236,7 +236,7 @@ def _crop_center(image, size):
     return image[border : border + size, border : border + size]
 
 
-def test_antialiased_and_other_sets_together(bpy, lodgs, draw_view, truth):
+def test_antialiased_and_other_sets_match_the_rasterizer(bpy, lodgs, draw_view, truth):
     """Each of two overlapping scenes with subpixel splats has its own filter."""
     scenes, bundle = lodgs("data.scenes"), lodgs("training.splats.bundle")
     sets = [(make_splats(lodgs, 6000, 1, seed, size=-5.5), np.eye(4)) for seed in range(2)]
@@ -369,29 +369,31 @@ def test_mesh_occludes_with_pixel_accuracy(bpy, lodgs, add, draw_view, camera):
     corners = np.array([(-3, -3), (-0.15, -3), (0.15, 3), (-3, 3)], float)
     corners = np.c_[corners, np.full(4, -1.2), np.ones(4)] @ inverse.T
     no_mesh = draw_view()
-    image = draw_view(before=_plane((0, 0, 1, 1), [tuple(corner) for corner in corners[:, :3]]))
+    image = draw_view(draw_first=_plane((0, 0, 1, 1), [tuple(corner) for corner in corners[:, :3]]))
     projection = np.array(
         camera.calc_matrix_camera(bpy.context.evaluated_depsgraph_get(), x=SIZE, y=SIZE), float
     )
     edge = np.array([(-0.15, -3, -1.2, 1), (0.15, 3, -1.2, 1)]) @ projection.T
     edge = (edge[:, :2] / edge[:, 3:] * (1, -1) + 1) * SIZE / 2
     y, x = np.mgrid[:SIZE, :SIZE] + 0.5
-    at = edge[0, 0] + (y - edge[0, 1]) / (edge[1, 1] - edge[0, 1]) * (edge[1, 0] - edge[0, 0])
-    occluded, visible = x < at - 1, x > at + 1
+    edge_x = edge[0, 0] + (y - edge[0, 1]) / (edge[1, 1] - edge[0, 1]) * (edge[1, 0] - edge[0, 0])
+    occluded, visible = x < edge_x - 1, x > edge_x + 1
     assert occluded.mean() > 0.3 and visible.mean() > 0.3
     assert (image[occluded] == (0, 0, 1, 1)).all()
     assert np.array_equal(image[visible], no_mesh[visible])
     assert not np.array_equal(image[occluded], no_mesh[occluded])
 
 
-def test_mesh_between_splats(bpy, lodgs, add, draw_view, truth, camera):
+def test_mesh_hides_splats_behind_it(bpy, lodgs, add, draw_view, truth, camera):
     splats = make_splats(lodgs, degree=0)
     add(splats)
     matrix = np.array(camera.matrix_world, float)
     depth = -np.linalg.norm(camera.location)  # through the centre of the splats
     corners = np.array([(-9, -9), (9, -9), (9, 9), (-9, 9)], float)
     corners = np.c_[corners, np.full(4, depth), np.ones(4)] @ matrix.T
-    image = displayed(draw_view(before=_plane((0, 0, 0, 0), [tuple(corner) for corner in corners[:, :3]])))
+    image = displayed(
+        draw_view(draw_first=_plane((0, 0, 0, 0), [tuple(corner) for corner in corners[:, :3]]))
+    )
 
     def is_in_front(means):
         return (np.c_[means, np.ones(len(means))] @ np.linalg.inv(matrix).T)[:, 2] > depth

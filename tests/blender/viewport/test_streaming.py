@@ -1,5 +1,7 @@
-"""Streaming of trees while the camera moves: the drawn splats are always a complete cut, and the cut of the
-whole file if the budget allows."""
+"""Streaming of trees while the camera moves.
+
+The drawn splats are always a complete cut. They are the cut of the full file if the budget allows.
+"""
 
 import shutil
 import time
@@ -99,7 +101,7 @@ def test_cuts_are_complete_while_finer_splats_are_loaded(bpy, lodgs, tree, path,
     assert len({len(nodes) for nodes in numbers}) > 10, "all pages arrived at once"
 
 
-def test_a_resting_view_redraws_until_loading_ends(lodgs, root, draw_from, monkeypatch):
+def test_resting_view_redraws_until_loading_ends(lodgs, root, draw_from, monkeypatch):
     """Windows redraw only on request, and loading takes several redraws."""
     views, position = lodgs("viewport.views"), POSITIONS[0]
     view, slices = views.ViewState(), 0
@@ -122,11 +124,11 @@ def test_streamed_image_matches_the_whole_file(bpy, lodgs, path, root, draw_from
     images = [draw_from(root, view, position, 30.0, wait=True) for position in POSITIONS]
     lodgs("viewport.views").clear()
     lodgs("data.removal").remove(root)
-    whole = lodgs("data.importing").import_splats(bpy.context, path, upright=False)
-    assert lodgs("data.streams").source_of(whole) is None
+    full_root = lodgs("data.importing").import_splats(bpy.context, path, upright=False)
+    assert lodgs("data.streams").source_of(full_root) is None
     view = lodgs("viewport.views").ViewState()
     for position, image in zip(POSITIONS, images, strict=True):
-        np.testing.assert_allclose(image, draw_from(whole, view, position, 30.0, wait=True), atol=2e-3)
+        np.testing.assert_allclose(image, draw_from(full_root, view, position, 30.0, wait=True), atol=2e-3)
         assert image[..., 3].max() > 0.1
 
 
@@ -173,7 +175,7 @@ def test_missing_files_leave_the_splats_of_the_scene(bpy, lodgs, path, tree, roo
     shutil.copy(path.with_name("moved.ply"), path)
 
 
-def test_a_replaced_file_is_reported(bpy, lodgs, path, root, draw_from):
+def test_replaced_file_is_reported(bpy, lodgs, path, root, draw_from):
     bundle = lodgs("training.splats.bundle")
     bundle.write_bundle(path, tree_of(random_leaves(3000, np.random.default_rng(1), degree=1)))
     view = lodgs("viewport.views").ViewState()

@@ -15,7 +15,7 @@ def test_wipe_draws_both_images(bpy, lodgs):
     try:
         gpu.init()
     except Exception as error:
-        pytest.skip(f"no graphics here: {error}")
+        pytest.skip(f"no graphics: {error}")
     rng = np.random.default_rng(0)
     photo, rendered = (rng.uniform(size=(32, 48, 3)).astype(np.float32) for _ in range(2))
     comparison = lodgs("viewport.wipe").Comparison(0, photo, rendered, 10.0)

@@ -72,16 +72,16 @@ def test_baked_images_resemble_filtered_images(bundle):
 
 
 def test_opacities_match_the_filter_in_one_view(bundle):
-    """For one view: compare with the alpha at the centre of a single rendered splat."""
+    """Compare with the alpha at the centre of a single rendered splat."""
     position = EYES["a"]
     single = replace(bundle, tables=make_view_tables([view("a", position, 3)], 0.05))
     result = bake_filter(single).levels[0].rows.select(np.array([1, 4, 900]))
-    own = bundle.levels[0].splats.select(np.array([1, 4, 900]))
+    trained = bundle.levels[0].splats.select(np.array([1, 4, 900]))
     for row in range(3):
-        first = own.select(slice(row, row + 1))
+        first = trained.select(slice(row, row + 1))
         camera = view("a", position)
-        place, _ = camera.project(first.means)  # moved to the centre of a pixel
-        camera = replace(camera, cx=camera.cx + 24.5 - place[0, 0], cy=camera.cy + 18.5 - place[0, 1])
+        pixel, _ = camera.project(first.means)  # moved to the centre of a pixel
+        camera = replace(camera, cx=camera.cx + 24.5 - pixel[0, 0], cy=camera.cy + 18.5 - pixel[0, 1])
         alpha = rasterize(Gaussians.of(first), camera, near=0.05, antialias=True, backend="reference").alpha
         expected = 1 / (1 + np.exp(-result.opacity_logits[row]))
         assert alpha[18, 24].item() == pytest.approx(expected, abs=5e-3)
@@ -99,7 +99,7 @@ def test_exports_are_baked_and_bundles_are_not(bundle, tmp_path):
             retained.levels[0].splats.opacity_logits, bundle.levels[0].splats.opacity_logits
         )
         plain = read_bundle(paths[0])
-        assert plain.antialias is antialiased, "so that the filter is not baked twice"
+        assert plain.antialias is antialiased, "the filter is not baked twice"
         expected = (bundle if antialiased else bake_filter(bundle)).levels[0].rows.select(slice(None))
         np.testing.assert_array_equal(plain.levels[0].splats.opacity_logits, expected.opacity_logits)
         with open_as_ply(paths[1]) as path:

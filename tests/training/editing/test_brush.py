@@ -34,8 +34,8 @@ def to_segment(x, y, begin, end):
     return np.hypot(*(current - share * along))
 
 
-def odd(x, y, corners):
-    """Return whether a ray from (x, y) to the left crosses an odd number of edges."""
+def is_enclosed(x, y, corners):
+    """Return True if a ray from (x, y) to the left crosses an odd number of edges."""
     result = False
     for (ax, ay), (bx, by) in zip(corners, [*corners[1:], corners[0]], strict=True):
         if (ay > y) != (by > y) and ax + (y - ay) * (bx - ax) / (by - ay) < x:
@@ -114,12 +114,12 @@ def test_dab_between_coarse_splats_hits_them_partly():
     [
         [(10.2, 10.7), (70.1, 50.3), (72.4, 12.9)],
         [(5.3, 5.1), (60.7, 55.2), (60.1, 5.9), (5.8, 55.6)],  # crosses itself
-        [(-40.3, -10.2), (150.8, 20.7), (30.4, 90.9)],  # leaves the picture
+        [(-40.3, -10.2), (150.8, 20.7), (30.4, 90.9)],  # outside the image
         [(3, 3), (90, 3), (90, 60), (3, 60), (3, 30), (50, 30), (50, 20), (3, 20)],
     ],
 )
 def test_lasso_covers_enclosed_pixels(path):
-    expected = mask_of(lambda x, y: odd(x, y, path))
+    expected = mask_of(lambda x, y: is_enclosed(x, y, path))
     np.testing.assert_array_equal(lasso_coverage(path, SIZE), expected)
     assert 0 < expected.sum() < expected.size
 

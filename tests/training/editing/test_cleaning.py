@@ -69,8 +69,8 @@ def bundle_of(name, rng):
     return Bundle("any", levels, name, facts, cumulative=rule.cumulative, tables=tables)
 
 
-def turned(rng):
-    """Return a rotation (3, 3)."""
+def random_rotation(rng):
+    """Return a random rotation (3, 3)."""
     q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     return q * np.sign(np.linalg.det(q))
 
@@ -79,11 +79,11 @@ def turned(rng):
 def test_rotated_crop_contains_its_points(shape):
     rng = np.random.default_rng(0)
     matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = turned(rng) * (2.0, 0.5, 3.0), (4, -3, 7)
-    own = rng.uniform(-2, 2, (5000, 3))
-    distance = np.abs(own).max(axis=1) if shape == "BOX" else np.linalg.norm(own, axis=1)
+    matrix[:3, :3], matrix[:3, 3] = random_rotation(rng) * (2.0, 0.5, 3.0), (4, -3, 7)
+    local = rng.uniform(-2, 2, (5000, 3))
+    distance = np.abs(local).max(axis=1) if shape == "BOX" else np.linalg.norm(local, axis=1)
     clear = np.abs(distance - 1) > 1e-4
-    means = (own @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32)
+    means = (local @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32)
     np.testing.assert_array_equal(
         Crop.from_matrix(shape, matrix).contains(means)[clear], (distance <= 1)[clear]
     )
@@ -183,12 +183,12 @@ def test_selection_of_remaining_splats_is_unchanged(name):
         original, updated = (select_levels(first, position, 3.0, values) for first in (bundle, result))
         for first, second in zip(original, updated, strict=True):
             splats = first.splats
-            stays = np.linalg.norm(splats.means.astype(np.float64) - (1, 0, -1), axis=1) <= 4
-            stays &= np.exp(splats.log_scales).max(axis=1) <= 0.4
-            stays &= 1 / (1 + np.exp(-splats.opacity_logits)) >= 0.05
-            np.testing.assert_array_equal(second.splats.extras["row"], splats.extras["row"][stays])
+            remaining = np.linalg.norm(splats.means.astype(np.float64) - (1, 0, -1), axis=1) <= 4
+            remaining &= np.exp(splats.log_scales).max(axis=1) <= 0.4
+            remaining &= 1 / (1 + np.exp(-splats.opacity_logits)) >= 0.05
+            np.testing.assert_array_equal(second.splats.extras["row"], splats.extras["row"][remaining])
             weights = [np.ones(len(x.splats)) if x.weights is None else x.weights for x in (first, second)]
-            np.testing.assert_array_equal(weights[1], weights[0][stays])
+            np.testing.assert_array_equal(weights[1], weights[0][remaining])
 
 
 @pytest.mark.parametrize("name", NOT_TREES)
@@ -201,30 +201,30 @@ def test_query_with_crops_equals_rule_on_cropped_splats(name):
         splats = level.splats
         columns = {**splats.extras, OPACITY: 1 / (1 + np.exp(-splats.opacity_logits))}
         columns["hidden"] = (splats.extras["row"] % 3 == 0).astype(np.float32)
-        stays = crop_mask(crops, splats.means) & (splats.extras["row"] % 3 > 0)
-        choice = LodQuery(
+        remaining = crop_mask(crops, splats.means) & (splats.extras["row"] % 3 > 0)
+        query = LodQuery(
             name, (1.0, 2.0, 3.0), 3.0,
             tuple(collect_facts(rule, bundle.facts, numbered, level.number).items()),
             tuple(resolve_controls(bundle, {}).items()), crops=crops,
         )  # fmt: skip
-        remainder = {key: column[stays] for key, column in columns.items()}
+        remaining_columns = {key: column[remaining] for key, column in columns.items()}
         expected = rule.weights(
-            splats.means[stays],
+            splats.means[remaining],
             np.float32([1, 2, 3]),
             3.0,
-            remainder,
-            dict(choice.facts),
-            dict(choice.values),
+            remaining_columns,
+            dict(query.facts),
+            dict(query.values),
         )
-        rows, weights = SplatSelector(splats.means, columns, splats.log_scales).select(choice)
-        np.testing.assert_array_equal(rows, np.flatnonzero(stays)[expected > 0])
+        rows, weights = SplatSelector(splats.means, columns, splats.log_scales).select(query)
+        np.testing.assert_array_equal(rows, np.flatnonzero(remaining)[expected > 0])
         np.testing.assert_array_equal(weights, expected[expected > 0])
     single, _ = SplatSelector(splats.means, columns).select(LodQuery.from_crops(crops))
-    np.testing.assert_array_equal(single, np.flatnonzero(stays))
+    np.testing.assert_array_equal(single, np.flatnonzero(remaining))
 
 
 def drawn_for_each_leaf(tree, position, focal):
-    """Return the number of drawn nodes on the path to each leaf; parents are found by size and position."""
+    """Return the number of drawn nodes on the path to each leaf. Size and position identify parents."""
     splats = Splats.concatenated([level.splats for level in tree.levels])
     columns = splats.extras | dict(zip("xyz", splats.means.T, strict=True))
     standing = ResidentTree(columns)
@@ -252,22 +252,22 @@ def test_cropped_tree_is_a_valid_tree():
     crop = Crop.box((-4, -6, -2), (6, 3, 4))
     result = clean_bundle(tree, Cleaning((crop,)))
     leaves = tree.levels[1].splats.means
-    stays = ((leaves >= (-4, -6, -2)) & (leaves <= (6, 3, 4))).all(axis=1)
-    np.testing.assert_array_equal(result.levels[1].splats.means, leaves[stays])
-    assert len(result.levels[0].splats) == stays.sum() - 1
+    remaining = ((leaves >= (-4, -6, -2)) & (leaves <= (6, 3, 4))).all(axis=1)
+    np.testing.assert_array_equal(result.levels[1].splats.means, leaves[remaining])
+    assert len(result.levels[0].splats) == remaining.sum() - 1
     for focal in (1e6, 300.0, 30.0, 8.0):
         means, count = drawn_for_each_leaf(result, rng.normal(0, 8, 3), focal)
-        assert len(means) == stays.sum() and (count == 1).all()
+        assert len(means) == remaining.sum() and (count == 1).all()
 
 
 def test_nodes_are_removed_with_their_last_leaf():
     tree = tree_of(random_leaves(200, np.random.default_rng(6)))
     masks = {1: np.ones(199, bool), 2: np.arange(200) < 130}
     relations = read_relations(tree)
-    stays = relations.completed(masks)
+    remaining = relations.completed(masks)
     leaves = relations.testable({1: masks[1], 2: np.ones(200, bool)})
     splats = Splats.concatenated([level.splats for level in tree.levels])
-    place = {(size, *mean): i for i, (size, mean) in enumerate(
+    node_of_key = {(size, *mean): i for i, (size, mean) in enumerate(
         zip(splats.extras["node_size"].tolist(), splats.means.tolist(), strict=True))}  # fmt: skip
     alive = set()
     for leaf in range(199, 199 + 130):
@@ -276,8 +276,8 @@ def test_nodes_are_removed_with_their_last_leaf():
             alive.add(node)
             names = ("parent_size", "parent_x", "parent_y", "parent_z")
             key = [splats.extras[name][node].item() for name in names]
-            node = place.get(tuple(key)) if splats.extras["parent_size"][node] < 1e38 else None
-    np.testing.assert_array_equal(np.flatnonzero(np.concatenate([stays[1], stays[2]])), sorted(alive))
+            node = node_of_key.get(tuple(key)) if splats.extras["parent_size"][node] < 1e38 else None
+    np.testing.assert_array_equal(np.flatnonzero(np.concatenate([remaining[1], remaining[2]])), sorted(alive))
     assert leaves[2].all() and not leaves[1].any()
 
 
@@ -297,10 +297,10 @@ def test_cropped_tree_on_disk_can_be_paged(tmp_path):
     np.testing.assert_equal(present.tables[BLOCKS], in_memory.tables[BLOCKS])
 
     file = open_paged(out)
-    choice = LodQuery("cut", (1.0, 2.0, 3.0), 400.0, (), (("pixels", 2.0),))
-    expected = select_levels(present, np.float32(choice.position), 400.0, {"pixels": 2.0})
+    query = LodQuery("cut", (1.0, 2.0, 3.0), 400.0, (), (("pixels", 2.0),))
+    expected = select_levels(present, np.float32(query.position), 400.0, {"pixels": 2.0})
     for first in expected:
-        cut = file.visible(choice)[first.number]
+        cut = file.visible(query)[first.number]
         assert sorted(map(tuple, cut.means)) == sorted(map(tuple, first.splats.means))
     top = file.top(1024)
     assert file.total == sum(len(level.splats) for level in present.levels)
@@ -316,9 +316,9 @@ def test_block_table_is_updated(tmp_path):
     result = read_bundle(tmp_path / "some.ply")
     levels = ((level.number, level.splats.extras) for level in result.levels)
     np.testing.assert_equal(result.tables[BLOCKS], block_table(rules()["chunks"].block_bounds, levels))
-    part, _ = read_part(tmp_path / "some.ply", [3], (1,))
+    partial, _ = read_part(tmp_path / "some.ply", [3], (1,))
     member = result.levels[2].splats.extras["chunks_0"].astype(int) & 2 != 0
-    np.testing.assert_array_equal(part.levels[2].splats.means, result.levels[2].splats.means[member])
+    np.testing.assert_array_equal(partial.levels[2].splats.means, result.levels[2].splats.means[member])
 
 
 def test_folder_stays_a_folder_and_counts_are_printed(tmp_path, capsys):
@@ -326,10 +326,10 @@ def test_folder_stays_a_folder_and_counts_are_printed(tmp_path, capsys):
     write_folder(tmp_path / "all", bundle)
     arguments = ["--crop-sphere", "0", "0", "0", "4", "--keep", "outside", "--drop-floaters", "--gap", "2"]
     assert main(["edit", str(tmp_path / "all"), "--out", str(tmp_path / "some"), *arguments]) == 0
-    result, stays = read_folder(tmp_path / "some"), []
+    result, masks = read_folder(tmp_path / "some"), []
     for level in bundle.levels:
-        stays.append(np.linalg.norm(level.splats.means, axis=1) > 4)
-    means = np.concatenate([x.splats.means[stay] for x, stay in zip(bundle.levels, stays, strict=True)])
+        masks.append(np.linalg.norm(level.splats.means, axis=1) > 4)
+    means = np.concatenate([x.splats.means[mask] for x, mask in zip(bundle.levels, masks, strict=True)])
     floating = naive_floaters(means, 2.0, 0.001 * len(means))
     np.testing.assert_array_equal(
         np.concatenate([level.splats.means for level in result.levels]), means[~floating]

@@ -21,7 +21,7 @@ from training.splats.sh import basis, coefficient_count
 LOOK = Look(exposure=-0.7, temperature=8000, tint=(1, 0.8, 0.9), saturation=0.4, opacity=0.6)
 
 
-def seen(splats, degree, direction):
+def view_colors(splats, degree, direction):
     """Return colours (N, 3) float64 from a direction, not clamped at black."""
     values = np.empty(coefficient_count(degree))
     basis(*direction, degree, values)
@@ -50,8 +50,8 @@ def test_exposure_scales_linear_light(exposure):
 def planck_in_srgb(kelvins):
     """Return linear sRGB (3,) of a black body: Planck's law, with the observer fit of Wyman et al. (2013)."""
 
-    def lobe(x, height, middle, remaining, right):
-        return height * np.exp(-0.5 * ((x - middle) * np.where(x < middle, remaining, right)) ** 2)
+    def lobe(x, height, peak, left_slope, right_slope):
+        return height * np.exp(-0.5 * ((x - peak) * np.where(x < peak, left_slope, right_slope)) ** 2)
 
     nm = np.arange(360.0, 831.0)
     power = nm**-5 / np.expm1(1.438777e7 / (nm * kelvins))
@@ -92,8 +92,8 @@ def test_matrix_applies_to_every_degree_and_direction(degree):
     splats = random_splats(200, degree)
     result = apply_looks(splats, [(None, LOOK)])
     for direction in ((0, 0, 1), (0.6, -0.8, 0), (-0.48, 0.6, 0.64)):
-        expected = seen(splats, degree, direction) @ LOOK.matrix.T
-        np.testing.assert_allclose(seen(result, degree, direction), expected, atol=1e-5)
+        expected = view_colors(splats, degree, direction) @ LOOK.matrix.T
+        np.testing.assert_allclose(view_colors(result, degree, direction), expected, atol=1e-5)
     np.testing.assert_allclose(opacities(result), 0.6 * opacities(splats), rtol=1e-5)
     for name in ("means", "quats", "log_scales"):
         assert getattr(result, name) is getattr(splats, name)
@@ -114,9 +114,9 @@ def test_regions_combine_with_a_global_look():
     holder = np.linalg.norm(splats.means - np.float32([0.2, 0, 0]), axis=1) <= 0.8
     above = splats.means[:, 2] >= 0
     assert 50 < holder.sum() < 450 and 50 < above.sum() < 450
-    expected = seen(splats, 1, (0, 0, 1)) @ LOOK.matrix.T
+    expected = view_colors(splats, 1, (0, 0, 1)) @ LOOK.matrix.T
     expected[holder] *= (0.2, 1, 1)
-    np.testing.assert_allclose(seen(result, 1, (0, 0, 1)), expected, atol=1e-5)
+    np.testing.assert_allclose(view_colors(result, 1, (0, 0, 1)), expected, atol=1e-5)
     np.testing.assert_allclose(
         opacities(result), 0.6 * opacities(splats) * np.where(above, 0.5, 1), rtol=1e-5
     )

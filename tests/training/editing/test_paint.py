@@ -25,7 +25,7 @@ from training.splats.sh import basis
 RED, BLUE = (0.9, 0.2, 0.1), (0.1, 0.3, 0.8)
 
 
-def seen(sh, direction):
+def view_colors(sh, direction):
     """Return colours (N, 3) float64 from a direction."""
     values = [0.0] * sh.shape[1]
     x, y, z = direction
@@ -37,19 +37,19 @@ def seen(sh, direction):
 def test_strokes_mix_colours_in_order(degree):
     rng = np.random.default_rng(degree)
     sh = rng.normal(0, 0.4, (200, (degree + 1) ** 2, 3)).astype(np.float32)
-    first, second, removed = rng.uniform(0, 1, (3, 200)).astype(np.float32)
+    first, second, erased = rng.uniform(0, 1, (3, 200)).astype(np.float32)
     paint = blend_paint(
-        blend_paint(blend_paint(np.zeros((200, 4), np.float32), first, RED), second, BLUE), removed, None
+        blend_paint(blend_paint(np.zeros((200, 4), np.float32), first, RED), second, BLUE), erased, None
     )
     result = mix_paint(sh, paint)
     for direction in rng.normal(size=(5, 3)):
         direction /= np.linalg.norm(direction)
-        own = seen(sh, direction)
-        expected = own.copy()
+        trained = view_colors(sh, direction)
+        expected = trained.copy()
         for share, color in ((first, RED), (second, BLUE)):
             expected = (1 - share[:, None]) * expected + share[:, None] * np.array(color)
-        expected = (1 - removed[:, None]) * expected + removed[:, None] * own
-        np.testing.assert_allclose(seen(result, direction), expected, atol=2e-5)
+        expected = (1 - erased[:, None]) * expected + erased[:, None] * trained
+        np.testing.assert_allclose(view_colors(result, direction), expected, atol=2e-5)
 
 
 def test_looks_apply_to_paint_and_mixing_removes_columns():
@@ -64,29 +64,31 @@ def test_looks_apply_to_paint_and_mixing_removes_columns():
     result = apply_looks(present, [(None, look)])
     assert result.extras.keys() == splats.extras.keys()
     direction = (0.6, 0.0, 0.8)
-    expected = (1 - share[:, None]) * seen(splats.sh, direction) + share[:, None] * np.array(RED)
-    np.testing.assert_allclose(seen(result.sh, direction), expected @ look.matrix.T, atol=2e-5)
+    expected = (1 - share[:, None]) * view_colors(splats.sh, direction) + share[:, None] * np.array(RED)
+    np.testing.assert_allclose(view_colors(result.sh, direction), expected @ look.matrix.T, atol=2e-5)
     assert apply_paint(splats) is splats
 
 
 def test_paint_is_transferred_by_position():
-    """From a painted half and a small patch in the other; distant splats get no paint."""
+    """One half is painted, and a small patch of the other. Distant splats get no paint."""
     rng = np.random.default_rng(4)
     means = rng.uniform(-5, 5, (20_000, 3)).astype(np.float32)
     patch = np.linalg.norm(means - (-3, 0, 0), axis=1) < 2.5
     paint = np.zeros((len(means), 4), np.float32)
     paint = blend_paint(paint, (means[:, 0] > 0).astype(np.float32), RED)
     paint = blend_paint(paint, 0.5 * patch.astype(np.float32), BLUE)
-    to = np.concatenate([rng.uniform(-4, 4, (3000, 3)), rng.uniform(50, 60, (100, 3))]).astype(np.float32)
-    result, clear = transfer_paint(paint, means, to), 1.2  # as long as the largest cells are
-    distance, far = np.linalg.norm(to - (-3, 0, 0), axis=1), to[:, 0] > 20
-    in_half, in_patch = (to[:, 0] > clear) & ~far, distance < 2.5 - clear
-    nowhere = ((to[:, 0] < -clear) & (distance > 2.5 + clear)) | far
-    assert min(in_half.sum(), in_patch.sum(), nowhere.sum()) > 5
+    targets = np.concatenate([rng.uniform(-4, 4, (3000, 3)), rng.uniform(50, 60, (100, 3))]).astype(
+        np.float32
+    )
+    result, clear = transfer_paint(paint, means, targets), 1.2  # size of the largest cells
+    distance, far = np.linalg.norm(targets - (-3, 0, 0), axis=1), targets[:, 0] > 20
+    in_half, in_patch = (targets[:, 0] > clear) & ~far, distance < 2.5 - clear
+    unpainted = ((targets[:, 0] < -clear) & (distance > 2.5 + clear)) | far
+    assert min(in_half.sum(), in_patch.sum(), unpainted.sum()) > 5
     np.testing.assert_allclose(result[in_half], np.tile([*RED, 1], (in_half.sum(), 1)), atol=1e-5)
-    half = [*(0.5 * np.array(BLUE)), 0.5]
-    np.testing.assert_allclose(result[in_patch], np.tile(half, (in_patch.sum(), 1)), atol=1e-5)
-    assert not result[nowhere].any()
+    patch_paint = [*(0.5 * np.array(BLUE)), 0.5]
+    np.testing.assert_allclose(result[in_patch], np.tile(patch_paint, (in_patch.sum(), 1)), atol=1e-5)
+    assert not result[unpainted].any()
     # a target at the position of a painted splat takes its paint, if no other splat is as close
     few = np.arange(0, len(means), 400)
     np.testing.assert_allclose(transfer_paint(paint[few], means[few], means[few]), paint[few], atol=1e-6)
@@ -98,14 +100,14 @@ def test_edit_writes_paint_mixed_in(tmp_path):
         share = (level.splats.means[:, 0] > 0).astype(np.float32)
         level.splats.extras |= paint_columns(blend_paint(np.zeros((len(share), 4), np.float32), share, RED))
     write_bundle(tmp_path / "in.ply", bundle)
-    back = read_bundle(tmp_path / "in.ply")
-    assert all(set(COLUMNS) <= level.splats.extras.keys() for level in back.levels)
+    written = read_bundle(tmp_path / "in.ply")
+    assert all(set(COLUMNS) <= level.splats.extras.keys() for level in written.levels)
     edit(tmp_path / "in.ply", tmp_path / "out.ply", Cleaning(), plain=[tmp_path / "plain.ply"])
     result = read_bundle(tmp_path / "out.ply")
-    for level, was in zip(result.levels, bundle.levels, strict=True):
+    for level, original in zip(result.levels, bundle.levels, strict=True):
         assert not set(COLUMNS) & level.splats.extras.keys()
-        own, present = seen(was.splats.sh, (0, 0, 1)), seen(level.splats.sh, (0, 0, 1))
-        half = was.splats.means[:, 0] > 0
-        np.testing.assert_allclose(present[half], np.tile(RED, (half.sum(), 1)), atol=1e-5)
-        np.testing.assert_allclose(present[~half], own[~half], atol=1e-6)
+        trained, edited = view_colors(original.splats.sh, (0, 0, 1)), view_colors(level.splats.sh, (0, 0, 1))
+        painted = original.splats.means[:, 0] > 0
+        np.testing.assert_allclose(edited[painted], np.tile(RED, (painted.sum(), 1)), atol=1e-5)
+        np.testing.assert_allclose(edited[~painted], trained[~painted], atol=1e-6)
     np.testing.assert_array_equal(read_ply(tmp_path / "plain.ply").sh, result.levels[-1].splats.sh)

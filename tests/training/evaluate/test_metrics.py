@@ -21,8 +21,8 @@ def test_psnr_of_a_known_difference():
 def test_images_are_clamped_and_rounded_to_8_bits():
     image = torch.tensor([[[-0.2, 0.5003, 1.7]]])
     assert (to_8_bit(image) * 255).tolist() == [[[0, 128, 255]]]
-    nearly = torch.full((8, 8, 3), 0.5) + 0.0004  # rounds to the same byte as 0.5
-    assert psnr(nearly, torch.full((8, 8, 3), 0.5)) == MAX_PSNR == 100
+    similar = torch.full((8, 8, 3), 0.5) + 0.0004  # rounds to the same byte as 0.5
+    assert psnr(similar, torch.full((8, 8, 3), 0.5)) == MAX_PSNR == 100
 
 
 def test_fitted_exposure_matches_least_squares():

@@ -16,10 +16,10 @@ from training.splats.gaussians import Splats
 MEDIAN_DEPTH = 10.0
 
 
-def camera(x: float, turn: float = 0.0, width: int = 64) -> Camera:
+def camera(x: float, angle: float = 0.0, width: int = 64) -> Camera:
     """Return a camera at (x, 0, 0) that looks along +z, turned about y, with a field of view of 90°."""
     pose = np.eye(4)
-    pose[:3, :3] = [[np.cos(turn), 0, -np.sin(turn)], [0, 1, 0], [np.sin(turn), 0, np.cos(turn)]]
+    pose[:3, :3] = [[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], [np.sin(angle), 0, np.cos(angle)]]
     pose[:3, 3] = -pose[:3, :3] @ [x, 0, 0]
     return Camera(f"{x}", width, width, width / 2, width / 2, width / 2, width / 2, pose)
 

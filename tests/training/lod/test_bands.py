@@ -62,8 +62,8 @@ def test_deleted_level_leaves_no_gap():
     result = [
         BANDS.distance_band(100, collect_facts(BANDS, {}, levels, number), values) for number, _ in levels
     ]
-    near, middle, far = (0, 1.25, 20)
-    expected = [(far, inf), (middle, far), (near, middle)]
+    near, border, far = (0, 1.25, 20)
+    expected = [(far, inf), (border, far), (near, border)]
     assert [pytest.approx(band) for band in expected] == result
 
 

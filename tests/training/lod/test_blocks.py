@@ -43,10 +43,10 @@ def test_culled_blocks_are_invisible(splats):
         for near in (0.05, 2.0):
             visible = blocks.in_view(camera, near)
             rows = torch.from_numpy(blocks.rows(visible))
-            ours = rasterize(gaussians, camera, near=near, rows=rows, backend="cpu")
-            everything = rasterize(gaussians, camera, near=near, backend="cpu")
-            assert torch.equal(ours.image, everything.image)
-            assert torch.equal(ours.radii, everything.radii)
+            culled = rasterize(gaussians, camera, near=near, rows=rows, backend="cpu")
+            complete = rasterize(gaussians, camera, near=near, backend="cpu")
+            assert torch.equal(culled.image, complete.image)
+            assert torch.equal(culled.radii, complete.radii)
             left_out += len(gaussians) - len(rows)
     assert left_out > 0.2 * 24 * COUNT
 

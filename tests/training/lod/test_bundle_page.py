@@ -61,12 +61,12 @@ class Page:
         self.level_facts = {line["level"]: line.get("facts", {}) for line in lines}
         self.means, self.opacities, self.columns, original = {}, {}, {}, 0
         for n in self.numbers:
-            part, extra = rows[n][original:], extras[n]
-            self.means[n] = np.stack([part[axis] for axis in "xyz"], 1)
-            self.opacities[n] = 1 / (1 + np.exp(-part["opacity"]))
+            rows_of_level, extra = rows[n][original:], extras[n]
+            self.means[n] = np.stack([rows_of_level[axis] for axis in "xyz"], 1)
+            self.opacities[n] = 1 / (1 + np.exp(-rows_of_level["opacity"]))
             names = extra.dtype.names if extra is not None else ()
             self.columns[n] = {name: extra[name][original:] for name in names}
-            if path.is_dir() and self.cumulative:  # each file has the coarser levels too
+            if path.is_dir() and self.cumulative:  # files of cumulative levels contain coarser levels
                 original = len(rows[n])
 
     def weights(self, position, f: float, arguments: dict) -> dict[int, np.ndarray]:
@@ -157,7 +157,7 @@ class Page:
 
         s = values["s_v"]
         if values["at_most"] and (weights(s) > 0).sum() > values["at_most"]:
-            low, high = s, 1000.0  # any search that keeps the number
+            low, high = s, 1000.0  # any search with this count is valid
             for _ in range(60):
                 middle = (low + high) / 2
                 low, high = (
@@ -208,20 +208,20 @@ def write_named(tmp_path):
     }
     table = {"chunks": centres | {"radius": np.full(30, 2, np.float32)}}
     chunks = Bundle("lodge", in_chunks, "chunks", tables=table)
-    of_tree = levels({1: {}, 2: {}}, RULE.columns)
-    for level, (own, its_parent) in zip(of_tree, ((0.03, 0.2), (0.0, 0.06)), strict=True):
+    tree_levels = levels({1: {}, 2: {}}, RULE.columns)
+    for level, (size_factor, growth) in zip(tree_levels, ((0.03, 0.2), (0.0, 0.06)), strict=True):
         columns = level.splats.extras
-        columns["node_size"] = np.float32(own) * abs(columns["node_size"])
-        columns["parent_size"] = columns["node_size"] + np.float32(its_parent) * abs(columns["parent_size"])
+        columns["node_size"] = np.float32(size_factor) * abs(columns["node_size"])
+        columns["parent_size"] = columns["node_size"] + np.float32(growth) * abs(columns["parent_size"])
         columns["parent_size"][:1] = 3e38
-    tree = Bundle("tree", of_tree, "cut", controls={"pixels": 2.5})
-    of_prefix = levels({n: {} for n in (1, 2, 4)}, ("view_distance",))
+    tree = Bundle("tree", tree_levels, "cut", controls={"pixels": 2.5})
+    prefix_levels = levels({n: {} for n in (1, 2, 4)}, ("view_distance",))
     order = np.random.default_rng(7).permutation(300 * 7).astype(np.float32)
-    for level, ranks in zip(of_prefix, np.split(order, (300, 900)), strict=True):
+    for level, ranks in zip(prefix_levels, np.split(order, (300, 900)), strict=True):
         level.splats.extras["prefix_rank"] = ranks
         level.splats.extras["view_distance"] = np.float32(6) + level.splats.extras["view_distance"]
     facts = {"share": 0.4, "share_focal": 480.0, "splats": 2100.0}
-    prefix = Bundle("matryoshka", of_prefix, "prefix", facts, cumulative=True)
+    prefix = Bundle("matryoshka", prefix_levels, "prefix", facts, cumulative=True)
     bundles = {
         "tree": tree,
         "prefix": prefix,

@@ -31,8 +31,8 @@ def test_each_distance_belongs_to_one_level():
 
 
 def test_levels_extend_over_missing_neighbours():
-    assert weights(2, LEVELS[1:]) == [0, 0, 1, 1, 1, 1]  # the coarsest that there is has no end
-    assert weights(2, LEVELS[:2]) == [1, 1, 1, 1, 0, 0]  # the finest begins at the camera
+    assert weights(2, LEVELS[1:]) == [0, 0, 1, 1, 1, 1]  # the coarsest level has no far end
+    assert weights(2, LEVELS[:2]) == [1, 1, 1, 1, 0, 0]  # the finest level begins at the camera
     assert weights(1, [LEVELS[0], LEVELS[2]]) == [0, 0, 0, 0, 1, 1]
     assert weights(3, [LEVELS[0], LEVELS[2]]) == [1, 1, 1, 1, 0, 0]
 
@@ -75,22 +75,23 @@ def chunk_weights(position, tables=TABLES, **values):
 def test_two_nearest_chunks_fade_into_each_other():
     assert chunk_weights([0, 0, 0]) == [1, 1, 0, 0]
     assert chunk_weights([2.5, 0, 0]) == [0.75, 1, 0.25, 0]
-    assert chunk_weights([2.5, 3, 0]) == [0.75, 1, 0.25, 0]  # the projection counts, not the distance
+    assert chunk_weights([2.5, 3, 0]) == [0.75, 1, 0.25, 0]  # only the projection counts
     assert chunk_weights([5, 0, 0]) == [0.5, 1, 0.5, 0]
-    assert chunk_weights([-5, 0, 0]) == [1, 1, 0, 0]  # before the line: clipped
+    assert chunk_weights([-5, 0, 0]) == [1, 1, 0, 0]  # the projection is clipped to the line
     assert chunk_weights([2.5, 0, 0], fade=0) == [1, 1, 0, 0]
     assert chunk_weights([7.5, 0, 0], fade=0) == [0, 1, 1, 0]
 
 
 def test_without_chunks_camera_distances_apply():
     for result in (chunk_weights([0, 90, 0], chunks=0), chunk_weights([0, 90, 0], tables=NO_TABLES)):
-        assert result == [1, 1, 1, 1]  # 10 away: the middle level's band
+        assert result == [1, 1, 1, 1]  # distance 10 is in the band of the middle level
     empty = {"chunks": {name: column[:0] for name, column in TABLES["chunks"].items()}}
     assert chunk_weights([0, 90, 0], tables=empty) == [1, 1, 1, 1]
 
 
 def test_sets_fade_out_beyond_the_radius():
-    assert chunk_weights([0, -10, 0]) == [1, 1, 0, 0]  # a hundred and ten from the splats: no middle level
+    # distance 110 from the splats is outside the band of the middle level
+    assert chunk_weights([0, -10, 0]) == [1, 1, 0, 0]
     assert chunk_weights([0, -11.25, 0]) == [0.5, 0.5, 0, 0]
     assert chunk_weights([0, -12.5, 0]) == [0, 0, 0, 0]
     assert chunk_weights([0, 88, 0]) == [1, 1, 1, 1]
@@ -151,15 +152,15 @@ def test_bits_of_96_chunks_are_exact_in_float32():
 
 
 def test_region_labels():
-    def said(position, tables=TABLES, **values):
+    def label(position, tables=TABLES, **values):
         return CHUNKS.region_label(np.array(position, float), CHUNKS.defaults([1]) | values, tables)
 
-    assert said([2.5, 0, 0]) == "Chunks 0 and 1, 25 %"
-    assert said([26.0, 0, 0]) == "Chunks 2 and 1, 15 %"  # the nearest first; t is 0.2, t' 2 / 15
-    assert said([-3.0, 0, 0]) == said([2.5, 0, 0], fade=0) == "Chunk 0"
-    assert said([0, -11.25, 0]) == "Chunk 0, 50 % outside"
-    assert said([0, -50.0, 0]) == "Outside the chunks"
-    assert said([2.5, 0, 0], NO_TABLES) == said([2.5, 0, 0], chunks=0) == ""
+    assert label([2.5, 0, 0]) == "Chunks 0 and 1, 25 %"
+    assert label([26.0, 0, 0]) == "Chunks 2 and 1, 15 %"  # the nearest chunk first; t is 0.2, t' 2 / 15
+    assert label([-3.0, 0, 0]) == label([2.5, 0, 0], fade=0) == "Chunk 0"
+    assert label([0, -11.25, 0]) == "Chunk 0, 50 % outside"
+    assert label([0, -50.0, 0]) == "Outside the chunks"
+    assert label([2.5, 0, 0], NO_TABLES) == label([2.5, 0, 0], chunks=0) == ""
 
 
 def test_inactive_controls_have_reasons():
@@ -182,7 +183,7 @@ def test_positions_belong_to_the_nearest_chunk():
     means = np.random.default_rng(0).normal(10, 15, (40_000, 3)).astype(np.float32)
     centres = np.stack([TABLES["chunks"][axis] for axis in "xyz"], axis=1)
     nearest = np.linalg.norm(means[:, None] - centres, axis=2).argmin(axis=1)
-    assert (CHUNKS.part_numbers(means, TABLES) == nearest + 1).mean() > 0.9999  # halfway, a bit decides
+    assert (CHUNKS.part_numbers(means, TABLES) == nearest + 1).mean() > 0.9999  # halfway, rounding decides
     assert not CHUNKS.part_numbers(means, NO_TABLES).any()
 
 

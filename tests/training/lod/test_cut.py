@@ -26,7 +26,7 @@ def columns_of(sizes, parents, means):
     return {name: column.astype(np.float32) for name, column in named.items()}
 
 
-def random_tree(rng, leaves, spread=1.0, place=0.0):
+def random_tree(rng, leaves, spread=1.0, offset=0.0):
     """Return means, parents and saturated sizes of a binary tree, parents before children."""
     parents, ends = [-1], [0]
     while len(ends) < leaves:
@@ -37,7 +37,7 @@ def random_tree(rng, leaves, spread=1.0, place=0.0):
     means = rng.normal(0, 1, (len(parents), 3))
     for node in range(1, len(parents)):
         means[node] = means[parents[node]] + spread * 0.6 ** rng.integers(1, 9) * means[node]
-    means, sizes = (means + place).astype(np.float32), np.zeros(len(parents), np.float32)
+    means, sizes = (means + offset).astype(np.float32), np.zeros(len(parents), np.float32)
     inner = np.unique(parents[1:])
     sizes[inner] = rng.uniform(0, 0.1, len(inner))
     for node in range(len(parents) - 1, 0, -1):
@@ -49,13 +49,13 @@ def random_tree(rng, leaves, spread=1.0, place=0.0):
 
 
 def test_fine_enough_nodes_with_coarse_parents_are_drawn():
-    # k = 100 / 2 = 50: the node of size 0.1 from 5 on, its parent, 1 behind it, of size 0.2 from 10 on
+    # k = 100 / 2 = 50: the node of size 0.1 is drawn from 5, its parent of size 0.2, 1 behind it, from 10
     means = np.float32([[0, 0, 4.9], [0, 0, 5.1], [0, 0, 8.9], [0, 0, 9.1]])
     columns = columns_of(np.full(4, 0.1, np.float32), np.full(4, -1), means)
     columns["parent_size"][:] = 0.2
     columns["parent_z"] = means[:, 2] + 1
     assert weights(means, columns, pixels=2.0).tolist() == [0, 1, 1, 0]
-    # k = 120 / 2 = 60: from 6 and from 12 on, seen from 1 farther away
+    # k = 120 / 2 = 60: from 6 and from 12, for a camera that is 1 farther away
     assert weights(means, columns, (0, 0, -1), focal=120, pixels=2.0).tolist() == [0, 1, 1, 1]
 
 
@@ -83,25 +83,25 @@ def test_detail_has_a_minimum():
 @given(st.integers(0, 2**32), st.integers(1, 60), st.floats(MIN_DETAIL, 5000), st.floats(0.01, 200))
 def test_each_path_to_a_leaf_has_one_drawn_node(seed, leaves, k, reach):
     rng = np.random.default_rng(seed)
-    spread, place = rng.choice([1e-3, 1.0, 30.0]), rng.choice([0, 1000])  # where places are coarse
-    means, parents, sizes = random_tree(rng, leaves, spread, place)
+    spread, offset = rng.choice([1e-3, 1.0, 30.0]), rng.choice([0, 1000])  # float32 is coarse at 1000
+    means, parents, sizes = random_tree(rng, leaves, spread, offset)
     columns = columns_of(sizes, parents, means)
     leaf = np.setdiff1d(np.arange(len(means)), parents)
     direction = rng.normal(size=3)
     direction /= np.linalg.norm(direction)
-    subset = int(rng.integers(len(means)))  # and the camera is on its boundary
+    node_at_border = int(rng.integers(len(means)))
     for position in (
-        means[subset] + reach * direction,
-        means[subset] + k * sizes[subset] * direction,
-        means[subset],
+        means[node_at_border] + reach * direction,
+        means[node_at_border] + k * sizes[node_at_border] * direction,
+        means[node_at_border],
     ):
         drawn = weights(means, columns, position, k) > 0
         for node in leaf:
-            result = 0
+            count = 0
             while node >= 0:
-                result += int(drawn[node])
+                count += int(drawn[node])
                 node = parents[node]
-            assert result == 1
+            assert count == 1
 
 
 def test_coarser_granularity_draws_less():

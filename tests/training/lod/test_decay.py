@@ -84,9 +84,9 @@ def test_max_visible_scale_is_where_opacity_meets_the_threshold():
 @pytest.mark.parametrize("position", [(0, 0, 0), (30, 1, 2)])
 def test_budget_keeps_the_splats_with_the_largest_limits(at_most, position):
     means, columns = scene()
-    everything = (weights(means, columns, position=position) > 0).sum()
+    total = (weights(means, columns, position=position) > 0).sum()
     selected = weights(means, columns, at_most=at_most, position=position) > 0
-    assert min(at_most, everything) - 2 <= selected.sum() <= at_most
+    assert min(at_most, total) - 2 <= selected.sum() <= at_most
     normalized = DECAY.normalized(means, np.float32(position), FACTS)
     limit = max_visible_scale(normalized, columns["sigma_d"], columns["opacity"], 0.004)
     assert limit[selected].min() >= limit[~selected].max() * (1 - 1e-4)

@@ -45,16 +45,16 @@ def bundle():
 @pytest.mark.parametrize("region", [(3,), (3, 4), (25, 26), (0, 29)])
 def test_region_equals_selection_from_the_full_bundle(tmp_path, bundle, order, region):
     write_bundle(tmp_path / "bundle.ply", bundle, order)
-    part, size = read_part(tmp_path / "bundle.ply", COUNTS, region)
-    for level, full in zip(part.levels, read_bundle(tmp_path / "bundle.ply").levels, strict=True):
+    partial, size = read_part(tmp_path / "bundle.ply", COUNTS, region)
+    for level, full in zip(partial.levels, read_bundle(tmp_path / "bundle.ply").levels, strict=True):
         subset = np.any([in_chunk(full.splats.extras, chunk) for chunk in region], axis=0)
         np.testing.assert_array_equal(level.splats.means, full.splats.means[subset])
         np.testing.assert_array_equal(level.splats.sh, full.splats.sh[subset])
         assert all(
             in_chunk(level.splats.extras, region[0]) == in_chunk(full.splats.extras, region[0])[subset]
         )
-    loaded, everything = sum(len(level.splats) for level in part.levels), sum(COUNTS.values())
-    assert loaded * BYTES < size < 0.6 * everything * BYTES
+    loaded, total = sum(len(level.splats) for level in partial.levels), sum(COUNTS.values())
+    assert loaded * BYTES < size < 0.6 * total * BYTES
 
 
 def test_files_without_blocks_are_read_completely(tmp_path, bundle):

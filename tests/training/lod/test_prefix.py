@@ -29,8 +29,8 @@ def ordered(counts=(120, 380, 500)) -> Bundle:
         },
     )  # fmt: skip
     ends = np.cumsum(counts)
-    parts = [slice(end - count, end) for end, count in zip(ends, counts, strict=True)]
-    levels = [Level(number, splats.select(part)) for number, part in enumerate(parts, 1)]
+    slices = [slice(end - count, end) for end, count in zip(ends, counts, strict=True)]
+    levels = [Level(number, splats.select(rows)) for number, rows in enumerate(slices, 1)]
     facts = {"share": 1e6, "share_focal": 100.0, "splats": float(total)}
     return Bundle("matryoshka", levels, "prefix", facts, cumulative=True)
 
@@ -104,8 +104,8 @@ def test_shuffled_rows_give_the_same_selection():
     """Programs may sort rows; the rule reads the column."""
     bundle, rng = ordered(), np.random.default_rng(2)
     shuffled = [Level(x.number, x.splats.select(rng.permutation(len(x.splats)))) for x in bundle.levels]
-    other = Bundle("matryoshka", shuffled, "prefix", bundle.facts, cumulative=True)
-    assert sorted(selected_ranks(other, at_most=333)) == list(range(333))
+    shuffled_bundle = Bundle("matryoshka", shuffled, "prefix", bundle.facts, cumulative=True)
+    assert sorted(selected_ranks(shuffled_bundle, at_most=333)) == list(range(333))
 
 
 def test_rows_of_the_bundle_are_in_order(tmp_path):

@@ -142,8 +142,8 @@ def test_distances_match_float64():
 
 @pytest.mark.parametrize("name", RULES)
 def test_controls_of_other_rules_are_rejected(name):
-    bundle, own = bundle_of(name), {control.name for control in rules()[name].controls}
-    for foreign in all_controls().keys() - own | {"nonsense"}:
+    bundle, own_controls = bundle_of(name), {control.name for control in rules()[name].controls}
+    for foreign in all_controls().keys() - own_controls | {"nonsense"}:
         with pytest.raises(LodgsError, match=f"The rule '{name}' has no option '{foreign}'. It has: "):
             resolve_controls(bundle, {foreign: 1})
 

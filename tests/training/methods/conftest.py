@@ -14,15 +14,16 @@ from training.splats.ply import extra_columns, splat_columns
 
 @pytest.fixture
 def check_resumed() -> Callable[..., None]:
-    """Return check_resumed(make, *stops): resume a method from its states after these numbers of steps, and
-    require the same bits as from the uninterrupted run.
+    """``check_resumed(make, *stops)``: resume a method after these numbers of steps.
+
+    Each resumed run must return the same bits as the uninterrupted run.
     """
 
     def check(make: Callable[[], Method], *stops: int) -> None:
         full_run, states = make(), {}
         levels: list[Level] = []
         step = 0
-        while step < full_run.steps:  # some methods learn the number on the way
+        while step < full_run.steps:  # some methods determine the number while training
             levels += _train(full_run, step)
             step += 1
             if step in stops:
@@ -50,8 +51,10 @@ def _train(method: Method, step: int) -> list[Level]:
 
 def _require_equal(actual: list[Level], expected: list[Level]) -> None:
     assert [level.number for level in actual] == [level.number for level in expected] != []
-    for one, other in zip(expected, actual, strict=True):
-        columns, others = (splat_columns(x.splats) | extra_columns(x.splats) for x in (one, other))
-        assert one.facts == other.facts and columns.keys() == others.keys()
-        for name, column in columns.items():
-            np.testing.assert_array_equal(column, others[name])
+    for expected_level, actual_level in zip(expected, actual, strict=True):
+        expected_columns, actual_columns = (
+            splat_columns(x.splats) | extra_columns(x.splats) for x in (expected_level, actual_level)
+        )
+        assert expected_level.facts == actual_level.facts and expected_columns.keys() == actual_columns.keys()
+        for name, column in expected_columns.items():
+            np.testing.assert_array_equal(column, actual_columns[name])

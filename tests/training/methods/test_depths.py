@@ -51,11 +51,11 @@ def create_method(name: str, data: TrainingData, weight: float):
 
 @pytest.mark.parametrize("name", METHODS)
 def test_every_method_uses_depth_loss(name, data):
-    none, half, full_run = (
+    without_loss, half_weight, full_weight = (
         create_method(name, data, weight).train_step(0).loss() for weight in (0.0, 0.5, 1.0)
     )
-    assert full_run - none > 0.01
-    assert half - none == pytest.approx((full_run - none) / 2, rel=1e-3)
+    assert full_weight - without_loss > 0.01
+    assert half_weight - without_loss == pytest.approx((full_weight - without_loss) / 2, rel=1e-3)
 
 
 def test_depth_loss_matches_reference(data):
@@ -77,7 +77,7 @@ def test_depth_loss_matches_reference(data):
     small = (1 / depth_of(camera.scaled(0.25 / view.shrink))).astype(np.float64)
     assert drawn is not None and drawn.shape == small.shape
     expected = 0.7 * data.median_depth * np.abs(drawn.numpy() - small).mean()
-    assert actual == pytest.approx(expected, rel=0.02)  # a corner between floor and wall is no plane
+    assert actual == pytest.approx(expected, rel=0.02)  # reduced depth is inexact at corners
     later = float(method.depth_loss(drawings[0].rendering, view.target, 1.0).detach())
     assert later == pytest.approx(actual / 100, rel=1e-3)
 
@@ -88,10 +88,10 @@ def test_masked_and_held_out_depths_are_ignored(scene, data, tmp_path):
     assert data.target(0).inverse_depth is not None
     shutil.copytree(scene.folder, tmp_path / "scene")
     (tmp_path / "scene" / "masks").mkdir()
-    half = np.full((240, 320, 3), 255, np.uint8)
-    half[:, :160] = 0
+    mask = np.full((240, 320, 3), 255, np.uint8)
+    mask[:, :160] = 0
     for number in range(6):
-        write_png(tmp_path / "scene" / "masks" / f"{number}.png", half)
+        write_png(tmp_path / "scene" / "masks" / f"{number}.png", mask)
     masked = read_scene(tmp_path / "scene")
     valid = TrainingData(masked, 0.25, 3, depths=DepthPriors(masked, "metric")).target(0).inverse_depth
     assert valid is not None
@@ -101,9 +101,9 @@ def test_masked_and_held_out_depths_are_ignored(scene, data, tmp_path):
 def copy_without_points(scene: Path) -> None:
     """Replace the model by a copy without points."""
     model = scene / "sparse" / "0"
-    there = model.resolve()
+    original = model.resolve()
     (scene / "sparse").unlink()
-    shutil.copytree(there, model)
+    shutil.copytree(original, model)
     (model / "points3D.bin").write_bytes(bytes(8))
 
 

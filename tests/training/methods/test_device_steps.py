@@ -47,12 +47,12 @@ def steps(method, begin: int, end: int) -> list[float]:
 @pytest.fixture
 def device_steps(graphics, monkeypatch) -> list:
     """Return a list that gains an entry for each step on the device."""
-    actual, twin = [], Model.device_model
+    actual, create_device_model = [], Model.device_model
 
     def count_step(model, *arguments):
-        created = twin(model, *arguments)
-        actual.append(created is not None)
-        return created
+        device_model = create_device_model(model, *arguments)
+        actual.append(device_model is not None)
+        return device_model
 
     monkeypatch.setattr(Model, "device_model", count_step)
     return actual
@@ -65,7 +65,7 @@ def test_device_steps_equal_autograd_steps(name, data, device_steps):
     losses, expected = steps(method, 0, count), steps(second, 0, count)
     assert device_steps == [True] * count + [False] * count
     assert losses == pytest.approx(expected, rel=2e-2)
-    assert losses[0] == pytest.approx(expected[0], rel=5e-4)  # photographs there have eight bits
+    assert losses[0] == pytest.approx(expected[0], rel=5e-4)  # the device stores photos with 8 bits
     assert len(method.model) == pytest.approx(len(second.model), rel=0.05)
 
 
@@ -77,11 +77,16 @@ def trained(count: int) -> Model:
     tensors["opacity_logits"] = torch.linspace(-8, 4, count)
     rates = dict.fromkeys(tensors, 1e-3)
     model = Model(tensors, rates, columns={"level": torch.arange(float(count))}, peaks=True)
-    twin, camera = model.device_model("gpu", False), Camera("", 75, 50, 60.0, 60.0, 37.5, 25.0, np.eye(4))
-    assert twin is not None
+    device_model, camera = (
+        model.device_model("gpu", False),
+        Camera("", 75, 50, 60.0, 60.0, 37.5, 25.0, np.eye(4)),
+    )
+    assert device_model is not None
     target = Target(rng.integers(0, 256, (50, 75, 3)) / np.float32(255))
     for _ in range(2):
-        twin.step(camera, target, near=0.2, sh_degree=3, background=(0, 0, 0), ssim_weight=0.2, shrink=1)
+        device_model.step(
+            camera, target, near=0.2, sh_degree=3, background=(0, 0, 0), ssim_weight=0.2, shrink=1
+        )
     return model
 
 
@@ -100,7 +105,7 @@ def test_density_control_on_device_equals_host(graphics, monkeypatch, max_bytes)
     """Bit-identical, also on a device that processes the moments of 512 splats at a time."""
     monkeypatch.setattr(graphics, "binding_bytes", max_bytes)
     first, second = trained(1000), trained(1000)
-    second.adam.zero_grad()  # which brings it home
+    second.adam.zero_grad()  # copies it to the host
     for model in (first, second):
         control_density(model)
         model.append({name: row[:0] for name, row in model.read_rows(torch.arange(3)).items()})
@@ -108,8 +113,10 @@ def test_density_control_on_device_equals_host(graphics, monkeypatch, max_bytes)
         model.keep(torch.arange(len(model)) != 5)
         model.assign("sh", 2 * model.read("sh"))
     assert first._device_model is not None and second._device_model is None
-    for part, theirs in zip(_flat(first.state_dict()), _flat(second.state_dict()), strict=True):
-        assert torch.equal(part, theirs)
+    for first_tensor, second_tensor in zip(
+        _flat(first.state_dict()), _flat(second.state_dict()), strict=True
+    ):
+        assert torch.equal(first_tensor, second_tensor)
     first.keep(torch.zeros(len(first), dtype=torch.bool))
     assert len(first) == 0 and first._device_model is None
 
@@ -124,23 +131,23 @@ def test_density_control_transfers_little(graphics):
 def _flat(state) -> list[torch.Tensor]:
     if not isinstance(state, dict):
         return [torch.as_tensor(state)]
-    return [part for name in sorted(state) for part in _flat(state[name])]
+    return [tensor for name in sorted(state) for tensor in _flat(state[name])]
 
 
 def test_checkpoint_moves_between_host_and_device(data, device_steps):
     """Checkpoints contain the state on the device, in both directions."""
-    full_run, parts, at = make("flod", data, "cpu"), [], 0
+    full_run, losses, begin = make("flod", data, "cpu"), [], 0
     expected = steps(full_run, 0, 13)
     file = io.BytesIO()
     for backend, end in (("cpu", 4), ("gpu", 9), ("cpu", 13)):
         method = make("flod", data, backend)
-        if at:
+        if begin:
             file.seek(0)
             method.load_state_dict(torch.load(file, weights_only=True))
-        parts += steps(method, at, end)
-        file, at = io.BytesIO(), end
+        losses += steps(method, begin, end)
+        file, begin = io.BytesIO(), end
         torch.save(method.state_dict(), file)
-    assert parts == pytest.approx(expected, rel=2e-2)
+    assert losses == pytest.approx(expected, rel=2e-2)
     assert device_steps.count(True) == 5
 
 
@@ -150,13 +157,11 @@ def test_resume_on_device_is_bit_identical(data, graphics, check_resumed):
 
 def test_device_image_is_read_lazily(data, graphics):
     method, second = make("3dgs", data), make("3dgs", data, "cpu")
-    created, expected = method.train_step(0), second.train_step(0)
-    torch.testing.assert_close(created.image(), expected.image(), atol=2e-3, rtol=0)
+    result, expected = method.train_step(0), second.train_step(0)
+    torch.testing.assert_close(result.image(), expected.image(), atol=2e-3, rtol=0)
     initial = graphics.transferred
-    created.image()
-    assert (
-        graphics.transferred - initial == 16 * created.target.image.shape[0] * created.target.image.shape[1]
-    )
+    result.image()
+    assert graphics.transferred - initial == 16 * result.target.image.shape[0] * result.target.image.shape[1]
 
 
 def test_loss_that_is_not_finite_ends_the_training():

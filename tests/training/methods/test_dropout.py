@@ -31,8 +31,8 @@ def test_dropout_rate(data):
 
 
 def test_dropout_is_random_per_step_and_repeatable(data):
-    first, again, second = make(data), make(data), create("3dgs", data, make(data).parameters, 1, "cpu")
-    assert torch.equal(weights(first, 3), weights(again, 3))
+    first, repeated, second = make(data), make(data), create("3dgs", data, make(data).parameters, 1, "cpu")
+    assert torch.equal(weights(first, 3), weights(repeated, 3))
     assert not torch.equal(weights(first, 3), weights(first, 4))
     assert not torch.equal(weights(first, 3), weights(second, 3))
 
@@ -57,10 +57,10 @@ def test_dropped_splats_get_no_update(data, name):
     """Some of the remaining splats are updated."""
     method = make(data, name, dropout=0.5, margin=0.0)
     initial = method.model["means"].detach().clone()
-    left = weights(method)
+    remaining = weights(method)
     method.train_step(0)
     moved = (method.model["means"].detach() != initial).any(1)
-    assert not moved[left == 0].any() and moved[left > 0].any()
+    assert not moved[remaining == 0].any() and moved[remaining > 0].any()
 
 
 def test_finishing_has_no_dropout(data):

@@ -53,7 +53,7 @@ from ...optimize.model import Model, splat_rates
 from ...optimize.initialize import drop_duplicates, from_points, from_splats
 
 class Method(method.Method):
-    """Draws everything, and once more with weights that are trained; clones in step 4, prunes in step 6."""
+    """Draw all splats without and with trained weights; clone in step 4, prune in step 6."""
 
     def setup(self, base):
         p, scene = self.parameters, self.data.scene
@@ -155,10 +155,10 @@ def test_two_drawings_train_extra_weights_and_columns(tiny, data):
 def test_loss_sums_over_drawings(tiny, data):
     method = methods.create("tiny", data, tiny.preset("draft"), seed=0, backend="cpu")
     view = method.choose_view(0)
-    both = method.draw(view, 0)
-    losses = [float(method.loss([drawing], view, 0).detach()) for drawing in both]
+    drawings = method.draw(view, 0)
+    losses = [float(method.loss([drawing], view, 0).detach()) for drawing in drawings]
     assert losses[0] != losses[1]
-    assert float(method.loss(both, view, 0).detach()) == pytest.approx(sum(losses))
+    assert float(method.loss(drawings, view, 0).detach()) == pytest.approx(sum(losses))
 
 
 def test_run_with_base_writes_its_column(tiny, tiny_scene, tmp_path):
@@ -169,10 +169,10 @@ def test_run_with_base_writes_its_column(tiny, tiny_scene, tmp_path):
     splats = read_bundle(folder.bundle).levels[0].splats
     assert "decay" in splats.extras and splats.extras["decay"].dtype == np.float32
     assert splats.sh_degree == 3
-    # what began as the base's first splats hardly moved in eight steps
+    # splats of the base hardly move in eight steps
     near = np.linalg.norm(splats.means[:, None] - base().means, axis=2).min(1)
     assert np.median(near) < 0.05
-    assert training_loop.train(created) == 0, "started again with the same job, it is resumed"
+    assert training_loop.train(created) == 0, "the same job resumes"
 
 
 @pytest.mark.parametrize("antialias", [False, True])
@@ -186,9 +186,9 @@ def test_run_uses_antialiasing_of_its_base(tiny, tiny_scene, tmp_path, antialias
     assert training_loop.train(created) == 0
     folder = RunFolder(created.out)
     events, _ = folder.events()
-    said = [event["message"] for event in events if event["event"] == "warning"]
-    said = [message for message in said if "Antialiasing" in message]
-    assert said == [f"Antialiasing is {'on' if antialias else 'off'} for this run, as in its base."]
+    warnings = [event["message"] for event in events if event["event"] == "warning"]
+    warnings = [message for message in warnings if "Antialiasing" in message]
+    assert warnings == [f"Antialiasing is {'on' if antialias else 'off'} for this run, as in its base."]
     bundle = read_bundle(folder.bundle)
     assert bundle.antialias is antialias and bundle.meta.get("antialias", False) is antialias
     level = next(event for event in events if event["event"] == "level")
@@ -246,25 +246,25 @@ def test_base_is_finest_complete_level(tmp_path):
 
 
 def test_incomplete_method_cannot_be_created(data, tiny):
-    class Forgetful(Method):
+    class Incomplete(Method):
         def setup(self, base):
             pass
 
     assert inspect.isabstract(Method)
     with pytest.raises(TypeError, match="levels_after"):
-        Forgetful(data, tiny.preset("draft"), 0, "cpu")
+        Incomplete(data, tiny.preset("draft"), 0, "cpu")
 
 
 def test_scene_metadata(data, tiny):
     method = methods.create("tiny", data, tiny.preset("draft"), seed=0, backend="cpu")
     meta = method.meta()
     assert meta["focal_px"] == 60
-    eye, target = np.array(meta["view"])
-    middle = np.argmin(
+    position, target = np.array(meta["view"])
+    central = np.argmin(
         np.linalg.norm([c.center - np.array(meta["camera_center"]) for c in data.train], axis=1)
     )
-    assert eye == pytest.approx(data.train[middle].center)
-    assert data.train[middle].view_space(target[None])[0] == pytest.approx([0, 0, data.median_depth])
+    assert position == pytest.approx(data.train[central].center)
+    assert data.train[central].view_space(target[None])[0] == pytest.approx([0, 0, data.median_depth])
     assert meta["camera_center"] == pytest.approx(np.mean([c.center for c in data.train], 0).tolist())
     assert {"scene_extent", "median_depth"} <= set(meta) and method.facts == {}
     assert torch.device("cpu") == method.device
@@ -279,10 +279,10 @@ def test_step_has_random_background_and_image_has_none(data, name):
     method = create(name, data, presets["draft"], seed=0, backend="cpu")
     view = method.choose_view(3)
     drawn = method.draw(view, 3)[0].rendering
-    behind = torch.tensor(method.background(3)).float()
+    background = torch.tensor(method.background(3)).float()
     black = create(name, data, override(presets["draft"], {"random_background": False}), 0, "cpu")
     expected = black.draw(view, 3)[0].rendering
-    torch.testing.assert_close(drawn.image - expected.image, (1 - drawn.alpha[..., None]) * behind)
+    torch.testing.assert_close(drawn.image - expected.image, (1 - drawn.alpha[..., None]) * background)
     torch.testing.assert_close(method.background.remove(drawn.image, drawn.alpha, 3), expected.image)
     assert (drawn.alpha < 0.9).any()
     colors = {method.background(step) for step in range(9)}

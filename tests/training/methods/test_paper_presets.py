@@ -269,10 +269,10 @@ def test_steps_of_density_control_of_flod_levels(data, events, monkeypatch):
     begin, expected = 0, {"densify": [], "prune": [], "reset_opacities": []}
     ends, intervals = (5_000, 6_000, 8_000, 10_000, 15_000), (2000, 1000, 500, 500, 200)
     for steps, end, interval in zip(paper.steps, ends, intervals, strict=True):
-        for local in range(501, end):  # the programs: 500 < iteration < end
-            for name, every in (("densify", interval), ("prune", 100), ("reset_opacities", 3000)):
-                if local % every == 0:
-                    expected[name].append(begin + local)
+        for iteration in range(501, end):  # the programs: 500 < iteration < end
+            for name, period in (("densify", interval), ("prune", 100), ("reset_opacities", 3000)):
+                if iteration % period == 0:
+                    expected[name].append(begin + iteration)
         begin += steps
     assert monitored == expected
 

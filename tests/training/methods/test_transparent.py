@@ -1,4 +1,4 @@
-"""Tests of training an object on transparent ground: same transparency, no halo."""
+"""Tests of training an object before a transparent background: same transparency, no halo."""
 
 import sys
 
@@ -22,13 +22,13 @@ SIDE = 64
 
 def ring() -> list[Camera]:
     """Return sixteen cameras around the object, at two heights."""
-    actual = []
+    cameras = []
     for number in range(16):
         angle = 2 * np.pi * number / 16
-        eye = np.array([3 * np.cos(angle), 3 * np.sin(angle), 0.8 if number % 2 else -0.4])
-        pose = look_at(eye, np.zeros(3), (0, 0, 1))
-        actual.append(Camera(f"{number:02d}.png", SIDE, SIDE, 90.0, 90.0, SIDE / 2, SIDE / 2, pose))
-    return actual
+        position = np.array([3 * np.cos(angle), 3 * np.sin(angle), 0.8 if number % 2 else -0.4])
+        pose = look_at(position, np.zeros(3), (0, 0, 1))
+        cameras.append(Camera(f"{number:02d}.png", SIDE, SIDE, 90.0, 90.0, SIDE / 2, SIDE / 2, pose))
+    return cameras
 
 
 def ball(random: np.random.Generator) -> Gaussians:
@@ -51,7 +51,7 @@ def scene(tmp_path_factory):
     for camera in ring():
         drawn = rasterize(truth, camera, near=0.1, backend="cpu")
         alpha = drawn.alpha[..., None].numpy()
-        straight = np.where(alpha > 0, drawn.image.numpy() / np.maximum(alpha, 1e-6), 0.9)  # beside: light
+        straight = np.where(alpha > 0, drawn.image.numpy() / np.maximum(alpha, 1e-6), 0.9)  # light background
         codes = np.rint(255 * np.concatenate([straight, alpha], axis=2).clip(0, 1)).astype(np.uint8)
         (folder / "images").mkdir(exist_ok=True)
         write_png(folder / "images" / camera.name, codes)
@@ -91,6 +91,6 @@ def test_trained_object_is_as_transparent(scene, tmp_path, method, capsys):
         drawn = rasterize(Gaussians.of(splats), camera, near=0.03, backend="cpu")
         pixels = load_image(scene / "images" / camera.name, SIDE, SIDE, alpha=True)
         outside = pixels[..., 3] == 0
-        assert drawn.alpha.numpy()[outside].mean() < 0.02, "a halo"
+        assert drawn.alpha.numpy()[outside].mean() < 0.02, "no halo"
         assert drawn.alpha.numpy()[pixels[..., 3] > 0.99].mean() > 0.9
         assert np.abs(drawn.image.numpy() - pixels[..., :3]).mean() < 0.05

@@ -37,7 +37,7 @@ def test_small_splats_are_cloned_in_place(model, moments):
 
 def test_large_splats_are_split_at_random_positions_inside(model):
     model.assign("log_scales", torch.log(torch.tensor([[0.5, 1.0, 2.0]])).repeat(50, 1))
-    # a quarter turn about z: the splat's x axis lies along the world's y
+    # a rotation by 90 degrees about z: the splat's x axis is the world's y axis
     model.assign(
         "quats", torch.tensor([[np.sqrt(0.5), 0, 0, np.sqrt(0.5)]], dtype=torch.float32).repeat(50, 1)
     )
@@ -63,9 +63,9 @@ def test_large_splats_are_split_at_random_positions_inside(model):
 def test_split_along_the_longest_axis_preserves_appearance(model, moments):
     """Positions, scales and opacity follow the formulas of Improved-GS."""
     model.assign("log_scales", torch.log(torch.tensor([[0.05, 0.4, 0.1]])).repeat(50, 1))
-    # a quarter turn about z: the splat's y axis lies along the world's -x
-    turn = torch.tensor([[np.sqrt(0.5), 0, 0, np.sqrt(0.5)]], dtype=torch.float32)
-    model.assign("quats", turn.repeat(50, 1))
+    # a rotation by 90 degrees about z: the splat's y axis is the world's -x axis
+    rotation = torch.tensor([[np.sqrt(0.5), 0, 0, np.sqrt(0.5)]], dtype=torch.float32)
+    model.assign("quats", rotation.repeat(50, 1))
     model.assign("opacity_logits", torch.full((50,), 0.5).logit())
     parent = {name: model[name].detach()[7].clone() for name in ALL}
     gradients = torch.zeros(50)

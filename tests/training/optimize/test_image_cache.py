@@ -212,8 +212,8 @@ def test_training_is_bit_identical_for_any_cache_size_and_timing(scene, name, mo
     monkeypatch.setattr(TrainingData, "_read", slow_read)
     for memory in (0, image_bytes, 3 * image_bytes, 1 << 30):
         assert equal(train(scene, name, range(16), memory, overrides=overrides), truth)
-    half = train(scene, name, range(7), 2 * image_bytes, overrides=overrides)
-    assert equal(train(scene, name, range(7, 16), image_bytes, half, overrides=overrides), truth)
+    partial = train(scene, name, range(7), 2 * image_bytes, overrides=overrides)
+    assert equal(train(scene, name, range(7, 16), image_bytes, partial, overrides=overrides), truth)
 
 
 @pytest.mark.parametrize("name", sorted(METHODS))

@@ -35,7 +35,7 @@ def test_moments_of_two_splats():
     np.testing.assert_allclose(np.sort(np.exp(merged.log_scales[0])), [0.5, 0.5, 3.25**0.5], rtol=1e-3)
     np.testing.assert_allclose(0.5 + SH_C0 * merged.sh[0, 0], [0.25, 0.75, 0], atol=1e-3)
     assert masses(merged)[0] == pytest.approx(masses(two).sum(), rel=1e-3)
-    assert merged.extras["label"].tolist() == [1], "the heavier member's"
+    assert merged.extras["label"].tolist() == [1], "the value of the heavier splat"
 
 
 @pytest.mark.parametrize("count", [0, 1, 37, 299, 300, 400])

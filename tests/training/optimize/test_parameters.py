@@ -36,7 +36,7 @@ def test_method_numbers_are_unique_and_stable():
     numbers = {name: method.number for name, method in METHODS.items()}
     assert len(set(numbers.values())) == len(numbers)
     assert list(numbers)[:4] == ["flod", "octree", "octree_neural", "3dgs"]
-    assert [numbers[name] for name in list(numbers)[:4]] == [0, 1, 2, 3], "a .blend stores them"
+    assert [numbers[name] for name in list(numbers)[:4]] == [0, 1, 2, 3], ".blend files store the numbers"
 
 
 def test_unknown_methods_and_presets_are_rejected():

@@ -46,7 +46,7 @@ def moments(alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         (ORTHO, 7.0, FOCAL / ORTHO.distance * 0.3 * (7 / 4 - 1)),
     ],
 )
-def test_a_point_out_of_focus_becomes_the_circle_of_confusion(projection, depth, radius):
+def test_point_out_of_focus_becomes_the_circle_of_confusion(projection, depth, radius):
     """Coverage of a disk of radius R has the variance R²/4 along each axis; R = f r |1/focus - 1/depth|."""
     point = [dot((0.1, -0.2, depth))]
     sharp = draw_blurred(point, CAMERA, projection, background=None)
@@ -71,7 +71,7 @@ def test_blades_and_ratio_shape_the_opening():
 
 
 @pytest.mark.parametrize("moving", ["splat", "camera"])
-def test_a_moving_splat_becomes_a_streak(moving):
+def test_moving_splat_becomes_a_streak(moving):
     """The streak of an even motion of L pixels has the variance L²/12 along it."""
     keys = [np.eye(4) for _ in range(3)]
     for key, shift in zip(keys, (-0.5, 0.0, 0.5), strict=True):
@@ -91,7 +91,7 @@ def test_a_moving_splat_becomes_a_streak(moving):
     assert (blurred.depth < 1e9).sum() == (sharp.alpha > 0).sum()  # the depth is sharp
 
 
-def test_a_turning_camera_keeps_its_place_between_keys():
+def test_turning_camera_keeps_its_place_between_keys():
     poses = []
     for angle in (-0.4, 0.4):
         pose = np.eye(4)
@@ -102,7 +102,7 @@ def test_a_turning_camera_keeps_its_place_between_keys():
     np.testing.assert_allclose(moments(blurred.alpha)[0], (48, 32), atol=0.01)
 
 
-def test_a_set_turns_around_its_origin_between_keys():
+def test_set_turns_around_its_origin_between_keys():
     """The middle of half a turn is a quarter turn, also of a mirrored set."""
     for mirror in (1, -1):
         keys = [np.diag([mirror, 1.0, 1, 1]), np.diag([mirror, 1.0, 1, 1])]
@@ -185,7 +185,7 @@ def test_panorama_shows_directions_at_their_angles_and_distances():
     np.testing.assert_allclose(moments(image.alpha)[0], (50 / 90 * 128, 16 / 60 * 64), atol=0.2)
 
 
-def test_a_blurred_image_can_be_cancelled_in_any_sample(monkeypatch):
+def test_blurred_image_can_be_cancelled_in_any_sample(monkeypatch):
     shares = []
 
     def progress(share):

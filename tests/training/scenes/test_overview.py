@@ -81,7 +81,7 @@ def test_ground_is_below(points):
         assert up["-z"] == [0, 0, -1] and up["y"] == [0, 1, 0]
 
 
-def test_a_wall_is_no_ground():
+def test_wall_is_no_ground():
     assert guess_up_rotation(splats_at(facade() @ Y_DOWN.T)) is None
 
 

@@ -46,17 +46,17 @@ def test_pieces_form_the_tree(leaves, longest):
     assert upper.leaves == len(forest.subtrees) and len(above) == upper.leaves - 1
     of_tree = families(splats, tree)
     result, roots = {}, []
-    for part, own in forest:
-        assert len(part) == len(own) and own.leaves <= longest
-        result |= families(part, own)
-        roots.append(int(part.sh[-1, 0, 0]))
+    for piece, subtree in forest:
+        assert len(piece) == len(subtree) and subtree.leaves <= longest
+        result |= families(piece, subtree)
+        roots.append(int(piece.sh[-1, 0, 0]))
     tags = [*roots, *above.sh[:, 0, 0].astype(int).tolist()]
     for i, pair in enumerate(upper.children):
         result[tags[upper.leaves + i]] = {tags[child] for child in pair}
     assert result == of_tree
     assert tags[-1] == len(tree) - 1  # the root is the last one
     parents = {child: parent for parent, pair in of_tree.items() for child in pair}
-    for root in roots:  # none could be larger
+    for root in roots:  # pieces are as large as possible
         assert root == len(tree) - 1 or tree.leaves_below[parents[root]] > longest
     full, reread = merge_forest(forest)
     assert families(full, reread) == of_tree and reread.parents[-1] == -1

@@ -92,29 +92,29 @@ class Memory:
                 self.columns[name][rows] = splats.extras[name]
         self.columns |= update.columns
 
-    def shown(self, position, pixels):
+    def visible_means(self, position, pixels):
         """Return the means of the splats that a camera sees."""
         weights = CUT.weights(self.means, np.float32(position), FOCAL, self.columns, {}, {"pixels": pixels})
         return self.means[weights > 0]
 
 
-def come_in(pager, memory, position, pixels):
-    """Apply updates until the camera needs no more pages."""
+def load_pages(pager, memory, position, pixels):
+    """Apply updates one by one until the camera needs no more pages."""
     while (update := pager.step(np.array(position), max(FOCAL / pixels, 32))) is not None:
         memory.take(update)
         yield
 
 
-EYES = [(0, 0, 3), (0.5, 0.2, 2), (-8, 8, 1), (7, -7, 0.5), (7, -6, 0.2), (60, 0, 20), (0, 0, 3)]
+POSITIONS = [(0, 0, 3), (0.5, 0.2, 2), (-8, 8, 1), (7, -7, 0.5), (7, -6, 0.2), (60, 0, 20), (0, 0, 3)]
 
 
 def test_sufficient_budget_gives_the_full_cut(truth, path):
     pager = TreeFile(path).pager(10**6)
     memory = Memory(pager)
-    for position in EYES:
+    for position in POSITIONS:
         for pixels in (1.0, 4.0, 30.0):
-            list(come_in(pager, memory, position, pixels))
-            drawn = truth.nodes(memory.shown(position, pixels))
+            list(load_pages(pager, memory, position, pixels))
+            drawn = truth.nodes(memory.visible_means(position, pixels))
             np.testing.assert_array_equal(np.sort(drawn), truth.cut(position, pixels))
 
 
@@ -125,38 +125,38 @@ def test_cuts_are_complete_within_a_budget(truth, path, budget, monkeypatch):
     pager, equal = TreeFile(path).pager(budget), 0
     memory = Memory(pager)
     assert pager.rows <= budget
-    memory.take(pager.step(None, 0.0))  # nothing is there before
-    for position in EYES:
+    memory.take(pager.step(None, 0.0))  # the initial pages
+    for position in POSITIONS:
         for pixels in (30.0, 3.0):
-            for number, _ in enumerate(come_in(pager, memory, position, pixels)):
+            for number, _ in enumerate(load_pages(pager, memory, position, pixels)):
                 assert pager.splats <= budget
                 if number % 5 == 0:
                     for second in (position, (3, 3, 1)):
-                        truth.require_complete(truth.nodes(memory.shown(second, pixels)))
-            drawn = truth.nodes(memory.shown(position, pixels))
+                        truth.require_complete(truth.nodes(memory.visible_means(second, pixels)))
+            drawn = truth.nodes(memory.visible_means(position, pixels))
             truth.require_complete(drawn)
             needed = paging.page_order(pager._index, np.array(position), FOCAL / pixels * 1.001)
             if len(needed) <= budget // SIZE:
                 equal += 1
                 np.testing.assert_array_equal(np.sort(drawn), truth.cut(position, pixels))
-    assert equal or budget < 20_000 or path.stem == "by size"  # where pages are wide
+    assert equal or budget < 20_000 or path.stem == "by size"  # pages sorted by size are wide
 
 
 def test_coarse_pages_load_first_and_old_pages_are_evicted_first(path):
     file = TreeFile(path)
     order = paging.page_order(file.index(), np.array([7, -7, 0.5]), 1000.0)
-    sizes, place = file.index().columns["parent_size"][order], np.arange(len(order))
-    assert np.corrcoef(np.log(np.minimum(sizes, 100)), place)[0, 1] < -0.5
+    sizes, ranks = file.index().columns["parent_size"][order], np.arange(len(order))
+    assert np.corrcoef(np.log(np.minimum(sizes, 100)), ranks)[0, 1] < -0.5
     pager = TreeFile(path).pager(12 * SIZE)
     a, b, c = ((0, 0, 40), 300.0), ((9, 9, 1), 60.0), ((-9, -9, 1), 60.0)
     present = []
     for position, pixels in (a, b, c, a, b):
-        list(come_in(pager, Memory(pager), position, pixels))
+        list(load_pages(pager, Memory(pager), position, pixels))
         present.append(set(np.flatnonzero(pager._slot_of >= 0)))
         assert len(present[-1]) <= 12 and pager.splats <= 12 * SIZE
         needed = paging.page_order(pager.file.index(), np.array(position), max(FOCAL / pixels, 32))
         assert pager.short == (len(needed) > 12)
-    assert present[0] <= present[1]  # there was room
+    assert present[0] <= present[1]  # within the budget
 
 
 def test_thread_reads_requested_pages(truth, path):
@@ -164,16 +164,16 @@ def test_thread_reads_requested_pages(truth, path):
     memory, used = Memory(pager), 0
     pager.start()
     try:
-        for position in EYES[:4]:
+        for position in POSITIONS[:4]:
             pager.ask(by_values.LodQuery("cut", position, FOCAL, (), (("pixels", 1.0),)))
             expected, until = truth.cut(position, 1.0), time.monotonic() + 200
             while not pager.idle and time.monotonic() < until:
                 if (update := pager.take()) is not None:
                     memory.take(update)
                     used += 1
-                    truth.require_complete(truth.nodes(memory.shown(position, 1.0)))
+                    truth.require_complete(truth.nodes(memory.visible_means(position, 1.0)))
                 time.sleep(0.01)
-            np.testing.assert_array_equal(np.sort(truth.nodes(memory.shown(position, 1.0))), expected)
+            np.testing.assert_array_equal(np.sort(truth.nodes(memory.visible_means(position, 1.0))), expected)
             assert used == pager.arrived
     finally:
         pager.stop()
@@ -197,7 +197,7 @@ def test_budgeted_read_gives_a_smaller_tree(truth, path, budget, tmp_path):
     assert 0 < sum(len(level.splats) for level in bundle.levels) <= budget
     write_bundle(tmp_path / "small.ply", bundle)
     choice = BundleSelector(read_bundle(tmp_path / "small.ply"))
-    for position in EYES:
+    for position in POSITIONS:
         for pixels in (1.0, 30.0):
             subset = choice.weights(np.float32(position), FOCAL, {"pixels": pixels}) > 0
             drawn = truth.nodes(choice.splats.means[subset])
@@ -210,7 +210,7 @@ def test_budgeted_read_gives_a_smaller_tree(truth, path, budget, tmp_path):
 
 
 def test_budgeted_read_for_one_camera(truth, path):
-    for position in EYES[-2:]:
+    for position in POSITIONS[-2:]:
         k = FOCAL / 20
         part = TreeFile(path).top(10**6, np.array(position), k)
         assert sum(len(level.splats) for level in part.levels) < 1.8 * LEAVES
@@ -229,47 +229,48 @@ def test_nodes_replace_missing_children():
     }  # fmt: skip
     columns["parent_size"][0] = ABOVE_ROOT
 
-    def found(*rows):
+    def links(*rows):
         current = ResidentTree({name: column[list(rows)] for name, column in columns.items()})
         return [np.array(rows)[item].tolist() for item in current.update(np.arange(len(rows)))]
 
-    assert found(0, 1, 2, 3, 4, 5, 6) == [[0, 1, 3], [0, 1, 2, 3, 4, 5, 6]]
-    assert found(6, 5, 4, 3, 2, 1, 0) == [[3, 1, 0], [6, 5, 4, 3, 2, 1, 0]]
-    assert found(0, 1, 2, 3, 4, 5) == [[0, 1], [0, 1, 2, 3, 4]]
-    assert found(0, 1, 3, 4, 5, 6) == [[1, 3], [0]]
-    assert found(0, 1, 2, 3, 5, 6) == [[0, 3], [0, 1, 2]]
-    assert found(1, 2, 3, 4, 5, 6) == [[1, 3], []]
-    assert found(5, 6) == [[], []]
-    assert found(0) == [[], [0]]
-    assert found(0, 1, 2, 3, 4, 5, 6, 7) == [[0, 1], [0, 1, 2, 3, 4]]  # three children are none
+    assert links(0, 1, 2, 3, 4, 5, 6) == [[0, 1, 3], [0, 1, 2, 3, 4, 5, 6]]
+    assert links(6, 5, 4, 3, 2, 1, 0) == [[3, 1, 0], [6, 5, 4, 3, 2, 1, 0]]
+    assert links(0, 1, 2, 3, 4, 5) == [[0, 1], [0, 1, 2, 3, 4]]
+    assert links(0, 1, 3, 4, 5, 6) == [[1, 3], [0]]
+    assert links(0, 1, 2, 3, 5, 6) == [[0, 3], [0, 1, 2]]
+    assert links(1, 2, 3, 4, 5, 6) == [[1, 3], []]
+    assert links(5, 6) == [[], []]
+    assert links(0) == [[], [0]]
+    # nodes with three children are not linked
+    assert links(0, 1, 2, 3, 4, 5, 6, 7) == [[0, 1], [0, 1, 2, 3, 4]]
 
 
 def test_links_follow_arbitrary_changes(truth):
     """Compare with a walk from each splat to the root, for random contents of memory."""
     rng, splats = np.random.default_rng(3), truth.choice.splats
-    top = np.argsort(-splats.extras["parent_size"], kind="stable")[:600]  # of several ways few go far down
+    top = np.argsort(-splats.extras["parent_size"], kind="stable")[:600]  # large nodes and few leaves
     full = splats.extras | dict(zip("xyz", splats.means.T, strict=True))
     columns = {name: np.zeros(len(top), np.float32) for name in (*CUT.columns, *"xyz")}
-    holds, current, limit = np.full(len(top), -1), ResidentTree(columns), 0
+    node_of_slot, current, limit = np.full(len(top), -1), ResidentTree(columns), 0
     for _ in range(60):
-        places = rng.permutation(len(top))[: rng.integers(1, 200)]
-        free = np.setdiff1d(top, np.delete(holds, places))
-        holds[places] = -1
-        come = rng.permutation(free)[: len(places) - rng.integers(min(len(places), 9))]
-        holds[places[: len(come)]] = come
+        slots = rng.permutation(len(top))[: rng.integers(1, 200)]
+        absent = np.setdiff1d(top, np.delete(node_of_slot, slots))
+        node_of_slot[slots] = -1
+        loaded = rng.permutation(absent)[: len(slots) - rng.integers(min(len(slots), 9))]
+        node_of_slot[slots[: len(loaded)]] = loaded
         for name, column in columns.items():
-            column[places] = 0
-            column[places[: len(come)]] = full[name][come]
-        present = {node: place for place, node in enumerate(holds.tolist()) if node >= 0}
-        children = Counter(truth.parents[node] for node in present)
+            column[slots] = 0
+            column[slots[: len(loaded)]] = full[name][loaded]
+        slot_of_node = {node: slot for slot, node in enumerate(node_of_slot.tolist()) if node >= 0}
+        children = Counter(truth.parents[node] for node in slot_of_node)
         inner, reached = np.zeros((2, len(top)), bool)
-        for node, place in present.items():
-            inner[place] = children[node] == 2
+        for node, slot in slot_of_node.items():
+            inner[slot] = children[node] == 2
             above = truth.parents[node]
-            while above >= 0 and above in present and children[above] == 2:
+            while above >= 0 and above in slot_of_node and children[above] == 2:
                 above = truth.parents[above]
-            reached[place] = above < 0
-        result = current.update(places)
+            reached[slot] = above < 0
+        result = current.update(slots)
         np.testing.assert_array_equal(result[0], inner)
         np.testing.assert_array_equal(result[1], reached)
         limit = max(limit, int(reached.sum()))
@@ -298,8 +299,8 @@ def test_undrawable_splats_leave_no_holes(truth, tmp_path):
     write_bundle(tmp_path / "tree.ply", replace(truth.bundle, levels=[Level(1, above), Level(2, leaves)]))
     pager = TreeFile(tmp_path / "tree.ply").pager(10**6)
     memory = Memory(pager)
-    list(come_in(pager, memory, (0, 0, 3), 1.0))
-    truth.require_complete(truth.nodes(memory.shown((0, 0, 3), 1.0)))
+    list(load_pages(pager, memory, (0, 0, 3), 1.0))
+    truth.require_complete(truth.nodes(memory.visible_means((0, 0, 3), 1.0)))
 
 
 def test_other_rules_and_small_budgets_are_reported(truth, tmp_path):
@@ -320,7 +321,7 @@ def test_other_rules_and_small_budgets_are_reported(truth, tmp_path):
 def test_cut_is_read_from_disk(truth, path, pixels):
     """Complete without a camera; with a camera, all visible splats and few others."""
     file, shares = TreeFile(path), []
-    for position in EYES:
+    for position in POSITIONS:
         choice = by_values.LodQuery("cut", position, FOCAL, (), (("pixels", pixels),))
         result = file.visible(choice)
         expected = truth.cut(position, pixels)
@@ -334,13 +335,13 @@ def test_cut_is_read_from_disk(truth, path, pixels):
         assert set(visible) <= set(expected)
         assert set(expected[camera.sees(truth.choice.splats.means[expected], 0.1)]) <= set(visible)
         shares.append(len(visible) / len(expected))
-    assert min(shares) < 0.75 or pixels > 1 or path.stem == "by size"  # few splats are in wide blocks
+    assert min(shares) < 0.75 or pixels > 1 or path.stem == "by size"  # few blocks are wide
 
 
-def index_of(places, sizes):
+def index_of(positions, sizes):
     """Return an index of pages that are points."""
-    bounds = dict(zip(BOUNDS, [*places.T, *places.T], strict=True))
-    return BlockIndex({1: SIZE * len(places)}, bounds | {"parent_size": sizes})
+    bounds = dict(zip(BOUNDS, [*positions.T, *positions.T], strict=True))
+    return BlockIndex({1: SIZE * len(positions)}, bounds | {"parent_size": sizes})
 
 
 def test_pages_in_view_load_first(truth):
@@ -349,8 +350,8 @@ def test_pages_in_view_load_first(truth):
     direction = np.array([2.0, -1.0, 2.0]) / 3
     direction_to = rng.normal(size=(500, 3))
     direction_to /= np.linalg.norm(direction_to, axis=1, keepdims=True)
-    places = position + 7 * direction_to
-    index = index_of(places, np.full(500, 1e-4))
+    positions = position + 7 * direction_to
+    index = index_of(positions, np.full(500, 1e-4))
     for k, result in ((1e6, 500), (6e4, 0)):
         assert len(paging.page_order(index, position, k, direction)) == result
     ahead = np.degrees(np.arccos(direction_to @ direction)) < 50
@@ -371,4 +372,4 @@ def test_cuts_are_complete_for_every_view_direction(truth, path):
     for direction in ((1, 0, 0), (-1, 0, 0), (0, 1, 0)):
         while (update := pager.step(position, FOCAL, np.array(direction, float))) is not None:
             memory.take(update)
-            truth.require_complete(truth.nodes(memory.shown(position, 1.0)))
+            truth.require_complete(truth.nodes(memory.visible_means(position, 1.0)))

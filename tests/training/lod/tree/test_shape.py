@@ -112,7 +112,7 @@ def test_complete_levels_are_complete_scenes(tmp_path):
     for level in result.levels:
         visible = np.zeros(len(tree), bool)
         visible[level.splats.sh[:, 0, 0].astype(int)] = True
-        covered = visible.copy()  # by itself, or by one above: never by two
+        covered = visible.copy()  # drawn itself or covered by one ancestor
         for layer in tree.layers:
             below = tree.children[layer - tree.leaves]
             assert not (covered[layer][:, None] & visible[below]).any()

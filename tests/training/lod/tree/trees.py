@@ -1,4 +1,4 @@
-"""Trees of splats of any size for tests, from a crude merge of neighbours, with proper sizes."""
+"""Trees of splats for tests: neighbours are merged simply, and sizes give proper cuts."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def tree_of(leaves: Splats) -> Bundle:
         two, new = row[: 2 * pairs].reshape(-1, 2), np.arange(first, first + pairs)
         weight = (opacity * squares)[two]
         weight /= weight.sum(axis=1, keepdims=True)
-        means[new] = np.float32(np.einsum("nt,ntc->nc", weight, means[two]))  # as files have it
+        means[new] = np.float32(np.einsum("nt,ntc->nc", weight, means[two]))  # as in files
         distance = np.linalg.norm(means[two] - means[new][:, None], axis=2)
         squares[new] = np.einsum("nt,nt->n", weight, squares[two] + distance**2 / 3)
         sh[new] = np.einsum("nt,ntkc->nkc", weight, sh[two])

@@ -81,7 +81,7 @@ def test_count_uses_straight_through_gradient(data):
     assert share > target
     assert excess.item() == pytest.approx(9 * (share - target).item() ** 2)
     excess.backward()
-    # d excess / d share times the mean's, times the sigmoid's of the logarithm, by hand
+    # by hand: derivatives of the excess, of the mean and of the sigmoid of the logarithm
     margin = (opacities.detach() / (p.tau * s_v)).log() / p.count_softness
     slope = margin.sigmoid() * (1 - margin.sigmoid()) / p.count_softness / opacities.detach()
     expected = 18 * (share - target) / in_view.sum() * slope * in_view
@@ -100,7 +100,7 @@ def test_initial_decays_follow_importance(data):
     )
     means = clod.model["means"].detach().numpy().copy()
     clod.begin_decay()
-    # those that give most to the pixels of a view stay, as many as views draw 74 % of what they drew
+    # the most important splats remain, so many that views draw 74 % of the splats before
     remaining = torch.from_numpy((means[:, None] == clod.model["means"].detach().numpy()[None]).all(2).any(1))
     views, importance = contribution.views.double(), contribution.total / contribution.views.clamp_min(1)
     assert importance[remaining].min() >= importance[~remaining].max()
@@ -115,11 +115,11 @@ def test_initial_decays_follow_importance(data):
     nearest = torch.from_numpy(np.where(in_view, distances, np.inf).min(1) / clod.reference)
     alpha, sigma = clod.model["opacity_logits"].detach().sigmoid(), clod.sigma.detach()
     subset &= (sigma > 2e-3) & (sigma < 49) & (alpha < 0.989) & (alpha > 2e-4)
-    # from its nearest view a splat looks as before ...
+    # in its nearest view, a splat keeps its opacity
     visible = alpha * torch.exp(-(nearest**2) / (2 * sigma**2))
     assert subset.sum() > 5
     torch.testing.assert_close(visible[subset], initial[remaining].double()[subset], rtol=2e-3, atol=1e-5)
-    # ... and from its mean one it is gone at the scale of its rank
+    # at its mean distance, it vanishes at the scale of its rank
     rank = (torch.argsort(torch.argsort(importance[remaining], descending=True, stable=True)) + 0.5) / int(
         remaining.sum()
     )
@@ -139,7 +139,9 @@ def test_reference_distance(data):
     clod = make(data, reference_quantile=0.9)
     assert clod.reference == pytest.approx(np.quantile(np.concatenate(visible), 0.9), rel=1e-5)
     published = make(data, reference_quantile=0.0)
-    assert published.facts["reference"] == pytest.approx(max(away.max() for away in visible), rel=1e-5)
+    assert published.facts["reference"] == pytest.approx(
+        max(distances.max() for distances in visible), rel=1e-5
+    )
 
 
 def test_published_distances_are_relative_to_the_farthest_splat_in_view(data):
@@ -150,24 +152,24 @@ def test_published_distances_are_relative_to_the_farthest_splat_in_view(data):
     opacity, farthest = clod.model["opacity_logits"].detach().double().sigmoid().numpy(), []
     beyond = []
     for camera in data.train:
-        away = np.linalg.norm(means - camera.center, axis=1)
-        farthest.append(away[camera.sees(means, near=data.near)].max())
-        beyond.append(away.max() - farthest[-1])
-        falloff = np.exp(-((away / farthest[-1] * 2.5) ** 2) / (2 * sigma.clip(0) ** 2 + 1e-8))
+        distances = np.linalg.norm(means - camera.center, axis=1)
+        farthest.append(distances[camera.sees(means, near=data.near)].max())
+        beyond.append(distances.max() - farthest[-1])
+        falloff = np.exp(-((distances / farthest[-1] * 2.5) ** 2) / (2 * sigma.clip(0) ** 2 + 1e-8))
         actual, _, drawn = clod.attenuate(camera, 2.5)
         np.testing.assert_allclose(actual.detach(), falloff, rtol=1e-3, atol=1e-7)
         assert (drawn.numpy() != (opacity * falloff > 2.5 / 255)).sum() <= 1
     assert max(beyond) > 0  # splats outside the view do not count
-    away = np.linalg.norm(level.splats.means - data.train[0].center, axis=1)
+    distances = np.linalg.norm(level.splats.means - data.train[0].center, axis=1)
     rule, values = rules()["decay"], {"s_v": 2.5, "at_most": 0}
     stored = level.splats.extras["sigma_d"]
     columns = {"sigma_d": stored, "opacity": np.ones(len(stored), np.float32)}
-    assert clod.facts == make(data, preset="paper").facts  # so that the cells of a divided run agree
+    assert clod.facts == make(data, preset="paper").facts  # so that all cells of a run agree
     facts = collect_facts(rule, clod.facts, [(1, {})], 1)
     weights = rule.weights(level.splats.means, data.train[0].center, 1.0, columns, facts, values)
     trained_sigma = stored.astype(float) * clod.facts["reference"] / np.mean(farthest)
     np.testing.assert_allclose(np.sort(trained_sigma), np.sort(sigma), rtol=1e-5)
-    expected = np.exp(-((away / np.mean(farthest) * 2.5) ** 2) / (2 * trained_sigma.clip(0) ** 2 + 1e-8))
+    expected = np.exp(-((distances / np.mean(farthest) * 2.5) ** 2) / (2 * trained_sigma.clip(0) ** 2 + 1e-8))
     np.testing.assert_allclose(weights, np.where(expected > 2.5 / 255, expected, 0), rtol=1e-3, atol=1e-6)
 
 
@@ -177,10 +179,10 @@ def test_published_decay_halves_opacities_at_the_middle_scale(data):
     trained(clod)
     clod.begin_decay()
     means = clod.model["means"].detach().numpy()
-    away = np.stack([np.linalg.norm(means - camera.center, axis=1) for camera in data.train], 1)
+    distances = np.stack([np.linalg.norm(means - camera.center, axis=1) for camera in data.train], 1)
     in_view = np.stack([camera.sees(means, near=data.near) for camera in data.train], 1)
-    farthest = np.mean([away[seen, view].max() for view, seen in enumerate(in_view.T)])
-    distance = (away * in_view).sum(1) / in_view.sum(1).clip(1) / farthest
+    farthest = np.mean([distances[visible, view].max() for view, visible in enumerate(in_view.T)])
+    distance = (distances * in_view).sum(1) / in_view.sum(1).clip(1) / farthest
     subset = in_view.any(1)
     falloff = np.exp(-5 * distance[subset] ** 2 / (2 * clod.sigma.detach().numpy()[subset] ** 2))
     assert subset.sum() > 20
@@ -202,15 +204,15 @@ def test_published_count_trains_decays_only(data, preset):
     trained(clod, 13)
     camera = data.train[0]
     _, attenuated, drawn = clod.attenuate(camera, 5.0)
-    everything = torch.ones_like(drawn)
+    all_splats = torch.ones_like(drawn)
     clod.model.adam.zero_grad()
-    clod.count_excess(ClodDrawing(None, 5.0, attenuated, everything, everything)).backward()
+    clod.count_excess(ClodDrawing(None, 5.0, attenuated, all_splats, all_splats)).backward()
     assert clod.model["sigma_d"].grad.abs().sum() > 0
     gradient = clod.model["opacity_logits"].grad
     assert (gradient is None or not gradient.any()) == (preset == "paper")
 
 
-def test_without_count_weight_only_the_images_count(data):
+def test_loss_without_count_weight_is_that_of_the_images(data):
     """Table 2 without L_reg: the loss is the sum of both images' losses."""
     clod = make(data, preset="paper", count_weight=0.0)
     trained(clod, 13)
@@ -241,7 +243,7 @@ def test_published_preset_keeps_undrawn_splats(data):
         initial = len(clod.model)
         with torch.no_grad():
             clod.model["sigma_d"][:5] = -1.0  # never drawn again
-        clod.train_step(17)  # the 18th, when removal is due
+        clod.train_step(17)  # step 18 removes splats
         assert (len(clod.model) == initial) == remaining
 
 
@@ -307,9 +309,9 @@ def test_base_starts_decay_without_new_splats(data, preset):
 def test_resume_keeps_decay(data):
     clod = make(data)
     trained(clod, 15)
-    again = make(data)
-    again.load_state_dict(deepcopy(clod.state_dict()))
-    assert clod.train_step(15).loss() == again.train_step(15).loss()
+    resumed = make(data)
+    resumed.load_state_dict(deepcopy(clod.state_dict()))
+    assert clod.train_step(15).loss() == resumed.train_step(15).loss()
 
 
 def test_invalid_values_raise():

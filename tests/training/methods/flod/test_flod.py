@@ -72,7 +72,7 @@ def test_gamma_is_clamped(data, s_min_1, expected):
 
 @pytest.mark.slow
 def test_splats_respect_minimum_size_of_ordered_levels(data):
-    flod, finished = make(data, footprint=40.0), []  # larger than the points' distances: it binds
+    flod, finished = make(data, footprint=40.0), []  # larger than the distances of the points
     for step in range(flod.steps):
         assert flod.level_at(step) == step // 6 + 1
         flod.train_step(step)
@@ -94,23 +94,23 @@ def test_image_is_continuous_between_levels(data):
 
     for step in range(6):
         flod.train_step(step)
-    old_min = render_level(1)
+    before = render_level(1)
     assert len(flod.levels_after(5)) == 1
-    torch.testing.assert_close(render_level(2), old_min, atol=2e-5, rtol=0)
-    # and it is the new constraint that is in force: the old one would draw larger splats
-    assert (render_level(1) - old_min).abs().max() > 0.01
+    torch.testing.assert_close(render_level(2), before, atol=2e-5, rtol=0)
+    # with the constraint of level 1, the changed splats are larger
+    assert (render_level(1) - before).abs().max() > 0.01
 
 
 def test_points_rejoin_at_next_level(data):
     flod = make(data, min_opacity=0.0, densify_interval=100)
     points = torch.from_numpy(np.unique(data.scene.points, axis=0))
-    flod.model.keep(torch.arange(len(points)) % 2 == 0)  # as if pruned
-    stayed = flod.model["means"].detach().clone()
+    flod.model.keep(torch.arange(len(points)) % 2 == 0)  # simulate pruning
+    remaining = flod.model["means"].detach().clone()
     flod.start_level(2)
-    distances = torch.cdist(points, stayed).min(1).values
+    distances = torch.cdist(points, remaining).min(1).values
     expected = points[distances >= flod.s_min[1] / 2]
     assert 0 < len(expected) < len(points)
-    assert torch.equal(flod.model["means"].detach(), torch.cat([stayed, expected]))
+    assert torch.equal(flod.model["means"].detach(), torch.cat([remaining, expected]))
 
 
 def test_rejoining_points_are_sampled_to_budget(data):
@@ -124,16 +124,16 @@ def test_rejoining_points_are_sampled_to_budget(data):
         assert len(flod.model) == flod.budget(2) == 40
         models.append(flod.model["means"].detach())
     assert torch.equal(*models)
-    join_levels = {tuple(mean) for mean in models[0][10:].tolist()}
-    assert len(join_levels) == 30 and join_levels <= {tuple(point) for point in np.float32(points).tolist()}
-    assert {tuple(point) for point in np.float32(points[10:40]).tolist()} != join_levels
+    joined = {tuple(mean) for mean in models[0][10:].tolist()}
+    assert len(joined) == 30 and joined <= {tuple(point) for point in np.float32(points).tolist()}
+    assert {tuple(point) for point in np.float32(points[10:40]).tolist()} != joined
 
 
 def test_initial_points_are_limited_to_max_splats(data):
     flod = make(data, max_splats=20)
     assert len(flod.model) == len(flod.points) == 20
-    everything = {tuple(point) for point in data.scene.points.tolist()}
-    assert {tuple(point) for point in flod.points.tolist()} < everything
+    all_points = {tuple(point) for point in data.scene.points.tolist()}
+    assert {tuple(point) for point in flod.points.tolist()} < all_points
 
 
 def test_overlap_pruning_equals_brute_force():
@@ -146,12 +146,12 @@ def test_overlap_pruning_equals_brute_force():
 
 def test_overlap_pruning_skips_last_level(data):
     flod = make(data, overlap_interval=1, s_min_1=1e6, steps=[1, 1, 4], densify_until=1.0)
-    with pytest.raises(LodgsError, match="footprint"):  # nothing is a million apart: level 1 loses all
+    with pytest.raises(LodgsError, match="footprint"):  # prunes all splats of level 1
         flod.train_step(0)
     last = make(data, overlap_interval=1, levels=1, steps=[4], densify_until=1.0)
-    old_min = len(last.model)
+    count = len(last.model)
     last.train_step(0)
-    assert len(last.model) == old_min
+    assert len(last.model) == count
 
 
 @pytest.mark.parametrize("margin", [0.0, 0.5])
@@ -164,10 +164,10 @@ def test_levels_respect_their_budgets(data, margin):
     for step in range(flod.steps):
         flod.train_step(step)
         counts += [len(level.splats) for level in flod.levels_after(step)]
-    # 200 x 0.5^2 = 50 is fewer than the 60 points to begin with; then 100 and 200 are filled to the last
+    # 200 x 0.5^2 = 50 is below the 60 initial points; the budgets 100 and 200 are reached
     if not margin:
         assert counts == [60, 100, 200]
-    # a tenth of each budget is for what continues photographs
+    # a tenth of each budget is reserved for margins
     assert counts[0] <= 65 and 90 <= counts[1] <= 100 and 180 <= counts[2] <= 200
 
 
@@ -194,108 +194,112 @@ def test_duplicate_points_train_and_too_few_raise(data, tiny_scene, tmp_path):
         make(TrainingData(few))
 
 
-def is_finishing(data, **values) -> tuple[Method, list[Level]]:
+def train_until_finishing(data, **values) -> tuple[Method, list[Level]]:
     """Return a run before its first finishing step, and its completed levels."""
     values = {"finish_share": 0.5, "footprint": 40.0, "random_background": False, **values}
-    flod, handed = make(data, **values), []
+    flod, levels = make(data, **values), []
     for step in range(18):
         flod.train_step(step)
-        handed += flod.levels_after(step)
-    return flod, handed
+        levels += flod.levels_after(step)
+    return flod, levels
 
 
 def test_finishing_starts_from_completed_levels(data):
-    flod, handed = is_finishing(data, levels=4, steps=[3, 5, 5, 5])
-    assert flod.steps == 27 and [level.number for level in handed] == [1, 2, 3, 4]
-    again = finish.split_levels(flod.model, flod.s_min)
-    assert [level.number for level in again] == [2, 3, 4], "the finest and the two before it"
-    for old_min, new_min in zip(handed[1:], again, strict=True):
-        assert old_min.facts == new_min.facts
+    flod, completed = train_until_finishing(data, levels=4, steps=[3, 5, 5, 5])
+    assert flod.steps == 27 and [level.number for level in completed] == [1, 2, 3, 4]
+    starting = finish.split_levels(flod.model, flod.s_min)
+    assert [level.number for level in starting] == [2, 3, 4], "the three finest levels"
+    for level, starting_level in zip(completed[1:], starting, strict=True):
+        assert level.facts == starting_level.facts
         for name in NAMES:
-            np.testing.assert_array_equal(getattr(old_min.splats, name), getattr(new_min.splats, name))
+            np.testing.assert_array_equal(getattr(level.splats, name), getattr(starting_level.splats, name))
 
 
 def projected_area(scales: np.ndarray) -> np.ndarray:
     """Return the root mean square area (N,) of projections of ellipsoids (N, 3) in all directions."""
     bases, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(300, 3, 2)))
-    squares = [np.linalg.det(np.einsum("mki,k,mkj->mij", bases, first**2, bases)).mean() for first in scales]
+    squares = [np.linalg.det(np.einsum("mki,k,mkj->mij", bases, axes**2, bases)).mean() for axes in scales]
     return np.sqrt(squares)
 
 
 def test_fine_levels_restart_from_important_splats(data):
     """The reference rasterizer gives the weights; views include the margins."""
-    flod, handed = is_finishing(data, footprint=1.0, drawn=0.6, margin=0.25)
-    finest, (*coarser, last) = handed[-1].splats, finish.split_levels(flod.model, flod.s_min)
+    flod, completed = train_until_finishing(data, footprint=1.0, drawn=0.6, margin=0.25)
+    finest, (*coarser, last) = completed[-1].splats, finish.split_levels(flod.model, flod.s_min)
     assert_same(last.splats, finest)
-    wide = [camera.widened(0.25) for camera in data.train]
+    widened = [camera.widened(0.25) for camera in data.train]
     shares = contributions(
-        Gaussians.of(finest), wide, near=data.near, antialias=True, backend="reference"
+        Gaussians.of(finest), widened, near=data.near, antialias=True, backend="reference"
     ).largest.numpy()
     assert [level.number for level in coarser] == [1, 2]
     for level in coarser:
-        places = {tuple(mean): row for row, mean in enumerate(finest.means.tolist())}
-        rows = [places[tuple(mean)] for mean in level.splats.means.tolist()]  # each is one of the finest's
+        row_of_mean = {tuple(mean): row for row, mean in enumerate(finest.means.tolist())}
+        rows = [row_of_mean[tuple(mean)] for mean in level.splats.means.tolist()]
         assert len(set(rows)) == len(rows)
         assert shares[rows].min() >= np.delete(shares, rows).max() - 1e-4
         np.testing.assert_array_equal(level.splats.sh, finest.sh[rows])
         scales = np.exp(level.splats.log_scales)
         assert scales.min() >= level.facts["s_min"] * (1 - 1e-6)
-        free = scales > level.facts["s_min"] * (1 + 1e-6)
-        larger = (scales / np.exp(finest.log_scales[rows]))[
-            free
-        ]  # a block takes over the room of what it lost
-        assert larger.min() >= 1 - 1e-6 and 1.02 < larger.max() <= 2 + 1e-6
-        assert len(np.unique(larger.round(3))) <= -(-len(finest) // SIZE)
-    first, two = (len(level.splats) for level in coarser)
-    assert first == pytest.approx(0.8 * two, abs=1)
+        unconstrained = scales > level.facts["s_min"] * (1 + 1e-6)
+        # the remaining splats of a block grow to cover the area of removed ones
+        enlargement = (scales / np.exp(finest.log_scales[rows]))[unconstrained]
+        assert enlargement.min() >= 1 - 1e-6 and 1.02 < enlargement.max() <= 2 + 1e-6
+        assert len(np.unique(enlargement.round(3))) <= -(-len(finest) // SIZE)
+    first, second = (len(level.splats) for level in coarser)
+    assert first == pytest.approx(0.8 * second, abs=1)
 
 
 @pytest.mark.nightly
 def test_enlarged_splats_become_fainter(data):
     """Applies to the antialiasing filter; without it small splats are already drawn enlarged."""
-    flod, handed = is_finishing(data, footprint=1.0, drawn=0.6)
-    levels = {level.number: from_splats(level.splats, 3, torch.device("cpu")) for level in handed}
+    flod, completed = train_until_finishing(data, footprint=1.0, drawn=0.6)
+    levels = {level.number: from_splats(level.splats, 3, torch.device("cpu")) for level in completed}
     finest = levels[3]
     finest["log_scales"] -= torch.tensor([6.0, 5.0, 7.0])
     for antialias in (True, False):
         p = replace(flod.parameters, antialias=antialias)
-        anew = finish.restart_levels(levels, [1, 2], flod.s_min, data, p, flod.controls["gamma"], "cpu")[2]
-        places = {tuple(mean): row for row, mean in enumerate(finest["means"].tolist())}
-        rows = [places[tuple(mean)] for mean in anew["means"].tolist()]
-        own, raised = finest["log_scales"][rows].exp().numpy(), anew["log_scales"].exp().numpy()
-        ratio = (anew["opacity_logits"].sigmoid() / finest["opacity_logits"][rows].sigmoid()).numpy()
+        restarted = finish.restart_levels(levels, [1, 2], flod.s_min, data, p, flod.controls["gamma"], "cpu")[
+            2
+        ]
+        row_of_mean = {tuple(mean): row for row, mean in enumerate(finest["means"].tolist())}
+        rows = [row_of_mean[tuple(mean)] for mean in restarted["means"].tolist()]
+        trained_scales, enlarged_scales = (
+            finest["log_scales"][rows].exp().numpy(),
+            restarted["log_scales"].exp().numpy(),
+        )
+        ratio = (restarted["opacity_logits"].sigmoid() / finest["opacity_logits"][rows].sigmoid()).numpy()
         if not antialias:
             np.testing.assert_array_equal(ratio, 1)
             continue
-        expected = projected_area(own) / projected_area(raised)
+        expected = projected_area(trained_scales) / projected_area(enlarged_scales)
         assert np.median(expected) < 0.1
-        # but for what a block takes over of the room of those that went, at most four times the area
-        taken, block = ratio / expected, np.argsort(spatial_order(finest["means"].numpy()))[rows] // SIZE
+        # the remaining splats of a block also cover the area of removed ones, at most four times theirs
+        growth, block = ratio / expected, np.argsort(spatial_order(finest["means"].numpy()))[rows] // SIZE
         for number in set(block):
-            assert np.ptp(taken[block == number]) < 0.05 * taken[block == number].max() <= 0.25
+            assert np.ptp(growth[block == number]) < 0.05 * growth[block == number].max() <= 0.25
 
 
 @pytest.mark.parametrize("drawn", [0.5, 0.8])
 def test_views_by_distance_respect_drawn_limit(data, drawn):
-    flod, handed = is_finishing(data, footprint=1.0, drawn=drawn)
+    flod, completed = train_until_finishing(data, footprint=1.0, drawn=drawn)
     levels = finish.split_levels(flod.model, flod.s_min)
     bundle, by_distance, finest = Bundle("flod", levels, "bands"), 0, 0
     for camera in data.train:
         values = resolve_controls(bundle, flod.controls)
-        shown, _ = select(bundle, camera.center, camera.focal, values)
-        by_distance += camera.sees(shown.means, data.near).sum()
-        finest += camera.sees(handed[-1].splats.means, data.near).sum()
+        selected, _ = select(bundle, camera.center, camera.focal, values)
+        by_distance += camera.sees(selected.means, data.near).sum()
+        finest += camera.sees(completed[-1].splats.means, data.near).sum()
     assert 0.9 * drawn < by_distance / finest <= drawn
 
 
-@pytest.mark.parametrize("alone", [0.0, 1.0])
-def test_finishing_steps_render_rule_selection(data, alone):
-    flod, handed = is_finishing(data, finish_alone=alone)
-    bundle, visible = Bundle("flod", handed, "bands"), set()
+@pytest.mark.parametrize("alone_share", [0.0, 1.0])
+def test_finishing_steps_render_rule_selection(data, alone_share):
+    flod, completed = train_until_finishing(data, finish_alone=alone_share)
+    bundle, gammas = Bundle("flod", completed, "bands"), set()
     for step in range(18, 27):
         view, values = flod.choose_view(step), flod._finishing_values(step)
-        assert (values["first"] == values["last"]) == bool(alone)
-        visible.add(values["gamma"])
+        assert (values["first"] == values["last"]) == bool(alone_share)
+        gammas.add(values["gamma"])
         assert 1 / 1.3 <= values["gamma"] / flod.controls["gamma"] <= 1.3
         splats, weights = select(bundle, view.camera.center, view.camera.focal, values)
         with torch.no_grad():
@@ -304,37 +308,39 @@ def test_finishing_steps_render_rule_selection(data, alone):
                 Gaussians.of(splats), view.camera, near=data.near, sh_degree=flod.sh_degree(step),
                 antialias=True,
             )  # fmt: skip
-        assert weights is None and 0 < len(splats) < sum(len(level.splats) for level in handed)
+        assert weights is None and 0 < len(splats) < sum(len(level.splats) for level in completed)
         torch.testing.assert_close(drawn, expected.image)
-    nearest = {flod._finishing_values(step)["last"] for step in range(18, 60)}
-    assert len(visible) == 9 and nearest == ({1, 2, 3} if alone else {3})
+    last_levels = {flod._finishing_values(step)["last"] for step in range(18, 60)}
+    assert len(gammas) == 9 and last_levels == ({1, 2, 3} if alone_share else {3})
 
 
 def test_finest_level_is_rendered_alone_twice_as_often(data):
-    flod, _ = is_finishing(data)
+    flod, _ = train_until_finishing(data)
     rng = np.random.default_rng(0)
     values = [finish.random_values(rng, 1.0, flod.model, 0.5) for _ in range(8000)]
-    alone = [item["last"] for item in values if item["first"] == item["last"]]
-    together = {(item["first"], item["last"]) for item in values if item["first"] != item["last"]}
-    assert together == {(1, 3)}
-    assert len(alone) / 8000 == pytest.approx(0.5, abs=0.03)
-    assert [alone.count(n) / len(alone) for n in (1, 2, 3)] == pytest.approx([0.25, 0.25, 0.5], abs=0.03)
+    alone_levels = [item["last"] for item in values if item["first"] == item["last"]]
+    ranges = {(item["first"], item["last"]) for item in values if item["first"] != item["last"]}
+    assert ranges == {(1, 3)}
+    assert len(alone_levels) / 8000 == pytest.approx(0.5, abs=0.03)
+    assert [alone_levels.count(n) / len(alone_levels) for n in (1, 2, 3)] == pytest.approx(
+        [0.25, 0.25, 0.5], abs=0.03
+    )
 
 
 def test_finishing_keeps_minimum_sizes_and_counts(data):
-    flod, handed = is_finishing(data, finish_alone=1.0, finish_share=1.0)
+    flod, completed = train_until_finishing(data, finish_alone=1.0, finish_share=1.0)
     for step in range(18, 36):
         flod.train_step(step)
         final = flod.levels_after(step)
         assert bool(final) == (step == 35) and flod.level_at(step) == 3
-    for old_min, new_min in zip(handed, final, strict=True):
-        assert (old_min.number, len(old_min.splats), old_min.facts) == (
-            new_min.number,
-            len(new_min.splats),
-            new_min.facts,
+    for level, finished_level in zip(completed, final, strict=True):
+        assert (level.number, len(level.splats), level.facts) == (
+            finished_level.number,
+            len(finished_level.splats),
+            finished_level.facts,
         )
-        assert not np.array_equal(old_min.splats.sh, new_min.splats.sh)
-        assert np.exp(new_min.splats.log_scales).min() >= new_min.facts["s_min"] * (1 - 1e-6)
+        assert not np.array_equal(level.splats.sh, finished_level.splats.sh)
+        assert np.exp(finished_level.splats.log_scales).min() >= finished_level.facts["s_min"] * (1 - 1e-6)
 
 
 def test_single_level_has_no_finishing(data):
@@ -347,7 +353,7 @@ def test_resume_is_bit_identical(data, check_resumed):
     check_resumed(lambda: make(data, finish_share=0.5, footprint=1.0), 8, 18, 21)
 
 
-# -- some of the levels -----------------------------------------------------
+# -- runs of some levels ----------------------------------------------------
 
 
 def trained(flod) -> list[Level]:
@@ -372,9 +378,9 @@ def test_coarse_levels_alone_equal_full_run(data):
     for step in range(9):
         full_run.train_step(step)
         for level in full_run.levels_after(step):
-            alone = levels.pop(0)
-            assert (alone.number, alone.facts) == (level.number, level.facts)
-            assert_same(alone.splats, level.splats)
+            coarse_level = levels.pop(0)
+            assert (coarse_level.number, coarse_level.facts) == (level.number, level.facts)
+            assert_same(coarse_level.splats, level.splats)
     assert not levels and coarse.controls == full_run.controls
 
 
@@ -394,11 +400,11 @@ def test_fine_levels_continue_from_coarse_level(data):
     drawn = fine.model["log_scales"].detach().exp().numpy() + fine.s_min[2]
     np.testing.assert_allclose(drawn, allowed, rtol=1e-5)
     assert [fine.level_at(step) for step in (0, 5, 6, 12)] == [3, 3, 4, 4]
-    assert fine.sh_degree(0) == 9 // 3, "harmonics that have joined stay"
+    assert fine.sh_degree(0) == 9 // 3, "the degree of harmonics continues"
     full_run = make(data, **values, finish_share=0.2)
     assert [fine.shrink(step) for step in range(13)] == [full_run.shrink(step) for step in range(9, 22)]
     levels = trained(fine)
-    assert [level.number for level in levels] == [3, 4, 2, 3, 4], "the one before them is finished with them"
+    assert [level.number for level in levels] == [3, 4, 2, 3, 4], "finishing steps include level 2"
     assert [level.facts["s_min"] for level in levels[:2]] == full_run.s_min[2:]
 
 

@@ -43,13 +43,13 @@ def error(flod, splats, factor: int = 1) -> float:
 
 def test_finest_level_is_first_after_previews(data):
     flod = make(data, free_depth=0.0, largest=0.0)
-    handed = [(step, trained, level.number, len(level.splats)) for step, trained, level in train(flod)]
-    # the finest has 60 - 10 - 8 steps; a third and two thirds of them
-    assert [entry[:3] for entry in handed] == [
+    completed = [(step, trained, level.number, len(level.splats)) for step, trained, level in train(flod)]
+    # the finest level has 60 - 10 - 8 steps, with previews after a third and two thirds
+    assert [entry[:3] for entry in completed] == [
         *((14, 3, 1), (28, 3, 2), (42, 3, 3), (52, 2, 2)),
-        *((60, 1, number) for number in (1, 2, 3)),  # again, with their distances
+        *((60, 1, number) for number in (1, 2, 3)),  # final levels with distances
     ]
-    coarse, middle, finest = (entry[3] for entry in handed[4:])
+    coarse, middle, finest = (entry[3] for entry in completed[4:])
     assert middle == round(finest / 2) and coarse == round(middle / 2)
 
 
@@ -64,17 +64,17 @@ def test_refined_levels_beat_merge(data):
 
 
 def test_merge_drops_invisible_splats(data):
-    """Splats that no training view sees take no room in the second finest level."""
+    """The second finest level has no splats that no training view sees."""
     flod = make(data, margin=0.0, steps=[2, 2, 2], refine_steps=1)
     rows = flod.model.read_rows(torch.arange(20))
-    behind = torch.tensor(
+    behind_cameras = torch.tensor(
         np.mean([c.center - 50 * c.world_to_camera[2, :3] for c in flod.data.train], axis=0)
     )
-    flod.model.append(rows | {"means": rows["means"] * 0.01 + behind.float()})
+    flod.model.append(rows | {"means": rows["means"] * 0.01 + behind_cameras.float()})
     count = len(flod.model)
     flod.start_level(2)
     assert len(flod.model) == round(count / 2)
-    assert (flod.model["means"] - behind).norm(dim=1).min() > 1
+    assert (flod.model["means"] - behind_cameras).norm(dim=1).min() > 1
 
 
 def test_refinement_starts_with_small_images(data):
@@ -96,19 +96,19 @@ def test_refinement_has_no_dropout(data):
 
 def test_finishing_steps_keep_all_merged_splats(data):
     flod = make(data, finish_share=0.2, free_depth=0.0, largest=0.0)
-    handed = [(step, level.number, len(level.splats)) for step, _, level in train(flod)]
-    assert flod.steps == 63, "a third as many as refine the second finest level"
-    assert [entry[:2] for entry in handed[-3:]] == [(63, 1), (63, 2), (63, 3)]
-    counts = {number: count for _, number, count in handed[:-3]}
-    assert {number: count for _, number, count in handed[-3:]} == counts
+    completed = [(step, level.number, len(level.splats)) for step, _, level in train(flod)]
+    assert flod.steps == 63, "a third of the steps that refine the second finest level"
+    assert [entry[:2] for entry in completed[-3:]] == [(63, 1), (63, 2), (63, 3)]
+    counts = {number: count for _, number, count in completed[:-3]}
+    assert {number: count for _, number, count in completed[-3:]} == counts
 
 
 def test_switches_have_least_error_within_the_budget():
     rng = np.random.default_rng(1)
     errors = np.sort(rng.uniform(1, 2, (5, 3)))[:, ::-1]
     counts = np.sort(rng.uniform(0, 1, (5, 3)))
-    least, *_, most = counts.sum(0)
-    for limit in np.linspace(least, most, 6):
+    min_count, *_, max_count = counts.sum(0)
+    for limit in np.linspace(min_count, max_count, 6):
         choices = {}
         for fine in range(6):
             for coarse in range(fine, 6):
@@ -117,7 +117,9 @@ def test_switches_have_least_error_within_the_budget():
                 if splats <= limit + 1e-9:
                     choices[coarse, fine] = error
         assert tuple(choose_switches(errors, counts, limit + 1e-9)) == min(choices, key=choices.__getitem__)
-    assert choose_switches(errors, counts, least) == [0, 0] and choose_switches(errors, counts, most) == [
+    assert choose_switches(errors, counts, min_count) == [0, 0] and choose_switches(
+        errors, counts, max_count
+    ) == [
         5,
         5,
     ]

@@ -64,7 +64,7 @@ def test_smallest_log_scale(s_min):
 
 
 def test_image_is_continuous_between_levels(data):
-    """Eq. 5: with looks of their own, Gaussians keep every scale; new anchors at points are faint."""
+    """Eq. 5: Gaussians with own looks keep all scales; new anchors at points are faint."""
     method = make(data, steps=[6, 4, 4], max_splats=0, least_weight=0.0)
     trained(method, 5)
     method.train_step(5)
@@ -83,8 +83,8 @@ def test_image_is_continuous_between_levels(data):
     )
 
 
-def test_disabled_gaussians_start_anew_in_the_next_level(data):
-    """They would otherwise keep the voxel of their anchor from splats of all finer levels."""
+def test_disabled_gaussians_restart_in_the_next_level(data):
+    """Otherwise the voxel of their anchor would remain empty in all finer levels."""
     method = make(data, steps=[6, 4, 4])
     trained(method, 5)
     method.train_step(5)
@@ -134,7 +134,7 @@ def test_levels_respect_their_budgets(data):
     for number in (2, 3):
         method.start_level(number)
         counts.append(len(method.model))
-    assert counts[0] <= 10 and counts[1] == 20 and counts[2] == 40  # 30, 60 and 120 Gaussians of 3 each
+    assert counts[0] <= 10 and counts[1] == 20 and counts[2] == 40  # 3 Gaussians per anchor: 30, 60 and 120
 
 
 def test_schedule_restarts_at_each_level(data):

@@ -31,9 +31,7 @@ def create_level(means, log_scale=-3.0) -> IndexedLevel:
 
 
 def test_chunk_count():
-    """The farthest camera is at distance 6 from the mean: 4 / d_1 * 6 (Eq. 5), limited to the number of
-    cameras.
-    """
+    """Eq. 5: 4 / d_1 * 6, as the farthest camera is at distance 6 from the mean; at most one per camera."""
     centers = np.array([[x, 0, 0] for x in np.linspace(-6, 6, 31)])
     assert chunks.chunk_count(centers, 2.0) == 12
     assert chunks.chunk_count(centers, 2.1) == 12  # 11.4
@@ -43,12 +41,12 @@ def test_chunk_count():
 
 def test_chunk_centres_and_radii():
     """Two clusters and a distant camera: centres are means, radii reach the next centre."""
-    places = np.array([[0, 0, 0], [2, 0, 0], [10, 0, 0], [12, 0, 0], [40, 0, 0]], float)
-    centres, radii = chunks.place_chunks(places, 3, 0)
+    positions = np.array([[0, 0, 0], [2, 0, 0], [10, 0, 0], [12, 0, 0], [40, 0, 0]], float)
+    centres, radii = chunks.place_chunks(positions, 3, 0)
     order = np.argsort(centres[:, 0])
     np.testing.assert_allclose(centres[order, 0], [1, 11, 40])
     np.testing.assert_allclose(radii[order], [10, 10, 29])
-    first, reach = chunks.place_chunks(places, 1, 0)
+    first, reach = chunks.place_chunks(positions, 1, 0)
     np.testing.assert_allclose(first, [[12.8, 0, 0]])
     np.testing.assert_allclose(reach, [27.2])  # to the farthest camera
 
@@ -66,24 +64,26 @@ def test_hidden_splats_are_not_in_a_set():
     wall = np.stack([0 * y + 2, y, z], axis=1)
     hidden, visible = [[2.5, 0, 0], [2.4, 0.3, 0.1]], [[1.5, 0, 0], [-2, 0, 0]]
     level = create_level(np.concatenate([wall, hidden, visible]), log_scale=np.log(0.12))
-    ahead = Camera("", 64, 64, 60.0, 60.0, 32.0, 32.0, look_at(np.zeros(3), np.array([1.0, 0, 0]), (0, 0, 1)))
+    camera = Camera(
+        "", 64, 64, 60.0, 60.0, 32.0, 32.0, look_at(np.zeros(3), np.array([1.0, 0, 0]), (0, 0, 1))
+    )
     rows = {1: np.arange(len(wall) + 4, dtype=np.int32)}
-    actual = chunks.prune_invisible({1: level}, rows, [ahead], 0.005, 0.1, "cpu")[1]
+    actual = chunks.prune_invisible({1: level}, rows, [camera], 0.005, 0.1, "cpu")[1]
     count = len(wall)
     assert not {count, count + 1} & set(actual) and count + 2 in actual
-    assert count + 3 not in actual  # behind the eye
-    around = chunks.turn_cameras([ahead] * 8, np.random.default_rng(0))
-    assert len(around) == 32 and all(np.allclose(view.center, 0) for view in around)
-    actual = chunks.prune_invisible({1: level}, rows, [ahead, *around], 0.005, 0.1, "cpu")[1]
+    assert count + 3 not in actual  # behind the camera
+    turned = chunks.turn_cameras([camera] * 8, np.random.default_rng(0))
+    assert len(turned) == 32 and all(np.allclose(view.center, 0) for view in turned)
+    actual = chunks.prune_invisible({1: level}, rows, [camera, *turned], 0.005, 0.1, "cpu")[1]
     assert not {count, count + 1} & set(actual) and {count + 2, count + 3} <= set(actual)
 
 
 def make(data, **values):
-    distances = {
+    parameters = {
         "steps": 8, "densify_until": 0.4, "prune_interval": 6, "tune_steps": 2, "margin": 0.0, "chunks": 3,
         "distances": [1.6, 0.8, 0.0], **values,
     }  # fmt: skip
-    return create("lodge", data, override(method_info("lodge").preset("draft"), distances), 0, "cpu")
+    return create("lodge", data, override(method_info("lodge").preset("draft"), parameters), 0, "cpu")
 
 
 def trained(lodge, begin=0, until=None):
@@ -97,7 +97,7 @@ def trained(lodge, begin=0, until=None):
 
 def test_last_steps_compute_chunks_and_return_all_levels(data):
     lodge = make(data)
-    assert lodge.steps == 8 + 2 * 2 * 2  # until it is known where the chunks are
+    assert lodge.steps == 8 + 2 * 2 * 2  # the steps of chunks are added once chunks exist
     levels = trained(lodge)
     assert lodge.steps == 16 + 3 and lodge.stage(17) == "chunk 2 of 3"
     assert [level.number for level in levels] == [3, 2, 1, 1, 2, 3]
@@ -120,8 +120,10 @@ def test_sets_without_visibility_follow_distances(data):
     ends = {1: (1.6, np.inf), 2: (0.8, 1.6), 3: (0.0, 0.8)}
     for level in levels:
         near, far = (end * data.median_depth + (radius if end else 0) for end in ends[level.number])
-        away = np.linalg.norm(level.splats.means - centre, axis=1)
-        np.testing.assert_array_equal(in_chunk(level.splats.extras, 2), (away >= near) & (away < far))
+        distances = np.linalg.norm(level.splats.means - centre, axis=1)
+        np.testing.assert_array_equal(
+            in_chunk(level.splats.extras, 2), (distances >= near) & (distances < far)
+        )
 
 
 def test_small_scenes_have_no_chunks_by_default(data):
@@ -140,7 +142,7 @@ def test_published_preset_makes_as_few_chunks_as_equation_5_gives(data):
     assert len(lodge.centres) == np.ceil(4 / (0.8 * data.median_depth) * reach) < 8
 
 
-def test_loaded_splats_are_those_of_the_sets_of_near_chunks(data):
+def test_loaded_splats_belong_to_the_sets_of_near_chunks(data):
     lodge = make(data)
     bundle = Bundle("lodge", trained(lodge)[3:], "chunks", tables=lodge.tables())
     selector, values = BundleSelector(bundle), resolve_controls(bundle, {})

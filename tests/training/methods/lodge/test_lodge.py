@@ -84,10 +84,10 @@ def test_base_is_the_finest_level(data, base):
 def test_first_steps_are_3dgs(data):
     values = {"steps": 12, "densify_until": 0.4, "prune_interval": 6, "margin": 0.0}
     plain = create("3dgs", data, override(method_info("3dgs").preset("draft"), values), 0, "cpu")
-    lodge = make(data, tune_steps=1)  # levels of three steps, whose ends would come within these
+    lodge = make(data, tune_steps=1)  # levels of three steps
     ends = [step for step in range(12) if lodge.ends_level(step)]
     assert ends == [step for step in range(12) if plain.ends_level(step)] == [11]
-    for step in range(12):  # to the last digits, which depend on how many threads add up
+    for step in range(12):  # the last digits depend on the number of threads
         assert lodge.train_step(step).loss() == pytest.approx(plain.train_step(step).loss(), rel=1e-5)
     torch.testing.assert_close(lodge.model["means"], plain.model["means"])
 
@@ -122,7 +122,7 @@ def test_chosen_distances_stay_below_fixed_ones(data, base, distances):
 
 
 def test_training_selection_equals_bundle_selection(data, base):
-    """Compares the blended levels of a step with the selection from the written bundle, image by image."""
+    """Compare images of a step's blended levels with images of the bundle's selection."""
     lodge = make(data, base, distances=[1.3, 0.8, 0.0])
     levels = sorted(trained(lodge), key=lambda level: level.number)
     bundle, camera = Bundle("lodge", levels, "chunks"), data.train[2]
@@ -162,13 +162,13 @@ def test_importance_equals_reference(data, base):
     assert (actual[:12] == 0).all()
     actual = actual[12 + 7 :]
     for row in range(7, 12):
-        lit = torch.zeros(12, 3)
-        lit[row] = 1.0
-        only = Gaussians(
-            gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.opacity_logits, lit
+        color = torch.zeros(12, 3)
+        color[row] = 1.0
+        single = Gaussians(
+            gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.opacity_logits, color
         )
-        picture = rasterize(only, camera, near=data.near, backend="reference").image
-        assert actual[row - 7] == pytest.approx(float(picture.max()), abs=2e-5)
+        image = rasterize(single, camera, near=data.near, backend="reference").image
+        assert actual[row - 7] == pytest.approx(float(image.max()), abs=2e-5)
 
 
 def test_paper_preset_matches_paper():
@@ -189,25 +189,27 @@ def test_antialiased_base_gives_antialiased_levels(data, base):
         largest = torch.zeros(len(actual))
         for camera in data.train:
             rows = visible_rows(levels, lodge.d_l, camera, data.near)
-            of_picture = contributions(
+            of_view = contributions(
                 gather_rows(levels, rows), [camera], near=data.near, antialias=flag, backend="reference"
             ).largest
-            own = torch.from_numpy(rows[2]).long()
-            largest[own] = torch.maximum(largest[own], of_picture[len(of_picture) - len(own) :])
+            rows_of_level = torch.from_numpy(rows[2]).long()
+            largest[rows_of_level] = torch.maximum(
+                largest[rows_of_level], of_view[len(of_view) - len(rows_of_level) :]
+            )
         assert ((actual - largest).abs().max() < 1e-4) == flag
     assert lodge.meta()["antialias"] is True
 
 
 def test_pruning_removes_unimportant_splats(data, base):
-    all_of_it = make(data, base, prune_weight=0.0, drawn=1.0, distances=[1.2, 0.8, 0.0])
-    subset = make(data, base, prune_weight=0.3, drawn=1.0, distances=[1.2, 0.8, 0.0])
-    for lodge in (all_of_it, subset):
+    unpruned = make(data, base, prune_weight=0.0, drawn=1.0, distances=[1.2, 0.8, 0.0])
+    pruned = make(data, base, prune_weight=0.3, drawn=1.0, distances=[1.2, 0.8, 0.0])
+    for lodge in (unpruned, pruned):
         trained(lodge, until=1)
-    assert len(all_of_it.model) == len(base)
-    weights = all_of_it.importance(2)
-    assert len(subset.model) < len(base)
-    # the first of three prunings takes a fifth of the threshold; the step in between changes little
-    assert len(subset.model) == pytest.approx(int((weights >= 0.06).sum()), abs=2)
+    assert len(unpruned.model) == len(base)
+    weights = unpruned.importance(2)
+    assert len(pruned.model) < len(base)
+    # the first of three prunings uses a fifth of the threshold; one step changes weights little
+    assert len(pruned.model) == pytest.approx(int((weights >= 0.06).sum()), abs=2)
 
 
 @pytest.mark.parametrize("drawn", [0.5, 0.8])
@@ -216,8 +218,8 @@ def test_views_by_distance_respect_drawn_limit(data, base, drawn):
     bundle = Bundle("lodge", sorted(trained(lodge), key=lambda level: level.number), "chunks")
     by_distance = finest = 0
     for camera in data.train:
-        shown, _ = select(bundle, camera.center, camera.focal, resolve_controls(bundle, {}))
-        by_distance += camera.sees(shown.means, data.near).sum()
+        selected, _ = select(bundle, camera.center, camera.focal, resolve_controls(bundle, {}))
+        by_distance += camera.sees(selected.means, data.near).sum()
         finest += camera.sees(base.means, data.near).sum()
     assert 0.8 * drawn < by_distance / finest <= drawn * 1.001
 
@@ -239,16 +241,16 @@ def test_cost_of_distances():
     )  # fmt: skip
     thresholds = Thresholds([camera], 0.01, "cpu", prune_weight=0.001, std=lambda d: 0.5 * d / 64)
     levels, d_l = {2: IndexedLevel.of(Gaussians.of(splats))}, {2: 0.0}
-    # each of the two splats, small ones in the picture, stands on the corner of four of the 16 tiles
+    # both splats are small in the image and touch the corner of four of the 16 tiles
     assert thresholds.cost(levels, d_l, 5.0) == pytest.approx((4 + 4) / 16)
     assert thresholds.cost(levels, d_l, 20.0) == pytest.approx((4 + 4) / 16)
-    # smoothed by 8 px the far one reaches the corners of the picture
+    # smoothed by 8 px, the far one touches all tiles
     wide = Thresholds([camera], 0.01, "cpu", prune_weight=0.0, std=lambda d: d / 5)
     assert wide.cost(levels, d_l, 5.0) == pytest.approx((4 + 16) / 16)
     assert thresholds.choose(levels, d_l)[1]["before"] == pytest.approx((4 + 4) / 16)
-    # and where nothing of it is left, it costs nothing
-    gone = Thresholds([camera], 0.01, "cpu", prune_weight=0.9, std=lambda d: d / 5)
-    assert gone.cost(levels, d_l, 5.0) == pytest.approx(4 / 16)
+    # a pruned splat costs nothing
+    pruned = Thresholds([camera], 0.01, "cpu", prune_weight=0.9, std=lambda d: d / 5)
+    assert pruned.cost(levels, d_l, 5.0) == pytest.approx(4 / 16)
 
 
 def test_chosen_distance_has_least_cost(data, base):
@@ -263,9 +265,10 @@ def test_chosen_distance_has_least_cost(data, base):
 @pytest.mark.parametrize("count", [MAX_CURVES, MAX_LEVELS])
 def test_costs_fit_in_bundle_header(data, base, tmp_path, count):
     lodge = make(data, base, levels=count)
-    odd = [123.4] * CANDIDATES
+    numbers = [123.4] * CANDIDATES
     lodge.costs = [
-        {"level": number, "distances": odd, "costs": odd, "before": 123.4} for number in range(1, count)
+        {"level": number, "distances": numbers, "costs": numbers, "before": 123.4}
+        for number in range(1, count)
     ]
     splats = replace(base, extras={"chunks_0": np.zeros(len(base), np.float32)})
     levels = [Level(number, splats, {"d_l": 100 / 3 * number}) for number in range(1, count + 1)]
@@ -277,7 +280,7 @@ def test_costs_fit_in_bundle_header(data, base, tmp_path, count):
 
 
 def test_resume_is_bit_identical(data, check_resumed):
-    """Stops in the finest level, at its end, within a round, and at the ends of a round and a level."""
+    """Stop in the finest level, at its end, within a round, and at the ends of a round and a level."""
     check_resumed(lambda: make(data), 11, 12, 14, 15, 21)
 
 

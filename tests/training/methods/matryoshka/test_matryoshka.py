@@ -103,8 +103,8 @@ def test_fraction_drawn_at_the_view_distance(data, drawn):
     bundle = bundle_of(method, trained(method))
     splats = bundle.levels[-1].splats
     distances = np.stack([np.linalg.norm(splats.means - camera.center, axis=1) for camera in data.train])
-    seen = np.stack([camera.sees(splats.means, near=data.near) for camera in data.train])
-    mean = np.where(seen.any(0), (distances * seen).sum(0) / seen.sum(0).clip(1), distances.min(0))
+    visible = np.stack([camera.sees(splats.means, near=data.near) for camera in data.train])
+    mean = np.where(visible.any(0), (distances * visible).sum(0) / visible.sum(0).clip(1), distances.min(0))
     np.testing.assert_allclose(splats.extras["view_distance"], mean, rtol=1e-5)
     total = len(method.model)
     columns = {"prefix_rank": np.arange(total, dtype=np.float32), "view_distance": np.full(total, 3, "f4")}
@@ -115,7 +115,7 @@ def test_fraction_drawn_at_the_view_distance(data, drawn):
 
 
 def test_truncated_plain_ply_is_a_level(data, tmp_path):
-    """The exported file, cut after the first splats, draws as the rule's budget."""
+    """The first splats of the exported file equal a selection by the rule's budget."""
     method = make(data)
     bundle = bundle_of(method, trained(method))
     write_bundle(tmp_path / "bundle.ply", bundle)
@@ -125,8 +125,8 @@ def test_truncated_plain_ply_is_a_level(data, tmp_path):
     assert weights is None and len(expected) == 20
     for name in ("plain.ply", "bundle.ply"):
         first = read_ply(tmp_path / name).select(slice(0, 20))
-        for part in ("means", "quats", "log_scales", "opacity_logits", "sh"):
-            np.testing.assert_array_equal(getattr(first, part), getattr(expected, part))
+        for name_of_array in ("means", "quats", "log_scales", "opacity_logits", "sh"):
+            np.testing.assert_array_equal(getattr(first, name_of_array), getattr(expected, name_of_array))
 
 
 def test_order_begins_with_a_merge_of_all_splats(data):
@@ -144,7 +144,7 @@ def test_order_begins_with_a_merge_of_all_splats(data):
     assert set(method.order()[:count].tolist()) == set(range(count))
 
 
-def test_base_is_ordered_at_once(data):
+def test_base_is_ordered_in_the_first_step(data):
     base = make(data).model.splats()
     method = make(data, base=base)
     method.train_step(0)

@@ -22,7 +22,7 @@ def make(data, **values) -> Method:
 
 def test_levels_join_at_decreasing_intervals(data):
     octree = make(data, levels=6, steps=1000, coarse_share=0.5, coarse_factor=2.0)
-    # half of the levels at once; then intervals of 8, 4, 2, 1 fifteenths of the first 500 steps
+    # half of the levels start at 0; then intervals of 8, 4, 2, 1 fifteenths of the first 500 steps
     assert octree.schedule.join_steps == [0, 0, 0, 267, 400, 467]
     assert [octree.level_at(step) for step in (0, 266, 267, 466, 467, 999)] == [3, 3, 4, 5, 6, 6]
 
@@ -32,9 +32,9 @@ def test_step_draws_needed_joined_levels(data):
     camera = data.train[0]
     distance = np.linalg.norm(octree.model["means"].detach().numpy() - camera.center, axis=1)
     level = octree.model.columns["level"].numpy()
-    for step, newest in ((0, 2), (399, 4)):
-        wanted = np.clip(np.round(np.log2(octree.schedule.tree.d_max / distance)), 0, 3) + 1  # Eq. 5, rounded
-        expected = level <= np.minimum(wanted, newest)
+    for step, joined in ((0, 2), (399, 4)):
+        target = np.clip(np.round(np.log2(octree.schedule.tree.d_max / distance)), 0, 3) + 1  # Eq. 5, rounded
+        expected = level <= np.minimum(target, joined)
         weights = octree.schedule.weights(camera, octree.model, step, full=True).numpy()
         close = np.abs(np.log2(octree.schedule.tree.d_max / distance) % 1 - 0.5) < 1e-4
         assert ((weights > 0) == expected)[~close].all()
@@ -44,19 +44,20 @@ def test_step_draws_needed_joined_levels(data):
 def test_half_size_image_needs_one_level_less(data):
     octree = make(data, far_share=1.0)
     near = octree.schedule.weights(data.train[0], octree.model, 39, full=False)
-    half = octree.schedule.weights(data.camera(0, 2), octree.model, 39, full=False)
-    octree.model.columns["bias"] += 1  # what the smaller picture takes away
+    half_size = octree.schedule.weights(data.camera(0, 2), octree.model, 39, full=False)
+    octree.model.columns["bias"] += 1  # compensates for the smaller image
     assert torch.equal(octree.schedule.weights(data.camera(0, 2), octree.model, 39, full=False), near)
-    assert 0 < half.mean() < near.mean() < 1
+    assert 0 < half_size.mean() < near.mean() < 1
 
 
 def test_image_size_matches_joined_levels(data, monkeypatch):
     monkeypatch.setattr("training.optimize.anchors.schedule.MIN_SIDE", 4)
     octree = make(data, levels=4, steps=400, coarse_share=0.5, far_share=1e-9)
     schedule = octree.schedule
-    assert [schedule.join_steps[2:], schedule.shrink(0)] == [[95, 158], 4]  # two of four levels: two halvings
+    assert schedule.join_steps[2:] == [95, 158]
+    assert schedule.shrink(0) == 4  # two of four levels: two halvings of size
     assert [schedule.shrink(step) for step in (94, 95, 157, 158, 399)] == [4, 2, 2, 1, 1]
-    monkeypatch.setattr("training.optimize.anchors.schedule.MIN_SIDE", 20)  # of 48 pixels: one halving
+    monkeypatch.setattr("training.optimize.anchors.schedule.MIN_SIDE", 20)  # allows one halving of 48 pixels
     assert schedule.shrink(0) == 2
     assert make(data, levels=4, steps=400, coarse_share=0.5, far_share=0.0).schedule.shrink(0) == 1
 
@@ -66,7 +67,7 @@ def test_gradients_are_independent_of_image_size(data, monkeypatch):
     camera, sums = data.train[data.training_view(0, 0)], []
     x, y = (camera.width / 2 - camera.cx) / camera.fx, (camera.height / 2 - camera.cy) / camera.fy
     pose = np.linalg.inv(camera.world_to_camera)
-    middle = pose[:3, :3] @ (np.array([x, y, 1.0]) * data.median_depth) + pose[:3, 3]
+    center = pose[:3, :3] @ (np.array([x, y, 1.0]) * data.median_depth) + pose[:3, 3]
     for shrink in (1, 2):
         octree = make(data, steps=40, ssim_weight=0.0)
         height, width = camera.height // shrink, camera.width // shrink
@@ -74,11 +75,11 @@ def test_gradients_are_independent_of_image_size(data, monkeypatch):
         edge[:, width // 2 :] = 1
         monkeypatch.setattr(data, "target", lambda *_, edge=edge: Target(edge))
         monkeypatch.setattr(octree.schedule, "shrink", lambda step, shrink=shrink: shrink)
-        only = torch.zeros(len(octree.model))
-        only[0] = 1
-        monkeypatch.setattr(octree.schedule, "weights", lambda *_, only=only, **__: only)
+        only_first = torch.zeros(len(octree.model))
+        only_first[0] = 1
+        monkeypatch.setattr(octree.schedule, "weights", lambda *_, only_first=only_first, **__: only_first)
         octree.schedule.join_steps = [0, 39]
-        octree.model["means"].data[0] = torch.from_numpy(middle)
+        octree.model["means"].data[0] = torch.from_numpy(center)
         octree.model["log_scales"].data[0] = float(np.log(1.5 * shrink * data.median_depth / camera.fx))
         octree.train_step(0)
         sums.append(float(octree.model.stats["gradient_sum"].sum()))
@@ -88,7 +89,7 @@ def test_gradients_are_independent_of_image_size(data, monkeypatch):
 
 def test_random_far_and_full_steps(data, monkeypatch):
     octree = make(data, far_share=0.5, full_share=0.5, steps=400, coarse_share=0.0)
-    assert {octree.schedule.shrink(step) for step in range(400)} == {1}  # half of 48 pixels would be too few
+    assert {octree.schedule.shrink(step) for step in range(400)} == {1}  # 24 pixels would be too few
     monkeypatch.setattr("training.optimize.anchors.schedule.MIN_SIDE", 12)
     shrink_factors = np.array([octree.schedule.shrink(step) for step in range(400)])
     assert set(shrink_factors) == {1, 2, 4}
@@ -107,7 +108,7 @@ def test_new_anchors_are_in_free_voxels(data):
     )
     count = len(octree.model)
     octree.model.stats["seen"] += 1
-    octree.model.stats["gradient_sum"] += 1  # far above every threshold: all go on to the next level
+    octree.model.stats["gradient_sum"] += 1  # far above every threshold: all grow into the next level
     levels = octree.model.columns["level"].clone()
     octree.grow(200)
     added, level = octree.model["means"][count:], octree.model.columns["level"][count:]
@@ -146,10 +147,10 @@ def test_new_anchors_hardly_change_images(data):
 
 @pytest.mark.parametrize(("coarser", "times"), [(0, 4), (1, 2), (2, 1)])
 def test_growth_threshold_increases_with_level(data, coarser, times):
-    """tau 2^(beta (l - 1)), Sec. 4.2: below a level's threshold nothing grows, below the next one's growth
-    stays in the level.
+    """Sec. 4.2: the threshold of a level is tau 2^(beta (l - 1)).
 
-    Levels for views from farther away than any photo do not count.
+    Below it, nothing grows; below the threshold of the next level, new anchors are in the same level. Levels
+    for views from farther away than any photo do not count.
     """
     for factor, expected in ((0.99, None), (1.01, 0), (2.01, 1)):
         octree = make(
@@ -168,7 +169,7 @@ def test_growth_threshold_increases_with_level(data, coarser, times):
 
 def test_learning_rates_fall_after_growth(data):
     octree = make(data, steps=100, grow_until=0.6, lr_end=0.01, coarse_share=0.0)
-    for step, share in ((0, 1.0), (60, 1.0), (80, 0.1), (100, 0.01)):  # of 40 steps, in equal factors
+    for step, share in ((0, 1.0), (60, 1.0), (80, 0.1), (100, 0.01)):  # exponential over 40 steps
         octree.set_learning_rates(step)
         p, lr = octree.parameters, octree.model.adam.lr
         assert lr["log_scales"] == pytest.approx(p.lr_scales * share)
@@ -182,11 +183,11 @@ def test_learning_rates_are_constant_during_growth(data):
 
 
 def test_unseen_splats_are_pruned_after_growth_and_at_the_end(data, monkeypatch):
-    octree, reviewed = make(data, steps=12, grow_until=0.5, grow_interval=3), []
-    monkeypatch.setattr(octree, "prune_unseen", reviewed.append)
+    octree, pruned_after = make(data, steps=12, grow_until=0.5, grow_interval=3), []
+    monkeypatch.setattr(octree, "prune_unseen", pruned_after.append)
     for step in range(12):
         octree.train_step(step)
-    assert reviewed == [5, 11]
+    assert pruned_after == [5, 11]
 
 
 def test_growth_into_next_level_waits_for_all_levels(data):
@@ -215,9 +216,9 @@ def test_faint_anchors_are_removed_unless_unseen(data):
 
 
 def test_invisible_anchors_are_removed(data):
-    """No view counts as having drawn them."""
+    """Views do not count invisible anchors as drawn."""
     octree = make(data, grad_threshold=1e9)
-    octree.model["opacity_logits"].data[:5] = -5.55  # 1/258
+    octree.model["opacity_logits"].data[:5] = -5.55  # opacity 1/258, below 1/255
     remaining = octree.model["means"].detach()[5:].clone()
     rendering = octree.rasterize_model(data.train[0], 0)
     assert (rendering.radii[:5] == 0).all()
@@ -227,8 +228,9 @@ def test_invisible_anchors_are_removed(data):
 
 @pytest.mark.parametrize("far_share", [0.0, 0.1])
 def test_splats_of_low_weight_are_pruned(data, far_share, monkeypatch):
-    """The reference renders weights as features, one column per splat. Coarse splats hidden by finer ones
-    count for distant views.
+    """The reference renders weights as features, one column per splat.
+
+    Distant views draw coarse splats that finer ones hide in near views.
     """
     monkeypatch.setattr("training.optimize.anchors.schedule.MIN_SIDE", 12)
     octree = make(data, far_share=far_share, least_weight=0.3)
@@ -245,14 +247,14 @@ def test_splats_of_low_weight_are_pruned(data, far_share, monkeypatch):
             for column in range(0, len(model), 100):
                 first = torch.eye(len(model))[:, column : column + 100].contiguous()
                 blended = rasterize(splats, camera, weights=drawn, near=data.near, features=first).features
-                here = largest[column : column + 100]
-                torch.maximum(here, blended.amax((0, 1)), out=here)
+                columns = largest[column : column + 100]
+                torch.maximum(columns, blended.amax((0, 1)), out=columns)
     clear = (largest - 0.3).abs() > 1e-3
     means = model["means"].detach().clone()
     octree.prune_unseen(39)
-    stayed = (means[:, None] == octree.model["means"].detach()[None]).all(2).any(1)
-    assert torch.equal(stayed[clear], (largest > 0.3)[clear])
-    assert 0.1 < stayed.float().mean() < 0.9
+    remaining = (means[:, None] == octree.model["means"].detach()[None]).all(2).any(1)
+    assert torch.equal(remaining[clear], (largest > 0.3)[clear])
+    assert 0.1 < remaining.float().mean() < 0.9
 
 
 def test_invalid_least_weight_raises(data):
@@ -266,15 +268,15 @@ def test_narrow_splats_move_to_finer_level(data, coarser, finest):
     level = octree.model.columns["level"]
     level[:], level[1], level[3] = 1, 2, 4
     tree = octree.schedule.tree
-    pixel = tree.d_max / tree.focal_px  # where level 1 is just wanted; level 4's is an eighth
+    pixel = tree.d_max / tree.focal_px  # size at the distance where level 1 starts; 1/8 for level 4
     widths = torch.tensor([0.5 / 4 * 1.01, 0.5 / 4 * 0.99, 0.51, 0.01])
     octree.model["log_scales"].detach()[:4] = (pixel * widths).log()[:, None] - torch.tensor(
         [1.0, 0.001, 3.0]  # only the widest counts
     )
-    for step, newest in ((octree.schedule.join_steps[-1] - 1, 3), (octree.schedule.join_steps[-1], 4)):
+    for step, joined in ((octree.schedule.join_steps[-1] - 1, 3), (octree.schedule.join_steps[-1], 4)):
         octree.reassign_levels(step)
-        fitting = [min(3, finest), min(newest, finest), 1, 4]
-        assert octree.model.columns["level"][:4].tolist() == fitting
+        expected = [min(3, finest), min(joined, finest), 1, 4]
+        assert octree.model.columns["level"][:4].tolist() == expected
 
 
 def test_narrow_splats_stay_if_no_photo_needs_finer_level(data):
@@ -292,7 +294,7 @@ def test_wide_splats_move_to_coarser_level(data):
     octree.model.columns["level"][:] = 4
     octree.model.columns["level"][3] = 2
     tree = octree.schedule.tree
-    pixel = tree.d_max / tree.focal_px  # where level 1 is just wanted; level 4's is an eighth
+    pixel = tree.d_max / tree.focal_px  # size at the distance where level 1 starts; 1/8 for level 4
     widths = torch.tensor([1 / 8, 1 / 3, 1.1, 1 / 8])
     octree.model["log_scales"].detach()[:4] = (2 * pixel * widths).log()[:, None] - torch.tensor(
         [1.0, 0.001, 3.0]  # only the widest counts
@@ -313,13 +315,13 @@ def test_volume_uses_median_depths(data):
 
 def test_levels_add_up_to_all_splats_with_their_bias(data):
     octree = make(data, steps=8, coarse_share=0.5)
-    handed_over = {}
+    completed = {}
     for step in range(octree.steps):
         octree.train_step(step)
         if levels := octree.levels_after(step):
-            handed_over[step + 1] = levels
-    assert list(handed_over) == [octree.schedule.join_steps[-1], 8]
-    levels = handed_over[8]
+            completed[step + 1] = levels
+    assert list(completed) == [octree.schedule.join_steps[-1], 8]
+    levels = completed[8]
     assert [level.number for level in levels] == [1, 2, 3, 4]
     assert sum(len(level.splats) for level in levels) == len(octree.model)
     for level in levels:

@@ -24,7 +24,7 @@ def make(data, **values) -> Method:
     }  # fmt: skip
     method = Method(data, override(METHOD.preset("draft"), values), seed=0, backend="cpu")
     rng = torch.Generator().manual_seed(1)
-    for name in set(method.model.adam.tensors) & {"features", "offsets", "looks"}:  # as if trained
+    for name in set(method.model.adam.tensors) & {"features", "offsets", "looks"}:  # simulate training
         method.model[name].data.copy_(torch.randn(method.model[name].shape, generator=rng))
     return method
 
@@ -60,20 +60,20 @@ def test_decoding_matches_papers(data, changes):
     direction = model["means"] - camera.center
     direction /= np.linalg.norm(direction)
     inputs = np.concatenate([model["features"], direction])
-    still = np.concatenate([model["features"], direction * method.parameters.view_shapes])
+    shape_inputs = np.concatenate([model["features"], direction * method.parameters.view_shapes])
 
-    def network(net, inputs=still):
+    def network(net, inputs=shape_inputs):
         (w1, b1), (w2, b2) = ((x.weight.detach().double().numpy(), x.bias.detach().double().numpy())
                               for x in (net[0], net[2]))  # fmt: skip
         return w2 @ np.maximum(w1 @ inputs + b1, 0) + b2
 
-    own = model.get("looks", np.zeros((4, 11)))
-    logit = network(method.networks.opacity) + own[:, 0]
+    own_looks = model.get("looks", np.zeros((4, 11)))
+    logit = network(method.networks.opacity) + own_looks[:, 0]
     opacity = 1 / (1 + np.exp(-logit)) if direct else np.tanh(logit)
     drawn = np.flatnonzero(opacity > (1 / 255 if direct else 0))
     assert len(drawn) == 2 and g.offset_index.tolist() == drawn.tolist()
-    looks = (network(method.networks.covariance).reshape(4, 7) + own[:, 1:8])[drawn]
-    colors = (network(method.networks.color, inputs).reshape(4, 3) + own[:, 8:])[drawn]
+    looks = (network(method.networks.covariance).reshape(4, 7) + own_looks[:, 1:8])[drawn]
+    colors = (network(method.networks.color, inputs).reshape(4, 3) + own_looks[:, 8:])[drawn]
     extents = np.exp(model["log_scales"])
     for name, expected in {
         "opacities": opacity[drawn],
@@ -88,19 +88,19 @@ def test_decoding_matches_papers(data, changes):
 def test_anchors_reaching_into_the_image_are_visible(data):
     method = make(data)
     method.model["log_scales"].data -= 2
-    everything = torch.arange(len(method.model))
-    beside = 0
+    all_anchors = torch.arange(len(method.model))
+    outside_count = 0
     for camera in data.train:
         camera = replace(camera, fx=8 * camera.fx, fy=8 * camera.fy)  # a narrow view
         visible = method.decoder.visible_anchors(method.model, camera, torch.ones(len(method.model)))
         with torch.no_grad():
-            all_of_it, drawn = (draw_anchors(method, camera, anchors) for anchors in (everything, visible))
-        assert (drawn - all_of_it).abs().max() < 1e-5
+            expected, drawn = (draw_anchors(method, camera, anchors) for anchors in (all_anchors, visible))
+        assert (drawn - expected).abs().max() < 1e-5
         local = method.model["means"][visible].detach().numpy() @ camera.world_to_camera[:3, :3].T
         x, _, z = (local + camera.world_to_camera[:3, 3]).T
-        beside += np.sum((np.abs(camera.fx * x / z) > 0.6 * camera.width) | (z < 0))
-        assert len(visible) < len(everything)
-    assert beside > 0
+        outside_count += np.sum((np.abs(camera.fx * x / z) > 0.6 * camera.width) | (z < 0))
+        assert len(visible) < len(all_anchors)
+    assert outside_count > 0
 
 
 def test_gaussians_of_low_weight_are_disabled(data):
@@ -112,11 +112,11 @@ def test_gaussians_of_low_weight_are_disabled(data):
         g = method.decoder.decode(method.model, camera, method.drawn_anchors(camera), view)
         actual = contributions(g.gaussians(), [camera], near=data.near, backend="reference").largest
         largest[g.anchor, g.offset_index] = torch.maximum(largest[g.anchor, g.offset_index], actual)
-    stay = (largest >= 0.1).any(1)
-    assert 0 < stay.sum() < len(stay)
+    remaining = (largest >= 0.1).any(1)
+    assert 0 < remaining.sum() < len(remaining)
     method.prune_unseen(39)
     alive = method.model["looks"][..., 0].detach() > -20
-    assert torch.equal(alive, largest[stay] >= 0.1) and not alive.all()
+    assert torch.equal(alive, largest[remaining] >= 0.1) and not alive.all()
     assert method.splats == alive.sum()
 
 
@@ -165,9 +165,9 @@ def test_baking_is_exact_without_view_dependence(data, appearance):
     baked = method.bake()
     for camera in (data.train[0], data.test[0]):
         with torch.no_grad():
-            everything = draw_anchors(method, camera, drawn_in_training(method))
-        assert everything.max() > 0.2
-        assert (draw(baked, camera, data) - everything).abs().max() < 1e-3
+            expected = draw_anchors(method, camera, drawn_in_training(method))
+        assert expected.max() > 0.2
+        assert (draw(baked, camera, data) - expected).abs().max() < 1e-3
 
 
 def test_baking_uses_the_median_view(data):
@@ -178,8 +178,8 @@ def test_baking_uses_the_median_view(data):
         visible = [camera for camera in data.train if anchor in method.drawn_anchors(camera)]
         if not visible:
             continue
-        far = [float((means[anchor] - torch.as_tensor(c.center).float()).norm()) for c in visible]
-        camera = visible[int(np.argsort(far)[(len(far) - 1) // 2])]
+        distances = [float((means[anchor] - torch.as_tensor(c.center).float()).norm()) for c in visible]
+        camera = visible[int(np.argsort(distances)[(len(distances) - 1) // 2])]
         anchors.append(method.decoder.decode(method.model, camera, torch.tensor([anchor])))
     opacity = torch.cat([g.opacities for g in anchors]).detach()
     scales = torch.cat([g.scales for g in anchors]).detach()
@@ -191,7 +191,7 @@ def test_baking_fits_harmonics(data):
     """Colours linear in the direction are reproduced between the training views."""
     method = make(data, bake_ridge=1e-5)
     ignore_direction(method, "opacity", "covariance")
-    # sigmoid(x) is x/4 + 1/2 near 0: a first layer of directions that stay positive, a faint second one
+    # sigmoid(x) is x/4 + 1/2 near 0: the first layer gives positive directions, the second small values
     first, last = method.networks.color[0], method.networks.color[2]
     first.weight.data.zero_()
     first.weight.data[:3, -3:] = torch.eye(3)
@@ -219,16 +219,16 @@ def test_arrays_restore_the_networks(data, tmp_path):
     second.load_arrays(arrays)
     camera = data.test[0]
     assert torch.equal(second.render_image(camera), method.render_image(camera))
-    second.train_step(4)  # and training can go on
+    second.train_step(4)  # training continues
     network = next(name for name in arrays if name.startswith("network."))
-    for name, odd in (
+    for name, invalid in (
         ("means", arrays["means"][:-1]),
         ("means", arrays["means"].astype("f8")),
         ("level", arrays["level"][:, None]),
         (network, arrays[network][:-1]),
     ):
         with pytest.raises(ValueError, match=r" is \(.* not \("):
-            second.load_arrays(arrays | {name: odd})
+            second.load_arrays(arrays | {name: invalid})
     with pytest.raises(KeyError, match="means"):
         second.load_arrays({})
 
@@ -237,18 +237,20 @@ def test_growth_at_large_gradients(data):
     method = make(data, steps=400, coarse_share=0.0, min_opacity=0.0, max_splats=10_000)
     count, columns = len(method.model), method.model.columns
     method.model.stats["seen"] += 1
-    method.model.stats["gradient_sum"][:, 1] += 1  # one of each anchor's four
-    places = method.model["means"] + method.model["offsets"][:, 1] * method.model["log_scales"].exp()[:, :3]
+    method.model.stats["gradient_sum"][:, 1] += 1  # one of four Gaussians of each anchor
+    positions = (
+        method.model["means"] + method.model["offsets"][:, 1] * method.model["log_scales"].exp()[:, :3]
+    )
     level = (columns["level"] + 1).clamp_max(method.levels)
-    keys = method.schedule.tree.keys(places.detach().double().numpy(), level.long().numpy())
+    keys = method.schedule.tree.keys(positions.detach().double().numpy(), level.long().numpy())
     method.grow(200)
     added = method.model["means"][count:].detach().double().numpy()
     assert len(added) > 0
     grown = method.schedule.tree.keys(added, method.model.columns["level"][count:].long().numpy())
     assert set(grown) <= set(keys)
-    apart = method.model["offsets"][count:].detach()
-    assert (apart.abs() <= 0.5).all()  # in their voxel, no two in one place
-    assert all(len(places.unique(dim=0)) == 4 for places in apart)
+    offsets = method.model["offsets"][count:].detach()
+    assert (offsets.abs() <= 0.5).all()  # inside the voxel, and distinct
+    assert all(len(positions.unique(dim=0)) == 4 for positions in offsets)
 
 
 def test_statistics_are_kept_until_enough_views_drew_an_anchor(data):
@@ -263,9 +265,9 @@ def test_statistics_are_kept_until_enough_views_drew_an_anchor(data):
     method.grow(199)
     rows = {tuple(mean): row for row, mean in enumerate(method.model["means"].tolist())}
     assert tuple(means[3].tolist()) not in rows and tuple(means[2].tolist()) in rows
-    kept = method.model.stats
-    assert kept["seen"][0].tolist() == [40] * 4 and kept["seen"][1].tolist() == [0] * 4
-    assert kept["anchor_seen"][2] == 80
+    final_stats = method.model.stats
+    assert final_stats["seen"][0].tolist() == [40] * 4 and final_stats["seen"][1].tolist() == [0] * 4
+    assert final_stats["anchor_seen"][2] == 80
     assert method.model.columns["bias"][:3].tolist() == [0.0, 0.5, 0.0]
 
 
@@ -304,10 +306,10 @@ def test_appearance_of_a_photo_is_rendered(data):
     with torch.no_grad():
         method.networks.appearance.copy_(torch.randn(method.networks.appearance.shape))
     anchors, camera = torch.arange(5), data.train[0]
-    rendered, photo, other = (
+    rendered, photo, other_photo = (
         method.decoder.decode(method.model, camera, anchors, view).colors for view in (None, 1, 2)
     )
-    assert torch.equal(rendered, photo) and not torch.equal(photo, other)
+    assert torch.equal(rendered, photo) and not torch.equal(photo, other_photo)
     method.use_appearance([data.train[2].name, data.train[1].name])
     mean = method.networks.appearance[1:3].mean(0)
     mixed = method.decoder.decode(method.model, camera, anchors).colors

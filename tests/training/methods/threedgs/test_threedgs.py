@@ -17,12 +17,12 @@ def make(data, name="3dgs", **values):
 
 def test_single_level_is_returned_at_the_end(data):
     method = make(data, steps=4)
-    handed_over = []
+    completed = []
     for step in range(method.steps):
         assert method.level_at(step) == 1
         method.train_step(step)
-        handed_over.append([level.number for level in method.levels_after(step)])
-    assert handed_over == [[], [], [], [1]] and method.levels == 1
+        completed.append([level.number for level in method.levels_after(step)])
+    assert completed == [[], [], [], [1]] and method.levels == 1
 
 
 def test_equals_flod_with_one_level(data):
@@ -60,7 +60,7 @@ def test_max_criterion_starts_at_densify_from(data, threshold):
     )  # fmt: skip
     counts, above = [method.splats], 0
     for step in range(8):
-        if step == 7:  # what the 8th step's control of density sees, but for that step's own view
+        if step == 7:  # scores of density control in the 8th step, without the view of that step
             above = int((peak_scores(method.model) > threshold * np.sqrt(1e6 / (64 * 48))).sum())
         method.train_step(step)
         counts.append(method.splats)
@@ -74,15 +74,15 @@ def test_unimportant_splats_are_pruned_three_times(data):
     )
     counts = [method.splats]
     for step in range(30):
-        if step + 1 in (8, 16, 24):  # the step before decides nearly alike
+        if step + 1 in (8, 16, 24):  # scores of the previous step are similar
             actual = contributions(method.model.gaussians, data.train, near=data.near, backend="reference")
             expected = int((actual.largest >= 0.08).sum())
         method.train_step(step)
         counts.append(method.splats)
         if step + 1 == 8:
             assert 0 < counts[-1] == pytest.approx(expected, abs=3) and counts[-1] < counts[0]
-    gone = [step for step in range(1, 31) if counts[step] < counts[step - 1]]
-    assert 8 in gone and set(gone) <= {8, 16, 24}
+    pruned = [step for step in range(1, 31) if counts[step] < counts[step - 1]]
+    assert 8 in pruned and set(pruned) <= {8, 16, 24}
 
 
 def test_antialiasing_is_used_in_training(data):

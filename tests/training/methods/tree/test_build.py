@@ -28,9 +28,9 @@ def scene(count, seed=0, opacity=0.6):
 
 
 def covariances(splats):
-    turns = Rotation.from_quat(splats.quats[:, [1, 2, 3, 0]].astype(float)).as_matrix()
+    rotations = Rotation.from_quat(splats.quats[:, [1, 2, 3, 0]].astype(float)).as_matrix()
     scales = np.exp(splats.log_scales.astype(float))
-    return np.einsum("nij,nj,nkj->nik", turns, scales**2, turns)
+    return np.einsum("nij,nj,nkj->nik", rotations, scales**2, rotations)
 
 
 def leaves_below(tree, node):
@@ -49,17 +49,17 @@ def test_nodes_have_moments_of_their_leaves(count):
     weights = optical_depth(expit(nodes.opacity_logits.astype(float))) * splat_area(nodes.log_scales)
     for node in range(count, len(tree), 1 + count // 40):
         leaves = leaves_below(tree, node)
-        rate_factors = weights[leaves] / weights[leaves].sum()
-        mean = rate_factors @ means[leaves]
+        shares = weights[leaves] / weights[leaves].sum()
+        mean = shares @ means[leaves]
         np.testing.assert_allclose(means[node], mean, atol=1e-4)
-        apart = means[leaves] - mean
-        expected = np.einsum("n,nij->ij", rate_factors, spreads[leaves] + apart[:, :, None] * apart[:, None])
+        offsets = means[leaves] - mean
+        expected = np.einsum("n,nij->ij", shares, spreads[leaves] + offsets[:, :, None] * offsets[:, None])
         ratio = np.trace(spreads[node]) / np.trace(expected)
         assert 0.999 < ratio < MAX_SPREAD * 1.001
         np.testing.assert_allclose(spreads[node] / ratio, expected, atol=1e-3 * np.trace(expected))
-        color = np.einsum("n,nkc->kc", rate_factors, nodes.sh[leaves])
+        color = np.einsum("n,nkc->kc", shares, nodes.sh[leaves])
         np.testing.assert_allclose(nodes.sh[node], color, atol=1e-4)
-        if expit(nodes.opacity_logits[node]) < MAX_OPACITY * 0.999:  # what is hidden stays as much
+        if expit(nodes.opacity_logits[node]) < MAX_OPACITY * 0.999:  # optical depth is preserved
             assert weights[node] == pytest.approx(weights[leaves].sum(), rel=1e-3) and ratio < 1.001
 
 
@@ -73,8 +73,8 @@ def test_opacities_stay_below_one():
 
 @pytest.mark.parametrize("opacity", [0.02, 0.5, 0.9, 0.99])
 def test_optical_depth_is_integral_of_absorption(opacity):
-    hidden, _ = quad(lambda r: -np.log(1 - opacity * np.exp(-r * r / 2)) * r, 0, 12)
-    assert optical_depth(np.array([opacity]))[0] == pytest.approx(hidden, rel=1e-5)
+    depth, _ = quad(lambda r: -np.log(1 - opacity * np.exp(-r * r / 2)) * r, 0, 12)
+    assert optical_depth(np.array([opacity]))[0] == pytest.approx(depth, rel=1e-5)
 
 
 def test_merged_coincident_splats_keep_optical_depth():
@@ -82,7 +82,7 @@ def test_merged_coincident_splats_keep_optical_depth():
     for column in (two.means, two.quats, two.log_scales):
         column[1] = column[0]
     nodes, _ = build(two)
-    # 1 - 0.7² in the middle, and more outside: of the same shape, 0.55 hides as much in all
+    # opacity is 1 - 0.7² in the centre and relatively more outside; one splat of 0.55 has the same depth
     assert expit(nodes.opacity_logits[2]) == pytest.approx(0.55, abs=0.01)
     np.testing.assert_allclose(covariances(nodes)[2], covariances(nodes)[0], rtol=1e-4)
 
@@ -102,7 +102,7 @@ def test_wall_has_no_holes_at_any_cut():
     nodes, tree = build(wall)
     pose = np.eye(4)
     pose[2, 3] = 3
-    camera = Camera("a", 48, 48, 100.0, 100.0, 24.0, 24.0, pose)  # well within the wall
+    camera = Camera("a", 48, 48, 100.0, 100.0, 24.0, 24.0, pose)  # the wall fills the image
     sizes = tree.sizes(nodes.means, nodes.log_scales)
     parents = np.append(sizes, np.inf)[tree.parents]
     for size in (2 * step, 4 * step, 8 * step):
@@ -117,7 +117,7 @@ def test_wall_has_no_holes_at_any_cut():
 
 
 def test_equal_splats_and_chains_give_flat_trees():
-    """Test equal splats, and a row with shrinking gaps, in which each splat prefers the next one."""
+    """Test equal splats, and a row with shrinking gaps, in which each splat is nearest to the next one."""
     equal = scene(1000)
     for column in (equal.means, equal.quats, equal.log_scales, equal.sh):
         column[:] = column[0]
@@ -132,11 +132,11 @@ def test_equal_splats_and_chains_give_flat_trees():
 
 
 def test_extreme_splats_build_a_tree():
-    odd = scene(40)
-    odd.log_scales[0], odd.log_scales[1], odd.log_scales[2, 0] = -80, 25, -80
-    odd.opacity_logits[3], odd.opacity_logits[4] = -100, 100
-    odd.means[5] = 1e9
-    nodes, _ = build(odd)
+    splats = scene(40)
+    splats.log_scales[0], splats.log_scales[1], splats.log_scales[2, 0] = -80, 25, -80
+    splats.opacity_logits[3], splats.opacity_logits[4] = -100, 100
+    splats.means[5] = 1e9
+    nodes, _ = build(splats)
     for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
         assert np.isfinite(getattr(nodes, name)[40:]).all()
 

@@ -30,7 +30,7 @@ def edit_nested(node, split, dead):
     if len(node) == 1:
         return (node[0], node, node) if node[0] in split and node[0] not in dead else node
     name, left, right = node
-    if len(right) == 1 and right[0] in dead:  # of two dead ones the right one
+    if len(right) == 1 and right[0] in dead:  # if both are dead, the right one is removed
         return edit_nested(left, split, dead)
     if len(left) == 1 and left[0] in dead:
         return edit_nested(right, split, dead)
@@ -48,7 +48,7 @@ def test_edit_matches_reference(seed):
         nested(tree, range(len(tree))), set(np.flatnonzero(split)), set(np.flatnonzero(dead))
     )
     assert nested(new, source.tolist()) == expected
-    # numbers rise towards the root, and leaves stay in their order
+    # numbers increase towards the root, and leaves keep their order
     assert (new.children < np.arange(new.leaves, len(new))[:, None]).all()
     assert (np.diff(source[: new.leaves]) >= 0).all()
 
@@ -58,19 +58,19 @@ def test_edge_cases_of_the_paper():
     #    5     4     leaves 0 and 1 below 5, 2 and 3 below 4
     tree = Tree(np.array([[2, 3], [0, 1], [5, 4]], np.int32))
 
-    def after(split=(), dead=()):
+    def edited(split=(), dead=()):
         flags = (np.isin(np.arange(4), item) for item in (split, dead))
         new, source = edit_tree(tree, *flags)
         return nested(new, source.tolist())
 
-    assert after(dead=[1]) == (6, (0,), (4, (2,), (3,)))
-    assert after(dead=[0, 1]) == (6, (0,), (4, (2,), (3,)))  # the left one is dead still
-    assert after(dead=[0, 1, 2, 3]) == (6, (0,), (2,))
-    assert after(split=[1]) == (6, (5, (0,), (1, (1,), (1,))), (4, (2,), (3,)))
-    assert after(split=[0], dead=[1]) == (6, (0, (0,), (0,)), (4, (2,), (3,)))
+    assert edited(dead=[1]) == (6, (0,), (4, (2,), (3,)))
+    assert edited(dead=[0, 1]) == (6, (0,), (4, (2,), (3,)))  # the left one remains
+    assert edited(dead=[0, 1, 2, 3]) == (6, (0,), (2,))
+    assert edited(split=[1]) == (6, (5, (0,), (1, (1,), (1,))), (4, (2,), (3,)))
+    assert edited(split=[0], dead=[1]) == (6, (0, (0,), (0,)), (4, (2,), (3,)))
     deep = Tree(np.array([[0, 1], [3, 2]], np.int32))  # 2 is the sibling of the node over 0 and 1
     new, source = edit_tree(deep, np.zeros(3, bool), np.array([False, False, True]))
-    assert nested(new, source.tolist()) == (3, (0,), (1,))  # its whole subtree takes the root's place
+    assert nested(new, source.tolist()) == (3, (0,), (1,))  # its subtree replaces the root
 
 
 def test_single_leaf_remains():
@@ -80,7 +80,7 @@ def test_single_leaf_remains():
     assert nested(new, source.tolist()) == (0, (0,), (0,))
 
 
-# -- of a store ----------------------------------------------------------------------------------------
+# -- density control of a store ------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -130,7 +130,7 @@ def test_highest_scores_are_split_up_to_limit(store):
     control, final = control_density(store, threshold=0.5, max_leaves=450)
     splats, new = merge_forest(final)
     assert control.added == 50 and new.leaves == 450 and len(splats) == len(new) == 899
-    # those that are nodes now are the leaves of the highest scores, as they were
+    # the leaves with the highest scores have become inner nodes, unchanged
     minimum = np.sort(scores)[-50]
     records = store.rows.read(np.arange(len(store)))
     chosen = {row.tobytes() for row in records[scores >= minimum][:, :3].numpy()}
@@ -139,25 +139,29 @@ def test_highest_scores_are_split_up_to_limit(store):
     assert len(chosen) == 50 and chosen <= above and not chosen & remaining
     columns = final.layout.split(final.rows.read(np.arange(len(final))))
     assert not columns["score"].any()
-    fresh = columns["steps"] == 0
-    assert fresh.sum() == 100 and not columns["first"][fresh].any() and (columns["seen"][fresh] == 9).all()
-    # two children look much like the one they come from: as far from it, on one line
-    place = {row.tobytes(): node for node, row in enumerate(splats.means)}
+    new_rows = columns["steps"] == 0
+    assert (
+        new_rows.sum() == 100
+        and not columns["first"][new_rows].any()
+        and (columns["seen"][new_rows] == 9).all()
+    )
+    # children are symmetric about their parent and fainter
+    node_of_row = {row.tobytes(): node for node, row in enumerate(splats.means)}
     for row in chosen:
-        node = place[row]
+        node = node_of_row[row]
         first, second = new.children[node - new.leaves]
-        middle = (splats.means[first].astype(float) + splats.means[second]) / 2
-        np.testing.assert_allclose(middle, splats.means[node], atol=1e-5)
+        center = (splats.means[first].astype(float) + splats.means[second]) / 2
+        np.testing.assert_allclose(center, splats.means[node], atol=1e-5)
         assert splats.opacity_logits[first] == splats.opacity_logits[second] < splats.opacity_logits[node]
 
 
 def test_faint_and_unseen_leaves_are_removed(store):
     leaves = is_leaf(store)
     visible = np.full(len(store), 7.0)
-    gone = np.flatnonzero(leaves)[[3, 50, 200]]
-    visible[gone] = 2
+    unseen = np.flatnonzero(leaves)[[3, 50, 200]]
+    visible[unseen] = 2
     set_columns(store, seen=visible)
-    removed = store.rows.read(gone)[:, :3].numpy()
+    removed = store.rows.read(unseen)[:, :3].numpy()
     control, final = control_density(store, unseen_since=3)
     splats, tree = merge_forest(final)
     assert control.removed == 3 and tree.leaves == 397

@@ -43,10 +43,10 @@ def test_nodes_represent_their_leaves(cell):
     assert sorted(leaves_below(tree, len(tree) - 1)) == list(range(600))
     order = np.lexsort(nodes.means[:600].T)
     expected = leaves.select(np.lexsort(leaves.means.T))
-    for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):  # leaves are untouched
+    for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):  # leaves are unchanged
         np.testing.assert_array_equal(getattr(nodes, name)[:600][order], getattr(expected, name))
     first, _ = merge_forest(ForestBuilder(leaves))
-    np.testing.assert_allclose(nodes.means[-1], first.means[-1], atol=1e-4)  # the root's, of all leaves
+    np.testing.assert_allclose(nodes.means[-1], first.means[-1], atol=1e-4)  # the root
     np.testing.assert_allclose(covariances(nodes)[-1], covariances(first)[-1], rtol=1e-3)
     np.testing.assert_allclose(nodes.sh[-1], first.sh[-1], atol=1e-4)
     assert nodes.opacity_logits[-1] == pytest.approx(first.opacity_logits[-1], abs=1e-3)
@@ -59,9 +59,9 @@ def test_leaves_on_disk_give_the_same_tree(tmp_path, monkeypatch):
     leaves = scene(5000)
     write_ply(tmp_path / "a.ply", leaves)
     (tmp_path / "scratch").mkdir()
-    of_file = ForestBuilder(open_ply(tmp_path / "a.ply"), tmp_path / "scratch", cell=300)
-    for (first, tree), (second, same) in zip(ForestBuilder(leaves, cell=300), of_file, strict=True):
-        np.testing.assert_array_equal(tree.children, same.children)
+    from_file = ForestBuilder(open_ply(tmp_path / "a.ply"), tmp_path / "scratch", cell=300)
+    for (first, tree), (second, second_tree) in zip(ForestBuilder(leaves, cell=300), from_file, strict=True):
+        np.testing.assert_array_equal(tree.children, second_tree.children)
         np.testing.assert_array_equal(first.sh, second.sh)
         np.testing.assert_array_equal(first.quats, second.quats)
     assert not list((tmp_path / "scratch").iterdir())
@@ -79,9 +79,9 @@ def test_cells_have_no_seams():
             for row, count in zip(rows, tree.leaves_below[tree.leaves :], strict=True)
         }
 
-    full_run, pieces = nodes_of(1 << 20), nodes_of(2000)
-    rest = [count for row, count in pieces.items() if row not in full_run]
-    assert 0 < len(rest) < 0.02 * len(full_run) and np.median(rest) > 100
+    single, by_cells = nodes_of(1 << 20), nodes_of(2000)
+    different = [count for row, count in by_cells.items() if row not in single]
+    assert 0 < len(different) < 0.02 * len(single) and np.median(different) > 100
 
 
 def test_levels_contain_all_nodes(tmp_path):
@@ -110,16 +110,16 @@ def test_cuts_of_cells_are_proper(tmp_path, cell, subtree_leaves):
 
     number = {key: node for node, key in enumerate(keys(nodes))}
     assert len(number) == len(tree) == sum(len(level.splats) for level in bundle.levels)
-    for eye in (np.zeros(3), np.array([30.0, 3, 1]), np.array([900.0, 0, 0]), nodes.means[7]):
+    for position in (np.zeros(3), np.array([30.0, 3, 1]), np.array([900.0, 0, 0]), nodes.means[7]):
         for pixels in (0.5, 4, 15):
             visible = np.zeros(len(tree), bool)
-            for first in select_levels(bundle, eye, 500.0, resolve_controls(bundle, {"pixels": pixels})):
-                visible[[number[key] for key in keys(first.splats)]] = True
-            above = np.zeros(len(tree), int)  # how many of a node and those above it are drawn
+            for level in select_levels(bundle, position, 500.0, resolve_controls(bundle, {"pixels": pixels})):
+                visible[[number[key] for key in keys(level.splats)]] = True
+            above = np.zeros(len(tree), int)  # number of drawn nodes on the path to the root
             above[-1] = visible[-1]
             for layer in tree.layers:
-                leaves_below = tree.children[layer - tree.leaves]
-                above[leaves_below] = above[layer][:, None] + visible[leaves_below]
+                children = tree.children[layer - tree.leaves]
+                above[children] = above[layer][:, None] + visible[children]
             assert (above[: tree.leaves] == 1).all()
             drawn.append(visible.sum())
     assert min(drawn) < 20 and max(drawn) == 500

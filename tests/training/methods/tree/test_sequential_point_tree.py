@@ -89,7 +89,7 @@ def test_cut_of_large_tree_matches_rule_and_covers_leaves_once(large):
     in_cut = np.zeros(len(tree), bool)
     in_cut[cut] = True
     times = in_cut.astype(int)
-    for layer in tree.layers:  # from the root down, count the ancestors of each node that are in the cut
+    for layer in tree.layers:  # count the ancestors of each node that are in the cut, from the root down
         times[tree.children[layer - tree.leaves]] += times[layer][:, None]
     assert (times[: tree.leaves] == 1).all()
 
@@ -134,7 +134,7 @@ def test_larger_pixel_limit_draws_fewer_nodes(large):
     hspt = SequentialPointTree(tree, nodes.means, sizes, nodes.log_scales)
     for camera in cameras(np.random.default_rng(9), 4):
         counts = [len(hspt.cut(camera, pixels)) for pixels in (0.1, 0.2, 0.4, 0.8, 1.6, 2.4)]
-        assert all(more >= less for more, less in pairwise(counts)) and counts[0] > counts[-1]
+        assert all(count >= next_count for count, next_count in pairwise(counts)) and counts[0] > counts[-1]
 
 
 def test_tree_of_two_leaves():

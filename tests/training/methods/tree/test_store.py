@@ -38,10 +38,10 @@ def create_store(folder, town, budget=1 << 30, subtree_leaves=0):
 
 def match_rows(rows, names):
     """Return the row of ``names`` (N, 3) that equals each row of ``rows``."""
-    rows_found = np.empty(len(rows), np.int64)
-    rows_found[np.lexsort(rows.T)] = np.lexsort(names.T)
-    np.testing.assert_array_equal(rows, names[rows_found])
-    return rows_found
+    matches = np.empty(len(rows), np.int64)
+    matches[np.lexsort(rows.T)] = np.lexsort(names.T)
+    np.testing.assert_array_equal(rows, names[matches])
+    return matches
 
 
 def read_means(store):
@@ -53,7 +53,7 @@ def read_means(store):
     [pytest.param(1, marks=pytest.mark.nightly), 7, pytest.param(0, marks=pytest.mark.nightly), 10_000],
 )
 def test_new_cut_equals_hspt_in_memory(town, tmp_path, subtree_leaves, monkeypatch):
-    monkeypatch.setattr(store_module, "BATCH_NODES", 300)  # many parts of everything
+    monkeypatch.setattr(store_module, "BATCH_NODES", 300)  # many batches
     nodes, tree = town
     store = create_store(tmp_path, town, subtree_leaves=subtree_leaves)
     order = match_rows(read_means(store), nodes.means)
@@ -61,19 +61,19 @@ def test_new_cut_equals_hspt_in_memory(town, tmp_path, subtree_leaves, monkeypat
     hspt = SequentialPointTree(
         tree, nodes.means, sizes, nodes.log_scales, subtree_leaves or max_subtree_leaves(tree.leaves)
     )
-    rows_found = 0
+    row_count = 0
     for camera in cameras(np.random.default_rng(subtree_leaves)):
         for pixels in (0.2, 0.7, 1.8):
             store.cache.release_cuts()
             indices = store.load_cut(camera, pixels, 0.3)
             rows = store.cache.rows_at(indices)
-            assert (np.diff(rows) > 0).all(), "rows ascend, whatever was here before"
+            assert (np.diff(rows) > 0).all(), "rows are sorted"
             np.testing.assert_array_equal(np.sort(order[rows]), np.sort(hspt.cut(camera, pixels, 0.3)))
             splats = store.gaussians_at(indices)
             for name in NAMES:
                 np.testing.assert_array_equal(getattr(splats, name), getattr(nodes, name)[order[rows]])
-            rows_found += len(rows)
-    assert rows_found > 1000
+            row_count += len(rows)
+    assert row_count > 1000
 
 
 def move_nodes(store, seed):
@@ -89,7 +89,7 @@ def move_nodes(store, seed):
 
 
 def test_sizes_follow_moved_nodes(town, tmp_path, monkeypatch):
-    """Runs twice, because lists are sorted by previous sizes; the reference is a tree in memory."""
+    """Test twice, because lists are sorted by previous sizes. The reference is a tree in memory."""
     monkeypatch.setattr(store_module, "BATCH_NODES", 500)
     store = create_store(tmp_path, town)
     for seed in range(2):
@@ -111,19 +111,21 @@ def test_store_returns_its_input(town, tmp_path):
     nodes, tree = town
     forest = split_tree(nodes, tree, max_subtree_leaves(tree.leaves))
     store = create_store(tmp_path, town)
-    for (ours, shape), (theirs, second) in zip([*store, store.upper], [*forest, forest.upper], strict=True):
-        if not len(ours):
+    for (stored, shape), (original, original_shape) in zip(
+        [*store, store.upper], [*forest, forest.upper], strict=True
+    ):
+        if not len(stored):
             continue
-        names = match_rows(ours.means, theirs.means)
+        names = match_rows(stored.means, original.means)
         for name in NAMES:
-            np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name)[names])
-        if len(ours) < len(shape):  # the upper tree, whose leaves are elsewhere
+            np.testing.assert_array_equal(getattr(stored, name), getattr(original, name)[names])
+        if len(stored) < len(shape):  # the upper tree, whose leaves are roots of subtrees
             np.testing.assert_array_equal(names, np.arange(len(names)))
-            np.testing.assert_array_equal(shape.children, second.children)
+            np.testing.assert_array_equal(shape.children, original_shape.children)
             continue
         assert (names[: shape.leaves] < shape.leaves).all() and names[-1] == len(shape) - 1
         np.testing.assert_array_equal(
-            names[shape.children], second.children[names[shape.leaves :] - shape.leaves]
+            names[shape.children], original_shape.children[names[shape.leaves :] - shape.leaves]
         )
 
 
@@ -131,13 +133,13 @@ def test_nodes_are_sorted_by_parent_size(town, tmp_path):
     store, count = create_store(tmp_path, town), 0
     for splats, tree in store:
         sizes, parents = tree.sizes(splats.means, splats.log_scales), tree.parents
-        for part in (slice(0, tree.leaves), slice(tree.leaves, -1)):
-            assert (np.diff(sizes[parents[part]]) >= 0).all()
+        for rows in (slice(0, tree.leaves), slice(tree.leaves, -1)):
+            assert (np.diff(sizes[parents[rows]]) >= 0).all()
         count += len(tree) > 10
     assert count > 50
 
 
-def steps(store, begin, end):
+def make_steps(store, begin, end):
     """Imitate training: load cuts of moving views, and change their records by their values."""
     views = list(cameras(np.random.default_rng(1), 40))
     for step in range(begin, end):
@@ -164,29 +166,29 @@ def test_small_budget_gives_identical_bits(town, tmp_path):
         create_store(tmp_path / "some", town, budget=needed * RECORD + large_store.cache.tables)
     )
     assert small_store.cache.capacity == needed < len(large_store) / 3
-    truth, rows_found = (
-        steps(without_reuse(create_store(tmp_path / "more", town)), 0, 40),
-        steps(small_store, 0, 40),
+    truth, actual = (
+        make_steps(without_reuse(create_store(tmp_path / "more", town)), 0, 40),
+        make_steps(small_store, 0, 40),
     )
-    torch.testing.assert_close(rows_found, truth, rtol=0, atol=0)
+    torch.testing.assert_close(actual, truth, rtol=0, atol=0)
     assert small_store.cache.loaded > 2 * needed
 
 
 @pytest.mark.parametrize("stop", [14, *(pytest.param(step, marks=pytest.mark.nightly) for step in (3, 29))])
 def test_resume_is_bit_identical(town, tmp_path, stop):
-    """Uses reused cuts and a small budget, so that the content of the cache matters."""
+    """Reused cuts and a small budget make the result depend on the cache."""
     budget = 3500 * RECORD + TABLE
-    truth = steps(create_store(tmp_path / "whole", town, budget), 0, 40)
+    truth = make_steps(create_store(tmp_path / "whole", town, budget), 0, 40)
     first = create_store(tmp_path / "parts", town, budget)
-    steps(first, 0, stop)
+    make_steps(first, 0, stop)
     file = io.BytesIO()
     torch.save(first.state_dict(), file)
-    steps(first, stop, min(stop + 9, 40))  # which is lost
+    make_steps(first, stop, min(stop + 9, 40))  # these steps are lost
     first.close()
     file.seek(0)
     second = NodeStore(tmp_path / "parts", 1, budget)
     second.load_state_dict(torch.load(file, weights_only=True))
-    torch.testing.assert_close(steps(second, stop, 40), truth, rtol=0, atol=0)
+    torch.testing.assert_close(make_steps(second, stop, 40), truth, rtol=0, atol=0)
 
 
 def test_cut_is_coarsened_to_fit_budget(town, tmp_path):
@@ -207,7 +209,7 @@ def test_cut_is_coarsened_to_fit_budget(town, tmp_path):
         if store.max_coarsening == 1:
             assert store.needed_budget == 0
             continue
-        assert len(rows) > 200, "no coarser than it need be"
+        assert len(rows) > 200, "no coarser than necessary"
         coarser += 1
         sufficient_store = create_store(tmp_path / f"{coarser}", town, budget=store.needed_budget)
         sufficient_store.load_cut(camera, 0.2, 0.3)

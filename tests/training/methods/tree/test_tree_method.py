@@ -46,8 +46,8 @@ def cut_rows(tree, camera, pixels):
 def inner_rows(tree):
     """Return which rows are inner nodes."""
     forest = tree.store.shape
-    place = np.concatenate([np.arange(2 * count - 1) - count for count in forest.counts.tolist()])
-    return np.append(place, np.zeros(len(forest.counts) - 1)) >= 0
+    offsets = np.concatenate([np.arange(2 * count - 1) - count for count in forest.counts.tolist()])
+    return np.append(offsets, np.zeros(len(forest.counts) - 1)) >= 0
 
 
 def records(tree):
@@ -73,12 +73,12 @@ def base(data) -> Splats:
 def test_run_returns_leaves_then_all_nodes(data):
     tree = make(data)
     assert tree.steps == tree.parameters.total_steps == 12 + 1 + 8 and tree.levels == 2
-    first, above, leaves = trained(tree)
-    assert [level.number for level in (first, above, leaves)] == [2, 1, 2]
+    first, inner, leaves = trained(tree)
+    assert [level.number for level in (first, inner, leaves)] == [2, 1, 2]
     assert (
-        len(first.splats) == len(leaves.splats) == len(above.splats) + 1 == merge_forest(tree.store)[1].leaves
+        len(first.splats) == len(leaves.splats) == len(inner.splats) + 1 == merge_forest(tree.store)[1].leaves
     )
-    camera = data.train[0]  # until there is a tree everything is shown
+    camera = data.train[0]  # before the tree is built, all splats are drawn
     weights = BundleSelector(Bundle("tree", [first], "cut")).weights(
         camera.center, camera.focal, {"pixels": 16.0}
     )
@@ -109,7 +109,7 @@ def test_sky_points_lie_evenly_on_a_sphere(data, base):
     # 200 points share the area 4 pi of the unit sphere, so neighbours are sqrt(4 pi / 200) apart
     scales = tree.model["log_scales"].detach().numpy()[count:].astype(float)
     np.testing.assert_allclose(np.exp(scales), radius * (4 * np.pi / 200) ** 0.5, rtol=0.15)
-    for camera in data.train:  # and a share of them is in each image
+    for camera in data.train:  # each image contains some of them
         assert camera.sees(tree.model["means"].detach().numpy()[count:]).sum() > 2
     tree.train_step(0)
     assert tree.parameters.max_trained_splats == tree.parameters.max_splats + 200
@@ -138,20 +138,20 @@ def test_margins_are_added_before_the_tree_is_built(data, monkeypatch):
 def test_without_tuning_leaves_equal_the_base(data, base):
     tree = make(data, base, tune_steps=0)
     assert tree.steps == tree.parameters.base_steps == 1
-    above, leaves = trained(tree)
+    inner, leaves = trained(tree)
     leaves.splats.extras = {}
     first, second = (splats.select(np.lexsort(splats.means.T)) for splats in (leaves.splats, base))
-    assert same(first, second) and above.number == 1
+    assert same(first, second) and inner.number == 1
 
 
 def test_leaf_rate_zero_freezes_leaves(data, base):
     tree = make(data, base, leaf_rate=0.0, pixels=16.0)
     trained(tree, until=1)
-    built, above = records(tree), inner_rows(tree)
+    built, inner = records(tree), inner_rows(tree)
     trained(tree, begin=1)
     values = slice(11 + 3 * 16)
-    assert torch.equal(records(tree)[~above, values], built[~above, values])
-    assert (records(tree)[above, values] != built[above, values]).any()
+    assert torch.equal(records(tree)[~inner, values], built[~inner, values])
+    assert (records(tree)[inner, values] != built[inner, values]).any()
 
 
 def test_leaf_rate_decreases(data, base):
@@ -160,32 +160,34 @@ def test_leaf_rate_decreases(data, base):
     trained(tree, until=1)
     camera = data.train[0]
     indices = tree.store.load_cut(camera, 16.0, data.near)
-    above = inner_rows(tree)[tree.store.cache.rows_at(indices)]
-    assert above.any() and not above.all()
+    inner = inner_rows(tree)[tree.store.cache.rows_at(indices)]
+    assert inner.any() and not inner.all()
     for step, share in ((1, 0.2), (201, 0.2 * 0.03**0.5), (401, 0.2 * 0.03)):
         actual = tree._rate_factors(indices, step).numpy()
-        np.testing.assert_allclose(actual, np.where(above, 3, share), rtol=0.01)
+        np.testing.assert_allclose(actual, np.where(inner, 3, share), rtol=0.01)
 
 
 def test_sizes_are_saturated_after_training(data, base):
-    tree = make(data, base, lr_scales=0.5, lr_means_final=0.05)  # which moves nodes far
+    tree = make(data, base, lr_scales=0.5, lr_means_final=0.05)  # large rates move nodes far
     levels = trained(tree)
     splats, nodes = merge_forest(tree.store)
     sizes = nodes.sizes(splats.means, splats.log_scales)
     for node in range(nodes.leaves, len(nodes)):
         assert sizes[node] >= splat_size(splats.log_scales[node : node + 1])[0]
         for child in nodes.children[node - nodes.leaves]:
-            away = np.linalg.norm(splats.means[child].astype(float) - splats.means[node].astype(float))
-            assert float(sizes[node]) >= min_parent_size(np.array(float(sizes[child])), np.array(away))
+            distance = np.linalg.norm(splats.means[child].astype(float) - splats.means[node].astype(float))
+            assert float(sizes[node]) >= min_parent_size(np.array(float(sizes[child])), np.array(distance))
     np.testing.assert_array_equal(
         np.sort(levels[0].splats.extras["node_size"]), np.sort(sizes[nodes.leaves :])
     )  # fmt: skip
 
 
 def test_step_updates_only_the_cut_of_its_view(data, base):
-    middle = base.means.mean(axis=0)
-    far = replace(base, means=middle + (base.means - middle) / 30, log_scales=base.log_scales - np.float32(3))
-    tree = make(data, far, lod_noise=0.0)
+    center = base.means.mean(axis=0)
+    small = replace(
+        base, means=center + (base.means - center) / 30, log_scales=base.log_scales - np.float32(3)
+    )
+    tree = make(data, small, lod_noise=0.0)
     trained(tree, until=4)
     initial = records(tree)
     tree.store.cache.evict_all()
@@ -195,23 +197,23 @@ def test_step_updates_only_the_cut_of_its_view(data, base):
     cut = torch.zeros_like(moved)
     cut[rows] = True
     assert moved.sum() > 0 and not (moved & ~cut).any()
-    assert moved[inner_rows(tree)].any()  # which are trained, too
+    assert moved[inner_rows(tree)].any()  # inner nodes are trained
 
 
 def test_training_cut_equals_bundle_cut(data, base):
     tree = make(data, base, tune_steps=0)
     bundle = Bundle("tree", trained(tree), "cut")
-    choice = BundleSelector(bundle)
+    selector = BundleSelector(bundle)
     for pixels in (0.5, 3.0, 11.0):
         for camera in data.train[:3]:
             rows = cut_rows(tree, camera, pixels)
             gaussians = tree.store.gaussians_at(tree.store.load_cut(camera, pixels, data.near))
             first = tree.rasterize_model(camera, 0, gaussians=gaussians).image
-            weights = choice.weights(
+            weights = selector.weights(
                 camera.center, camera.focal, resolve_controls(bundle, {"pixels": pixels})
             )
-            gaussians = Gaussians.of(choice.splats)
-            own, reference = (
+            gaussians = Gaussians.of(selector.splats)
+            expected, reference = (
                 rasterize(
                     gaussians, camera, weights=torch.from_numpy(weights), near=data.near,
                     background=tree.background(0), sh_degree=tree.sh_degree(0), antialias=True,
@@ -220,8 +222,8 @@ def test_training_cut_equals_bundle_cut(data, base):
                 for backend in ("cpu", "reference")
             )  # fmt: skip
             assert len(rows) <= (weights > 0).sum()
-            torch.testing.assert_close(first.detach(), own, atol=2e-5, rtol=1e-4)
-            # two backends may round a splat's alpha across its threshold in a pixel, which is worth a 255th
+            torch.testing.assert_close(first.detach(), expected, atol=2e-5, rtol=1e-4)
+            # rounding may move a splat's alpha across its threshold of 1/255 in a pixel
             off = ~torch.isclose(first.detach(), reference, atol=2e-5, rtol=1e-4).all(-1)
             assert off.sum() <= 2 and (first.detach() - reference).abs().max() < 1 / 255
 
@@ -231,7 +233,7 @@ def test_bundle_has_block_table(data, base):
     assert tree.tables() == {}
     levels = trained(tree)
     table = tree.tables()["blocks"]
-    assert table["level"].tolist() == [1, 2]  # of fewer than 512 rows each
+    assert table["level"].tolist() == [1, 2]  # fewer than 512 rows each
     for row, level in enumerate(levels):
         assert table["parent_size"][row] == level.splats.extras["parent_size"].max()
 
@@ -250,14 +252,14 @@ def test_lod_noise_follows_fourth_power(data, base):
     assert (actual < 4).mean() == pytest.approx(0.669, abs=0.02)
 
 
-def test_view_of_nothing_completes_its_step(data, base):
+def test_view_without_splats_completes_its_step(data, base):
     """All splats are behind one camera."""
     camera = data.train[0]
-    behind = replace(base, means=(base.means - camera.center + 0).astype(np.float32))
-    behind.means = (camera.center - 50 * camera.world_to_camera[2, :3] + 0.01 * behind.means).astype(
-        np.float32
-    )
-    tree = make(data, behind)
+    splats_behind = replace(base, means=(base.means - camera.center + 0).astype(np.float32))
+    splats_behind.means = (
+        camera.center - 50 * camera.world_to_camera[2, :3] + 0.01 * splats_behind.means
+    ).astype(np.float32)
+    tree = make(data, splats_behind)
     trained(tree, until=1)
     view = replace(tree.choose_view(1), camera=camera)
     assert len(cut_rows(tree, camera, 1.0)) == 0
@@ -269,7 +271,7 @@ def test_view_of_nothing_completes_its_step(data, base):
     "stop", [12, *(pytest.param(step, marks=pytest.mark.nightly) for step in (11, 13, 16))]
 )
 def test_resume_is_bit_identical(data, stop):
-    """Stops in the 3DGS steps, at their end, before the first step of the tree, and between size updates."""
+    """Stop in the 3DGS steps, at their end, before the first step of the tree, and between size updates."""
     values = {"resize_interval": 3, "lr_scales": 0.1}
     full_run, first = make(data, **values), make(data, **values)
     levels = trained(full_run)
@@ -281,7 +283,9 @@ def test_resume_is_bit_identical(data, stop):
     second.load_state_dict(torch.load(file, weights_only=True))
     final = initial + trained(second, stop)
     assert [level.number for level in final] == [level.number for level in levels]
-    assert all(same(one.splats, other.splats) for one, other in zip(levels, final, strict=True))
+    assert all(
+        same(level.splats, expected_level.splats) for level, expected_level in zip(levels, final, strict=True)
+    )
 
 
 def test_density_control_grows_the_tree(data, base):
@@ -301,18 +305,18 @@ def test_density_control_grows_the_tree(data, base):
         counts.append(int(tree.store.shape.counts.sum()))
     assert counts[5] == len(base) and counts[6] == len(base) + 60
     assert counts[-1] == counts[13] <= len(base) + 60
-    (above, leaves), *_ = [tree.levels_after(tree.steps - 1)]
-    assert len(leaves.rows) == counts[-1] == len(above.rows) + 1
+    (inner, leaves), *_ = [tree.levels_after(tree.steps - 1)]
+    assert len(leaves.rows) == counts[-1] == len(inner.rows) + 1
     for pause in (4, 9, 14):
         second = make(data, base, **values)
         trained(second, until=pause)
-        remaining = io.BytesIO()
-        torch.save(second.state_dict(), remaining)
-        remaining.seek(0)
-        again = make(data, base, **values)
-        again.load_state_dict(torch.load(remaining, weights_only=True))
-        trained(again, begin=pause)
-        assert torch.equal(records(again), records(tree))
+        file = io.BytesIO()
+        torch.save(second.state_dict(), file)
+        file.seek(0)
+        resumed = make(data, base, **values)
+        resumed.load_state_dict(torch.load(file, weights_only=True))
+        trained(resumed, begin=pause)
+        assert torch.equal(records(resumed), records(tree))
 
 
 def test_coarsening_for_budget_warns_once(data, monkeypatch):
@@ -332,8 +336,8 @@ def test_coarsening_for_budget_warns_once(data, monkeypatch):
 
 
 def test_unimportant_leaves_are_pruned_in_first_steps(data, monkeypatch):
-    tree, gone = make(data, steps=30, tune_steps=60, least_weight=0.1), []
-    monkeypatch.setattr(tree, "prune_unimportant", gone.append)
+    tree, pruned_after = make(data, steps=30, tune_steps=60, least_weight=0.1), []
+    monkeypatch.setattr(tree, "prune_unimportant", pruned_after.append)
     for step in range(tree.finest_steps):
         tree.control_density(step)
-    assert gone == [7, 15, 23]
+    assert pruned_after == [7, 15, 23]

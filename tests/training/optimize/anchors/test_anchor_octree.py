@@ -18,14 +18,14 @@ def camera(z: float, focal: float = 100.0) -> Camera:
 def test_distances_use_visible_points_and_one_focal_length():
     points = np.array([[0, 0, 4.0], [0, 3.0, 4.0], [0, 0, -1.0], [30.0, 0, 4.0]])
     near, long = octree.visible_distances(points, [camera(0.0), camera(0.0, focal=200.0)], 100.0)
-    assert near.tolist() == [4.0, 5.0]  # behind, and outside the image, count for nothing
-    assert long.tolist() == [2.0]  # twice the focal length, half as far; the second point is outside
+    assert near.tolist() == [4.0, 5.0]  # points behind the camera or outside the image are ignored
+    assert long.tolist() == [2.0]  # twice the focal length halves distances; the second point is outside
 
 
 def test_camera_among_points_gives_few_levels():
     points = np.array([[0, 0, 1e-6], [0, 0, 9.0]])
     tree = octree.build(points, [camera(0.0)], focal_px=100.0, footprint=2.0, quantiles=(0, 1), coarser=3)
-    assert (tree.levels, tree.d_max) == (12, 8 * 9.0)  # log2 has room for 23; the coarse stay
+    assert (tree.levels, tree.d_max) == (12, 8 * 9.0)  # the range has 23 levels; coarse ones are kept
 
 
 def test_views_without_points_raise():
@@ -37,7 +37,7 @@ def test_level_count_from_distance_range():
     points = np.array([[0, 0, z] for z in (1.0, 2.0, 4.0, 8.0, 9.0)])
     tree = octree.build(points, [camera(0.0)], focal_px=100.0, footprint=2.0, quantiles=(0, 1))
     assert (tree.levels, tree.d_max) == (4, 9.0)  # floor(log2 9) + 1
-    # at the distance from which on a level is wanted, its voxel covers two pixels
+    # at the distance where a level starts, its voxel covers two pixels
     for level in range(1, 5):
         assert 100.0 * tree.size(level) / (tree.d_max / 2 ** (level - 1)) == pytest.approx(2.0)
     further = octree.build(points, [camera(0.0)], focal_px=100.0, footprint=2.0, quantiles=(0, 1), coarser=2)

@@ -93,10 +93,10 @@ class RowFileModel(RuleBasedStateMachine):
         self.rows = grown
 
     @precondition(lambda self: self.checkpoints)
-    @rule(back=st.integers(0, 2), started=st.booleans())
-    def resume(self, back, started):
+    @rule(age=st.integers(0, 2), started=st.booleans())
+    def resume(self, age, started):
         """Resume one of the last three checkpoints, possibly after writes."""
-        del self.checkpoints[max(len(self.checkpoints) - back, 1) :]
+        del self.checkpoints[max(len(self.checkpoints) - age, 1) :]
         state, truth = self.checkpoints[-1]
         self.rows.close()
         self.rows = self.open()
@@ -375,12 +375,12 @@ def test_process_stays_within_the_memory_budget(tmp_path):
     """
     budget = 24 << 20
     for _ in range(6):
-        done = subprocess.run(
+        process = subprocess.run(
             [sys.executable, "-c", MEMORY_SCRIPT, str(budget), "10", str(tmp_path)],
             cwd=ROOT, capture_output=True, text=True,
         )  # fmt: skip
-        assert done.returncode == 0, done.stderr
-        result = json.loads(done.stdout)
+        assert process.returncode == 0, process.stderr
+        result = json.loads(process.stdout)
         assert result["rows"] * 280 >= 9.9 * budget and result["loaded"] > result["capacity"]
         if result["peak"] < budget + 4 * result["rows"] + (16 << 20):
             break
