@@ -473,6 +473,8 @@ def test_cancel_works_while_the_trainer_starts(uninterrupted, tmp_path, monkeypa
     keys = {**uninterrupted["keys"], "out": str(tmp_path / "run")}
     folder = RunFolder(keys["out"])
     folder.create()
+    # interrupted compilers and imports may crash this process later, which a trainer has ended by then
+    monkeypatch.setattr(training_loop, "warm_up", lambda *_: time.sleep(1000))
     folder.request_cancel()  # before the trainer locked the run
     assert run_in_process(keys)[0] == training_loop.CANCELLED and folder.state() == "cancelled"
 
