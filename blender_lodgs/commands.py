@@ -43,7 +43,7 @@ DONE, CRASHED, BAD_INPUT, CANCELLED = 0, 1, 2, 3
 """Exit codes, the same as the trainer's."""
 CANCELLED_MESSAGE = "Cancelled. The same command resumes."
 PATIENCE = 2.0
-"""Seconds after a signal until a command ends in the middle of a slow operation of Blender, as a render."""
+"""Seconds after a signal until a command ends during a slow operation of Blender, such as a render."""
 _Commands = argparse._SubParsersAction  # argparse has no public name for it
 
 
@@ -409,10 +409,10 @@ class _ProgressBar:
 def _interrupts(patience: float | None):
     """Make SIGINT and SIGTERM raise KeyboardInterrupt; by default background Blender exits immediately.
 
-    Python hears a signal only between Blender's operations, so a thread ends a process that is still busy.
+    Python handles a signal only between Blender's operations, so a thread ends a process that is still busy.
 
     Args:
-        patience: seconds from a signal until the process ends with exit code 3. None: it is never ended.
+        patience: seconds from a signal until the process ends with exit code 3. None: no limit.
     """
     numbers = signal.SIGINT, signal.SIGTERM
     previous = [signal.signal(number, signal.default_int_handler) for number in numbers]

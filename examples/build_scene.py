@@ -141,27 +141,27 @@ def material(
 # ---------------------------------------------------------------------------------------------- meshes
 
 
-def mesh(name, vertices, faces, made_of, *, at=(0, 0, 0), turn=0.0, smooth=True, colors=None):
+def mesh(name, vertices, faces, mat, *, at=(0, 0, 0), turn=0.0, smooth=True, colors=None):
     """Create an object from vertices (N, 3), faces and optional vertex colours (N, 3)."""
     data = bpy.data.meshes.new(name)
     data.from_pydata(np.asarray(vertices, float).tolist(), [], [list(face) for face in faces])
     if smooth:
         data.shade_smooth()
-    data.materials.append(made_of)
+    data.materials.append(mat)
     if colors is not None:
         layer = data.color_attributes.new("paint", "FLOAT_COLOR", "POINT")
         rgba = np.concatenate([colors, np.ones((len(colors), 1))], axis=1).astype(np.float32)
         layer.data.foreach_set("color", rgba.ravel())
-    return place(data, at, turn)
+    return add_object(data, at, turn)
 
 
-def place(data, at, turn=0.0, scale=1.0, tilt=(0.0, 0.0)):
+def add_object(data, at, turn=0.0, scale=1.0, tilt=(0.0, 0.0)):
     """Add an object with a mesh, rotated about z (radians), scaled, and tilted about x and y."""
-    thing = bpy.data.objects.new(data.name, data)
-    thing.location, thing.rotation_euler = at, (tilt[0], tilt[1], turn)
-    thing.scale = (scale,) * 3 if np.isscalar(scale) else scale
-    bpy.context.scene.collection.objects.link(thing)
-    return thing
+    obj = bpy.data.objects.new(data.name, data)
+    obj.location, obj.rotation_euler = at, (tilt[0], tilt[1], turn)
+    obj.scale = (scale,) * 3 if np.isscalar(scale) else scale
+    bpy.context.scene.collection.objects.link(obj)
+    return obj
 
 
 def wobble(points, seed, frequency, octaves=3, ridged=False):
@@ -176,19 +176,19 @@ def wobble(points, seed, frequency, octaves=3, ridged=False):
     return total / weight
 
 
-def box(name, size, made_of, *, at=(0, 0, 0), turn=0.0, bevel=0.008, tilt=(0.0, 0.0)):
+def box(name, size, mat, *, at=(0, 0, 0), turn=0.0, bevel=0.008, tilt=(0.0, 0.0)):
     """Create a box around its centre, with slightly rounded edges."""
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * np.array(size) / 2
     faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    thing = mesh(name, corners, faces, made_of, at=at, turn=turn, smooth=False)
-    thing.rotation_euler = (tilt[0], tilt[1], turn)
+    obj = mesh(name, corners, faces, mat, at=at, turn=turn, smooth=False)
+    obj.rotation_euler = (tilt[0], tilt[1], turn)
     if bevel:
-        rounded = thing.modifiers.new("Bevel", "BEVEL")
+        rounded = obj.modifiers.new("Bevel", "BEVEL")
         rounded.width, rounded.segments = bevel, 2
-    return thing
+    return obj
 
 
-def lathe(name, profile, made_of, *, at=(0, 0, 0), segments=40, turn=0.0, ribs=0, depth=0.0):
+def lathe(name, profile, mat, *, at=(0, 0, 0), segments=40, turn=0.0, ribs=0, depth=0.0):
     """Create a surface of revolution from a profile of (radius, height), with optional grooves."""
     profile = np.array(profile, float)
     angle = np.linspace(0, 2 * math.pi, segments, endpoint=False)
@@ -196,7 +196,7 @@ def lathe(name, profile, made_of, *, at=(0, 0, 0), segments=40, turn=0.0, ribs=0
     radius = profile[:, None, 0] * swell
     height = np.broadcast_to(profile[:, None, 1], radius.shape)
     vertices = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=2).reshape(-1, 3)
-    return mesh(name, vertices, grid_faces(len(profile), segments, closed=True), made_of, at=at, turn=turn)
+    return mesh(name, vertices, grid_faces(len(profile), segments, closed=True), mat, at=at, turn=turn)
 
 
 def grid_faces(rows, columns, closed=False):
@@ -219,11 +219,11 @@ def smooth_profile(points, count=24):
     return np.maximum(curve, [[0.0, -np.inf]]).tolist()
 
 
-def ball(name, radius, made_of, *, at=(0, 0, 0), rough=0.0, frequency=6.0, seed=0, squash=1.0, detail=4):
+def ball(name, radius, mat, *, at=(0, 0, 0), rough=0.0, frequency=6.0, seed=0, squash=1.0, detail=4):
     """Create a sphere of small triangles with a surface roughened by noise."""
     bpy.ops.mesh.primitive_ico_sphere_add(subdivisions=detail, radius=1.0)
-    thing = bpy.context.object
-    data = thing.data
+    obj = bpy.context.object
+    data = obj.data
     data.name = name
     points = np.empty((len(data.vertices), 3), np.float32)
     data.vertices.foreach_get("co", points.ravel())
@@ -232,12 +232,12 @@ def ball(name, radius, made_of, *, at=(0, 0, 0), rough=0.0, frequency=6.0, seed=
     )
     data.vertices.foreach_set("co", points.ravel())
     data.shade_smooth()
-    data.materials.append(made_of)
-    thing.location = at
-    return thing
+    data.materials.append(mat)
+    obj.location = at
+    return obj
 
 
-def scatter(name, points, made_of, *, blades, height, width, colors, lean=0.5, seed=0):
+def scatter(name, points, mat, *, blades, height, width, colors, lean=0.5, seed=0):
     """Create tufts of bent blades (grass, reeds, petals) at points (N, 3); height and width in metres."""
     source = np.random.default_rng(seed)
     base = np.repeat(points, blades, axis=0)
@@ -258,7 +258,7 @@ def scatter(name, points, made_of, *, blades, height, width, colors, lean=0.5, s
     chosen = palette[source.integers(len(palette), size=count)] * source.uniform(0.9, 1.5, (count, 1))
     shade = np.array([0.55, 0.55, 0.9, 0.9, 1.15])  # darker at the root
     paint = (chosen[:, None] * shade[None, :, None]).reshape(-1, 3)
-    return mesh(name, vertices.reshape(-1, 3), faces, made_of, colors=paint)
+    return mesh(name, vertices.reshape(-1, 3), faces, mat, colors=paint)
 
 
 # ------------------------------------------------------------------------------------------------ land
@@ -378,9 +378,9 @@ def lights():
     background.inputs["Strength"].default_value = 0.65
     sun = bpy.data.lights.new("sun", "SUN")
     sun.energy, sun.angle, sun.color = 4.2, math.radians(2.5), linear("#ffdcae")[:3]
-    thing = bpy.data.objects.new("sun", sun)
-    thing.rotation_euler = (math.radians(56), 0, math.radians(-48))
-    bpy.context.scene.collection.objects.link(thing)
+    obj = bpy.data.objects.new("sun", sun)
+    obj.rotation_euler = (math.radians(56), 0, math.radians(-48))
+    bpy.context.scene.collection.objects.link(obj)
 
 
 # ------------------------------------------------------------------------------------------- the table
@@ -553,11 +553,11 @@ def still_life():
     ]
     for i, spot in enumerate(spots):
         at = np.array(basket) + spot
-        place(
+        add_object(
             kinds[(i * 2 + i // 3) % 3], at, turn=i * 1.3, tilt=(0.4 * math.sin(i * 2), 0.4 * math.cos(i * 3))
         )
     for i, (fx, fy) in enumerate([(-0.12, -0.25), (-0.02, -0.31), (0.36, -0.27)]):
-        place(kinds[(i + 1) % 3], (fx, fy, TABLE + 0.05), turn=i, tilt=(0.25, 0.1))
+        add_object(kinds[(i + 1) % 3], (fx, fy, TABLE + 0.05), turn=i, tilt=(0.25, 0.1))
 
     # jug and bowl, matte and striped glaze
     stripes = material(
@@ -616,8 +616,8 @@ def still_life():
     for i, (color, turn) in enumerate([("#7a2e2a", 0.25), ("#2f4f63", -0.1), ("#5b6b35", 0.4)]):
         cover = material(f"cover {i}", [color, color, "#c9a45a"], pattern="noise", scale=14, bump=0.1)
         size = 0.25 - 0.025 * i
-        middle = (0.74, -0.17, z + 0.021)
-        box("pages", (size - 0.012, 0.18, 0.03), pages, at=middle, turn=turn, bevel=0.002)
+        center = (0.74, -0.17, z + 0.021)
+        box("pages", (size - 0.012, 0.18, 0.03), pages, at=center, turn=turn, bevel=0.002)
         for side in (-0.018, 0.018):
             box(
                 "cover",
@@ -787,17 +787,17 @@ def garden():
 
     crate = wood("crate", ("#8a6a44", "#b08c5e", "#c9a878"), along=0)
     for x, y, turn in ((-1.75, 0.35, 0.35), (1.85, 0.1, -0.3)):
-        turned = Matrix.Rotation(turn, 3, "Z")
+        rotation = Matrix.Rotation(turn, 3, "Z")
         for side in (-0.2, 0.2):
             for level in range(3):
-                at = turned @ Matrix.Translation((0, side, 0.06 + 0.11 * level)).translation
+                at = rotation @ Matrix.Translation((0, side, 0.06 + 0.11 * level)).translation
                 box("slat", (0.56, 0.02, 0.09), crate, at=(x + at.x, y + at.y, at.z), turn=turn, bevel=0.004)
-                at = turned @ Matrix.Translation((side * 1.35, 0, 0.06 + 0.11 * level)).translation
+                at = rotation @ Matrix.Translation((side * 1.35, 0, 0.06 + 0.11 * level)).translation
                 box("slat", (0.02, 0.38, 0.09), crate, at=(x + at.x, y + at.y, at.z), turn=turn, bevel=0.004)
         apples = [data for data in bpy.data.meshes if data.name.startswith("fruit")]
         for _ in range(46):
-            at = turned @ Matrix.Translation((*rng.uniform(-1, 1, 2) * [0.22, 0.15], 0)).translation
-            place(
+            at = rotation @ Matrix.Translation((*rng.uniform(-1, 1, 2) * [0.22, 0.15], 0)).translation
+            add_object(
                 apples[int(rng.integers(3))],
                 (x + at.x, y + at.y, 0.3 + rng.uniform(0, 0.06)),
                 turn=rng.uniform(0, 6),
@@ -824,7 +824,7 @@ def garden():
         for a in np.arange(n) * 2 * math.pi / n + rng.uniform(-0.1, 0.1, n)
     ]
     for x, y, r in steps:
-        place(shapes[int(rng.integers(4))], on_ground(x, y, -0.06 * r), turn=rng.uniform(0, 6), scale=r)
+        add_object(shapes[int(rng.integers(4))], on_ground(x, y, -0.06 * r), turn=rng.uniform(0, 6), scale=r)
 
     # grass and flowers, sparser with distance, none on the path
     grass = material("grass", ["#e0e0e0", "#ffffff"], scale=1.5, bump=0, attribute="paint")
@@ -941,8 +941,8 @@ def trees():
 
     def broad(x, y, size, kind):
         at, turn = on_ground(x, y), rng.uniform(0, 6)
-        place(trunk, at, turn, scale=size)
-        place(crowns[kind], at, turn, scale=size)
+        add_object(trunk, at, turn, scale=size)
+        add_object(crowns[kind], at, turn, scale=size)
 
     for x, y, size, kind in (
         (-5.6, 8.2, 0.95, 1),
@@ -970,7 +970,7 @@ def trees():
     ):
         spot = np.array([[x, y]])
         if wobble(spot, 50, 0.25, 2)[0] > -0.1 and math.hypot(x - MILL[0], y - MILL[1]) > 6:
-            place(pine, on_ground(x, y), rng.uniform(0, 6), scale=size)
+            add_object(pine, on_ground(x, y), rng.uniform(0, 6), scale=size)
 
 
 def buildings():
@@ -990,13 +990,13 @@ def buildings():
     lit = material("window", ["#ffc765", "#ffe0a0"], scale=2, bump=0, glow=0.8)
 
     def house(x, y, turn, wide, deep, tall):
-        turned = Matrix.Translation(on_ground(x, y).tolist()) @ Matrix.Rotation(turn, 4, "Z")
+        to_world = Matrix.Translation(on_ground(x, y).tolist()) @ Matrix.Rotation(turn, 4, "Z")
 
-        def put(name, size, at, stuff, tilt=(0.0, 0.0)):
-            position = turned @ Matrix.Translation(at).to_translation()
+        def add_part(name, size, at, stuff, tilt=(0.0, 0.0)):
+            position = to_world @ Matrix.Translation(at).to_translation()
             box(name, size, stuff, at=position, turn=turn, tilt=tilt, bevel=0.02)
 
-        put("walls", (wide, deep, tall + 1.0), (0, 0, tall / 2 - 0.5), plaster)
+        add_part("walls", (wide, deep, tall + 1.0), (0, 0, tall / 2 - 0.5), plaster)
         peak = 0.62 * deep
         gable = [
             (s * wide / 2, y, z)
@@ -1005,7 +1005,7 @@ def buildings():
         ]
         mesh(
             "gable",
-            [turned @ Matrix.Translation(v).to_translation() for v in gable],
+            [to_world @ Matrix.Translation(v).to_translation() for v in gable],
             [(0, 1, 2), (3, 5, 4)],
             plaster,
             smooth=False,
@@ -1013,18 +1013,18 @@ def buildings():
         slope = math.atan2(peak, deep / 2)
         length = math.hypot(peak, deep / 2) + 0.35
         for side in (-1, 1):
-            middle = (0, side * (deep / 4 + 0.08), tall + peak / 2 - 0.04)
+            center = (0, side * (deep / 4 + 0.08), tall + peak / 2 - 0.04)
             roof = box("roof", (wide + 0.5, length, 0.12), tiles, bevel=0.02)
-            roof.matrix_basis = turned @ Matrix.Translation(middle) @ Matrix.Rotation(-side * slope, 4, "X")
+            roof.matrix_basis = to_world @ Matrix.Translation(center) @ Matrix.Rotation(-side * slope, 4, "X")
         for sx in np.linspace(-0.5, 0.5, 4):
-            put("beam", (0.12, 0.08, tall), (sx * (wide - 0.12), -deep / 2, tall / 2), beam)
+            add_part("beam", (0.12, 0.08, tall), (sx * (wide - 0.12), -deep / 2, tall / 2), beam)
         for z in (0.06, tall * 0.52, tall - 0.06):
-            put("beam", (wide, 0.08, 0.12), (0, -deep / 2, z), beam)
+            add_part("beam", (wide, 0.08, 0.12), (0, -deep / 2, z), beam)
         for sx in (-0.32, 0.34):
             for z in (0.3, 0.76):
-                put("window", (0.42, 0.09, 0.42), (sx * wide, -deep / 2, tall * z), lit)
-        put("door", (0.55, 0.1, 1.1), (0, -deep / 2, 0.55), beam)
-        put("chimney", (0.35, 0.35, 1.0), (wide * 0.25, 0.2, tall + peak), plaster)
+                add_part("window", (0.42, 0.09, 0.42), (sx * wide, -deep / 2, tall * z), lit)
+        add_part("door", (0.55, 0.1, 1.1), (0, -deep / 2, 0.55), beam)
+        add_part("chimney", (0.35, 0.35, 1.0), (wide * 0.25, 0.2, tall + peak), plaster)
 
     house(-8.8, 18.5, 0.25, 3.6, 2.8, 2.4)
     house(-13.6, 20.5, 0.6, 3.2, 2.6, 2.2)

@@ -263,8 +263,8 @@ def _sky(plan: Plan, count: int) -> Discs:
     """Return a sky dome with clouds, far behind the hills."""
     number = np.arange(count, dtype=np.float64)
     z = 1 - 1.12 * (number + 0.5) / count
-    ring, turn = np.sqrt(np.maximum(1 - z * z, 0)), number * 2.399963
-    out = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
+    ring, angle = np.sqrt(np.maximum(1 - z * z, 0)), number * 2.399963
+    out = np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1)
     radius = (plan.half + shapes.PITCH) * 14
     size = np.full((count, 1), 1.4 * radius * np.sqrt(2.24 * np.pi / count))
     blue = z.clip(0, 1)[:, None] ** 0.6
@@ -372,10 +372,10 @@ def _along(path: np.ndarray, samples: np.ndarray) -> np.ndarray:
 def flight(plan: Plan, count: int, phase: float = 0.0) -> list[Camera]:
     """Return views of a flight over the roofs in a rising spiral; arguments as for :func:`walk`."""
     share = (np.arange(count) + phase) / count
-    turn, distance = share * 4 * np.pi, plan.half * (1.15 - 0.75 * share)
-    positions = np.stack([distance * np.cos(turn), distance * np.sin(turn), 24 + 30 * share], axis=1)
+    angle, distance = share * 4 * np.pi, plan.half * (1.15 - 0.75 * share)
+    positions = np.stack([distance * np.cos(angle), distance * np.sin(angle), 24 + 30 * share], axis=1)
     targets = np.stack(
-        [0.35 * distance * np.cos(turn + 1.1), 0.35 * distance * np.sin(turn + 1.1), 2 + 0 * turn], axis=1
+        [0.35 * distance * np.cos(angle + 1.1), 0.35 * distance * np.sin(angle + 1.1), 2 + 0 * angle], axis=1
     )
     poses = enumerate(zip(positions, targets, strict=True))
     return [level_camera(f"flight_{n:03d}", position, target) for n, (position, target) in poses]
@@ -399,18 +399,18 @@ def courtyard(plan: Plan, count: int) -> list[Camera]:
     largest = 1 + int(np.bincount(regions.ravel(), minlength=number + 1)[1:].argmax())
     row, column = np.nonzero(regions == largest)
     floor = np.stack([axis[column], axis[row]], axis=1)
-    middle = floor.mean(0)
-    out = floor - middle
+    center = floor.mean(0)
+    out = floor - center
     angle = np.arctan2(out[:, 1], out[:, 0])
     cameras = []
     for index in range(count):
-        turn = 2 * np.pi * (index + 0.5) / count - np.pi
-        apart = np.abs((angle - turn + np.pi) % (2 * np.pi) - np.pi)
+        direction = 2 * np.pi * (index + 0.5) / count - np.pi
+        difference = np.abs((angle - direction + np.pi) % (2 * np.pi) - np.pi)
         distance = np.linalg.norm(out, axis=1)
-        at = floor[np.argmax(np.where(apart < max(np.pi / count, 0.15), distance, 0))]
-        side = 0.6 * np.sin(index * 2.4) * (middle - at)[::-1] * [-1, 1]
+        at = floor[np.argmax(np.where(difference < max(np.pi / count, 0.15), distance, 0))]
+        side = 0.6 * np.sin(index * 2.4) * (center - at)[::-1] * [-1, 1]
         height = EYE_HEIGHT + 0.15 * np.sin(index * 1.7)
-        target = np.append(middle + side, height + 0.3 + 0.5 * np.sin(index * 0.9))
+        target = np.append(center + side, height + 0.3 + 0.5 * np.sin(index * 0.9))
         cameras.append(level_camera(f"yard_{index:03d}", np.append(at, height), target))
     return cameras
 

@@ -175,11 +175,11 @@ def lay_out(blocks: int, seed: int) -> Plan:
     )
     for row in range(blocks):
         for column in range(blocks):
-            middle = (np.array([column, row]) + 0.5) * PITCH - half
+            center = (np.array([column, row]) + 0.5) * PITCH - half
             if row == column == blocks // 2:
                 _square(build, crowns, rng)
             else:
-                _block(build, crowns, rng, middle)
+                _block(build, crowns, rng, center)
     for line in np.arange(blocks + 1) * PITCH - half:  # lamps and parked cars along every street
         for at in np.arange(-half + 9, half - 4, 12.0):
             for x, y, turn in ((line, at, np.pi / 2), (at, line, 0.0)):
@@ -204,7 +204,7 @@ def lay_out(blocks: int, seed: int) -> Plan:
     return Plan(blocks, sheets, np.array(crowns), heights, cell)
 
 
-def _block(build: Builder, crowns: list, rng: np.random.Generator, middle: np.ndarray) -> None:
+def _block(build: Builder, crowns: list, rng: np.random.Generator, center: np.ndarray) -> None:
     """Add houses along the four streets around a garden with trees."""
     inner = PITCH / 2 - STREET / 2  # from the centre of the block to its edge
     for quarter in range(4):
@@ -214,16 +214,16 @@ def _block(build: Builder, crowns: list, rng: np.random.Generator, middle: np.nd
         while offset < limit - 6:
             wide = min(rng.uniform(7.5, 11.5), limit - offset)
             deep = rng.uniform(7.0, 8.4)
-            at = middle + x[:2] * (offset + wide / 2) - y[:2] * (inner - deep / 2 - rng.uniform(0.1, 1.4))
+            at = center + x[:2] * (offset + wide / 2) - y[:2] * (inner - deep / 2 - rng.uniform(0.1, 1.4))
             build.house(at, turn, wide, deep, int(rng.integers(2, 5)))
             offset += wide + (0.0 if rng.random() < 0.6 else rng.uniform(1.5, 3.0))
-        hedge = middle + x[:2] * (inner - 4.5) - y[:2] * (inner - 0.4)
+        hedge = center + x[:2] * (inner - 4.5) - y[:2] * (inner - 0.4)
         build.box(np.array([*hedge, 0.0]), turn, (7.5, 0.7, 1.3), HEDGE, np.array([0.16, 0.30, 0.10]))
     for _ in range(rng.integers(3, 6)):
-        _tree(build, crowns, rng, middle + rng.uniform(-4.5, 4.5, 2))
+        _tree(build, crowns, rng, center + rng.uniform(-4.5, 4.5, 2))
     for corner in ((1, -1), (1, 1), (-1, 1), (-1, -1)):
         if rng.random() < 0.7:
-            _tree(build, crowns, rng, middle + np.array(corner) * (inner - 2.6))
+            _tree(build, crowns, rng, center + np.array(corner) * (inner - 2.6))
 
 
 def _tree(build: Builder, crowns: list, rng: np.random.Generator, at: np.ndarray) -> None:

@@ -280,8 +280,8 @@ def main() -> None:
         vars(options).update(TINY)
     options.out.parent.mkdir(parents=True, exist_ok=True)
     run("build", options.small, options)
-    half = options.small * 4e-6 * record_layout(0).width  # MB of the small tree's nodes
-    program = [run("train", options.small, options, budget=half) for _ in range(2)][
+    small_budget = options.small * 4e-6 * record_layout(0).width  # MB of the small tree's nodes
+    program = [run("train", options.small, options, budget=small_budget) for _ in range(2)][
         1
     ]  # the first one may compile
     program, small = program["peak_mb"] - program["cache_mb"], run("draw", options.small, options)["peak_mb"]
@@ -294,14 +294,14 @@ def main() -> None:
                 f"{built['nodes']:,} nodes: tree in {built['seconds']:.0f} s, peak {built['peak_mb']:,.0f} MB"
             )
         pixels = run("level", leaves, options)["pixels"]
-        for way in options.ways:
-            row = run("train", leaves, options, way=way, pixels=pixels)
+        for order in options.ways:
+            row = run("train", leaves, options, way=order, pixels=pixels)
             drawing = max(run("draw", leaves, options)["peak_mb"] - small, 0)
             allowed = 1.1 * options.budget + program + drawing
-            row |= {"name": way, "times": times, "budget_mb": options.budget, "program_mb": program,
+            row |= {"name": order, "times": times, "budget_mb": options.budget, "program_mb": program,
                     "drawing_mb": drawing, "allowed_mb": allowed, "pixels": pixels}  # fmt: skip
             add_row(options.out, {key: round(x, 4) if isinstance(x, float) else x for key, x in row.items()})
-            print(f"  {times:>4g} x {pixels:.2f} px  {way:<17} {format_row(row)}", flush=True)
+            print(f"  {times:>4g} x {pixels:.2f} px  {order:<17} {format_row(row)}", flush=True)
 
 
 if __name__ == "__main__":

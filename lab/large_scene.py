@@ -40,8 +40,8 @@ def write_large(folder: Path, points: int, views: int, photo: bytes) -> None:
     with open(model / "images.bin", "wb") as file:
         file.write(struct.pack("<Q", views))
         for view in range(views):
-            turn = np.pi * view / views  # half the angle, for the quaternion
-            head = struct.pack("<I7dI", view + 1, np.cos(turn), 0, np.sin(turn), 0, 0, 0, 10, 1)
+            half_angle = np.pi * view / views  # of the rotation, for the quaternion
+            head = struct.pack("<I7dI", view + 1, np.cos(half_angle), 0, np.sin(half_angle), 0, 0, 0, 10, 1)
             name = f"view_{view:05d}.jpg"
             observations = np.empty(per_view * TRACK, _OBSERVATION)
             observations["pixel"] = rng.uniform(0, SIZE, (len(observations), 2))

@@ -90,8 +90,8 @@ def report(run: Path, rendered: Path) -> Iterator[str]:
     folder = RunFolder(run)
     job, bundle = Job.from_file(folder.job), read_bundle(folder.bundle)
     evaluation = Evaluation(training_data(job, folder), job.backend, bundle.antialias)
-    everything, _ = full_detail_source(bundle, bundle.levels[-1])(evaluation.data.train[0])
-    splats = evaluation.load(everything)
+    all_splats, _ = full_detail_source(bundle, bundle.levels[-1])(evaluation.data.train[0])
+    splats = evaluation.load(all_splats)
     aside = [camera.scaled(job.image_scale) for camera in read_offset_views(Path(job.scene))]
     for name, cameras in (("off the path", aside), ("on the path", evaluation.data.test)):
         views_pixels = list(pixels(evaluation, splats, cameras, rendered))

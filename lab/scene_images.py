@@ -90,10 +90,10 @@ def copied(scene: Path, change: Callable[[Image.Image, int], Image.Image]) -> Pa
 def person_mask(number: int, size: tuple[int, int]) -> Image.Image:
     """Return a mask of a walking person, white, at a position that depends on the photo's number."""
     mask = Image.new("L", size)
-    draw, middle = ImageDraw.Draw(mask), 60 + (number * 137) % 360
-    draw.ellipse((middle - 14, 70, middle + 14, 104), fill=255)
-    draw.rounded_rectangle((middle - 26, 106, middle + 26, 230), 18, fill=255)
-    draw.rectangle((middle - 20, 226, middle + 20, 319), fill=255)
+    draw, center = ImageDraw.Draw(mask), 60 + (number * 137) % 360
+    draw.ellipse((center - 14, 70, center + 14, 104), fill=255)
+    draw.rounded_rectangle((center - 26, 106, center + 26, 230), 18, fill=255)
+    draw.rectangle((center - 20, 226, center + 20, 319), fill=255)
     return mask
 
 

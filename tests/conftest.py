@@ -1,4 +1,4 @@
-"""Fixtures that every room's tests share."""
+"""Fixtures for the tests of both packages."""
 
 import os
 from pathlib import Path
@@ -8,9 +8,9 @@ import pytest
 
 @pytest.fixture(scope="session")
 def shared_scenes() -> Path:
-    """Real COLMAP scenes, kept outside the repository: ``$LODGS_SCENES`` or ``../shared/scenes``."""
-    beside = Path(__file__).resolve().parents[2] / "shared" / "scenes"
-    folder = Path(os.environ.get("LODGS_SCENES", beside))
+    """Folder of real COLMAP scenes outside the repository: ``$LODGS_SCENES`` or ``../shared/scenes``."""
+    default = Path(__file__).resolve().parents[2] / "shared" / "scenes"
+    folder = Path(os.environ.get("LODGS_SCENES", default))
     if not folder.is_dir():
         pytest.skip(f"no real scenes at {folder}; set LODGS_SCENES")
     return folder.resolve()

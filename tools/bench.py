@@ -337,7 +337,8 @@ def weights_over_removed(splats: Gaussians, camera: Camera) -> float:
         return lambda: next(render(gaussians, [camera], **options))
 
     functions = draw(splats, weights=weights), draw(visible)
-    times = [[fastest(function, 1e-3) for function in functions] for _ in range(40)]  # interleave noise
+    # alternate, so that noise affects both
+    times = [[fastest(function, 1e-3) for function in functions] for _ in range(40)]
     return float(np.divide(*np.median(times, axis=0)))
 
 

@@ -182,8 +182,8 @@ def viewport(bpy, count: int) -> None:
         return shown.splat_instances(bpy.context.evaluated_depsgraph_get())
 
     def prepare(view, wait: bool = False) -> None:
-        depsgraph, look = bpy.context.evaluated_depsgraph_get(), camera.matrix_world.inverted()
-        views.prepare(view, sets(), depsgraph, look, 10 * count, wait)
+        depsgraph, view_matrix = bpy.context.evaluated_depsgraph_get(), camera.matrix_world.inverted()
+        views.prepare(view, sets(), depsgraph, view_matrix, 10 * count, wait)
 
     for _ in range(3):
         views.clear()
@@ -250,16 +250,16 @@ def clean_up(bpy, count: int) -> None:
     floater_rows = cleaning.find_floaters(bpy.context, root, 0.0, 0.001)
     strokes, depsgraph = load("blender_lodgs.viewport.strokes"), bpy.context.evaluated_depsgraph_get()
     brushed = load("training.editing.brush").brush_coverage
-    look, size = np.eye(4), (1280, 800)
-    look[2, 3] = -15.0
+    view_matrix, size = np.eye(4), (1280, 800)
+    view_matrix[2, 3] = -15.0
     clip = np.array([[2, 0, 0, 0], [0, 3.2, 0, 0], [0, 0, -1, -0.1], [0, 0, -1, 0]], float)
     path = [(400, 400), (900, 400)]
 
     def begin():
-        return strokes.StrokeTarget(root, depsgraph, look, clip, size)
+        return strokes.StrokeTarget(root, depsgraph, view_matrix, clip, size)
 
     image = begin()
-    begins, covers = fastest(begin), fastest(lambda: image.hits(brushed(path, 50, size)))
+    begin_seconds, cover_seconds = fastest(begin), fastest(lambda: image.hits(brushed(path, 50, size)))
     selects = fastest(lambda: cleaning.extend_selection(root, image.hits(brushed(path, 50, size))))
     painting, step = load("blender_lodgs.data.painting"), path[:1] * 2
     previous_paint = painting.read_paint(root)
@@ -279,7 +279,7 @@ def clean_up(bpy, count: int) -> None:
         f" {1e3 * counts:.0f} more), floaters {1e3 * everywhere:.0f} (goal 500), within the crop"
         f" {1e3 * floaters:.0f}; hiding {sum(map(np.count_nonzero, floater_rows.values())):,}"
         f" {1e3 * hide:.0f};\n"
-        f"  brush stroke: start {1e3 * begins:.0f} and hit test {1e3 * covers:.0f} (goal 300"
+        f"  brush stroke: start {1e3 * begin_seconds:.0f} and hit test {1e3 * cover_seconds:.0f} (goal 300"
         f" together), select {1e3 * selects:.0f}; paint {1e3 * follows:.0f} per step of the"
         f" mouse, apply paint {1e3 * paints:.0f}"
     )
@@ -307,12 +307,16 @@ def streaming(bpy, path: Path, budget: int, frames: int = 100) -> None:
     projection = Matrix(((2, 0, 0, 0), (0, 2, 0, 0), (0, 0, -1, -0.1), (0, 0, -1, 0)))
 
     def redraw(position: np.ndarray) -> tuple[float, float]:
-        look = Matrix.Translation(-position)
+        view_matrix = Matrix.Translation(-position)
         depsgraph = bpy.context.evaluated_depsgraph_get()
         wall_start, cpu_start = time.perf_counter(), time.thread_time()
-        looks = SimpleNamespace(view_matrix=look, window_matrix=projection @ look, view_distance=1.0)
-        view_camera.track(region, bpy.context.scene, looks, splats=True)
-        views.prepare(view, visible.splat_instances(depsgraph), depsgraph, look, 2_000_000, moving=True)
+        region_view = SimpleNamespace(
+            view_matrix=view_matrix, window_matrix=projection @ view_matrix, view_distance=1.0
+        )
+        view_camera.track(region, bpy.context.scene, region_view, splats=True)
+        views.prepare(
+            view, visible.splat_instances(depsgraph), depsgraph, view_matrix, 2_000_000, moving=True
+        )
         return time.perf_counter() - wall_start, time.thread_time() - cpu_start
 
     def wait() -> float:

@@ -27,9 +27,9 @@ def start_blender():
     link.symlink_to(REPOSITORY, target_is_directory=True)
     compiled = cache_folder() / "blender-module"
     compiled.mkdir(parents=True, exist_ok=True)
-    own = resources / "extensions" / ".user" / "user_default" / "lodgs"
-    own.mkdir(parents=True)
-    (own / "cache").symlink_to(compiled, target_is_directory=True)
+    extension_files = resources / "extensions" / ".user" / "user_default" / "lodgs"
+    extension_files.mkdir(parents=True)
+    (extension_files / "cache").symlink_to(compiled, target_is_directory=True)
     os.environ["BLENDER_USER_RESOURCES"] = str(resources)
 
     import bpy  # isort: skip

@@ -44,10 +44,10 @@ def main() -> int:
     if bundle.levels[0].splats.sh_degree > 3:
         print(f"interop: {PACKAGE} only reads spherical harmonics up to degree 3.")
         return 2
-    rows = [(check, ours, theirs, ours == theirs) for check, ours, theirs in checks(bundle)]
+    rows = [(check, expected, actual, expected == actual) for check, expected, actual in checks(bundle)]
     print(f"{'splat-transform ' + VERSION:<34}  {'ours':<34}  {'theirs':<34}")
-    for check, ours, theirs, same in rows:
-        print(f"{check:<34}  {ours!s:<34}  {theirs!s:<34}  {'ok' if same else 'DIFFERENT'}")
+    for check, expected, actual, same in rows:
+        print(f"{check:<34}  {expected!s:<34}  {actual!s:<34}  {'ok' if same else 'DIFFERENT'}")
     return 0 if all(same for *_, same in rows) else 1
 
 
@@ -155,13 +155,13 @@ def info(path: Path) -> tuple[int, int] | None:
 
 def values(path: Path) -> str:
     """Compare the values of ``vertex`` with those that splat-transform writes back."""
-    back = path.with_suffix(".back.ply")
-    back.unlink(missing_ok=True)
-    result = splat_transform("-w", str(path), str(back))
-    if result.returncode or not back.exists():
+    rewritten = path.with_suffix(".back.ply")
+    rewritten.unlink(missing_ok=True)
+    result = splat_transform("-w", str(path), str(rewritten))
+    if result.returncode or not rewritten.exists():
         return failure(result)
     ours = PlyData.read(str(path))["vertex"].data
-    theirs = PlyData.read(str(back))["vertex"].data
+    theirs = PlyData.read(str(rewritten))["vertex"].data
     different = [name for name in ours.dtype.names if not np.array_equal(ours[name], theirs[name])]
     return f"different: {', '.join(different)}" if different else "equal"
 

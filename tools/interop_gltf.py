@@ -62,9 +62,9 @@ def main() -> int:
     return int(value < MIN_PSNR)
 
 
-def psnr(image: np.ndarray, other: np.ndarray) -> float:
+def psnr(image: np.ndarray, expected: np.ndarray) -> float:
     """Return the PSNR of two images in dB."""
-    return float(-10 * np.log10(np.square(image - other.clip(0, 1)).mean()))
+    return float(-10 * np.log10(np.square(image - expected.clip(0, 1)).mean()))
 
 
 def draw(browser: str, page: Path, mounts: Mapping[str, Path], query: str) -> np.ndarray | str:

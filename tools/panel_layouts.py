@@ -64,8 +64,8 @@ def panel_digests(bpy) -> dict[str, str]:
                 recorder = LayoutRecorder()
                 panel.draw(SimpleNamespace(layout=recorder), bpy.context)
                 texts = json.dumps([panel.bl_label, recorder.calls], ensure_ascii=False)
-                kept = "".join(letter for letter in texts.replace(str(ROOT), "") if not letter.isdigit())
-                layouts.setdefault(panel.__name__, []).append(kept)
+                digitless = "".join(letter for letter in texts.replace(str(ROOT), "") if not letter.isdigit())
+                layouts.setdefault(panel.__name__, []).append(digitless)
     return {
         name: hashlib.sha256("\n".join(texts).encode()).hexdigest()[:16]
         for name, texts in sorted(layouts.items())

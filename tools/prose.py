@@ -75,14 +75,14 @@ def problems(sources: dict[str, str], listed: int = 0) -> list[str]:
     for kind, rows in rows_by_kind.items():
         words = [_words(text) for _, text in rows]
         total = sum(map(len, words))
-        what = 1000 * sum(row.count("what") for row in words) / max(total, 1)
+        what_rate = 1000 * sum(row.count("what") for row in words) / max(total, 1)
         openings = [
             row for row, first in zip(rows, words, strict=True) if first[:1] and first[0] in QUESTION_WORDS
         ]
         share = 100 * len(openings) / len(rows)
         examples = [f"  {path}: {' '.join(text.split())[:90]}" for path, text in openings[:listed]]
-        if what > MAX_WHAT:
-            report.append(f'{kind}: {what:.1f} "what" per 1000 words (limit {MAX_WHAT:g})')
+        if what_rate > MAX_WHAT:
+            report.append(f'{kind}: {what_rate:.1f} "what" per 1000 words (limit {MAX_WHAT:g})')
         if share > MAX_OPENINGS:
             report += [f"{kind}: {share:.1f} % open with a question word (limit {MAX_OPENINGS:g})", *examples]
     poor = {name: count for name, count in names.items() if name.rstrip("_") in FUNCTION_WORDS}

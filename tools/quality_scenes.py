@@ -165,23 +165,23 @@ def _write_model(scene: Scene, cameras: Sequence[Camera], out: Path) -> None:
     """Write the model of some cameras, with the points that two of them observe."""
     names = [camera.name for camera in cameras]
     observed = observations(scene, names)
-    seen = np.zeros(len(scene.points), np.int64)
+    view_counts = np.zeros(len(scene.points), np.int64)
     for indices in observed.values():
-        seen[np.unique(indices)] += 1
-    kept = seen > 1 if observed else np.ones(len(scene.points), bool)
-    numbers = np.cumsum(kept) - 1
+        view_counts[np.unique(indices)] += 1
+    observed_twice = view_counts > 1 if observed else np.ones(len(scene.points), bool)
+    numbers = np.cumsum(observed_twice) - 1
     lenses = dict(zip((camera.name for camera in scene.cameras), scene_lenses(scene), strict=True))
     tracks = []
     for camera in cameras:
         indices = np.unique(observed.get(camera.name, np.zeros(0, np.int64)))
-        indices = indices[kept[indices]]
+        indices = indices[observed_twice[indices]]
         tracks.append((numbers[indices], camera.project(scene.points[indices].astype(np.float64))[0]))
     write_model(
         out / "sparse" / "0",
         [lenses[name] for name in names],
         [(camera.name, camera.world_to_camera) for camera in cameras],
-        scene.points[kept],
-        scene.point_colors[kept],
+        scene.points[observed_twice],
+        scene.point_colors[observed_twice],
         tracks,
     )
 
@@ -209,16 +209,16 @@ def main(arguments: Sequence[str]) -> int:
     """Write one copy: SCENE COPY KIND [factor on changes of light]."""
     try:
         folder, out, kind, *stops = arguments
-        made = write_subset(Path(folder), Path(out), SUBSETS[kind], *map(float, stops))
+        copy = write_subset(Path(folder), Path(out), SUBSETS[kind], *map(float, stops))
     except (ValueError, KeyError):
         print(f"Usage: tools/quality_scenes.py SCENE COPY {{{','.join(SUBSETS)}}} [FACTOR]", file=sys.stderr)
         return 2
     except LodgsError as error:
         print(error.what, error.remedy, file=sys.stderr)
         return 2
-    if made is None:
+    if copy is None:
         print(f"The scene has fewer than {SUBSETS[kind].min_photos} photos.", file=sys.stderr)
-    return 0 if made else 1
+    return 0 if copy else 1
 
 
 if __name__ == "__main__":

@@ -208,7 +208,7 @@ def fly(timer: CallTimer, space: bpy.types.SpaceView3D) -> Steps:
     yield from until(lambda: bool(roots(bpy.context.scene)), 60)
     imported = time.monotonic() - opened
     space.clip_start, space.clip_end = 0.05, 5000.0
-    look(cameras[0])
+    look_along(cameras[0])
     yield from loaded()
     timer.report(f"opened: imported after {imported:.1f} s, loaded after {time.monotonic() - opened:.1f}")
     screenshot("opened")
@@ -220,7 +220,7 @@ def fly(timer: CallTimer, space: bpy.types.SpaceView3D) -> Steps:
     legs = list(pairwise(cameras))
     for number, (first, second) in enumerate(legs):
         for share in np.arange(FRAMES) / FRAMES:
-            look(first, second, float(share))
+            look_along(first, second, float(share))
             frames += 1
             yield 0.01
         if number % max(len(legs) // SCREENSHOTS, 1) == 0:
@@ -309,7 +309,7 @@ def _blender_matrix(camera) -> Matrix:
     return Matrix(matrix.tolist())
 
 
-def look(first, second=None, share: float = 0.0) -> None:
+def look_along(first, second=None, share: float = 0.0) -> None:
     """Set the viewport to a camera, interpolated towards a second one by ``share``."""
     matrix = pose(first, second, share)
     view = viewport()[1]

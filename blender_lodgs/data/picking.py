@@ -24,7 +24,7 @@ def scene_at(
     projection: Matrix,
     size: tuple[int, int],
     at: tuple[float, float],
-    before: float = np.inf,
+    max_depth: float = np.inf,
 ) -> bpy.types.Object | None:
     """Return the root of the splats at a pixel, or their object if they are in no scene.
 
@@ -36,7 +36,7 @@ def scene_at(
         projection: matrix from the camera's space to clip space.
         size: size (W, H) of the viewport in pixels.
         at: pixel, x from the left and y from below.
-        before: depth in the world beyond which splats are occluded at the pixel.
+        max_depth: depth in the world beyond which splats are occluded at the pixel.
 
     Returns:
         None if the splats at the pixel hide less than half of the background.
@@ -48,7 +48,7 @@ def scene_at(
     depths, alphas = (np.concatenate(values) for values in zip(*samples, strict=True))
     owners = np.repeat(np.arange(len(samples)), [len(values) for values, _ in samples])
     order = np.argsort(depths)
-    order = order[depths[order] < before]
+    order = order[depths[order] < max_depth]
     hidden = np.cumprod(1 - alphas[order]) <= MAX_TRANSMITTANCE
     if not hidden.any():
         return None

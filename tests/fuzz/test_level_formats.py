@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from tests.fuzz.entry_points import attempt
 from tests.fuzz.mutations import corrupted, corrupted_value
 from tests.training.splats.level_files import flod
-from tests.training.splats.test_gltf import assembled, parts
+from tests.training.splats.test_gltf import assembled, read_parts
 from training.editing.export import export_levels
 from training.splats.gltf import read_glb
 from training.splats.usd import read_usd
@@ -23,7 +23,7 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def glb(folder):
     export_levels(folder / "good.glb", flod(1))
-    return (folder / "good.glb").read_bytes(), *parts(folder / "good.glb")
+    return (folder / "good.glb").read_bytes(), *read_parts(folder / "good.glb")
 
 
 @pytest.fixture(scope="module")

@@ -11,14 +11,14 @@ from PIL import Image
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
 
 
-def look_at(eye, target=(0.0, 0.0, 0.0)) -> np.ndarray:
-    """world_to_camera (4, 4) of an eye that looks at a target, world up +y, OpenCV axes."""
-    forward = np.subtract(target, eye) / np.linalg.norm(np.subtract(target, eye))
+def look_at(position, target=(0.0, 0.0, 0.0)) -> np.ndarray:
+    """Return world_to_camera (4, 4) of a camera that looks at a target; +y is up, OpenCV axes."""
+    forward = np.subtract(target, position) / np.linalg.norm(np.subtract(target, position))
     right = np.cross(forward, (0.0, 1.0, 0.0))
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward])
     matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation, -rotation @ np.asarray(eye)
+    matrix[:3, :3], matrix[:3, 3] = rotation, -rotation @ np.asarray(position)
     return matrix
 
 
@@ -29,7 +29,7 @@ def quaternion(rotation: np.ndarray) -> np.ndarray:
 
 
 def write_tiny_scene(folder: Path, views: int = 9, points: int = 60) -> Path:
-    """Coloured discs around the origin and behind it, photographed from an arc; a text model."""
+    """Write a text model and photos from an arc of coloured discs around the origin and behind it."""
     rng = np.random.default_rng(7)
     means = np.concatenate(
         [rng.normal(0, 0.6, (points // 2, 3)), rng.normal(0, 3, (points - points // 2, 3))]
@@ -44,13 +44,13 @@ def write_tiny_scene(folder: Path, views: int = 9, points: int = 60) -> Path:
         angle = np.radians(-40 + 80 * view / (views - 1))
         matrix = look_at((4 * np.sin(angle), 0.3, 4 * np.cos(angle)))
         image = np.zeros((HEIGHT, WIDTH, 3))
-        seen = means @ matrix[:3, :3].T + matrix[:3, 3]
-        for place in np.argsort(-seen[:, 2]):  # painter's order
-            x, y, z = seen[place]
+        in_camera = means @ matrix[:3, :3].T + matrix[:3, 3]
+        for index in np.argsort(-in_camera[:, 2]):  # painter's order
+            x, y, z = in_camera[index]
             inside = (
                 np.hypot(xs - FOCAL * x / z - WIDTH / 2, ys - FOCAL * y / z - HEIGHT / 2) < FOCAL * 0.25 / z
             )
-            image[inside] = colors[place] / 255
+            image[inside] = colors[index] / 255
         Image.fromarray((image * 255).astype(np.uint8)).save(
             folder / "images" / f"{view:02d}.jpg", quality=95
         )
@@ -85,8 +85,8 @@ def data(tiny_scene):
 
 
 @pytest.fixture(scope="session")
-def tried_graphics() -> None:
-    """A device for the gpu backend is there, this computer's own or the software that stands for one."""
+def tested_graphics() -> None:
+    """Skip tests without a graphics device. Software rendering is used if there is no graphics card."""
     from training.errors import LodgsError
     from training.rasterize import self_test
     from training.rasterize.gpu import default_device
@@ -97,12 +97,12 @@ def tried_graphics() -> None:
         device = default_device.open_default_device()
     except LodgsError as problem:
         pytest.skip(f"no graphics device: {problem}")
-    assert self_test.run_self_test(device.adapter) == "", "or the cpu would stand for it in these tests"
+    assert self_test.run_self_test(device.adapter) == "", "otherwise tests would use the cpu backend"
 
 
 @pytest.fixture
-def graphics(tried_graphics):
-    """The device that the gpu backend uses: another one after a test that has lost it."""
+def graphics(tested_graphics):
+    """Return the device of the gpu backend, reopened if a test has lost it."""
     from training.rasterize.gpu import default_device
 
     return default_device.open_default_device()
@@ -110,7 +110,7 @@ def graphics(tried_graphics):
 
 @pytest.fixture
 def fake_card(monkeypatch):
-    """The cuda backend on the CPU: gsplat's place is taken by ``fake_gsplat``."""
+    """Run the cuda backend on the CPU, with ``fake_gsplat`` in place of gsplat."""
     from tests.training.rasterize import fake_gsplat
     from training.rasterize import cuda
 

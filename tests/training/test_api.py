@@ -160,8 +160,8 @@ def test_train_reports_events_and_resumes(tiny_scene, tmp_path):
     assert run.folder == tmp_path / "run" and run.metrics["train_psnr"] > 0
     assert events[0]["event"] == "hello" and events[-1]["event"] == "done"
     assert len(read_bundle(run.bundle).levels) == 1
-    again = lodgs.train(tiny_scene, tmp_path / "run", **KEYS)
-    assert again.metrics["train_psnr"] == run.metrics["train_psnr"]
+    repeated = lodgs.train(tiny_scene, tmp_path / "run", **KEYS)
+    assert repeated.metrics["train_psnr"] == run.metrics["train_psnr"]
 
 
 @pytest.mark.slow

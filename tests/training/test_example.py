@@ -94,8 +94,8 @@ def test_views_off_the_path_are_near_it_and_not_in_the_model():
         distances = np.linalg.norm(positions - view.center, axis=1)
         nearest = int(distances.argmin())
         assert 0.4 < distances[nearest] < 1.0
-        turned = np.degrees(np.arccos(view.world_to_camera[2, :3] @ path[nearest][2, :3]))
-        assert 5 < turned < 25
+        angle = np.degrees(np.arccos(view.world_to_camera[2, :3] @ path[nearest][2, :3]))
+        assert 5 < angle < 25
         assert (view.width, view.height) == (rig.WIDTH, rig.HEIGHT)
         np.testing.assert_allclose([view.fx, view.fy], rig.FOCAL)
 
@@ -129,9 +129,9 @@ def test_walk_has_nearby_objects_but_none_in_front_of_the_whole_view():
     quarters = [{tuple(side) for side in row[near]} for row, near in zip(sides, distances < 2.5, strict=True)]
     assert np.mean([len(quarter) == 4 for quarter in quarters]) > 0.5
     limit = VEIL_DEPTH * scene.median_depth()
-    for place in midpoint_views(scene.cameras):  # so that what an evaluation calls a veil is one
-        visible = place.sees(scene.points)
-        assert (place.view_space(scene.points)[visible, 2] > limit).mean() > 0.99
+    for view in midpoint_views(scene.cameras):  # evaluations measure veils in these views
+        visible = view.sees(scene.points)
+        assert (view.view_space(scene.points)[visible, 2] > limit).mean() > 0.99
 
 
 def test_points_have_the_colours_of_their_projections(model, images, photos):

@@ -204,16 +204,16 @@ def test_edits_name_the_origin_or_add_it(tmp_path, capsys):
     write_bundle(tmp_path / "b.ply", Bundle("", [Level(1, splats())], meta={"origin": OFFSET.tolist()}))
     write_folder(tmp_path / "folder", read_bundle(tmp_path / "b.ply"))
     assert read_origin(tmp_path / "folder").tolist() == OFFSET.tolist()
-    local, there = tmp_path / "local.ply", tmp_path / "there.ply"
+    local, original = tmp_path / "local.ply", tmp_path / "there.ply"
     assert main(["edit", str(tmp_path / "b.ply"), "--plain", str(local)]) == 0
     assert "relative to the local origin (500000, 4200000, 300)" in capsys.readouterr().out
     assert "lodgs origin 500000.0 4200000.0 300.0" in PlyData.read(local)["vertex"].comments
     assert read_bundle(local).origin.tolist() == OFFSET.tolist()  # and is not subtracted again
     np.testing.assert_array_equal(read_ply(local).means, splats().means)
 
-    assert main(["edit", str(tmp_path / "b.ply"), "--plain", str(there), "--original-place"]) == 0
+    assert main(["edit", str(tmp_path / "b.ply"), "--plain", str(original), "--original-place"]) == 0
     assert "local origin" not in capsys.readouterr().out
-    file = PlyData.read(there)
+    file = PlyData.read(original)
     assert not any("origin" in comment for comment in file["vertex"].comments)
     x, y, z = (file["vertex"][axis] for axis in "xyz")
     assert x.dtype == np.float64
@@ -223,9 +223,9 @@ def test_edits_name_the_origin_or_add_it(tmp_path, capsys):
 
         edit(tmp_path / "b.ply", None, Cleaning(), plain=[tmp_path / "a.splat"], original_place=True)
 
-    turned = tmp_path / "turned.ply"  # other coordinates than the scene's
-    assert main(["edit", str(tmp_path / "b.ply"), "--out", str(turned), "--rotate=90,0,0"]) == 0
-    assert not read_header(turned).origin.any()
+    rotated = tmp_path / "turned.ply"  # other coordinates than the scene's
+    assert main(["edit", str(tmp_path / "b.ply"), "--out", str(rotated), "--rotate=90,0,0"]) == 0
+    assert not read_header(rotated).origin.any()
     assert "drops the local origin" in capsys.readouterr().out
 
 

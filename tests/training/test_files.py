@@ -127,17 +127,17 @@ def test_leftovers_of_killed_processes_are_removed_by_the_next_write(tmp_path, m
     assert len(leftovers) == 2
     (temporary,) = [path for path in leftovers if path.is_file()]
     pid = temporary.name.split("-")[1]
-    others = [
+    remaining = [
         tmp_path / temporary.name.replace(f"-{pid}-", f"-{os.getppid()}-"),  # a running process
         tmp_path / f".b.ply.{'0000' if '.0000-' not in temporary.name else '0001'}-{pid}-abcd.tmp",
         tmp_path / "notes.tmp",
         tmp_path / ".lodgs-notes",
     ]
-    for path in others:
+    for path in remaining:
         path.touch()
     with atomic_write(tmp_path / "b.ply") as target:
         target.touch()
-    assert sorted(tmp_path.iterdir()) == sorted([*others, tmp_path / "b.ply"])
+    assert sorted(tmp_path.iterdir()) == sorted([*remaining, tmp_path / "b.ply"])
 
 
 def test_long_names_can_be_written(tmp_path):

@@ -200,7 +200,7 @@ def test_recipe_for_a_rule(tmp_path):
     install(tmp_path, "rings", "[lodgs.rules]\nrings = rings\n", {"rings.py": RECIPE})
     bundle, larger = tmp_path / "bundle.ply", tmp_path / "larger.ply"
     lines = run_python(tmp_path, "-c", EXPORT_AND_SELECT, bundle, larger).stdout.splitlines()
-    # the fine level ends at 12, and at 24 for the important half
+    # the fine level ends at 12, for the important half at 24
     assert lines[:4] == ["0 20", "0 20", "10 0", "10 0"]
     lines = lines[lines.index(f"{larger}: written") + 1 :]
     assert lines[:4] == ["0 20", "0 20", "5 10", "5 10"]

@@ -86,7 +86,7 @@ def test_benchmark_lists_scenes_with_their_copies_once(scene, tmp_path, monkeypa
 
     monkeypatch.setattr(bench_quality, "write_courtyard", courtyard)
     listed = bench_quality.scenes_to_train([scene], tmp_path / "copies")
-    assert {path.name: every for path, every in listed.items()} == {
+    assert {path.name: interval for path, interval in listed.items()} == {
         "tiny": 8, "courtyard": 8, **{f"tiny-{name}": subset.test_every for name, subset in SUBSETS.items()}
     }  # fmt: skip
     monkeypatch.setattr(quality_scenes, "read_scene", None)  # copies exist

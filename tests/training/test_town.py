@@ -71,12 +71,12 @@ def test_courtyard_views_stand_in_a_garden_between_walls(plan):
     reach = plan.half + town_shapes.PITCH
     x, y = ((centers[:, :2] + reach) / plan.cell).astype(int).T
     assert (plan.heights[y, x] < 0.5).all() and np.abs(centers[:, 2] - 1.65).max() < 0.2
-    middle = centers.mean(0)
-    assert np.linalg.norm(centers - middle, axis=1)[:, None].max() < 10
-    for camera in cameras:  # towards the middle, and a house in most directions
+    center = centers.mean(0)
+    assert np.linalg.norm(centers - center, axis=1)[:, None].max() < 10
+    for camera in cameras:  # views face the centre, with a house in most directions
         ahead = camera.world_to_camera[2, :3]
-        assert ahead @ (middle - camera.center) > 0
+        assert ahead @ (center - camera.center) > 0
     angles = np.linspace(0, 2 * np.pi, 36, endpoint=False)
-    rays = middle[:2] + np.arange(1, 25)[:, None, None] * np.stack([np.cos(angles), np.sin(angles)], -1)
+    rays = center[:2] + np.arange(1, 25)[:, None, None] * np.stack([np.cos(angles), np.sin(angles)], -1)
     column, row = np.moveaxis(((rays + reach) / plan.cell).astype(int), -1, 0)
     assert (plan.heights[row, column] > 4).any(0).mean() > 0.7

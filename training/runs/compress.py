@@ -78,7 +78,7 @@ def compress(
     counts = [len(level.rows) for level in bundle.levels]
     run = source if run is None and path != source else run
     if run is None or not _levels_are_scenes(bundle):
-        reason = "it has no training views" if run is None else "its levels are no scenes of their own"
+        reason = "it has no training views" if run is None else "its levels are not complete scenes"
         warn(f"{source}: splats are quantised, but none are removed, because {reason}.")
         bundle, weights = limit_degree(bundle, settings.sh_degree), None
     else:
@@ -198,7 +198,7 @@ def make_codebook(bundle: Bundle, size: int, weights: np.ndarray | None = None) 
 
     Args:
         size: maximum number of sets; bundles with few splats get fewer.
-        weights: (N,) chances of all levels' splats to be among those that k-means sees.
+        weights: (N,) relative probabilities that k-means samples a splat, for the splats of all levels.
     """
     rest = np.concatenate([level.splats.sh[:, 1:] for level in bundle.levels])
     rows = rest.reshape(len(rest), -1)
@@ -211,7 +211,7 @@ def make_codebook(bundle: Bundle, size: int, weights: np.ndarray | None = None) 
         first = rows[rng.choice(len(rows), size, replace=False, p=chances)]
         sample = rows[rng.choice(len(rows), SAMPLES * size, p=chances)]
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # sets that no splat is near to are kept
+            warnings.simplefilter("ignore")  # it warns of sets without splats, which are kept
             sets = kmeans2(sample, first, ITERATIONS, minit="matrix")[0]
         codes = vq(rows, sets)[0].astype(np.uint16)
     ends = np.cumsum([len(level.splats) for level in bundle.levels])[:-1]

@@ -25,8 +25,9 @@ from .sh import MAX_DEGREE, coefficient_count
 from .usd import DESCRIPTION, load_usd, report_error
 
 _MEMORY = 1 << 27
-"""Bytes that a file may unpack to in addition to a multiple of its size."""
+"""Bytes that a file of any size may unpack to."""
 _RATIO = 64
+"""Bytes that a file may unpack to per byte of its size, in addition to ``_MEMORY``."""
 _SPLAT_BYTES = 56
 """Bytes of a splat of SH degree 0."""
 

@@ -16,38 +16,40 @@ def gradients(step, shape):
 
 def test_steps_match_torch():
     start = torch.randn(700, 5, 3, generator=torch.Generator().manual_seed(99))
-    ours = start.clone()
+    actual = start.clone()
     rates = torch.full((5, 1), 2e-3)
     rates[0] = 1e-2
-    adam = Adam({"sh": ours}, {"sh": rates})
-    theirs = [start[:, :1].double().requires_grad_(), start[:, 1:].double().requires_grad_()]
-    expected = torch.optim.Adam(
-        [{"params": [theirs[0]], "lr": 1e-2}, {"params": [theirs[1]], "lr": 2e-3}], eps=1e-15
+    adam = Adam({"sh": actual}, {"sh": rates})
+    expected = [start[:, :1].double().requires_grad_(), start[:, 1:].double().requires_grad_()]
+    optimizer = torch.optim.Adam(
+        [{"params": [expected[0]], "lr": 1e-2}, {"params": [expected[1]], "lr": 2e-3}], eps=1e-15
     )
     for step in range(30):
         gradient = gradients(step, start.shape)
         adam.step({"sh": gradient})
-        theirs[0].grad, theirs[1].grad = gradient[:, :1].double(), gradient[:, 1:].double()
-        expected.step()
-    torch.testing.assert_close(ours.double(), torch.cat(theirs, 1).detach(), atol=2e-6, rtol=2e-6)
+        expected[0].grad, expected[1].grad = gradient[:, :1].double(), gradient[:, 1:].double()
+        optimizer.step()
+    torch.testing.assert_close(actual.double(), torch.cat(expected, 1).detach(), atol=2e-6, rtol=2e-6)
 
 
 @pytest.mark.parametrize("lr", [1e-2, torch.tensor([[1e-2], [1e-3], [1e-3], [2e-3]])])
 def test_torch_update_matches_kernel_and_formula(lr):
     """Compare the GPU code path with the CPU kernel, and with Algorithm 1 in float64."""
     start = torch.randn(300, 4, 3, generator=torch.Generator().manual_seed(99))
-    ours, kernels = ([start.clone(), torch.zeros_like(start), torch.zeros_like(start)] for _ in range(2))
+    in_torch, in_kernel = (
+        [start.clone(), torch.zeros_like(start), torch.zeros_like(start)] for _ in range(2)
+    )
     exact, m, v = start.double(), torch.zeros(()).double(), torch.zeros(()).double()
     for step in range(1, 31):
         gradient = gradients(step, start.shape) * (step % 3)
-        update_in_torch(ours[0], gradient, *ours[1:], lr, (0.9, 0.999), 1e-15, step)
-        arrays = [array.numpy() for array in (kernels[0], gradient, *kernels[1:])]
+        update_in_torch(in_torch[0], gradient, *in_torch[1:], lr, (0.9, 0.999), 1e-15, step)
+        arrays = [array.numpy() for array in (in_kernel[0], gradient, *in_kernel[1:])]
         update(*arrays, lr, (0.9, 0.999), 1e-15, step)
         m, v = 0.9 * m + 0.1 * gradient.double(), 0.999 * v + 0.001 * gradient.double() ** 2
         exact -= lr * (m / (1 - 0.9**step)) / ((v / (1 - 0.999**step)).sqrt() + 1e-15)
-    for actual, expected in zip(ours, kernels, strict=True):
+    for actual, expected in zip(in_torch, in_kernel, strict=True):
         torch.testing.assert_close(actual, expected, atol=2e-6, rtol=2e-5)
-    torch.testing.assert_close(ours[0].double(), exact, atol=2e-6, rtol=2e-5)
+    torch.testing.assert_close(in_torch[0].double(), exact, atol=2e-6, rtol=2e-5)
 
 
 def test_resumed_optimizer_is_bit_identical():

@@ -303,9 +303,9 @@ def test_compilation_holds_a_lock(card, monkeypatch, tmp_path):
 @pytest.mark.parametrize("name", ["rasterize_to_pixels", "spherical_harmonics"])
 def test_fake_signatures_match_gsplat(name):
     gsplat = pytest.importorskip("gsplat", reason="gsplat is not installed")
-    real, ours = (inspect.signature(getattr(module, name)) for module in (gsplat, fake_gsplat))
+    real, fake = (inspect.signature(getattr(module, name)) for module in (gsplat, fake_gsplat))
     assert [(p.name, p.default) for p in real.parameters.values()] == [
-        (p.name, p.default) for p in ours.parameters.values()
+        (p.name, p.default) for p in fake.parameters.values()
     ]
 
 
@@ -321,9 +321,9 @@ def test_empty_view_renders_background(device, make_splats):
     """Without visible splats, gsplat is not called and gradients are zero."""
     import numpy as np
 
-    away = Camera("away", 20, 10, 10.0, 10.0, 5.0, 5.0, np.diag([-1.0, 1.0, -1.0, 1.0]))
+    camera = Camera("away", 20, 10, 10.0, 10.0, 5.0, 5.0, np.diag([-1.0, 1.0, -1.0, 1.0]))
     leaves = make_splats(5).map(lambda t: t.to(device, torch.float32).requires_grad_())
-    drawn = rasterize(leaves, away, background=(0.2, 0.4, 0.6), outputs=["depth"], backend="cuda")
+    drawn = rasterize(leaves, camera, background=(0.2, 0.4, 0.6), outputs=["depth"], backend="cuda")
     (drawn.image.sum() + drawn.depth.sum()).backward()
     assert torch.equal(drawn.image.detach().cpu(), torch.tensor([0.2, 0.4, 0.6]).expand(10, 20, 3))
     assert all(leaf.grad is not None and leaf.grad.abs().max() == 0 for leaf in vars(leaves).values())

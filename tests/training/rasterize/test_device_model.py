@@ -150,15 +150,15 @@ def test_steps_wait_for_the_device_once_in_many(graphics, make_splats, odd_camer
     model = make_device_model("gpu", adam_of(make_splats(300)), zero_stats(300))
     assert model is not None
     losses = [model.step(odd_camera, photo, ssim_weight=0.2, shrink=1, **VIEW)]
-    before = graphics.counts.copy()
+    counts = graphics.counts.copy()
     losses += [
         model.step(odd_camera, photo, ssim_weight=0.2, shrink=1, **VIEW) for _ in range(device_model.PENDING)
     ]
-    spent = graphics.counts - before
-    assert spent["reads"] == 1 and not spent["buffers"] and not spent["bind_groups"]
-    assert spent["submissions"] == device_model.PENDING
+    difference = graphics.counts - counts
+    assert difference["reads"] == 1 and not difference["buffers"] and not difference["bind_groups"]
+    assert difference["submissions"] == device_model.PENDING
     values = [loss() for loss in losses]
-    assert graphics.counts["reads"] == before["reads"] + 2
+    assert graphics.counts["reads"] == counts["reads"] + 2
     assert all(np.diff(values) < 0)
 
 

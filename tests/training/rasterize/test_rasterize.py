@@ -145,9 +145,9 @@ def test_median_depth_matches_reference(kernels, make_splats, odd_camera):
 def test_contributions_of_two_splats_to_two_views(backend, axis_camera):
     """The near splat contributes alpha, the far one the remainder; the second view halves their size."""
     splats = isotropic([4.0, 2.0], 0.3, [0.9, 0.5], [[1.0, 1.0, 1.0]] * 2)
-    half = Camera("half", 32, 32, 20.0, 20.0, 16.0, 16.0, np.eye(4))
-    away = Camera("away", 32, 32, 20.0, 20.0, 16.0, 16.0, np.diag([-1.0, 1.0, -1.0, 1.0]))
-    measured = contributions(splats, [axis_camera, half, away], backend=backend)
+    half_size = Camera("half", 32, 32, 20.0, 20.0, 16.0, 16.0, np.eye(4))
+    opposite = Camera("away", 32, 32, 20.0, 20.0, 16.0, 16.0, np.diag([-1.0, 1.0, -1.0, 1.0]))
+    measured = contributions(splats, [axis_camera, half_size, opposite], backend=backend)
     expected = np.zeros((3, 2))
     for focal in (40, 20):
         far, near = (
@@ -271,9 +271,9 @@ def test_unselected_rows_act_like_zero_weights(backend, make_splats, odd_camera)
     mask[rows.long()] = 1
     for row_weights in (None, weights):
         masked = mask if row_weights is None else mask * row_weights
-        ours = rasterize(splats, odd_camera, weights=row_weights, rows=rows, backend=backend)
-        theirs = rasterize(splats, odd_camera, weights=masked, backend=backend)
-        assert torch.equal(ours.image, theirs.image) and torch.equal(ours.radii, theirs.radii)
+        selected = rasterize(splats, odd_camera, weights=row_weights, rows=rows, backend=backend)
+        expected = rasterize(splats, odd_camera, weights=masked, backend=backend)
+        assert torch.equal(selected.image, expected.image) and torch.equal(selected.radii, expected.radii)
         largest = [
             contributions(splats, [odd_camera], weights=w, rows=r, backend=backend).largest
             for w, r in ((row_weights, rows), (masked, None))

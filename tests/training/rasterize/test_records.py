@@ -23,11 +23,11 @@ def rendering(count):
 
 
 def test_gathered_values_have_order_of_gaussians():
-    array, places = random_records(), np.array([7, 3, 499, 0])
-    splats = records.gather_gaussians(array, places, TERMS)
+    array, rows = random_records(), np.array([7, 3, 499, 0])
+    splats = records.gather_gaussians(array, rows, TERMS)
     values = torch.cat([tensor.reshape(4, -1) for tensor in vars(splats).values()], 1)
-    torch.testing.assert_close(values, array[places, :C], rtol=0, atol=0)
-    assert records.gather_gaussians(array, places[:0], TERMS).sh.shape == (0, TERMS, 3)
+    torch.testing.assert_close(values, array[rows, :C], rtol=0, atol=0)
+    assert records.gather_gaussians(array, rows[:0], TERMS).sh.shape == (0, TERMS, 3)
 
 
 def test_every_record_counts_its_own_steps():
@@ -36,14 +36,14 @@ def test_every_record_counts_its_own_steps():
     values, m, v = array[:, :C].double(), torch.zeros(COUNT, C).double(), torch.zeros(COUNT, C).double()
     times, largest, last = torch.zeros(COUNT, 1), torch.zeros(COUNT), torch.zeros(COUNT)
     for number in range(1, 40):
-        places = np.random.default_rng(number).permutation(COUNT)[:200]
-        at = torch.from_numpy(places)
+        rows = np.random.default_rng(number).permutation(COUNT)[:200]
+        at = torch.from_numpy(rows)
         shapes = (3,), (4,), (3,), (), (TERMS, 3)
         gradients = [torch.randn(200, *shape, generator=NUMBERS) * (number % 3) for shape in shapes]
         drawn = rendering(200)
         opacity = array[at, 10].sigmoid()
         shares = torch.tensor([0.0, 0.25, 1.0])[torch.arange(200) % 3] if number % 2 else None
-        records.adam_step(array, places, gradients, drawn, number, rates, shares)
+        records.adam_step(array, rows, gradients, drawn, number, rates, shares)
         score = drawn.grad2d.norm(dim=1) * drawn.radii * opacity**0.2
         g = torch.cat([gradient.reshape(200, -1) for gradient in gradients], 1).double()
         largest[at] = torch.maximum(largest[at], score)

@@ -91,14 +91,14 @@ def test_images_match_selection_and_rasterization(rule, controls):
     resident = ResidentBundle(source, "cpu")
     drawn_count = 0
     for camera in views():
-        ours = resident.draw(camera, values, near=NEAR)
+        actual = resident.draw(camera, values, near=NEAR)
         splats, weights = select(source, camera.center, camera.focal, values)
         weights = None if weights is None else torch.from_numpy(weights)
-        theirs = rasterize(Gaussians.of(splats), camera, weights=weights, near=NEAR, backend="cpu")
+        expected = rasterize(Gaussians.of(splats), camera, weights=weights, near=NEAR, backend="cpu")
         # splats of equal depth may have another order
-        torch.testing.assert_close(ours.image, theirs.image, atol=2e-5, rtol=1e-5)
-        assert int((ours.radii > 0).sum()) == int((theirs.radii > 0).sum())
-        drawn_count = max(drawn_count, int((ours.radii > 0).sum()))
+        torch.testing.assert_close(actual.image, expected.image, atol=2e-5, rtol=1e-5)
+        assert int((actual.radii > 0).sum()) == int((expected.radii > 0).sum())
+        drawn_count = max(drawn_count, int((actual.radii > 0).sum()))
     assert drawn_count > 100
 
 
@@ -255,13 +255,15 @@ def test_blocks_inside_a_band_skip_the_rule(monkeypatch):
 
     monkeypatch.setattr(type(rule), "weights", counting)
     selector = SplatSelector(splats.means, {}, splats.log_scales)
-    away = np.linalg.norm(splats.means, axis=1)
+    distances = np.linalg.norm(splats.means, axis=1)
     counts = []
     for s_min, coarser in ((0.0, 1e6), (0.0, 0.23), (0.02, 0.1), (0.3, 0.4)):
         facts = {"level": 2, "levels": 3, "finer": 3, "coarser": 1, "s_min": s_min, "coarser_s_min": coarser}
         values = {"gamma": 1.0, "first": 1, "last": 3}
         query = LodQuery("bands", (0.0, 0.0, 0.0), 60.0, tuple(facts.items()), tuple(values.items()))
-        expected = np.flatnonzero((away >= np.float32(60 * s_min)) & (away < np.float32(60 * coarser)))
+        expected = np.flatnonzero(
+            (distances >= np.float32(60 * s_min)) & (distances < np.float32(60 * coarser))
+        )
         evaluated.clear()
         rows, weights = selector.select(query)
         np.testing.assert_array_equal(rows, expected)

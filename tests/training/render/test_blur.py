@@ -62,8 +62,8 @@ def test_blades_and_ratio_shape_the_opening():
     """A square has the variance r²/6 along both axes, an anamorphic lens 1/ratio of the width."""
     square = Aperture(2.0, 1.0, blades=4, rotation=0.2).points(4000)
     np.testing.assert_allclose(np.cov(square.T), np.eye(2) * 4 / 6, atol=0.01)
-    turned = square @ Rotation.from_euler("z", 0.2).as_matrix()[:2, :2].T  # y is down: undo the turn
-    assert np.abs(turned).sum(1).max() == pytest.approx(2, abs=0.01)  # corners on the axes, at the radius
+    aligned = square @ Rotation.from_euler("z", 0.2).as_matrix()[:2, :2].T  # y is down: undo the rotation
+    assert np.abs(aligned).sum(1).max() == pytest.approx(2, abs=0.01)  # corners on the axes, at the radius
     few = Aperture(1.0, 1.0, blades=6, rotation=0.4).points(64)
     np.testing.assert_allclose(np.cov(few.T, bias=True), np.eye(2) * 2.5 / 12, atol=0.01)
     wide = Aperture(1.0, 1.0, ratio=2.0).points(1000)
@@ -103,7 +103,7 @@ def test_turning_camera_keeps_its_place_between_keys():
 
 
 def test_set_turns_around_its_origin_between_keys():
-    """The middle of half a turn is a quarter turn, also of a mirrored set."""
+    """Halfway through a rotation by 180 degrees, a set is rotated by 90 degrees, also a mirrored one."""
     for mirror in (1, -1):
         keys = [np.diag([mirror, 1.0, 1, 1]), np.diag([mirror, 1.0, 1, 1])]
         keys[1][:3, :3] = Rotation.from_euler("z", 179.9, degrees=True).as_matrix() @ keys[0][:3, :3]
@@ -125,18 +125,18 @@ def test_blur_averages_linear_light_over_the_background():
 
 
 def test_orthographic_splats_have_their_projected_covariance():
-    """Scales are the same at all depths, also at the border of the image, and with a turned set."""
-    turn = Rotation.from_euler("xyz", (0.4, -0.7, 1.1))
+    """Scales are the same at all depths, also at the border of the image, and for a rotated set."""
+    rotation = Rotation.from_euler("xyz", (0.4, -0.7, 1.1))
     matrix = np.eye(4)
-    matrix[:3, :3] = turn.as_matrix() * 2
+    matrix[:3, :3] = rotation.as_matrix() * 2
     sigma = np.array([0.25, 0.1, 0.05])
-    own = Rotation.from_euler("z", 0.6)
-    axes = matrix[:3, :3] @ own.as_matrix() * sigma
+    splat_rotation = Rotation.from_euler("z", 0.6)
+    axes = matrix[:3, :3] @ splat_rotation.as_matrix() * sigma
     scale = FOCAL / ORTHO.distance
     expected = scale**2 * (axes @ axes.T)[:2, :2] + np.eye(2) * DILATION
     for position in ((0, 0, 3), (1.2, -0.6, 9)):
         local = np.linalg.solve(matrix, (*position, 1))[:3]
-        item = replace(dot(local, sigma, rotation=own), matrix=matrix)
+        item = replace(dot(local, sigma, rotation=splat_rotation), matrix=matrix)
         item.splats.gaussians.opacity_logits[:] = 0
         image = draw_blurred([item], CAMERA, ORTHO, background=None, depth=True)
         centre, covariance = moments(image.alpha)
@@ -180,8 +180,8 @@ def test_panorama_shows_directions_at_their_angles_and_distances():
     background = draw_blurred([point], camera, projection, background=(1, 1, 1))
     assert (background.alpha == 1).all() and background.image[0, 0] == pytest.approx((1, 1, 1))
     west, east = np.radians((-30, 60))
-    part = LensProjection(EQUIRECTANGULAR, longitude=(west, east), latitude=np.radians((0, 60)))
-    image = draw_blurred([point], camera, part, background=None)
+    projection = LensProjection(EQUIRECTANGULAR, longitude=(west, east), latitude=np.radians((0, 60)))
+    image = draw_blurred([point], camera, projection, background=None)
     np.testing.assert_allclose(moments(image.alpha)[0], (50 / 90 * 128, 16 / 60 * 64), atol=0.2)
 
 

@@ -57,7 +57,7 @@ def bundle(tmp_path, monkeypatch):
     levels = [
         Level(1, red_splats([*wall(0.2), FLOATERS[0]]), {"s_min": 0.2}), Level(2, fine, {"s_min": 0.0}),
     ]  # fmt: skip
-    away = Camera(
+    opposite = Camera(
         "away.jpg",
         128,
         72,
@@ -67,7 +67,7 @@ def bundle(tmp_path, monkeypatch):
         36.0,
         look_at(np.array([0, 0, -6.0]), np.array([0, 0, -9.0]), (0, -1, 0)),
     )
-    write_bundle("in.ply", Bundle("flod", levels, "bands", tables=make_view_tables([away, FRONT], 0.1)))
+    write_bundle("in.ply", Bundle("flod", levels, "bands", tables=make_view_tables([opposite, FRONT], 0.1)))
     return tmp_path
 
 
@@ -112,7 +112,7 @@ def test_splats_of_two_kinds_count_in_both(bundle, capsys):
 
 @pytest.mark.parametrize("count", [3, 2000])
 def test_views_are_chosen_for_files_without_them(tmp_path, monkeypatch, capsys, count):
-    """Few splats are seen from the front, and many from a viewpoint of ``overview.choose_view``."""
+    """Few splats are visible from the front, and many from a viewpoint of ``overview.choose_view``."""
     monkeypatch.chdir(tmp_path)
     means = np.random.default_rng(0).normal(size=(count, 3)).tolist()
     write_ply("in.ply", red_splats([tuple(mean) for mean in means]))

@@ -27,11 +27,11 @@ def zip_file(name: str, content: bytes, kind: int = zipfile.ZIP_STORED) -> bytes
 
 def test_arrays_round_trip(tmp_path):
     (tmp_path / "model.npz").write_bytes(npz(**GOOD))
-    back = read_arrays(tmp_path / "model.npz")
-    assert back.keys() == GOOD.keys()
+    arrays = read_arrays(tmp_path / "model.npz")
+    assert arrays.keys() == GOOD.keys()
     for name, array in GOOD.items():
-        np.testing.assert_array_equal(back[name], array)
-        assert back[name].dtype == array.dtype
+        np.testing.assert_array_equal(arrays[name], array)
+        assert arrays[name].dtype == array.dtype
 
 
 VALID = npz(**GOOD)

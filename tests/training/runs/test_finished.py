@@ -33,15 +33,15 @@ def test_baking_again_changes_colours_alone(run, tmp_path):
     levels = read_bundle(run / "bundle.ply").levels
     photos = ["01.jpg", "02.jpg"]
     with bake_again(run, photos) as path:
-        again = read_bundle(path)
-    assert again.meta["appearance"] == photos
-    for old, new in zip(levels, again.levels, strict=True):
+        baked = read_bundle(path)
+    assert baked.meta["appearance"] == photos
+    for old, new in zip(levels, baked.levels, strict=True):
         for name in ("means", "log_scales", "quats", "opacity_logits"):
             np.testing.assert_array_equal(getattr(old.splats, name), getattr(new.splats, name))
         assert not np.array_equal(old.splats.sh, new.splats.sh)
     out = tmp_path / "edited.ply"
     assert main(["edit", str(run), "--appearance", *photos, "--out", str(out)]) == 0
-    for new, edited in zip(again.levels, read_bundle(out).levels, strict=True):
+    for new, edited in zip(baked.levels, read_bundle(out).levels, strict=True):
         np.testing.assert_allclose(new.splats.sh, edited.splats.sh, atol=1e-6)
 
 

@@ -48,10 +48,10 @@ def test_case(tmp_path, name):
         )
     if "points" in case:
         np.testing.assert_allclose(scene.points + scene.origin, case["points"], atol=1e-6)
-    if place := case.get("georeference"):
-        assert scene.georeference.crs == place["crs"]
-        position = scene.georeference.matrix @ [*place["point"], 1]
-        np.testing.assert_allclose(position[:3], place["position"], atol=1e-6)
+    if georeference := case.get("georeference"):
+        assert scene.georeference.crs == georeference["crs"]
+        position = scene.georeference.matrix @ [*georeference["point"], 1]
+        np.testing.assert_allclose(position[:3], georeference["position"], atol=1e-6)
     if "distorted" in case:
         assert [Path(name).name for name in scene.distorted] == case["distorted"]
     masked = [Path(camera.name).name for camera in scene.cameras if camera.mask is not None]

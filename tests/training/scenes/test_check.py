@@ -57,8 +57,10 @@ def test_few_and_tiny_photos():
     few = replace(scene, cameras=scene.cameras[:5], names=scene.names[:5])
     assert "only 5 views" in texts(check_scene(few))
     assert check_scene(replace(scene, cameras=scene.cameras[:1]))[0].severity == "error"
-    found = texts(check_scene(scene, image_scale=100 / side))
-    assert f"{len(scene.cameras)} of {len(scene.cameras)} photos have fewer" in found and "100)" in found
+    findings = texts(check_scene(scene, image_scale=100 / side))
+    assert (
+        f"{len(scene.cameras)} of {len(scene.cameras)} photos have fewer" in findings and "100)" in findings
+    )
 
 
 def test_scene_without_points(copy):
@@ -70,21 +72,25 @@ def test_scene_without_points(copy):
 def test_views_without_overlap(monkeypatch):
     scene = read_scene(GARDEN)
     names = [camera.name for camera in scene.cameras]
-    half, rest = len(names) // 2, len(names) - len(names) // 2 - 1
+    half, remaining = len(names) // 2, len(names) - len(names) // 2 - 1
     rows = {name: np.arange(100) + 200 * (number >= half) for number, name in enumerate(names)}
     rows[names[-1]] = np.arange(19)
     monkeypatch.setattr("training.scenes.check.observations", lambda scene, names: rows)
     isolated, groups = [finding for finding in check_scene(scene) if "views" in finding.what]
     assert f"1 of {len(names)} views share fewer" in isolated.what and names[-1] in isolated.what
-    assert f"2 groups without common points, the largest of {half} and {rest} views" in groups.what
+    assert f"2 groups without common points, the largest of {half} and {remaining} views" in groups.what
 
 
 def test_photos_of_other_exposure(copy):
     file = sorted((copy / "images").iterdir())[4]
     pixels = np.asarray(Image.open(file).convert("RGB"))
     Image.fromarray((pixels * 0.6).astype(np.uint8)).save(file, quality=97)
-    found = texts(check_folder(copy))
-    assert "Exposure or white balance differs" in found and file.name in found and "match_exposure" in found
+    findings = texts(check_folder(copy))
+    assert (
+        "Exposure or white balance differs" in findings
+        and file.name in findings
+        and "match_exposure" in findings
+    )
 
 
 def test_parts_that_few_photos_see(monkeypatch):

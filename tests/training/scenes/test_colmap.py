@@ -52,9 +52,9 @@ def assert_same(scene: colmap.Scene, truth: pycolmap.Reconstruction, skipped: in
         np.testing.assert_allclose(camera.center, view.projection_center(), atol=1e-9)
     points = np.array([point.xyz for point in truth.points3D.values()]).reshape(-1, 3).astype(np.float32)
     colors = np.array([point.color for point in truth.points3D.values()]).reshape(-1, 3)
-    ours = np.hstack([scene.points, scene.point_colors])
-    theirs = np.hstack([points, colors]).astype(np.float32)
-    np.testing.assert_array_equal(ours[np.lexsort(ours.T)], theirs[np.lexsort(theirs.T)])
+    actual = np.hstack([scene.points, scene.point_colors])
+    expected = np.hstack([points, colors]).astype(np.float32)
+    np.testing.assert_array_equal(actual[np.lexsort(actual.T)], expected[np.lexsort(expected.T)])
 
 
 @pytest.mark.parametrize("name", [*SCENES, *(f"variants/{variant}" for variant in VARIANTS)])

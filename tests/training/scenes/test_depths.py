@@ -69,7 +69,7 @@ def test_maps_are_fitted_per_view(walls, tmp_path, kind):
 
 
 def test_fit_ignores_occluded_points():
-    """A fifth of the points lie occluded the map's surface."""
+    """A fifth of the points are occluded by the surface of the map."""
     rng = np.random.default_rng(0)
     z = rng.uniform(2, 9, 400)
     occluded = z * np.where(rng.random(400) < 0.2, rng.uniform(1.2, 3, 400), 1)

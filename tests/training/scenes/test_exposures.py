@@ -158,8 +158,8 @@ def test_stated_exposures_fill_in_missing_gains_relative_to_the_compared_photos(
     np.testing.assert_allclose(filled[:2], gains[:2])
     np.testing.assert_allclose(filled[2], 2.2 * np.log(2) / 2.2)
     assert np.isnan(filled[3]).all()
-    alone = complete_gains(np.full((3, 3), np.nan), np.array([-1.1, 0, 1.1]))
-    np.testing.assert_allclose(alone[:, 0], np.log(2) / 2 * np.array([-1, 0, 1]))
+    stated_only = complete_gains(np.full((3, 3), np.nan), np.array([-1.1, 0, 1.1]))
+    np.testing.assert_allclose(stated_only[:, 0], np.log(2) / 2 * np.array([-1, 0, 1]))
 
 
 def test_photos_without_shared_points_are_matched_by_exif(tmp_path):

@@ -54,12 +54,12 @@ def test_sky_and_plain_wall_have_the_depths_of_their_surfaces():
 def test_each_cell_is_filled_once():
     views, points = make_scene()
     new, _ = fill_cells(views[:1], points, np.inf)
-    known = np.concatenate([points, new])
-    pixels = Pinhole().img_from_cam(known) / 10
+    all_points = np.concatenate([points, new])
+    pixels = Pinhole().img_from_cam(all_points) / 10
     cells = np.unique(np.floor(pixels).astype(int), axis=0)
     assert len(cells) >= 32 * CELLS and len(new) < 32 * CELLS
-    again, _ = fill_cells([views[0], views[0]], points, np.inf)
-    assert len(again) == len(new)
+    repeated, _ = fill_cells([views[0], views[0]], points, np.inf)
+    assert len(repeated) == len(new)
 
 
 def test_ignored_cells_stay_empty():

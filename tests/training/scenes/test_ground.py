@@ -37,9 +37,9 @@ def scene(seed: int, size: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndar
 @pytest.mark.parametrize("size", [1e-3, 1.0, 1e4])
 def test_ground_plane_of_synthetic_scenes(seed, size):
     points, expected, point = scene(seed, size)
-    normal, middle = find_ground(points, UP)
+    normal, center = find_ground(points, UP)
     assert np.degrees(np.arccos(min(normal @ expected, 1))) < 0.2
-    assert abs((middle - point) @ expected) < 0.01 * size
+    assert abs((center - point) @ expected) < 0.01 * size
     repeated, _ = find_ground(points, UP)
     np.testing.assert_array_equal(repeated, normal)
 
@@ -48,8 +48,8 @@ def test_ground_plane_of_example():
     """The garden's ground is at z = 0 with bumps up to 0.03, between hills."""
     garden = read_scene(GARDEN)
     near = np.linalg.norm(garden.points - garden.center, axis=1) < 1.5 * garden.median_depth()
-    normal, middle = find_ground(garden.points[near], np.array([0.1, 0.1, 1]))
-    assert np.degrees(np.arccos(normal[2])) < 0.5 and abs(middle[2]) < 0.03
+    normal, center = find_ground(garden.points[near], np.array([0.1, 0.1, 1]))
+    assert np.degrees(np.arccos(normal[2])) < 0.5 and abs(center[2]) < 0.03
 
 
 def test_scene_without_ground_is_rejected():
@@ -60,17 +60,17 @@ def test_scene_without_ground_is_rejected():
 
 
 def test_fit_plane_is_exact_for_three_points_and_least_squares_for_more():
-    normal, middle = fit_plane([[0, 0, 1], [1, 0, 2], [0, 1, 1]], UP)
+    normal, center = fit_plane([[0, 0, 1], [1, 0, 2], [0, 1, 1]], UP)
     np.testing.assert_allclose(normal, np.array([-1, 0, 1]) / np.sqrt(2), atol=1e-12)
-    np.testing.assert_allclose(middle, [1 / 3, 1 / 3, 4 / 3])
+    np.testing.assert_allclose(center, [1 / 3, 1 / 3, 4 / 3])
     rng = np.random.default_rng(0)
     points = rng.normal(size=(40, 3)) * (3, 2, 0.1) @ Rotation.random(random_state=0).as_matrix()
-    normal, middle = fit_plane(points, UP)
-    residual = np.square((points - middle) @ normal).sum()
+    normal, center = fit_plane(points, UP)
+    residual = np.square((points - center) @ normal).sum()
     for _ in range(300):  # no nearby plane fits better
         nearby = normal + rng.normal(0, 0.02, 3)
         nearby /= np.linalg.norm(nearby)
-        assert np.square((points - middle - rng.normal(0, 0.01, 3)) @ nearby).sum() >= residual
+        assert np.square((points - center - rng.normal(0, 0.01, 3)) @ nearby).sum() >= residual
 
 
 @pytest.mark.parametrize(
@@ -87,11 +87,11 @@ def test_degenerate_points_are_rejected(points, message):
 def test_ground_placement_levels_plane_at_zero(seed):
     rng = np.random.default_rng(seed)
     normal = rng.normal(size=3) if seed else -UP
-    normal, middle = normal / np.linalg.norm(normal), rng.normal(size=3)
-    placement = ground_placement(normal, middle)
+    normal, center = normal / np.linalg.norm(normal), rng.normal(size=3)
+    placement = ground_placement(normal, center)
     np.testing.assert_allclose(placement.rotation @ normal, UP, atol=1e-12)
     np.testing.assert_allclose(placement.rotation @ placement.rotation.T, np.eye(3), atol=1e-12)
-    np.testing.assert_allclose(placement.transform_points(middle[None])[0], [*middle[:2], 0], atol=1e-12)
+    np.testing.assert_allclose(placement.transform_points(center[None])[0], [*center[:2], 0], atol=1e-12)
     np.testing.assert_allclose(
-        scaling_about(middle, 3.0).transform_points(np.array([middle, middle + 1])), [middle, middle + 3]
+        scaling_about(center, 3.0).transform_points(np.array([center, center + 1])), [center, center + 3]
     )

@@ -67,7 +67,7 @@ def test_strips_do_not_change_the_result(tmp_path, monkeypatch, size):
 
 
 def test_large_jpegs_are_reduced_while_decoding(tmp_path, monkeypatch):
-    """The reduced image is offset least twice as large as requested, and looks the same."""
+    """The reduced image is at least twice as large as requested, and looks the same."""
     red, green = np.meshgrid(np.linspace(20, 220, 640), np.linspace(40, 200, 480))
     pixels = np.stack([red, green, 255 - red], 2).astype(np.uint8)
     Image.fromarray(pixels).save(tmp_path / "a.jpg", quality=95)

@@ -59,7 +59,7 @@ def test_cell_is_enlarged_by_a_fifth_of_its_side(grid):
 
 
 def test_border_zone_is_a_fifth_of_the_cell_wide(grid):
-    """The left cell ends at 15 and is 15 wide, so its border zone is 3 wide, and so is the right one's."""
+    """The left cell ends at 15 and is 15 wide, so border zones are 3 wide on both sides."""
     left, right = sorted(plan_cells(grid, 2, 1), key=lambda region: positions_in(region, grid)[:, 0].max())
     x = grid.points[:, 0]
     np.testing.assert_array_equal(left.near_border(grid.points), (x >= 12) & (x < 15))

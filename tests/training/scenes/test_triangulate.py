@@ -100,8 +100,8 @@ def test_progress_and_result_are_reported(result, walls):
 def test_result_is_cached(result, walls, tmp_path, monkeypatch):
     scene, _ = result
     monkeypatch.setattr(triangulate.pycolmap_process, "run_program", None)
-    again = triangulate_scene(read_scene(walls), tmp_path, lambda *values: None)
-    for other in (again, cached_points(read_scene(walls))):
+    repeated = triangulate_scene(read_scene(walls), tmp_path, lambda *values: None)
+    for other in (repeated, cached_points(read_scene(walls))):
         assert np.array_equal(other.points, scene.points)
         assert np.array_equal(other.point_colors, scene.point_colors)
     assert len(cached_points(read_scene(shutil.copytree(walls / "..", tmp_path / "copy") / "scene")).points)
@@ -211,7 +211,7 @@ def test_command_adds_points_to_a_colmap_scene(walls, tmp_path, capsys):
     assert "already is a COLMAP scene" in capsys.readouterr().err
 
 
-def test_lens_is_kept_where_nothing_can_be_matched(tmp_path):
+def test_lens_is_kept_if_nothing_can_be_matched(tmp_path):
     photos = [np.full((HEIGHT, WIDTH, 3), 90, np.uint8)] * 6
     write_walls(tmp_path / "scene", photos, DISTORTION)
     assert main(["scene", "--from", str(tmp_path / "scene"), "--out", str(tmp_path / "out")]) == 0

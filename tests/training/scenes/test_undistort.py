@@ -192,13 +192,14 @@ def test_photos_with_another_suffix_and_turned_photos(tmp_path):
     segment = b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif
     (tmp_path / "images" / "b.jpg").write_bytes(content[:2] + segment + content[2:])
     scene = read_scene(tmp_path, model=model)
-    turned = next(camera for camera in scene.cameras if camera.name == "b.jpg")
-    assert (turned.width, turned.height, turned.fx, turned.cx) == (96, 72, 82, 47)
+    rotated_view = next(camera for camera in scene.cameras if camera.name == "b.jpg")
+    assert (rotated_view.width, rotated_view.height, rotated_view.fx, rotated_view.cx) == (96, 72, 82, 47)
     result = undistort_scene(scene, tmp_path / "cache").cameras
     np.testing.assert_allclose(
-        next(camera for camera in result if camera.name == "b.jpg").world_to_camera, turned.world_to_camera,
+        next(camera for camera in result if camera.name == "b.jpg").world_to_camera,
+        rotated_view.world_to_camera,
         atol=1e-12,
-    )  # fmt: skip
+    )
     assert [(camera.fx, camera.cx) for camera in result if camera.name == "b.jpg"] == [(82, 47)]
 
 
@@ -210,8 +211,10 @@ def test_tracks_of_absent_observations_do_not_matter(tmp_path):
         file.unlink()
     model.write_text(tmp_path / "sparse/0")
     lines = (tmp_path / "sparse/0/images.txt").read_text().splitlines()
-    kept = [line if line.endswith(".png") else "" for line in lines if not line.startswith("#")]
-    (tmp_path / "sparse/0/images.txt").write_text("\n".join([*kept, ""]))
+    lines_without_observations = [
+        line if line.endswith(".png") else "" for line in lines if not line.startswith("#")
+    ]
+    (tmp_path / "sparse/0/images.txt").write_text("\n".join([*lines_without_observations, ""]))
     result = undistort_scene(read_scene(tmp_path), tmp_path / "cache")
     assert len(result.cameras) == 3 and len(result.points) == 50
 

@@ -33,11 +33,11 @@ def read(path):
         return read_bundle(ply)
 
 
-def assert_equal(actual, expected, places=1e-5):
+def assert_equal(actual, expected, tolerance=1e-5):
     unit = expected.quats / np.linalg.norm(expected.quats, axis=1, keepdims=True)
-    for one, other, limit in (
-        (actual.means, expected.means, places), (actual.log_scales, expected.log_scales, 1e-5),
+    for actual_values, expected_values, limit in (
+        (actual.means, expected.means, tolerance), (actual.log_scales, expected.log_scales, 1e-5),
         (actual.quats, unit, 1e-6), (actual.opacity_logits, expected.opacity_logits, 2e-3),
         (actual.sh, expected.sh, 0),
     ):  # fmt: skip
-        np.testing.assert_allclose(one, other, atol=limit, rtol=1e-6)
+        np.testing.assert_allclose(actual_values, expected_values, atol=limit, rtol=1e-6)

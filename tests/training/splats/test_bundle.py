@@ -151,11 +151,11 @@ def test_readers_that_sum_all_properties_need_a_plain_file(tmp_path, bundle):
     """This known limit of bundles is the reason to export plain PLYs."""
     write_bundle(tmp_path / "b.ply", bundle)
     with pytest.raises(ValueError, match="out of bounds"):
-        viewers.sums_all_properties((tmp_path / "b.ply").read_bytes())
+        viewers.read_all_properties((tmp_path / "b.ply").read_bytes())
     finest = bundle.levels[2].splats
     finest.extras = {}
     write_ply(tmp_path / "plain.ply", finest)
-    rows = viewers.sums_all_properties((tmp_path / "plain.ply").read_bytes())
+    rows = viewers.read_all_properties((tmp_path / "plain.ply").read_bytes())
     np.testing.assert_array_equal(rows[:, -4:], finest.quats)
 
 

@@ -61,11 +61,11 @@ def test_errors_are_within_half_a_step(tmp_path, bundle, codebook, cumulative):
     write_bundle(tmp_path / "b.ply", bundle, codebook=codebook)
     pairs = list(zip(bundle.levels, read_bundle(tmp_path / "b.ply").levels, strict=True))
     for group in [pairs] if cumulative else [[pair] for pair in pairs]:
-        given, decoded = (Splats.concatenated([pair[side].splats for pair in group]) for side in range(2))
+        original, decoded = (Splats.concatenated([pair[side].splats for pair in group]) for side in range(2))
         for name, codes in (("means", 65535), ("log_scales", 255), ("opacity_logits", 255)):
             values, result = (
                 getattr(splats, name).reshape(len(splats), -1).astype(np.float64)
-                for splats in (given, decoded)
+                for splats in (original, decoded)
             )
             m = np.median(values, axis=0)
             w = np.median(np.abs(values - m), axis=0)
@@ -74,7 +74,7 @@ def test_errors_are_within_half_a_step(tmp_path, bundle, codebook, cumulative):
             assert (np.abs(result - values) <= 0.52 * step + 1e-6 * np.abs(values)).all(), name
         sets = codebook.sets[np.concatenate([codebook.codes[level.number] for level, _ in group])]
         np.testing.assert_allclose(decoded.sh[:, 1:], sets, atol=0.07)
-        cosines = np.abs((given.quats * decoded.quats).sum(1)) / np.linalg.norm(given.quats, axis=1)
+        cosines = np.abs((original.quats * decoded.quats).sum(1)) / np.linalg.norm(original.quats, axis=1)
         assert np.degrees(2 * np.arccos(cosines.clip(0, 1))).max() < 3
 
 
@@ -102,11 +102,11 @@ def test_all_readers_decode_the_same_splats(tmp_path, bundle, file, same):
     finest = result.levels[-1].splats
     _, rows = open_bundle(file)
     assert same(finest.select(slice(7, 90)), rows[2].select(slice(7, 90)))
-    some = np.array([3, 500, 2999])
-    assert same(finest.select(some), rows[2].select(some))
-    columns = rows[2].columns(some, ("x", "label", "missing"))
-    np.testing.assert_array_equal(columns["x"], finest.means[some, 0])
-    np.testing.assert_array_equal(columns["label"], finest.extras["label"][some])
+    indices = np.array([3, 500, 2999])
+    assert same(finest.select(indices), rows[2].select(indices))
+    columns = rows[2].columns(indices, ("x", "label", "missing"))
+    np.testing.assert_array_equal(columns["x"], finest.means[indices, 0])
+    np.testing.assert_array_equal(columns["label"], finest.extras["label"][indices])
     assert same(read_part(file, [2])[0].levels[-1].splats, finest)
     on_disk = open_if_large(file, 10)
     assert on_disk is not None and same(on_disk.levels[1].rows.select(slice(None)), finest)

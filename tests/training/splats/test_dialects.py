@@ -80,8 +80,8 @@ def test_3d_filter_is_accurate_for_extreme_values(write):
     wide = 0.5 * np.log(np.exp(2 * s) + f**2)
     np.testing.assert_allclose(splats.log_scales[:, 0], wide, rtol=1e-5, atol=1e-6)
     log_opacity = -np.logaddexp(0, -o) + 3 * (s - wide)
-    log_found = -np.logaddexp(0, -splats.opacity_logits.astype(np.float64))
-    np.testing.assert_allclose(log_found, log_opacity, rtol=1e-5, atol=1e-5)
+    log_filtered = -np.logaddexp(0, -splats.opacity_logits.astype(np.float64))
+    np.testing.assert_allclose(log_filtered, log_opacity, rtol=1e-5, atol=1e-5)
     assert (splats.opacity_logits <= o.astype(np.float32)).all()
 
 

@@ -34,8 +34,8 @@ GEOCENTRIC = 3771793.968, 140253.342, 5124304.349
 
 
 def test_local_tangent_plane_matches_the_published_example():
-    place = local_tangent_plane(LATITUDE, LONGITUDE, 73.0)
-    np.testing.assert_allclose(place.matrix[:3, 3], GEOCENTRIC, atol=1e-3)
+    georeference = local_tangent_plane(LATITUDE, LONGITUDE, 73.0)
+    np.testing.assert_allclose(georeference.matrix[:3, 3], GEOCENTRIC, atol=1e-3)
     far = np.linalg.solve(local_tangent_plane(55.0, 5.0, 200.0).matrix, [*GEOCENTRIC, 1.0])
     np.testing.assert_allclose(far[:3], (-189013.869, -128642.040, -4220.171), atol=2e-3)
 
@@ -64,8 +64,8 @@ def test_damaged_file_is_a_warning_of_the_scene(tiny_scene, tmp_path):
     )
     (copy / FILE).unlink()
     (copy / "site.prj").write_text('PROJCS["WGS 84 / UTM zone 31N",\n  AUTHORITY["EPSG","32631"]]')
-    place = read_scene(copy).georeference
-    assert place.crs.startswith("PROJCS[") and np.array_equal(place.matrix, np.eye(4))
+    georeference = read_scene(copy).georeference
+    assert georeference.crs.startswith("PROJCS[") and np.array_equal(georeference.matrix, np.eye(4))
     write_georeference(copy, Georeference("EPSG:32631", np.diag([2.0, 2.0, 2.0, 1.0])))
     assert read_scene(copy).georeference.crs == "EPSG:32631"
     data = TrainingData(read_scene(copy), test_every=4)
@@ -75,8 +75,8 @@ def test_damaged_file_is_a_warning_of_the_scene(tiny_scene, tmp_path):
 
 @pytest.fixture
 def bundle():
-    place = local_tangent_plane(LATITUDE, LONGITUDE, 73.0)
-    meta = {"origin": [100.0, -50.0, 10.0], "georeference": place.to_json()}
+    georeference = local_tangent_plane(LATITUDE, LONGITUDE, 73.0)
+    meta = {"origin": [100.0, -50.0, 10.0], "georeference": georeference.to_json()}
     return Bundle("", [Level(1, random_splats(30))], meta=meta)
 
 
@@ -92,9 +92,9 @@ def test_files_and_placements_keep_the_place(bundle, tmp_path):
     assert distances == pytest.approx(np.linalg.norm(east_north_up, axis=1), abs=1e-3)
     write_bundle(tmp_path / "bundle.ply", bundle)
     np.testing.assert_array_equal(on_earth(read_bundle(tmp_path / "bundle.ply")), expected)
-    turned = transform_bundle(bundle, Similarity.from_angles((10, 20, 30), 0.5, (1, 2, 3)))
-    assert not turned.origin.any()
-    np.testing.assert_allclose(on_earth(turned), expected, atol=1e-4)
+    rotated = transform_bundle(bundle, Similarity.from_angles((10, 20, 30), 0.5, (1, 2, 3)))
+    assert not rotated.origin.any()
+    np.testing.assert_allclose(on_earth(rotated), expected, atol=1e-4)
 
 
 def test_tiles_are_placed_on_the_globe(bundle, tmp_path):

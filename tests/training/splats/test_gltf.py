@@ -21,7 +21,7 @@ from training.splats.portable_levels import PortableLevels
 PREFIX = "KHR_gaussian_splatting:"
 
 
-def parts(path):
+def read_parts(path):
     """Return the JSON document and the binary data of a file, read by the glTF 2.0 specification."""
     data = path.read_bytes()
     magic, version, size, length, kind = struct.unpack("<4sIII4s", data[:20])
@@ -52,7 +52,7 @@ def accessor(document, data, index):
 def test_attributes_follow_the_extension(tmp_path):
     bundle = flod()
     export_levels(tmp_path / "a.glb", bundle)
-    document, data = parts(tmp_path / "a.glb")
+    document, data = read_parts(tmp_path / "a.glb")
     assert document["extensionsUsed"] == ["KHR_gaussian_splatting", "MSFT_lod"]
     (primitive,) = document["meshes"][0]["primitives"]
     assert primitive["mode"] == 0 and primitive["extensions"]["KHR_gaussian_splatting"] == {
@@ -76,7 +76,7 @@ def test_attributes_follow_the_extension(tmp_path):
 
 def test_levels_are_nodes_by_coverage(tmp_path):
     export_levels(tmp_path / "a.glb", flod())
-    document, _ = parts(tmp_path / "a.glb")
+    document, _ = read_parts(tmp_path / "a.glb")
     nodes = document["nodes"]
     assert nodes[0]["extensions"]["MSFT_lod"]["ids"] == [1, 2]
     assert [node["name"] for node in nodes[:3]] == ["Level 3", "Level 2", "Level 1"]
@@ -87,16 +87,16 @@ def test_levels_are_nodes_by_coverage(tmp_path):
     np.testing.assert_allclose(up, [0, 1, 0], atol=1e-12)
 
 
-def test_cameras_look_as_ours(tmp_path):
+def test_cameras_match_the_views(tmp_path):
     export_levels(tmp_path / "a.glb", flod())
-    document, _ = parts(tmp_path / "a.glb")
+    document, _ = read_parts(tmp_path / "a.glb")
     node = next(node for node in document["nodes"] if "camera" in node)
     lens = document["cameras"][node["camera"]]["perspective"]
     point = np.array([0.4, 0.2, 1.5, 1])
     splats_to_world = np.array(document["nodes"][0]["matrix"]).reshape(4, 4).T
     x, y, z, _ = np.linalg.inv(np.array(node["matrix"]).reshape(4, 4).T) @ splats_to_world @ point
-    ours = camera()
-    right, down, ahead, _ = ours.world_to_camera @ point
+    view = camera()
+    right, down, ahead, _ = view.world_to_camera @ point
     np.testing.assert_allclose([x, y, z], [right, -down, -ahead], atol=1e-12)
     focal = 1 / np.tan(lens["yfov"] / 2)
     np.testing.assert_allclose(focal * 240, 520)
@@ -121,7 +121,7 @@ def test_original_place_survives(tmp_path):
     reread = read(tmp_path / "a.glb")
     expected = bundle.levels[2].splats.means.astype(np.float64) + origin
     np.testing.assert_allclose(reread.levels[2].splats.means + reread.origin, expected, atol=1e-4)
-    document, data = parts(tmp_path / "a.glb")
+    document, data = read_parts(tmp_path / "a.glb")
     document["scenes"][0].pop("extras")  # as from another program
     (tmp_path / "b.glb").write_bytes(assembled(document, data))
     reread = read(tmp_path / "b.glb")
@@ -133,7 +133,7 @@ def test_original_place_survives(tmp_path):
 def test_one_level_has_no_nodes_for_levels(tmp_path):
     splats = random_splats(50, 1)
     run_to_end(export_finest_level(tmp_path / "a.glb", Bundle("", [Level(4, splats)])))
-    document, _ = parts(tmp_path / "a.glb")
+    document, _ = read_parts(tmp_path / "a.glb")
     assert document["extensionsUsed"] == ["KHR_gaussian_splatting"] and len(document["nodes"]) == 1
     assert_equal(read(tmp_path / "a.glb").levels[0].splats, splats)
     kind = find_format(tmp_path / "a.glb")
@@ -216,7 +216,7 @@ def change_index(document):
 )
 def test_unusable_files_raise_one_sentence(tmp_path, change, reason):
     export_levels(tmp_path / "a.glb", flod())
-    document, data = parts(tmp_path / "a.glb")
+    document, data = read_parts(tmp_path / "a.glb")
     change(document)
     (tmp_path / "b.glb").write_bytes(assembled(document, data))
     with pytest.raises(LodgsError, match=reason):
@@ -234,7 +234,7 @@ def test_compressed_level_is_read_within_the_steps_of_spz(tmp_path):
     bundle = flod(2)
     del bundle.levels[:-1]
     write_compressed_glb(tmp_path / "a.glb", PortableLevels(bundle))
-    document, _ = parts(tmp_path / "a.glb")
+    document, _ = read_parts(tmp_path / "a.glb")
     extension = "KHR_gaussian_splatting_compression_spz_2"
     assert document["extensionsRequired"] == ["KHR_gaussian_splatting", extension]
     reread = read(tmp_path / "a.glb").levels[-1].splats

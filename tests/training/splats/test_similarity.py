@@ -27,11 +27,11 @@ def random_splats(count: int, degree: int, seed: int = 0) -> Splats:
     )
 
 
-def matrix_of(seed: int, scale: float = 1.0, away: float = 3.0) -> np.ndarray:
+def matrix_of(seed: int, scale: float = 1.0, extent: float = 3.0) -> np.ndarray:
     rng = np.random.default_rng(seed)
     matrix = np.eye(4)
     matrix[:3, :3] = scale * Rotation.random(random_state=seed).as_matrix()
-    matrix[:3, 3] = rng.uniform(-away, away, 3)
+    matrix[:3, 3] = rng.uniform(-extent, extent, 3)
     return matrix
 
 

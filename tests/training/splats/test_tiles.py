@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 
 from tests.training.splats.level_files import UP, flod, read
 from tests.training.splats.test_formats import random_splats
-from tests.training.splats.test_gltf import parts
+from tests.training.splats.test_gltf import read_parts
 from training.editing.export import export_tiles
 from training.errors import LodgsError
 from training.splats import tiles
@@ -49,8 +49,8 @@ def test_tileset_is_nested(tmp_path, bundle):
     export_tiles(tmp_path / "web", bundle)
     tileset = load(tmp_path / "web")
     assert tileset["asset"]["version"] == "1.1" and tileset["geometricError"] > 0
-    found = [tile["content"]["uri"] for tile, _ in walk(tileset["root"]) if "content" in tile]
-    assert sorted([*found, "tileset.json"]) == sorted(path.name for path in (tmp_path / "web").iterdir())
+    uris = [tile["content"]["uri"] for tile, _ in walk(tileset["root"]) if "content" in tile]
+    assert sorted([*uris, "tileset.json"]) == sorted(path.name for path in (tmp_path / "web").iterdir())
     for tile, parent in walk(tileset["root"]):
         assert tile["refine"] == "REPLACE"
         if parent is not None:
@@ -67,7 +67,7 @@ def test_each_splat_is_in_one_cell(tmp_path, bundle):
     for level in bundle.levels:
         means = []
         for path in (tmp_path / "web").glob(f"*_level{level.number}.glb"):
-            document, data = parts(path)
+            document, data = read_parts(path)
             means.append(unpack_spz(data, 1000).means)
             attributes = document["meshes"][0]["primitives"][0]["attributes"]
             position = document["accessors"][attributes["POSITION"]]
@@ -98,14 +98,14 @@ def test_cesium_selects_the_level_of_the_rule(tmp_path, bundle):
 
 
 def test_contents_are_upright(tmp_path, bundle):
-    """Viewers turn the y axis of glTF up to z."""
+    """Viewers rotate the y axis of glTF to z."""
     export_tiles(tmp_path / "web", bundle)
     path = next((tmp_path / "web").glob("cell0_level3.glb"))
     reread = read(path).levels[-1].splats
     low, high = corners(load(tmp_path / "web")["root"])
     upright = reread.means @ np.array(UP).T
     assert (upright >= low).all() and (upright <= high).all()
-    matrix = np.array(parts(path)[0]["nodes"][0]["matrix"]).reshape(4, 4).T[:3, :3]
+    matrix = np.array(read_parts(path)[0]["nodes"][0]["matrix"]).reshape(4, 4).T[:3, :3]
     to_z_up = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
     np.testing.assert_allclose(to_z_up @ matrix, UP, atol=1e-12)
 
@@ -120,7 +120,7 @@ def test_earth_centred_scenes_are_placed_on_the_globe(tmp_path, bundle):
     finest = bundle.levels[2].splats.means
     placed = corners(root)[0] + origin, corners(root)[1] + origin
     assert (finest + origin >= placed[0]).all() and (finest + origin <= placed[1]).all()
-    bundle.meta["origin"] = [448_250.0, 5_411_900.0, 300.0]  # UTM is no place in space
+    bundle.meta["origin"] = [448_250.0, 5_411_900.0, 300.0]  # UTM coordinates are not geocentric
     export_tiles(tmp_path / "web", bundle)
     assert "transform" not in load(tmp_path / "web")["root"]
 

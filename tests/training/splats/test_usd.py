@@ -68,14 +68,14 @@ def test_octree_levels_fade_where_their_splats_do(tmp_path):
     np.testing.assert_allclose(
         np.array(heuristic.GetBlendThresholdsAttr().Get()) - radius, expected[::-1], rtol=1e-2
     )
-    begins = np.array(heuristic.GetThresholdsAttr().Get()) - radius
-    np.testing.assert_allclose(begins, np.array(expected[::-1]) / 2**0.5, rtol=1e-2)
+    thresholds = np.array(heuristic.GetThresholdsAttr().Get()) - radius
+    np.testing.assert_allclose(thresholds, np.array(expected[::-1]) / 2**0.5, rtol=1e-2)
     reread = read(tmp_path / "a.usdc")
     assert [len(level.splats) for level in reread.levels] == [30, 60, 90] and reread.rule == "chunks"
 
 
 def test_single_splats_become_nested_levels():
-    """CLoD-GS: a level holds the splats with the longest reach, and is used where no others are visible."""
+    """CLoD-GS: a level contains the splats with the longest reach, and is used if no others are visible."""
     splats = random_splats(9000, 0)
     rng = np.random.default_rng(0)
     splats.extras["sigma_d"] = rng.uniform(0.1, 2, 9000).astype(np.float32)
@@ -93,15 +93,15 @@ def test_single_splats_become_nested_levels():
             assert (visible > len(level.rows)) is more
 
 
-def test_cameras_project_as_ours(stage):
+def test_cameras_match_the_views(stage):
     usd = load_usd()
     prims = [prim for prim in stage.Traverse() if prim.GetTypeName() == "Camera"]
     assert [prim.GetName() for prim in prims] == ["a_b", "a_b_2", "c"]
     assert prims[0].GetDisplayName() == "images/a b.jpg"
-    ours = camera()
+    view = camera()
     point = np.array([0.4, 0.2, 1.5])
-    x, y, z = (ours.world_to_camera @ [*point, 1])[:3]
-    pixel = ours.fx * x / z + ours.cx, ours.fy * y / z + ours.cy
+    x, y, z = (view.world_to_camera @ [*point, 1])[:3]
+    pixel = view.fx * x / z + view.cx, view.fy * y / z + view.cy
     frustum = usd.UsdGeom.Camera(prims[0]).GetCamera(usd.Usd.TimeCode.Default()).frustum
     placed = (
         usd.UsdGeom.XformCache()

@@ -58,7 +58,7 @@ def fixed_record(data: bytes, degree: int) -> np.ndarray:
     return np.frombuffer(data, "<f4", int(match[1]) * width, start).reshape(-1, width)
 
 
-def sums_all_properties(data: bytes) -> np.ndarray:
+def read_all_properties(data: bytes) -> np.ndarray:
     """Read as antimatter15 and gsplat.js do: header within 10 KB, stride of all its property lines."""
     head = data[: 10 * 1024]
     start = head.index(b"\nend_header\n") + len(b"\nend_header\n")

@@ -117,7 +117,7 @@ class TreeRelations(Relations):
             original, (NODE_SIZE, PARENT_SIZE), (PARENT, ("x", "y", "z"))
         )
         inside = (original[PARENT_SIZE] > 0) & (original[PARENT_SIZE] < ABOVE_ROOT)
-        # nodes know their parent by size and position: one key per parent, shared by its children
+        # nodes refer to their parent by its size and position, so children of a parent share a key
         parent_hashes = hash_rows(node_keys(*(original[name] for name in (PARENT_SIZE, *PARENT)))[inside])
         keys, first, key_of_child = np.unique(parent_hashes, return_index=True, return_inverse=True)
         own_hashes = hash_rows(node_keys(*(original[name] for name in (NODE_SIZE, *"xyz"))))

@@ -14,10 +14,10 @@ _GRAIN = 1 << 12
 
 
 @kernel(STRICT)
-def _gather(begin, end, records, width, places, means, quats, log_scales, opacity_logits, sh):
+def _gather(begin, end, records, width, indices, means, quats, log_scales, opacity_logits, sh):
     terms = sh.shape[1]
     for k in range(begin, end):
-        i = places[k] * width
+        i = indices[k] * width
         for j in range(3):
             means[k, j] = records[i + j]
             log_scales[k, j] = records[i + 7 + j]
@@ -39,16 +39,16 @@ def _move(records, first, count, extent, gradient, place, lr, keep, keep_m, keep
 
 @kernel(STRICT)
 def _step(
-    begin, end, records, width, places, means, quats, log_scales, opacity_logits, sh, grad2d, radii, number,
+    begin, end, records, width, indices, means, quats, log_scales, opacity_logits, sh, grad2d, radii, number,
     lr, shares, bias_m, bias_v, keep_m, keep_v, eps,
 ):  # fmt: skip
-    """Update flat arrays."""
+    """Update the visible records of ``indices[begin:end]``; all arrays are flat."""
     count = lr.shape[0]
     terms = count - 11
     for k in range(begin, end):
         if radii[k] <= 0:
             continue
-        i = places[k] * width
+        i = indices[k] * width
         stats = i + 3 * count
         x, y = grad2d[2 * k], grad2d[2 * k + 1]
         opacity = 1 / (1 + np.exp(-records[i + 10]))
@@ -76,17 +76,17 @@ def _corrections(betas: tuple[float, float], count: int) -> tuple[np.ndarray, np
     return first.astype(np.float32), (1 / second).astype(np.float32)
 
 
-def gather(records: np.ndarray, places: np.ndarray, arrays: Sequence[np.ndarray]) -> None:
-    """Copy the values of records (N, width) at ``places`` (M,) int64 to arrays (M, ...)."""
+def gather(records: np.ndarray, indices: np.ndarray, arrays: Sequence[np.ndarray]) -> None:
+    """Copy the values of records (N, width) at ``indices`` (M,) int64 to arrays (M, ...)."""
     *arrays, sh = arrays
-    sh = sh.reshape(len(places), 3 * sh.shape[1])
-    run_parallel(_gather, len(places), _GRAIN, records.reshape(-1), records.shape[1], places, *arrays, sh)
+    sh = sh.reshape(len(indices), 3 * sh.shape[1])
+    run_parallel(_gather, len(indices), _GRAIN, records.reshape(-1), records.shape[1], indices, *arrays, sh)
 
 
 @serialised
 def step(
     records: np.ndarray,
-    places: np.ndarray,
+    indices: np.ndarray,
     gradients: Sequence[np.ndarray],
     grad2d: np.ndarray,
     radii: np.ndarray,
@@ -100,6 +100,6 @@ def step(
     corrections = _corrections(betas, 1 << int(number + 1).bit_length())
     flat = (array.reshape(-1) for array in (*gradients, grad2d))
     run_parallel(
-        _step, len(places), _GRAIN, records.reshape(-1), records.shape[1], places, *flat, radii, f32(number),
-        lr, shares, *corrections, f32(betas[0]), f32(betas[1]), f32(eps),
+        _step, len(indices), _GRAIN, records.reshape(-1), records.shape[1], indices, *flat, radii,
+        f32(number), lr, shares, *corrections, f32(betas[0]), f32(betas[1]), f32(eps),
     )  # fmt: skip

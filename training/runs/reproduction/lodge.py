@@ -64,7 +64,7 @@ PAPER = Paper(
         ),
     ),
     missing=(
-        "Table 3: distances are chosen from the scene, so those of the labels are the paper's. Rows with "
+        "Table 3: distances are chosen from the scene; the labels give those of the paper. Rows with "
         "distances chosen by hand, and chunks without visibility filtering or blending, have no switch.",
         "Tables 1 and 2 compare other programs on scenes of kilometres; make bench-lod measures levels and "
         "chunks on a synthetic town. Table 4 needs phones. Memory is not measured.",
