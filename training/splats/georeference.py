@@ -22,6 +22,13 @@ _MAX_TEXT = 8192
 """Maximum length of a WKT text."""
 _EQUATOR, _FLATTENING = 6_378_137.0, 1 / 298.257223563
 """Semi-major axis in metres and flattening of WGS 84."""
+_SURFACE = 6.2e6, 6.6e6
+"""Distances in metres from the Earth's centre between which a position counts as geocentric."""
+
+
+def is_geocentric(position: np.ndarray) -> bool:
+    """Return whether a position (3,) in metres is as far from the Earth's centre as its surface."""
+    return _SURFACE[0] < float(np.linalg.norm(position)) < _SURFACE[1]
 
 
 @dataclass(frozen=True)

@@ -47,8 +47,8 @@ _MIN_SPLAT = 32
 """Minimum bytes of a splat: position, rotation, scale, opacity and base colour."""
 _SPZ_SPLAT = 19
 """Minimum bytes of a splat of SPZ before compression."""
-_MAX_RATIO = 200
-"""Maximum ratio of compression that is read; equal splats are compressed best."""
+_MAX_RATIO = 20
+"""Maximum ratio of compression that is read; that of trained splats is about 2."""
 _VIEW_ANGLE = math.radians(60)
 """Vertical field of view for which distances are converted to covered shares of the screen."""
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])

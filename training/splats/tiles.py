@@ -16,7 +16,7 @@ import numpy as np
 from ..errors import LodgsError
 from ..files import temporary_folder
 from .gaussians import SplatRows, Splats
-from .georeference import ECEF
+from .georeference import ECEF, is_geocentric
 from .gltf import COMPRESSION, SPLATS, write_compressed_glb
 from .levels import Bundle, Level
 from .portable_levels import PortableLevels, batches
@@ -26,8 +26,6 @@ MAX_TILE_SPLATS = 200_000
 """Maximum number of splats in a tile of the finest level."""
 SCREEN_ERROR = 16.0
 """Cesium's default limit of the error on the screen in pixels."""
-_EARTH = 6.2e6, 6.6e6
-"""Distances in metres from the Earth's centre between which a local origin counts as ECEF."""
 _FAR = 1000.0
 """Distance up to which a scene is shown, in multiples of its diagonal."""
 _CORE = 3.0
@@ -73,7 +71,7 @@ def _earth_transform(bundle: Bundle) -> np.ndarray | None:
     place = bundle.georeference
     if place is not None and place.crs == ECEF:
         return place.matrix
-    if not _EARTH[0] < np.linalg.norm(bundle.origin) < _EARTH[1]:
+    if not is_geocentric(bundle.origin):
         return None
     transform = np.eye(4)
     transform[:3, 3] = bundle.origin

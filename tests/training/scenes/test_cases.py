@@ -48,6 +48,8 @@ def test_case(tmp_path, name):
         )
     if "points" in case:
         np.testing.assert_allclose(scene.points + scene.origin, case["points"], atol=1e-6)
+    if case.get("georeference", 0) is None:
+        assert scene.georeference is None
     if georeference := case.get("georeference"):
         assert scene.georeference.crs == georeference["crs"]
         position = scene.georeference.matrix @ [*georeference["point"], 1]

@@ -242,3 +242,12 @@ def test_compressed_level_is_read_within_the_steps_of_spz(tmp_path):
     np.testing.assert_allclose(reread.means, expected.means, atol=1e-5)
     np.testing.assert_allclose(reread.log_scales, expected.log_scales, atol=0.5 / 16 + 1e-5)
     assert reread.sh.shape == expected.sh.shape
+
+
+def test_highly_compressed_level_is_rejected(tmp_path):
+    bundle = flod(0)
+    del bundle.levels[:-1]
+    bundle.levels[0] = Level(1, bundle.levels[0].splats.select(np.zeros(20_000, int)))
+    write_compressed_glb(tmp_path / "a.glb", PortableLevels(bundle))
+    with pytest.raises(LodgsError, match="20,000 splats"):
+        read(tmp_path / "a.glb")

@@ -16,7 +16,7 @@ import numpy as np
 from ...documents import DECIMAL_COMMAS, has_decimal_commas, open_text
 from ...errors import LodgsError
 from ...files import is_file
-from ...splats.georeference import ECEF, Georeference
+from ...splats.georeference import ECEF, Georeference, is_geocentric
 from ..lenses import Intrinsics
 from .exported import (
     ExportedScene,
@@ -114,7 +114,7 @@ def read(path: Path) -> ExportedScene:
             excluded.append((label, error.what))
     system = (chunk.findtext("reference") or "").strip()
     place = None
-    if aligned and system and not system.startswith(_LOCAL):
+    if system and not system.startswith(_LOCAL) and is_geocentric(base[:3, 3]):
         place = Georeference(ECEF, base @ np.diag([1 / scale] * 3 + [1.0]))
     return ExportedScene(views, excluded=excluded, warnings=warnings, georeference=place)
 
