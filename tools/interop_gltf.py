@@ -27,7 +27,9 @@ sys.path.insert(0, str(ROOT))
 from tools import interop  # noqa: E402
 from training.api import load_bundle, render_image  # noqa: E402
 from training.editing.export import export_levels  # noqa: E402
+from training.scenes.cameras import Camera  # noqa: E402
 from training.scenes.view_tables import read_view_tables  # noqa: E402
+from training.splats.levels import Bundle  # noqa: E402
 
 PACKAGE, VERSION = "three", "0.187.0"
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
@@ -38,28 +40,48 @@ DEMO = ROOT / "build" / "demo" / "bundle.ply"
 
 
 def main() -> int:
-    source = Path(sys.argv[1]) if len(sys.argv) > 1 else DEMO
-    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
-    problem = interop.node_problem() or ("" if browser else "Chromium is not installed.")
-    problem = problem or ("" if source.exists() else f"{source} does not exist; run make demo.")
-    if problem or not interop.install(PACKAGE, VERSION):
-        print(f"interop: {problem or 'npm cannot install three.js.'} glTF files are not checked.")
+    inputs = prepare(PACKAGE, VERSION, WIDTH)
+    if inputs is None:
         return 2
-    bundle = load_bundle(source)
-    cameras, _, _ = read_view_tables(bundle.tables)
-    camera = cameras[0].scaled(WIDTH / cameras[0].width)
+    browser, source, bundle, camera = inputs
     with tempfile.TemporaryDirectory() as folder:
         scene = Path(folder) / "scene.glb"
         export_levels(scene, bundle, antialiased=True)
         mounts = {"/three": interop.FOLDER / "node_modules" / "three", "/scene.glb": scene}
         page = Path(__file__).with_suffix(".html")
-        answer = draw(str(browser), page, mounts, f"{camera.width}x{camera.height}")
+        answer = draw(browser, page, mounts, f"{camera.width}x{camera.height}")
+    return judge(f"three.js {VERSION}", answer, render_image(bundle, camera, backend="cpu"), source, MIN_PSNR)
+
+
+def prepare(package: str, version: str, width: int) -> tuple[str, Path, Bundle, Camera] | None:
+    """Install a package from npm. Return Chromium, the bundle's path, the bundle, and its first view.
+
+    The bundle is that of the command line or of ``make demo``. If something is missing, print a message and
+    return None.
+
+    Args:
+        width: width of the view in pixels.
+    """
+    source = Path(sys.argv[1]) if len(sys.argv) > 1 else DEMO
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    problem = interop.node_problem() or ("" if browser else "Chromium is not installed.")
+    problem = problem or ("" if source.exists() else f"{source} does not exist; run make demo.")
+    if problem or not interop.install(package, version):
+        print(f"interop: {problem or 'npm cannot install it.'} {package} is not checked.")
+        return None
+    bundle = load_bundle(source)
+    cameras, _, _ = read_view_tables(bundle.tables)
+    return str(browser), source, bundle, cameras[0].scaled(width / cameras[0].width)
+
+
+def judge(program: str, answer: np.ndarray | str, expected: np.ndarray, source: Path, min_psnr: float) -> int:
+    """Print the likeness of a program's image, or its error message, and return the exit code."""
     if isinstance(answer, str):
-        print(f"three.js {VERSION}: {answer}")
+        print(f"{program}: {answer}")
         return 1
-    value = psnr(answer, render_image(bundle, camera, backend="cpu"))
-    print(f"three.js {VERSION}: {value:.1f} dB from our image of {source}, at least {MIN_PSNR:g}")
-    return int(value < MIN_PSNR)
+    value = psnr(answer, expected)
+    print(f"{program}: {value:.1f} dB from our image of {source}, at least {min_psnr:g}")
+    return int(value < min_psnr)
 
 
 def psnr(image: np.ndarray, expected: np.ndarray) -> float:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import math
-import shutil
 import sys
 import tempfile
 import urllib.parse
@@ -20,10 +19,9 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from tools import interop  # noqa: E402
-from tools.interop_gltf import BROWSERS, DEMO, draw, psnr  # noqa: E402
-from training.api import load_bundle, render_image  # noqa: E402
+from tools.interop_gltf import draw, judge, prepare  # noqa: E402
+from training.api import render_image  # noqa: E402
 from training.editing.export import export_tiles  # noqa: E402
-from training.scenes.view_tables import read_view_tables  # noqa: E402
 
 PACKAGE, VERSION = "cesium", "1.145.0"
 MIN_PSNR = 28.0
@@ -32,16 +30,10 @@ WIDTH = 480
 
 
 def main() -> int:
-    source = Path(sys.argv[1]) if len(sys.argv) > 1 else DEMO
-    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
-    problem = interop.node_problem() or ("" if browser else "Chromium is not installed.")
-    problem = problem or ("" if source.exists() else f"{source} does not exist; run make demo.")
-    if problem or not interop.install(PACKAGE, VERSION):
-        print(f"interop: {problem or 'npm cannot install CesiumJS.'} 3D Tiles are not checked.")
+    inputs = prepare(PACKAGE, VERSION, WIDTH)
+    if inputs is None:
         return 2
-    bundle = load_bundle(source)
-    cameras, _, _ = read_view_tables(bundle.tables)
-    camera = cameras[0].scaled(WIDTH / cameras[0].width)
+    browser, source, bundle, camera = inputs
     axes = bundle.up_rotation @ camera.world_to_camera[:3, :3].T  # right, down and forward, with z up
     view = {
         "eye": (bundle.up_rotation @ camera.center).tolist(), "up": (-axes[:, 1]).tolist(),
@@ -53,13 +45,8 @@ def main() -> int:
         build = interop.FOLDER / "node_modules" / PACKAGE / "Build" / "Cesium"
         mounts = {"/cesium": build, "/tiles": Path(folder) / "tiles"}
         page, query = Path(__file__).with_suffix(".html"), urllib.parse.quote(json.dumps(view))
-        answer = draw(str(browser), page, mounts, query)
-    if isinstance(answer, str):
-        print(f"CesiumJS {VERSION}: {answer}")
-        return 1
-    value = psnr(answer, render_image(bundle, camera, backend="cpu"))
-    print(f"CesiumJS {VERSION}: {value:.1f} dB from our image of {source}, at least {MIN_PSNR:g}")
-    return int(value < MIN_PSNR)
+        answer = draw(browser, page, mounts, query)
+    return judge(f"CesiumJS {VERSION}", answer, render_image(bundle, camera, backend="cpu"), source, MIN_PSNR)
 
 
 if __name__ == "__main__":
