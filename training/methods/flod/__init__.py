@@ -33,7 +33,8 @@ class FlodParameters(FlodLevels, DensityParameters):
     footprint: float = setting(
         16.0,
         "Detail of level 1, in pixels at the scene's median depth: its minimum splat size (FLoD: lambda). "
-        "Sets the distances of trained levels; those of merged levels follow from 'drawn'.",
+        "Sets the distances of trained levels, and in regions and cells those of merged levels, which "
+        "otherwise follow from 'drawn'.",
         label="Coarsest Detail",
         above=0,
         unit="px",
