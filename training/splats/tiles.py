@@ -7,14 +7,13 @@ replace one another (``refine: REPLACE``). Geometric errors make Cesium switch a
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from ..errors import LodgsError
-from ..files import temporary_folder
+from ..files import atomic_folder
 from .gaussians import SplatRows, Splats
 from .georeference import ECEF, is_geocentric
 from .gltf import COMPRESSION, SPLATS, write_compressed_glb
@@ -50,20 +49,11 @@ def write_tiles(folder: Path, levels: PortableLevels) -> None:
         meta = levels.bundle.meta | {"up_rotation": np.eye(3).tolist()}
         levels = replace(levels, bundle=replace(levels.bundle, meta=meta))
     levels = replace(levels, origin=np.zeros(3), views=())
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with temporary_folder(folder.parent) as temporary:
-            tiles = temporary / "tiles"
-            tiles.mkdir()
-            document = _write_cells(tiles, levels)
-            if transform is not None:
-                document["root"]["transform"] = transform.T.reshape(-1).tolist()
-            (tiles / TILESET_FILE).write_text(json.dumps(document, allow_nan=False), "utf-8")
-            if folder.exists():
-                os.rename(folder, temporary / "previous")
-            os.rename(tiles, folder)
-    except OSError as error:
-        raise LodgsError(f"Cannot write {folder}: {error.strerror}.", "Choose another folder.") from error
+    with atomic_folder(folder) as tiles:
+        document = _write_cells(tiles, levels)
+        if transform is not None:
+            document["root"]["transform"] = transform.T.reshape(-1).tolist()
+        (tiles / TILESET_FILE).write_text(json.dumps(document, allow_nan=False), "utf-8")
 
 
 def _earth_transform(bundle: Bundle) -> np.ndarray | None:
