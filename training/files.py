@@ -79,7 +79,7 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
         if error.filename is not None and Path(error.filename) not in (temporary, path, *path.parents):
             raise
         raise LodgsError(
-            f"Cannot write {path}: {error.strerror or error}.",
+            f"Cannot write {_final_path(path)}: {error.strerror or error}.",
             system_remedy(error, "Choose another name or folder."),
         ) from error
     finally:
@@ -161,6 +161,12 @@ def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
 def _temporary_path(path: Path) -> Path:
     """Return a unique path next to ``path``, with a name that is not longer than file systems allow."""
     return path.with_name(f".{path.name[:50]}.{_token()}.tmp")
+
+
+def _final_path(path: Path) -> Path:
+    """Return the path that a path of :func:`_temporary_path` replaces, for messages; others unchanged."""
+    match = _TEMPORARY.fullmatch(path.name)
+    return path.with_name(path.name[1 : match.start(1) - 1]) if match and path.suffix == ".tmp" else path
 
 
 def _token() -> str:

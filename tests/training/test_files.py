@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 import subprocess
 import sys
 from contextlib import contextmanager
@@ -88,6 +89,15 @@ def test_impossible_names_raise_one_sentence(tmp_path, name):
     with pytest.raises(LodgsError, match="not a valid file name"):
         create_folder(tmp_path / name)
     assert not os.listdir(tmp_path)
+
+
+def test_nested_writes_name_the_final_file(tmp_path):
+    with (
+        pytest.raises(LodgsError, match=rf"^Cannot write {re.escape(str(tmp_path / 'a.b.ply'))}: No space"),
+        atomic_write(tmp_path / "a.b.ply") as temporary,
+        atomic_write(temporary),
+    ):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 @contextmanager

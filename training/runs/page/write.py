@@ -188,7 +188,7 @@ def _pose(camera: Camera, center: np.ndarray, radius: float) -> dict:
 def _write_poster(path: Path, bundle: Bundle, camera: Camera, near: float, backend: str) -> None:
     camera = camera.scaled(min(1.0, POSTER_WIDTH / camera.width))
     rendering = ResidentBundle(bundle, backend).draw_level(bundle.levels[-1].number, camera, near=near)
-    image = rendering.image.detach().cpu().numpy()
+    image = np.nan_to_num(rendering.image.detach().cpu().numpy())  # extreme coefficients give NaN
     write_png(path, np.rint(image.clip(0, 1) * 255).astype(np.uint8))
 
 
