@@ -14,12 +14,14 @@ import shutil
 import subprocess
 import sys
 import time
+from contextlib import redirect_stdout
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from tools.blender_module import EXTENSION, start_blender  # noqa: E402
+from training.__main__ import main as lodgs  # noqa: E402
 from training.methods import METHODS  # noqa: E402
 from training.runs.folder import RunFolder  # noqa: E402
 
@@ -30,6 +32,7 @@ def main() -> int:
     parser.add_argument("--method", choices=list(METHODS), default="flod")
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "demo")
     parser.add_argument("--image-scale", type=float, default=1.0)
+    parser.add_argument("--report", action="store_true", help="only measure a finished run")
     parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", help="parameter of the method"
     )
@@ -37,6 +40,8 @@ def main() -> int:
     started = time.monotonic()
     out: Path = options.out
     run = RunFolder(out / options.method)
+    if options.report:
+        return write_report(options.scene, run, out)
     if run.state() == "done":  # resume an interrupted demo, repeat a finished one
         shutil.rmtree(run.path)
     os.environ.setdefault("LODGS_TRAINER_PYTHON", sys.executable)
@@ -53,36 +58,10 @@ def main() -> int:
     )  # fmt: skip
     if code:
         return code
-    evaluation = [
-        sys.executable,
-        "-m",
-        "training",
-        "evaluate",
-        str(run.path),
-        "--picture",
-        str(out / "levels.png"),
-    ]
-    code = subprocess.run(evaluation, cwd=ROOT, check=False).returncode
-    if code:
+    report = [sys.executable, __file__, "--report", "--method", options.method,
+              "--scene", str(options.scene), "--out", str(out)]  # fmt: skip
+    if code := subprocess.run(report, check=False).returncode:
         return code
-    measured = json.loads(run.metrics.read_text())
-    report = {"scene": str(options.scene), "method": options.method, "levels": measured["levels"]}
-    if measured["selective"]:
-        per_view = measured["selective"][0]
-        report["selective"] = _splat_count_row(per_view)
-    if "curve" in measured:
-        report["curve"] = [_splat_count_row(row) for row in measured["curve"]]
-    (out / "report.json").write_text(json.dumps(report, indent=1))
-    title = options.scene.resolve().name.replace("_", " ").capitalize()
-    pages = [
-        ["compare", str(run.path), "--out", str(out)],
-        ["page", str(run.path), "--out", str(out / "page"), "--title", title],
-    ]
-    for arguments in pages:
-        command = [sys.executable, "-m", "training", *arguments]
-        code = subprocess.run(command, cwd=ROOT, stdout=subprocess.DEVNULL, check=False).returncode
-        if code:
-            return code
     print(f"Finished in {time.monotonic() - started:.0f} seconds. Files in {os.path.relpath(out)}:")
     print("  index.html   compare the levels in a browser: open this next")
     print("  scene.blend  the scene in Blender, with levels by distance")
@@ -92,6 +71,26 @@ def main() -> int:
     if run.costs.exists():
         print(f"In {os.path.relpath(run.path)}: costs.png (costs measured to choose the levels' distances)")
     return 0
+
+
+def write_report(scene: Path, run: RunFolder, out: Path) -> int:
+    """Measure a finished run, and write its report and pages; return an exit code."""
+    if code := lodgs(["evaluate", str(run.path)]):
+        return code
+    measured = json.loads(run.metrics.read_text())
+    report = {"scene": str(scene), "method": run.path.name, "levels": measured["levels"]}
+    if measured["selective"]:
+        per_view = measured["selective"][0]
+        report["selective"] = _splat_count_row(per_view)
+    if "curve" in measured:
+        report["curve"] = [_splat_count_row(row) for row in measured["curve"]]
+    (out / "report.json").write_text(json.dumps(report, indent=1))
+    shutil.copy2(run.sheet, out / "levels.png")
+    title = scene.resolve().name.replace("_", " ").capitalize()
+    with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere):
+        return lodgs(["compare", str(run.path), "--out", str(out)]) or lodgs(
+            ["page", str(run.path), "--out", str(out / "page"), "--title", title]
+        )
 
 
 def _splat_count_row(row: dict) -> dict:

@@ -156,8 +156,8 @@ def lens(folder: Path) -> list[Tile]:
     lodgs("undistort", folder / "bent")
     straight = next((folder / "bent" / ".undistorted").rglob(SEEN))
     return [
-        ("with lens distortion", Image.open(folder / "bent" / "images" / SEEN)),
-        ("straightened", Image.open(straight)),
+        ("photo with lens distortion", Image.open(folder / "bent" / "images" / SEEN)),
+        ("undistorted photo", Image.open(straight)),
     ]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -84,6 +85,15 @@ def reduce_view(camera: Camera, target: Target, factor: int) -> tuple[Camera, Ta
     )
 
 
+def _digest(parts: Sequence[Splats]) -> bytes:
+    """Return a digest of splats, without extras."""
+    digest = hashlib.blake2b(digest_size=16)
+    for splats in parts:
+        for values in (splats.means, splats.quats, splats.log_scales, splats.opacity_logits, splats.sh):
+            digest.update(np.ascontiguousarray(values))
+    return digest.digest()
+
+
 class Evaluation:
     """Comparison of rendered images with the photos of a scene.
 
@@ -104,6 +114,7 @@ class Evaluation:
         self.antialias = antialias
         self.cameras = data.test or pick_evenly(data.train, MAX_TRAINING_VIEWS)
         self.prefix = "" if data.test else "train_"
+        self._measured: dict[bytes, dict] = {}
 
     def target(self, camera: Camera) -> Target:
         """Return the photo of a view, with transparent parts black, and its mask."""
@@ -213,16 +224,23 @@ class Evaluation:
         return self.measure(lambda camera: resident.draw(camera, values, **self._options), count)
 
     def measure_level(self, bundle: Bundle, level: Level) -> dict:
-        """Measure a complete level, with the weights of full detail."""
+        """Measure a complete level, with the weights of full detail.
+
+        Levels in memory without weights are measured once, because trainings finish some levels repeatedly.
+        """
         drawn = replace(bundle, levels=bundle.drawn_levels(level.number))
         resident = ResidentBundle(drawn, self.backend)
         controls = full_detail_controls(drawn)
         if controls is not None:
             return self.measure_by_distance(resident, controls)
         total = sum(len(part.rows) for part in drawn.levels)
-        return self.measure(
-            lambda camera: resident.draw_level(level.number, camera, **self._options), lambda camera: total
-        )
+        digest = b"" if drawn.on_disk else _digest([part.splats for part in drawn.levels])
+        if not digest or digest not in self._measured:
+            self._measured[digest] = self.measure(
+                lambda camera: resident.draw_level(level.number, camera, **self._options),
+                lambda camera: total,
+            )
+        return dict(self._measured[digest])
 
     def measure_splats(self, splats: Splats, weights: np.ndarray | None = None) -> dict:
         """Measure one set of splats that is the same for all views."""

@@ -83,12 +83,14 @@ def _pixels(
     """Return distances (P,) of a view's opaque pixels in the finest level, and squared errors (P, L)."""
     camera, target = data.train[view], data.target(view)
     errors, depth = [], np.empty(0)
-    for gaussians in levels.values():
+    *_, finest = levels
+    for number, gaussians in levels.items():
+        outputs = ("median_depth",) if number == finest else ()
         rendering = rasterize(
-            gaussians, camera, near=data.near, antialias=antialias, outputs=("median_depth",), backend=backend
+            gaussians, camera, near=data.near, antialias=antialias, outputs=outputs, backend=backend
         )
-        assert rendering.median_depth is not None
-        depth = rendering.median_depth.cpu().numpy()
+        if rendering.median_depth is not None:
+            depth = rendering.median_depth.cpu().numpy()
         errors.append(((rendering.image.cpu().clamp(0, 1) - target.image) ** 2).mean(-1).numpy())
     opaque = (depth > 0) & (True if target.mask is None else target.mask.numpy() > 0.5)
     return (depth * _ray_lengths(camera))[opaque], np.stack(errors, axis=-1)[opaque]

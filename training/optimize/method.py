@@ -382,8 +382,10 @@ class Method(ABC, Generic[P, D]):
             optimizer.step()
             optimizer.zero_grad()
         rendering = drawings[0].rendering
-        image = self.background.remove(rendering.image, rendering.alpha, step)
-        return StepResult(lambda: float(loss.detach()), lambda: image, view.target)
+        image, alpha = rendering.image.detach(), rendering.alpha.detach()
+        return StepResult(
+            lambda: float(loss.detach()), lambda: self.background.remove(image, alpha, step), view.target
+        )
 
     def _step_on_device(self, view: TrainingView, step: int) -> StepResult | None:
         """Make the step entirely on the backend's device. Return None if it cannot."""

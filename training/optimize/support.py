@@ -93,9 +93,9 @@ class Support:
         near = np.flatnonzero(distances < share * self._slant * self._nearest.max())
         points = means[near].astype(np.float64)
         for view, nearest in zip(self._views, self._nearest, strict=True):
-            in_front = view.view_space(points)[:, 2] < share * nearest
-            in_front[in_front] = view.sees(points[in_front], margin=MARGIN)
-            intruding[near] |= in_front
+            depths = points @ view.world_to_camera[2, :3] + view.world_to_camera[2, 3]
+            in_front = np.flatnonzero((depths > 0) & (depths < share * nearest))
+            intruding[near[in_front[view.sees(points[in_front], margin=MARGIN)]]] = True
         around = distances[near] < share * self._nearest[positions[near]]
         photos = np.zeros(int(around.sum()), np.int64)
         for camera in self._cameras:

@@ -57,7 +57,7 @@ from .folder import RunFolder
 from .job import Job, save_job
 
 CHECKPOINT_SECONDS = float(os.environ.get("LODGS_CHECKPOINT_SECONDS", "60"))
-PROGRESS_SECONDS = 0.25, 10.0
+PROGRESS_SECONDS = 0.5, 10.0
 """Minimum and maximum seconds between ``progress`` events; a thousandth of the elapsed time in between."""
 
 
