@@ -57,8 +57,7 @@ CASES = [(50_000, 640, 426), (200_000, 960, 540), (1_000_000, 1920, 1080), (3_00
 """Splats, width and height. A software device runs only the first case."""
 STAGES = {
     "project forward": "project", "project backward": "project_backward", "blend forward": "blend",
-    "blend backward": "blend_backward", "gather gradients": "gather", "train adam": "adam",
-    "train collect_stats": "statistics",
+    "blend backward": "blend_backward", "gather gradients": "gather", "project train": "adam",
 }  # fmt: skip
 """Stages by shader and function; for other shaders, by shader only."""
 SHADERS = {"sort": "sort", "scan": "sort", "bin": "bin", "loss": "loss", "train": "loss"}

@@ -16,7 +16,7 @@ def _backends(_self: object, _context: object) -> list[tuple[str, str, str, int]
     """Return the trainer's backends as enum items, without the slow reference backend."""
     card = environment.report.graphics if environment.report else ""
     _items[:] = [
-        ("auto", "Automatic", "Use CUDA if the computer supports it, otherwise the CPU", 0),
+        ("auto", "Automatic", "Use the device with the fastest training step, measured once per computer", 0),
         ("cpu", "CPU", "Train on the processor, which works on every computer", 1),
         ("cuda", "NVIDIA GPU (CUDA)", "Train with CUDA, which requires gsplat in the trainer's Python", 2),
         (

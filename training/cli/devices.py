@@ -10,7 +10,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.add_argument("--time", action="store_true", help="also time a training step on each device")
     parser.add_argument(
-        "--json", action="store_true", help="print only the drivers' answers, as JSON, without tests"
+        "--json", action="store_true", help="print only the choice of auto and its reason, as JSON"
     )
 
 

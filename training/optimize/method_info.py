@@ -23,6 +23,11 @@ def no_split(parameters: Parameters) -> None:
     return None
 
 
+def never(parameters: Parameters) -> bool:
+    """Return False."""
+    return False
+
+
 @dataclass(frozen=True)
 class MethodInfo:
     """Description of a method, declared as ``METHOD`` by its package.
@@ -46,6 +51,8 @@ class MethodInfo:
         split_parameters: split the parameters of a scene in cells into those of a run over the full scene,
             which trains the coarser levels, and those of the cells, which continue them. Returns None if
             every cell trains all levels.
+        trains_on_device: return whether the backend gpu can make all steps with given parameters
+            (``Method.allows_device_step``). The backend auto then considers it.
         unused: names of inherited parameters that this method ignores.
         package: package of the method as a module name, set at discovery.
     """
@@ -64,6 +71,7 @@ class MethodInfo:
     cell_method: str = ""
     split_parameters: Callable[[Any], tuple[Parameters, Parameters] | None] = no_split
     capture_values: Mapping[str, Any] = field(default_factory=dict)
+    trains_on_device: Callable[[Any], bool] = never
     unused: tuple[str, ...] = ()
     package: str = ""
 

@@ -2,36 +2,23 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from importlib.util import find_spec
 
-import numpy as np
 import torch
 
 from ..errors import LodgsError
-from ..scenes.cameras import Camera
-from . import (
-    Adam,
-    Gaussians,
-    Target,
-    cuda,
-    make_device_model,
-    photometric_loss,
-    rasterize,
-    resolve_backend,
-    tensor_device,
-    warm_up,
-)
+from . import cuda, trial
 from .cpu.compile import thread_count
 from .gpu import default_device
 from .gpu.device import Adapter, adapters, open_device
-from .self_test import run_self_test
+from .self_test import failure, run_self_test
 
-SPLATS, SIZE = 50_000, (640, 426)
-"""Scene and image size of :func:`step_seconds`."""
 SECONDS = 5.0
-"""Approximate duration of :func:`step_seconds`."""
+"""Approximate duration of a trial of one device."""
+SCENE = f"{trial.SPLATS:,} splats, {trial.SIZE[0]}x{trial.SIZE[1]} pixels"
+"""Scene of a trial."""
+LIMITS = "Jobs that the graphics card cannot train alone use the CPU."
 
 
 @dataclass
@@ -65,12 +52,22 @@ class Devices:
 
     @property
     def summary(self) -> str:
-        """Device that automatic training uses, and devices that may be faster."""
+        """Device that automatic training uses, with the times of a trial, and devices that may be faster.
+
+        The trial takes some seconds per device, once per machine and driver.
+        """
         cores = f"the CPU ({thread_count()} thread{'s' * (thread_count() > 1)})"
-        if self.card and find_spec("gsplat"):
-            return f"Automatic trains on {self.card} if gsplat works, otherwise on {cores}."
-        if self.selected is not None and not self.selected.software:
-            hint = f"The graphics card may be faster: choose it to try {self.selected.name}."
+        if self.card and find_spec("gsplat"):  # its compilation can take minutes
+            return f"Automatic trains on {self.card} if gsplat works and is faster, otherwise on {cores}."
+        times = trial.step_times()
+        if "gpu" in times and self.selected is not None:
+            names = {"cpu": cores, "gpu": self.selected.name}
+            first, *others = (f"{names[name]}: {times[name]:.1f} ms" for name in sorted(times, key=times.get))
+            hint = f"A training step takes {first}, {', '.join(others)} ({SCENE})."
+            if min(times, key=times.get) == "gpu":
+                return f"Automatic trains on {self.selected.name}. {hint} {LIMITS}"
+        elif self.selected is not None and not self.selected.software:
+            hint = _reason_against(self.selected)
         elif self.adapters or not self.reason:
             hint = "A graphics card may be faster, but none was detected."
         else:
@@ -106,12 +103,20 @@ def describe(timed: bool = False) -> str:
         rows.append(("gpu", f"{adapter.name}: {', '.join(filter(None, properties))}"))
     if devices.selected is None:
         rows.append(("gpu", devices.reason))
-    rows.append(("auto", resolve_backend("auto")))
+    rows.append(("auto", trial.fastest_backend()))
     lines = [f"{name:<6}{text}" for name, text in rows]
     if timed:
-        lines.append(f"Training step with {SPLATS:,} splats, {SIZE[0]}x{SIZE[1]} pixels:")
-        lines += [f"{name:<6}{1000 * step_seconds(name):.0f} ms" for name in working]
+        lines.append(f"Training step with {SCENE}:")
+        lines += [f"{name:<6}{1000 * trial.step_seconds(name, SECONDS):.0f} ms" for name in working]
     return "\n".join([*lines, devices.summary])
+
+
+def _reason_against(adapter: Adapter) -> str:
+    """Return why the selected device is not used."""
+    try:
+        return f"{adapter.name} is not used: {failure(adapter) or 'its trial failed'}."
+    except LodgsError as problem:
+        return str(problem)
 
 
 def _test(adapter: Adapter) -> tuple[list[str], bool]:
@@ -124,51 +129,3 @@ def _test(adapter: Adapter) -> tuple[list[str], bool]:
     if reason:
         return [memory, f"not used, because {reason}"], False
     return [memory, "selected, passed the self-test"], True
-
-
-def step_seconds(backend: str) -> float:
-    """Measure the median time in seconds of a training step (image, loss, gradients, Adam) on random splats.
-
-    Splats stay on the device if the backend supports it, as in training.
-    """
-    random = np.random.default_rng(0)
-    width, height = SIZE
-    arrays = {
-        "means": random.uniform((-1.5, -1, 2), (1.5, 1, 4), (SPLATS, 3)),
-        "quats": random.normal(size=(SPLATS, 4)),
-        "log_scales": random.normal(-4.5, 0.5, (SPLATS, 3)),
-        "opacity_logits": random.normal(0, 2, SPLATS),
-        "sh": random.normal(0, 0.3, (SPLATS, 16, 3)),
-    }
-    device = tensor_device(backend)
-    leaves = {
-        name: torch.tensor(array, dtype=torch.float32, device=device).requires_grad_()
-        for name, array in arrays.items()
-    }
-    camera = Camera("", width, height, 0.8 * width, 0.8 * width, width / 2, height / 2, np.eye(4))
-    target = Target(random.uniform(0, 1, (height, width, 3)).astype(np.float32))
-    adam = Adam(leaves, dict.fromkeys(leaves, 1e-4))
-    warm_up(backend)
-    device_model = make_device_model(backend, adam, {})
-
-    def step() -> None:
-        if device_model is not None:
-            loss = device_model.step(
-                camera, target, near=0.01, sh_degree=3, background=(0.0, 0.0, 0.0), ssim_weight=0.2
-            )
-            loss()
-            return
-        rendering = rasterize(Gaussians(**leaves), camera, backend=backend)
-        photometric_loss(rendering.image, target, backend=backend).backward()
-        adam.step()
-        adam.zero_grad()
-        if device.type == "cuda":
-            torch.cuda.synchronize()
-
-    times: list[float] = []
-    end = time.perf_counter() + SECONDS
-    while len(times) < 3 or time.perf_counter() < end:
-        begin = time.perf_counter()
-        step()
-        times.append(time.perf_counter() - begin)
-    return float(np.median(times[1:]))

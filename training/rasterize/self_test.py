@@ -45,7 +45,7 @@ def failure(adapter: Adapter) -> str:
         LodgsError: the device was lost or is out of memory.
     """
     with suppress(LodgsError):
-        if isinstance(stored := read_json(cache_folder() / RESULTS).get(_key(adapter)), str):
+        if isinstance(stored := read_json(cache_folder() / RESULTS).get(result_key(adapter)), str):
             return stored
     return run_self_test(adapter)
 
@@ -59,8 +59,7 @@ def run_self_test(adapter: Adapter) -> str:
     except Exception as error:  # shader compilers of drivers fail in unpredictable ways
         traceback.print_exc(file=sys.stderr)
         reason = f"it failed ({' '.join(f'{type(error).__name__}: {error}'.split())[:REASON_LENGTH]})"
-    with suppress(LodgsError):
-        _store(_key(adapter), reason)
+    store_result(RESULTS, result_key(adapter), reason)
     return reason
 
 
@@ -119,7 +118,7 @@ def _results(backend: ModuleType, kind: torch.dtype) -> dict[str, torch.Tensor]:
 
 
 @cache
-def _key(adapter: Adapter) -> str:
+def result_key(adapter: Adapter) -> str:
     """Return a key of a result: a digest of adapter, driver, wgpu and this backend's source."""
     digest = hashlib.sha256("\n".join([*adapter, metadata.version("wgpu")]).encode())
     for path in sorted((Path(__file__).parent / "gpu").rglob("*.*")):
@@ -128,11 +127,12 @@ def _key(adapter: Adapter) -> str:
     return digest.hexdigest()[:32]
 
 
-def _store(key: str, reason: str) -> None:
-    path = cache_folder() / RESULTS
+def store_result(name: str, key: str, result: object) -> None:
+    """Store a result in a file of the cache folder, if possible; the file keeps the newest 50."""
+    path = cache_folder() / name
     results = {}
     with suppress(LodgsError):
         results = read_json(path)
-    newest = dict(list({**results, key: reason}.items())[-50:])
-    with atomic_write(path) as temporary:
+    newest = dict(list({**results, key: result}.items())[-50:])
+    with suppress(LodgsError), atomic_write(path) as temporary:
         Path(temporary).write_text(json.dumps(newest), encoding="utf-8")

@@ -19,10 +19,11 @@ from ..optimize.memory import MAX_BYTES, TARGET_BYTES, free_memory, peak_memory,
 from ..optimize.method import Method
 from ..optimize.parameters import Parameters
 from ..optimize.training_data import TrainingData
-from ..rasterize import resolve_backend, warm_up
+from ..rasterize import warm_up
 from ..scenes.check import ESTIMATE, Finding
 from ..scenes.colmap import Scene, read_scene
 from ..scenes.triangulate import cached_points
+from .backend import choose_backend
 from .blocks.plan import PROGRAM_BYTES, SPLAT_BYTES, choose_cells
 from .job import Job
 
@@ -106,7 +107,7 @@ def estimate(job: Job, scratch: Path) -> Estimate:
     parameters = job.resolved_parameters()
     model, images = (Path(path) if path else None for path in (job.model, job.images))
     scene = cached_points(read_scene(Path(job.scene), model, images))
-    backend = resolve_backend(job.backend)
+    backend = choose_backend(job, scene)
     torch.set_num_threads(1)  # as in training
     warm_up(backend)
     start = START_SECONDS + time.monotonic() - begin

@@ -77,7 +77,7 @@ class Job:
     seed: int = setting(0, "Seed of random choices. Runs with the same seed are equal.", panel="Advanced")
     backend: str = setting(
         "auto",
-        "Rasterizer. The choice auto is cuda if that works, otherwise cpu.",
+        "Rasterizer. The choice auto is the fastest device that can train the job alone.",
         choices=BACKENDS,
         changeable=True,
     )

@@ -31,8 +31,7 @@ from ..methods import METHODS, create
 from ..optimize.memory import keep_freed_memory, peak_memory, reset_peak_memory
 from ..optimize.method import Method, require_finite
 from ..optimize.training_data import TrainingData
-from ..rasterize import Gaussians, contributions, cpu_fallback_reason, resolve_backend, tensor_device, warm_up
-from ..rasterize.gpu.default_device import default_adapter as graphics_device
+from ..rasterize import Gaussians, contributions, tensor_device, warm_up
 from ..rasterize.resident import ResidentBundle
 from ..scenes.check import INFO, check_scene
 from ..scenes.orientation import up_rotation
@@ -45,6 +44,7 @@ from ..splats.gaussians import SplatRows, Splats
 from ..splats.levels import NO_SPLATS, Bundle, Level
 from ..splats.ply import BATCH_ROWS, Columns, read_ply, write_ply
 from . import processes
+from .backend import choose_backend, report_backend
 from .base import open_base
 from .blocks.plan import write_plan
 from .blocks.train import BlocksStopped, train_blocks
@@ -148,9 +148,9 @@ def _train(job: Job, folder: RunFolder, events: EventWriter, placement: dict[str
         events("status", message="Preparing to train (up to a minute on first use)")
         torch.set_num_threads(1)  # torch's threads would compete with the kernels' threads
         keep_freed_memory()
-        backend = resolve_backend(job.backend)
+        backend = choose_backend(job, data.scene, lambda: data.transparent)
         warm_up(backend)
-        _report_backend(job.backend, backend, events)
+        report_backend(job.backend, backend, events)
         if merged_is_result:
             _write_merged_levels(folder, events, data, backend, started)
             return DONE
@@ -434,15 +434,6 @@ def _any_visible(base: SplatRows, data: TrainingData) -> bool:
         if any(camera.sees(means, near=data.near).any() for camera in data.train):
             return True
     return False
-
-
-def _report_backend(requested: str, backend: str, events: EventWriter) -> None:
-    """Report the rasterizer, and the reason if an existing GPU is not used."""
-    names = {"cpu": "the CPU", "cuda": "the NVIDIA GPU", "reference": "the CPU (slow reference rasterizer)"}
-    if problem := cpu_fallback_reason(requested):
-        events("warning", message=problem)
-    name = names.get(backend) or graphics_device().name
-    events("status", message=f"Training on {name}", backend=backend)
 
 
 # -- stopping -----------------------------------------------------------------

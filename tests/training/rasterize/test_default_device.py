@@ -1,11 +1,13 @@
 """Test selection, self-test and description of graphics devices."""
 
+import json
+
 import pytest
 import torch
 
 from training import __main__ as command
 from training.errors import LodgsError
-from training.rasterize import cpu, cpu_fallback_reason, cuda, gpu, resolve_backend, self_test
+from training.rasterize import cpu, cpu_fallback_reason, cuda, gpu, resolve_backend, self_test, trial
 from training.rasterize.devices import Devices, describe
 from training.rasterize.gpu import default_device
 from training.rasterize.gpu.device import Adapter
@@ -36,7 +38,9 @@ def set_adapters(monkeypatch, tmp_path):
         binding_bytes = 2 << 30
 
     monkeypatch.delenv(default_device.VARIABLE, raising=False)
-    monkeypatch.setattr(self_test, "cache_folder", lambda: tmp_path)
+    for module in (self_test, trial):
+        monkeypatch.setattr(module, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(trial, "default_adapter", lambda: default_device.default_adapter())
     monkeypatch.setattr("training.rasterize.devices.open_device", lambda name: OpenedDevice())
     for name in ("rasterize", "contributions", "photometric_loss"):
         monkeypatch.setattr(gpu, name, getattr(cpu, name), raising=False)
@@ -46,6 +50,23 @@ def set_adapters(monkeypatch, tmp_path):
     yield simulate
     self_test.failure.cache_clear()
     cuda.problem.cache_clear()
+
+
+@pytest.fixture
+def set_times(monkeypatch):
+    """Function that sets the milliseconds of a training step by backend, and counts measurements."""
+
+    def set_times(**times: float) -> list[str]:
+        measured: list[str] = []
+
+        def step_seconds(backend: str, seconds: float = 0) -> float:
+            measured.append(backend)
+            return times[backend] / 1e3
+
+        monkeypatch.setattr(trial, "step_seconds", step_seconds)
+        return measured
+
+    return set_times
 
 
 @pytest.fixture
@@ -165,6 +186,45 @@ def test_shader_compilation_error_disables_the_device(set_adapters, monkeypatch)
     assert len(reason) < 600 and reason.endswith("The CPU is used instead; a newer driver may help.")
 
 
+@pytest.mark.parametrize(("cpu_ms", "gpu_ms", "expected"), [(48, 6, "gpu"), (48, 80, "cpu"), (7, 7, "cpu")])
+def test_auto_trains_on_the_fastest_device(set_adapters, set_times, cpu_ms, gpu_ms, expected):
+    """Each machine and driver is measured once."""
+    set_adapters(CARD, SOFTWARE)
+    measured = set_times(cpu=cpu_ms, gpu=gpu_ms)
+    assert trial.fastest_backend() == trial.fastest_backend() == expected
+    assert measured == ["cpu", "gpu"]
+    self_test.failure.cache_clear()
+    set_adapters(CARD._replace(driver="556.0"))
+    trial.fastest_backend()
+    assert measured == ["cpu", "gpu"] * 2
+
+
+def test_auto_never_trains_on_software_or_a_wrong_device(set_adapters, set_times, monkeypatch):
+    measured = set_times(cpu=48, gpu=6)
+    for available in ((SOFTWARE,), ()):
+        set_adapters(*available)
+        assert trial.fastest_backend() == "cpu"
+    set_adapters(SOFTWARE)
+    monkeypatch.setenv(default_device.VARIABLE, "software")
+    assert trial.fastest_backend() == "cpu"
+    monkeypatch.delenv(default_device.VARIABLE)
+    set_adapters(CARD)
+    monkeypatch.setattr(trial, "resolve_backend", lambda name: "cpu")  # the self-test failed
+    assert trial.fastest_backend() == "cpu" and not measured
+
+
+def test_device_that_fails_its_trial_is_not_used(set_adapters, monkeypatch):
+    set_adapters(CARD)
+
+    def step_seconds(backend: str) -> float:
+        if backend == "gpu":
+            raise LodgsError("GeForce RTX 4070 Laptop is out of memory.")
+        return 0.05
+
+    monkeypatch.setattr(trial, "step_seconds", step_seconds)
+    assert trial.fastest_backend() == "cpu"
+
+
 def test_corrupt_cache_is_ignored(set_adapters, tmp_path):
     set_adapters(CARD)
     (tmp_path / self_test.RESULTS).write_text("{no json")
@@ -174,24 +234,28 @@ def test_corrupt_cache_is_ignored(set_adapters, tmp_path):
     assert resolve_backend("gpu") == "gpu"
 
 
-def test_description_of_devices(set_adapters, monkeypatch, wrong_images):
+def test_description_of_devices(set_adapters, set_times, monkeypatch, wrong_images):
     set_adapters(INTEGRATED, SOFTWARE)
+    set_times(cpu=48, gpu=6)
     assert (
         "Radeon 780M: integrated, Vulkan, radv 24.1, 2048 MB in one buffer, not used, because its"
         in describe()
     )
+    assert describe().endswith("Radeon 780M is not used: its images are 2% off.")
     monkeypatch.setattr(gpu, "rasterize", cpu.rasterize, raising=False)
+    self_test.failure.cache_clear()  # simulate a new process
     lines = describe().splitlines()
     assert [line.split()[0] for line in lines[:5]] == ["cpu", "cuda", "gpu", "gpu", "auto"]
     assert lines[2].endswith("2048 MB in one buffer, selected, passed the self-test")
     assert lines[3].startswith(
         "gpu   llvmpipe (LLVM 15): software, Vulkan, Mesa, not selected: set LODGS_GPU"
     )
-    assert lines[4] == "auto  cpu"
-    assert lines[-1].endswith("The graphics card may be faster: choose it to try Radeon 780M.")
+    assert lines[4] == "auto  gpu"
+    assert lines[-1].startswith("Automatic trains on Radeon 780M. A training step takes Radeon 780M: 6.0 ms,")
 
 
-def test_summary_names_training_device_and_faster_ones(set_adapters, monkeypatch):
+def test_summary_names_training_device_and_faster_ones(set_adapters, set_times, monkeypatch):
+    set_times(cpu=5, gpu=6)
     set_adapters()
     summary = Devices.detect().summary
     assert "Automatic trains on the CPU (" in summary and "Cannot detect" in summary
@@ -203,16 +267,17 @@ def test_summary_names_training_device_and_faster_ones(set_adapters, monkeypatch
     assert devices.summary.endswith(
         "NVIDIA GeForce RTX 4070 Laptop GPU may be faster with CUDA: install gsplat."
     )
+    assert "Laptop: 6.0 ms (50,000 splats" in devices.summary and "trains on the CPU" in devices.summary
     monkeypatch.setattr("training.rasterize.devices.find_spec", lambda name: name)
     assert "trains on NVIDIA GeForce RTX 4070 Laptop GPU if gsplat works" in devices.summary
 
 
-def test_command_prints_json(set_adapters, capsys):
-    import json
-
+def test_command_prints_json(set_adapters, set_times, capsys):
     set_adapters(CARD)
+    set_times(cpu=48, gpu=6)
     assert command.main(["devices", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["graphics"] == CARD.name
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["graphics"] == CARD.name and CARD.name in answer["sentence"]
 
 
 def test_lost_device_is_reported_and_tested_again(set_adapters, monkeypatch):

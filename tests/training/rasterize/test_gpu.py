@@ -28,7 +28,7 @@ def test_exclusive_scan_matches_numpy(graphics, count):
     np.testing.assert_array_equal(graphics.read(buffer), np.cumsum(values) - values)
 
 
-@pytest.mark.parametrize("count", SIZES)
+@pytest.mark.parametrize("count", [*SIZES, 600_000])
 def test_sort_matches_stable_numpy_sort(narrow, count):
     keys = np.random.default_rng(count).integers(0, 2**32, count, dtype=np.uint32)
     keys[::3] &= 255

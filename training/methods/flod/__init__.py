@@ -216,4 +216,5 @@ METHOD = MethodInfo(
     panel_parameters=("levels", "footprint", "max_splats"),
     cell_method="flod",
     split_parameters=divide,
+    trains_on_device=lambda parameters: True,
 )

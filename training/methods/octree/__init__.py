@@ -39,4 +39,5 @@ METHOD = MethodInfo(
     rule="octree",
     panel_parameters=("levels", "max_splats"),
     cell_method="octree",
+    trains_on_device=lambda parameters: not parameters.volume_weight,
 )

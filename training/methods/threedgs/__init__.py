@@ -19,4 +19,5 @@ METHOD = MethodInfo(
     panel_parameters=("max_splats",),
     from_base=True,
     cell_method="3dgs",
+    trains_on_device=lambda parameters: True,
 )

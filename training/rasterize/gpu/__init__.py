@@ -24,7 +24,7 @@ from .default_device import open_default_device
 from .device import Buffer, Device
 from .device_model import COLUMNS, STATS, GpuModel, pack_splats
 from .loss import loss_and_gradient
-from .scene import BY_SPLAT, GEOMETRY, SUMS, ProjectedScene
+from .scene import BY_SPLAT, PAIR_SUMS, ProjectedScene
 
 
 def rasterize(
@@ -120,8 +120,8 @@ class _Rasterize(torch.autograd.Function):
         scene, index, shades, images, visited, settings, side = ctx.saved
         device = scene.device
         count = scene.count
-        sums = device.empty(np.float32, count, SUMS)
-        by_shades = [device.empty(np.float32, count, 3) for _ in shades]
+        sums = device.scratch(np.float32, count, PAIR_SUMS)
+        by_shades = [None, *(device.empty(np.float32, count, 3) for _ in shades[1:])]
         with device.lock:
             for k, (shade, image, by_shade) in enumerate(zip(shades, images, by_shades, strict=True)):
                 output_gradient = np.zeros(image.shape, np.float32)
@@ -132,15 +132,15 @@ class _Rasterize(torch.autograd.Function):
                     output_gradient[..., :3] = by_image
                     output_gradient[..., 3] = by_alpha
                 scene.differentiate(
-                    GEOMETRY if k else SUMS, settings.absolute and k == 0, sums, by_shade, visited,
-                    colours=shade, image=image, by_image=device.upload(output_gradient),
+                    sums, visited, settings.absolute and k == 0, by_shade, colours=shade, image=image,
+                    by_image=device.upload(output_gradient),
                 )  # fmt: skip
             by_splats = device.empty(np.float32, count, BY_SPLAT)
             by_sh = device.empty(np.float32, *scene.sh.shape)
-            scene.backward(sums, by_shades[0], by_splats, by_sh)
+            scene.backward(sums, by_splats, by_sh)
             splat_gradients = device.read(by_splats)
             sh_gradients = device.read(by_sh)
-            feature_gradients = [device.read(by_shade) for by_shade in by_shades[1:]]
+            feature_gradients = [device.read(by_shade) for by_shade in by_shades if by_shade is not None]
         gradients = [torch.zeros_like(tensor, requires_grad=False) for tensor in ctx.saved_tensors]
         parts = [slice(0, 3), slice(4, 8), slice(8, 11), 3]
         for gradient, part in zip(gradients, parts, strict=False):
@@ -163,11 +163,11 @@ class _Photometric(torch.autograd.Function):
         device = open_default_device()
         with device.lock:
             if target.cache.get("gpu", (None,))[0] is not device:
-                target.cache["gpu"] = device, device.upload(_planes(target.image.float()))
-            _, truth = target.cache["gpu"]
-            planes = device.upload(_planes(image.detach()))
-            loss, gradient = loss_and_gradient(device, planes, truth, ssim_weight)
-            ctx.gradient = torch.from_numpy(device.read(gradient)).permute(1, 2, 0).contiguous()
+                target.cache["gpu"] = device, device.upload(target.image.float().numpy())
+            _, photo = target.cache["gpu"]
+            drawn = device.upload(np.pad(image.detach().numpy(), ((0, 0), (0, 0), (0, 1))))
+            loss, gradient = loss_and_gradient(device, drawn, photo, ssim_weight)
+            ctx.gradient = torch.from_numpy(np.ascontiguousarray(gradient[..., :3]))
         return torch.tensor(loss, dtype=torch.float32)
 
     @staticmethod
@@ -192,11 +192,6 @@ def _upload_scene(
     splats = pack_splats(*(array[index] for array in arrays[:4]), weights=weights, filtered=filtered)
     sh = device.upload(arrays[4][index, : (settings.degree + 1) ** 2])
     return ProjectedScene.of(device, device.upload(splats), sh, settings), index
-
-
-def _planes(image: torch.Tensor) -> np.ndarray:
-    """Convert an image (H, W, 3) to planes (3, H, W)."""
-    return image.permute(2, 0, 1).numpy()
 
 
 def _as_colours(device: Device, features: np.ndarray) -> list[Buffer]:

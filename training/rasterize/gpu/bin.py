@@ -10,10 +10,12 @@ from .device import LANES, Buffer, Device
 
 TILE = 16
 BLOCK = 1024
-"""Values that one workgroup scans or sorts."""
+"""Values that one workgroup scans."""
 SINGLE_GROUP = 16 * BLOCK
 """Maximum number of values that a single workgroup scans."""
-DIGIT_BITS = 4
+DIGIT_BITS = 8
+SORTED = 2048
+"""Values that one workgroup sorts."""
 DEPTH_BITS = 32
 
 
@@ -65,13 +67,13 @@ def sort(
     """
     (count,) = keys.shape
     totals = totals or device.upload(np.array([count], np.uint32))
-    blocks = group_count(count, BLOCK)
+    blocks = group_count(count, SORTED)
     target = device.scratch(np.uint32, count), device.scratch(np.uint32, count)
     for shift in range(0, bits, DIGIT_BITS):
-        places = device.scratch(np.uint32, (1 << DIGIT_BITS) * blocks)
+        places = device.scratch(np.uint32, 1 << DIGIT_BITS, blocks + 1)
         numbers = count, shift, blocks, slot
         device.run("sort", "count", blocks, numbers, keys=keys, places=places, totals=totals)
-        exclusive_scan(device, places)
+        device.run("sort", "scan_blocks", 1 << DIGIT_BITS, numbers, places=places)
         device.run(
             "sort", "scatter", blocks, numbers, keys=keys, values=values, places=places,
             sorted_keys=target[0], sorted_values=target[1], totals=totals,
@@ -84,6 +86,7 @@ def bin_splats(
     device: Device,
     rows: Buffer,
     depths: Buffer,
+    order: Buffer,
     width: int,
     height: int,
     max_pairs: int,
@@ -95,6 +98,7 @@ def bin_splats(
         rows: (M, 12), projected splats.
         depths: (M,) uint32, bits of the depths, which have the order of the depths; the maximum value for
             splats that are not drawn. Overwritten.
+        order: (M,) uint32, indices of the splats. Overwritten.
         max_pairs: maximum number of pairs in a band of more than one tile.
         capacity: maximum number of pairs in a single band, whose number of pairs is not read from the device.
             ``starts`` of the band has it, so the caller can test if pairs were left out. None counts them.
@@ -106,8 +110,7 @@ def bin_splats(
     count = rows.shape[0]
     across = -(-width // TILE)
     down = -(-height // TILE)
-    order, ranges = device.scratch(np.uint32, count), device.empty(np.uint32, across * down, 2)
-    device.run("bin", "number", group_count(count), (count, across, 0, 0, 0), pairs=order)
+    ranges = device.empty(np.uint32, across * down, 2)
     _, order = sort(device, depths, order, DEPTH_BITS)
 
     def bands(tiles: range) -> list[Band]:

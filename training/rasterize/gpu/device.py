@@ -342,22 +342,10 @@ class Device:
             LodgsError: the device was lost.
         """
         self.submit()
-        self._write(recording.uniforms, recording.numbers())
+        handles = [(a.handle, a.offset, b.handle, b.offset, a.size) for a, b in copies]
         with self._translate_errors():
-            encoder = self._device.create_command_encoder()
-            for source, target in copies:
-                encoder.copy_buffer_to_buffer(
-                    source.handle, source.offset, target.handle, target.offset, source.size
-                )
-            for handle in recording.cleared:
-                encoder.clear_buffer(handle)
-            for part in recording.parts:
-                encoder = encoder or self._device.create_command_encoder()
-                compute_pass = encoder.begin_compute_pass()
-                encode(compute_pass, part)
-                compute_pass.end()
-                self._device.queue.submit([encoder.finish()])
-                encoder = None
+            recording.replay(self._device, handles)
+        self.transferred += recording.uniforms.size
         self.counts.update(dispatches=len(recording), submissions=len(recording.parts))
 
     def read(self, buffer: Buffer, begin: int = 0) -> np.ndarray:

@@ -21,9 +21,9 @@ from ..adam import Adam
 from ..rendering import KernelCamera, RasterSettings, Target
 from .bin import group_count
 from .device import Buffer, Device
-from .loss import combine_loss, sums_and_gradient
-from .scene import BY_SPLAT, PAIR_SUMS, SPLAT, SUMS, ProjectedScene
-from .steps import Inputs, Step
+from .loss import combine_loss, record_loss
+from .scene import PAIR_SUMS, SPLAT, TRAINING_NUMBERS, ProjectedScene
+from .steps import LOSSES, Inputs, Step
 
 COLUMNS = {
     "means": slice(0, 3),
@@ -35,12 +35,10 @@ COLUMNS = {
 TRAINED = 11
 """Number of trained columns; weight and filter flag follow."""
 STATS = ("gradient_sum", "seen", "gradient_max", "radius_max", "opacity_sum")
-"""Statistics that a device collects (train.wgsl)."""
-STATE = ("_splats", "_sh", "_splat_moments", "_sh_moments", "_stat_sums")
+"""Statistics that a device collects (project.wgsl)."""
+STATE = ("_splats", "_sh", "_moments", "_stat_sums")
 """Attributes with buffers that persist between steps."""
 
-LOSSES = 2
-"""Index of the first loss in the report (train.wgsl)."""
 PENDING = 32
 """Maximum number of steps whose losses the host has not read."""
 RECORDINGS = 2
@@ -90,10 +88,10 @@ class GpuModel:
         arrays = {name: tensor.detach().numpy() for name, tensor in adam.tensors.items()}
         moments = {name: [m.numpy() for m in state] for name, state in adam.state.items()}
         count = len(arrays["means"])
-        splat_moments = np.empty((count, TRAINED, 2), np.float32)
-        for name, column in COLUMNS.items():
+        packed = np.empty((count, TRAINED + arrays["sh"][0].size, 2), np.float32)
+        for name, columns in {**COLUMNS, "sh": slice(TRAINED, None)}.items():
             for k, moment in enumerate(moments[name]):
-                splat_moments[:, column, k] = moment.reshape(count, -1)
+                packed[:, columns, k] = moment.reshape(count, -1)
         stat_sums = np.zeros((count, len(STATS)), np.float32)
         for name, values in stats.items():
             stat_sums[:, STATS.index(name)] = values.numpy()
@@ -101,13 +99,14 @@ class GpuModel:
         with device.lock:
             self._splats = device.upload(pack_splats(*geometry, weights=1, filtered=antialias))
             self._sh = device.upload(arrays["sh"])
-            self._splat_moments = device.upload(splat_moments)
-            self._sh_moments = device.upload(np.stack(moments["sh"], -1))
+            self._moments = device.upload(packed)
             self._stat_sums = device.upload(stat_sums)
-            self._allocate_gradients()
-            self._rates = device.empty(np.float32, TRAINED + 3 * self._sh.shape[1], 2)
             self._report = device.empty(np.uint32, LOSSES + 2 * PENDING)
         self.drawn = device.empty(np.float32, 0, 0, 4)
+        self._numbers = np.zeros(TRAINING_NUMBERS, np.float32)
+        rates = self._numbers[4 : 4 + 2 * self._moments.shape[1]].reshape(-1, 2)
+        self._rates = {name: rates[columns] for name, columns in COLUMNS.items()}
+        self._rates["sh"] = rates[TRAINED:].reshape(-1, 3, 2)
         self._pending: list[Step] = []
         self._recorded: dict[tuple, Inputs] = {}
         self._diverged: float | None = None
@@ -149,7 +148,7 @@ class GpuModel:
             if len(self._pending) == PENDING:
                 self._settle()
             photo = _upload_photo(self.device, target)
-            step = Step(settings, photo, ssim_weight, array, shrink, self._next_rates())
+            step = Step(settings, photo, ssim_weight, array, self._next_numbers(shrink))
             self._start(step)
 
         def loss() -> float:
@@ -165,7 +164,6 @@ class GpuModel:
         """Submit a step, whose loss is then pending."""
         device = self.device
         self._set_weights(step.weights)
-        device.write(self._rates, step.rates)
         if self._capacity is None:  # the pairs are counted in the middle of the step
             inputs = self._dispatch(step, None)
             device.submit()
@@ -200,33 +198,23 @@ class GpuModel:
         photo = step.photo if capacity is None else device.scratch(np.uint32, *size)
         scene = ProjectedScene.of(device, self._splats, self._sh, step.settings, capacity)
         inputs = Inputs(
-            photo, scene.lens, np.zeros(3, np.float32), np.ones(1, np.float32),
-            (np.zeros(1, np.uint32), np.zeros(1, np.uint32)), device.scratch(np.float32, *size, 4),
+            photo, scene.lens, np.zeros(3, np.float32), np.zeros(TRAINING_NUMBERS, np.float32),
+            np.zeros(1, np.uint32), device.scratch(np.float32, *size, 4),
         )  # fmt: skip
         inputs.set(step, len(self._pending))
         pairs = (1 << 32) - 1 if capacity is None else capacity
         device.run(
-            "train", "check", 1, _numbers(count, width=pairs), starts=scene.bands[0].starts,
-            report=self._report,
-        )  # fmt: skip
+            "train", "check", 1, (count, pairs, 0, 0), starts=scene.bands[0].starts, report=self._report
+        )
         visited = device.scratch(np.uint32, *scene.ranges.shape)
         scene.draw(
             inputs.background, False, colours=scene.colours, visited=visited, drawn=inputs.drawn,
             limit=device.scratch(np.float32, 1), median=device.scratch(np.int32, *size),
         )  # fmt: skip
-        by_image = self._loss(inputs, step.ssim_weight)
-        sums, by_colours = device.empty(np.float32, count, SUMS), device.empty(np.float32, count, 3)
-        scene.differentiate(
-            SUMS, False, sums, by_colours, visited, colours=scene.colours, image=inputs.drawn,
-            by_image=by_image,
-        )  # fmt: skip
-        scene.backward(sums, by_colours, self._by_splats, self._by_sh)
-        if step.shrink is not None:
-            self._run(
-                "collect_stats", {"shrink": inputs.shrink}, {"report": self._report}, radii=scene.radii,
-                by_rows=self._by_splats, stats=self._stat_sums, values=self._splats,
-            )  # fmt: skip
-        self._adam_step(scene.radii, 3 * (step.settings.degree + 1) ** 2)
+        by_image = record_loss(device, inputs.drawn, photo, step.ssim_weight, self._report, inputs.slot)
+        sums = device.scratch(np.float32, count, PAIR_SUMS)
+        scene.differentiate(sums, visited, colours=scene.colours, image=inputs.drawn, by_image=by_image)
+        scene.train(sums, inputs.training, self._report, moments=self._moments, stats=self._stat_sums)
         return inputs
 
     def _settle(self) -> None:
@@ -270,8 +258,7 @@ class GpuModel:
                 values = self._stat_sums
                 columns = slice(STATS.index(name), STATS.index(name) + 1)
             copied = device.empty(np.float32, len(self), _width(columns))
-            numbers = {"width": _width(columns), "stride": values.shape[1], "slot": columns.start}
-            self._run("read_columns", numbers, values=values, totals=copied)
+            self._run("read_columns", columns, values=values, totals=copied)
             return _as_tensor(device.read(copied))
 
     def read_rows(self, index: torch.Tensor) -> dict[str, torch.Tensor]:
@@ -305,17 +292,15 @@ class GpuModel:
         with device.lock:
             self._settle()
             uploaded = device.upload(values.numpy())
+            columns = COLUMNS.get(name) or slice(TRAINED, self._moments.shape[1])
             if name == "sh":
                 self._recorded.clear()
                 self._sh = uploaded
-                self._sh_moments = device.empty(np.float32, *self._sh_moments.shape)
-                return
-            columns = COLUMNS[name]
-            numbers = {"width": _width(columns), "slot": columns.start}
-            self._run("write_columns", numbers, parts=uploaded, values=self._splats)
-            numbers = {"width": 2 * _width(columns), "stride": 2 * TRAINED, "slot": 2 * columns.start}
-            zeros = device.empty(np.float32, len(self), numbers["width"])
-            self._run("write_columns", numbers, parts=zeros, values=self._splat_moments)
+            else:
+                self._run("write_columns", columns, parts=uploaded, values=self._splats)
+            zeros = device.empty(np.float32, len(self), 2 * _width(columns))
+            pairs = slice(2 * columns.start, 2 * columns.stop)
+            self._run("write_columns", pairs, parts=zeros, values=self._moments)
 
     def reset_stats(self) -> None:
         """Reset all statistics to zero."""
@@ -328,40 +313,31 @@ class GpuModel:
         lowest = minimum.numpy().clip(np.finfo(np.float32).min)  # not every device supports infinity
         with self.device.lock:
             self._settle()
-            self._run("raise_log_scales", {}, parts=self.device.upload(lowest), values=self._splats)
+            columns = COLUMNS["log_scales"]
+            self._run("raise_columns", columns, parts=self.device.upload(lowest), values=self._splats)
 
     def copy_to_host(self) -> None:
         """Replace the host's tensors, moments and statistics by the device's values."""
         with self.device.lock:
             self._settle()
-            splats, sh, splat_moments, sh_moments, stat_sums = (
-                self.device.read(getattr(self, name)) for name in STATE
-            )
+            splats, sh, packed, stat_sums = (self.device.read(getattr(self, name)) for name in STATE)
         for name, columns in COLUMNS.items():
             values, *moments = map(
-                _as_tensor,
-                (splats[:, columns], splat_moments[:, columns, 0], splat_moments[:, columns, 1]),
+                _as_tensor, (splats[:, columns], packed[:, columns, 0], packed[:, columns, 1])
             )
             self._adam.replace(name, values.requires_grad_(), *moments)
-        first, second = (torch.from_numpy(sh_moments[..., k].copy()) for k in range(2))
-        self._adam.replace("sh", torch.from_numpy(sh).requires_grad_(), first, second)
+        moments = [_as_tensor(packed[:, TRAINED:, k]).reshape(sh.shape) for k in range(2)]
+        self._adam.replace("sh", torch.from_numpy(sh).requires_grad_(), *moments)
         for name in self._stats:
             self._stats[name] = torch.from_numpy(stat_sums[:, STATS.index(name)].copy())
-
-    def _allocate_gradients(self) -> None:
-        """Allocate the gradients of all splats."""
-        self._by_splats = self.device.empty(np.float32, len(self), BY_SPLAT)
-        self._by_sh = self.device.empty(np.float32, *self._sh.shape)
 
     def _replace_state(self, make: Callable[[str, Buffer], Buffer]) -> None:
         """Replace the buffers of STATE one by one, so that at most one exists twice."""
         self._settle()
         self._recorded.clear()
-        del self._by_splats, self._by_sh
         for name in STATE:
             setattr(self, name, make(name, getattr(self, name)))
             self.device.wait()
-        self._allocate_gradients()
 
     def _select_rows(self, buffer: Buffer, index: Buffer) -> Buffer:
         """Copy the rows of a buffer at indices (M,)."""
@@ -384,79 +360,29 @@ class GpuModel:
             return
         array = np.ones(len(self), np.float32) if weights is None else weights
         self._weighted = weights is not None
-        self._run("write_columns", {"slot": TRAINED}, parts=self.device.upload(array), values=self._splats)
+        columns = slice(TRAINED, TRAINED + 1)
+        self._run("write_columns", columns, parts=self.device.upload(array), values=self._splats)
 
-    def _loss(self, inputs: Inputs, ssim_weight: float) -> Buffer:
-        """Compute the gradient (H, W, 4) by the image, and write the sums of L1 and SSIM to the report."""
-        device = self.device
-        height, width, _ = inputs.drawn.shape
-        image, truth = (device.scratch(np.float32, 3, height, width) for _ in range(2))
-        groups = group_count(height * width)
-        numbers = _numbers(height * width)
-        device.run(
-            "train", "unpack", groups, numbers, photo=inputs.photo, drawn=inputs.drawn, image=image,
-            truth=truth,
-        )  # fmt: skip
-        *sums, gradient = sums_and_gradient(device, image, truth, ssim_weight)
-        by_image = device.scratch(np.float32, height, width, 4)
-        device.run("train", "pack", groups, numbers, gradient=gradient, by_image=by_image)
-        for slot, parts in zip(inputs.slots, sums, strict=True):
-            numbers = _numbers(parts.shape[0], slot=slot)
-            device.run("train", "total", 1, numbers, parts=parts, report=self._report)
-        return by_image
-
-    def _next_rates(self) -> np.ndarray:
-        """Count a step of Adam; return learning rates and scales of second moments (TRAINED + 3 K, 2)."""
+    def _next_numbers(self, shrink: float | None) -> np.ndarray:
+        """Count a step of Adam; return the numbers of its ``ProjectedScene.train``."""
         adam = self._adam
-        rates = np.empty(self._rates.shape, np.float32)
-        for name, columns in (*COLUMNS.items(), ("sh", slice(TRAINED, None))):
+        numbers = self._numbers
+        numbers[:4] = *adam.betas, adam.eps, shrink or 0.0
+        for name, columns in self._rates.items():
             adam.steps[name] += 1
             first, second = (1 - beta ** adam.steps[name] for beta in adam.betas)
-            rate = np.asarray(adam.lr[name], np.float32) / np.float32(first)
-            of_name = rates[columns]
-            if name == "sh":
-                of_name.reshape(-1, 3, 2)[..., 0] = rate
-            else:
-                of_name[:, 0] = rate
-            of_name[:, 1] = 1 / second
-        return rates
+            rate = adam.lr[name]
+            columns[..., 0] = (rate if isinstance(rate, float) else np.asarray(rate)) / first
+            columns[..., 1] = 1 / second
+        return numbers.copy()
 
-    def _adam_step(self, radii: Buffer, harmonics: int) -> None:
-        """Record the Adam step; ``harmonics`` is the number of active numbers in a splat's harmonics."""
-        numbers_of_sh = 3 * self._sh.shape[1]
-        shared = {"rates": self._rates, "report": self._report}
-        for values, moments, gradient, stride, by_stride, width, trained, slot in (
-            (self._splats, self._splat_moments, self._by_splats, SPLAT, BY_SPLAT, TRAINED, TRAINED, 0),
-            (self._sh, self._sh_moments, self._by_sh, *[numbers_of_sh] * 3, harmonics, TRAINED),
-        ):
-            numbers = {
-                "width": width, "stride": stride, "by_stride": by_stride, "trained": trained, "slot": slot,
-                "adam": (*self._adam.betas, self._adam.eps),
-            }  # fmt: skip
-            self._run("adam", numbers, shared, radii=radii, by_rows=gradient, values=values, moments=moments)
-
-    def _run(
-        self, entry: str, numbers: Mapping, shared: Mapping[str, Buffer] | None = None, **rows: Buffer
-    ) -> None:
-        """Record a function of train.wgsl for all rows of buffers with one row per splat."""
-        for part in self.device.parts(**rows):
-            count = numbers.get("width", 1) * next(iter(part.values())).shape[0]
-            buffers = {**part, **(shared or {})}
-            self.device.run("train", entry, group_count(count), _numbers(count, **numbers), **buffers)
-
-
-def _numbers(
-    count: int,
-    width: int = 1,
-    stride: int = SPLAT,
-    by_stride: int = BY_SPLAT,
-    trained: int = 0,
-    slot: int | np.ndarray = 0,
-    adam: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    shrink: float | np.ndarray = 1.0,
-) -> tuple:
-    """Return the uniform of train.wgsl."""
-    return count, width, stride, by_stride, trained, slot, *adam, shrink
+    def _run(self, entry: str, columns: slice, values: Buffer, **rows: Buffer) -> None:
+        """Record a function of train.wgsl for columns of ``values`` and buffers with as many rows."""
+        stride = int(np.prod(values.shape[1:]))
+        for part in self.device.parts(values=values, **rows):
+            count = _width(columns) * part["values"].shape[0]
+            numbers = count, _width(columns), stride, columns.start
+            self.device.run("train", entry, group_count(count), numbers, **part)
 
 
 def _as_tensor(values: np.ndarray) -> torch.Tensor:

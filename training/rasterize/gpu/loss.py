@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import numpy as np
 
-from .bin import group_count
+from .bin import TILE, group_count
 from .device import Buffer, Device
-
-SUM_LENGTH = 256
-"""Values that one invocation sums."""
 
 
 def loss_and_gradient(
-    device: Device, image: Buffer, truth: Buffer, ssim_weight: float
-) -> tuple[float, Buffer]:
-    """Compute (1 − ssim_weight) L1 + ssim_weight (1 − SSIM) of images (3, H, W), and its gradient."""
-    *sums, gradient = sums_and_gradient(device, image, truth, ssim_weight)
-    l1, ssim = (device.read(parts).sum(dtype=np.float64) for parts in sums)
-    return combine_loss(l1, ssim, int(np.prod(image.shape)), ssim_weight), gradient
+    device: Device, drawn: Buffer, photo: Buffer, ssim_weight: float
+) -> tuple[float, np.ndarray]:
+    """Compute (1 − ssim_weight) L1 + ssim_weight (1 − SSIM) of an image, and its gradient (H, W, 4).
+
+    Args:
+        drawn: (H, W, 4), of which three columns are used.
+        photo: (H, W, 3).
+    """
+    totals = device.scratch(np.float32, 2)
+    gradient = record_loss(device, drawn, photo, ssim_weight, totals, 0)
+    height, width, _ = drawn.shape
+    loss = combine_loss(*device.read(totals), 3 * height * width, ssim_weight)
+    return loss, device.read(gradient)
 
 
 def combine_loss(l1: float, ssim: float, size: int, ssim_weight: float) -> float:
@@ -25,26 +29,27 @@ def combine_loss(l1: float, ssim: float, size: int, ssim_weight: float) -> float
     return (1 - ssim_weight) * float(l1) / size + ssim_weight * (1 - float(ssim) / size)
 
 
-def sums_and_gradient(
-    device: Device, image: Buffer, truth: Buffer, ssim_weight: float
-) -> tuple[Buffer, Buffer, Buffer]:
-    """Compute partial sums of L1 and SSIM over SUM_LENGTH values of images (3, H, W), and the gradient."""
-    channels, height, width = image.shape
-    size = channels * height * width
-    lines, slopes = (device.scratch(np.float32, height, width, 4) for _ in range(2))
-    similar, different, gradient = (device.scratch(np.float32, *image.shape) for _ in range(3))
-    weights = (1 - ssim_weight) / size, ssim_weight / size
-    for channel in range(channels):
-        launch = group_count(height * width), (*weights, width, height, channel)
-        device.run("loss", "products", *launch, image=image, truth=truth, lines=lines)
-        device.run("loss", "similarity", *launch, across=lines, by_means=slopes, similar=similar)
-        device.run("loss", "slopes_across", *launch, slopes=slopes, lines=lines)
-        device.run(
-            "loss", "finish", *launch, across=lines, image=image, truth=truth, gradient=gradient,
-            different=different,
-        )  # fmt: skip
-    l1, ssim = (device.scratch(np.float32, group_count(size, SUM_LENGTH)) for _ in range(2))
-    for values, totals in ((different, l1), (similar, ssim)):
-        numbers = *weights, width, height, 0
-        device.run("loss", "add", group_count(totals.shape[0]), numbers, values=values, totals=totals)
-    return l1, ssim, gradient
+def record_loss(
+    device: Device, drawn: Buffer, photo: Buffer, ssim_weight: float, totals: Buffer, slot: int | np.ndarray
+) -> Buffer:
+    """Record the loss of an image (H, W, 4); return its gradient (H, W, 4).
+
+    Args:
+        photo: (H, W) with one byte per colour, or (H, W, 3).
+        totals, slot: buffer of the sums of L1 and SSIM, and the place of the first.
+    """
+    height, width, _ = drawn.shape
+    count = 3 * height * width
+    groups = group_count(width, TILE) * group_count(height, TILE)
+    weights = (1 - ssim_weight) / count, ssim_weight / count
+    numbers = *weights, width, height, int(len(photo.shape) == 3), groups, slot
+    slopes = device.scratch(np.float32, 9, height, width)
+    parts = device.scratch(np.float32, groups, 2)
+    gradient = device.scratch(np.float32, height, width, 4)
+    device.run("loss", "compare", groups, numbers, drawn=drawn, photo=photo, slopes=slopes, parts=parts)
+    device.run(
+        "loss", "differentiate", groups, numbers, drawn=drawn, photo=photo, slopes_of=slopes,
+        by_image=gradient,
+    )  # fmt: skip
+    device.run("loss", "total", 1, numbers, all_parts=parts, totals=totals)
+    return gradient

@@ -13,6 +13,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+Copy = tuple[Any, int, Any, int, int]
+"""Copy of a buffer: source, its offset, target, its offset, and size in bytes."""
+FUNCTIONS = (
+    "QueueWriteBuffer", "DeviceCreateCommandEncoder", "CommandEncoderCopyBufferToBuffer",
+    "CommandEncoderClearBuffer", "CommandEncoderBeginComputePass", "ComputePassEncoderSetPipeline",
+    "ComputePassEncoderSetBindGroup", "ComputePassEncoderDispatchWorkgroups", "ComputePassEncoderEnd",
+    "CommandEncoderFinish", "QueueSubmit", "ComputePassEncoderRelease", "CommandBufferRelease",
+    "CommandEncoderRelease",
+)  # fmt: skip
+"""Functions of wgpu-native that a replay calls."""
+
 
 class Dispatch(NamedTuple):
     """A dispatch to prepare.
@@ -91,6 +102,10 @@ class Recording:
             self.parts.append(part)
         self._dispatches, self._words = [], []
 
+    def replay(self, device: Any, copies: list[Copy]) -> None:
+        """Submit the dispatches to wgpu's device, after copies of buffers."""
+        (_native_replay() or _replay)(self, device, copies)
+
     def numbers(self) -> np.ndarray:
         """Return the current numbers of all dispatches."""
         for begin, array in self._arrays:
@@ -100,28 +115,69 @@ class Recording:
 
 def encode(compute_pass: Any, dispatches: Iterable[tuple[Any, Any, int]]) -> None:
     """Encode prepared dispatches in a compute pass."""
-    native = _native()
-    if native is None:
-        for pipeline, group, groups in dispatches:
-            compute_pass.set_pipeline(pipeline)
-            compute_pass.set_bind_group(0, group)
-            compute_pass.dispatch_workgroups(groups)
-        return
-    set_pipeline, set_bind_group, dispatch, null = native
-    handle = compute_pass._internal
     for pipeline, group, groups in dispatches:
-        set_pipeline(handle, pipeline._internal)
-        set_bind_group(handle, 0, group._internal, 0, null)
-        dispatch(handle, groups, 1, 1)
+        compute_pass.set_pipeline(pipeline)
+        compute_pass.set_bind_group(0, group)
+        compute_pass.dispatch_workgroups(groups)
+
+
+def _replay(recording: Recording, device: Any, copies: list[Copy]) -> None:
+    """Submit a recording through wgpu-py."""
+    device.queue.write_buffer(recording.uniforms, 0, recording.numbers())
+    encoder = device.create_command_encoder()
+    for copy in copies:
+        encoder.copy_buffer_to_buffer(*copy)
+    for handle in recording.cleared:
+        encoder.clear_buffer(handle)
+    for part in recording.parts:
+        encoder = encoder or device.create_command_encoder()
+        compute_pass = encoder.begin_compute_pass()
+        encode(compute_pass, part)
+        compute_pass.end()
+        device.queue.submit([encoder.finish()])
+        encoder = None
 
 
 @cache
-def _native() -> tuple | None:
-    """Return wgpu-native's functions of a compute pass and a null pointer; None if wgpu-py hides them."""
+def _native_replay() -> Callable[[Recording, Any, list[Copy]], None] | None:
+    """Return :func:`_replay` through wgpu-native's functions; None if wgpu-py hides them.
+
+    wgpu-py raises an exception for errors that wgpu-native reports during the call.
+    """
     try:
-        module = import_module("wgpu.backends.wgpu_native._ffi")
-        names = "SetPipeline", "SetBindGroup", "DispatchWorkgroups"
-        functions = [getattr(module.lib, f"wgpuComputePassEncoder{name}") for name in names]
-        return *functions, module.ffi.NULL
+        wgpu = import_module("wgpu.backends.wgpu_native._api")
+        lib, null, new, cast = wgpu.lib, wgpu.ffi.NULL, wgpu.ffi.new, wgpu.ffi.cast
+        functions = [getattr(lib, f"wgpu{name}") for name in FUNCTIONS]
+        raise_errors = wgpu.libf._make_proxy_func
     except (ImportError, AttributeError):
         return None
+    (
+        write, create_encoder, copy_buffer, clear, begin, set_pipeline, set_group, dispatch, end, finish,
+        submit, release_pass, release_commands, release_encoder,
+    ) = functions  # fmt: skip
+
+    def replay(recording: Recording, device: Any, copies: list[Copy]) -> None:
+        queue, numbers = device.queue._internal, recording.numbers()
+        commands = new("WGPUCommandBuffer[1]")
+        write(queue, recording.uniforms._internal, 0, cast("void *", numbers.ctypes.data), numbers.nbytes)
+        encoder = create_encoder(device._internal, null)
+        for source, source_offset, target, offset, size in copies:
+            copy_buffer(encoder, source._internal, source_offset, target._internal, offset, size)
+        for handle in recording.cleared:
+            clear(encoder, handle._internal, 0, handle.size)
+        for part in recording.parts:
+            encoder = encoder or create_encoder(device._internal, null)
+            compute_pass = begin(encoder, null)
+            for pipeline, group, groups in part:
+                set_pipeline(compute_pass, pipeline._internal)
+                set_group(compute_pass, 0, group._internal, 0, null)
+                dispatch(compute_pass, groups, 1, 1)
+            end(compute_pass)
+            release_pass(compute_pass)
+            commands[0] = finish(encoder, null)
+            submit(queue, 1, commands)
+            release_commands(commands[0])
+            release_encoder(encoder)
+            encoder = None
+
+    return raise_errors("replay", replay)

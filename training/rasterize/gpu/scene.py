@@ -14,10 +14,10 @@ ROW = 12
 """Size of a projected splat (``Row`` in common.wgsl)."""
 SPLAT, BY_SPLAT = 13, 16
 """Sizes of a splat and of its gradient on the device (project.wgsl)."""
-SUMS, PAIR_SUMS = 8, 11
-"""Numbers of sums per splat and per pair in blending's backward pass (common.wgsl)."""
-GEOMETRY = 6
-"""Number of sums per splat without absolute gradients, which exclude features."""
+PAIR_SUMS = 11
+"""Sums per splat and per pair in blending's backward pass (common.wgsl)."""
+TRAINING_NUMBERS = 176
+"""Size of Adam's constants, the factor of the photo and the rates, the end of project.wgsl's uniform."""
 TILES = 1024
 """Tiles per dispatch, so that the device can do other work in between."""
 
@@ -70,13 +70,14 @@ class ProjectedScene:
         count = splats.shape[0]
         lens = lens_of(settings)
         rows, colours = device.scratch(np.float32, count, ROW), device.scratch(np.float32, count, 4)
-        depths, radii = device.scratch(np.uint32, count), device.scratch(np.float32, count)
+        depths, order = device.scratch(np.uint32, count), device.scratch(np.uint32, count)
+        radii = device.scratch(np.float32, count)
         _project(
             device, "forward", lens, settings.degree, splats=splats, sh=sh, rows=rows, colours=colours,
-            depths=depths, radii=radii,
+            depths=depths, radii=radii, order=order,
         )  # fmt: skip
         max_pairs = device.binding_bytes // (4 * PAIR_SUMS)
-        bands, ranges = bin_splats(device, rows, depths, view.width, view.height, max_pairs, capacity)
+        bands, ranges = bin_splats(device, rows, depths, order, view.width, view.height, max_pairs, capacity)
         return cls(
             device, view, count, lens, settings.degree, splats, sh, rows, colours, radii, bands, ranges
         )
@@ -102,31 +103,51 @@ class ProjectedScene:
 
     def differentiate(
         self,
-        columns: int,
-        absolute: bool,
         sums: Buffer,
-        by_colours: Buffer,
         visited: Buffer,
+        absolute: bool = False,
+        by_features: Buffer | None = None,
         **buffers: Buffer,
     ) -> None:
-        """Record ``backward`` of blend.wgsl, and add ``columns`` columns of its pair sums to ``sums``."""
-        for band in self.bands:
+        """Record ``backward`` of blend.wgsl, and write its sums per splat to ``sums`` (M, PAIR_SUMS).
+
+        Args:
+            by_features: (M, 3), takes the gradient by colour of a pass that blends features. Its other sums
+                are added to ``sums``.
+        """
+        entry, targets = "gradients", {"sums": sums}
+        if by_features is not None:
+            entry, targets = "feature_gradients", targets | {"by_features": by_features}
+        for k, band in enumerate(self.bands):
+            adds = k > 0 or by_features is not None
             pair_sums = self.device.empty(np.float32, band.count, PAIR_SUMS)
             self._blend(
                 "backward", band, BLACK, False, absolute, ranges=visited, sorted_pairs=band.sorted_pairs,
                 pair_sums=pair_sums, **buffers,
             )  # fmt: skip
             self.device.run(
-                "gather", "gradients", group_count(self.count), (self.count, columns), spans=band.spans,
-                pair_sums=pair_sums, sums=sums, by_colours=by_colours,
+                "gather", entry, group_count(self.count), (self.count, int(adds)), spans=band.spans,
+                pair_sums=pair_sums, **targets,
             )  # fmt: skip
 
-    def backward(self, sums: Buffer, by_colours: Buffer, by_splats: Buffer, by_sh: Buffer) -> None:
+    def backward(self, sums: Buffer, by_splats: Buffer, by_sh: Buffer) -> None:
         """Record the gradients of drawn splats from the sums of :meth:`differentiate`; other rows stay."""
         _project(
             self.device, "backward", self.lens, self.degree, splats=self.splats, sh=self.sh,
-            projected=self.rows, projected_colours=self.colours, sums=sums, by_colours=by_colours,
-            by_splats=by_splats, by_sh=by_sh,
+            projected=self.rows, sums=sums, by_splats=by_splats, by_sh=by_sh,
+        )  # fmt: skip
+
+    def train(self, sums: Buffer, training: np.ndarray, report: Buffer, **buffers: Buffer) -> None:
+        """Record statistics and an Adam step from the sums of :meth:`differentiate`.
+
+        Args:
+            training: (TRAINING_NUMBERS,) float32.
+            report: tells if the step had too many pairs (common.wgsl).
+            buffers: moments and statistics, with a row per splat.
+        """
+        _project(
+            self.device, "train", self.lens, self.degree, training, {"report": report}, splats=self.splats,
+            sh=self.sh, projected=self.rows, sums=sums, **buffers,
         )  # fmt: skip
 
     def _blend(
@@ -147,18 +168,37 @@ class ProjectedScene:
         )  # fmt: skip
 
 
-def _project(device: Device, entry: str, lens: np.ndarray, degree: int, **buffers: Buffer) -> None:
-    """Record a function of project.wgsl for all splats."""
+def _project(
+    device: Device,
+    entry: str,
+    lens: np.ndarray,
+    degree: int,
+    training: np.ndarray | None = None,
+    shared: dict[str, Buffer] | None = None,
+    **buffers: Buffer,
+) -> None:
+    """Record a function of project.wgsl for all splats; ``shared`` has buffers without a row per splat."""
+    if training is None:
+        training = np.zeros(TRAINING_NUMBERS, np.float32)
+    first = 0
     for part in device.parts(**buffers):
         count, terms, _ = part["sh"].shape
-        device.run("project", entry, group_count(count), (lens, count, degree, terms), **part)
+        numbers = lens, count, degree, terms, first, training
+        device.run("project", entry, group_count(count), numbers, **part, **(shared or {}))
+        first += count
 
 
 def lens_of(settings: RasterSettings) -> np.ndarray:
     """Convert a view to the first numbers of project.wgsl's uniform, up to ``min_scale``."""
     view = settings.view
-    pose = np.column_stack([view.rotation, view.translation])
-    limits = np.array([view.x_limits, view.y_limits]).T
+    numbers = np.zeros(28, np.float32)
+    pose = numbers[:12].reshape(3, 4)
+    pose[:, :3] = view.rotation
+    pose[:, 3] = view.translation
+    numbers[12:15] = view.position
+    (left, right), (top, bottom) = view.x_limits, view.y_limits
     size = view.width, view.height
-    numbers = 0, view.fx, view.fy, view.cx, view.cy, *limits.flat, *size, view.near, settings.min_scale
-    return np.concatenate([pose.flat, view.position, numbers], dtype=np.float32)
+    numbers[16:] = (
+        view.fx, view.fy, view.cx, view.cy, left, top, right, bottom, *size, view.near, settings.min_scale
+    )  # fmt: skip
+    return numbers

@@ -11,6 +11,9 @@ from .device import Buffer
 from .recording import Recording
 from .scene import lens_of
 
+LOSSES = 2
+"""Index of the first loss in the report (common.wgsl)."""
+
 
 @dataclass
 class Step:
@@ -18,7 +21,7 @@ class Step:
 
     Attributes:
         photo: (H, W), photo on the device.
-        rates: (trained numbers of a splat, 2), learning rates and scales of second moments.
+        training: (TRAINING_NUMBERS,), see ``ProjectedScene.train``.
         loss: None until it is read from the device.
     """
 
@@ -26,14 +29,13 @@ class Step:
     photo: Buffer
     ssim_weight: float
     weights: np.ndarray | None
-    shrink: float | None
-    rates: np.ndarray
+    training: np.ndarray
     loss: float | None = None
 
     @property
     def key(self) -> tuple:
         """Properties that decide which dispatches make the step."""
-        return (*self.photo.shape, self.settings.degree, self.ssim_weight, self.shrink is None)
+        return (*self.photo.shape, self.settings.degree, self.ssim_weight)
 
 
 @dataclass
@@ -43,8 +45,8 @@ class Inputs:
     photo: Buffer
     lens: np.ndarray
     background: np.ndarray
-    shrink: np.ndarray
-    slots: tuple[np.ndarray, np.ndarray]
+    training: np.ndarray
+    slot: np.ndarray
     drawn: Buffer
     recording: Recording | None = None
 
@@ -52,6 +54,5 @@ class Inputs:
         """Set the numbers of a step, whose losses have the given index in the report."""
         self.lens[:] = lens_of(step.settings)
         self.background[:] = step.settings.background
-        self.shrink[:] = step.shrink or 1.0
-        for k, slot in enumerate(self.slots):
-            slot[:] = 2 * index + k
+        self.training[:] = step.training
+        self.slot[:] = LOSSES + 2 * index

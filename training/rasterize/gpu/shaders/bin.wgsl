@@ -46,13 +46,6 @@ fn touches_tile(row: Row, x: u32, y: u32) -> bool {
         && touches(row, vec2f(f32(x * TILE), f32(y * TILE)) + 0.5, vec2f(SPAN));
 }
 
-// Fill pairs with their indices.
-@compute @workgroup_size(LANES)
-fn number(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
-    let k = group_of(group) * LANES + lane;
-    if (k < u.count) { pairs[k] = k; }
-}
-
 @compute @workgroup_size(LANES)
 fn count(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
     let k = group_of(group) * LANES + lane;

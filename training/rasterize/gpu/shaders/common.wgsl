@@ -11,6 +11,7 @@ struct Row {
     log2_opacity: f32,
     depth: f32,  // along the camera's z axis
     radius: f32,  // three standard deviations along the longest axis; 0 if not drawn
+    channels: u32,  // bit mask of the colour channels above zero
 }
 
 // Test if the ellipse alpha = ALPHA_MIN intersects the rectangle of pixel centres from first to first + span.
@@ -55,7 +56,9 @@ const G_XY: u32 = 4;
 const G_YY: u32 = 5;
 const ABS_X: u32 = 6;
 const ABS_Y: u32 = 7;
-const SUMS: u32 = 8;
-// A pair also has d loss / d colour.
-const RED: u32 = 8;
+const RED: u32 = 8;  // d loss / d colour
 const PAIR_SUMS: u32 = 11;
+
+// Columns of the report of training steps, before their losses.
+const NEEDED: u32 = 0;  // number of pairs of the first step that had too many; zero without one
+const COMPLETED: u32 = 1;  // number of steps before it

@@ -3,15 +3,15 @@
 
 struct Parameters {
     count: u32,
-    columns: u32,  // columns of sums to add (features do not affect absolute gradients), or of rows to select
+    columns: u32,  // of rows to select; for gradients, 1 adds to sums and 0 replaces them
     first: u32,  // index of the source's first row
     end: u32,
 }
 @group(0) @binding(0) var<uniform> u: Parameters;
 @group(0) @binding(1) var<storage, read> spans: array<vec2u>;
 @group(0) @binding(2) var<storage, read> pair_sums: array<f32>;  // (P, PAIR_SUMS)
-@group(0) @binding(3) var<storage, read_write> sums: array<f32>;  // (M, SUMS), added to
-@group(0) @binding(4) var<storage, read_write> by_colours: array<f32>;  // (M, 3), added to
+@group(0) @binding(3) var<storage, read_write> sums: array<f32>;  // (M, PAIR_SUMS)
+@group(0) @binding(4) var<storage, read_write> by_features: array<f32>;  // (M, 3), added to
 @group(0) @binding(5) var<storage, read> pair_weights: array<f32>;  // (P, 3)
 @group(0) @binding(6) var<storage, read_write> weights: array<f32>;  // (M, 3), accumulated: largest, sum, pixels
 @group(0) @binding(7) var<storage, read> index: array<u32>;  // rows to select
@@ -26,19 +26,40 @@ fn select_rows(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_in
     if (row >= u.first && row < u.end) { selected[k] = source[(row - u.first) * u.columns + k % u.columns]; }
 }
 
+// Return the sum of a number and of a column of a splat's pairs.
+fn sum_of(i: u32, column: u32, start: f32) -> f32 {
+    var total = start;
+    let end = spans[i].x + spans[i].y;
+    for (var pair = spans[i].x; pair < end; pair++) { total += pair_sums[pair * PAIR_SUMS + column]; }
+    return total;
+}
+
+// Each workgroup sums the columns of 64 splats.
 @compute @workgroup_size(LANES)
 fn gradients(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
-    let i = group_of(group) * LANES + lane;
-    if (i >= u.count) { return; }
-    var total: array<f32, PAIR_SUMS>;
-    for (var k = 0u; k < u.columns; k++) { total[k] = sums[i * SUMS + k]; }
-    for (var k = 0u; k < 3u; k++) { total[RED + k] = by_colours[i * 3u + k]; }
-    let end = spans[i].x + spans[i].y;
-    for (var pair = spans[i].x; pair < end; pair++) {
-        for (var k = 0u; k < PAIR_SUMS; k++) { total[k] += pair_sums[pair * PAIR_SUMS + k]; }
+    let first = group_of(group) * LANES;
+    let end = min(first + LANES, u.count) * PAIR_SUMS;
+    for (var k = first * PAIR_SUMS + lane; k < end; k += LANES) {
+        var start = 0.0;
+        if (u.columns != 0u) { start = sums[k]; }
+        sums[k] = sum_of(k / PAIR_SUMS, k % PAIR_SUMS, start);
     }
-    for (var k = 0u; k < u.columns; k++) { sums[i * SUMS + k] = total[k]; }
-    for (var k = 0u; k < 3u; k++) { by_colours[i * 3u + k] = total[RED + k]; }
+}
+
+// Features affect no absolute gradients, and have gradients of their own instead of the colour's.
+@compute @workgroup_size(LANES)
+fn feature_gradients(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let first = group_of(group) * LANES;
+    let end = min(first + LANES, u.count) * PAIR_SUMS;
+    for (var k = first * PAIR_SUMS + lane; k < end; k += LANES) {
+        let i = k / PAIR_SUMS;
+        let column = k % PAIR_SUMS;
+        if (column < ABS_X) { sums[k] = sum_of(i, column, sums[k]); }
+        if (column >= RED) {
+            let at = i * 3u + column - RED;
+            by_features[at] = sum_of(i, column, by_features[at]);
+        }
+    }
 }
 
 @compute @workgroup_size(LANES)

@@ -17,25 +17,52 @@ struct View {
     count: u32,
     degree: u32,  // active degree of the harmonics
     terms: u32,  // number of coefficients
+    first: u32,  // index of the first splat
+    keep_m: f32,  // Adam's betas
+    keep_v: f32,
+    eps: f32,
+    shrink: f32,  // factor by which the photo was downscaled; 0 collects no statistics
+    // learning rate and scale of second moments, for the trained numbers of a splat and its coefficients
+    rates: array<vec4f, 43>,
 }
 @group(0) @binding(0) var<uniform> u: View;
-@group(0) @binding(1) var<storage, read> splats: array<f32>;  // (M, SPLAT)
-@group(0) @binding(2) var<storage, read> sh: array<f32>;  // (M, terms, 3)
+@group(0) @binding(1) var<storage, read_write> splats: array<f32>;  // (M, SPLAT)
+@group(0) @binding(2) var<storage, read_write> sh: array<f32>;  // (M, terms, 3)
 @group(0) @binding(3) var<storage, read_write> rows: array<Row>;
 @group(0) @binding(4) var<storage, read_write> colours: array<vec4f>;
 @group(0) @binding(5) var<storage, read_write> depths: array<u32>;
 @group(0) @binding(6) var<storage, read_write> radii: array<f32>;
-@group(0) @binding(7) var<storage, read> projected: array<Row>;
-@group(0) @binding(8) var<storage, read> projected_colours: array<vec4f>;
-@group(0) @binding(9) var<storage, read> sums: array<f32>;  // (M, SUMS)
-@group(0) @binding(10) var<storage, read> by_colours: array<f32>;  // (M, 3)
-@group(0) @binding(11) var<storage, read_write> by_splats: array<f32>;  // (M, BY_SPLAT)
-@group(0) @binding(12) var<storage, read_write> by_sh: array<f32>;  // (M, terms, 3)
+@group(0) @binding(7) var<storage, read_write> order: array<u32>;
+@group(0) @binding(8) var<storage, read> projected: array<Row>;
+@group(0) @binding(9) var<storage, read> sums: array<f32>;  // (M, PAIR_SUMS)
+@group(0) @binding(10) var<storage, read_write> by_splats: array<f32>;  // (M, BY_SPLAT)
+@group(0) @binding(11) var<storage, read_write> by_sh: array<f32>;  // (M, terms, 3)
+@group(0) @binding(12) var<storage, read_write> moments: array<vec2f>;  // (M, TRAINED + 3 terms): first and second
+@group(0) @binding(13) var<storage, read_write> stats: array<f32>;  // (M, STATS)
+@group(0) @binding(14) var<storage, read> report: array<u32>;
 
 // Columns of splats: mean, opacity logit, quaternion, log-scales, weight, and Mip-Splatting filter flag. Columns of
 // by_splats: gradients of the first twelve, grad2d and absgrad2d.
 const SPLAT: u32 = 13;
 const BY_SPLAT: u32 = 16;
+const TRAINED: u32 = 11;  // first columns, which Adam changes
+const LOGIT: u32 = 3;
+const BY_MEAN2D: u32 = 12;
+// Columns of stats, in the order of STATS in device_model.py.
+const GRADIENT_SUM: u32 = 0;
+const SEEN: u32 = 1;
+const GRADIENT_MAX: u32 = 2;
+const RADIUS_MAX: u32 = 3;
+const OPACITY_SUM: u32 = 4;
+const STATS: u32 = 5;
+// Smaller moments are set to zero, as on the CPU.
+const M_TINY: f32 = 1e-30;
+const V_TINY: f32 = 1e-36;
+
+// Gradients of the splats of a workgroup.
+var<workgroup> splat_gradients: array<f32, LANES * TRAINED>;
+var<workgroup> bases: array<f32, LANES * 25>;
+var<workgroup> colour_gradients: array<vec3f, LANES>;
 
 struct Axes {
     turned: mat3x3f,  // R Q
@@ -101,6 +128,7 @@ fn forward(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index)
     let i = group_of(group) * LANES + lane;
     if (i >= u.count) { return; }
     depths[i] = 0xffffffffu;
+    order[i] = u.first + i;
     rows[i].radius = 0.0;
     radii[i] = 0.0;
     let first = i * SPLAT;
@@ -126,18 +154,20 @@ fn forward(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index)
     let longest = 0.5 * (xx + yy) + sqrt(half_difference * half_difference + e.uv * e.uv);
     let radius = 3.0 * sqrt(longest);
     let conic = vec3f(yy, -e.uv, xx) / determinant;
-    rows[i] = Row(middle, half_size, conic, log(opacity) * LOG2_E, p.z, radius);
     radii[i] = radius;
     depths[i] = bitcast<u32>(p.z);
 
     var values: array<f32, 25>;
     basis(normalize(mean - u.position.xyz), u.degree, &values);
     var colour = vec3f(0.5);
-    for (var k = 0u; k < (u.degree + 1u) * (u.degree + 1u); k++) {
+    for (var k = 0u; k < active_terms(); k++) {
         let at = (i * u.terms + k) * 3u;
         colour += values[k] * vec3f(sh[at], sh[at + 1u], sh[at + 2u]);
     }
     colours[i] = vec4f(max(colour, vec3f(0.0)), 0.0);
+    let positive = vec3u(colour > vec3f(0.0));
+    let channels = positive.x | positive.y << 1u | positive.z << 2u;
+    rows[i] = Row(middle, half_size, conic, log(opacity) * LOG2_E, p.z, radius, channels);
 }
 
 // Compute d loss / d quat from d loss / d Q, including the normalisation. r[column][row].
@@ -159,15 +189,18 @@ fn quat_gradient(q: vec4f, per_length: f32, r: mat3x3f) -> vec4f {
     return (by - dot(by, q) * q) * per_length;
 }
 
-// Compute the gradients of drawn splats; those of other splats stay zero.
-@compute @workgroup_size(LANES)
-fn backward(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
-    let i = group_of(group) * LANES + lane;
-    if (i >= u.count || projected[i].radius == 0.0) { return; }
+struct Gradient {
+    splat: array<f32, BY_SPLAT>,
+    basis: array<f32, 25>,  // the gradient of coefficient k is basis[k] colour
+    colour: vec3f,
+}
+
+// Compute the gradient of a drawn splat.
+fn gradient_of(i: u32) -> Gradient {
+    var result: Gradient;
     let first = i * SPLAT;
-    let out = i * BY_SPLAT;
     let conic = projected[i].conic;
-    let at = i * SUMS;
+    let at = i * PAIR_SUMS;
     let mean = triple(first);
     let p = to_camera(mean);
     let axes = axes_of(first);
@@ -180,10 +213,10 @@ fn backward(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index
     let by_mean2d = -vec2f(sums[at + G_X], sums[at + G_Y]);
     var by_cov = vec3f(-0.5 * sums[at + G_XX], -sums[at + G_XY], -0.5 * sums[at + G_YY]);  // xx, xy (as one), yy
     let half_size = 0.5 * u.size;
-    by_splats[out + 12u] = by_mean2d.x * half_size.x;
-    by_splats[out + 13u] = by_mean2d.y * half_size.y;
-    by_splats[out + 14u] = sums[at + ABS_X] * half_size.x;
-    by_splats[out + 15u] = sums[at + ABS_Y] * half_size.y;
+    result.splat[12u] = by_mean2d.x * half_size.x;
+    result.splat[13u] = by_mean2d.y * half_size.y;
+    result.splat[14u] = sums[at + ABS_X] * half_size.x;
+    result.splat[15u] = sums[at + ABS_Y] * half_size.y;
 
     // u and v: xx = u.u, xy = u.v, yy = v.v
     var by_u = 2.0 * by_cov.x * e.u + by_cov.y * e.v;
@@ -221,31 +254,111 @@ fn backward(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index
     let by_m = transpose(mat3x3f(by_m0 * axes.scale, by_m1 * axes.scale, by_m2 * axes.scale));
     let by_quat = quat_gradient(axes.quat, axes.per_length, transpose(camera_rotation()) * by_m);
 
-    by_splats[out + 3u] = by_log_opacity * (1.0 - sigmoid(splats[first + 3u]));
-    by_splats[out + 4u] = by_quat.w;
+    result.splat[3u] = by_log_opacity * (1.0 - sigmoid(splats[first + 3u]));
+    result.splat[4u] = by_quat.w;
     for (var k = 0u; k < 3u; k++) {
-        by_splats[out + 5u + k] = by_quat[k];
-        by_splats[out + 8u + k] = by_log_scale[k];
+        result.splat[5u + k] = by_quat[k];
+        result.splat[8u + k] = by_log_scale[k];
     }
-    by_splats[out + 11u] = by_log_opacity / splats[first + 11u];
+    result.splat[11u] = by_log_opacity / splats[first + 11u];
 
-    let gradient = vec3f(by_colours[3u * i], by_colours[3u * i + 1u], by_colours[3u * i + 2u]);
-    let by_colour = select(vec3f(0.0), gradient, projected_colours[i].xyz > vec3f(0.0));
+    let gradient = vec3f(sums[at + RED], sums[at + RED + 1u], sums[at + RED + 2u]);
+    let channels = vec3u(projected[i].channels) & vec3u(1u, 2u, 4u);
+    result.colour = select(vec3f(0.0), gradient, channels != vec3u(0u));
     let offset = mean - u.position.xyz;
     let per_length = 1.0 / length(offset);
     let direction = offset * per_length;
     var values: array<f32, 25>;
-    var slopes: array<vec3f, 25>;
     basis(direction, u.degree, &values);
+    result.basis = values;
+    var slopes: array<vec3f, 25>;
     basis_gradient(direction, u.degree, &slopes);
     var by_direction = vec3f(0.0);
-    for (var k = 0u; k < (u.degree + 1u) * (u.degree + 1u); k++) {
+    for (var k = 0u; k < active_terms(); k++) {
         let c = (i * u.terms + k) * 3u;
-        by_direction += dot(vec3f(sh[c], sh[c + 1u], sh[c + 2u]), by_colour) * slopes[k];
-        for (var channel = 0u; channel < 3u; channel++) { by_sh[c + channel] = values[k] * by_colour[channel]; }
+        by_direction += dot(vec3f(sh[c], sh[c + 1u], sh[c + 2u]), result.colour) * slopes[k];
     }
     // direction = (mean - position) / length: only the perpendicular component changes it
     let through_colour = (by_direction - dot(by_direction, direction) * direction) * per_length;
     let by_mean = through_colour + transpose(camera_rotation()) * by_p;
-    for (var k = 0u; k < 3u; k++) { by_splats[out + k] = by_mean[k]; }
+    for (var k = 0u; k < 3u; k++) { result.splat[k] = by_mean[k]; }
+    return result;
+}
+
+fn active_terms() -> u32 {
+    return (u.degree + 1u) * (u.degree + 1u);
+}
+
+// Write the gradients of drawn splats; those of other splats stay zero.
+@compute @workgroup_size(LANES)
+fn backward(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let i = group_of(group) * LANES + lane;
+    if (i >= u.count || projected[i].radius == 0.0) { return; }
+    var gradient = gradient_of(i);
+    for (var k = 0u; k < BY_SPLAT; k++) { by_splats[i * BY_SPLAT + k] = gradient.splat[k]; }
+    for (var k = 0u; k < active_terms(); k++) {
+        let c = (i * u.terms + k) * 3u;
+        for (var channel = 0u; channel < 3u; channel++) {
+            by_sh[c + channel] = gradient.basis[k] * gradient.colour[channel];
+        }
+    }
+}
+
+// Collect the statistics of density control.
+fn collect_stats(i: u32, gradient: ptr<function, Gradient>) {
+    let norm = length(vec2f((*gradient).splat[BY_MEAN2D], (*gradient).splat[BY_MEAN2D + 1u])) / u.shrink;
+    let at = i * STATS;
+    stats[at + GRADIENT_SUM] += norm;
+    stats[at + SEEN] += 1.0;
+    stats[at + GRADIENT_MAX] = max(stats[at + GRADIENT_MAX], norm);
+    stats[at + RADIUS_MAX] = max(stats[at + RADIUS_MAX], projected[i].radius);
+    stats[at + OPACITY_SUM] += sigmoid(splats[i * SPLAT + LOGIT]);
+}
+
+// Make an Adam step (Kingma and Ba 2015, Algorithm 1) of number j of a splat; return the difference of its value.
+fn adam(i: u32, j: u32, g: f32) -> f32 {
+    let at = i * (TRAINED + 3u * u.terms) + j;
+    let previous = moments[at];
+    var m = u.keep_m * previous.x + (1.0 - u.keep_m) * g;
+    var v = u.keep_v * previous.y + (1.0 - u.keep_v) * (g * g);
+    m = select(0.0, m, abs(m) > M_TINY);
+    v = select(0.0, v, v > V_TINY);
+    moments[at] = vec2f(m, v);
+    let pair = u.rates[j / 2u];
+    let rate = select(pair.xy, pair.zw, j % 2u == 1u);
+    return rate.x * m / (sqrt(v * rate.y) + u.eps);
+}
+
+// Train the splats of a workgroup. First each invocation computes the gradient of one splat, then each changes single
+// numbers. Splats that were not drawn have zero gradients. A step that had too many pairs changes nothing.
+@compute @workgroup_size(LANES)
+fn train(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let first = group_of(group) * LANES;
+    let i = first + lane;
+    let fits = report[NEEDED] == 0u;
+    var gradient: Gradient;  // zero
+    if (i < u.count && projected[i].radius > 0.0) {
+        gradient = gradient_of(i);
+        if (fits && u.shrink > 0.0) { collect_stats(i, &gradient); }
+    }
+    for (var k = 0u; k < TRAINED; k++) { splat_gradients[lane * TRAINED + k] = gradient.splat[k]; }
+    for (var k = 0u; k < active_terms(); k++) { bases[lane * 25u + k] = gradient.basis[k]; }
+    colour_gradients[lane] = gradient.colour;
+    workgroupBarrier();
+    if (!fits) { return; }
+    let count = min(LANES, u.count - first);
+    for (var k = lane; k < count * TRAINED; k += LANES) {
+        let row = k / TRAINED;
+        let j = k % TRAINED;
+        splats[(first + row) * SPLAT + j] -= adam(first + row, j, splat_gradients[k]);
+    }
+    let width = 3u * u.terms;
+    for (var k = lane; k < count * width; k += LANES) {
+        let row = k / width;
+        let j = k % width;
+        let term = j / 3u;
+        var g = 0.0;
+        if (term < active_terms()) { g = bases[row * 25u + term] * colour_gradients[row][j % 3u]; }
+        sh[first * width + k] -= adam(first + row, TRAINED + j, g);
+    }
 }

@@ -1,5 +1,5 @@
-// One pass of a stable radix sort of keys with values, by four bits. Blocks of 1024 pairs count their digits, the
-// shader `scan` sums the counts by digit and block, and every pair is copied to its position.
+// One pass of a stable radix sort of keys with values, by eight bits. `count` counts the digits of each block of pairs,
+// `scan_blocks` sums the counts of each digit over the blocks, and `scatter` copies every pair to its position.
 
 struct Parameters {
     count: u32,  // maximum number of pairs
@@ -10,14 +10,18 @@ struct Parameters {
 @group(0) @binding(0) var<uniform> u: Parameters;
 @group(0) @binding(1) var<storage, read> keys: array<u32>;
 @group(0) @binding(2) var<storage, read> values: array<u32>;
-@group(0) @binding(3) var<storage, read_write> places: array<u32>;  // (16, blocks)
+@group(0) @binding(3) var<storage, read_write> places: array<u32>;  // (DIGITS, blocks + 1): of each block, and the sum
 @group(0) @binding(4) var<storage, read_write> sorted_keys: array<u32>;
 @group(0) @binding(5) var<storage, read_write> sorted_values: array<u32>;
 @group(0) @binding(6) var<storage, read> totals: array<u32>;
 
-const DIGITS: u32 = 16;
-const PER_LANE: u32 = 16;  // consecutive pairs per invocation, which makes the sort stable
-var<workgroup> tally: array<u32, DIGITS * LANES>;  // (digits, lanes)
+const DIGITS: u32 = 256;
+const WIDE: u32 = 256;  // invocations, one per digit
+const ROWS: u32 = 8;  // pairs per invocation
+const WORDS: u32 = WIDE / 32;
+var<workgroup> tally: array<atomic<u32>, DIGITS>;
+var<workgroup> sums: array<u32, DIGITS>;
+var<workgroup> lanes_of: array<atomic<u32>, DIGITS * WORDS>;  // bit mask of the invocations with each digit
 
 fn digit_of(key: u32) -> u32 {
     return (key >> u.shift) % DIGITS;
@@ -27,45 +31,88 @@ fn pair_count() -> u32 {
     return min(u.count, totals[u.slot]);
 }
 
-fn count_digits(first: u32, lane: u32) {
-    for (var digit = 0u; digit < DIGITS; digit++) { tally[digit * LANES + lane] = 0u; }
-    for (var k = first; k < min(first + PER_LANE, pair_count()); k++) {
-        tally[digit_of(keys[k]) * LANES + lane] += 1u;
+// Return the sum of the values of all invocations before this one; call in uniform control flow.
+fn sum_before(value: u32, lane: u32) -> u32 {
+    sums[lane] = value;
+    workgroupBarrier();
+    for (var reach = 1u; reach < WIDE; reach *= 2u) {
+        var sum = sums[lane];
+        if (lane >= reach) { sum += sums[lane - reach]; }
+        workgroupBarrier();
+        sums[lane] = sum;
+        workgroupBarrier();
     }
+    return sums[lane] - value;
 }
 
-@compute @workgroup_size(LANES)
+@compute @workgroup_size(WIDE)
 fn count(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
     let block = group_of(group);
-    count_digits((block * LANES + lane) * PER_LANE, lane);
+    let end = pair_count();
+    atomicStore(&tally[lane], 0u);
     workgroupBarrier();
-    if (lane < DIGITS) {
-        var sum = 0u;
-        for (var k = 0u; k < LANES; k++) { sum += tally[lane * LANES + k]; }
-        places[lane * u.blocks + block] = sum;
+    for (var row = 0u; row < ROWS; row++) {
+        let k = (block * ROWS + row) * WIDE + lane;
+        if (k < end) { atomicAdd(&tally[digit_of(keys[k])], 1u); }
     }
+    workgroupBarrier();
+    places[lane * (u.blocks + 1u) + block] = atomicLoad(&tally[lane]);
 }
 
-@compute @workgroup_size(LANES)
+// Replace the counts of one digit by their sums before each block.
+@compute @workgroup_size(WIDE)
+fn scan_blocks(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let row = group_of(group) * (u.blocks + 1u);
+    let length = (u.blocks + WIDE - 1u) / WIDE;
+    let first = min(lane * length, u.blocks);
+    let end = min(first + length, u.blocks);
+    var sum = 0u;
+    for (var block = first; block < end; block++) { sum += places[row + block]; }
+    var at = sum_before(sum, lane);
+    for (var block = first; block < end; block++) {
+        let count = places[row + block];
+        places[row + block] = at;
+        at += count;
+    }
+    if (lane == WIDE - 1u) { places[row + u.blocks] = at; }
+}
+
+@compute @workgroup_size(WIDE)
 fn scatter(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
     let block = group_of(group);
-    let first = (block * LANES + lane) * PER_LANE;
-    count_digits(first, lane);
+    let end = pair_count();
+    let row_of_digit = lane * (u.blocks + 1u);
+    let smaller_digits = sum_before(places[row_of_digit + u.blocks], lane);
+    atomicStore(&tally[lane], smaller_digits + places[row_of_digit + block]);  // next position of each digit
+    for (var word = 0u; word < WORDS; word++) { atomicStore(&lanes_of[word * WIDE + lane], 0u); }
     workgroupBarrier();
-    if (lane < DIGITS) {  // from counts to positions
-        var at = places[lane * u.blocks + block];
-        for (var k = 0u; k < LANES; k++) {
-            let count = tally[lane * LANES + k];
-            tally[lane * LANES + k] = at;
-            at += count;
+    for (var row = 0u; row < ROWS; row++) {
+        let k = (block * ROWS + row) * WIDE + lane;
+        let valid = k < end;
+        var key = 0u;
+        if (valid) { key = keys[k]; }
+        let digit = digit_of(key);
+        let bit = 1u << (lane % 32u);
+        if (valid) { atomicOr(&lanes_of[digit * WORDS + lane / 32u], bit); }
+        workgroupBarrier();
+        var before = 0u;  // invocations before this one with the same digit
+        var same = 0u;
+        for (var word = 0u; word < WORDS; word++) {
+            let mask = atomicLoad(&lanes_of[digit * WORDS + word]);
+            same += countOneBits(mask);
+            if (word < lane / 32u) { before += countOneBits(mask); }
+            if (word == lane / 32u) { before += countOneBits(mask & (bit - 1u)); }
         }
-    }
-    workgroupBarrier();
-    for (var k = first; k < min(first + PER_LANE, pair_count()); k++) {
-        let place = digit_of(keys[k]) * LANES + lane;
-        let at = tally[place];
-        tally[place] = at + 1u;
-        sorted_keys[at] = keys[k];
-        sorted_values[at] = values[k];
+        let at = atomicLoad(&tally[digit]) + before;
+        if (valid) {
+            sorted_keys[at] = key;
+            sorted_values[at] = values[k];
+        }
+        workgroupBarrier();
+        if (valid) {
+            atomicStore(&lanes_of[digit * WORDS + lane / 32u], 0u);
+            if (before + 1u == same) { atomicStore(&tally[digit], at + 1u); }
+        }
+        workgroupBarrier();
     }
 }

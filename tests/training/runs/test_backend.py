@@ -1,0 +1,59 @@
+"""Choice of the backend that trains a job."""
+
+from dataclasses import replace
+from importlib import import_module
+from types import SimpleNamespace
+
+import pytest
+
+from training.methods import METHODS
+from training.runs import backend
+from training.runs.job import Job
+from training.scenes.colmap import read_scene
+
+
+@pytest.fixture
+def fast_card(monkeypatch):
+    """Simulate a computer whose graphics card is fastest, without CUDA."""
+    monkeypatch.setattr(backend, "fastest_backend", lambda: "gpu")
+
+
+@pytest.mark.parametrize(
+    ("keys", "expected"),
+    [
+        ({"method": "3dgs"}, "gpu"),
+        ({"method": "flod"}, "gpu"),
+        ({"method": "octree"}, "gpu"),
+        ({"method": "octree", "parameters": {"volume_weight": 0.01}}, "cpu"),
+        ({"method": "lodge"}, "cpu"),
+        ({"method": "octree_neural"}, "cpu"),
+        ({"method": "3dgs", "parameters": {"lr_exposure": 1e-3}}, "cpu"),
+        ({"method": "3dgs", "parameters": {"depth_weight": 1.0}}, "cpu"),
+        ({"method": "3dgs", "region": "0 0 0 1 1 1"}, "cpu"),
+        ({"method": "3dgs", "backend": "cpu"}, "cpu"),
+        ({"method": "3dgs", "backend": "reference"}, "reference"),
+    ],
+)
+def test_auto_uses_a_card_that_makes_all_steps(fast_card, tiny_scene, tmp_path, keys, expected):
+    scene = read_scene(tiny_scene)
+    job = Job(scene=str(tiny_scene), out=str(tmp_path), **keys)
+    assert backend.choose_backend(job, scene) == expected
+
+
+def test_auto_trains_masked_and_transparent_photos_on_the_cpu(fast_card, tiny_scene, tmp_path):
+    scene = read_scene(tiny_scene)
+    job = Job(scene=str(tiny_scene), out=str(tmp_path), method="3dgs")
+    assert backend.choose_backend(job, scene, lambda: False) == "gpu"
+    assert backend.choose_backend(job, scene, lambda: True) == "cpu"
+    masked = replace(scene.cameras[0], mask=tmp_path / "mask.png")
+    assert backend.choose_backend(job, replace(scene, cameras=[masked, *scene.cameras[1:]])) == "cpu"
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_declared_methods_make_all_steps_on_the_device(name):
+    info = METHODS[name]
+    for parameters in info.presets.values():
+        if info.trains_on_device(parameters):
+            method = import_module(f"{info.package}.train").Method
+            state = SimpleNamespace(parameters=parameters)
+            assert all(method.allows_device_step(state, step) for step in range(0, 30_000, 1000))
