@@ -191,6 +191,11 @@ def show_marks(marks: Mapping[int, np.ndarray]) -> None:
     changes.report_selected()
 
 
+def shows_marks(cloud: bpy.types.PointCloud, marks: np.ndarray) -> bool:
+    """Return whether :func:`show_marks` displays this array for a point cloud."""
+    return _marks.get(cloud.session_uid) is marks
+
+
 def displayed_marks(cloud: bpy.types.PointCloud) -> np.ndarray:
     """Return the marks (N,) uint8 that viewports display: 0 none, 1 selected, else :func:`mark_of` a kind."""
     for values in (_in_stroke.get(cloud.session_uid), _marks.get(cloud.session_uid)):

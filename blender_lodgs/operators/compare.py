@@ -6,7 +6,7 @@ import bpy
 
 from ...training.errors import LodgsError
 from ...training.methods import METHODS
-from ..data import photographs, roots
+from ..data import evidence, photographs, roots
 from ..render import compare
 from ..runs import method_comparison, processes
 from .base import SceneOperator, report_errors
@@ -37,6 +37,22 @@ class LODGS_OT_measure_views(_ViewsOperator, bpy.types.Operator):
         if measurement.problem:
             self.report({"ERROR"}, measurement.problem)
             return {"CANCELLED"}
+        return {"FINISHED"}
+
+
+class LODGS_OT_show_evidence(_ViewsOperator, bpy.types.Operator):
+    """Colour the splats by the photos that see them, to find places that need more photos"""
+
+    bl_idname = "lodgs.show_evidence"
+    bl_label = "Show Evidence"
+
+    @report_errors
+    def execute(self, context):
+        root = roots.active_root(context)
+        if evidence.shares(root) is None:
+            evidence.show(root)
+        else:
+            evidence.hide()
         return {"FINISHED"}
 
 
@@ -161,6 +177,7 @@ class LODGS_OT_cancel_comparing_methods(bpy.types.Operator):
 CLASSES = (
     LODGS_OT_compare_methods,
     LODGS_OT_cancel_comparing_methods,
+    LODGS_OT_show_evidence,
     LODGS_OT_measure_views,
     LODGS_OT_cancel_measuring,
     LODGS_OT_compare_view,

@@ -7,13 +7,7 @@ import bpy
 from ...training.editing.clutter import KINDS
 from ..data import cleaning, clutter, crops, roots
 from ..data.cleanup_tests import CLUTTER_TESTS, HIDE_TESTS, limit_property
-from .parts import LevelsPanel, say, split_column
-
-_ICONS = {
-    "orange": "COLLECTION_COLOR_02", "yellow": "COLLECTION_COLOR_03", "pink": "COLLECTION_COLOR_07",
-    "violet": "COLLECTION_COLOR_06", "red": "COLLECTION_COLOR_01",
-}  # fmt: skip
-"""Icons by colour of clutter."""
+from .parts import TINT_ICONS, LevelsPanel, say, split_column
 
 
 class LODGS_PT_clean_up(LevelsPanel):
@@ -85,7 +79,7 @@ def _draw_clutter(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:
         count = row.row()
         count.alignment = "RIGHT"
         text = f"{counts[test.identifier]:,}" if used and counts is not None else ""
-        count.label(text=text, icon=_ICONS[KINDS[test.kind].tint])
+        count.label(text=text, icon=TINT_ICONS[KINDS[test.kind].tint])
         if used:
             column = split_column(box, align=True)
             for name in test.limits:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import bpy
 
-from ..data import photographs, roots
+from ...training.scenes.splat_evidence import GRADES
+from ..data import evidence, photographs, roots
 from ..render import compare
 from ..runs import method_comparison
 from ..viewport import wipe
-from .parts import Panel, say
+from .parts import TINT_ICONS, Panel, say
 
 HELD_OUT = "HIDE_ON"
 """Icon of held-out views."""
@@ -85,7 +86,20 @@ class LODGS_PT_compare(Panel):
             row.prop(settings, "wipe", slider=True)
             if context.scene.camera is None or context.scene.camera.session_uid != comparison.view:
                 say(layout, "Press Compare to compare this view.", "INFO")
+        _draw_evidence(layout, root)
         _draw_methods(layout)
+
+
+def _draw_evidence(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:
+    """Draw the button of the heat map, and its legend with the share of the splats of each grade."""
+    shares = evidence.shares(root)
+    icon = "HIDE_ON" if shares is None else "HIDE_OFF"
+    layout.operator("lodgs.show_evidence", icon=icon, depress=shares is not None)
+    if shares is None:
+        return
+    column = layout.column(align=True)
+    for tint, grade, share in zip(evidence.TINTS, GRADES, shares, strict=True):
+        column.label(text=f"{grade}: {share:.0%}", icon=TINT_ICONS[tint])
 
 
 def _draw_methods(layout: bpy.types.UILayout) -> None:

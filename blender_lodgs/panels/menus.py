@@ -13,7 +13,7 @@ OPERATORS = (
      "lodgs.add_region", "lodgs.plan_cells", "lodgs.submit_to_flamenco", "lodgs.show_log",
      "lodgs.show_costs", "lodgs.show_levels", "lodgs.reduce_detail"),
     ("lodgs.look_through", "lodgs.compare_view", "lodgs.compare_worst", "lodgs.measure_views",
-     "lodgs.cancel_measuring", "lodgs.compare_methods"),
+     "lodgs.cancel_measuring", "lodgs.show_evidence", "lodgs.compare_methods"),
     ("lodgs.use_engine", "lodgs.render_quick", "lodgs.combine_with_meshes", "lodgs.separate_meshes",
      "lodgs.render_mesh_depth", "lodgs.export_camera"),
     ("lodgs.reload_splats", "lodgs.add_to_scene", "lodgs.capture_scene", "lodgs.import_capture",

@@ -11,6 +11,12 @@ from ..data.placement import axes_of
 from ..data.viewpoints import VIEW_PATTERNS, ViewsSettings
 from ..runs import environment_setup
 
+TINT_ICONS = {
+    "orange": "COLLECTION_COLOR_02", "yellow": "COLLECTION_COLOR_03", "pink": "COLLECTION_COLOR_07",
+    "violet": "COLLECTION_COLOR_06", "red": "COLLECTION_COLOR_01", "green": "COLLECTION_COLOR_04",
+}  # fmt: skip
+"""Icons by the colour of marked splats."""
+
 
 class Panel(bpy.types.Panel):
     """A panel of the LODGS tab in the 3D viewport's sidebar."""

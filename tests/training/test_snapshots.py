@@ -129,6 +129,8 @@ def test_report_of_evaluate(file_regression):
         "levels": rows,
         "selective": [{"set": "per view", **detail}, {"set": "predetermined", **detail}],
         "frame_s": {"by_distance": 0.04, "full": 0.08},
+        "bytes": 35_100_000,
+        "frame_memory": {"by_distance": 12_340_000, "full": 34_500_000},
         "farther": [{"factor": 2, "drawn": 9_000, "drawn_full": 120_000, "psnr": 31.5}],
         "jumps": {"faded": 1.25, "hard": 3.5},
     }

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from ..errors import LodgsError
 from ..files import check_folder, create_folder
-from ..settings import settings_of
-from .options import add_setting, warn
+from ..settings import default_of, settings_of
+from .options import add_lpips, add_setting, lpips_archive, parse_factor, warn
 from .progress import notify, train
 
 _JOB_KEYS = ("preset", "image_scale", "test_every", "seed", "backend")
@@ -22,42 +22,69 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
     parser.description = (
         "Measures finished runs of one scene, and writes a page that compares quality, splats, speed and "
-        "images. For a scene, it first trains each method."
+        "images. Of scenes, it first trains each method. The same command resumes."
     )
-    parser.add_argument("sources", type=Path, nargs="+", metavar="SOURCE", help="a scene, or run folders")
+    parser.add_argument("sources", type=Path, nargs="+", metavar="SOURCE", help="scenes, or run folders")
     parser.add_argument(
         "--out", type=Path, required=True, metavar="DIR",
-        help="folder of index.html, compare.json and new runs",
+        help="folder of results.md, index.html, compare.json and new runs; each of several scenes has a "
+        "folder in it",
     )  # fmt: skip
     parser.add_argument(
         "--methods", nargs="+", choices=list(METHODS), metavar="METHOD",
         help="methods to train on a scene (default: all)",
     )  # fmt: skip
+    parser.add_argument(
+        "--effort", type=parse_factor, default=1.0, metavar="N",
+        help="factor on the numbers of steps of the preset (default 1)",
+    )  # fmt: skip
+    add_lpips(parser)
     for name in _JOB_KEYS:
         add_setting(parser, settings_of(Job)[name])
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
+    from ..files import atomic_write
     from ..runs.comparison.page import compare, format_comparison
+    from ..runs.comparison.results import format_results
     from ..runs.folder import RunFolder
 
     create_folder(options.out)
     is_run = [RunFolder(source).job.is_file() for source in options.sources]
-    if all(is_run):
-        runs = options.sources
-    elif len(is_run) == 1:
-        runs = _train_methods(options)
-    else:
+    if any(is_run) and not all(is_run):
         wrong = next(source for source, known in zip(options.sources, is_run, strict=True) if not known)
-        raise LodgsError(f"Cannot compare {wrong}: it is not a run.", "Name one scene, or runs only.")
-    report = compare(runs, options.out, warn, notify)
-    print(format_comparison(report))
-    print(f"{options.out / 'index.html'}: open it in a browser")
+        raise LodgsError(f"Cannot compare {wrong}: it is not a run.", "Name scenes only, or runs only.")
+    weights = lpips_archive(options)
+    reports = []
+    scenes = [None] if all(is_run) else _scene_folders(options)
+    for scene in scenes:
+        out = options.out if len(scenes) == 1 or scene is None else options.out / scene.resolve().name
+        runs = options.sources if scene is None else _train_methods(options, scene, out)
+        report = compare(runs, out, warn, notify, weights)
+        reports.append(report)
+        print(format_comparison(report))
+        print(f"{out / 'index.html'}: open it in a browser")
+    with atomic_write(options.out / "results.md") as temporary:
+        Path(temporary).write_text(format_results(reports), encoding="utf-8")
     return 0
 
 
-def _train_methods(options: argparse.Namespace) -> list[Path]:
+def _scene_folders(options: argparse.Namespace) -> list[Path]:
+    """Return the scenes to compare methods on.
+
+    Raises:
+        LodgsError: a scene does not exist, or two have the same name.
+    """
+    for scene in options.sources:
+        check_folder(scene, "Name scenes, or runs.")
+    names = [scene.resolve().name for scene in options.sources]
+    if len(set(names)) < len(names):
+        raise LodgsError("Cannot compare scenes of the same name.", "Rename a folder.")
+    return options.sources
+
+
+def _train_methods(options: argparse.Namespace, scene: Path, out: Path) -> list[Path]:
     """Train a scene with each method, or resume, and return the folders of the finished runs.
 
     A method that fails is reported and left out.
@@ -69,16 +96,17 @@ def _train_methods(options: argparse.Namespace) -> list[Path]:
     from ..methods import METHODS
     from ..runs.job import Job
 
-    (scene,) = options.sources
-    check_folder(scene, "Name a scene, or runs.")
     keys = {"scene": str(scene)} | {name: vars(options)[name] for name in _JOB_KEYS if name in options}
+    preset = keys.get("preset", default_of(settings_of(Job)["preset"]))
     names = options.methods or list(METHODS)
     runs = []
     for number, name in enumerate(names, 1):
         label = METHODS[name].label
-        text = f"Training {label} ({number} of {len(names)})"
-        folder = options.out / "runs" / name
-        if problem := train(Job.from_dict({**keys, "method": name, "out": str(folder)}), text):
+        text = f"Training {label} on {scene.resolve().name} ({number} of {len(names)})"
+        folder = out / "runs" / name
+        parameters = METHODS[name].scaled_steps(preset, options.effort, {})
+        job = Job.from_dict({**keys, "method": name, "out": str(folder), "parameters": parameters})
+        if problem := train(job, text):
             warn(f"{label} is left out: {problem}")
         else:
             runs.append(folder)

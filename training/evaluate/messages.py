@@ -32,6 +32,16 @@ def summary_lines(measures: dict) -> list[str]:
     match measures.get("loaded"):
         case int() as count if count:
             lines.append(f"Splats loaded by distance: {count:,}")
+    match measures.get("frame_memory"):
+        case {"by_distance": int() as by_distance, "full": int() as full}:
+            lines.append(
+                f"Memory to draw: {_megabytes(by_distance)} by distance, {_megabytes(full)} in full detail"
+            )
+        case {"full": int() as full}:
+            lines.append(f"Memory to draw: {_megabytes(full)}")
+    match measures.get("bytes"):
+        case int() as size:
+            lines.append(f"File of all levels: {_megabytes(size)}")
     match measures.get("memory"):
         case int() as size if size:
             lines.append(f"Memory of the training: {size / 1e9:.1f} GB")
@@ -41,6 +51,10 @@ def summary_lines(measures: dict) -> list[str]:
     if lines and "worst" not in measures:
         lines.append(NOT_HELD_OUT)
     return lines
+
+
+def _megabytes(size: int) -> str:
+    return f"{size / 1e6:.1f} MB"
 
 
 def format_duration(seconds: float) -> str:

@@ -52,10 +52,13 @@ def ssim(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = 
     """
     from torchmetrics.functional.image import structural_similarity_index_measure
 
-    if mask is not None:
-        image = torch.where((mask > MASK_THRESHOLD)[..., None], image, target)
-    pair = [to_8_bit(x).permute(2, 0, 1)[None] for x in (image, target)]
+    pair = [to_8_bit(x).permute(2, 0, 1)[None] for x in (replace_masked(image, target, mask), target)]
     return float(structural_similarity_index_measure(*pair, data_range=1.0))  # type: ignore[arg-type]
+
+
+def replace_masked(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
+    """Replace the pixels of an image (H, W, 3) that do not count with the target."""
+    return image if mask is None else torch.where((mask > MASK_THRESHOLD)[..., None], image, target)
 
 
 def _masked_pixels(

@@ -101,20 +101,32 @@ class Evaluation:
         data: scene at training size.
         backend: rasterizer backend.
         antialias: as ``Bundle.antialias``.
+        perceptual: further measures of images by name, such as LPIPS.
 
     Attributes:
         cameras: held-out views; without any, at most ``MAX_TRAINING_VIEWS`` training views.
         prefix: prefix of the names of quality measures on ``cameras``: "", or "train_" for training views.
     """
 
-    def __init__(self, data: TrainingData, backend: str = "auto", antialias: bool = False) -> None:
+    def __init__(
+        self,
+        data: TrainingData,
+        backend: str = "auto",
+        antialias: bool = False,
+        perceptual: Mapping[str, Measure] | None = None,
+    ) -> None:
         self.data = data
         self.backend = backend
         self.device = tensor_device(backend)
         self.antialias = antialias
+        self.perceptual = perceptual or {}
         self.cameras = data.test or pick_evenly(data.train, MAX_TRAINING_VIEWS)
         self.prefix = "" if data.test else "train_"
         self._measured: dict[bytes, dict] = {}
+
+    def with_filter(self, antialias: bool) -> Evaluation:
+        """Return the evaluation for a bundle with or without antialiasing."""
+        return Evaluation(self.data, self.backend, antialias, self.perceptual)
 
     def target(self, camera: Camera) -> Target:
         """Return the photo of a view, with transparent parts black, and its mask."""
@@ -182,9 +194,9 @@ class Evaluation:
             count: returns the number of splats with a weight for a camera, visible or not.
 
         Returns:
-            ``splats`` (mean count), ``drawn`` (mean number in the image), ``psnr`` (dB), ``ssim``,
-                ``frame_s``
-            (median, with selection). Names on training views are ``train_psnr`` and ``train_ssim``.
+            ``splats`` (mean count), ``drawn`` (mean number in the image), ``psnr`` (dB), ``ssim``, the
+            perceptual measures and ``frame_s`` (median, with selection). Names on training views are
+            ``train_psnr`` and so on.
         """
         drawn = []
 
@@ -206,12 +218,14 @@ class Evaluation:
             seconds = time.perf_counter() - started
             target = self.target(camera)
             pair = image, target.image, target.mask
-            rows.append((psnr(*pair), ssim(*pair), seconds))
-        table = np.array(rows)
+            perceptual = [measure(*pair) for measure in self.perceptual.values()]
+            rows.append((seconds, psnr(*pair), ssim(*pair), *perceptual))
+        seconds, quality, *others = np.array(rows).T
+        named = zip(("ssim", *self.perceptual), others, strict=True)
         return {
-            f"{self.prefix}psnr": round(float(table[:, 0].mean()), 3),
-            f"{self.prefix}ssim": round(float(table[:, 1].mean()), 4),
-            "frame_s": round(float(np.median(table[:, 2])), 4),
+            f"{self.prefix}psnr": round(float(quality.mean()), 3),
+            **{f"{self.prefix}{name}": round(float(values.mean()), 4) for name, values in named},
+            "frame_s": round(float(np.median(seconds)), 4),
         }
 
     def measure_by_distance(self, resident: ResidentBundle, values: Values) -> dict:

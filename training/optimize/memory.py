@@ -41,16 +41,27 @@ def reset_peak_memory() -> None:
             Path("/proc/self/clear_refs").write_text("5")
 
 
+def resident_memory() -> int | None:
+    """Return the number of bytes of memory that this process uses; None if it is unknown."""
+    return _process_memory("VmRSS") if sys.platform == "linux" else None
+
+
 def peak_memory() -> int | None:
     """Return the largest number of bytes of memory that this process used; None if it is unknown."""
     if sys.platform == "linux":
-        with suppress(OSError):
-            match = re.search(r"^VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text(), re.MULTILINE)
-            return int(match[1]) << 10 if match else None
-    elif sys.platform != "win32":
+        return _process_memory("VmHWM")
+    if sys.platform != "win32":
         import resource
 
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # macOS: bytes
+    return None
+
+
+def _process_memory(name: str) -> int | None:
+    """Return a size of this process that Linux states, in bytes."""
+    with suppress(OSError):
+        match = re.search(rf"^{name}:\s+(\d+) kB", Path("/proc/self/status").read_text(), re.MULTILINE)
+        return int(match[1]) << 10 if match else None
     return None
 
 

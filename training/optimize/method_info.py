@@ -89,3 +89,26 @@ class MethodInfo:
         if name not in self.presets:
             raise LodgsError(f"Unknown preset: {quote(name)}.", f"Choose one of: {', '.join(self.presets)}.")
         return self.presets[name]
+
+    def scaled_steps(self, preset: str, effort: float, changes: Mapping[str, Any]) -> dict[str, Any]:
+        """Return changes of a preset with which all numbers of steps are multiplied by ``effort``.
+
+        Steps of 0 stay 0; others are at least 1.
+
+        Args:
+            changes: further parameters that differ from the preset. Their steps are multiplied, too.
+
+        Raises:
+            LodgsError: unknown preset.
+        """
+        parameters, scaled = self.preset(preset), dict(changes)
+
+        def scale(steps: int) -> int:
+            return max(round(steps * effort), 1) if steps else 0
+
+        for f in self.fields:
+            value = changes.get(f.name, getattr(parameters, f.name))
+            if f.metadata["unit"] == "steps" and effort != 1:
+                is_row = isinstance(value, (tuple, list))
+                scaled[f.name] = [scale(x) for x in value] if is_row else scale(value)
+        return scaled

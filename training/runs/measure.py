@@ -1,10 +1,38 @@
-"""Measure the quality and speed of a finished run."""
+"""Measure the quality and speed of a finished run.
+
+A report has these keys:
+
+- ``levels``: levels that are complete by themselves, coarse to fine: ``level``, facts, ``splats``,
+  ``drawn``, ``psnr``, ``ssim``, ``lpips_alex`` and ``lpips_vgg`` (if there are weights), ``frame_s``,
+  ``veil``. Cumulative levels include all coarser ones.
+  ``by_size`` is the PSNR at full, 1/2, 1/4 and 1/8 of the image size. Coarser levels in memory also
+  have ``merged``, the same of the finest level merged to as many splats
+- ``train_psnr``, ``veil``, ``oversized``, ``worst``, ``fitted_psnr``: see ``evaluate.summary``
+- ``aside``: mean ``psnr`` of the finest level in ``views`` off the path (``scenes.offset_views``)
+- ``selective``: quality with the rule, selected per view, and once for the mean training camera
+  (not if the bundle exceeds memory), with the rule's controls. Earlier rows with others follow
+- ``loaded``: mean number of splats that a viewer loads for a view, all without chunks (not if the
+  bundle exceeds memory)
+- ``bytes``: size of the bundle's file
+- ``frame_s``: seconds per frame ``by_distance``, including selection, and in ``full`` detail, drawn
+  alternately; not for rules that always weight
+- ``frame_memory``: bytes in use while views are drawn, ``by_distance`` and in ``full`` detail, see
+  ``evaluate.frame_memory``
+- ``curve``: as ``selective``, for each value of the rule's ``sweep``; in memory also PSNR ``merged``
+- ``networks``: quality of a neural model before baking
+- ``farther`` and ``jumps`` (of the middle view), if ``far``
+
+Without held-out views, ``test_views`` is empty, ``worst`` is missing, and quality is measured on
+training views as ``train_psnr`` and ``train_ssim``.
+"""
 
 from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +40,9 @@ import numpy as np
 
 from ..errors import LodgsError
 from ..evaluate.distance import measure_farther_views, measure_popping
+from ..evaluate.frame_memory import measure_frame_memory
 from ..evaluate.level_sheet import write_level_sheet
+from ..evaluate.lpips import load_lpips
 from ..evaluate.messages import summary_lines
 from ..evaluate.offset_views import measure_veil
 from ..evaluate.summary import summarize
@@ -23,13 +53,16 @@ from ..lod.rule import Rule, Values, find_rule
 from ..lod.selection import (
     BundleSelector,
     complete_splats,
+    full_detail_controls,
     resolve_controls,
     select,
     standalone_levels,
     unknown_rule_error,
 )
 from ..optimize.merging import merge
+from ..rasterize import tensor_device
 from ..rasterize.resident import ResidentBundle
+from ..scenes.cameras import Camera
 from ..scenes.offset_views import read_offset_views
 from ..splats.bundle import read_bundle
 from ..splats.dialects import Warn, ignore
@@ -40,6 +73,8 @@ from .job import Job
 
 MAX_EARLIER_ROWS = 100
 """Maximum number of rows of earlier evaluations that a report keeps."""
+_TITLES = {"psnr": "PSNR", "ssim": "SSIM", "lpips_alex": "LPIPS-A", "lpips_vgg": "LPIPS-V"}
+"""Heads of the columns of a report's text, by measure."""
 
 
 def evaluate_run(
@@ -48,6 +83,7 @@ def evaluate_run(
     image: Path | None = None,
     far: bool = False,
     warn: Warn = ignore,
+    lpips: Path | None = None,
 ) -> dict:
     """Measure a finished run and write its ``metrics.json``.
 
@@ -57,28 +93,10 @@ def evaluate_run(
         image: PNG file to write, with all levels from the middle held-out view.
         far: also measure the levels from greater distances (``evaluate.distance``).
         warn: called with warnings about the scene, such as missing photos.
+        lpips: archive of the networks' weights, see ``evaluate.lpips.load_lpips``.
 
     Returns:
-        A report with these keys:
-
-        - ``levels``: levels that are complete by themselves, coarse to fine: ``level``, facts, ``splats``,
-          ``drawn``, ``psnr``, ``ssim``, ``frame_s``, ``veil``. Cumulative levels include all coarser ones.
-          ``by_size`` is the PSNR at full, 1/2, 1/4 and 1/8 of the image size. Coarser levels in memory also
-          have ``merged``, the same of the finest level merged to as many splats
-        - ``train_psnr``, ``veil``, ``oversized``, ``worst``, ``fitted_psnr``: see ``evaluate.summary``
-        - ``aside``: mean ``psnr`` of the finest level in ``views`` off the path (``scenes.offset_views``)
-        - ``selective``: quality with the rule, selected per view, and once for the mean training camera
-          (not if the bundle exceeds memory), with the rule's controls. Earlier rows with others follow
-        - ``loaded``: mean number of splats that a viewer loads for a view, all without chunks (not if the
-          bundle exceeds memory)
-        - ``frame_s``: seconds per frame ``by_distance``, including selection, and in ``full`` detail, drawn
-          alternately; not for rules that always weight
-        - ``curve``: as ``selective``, for each value of the rule's ``sweep``; in memory also PSNR ``merged``
-        - ``networks``: quality of a neural model before baking
-        - ``farther`` and ``jumps`` (of the middle view), if ``far``
-
-        Without held-out views, ``test_views`` is empty, ``worst`` is missing, and quality is measured on
-        training views as ``train_psnr`` and ``train_ssim``.
+        A report, see the module.
 
     Raises:
         LodgsError: the run is not finished or contains a link, the rule has no such control, or a view off
@@ -86,12 +104,15 @@ def evaluate_run(
     """
     folder, job, data = open_finished(run, warn)
     bundle = open_if_large(folder.bundle) or read_bundle(folder.bundle)
-    evaluation = Evaluation(data, job.backend, bundle.antialias)
+    networks = load_lpips(lpips, tensor_device(job.backend))
+    evaluation = Evaluation(data, job.backend, bundle.antialias, networks)
     rule, values = _resolve_rule(bundle, controls or {})
     report = _measure_levels(job, evaluation, bundle)
     middle = evaluation.cameras[len(evaluation.cameras) // 2]
     if rule:
         report |= _measure_rule(job, folder, evaluation, bundle, rule, values)
+    report["bytes"] = folder.bundle.stat().st_size
+    report["frame_memory"] = _measure_memory(folder, evaluation, bundle, values if rule else None)
     if folder.model.exists():
         report["networks"] = _measure_networks(job, folder, evaluation)
     if far and rule:
@@ -205,6 +226,31 @@ def _add_merges(evaluation: Evaluation, bundle: Bundle, rows: list[dict]) -> Non
         row["merged"] = round(float(quality.mean()), 3)
 
 
+def _measure_memory(
+    folder: RunFolder, evaluation: Evaluation, bundle: Bundle, values: Values | None
+) -> dict[str, int | None]:
+    """Return ``frame_memory`` of the report.
+
+    Args:
+        values: values of the rule's controls; None without a rule.
+    """
+    backend, near = evaluation.backend, evaluation.data.near
+    finest = standalone_levels(bundle)[-1].number
+    controls = full_detail_controls(bundle)
+
+    def prepare(values: Values | None) -> Callable[[Camera], object]:
+        resident = ResidentBundle(folder.bundle, backend)
+        if values is None:
+            return lambda camera: resident.draw_level(finest, camera, near=near)
+        return lambda camera: resident.draw(camera, values, near=near)
+
+    cases = {"full": controls} if values is None else {"by_distance": values, "full": controls}
+    return {
+        name: measure_frame_memory(partial(prepare, case), evaluation.cameras, backend)
+        for name, case in cases.items()
+    }
+
+
 def _earlier_rows(folder: RunFolder, row: dict, values: Values) -> list[dict]:
     """Return the rows of earlier evaluations of the same bundle with other values of the controls.
 
@@ -254,9 +300,12 @@ def size_lines(rows: list[dict]) -> list[str]:
 
 def format_report(report: dict) -> str:
     """Format the report of :func:`evaluate_run` as text."""
-    quality = [f"{'' if report['test_views'] else 'train_'}{name}" for name in ("psnr", "ssim")]
-    measures = ("splats", "drawn", *quality, "frame_s", "veil", "by_size", "merged")
-    lines = [f"{'':>28} {'splats':>9} {'PSNR':>7} {'SSIM':>7} {'ms/frame':>8} {'veiled':>7}"]
+    prefix = "" if report["test_views"] else "train_"
+    titles = {f"{prefix}{name}": title for name, title in _TITLES.items()}
+    shown = [name for name in titles if name in report["levels"][-1]]
+    measures = ("splats", "drawn", *shown, "frame_s", "veil", "by_size", "merged")
+    heads = "".join(f" {titles[name]:>7}" for name in shown)
+    lines = [f"{'':>28} {'splats':>9}{heads} {'ms/frame':>8} {'veiled':>7}"]
     rows = []
     for row in report["levels"]:
         facts = "".join(f", {k} {v:.5g}" for k, v in row.items() if k not in ("level", *measures))
@@ -275,11 +324,9 @@ def format_report(report: dict) -> str:
         if row is None:
             lines.append(name)
             continue
-        psnr, ssim = (row[measure] for measure in quality)
+        quality = "".join(f" {row[key]:>7.{2 if key.endswith('psnr') else 4}f}" for key in shown)
         veil = f" {row['veil']['mean']:>7.1%}" if "veil" in row else ""
-        lines.append(
-            f"{name:<28} {row['splats']:>9,} {psnr:>7.2f} {ssim:>7.4f} {1e3 * row['frame_s']:>8.1f}{veil}"
-        )
+        lines.append(f"{name:<28} {row['splats']:>9,}{quality} {1e3 * row['frame_s']:>8.1f}{veil}")
     lines += [*size_lines(report["levels"]), *summary_lines(report)]
     for row in report.get("farther", []):
         lines.append(

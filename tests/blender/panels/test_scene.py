@@ -41,6 +41,25 @@ def test_held_out_views_have_a_separate_mean(bpy, lodgs, root, draw_panel):
     assert f"Training: {np.mean(trained):.1f} dB ({len(trained)} views)" in texts
 
 
+def test_heat_map_of_evidence_is_shown_and_hidden(bpy, lodgs, root, draw_panel):
+    """The splats of the levels stand at the origin of the scene, or far outside of every frame."""
+    cleaning = lodgs("data.cleaning")
+    cloud = cleaning.levels(root)[-1].object.data
+    assert bpy.ops.lodgs.show_evidence() == {"FINISHED"}
+    marks = cleaning.displayed_marks(cloud)
+    assert len(set(marks) - {0, 1}) >= 1 and (marks > 1).all()
+    texts = draw_panel("compare", "LODGS_PT_compare").texts
+    shares = [int(text.split(": ")[1].rstrip("%")) for text in texts if text.startswith("Seen ")]
+    assert len(shares) == 4 and sum(shares) == pytest.approx(100, abs=2)
+    root.lodgs_clutter.preview = False
+    assert bpy.ops.lodgs.find_clutter() == {"FINISHED"}  # replaces the heat map
+    assert lodgs("data.evidence").shares(root) is None
+    assert bpy.ops.lodgs.show_evidence() == {"FINISHED"}
+    assert not root.lodgs_clutter.preview and lodgs("data.evidence").shares(root) is not None
+    assert bpy.ops.lodgs.show_evidence() == {"FINISHED"}  # hides it
+    assert not cleaning.displayed_marks(cloud).any()
+
+
 def test_result_of_an_import_is_shown_until_the_next_import(bpy, lodgs, draw_panel, monkeypatch, tmp_path):
     photo_preparation = lodgs("runs.photo_preparation")
     write_bundle(tmp_path / "splats.ply", Bundle("flod", [Level(1, splats(5), {})], "bands"))

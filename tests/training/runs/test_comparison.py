@@ -9,6 +9,7 @@ import pytest
 
 from training.__main__ import main
 from training.errors import LodgsError
+from training.methods import METHODS
 from training.runs.comparison.measures import ComparedRun, Point, answers, label_runs, measure_run
 from training.runs.comparison.page import build_page, compare
 from training.runs.events import event_line
@@ -50,6 +51,9 @@ def test_measures_equal_those_of_evaluate(runs, report):
     assert measured["merged"] == [(coarse["splats"], coarse["merged"][0]), (fine["splats"], fine["psnr"])]
     assert measured["by_distance"]["psnr"] == expected["selective"][0]["psnr"]
     assert measured["loaded"] == expected["loaded"]
+    assert measured["by_distance"]["drawn"] == expected["selective"][0]["drawn"]
+    assert measured["megabytes"] == expected["bytes"] / 1e6
+    assert (measured["frame_memory"] is None) == (expected["frame_memory"]["by_distance"] is None)
     assert (measured["seconds"], measured["memory"]) == (5.5, 10**9)
 
 
@@ -163,9 +167,60 @@ def test_command_trains_the_methods_of_a_scene(tiny_scene, runs, tmp_path, capsy
     assert run["points"][-1]["splats"] == merged["points"][-1]["splats"]
 
 
+def test_several_scenes_share_a_page_of_results(tiny_scene, runs, tmp_path, monkeypatch):
+    """Each method is finished at once; the second scene is a copy."""
+    scenes = [shutil.copytree(tiny_scene, tmp_path / name) for name in ("first", "second")]
+    jobs = []
+
+    def train(job, events):
+        jobs.append(job)
+        run = RunFolder(job.out)
+        run.create()
+        job.write(run.job)
+        source = runs[0] if job.method == "flod" else runs[1]
+        shutil.copy(RunFolder(source).bundle, run.bundle)
+        return 0
+
+    monkeypatch.setattr("training.runs.train.train", train)
+    out = tmp_path / "out"
+    arguments = ["compare", *map(str, scenes), "--out", str(out), "--methods", "flod", "3dgs"]
+    arguments += [
+        "--backend",
+        "cpu",
+        "--test-every",
+        "4",
+        "--image-scale",
+        "1",
+        "--effort",
+        "0.1",
+        "--lpips",
+        "none",
+    ]
+    assert main(arguments) == 0
+    assert [(job.scene, job.method) for job in jobs] == [
+        (str(scene), method) for scene in scenes for method in ("flod", "3dgs")
+    ]
+    assert jobs[1].resolved_parameters().steps == round(0.1 * METHODS["3dgs"].preset("draft").steps)
+    text = (out / "results.md").read_text()
+    assert all((out / name / "index.html").is_file() for name in ("first", "second"))
+    assert re.findall("^## (.*)", text, re.M) == [
+        "Choice of a method", "Means over the scenes", "first", "second",
+    ]  # fmt: skip
+    flod = json.loads((out / "first" / "compare.json").read_text())["runs"][0]
+    row = next(line for line in text.splitlines() if line.startswith(f"| {flod['label']} "))
+    assert f" {flod['points'][-1]['psnr']:.2f} " in row  # both scenes are equal
+    assert "LPIPS" not in text  # not measured
+
+
+def test_scenes_of_the_same_name_are_refused(tiny_scene, tmp_path, capsys):
+    scenes = [shutil.copytree(tiny_scene, tmp_path / name / "scene") for name in ("first", "second")]
+    assert main(["compare", *map(str, scenes), "--out", str(tmp_path / "out")]) == 2
+    assert "same name" in capsys.readouterr().err
+
+
 def test_scene_and_run_together_are_refused(tiny_scene, runs, tmp_path, capsys):
     assert main(["compare", str(tiny_scene), str(runs[0]), "--out", str(tmp_path)]) == 2
-    assert "Name one scene, or runs only." in capsys.readouterr().err
+    assert "Name scenes only, or runs only." in capsys.readouterr().err
 
 
 def test_missing_scene_and_unwritable_folder_are_named_before_any_work(runs, tmp_path, capsys):

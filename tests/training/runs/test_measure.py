@@ -4,6 +4,7 @@ import errno
 import json
 import os
 import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -139,6 +140,41 @@ def test_merge_of_the_finest_level_is_the_baseline_of_a_level(finished, scene, s
     assert "merged" not in finest and finest["by_size"][0] == finest["psnr"]
     assert size_lines([coarse])[1].endswith(f"{coarse['by_size'][3]:.2f} ({coarse['merged'][3]:.2f})")
     assert size_lines([coarse])[1] in format_report(report)
+
+
+def test_perceptual_measures_stand_beside_psnr(finished, monkeypatch, tmp_path):
+    """A measure in place of the networks, whose weights are a download."""
+    folders = []
+
+    def load(folder, device):
+        folders.append(folder)
+        return {"lpips_vgg": lambda image, target, mask: float((image - target).abs().mean() / 4)}
+
+    monkeypatch.setattr("training.runs.measure.load_lpips", load)
+    report = evaluate_run(finished(test_every=4), lpips=tmp_path)
+    coarse, fine = report["levels"]
+    assert folders == [tmp_path] and 0 < fine["lpips_vgg"] < coarse["lpips_vgg"] < 0.25
+    assert report["selective"][0]["lpips_vgg"] > 0
+    head, *lines = format_report(report).splitlines()
+    assert head.split() == ["splats", "PSNR", "SSIM", "LPIPS-V", "ms/frame", "veiled"]
+    assert f" {fine['lpips_vgg']:.4f} " in next(line for line in lines if line.startswith("level 2"))
+
+
+def test_missing_weights_are_stated_in_a_sentence(finished, tmp_path, capsys):
+    assert main(["evaluate", str(finished(test_every=4)), "--lpips", str(tmp_path / "none")]) == 0
+    line = capsys.readouterr().out.splitlines()[-1]
+    assert line.startswith(f"LPIPS is not measured: {tmp_path / 'none'} does not exist.")
+
+
+def test_file_size_and_memory_to_draw_are_reported(finished):
+    run = finished(test_every=4)
+    report = evaluate_run(run)
+    assert report["bytes"] == (run / "bundle.ply").stat().st_size
+    assert report["frame_memory"].keys() == {"by_distance", "full"}
+    if sys.platform == "linux":
+        assert all(0 <= size < 10**9 for size in report["frame_memory"].values())
+        assert "Memory to draw: " in format_report(report)
+    assert "File of all levels: " in format_report(report)
 
 
 def test_incomplete_blocks_and_masked_pixels_of_a_reduced_view_do_not_count():

@@ -1,6 +1,8 @@
 """Tables of the papers: declarations, shortened trainings, trends, and the command."""
 
 import json
+import sys
+from pathlib import Path
 
 import pytest
 
@@ -17,9 +19,9 @@ from training.runs.reproduction.run import (
     make_job,
     reproduce,
     run_folder,
-    shortened,
 )
-from training.runs.reproduction.tables import PSNR, SPLATS, Training, ascending, format_table, trade
+from training.runs.reproduction.subject import Subject
+from training.runs.reproduction.tables import PSNR, SPLATS, ascending, format_table, trade
 from training.scenes.colmap import read_scene
 from training.splats.bundle import write_bundle
 from training.splats.levels import Bundle, Level
@@ -52,11 +54,12 @@ def test_trainings_are_valid_jobs(name, tmp_path):
 
 
 def test_effort_multiplies_steps_and_keeps_disabled_intervals():
-    changes = shortened(Training("flod", {"overlap_interval": 0}), 0.1)
+    flod = METHODS["flod"]
+    changes = flod.scaled_steps("paper", 0.1, {"overlap_interval": 0})
     assert changes["steps"] == [1000, 1500, 2000, 2500, 3000]  # a tenth of the paper's steps
     assert changes["overlap_interval"] == 0 and changes["sh_interval"] == 100
     assert "densify_until" not in changes  # a fraction
-    assert shortened(Training("flod"), 1.0) == {}
+    assert flod.scaled_steps("paper", 1.0, {}) == {}
 
 
 def test_trends_state_our_numbers():
@@ -114,6 +117,17 @@ def test_tables_are_measured_on_each_scene_and_resumed(tiny_scene, train, tmp_pa
     assert rows["Table 4"]["max level"]["splats"] == len(read_scene(tiny_scene).points)
     reproduce("flod", [tiny_scene], tmp_path, train, tables=["2"], effort=0.1, keys=KEYS)
     assert len(train.jobs) == 1
+
+
+def test_memory_and_image_sizes_of_a_subject(tiny_scene, train, tmp_path):
+    job = make_job(load_paper("flod"), "FLoD", tiny_scene, tmp_path, 0.1, KEYS)
+    train(job, "")
+    subject = Subject(Path(job.out))
+    sizes = subject.by_size()
+    assert list(sizes) == ["psnr_1", "psnr_2", "psnr_4", "psnr_8"]
+    measured = subject.level_with_memory(5)
+    assert sizes["psnr_1"] == measured["psnr"] == subject.level()["psnr"]
+    assert sys.platform != "linux" or 0 <= measured["memory"] < 1
 
 
 def test_failed_training_is_named(tiny_scene, tmp_path):

@@ -91,7 +91,7 @@ def render_run(
         cameras: views to render.
         splats: number of splats of the variant "Reduced". None renders a variant for each set of the run.
     """
-    evaluation = _with_filter(evaluation, bundle)
+    evaluation = evaluation.with_filter(bundle.antialias)
     resident = ResidentBundle(bundle, evaluation.backend)
     near = evaluation.data.near
 
@@ -155,12 +155,6 @@ def _fly_out(evaluation: Evaluation, bundle: Bundle, values: Values) -> tuple[li
 
     jumps = fly_out.jumps(frames())
     return images, [round(float(jump), 3) for jump in jumps]
-
-
-def _with_filter(evaluation: Evaluation, bundle: Bundle) -> Evaluation:
-    if evaluation.antialias == bundle.antialias:
-        return evaluation
-    return Evaluation(evaluation.data, evaluation.backend, bundle.antialias)
 
 
 def _narrowed(camera: Camera, width: int) -> Camera:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import LodgsError
+from ...evaluate.lpips import missing_line
 from ...evaluate.views import Evaluation
 from ...lod.rule import Values, find_rule
 from ...methods import METHODS
@@ -44,6 +45,8 @@ class Point:
         frame_s: seconds per frame with selection.
         level: number of the level, or 0.
         values: values of the rule's controls, if they select the set.
+        drawn: mean number of splats in the image.
+        lpips_alex, lpips_vgg: LPIPS of AlexNet and VGG, or None without their weights.
     """
 
     name: str
@@ -53,12 +56,17 @@ class Point:
     frame_s: float
     level: int = 0
     values: dict[str, float] = field(default_factory=dict)
+    drawn: int = 0
+    lpips_alex: float | None = None
+    lpips_vgg: float | None = None
 
     @classmethod
     def of(cls, row: dict, name: str, prefix: str, **where: Any) -> Point:
         """Make a point of a row of ``evaluate_run``'s report, whose quality names have a prefix."""
         psnr, ssim = (float(row[f"{prefix}{measure}"]) for measure in ("psnr", "ssim"))
-        return cls(name, int(row["splats"]), psnr, ssim, float(row["frame_s"]), **where)
+        alex, vgg = (row.get(f"{prefix}{measure}") for measure in ("lpips_alex", "lpips_vgg"))
+        splats, drawn, frame_s = int(row["splats"]), int(row["drawn"]), float(row["frame_s"])
+        return cls(name, splats, psnr, ssim, frame_s, drawn=drawn, lpips_alex=alex, lpips_vgg=vgg, **where)
 
 
 @dataclass(frozen=True)
@@ -78,6 +86,8 @@ class ComparedRun:
         megabytes: size of all levels in one file.
         seconds: seconds of training, or None.
         memory: most bytes of memory that the training used, or None.
+        frame_memory: bytes in use while views are drawn, by distance if the run has a rule, or None.
+        steps: number of training steps.
         baseline: the sets are not trained; they are only drawn for comparison.
     """
 
@@ -92,6 +102,8 @@ class ComparedRun:
     megabytes: float = 0.0
     seconds: float | None = None
     memory: int | None = None
+    frame_memory: int | None = None
+    steps: int = 0
     baseline: bool = False
 
     @property
@@ -115,14 +127,21 @@ class ComparedRun:
 
 
 def measure_run(
-    run: Path, label: str, values: Values, far: bool = True, warn: Warn = ignore, notify: Notify = ignore
+    run: Path,
+    label: str,
+    values: Values,
+    far: bool = True,
+    warn: Warn = ignore,
+    notify: Notify = ignore,
+    lpips: Path | None = None,
 ) -> ComparedRun:
     """Measure a finished run as ``lodgs evaluate`` does, by default with ``--far``.
 
-    A report that is newer than the run's bundle and has the same values is not measured again.
+    A report that is newer than the run's bundle and has the same values and measures is not measured again.
 
     Args:
         values: values of the controls of the run's rule.
+        lpips: archive of the networks' weights, see ``evaluate.lpips.load_lpips``.
 
     Raises:
         LodgsError: as ``evaluate_run``.
@@ -135,10 +154,12 @@ def measure_run(
         report = folder.read_metrics()
         newest = report["selective"][0] if report["selective"] else {}
         is_same = all(newest[name] == value for name, value in values.items())
-        if is_same and (not far or not report["rule"] or "farther" in report):
+        level = report["levels"][-1]
+        is_complete = missing_line(lpips) or any(f"{prefix}lpips_vgg" in level for prefix in ("", "train_"))
+        if is_same and is_complete and (not far or not report["rule"] or "farther" in report):
             return compared_run(folder, job, report, label)
     notify(f"Measuring {label}.")
-    return compared_run(folder, job, evaluate_run(run, values, far=far, warn=warn), label)
+    return compared_run(folder, job, evaluate_run(run, values, far=far, warn=warn, lpips=lpips), label)
 
 
 def compared_run(folder: RunFolder, job: Job, report: dict, label: str) -> ComparedRun:
@@ -172,9 +193,11 @@ def compared_run(folder: RunFolder, job: Job, report: dict, label: str) -> Compa
         farther=[dict(row) for row in report.get("farther", [])],
         largest_jump=float(next(iter(report["jumps"].values()))) if report.get("jumps") else None,
         loaded=int(report.get("loaded", finest.splats)),
-        megabytes=folder.bundle.stat().st_size / 1e6,
+        megabytes=report["bytes"] / 1e6,
         seconds=float(seconds) if isinstance(seconds, (int, float)) else None,
         memory=memory if isinstance(memory, int) else None,
+        frame_memory=report["frame_memory"]["by_distance" if report["selective"] else "full"],
+        steps=job.resolved_parameters().total_steps,
     )
 
 
@@ -209,6 +232,50 @@ def compared_count(runs: Sequence[ComparedRun]) -> float:
     return SHARE * median(run.finest.splats for run in runs if not run.baseline)
 
 
+@dataclass(frozen=True)
+class Purpose:
+    """A purpose for which runs are compared.
+
+    Attributes:
+        name: its name in tables. "{count}" is the number of splats at which runs are compared.
+        cost: returns the measure to minimise, from a run and that number; None without a measure.
+        describe: returns the measure as text.
+    """
+
+    name: str
+    cost: Callable[[ComparedRun, float], float | None]
+    describe: Callable[[ComparedRun, float], str]
+
+
+def _describe_reduced(run: ComparedRun, count: float) -> str:
+    return f"{run.psnr_at(count) or 0:.2f} dB; full detail has {run.finest.psnr:.2f} dB"
+
+
+def _describe_far(run: ComparedRun, count: float) -> str:
+    row = run.farther[-1]
+    return (
+        f"{1e3 * row['frame_s']:.1f} ms a frame from {row['factor']} times the distance, with "
+        f"{row['drawn']:,} splats in the image"
+    )
+
+
+PURPOSES = (
+    Purpose("Quality at full detail", lambda run, _: -run.finest.psnr,
+            lambda run, _: f"{run.finest.psnr:.2f} dB with {run.finest.splats:,} splats"),
+    Purpose("Quality with {count} splats",
+            lambda run, count: None if (quality := run.psnr_at(count)) is None else -quality,
+            _describe_reduced),
+    Purpose("Speed from far away", lambda run, _: run.farther[-1]["frame_s"] if run.farther else None,
+            _describe_far),
+    Purpose("Few splats to load", lambda run, _: run.loaded if run.by_distance else None,
+            lambda run, _: f"{run.loaded:,} splats for a view"),
+    Purpose("Smooth changes", lambda run, _: run.largest_jump,
+            lambda run, _: f"largest jump between frames {run.largest_jump:.2f} times that of full detail"),
+    Purpose("Short training", lambda run, _: run.seconds, lambda run, _: f"{run.seconds:,.0f} s"),
+)  # fmt: skip
+"""Purposes in the order of the page."""
+
+
 def answers(runs: Sequence[ComparedRun]) -> list[dict[str, str]]:
     """Answer which run is best for a purpose.
 
@@ -218,30 +285,13 @@ def answers(runs: Sequence[ComparedRun]) -> list[dict[str, str]]:
     """
     runs = [run for run in runs if not run.baseline]
     count = compared_count(runs)
-    at_count = {run.label: quality for run in runs if (quality := run.psnr_at(count)) is not None}
-    far = {run.label: run.farther[-1] for run in runs if run.farther}
-    trained = [run for run in runs if run.seconds is not None]
-    candidates = [
-        ("Quality at full detail", {run.label: -run.finest.psnr for run in runs},
-         lambda run: f"{run.finest.psnr:.2f} dB with {run.finest.splats:,} splats"),
-        (f"Quality with {count:,.0f} splats", {label: -quality for label, quality in at_count.items()},
-         lambda run: f"{at_count[run.label]:.2f} dB; full detail has {run.finest.psnr:.2f} dB"),
-        ("Speed from far away", {label: row["frame_s"] for label, row in far.items()},
-         lambda run: f"{1e3 * far[run.label]['frame_s']:.1f} ms a frame from {far[run.label]['factor']} "
-                     f"times the distance, with {far[run.label]['drawn']:,} splats in the image"),
-        ("Few splats to load", {run.label: run.loaded for run in runs if run.by_distance},
-         lambda run: f"{run.loaded:,} splats for a view"),
-        ("Smooth changes", {run.label: run.largest_jump for run in runs if run.largest_jump is not None},
-         lambda run: f"largest jump between frames {run.largest_jump:.2f} times that of full detail"),
-        ("Short training", {run.label: run.seconds for run in trained},
-         lambda run: f"{run.seconds:,.0f} s"),
-    ]  # fmt: skip
-    by_label = {run.label: run for run in runs}
     result = []
-    for purpose, costs, describe in candidates:
+    for purpose in PURPOSES:
+        costs = [(cost, run) for run in runs if (cost := purpose.cost(run, count)) is not None]
         if len(costs) > 1:
-            best = by_label[min(costs, key=costs.__getitem__)]
-            result.append({"purpose": purpose, "best": best.label, "why": describe(best)})
+            _, best = min(costs, key=lambda pair: pair[0])
+            name, why = purpose.name.format(count=f"{count:,.0f}"), purpose.describe(best, count)
+            result.append({"purpose": name, "best": best.label, "why": why})
     return result
 
 

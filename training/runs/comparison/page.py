@@ -8,11 +8,14 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
+from ...evaluate.lpips import load_lpips
 from ...evaluate.views import Evaluation
 from ...files import atomic_write, create_folder
 from ...lod.on_disk import open_if_large
 from ...lod.rule import Values
 from ...lod.selection import complete_splats, resolve_controls
+from ...rasterize import tensor_device
+from ...scenes.cameras import Camera
 from ...splats.bundle import read_bundle
 from ...splats.dialects import Warn, ignore
 from ...splats.levels import Bundle
@@ -25,7 +28,13 @@ from .measures import ComparedRun, Notify, compared_count, label_runs, measure_r
 TEMPLATE = Path(__file__).with_name("page.html")
 
 
-def compare(runs: Sequence[Path], out: Path, warn: Warn = ignore, notify: Notify = ignore) -> dict:
+def compare(
+    runs: Sequence[Path],
+    out: Path,
+    warn: Warn = ignore,
+    notify: Notify = ignore,
+    lpips: Path | None = None,
+) -> dict:
     """Compare finished runs of a scene and write ``index.html`` and ``compare.json``.
 
     Args:
@@ -33,10 +42,12 @@ def compare(runs: Sequence[Path], out: Path, warn: Warn = ignore, notify: Notify
         out: folder of the page. It is created.
         warn: receives warnings about the scene.
         notify: receives one sentence for each part of the work.
+        lpips: archive of the weights of LPIPS, see ``evaluate.lpips.load_lpips``.
 
     Returns:
-        The contents of ``compare.json``: ``scene``, ``views``, ``compared_splats``, ``runs`` (see
-        ``measures.ComparedRun``) and ``answers``.
+        The contents of ``compare.json``: ``scene``, ``held_out``, ``views``, ``measured_views`` (number),
+        ``size`` (width and height in pixels), ``compared_splats``, ``runs`` (see ``measures.ComparedRun``)
+        and ``answers``.
 
     Raises:
         LodgsError: a run is not finished, the runs have different scenes, or a file cannot be written.
@@ -44,30 +55,19 @@ def compare(runs: Sequence[Path], out: Path, warn: Warn = ignore, notify: Notify
     labels = label_runs(runs)
     several = len(runs) > 1
     measured = [
-        measure_run(run, label, _default_values(run), several, warn, notify)
+        measure_run(run, label, _default_values(run), several, warn, notify, lpips)
         for run, label in zip(runs, labels, strict=True)
     ]
-    count = compared_count(measured)
-    _, first_job, data = open_finished(runs[0], warn)
-    evaluation = Evaluation(data, first_job.backend)
+    _, job, data = open_finished(runs[0], warn)
+    evaluation = Evaluation(data, job.backend, perceptual=load_lpips(lpips, tensor_device(job.backend)))
     cameras = compared_views(evaluation)
-    images: list[RunImages] = []
-    baselines: list[ComparedRun] = []
-    for run, row in zip(runs, list(measured), strict=True):
-        notify(f"Rendering {row.label}.")
-        bundle = _read(run)
-        images.append(render_run(evaluation, bundle, row, cameras, count if several else None))
-        if len(bundle.levels) == 1 and not bundle.rule and not bundle.on_disk and not baselines:
-            plain = Evaluation(data, first_job.backend, bundle.antialias)
-            splats = complete_splats(bundle, bundle.levels[0])
-            baseline, sets = merge_baseline(plain, splats, row.label)
-            baselines.append(baseline)
-            images.append(render_merges(plain, baseline, sets, cameras, count))
-            measured.insert(measured.index(row) + 1, baseline)
+    images = _render(runs, measured, evaluation, cameras, notify)
     report = {
-        "scene": Path(first_job.scene).name,
+        "scene": Path(job.scene).name,
         "held_out": bool(data.test),
         "views": [camera.name for camera in cameras],
+        "measured_views": len(evaluation.cameras),
+        "size": [evaluation.cameras[0].width, evaluation.cameras[0].height],
         **measures(measured),
     }
     page = build_page(report, photos(evaluation, cameras), images)
@@ -77,6 +77,29 @@ def compare(runs: Sequence[Path], out: Path, warn: Warn = ignore, notify: Notify
     with atomic_write(out / "index.html") as temporary:
         Path(temporary).write_text(page, encoding="utf-8")
     return report
+
+
+def _render(
+    runs: Sequence[Path],
+    measured: list[ComparedRun],
+    evaluation: Evaluation,
+    cameras: Sequence[Camera],
+    notify: Notify,
+) -> list[RunImages]:
+    """Render the images of runs, and insert the baseline of the first single level into ``measured``."""
+    count, images, has_baseline = compared_count(measured), [], False
+    for run, row in zip(runs, list(measured), strict=True):
+        notify(f"Rendering {row.label}.")
+        bundle = _read(run)
+        images.append(render_run(evaluation, bundle, row, cameras, count if len(runs) > 1 else None))
+        if len(bundle.levels) == 1 and not bundle.rule and not bundle.on_disk and not has_baseline:
+            plain = evaluation.with_filter(bundle.antialias)
+            splats = complete_splats(bundle, bundle.levels[0])
+            baseline, sets = merge_baseline(plain, splats, row.label)
+            has_baseline = True
+            images.append(render_merges(plain, baseline, sets, cameras, count))
+            measured.insert(measured.index(row) + 1, baseline)
+    return images
 
 
 def _read(run: Path) -> Bundle:

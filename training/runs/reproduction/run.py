@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 
 from ...errors import LodgsError
+from ...evaluate.lpips import missing_line
 from ...files import atomic_write, create_folder
 from ...methods import method_info
 from ...splats.dialects import Warn, ignore
 from ..folder import RunFolder
 from ..job import Job
 from .subject import Subject
-from .tables import Measured, Paper, Table, Training, format_table
+from .tables import Measured, Paper, Table, format_table
 
 PAPERS = ("flod", "octree", "clod", "lodge", "tree")
 """Names of the papers; each has a module."""
@@ -47,25 +48,6 @@ def chosen_tables(paper: Paper, names: Collection[str]) -> list[Table]:
     return [known[name] for name in wanted] if wanted else list(paper.tables)
 
 
-def shortened(training: Training, effort: float) -> dict[str, Any]:
-    """Return a training's parameters with all numbers of steps multiplied by ``effort``.
-
-    Steps of 0 stay 0; others are at least 1.
-    """
-    info = method_info(training.method)
-    parameters = info.preset("paper")
-    changes = dict(training.changes)
-
-    def scale(steps: int) -> int:
-        return max(round(steps * effort), 1) if steps else 0
-
-    for f in info.fields:
-        value = changes.get(f.name, getattr(parameters, f.name))
-        if f.metadata["unit"] == "steps" and effort != 1:
-            changes[f.name] = [scale(x) for x in value] if isinstance(value, (tuple, list)) else scale(value)
-    return changes
-
-
 def make_job(paper: Paper, name: str, scene: Path, out: Path, effort: float, keys: Mapping[str, Any]) -> Job:
     """Return the job of a training of a paper on a scene.
 
@@ -75,9 +57,10 @@ def make_job(paper: Paper, name: str, scene: Path, out: Path, effort: float, key
     """
     training = paper.trainings[name]
     base = str(run_folder(out, training.base)) if training.base else ""
+    parameters = method_info(training.method).scaled_steps("paper", effort, training.changes)
     return Job.from_dict({
         "scene": str(scene), "out": str(run_folder(out, name)), "method": training.method, "base": base,
-        "preset": "paper", "parameters": shortened(training, effort), **keys,
+        "preset": "paper", "parameters": parameters, **keys,
     })  # fmt: skip
 
 
@@ -173,4 +156,6 @@ def format_paper(
     lines += ["Published values are from other scenes, so only the trends can be compared.", ""]
     lines += [format_table(table, measured[table.name]) for table in tables]
     lines += ["Not reproduced:", "", *(f"- {text}" for text in paper.missing)]
+    if missing := missing_line(None):
+        lines.append(f"- {missing}")
     return "\n".join(lines) + "\n"

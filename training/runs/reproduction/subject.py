@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
 from ...editing.export import Compression
-from ...evaluate.views import Evaluation
+from ...evaluate.frame_memory import measure_frame_memory
+from ...evaluate.lpips import load_lpips
+from ...evaluate.views import REDUCTIONS, Evaluation, full_detail_source
 from ...lod.on_disk import open_if_large
 from ...lod.selection import resolve_controls, select
+from ...rasterize import tensor_device
 from ...rasterize.resident import ResidentBundle
+from ...scenes.cameras import Camera
 from ...splats.bundle import read_bundle
 from ...splats.dialects import Warn, ignore
 from ...splats.levels import Bundle
@@ -22,9 +27,9 @@ from ..finished import load_networks, open_finished
 class Subject:
     """A finished run, measured on its held-out views, or on training views if none are held out.
 
-    All methods return means over the views: ``psnr`` in dB, ``ssim``, ``fps``, ``ms`` per frame, and, except
-    for networks, ``splats`` (number with a weight above 0, in view or not) and ``drawn`` (number in the
-    image). Levels count from 1; 0 is the finest.
+    All methods return means over the views: ``psnr`` in dB, ``ssim``, LPIPS if its weights are there,
+    ``fps``, ``ms`` per frame, and, except for networks, ``splats`` (number with a weight above 0, in view or
+    not) and ``drawn`` (number in the image). Levels count from 1; 0 is the finest.
 
     Raises:
         LodgsError: the run is not finished, or its scene cannot be read.
@@ -34,7 +39,8 @@ class Subject:
         self.run = run
         self.folder, self.job, data = open_finished(run, warn)
         self.bundle = open_if_large(self.folder.bundle) or read_bundle(self.folder.bundle)
-        self.evaluation = Evaluation(data, self.job.backend, self.bundle.antialias)
+        networks = load_lpips(None, tensor_device(self.job.backend))
+        self.evaluation = Evaluation(data, self.job.backend, self.bundle.antialias, networks)
 
     @cached_property
     def _resident(self) -> ResidentBundle:
@@ -70,6 +76,23 @@ class Subject:
         """Measure the images of the networks, before baking."""
         _, model = load_networks(self.job, self.folder, self.evaluation.data)
         return self._named(self.evaluation.measure_images(model.render_image))
+
+    def level_with_memory(self, number: int) -> dict[str, float]:
+        """Measure a complete level, with the memory to draw it as ``memory`` in GB, if it is known."""
+        near = self.evaluation.data.near
+
+        def prepare() -> Callable[[Camera], object]:
+            resident = ResidentBundle(self.folder.bundle, self.job.backend)
+            return lambda camera: resident.draw_level(number, camera, near=near)
+
+        size = measure_frame_memory(prepare, self.evaluation.cameras, self.job.backend)
+        return {**self.level(number), **({} if size is None else {"memory": size / 1e9})}
+
+    def by_size(self) -> dict[str, float]:
+        """Measure the finest level at reduced image sizes, as ``psnr_1``, ``psnr_2`` and so on."""
+        source = full_detail_source(self.bundle, self.bundle.levels[-1])
+        values = zip(REDUCTIONS, self.evaluation.measure_sizes(source), strict=True)
+        return {f"psnr_{factor}": value for factor, value in values}
 
     def sized_level(self) -> dict[str, float]:
         """Measure the finest level, with its share of the bundle's size as ``megabytes``."""

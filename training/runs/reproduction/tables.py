@@ -19,8 +19,10 @@ class Column(NamedTuple):
 
 
 PSNR, SSIM = Column("PSNR", "psnr"), Column("SSIM", "ssim", 3)
+LPIPS = Column("LPIPS", "lpips_vgg", 3)
 SPLATS, DRAWN = Column("splats", "splats", 0), Column("drawn", "drawn", 0)
 FPS, TIME = Column("FPS", "fps", 0), Column("ms/frame", "ms", 1)
+MEMORY = Column("memory (GB)", "memory", 3)
 SIZE = Column("size (MB)", "megabytes", 1)
 
 Measured = Mapping[str, float]
