@@ -32,6 +32,7 @@ from ..training.splats.origin import describe_origin
 from . import extension
 from .data import importing, scenes, viewpoints
 from .data.paths import save_file
+from .render import engine
 from .render.capture import noise_warning, render_views, write_model
 from .render.video import MAX_FRAMES, extract_frames
 from .runs import environment, job_settings, jobs, photo_preparation
@@ -291,9 +292,8 @@ def _capture(args: argparse.Namespace) -> int:
         _print(f"warning: {message}")
 
     folder = args.out.resolve()
-    engine = scene.render.engine
-    if engine.startswith(("BLENDER_EEVEE", "BLENDER_WORKBENCH")):
-        name = "Workbench" if "WORKBENCH" in engine else "EEVEE"
+    if scene.render.engine.startswith(("BLENDER_EEVEE", "BLENDER_WORKBENCH")):
+        name = "Workbench" if "WORKBENCH" in scene.render.engine else "EEVEE"
         _print(f"{name} needs a GPU, also in background mode. If Blender crashes now, use Cycles.")
     if warning := noise_warning(scene):
         warn(warning)
@@ -347,7 +347,9 @@ def _info(args: argparse.Namespace) -> int:
 
 
 def _empty_file() -> None:
+    """Open an empty file, ready to render splats in their own colours."""
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    engine.use(bpy.context.scene)
 
 
 def _save(path: Path) -> None:

@@ -79,14 +79,14 @@ def take_pages(run: Path, work: Path, out: Path, camera: str) -> None:
         (
             "91-compare-page",
             ["compare", str(run), "--out", str(work / "comparison")],
-            "comparison/index.html",
+            "comparison/index.html#quality",
         ),
     ):
         subprocess.run([sys.executable, "-m", "training", *arguments], cwd=ROOT, check=True)
         process = subprocess.Popen(
             [browser, "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--kiosk",
              "--no-first-run", "--window-position=0,0", f"--window-size={window.SIZE[0]},{window.SIZE[1]}",
-             f"--user-data-dir={work / 'profile'}", (work / page).as_uri()],
+             f"--user-data-dir={work / 'profile'}", f"{work.as_uri()}/{page}"],
             stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         )  # fmt: skip
         try:

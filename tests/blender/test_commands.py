@@ -202,6 +202,8 @@ def test_import_writes_a_blend_file(bpy, lodgs_command, tmp_path):
     assert lodgs_command("import", SCENE, "--blend", tmp_path / "scene.blend") == 0
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "scene.blend"))
     assert [obj for obj in bpy.data.objects if obj.lodgs.is_root]
+    scene = bpy.context.scene  # renders show the colours of the photos
+    assert (scene.render.engine, scene.view_settings.view_transform) == ("LODGS", "Standard")
 
 
 COMMAND = """

@@ -91,5 +91,6 @@ def _assignment(text: str) -> tuple[str, object]:
         return name.strip(), parse_json(f'{{"value": {value}}}', "--set")["value"]
     except (LodgsError, KeyError):
         raise LodgsError(
-            f"--set {printable(text[:200])} is not NAME=VALUE.", "For example: --set max_splats=50000"
+            f"--set {printable(text[:200])} is not NAME=VALUE.",
+            "For example: --set max_splats=50000, or --set 'steps=[100, 200]' for a list.",
         ) from None

@@ -90,7 +90,7 @@ def _digest(parts: Sequence[Splats]) -> bytes:
     digest = hashlib.blake2b(digest_size=16)
     for splats in parts:
         for values in (splats.means, splats.quats, splats.log_scales, splats.opacity_logits, splats.sh):
-            digest.update(np.ascontiguousarray(values))
+            digest.update(np.ascontiguousarray(values).data)
     return digest.digest()
 
 

@@ -80,6 +80,7 @@ def test_words_need_no_quotation_marks():
         (["--scene", "a"], "--out RUN"),
         (["--scene", "a", "--out", "b", "--set", "rho"], "--set rho is not NAME=VALUE"),
         (["--scene", "a", "--out", "b", "--set", "rho=4 5"], "--set rho=4 5 is not NAME=VALUE"),
+        (["--scene", "a", "--out", "b", "--set", "steps=1,2"], r"not NAME=VALUE.*'steps=\[100, 200\]' for a"),
         (["--scene", "a", "--out", "b", "--set", "rho=four"], "rho"),
         (["--scene", "a", "--out", "b", "--set", "depth=deep"], "depth"),
         (["--scene", "a", "--out", "b", "--set", "wings=2"], "'wings'"),
