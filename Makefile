@@ -132,6 +132,7 @@ attacks: setup
 	$(VENV) tools/attacks.py
 	$(VENV) tools/attacks_commands.py
 	$(VENV) tools/attacks_blocks.py
+	$(VENV) tools/attacks_blender.py
 
 clean:
 	rm -rf build dist .venv .venv-blender-*

@@ -40,14 +40,21 @@ def sh_name(coefficient: int) -> str:
 def sh_names(cloud: bpy.types.PointCloud) -> list[str]:
     """Return the attribute names of a cloud's SH coefficients above degree 0, in the order of the basis.
 
-    The list covers complete degrees only, up to degree 4: 0, 3, 8, 15 or 24 names.
+    The list covers complete degrees only, up to degree 4: 0, 3, 8, 15 or 24 names. Attributes that are no
+    vectors of points end it.
     """
     first = 0 if _SH.format(0) in cloud.attributes else 1
     count = 0
-    while count < MAX_HIGHER_SH and _SH.format(first + count) in cloud.attributes:
+    while count < MAX_HIGHER_SH and is_vector(cloud, _SH.format(first + count)):
         count += 1
     complete = int((count + 1) ** 0.5) ** 2 - 1
     return [_SH.format(first + index) for index in range(complete)]
+
+
+def is_vector(cloud: bpy.types.PointCloud, name: str) -> bool:
+    """Return whether a cloud has an attribute of one vector per point."""
+    attribute = cloud.attributes.get(name)
+    return attribute is not None and (attribute.data_type, attribute.domain) == ("FLOAT_VECTOR", "POINT")
 
 
 def rename_sh(cloud: bpy.types.PointCloud) -> None:

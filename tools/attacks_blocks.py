@@ -50,7 +50,7 @@ ENVIRONMENT = {
 }  # fmt: skip
 KINDS = ("worker", "trainer", "computer", "shutdown")
 ONCE = ("scheduler", "command")
-DISK_FULL_MESSAGES = ("No space left on device", "disk is full")
+DISK_FULL_MESSAGES = ("No space left on device", "disk is full", "Free some disk space")
 
 
 class Cluster:

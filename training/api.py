@@ -116,7 +116,8 @@ def train(
         >>> max(steps), run.metrics["train_psnr"] > 5, len(bundle.levels)
         (3, True, 1)
     """
-    job = Job.from_dict({"scene": str(scene), "out": str(out), **keys})
+    source = ensure_colmap_scene(Path(scene), _warn) if str(scene) else ""
+    job = Job.from_dict({"scene": str(source), "out": str(out), **keys})
     from .runs.train import train as run_job
 
     stream = _EventStream(progress)

@@ -26,12 +26,14 @@ from ..attributes import (
     LAYOUTS,
     LOG_SCALE,
     LOOK_OPACITY,
+    MAX_HIGHER_SH,
     OPACITY_LOGIT,
     QUATERNION,
     RADIUS,
     ROTATION,
     SCALE,
     WEIGHT,
+    is_vector,
     read_attribute,
     rename_sh,
     sh_name,
@@ -44,6 +46,8 @@ _OWN = {
     "position", BASE, SCALE, ROTATION, LOG_SCALE, OPACITY_LOGIT, QUATERNION, COLOR, RADIUS, WEIGHT, HIDDEN,
     LOOK_OPACITY,
 }  # fmt: skip
+_WIDTHS = {BASE: 4, SCALE: 3, ROTATION: 4}
+"""Number of values per splat."""
 _TYPE = "lodgs_type:"  # custom property that remembers a column's type
 _EXTRA = COLUMN.format("")
 _OPACITIES = 1e-12, 1 - 2.0**-24
@@ -167,11 +171,15 @@ def splats_of(cloud: bpy.types.PointCloud, weights: np.ndarray | None = None) ->
 
     Returns:
         None if the cloud lacks an attribute of splats.
+
+    Raises:
+        LodgsError: an attribute has another type.
     """
     means, base = read_attribute(cloud, "position"), read_attribute(cloud, BASE)
     scale, rotation = read_attribute(cloud, SCALE), read_attribute(cloud, ROTATION)
     if means is None or base is None or scale is None or rotation is None:
         return None
+    _check_types(cloud, {BASE: base, SCALE: scale, ROTATION: rotation})
     if weights is not None:
         base[:, 3] *= weights
     higher = [values for name in sh_names(cloud) if (values := read_attribute(cloud, name)) is not None]
@@ -186,6 +194,18 @@ def splats_of(cloud: bpy.types.PointCloud, weights: np.ndarray | None = None) ->
         opacity_logits=_stored_or_inverse(cloud, OPACITY_LOGIT, _sigmoid, base[:, 3], logits),
         sh=sh,
     )
+
+
+def _check_types(cloud: bpy.types.PointCloud, values: dict[str, np.ndarray]) -> None:
+    """Raise LodgsError if an attribute of splats has another type, as Store Named Attribute can give it."""
+    wrong = [name for name, width in _WIDTHS.items() if values[name].shape[1:] != (width,)]
+    coefficients = (sh_name(k) for k in range(1, MAX_HIGHER_SH + 1))
+    wrong += [name for name in coefficients if name in cloud.attributes and not is_vector(cloud, name)]
+    if wrong:
+        raise LodgsError(
+            f"Cannot read '{cloud.name}': its attribute {wrong[0]} has another type than those of splats.",
+            "Store it with its own type, or remove it.",
+        )
 
 
 def megabytes(cloud: bpy.types.PointCloud) -> float:

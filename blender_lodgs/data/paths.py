@@ -7,6 +7,7 @@ as after Blender's Make Paths Relative.
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Iterator
 from contextlib import suppress
@@ -21,6 +22,7 @@ _previous: list[tuple[bpy.types.bpy_struct, str, str]] = []
 """Owners, property names and values of paths before the file is saved in another folder."""
 _target = ""
 """File that is being saved."""
+NO_SPACE = os.strerror(errno.ENOSPC)
 _SEEK_TABLE_END = b"\xb1\xea\x92\x8f"
 """Last bytes of a compressed .blend file, from the seekable format of Zstandard."""
 
@@ -58,10 +60,15 @@ def save_file(path: Path, copy: bool = False) -> None:
     Raises:
         RuntimeError: the file was not saved completely.
     """
-    bpy.ops.wm.save_as_mainfile(filepath=str(path), check_existing=False, copy=copy)
+    try:
+        bpy.ops.wm.save_as_mainfile(filepath=str(path), check_existing=False, copy=copy)
+    except RuntimeError as error:
+        if os.strerror(errno.ENOENT) in str(error) and path.parent.is_dir():
+            raise RuntimeError(NO_SPACE) from error  # Blender reports the removal of the incomplete file
+        raise
     if not is_complete_file(path):  # Blender 5.2 reports no error on a full disk if it compresses
         path.unlink(missing_ok=True)
-        raise RuntimeError("No space left on device")
+        raise RuntimeError(NO_SPACE)
 
 
 def is_complete_file(path: Path) -> bool:

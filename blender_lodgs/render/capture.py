@@ -28,6 +28,7 @@ from .engine import LodgsEngine
 
 ViewCallback = Callable[[int, int], object]
 """Function that is called before each view is rendered, with its number (from 1) and the number of views."""
+_PNG_END = b"IEND\xaeB`\x82"
 LOW_NOISE_SAMPLES = 256
 """Samples per pixel from which Cycles needs no denoiser."""
 
@@ -218,6 +219,19 @@ def _set_camera(
     return view_of(camera.evaluated_get(depsgraph), depsgraph, width, height)
 
 
+def is_complete_image(path: Path, size: tuple[int, int]) -> bool:
+    """Return whether an image that Blender has written has this size, and a PNG its last chunk."""
+    try:
+        if image_size(path) != size:
+            return False
+    except LodgsError:  # a full disk
+        return False
+    with path.open("rb") as file:
+        is_png = file.read(4) == b"\x89PNG"
+        file.seek(max(path.stat().st_size - len(_PNG_END), 0))
+        return not is_png or file.read() == _PNG_END
+
+
 def _save(scene: bpy.types.Scene, folder: Path, name: str, size: tuple[int, int]) -> None:
     """Write the last render: all layers as EXR, and the display image as PNG."""
     settings, result = scene.render.image_settings, bpy.data.images["Render Result"]
@@ -233,7 +247,7 @@ def _save(scene: bpy.types.Scene, folder: Path, name: str, size: tuple[int, int]
             try:
                 with compat.square_pixels(scene.render):
                     result.save_render(str(temporary), scene=scene)
-                complete = image_size(temporary) == size
+                complete = is_complete_image(temporary, size)
             except RuntimeError:  # Blender gives no reason
                 complete = False
             if not complete:

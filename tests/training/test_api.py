@@ -1,6 +1,7 @@
 """The Python interface: examples of docstrings, and each function."""
 
 import doctest
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -178,3 +179,19 @@ def test_invalid_jobs_raise(tiny_scene, tmp_path):
         lodgs.train(tiny_scene, tmp_path / "run", no_key=1)
     with pytest.raises(LodgsError, match="no_scene"):
         lodgs.train(tmp_path / "no_scene", tmp_path / "run", **KEYS)
+
+
+def test_train_converts_an_export(tmp_path, monkeypatch):
+    folder = shutil.copytree(ROOT / "tests/data/cases/transforms_width_height/export", tmp_path / "export")
+    (folder / "images").mkdir()
+    Image.new("RGB", (60, 40)).save(folder / "images" / "a.jpg")
+    views = []
+
+    def run(job, stream):
+        views.extend(camera.name for camera in read_scene(Path(job.scene)).cameras)
+        stream.write('{"event": "done"}')
+        return 0
+
+    monkeypatch.setattr("training.runs.train.train", run)
+    api.train(folder, tmp_path / "run", method="3dgs")
+    assert views == ["a.jpg"]

@@ -108,3 +108,11 @@ def test_edited_splats(base, tmp_path, kilobytes):
         else:
             assert len(read_ply(target)) == 600
         assert [path.name for path in disk.iterdir()] == ["edited.ply"]
+
+
+@pytest.mark.parametrize("suffix", ["usdc", "usdz", "glb", "sog"])
+def test_exported_levels(base, tmp_path, suffix):
+    option = "--plain" if suffix == "sog" else "--levels"
+    with small_disk(tmp_path / "disk", 12) as disk:
+        require_message(lodgs("edit", base, option, disk / f"a.{suffix}"), disk)
+        assert not any(disk.iterdir())

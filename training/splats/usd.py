@@ -6,8 +6,10 @@ libraries. Files are read in a process of their own (``usd_process``), because d
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -33,6 +35,8 @@ _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 _SIGMAS = 3.0
 """Extents of levels include splats up to so many standard deviations."""
 _SECONDS = 600
+_MIN_FREE_BYTES = 1 << 16
+"""Free space below which a failure is that of a full disk."""
 _INSTALL = "Install it with: pip install usd-core (or lodgs[usd])."
 
 
@@ -85,6 +89,8 @@ def write_usd(path: Path, levels: PortableLevels) -> None:
                     raise OSError(0, "the package cannot be written")
                 scene = package
         except usd.Tf.ErrorException as error:
+            if shutil.disk_usage(folder).free < _MIN_FREE_BYTES:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)) from error
             raise LodgsError(
                 f"Cannot write {path}: {_first_line(error)}.", "Check the free space."
             ) from error

@@ -106,6 +106,19 @@ def test_edits_take_precedence(lodgs, make):
     assert np.array_equal(edited.quats, splats.quats)
 
 
+@pytest.mark.parametrize("kind", ["FLOAT", "FLOAT_COLOR", "INT32_2D", "FLOAT4X4"])
+@pytest.mark.parametrize("name", ["radiance:sh_2", "radiance:base", "scale"])
+def test_attribute_of_another_type_is_named(lodgs, make, kind, name):
+    if (kind, name) == ("FLOAT_COLOR", "radiance:base"):
+        pytest.skip("that is its own type")
+    objects, obj = lodgs("data.objects"), lodgs("data.objects").new_splats("s", make(5, 1))
+    obj.data.attributes.remove(obj.data.attributes[name])
+    obj.data.attributes.new(name, kind, "POINT")
+    with pytest.raises(lodgs("training.errors").LodgsError, match=rf"'s': it.* (attribute {name}|no splats)"):
+        objects.read_splats(obj)
+    assert len(lodgs("attributes").sh_names(obj.data)) == (0 if name == "radiance:sh_2" else 3)
+
+
 def test_points_deleted_by_a_modifier_are_not_read(bpy, lodgs, make):
     """The remaining splats are unchanged to the bit."""
     objects, splats = lodgs("data.objects"), make(60, 1, label=np.arange(60, dtype=np.uint8))

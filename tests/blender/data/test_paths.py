@@ -150,3 +150,15 @@ def test_truncated_blend_file_is_noticed(bpy, lodgs, tmp_path, compressed):
     for size in (0, 4096, len(content) - 70):
         path.write_bytes(content[:size])
         assert not is_complete_file(path)
+
+
+def test_false_reason_of_a_full_disk_is_corrected(bpy, lodgs, tmp_path, monkeypatch):
+    def fail(**_):
+        raise RuntimeError("Error: No such file or directory")
+
+    paths, operators = lodgs("data.paths"), SimpleNamespace(wm=SimpleNamespace(save_as_mainfile=fail))
+    monkeypatch.setattr(paths, "bpy", SimpleNamespace(ops=operators))
+    with pytest.raises(RuntimeError, match="No space left"):
+        paths.save_file(tmp_path / "a.blend")
+    with pytest.raises(RuntimeError, match="No such file"):
+        paths.save_file(tmp_path / "missing" / "a.blend")

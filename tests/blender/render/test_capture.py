@@ -293,6 +293,16 @@ def test_capture_that_ended_in_its_first_view_continues(
     assert {file.stem for file in image.parent.iterdir()} == {"view_0001", "view_0002"}
 
 
+def test_incomplete_images_are_noticed(lodgs, tmp_path):
+    path, is_complete = tmp_path / "a.png", lodgs("render.capture").is_complete_image
+    lodgs("training.scenes.images").write_png(path, np.zeros((12, 16, 3), np.uint8))
+    assert is_complete(path, (16, 12)) and not is_complete(path, (12, 16))
+    path.write_bytes(path.read_bytes()[:-5])
+    assert not is_complete(path, (16, 12))
+    path.write_bytes(b"")
+    assert not is_complete(path, (16, 12))
+
+
 def test_existing_views_are_not_rendered_again(bpy, scene, capture, tmp_path, capfd):
     assert capture("--around", "--views", "4", "--range", "2-3") == 0
     out = tmp_path / "out"

@@ -1,0 +1,245 @@
+"""Fill disks while Blender saves, exports, captures and renders: no file may be half written.
+
+    python tools/attacks_blender.py [--disks 20] [--only NAME ...]
+
+Each action of ACTIONS runs undisturbed once, in Blender's module. Then it runs on disks that are too small (a
+tmpfs, which needs root on Linux). It must report an error with the name of a file or folder of the disk.
+Every file under its final name must be complete, and the same action must succeed afterwards, with enough
+space. Results are written to build/attacks_blender.json. Exports through the trainer need
+LODGS_TRAINER_PYTHON.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import io
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import redirect_stderr
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from tests.training.conftest import write_tiny_scene  # noqa: E402
+from tests.training.splats.test_formats import random_splats  # noqa: E402
+from tools.attacks_blocks import DISK_FULL_MESSAGES, contents, disk_usage, small_disk  # noqa: E402
+from tools.blender_module import EXTENSION, start_blender  # noqa: E402
+from training.runs.page.write import VIEWER  # noqa: E402
+from training.splats.bundle import write_bundle  # noqa: E402
+from training.splats.levels import Bundle, Level  # noqa: E402
+
+COUNTS = 200, 400
+SIZE = 96, 72
+
+
+class Action(NamedTuple):
+    """An action that writes to DISK, a folder.
+
+    Attributes:
+        words: arguments of ``blender --command lodgs``, in which INPUTS and DISK are replaced by folders.
+        operator: name of an operator of ``bpy.ops.lodgs``, or "render".
+        options: arguments of the operator.
+        same: whether equal inputs give equal files; other files are only checked to be complete.
+    """
+
+    words: tuple[str, ...] = ()
+    operator: str = ""
+    options: dict = {}
+    same: bool = True
+
+
+ACTIONS = {
+    "save": Action(("import", "INPUTS/bundle.ply", "--blend", "DISK/scene.blend"), same=False),
+    "save photos": Action(("import", "INPUTS/scene", "--blend", "DISK/scene.blend"), same=False),
+    "export command": Action(("export", "INPUTS/scene.blend", "DISK/bundle.ply")),
+    "capture command": Action(
+        (
+            "capture",
+            "INPUTS/mesh.blend",
+            "--out",
+            "DISK/scene",
+            "--around",
+            "--views",
+            "4",
+            "--size",
+            "64x48",
+        ),
+        same=False,
+    ),
+    "bundle": Action((), "export_bundle", {"filepath": "DISK/bundle.ply"}),
+    "plain ply": Action((), "export_plain", {"filepath": "DISK/plain.ply"}),
+    "plain splat": Action((), "export_plain", {"filepath": "DISK/plain.splat"}),
+    "plain sog": Action((), "export_plain", {"filepath": "DISK/plain.sog"}),
+    "folder": Action((), "export_folder", {"directory": "DISK/levels"}),
+    "compressed": Action((), "export_compressed", {"filepath": "DISK/small.ply"}),
+    "usd": Action((), "export_levels", {"filepath": "DISK/levels.usdz"}, same=False),
+    "glb": Action((), "export_levels", {"filepath": "DISK/levels.glb"}),
+    "tiles": Action((), "export_tiles", {"directory": "DISK/tiles"}),
+    "streamed": Action((), "export_streamed", {"directory": "DISK/web"}),
+    "page": Action((), "export_page", {"directory": "DISK/page"}),
+    "render": Action((), "render", {"write_still": True}, same=False),
+    "animation": Action((), "render", {"animation": True}, same=False),
+}
+
+
+class Attack:
+    """Blender, inputs in a folder, and a disk.
+
+    Args:
+        work: working folder.
+    """
+
+    def __init__(self, work: Path) -> None:
+        self.bpy = start_blender()
+        self.inputs, self.disk = work / "inputs", work / "disk"
+        self.commands = importlib.import_module(f"{EXTENSION}.blender_lodgs.commands")
+        self.is_complete_file = importlib.import_module(
+            f"{EXTENSION}.blender_lodgs.data.paths"
+        ).is_complete_file
+        self.wrong: list[str] = []
+        self.messages: dict[str, int] = {}
+        write_tiny_scene(self.inputs / "scene")
+        levels = [Level(n, random_splats(count, 1, n)) for n, count in enumerate(COUNTS, 1)]
+        write_bundle(self.inputs / "bundle.ply", Bundle("flod", levels))
+        self._mesh_scene(self.inputs / "mesh.blend")
+        problem = self._command(("import", "INPUTS/bundle.ply", "--blend", "INPUTS/scene.blend"))
+        assert not problem, problem
+
+    def fill_disks(self, name: str, disks: int) -> dict:
+        """Run an action on disks of several sizes; return the number of full disks and the seconds of one."""
+        self.disk.mkdir(exist_ok=True)
+        with small_disk(self.disk, 1 << 30):
+            start = time.monotonic()
+            if problem := self._run(name):
+                raise RuntimeError(f"{name}: undisturbed action failed: {problem}")
+            seconds = time.monotonic() - start
+            expected, written = contents(self.disk), disk_usage(self.disk)
+        full = 0
+        for number in range(disks):
+            size = int(written * (number + 0.5) / disks) // 4096 * 4096 + 4096
+            with small_disk(self.disk, size):
+                problem = self._run(name)
+                attack = f"{name}, {size} bytes"
+                if problem:
+                    full += 1
+                    self._check_message(attack, problem)
+                elif set(contents(self.disk)) != set(expected):
+                    self.wrong.append(f"{attack}: no error, but {sorted(contents(self.disk))}")
+                self._check_files(name, attack, expected)
+                subprocess.run(["mount", "-o", "remount,size=1g", str(self.disk)], check=True)
+                if problem := self._run(name):
+                    self.wrong.append(f"{attack}: afterwards: {problem}")
+                self._check_files(name, f"{attack}, afterwards", expected, complete=True)
+        return {"full disks": full, "seconds": round(seconds, 2)}
+
+    def _run(self, name: str) -> str:
+        """Run an action; return its error, or ""."""
+        action = ACTIONS[name]
+        if action.words:
+            return self._command(action.words)
+        self.bpy.ops.wm.open_mainfile(filepath=str(self.inputs / "scene.blend"))
+        if action.operator == "render":
+            return self._render(action.options)
+        disk = str(self.disk)
+        options = {key: value.replace("DISK", disk) for key, value in action.options.items()}
+        if "replace" in getattr(self.bpy.ops.lodgs, action.operator).get_rna_type().properties:
+            options["replace"] = True
+        return self._operator(getattr(self.bpy.ops.lodgs, action.operator), options)
+
+    def _operator(self, operator: Callable, options: dict) -> str:
+        try:
+            return "" if operator(**options) == {"FINISHED"} else "cancelled"
+        except RuntimeError as error:
+            return str(error)
+
+    def _command(self, words: tuple[str, ...]) -> str:
+        inputs, disk = str(self.inputs), str(self.disk)
+        words = tuple(word.replace("INPUTS", inputs).replace("DISK", disk) for word in words)
+        with redirect_stderr(io.StringIO()) as output:
+            code = self.commands.main(list(words))
+        return output.getvalue() if code else ""
+
+    def _render(self, options: dict) -> str:
+        """Render frames with LODGS to the disk."""
+        scene, data = self.bpy.context.scene, self.bpy.data
+        camera = data.objects.new("Camera", data.cameras.new("Camera"))
+        camera.location = 0, 0, 8
+        scene.collection.objects.link(camera)
+        scene.camera, scene.render.engine = camera, "LODGS"
+        scene.render.resolution_x, scene.render.resolution_y = SIZE
+        scene.render.filepath = str(self.disk / "frame_")
+        scene.frame_end = 3
+        return self._operator(self.bpy.ops.render.render, options)
+
+    def _mesh_scene(self, path: Path) -> None:
+        """Save a file with a cube, rendered by Cycles with one sample."""
+        self.bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+        self.bpy.ops.mesh.primitive_cube_add()
+        scene = self.bpy.context.scene
+        scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", 1, False
+        self.bpy.ops.wm.save_as_mainfile(filepath=str(path))
+
+    def _check_message(self, attack: str, problem: str) -> None:
+        is_named = str(self.disk) in problem
+        if not is_named or not any(message in problem for message in DISK_FULL_MESSAGES):
+            self.wrong.append(f"{attack}: {problem[-400:]}")
+        message = (
+            f"{attack.split(',', maxsplit=1)[0]}: {problem.strip().replace(str(self.disk), 'DISK')[-200:]}"
+        )
+        self.messages[message] = self.messages.get(message, 0) + 1
+
+    def _check_files(self, name: str, attack: str, expected: dict, complete: bool = False) -> None:
+        files = contents(self.disk)
+        names = (expected.keys() | files.keys()) if complete else (expected.keys() & files.keys())
+        differing = [
+            file for file in names if not self._is_same(name, file, files.get(file), expected.get(file))
+        ]
+        if differing:
+            self.wrong.append(f"{attack}: half written: {sorted(differing)[:9]}")
+
+    def _is_same(self, name: str, file: str, data: bytes | None, expected: bytes | None) -> bool:
+        if data is None or expected is None or ACTIONS[name].same:
+            return data == expected or file.endswith(".blend1")
+        if file.endswith(".png"):  # with the time
+            return data.endswith(b"IEND\xaeB`\x82")
+        if file.endswith(".blend"):
+            return self.is_complete_file(self.disk / file)
+        return abs(len(data) - len(expected)) < 64
+
+
+def main() -> int:
+    """Run the attacks, print and write results; return 1 if anything went wrong."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--disks", type=int, default=20)
+    parser.add_argument("--only", nargs="+", choices=ACTIONS, default=list(ACTIONS))
+    options = parser.parse_args()
+    if sys.platform != "linux" or os.geteuid() != 0:
+        print("Skipping full disks: mounting a small tmpfs needs root on Linux.")
+        return 0
+    with tempfile.TemporaryDirectory(prefix="lodgs-attacks-") as folder:
+        attack = Attack(Path(folder))
+        results = {}
+        for name in options.only:
+            if name == "page" and not VIEWER.is_dir():
+                print(f"Skipping {name}: the viewer is not installed (tools/viewer.py).")
+                continue
+            results[name] = attack.fill_disks(name, options.disks)
+            print(name, results[name], flush=True)
+    report = ROOT / "build" / "attacks_blender.json"
+    report.parent.mkdir(exist_ok=True)
+    figures = {"actions": results, "messages": attack.messages, "wrong": attack.wrong}
+    report.write_text(json.dumps(figures, indent=1))
+    print(json.dumps(figures, indent=1), flush=True)
+    return int(bool(attack.wrong))
+
+
+if __name__ == "__main__":
+    os._exit(main())  # the module can hang when Python ends
