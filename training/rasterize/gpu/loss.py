@@ -19,8 +19,8 @@ def loss_and_gradient(
     """
     parts, gradient = record_loss(device, drawn, photo, ssim_weight)
     height, width, _ = drawn.shape
-    loss = combine_loss(*device.read(parts).sum(0, dtype=np.float64), 3 * height * width, ssim_weight)
-    return loss, device.read(gradient)
+    l1, ssim = device.read(parts).sum(0, dtype=np.float64)
+    return combine_loss(l1, ssim, 3 * height * width, ssim_weight), device.read(gradient)
 
 
 def combine_loss(l1: float, ssim: float, size: int, ssim_weight: float) -> float:
