@@ -27,16 +27,14 @@ class Band:
         tiles: range of tiles.
         count: number of pairs P.
         spans: (M, 2), first pair and number of pairs of each splat.
-        sorted_pairs: (P,), pairs tile by tile, front to back in each tile.
-        owners: (P,), splats of the sorted pairs.
+        entries: (P, 2), splat and index of each pair, tile by tile, front to back in each tile.
         starts: (M + 1,), first pair of each splat by depth, and the number of pairs without a limit.
     """
 
     tiles: range
     count: int
     spans: Buffer
-    sorted_pairs: Buffer
-    owners: Buffer
+    entries: Buffer
     starts: Buffer
 
 
@@ -69,15 +67,18 @@ def sort(
     totals = totals or device.upload(np.array([count], np.uint32))
     blocks = group_count(count, SORTED)
     target = device.scratch(np.uint32, count), device.scratch(np.uint32, count)
+    places, next_places = (device.scratch(np.uint32, 1 << DIGIT_BITS, blocks + 1) for _ in range(2))
+    device.run(
+        "sort", "count", blocks, (count, 0, blocks, slot, bits), keys=keys, places=places, totals=totals
+    )
     for shift in range(0, bits, DIGIT_BITS):
-        places = device.scratch(np.uint32, 1 << DIGIT_BITS, blocks + 1)
-        numbers = count, shift, blocks, slot
-        device.run("sort", "count", blocks, numbers, keys=keys, places=places, totals=totals)
-        device.run("sort", "scan_blocks", 1 << DIGIT_BITS, numbers, places=places)
+        numbers = count, shift, blocks, slot, bits
+        device.run("sort", "scan_blocks", 1 << DIGIT_BITS, numbers, places=places, next_places=next_places)
         device.run(
             "sort", "scatter", blocks, numbers, keys=keys, values=values, places=places,
-            sorted_keys=target[0], sorted_values=target[1], totals=totals,
+            sorted_keys=target[0], sorted_values=target[1], totals=totals, next_places=next_places,
         )  # fmt: skip
+        places, next_places = next_places, places
         (keys, values), target = target, (keys, values)
     return keys, values
 
@@ -124,7 +125,8 @@ def bin_splats(
             return bands(tiles[:middle]) + bands(tiles[middle:])
         numbers = *numbers, total
         spans = device.scratch(np.uint32, count, 2)
-        owners, tile_of, pairs, sorted_owners = (device.scratch(np.uint32, total) for _ in range(4))
+        owners, tile_of, pairs = (device.scratch(np.uint32, total) for _ in range(3))
+        entries = device.scratch(np.uint32, total, 2)
         device.run(
             "bin", "make_pairs", group_count(count), numbers, rows=rows, order=order, starts=starts,
             spans=spans, owners=owners, tiles=tile_of, pairs=pairs,
@@ -132,8 +134,8 @@ def bin_splats(
         sorted_tiles, sorted_pairs = sort(device, tile_of, pairs, tiles.stop.bit_length(), starts, count)
         device.run(
             "bin", "find_ranges", group_count(total), numbers, sorted_tiles=sorted_tiles, starts=starts,
-            sorted_pairs=sorted_pairs, owner_of=owners, sorted_owners=sorted_owners, ranges=ranges,
+            sorted_pairs=sorted_pairs, owner_of=owners, entries=entries, ranges=ranges,
         )  # fmt: skip
-        return [Band(tiles, total, spans, sorted_pairs, sorted_owners, starts)]
+        return [Band(tiles, total, spans, entries, starts)]
 
     return bands(range(across * down)), ranges

@@ -202,16 +202,17 @@ class GpuModel:
             np.zeros(1, np.uint32), device.scratch(np.float32, *size, 4),
         )  # fmt: skip
         inputs.set(step, len(self._pending))
-        pairs = (1 << 32) - 1 if capacity is None else capacity
-        device.run(
-            "train", "check", 1, (count, pairs, 0, 0), starts=scene.bands[0].starts, report=self._report
-        )
         visited = device.scratch(np.uint32, *scene.ranges.shape)
         scene.draw(
             inputs.background, False, colours=scene.colours, visited=visited, drawn=inputs.drawn,
             limit=device.scratch(np.float32, 1), median=device.scratch(np.int32, *size),
         )  # fmt: skip
-        by_image = record_loss(device, inputs.drawn, photo, step.ssim_weight, self._report, inputs.slot)
+        losses, by_image = record_loss(device, inputs.drawn, photo, step.ssim_weight)
+        pairs = (1 << 32) - 1 if capacity is None else capacity
+        device.run(
+            "train", "report_step", 1, (count, pairs, losses.shape[0], inputs.slot), losses=losses,
+            starts=scene.bands[0].starts, report=self._report,
+        )  # fmt: skip
         sums = device.scratch(np.float32, count, PAIR_SUMS)
         scene.differentiate(sums, visited, colours=scene.colours, image=inputs.drawn, by_image=by_image)
         scene.train(sums, inputs.training, self._report, moments=self._moments, stats=self._stat_sums)

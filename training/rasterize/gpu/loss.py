@@ -17,11 +17,10 @@ def loss_and_gradient(
         drawn: (H, W, 4), of which three columns are used.
         photo: (H, W, 3).
     """
-    totals = device.scratch(np.float32, 2)
-    gradient = record_loss(device, drawn, photo, ssim_weight, totals, 0)
+    parts, gradient = record_loss(device, drawn, photo, ssim_weight)
     height, width, _ = drawn.shape
-    loss = combine_loss(*device.read(totals), 3 * height * width, ssim_weight)
-    return loss, device.read(gradient)
+    l1, ssim = device.read(parts).sum(0, dtype=np.float64)
+    return combine_loss(l1, ssim, 3 * height * width, ssim_weight), device.read(gradient)
 
 
 def combine_loss(l1: float, ssim: float, size: int, ssim_weight: float) -> float:
@@ -29,20 +28,20 @@ def combine_loss(l1: float, ssim: float, size: int, ssim_weight: float) -> float
     return (1 - ssim_weight) * float(l1) / size + ssim_weight * (1 - float(ssim) / size)
 
 
-def record_loss(
-    device: Device, drawn: Buffer, photo: Buffer, ssim_weight: float, totals: Buffer, slot: int | np.ndarray
-) -> Buffer:
-    """Record the loss of an image (H, W, 4); return its gradient (H, W, 4).
+def record_loss(device: Device, drawn: Buffer, photo: Buffer, ssim_weight: float) -> tuple[Buffer, Buffer]:
+    """Record the loss of an image (H, W, 4).
 
     Args:
         photo: (H, W) with one byte per colour, or (H, W, 3).
-        totals, slot: buffer of the sums of L1 and SSIM, and the place of the first.
+
+    Returns:
+        Parts (G, 2) of the sums of L1 and SSIM, and the gradient (H, W, 4).
     """
     height, width, _ = drawn.shape
     count = 3 * height * width
     groups = group_count(width, TILE) * group_count(height, TILE)
     weights = (1 - ssim_weight) / count, ssim_weight / count
-    numbers = *weights, width, height, int(len(photo.shape) == 3), groups, slot
+    numbers = *weights, width, height, int(len(photo.shape) == 3)
     slopes = device.scratch(np.float32, 9, height, width)
     parts = device.scratch(np.float32, groups, 2)
     gradient = device.scratch(np.float32, height, width, 4)
@@ -51,5 +50,4 @@ def record_loss(
         "loss", "differentiate", groups, numbers, drawn=drawn, photo=photo, slopes_of=slopes,
         by_image=gradient,
     )  # fmt: skip
-    device.run("loss", "total", 1, numbers, all_parts=parts, totals=totals)
-    return gradient
+    return parts, gradient

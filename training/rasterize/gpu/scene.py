@@ -92,9 +92,7 @@ class ProjectedScene:
         weights = self.device.empty(np.float32, self.count, 3)
         for band in self.bands:
             shares = self.device.empty(np.float32, band.count, 3)
-            self._blend(
-                "weigh", band, ranges=self.ranges, sorted_pairs=band.sorted_pairs, pair_weights=shares
-            )
+            self._blend("weigh", band, ranges=self.ranges, pair_weights=shares)
             self.device.run(
                 "gather", "contributions", group_count(self.count), (self.count, 0), spans=band.spans,
                 pair_weights=shares, weights=weights,
@@ -120,9 +118,9 @@ class ProjectedScene:
             entry, targets = "feature_gradients", targets | {"by_features": by_features}
         for k, band in enumerate(self.bands):
             adds = k > 0 or by_features is not None
-            pair_sums = self.device.empty(np.float32, band.count, PAIR_SUMS)
+            pair_sums = self.device.scratch(np.float32, band.count, PAIR_SUMS)
             self._blend(
-                "backward", band, BLACK, False, absolute, ranges=visited, sorted_pairs=band.sorted_pairs,
+                "backward", band, BLACK, False, absolute, ranges=visited, all_ranges=self.ranges,
                 pair_sums=pair_sums, **buffers,
             )  # fmt: skip
             self.device.run(
@@ -164,7 +162,7 @@ class ProjectedScene:
         numbers = (np.asarray(background, np.float32), 0.0, *size, int(limited), int(absolute))
         self.device.run(
             "blend", entry, len(band.tiles), numbers, TILES, band.tiles.start, rows=self.rows,
-            owners=band.owners, **buffers,
+            entries=band.entries, **buffers,
         )  # fmt: skip
 
 

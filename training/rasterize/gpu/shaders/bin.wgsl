@@ -21,7 +21,7 @@ struct Parameters {
 @group(0) @binding(9) var<storage, read> sorted_tiles: array<u32>;
 @group(0) @binding(10) var<storage, read> sorted_pairs: array<u32>;
 @group(0) @binding(11) var<storage, read> owner_of: array<u32>;
-@group(0) @binding(12) var<storage, read_write> sorted_owners: array<u32>;
+@group(0) @binding(12) var<storage, read_write> entries: array<vec2u>;  // splat and index of each sorted pair
 @group(0) @binding(13) var<storage, read_write> ranges: array<vec2u>;  // of each tile: first pair and end
 
 const SPAN = f32(TILE - 1);  // distance from a tile's first pixel centre to its last
@@ -71,7 +71,7 @@ fn make_pairs(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_ind
     let splat = order[k];
     let end = min(starts[k + 1u], u.capacity);
     var at = min(starts[k], u.capacity);
-    spans[splat] = vec2u(at, end - at);
+    let first = at;
     let row = rows[splat];
     if (row.radius > 0.0) {
         let columns = tile_range(row.mean.x, row.half_size.x, u.across);
@@ -87,6 +87,7 @@ fn make_pairs(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_ind
             }
         }
     }
+    spans[splat] = vec2u(first, at - first);
     for (; at < end; at++) {
         owners[at] = splat;
         tiles[at] = u.end;
@@ -100,7 +101,7 @@ fn find_ranges(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_in
     let at = group_of(group) * LANES + lane;
     let total = min(starts[u.count], u.capacity);
     if (at >= total) { return; }
-    sorted_owners[at] = owner_of[sorted_pairs[at]];
+    entries[at] = vec2u(owner_of[sorted_pairs[at]], sorted_pairs[at]);
     let tile = sorted_tiles[at];
     if (tile == u.end) { return; }
     if (at == 0u || sorted_tiles[at - 1u] != tile) { ranges[tile].x = at; }

@@ -10,13 +10,13 @@ struct Parameters { background: vec4f, width: u32, height: u32, across: u32, lim
 @group(0) @binding(0) var<uniform> u: Parameters;
 @group(0) @binding(1) var<storage, read> rows: array<Row>;
 @group(0) @binding(2) var<storage, read> colours: array<vec4f>;
-@group(0) @binding(3) var<storage, read> owners: array<u32>;  // splats of the pairs, tile by tile
+@group(0) @binding(3) var<storage, read> entries: array<vec2u>;  // splat and index of each pair, tile by tile
 @group(0) @binding(4) var<storage, read> ranges: array<vec2u>;  // range of pairs of each tile
 @group(0) @binding(5) var<storage, read> limit: array<f32>;  // (H, W)
 @group(0) @binding(6) var<storage, read_write> drawn: array<vec4f>;  // (H, W): colour and T
 @group(0) @binding(7) var<storage, read_write> visited: array<vec2u>;  // ranges up to the last pair that any pixel uses
 @group(0) @binding(8) var<storage, read_write> median: array<i32>;  // (H, W): splat that reduces T to a half
-@group(0) @binding(9) var<storage, read> sorted_pairs: array<u32>;
+@group(0) @binding(9) var<storage, read> all_ranges: array<vec2u>;  // of each tile, also of pairs that no pixel uses
 @group(0) @binding(10) var<storage, read> image: array<vec4f>;  // (H, W): the forward pass's drawn
 @group(0) @binding(11) var<storage, read> by_image: array<vec4f>;  // (H, W): gradient by colour and by alpha
 @group(0) @binding(12) var<storage, read_write> pair_sums: array<f32>;  // (P, PAIR_SUMS)
@@ -63,7 +63,7 @@ fn fetch(tile: u32, first: u32, count: u32, lane: u32) {
     if (lane < 2u * STRIPS) { atomicStore(&touching[lane], 0u); }
     workgroupBarrier();
     if (lane < count) {
-        let splat = owners[first + lane];
+        let splat = entries[first + lane].x;
         let row = rows[splat];
         var bits = 0u;
         for (var strip = 0u; strip < STRIPS; strip++) {
@@ -135,7 +135,7 @@ fn forward(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index)
                 green += w * batch_colours[k].y;
                 blue += w * batch_colours[k].z;
                 let halves = takes & (t > vec4f(0.5)) & (t_next <= vec4f(0.5));
-                if (any(halves)) { middle = select(middle, vec4i(i32(owners[first + k])), halves); }
+                if (any(halves)) { middle = select(middle, vec4i(i32(entries[first + k].x)), halves); }
                 t = select(-abs(t), t_next, takes);
             }
         }
@@ -237,12 +237,16 @@ fn backward(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index
             if (lane < batch_size * PAIR_SUMS) {
                 let k = start + lane / PAIR_SUMS;
                 let column = lane % PAIR_SUMS;
-                if (u.absolute != 0u || (column != ABS_X && column != ABS_Y)) {
-                    pair_sums[sorted_pairs[first + k] * PAIR_SUMS + column] = sum_strips(lane, strips_of[k]);
-                }
+                var sum = 0.0;
+                if (u.absolute != 0u || (column != ABS_X && column != ABS_Y)) { sum = sum_strips(lane, strips_of[k]); }
+                pair_sums[entries[first + k].y * PAIR_SUMS + column] = sum;
             }
             workgroupBarrier();
         }
+    }
+    let unused = (all_ranges[tile].y - range.y) * PAIR_SUMS;
+    for (var k = lane; k < unused; k += LANES) {
+        pair_sums[entries[range.y + k / PAIR_SUMS].y * PAIR_SUMS + k % PAIR_SUMS] = 0.0;
     }
 }
 
@@ -256,7 +260,7 @@ fn weigh(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) l
     for (var first = range.x; first < range.y; first += BATCH) {
         let batch_size = min(BATCH, range.y - first);
         for (var k = 0u; k < batch_size; k++) {
-            let a = alpha_of(rows[owners[first + k]], pixels.center).alpha;
+            let a = alpha_of(rows[entries[first + k].x], pixels.center).alpha;
             let t_next = t - a * t;
             let takes = t_next > vec4f(TRANSMITTANCE_MIN);
             let w = select(vec4f(0.0), a * t, takes);
@@ -275,7 +279,7 @@ fn weigh(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) l
                 let value = shares[(k * PAIR_SUMS + column) * STRIDE + i];
                 result = select(result + value, max(result, value), column == 0u);
             }
-            pair_weights[sorted_pairs[first + k] * 3u + column] = result;
+            pair_weights[entries[first + k].y * 3u + column] = result;
         }
         workgroupBarrier();
     }

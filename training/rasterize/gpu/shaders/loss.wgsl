@@ -12,8 +12,6 @@ struct Parameters {
     width: u32,
     height: u32,
     floats: u32,  // 1 if a pixel of the photo has three floats instead of four bytes
-    groups: u32,
-    slot: u32,  // first place of the sums in totals
 }
 @group(0) @binding(0) var<uniform> u: Parameters;
 @group(0) @binding(1) var<storage, read> drawn: array<vec4f>;  // (H, W)
@@ -22,8 +20,6 @@ struct Parameters {
 @group(0) @binding(4) var<storage, read_write> parts: array<vec2f>;  // L1 and SSIM of each workgroup
 @group(0) @binding(5) var<storage, read> slopes_of: array<f32>;  // same buffer as slopes, for reading
 @group(0) @binding(6) var<storage, read_write> by_image: array<vec4f>;  // (H, W)
-@group(0) @binding(7) var<storage, read> all_parts: array<vec2f>;
-@group(0) @binding(8) var<storage, read_write> totals: array<f32>;
 
 const REACH: u32 = 5;
 const TAPS: u32 = 11;
@@ -168,20 +164,5 @@ fn differentiate(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_
         let row = lane / TILE + k * (LANES / TILE);
         let at = index_of(corner, (row + REACH) * SIDE + column + REACH);
         if (at < count) { by_image[at] = gradients[k]; }
-    }
-}
-
-// Sum the parts of all workgroups.
-@compute @workgroup_size(LANES)
-fn total(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
-    var sum = vec2f(0.0);
-    for (var k = group_of(group) * LANES + lane; k < u.groups; k += LANES) { sum += all_parts[k]; }
-    sums[lane] = sum;
-    workgroupBarrier();
-    if (lane == 0u) {
-        sum = vec2f(0.0);
-        for (var k = 0u; k < LANES; k++) { sum += sums[k]; }
-        totals[u.slot] = sum.x;
-        totals[u.slot + 1u] = sum.y;
     }
 }
