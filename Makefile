@@ -101,6 +101,7 @@ bench-lod: setup
 bench-tree: setup
 	$(VENV) lab/bench_tree.py
 	$(VENV) lab/bench_tree_memory.py
+	$(VENV) lab/bench_tree_memory.py --times 3 --ways graph --caches 0.25 0.5 1 2 4
 
 bench-blocks: setup
 	$(VENV) lab/bench_blocks.py

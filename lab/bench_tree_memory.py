@@ -5,8 +5,9 @@ number of visible splats: the granularity is chosen for each town. Then it updat
 more steps and writes a checkpoint. Every run is a separate process; peak memory is the system's count
 (VmHWM). Memory besides the budget is measured, too: ``program`` is the trainer with a small tree of which
 half fits, minus this half (Python, torch, kernels, photos, transfer buffers); ``drawing`` is the additional
-memory for rendering the run's largest cut with gradients, relative to that of the small tree. Rows are
-added to build/bench/tree.json; towns are stored in the same folder.
+memory for rendering the run's largest cut with gradients, relative to that of the small tree. With several
+sizes of the cache, rows are the curve of the paper's Figure 19. Rows are added to build/bench/tree.json;
+towns are stored in the same folder.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import subprocess
 import sys
 import time
 from dataclasses import fields, replace
+from itertools import product
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
@@ -52,6 +54,8 @@ AFTER = 2
 TINY = {"budget": 10, "times": [10.0], "steps": 10, "views": 4, "drawn": 10_000, "size": 0.3, "small": 40_000,
         "ways": ["graph"]}  # fmt: skip
 """Options of the test."""
+KEY = ("name", "times", "budget_mb")
+"""Values that tell rows apart."""
 PHOTO_BYTES = 100 << 20
 """Memory for photos, less than all photos need."""
 
@@ -232,8 +236,8 @@ def run(stage: str, leaves: int, options: argparse.Namespace, **arguments: objec
 def format_row(row: dict) -> str:
     """Format a row of the table."""
     return (
-        f"peak {row['peak_mb']:>6,.0f} MB of {row['allowed_mb']:>6,.0f} (drawing "
-        f"{row['drawing_mb']:.0f})  step {row['step_s']:.3f} s, "
+        f"{row['budget_mb']:>5,.0f} MB: peak {row['peak_mb']:>6,.0f} MB of {row['allowed_mb']:>6,.0f} "
+        f"(drawing {row['drawing_mb']:.0f})  step {row['step_s']:.3f} s, "
         f"{row['s_per_million']:.3f} s per million of {row['drawn']:,.0f} drawn, cut {row['cut_ms']:.0f} ms, "
         f"{row['reused']:.0%} cached, sizes {row['resize_s']:.1f} s, "
         f"checkpoint {row['checkpoint_s']:.1f} s"
@@ -241,10 +245,10 @@ def format_row(row: dict) -> str:
 
 
 def add_row(path: Path, row: dict) -> None:
-    """Add a row to the report, replacing an earlier row of the same town and order of views."""
+    """Add a row to the report, replacing an earlier row of the same town, order of views and cache."""
     report = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"rows": []}
-    key = row["name"], row["times"]
-    report["rows"] = [old for old in report["rows"] if (old["name"], old.get("times")) != key] + [row]
+    others = [old for old in report["rows"] if any(old.get(name) != row[name] for name in KEY)]
+    report["rows"] = [*others, row]
     path.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
 
 
@@ -254,6 +258,9 @@ def main() -> None:
     parser.add_argument("--budget", type=float, default=400, help="memory for nodes and moments in MB")
     parser.add_argument(
         "--times", type=float, nargs="+", default=(1, 3, 10), help="sizes of towns as multiples of the budget"
+    )
+    parser.add_argument(
+        "--caches", type=float, nargs="+", default=(1,), help="sizes of the cache as multiples of the budget"
     )
     parser.add_argument("--steps", type=int, default=40)
     parser.add_argument("--views", type=int, default=24, help="views per camera path")
@@ -294,11 +301,12 @@ def main() -> None:
                 f"{built['nodes']:,} nodes: tree in {built['seconds']:.0f} s, peak {built['peak_mb']:,.0f} MB"
             )
         pixels = run("level", leaves, options)["pixels"]
-        for order in options.ways:
-            row = run("train", leaves, options, way=order, pixels=pixels)
+        for order, cache in product(options.ways, options.caches):
+            budget = cache * options.budget
+            row = run("train", leaves, options, way=order, pixels=pixels, budget=budget)
             drawing = max(run("draw", leaves, options)["peak_mb"] - small, 0)
-            allowed = 1.1 * options.budget + program + drawing
-            row |= {"name": order, "times": times, "budget_mb": options.budget, "program_mb": program,
+            allowed = 1.1 * budget + program + drawing
+            row |= {"name": order, "times": times, "budget_mb": budget, "program_mb": program,
                     "drawing_mb": drawing, "allowed_mb": allowed, "pixels": pixels}  # fmt: skip
             add_row(options.out, {key: round(x, 4) if isinstance(x, float) else x for key, x in row.items()})
             print(f"  {times:>4g} x {pixels:.2f} px  {order:<17} {format_row(row)}", flush=True)

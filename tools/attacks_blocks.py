@@ -308,6 +308,12 @@ def contents(run: Path) -> dict[str, bytes]:
     }
 
 
+def disk_usage(folder: Path) -> int:
+    """Return the bytes that a folder takes on a tmpfs."""
+    paths = list(folder.rglob("*"))
+    return sum(-(-path.stat().st_size // 4096) * 4096 for path in paths if path.is_file())
+
+
 @contextmanager
 def small_disk(folder: Path, size: int):
     """Mount a tmpfs of this many bytes at a folder."""

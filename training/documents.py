@@ -32,6 +32,8 @@ MAX_NESTING = 16
 MAX_INTEGER = 2**63 - 1
 """Largest integer that 64 bits hold."""
 
+_LINE_HEAD = 1 << 16
+"""Bytes at the start of a text that contain the end of a line."""
 _LFS_POINTER = b"version https://git-lfs.github.com/spec/"
 DECIMAL_COMMAS = "its numbers have decimal commas"
 _DECIMAL_COMMA = re.compile(r"(?<![^\s'\"])[-+]?\d*,\d+(?:[eE][-+]?\d+)?(?![^\s'\"])")
@@ -79,7 +81,31 @@ def open_text(path: str | Path) -> IO[bytes]:
     encoding = json.detect_encoding(head)
     if encoding == "utf-8" or not re.match(r"[\s!-~]{3}", head.decode(encoding, "ignore")):
         return file
-    errors = "surrogateescape" if encoding == "utf-8-sig" else "strict"
+    return _convert(file, path, encoding, "surrogateescape" if encoding == "utf-8-sig" else "strict")
+
+
+def open_lines(path: str | Path) -> IO[bytes]:
+    """Open a text file as :func:`open_text`, with lines that end in LF.
+
+    Old Mac programs and some spreadsheets end lines with CR alone. Such files are converted.
+
+    Raises:
+        LodgsError: as :func:`open_text`.
+    """
+    file = open_text(path)
+    head = file.read(_LINE_HEAD)
+    file.seek(0)
+    if b"\r" not in head or b"\n" in head:
+        return file
+    return _convert(file, path, "utf-8", "surrogateescape")
+
+
+def _convert(file: IO[bytes], path: str | Path, encoding: str, errors: str) -> IO[bytes]:
+    """Return a temporary file with the text of a file as UTF-8 and with LF, and close the file.
+
+    Raises:
+        LodgsError: the text is not valid.
+    """
     with ExitStack() as stack:
         converted = stack.enter_context(tempfile.TemporaryFile())
         try:

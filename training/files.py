@@ -18,7 +18,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path, PureWindowsPath
 from typing import IO, BinaryIO
 
-from .errors import LodgsError, is_system_problem, read_error, system_remedy
+from .errors import LodgsError, is_system_problem, printable, read_error, system_remedy
 
 _DEVICE = re.compile(r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9\xb9\xb2\xb3])\s*([.:].*)?", re.I)
 
@@ -63,6 +63,7 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
     Raises:
         LodgsError: the disk is full, or the location is not writable.
     """
+    check_name(path)
     path = Path(os.path.realpath(path)) if os.path.islink(path) else Path(path)
     temporary = _temporary_path(path)
     try:
@@ -78,12 +79,52 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
         if error.filename is not None and Path(error.filename) not in (temporary, path, *path.parents):
             raise
         raise LodgsError(
-            f"Cannot write {path}: {error.strerror or error}.",
+            f"Cannot write {_final_path(path)}: {error.strerror or error}.",
             system_remedy(error, "Choose another name or folder."),
         ) from error
     finally:
         with suppress(OSError):
             temporary.unlink()
+
+
+@contextmanager
+def atomic_folder(folder: Path) -> Iterator[Path]:
+    """Yield an empty folder, and rename it to ``folder`` when the block succeeds. It replaces a former one.
+
+    Raises:
+        LodgsError: the disk is full, or the location is not writable.
+    """
+    check_name(folder)
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with temporary_folder(folder.parent) as work:
+            new = work / "new"
+            new.mkdir()
+            yield new
+            try:
+                if folder.exists():
+                    os.rename(folder, work / "previous")
+                os.rename(new, folder)
+            finally:  # a signal, or a file that another program has open
+                if (work / "previous").exists() and not folder.exists():
+                    os.rename(work / "previous", folder)
+    except OSError as error:
+        raise LodgsError(
+            f"Cannot write {folder}: {error.strerror or error}.",
+            system_remedy(error, "Choose another folder."),
+        ) from error
+
+
+def check_name(path: str | Path) -> None:
+    """Raise LodgsError if a path contains a NUL or half of a surrogate pair, which no file system stores."""
+    try:
+        encoded = os.fsencode(path)
+    except ValueError:
+        encoded = b"\0"
+    if b"\0" in encoded:
+        raise LodgsError(
+            f"Cannot write {printable(path)}: the name is not a valid file name.", "Choose another name."
+        )
 
 
 @contextmanager
@@ -120,6 +161,12 @@ def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
 def _temporary_path(path: Path) -> Path:
     """Return a unique path next to ``path``, with a name that is not longer than file systems allow."""
     return path.with_name(f".{path.name[:50]}.{_token()}.tmp")
+
+
+def _final_path(path: Path) -> Path:
+    """Return the path that a path of :func:`_temporary_path` replaces, for messages; others unchanged."""
+    match = _TEMPORARY.fullmatch(path.name)
+    return path.with_name(path.name[1 : match.start(1) - 1]) if match and path.suffix == ".tmp" else path
 
 
 def _token() -> str:
@@ -221,6 +268,7 @@ def create_folder(folder: Path) -> None:
     Raises:
         LodgsError: it cannot be created or written.
     """
+    check_name(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if not os.access(folder, os.W_OK):

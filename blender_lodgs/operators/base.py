@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import functools
+from typing import cast
 
 import bpy
 
-from ...training.errors import LodgsError
+from ...training.errors import LodgsError, describe_system_error
 from ..data import roots
 
 
 def report_errors(execute):
-    """Wrap an operator's method to report a LodgsError or MemoryError and cancel the operator.
+    """Wrap an operator's method to report a LodgsError, MemoryError or OSError and cancel the operator.
 
     The remedy gets a line of its own, because Blender cuts off messages that are wider than the window.
     """
@@ -24,6 +25,9 @@ def report_errors(execute):
             self.report({"ERROR"}, f"{error.what} \n{error.remedy}".strip())
         except MemoryError:
             self.report({"ERROR"}, "Out of memory. Close other files and programs.")
+        except OSError as error:
+            described = cast(LodgsError, describe_system_error(error))
+            self.report({"ERROR"}, f"{described.what} \n{described.remedy}".strip())
         return {"CANCELLED"}
 
     return wrapper

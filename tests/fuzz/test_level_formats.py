@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import gzip
+
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -9,9 +12,15 @@ from hypothesis import strategies as st
 from tests.fuzz.entry_points import attempt
 from tests.fuzz.mutations import corrupted, corrupted_value
 from tests.training.splats.level_files import flod
+from tests.training.splats.test_formats import random_splats
 from tests.training.splats.test_gltf import assembled, read_parts
+from tests.training.splats.test_packed_files import spz
 from training.editing.export import export_levels
-from training.splats.gltf import read_glb
+from training.splats.bundle import read_bundle
+from training.splats.gltf import read_glb, write_compressed_glb
+from training.splats.levels import Bundle, Level
+from training.splats.portable_levels import PortableLevels
+from training.splats.spz import pack_spz
 from training.splats.usd import read_usd
 
 
@@ -52,6 +61,35 @@ def test_corrupt_glb_documents(folder, glb, data):
         return
     (folder / "a.glb").write_bytes(content)
     attempt("glTF document", lambda: read_glb(folder / "a.glb", folder / "a.ply"), document)
+
+
+@pytest.fixture(scope="module")
+def compressed_glb(folder) -> dict:
+    """Return the JSON document of splats as SPZ, in one primitive."""
+    bundle = Bundle("", [Level(1, random_splats(40, 2))])
+    write_compressed_glb(folder / "packed.glb", PortableLevels(bundle))
+    return read_parts(folder / "packed.glb")[0]
+
+
+@pytest.mark.cases(short=100, weight=1)
+@given(data=st.data())
+def test_corrupt_spz_in_glb(folder, compressed_glb, data):
+    """Corrupt the stream, or its content before compression, whose checksum then is right."""
+    seeds = [pack_spz(random_splats(40, 2)), spz(40, 1, bytes(40 * (20 + 9))), pack_spz(random_splats(3, 0))]
+    if data.draw(st.booleans()):
+        content = data.draw(corrupted(seeds))
+    else:
+        content = gzip.compress(data.draw(corrupted([gzip.decompress(seed) for seed in seeds])), 1)
+    document = compressed_glb | {
+        "buffers": [{"byteLength": len(content)}],
+        "bufferViews": [{"buffer": 0, "byteOffset": 0, "byteLength": len(content)}],
+    }
+    (folder / "a.glb").write_bytes(assembled(document, content + bytes(-len(content) % 4)))
+    (folder / "a.ply").unlink(missing_ok=True)
+    attempt("SPZ in glTF", lambda: read_glb(folder / "a.glb", folder / "a.ply"), content)
+    if (folder / "a.ply").exists():
+        splats = read_bundle(folder / "a.ply").levels[-1].splats
+        assert np.isfinite(splats.means).all() and np.isfinite(splats.sh).all()
 
 
 @pytest.mark.cases(short=4, weight=0.02)

@@ -15,8 +15,16 @@ from tests.fuzz.mutations import corrupted, corrupted_value
 from tests.training.scenes import synthetic
 from training.scenes.cameras import MAX_COORDINATE, Camera, camera_to_dict, read_camera
 from training.scenes.colmap import read_scene
+from training.splats.georeference import ECEF, FILE, Georeference, read_georeference
 
 CAMERA = camera_to_dict(Camera("a.png", 96, 72, 80.0, 82.0, 47.0, 37.0, np.eye(4)), 0.1)
+PLACE = Georeference(ECEF, np.diag([2.0, 2.0, 2.0, 1.0])).to_json()
+PROJECTION = (
+    'PROJCS["WGS 84 / UTM zone 31N",GEOGCS["WGS 84",DATUM["WGS_1984",'
+    'SPHEROID["WGS 84",6378137,298.257223563]],PRIMEM["Greenwich",0],'
+    'UNIT["degree",0.0174532925199433]],PROJECTION["Transverse_Mercator"],'
+    'PARAMETER["central_meridian",3],UNIT["metre",1],AUTHORITY["EPSG","32631"]]'
+)
 
 
 @pytest.fixture(scope="module")
@@ -105,3 +113,32 @@ def test_corrupt_camera_files(scene, data):
     path = scene / "text.json"
     path.write_bytes(text)
     attempt("camera", lambda: read_camera(path), text)
+
+
+def check_place(folder, name: str, content: bytes) -> None:
+    """Check that a place on Earth is valid, or ignored with a warning."""
+    for path in [*folder.glob("*.prj"), folder / FILE]:
+        path.unlink(missing_ok=True)
+    (folder / name).write_bytes(content)
+    warnings = []
+    place = attempt("place on Earth", lambda: read_georeference(folder, warnings.append), (name, content))
+    if place is None:
+        assert len(warnings) == 1 and warnings[0].encode()
+        return
+    assert not warnings and np.isfinite(np.linalg.inv(place.matrix)).all()
+    assert Georeference.from_json(json.loads(json.dumps(place.to_json()))).crs == place.crs
+
+
+@pytest.mark.cases(short=100, weight=1)
+@given(data=st.data(), name=st.sampled_from([FILE, "utm.prj"]))
+def test_corrupt_places(tmp_path_factory, data, name):
+    seed = (json.dumps(PLACE) if name == FILE else PROJECTION).encode()
+    content = data.draw(corrupted([seed, seed.decode().encode("utf-16")]))
+    check_place(tmp_path_factory.getbasetemp(), name, content)
+
+
+@pytest.mark.cases(short=60, weight=0.5)
+@given(values=corrupted_value(PLACE))
+def test_places_with_unusual_values(tmp_path_factory, values):
+    content = json.dumps(values).encode("utf-8", "surrogatepass")
+    check_place(tmp_path_factory.getbasetemp(), FILE, content)

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 import subprocess
 import sys
 from contextlib import contextmanager
@@ -13,7 +14,14 @@ import pytest
 
 from training import files
 from training.errors import LodgsError, system_reason
-from training.files import atomic_write, names_device, network_share, open_regular
+from training.files import (
+    atomic_folder,
+    atomic_write,
+    create_folder,
+    names_device,
+    network_share,
+    open_regular,
+)
 from training.render.wire import write_set
 from training.scenes.images import write_png
 from training.scenes.write_colmap import write_model
@@ -48,6 +56,48 @@ def test_full_disk_raises_one_sentence(tmp_path):
     ):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     assert os.listdir(tmp_path) == []
+
+
+def test_folder_appears_complete_and_replaces_the_former_one(tmp_path):
+    for text in ("old", "new"):
+        with atomic_folder(tmp_path / "parent" / "a") as folder:
+            (folder / text).touch()
+        assert os.listdir(tmp_path / "parent") == ["a"] and os.listdir(tmp_path / "parent" / "a") == [text]
+
+
+def test_interrupted_exchange_keeps_the_former_folder(tmp_path, monkeypatch):
+    (tmp_path / "a" / "old").mkdir(parents=True)
+    rename = os.rename
+
+    def interrupt(source, target):
+        if Path(source).name == "new":
+            raise KeyboardInterrupt
+        rename(source, target)
+
+    monkeypatch.setattr(os, "rename", interrupt)
+    with pytest.raises(KeyboardInterrupt), atomic_folder(tmp_path / "a") as folder:
+        (folder / "new").touch()
+    assert os.listdir(tmp_path) == ["a"] and os.listdir(tmp_path / "a") == ["old"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows stores halves of surrogate pairs")
+@pytest.mark.parametrize("name", ["a\0b", "a\ud800b"])
+def test_impossible_names_raise_one_sentence(tmp_path, name):
+    for action in (atomic_write, atomic_folder):
+        with pytest.raises(LodgsError, match="not a valid file name"), action(tmp_path / name):
+            pass
+    with pytest.raises(LodgsError, match="not a valid file name"):
+        create_folder(tmp_path / name)
+    assert not os.listdir(tmp_path)
+
+
+def test_nested_writes_name_the_final_file(tmp_path):
+    with (
+        pytest.raises(LodgsError, match=rf"^Cannot write {re.escape(str(tmp_path / 'a.b.ply'))}: No space"),
+        atomic_write(tmp_path / "a.b.ply") as temporary,
+        atomic_write(temporary),
+    ):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 @contextmanager

@@ -10,6 +10,7 @@ from ..errors import LodgsError
 from ..splats.gaussians import SH_C0, Splats
 from .density_control import constrained_log_scales
 from .model import NAMES
+from .neighbours import query_neighbours
 
 MIN_POINTS = 4
 """Minimum number of distinct points to start from."""
@@ -46,8 +47,7 @@ def neighbour_distances(means: np.ndarray, neighbours: int = 3) -> np.ndarray:
 
     With fewer points than neighbours, the missing distances are infinite.
     """
-    distances, _ = KDTree(means).query(means, k=neighbours + 1, workers=-1)
-    return distances[:, 1:]
+    return query_neighbours(KDTree(means), means, neighbours + 1)[0][:, 1:]
 
 
 def neighbour_scale(points: np.ndarray) -> np.ndarray:

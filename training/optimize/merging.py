@@ -17,6 +17,7 @@ from scipy.special import expit, logit, spence
 
 from ..splats.gaussians import SH_C0, Splats, splat_area
 from ..splats.morton import spatial_order
+from .neighbours import query_neighbours
 
 MAX_OPACITY = 0.99
 """Maximum opacity of a merged splat, the maximum that a rasterizer draws."""
@@ -124,11 +125,11 @@ def shapes_of_moments(
 def _cheapest_pairs(moments: np.ndarray, limit: int) -> tuple[np.ndarray, np.ndarray]:
     """Return rows (M,) and their larger partners (M,): disjoint pairs of least cost, 1 to ``limit``."""
     count = len(moments)
-    _, neighbours = KDTree(moments[:, :3]).query(moments[:, :3], min(NEIGHBOURS + 1, count), workers=-1)
+    _, neighbours = query_neighbours(KDTree(moments[:, :3]), moments[:, :3], min(NEIGHBOURS + 1, count))
     partners, costs = np.empty(count, np.int64), np.empty(count)
     for part in _batches(count, NEIGHBOURS):
         rows = np.arange(count)[part]
-        others = np.asarray(neighbours)[part]
+        others = neighbours[part]
         pair_costs = _costs(moments, np.minimum(rows[:, None], others), np.maximum(rows[:, None], others))
         pair_costs[others == rows[:, None]] = np.inf
         best = pair_costs.argmin(axis=1)[:, None]

@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 from ..scenes.cameras import Camera
 from .density_control import require_rows
 from .model import Model
+from .neighbours import query_neighbours
 
 NEIGHBOURS = (1, 2, 4)
 """Ranks of the neighbours of a camera to form midpoints with."""
@@ -75,8 +76,7 @@ class Support:
         Returns:
             (N,) float64 distances in scene units, and (N,) int indices of the positions.
         """
-        distances, positions = self._positions.query(means, workers=-1)
-        return np.asarray(distances), np.asarray(positions)
+        return query_neighbours(self._positions, means)
 
     def find_intruding(
         self, means: np.ndarray, distances: np.ndarray, positions: np.ndarray, share: float

@@ -31,6 +31,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
+from ..documents import read_json
 from ..errors import LodgsError
 from ..files import name_errors, open_regular, remove_temporaries, try_lock
 from . import processes
@@ -40,6 +41,8 @@ _STARTED = time.time()
 _STALE_SECONDS = 10.0
 """Cancel requests older than this at process start were meant for an earlier trainer."""
 _LOG_TAIL = 1 << 16  # bytes
+MAX_METRICS_BYTES = 1 << 24
+"""Maximum size of metrics.json."""
 
 
 class RunFolder:
@@ -162,6 +165,13 @@ class RunFolder:
         """Return the newest ``level`` event of each level, coarse to fine."""
         newest = {e["level"]: e for e in self.events()[0] if e["event"] == "level"}
         return [newest[level] for level in sorted(newest)]
+
+    def read_metrics(self) -> dict:
+        """Return the last evaluation of the bundle; {} if it is older than the bundle, missing or damaged."""
+        with suppress(OSError, LodgsError):
+            if self.metrics.stat().st_mtime >= self.bundle.stat().st_mtime:
+                return read_json(self.metrics, max_bytes=MAX_METRICS_BYTES)
+        return {}
 
     @property
     def running(self) -> bool:

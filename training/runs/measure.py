@@ -259,16 +259,14 @@ def _earlier_rows(folder: RunFolder, row: dict, values: Values) -> list[dict]:
     Args:
         row: a row of this evaluation.
     """
-    with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
-        if folder.metrics.stat().st_mtime >= folder.bundle.stat().st_mtime:
-            rows = json.loads(folder.metrics.read_text(encoding="utf-8"))["selective"][:MAX_EARLIER_ROWS]
-            return [
-                earlier
-                for earlier in rows
-                if earlier.keys() == row.keys()
-                and all(isinstance(earlier[name], (int, float)) for name in row.keys() - {"set"})
-                and any(earlier[name] != value for name, value in values.items())
-            ]
+    with suppress(KeyError, TypeError, AttributeError):  # a changed report
+        return [
+            earlier
+            for earlier in folder.read_metrics()["selective"][:MAX_EARLIER_ROWS]
+            if earlier.keys() == row.keys()
+            and all(isinstance(earlier[name], (int, float)) for name in row.keys() - {"set"})
+            and any(earlier[name] != value for name, value in values.items())
+        ]
     return []
 
 

@@ -20,10 +20,10 @@ from typing import IO, Any
 
 import numpy as np
 
-from ..documents import damage_error, open_file, open_text, read_lines
+from ..documents import damage_error, open_file, open_lines, read_lines
 from ..errors import LodgsError, printable
 from ..files import is_file
-from .lenses import LENS_BY_NAME, LENSES, Intrinsics, intrinsics_of
+from .lenses import LENS_BY_NAME, LENSES, MAX_LENS_ID, Intrinsics, UnknownLens, intrinsics_of
 
 DAMAGED_REMEDY = "Copy the model again, or rewrite it with COLMAP's model_converter."
 
@@ -89,7 +89,7 @@ def read_cameras(
     path = model / f"cameras{model_suffix(model)}"
     for camera_id, error in flaws.items():
         if used is None or camera_id in used:
-            raise damage_error(path, error, DAMAGED_REMEDY)
+            raise _model_error(path, error)
     if flaws:
         error = next(iter(flaws.values()))
         warn(f"Skipped {len(flaws):,} cameras of {path} that no image uses: {error}.")
@@ -144,7 +144,7 @@ def _read(model: Path, name: str, parsers: dict, suffix: str = "") -> Any:
     path = model / f"{name}{suffix}"
     try:
         if suffix == ".txt":
-            with open_text(path) as file:
+            with open_lines(path) as file:
                 return parsers[suffix](file)
         with open_file(path) as file:
             if not os.fstat(file.fileno()).st_size:
@@ -153,7 +153,17 @@ def _read(model: Path, name: str, parsers: dict, suffix: str = "") -> Any:
     except OSError as error:
         raise LodgsError(f"Cannot read {path}: {error.strerror}.", "Check the folder.") from error
     except (ValueError, IndexError, KeyError, struct.error) as error:
-        raise damage_error(path, error, DAMAGED_REMEDY) from error
+        raise _model_error(path, error) from error
+
+
+def _model_error(path: Path, error: Exception) -> LodgsError:
+    """Return the error for a model file that cannot be parsed."""
+    if isinstance(error, UnknownLens):
+        return LodgsError(
+            f"Cannot read {path}: {error}.",
+            "Undistort the photos in the program that wrote the model (colmap image_undistorter).",
+        )
+    return damage_error(path, error, DAMAGED_REMEDY)
 
 
 def _parse_cameras_bin(data: mmap.mmap) -> _Cameras:
@@ -163,8 +173,11 @@ def _parse_cameras_bin(data: mmap.mmap) -> _Cameras:
     for _ in range(count):
         camera_id, model_id, width, height = struct.unpack_from("<iiQQ", data, offset)
         lens = LENSES.get(model_id)
-        if lens is None:
-            raise ValueError(f"camera model {model_id} is unknown")
+        if lens is None:  # its number of parameters is unknown, too
+            is_plausible = 0 <= model_id < MAX_LENS_ID
+            raise (UnknownLens if is_plausible else ValueError)(
+                f"camera {camera_id} has the unknown lens model {model_id}"
+            )
         parameters = np.frombuffer(data, "<f8", lens.parameters, offset + 24).copy()
         offset += 24 + 8 * lens.parameters
         try:
@@ -181,7 +194,7 @@ def _parse_cameras_txt(file: IO[bytes]) -> _Cameras:
         number = int(camera_id)
         try:
             if (lens := LENS_BY_NAME.get(model_name.upper())) is None:
-                raise ValueError(f"camera model {model_name} is unknown")
+                raise UnknownLens(f"camera {number} has the unknown lens model {model_name[:40]}")
             size = _side(width), _side(height)
             cameras[number] = intrinsics_of(lens, *size, np.array(parameters, float))
         except (ValueError, OverflowError) as error:

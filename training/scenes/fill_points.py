@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -71,7 +71,10 @@ def cell_colors(pixels: np.ndarray, visible: np.ndarray) -> np.ndarray:
 
 
 def fill_cells(
-    views: Sequence[CellView], points: np.ndarray, deadline: float
+    views: Sequence[CellView],
+    points: np.ndarray,
+    deadline: float,
+    report: Callable[[int], object] = int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return points in cells of views without points, and their colours (N, 3) uint8.
 
@@ -81,13 +84,15 @@ def fill_cells(
     Args:
         points: (N, 3) triangulated points.
         deadline: time of ``time.monotonic`` after which no view is filled.
+        report: called with the number of filled views.
     """
     from scipy.spatial import KDTree  # Blender lacks scipy
 
     new, colors = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
-    for view in views:
+    for number, view in enumerate(views):
         if time.monotonic() > deadline:
             break
+        report(number)
         empty = np.isfinite(view.colors[..., 0])
         known, depths = [], []
         for positions in (points[view.observed], new):

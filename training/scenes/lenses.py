@@ -12,6 +12,10 @@ _MAX_SIDE = 1 << 31
 """Exclusive limit of an image's width and height."""
 
 
+class UnknownLens(ValueError):
+    """A camera model that COLMAP's list lacks."""
+
+
 @dataclass(frozen=True)
 class Lens:
     """A COLMAP camera model; its parameters are focal length(s), cx, cy, then the distortion."""
@@ -48,6 +52,8 @@ LENSES = dict(
     )
 )
 LENS_BY_NAME = {lens.name: lens for lens in LENSES.values()}
+MAX_LENS_ID = 256
+"""Exclusive limit of ids of lenses that newer versions of COLMAP may add; others are damage."""
 _TWO_FOCALS = {
     "SIMPLE_PINHOLE": "PINHOLE",
     "SIMPLE_RADIAL": "OPENCV",

@@ -267,7 +267,9 @@ def _estimate(
         pose, colors = image.cam_from_world().matrix(), cells[photo_number(image.name)]
         camera: Any = model.cameras[image.camera_id]
         views.append(CellView(camera, pose, colors, np.array(observed, int)))
-    return fill_cells(views, positions, deadline)
+    return fill_cells(
+        views, positions, deadline, lambda done: send(stage="empty parts", done=done, total=len(views))
+    )
 
 
 def _write(

@@ -48,6 +48,7 @@ STAGES = {
     "features": "Extracting features of photo",
     "pairs": "Comparing pair",
     "points": "Triangulating points",
+    "empty parts": "Estimating points in photo",
 }
 REPORT_SECONDS = 1.0
 """Minimum time between two reports."""

@@ -13,6 +13,7 @@ import numpy as np
 from ..documents import decode_text, parse_json, read_bytes
 from ..errors import LodgsError
 from ..files import atomic_write
+from .map_projection import UtmZone, geocentric
 
 ECEF = "EPSG:4978"
 """WGS 84 with geocentric coordinates in metres."""
@@ -20,8 +21,6 @@ FILE = "georeference.json"
 """File of a scene's folder with the values of :meth:`Georeference.to_json`."""
 _MAX_TEXT = 8192
 """Maximum length of a WKT text."""
-_EQUATOR, _FLATTENING = 6_378_137.0, 1 / 298.257223563
-"""Semi-major axis in metres and flattening of WGS 84."""
 _SURFACE = 6.2e6, 6.6e6
 """Distances in metres from the Earth's centre between which a position counts as geocentric."""
 
@@ -66,6 +65,11 @@ class Georeference:
         """Return JSON values."""
         return {"crs": self.crs, "matrix": self.matrix.tolist()}
 
+    @property
+    def zone(self) -> UtmZone | None:
+        """Zone of the system's coordinates; None if they are not those of UTM."""
+        return UtmZone.from_crs(self.crs)
+
     def after(self, matrix: np.ndarray) -> Georeference:
         """Return the georeference of coordinates that a matrix (4, 4) maps to the present ones."""
         return Georeference(self.crs, self.matrix @ matrix)
@@ -109,12 +113,9 @@ def local_tangent_plane(latitude: float, longitude: float, altitude: float) -> G
         altitude: metres above the ellipsoid.
     """
     phi, lam = np.radians((latitude, longitude))
-    eccentricity2 = _FLATTENING * (2 - _FLATTENING)
-    normal = _EQUATOR / np.sqrt(1 - eccentricity2 * np.sin(phi) ** 2)
     up = np.array([np.cos(phi) * np.cos(lam), np.cos(phi) * np.sin(lam), np.sin(phi)])
     east = np.array([-np.sin(lam), np.cos(lam), 0.0])
     matrix = np.eye(4)
     matrix[:3, :3] = np.stack([east, np.cross(up, east), up], axis=1)
-    matrix[:3, 3] = (normal + altitude) * up
-    matrix[2, 3] -= normal * eccentricity2 * np.sin(phi)
+    matrix[:3, 3] = geocentric(phi, lam, np.float64(altitude))
     return Georeference(ECEF, matrix)

@@ -100,8 +100,9 @@ def _check_spz_table(file: IO[bytes], size: int) -> None:
     magic, version, count, degree, streams, offset = _SPZ_4.unpack(file.read(_SPZ_4.size))
     if magic != _SPZ_MAGIC:
         raise ValueError("it is not an SPZ file")
-    if version < 4:
-        raise ValueError(f"version {version} must be compressed")
+    if version != 4:
+        problem = "must be compressed" if version < 4 else "is not supported"
+        raise ValueError(f"version {version} {problem}")
     file.seek(offset)
     table = list(_SPZ_ENTRY.iter_unpack(file.read(streams * _SPZ_ENTRY.size)))
     begin = offset + streams * _SPZ_ENTRY.size

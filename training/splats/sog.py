@@ -80,7 +80,7 @@ def write_sog(path: Path, splats: SplatRows, meta: dict) -> None:
     files = encode_sog(values.select(spatial_order(values.means)))
     with atomic_write(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
         for name, data in files.items():
-            archive.writestr(name, data)
+            archive.writestr(zipfile.ZipInfo(name), data)  # without the time: equal splats give equal files
 
 
 def encode_sog(splats: Splats) -> dict[str, bytes]:

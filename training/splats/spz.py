@@ -61,8 +61,10 @@ def unpack_spz(data: bytes, max_splats: int) -> Splats:
         stream = zlib.decompressobj(16 + zlib.MAX_WBITS)
         head = stream.decompress(data, _HEADER.size)
         magic, version, count, degree, bits, _, _ = _HEADER.unpack(head)
-        if magic != _MAGIC or version not in (2, 3) or degree > MAX_DEGREE or count > max_splats:
-            raise ValueError(f"version {version}, {count:,} splats, SH degree {degree}")
+        if magic == _MAGIC and version not in (2, 3):
+            raise ValueError(f"SPZ version {version} is not supported")
+        if magic != _MAGIC or degree > MAX_DEGREE or count > max_splats:
+            raise ValueError(f"its SPZ data declare {count:,} splats of SH degree {degree}")
         rest = (degree + 1) ** 2 - 1
         widths = (9, 1, 3, 3, 3 if version == 2 else 4, 3 * rest)
         body = stream.decompress(stream.unconsumed_tail, count * sum(widths) or 1)

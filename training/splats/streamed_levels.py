@@ -16,7 +16,7 @@ import numpy as np
 
 from ..documents import read_json
 from ..errors import LodgsError
-from ..files import temporary_folder
+from ..files import atomic_folder
 from .gaussians import SplatRows, Splats
 from .levels import MAX_READ_LEVELS, Bundle
 from .morton import spatial_order
@@ -82,19 +82,8 @@ def write_streamed_levels(folder: Path, bundle: Bundle) -> None:
         raise LodgsError(f"Cannot export to {folder}: it is not a folder.", "Choose an empty folder.")
     if folder.is_dir() and any(folder.iterdir()) and not (folder / STREAMED_FILE).exists():
         raise LodgsError(f"Cannot export to {folder}: it contains other files.", "Choose an empty folder.")
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with temporary_folder(folder.parent) as temporary:
-            target = temporary / "levels"
-            target.mkdir()
-            _write_files(target, levels, degree)
-            if folder.exists():
-                folder.rename(temporary / "previous")
-            target.rename(folder)
-    except OSError as error:
-        raise LodgsError(
-            f"Cannot write {folder}: {error.strerror}.", "Choose another folder, or free some space."
-        ) from error
+    with atomic_folder(folder) as target:
+        _write_files(target, levels, degree)
 
 
 def _write_files(folder: Path, levels: Sequence[SplatRows], degree: int) -> None:

@@ -7,14 +7,14 @@ replace one another (``refine: REPLACE``). Geometric errors make Cesium switch a
 from __future__ import annotations
 
 import json
-import os
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from ..errors import LodgsError
-from ..files import temporary_folder
+from ..files import atomic_folder
 from .gaussians import SplatRows, Splats
 from .georeference import ECEF, is_geocentric
 from .gltf import COMPRESSION, SPLATS, write_compressed_glb
@@ -30,6 +30,8 @@ _FAR = 1000.0
 """Distance up to which a scene is shown, in multiples of its diagonal."""
 _CORE = 3.0
 """Splats beyond so many radii of the scene, and larger ones than that, are a cell of their own."""
+_DERIVATIVE_STEP = 1.0
+"""Half distance in metres of positions that determine the transform of their surroundings."""
 _SIGMAS = 3.0
 """Boxes include splats up to so many standard deviations."""
 
@@ -37,45 +39,85 @@ _SIGMAS = 3.0
 def write_tiles(folder: Path, levels: PortableLevels) -> None:
     """Write a tileset into a folder, and replace an earlier one there.
 
-    A scene whose georeference, or else its local origin, is in ECEF coordinates is placed on the globe. Other
-    scenes have z up.
+    A scene whose georeference is in ECEF or UTM coordinates, or else whose local origin is in ECEF
+    coordinates, is placed on the globe. A scene on a UTM map gets the curvature of the Earth. Other scenes
+    have z up.
 
     Raises:
         LodgsError: the folder has other files or cannot be written.
     """
     if folder.is_dir() and any(folder.iterdir()) and not (folder / TILESET_FILE).exists():
         raise LodgsError(f"Cannot export to {folder}: it contains other files.", "Choose an empty folder.")
-    transform = _earth_transform(levels.bundle)
+    transform, bend = _earth_transform(levels.bundle, levels.sphere()[0])
+    if bend is not None:
+        bent = [_bend(level, bend) for level in levels.bundle.levels]
+        levels = replace(levels, bundle=replace(levels.bundle, levels=bent))
     if transform is not None:
         meta = levels.bundle.meta | {"up_rotation": np.eye(3).tolist()}
         levels = replace(levels, bundle=replace(levels.bundle, meta=meta))
     levels = replace(levels, origin=np.zeros(3), views=())
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with temporary_folder(folder.parent) as temporary:
-            tiles = temporary / "tiles"
-            tiles.mkdir()
-            document = _write_cells(tiles, levels)
-            if transform is not None:
-                document["root"]["transform"] = transform.T.reshape(-1).tolist()
-            (tiles / TILESET_FILE).write_text(json.dumps(document, allow_nan=False), "utf-8")
-            if folder.exists():
-                os.rename(folder, temporary / "previous")
-            os.rename(tiles, folder)
-    except OSError as error:
-        raise LodgsError(f"Cannot write {folder}: {error.strerror}.", "Choose another folder.") from error
+    with atomic_folder(folder) as tiles:
+        document = _write_cells(tiles, levels)
+        if transform is not None:
+            document["root"]["transform"] = transform.T.reshape(-1).tolist()
+        (tiles / TILESET_FILE).write_text(json.dumps(document, allow_nan=False), "utf-8")
 
 
-def _earth_transform(bundle: Bundle) -> np.ndarray | None:
-    """Return the transform (4, 4) from a bundle's coordinates to ECEF, or None if it is unknown."""
+def _earth_transform(
+    bundle: Bundle, center: np.ndarray
+) -> tuple[np.ndarray | None, Callable[[np.ndarray], np.ndarray] | None]:
+    """Return the transform (4, 4) from a bundle's coordinates to ECEF, or None if it is unknown.
+
+    Coordinates on a map get the transform of their surroundings at the center. A function then maps positions
+    (N, 3) to those that this transform moves to the right place.
+    """
     place = bundle.georeference
     if place is not None and place.crs == ECEF:
-        return place.matrix
+        return place.matrix, None
+    if place is not None and (zone := place.zone) is not None:
+        matrix = place.matrix
+
+        def on_earth(positions: np.ndarray) -> np.ndarray:
+            return zone.to_ecef(positions.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3])
+
+        step = _DERIVATIVE_STEP / np.cbrt(abs(np.linalg.det(matrix[:3, :3])))
+        sides = [on_earth(center + sign * step * np.eye(3)) for sign in (1, -1)]
+        linear = (sides[0] - sides[1]).T / (2 * step)
+        transform = np.eye(4)
+        transform[:3, :3] = linear
+        transform[:3, 3] = on_earth(center[None])[0] - linear @ center
+        back = np.linalg.inv(linear)
+        return transform, lambda positions: (on_earth(positions) - transform[:3, 3]) @ back.T
     if not is_geocentric(bundle.origin):
-        return None
+        return None, None
     transform = np.eye(4)
     transform[:3, 3] = bundle.origin
-    return transform
+    return transform, None
+
+
+@dataclass(frozen=True)
+class _BentRows:
+    """Splats whose positions a function maps when they are read."""
+
+    rows: SplatRows
+    bend: Callable[[np.ndarray], np.ndarray]
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def select(self, index: slice | np.ndarray, /) -> Splats:
+        splats = self.rows.select(index)
+        return replace(splats, means=self.bend(splats.means).astype(np.float32))
+
+
+def _bend(level: Level, bend: Callable[[np.ndarray], np.ndarray]) -> Level:
+    """Return a level whose positions a function maps."""
+    rows = _BentRows(level.rows, bend)
+    return (
+        replace(level, splats=rows.select(slice(None)))
+        if level.on_disk is None
+        else replace(level, on_disk=rows)
+    )
 
 
 def _write_cells(folder: Path, levels: PortableLevels) -> dict:

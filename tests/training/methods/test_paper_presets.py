@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from training.methods import create, method_info
 from training.methods.flod import train as flod_train
@@ -229,12 +230,21 @@ def events(monkeypatch):
 
     def run(method) -> dict[str, list[int]]:
         calls: dict[str, list[int]] = {}
+
+        def watch(owner, name: str, result=lambda *_: None) -> None:
+            def record(*arguments, **_):
+                calls.setdefault(name, []).append(step + 1)
+                return result(*arguments)
+
+            monkeypatch.setattr(owner, name, record)
+
         for name in ("densify", "prune", "prune_oversized", "reset_opacities"):
             for module in (splat_method, flod_train):
                 if hasattr(module, name):
-                    record = lambda *_, name=name, **__: calls.setdefault(name, []).append(step + 1)  # noqa: E731
-                    monkeypatch.setattr(module, name, record)
-        monkeypatch.setattr(type(method), "prune_unimportant", lambda *_: None, raising=False)
+                    watch(module, name)
+        watch(flod_train, "well_separated", lambda means, _: torch.ones(len(means), dtype=torch.bool))
+        if hasattr(type(method), "prune_unimportant"):
+            watch(type(method), "prune_unimportant")
         for step in range(method.steps):
             if method.parameters.prune_interval and step % 50 == 49:  # all events are at multiples of 50
                 type(method).control_density(method, step)
@@ -260,19 +270,24 @@ def test_steps_of_density_control(data, events, name, first, interval, last):
     assert monitored["prune_oversized"] == [step for step in steps if step > 3000]
     assert monitored["prune"] == list(range(600, last + 1, 100))
     assert monitored["reset_opacities"] == [3000, 6000, 9000, 12_000]
+    weighted = [8_000, 16_000, 24_000] if name == "lodge" else []  # LODGE, A.2
+    assert monitored.get("prune_unimportant", []) == weighted
 
 
-def test_steps_of_density_control_of_flod_levels(data, events, monkeypatch):
-    paper = replace(method_info("flod").preset("paper"), overlap_interval=0)
+def test_steps_of_density_control_of_flod_levels(data, events):
+    paper = method_info("flod").preset("paper")
     method = create("flod", data, paper, seed=0, backend="cpu")
     monitored = events(method)
-    begin, expected = 0, {"densify": [], "prune": [], "reset_opacities": []}
+    begin, expected = 0, {"densify": [], "prune": [], "reset_opacities": [], "well_separated": []}
     ends, intervals = (5_000, 6_000, 8_000, 10_000, 15_000), (2000, 1000, 500, 500, 200)
-    for steps, end, interval in zip(paper.steps, ends, intervals, strict=True):
+    for number, (steps, end, interval) in enumerate(zip(paper.steps, ends, intervals, strict=True), 1):
+        assert (method.level_at(begin), method.level_at(begin + steps - 1)) == (number, number)
         for iteration in range(501, end):  # the programs: 500 < iteration < end
             for name, period in (("densify", interval), ("prune", 100), ("reset_opacities", 3000)):
                 if iteration % period == 0:
                     expected[name].append(begin + iteration)
+        if end != ends[-1]:  # Sec. 6.1.4: overlap pruning at all levels but the finest
+            expected["well_separated"] += range(begin + 1000, begin + end, 1000)
         begin += steps
     assert monitored == expected
 

@@ -79,9 +79,12 @@ def test_report_with_other_control_values_is_measured_again(runs, report, tmp_pa
     assert measured.by_distance.psnr == report[0]["runs"][0]["by_distance"]["psnr"]
 
 
-def test_damaged_report_is_measured_again(runs, tmp_path):
+@pytest.mark.parametrize(
+    "text", ['{"rule": "", "levels": [{"level": "x"}], "test_views": []}', '{"rule":' * 20_000]
+)
+def test_damaged_report_is_measured_again(runs, tmp_path, text):
     run = shutil.copytree(runs[1], tmp_path / "run")
-    RunFolder(run).metrics.write_text('{"rule": "", "levels": [{"level": "x"}], "test_views": []}')
+    RunFolder(run).metrics.write_text(text)
     assert measure_run(run, "3DGS", {}).finest.psnr > 0
 
 

@@ -4,6 +4,7 @@ import base64
 import io
 import json
 import re
+import sys
 import zipfile
 from math import atan, degrees
 
@@ -178,3 +179,13 @@ def test_unusable_places_end_with_a_message(bundle, tmp_path, capsys, out):
 def test_title_that_is_not_utf8(bundle, tmp_path):
     write_page(bundle, tmp_path / "out", title="caf\udce9", backend="cpu")
     assert "caf\\xdce9" in (tmp_path / "out" / "index.html").read_text("utf-8")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows stores halves of surrogate pairs")
+def test_names_that_are_not_utf8(bundle, tmp_path):
+    folder = tmp_path / "caf\udce9"
+    assert str(folder) in write_page(bundle, folder, backend="cpu") and (folder / "index.html").is_file()
+    with pytest.raises(LodgsError, match="not a valid file name"):
+        write_page(bundle, tmp_path / "caf\ud800", backend="cpu")
+    with pytest.raises(LodgsError, match="not a valid file name"):
+        write_page(bundle, tmp_path / "caf\ud800.html", single=True, backend="cpu")

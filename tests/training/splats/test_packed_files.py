@@ -84,6 +84,7 @@ BAD = {
     "v4 table.spz": spz4(300, 0, sizes4(300, 0))[:50],
     "v4 head.spz": spz4(300, 0, sizes4(300, 0))[:20],
     "v3 unpacked.spz": spz4(300, 0, sizes4(300, 0), version=3),
+    "v5.spz": spz4(300, 0, sizes4(300, 0), version=5),
     "text.spz": b"no splats" * 10,
     "many.ksplat": ksplat(2**32 - 1, 8192),
     "short.ksplat": b"\0" * 19,

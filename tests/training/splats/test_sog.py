@@ -76,6 +76,12 @@ def test_splats_round_trip(tmp_path, degree):
     assert np.sqrt(np.mean((decoded.sh - splats.sh) ** 2)) < 0.02
 
 
+def test_equal_splats_give_equal_files(tmp_path):
+    write_sog(tmp_path / "a.sog", random_splats(20), {})
+    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
+        assert {info.date_time for info in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
+
+
 def test_palette_is_near_the_sets():
     """Two thousand copies of 800 sets need no more than the 1,024 sets of a palette."""
     rng = np.random.default_rng(0)

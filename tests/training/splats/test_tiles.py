@@ -14,6 +14,7 @@ from training.editing.export import export_tiles
 from training.errors import LodgsError
 from training.splats import tiles
 from training.splats.levels import Level
+from training.splats.map_projection import UtmZone
 from training.splats.spz import unpack_spz
 
 
@@ -123,6 +124,29 @@ def test_earth_centred_scenes_are_placed_on_the_globe(tmp_path, bundle):
     bundle.meta["origin"] = [448_250.0, 5_411_900.0, 300.0]  # UTM coordinates are not geocentric
     export_tiles(tmp_path / "web", bundle)
     assert "transform" not in load(tmp_path / "web")["root"]
+
+
+def test_splats_on_a_map_are_at_their_places_on_the_globe(tmp_path, bundle):
+    """Positions far from the middle follow the Earth's curvature, here 0.9 m. A matrix turns the scene."""
+    origin, turn = np.array([691_607.25, 5_334_783.5, 519.8]), np.eye(4)
+    turn[:3, :3] = 2 * np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    bundle.meta |= {
+        "origin": (np.linalg.inv(turn[:3, :3]) @ origin).tolist(),
+        "georeference": {"crs": "EPSG:32632", "matrix": turn.tolist()},
+    }
+    for level in bundle.levels:
+        level.splats.means[5] = (1200, -1200, 3)
+    export_tiles(tmp_path / "web", bundle)
+    transform = np.array(load(tmp_path / "web")["root"]["transform"]).reshape(4, 4).T
+    places, expected = [], bundle.levels[2].splats.means.astype(np.float64)
+    for path in (tmp_path / "web").glob("*_level3.glb"):
+        means = unpack_spz(read_parts(path)[1], 1000).means.astype(np.float64)
+        places.append(means @ transform[:3, :3].T + transform[:3, 3])
+    expected = UtmZone(32).to_ecef(expected @ turn[:3, :3].T + origin)
+    distances, nearest = KDTree(np.concatenate(places)).query(expected)
+    assert distances.max() < 1e-3 and len(set(nearest)) == len(expected)
+    flat = np.linalg.norm(expected[5] - expected[0]) ** 2 / (2 * 6.378e6)
+    assert 0.8 < flat < 1.0
 
 
 def test_other_files_are_not_replaced(tmp_path, bundle):

@@ -67,8 +67,8 @@ class OctreeParameters(Parameters):
     )
     coarse_share: float = setting(
         0.25,
-        "Fraction of the steps in which levels join one by one; in these steps anchors also grow into "
-        "the next level.",
+        "Fraction of the steps in which levels join one by one. Anchors grow into the next level only after "
+        "them.",
         high=1,
     )
     joins: str = setting(

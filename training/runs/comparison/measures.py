@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
@@ -149,17 +148,16 @@ def measure_run(
     """
     folder = RunFolder(run)
     job = Job.from_file(folder.job)
-    with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
-        if folder.metrics.stat().st_mtime >= folder.bundle.stat().st_mtime:
-            report = json.loads(folder.metrics.read_text(encoding="utf-8"))
-            newest = report["selective"][0] if report["selective"] else {}
-            is_same = all(newest[name] == value for name, value in values.items())
-            level = report["levels"][-1]
-            is_complete = missing_line(lpips) or any(
-                f"{prefix}lpips_vgg" in level for prefix in ("", "train_")
-            )
-            if is_same and is_complete and (not far or not report["rule"] or "farther" in report):
-                return compared_run(folder, job, report, label)
+    with suppress(
+        OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError
+    ):  # a changed report
+        report = folder.read_metrics()
+        newest = report["selective"][0] if report["selective"] else {}
+        is_same = all(newest[name] == value for name, value in values.items())
+        has_lpips = any({"lpips_vgg", "train_lpips_vgg"} & level.keys() for level in report["levels"])
+        is_complete = bool(missing_line(lpips)) or has_lpips
+        if is_same and is_complete and (not far or not report["rule"] or "farther" in report):
+            return compared_run(folder, job, report, label)
     notify(f"Measuring {label}.")
     return compared_run(folder, job, evaluate_run(run, values, far=far, warn=warn, lpips=lpips), label)
 

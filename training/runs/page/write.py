@@ -18,7 +18,7 @@ from ...editing.edit import open_levels
 from ...editing.placement import transform_bundle, upright_placement
 from ...editing.portable import portable_levels
 from ...errors import LodgsError, printable
-from ...files import temporary_folder
+from ...files import atomic_folder, atomic_write, check_name, temporary_folder
 from ...rasterize.resident import ResidentBundle
 from ...scenes.cameras import Camera, pick_evenly
 from ...scenes.images import write_png
@@ -86,31 +86,23 @@ def write_page(
     placement = Similarity(_DOWN, 1.0, np.zeros(3)).compose(upright_placement(bundle, upright=True))
     viewed = replace(levels.bundle, tables=make_view_tables(pick_evenly(cameras, MAX_CAMERAS), near))
     placed = transform_bundle(viewed, placement)
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        with temporary_folder(out.parent) as temporary:
-            target = temporary / "page"
-            target.mkdir()
+    page = _describe(placed)
+    if single:
+        with atomic_write(out) as temporary, temporary_folder(out.parent) as work:
+            _write_poster(work / POSTER, bundle, cameras[0], near, backend)
+            _write_single(work, placed, page, viewer, title)
+            (work / PAGE).replace(temporary)
+    else:
+        with atomic_folder(out) as target:
             _write_poster(target / POSTER, bundle, cameras[0], near, backend)
-            page = _describe(placed)
-            if single:
-                _write_single(target, placed, page, viewer, title)
-                (target / PAGE).replace(out)
-            else:
-                _write_folder(target, placed, page, viewer, title)
-                if out.exists():
-                    out.rename(temporary / "previous")
-                target.rename(out)
-    except OSError as error:
-        raise LodgsError(
-            f"Cannot write {out}: {error.strerror}.", "Choose another place, or free some space."
-        ) from error
+            _write_folder(target, placed, page, viewer, title)
     remedy = "" if single else f" Browsers need a server: python -m http.server --directory {out}"
     return f"{out}: written.{remedy}"
 
 
 def _check_place(out: Path, single: bool) -> None:
     """Raise a LodgsError if the page would replace anything but an earlier page."""
+    check_name(out)
     if single:
         if out.suffix.lower() != ".html":
             raise LodgsError(f"Cannot write {out}: a page in one file is HTML.", "End its name with .html.")
@@ -196,7 +188,7 @@ def _pose(camera: Camera, center: np.ndarray, radius: float) -> dict:
 def _write_poster(path: Path, bundle: Bundle, camera: Camera, near: float, backend: str) -> None:
     camera = camera.scaled(min(1.0, POSTER_WIDTH / camera.width))
     rendering = ResidentBundle(bundle, backend).draw_level(bundle.levels[-1].number, camera, near=near)
-    image = rendering.image.detach().cpu().numpy()
+    image = np.nan_to_num(rendering.image.detach().cpu().numpy())  # extreme coefficients give NaN
     write_png(path, np.rint(image.clip(0, 1) * 255).astype(np.uint8))
 
 

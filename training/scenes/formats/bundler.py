@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...documents import damage_error, decode_text, open_file, open_text, read_lines
+from ...documents import damage_error, decode_text, open_file, open_lines, read_lines
 from ...errors import LodgsError
 from ..images import image_size
 from ..lenses import make_intrinsics
@@ -45,7 +45,7 @@ def find(folder: Path) -> Path | None:
 
 def _is_bundle(path: Path) -> bool:
     try:
-        with open_text(path) as file:
+        with open_lines(path) as file:
             return file.read(len(_VERSION)) == _VERSION
     except LodgsError:
         return False
@@ -59,7 +59,7 @@ def read(path: Path) -> ExportedScene:
     """
     names = _read_names(path)
     try:
-        with open_text(path) as file:
+        with open_lines(path) as file:
             lines = filter(None, map(bytes.strip, read_lines(file, _MAX_LINE)))
             if not next(lines, b"").startswith(_VERSION):
                 raise ValueError("its version is not 0.3")

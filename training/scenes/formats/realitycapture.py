@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...documents import decode_text, open_text, read_bytes
+from ...documents import decode_text, open_lines, read_bytes
 from ...errors import LodgsError
 from ..images import image_size
 from ..lenses import Intrinsics
@@ -86,7 +86,7 @@ def read(path: Path) -> ExportedScene:
 
 def _is_table(path: Path) -> bool:
     try:
-        with open_text(path) as file:
+        with open_lines(path) as file:
             return any(_parse_header(decode_text(line)) for line in islice(file, _HEAD_LINES))
     except LodgsError:
         return False

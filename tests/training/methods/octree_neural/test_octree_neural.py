@@ -269,6 +269,8 @@ def test_statistics_are_kept_until_enough_views_drew_an_anchor(data):
     assert final_stats["seen"][0].tolist() == [40] * 4 and final_stats["seen"][1].tolist() == [0] * 4
     assert final_stats["anchor_seen"][2] == 80
     assert method.model.columns["bias"][:3].tolist() == [0.0, 0.5, 0.0]
+    new = method.model.columns["bias"][len(means) - 1 :]
+    assert len(new) and not new.any(), "program: new anchors begin without bias"
 
 
 def test_bias_follows_mean_gradient_of_ready_gaussians(data):

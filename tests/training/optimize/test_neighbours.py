@@ -1,0 +1,36 @@
+"""Queries of k-d trees, also when they are interrupted."""
+
+import threading
+import time
+
+import numpy as np
+import pytest
+from scipy.spatial import KDTree
+
+from training.optimize.neighbours import query_neighbours
+from training.runs import processes
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_neighbours_match_all_distances(count):
+    points, positions = np.random.default_rng(0).normal(size=(2, 50, 3))
+    distances = np.linalg.norm(positions[:, None] - points, axis=2)
+    expected = np.argsort(distances, axis=1)[:, :count].reshape(50, *[count] * (count > 1))
+    found, indices = query_neighbours(KDTree(points), positions, count)
+    np.testing.assert_array_equal(indices, expected)
+    np.testing.assert_allclose(found, np.sort(distances, axis=1)[:, :count].reshape(expected.shape))
+
+
+def test_interrupt_waits_for_the_threads_of_the_query():
+    finished = threading.Event()
+
+    class SlowTree:
+        def query(self, *_, **__):
+            time.sleep(0.4)
+            finished.set()
+            return 0, 0
+
+    threading.Timer(0.1, processes.interrupt).start()
+    with pytest.raises(KeyboardInterrupt):
+        query_neighbours(SlowTree(), np.zeros((1, 3)))
+    assert finished.is_set()
