@@ -3,7 +3,7 @@
 A report has these keys:
 
 - ``levels``: levels that are complete by themselves, coarse to fine: ``level``, facts, ``splats``,
-  ``drawn``, ``psnr``, ``ssim``, ``lpips_alex`` and ``lpips_vgg`` (if there are weights), ``frame_s``,
+  ``drawn``, ``psnr``, ``ssim``, ``lpips_alex`` and ``lpips_vgg`` (if weights exist), ``frame_s``,
   ``veil``. Cumulative levels include all coarser ones.
   ``by_size`` is the PSNR at full, 1/2, 1/4 and 1/8 of the image size. Coarser levels in memory also
   have ``merged``, the same of the finest level merged to as many splats
@@ -18,7 +18,8 @@ A report has these keys:
   alternately; not for rules that always weight
 - ``frame_memory``: bytes in use while views are drawn, ``by_distance`` and in ``full`` detail, see
   ``evaluate.frame_memory``
-- ``curve``: as ``selective``, for each value of the rule's ``sweep``; in memory also PSNR ``merged``
+- ``curve``: as ``selective``, for each value of the rule's ``sweep``, without LPIPS; in memory also
+  PSNR ``merged``
 - ``networks``: quality of a neural model before baking
 - ``farther`` and ``jumps`` (of the middle view), if ``far``
 
@@ -203,8 +204,9 @@ def _measure_rule(
     report["selective"] += _earlier_rows(folder, report["selective"][0], values)
     if rule.sweep:
         name, steps = rule.sweep
+        quick = Evaluation(data, job.backend, bundle.antialias)  # LPIPS takes seconds a view
         report["curve"] = [
-            {name: step, **evaluation.measure_by_distance(resident, {**values, name: step})} for step in steps
+            {name: step, **quick.measure_by_distance(resident, {**values, name: step})} for step in steps
         ]
         if not bundle.on_disk:
             _add_merges(evaluation, bundle, report["curve"])
@@ -324,7 +326,8 @@ def format_report(report: dict) -> str:
         if row is None:
             lines.append(name)
             continue
-        quality = "".join(f" {row[key]:>7.{2 if key.endswith('psnr') else 4}f}" for key in shown)
+        quality = "".join(f" {row[key]:>7.{2 if key.endswith('psnr') else 4}f}" if key in row else f" {'':>7}"
+                          for key in shown)  # fmt: skip
         veil = f" {row['veil']['mean']:>7.1%}" if "veil" in row else ""
         lines.append(f"{name:<28} {row['splats']:>9,}{quality} {1e3 * row['frame_s']:>8.1f}{veil}")
     lines += [*size_lines(report["levels"]), *summary_lines(report)]

@@ -160,6 +160,17 @@ def test_perceptual_measures_stand_beside_psnr(finished, monkeypatch, tmp_path):
     assert f" {fine['lpips_vgg']:.4f} " in next(line for line in lines if line.startswith("level 2"))
 
 
+def test_curve_has_no_perceptual_measures(finished, splats, monkeypatch):
+    monkeypatch.setattr("training.runs.measure.load_lpips", lambda *_: {"lpips_vgg": lambda *_: 0.125})
+    run = finished(test_every=4)
+    write_bundle(RunFolder(run).bundle, tree_of(splats))
+    report = evaluate_run(run)
+    assert report["selective"][0]["lpips_vgg"] == 0.125
+    assert all("lpips_vgg" not in row for row in report["curve"])
+    line = next(line for line in format_report(report).splitlines() if line.startswith("pixels = 16"))
+    assert "0.1250" not in line
+
+
 def test_missing_weights_are_stated_in_a_sentence(finished, tmp_path, capsys):
     assert main(["evaluate", str(finished(test_every=4)), "--lpips", str(tmp_path / "none")]) == 0
     line = capsys.readouterr().out.splitlines()[-1]

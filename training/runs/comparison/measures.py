@@ -154,8 +154,8 @@ def measure_run(
         report = folder.read_metrics()
         newest = report["selective"][0] if report["selective"] else {}
         is_same = all(newest[name] == value for name, value in values.items())
-        level = report["levels"][-1]
-        is_complete = missing_line(lpips) or any(f"{prefix}lpips_vgg" in level for prefix in ("", "train_"))
+        has_lpips = any({"lpips_vgg", "train_lpips_vgg"} & level.keys() for level in report["levels"])
+        is_complete = bool(missing_line(lpips)) or has_lpips
         if is_same and is_complete and (not far or not report["rule"] or "farther" in report):
             return compared_run(folder, job, report, label)
     notify(f"Measuring {label}.")

@@ -8,13 +8,11 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from ...evaluate.lpips import load_lpips
 from ...evaluate.views import Evaluation
 from ...files import atomic_write, create_folder
 from ...lod.on_disk import open_if_large
 from ...lod.rule import Values
 from ...lod.selection import complete_splats, resolve_controls
-from ...rasterize import tensor_device
 from ...scenes.cameras import Camera
 from ...splats.bundle import read_bundle
 from ...splats.dialects import Warn, ignore
@@ -59,7 +57,7 @@ def compare(
         for run, label in zip(runs, labels, strict=True)
     ]
     _, job, data = open_finished(runs[0], warn)
-    evaluation = Evaluation(data, job.backend, perceptual=load_lpips(lpips, tensor_device(job.backend)))
+    evaluation = Evaluation(data, job.backend)
     cameras = compared_views(evaluation)
     images = _render(runs, measured, evaluation, cameras, notify)
     report = {
