@@ -126,7 +126,7 @@ def measure_run(
         values: values of the controls of the run's rule.
 
     Raises:
-        LodgsError: as ``evaluate_run``.
+        LodgsError: see ``evaluate_run``.
     """
     folder = RunFolder(run)
     job = Job.from_file(folder.job)
