@@ -21,10 +21,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import numpy as np
 
 from examples import town
+from tests.training.methods.tree.sequential_tree import SequentialPointTree
 from training.lod.tree.nodes import ABOVE_ROOT, detail_of
 from training.lod.tree.shape import Tree
 from training.methods.tree.build import build
-from training.methods.tree.sequential_point_tree import SequentialPointTree
 from training.rasterize.cpu.compile import (
     STRICT,
     f32,

@@ -39,11 +39,11 @@ def bundles_by_renderer(bundle: Bundle) -> dict[str, Bundle]:
         return {"": bundle}
     baked = bake_filter(bundle)
     levels = [Level(level.number, level.rows.select(slice(None)), level.facts) for level in baked.levels]
-    untold = {name: value for name, value in bundle.meta.items() if name != "antialias"}
+    unmarked = {name: value for name, value in bundle.meta.items() if name != "antialias"}
     return {
         "": bundle,
         ", filter baked, other programs": replace(baked, levels=levels),
-        ", original, other programs": replace(bundle, meta=untold),
+        ", original, other programs": replace(bundle, meta=unmarked),
     }
 
 

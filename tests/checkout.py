@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 from pathlib import Path
+from textwrap import dedent
 
 ROOT = Path(__file__).resolve().parents[1]
 _PARTS = "blender_lodgs", "training", "tools", "__init__.py", "blender_manifest.toml"
@@ -19,9 +20,10 @@ def copy_checkout(folder: Path, package: str) -> None:
             (folder / name).symlink_to(ROOT / name)
 
 
-def recipe_code(title: str) -> str:
-    """Return the Python code in a section of CONTRIBUTING."""
-    section = (ROOT / "CONTRIBUTING.md").read_text().split(f"## {title}\n")[1].split("\n## ")[0]
-    match = re.search(r"```python\n(.*?)```", section, re.S)
-    assert match, title
-    return match[1]
+def recipe_code(title: str, text: str = "", language: str = "python") -> str:
+    """Return the code block in a section of CONTRIBUTING that contains a text."""
+    contributing = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    section = contributing.split(f"## {title}\n")[1].split("\n## ")[0]
+    blocks = re.findall(rf"^ *```{language}\n(.*?)^ *```$", section, re.DOTALL | re.MULTILINE)
+    (block,) = (dedent(block) for block in blocks if text in block)
+    return block

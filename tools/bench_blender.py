@@ -133,7 +133,7 @@ def two_levels(bpy, splats):
     """Create a scene with the same splats as two levels selected by distance; return its camera."""
     scenes, bundle = load("blender_lodgs.data.scenes"), load("training.splats.bundle")
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
-    camera = bpy.data.objects.new("eye", bpy.data.cameras.new("eye"))
+    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     bpy.context.scene.collection.objects.link(camera)
     bpy.context.scene.camera = camera
     with load("blender_lodgs.data.importing").new_scene(bpy.context, "bench") as root:

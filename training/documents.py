@@ -73,7 +73,7 @@ def open_text(path: str | Path) -> IO[bytes]:
     a temporary file. Other bytes stay as they are.
 
     Raises:
-        LodgsError: as :func:`open_file`, or the text is not valid.
+        LodgsError: see :func:`open_file`, or the text is not valid.
     """
     file = open_file(path)
     head = file.read(32)

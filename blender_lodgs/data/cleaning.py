@@ -53,7 +53,7 @@ def distance_test(context: bpy.types.Context, root: bpy.types.Object, max_distan
     """Return a test for splats farther than a length in the world from every camera.
 
     Raises:
-        LodgsError: as :func:`cameras`.
+        LodgsError: see :func:`cameras`.
     """
     positions = np.array([camera.center for camera in cameras(context, root)])
     max_distance /= unit_length(root)
@@ -64,7 +64,7 @@ def views_test(context: bpy.types.Context, root: bpy.types.Object, min_views: in
     """Return a test for splats in the frames of fewer than ``min_views`` cameras.
 
     Raises:
-        LodgsError: as :func:`cameras`.
+        LodgsError: see :func:`cameras`.
     """
     views = cameras(context, root)
     return lambda cloud: cleaning.find_unseen(splat_attribute(cloud, "position"), views, min_views)

@@ -25,7 +25,7 @@ class CleanupTest(NamedTuple):
 
     Attributes:
         identifier, label, about: entry of the enum of tests.
-        noun: the matching splats, in menus; "" for tests of *Find Clutter* alone.
+        noun: the matching splats, in menus; "" for tests that only *Find Clutter* has.
         limits: names of its settings; empty for the selection.
         find: function of the context, the root and the limits that returns masks by level number.
         kind: its entry of ``clutter.KINDS`` in *Find Clutter*; "" if it lacks the test.

@@ -241,7 +241,7 @@ def read_splats_file(path: Path | str, budget: int = 0) -> SplatsFile:
     else:
         with open_as_ply(path) as file:
             bundle = (read_folder if file.is_dir() else read_bundle)(file, warnings.append)
-        if not bundle.method and not bundle.on_disk:  # of another program
+        if not bundle.method and not bundle.on_disk:  # another program's file
             overview.complete_meta(bundle)
             warnings += overview.describe_clutter(bundle.levels[-1].splats)
     return SplatsFile(path, bundle, total, budget, warnings, stamp)

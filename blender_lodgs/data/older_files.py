@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import json
-
 import bpy
 
-from ...training.lod.rule import find_rule
 from ..attributes import BASE, LOG_SCALE, rename_sh
 from ..nodes import display
 from . import looks, selection
@@ -47,12 +44,6 @@ def upgrade_scene(root: bpy.types.Object) -> None:
     """Upgrade a splat scene of an older version; scenes of this version stay unchanged."""
     repair_references(root.lodgs)
     repair_levels(root)
-    if root.lodgs.itself is None:
-        root.lodgs.itself = root
-    rule, levels = find_rule(root.lodgs.rule), [item.number for item in root.lodgs.levels if item.exists]
-    if rule is not None and levels and not root.lodgs.initial_controls:  # older: unset controls moved along
-        finest = {control.name: levels[-1] for control in rule.controls if control.follows == "finest"}
-        root.lodgs.initial_controls = json.dumps(finest)
     if selection.outdated(root) or looks.outdated(root):
         selection.attach(root)
 

@@ -57,7 +57,7 @@ def set_bundle_facts(root: bpy.types.Object, bundle: Bundle) -> None:
     levels or levels without splats.
 
     Raises:
-        LodgsError: as :func:`check_facts`. Nothing is changed in that case.
+        LodgsError: see :func:`check_facts`. Nothing is changed in that case.
     """
     settings, rule = root.lodgs, check_facts(root, bundle)
     if rule is not None and (rule.weights_full_detail or not rule.complete) and settings.rule != bundle.rule:
@@ -210,7 +210,7 @@ def delete_excluded(root: bpy.types.Object) -> int:
         The number of deleted splats.
 
     Raises:
-        LodgsError: as :func:`read_levels`, or the levels are only the coarsest splats of a file.
+        LodgsError: see :func:`read_levels`, or the levels are only the coarsest splats of a file.
     """
     file = streams.file_of(root)
     if file is not None:

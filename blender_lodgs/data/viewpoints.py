@@ -206,7 +206,7 @@ def capture_views(context: bpy.types.Context, width: int, height: int) -> list[t
     """Return the views and near depths of the shots of :func:`capture_shots`, in Blender's world.
 
     Raises:
-        LodgsError: as :func:`capture_shots`.
+        LodgsError: see :func:`capture_shots`.
     """
     return [view for _, view in _shots_with_views(context, width, height, _ignore)]
 

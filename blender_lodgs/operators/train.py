@@ -212,7 +212,7 @@ class LODGS_OT_show_levels(SceneOperator, bpy.types.Operator):
 
 
 def _show_file(context: bpy.types.Context, path: Path) -> None:
-    """Show an image file, read anew: a training may have replaced it."""
+    """Show an image file. Read it again, because a training may have replaced it."""
     image = bpy.data.images.load(str(path), check_existing=True)
     image.reload()
     show_image(context, image)

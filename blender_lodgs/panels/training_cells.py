@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ...training.errors import LodgsError
-from ...training.lod.colors import level_color
+from ...training.splats.level_colors import level_color
 from ..data import cells, roots, viewpoints
 from ..runs import job_settings, run_folders
 from ..runs.watch import RunPart, Watch, watch_of

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import bpy
 
-from ...training.lod.colors import level_color
 from ...training.lod.rule import resolve_rule
+from ...training.splats.level_colors import level_color
 from .. import compat, viewport
 from ..data import roots
 from ..viewport import views

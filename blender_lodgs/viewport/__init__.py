@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import bpy
 
-from ...training.lod.colors import level_color
+from ...training.splats.level_colors import level_color
 from .. import extension
 from ..data import roots
 from . import cells, coverage, discs, frusta, shaders, splats, view_camera, views

@@ -148,7 +148,7 @@ class Placement:
     Attributes:
         matrix: ``matrix_world``, (4, 4) float64 as bytes, so that placements compare.
         level: 1 is the coarsest; 0 for splats that are no level.
-        query: selects and weights the splats; None: all with weight 1.
+        query: selects and weights the splats; None means all with weight 1.
         scene: number of the splat scene.
         colors: meaning of the colours, see ``SplatScene.colors``.
         antialias: see ``SplatScene.antialias``.

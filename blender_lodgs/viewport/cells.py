@@ -7,7 +7,7 @@ import gpu
 import numpy as np
 from gpu_extras.batch import batch_for_shader
 
-from ...training.lod.colors import level_color
+from ...training.splats.level_colors import level_color
 from ..data import cells, roots
 from ..data.placement import axes_of
 from . import frusta

@@ -185,7 +185,7 @@ class Store:
         self.orphans = np.concatenate([self.orphans, slots])
 
     def release(self) -> None:
-        """Release the records of replaced splats, which nobody draws any more."""
+        """Release the records of replaced splats, which no viewport draws any more."""
         self.orphans = self.orphans[:0]
 
     def missing(self, indices: np.ndarray) -> np.ndarray:
@@ -318,13 +318,6 @@ def _read_attribute(pool: Pool, rows: slice, cloud: bpy.types.PointCloud, name: 
             pool.opacities[rows] *= weights
     else:
         pool.columns[name][rows] = values
-
-
-def read_pool(clouds: Sequence[Cloud]) -> Resident:
-    """Read a pool completely, see :class:`PoolReader`."""
-    resident = PoolReader(clouds).advance(clouds)
-    assert resident is not None
-    return resident
 
 
 def read_records(cloud: bpy.types.PointCloud, rows: np.ndarray, higher: int) -> np.ndarray:

@@ -9,8 +9,8 @@ import gpu
 import numpy as np
 
 from ...training.editing.clutter import KINDS
-from ...training.lod.colors import LEVEL_COLORS
 from ...training.lod.crop import FACE_SQUARED
+from ...training.splats.level_colors import LEVEL_COLORS
 from .arrangement import WIDTH
 
 MARK_COLORS = ((1.0, 0.45, 0.05), *(kind.color for kind in KINDS.values()), (0.5, 0.5, 0.5))

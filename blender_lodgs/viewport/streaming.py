@@ -78,7 +78,7 @@ class Stream:
         """Request the pages of a query. Returns at once.
 
         Args:
-            direction: view direction in the splats' space; None: all directions.
+            direction: view direction in the splats' space; None means all directions.
         """
         if (query, direction) != self._request:
             self._request = query, direction

@@ -104,7 +104,7 @@ def test_same_command_resumes_a_stopped_run(lodgs_command, fake, tmp_path, capfd
     fake("killed")
     assert lodgs_command(*train, "--blend", tmp_path / "part.blend") == 1
     assert "signal 9" in capfd.readouterr().err
-    assert (tmp_path / "part.blend").exists()  # with the finished level
+    assert (tmp_path / "part.blend").exists()  # holds the finished level
     fake("full")
     assert lodgs_command(*train) == 2
     assert "The disk is full" in capfd.readouterr().err
@@ -114,7 +114,7 @@ def test_same_command_resumes_a_stopped_run(lodgs_command, fake, tmp_path, capfd
     assert lodgs_command(*train, "--export", tmp_path / "bundle.ply") == 0
     assert (tmp_path / "bundle.ply").exists()
     (tmp_path / "bundle.ply").unlink()
-    assert lodgs_command(*train, "--export", tmp_path / "bundle.ply") == 0  # finished: loaded
+    assert lodgs_command(*train, "--export", tmp_path / "bundle.ply") == 0  # loads the finished run
     assert (tmp_path / "bundle.ply").exists()
     assert lodgs_command(*train, "--seed", 5) == 2
     (tmp_path / "bundle.ply").unlink()
@@ -300,4 +300,4 @@ def test_cells_are_trained_by_one_command(bpy, lodgs, lodgs_command, fake, tmp_p
     bpy.ops.wm.open_mainfile(filepath=str(blend))
     (root,) = [obj for obj in bpy.data.objects if obj.lodgs.is_root]
     assert (root.lodgs.training.columns, root.lodgs.training.rows) == (2, 1), "the panel shows the cells"
-    assert lodgs_command(*command) == 0, "it is finished"
+    assert lodgs_command(*command) == 0, "a finished run is loaded"

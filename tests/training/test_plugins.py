@@ -2,37 +2,21 @@
 
 import json
 import os
-import re
 import subprocess
 import sys
 import tomllib
 from functools import partial
 from pathlib import Path
-from textwrap import dedent
 
 import pytest
 
+from tests.checkout import ROOT, recipe_code
 from training.splats.bundle import read_bundle
 
-ROOT = Path(__file__).resolve().parents[2]
-
-
-def recipe_block(language: str, text: str) -> str:
-    """Return the code block of CONTRIBUTING's recipe "Add a method" that contains a text."""
-    recipe = (
-        (ROOT / "CONTRIBUTING.md")
-        .read_text(encoding="utf-8")
-        .split("\n## Add a method\n")[1]
-        .split("\n## ")[0]
-    )
-    blocks = re.findall(rf"^ *```{language}\n(.*?)^ *```$", recipe, re.DOTALL | re.MULTILINE)
-    (block,) = (dedent(block) for block in blocks if text in block)
-    return block
-
-
-METHOD = recipe_block("python", "METHOD = MethodInfo(")
-TRAIN = recipe_block("python", "class Method(")
-ENTRY_POINT = tomllib.loads(recipe_block("toml", "entry-points"))["project"]["entry-points"]["lodgs.methods"]
+METHOD = recipe_code("Add a method", "METHOD = MethodInfo(")
+TRAIN = recipe_code("Add a method", "class Method(")
+PROJECT = tomllib.loads(recipe_code("Add a method", language="toml"))["project"]
+ENTRY_POINT = PROJECT["entry-points"]["lodgs.methods"]
 RULE = """
 import numpy as np
 from lodgs.lod.rule import NO_TABLES, Rule

@@ -23,8 +23,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     from ..runs.reproduction.run import PAPERS
 
     parser.description = (
-        "Trains what the tables of a paper need with the preset paper, prints our values beside those of "
-        "the paper, and says which trends hold. The same command resumes."
+        "Trains the runs behind the tables of a paper with the preset paper, prints our values beside those "
+        "of the paper, and says which trends hold. The same command resumes."
     )
     parser.add_argument("paper", choices=PAPERS, help="method of the paper")
     parser.add_argument(

@@ -36,17 +36,17 @@ _MAX_CELL = (1 << 20) - 2
 
 
 def find_large(scales: np.ndarray, limit: float) -> np.ndarray:
-    """Return (N,) bool: splats whose largest standard deviation, of (N, 3), exceeds a limit."""
+    """Return a mask (N,) of splats whose largest standard deviation, of (N, 3), exceeds a limit."""
     return scales.max(axis=1, initial=0) > limit
 
 
 def find_faint(opacities: np.ndarray, limit: float) -> np.ndarray:
-    """Return (N,) bool: splats whose opacity (N,) is below a limit."""
+    """Return a mask (N,) of splats whose opacity (N,) is below a limit."""
     return opacities < limit
 
 
 def find_far(means: np.ndarray, positions: np.ndarray, limit: float) -> np.ndarray:
-    """Return (N,) bool: means (N, 3) farther than a limit from every camera position (C, 3)."""
+    """Return a mask (N,) of means (N, 3) farther than a limit from every camera position (C, 3)."""
     far = np.ones(len(means), bool)
     for position in positions:
         offset = means[far] - np.asarray(position, np.float32)
@@ -57,7 +57,7 @@ def find_far(means: np.ndarray, positions: np.ndarray, limit: float) -> np.ndarr
 def find_unseen(
     means: np.ndarray, cameras: Sequence[Camera], min_views: int, reach: float = inf
 ) -> np.ndarray:
-    """Return (N,) bool: means (N, 3) inside the images of fewer than ``min_views`` cameras.
+    """Return a mask (N,) of means (N, 3) inside the images of fewer than ``min_views`` cameras.
 
     Ignores occlusion.
 
@@ -75,13 +75,13 @@ def find_unseen(
 
 
 def find_floaters(means: np.ndarray, gap: float = 0.0, share: float = MAX_FLOATER_SHARE) -> np.ndarray:
-    """Return (N,) bool: splats at means (N, 3) in clusters of at most a fraction ``share`` of all splats.
+    """Return a mask (N,) of means (N, 3) in clusters of at most a fraction ``share`` of all splats.
 
     Space is divided into cells. A cluster consists of occupied cells that touch, also at edges and corners.
     So splats closer than a cell size are in one cluster, and gaps of more than two cells separate clusters.
 
     Args:
-        gap: cell size; 0: :func:`default_gap`.
+        gap: cell size; 0 means :func:`default_gap`.
     """
     if not len(means):
         return np.zeros(0, bool)
@@ -117,7 +117,7 @@ class Cleaning:
     Attributes:
         crops: see ``crop.crop_mask``.
         cameras: cameras in the splats' space.
-        subject: subject of the scene; None: :func:`.clutter.subject_of` the bundle.
+        subject: subject of the scene; None means :func:`.clutter.subject_of` the bundle.
     """
 
     crops: tuple[Crop, ...] = ()
@@ -172,7 +172,7 @@ class Cleaning:
     )  # fmt: skip
 
     def matches(self, splats: Splats) -> dict[str, np.ndarray]:
-        """Return (N,) bool of each enabled test except the one for floaters: the splats to remove.
+        """Return a mask (N,) of the splats to remove for each enabled test except the one for floaters.
 
         Names are those of the limits, and ``crops``.
         """
@@ -245,14 +245,14 @@ def clean_bundle(bundle: Bundle, cleaning: Cleaning) -> Bundle:
     Reads all splats once, and again when they are written. Needs some dozens of bytes of memory per splat.
 
     Raises:
-        LodgsError: as :func:`keep_splats`.
+        LodgsError: see :func:`keep_splats`.
     """
     unwanted = find_unwanted(bundle, cleaning)
     return keep_splats(bundle, unwanted.remaining, unwanted.relations)
 
 
 def find_unwanted(bundle: Bundle, cleaning: Cleaning) -> Unwanted:
-    """Apply all tests to a bundle's splats, which are read once; the finest level twice for clutter."""
+    """Apply all tests to a bundle's splats. Reads each level once, the finest one twice for clutter."""
     cleaning = cleaning.for_bundle(bundle)
     related = resolve_rule(bundle.rule).relations
     matches: dict[str, dict[int, np.ndarray]] = {}

@@ -62,13 +62,13 @@ class SceneSubject:
         return np.linalg.norm(means - self.center, axis=1)
 
     def near(self, means: np.ndarray) -> np.ndarray:
-        """Return (N,) bool: means (N, 3) near the subject. A distant background is large and sparse."""
+        """Return a mask (N,) of means (N, 3) near the subject. A distant background is large and sparse."""
         return self.distances(means) < NEAR * self.radius
 
     def find_halos(
         self, means: np.ndarray, scales: np.ndarray, opacities: np.ndarray, limit: float
     ) -> np.ndarray:
-        """Return (N,) bool: splats near the subject that are fainter than a limit and larger than most.
+        """Return a mask (N,) of splats near the subject that are fainter than a limit and larger than most.
 
         Args:
             scales: (N, 3) standard deviations.
@@ -78,7 +78,7 @@ class SceneSubject:
         return large & (opacities < limit) & self.near(means)
 
     def find_below(self, means: np.ndarray, depth: float) -> np.ndarray:
-        """Return (N,) bool: means (N, 3) deeper than a length below the ground; none without a ground."""
+        """Return a mask (N,) of means (N, 3) deeper than a length below the ground; none without a ground."""
         if self.ground is None:
             return np.zeros(len(means), bool)
         normal, middle = self.ground

@@ -53,8 +53,8 @@ def edit(
     Binary PLYs are processed in batches of rows.
 
     Args:
-        out: output in the format of the source; None: none.
-        warn: as for ``read_ply``.
+        out: output in the format of the source; None writes none.
+        warn: see ``read_ply``.
         looks: applied to the remaining splats.
         placement: applied after upright and ground; crops and lengths of the cleaning are the source's.
         upright, ground, points: see ``placement.upright_placement``.
@@ -144,7 +144,7 @@ def open_levels(source: Path, warn: Warn) -> Bundle:
     """Open a bundle or PLY on disk; read a folder of levels.
 
     Args:
-        warn: as for ``read_ply``.
+        warn: see ``read_ply``.
     """
     if source.is_dir():
         return read_folder(source, warn)

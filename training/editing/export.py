@@ -95,7 +95,7 @@ def export_finest_level(
         Progress messages, as :func:`..splats.formats.write_splats`.
 
     Raises:
-        LodgsError: as :func:`..splats.formats.write_splats`, or the format has no double precision.
+        LodgsError: see :func:`..splats.formats.write_splats`, or the format has no double precision.
     """
     origin = bundle.origin if original_place else NO_ORIGIN
     kind = find_format(path)

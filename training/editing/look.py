@@ -84,7 +84,7 @@ LOOK_SETTINGS = settings_of(Look)
 NEUTRAL = Look()
 
 Looks = Sequence[tuple[Crop | None, Look]]
-"""Looks in the order of application, each with a crop that limits it; None: all splats."""
+"""Looks in the order of application, each with a crop that limits it; None means all splats."""
 
 
 def looks_as_dicts(looks: Looks) -> list[dict[str, Any]]:

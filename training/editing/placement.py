@@ -74,7 +74,7 @@ def upright_placement(
     Args:
         upright: turn the scene so that its up axis is z.
         ground: turn the scene upright and move its ground to z = 0.
-        points: (P, 3) for ground detection; None: the means of the finest level's opaque splats.
+        points: (P, 3) for ground detection; None means the means of the finest level's opaque splats.
 
     Raises:
         LodgsError: no ground detected.

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from ..files import atomic_write
-from ..lod.colors import level_color
 from ..scenes.images import write_png
+from ..splats.level_colors import level_color
 
 PLOT_SIZE = 960, 540
 """Width and height of the plot in pixels."""

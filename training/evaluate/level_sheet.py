@@ -9,13 +9,13 @@ import numpy as np
 import torch
 
 from ..files import atomic_write
-from ..lod.colors import level_color
 from ..lod.on_disk import read_visible
 from ..lod.rule import Values, find_rule
 from ..lod.selection import complete_splats, full_detail_controls, select, standalone_levels
 from ..scenes.cameras import Camera
 from ..scenes.images import write_png
 from ..splats.gaussians import SH_C0, Splats
+from ..splats.level_colors import level_color
 from ..splats.levels import Bundle
 from .metrics import psnr
 from .views import Evaluation

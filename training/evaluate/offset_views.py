@@ -40,7 +40,7 @@ def measure_veil(evaluation: Evaluation, source: SplatSource) -> dict[str, float
     for camera in pick_evenly(midpoint_views(evaluation.data.train), MAX_POSITIONS):
         splats, weights = source(camera)
         near = camera.view_space(splats.means)[:, 2] < VEIL_DEPTH * evaluation.data.median_depth
-        # near splats alone determine whether half of the light is stopped in front of the limit
+        # only near splats determine whether half of the light is stopped in front of the limit
         veil = evaluation.render(splats.select(near), camera, None if weights is None else weights[near])
         shares.append(float((veil.alpha >= OPAQUE_OPACITY).float().mean()))
     return {"mean": round(float(np.mean(shares)), 5), "max": round(float(np.max(shares)), 5)}

@@ -85,7 +85,7 @@ class BlockIndex:
         """Return the index of a table BLOCKS; None if it contradicts the levels.
 
         Args:
-            lengths: number of rows of each level; None: unknown, only full blocks.
+            lengths: number of rows of each level; None means unknown, so only full blocks.
         """
         levels = table["level"]
         if lengths is None:

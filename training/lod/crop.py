@@ -74,7 +74,7 @@ class Crop:
         return cls.from_matrix("SPHERE", matrix, outside)
 
     def contains(self, means: np.ndarray) -> np.ndarray:
-        """Return (N,) bool: means (N, 3) inside the crop."""
+        """Return a mask (N,) of means (N, 3) inside the crop."""
         x, y, z = means.T
         squares = None
         for a, b, c, d in np.array(self.to_own, np.float32):
@@ -131,10 +131,10 @@ class Crop:
 
 
 def crop_mask(crops: Sequence[Crop], means: np.ndarray) -> np.ndarray:
-    """Return (N,) bool: splats at means (N, 3) that crops keep.
+    """Return a mask (N,) of the splats at means (N, 3) that crops keep.
 
-    Kept are splats inside any crop that keeps its inside (all splats if there is no such crop), except those
-    inside any crop that keeps its outside.
+    Crops keep splats inside any crop that keeps its inside (all splats if there is no such crop), except
+    those inside any crop that keeps its outside.
     """
     inside = [crop for crop in crops if not crop.outside]
     mask = np.full(len(means), not inside)

@@ -23,22 +23,22 @@ from .rule import Region, Rule, find_rule, resolve_rule
 from .selection import require_rule, rule_columns
 
 MAX_IN_MEMORY = 4_000_000
-"""Default limit of splats to keep all of a file in memory: 1 GB at degree 3."""
+"""Default maximum number of splats of a file that is kept in memory as a whole: 1 GB at degree 3."""
 _FAR = np.float32(1e15)
 """Coordinate beyond every drawable splat."""
 _BATCH = 64 * SIZE
 """Splats per batch of the first pass over a file."""
 _GAP = 4
-"""Read gaps of up to so many blocks along with their neighbours, instead of seeking."""
+"""Maximum number of blocks in a gap that is read along with its neighbours instead of skipped."""
 _MAX_SURPLUS = 2
-"""Keep blocks in memory while they are at most so many times those that a camera can see."""
+"""Maximum number of blocks in memory, as a multiple of those that a camera can see."""
 
 
 def read_header_and_tables(path: str | Path) -> Bundle:
     """Return a bundle with its tables and levels, but without splats.
 
     Raises:
-        LodgsError: as ``read_bundle``.
+        LodgsError: see ``read_bundle``.
     """
     return replace(read_header(path), tables=read_tables(path))
 
@@ -52,14 +52,14 @@ def read_part(
 
     Args:
         numbers: numbers of the levels.
-        region: region of the splats; None, or a file without a table of blocks: all splats.
-        warn: as for ``read_bundle``.
+        region: region of the splats. None reads all splats, and so does a file without a table of blocks.
+        warn: see ``read_bundle``.
 
     Returns:
         The bundle, and the number of bytes read.
 
     Raises:
-        LodgsError: as ``read_bundle``; unknown rule, if there is a region.
+        LodgsError: see ``read_bundle``; or there is a region, but the rule is unknown.
     """
     size = 0
 
@@ -94,7 +94,7 @@ def open_paged(path: str | Path) -> PagedFile:
     """Open a bundle whose rule allows reads of only the part that a camera needs.
 
     Raises:
-        LodgsError: as ``read_bundle``, or another rule.
+        LodgsError: see ``read_bundle``, or the rule allows no such reads.
     """
     name = read_header(path).rule
     paged_file = resolve_rule(name).paged_file
@@ -117,14 +117,14 @@ def open_if_large(path: str | Path, limit: int = 0) -> Bundle | None:
     """Open a bundle with more splats than a limit; its levels stay on disk.
 
     Args:
-        limit: number of splats; 0: MAX_IN_MEMORY.
+        limit: number of splats; 0 means MAX_IN_MEMORY.
 
     Returns:
         The bundle with its tables; None if it has at most ``limit`` splats, is another PLY, or has a rule
         that needs all splats or regions.
 
     Raises:
-        LodgsError: as ``read_bundle``.
+        LodgsError: see ``read_bundle``.
     """
     if not supports_culled_reads(read_header(path).rule):
         return None
@@ -140,7 +140,7 @@ class CulledReader:
     """Reads blocks of a level's splats that a camera can see. Reads all splats once to find their bounds.
 
     Args:
-        rows: rows of the level; blocks can be skipped only if they are sorted by space.
+        rows: rows of the level; blocks can be skipped only if rows are in spatial order.
         rule: rule of the levels, or None.
         path: file name for warnings.
 

@@ -29,7 +29,7 @@ class LodQuery:
         focal_px: focal length of the camera in pixels.
         facts, values: see ``rule.Rule.weights``, as pairs.
         tables: the rule's tables: name, columns by name, each as its dtype and bytes.
-        crops: the rule sees only splats that are inside these crops and not HIDDEN; None: all splats.
+        crops: the rule sees only splats that are inside these crops and not HIDDEN; None means all splats.
     """
 
     rule: str
@@ -197,7 +197,7 @@ class Pager(Protocol):
         """Request the pages that a query selects. Returns immediately.
 
         Args:
-            direction: (3,) of length 1, the view direction: pages outside the view come later; None: the
+            direction: (3,) of length 1, the view direction: pages outside the view come later; None means the
                 camera looks in all directions.
         """
 
@@ -255,7 +255,7 @@ class SplatSelector:
     Args:
         means: (N, 3).
         columns: (N,) by name, with OPACITY; missing ones count as zeros.
-        log_scales: (N, 3), to skip blocks; None: evaluate all splats.
+        log_scales: (N, 3), to skip blocks; None evaluates all splats.
     """
 
     def __init__(
@@ -277,7 +277,7 @@ class SplatSelector:
 
         Args:
             query: None: all splats have weight 1.
-            camera: skip blocks outside its image; None: keep them.
+            camera: skip blocks outside its image; None keeps them.
             near: depth where the camera's image begins.
         """
         if camera is not None:

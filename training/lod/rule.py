@@ -61,7 +61,7 @@ class Control:
         name: name in code, sockets, options and files.
         default: default value.
         low, high: minimum and maximum.
-        soft: range of the slider; None: a checkbox or a number field instead of a slider.
+        soft: range of the slider; None shows a checkbox or a number field instead of a slider.
         label, about: label and tooltip.
         unit: Blender's subtype of the property: "NONE", "PIXEL", "FACTOR".
         integer: only whole numbers are valid; with the range 0 to 1 the control is a checkbox.
@@ -161,8 +161,8 @@ class Rule(ABC):
         block_bounds: columns of the table of blocks (``blocks.BLOCKS``) besides ``level``, for partial reads
             of files: each is the reduction of a column over the rows of a block.
         relations: relations among splats that edits preserve.
-        paged_file: class of files (``query.PagedFile``) of which only a part is in memory; None: files are
-            read completely.
+        paged_file: class of files (``query.PagedFile``) of which only a part is in memory; None means that
+            files are read completely.
         plain_values: control values with which weights depend on distance alone.
         fade_factor: ratio of end to begin of the distances over which a level fades; 1 if it switches.
         sweep: a control and values of it that a report measures one by one; None for no such curve.
@@ -245,7 +245,7 @@ class Rule(ABC):
         return None
 
     def visible_in_region(self, columns: Mapping[str, np.ndarray], region: Region) -> np.ndarray:
-        """Return (N,) bool: splats of a level that may have a weight in a region."""
+        """Return a mask (N,) of the splats of a level that may have a weight in a region."""
         raise NotImplementedError("this rule has no regions")
 
     def region_label(self, position: np.ndarray, values: Values, tables: Tables) -> str:
@@ -302,7 +302,7 @@ class Rule(ABC):
         return self.full_detail_values((1,)) is not None
 
     def exceeds_budget(self, finest: int, budget: int) -> bool:
-        """Return whether a scene with so many splats in its finest level is paged for a memory budget."""
+        """Return whether a scene with ``finest`` splats in its finest level is paged for a memory budget."""
         return False
 
     @property

@@ -81,7 +81,7 @@ def resolve_controls(bundle: Bundle, changes: Values) -> Values:
     """Return a value for every control of a bundle's rule: changed, else the bundle's, else the default.
 
     Raises:
-        LodgsError: as :func:`require_rule`; unknown control, invalid value, or no level in use.
+        LodgsError: see :func:`require_rule`; unknown control, invalid value, or no level in use.
     """
     numbers = [level.number for level in bundle.levels]
     return require_rule(bundle).resolve_controls(changes, numbers, bundle.controls)
@@ -100,7 +100,7 @@ def select(
         values: values of the rule's controls, see :func:`resolve_controls`.
 
     Raises:
-        LodgsError: as :func:`require_rule`, or the rule's facts are incomplete.
+        LodgsError: see :func:`require_rule`, or the rule's facts are incomplete.
     """
     levels = select_levels(bundle, position, focal_px, values)
     splats = Splats.concatenated([level.splats for level in levels])
@@ -133,7 +133,7 @@ class BundleSelector:
     to nothing.
 
     Raises:
-        LodgsError: as :func:`require_rule`, or the rule's facts are incomplete.
+        LodgsError: see :func:`require_rule`, or the rule's facts are incomplete.
     """
 
     def __init__(self, bundle: Bundle) -> None:

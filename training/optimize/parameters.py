@@ -262,7 +262,7 @@ AS_PUBLISHED: dict[str, Any] = {
     "match_exposure": False,
     "dropout": 0.0,
 }
-"""Values of presets *paper* that disable additions to the papers. LODGE alone uses the filter."""
+"""Values of presets *paper* that disable additions to the papers. Only LODGE uses the filter."""
 PAPER: dict[str, Any] = AS_PUBLISHED | {
     "first_resolution": 1.0,
     "long_axis": False,

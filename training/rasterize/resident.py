@@ -251,7 +251,7 @@ class ResidentBundle:
         self._rule = check_rule(self.bundle)
         if self._path is not None:
             self.bundle = open_if_large(self._path, max_in_memory) or self.bundle
-        self._sights: dict[int, CulledReader] = {}
+        self._readers: dict[int, CulledReader] = {}
         self._row_bytes = 0
         self._facts: dict[int, tuple[tuple[str, float], ...]] = {}
         self._tables = tuple(
@@ -329,18 +329,18 @@ class ResidentBundle:
 
     def _read_visible(self, number: int, camera: Camera, query: LodQuery | None) -> SplatSet:
         """Read the splats of a level that a camera may see."""
-        if number not in self._sights:
+        if number not in self._readers:
             (level,) = (level for level in self.bundle.levels if level.number == number)
-            self._sights[number] = CulledReader(level.rows, self._rule, self._path or "", self._warn)
-        sight = self._sights[number]
-        missing = sight.missing(camera, query)
+            self._readers[number] = CulledReader(level.rows, self._rule, self._path or "", self._warn)
+        reader = self._readers[number]
+        missing = reader.missing(camera, query)
         if missing is not None:
             self._sets.pop(number, None)  # free it before reading the replacement
-            splats = sight.read(missing)
+            splats = reader.read(missing)
             self._sets[number] = SplatSet(splats, None, self._backend, ordered=True)
             self._row_bytes = Element.from_columns("", all_columns(splats)).dtype.itemsize
         self.loaded = sum(map(len, self._sets.values()))
-        self.bytes_read = self._row_bytes * sum(sight.splats_read for sight in self._sights.values())
+        self.bytes_read = self._row_bytes * sum(reader.splats_read for reader in self._readers.values())
         return self._sets[number]
 
     def _load(self, region: Region | None, numbers: frozenset[int]) -> None:

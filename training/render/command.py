@@ -77,7 +77,7 @@ class RenderSource:
 
         Args:
             name: photo's path in the scene, file name, or file name without suffix.
-            scene: folder of the COLMAP scene; None: the bundle's views, or the run's scene.
+            scene: folder of the COLMAP scene; None means the bundle's views, or the run's scene.
 
         Returns:
             The camera in the photo's size, relative to the local origin, and the depth of the near plane.
@@ -133,11 +133,11 @@ def render(
     Args:
         near: depth of the near plane.
         level: level to draw; 0 is the finest.
-        controls: select levels by distance, with these values of the rule's controls by name; None: draw
+        controls: select levels by distance, with these values of the rule's controls by name; None draws
             ``level``.
         background: display-coded; None is transparent.
-        holdout: EXR with the depth of meshes that hide splats, as for :func:`.image.read_depth`.
-        warn: as for :meth:`RenderSource.read`.
+        holdout: EXR with the depth of meshes that hide splats, see :func:`.image.read_depth`.
+        warn: see :meth:`RenderSource.read`.
 
     Returns:
         The loaded splats, with the number of bytes that were read.

@@ -158,7 +158,7 @@ def read_depth(path: Path, width: int, height: int, window: tuple[int, int, int,
 
     Args:
         width, height: size of the full image; the EXR may have the size of the window instead.
-        window: left, top, width and height of the part to return; None: all.
+        window: left, top, width and height of the part to return; None means all.
 
     Raises:
         LodgsError: the file cannot be read, has no depth, or has another size.

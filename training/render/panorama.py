@@ -34,7 +34,7 @@ def draw_panorama(
         draw: function that draws a side of the cube.
         camera: pose, width and height of the panorama.
         projection: angles at the edges of the panorama.
-        window: left, top, width and height of the part to draw; None: all.
+        window: left, top, width and height of the part to draw; None means all.
         image: image of that size to fill, with the passes to draw.
         progress: receives the completed share; returning False cancels.
 

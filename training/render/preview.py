@@ -51,8 +51,8 @@ def preview(
     Args:
         source: bundle, folder of levels or any 3DGS PLY.
         out: PNG to write.
-        warn: as for ``read_ply``.
-        views: cameras in the splats' space and their near depth; None: those of the bundle.
+        warn: see ``read_ply``.
+        views: cameras in the splats' space and their near depth; None means those of the bundle.
 
     Returns:
         One line for each kind of removed splats with their number in all levels, and one for the file.

@@ -99,7 +99,7 @@ def draw(
         background: display-coded colour behind the splats; None is transparent.
         depth: draw the depth pass.
         levels: draw the share of each pixel that each level covers.
-        window: left, top, width and height of the part of the image to draw in pixels; None: all.
+        window: left, top, width and height of the part of the image to draw in pixels; None means all.
         limit: (H, W) of the window, depth of meshes along the camera's z axis in the world, or NO_DEPTH;
             splats and background behind it are held out.
         orthographic: depth at which an orthographic camera and the pinhole camera show the same scale; None

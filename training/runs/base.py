@@ -36,7 +36,7 @@ def open_base(path: str | Path, warn: Warn = ignore) -> tuple[SplatRows, bool]:
 
     Args:
         path: run folder, folder of levels with a manifest, or PLY file.
-        warn: as for ``read_bundle``.
+        warn: see ``read_bundle``.
 
     Returns:
         The splats, and whether they are antialiased (``Bundle.antialias``).
@@ -61,7 +61,7 @@ def read_base_origin(path: str | Path) -> np.ndarray:
     """Return the local origin (3,) of a base.
 
     Raises:
-        LodgsError: as :func:`open_base`.
+        LodgsError: see :func:`open_base`.
     """
     return read_origin(_base_file(Path(path)))
 
@@ -70,7 +70,7 @@ def read_base_cameras(path: str | Path) -> tuple[list[Camera], float]:
     """Return the cameras that a base has in its tables, and their near depth; none in most PLY files.
 
     Raises:
-        LodgsError: as :func:`open_base`.
+        LodgsError: see :func:`open_base`.
     """
     path = _base_file(Path(path))
     return ([], 0.0) if path.is_dir() else read_view_tables(read_tables(path))[:2]
@@ -82,7 +82,7 @@ def base_origin(job: Job) -> np.ndarray | None:
     A base without an origin lies near 0, so its scene chooses the origin, except for captures of the base.
 
     Raises:
-        LodgsError: as :func:`open_base`.
+        LodgsError: see :func:`open_base`.
     """
     if not job.base:
         return None

@@ -121,7 +121,7 @@ def ensure_points(scene: Scene, job: Job, folder: RunFolder, report: Callable[..
         report: called with the kind and values of an event.
 
     Raises:
-        LodgsError: as ``triangulate_scene``.
+        LodgsError: see ``triangulate_scene``.
     """
     if len(scene.points):
         return scene
@@ -142,8 +142,8 @@ def _ignore(kind: str, **values: object) -> None:
 def _origin(job: Job, folder: RunFolder) -> np.ndarray | None:
     """Return the local origin of a job's scene, or None to choose it from the cameras.
 
-    A finished run can be evaluated without its base. The coarse run of cells, a base that does not exist
-    before training, has the scene's own origin.
+    A finished run can be evaluated without its base. The base of cells does not exist before training: it is
+    the coarse run, which has the scene's own origin.
     """
     if job.base and folder.bundle.exists() and not Path(job.base).exists():
         return read_header(folder.bundle).origin

@@ -81,7 +81,7 @@ class RunFolder:
         """Create the folder and its subfolders; a finished run needs none for checkpoints.
 
         Raises:
-            LodgsError: the folder cannot be written, or as ``reject_links``.
+            LodgsError: the folder cannot be written; or see ``reject_links``.
         """
         try:
             self.path.mkdir(parents=True, exist_ok=True)

@@ -456,14 +456,16 @@ def _interrupt_on_cancel(folder: RunFolder):
         # shells start background programs with SIGINT ignored
         previous = signal.signal(signal.SIGINT, signal.default_int_handler)
     watcher = threading.Thread(target=watch, daemon=True)
-    watcher.start()
     try:
+        watcher.start()
         yield
     finally:
-        finished.set()
-        watcher.join()
-        if previous is not None:
-            signal.signal(signal.SIGINT, previous)
+        try:
+            finished.set()
+            watcher.join()
+        finally:  # also if the interruption arrives while this waits
+            if previous is not None:
+                signal.signal(signal.SIGINT, previous)
 
 
 @contextmanager

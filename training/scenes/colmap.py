@@ -121,7 +121,7 @@ class Scene:
             default: value if there is no median depth either; None raises an error.
 
         Raises:
-            LodgsError: as :meth:`median_depth`.
+            LodgsError: see :meth:`median_depth`.
         """
         return camera_extent(self.cameras) or self.median_depth(default)
 
@@ -164,7 +164,7 @@ class Scene:
             default: value if no camera sees a point; None raises an error.
 
         Raises:
-            LodgsError: as :meth:`median_depth`.
+            LodgsError: see :meth:`median_depth`.
         """
         if default is not None and not np.isfinite(self._median_depth):
             return default

@@ -37,17 +37,6 @@ TURNS = (0, 60, -60, 180, 120, -120)
 """Headings of consecutive path views, in degrees from the path's direction; they cover a full turn."""
 
 
-def dome_views(splats: Splats, count: int, width: int = 960, height: int = 640) -> tuple[list[Camera], float]:
-    """Return views of splats from all directions on two shells, and their near depth.
-
-    The up direction is assumed, and the views look from outside.
-
-    Raises:
-        LodgsError: there is no opaque splat.
-    """
-    return dome_views_around(central_ball(opaque_means(splats)), count, width, height)
-
-
 def surrounding_views(
     points: np.ndarray, count: int, width: int = 960, height: int = 640
 ) -> tuple[list[Camera], float]:
@@ -112,7 +101,7 @@ def dome_views_around(
     up: tuple[float, float, float] = UP,
     lowest: float = -1.0,
 ) -> tuple[list[Camera], float]:
-    """Return views of a ball as :func:`dome_views`, and their near depth.
+    """Return views of a ball from all directions on two shells, and their near depth.
 
     Args:
         ball: center (3,) float64 and radius, see ``overview.central_ball`` and :func:`ball_of_corners`.
@@ -186,7 +175,7 @@ def walk_views(
         up: (3,) up direction of the images in the splats' world.
 
     Raises:
-        LodgsError: as :func:`views_along`, or if there is no opaque splat.
+        LodgsError: see :func:`views_along`, or if there is no opaque splat.
     """
     views = views_along(path, up, count, width, height)
     positions = np.array([view.center for view in views])

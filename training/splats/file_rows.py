@@ -62,7 +62,7 @@ class FileRows:
         """Read splats, drawable or not, and keep nothing of the file in memory.
 
         Raises:
-            LodgsError: as ``splats_from_rows``.
+            LodgsError: see ``splats_from_rows``.
         """
         splats = splats_from_rows(self.vertices[index], self.path, self.origin)
         if self.extras is not None:
@@ -113,6 +113,6 @@ def open_ply(path: str | Path) -> FileRows:
     """Open a plain PLY to read its splats in batches, without conversion.
 
     Raises:
-        LodgsError: as ``read_elements``.
+        LodgsError: see ``read_elements``.
     """
     return FileRows(read_elements(path)[0]["vertex"], None, path)

@@ -72,7 +72,7 @@ class ScratchFile:
         """Write splats after the last row.
 
         Raises:
-            LodgsError: as :meth:`write`.
+            LodgsError: see :meth:`write`.
         """
         self.write(len(self), splats)
 

@@ -26,7 +26,7 @@ def degree_from_count(count: int) -> int:
     """Return the degree of ``count`` coefficients per channel.
 
     Raises:
-        ValueError: no degree from 0 to 4 has so many coefficients.
+        ValueError: no degree from 0 to 4 has this number of coefficients.
     """
     for degree in range(MAX_DEGREE + 1):
         if coefficient_count(degree) == count:

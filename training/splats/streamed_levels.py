@@ -37,9 +37,9 @@ Unit: the radius that contains 90 % of the finest splats.
 LEAF_SPLATS = 1 << 14
 """Maximum number of splats of all levels in a leaf."""
 FILE_SPLATS = 1 << 17
-"""Number of splats from which on a level continues in another SOG."""
+"""Maximum number of splats of a SOG; larger levels have several."""
 _SIGMAS = 3.0
-"""Bounds of leaves include splats up to so many standard deviations."""
+"""Extent of a splat in the bounds of leaves, in standard deviations."""
 
 
 @dataclass

@@ -29,11 +29,11 @@ SCREEN_ERROR = 16.0
 _FAR = 1000.0
 """Distance up to which a scene is shown, in multiples of its diagonal."""
 _CORE = 3.0
-"""Splats beyond so many radii of the scene, and larger ones than that, are a cell of their own."""
+"""Radius of the core, in radii of the scene. Splats that extend beyond it share a cell."""
 _DERIVATIVE_STEP = 1.0
 """Half distance in metres of positions that determine the transform of their surroundings."""
 _SIGMAS = 3.0
-"""Boxes include splats up to so many standard deviations."""
+"""Extent of a splat in boxes, in standard deviations."""
 
 
 def write_tiles(folder: Path, levels: PortableLevels) -> None:

@@ -33,7 +33,7 @@ _FAR = 1e6
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 """From the axes of OpenCV's cameras to those of USD's."""
 _SIGMAS = 3.0
-"""Extents of levels include splats up to so many standard deviations."""
+"""Extent of a splat in the bounds of levels, in standard deviations."""
 _SECONDS = 600
 _MIN_FREE_BYTES = 1 << 16
 """Free space below which a failure is that of a full disk."""

@@ -189,7 +189,8 @@ def test_strokes_are_undone_one_by_one_and_saved(bpy, lodgs, scene_of, viewport,
 def test_selecting_updates_viewport_marks_but_not_splats(bpy, lodgs, scene_of, viewport):
     root, _ = scene_of(bundle_of("bands", np.random.default_rng(4)))
     clouds = [item.object.data for item in root.lodgs.levels]
-    store, changes = lodgs("viewport.resident").read_pool(clouds), lodgs("data.changes")
+    store = lodgs("viewport.resident").PoolReader(clouds).advance(clouds)
+    changes = lodgs("data.changes")
     store.update_marks(clouds)
     assert store.marks is None
     _, size = viewport

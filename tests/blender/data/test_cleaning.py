@@ -148,7 +148,8 @@ def test_viewport_draws_remaining_splats(bpy, lodgs, cropped, name):
     resident, arrangement = lodgs("viewport.resident"), lodgs("viewport.arrangement")
     selection, depsgraph = lodgs("data.selection"), bpy.context.evaluated_depsgraph_get()
     for item in root.lodgs.levels:
-        pool = resident.read_pool([item.object.data]).pool
+        clouds = [item.object.data]
+        pool = resident.PoolReader(clouds).advance(clouds).pool
         query = selection.evaluated_query(item.object.evaluated_get(depsgraph), depsgraph)
         count = len(item.object.data.points)
         placement = arrangement.Placement(0, count, np.eye(4).tobytes(), item.number, query, 0, "LEVELS")

@@ -133,12 +133,6 @@ def test_duplicate_root_is_removed_without_the_original(bpy, lodgs, root):
     assert data_names(bpy)["objects"] == before["objects"]
 
 
-def test_root_of_an_older_file_refers_to_itself(lodgs, root):
-    root.lodgs.itself = None
-    lodgs("data.older_files").upgrade_scene(root)
-    assert root.lodgs.itself == root
-
-
 def test_animated_cameras_are_removed_with_their_scene(bpy, lodgs, root):
     """Objects of the user are kept."""
     before = data_names(bpy)["objects"]

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from tests.blender.fake_trainer import splats
-from training.lod.colors import level_color
 from training.splats.bundle import write_bundle
+from training.splats.level_colors import level_color
 from training.splats.levels import Bundle, Level
 
 GARDEN = Path(__file__).resolve().parents[3] / "examples" / "lantern_garden"

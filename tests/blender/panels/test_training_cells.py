@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from tests.blender.panels.conftest import RecordingLayout
-from training.lod.colors import level_color
+from training.splats.level_colors import level_color
 
 pytestmark = pytest.mark.one_blender
 

@@ -5,22 +5,24 @@ import sys
 
 import pytest
 
+from tests.checkout import ROOT
 from tests.training.runs.test_new_job_key import checkout_with_key
 
 pytestmark = pytest.mark.one_blender
 
 
 SCRIPT = """
-import importlib
+import importlib, sys
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import MagicMock
-from tools.blender_module import EXTENSION, start_blender
+from tools import blender_module
 
-bpy = start_blender()
+blender_module.REPOSITORY = Path(sys.argv[1])
+bpy = blender_module.start_blender()
 
 def lodgs(name):
-    return importlib.import_module(f"{EXTENSION}.blender_lodgs.{name}")
+    return importlib.import_module(f"{blender_module.EXTENSION}.blender_lodgs.{name}")
 
 root = bpy.data.objects.new("root", None)
 bpy.context.scene.collection.objects.link(root)
@@ -43,8 +45,9 @@ assert "fog" in [call.args[1] for call in layout.prop.call_args_list]
 
 
 def test_new_key_has_a_property_and_is_in_jobs(bpy, tmp_path):
+    checkout = checkout_with_key(tmp_path / "checkout")
     process = subprocess.run(
-        [sys.executable, "-c", SCRIPT], cwd=checkout_with_key(tmp_path / "checkout"), capture_output=True,
-        text=True, check=False, timeout=600,
+        [sys.executable, "-c", SCRIPT, checkout], cwd=ROOT, capture_output=True, text=True, check=False,
+        timeout=600,
     )  # fmt: skip
     assert process.returncode == 0, process.stdout + process.stderr

@@ -60,7 +60,7 @@ def test_frames_of_cell_cameras_match_their_views(lodgs, root):
 
 
 def test_cells_have_colours_and_the_active_one_is_filled(lodgs, root, draw_cells):
-    settings, color = root.lodgs.training, lodgs("training.lod.colors").level_color
+    settings, color = root.lodgs.training, lodgs("training.splats.level_colors").level_color
     image = draw_cells()
     inside = {1: image[32, 20, :3], 2: image[32, 44, :3]}
     assert inside[1].any() and not inside[2].any(), "only the active cell is filled"

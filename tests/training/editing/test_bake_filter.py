@@ -30,7 +30,7 @@ def view(name: str, position: tuple, times: int = 1) -> Camera:
     return Camera(name, width, height, times * FOCAL, times * FOCAL, width / 2, height / 2, pose)
 
 
-EYES = {"a": (4, 0, 0), "b": (4, 2, 1), "c": (4, -2, 0.5), "d": (5, 0.5, 1)}
+POSITIONS = {"a": (4, 0, 0), "b": (4, 2, 1), "c": (4, -2, 0.5), "d": (5, 0.5, 1)}
 
 
 @pytest.fixture
@@ -43,7 +43,7 @@ def bundle() -> Bundle:
         sizes.astype(np.float32), rng.normal(1, 1, count).astype(np.float32),
         rng.normal(0, 1, (count, 1, 3)).astype(np.float32),
     )  # fmt: skip
-    views = [view(name, position, 3) for name, position in EYES.items()]
+    views = [view(name, position, 3) for name, position in POSITIONS.items()]
     meta = {"antialias": True, "focal_px": FOCAL}
     return Bundle("3dgs", [Level(1, splats)], meta=meta, tables=make_view_tables(views, 0.05))
 
@@ -51,7 +51,7 @@ def bundle() -> Bundle:
 def error(selected: Bundle, truth: Bundle) -> float:
     """Return the mean absolute difference of images at training size."""
     separate = []
-    for name, position in EYES.items():
+    for name, position in POSITIONS.items():
         images = [
             rasterize(
                 Gaussians.of(first.levels[0].rows.select(slice(None))), view(name, position), near=0.05,
@@ -64,16 +64,16 @@ def error(selected: Bundle, truth: Bundle) -> float:
 
 
 def test_baked_images_resemble_filtered_images(bundle):
-    untold = replace(bundle, meta={})
+    unmarked = replace(bundle, meta={})
     result = bake_filter(bundle)
     assert not result.antialias and result.tables == bundle.tables
-    assert error(result, bundle) < 0.4 * error(untold, bundle)
+    assert error(result, bundle) < 0.4 * error(unmarked, bundle)
     assert bundle.antialias, "the source is unchanged"
 
 
 def test_opacities_match_the_filter_in_one_view(bundle):
     """Compare with the alpha at the centre of a single rendered splat."""
-    position = EYES["a"]
+    position = POSITIONS["a"]
     single = replace(bundle, tables=make_view_tables([view("a", position, 3)], 0.05))
     result = bake_filter(single).levels[0].rows.select(np.array([1, 4, 900]))
     trained = bundle.levels[0].splats.select(np.array([1, 4, 900]))

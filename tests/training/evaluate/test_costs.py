@@ -6,7 +6,7 @@ from PIL import Image
 
 from training.evaluate import costs
 from training.evaluate.costs import cost_curves, cost_lines, write_cost_plot
-from training.lod.colors import level_color
+from training.splats.level_colors import level_color
 
 CURVES = [
     {"level": 2, "distances": [4.0, 10.0, 16.0], "costs": [812.0, 301.2, 400.0], "before": 830.4},

@@ -17,7 +17,7 @@ from training.splats.level_folder import read_folder, write_folder
 from training.splats.levels import Bundle, Level
 
 ROOT = Path(__file__).parents[3]
-EYES = ((0, 0, 0), (1.5, -2, 3), (9, 0, 1), (40.25, 3, -8), (-3000, 0, 0))
+POSITIONS = ((0, 0, 0), (1.5, -2, 3), (9, 0, 1), (40.25, 3, -8), (-3000, 0, 0))
 FOCAL = (60.0, 500.0, 1333.3)
 CHOICES = {
     "bands": [{}, {"gamma": 0.3}, {"gamma": 4, "first": 1}, {"first": 2, "last": 4}, {"first": 1, "last": 1}],
@@ -269,7 +269,7 @@ def test_selection_from_the_documentation_matches(name, write_named):
     page, bundle = Page(path), (read_folder if path.is_dir() else read_bundle)(path)
     assert page.rule == bundle.rule and page.numbers == [level.number for level in bundle.levels]
     drawn = 0
-    for position in EYES:
+    for position in POSITIONS:
         for f in FOCAL:
             for values in CHOICES[page.rule]:
                 theirs = page.weights(position, f, values)

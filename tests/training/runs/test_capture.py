@@ -19,11 +19,13 @@ from training.runs.job import Job
 from training.scenes.cameras import read_camera_folder, write_camera
 from training.scenes.colmap import read_scene
 from training.scenes.images import load_image
+from training.scenes.overview import central_ball
 from training.scenes.view_tables import make_view_tables
 from training.scenes.viewpoints import (
     aerial_views,
     close_views,
-    dome_views,
+    dome_views_around,
+    opaque_means,
     surrounding_views,
     walk_views,
 )
@@ -45,6 +47,10 @@ def ball() -> Splats:
         np.full((600, 3), np.log(0.12), np.float32), np.full(600, 4.0, np.float32),
         rng.normal(0, 1, (600, 1, 3)).astype(np.float32),
     )  # fmt: skip
+
+
+def dome_views(splats: Splats, count: int, width: int = 960, height: int = 640):
+    return dome_views_around(central_ball(opaque_means(splats)), count, width, height)
 
 
 def test_dome_views_surround_all_splats_except_outliers(ball):

@@ -76,7 +76,7 @@ def test_rows_of_earlier_evaluations_with_other_controls_are_kept(finished):
     assert len(evaluate_run(run, {"gamma": 2.0})["selective"]) == 2
     bundle = RunFolder(run).bundle
     os.utime(bundle, (bundle.stat().st_atime, RunFolder(run).metrics.stat().st_mtime + 10))
-    assert len(evaluate_run(run, {"gamma": 50.0})["selective"]) == 2  # of another bundle
+    assert len(evaluate_run(run, {"gamma": 50.0})["selective"]) == 2  # rows of an older bundle are dropped
 
 
 def test_large_tree_measured_in_parts_gives_the_same_report(finished, splats, tmp_path, monkeypatch):

@@ -1,12 +1,12 @@
 """A job key is added by its declaration alone: see "Add a job key" in CONTRIBUTING."""
 
 import json
-import shutil
 import subprocess
 import sys
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[3]
+from tests.checkout import copy_checkout
+
 KEY = """
     fog: float = setting(
         0.5, "Density of the fog.", low=0.25, high=2, soft=(None, 1), unit="px", panel="Advanced"
@@ -15,10 +15,10 @@ KEY = """
 SCRIPT = """
 import argparse, json, sys
 from pathlib import Path
-from tools import tables
 from training.cli.job_options import add_options, job_from_options, options_of
 from training.errors import LodgsError
 from training.runs.job import Job
+from tools import tables  # last: it puts the original checkout on the path
 
 parser = argparse.ArgumentParser()
 add_options(parser)
@@ -37,10 +37,8 @@ print(json.dumps({
 
 def checkout_with_key(folder: Path) -> Path:
     """Copy the checkout, with KEY added to the declaration of jobs."""
-    for name in ("training", "blender_lodgs", "tools"):
-        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
-    for name in ("__init__.py", "blender_manifest.toml"):
-        shutil.copy(ROOT / name, folder)
+    folder.mkdir()
+    copy_checkout(folder, "training")
     declaration = folder / "training" / "runs" / "job.py"
     before, marker, after = declaration.read_text().partition("    parameters: dict = ")
     declaration.write_text(before + KEY.lstrip("\n") + marker + after)

@@ -81,7 +81,7 @@ def test_folder_has_levels_viewer_and_cameras(bundle, tmp_path):
     np.testing.assert_allclose(forward / np.linalg.norm(forward), [0, 0, 1], atol=1e-6)
     assert pose["fov"] == pytest.approx(degrees(2 * atan(16 / 9 * 24 / 60)))
     assert page["settings"]["annotations"][0]["title"] == "<first>.jpg" and "<first>" not in text
-    write_page(bundle, tmp_path / "out", backend="cpu")  # replaces it
+    write_page(bundle, tmp_path / "out", backend="cpu")  # replaces the page
     assert {path.name for path in tmp_path.iterdir()} == {"garden", "out", "viewer"}
 
 
@@ -120,7 +120,7 @@ def test_errors_name_the_cause_and_leave_nothing(bundle, tmp_path, viewer, monke
     (tmp_path / "other" / "thesis.txt").touch()
     with pytest.raises(LodgsError, match="other files"):
         write_page(bundle, tmp_path / "other")
-    (tmp_path / "other" / "index.html").touch()  # a page of somebody else
+    (tmp_path / "other" / "index.html").touch()  # another page
     with pytest.raises(LodgsError, match="other files"):
         write_page(bundle, tmp_path / "other")
     with pytest.raises(LodgsError, match="not a folder"):

@@ -77,6 +77,7 @@ def test_resumed_run_does_not_repeat_and_has_the_same_bits(walls, tmp_path, monk
     def stop(message):
         if message.startswith("Training on"):
             run.request_cancel()
+            time.sleep(1000)  # the request interrupts it
 
     assert train(walls, run.path, stop)[0] == training_loop.CANCELLED
     code, messages = train(walls, run.path)

@@ -468,24 +468,24 @@ def test_finished_run_deletes_checkpoints_and_repeats_its_final_event(uninterrup
 
 
 @pytest.mark.parametrize("handler", [signal.default_int_handler, signal.SIG_IGN])
-def test_cancel_works_while_the_trainer_starts(uninterrupted, tmp_path, monkeypatch, handler):
-    """Also in a shell's background, where programs start with Ctrl-C ignored."""
+@pytest.mark.parametrize("early", [True, False])
+def test_cancel_works_while_the_trainer_starts(uninterrupted, tmp_path, monkeypatch, handler, early):
+    """Also before the trainer locks the run, and in a shell's background, which ignores Ctrl-C."""
     keys = {**uninterrupted["keys"], "out": str(tmp_path / "run")}
     folder = RunFolder(keys["out"])
     folder.create()
-    # interrupted compilers and imports may crash this process later, which a trainer has ended by then
-    monkeypatch.setattr(training_loop, "warm_up", lambda *_: time.sleep(1000))
-    folder.request_cancel()  # before the trainer locked the run
-    assert run_in_process(keys)[0] == training_loop.CANCELLED and folder.state() == "cancelled"
-
-    def slow(*_):
+    if early:
         folder.request_cancel()
-        time.sleep(1000)
 
-    monkeypatch.setattr(training_loop, "warm_up", slow)
+    def read_slowly(*_, **__):  # an interrupted compiler or import may crash this process later
+        if not early:
+            folder.request_cancel()
+        time.sleep(100)
+
+    monkeypatch.setattr(training_loop, "training_data", read_slowly)
     previous = signal.signal(signal.SIGINT, handler)
     try:
-        assert run_in_process(keys)[0] == training_loop.CANCELLED
+        assert run_in_process(keys)[0] == training_loop.CANCELLED and folder.state() == "cancelled"
         assert signal.getsignal(signal.SIGINT) is handler
     finally:
         signal.signal(signal.SIGINT, previous)

@@ -1,4 +1,4 @@
-"""Compressed splat files that promise or unpack to more than they hold; layouts as their formats document."""
+"""Compressed splat files whose declared or unpacked size is wrong; layouts follow the formats' documents."""
 
 import gzip
 import io

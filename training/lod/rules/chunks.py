@@ -189,7 +189,7 @@ def _ends(facts: Mapping[str, float]) -> tuple[float, float]:
 
 
 def in_chunk(columns: Mapping[str, np.ndarray], chunk: int) -> np.ndarray:
-    """Return (N,) bool: splats in the set of a chunk."""
+    """Return a mask (N,) of the splats in the set of a chunk."""
     bits = columns[MEMBER_COLUMNS[chunk // BITS]].astype(np.int32)
     bits &= 1 << (chunk % BITS)
     return bits != 0

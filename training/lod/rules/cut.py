@@ -10,10 +10,10 @@ import numpy as np
 
 from ...scenes.view_tables import VIEW_TABLES
 from ...splats.gaussians import Splats
+from ...splats.level_colors import LEVEL_COLORS
 from ...splats.levels import MAX_LEVELS, Bundle, Level
 from ...splats.ply import Columns
 from ...splats.similarity import Similarity
-from ..colors import LEVEL_COLORS
 from ..rule import (
     MIN_SPLATS,
     NO_COLUMNS,

@@ -40,7 +40,7 @@ def detail_of(focal_px: float, pixels: float) -> float:
 def is_fine_enough(
     axes: Sequence[np.ndarray], sizes: np.ndarray, position: np.ndarray, k: float
 ) -> np.ndarray:
-    """Return (N,) bool: nodes that are fine enough, ‖c - μ‖ >= k size.
+    """Return a mask (N,) of the nodes that are fine enough, ‖c - μ‖ >= k size.
 
     All operations are float32, so that a node gives the same bits as itself and as a parent.
 

@@ -61,7 +61,7 @@ class TreeFile:
         total: number of splats in the file.
 
     Raises:
-        LodgsError: as ``open_bundle``.
+        LodgsError: see ``open_bundle``.
     """
 
     def __init__(self, path: Path) -> None:
@@ -142,7 +142,7 @@ class TreeFile:
 
         Args:
             budget: maximum number of splats.
-            position: (3,) of a camera to read for; None: for any.
+            position: (3,) of a camera to read for; None means any camera.
             k: the camera's detail (``detail_of``); if the budget suffices, its cut equals the full tree's.
 
         Raises:
@@ -297,7 +297,7 @@ class TreePager:
         """Read the next pages for a camera; return None if there are none. The thread calls this repeatedly.
 
         Args:
-            position: (3,) in the splats' space; None: unknown, read the first pages of the file.
+            position: (3,) in the splats' space; None means unknown: the first pages of the file.
             k: detail, see ``detail_of``.
             direction: see :func:`page_order`.
         """

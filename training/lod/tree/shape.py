@@ -155,7 +155,7 @@ class UniqueSizes:
         return sizes
 
     def _is_free(self, keys: np.ndarray) -> np.ndarray:
-        """Return (N,) bool: keys that are neither taken nor repeated from an earlier row."""
+        """Return a mask (N,) of the keys that are neither taken nor repeated from an earlier row."""
         free = np.zeros(len(keys), bool)
         free[np.unique(keys, return_index=True)[1]] = True
         for keys_taken in self._taken:

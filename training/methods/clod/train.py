@@ -128,7 +128,7 @@ class Method(SplatMethod):
         normalized = self._distances_from(camera) / (self.far_distance(camera) if far is None else far)
         falloff = attenuation(normalized, self.sigma, s_v)
         logits = self.model["opacity_logits"]
-        if not self.parameters.count_opacities:  # images alone decide how a splat looks
+        if not self.parameters.count_opacities:  # only images decide how a splat looks
             logits = logits.detach()
         opacities = logits.sigmoid() * falloff
         return falloff, opacities, opacities > self.parameters.tau * s_v

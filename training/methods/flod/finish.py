@@ -19,6 +19,7 @@ import torch
 from ...lod.rule import Values, collect_facts
 from ...lod.rules.bands import RULE
 from ...optimize.model import Model
+from ...optimize.parameters import Parameters
 from ...optimize.pruning import importance_threshold, log_scale_gain
 from ...optimize.training_data import TrainingData
 from ...rasterize import Gaussians, contributions
@@ -26,7 +27,6 @@ from ...rasterize.adam import LearningRate
 from ...scenes.cameras import Camera, pick_evenly
 from ...splats.levels import Level
 from ...splats.morton import spatial_order
-from . import FlodParameters
 
 LEVEL = "level"
 """Column with the level number of each row; levels are consecutive, coarse to fine."""
@@ -64,19 +64,20 @@ def restart_levels(
     numbers: Sequence[int],
     s_min: Sequence[float],
     data: TrainingData,
-    parameters: FlodParameters,
+    parameters: Parameters,
+    drawn: float,
     gamma: float,
     backend: str,
 ) -> dict[int, dict[str, torch.Tensor]]:
     """Restart levels with the most important splats of the finest level.
 
     Importance is a splat's maximum share of a pixel. The levels get as many splats as views by distance
-    may draw, ``drawn`` of those of the finest level. Views include the margins, so that margin splats
-    count.
+    may draw. Views include the margins, so that margin splats count.
 
     Args:
         levels: see :func:`join_levels`.
         numbers: levels to restart, coarse to fine, the last one before the finest.
+        drawn: number of splats that views by distance may draw, as a fraction of those of the finest level.
         gamma: screen size for the selection of levels.
 
     Returns:
@@ -104,9 +105,8 @@ def restart_levels(
     finest_views = _count_views(tensors["means"], finest, s_min, data, {**values, "first": finest})
     own_views = np.concatenate([views[number] for number in numbers])
     other_splats = sum(int(counts.sum()) for number, counts in views.items() if number not in numbers)
-    max_views = max(p.drawn * finest_views.sum() - other_splats, MIN_SHARE * own_views.sum())
+    max_views = max(drawn * finest_views.sum() - other_splats, MIN_SHARE * own_views.sum())
     threshold = importance_threshold(np.concatenate(list(first.values())), own_views, max_views)
-
     restarted = {}
     for number in numbers:
         keep = first[number] >= threshold

@@ -333,7 +333,7 @@ class Method(method.Method[FlodParameters, Drawing]):
         fine = [number for number in levels if 0 < self.s_min[number - 1] <= max_size]
         if fine and not p.merges:
             gamma = self.controls["gamma"]
-            levels |= finish.restart_levels(levels, fine, self.s_min, data, p, gamma, self.backend)
+            levels |= finish.restart_levels(levels, fine, self.s_min, data, p, p.drawn, gamma, self.backend)
         self.model = finish.join_levels(levels, refining_rates(p, data.extent, 0.0))
 
     def _from_points(self, level: int) -> dict[str, torch.Tensor]:

@@ -113,7 +113,7 @@ class Method(octree_neural.Method):
         """Start a level from the one before: same scales, a smaller constraint, new optimizers (Eq. 5).
 
         Its finer voxels get anchors at the scene's points where they have none. Gaussians that the level
-        before disabled start anew, because their anchor keeps its voxel from others.
+        before disabled restart, because their anchor keeps its voxel from others.
         """
         rows = {name: tensor.detach() for name, tensor in self._next_tensors(self.s_min[number - 1]).items()}
         if self.parameters.direct:

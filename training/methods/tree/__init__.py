@@ -17,7 +17,7 @@ class TreeParameters(SplatParameters):
     sky_points: int = setting(
         0,
         "Number of additional points on a sphere around the scene, for outdoor scenes whose points do not "
-        "cover the sky. They count beside 'max_splats'. A base has none.",
+        "cover the sky. 'max_splats' does not count them. A base has none.",
         high=1_000_000,
         label="Sky Points",
     )

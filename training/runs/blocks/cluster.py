@@ -22,7 +22,7 @@ from ...files import atomic_write
 PORT = 8786
 """Port of a scheduler; Dask's default."""
 NO_HTTP = {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
-"""Dask configuration without pages. Dask opens its HTTP servers in any case."""
+"""Dask configuration without web pages. Dask opens its HTTP servers even without pages."""
 _HTTP_ADDRESS = "127.0.0.1:0"
 _MAX_KEY_BYTES = 1 << 16
 _COMMENT = "# Key of a LODGS cluster. Keep it secret: it permits running programs on all its computers."
@@ -43,7 +43,7 @@ def import_dask() -> Any:
         name = "Dask" if error.name == "distributed" else f"The package {error.name}"
         raise LodgsError(
             f"{name} is not installed in {sys.executable}.",
-            'Install it with: pip install "lodgs[cluster]", or train on: here.',
+            'Install it with: pip install "lodgs[cluster]", or train with --on here.',
         ) from None
     return distributed
 
@@ -92,7 +92,7 @@ def read_key_file(path: Path) -> tuple[str, Any]:
 
 
 def write_key_file(path: Path, address: str, security: Any) -> None:
-    """Write a key file that only its owner can read; arguments as the results of `read_key_file`."""
+    """Write a key file that only its owner can read; see `read_key_file` for the arguments."""
     text = "\n".join([_COMMENT, address, security.tls_scheduler_key + security.tls_scheduler_cert])
     with atomic_write(path) as temporary:
         descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)

@@ -255,7 +255,7 @@ def write_plan(
         add_points: adds points to a scene without points.
 
     Raises:
-        LodgsError: as :func:`plan`, or the folder cannot be written.
+        LodgsError: see :func:`plan`, or the folder cannot be written.
     """
     if not folder.blocks.exists():
         scene = scene or read_planned_scene(job, add_points)

@@ -144,7 +144,7 @@ def measure_run(
         lpips: archive of the networks' weights, see ``evaluate.lpips.load_lpips``.
 
     Raises:
-        LodgsError: as ``evaluate_run``.
+        LodgsError: see ``evaluate_run``.
     """
     folder = RunFolder(run)
     job = Job.from_file(folder.job)

@@ -81,7 +81,7 @@ def reproduce(
     warn: Warn = ignore,
     notify: Callable[[str], object] = ignore,
 ) -> str:
-    """Train what tables of a paper need, measure it, and write ``tables.md`` and ``tables.json``.
+    """Train the runs behind tables of a paper, measure them, and write ``tables.md`` and ``tables.json``.
 
     Args:
         name: one of PAPERS.

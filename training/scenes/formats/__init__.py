@@ -112,7 +112,7 @@ def ensure_colmap_scene(folder: Path, warn: Callable[[str], object]) -> Path:
     """Convert another program's export in place unless the folder is a COLMAP scene, and return the folder.
 
     Raises:
-        LodgsError: as :func:`convert_export`.
+        LodgsError: see :func:`convert_export`.
     """
     if folder.is_dir() and not find_models(folder) and find_exports(folder):
         for message in convert_export(folder).warnings:
@@ -217,7 +217,7 @@ def _read_model_without_points(folder: Path) -> ExportedScene:
     """Return the views of a COLMAP scene.
 
     Raises:
-        LodgsError: as ``read_scene``, or the scene has points.
+        LodgsError: see ``read_scene``, or the scene has points.
     """
     scene = read_scene(folder)
     if len(scene.points):

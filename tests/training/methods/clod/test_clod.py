@@ -100,7 +100,7 @@ def test_initial_decays_follow_importance(data):
     )
     means = clod.model["means"].detach().numpy().copy()
     clod.begin_decay()
-    # the most important splats remain, so many that views draw 74 % of the splats before
+    # the most important splats remain; views draw 74 % of the previous number of splats
     remaining = torch.from_numpy((means[:, None] == clod.model["means"].detach().numpy()[None]).all(2).any(1))
     views, importance = contribution.views.double(), contribution.total / contribution.views.clamp_min(1)
     assert importance[remaining].min() >= importance[~remaining].max()

@@ -258,9 +258,8 @@ def test_enlarged_splats_become_fainter(data):
     finest["log_scales"] -= torch.tensor([6.0, 5.0, 7.0])
     for antialias in (True, False):
         p = replace(flod.parameters, antialias=antialias)
-        restarted = finish.restart_levels(levels, [1, 2], flod.s_min, data, p, flod.controls["gamma"], "cpu")[
-            2
-        ]
+        gamma = flod.controls["gamma"]
+        restarted = finish.restart_levels(levels, [1, 2], flod.s_min, data, p, p.drawn, gamma, "cpu")[2]
         row_of_mean = {tuple(mean): row for row, mean in enumerate(finest["means"].tolist())}
         rows = [row_of_mean[tuple(mean)] for mean in restarted["means"].tolist()]
         trained_scales, enlarged_scales = (

@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.training.lod.tree.trees import random_tree, surfaces
+from tests.training.methods.tree.sequential_tree import SequentialPointTree
 from training.lod.rule import rules
 from training.lod.tree.shape import Tree
 from training.methods.tree.build import build
-from training.methods.tree.sequential_point_tree import SequentialPointTree
 from training.rasterize import Gaussians, rasterize
 from training.rasterize.cpu.compile import set_thread_count, thread_count
 from training.scenes.cameras import Camera, look_at

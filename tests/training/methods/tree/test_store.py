@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from tests.training.lod.tree.trees import surfaces
+from tests.training.methods.tree.sequential_tree import SequentialPointTree
 from tests.training.methods.tree.test_sequential_point_tree import cameras
 from training.errors import LodgsError
 from training.lod.tree.forest import forest_shape, max_subtree_leaves, merge_forest, split_tree
 from training.methods.tree import store as store_module
 from training.methods.tree.build import build
-from training.methods.tree.sequential_point_tree import SequentialPointTree
 from training.methods.tree.store import NodeStore, record_layout
 from training.optimize.out_of_core.cut_cache import INDEX_BYTES, SLOT_BYTES
 from training.optimize.out_of_core.row_file import BLOCK, TABLE_BYTES

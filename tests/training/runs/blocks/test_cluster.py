@@ -1,4 +1,4 @@
-"""Encrypted Dask clusters: nobody without the key can use or watch them."""
+"""Encrypted Dask clusters: using or watching them requires the key."""
 
 import os
 import socket
