@@ -53,7 +53,7 @@ def merge(splats: Splats, count: int) -> Splats:
     moments = np.concatenate([means, covariances, masses[:, None], colors], axis=1)
     members = np.arange(len(splats))
     while len(moments) > count:
-        first, second = _cheapest_pairs(moments, len(moments) - count)
+        first, second = cheapest_pairs(moments, len(moments) - count)
         moments[first] = merge_pairs(moments[first], moments[second])
         remaining = np.ones(len(moments), bool)
         remaining[second] = False
@@ -121,7 +121,7 @@ def shapes_of_moments(
     return quats, log_scales, logit(opacities).astype(np.float32)
 
 
-def _cheapest_pairs(moments: np.ndarray, limit: int) -> tuple[np.ndarray, np.ndarray]:
+def cheapest_pairs(moments: np.ndarray, limit: int) -> tuple[np.ndarray, np.ndarray]:
     """Return rows (M,) and their larger partners (M,): disjoint pairs of least cost, 1 to ``limit``."""
     count = len(moments)
     _, neighbours = KDTree(moments[:, :3]).query(moments[:, :3], min(NEIGHBOURS + 1, count), workers=-1)
@@ -129,7 +129,8 @@ def _cheapest_pairs(moments: np.ndarray, limit: int) -> tuple[np.ndarray, np.nda
     for part in _batches(count, NEIGHBOURS):
         rows = np.arange(count)[part]
         others = np.asarray(neighbours)[part]
-        pair_costs = _costs(moments, np.minimum(rows[:, None], others), np.maximum(rows[:, None], others))
+        first, second = np.minimum(rows[:, None], others), np.maximum(rows[:, None], others)
+        pair_costs = merge_errors(moments, first, second)
         pair_costs[others == rows[:, None]] = np.inf
         best = pair_costs.argmin(axis=1)[:, None]
         partners[part] = np.take_along_axis(others, best, 1)[:, 0]
@@ -147,8 +148,8 @@ def _cheapest_pairs(moments: np.ndarray, limit: int) -> tuple[np.ndarray, np.nda
     return np.minimum(chosen, partners[chosen]), np.maximum(chosen, partners[chosen])
 
 
-def _costs(moments: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the costs of merging rows ``first`` with rows ``second``."""
+def merge_errors(moments: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return the errors of merging rows ``first`` with rows ``second``: areas, times an optical depth."""
     log_areas = _log_areas(moments)
     a, b = moments[first], moments[second]
     merged = merge_pairs(a[..., :10], b[..., :10])
