@@ -78,7 +78,7 @@ def method_in(folder: Path, options: argparse.Namespace) -> Method:
     )
     data.__dict__["near"] = near
     numbers = {"tune_steps": options.steps, "resize_interval": options.steps - AFTER, "grow_interval": 0}
-    values = numbers | {"pixels": options.pixels, "lod_noise": 0.0, "sh_degree": 0}
+    values = numbers | {"pixels": options.pixels, "lod_noise": 0.0, "octaves": 0.0, "sh_degree": 0}
     parameters = override(method_info("tree").preset("draft"), values)
     assert isinstance(parameters, TreeParameters)
     empty = [np.zeros((2, *shape), np.float32) for shape in ((3,), (4,), (3,), (), (1, 3))]

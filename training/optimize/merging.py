@@ -54,7 +54,7 @@ def merge(splats: Splats, count: int) -> Splats:
     moments = np.concatenate([means, covariances, masses[:, None], colors], axis=1)
     members = np.arange(len(splats))
     while len(moments) > count:
-        first, second = _cheapest_pairs(moments, len(moments) - count)
+        first, second = cheapest_pairs(moments, len(moments) - count)
         moments[first] = merge_pairs(moments[first], moments[second])
         remaining = np.ones(len(moments), bool)
         remaining[second] = False
@@ -122,7 +122,7 @@ def shapes_of_moments(
     return quats, log_scales, logit(opacities).astype(np.float32)
 
 
-def _cheapest_pairs(moments: np.ndarray, limit: int) -> tuple[np.ndarray, np.ndarray]:
+def cheapest_pairs(moments: np.ndarray, limit: int) -> tuple[np.ndarray, np.ndarray]:
     """Return rows (M,) and their larger partners (M,): disjoint pairs of least cost, 1 to ``limit``."""
     count = len(moments)
     _, neighbours = query_neighbours(KDTree(moments[:, :3]), moments[:, :3], min(NEIGHBOURS + 1, count))
@@ -133,7 +133,7 @@ def _cheapest_pairs(moments: np.ndarray, limit: int) -> tuple[np.ndarray, np.nda
         rows = np.arange(count)[part]
         others = neighbours[part]
         first, second = np.minimum(rows[:, None], others), np.maximum(rows[:, None], others)
-        pair_costs = _costs(columns, log_areas, first, second)
+        pair_costs = _merge_errors(columns, log_areas, first, second)
         pair_costs[others == rows[:, None]] = np.inf
         best = pair_costs.argmin(axis=1)[:, None]
         partners[part] = np.take_along_axis(others, best, 1)[:, 0]
@@ -151,8 +151,14 @@ def _cheapest_pairs(moments: np.ndarray, limit: int) -> tuple[np.ndarray, np.nda
     return np.minimum(chosen, partners[chosen]), np.maximum(chosen, partners[chosen])
 
 
-def _costs(moments: np.ndarray, log_areas: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the costs of merging columns ``first`` of moments (C, N) with columns ``second``.
+def merge_errors(moments: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return the errors of merging rows ``first`` with rows ``second``: areas, times an optical depth."""
+    columns = np.ascontiguousarray(moments.T)
+    return _merge_errors(columns, _log_areas(columns[3:9]), first, second)
+
+
+def _merge_errors(moments: np.ndarray, log_areas: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return the errors of merging columns ``first`` of moments (C, N) with columns ``second``.
 
     Args:
         log_areas: :func:`_log_areas` of all columns.

@@ -24,7 +24,10 @@ _KEYS = (PARENT_SIZE, *PARENT)
 
 
 class Forest(Protocol):
-    """A tree of splats: subtrees, and an upper tree whose leaves are the subtrees' roots, in order."""
+    """A tree of splats: subtrees, and an upper tree whose leaves are the subtrees' roots, in order.
+
+    The column NODE_SIZE of the splats, if any, has the errors of ``shape.own_sizes``.
+    """
 
     def __iter__(self) -> Iterator[Piece]:
         """Iterate over the subtrees, sorted by space: the 2N - 1 nodes and the tree of each.
@@ -224,7 +227,9 @@ def build_levels(forest: Forest, folder: Path) -> tuple[list[Level], Columns]:
     files = {number: _LevelFile(folder) for number in (NODES, LEAVES)}
     roots, locations, unique = [], [], UniqueSizes()
     for splats, tree in forest:
-        columns = tree.columns(splats.means, unique.sizes(tree, splats.means, splats.log_scales))
+        errors = splats.extras.get(NODE_SIZE)
+        sizes = unique.sizes(tree, splats.means, splats.log_scales, errors=errors)
+        columns = tree.columns(splats.means, sizes)
         splats = replace(splats, extras=columns)
         roots.append(splats.select([-1]))  # a copy: a view would keep them all
         files[LEAVES].append(splats.select(slice(0, tree.leaves)))
@@ -235,7 +240,10 @@ def build_levels(forest: Forest, folder: Path) -> tuple[list[Level], Columns]:
     root_splats = Splats.concatenated(roots)
     means = np.concatenate([root_splats.means, upper_splats.means])
     log_scales = np.concatenate([root_splats.log_scales, upper_splats.log_scales])
-    sizes = unique.sizes(upper, means, log_scales, root_splats.extras[NODE_SIZE])
+    errors = upper_splats.extras.get(NODE_SIZE)
+    if errors is not None:
+        errors = np.append(np.zeros(len(roots), np.float32), errors)
+    sizes = unique.sizes(upper, means, log_scales, root_splats.extras[NODE_SIZE], errors)
     columns = upper.columns(means, sizes)
     for i, (root, (file, part, row)) in enumerate(zip(roots, locations, strict=True)):  # add the parents
         root.extras = {name: column[i : i + 1] for name, column in columns.items()}

@@ -77,13 +77,15 @@ class Tree:
         log_scales: np.ndarray,
         leaf_sizes: np.ndarray | float = 0.0,
         adjust: Callable[[np.ndarray, np.ndarray], np.ndarray] = lambda sizes, means: sizes,
+        errors: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Return saturated sizes (2N - 1,) float32: 0 for leaves, others at least :func:`splat_size` and
+        """Return saturated sizes (2N - 1,) float32: 0 for leaves, others at least :func:`own_sizes` and
         ``min_parent_size``.
 
         Args:
             means, log_scales: (2N - 1, 3) float32 of all nodes; log-scales of leaves are ignored.
             leaf_sizes: (N,) float32, if leaves are roots of other trees.
+            errors: (2N - 1,) float32, see :func:`own_sizes`.
             adjust: maps sizes (M,) and means (M, 3) of a layer to the sizes to use, none of them smaller.
         """
         sizes = np.zeros(len(self), np.float32)
@@ -92,7 +94,8 @@ class Tree:
             below = self.children[layer - self.leaves]
             offset = means[below].astype(np.float64) - means[layer, None].astype(np.float64)
             minimum = min_parent_size(sizes[below], np.sqrt(np.square(offset).sum(axis=2))).max(axis=1)
-            saturated = round_up(np.maximum(minimum, splat_size(log_scales[layer])))
+            own = own_sizes(log_scales[layer], None if errors is None else errors[layer])
+            saturated = round_up(np.maximum(minimum, own))
             sizes[layer] = adjust(saturated, means[layer])
         return sizes
 
@@ -107,7 +110,8 @@ class Tree:
 
         Both are sorted coarse to fine, with neighbours in space close together (``nodes.streaming_order``).
         """
-        sizes = UniqueSizes().sizes(self, splats.means, splats.log_scales)
+        errors = splats.extras.get(NODE_SIZE)
+        sizes = UniqueSizes().sizes(self, splats.means, splats.log_scales, errors=errors)
         splats.extras |= self.columns(splats.means, sizes)
         levels = []
         for number, begin, end in ((NODES, self.leaves, len(self)), (LEAVES, 0, self.leaves)):
@@ -128,16 +132,21 @@ class UniqueSizes:
         self._rng = np.random.default_rng(0)
 
     def sizes(
-        self, tree: Tree, means: np.ndarray, log_scales: np.ndarray, leaf_sizes: np.ndarray | float = 0.0
+        self,
+        tree: Tree,
+        means: np.ndarray,
+        log_scales: np.ndarray,
+        leaf_sizes: np.ndarray | float = 0.0,
+        errors: np.ndarray | None = None,
     ) -> np.ndarray:
         """Return the sizes of ``Tree.sizes``, increased by some ulps for nodes that are not unique."""
-        sizes = tree.sizes(means, log_scales, leaf_sizes)
+        sizes = tree.sizes(means, log_scales, leaf_sizes, errors=errors)
         inner = np.flatnonzero(sizes[tree.leaves :]) + tree.leaves
         keys = hash_rows(node_keys(sizes[inner], *means[inner].T))
         if self._is_free(keys).all():
             self._take(keys)
             return sizes
-        return tree.sizes(means, log_scales, leaf_sizes, self._make_unique)
+        return tree.sizes(means, log_scales, leaf_sizes, self._make_unique, errors)
 
     def _make_unique(self, sizes: np.ndarray, means: np.ndarray) -> np.ndarray:
         sizes = sizes.copy()
@@ -172,6 +181,18 @@ class UniqueSizes:
 def splat_size(log_scales: np.ndarray) -> np.ndarray:
     """Return sqrt(s1 s2 + s1 s3 + s2 s3), (N,) float64, of log-scales (N, 3) (A LoD of Gaussians, Eq. 6)."""
     return np.sqrt(splat_area(log_scales))
+
+
+def own_sizes(log_scales: np.ndarray, errors: np.ndarray | None) -> np.ndarray:
+    """Return the sizes (N,) of nodes before saturation.
+
+    Args:
+        log_scales: (N, 3).
+        errors: (N,) square roots of the area of wrong pixels of each node, in scene units (not in the paper).
+            Where an error is 0, and without errors, the size is :func:`splat_size`.
+    """
+    sizes = splat_size(log_scales)
+    return sizes if errors is None else np.where(errors > 0, errors, sizes)
 
 
 def leaf_only_columns(count: int) -> Mapping[str, np.ndarray]:

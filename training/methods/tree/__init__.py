@@ -21,6 +21,12 @@ class TreeParameters(SplatParameters):
         high=1_000_000,
         label="Sky Points",
     )
+    merge_by: str = setting(
+        "error",
+        "Order in which neighbours merge to nodes, and size of nodes, which decides the cuts: by the error "
+        "of the merge, which is not in the paper, or by the size of the merged splat.",
+        choices=("error", "size"),
+    )
     tune_steps: int = setting(
         600,
         "Training steps for cuts of the tree, one view per step. 0 keeps the tree as built.",
@@ -37,14 +43,23 @@ class TreeParameters(SplatParameters):
     lod_noise: float = setting(
         10.0,
         "Random coarsening in training: granularity is multiplied by 1 + this value times r⁴, with r "
-        "uniform from 0 to 1. Most cuts are fine, some coarse.",
+        "uniform from 0 to 1. Most cuts are fine, some coarse. Applies if 'octaves' is 0.",
         high=100,
     )
+    octaves: float = setting(
+        5.0,
+        "Random coarsening in training: granularity is multiplied by up to 2 to this power, evenly in "
+        "octaves. 0 uses 'lod_noise'. Not in the paper.",
+        high=8,
+    )
     node_rate: float = setting(
-        2.0,
+        4.0,
         "Learning rates of inner nodes, as multiples of the current 3DGS rates; with a base, of the "
         "final ones.",
         high=100,
+    )
+    node_end: float = setting(
+        0.1, "Final learning rates of inner nodes, as a fraction of the initial ones.", above=0, high=1
     )
     leaf_rate: float = setting(
         0.5,
@@ -103,9 +118,12 @@ _STANDARD = replace(
 _PAPER = replace(
     _STANDARD,
     **PAPER | {"opacity_reset_interval": 0},
+    merge_by="size",
     pixels=3.0,
     lod_noise=5.0,
+    octaves=0.0,
     node_rate=1.0,
+    node_end=1.0,
     sh_degree=1,
     tune_steps=150_000,
     max_threshold=0.0075,

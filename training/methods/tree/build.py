@@ -4,6 +4,9 @@ A node represents all leaves below it. Its mean, covariance and harmonics are th
 in A LoD of Gaussians, which uses the merge of H3DGS. Weights are optical depth times area; the paper uses
 opacity times area. Not in the paper: opacities stay below 1, as required by files, and a node that hides
 less than its leaves is enlarged instead (``optimize.merging``).
+
+Also not in the paper, and optional: neighbours of least error merge first, as in ``optimize.merging``. The
+sum of the errors of all merges in a node becomes its size, which decides the cuts.
 """
 
 from __future__ import annotations
@@ -17,7 +20,9 @@ import numpy as np
 
 from ...errors import LodgsError
 from ...lod.tree.forest import Piece, max_subtree_leaves, merge_forest, merge_trees, split_tree
+from ...lod.tree.nodes import NODE_SIZE
 from ...lod.tree.shape import Tree
+from ...optimize import merging
 from ...optimize.merging import merge_pairs, shapes_of_moments, splat_moments
 from ...rasterize.cpu.compile import STRICT, inlined, kernel, run_parallel
 from ...splats.gaussians import SH_C0, SplatRows, Splats
@@ -34,6 +39,13 @@ MAX_SPREAD = 3.0
 A uniform square has a standard deviation of 0.29 of its side, which leaves gaps to its neighbours; half the
 side closes them.
 """
+ERROR = 13
+"""Column of moments with the sum of the errors of all merges below."""
+ERROR_SCALE = 1.5
+"""Size of a node relative to the square root of its error, an area. Nodes then have about the sizes of the
+paper."""
+MIN_ERROR = 1e-30
+"""Minimum error of a node; nodes without an error have the size of the paper."""
 MIN_PAIRED_SHARE = 1 / 16
 """Minimum fraction of splats that must pair up in a round; otherwise neighbours on the curve merge."""
 CELL_LEAVES = 1 << 18
@@ -42,7 +54,7 @@ _BATCH_ROWS = 1 << 18
 """Number of leaves to read at a time."""
 
 
-def build(leaves: Splats) -> tuple[Splats, Tree]:
+def build(leaves: Splats, by_error: bool = False) -> tuple[Splats, Tree]:
     """Build a tree over splats in memory.
 
     Returns the 2N - 1 nodes, leaves in spatial order before inner nodes, and the tree.
@@ -50,19 +62,18 @@ def build(leaves: Splats) -> tuple[Splats, Tree]:
     Raises:
         LodgsError: see :class:`ForestBuilder`.
     """
-    return merge_forest(ForestBuilder(leaves))
+    return merge_forest(ForestBuilder(leaves, by_error=by_error))
 
 
 class ForestBuilder:
     """A tree over splats that is built during iteration over its subtrees (``lod.tree.forest.Forest``).
 
-    It can be iterated once. Each splat chooses the partner of least merged area, with a penalty for
-    different colours; splats that choose each other merge (parallel locally-ordered clustering, Meister and
-    Bittner 2018). The result is deterministic for any number of threads.
+    It can be iterated once. Each splat chooses the partner of least cost: merged area, with a penalty for
+    different colours, or merge error. Splats that choose each other merge (parallel locally-ordered
+    clustering, Meister and Bittner 2018). The result is deterministic for any number of threads.
 
-    Space is halved into cells of at most CELL_LEAVES leaves. Their trees are built one after the other. The
-    roots
-    of the cells are merged in the same way. Memory holds one cell, 12 bytes per leaf and the upper tree.
+    Space is halved into cells of at most CELL_LEAVES leaves. Their trees are built one after the other, and
+    their roots are merged in the same way. Memory holds one cell, 12 bytes per leaf and the upper tree.
 
     Args:
         leaves: N splats; extras are dropped.
@@ -70,6 +81,8 @@ class ForestBuilder:
         sh_degree: maximum degree of the harmonics; higher ones are dropped.
         subtree_leaves: maximum number of leaves of a subtree; 0 uses ``max_subtree_leaves``.
         cell: see CELL_LEAVES.
+        by_error: merge neighbours of least error first, and add the column NODE_SIZE with the nodes' errors.
+            Otherwise each splat chooses the partner of least merged area.
 
     Raises:
         LodgsError: there are fewer than two leaves.
@@ -82,10 +95,12 @@ class ForestBuilder:
         sh_degree: int = 4,
         subtree_leaves: int = 0,
         cell: int = CELL_LEAVES,
+        by_error: bool = False,
     ) -> None:
         if len(leaves) < 2:
             raise LodgsError("Cannot build a tree: it needs at least two splats.", "Start with more splats.")
         self._leaves, self._scratch, self._cell = leaves, scratch, cell
+        self._by_error = by_error
         self._coefficients = (sh_degree + 1) ** 2
         self._subtree_leaves = subtree_leaves or max_subtree_leaves(len(leaves))
         self._upper: Piece | None = None
@@ -100,7 +115,7 @@ class ForestBuilder:
         uppers, moments, harmonics = [], [], []
         for leaves in _read_cells(self._leaves, self._scratch, self._cell):
             leaves.sh = leaves.sh[:, : self._coefficients]
-            nodes, tree, root = _build_cell(leaves)
+            nodes, tree, root = _build_cell(leaves, self._by_error)
             moments.append(root)
             harmonics.append(nodes.sh[-1].copy())
             grove = split_tree(nodes, tree, self._subtree_leaves)
@@ -109,8 +124,8 @@ class ForestBuilder:
             del nodes, leaves
             yield from grove
             del grove, above
-        above, top = _merge_to_root(np.stack(moments))
-        nodes = _node_splats(above, top, np.stack(harmonics), np.stack(moments)[:, 9])
+        above, top = _merge_to_root(np.stack(moments), self._by_error)
+        nodes = _node_splats(above, top, np.stack(harmonics), np.stack(moments)[:, 9], self._by_error)
         splats = Splats.concatenated([*(splats for splats, _ in uppers), nodes])
         self._upper = splats, merge_trees([tree for _, tree in uppers], top)
 
@@ -177,24 +192,27 @@ def _drop_extras(splats: Splats) -> Splats:
     return replace(splats, extras={})
 
 
-def _build_cell(leaves: Splats) -> tuple[Splats, Tree, np.ndarray]:
-    """Build the tree over splats in spatial order; return nodes, tree and the root's moments (13,)."""
+def _build_cell(leaves: Splats, by_error: bool) -> tuple[Splats, Tree, np.ndarray]:
+    """Build the tree over splats in spatial order; return nodes, tree and the root's moments (14,)."""
     means, covariances, depths = splat_moments(leaves)
     colors = 0.5 + SH_C0 * leaves.sh[:, 0].astype(np.float64)
-    moments = np.concatenate([means, covariances, depths[:, None], colors], axis=1)
-    above, tree = _merge_to_root(moments)
-    nodes = Splats.concatenated([leaves, _node_splats(above, tree, leaves.sh, depths)])
+    no_errors = np.zeros((len(leaves), 1))
+    moments = np.concatenate([means, covariances, depths[:, None], colors, no_errors], axis=1)
+    above, tree = _merge_to_root(moments, by_error)
+    if by_error:
+        leaves.extras = {NODE_SIZE: np.zeros(len(leaves), np.float32)}
+    nodes = Splats.concatenated([leaves, _node_splats(above, tree, leaves.sh, depths, by_error)])
     return nodes, tree, (above if len(above) else moments)[-1].copy()
 
 
-def _merge_to_root(moments: np.ndarray) -> tuple[np.ndarray, Tree]:
+def _merge_to_root(moments: np.ndarray, by_error: bool) -> tuple[np.ndarray, Tree]:
     """Merge N splats in spatial order up to a root.
 
     Args:
-        moments: (N, 13), overwritten.
+        moments: (N, 14), overwritten.
 
     Returns:
-        The moments (N - 1, 13) of the inner nodes, and the tree.
+        The moments (N - 1, 14) of the inner nodes, and the tree.
     """
     leaves = len(moments)
     numbers = np.arange(leaves, dtype=np.int32)
@@ -202,9 +220,15 @@ def _merge_to_root(moments: np.ndarray) -> tuple[np.ndarray, Tree]:
     best = np.zeros(leaves, np.int32)
     while len(moments) > 1:
         count = len(moments)
-        run_parallel(_choose_partners, count, 1 << 12, moments, RADIUS, COLOR_WEIGHT, best)
-        first, second = _mutual_pairs(best[:count])
+        if by_error:
+            first, second = merging.cheapest_pairs(moments[:, :ERROR], count)
+        else:
+            run_parallel(_choose_partners, count, 1 << 12, moments, RADIUS, COLOR_WEIGHT, best)
+            first, second = _mutual_pairs(best[:count])
         merged = merge_pairs(moments[first], moments[second])
+        if by_error:
+            pair_errors = np.maximum(merging.merge_errors(moments[:, :ERROR], first, second), MIN_ERROR)
+            merged[:, ERROR] = moments[first, ERROR] + moments[second, ERROR] + pair_errors
         children.append(np.stack([numbers[first], numbers[second]], axis=1))
         remaining = np.ones(count, bool)
         remaining[second] = False
@@ -259,9 +283,12 @@ def _mutual_pairs(best: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return first, best[first]
 
 
-def _node_splats(moments: np.ndarray, tree: Tree, sh: np.ndarray, depths: np.ndarray) -> Splats:
-    """Return the splats (M,) of inner nodes with these moments (M, 13)."""
-    quats, log_scales, logits = shapes_of_moments(moments, MAX_SPREAD)
+def _node_splats(
+    moments: np.ndarray, tree: Tree, sh: np.ndarray, depths: np.ndarray, by_error: bool
+) -> Splats:
+    """Return the splats (M,) of inner nodes with these moments (M, 14)."""
+    spread = merging.MAX_SPREAD if by_error else MAX_SPREAD
+    quats, log_scales, logits = shapes_of_moments(moments, spread)
     harmonics = np.empty((len(moments), *sh.shape[1:]), np.float32)
     depths = np.concatenate([depths, moments[:, 9]])
     for layer in reversed(tree.layers):
@@ -274,4 +301,7 @@ def _node_splats(moments: np.ndarray, tree: Tree, sh: np.ndarray, depths: np.nda
             harmonics[np.where(of_leaf, 0, below - tree.leaves)],
         )
         harmonics[layer - tree.leaves] = (rate_factors[..., None, None] * parts).sum(axis=1)
-    return Splats(moments[:, :3].astype(np.float32), quats, log_scales, logits, harmonics)
+    means = moments[:, :3].astype(np.float32)
+    sizes = (ERROR_SCALE * np.sqrt(moments[:, ERROR])).astype(np.float32)
+    extras = {NODE_SIZE: sizes} if by_error else {}
+    return Splats(means, quats, log_scales, logits, harmonics, extras)

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from ...lod.tree.forest import Forest, ForestShape, Piece, combine_trees
-from ...lod.tree.nodes import MIN_DETAIL, detail_of
+from ...lod.tree.nodes import MIN_DETAIL, NODE_SIZE, detail_of
 from ...lod.tree.shape import Tree
 from ...optimize.memory import free_memory
 from ...optimize.model import NAMES
@@ -69,7 +69,7 @@ def record_layout(sh_degree: int) -> RowLayout:
     values = shapes | {"sh": ((sh_degree + 1) ** 2, 3)}
     count = sum(map(prod, values.values()))
     moments: dict[str, tuple[int, ...]] = {"first": (count,), "second": (count,)}
-    return RowLayout({**values, **moments, "steps": (), "score": (), "seen": ()})
+    return RowLayout({**values, **moments, "steps": (), "score": (), "seen": (), "error": ()})
 
 
 class NodeStore:
@@ -163,7 +163,8 @@ class NodeStore:
         values = self.layout.split(records)
         order, tree = combine_trees(counts, children.astype(np.int32))
         sizes = np.empty(len(order), np.float32)
-        sizes[order] = tree.sizes(values["means"].numpy()[order], values["log_scales"].numpy()[order])
+        means, log_scales, errors = (values[name].numpy()[order] for name in ("means", "log_scales", "error"))
+        sizes[order] = tree.sizes(means, log_scales, errors=errors)
         return sizes
 
     def _records_of(self, splats: Splats) -> torch.Tensor:
@@ -173,6 +174,8 @@ class NodeStore:
             end = begin + prod(self.layout.shapes[name])
             records[:, begin:end] = getattr(splats, name).reshape(len(splats), end - begin)
             begin = end
+        if NODE_SIZE in splats.extras:
+            records[:, -1] = splats.extras[NODE_SIZE]
         return torch.from_numpy(records)
 
     def _set_shape(self, shape: ForestShape) -> None:
@@ -294,7 +297,8 @@ class NodeStore:
         upper = self.layout.split(self.rows.read(np.arange(self.shape.ends[-1], len(self))))
         means = np.append(roots[:, :3], upper["means"].numpy(), axis=0)
         log_scales = np.append(shapes, upper["log_scales"].numpy(), axis=0)
-        sizes = self.shape.upper.sizes(means, log_scales, roots[:, 3])
+        errors = np.append(np.zeros(len(roots), np.float32), upper["error"].numpy())
+        sizes = self.shape.upper.sizes(means, log_scales, roots[:, 3], errors=errors)
         low, high, reach = bounds
         self._top = UpperTree.from_bounds(self.shape.upper, means, log_scales, sizes, (low, high, reach))
 
@@ -368,7 +372,9 @@ class NodeStore:
     def _splats(self, records: torch.Tensor) -> Splats:
         values = self.layout.split(records)
         means, quats, log_scales, opacity_logits, sh = (values[name].numpy().copy() for name in NAMES)
-        return Splats(means, quats, log_scales, opacity_logits, sh)
+        return Splats(
+            means, quats, log_scales, opacity_logits, sh, {NODE_SIZE: values["error"].numpy().copy()}
+        )
 
     def release_cache(self) -> None:
         """Write back changes and free the cache; afterwards no cut can be loaded."""

@@ -23,7 +23,7 @@ from ...optimize.initialize import from_points, from_splats
 from ...optimize.method import Drawing, StepResult
 from ...optimize.out_of_core.view_order import ViewOrder
 from ...optimize.refining import RefiningMethod
-from ...optimize.schedules import due
+from ...optimize.schedules import due, random_reduction
 from ...optimize.splat_method import SplatMethod
 from ...optimize.training_data import TrainingView
 from ...rasterize import Rendering, records
@@ -205,6 +205,10 @@ class Method(RefiningMethod):
         else:
             super().set_learning_rates(step)
 
+    def shrink(self, step: int) -> float:
+        small = self.refines(step) and self.parameters.octaves
+        return random_reduction(self.seed, step) if small else super().shrink(step)
+
     def draw(self, view: TrainingView, step: int) -> Sequence[Drawing]:
         if not self.refines(step):
             return super().draw(view, step)
@@ -257,13 +261,15 @@ class Method(RefiningMethod):
     def _build_step(self, step: int) -> StepResult:
         """Build the tree; the result of the step is an image rendered from it."""
         self.store = self._new_store()
+        by_error = self.parameters.merge_by == "error"
         if self._base is not None:
-            self.store.fill(ForestBuilder(self._base, self.data.scratch, self.parameters.sh_degree))
+            degree = self.parameters.sh_degree
+            self.store.fill(ForestBuilder(self._base, self.data.scratch, degree, by_error=by_error))
         else:
             leaves = self.model.splats()
             no_splats = from_splats(leaves.select(slice(0)), self.parameters.sh_degree, self.device)
             self.model = self.new_model(no_splats)
-            self.store.fill(ForestBuilder(leaves))
+            self.store.fill(ForestBuilder(leaves, by_error=by_error))
         view = self.choose_view(step)
         gaussians = self.load_cut(view, step, self.parameters.pixels).gaussians
         rendering = self.rasterize_model(view.camera, step, gaussians=gaussians)
@@ -280,15 +286,16 @@ class Method(RefiningMethod):
 
     def _pixels(self, step: int) -> float:
         """Return the granularity of a step (A.6: distances times 1 + 5 r⁴)."""
-        r = np.random.default_rng([self.seed, step, 12]).random()
-        return self.parameters.pixels * (1 + self.parameters.lod_noise * r**4)
+        p, r = self.parameters, np.random.default_rng([self.seed, step, 12]).random()
+        return p.pixels * (2 ** (p.octaves * r) if p.octaves else 1 + p.lod_noise * r**4)
 
     def _rate_factors(self, indices: np.ndarray, step: int) -> torch.Tensor:
-        """Return factors (M,) on the learning rates of records (M,); those of leaves decrease."""
+        """Return factors (M,) on the learning rates of records (M,), which decrease."""
         assert self.store is not None
-        done = (step - self.finest_steps) / max(self.parameters.tune_steps, 1)
-        slow = self.parameters.leaf_rate * FINAL_LEAF_RATE**done
-        return torch.where(torch.from_numpy(self.store.is_leaf(indices)), slow, self.parameters.node_rate)
+        p = self.parameters
+        done = (step - self.finest_steps) / max(p.tune_steps, 1)
+        leaf_rate, node_rate = p.leaf_rate * FINAL_LEAF_RATE**done, p.node_rate * p.node_end**done
+        return torch.where(torch.from_numpy(self.store.is_leaf(indices)), leaf_rate, node_rate)
 
     # -- checkpoints -----------------------------------------------------------------------------------
 

@@ -8,11 +8,11 @@ from scipy.spatial.transform import Rotation
 from scipy.special import expit, logit
 
 from training.errors import LodgsError
-from training.methods.tree.build import MAX_SPREAD, build
-from training.optimize.merging import MAX_OPACITY, optical_depth
+from training.methods.tree.build import ERROR_SCALE, MAX_SPREAD, build
+from training.optimize.merging import COLOR_WEIGHT, MAX_OPACITY, optical_depth
 from training.rasterize import Gaussians, rasterize
 from training.scenes.cameras import Camera
-from training.splats.gaussians import Splats, splat_area
+from training.splats.gaussians import SH_C0, Splats, splat_area
 
 
 def scene(count, seed=0, opacity=0.6):
@@ -116,7 +116,8 @@ def test_wall_has_no_holes_at_any_cut():
         )
 
 
-def test_equal_splats_and_chains_give_flat_trees():
+@pytest.mark.parametrize("by_error", [False, True])
+def test_equal_splats_and_chains_give_flat_trees(by_error):
     """Test equal splats, and a row with shrinking gaps, in which each splat is nearest to the next one."""
     equal = scene(1000)
     for column in (equal.means, equal.quats, equal.log_scales, equal.sh):
@@ -126,19 +127,68 @@ def test_equal_splats_and_chains_give_flat_trees():
     chain.means[:, 0] = np.float32(1.2) ** -np.arange(300)
     chain.quats[:], chain.log_scales[:] = chain.quats[0], -20
     for splats in (equal, chain):
-        nodes, tree = build(splats)
+        nodes, tree = build(splats, by_error)
         assert len(tree.layers) <= 60
         assert all(np.isfinite(getattr(nodes, name)).all() for name in ("means", "quats", "log_scales", "sh"))
 
 
-def test_extreme_splats_build_a_tree():
+@pytest.mark.parametrize("by_error", [False, True])
+def test_extreme_splats_build_a_tree(by_error):
     splats = scene(40)
     splats.log_scales[0], splats.log_scales[1], splats.log_scales[2, 0] = -80, 25, -80
     splats.opacity_logits[3], splats.opacity_logits[4] = -100, 100
     splats.means[5] = 1e9
-    nodes, _ = build(splats)
+    nodes, _ = build(splats, by_error)
     for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
         assert np.isfinite(getattr(nodes, name)[40:]).all()
+
+
+def test_size_by_error_follows_from_area_and_colour():
+    """Two flat discs of radius s at distance d merge to an ellipse of s by sqrt(s² + d² / 4)."""
+    s, d, opacity, colors = 0.5, 0.8, 0.6, np.array([0.2, 0.5])
+    discs = Splats(
+        np.float32([[0, 0, 0], [d, 0, 0]]),
+        np.tile(np.float32([1, 0, 0, 0]), (2, 1)),
+        np.tile(np.log([s, s, 1e-6]), (2, 1)).astype(np.float32),
+        np.full(2, logit(opacity), np.float32),
+        np.tile(((colors - 0.5) / SH_C0)[:, None, None], (1, 1, 3)).astype(np.float32),
+    )
+    nodes, tree = build(discs, by_error=True)
+    depth, _ = quad(lambda r: -np.log(1 - opacity * np.exp(-r * r / 2)) * r, 0, 12)
+    enlarged = np.log(np.sqrt(s**2 + d**2 / 4) / s)
+    error = 2 * depth * s**2 * (enlarged + COLOR_WEIGHT * 3 * 0.25 * (colors[1] - colors[0]) ** 2)
+    sizes = tree.sizes(nodes.means, nodes.log_scales, errors=nodes.extras["node_size"])
+    assert sizes[2] == pytest.approx(ERROR_SCALE * np.sqrt(error), rel=1e-3)
+    assert not sizes[:2].any()
+
+
+def test_cut_by_error_is_better_than_by_size():
+    """A wall of random colours whose right half is faint: cuts by error keep the splats of the left half."""
+    side = 48
+    grid = np.stack(np.meshgrid(*[np.linspace(-1, 1, side)] * 2), axis=-1).reshape(-1, 2)
+    colors = np.random.default_rng(0).uniform(-1, 1, (side**2, 1, 3))
+    wall = Splats(
+        np.concatenate([grid, np.zeros((side**2, 1))], axis=1).astype(np.float32),
+        np.tile(np.float32([1, 0, 0, 0]), (side**2, 1)),
+        np.tile(np.log([1 / side, 1 / side, 1e-4]), (side**2, 1)).astype(np.float32),
+        logit(np.where(grid[:, 0] < 0, 0.9, 0.02)).astype(np.float32),
+        colors.astype(np.float32),
+    )
+    pose = np.eye(4)
+    pose[2, 3] = 3
+    camera = Camera("a", 96, 96, 140.0, 140.0, 48.0, 48.0, pose)
+    full = rasterize(Gaussians.of(wall), camera, backend="cpu").image
+    errors = []
+    for by_error in (False, True):
+        nodes, tree = build(wall, by_error)
+        sizes = tree.sizes(nodes.means, nodes.log_scales, errors=nodes.extras.get("node_size"))
+        parents = np.append(sizes, np.inf)[tree.parents]
+        limits = np.sort(sizes)
+        counts = [int(((sizes <= limit) & (parents > limit)).sum()) for limit in limits]
+        limit = limits[np.argmax(np.array(counts) <= side**2 * 0.6)]
+        cut = nodes.select((sizes <= limit) & (parents > limit))
+        errors.append(float(((rasterize(Gaussians.of(cut), camera, backend="cpu").image - full) ** 2).mean()))
+    assert errors[1] < 0.3 * errors[0]
 
 
 def test_single_splat_raises():

@@ -155,25 +155,30 @@ def test_leaf_rate_zero_freezes_leaves(data, base):
 
 
 def test_leaf_rate_decreases(data, base):
-    """The rate of leaves falls to 0.03 of its initial value; the rate of nodes is constant."""
-    tree = make(data, base, leaf_rate=0.2, node_rate=3.0, tune_steps=400)
+    """The rate of leaves falls to 0.03 of its initial value, that of nodes to ``node_end``."""
+    tree = make(data, base, leaf_rate=0.2, node_rate=3.0, node_end=0.25, tune_steps=400)
     trained(tree, until=1)
     camera = data.train[0]
     indices = tree.store.load_cut(camera, 16.0, data.near)
     inner = inner_rows(tree)[tree.store.cache.rows_at(indices)]
     assert inner.any() and not inner.all()
-    for step, share in ((1, 0.2), (201, 0.2 * 0.03**0.5), (401, 0.2 * 0.03)):
+    for step, leaf_rate, node_rate in ((1, 0.2, 3), (201, 0.2 * 0.03**0.5, 1.5), (401, 0.2 * 0.03, 0.75)):
         actual = tree._rate_factors(indices, step).numpy()
-        np.testing.assert_allclose(actual, np.where(inner, 3, share), rtol=0.01)
+        np.testing.assert_allclose(actual, np.where(inner, node_rate, leaf_rate), rtol=0.01)
 
 
-def test_sizes_are_saturated_after_training(data, base):
-    tree = make(data, base, lr_scales=0.5, lr_means_final=0.05)  # large rates move nodes far
+@pytest.mark.parametrize("merge_by", ["error", "size"])
+def test_sizes_are_saturated_after_training(data, base, merge_by):
+    tree = make(
+        data, base, merge_by=merge_by, lr_scales=0.5, lr_means_final=0.05
+    )  # large rates move nodes far
     levels = trained(tree)
     splats, nodes = merge_forest(tree.store)
-    sizes = nodes.sizes(splats.means, splats.log_scales)
+    errors = splats.extras["node_size"]
+    sizes = nodes.sizes(splats.means, splats.log_scales, errors=errors)
+    own_sizes = splat_size(splats.log_scales) if merge_by == "size" else errors
     for node in range(nodes.leaves, len(nodes)):
-        assert sizes[node] >= splat_size(splats.log_scales[node : node + 1])[0]
+        assert sizes[node] >= own_sizes[node] > 0
         for child in nodes.children[node - nodes.leaves]:
             distance = np.linalg.norm(splats.means[child].astype(float) - splats.means[node].astype(float))
             assert float(sizes[node]) >= min_parent_size(np.array(float(sizes[child])), np.array(distance))
@@ -187,7 +192,7 @@ def test_step_updates_only_the_cut_of_its_view(data, base):
     small = replace(
         base, means=center + (base.means - center) / 30, log_scales=base.log_scales - np.float32(3)
     )
-    tree = make(data, small, lod_noise=0.0)
+    tree = make(data, small, lod_noise=0.0, octaves=0.0)
     trained(tree, until=4)
     initial = records(tree)
     tree.store.cache.evict_all()
@@ -245,11 +250,17 @@ def test_rendering_uses_trained_granularity(data, base):
 
 
 def test_lod_noise_follows_fourth_power(data, base):
-    tree = make(data, base, pixels=2.0, lod_noise=5.0)
+    tree = make(data, base, pixels=2.0, lod_noise=5.0, octaves=0.0)
     actual = np.array([tree._pixels(step) for step in range(4000)])
     assert actual.min() >= 2 and actual.max() <= 12
     # A.6: 1 + 5 r⁴ is below 2 for r < (1/5)^(1/4) = 0.669
     assert (actual < 4).mean() == pytest.approx(0.669, abs=0.02)
+
+
+def test_granularity_is_uniform_in_octaves(data, base):
+    tree = make(data, base, pixels=2.0, octaves=4.0)
+    octaves = np.log2([tree._pixels(step) / 2 for step in range(4000)])
+    assert np.histogram(octaves, bins=4, range=(0, 4))[0] == pytest.approx([1000] * 4, rel=0.1)
 
 
 def test_view_without_splats_completes_its_step(data, base):
