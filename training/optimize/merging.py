@@ -133,7 +133,7 @@ def cheapest_pairs(moments: np.ndarray, limit: int) -> tuple[np.ndarray, np.ndar
         rows = np.arange(count)[part]
         others = neighbours[part]
         first, second = np.minimum(rows[:, None], others), np.maximum(rows[:, None], others)
-        pair_costs = _merge_errors(columns, log_areas, first, second)
+        pair_costs = _errors(columns, log_areas, first, second)
         pair_costs[others == rows[:, None]] = np.inf
         best = pair_costs.argmin(axis=1)[:, None]
         partners[part] = np.take_along_axis(others, best, 1)[:, 0]
@@ -154,10 +154,10 @@ def cheapest_pairs(moments: np.ndarray, limit: int) -> tuple[np.ndarray, np.ndar
 def merge_errors(moments: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return the errors of merging rows ``first`` with rows ``second``: areas, times an optical depth."""
     columns = np.ascontiguousarray(moments.T)
-    return _merge_errors(columns, _log_areas(columns[3:9]), first, second)
+    return _errors(columns, _log_areas(columns[3:9]), first, second)
 
 
-def _merge_errors(moments: np.ndarray, log_areas: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+def _errors(moments: np.ndarray, log_areas: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return the errors of merging columns ``first`` of moments (C, N) with columns ``second``.
 
     Args:
