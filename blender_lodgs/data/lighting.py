@@ -77,7 +77,7 @@ def _environment(world: bpy.types.World | None) -> bpy.types.Image | None:
 
 def _mean_color(image: bpy.types.Image) -> np.ndarray:
     """Return the mean colour (3,) of an equirectangular image over the sphere, linear."""
-    width, height = image.size
+    width, height = tuple(image.size)  # type: ignore[misc]
     if not width or not height:
         return np.zeros(3)
     small = image
@@ -85,7 +85,7 @@ def _mean_color(image: bpy.types.Image) -> np.ndarray:
         small = image.copy()  # scaling changes an image
         shrink = (width * height / _MAX_PIXELS) ** 0.5
         small.scale(max(int(width / shrink), 1), max(int(height / shrink), 1))
-    columns, rows = small.size
+    columns, rows = tuple(small.size)  # type: ignore[misc]
     values = np.empty(columns * rows * 4, np.float32)
     small.pixels.foreach_get(values)
     if small != image:
