@@ -198,14 +198,8 @@ def reset_compositor(scene: bpy.types.Scene) -> None:
     scene.use_nodes = False
 
 
-def to_straight(tree: bpy.types.NodeTree) -> bpy.types.Node:
-    """Add a node that converts premultiplied to straight alpha."""
-    node = tree.nodes.new("CompositorNodePremulKey")
-    if hasattr(node, "mapping"):
-        node.mapping = "PREMUL_TO_STRAIGHT"
-    else:
-        node.inputs["Type"].default_value = "To Straight"
-    return node
+COMPOSITOR_MATH = "CompositorNodeMath" if hasattr(bpy.types, "CompositorNodeMath") else "ShaderNodeMath"
+COMPOSITOR_MIX = "CompositorNodeMixRGB" if hasattr(bpy.types, "CompositorNodeMixRGB") else "ShaderNodeMix"
 
 
 def compositor_output(tree: bpy.types.NodeTree) -> bpy.types.NodeSocket:
@@ -216,5 +210,5 @@ def compositor_output(tree: bpy.types.NodeTree) -> bpy.types.NodeSocket:
         if not any(item.in_out == "OUTPUT" for item in tree.interface.items_tree):
             tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
         output = tree.nodes.new("NodeGroupOutput")
-    output.location = (600, 0)
+    output.location = (1400, 0)
     return output.inputs[0]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ...training.editing.look import LOOK_SETTINGS
-from ..data import crops, looks, roots
+from ..data import crops, lighting, looks, roots
 from .parts import LevelsPanel, split_column
 
 
@@ -21,6 +21,8 @@ class LODGS_PT_look(LevelsPanel):
     def draw(self, context):
         layout, root = self.layout, roots.active_root(context)
         _draw_look(layout, root)
+        if lighting.has_lamps(context):
+            layout.operator("lodgs.tint_by_light", icon="LIGHT")
         layout.operator("lodgs.reset_look", icon="LOOP_BACK")
 
 
@@ -57,6 +59,8 @@ class LODGS_PT_look_regions(LevelsPanel):
                 used = "CHECKBOX_HLT" if crop.lodgs_crop.use else "CHECKBOX_DEHLT"
                 row.prop(crop.lodgs_crop, "use", text="", icon=used)
                 row.prop(crop, "name", text="")
+                if lighting.has_lamps(context):
+                    row.operator("lodgs.tint_by_light", text="", icon="LIGHT").name = crop.name
                 row.operator("lodgs.reset_look", text="", icon="LOOP_BACK").name = crop.name
                 row.operator("lodgs.remove_crop", text="", icon="X").name = crop.name
                 _draw_look(box, crop)

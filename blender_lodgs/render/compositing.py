@@ -24,9 +24,18 @@ _COPIED = (
 )  # fmt: skip
 
 
-Z_COMBINE = "CompositorNodeZcombine"
 ALPHA_OVER = "CompositorNodeAlphaOver"
+MIN_DEPTH = "CompositorNodeDilateErode"
+"""Type of a node that only occurs where images are combined by depth."""
+_NODES = {
+    ALPHA_OVER, MIN_DEPTH, "CompositorNodeAntiAliasing", compat.COMPOSITOR_MATH, compat.COMPOSITOR_MIX,
+    "CompositorNodeZcombine", "CompositorNodePremulKey",  # of older versions
+}  # fmt: skip
+_COVERED = 0.999
+"""Minimum alpha of a pixel that a mesh covers completely."""
 
+CENTER_FILTER = "BLACKMAN_HARRIS", 0.01
+"""Pixel filter of Cycles with all samples at the pixel centre; the width of its box filter is fixed."""
 SAMPLES = 128
 """Initial number of Cycles samples for the meshes. Blender's default of 4096 is slow."""
 
@@ -56,27 +65,26 @@ def combine_with_meshes(scene: bpy.types.Scene, mesh_engine: str = "CYCLES") -> 
         )
     meshes = scene.lodgs_render.meshes
     tree = compat.compositor_tree(scene)
-    previous = _changed_settings(scene)
-    join = ALPHA_OVER if scene.lodgs_render.holdout else Z_COMBINE
+    previous, is_new = _changed_settings(scene), meshes is None
     if meshes is None:
         if not _is_ours(tree):
             raise LodgsError(
                 f"Cannot combine with meshes: the scene '{scene.name}' has compositor nodes.",
-                "Add a Z Combine node for both images and depths (manual: Rendering).",
+                "Add nodes for both images and depths (manual: Rendering).",
             )
         meshes = scene.lodgs_render.meshes = bpy.data.scenes.new(f"{scene.name} Meshes")
         meshes.render.engine = mesh_engine
         meshes.cycles.samples = SAMPLES
         scene.lodgs_render.before_meshes = json.dumps(previous)
-        _build_nodes(tree, join, scene, meshes)
-    elif _is_ours(tree) and join not in _node_types(tree):
-        _build_nodes(tree, join, scene, meshes)
     engine.use(scene)
     for rendered in (scene, meshes):
         rendered.render.film_transparent = True
         for layer in rendered.view_layers:
             layer.use_pass_z = True
     _copy_settings(scene, meshes)
+    by_depth = not scene.lodgs_render.holdout
+    if is_new or (_is_ours(tree) and by_depth != (MIN_DEPTH in _node_types(tree))):
+        _build_nodes(tree, by_depth, scene, meshes)
     return meshes
 
 
@@ -118,8 +126,7 @@ def _node_types(tree: bpy.types.NodeTree) -> set[str]:
 
 def _is_ours(tree: bpy.types.NodeTree) -> bool:
     """Return whether a compositor tree has only default nodes and nodes of :func:`combine_with_meshes`."""
-    ours = {*compat.COMPOSITOR_START, Z_COMBINE, ALPHA_OVER, "CompositorNodePremulKey"}
-    return _node_types(tree) <= ours
+    return _node_types(tree) <= {*compat.COMPOSITOR_START, *_NODES}
 
 
 def render_mesh_depth(scene: bpy.types.Scene, frames: Iterable[int]) -> Iterator[Path]:
@@ -194,7 +201,7 @@ def _set_depth_only(scene: bpy.types.Scene) -> None:
         layer.use_pass_z, layer.use_pass_combined = True, False
     settings.samples, settings.max_bounces = 1, 0
     settings.use_denoising = settings.use_adaptive_sampling = False
-    settings.pixel_filter_type, settings.filter_width = "BOX", 0.01
+    settings.pixel_filter_type, settings.filter_width = CENTER_FILTER
 
 
 def _copy_settings(scene: bpy.types.Scene, meshes: bpy.types.Scene) -> None:
@@ -259,32 +266,99 @@ def _included(collection: bpy.types.LayerCollection) -> Iterator[bpy.types.Layer
 
 
 def _build_nodes(
-    tree: bpy.types.NodeTree, kind: str, scene: bpy.types.Scene, meshes: bpy.types.Scene
+    tree: bpy.types.NodeTree, by_depth: bool, scene: bpy.types.Scene, meshes: bpy.types.Scene
 ) -> None:
-    """Build compositor nodes that combine two scenes.
+    """Build compositor nodes that combine two scenes: by depth, or ``scene`` over ``meshes``.
 
-    With Z_COMBINE, the nearer pixel is placed over the other one. With ALPHA_OVER, ``scene`` is placed over
-    ``meshes``.
+    The mesh image gets the samples that fit: soft edges by depth, and otherwise one sample at each pixel
+    centre, as in the holdout. Soft edges over a holdout would leave dark seams.
     """
     tree.nodes.clear()
-    join = tree.nodes.new(kind)
-    by_depth = kind == Z_COMBINE
-    join.location = (400, 0)
+    nodes = _TreeBuilder(tree)
+    scene.view_layers[0].use_pass_z = meshes.view_layers[0].use_pass_z = True  # before nodes with its socket
+    splats = nodes.render_layer(scene, scene.view_layers[0].name, 0)
+    mesh = nodes.render_layer(meshes, meshes.view_layers[0].name, 1)
+    splat_image, mesh_image = splats.outputs["Image"], mesh.outputs["Image"]
+    result = nodes.over(splat_image, mesh_image)
     if by_depth:
-        join.inputs["Use Alpha"].default_value = join.inputs["Anti-Alias"].default_value = True
-    image_inputs = [socket for socket in join.inputs if socket.type == "RGBA"]
-    for index, rendered in enumerate((scene, meshes)):
-        rendered.view_layers[0].use_pass_z = True  # before the node, whose sockets are the passes
-        layers = tree.nodes.new("CompositorNodeRLayers")
-        layers.location = (0, -420 * index)
-        layers.scene, layers.layer = rendered, rendered.view_layers[0].name
-        layers.label = rendered.name
-        if by_depth:  # Z Combine multiplies by alpha, but images are premultiplied
-            straight = compat.to_straight(tree)
-            straight.location = (180, -420 * index)
-            tree.links.new(layers.outputs["Image"], straight.inputs["Image"])
-            tree.links.new(straight.outputs["Image"], image_inputs[index])
-            tree.links.new(layers.outputs["Depth"], join.inputs[2 * index + 1])
-        else:
-            tree.links.new(layers.outputs["Image"], image_inputs[1 - index])
-    tree.links.new(join.outputs[0], compat.compositor_output(tree))
+        near = nodes.nearer(mesh, splats)
+        result = nodes.mix(near, result, nodes.over(mesh_image, splat_image))
+    _sample_meshes(meshes, soft=by_depth)
+    tree.links.new(result, compat.compositor_output(tree))
+
+
+class _TreeBuilder:
+    """Builder of compositor nodes, from left to right."""
+
+    def __init__(self, tree: bpy.types.NodeTree) -> None:
+        self._tree = tree
+        self._x = 0
+
+    def render_layer(self, scene: bpy.types.Scene, layer: str, row: int) -> bpy.types.Node:
+        """Add the images of a view layer."""
+        node = self._tree.nodes.new("CompositorNodeRLayers")
+        node.location = (0, -420 * row)
+        node.scene, node.layer, node.label = scene, layer, scene.name
+        return node
+
+    def over(self, front: bpy.types.NodeSocket, back: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+        """Add a node that places an image over another one."""
+        node = self._add(ALPHA_OVER)
+        background, foreground = (socket for socket in node.inputs if socket.type == "RGBA")
+        self._tree.links.new(back, background)
+        self._tree.links.new(front, foreground)
+        return node.outputs[0]
+
+    def mix(
+        self,
+        factor: bpy.types.NodeSocket,
+        first: bpy.types.NodeSocket,
+        second: bpy.types.NodeSocket,
+    ) -> bpy.types.NodeSocket:
+        """Add a node that mixes two images; the alpha is that of the first."""
+        node = self._add(compat.COMPOSITOR_MIX)
+        if hasattr(node, "data_type"):
+            node.data_type = "RGBA"
+        sockets = [node.inputs[0], *(socket for socket in node.inputs if socket.type == "RGBA")]
+        self._connect(sockets, factor, first, second)
+        return next(socket for socket in node.outputs if socket.type == "RGBA")
+
+    def nearer(self, front: bpy.types.Node, back: bpy.types.Node) -> bpy.types.NodeSocket:
+        """Add nodes that return 1 where a layer of meshes is nearer than another layer.
+
+        Where a mesh covers a part of a pixel, the pixel's depth is that of the mesh or of the background. The
+        smallest depth of the neighbouring pixels is that of the mesh.
+        """
+        depth, other_depth = front.outputs["Depth"], back.outputs["Depth"]
+        smallest = self._add(MIN_DEPTH, depth)
+        smallest.inputs["Size"].default_value = -1
+        near = self._add("CompositorNodeAntiAliasing", self._math("LESS_THAN", depth, other_depth))
+        edge_near = self._math("LESS_THAN", smallest.outputs[0], other_depth)
+        edge = self._math("LESS_THAN", front.outputs["Alpha"], _COVERED)
+        return self._math("MAXIMUM", near.outputs[0], self._math("MULTIPLY", edge_near, edge))
+
+    def _math(self, operation: str, *sources: bpy.types.NodeSocket | float) -> bpy.types.NodeSocket:
+        node = self._add(compat.COMPOSITOR_MATH, *sources)
+        node.operation = operation
+        return node.outputs[0]
+
+    def _add(self, kind: str, *sources: bpy.types.NodeSocket | float) -> bpy.types.Node:
+        node = self._tree.nodes.new(kind)
+        self._x += 200
+        node.location = (200 + self._x, -self._x % 400)
+        self._connect(node.inputs, *sources)
+        return node
+
+    def _connect(self, sockets, *sources: bpy.types.NodeSocket | float) -> None:
+        for source, socket in zip(sources, sockets, strict=False):
+            if isinstance(source, bpy.types.NodeSocket):
+                self._tree.links.new(source, socket)
+            else:
+                socket.default_value = source
+
+
+def _sample_meshes(meshes: bpy.types.Scene, soft: bool) -> None:
+    """Set the pixel filter of the mesh image: Blender's default, or one sample at each pixel centre."""
+    settings = meshes.cycles
+    settings.pixel_filter_type, settings.filter_width = ("BLACKMAN_HARRIS", 1.5) if soft else CENTER_FILTER
+    meshes.render.filter_size = 1.5 if soft else 0.0

@@ -1,8 +1,13 @@
-"""Equirectangular images, resampled from perspective images of the six sides of a cube."""
+"""Equirectangular images, resampled from perspective images in 26 directions.
+
+A perspective image of splats is the less exact, the farther a large splat is from its axis, and images with
+different axes then differ. Images of the six sides of a cube would show edges where they meet.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import product
 
 import numpy as np
 
@@ -10,10 +15,13 @@ from ..scenes.cameras import Camera
 from .image import NO_DEPTH, RenderedImage
 from .lens import LensProjection
 
-OVERLAP = 0.1
-"""Half width of the seam within which neighbouring sides of the cube blend, relative to half a side."""
+DIRECTIONS = np.array([axis for axis in product((-1, 0, 1), repeat=3) if any(axis)], np.float64)
+"""Axes of the perspective images, in the camera's space: sides, edges and corners of a cube."""
+REACH = np.radians(40.0)
+"""Angle from its axis up to which an image contributes. Every direction is within 28 degrees of an axis."""
 OVERSAMPLING = 1.5
-"""Pixels of a cube side per pixel of the panorama, at the centre of the side."""
+"""Pixels of an image per pixel of the panorama, at the centre of the image."""
+_MAX_FOCAL = 4096
 
 Window = tuple[int, int, int, int]
 DrawSide = Callable[[Camera, Window, Callable[[float], bool]], RenderedImage | None]
@@ -31,7 +39,7 @@ def draw_panorama(
     """Draw an equirectangular image. Depths are distances from the camera, as in Cycles.
 
     Args:
-        draw: function that draws a side of the cube.
+        draw: function that draws a perspective image.
         camera: pose, width and height of the panorama.
         projection: angles at the edges of the panorama.
         window: left, top, width and height of the part to draw; None means all.
@@ -42,32 +50,33 @@ def draw_panorama(
         ``image``, or None if drawing was cancelled.
     """
     rays = directions(camera.width, camera.height, projection, window)
-    half = _side_length(camera, projection) / 2
-    reach = int(np.ceil(half * (1 + OVERLAP))) + 1
-    weights = np.zeros(rays.shape[:2], np.float32)
+    focal = _focal_length(camera, projection)
+    reach = int(np.ceil(focal * np.tan(REACH))) + 1
+    weights, largest = np.zeros((2, *rays.shape[:2]), np.float32)
     image.image[:], image.alpha[:], image.masks[:] = 0, 0, 0
-    for number in range(6):
-        rotation = _rotation(number)
+    for number, axis in enumerate(DIRECTIONS):
+        rotation = _rotation(axis)
         local = rays @ rotation.T.astype(np.float32)
-        width = np.maximum(np.abs(local[..., 0]), np.abs(local[..., 1]))
-        mask = width < (1 + OVERLAP) * local[..., 2]
+        mask = local[..., 2] > np.cos(REACH)
         if not mask.any():
             continue
         x, y, z = local[mask].T
         pose = np.eye(4)
         pose[:3, :3] = rotation
-        cube_camera = Camera(
-            camera.name, 2 * reach, 2 * reach, half, half, reach, reach, pose @ camera.world_to_camera
+        side = Camera(
+            camera.name, 2 * reach, 2 * reach, focal, focal, reach, reach, pose @ camera.world_to_camera
         )
-        u, v = half * x / z + reach - 0.5, half * y / z + reach - 0.5  # from pixel centres
+        u, v = focal * x / z + reach - 0.5, focal * y / z + reach - 0.5  # from pixel centres
         left, top = int(u.min()), int(v.min())
         part = left, top, int(u.max()) + 2 - left, int(v.max()) + 2 - top
-        drawn = draw(cube_camera, part, lambda share, n=number: progress((n + share) / 6))
+        drawn = draw(side, part, lambda share, n=number: progress((n + share) / len(DIRECTIONS)))
         if drawn is None:
             return None
-        weight = ((1 + OVERLAP - width[mask] / z) / (2 * OVERLAP)).clip(max=1)
+        weight = ((z - np.cos(REACH)) / (1 - np.cos(REACH))) ** 2  # smooth at the edge of the image
         weights[mask] += weight
-        _add(drawn, image, mask, weight, u - left, v - top, 1 / z)
+        nearest = weight > largest[mask]
+        largest[mask] = np.maximum(largest[mask], weight)
+        _add(drawn, image, mask, weight, nearest, u - left, v - top, 1 / z)
     image.image /= weights[..., None]
     image.alpha /= weights
     image.masks /= weights
@@ -93,18 +102,18 @@ def directions(
     return rays.astype(np.float32)
 
 
-def _side_length(camera: Camera, projection: LensProjection) -> int:
-    """Return the size of a cube side in pixels, which shows as many pixels per angle as the panorama."""
+def _focal_length(camera: Camera, projection: LensProjection) -> int:
+    """Return the focal length in pixels at which images show as many pixels per angle as the panorama."""
     (west, east), (south, north) = projection.longitude, projection.latitude
     density = max(camera.width / max(abs(east - west), 1e-6), camera.height / max(abs(north - south), 1e-6))
-    return min(int(np.ceil(2 * OVERSAMPLING * density)), 8192)
+    return min(int(np.ceil(OVERSAMPLING * density)), _MAX_FOCAL)
 
 
-def _rotation(number: int) -> np.ndarray:
-    """Return the rotation (3, 3) from the camera to a side: -x, +x, -y, +y, -z, +z."""
-    forward = np.zeros(3)
-    forward[number // 2] = 1 if number % 2 else -1
-    right = np.array([0.0, 0, -forward[0]]) if number < 2 else np.array([forward[2] or 1.0, 0, 0])
+def _rotation(axis: np.ndarray) -> np.ndarray:
+    """Return a rotation (3, 3) from the camera to an image that looks along an axis (3,)."""
+    forward = axis / np.linalg.norm(axis)
+    right = np.cross((0.0, 1.0, 0.0) if forward[[0, 2]].any() else (0.0, 0.0, 1.0), forward)
+    right /= np.linalg.norm(right)
     return np.array([right, np.cross(forward, right), forward])
 
 
@@ -113,14 +122,16 @@ def _add(
     image: RenderedImage,
     mask: np.ndarray,
     weight: np.ndarray,
+    nearest: np.ndarray,
     u: np.ndarray,
     v: np.ndarray,
     stretch: np.ndarray,
 ) -> None:
-    """Add a side's colours at pixels (u, v) to the masked pixels. Copy depths where it is the nearest side.
+    """Add an image's colours at pixels (u, v) to the masked pixels, and copy depths.
 
     Args:
-        weight: weight of the side in each pixel.
+        weight: weight of the image in each pixel.
+        nearest: pixels whose depth is copied, as this axis is the nearest one so far.
         stretch: distance per depth of each pixel.
     """
     column, row = u.astype(int), v.astype(int)
@@ -141,4 +152,4 @@ def _add(
     if image.depth.size:
         depth = drawn.depth[(v + 0.5).astype(int), (u + 0.5).astype(int)]
         depth = np.where(depth < NO_DEPTH, depth * stretch, NO_DEPTH)
-        image.depth[mask] = np.where(weight >= 0.5, depth, image.depth[mask])
+        image.depth[mask] = np.where(nearest, depth, image.depth[mask])

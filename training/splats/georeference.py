@@ -117,5 +117,5 @@ def local_tangent_plane(latitude: float, longitude: float, altitude: float) -> G
     east = np.array([-np.sin(lam), np.cos(lam), 0.0])
     matrix = np.eye(4)
     matrix[:3, :3] = np.stack([east, np.cross(up, east), up], axis=1)
-    matrix[:3, 3] = geocentric(phi, lam, np.float64(altitude))
+    matrix[:3, 3] = geocentric(np.asarray(phi), np.asarray(lam), np.asarray(altitude, np.float64))
     return Georeference(ECEF, matrix)

@@ -23,3 +23,8 @@ def test_panel_shows_looks_of_scene_regions_and_selected_crop(bpy, lodgs, draw_p
     assert draw_regions().properties.count("exposure") == 2
     bpy.context.view_layer.objects.active = root
     assert draw_regions().properties.count("exposure") == 1
+    assert "lodgs.tint_by_light" not in draw_panel("look", "LODGS_PT_look").operators
+    lamp = bpy.data.objects.new("lamp", bpy.data.lights.new("lamp", "SUN"))
+    bpy.context.scene.collection.objects.link(lamp)
+    assert "lodgs.tint_by_light" in draw_panel("look", "LODGS_PT_look").operators
+    assert "lodgs.tint_by_light" in draw_regions().operators

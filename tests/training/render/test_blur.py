@@ -185,6 +185,22 @@ def test_panorama_shows_directions_at_their_angles_and_distances():
     np.testing.assert_allclose(moments(image.alpha)[0], (50 / 90 * 128, 16 / 60 * 64), atol=0.2)
 
 
+@pytest.mark.parametrize("longitude", [-150, -100, 20, 60])
+def test_large_splats_have_no_edge_in_a_panorama(longitude):
+    """A splat as large as the sky: its image is as smooth as the Gaussian along the rays."""
+    size = 0.5  # standard deviation divided by distance
+    projection = LensProjection(EQUIRECTANGULAR, longitude=(-np.pi, np.pi), latitude=(-np.pi / 2, np.pi / 2))
+    camera = replace(CAMERA, width=128, height=64, world_to_camera=np.eye(4))
+    a, b = np.radians((longitude, 25))
+    direction = np.array([np.cos(b) * np.sin(a), -np.sin(b), np.cos(b) * np.cos(a)])
+    splat = dot(tuple(5 * direction), sigma=(5 * size,) * 3)
+    image = draw_blurred([splat], camera, projection, background=None)
+    steepest = 0.6065 / size  # slope of a Gaussian per radian, at one standard deviation
+    rows = slice(16, 48)  # away from the poles
+    change = np.abs(np.diff(image.alpha[rows], axis=1)).max() / np.radians(360 / 128)
+    assert 0.5 * steepest < change < 1.5 * steepest
+
+
 def test_blurred_image_can_be_cancelled_in_any_sample(monkeypatch):
     shares = []
 

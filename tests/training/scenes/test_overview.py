@@ -102,6 +102,30 @@ def test_view_of_a_room_is_from_inside():
     assert (np.abs(position) < half).all()
 
 
+@pytest.mark.parametrize("case", ["brush", "postshot", "outliers"])
+def test_splats_of_other_programs_open_with_the_same_view(case):
+    """A garden as Brush (y down, other scale), Postshot (z up, far from 0) and with far, large outliers."""
+    base = splats_at(garden(), 0.1)
+    turn, scale, offset = np.float64(Y_DOWN), 1.0, np.zeros(3)
+    if case == "brush":
+        scale = 0.3
+    elif case == "postshot":
+        turn, offset = np.eye(3), np.float64([5200, -3100, 400])
+    splats = splats_at(scale * base.means.astype(np.float64) @ turn.T + offset, 0.1 * scale)
+    if case == "outliers":
+        rng = np.random.default_rng(6)
+        directions = rng.normal(size=(300, 3))
+        directions *= rng.uniform(100, 1000, (300, 1)) / np.linalg.norm(directions, axis=1, keepdims=True)
+        splats = Splats.concatenated([splats, splats_at(directions, 5.0)])
+    bundle = Bundle("", [Level(1, splats)])
+    complete_meta(bundle)
+    position, target = (np.float64(point) - offset for point in bundle.meta["view"])
+    position, target = (point @ turn / scale for point in (position, target))  # in the garden's own space
+    np.testing.assert_allclose(bundle.up_rotation[2], turn @ (0, 0, 1), atol=1e-9)
+    np.testing.assert_allclose(target, (0, 0, 0.25), atol=0.3)
+    assert 0.5 < position[2] < 5 and 3 < np.linalg.norm(position[:2]) < 10
+
+
 def test_view_avoids_splats_near_the_eye():
     """A veil covers one half of the candidates around a ball."""
     rng = np.random.default_rng(4)
