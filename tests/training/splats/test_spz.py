@@ -65,11 +65,20 @@ def test_errors_are_at_most_half_a_step(degree):
 GOOD = content(2, bytes(3))
 
 
-@pytest.mark.parametrize(
-    "data",
-    [b"", b"NGSP", GOOD[:-12], GOOD[:20], content(4, bytes(3)), content(1, bytes(3)), content(2, b""),
-     content(2, bytes(3), 9), gzip.compress(struct.pack(HEADER, 0x5053474E, 2, 2**32 - 1, 3, 12, 0, 0))],
-)  # fmt: skip
+DAMAGED = {
+    "empty": b"",
+    "not compressed": b"NGSP",
+    "without end": GOOD[:-12],
+    "cut": GOOD[:20],
+    "version 4": content(4, bytes(3)),
+    "version 1": content(1, bytes(3)),
+    "without rotations": content(2, b""),
+    "degree 9": content(2, bytes(3), 9),
+    "2^32 splats": gzip.compress(struct.pack(HEADER, 0x5053474E, 2, 2**32 - 1, 3, 12, 0, 0)),
+}
+
+
+@pytest.mark.parametrize("data", DAMAGED.values(), ids=DAMAGED)
 def test_damaged_data_are_rejected(data):
     with pytest.raises(ValueError):
         unpack_spz(data, 1000)
