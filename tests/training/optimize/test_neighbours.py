@@ -1,5 +1,6 @@
 """Queries of k-d trees, also when they are interrupted."""
 
+import signal
 import threading
 import time
 
@@ -21,6 +22,15 @@ def test_neighbours_match_all_distances(count):
     np.testing.assert_allclose(found, np.sort(distances, axis=1)[:, :count].reshape(expected.shape))
 
 
+@pytest.fixture
+def interruptible():
+    """Hear Ctrl-C, which shells ignore for programs in background."""
+    previous = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, previous)
+
+
+@pytest.mark.usefixtures("interruptible")
 def test_interrupt_waits_for_the_threads_of_the_query():
     finished = threading.Event()
 
