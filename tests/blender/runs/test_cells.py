@@ -18,16 +18,6 @@ GARDEN = Path(__file__).resolve().parents[3] / "examples" / "lantern_garden"
 
 
 @pytest.fixture
-def jobs(lodgs):
-    return lodgs("runs.jobs")
-
-
-@pytest.fixture
-def job_settings(lodgs):
-    return lodgs("runs.job_settings")
-
-
-@pytest.fixture
 def root(bpy):
     bpy.ops.lodgs.import_colmap(directory=str(GARDEN), photographs=False)
     (root,) = [obj for obj in bpy.data.objects if obj.lodgs.is_root]

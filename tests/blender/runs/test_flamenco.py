@@ -75,12 +75,7 @@ def flamenco(lodgs, bpy, monkeypatch):
 
 
 @pytest.fixture
-def root(bpy, tmp_path):
-    collection = bpy.data.collections.new("tiny")
-    bpy.context.scene.collection.children.link(collection)
-    root = bpy.data.objects.new("tiny", None)
-    collection.objects.link(root)
-    root.lodgs.is_root, root.lodgs.scene_folder = True, str(tmp_path / "scene")
+def root(root, tmp_path):
     root.lodgs.training.output = str(tmp_path / "runs")
     return root
 

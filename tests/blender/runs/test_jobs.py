@@ -21,29 +21,8 @@ TRAINER = os.environ.get("LODGS_TRAINER_PYTHON", "")
 
 
 @pytest.fixture
-def jobs(lodgs):
-    return lodgs("runs.jobs")
-
-
-@pytest.fixture
-def job_settings(lodgs):
-    return lodgs("runs.job_settings")
-
-
-@pytest.fixture
 def watch_of(lodgs):
     return lodgs("runs.watch").watch_of
-
-
-@pytest.fixture
-def root(bpy, tmp_path):
-    """A scene root as after an import, without cameras."""
-    collection = bpy.data.collections.new("tiny")
-    bpy.context.scene.collection.children.link(collection)
-    root = bpy.data.objects.new("tiny", None)
-    collection.objects.link(root)
-    root.lodgs.is_root, root.lodgs.scene_folder = True, str(tmp_path / "scene")
-    return root
 
 
 def _levels(root) -> dict[int, int]:
