@@ -8,7 +8,7 @@ from typing import Any
 import bpy
 
 from ...training.methods import METHODS, MethodInfo, method_info
-from ...training.runs.job import KEYS, MAX_CELLS, Job
+from ...training.runs.job import KEYS, MAX_CELLS, Job, default_image_scale
 from ...training.settings import label_of
 from ...training.splats.levels import MAX_LEVELS
 from . import crops, photographs, viewpoints
@@ -34,6 +34,13 @@ def _default_interval(settings: bpy.types.PropertyGroup) -> int:
         viewpoints.view_count(settings) if viewpoints.has_only_splats(root) else len(photographs.views(root))
     )
     return 0 if views < MIN_HOLD_OUT else Job.test_every
+
+
+def _set_image_scale(settings: bpy.types.PropertyGroup, _context: bpy.types.Context) -> None:
+    """Give the image scale the default of the new preset, unless the artist changed it."""
+    scales = [default_image_scale(preset) for preset in KEYS["preset"].metadata["choices"]]
+    if any(abs(settings.image_scale - scale) < 1e-6 for scale in scales):
+        settings.image_scale = default_image_scale(settings.preset)
 
 
 def panel_parameters(method: str) -> list[Field]:
@@ -173,6 +180,7 @@ class TrainingSettings(viewpoints.ViewsSettings, bpy.types.PropertyGroup):
         description="Median depth of the photos, in scene units. 0 if unknown",
         options={"HIDDEN"},
     )
+    preset: property_of(KEYS["preset"], update=_set_image_scale)
     image_scale: property_of(KEYS["image_scale"], min=0.01)
     region: bpy.props.PointerProperty(
         type=bpy.types.Object,

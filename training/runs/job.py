@@ -206,8 +206,7 @@ class Job:
         for key, value in checked.items():
             if value and _is_path(declared[key], value):
                 checked[key] = _absolute_path(key, value, folder)
-        if checked.get("preset") == "paper":
-            checked.setdefault("image_scale", 1.0)
+        checked.setdefault("image_scale", default_image_scale(checked.get("preset", "")))
         job = cls(**checked, parameters=parameters)
         job._check()
         return job
@@ -332,6 +331,11 @@ KEYS = settings_of(Job)
 """Declarations of all keys except ``parameters``, by name."""
 CHANGEABLE = tuple(name for name, key in KEYS.items() if key.metadata.get("changeable"))
 """Keys that may change when a run is resumed."""
+
+
+def default_image_scale(preset: str) -> float:
+    """Return the image scale of jobs that omit it: the preset paper trains at the photos' size."""
+    return 1.0 if preset == "paper" else Job.image_scale
 
 
 def save_job(job: Job, folder: RunFolder) -> None:

@@ -130,3 +130,15 @@ def test_held_out_views_follow_the_job(lodgs, scene_with_photos, tmp_path):
     assert job_settings.make_job(root, tmp_path, {}).test_every == 0
     root.lodgs.training.test_every = 4
     assert job_settings.make_job(root, tmp_path, {}).test_every == 4
+
+
+def test_image_scale_follows_the_preset_until_it_is_changed(object_with_method):
+    settings = object_with_method.lodgs.training
+    scales = []
+    for preset in ("paper", "draft", "paper"):
+        settings.preset = preset
+        scales.append(settings.image_scale)
+    assert scales == [1, 0.5, 1]
+    settings.image_scale = 0.25
+    settings.preset = "standard"
+    assert settings.image_scale == 0.25
