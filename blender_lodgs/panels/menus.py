@@ -17,7 +17,7 @@ OPERATORS = (
     ("lodgs.use_engine", "lodgs.render_quick", "lodgs.combine_with_meshes", "lodgs.separate_meshes",
      "lodgs.render_mesh_depth", "lodgs.export_camera"),
     ("lodgs.reload_splats", "lodgs.add_to_scene", "lodgs.capture_scene", "lodgs.import_capture",
-     "lodgs.reset_look", "lodgs.remove_paint", "lodgs.remove_scene"),
+     "lodgs.reset_look", "lodgs.tint_by_light", "lodgs.remove_paint", "lodgs.remove_scene"),
 )  # fmt: skip
 """Operators of the menu, without those that other menus list: placement, clean-up, import and export."""
 
