@@ -183,9 +183,9 @@ def divide(parameters: FlodParameters) -> tuple[FlodParameters, FlodParameters] 
     return replace(parameters, last_level=coarse), replace(parameters, first_level=coarse + 1)
 
 
-_DRAFT = FlodParameters()
+_DRAFT = FlodParameters(grad_threshold=7e-5)  # few steps for growth
 _STANDARD = replace(
-    _DRAFT,
+    FlodParameters(),
     **STANDARD,
     steps=STANDARD_STEPS,
     refine_steps=1_400,

@@ -123,11 +123,12 @@ class Method(method.Method[FlodParameters, Drawing]):
 
     def shrink(self, step: int) -> float:
         p = self.parameters
-        if not self._refines(step):
-            return shrink_at(self._progress(step), p.first_resolution, p.full_resolution)
-        if (factor := random_reduction(self.seed, step)) > 1:
+        if self._refines(step) and (factor := random_reduction(self.seed, step)) > 1:
             return factor
-        progress = self._level_step(step) / p.stages[self._stage(step)][1]
+        if p.merges and step < self._ends[-1]:
+            progress = self._level_step(step) / p.stages[self._stage(step)][1]
+        else:
+            progress = self._progress(step)
         return shrink_at(progress, p.first_resolution, p.full_resolution)
 
     def sh_degree(self, step: int) -> int:

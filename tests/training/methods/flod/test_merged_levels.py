@@ -77,6 +77,17 @@ def test_merge_drops_invisible_splats(data):
     assert (flod.model["means"] - behind_cameras).norm(dim=1).min() > 1
 
 
+def test_finest_level_has_full_images_after_its_own_share(data):
+    """The schedule of the finest level counts its own steps, not those of the run, so that it densifies on
+    almost full-size images.
+    """
+    flod = make(data, steps=[400] * 3, refine_steps=300, first_resolution=0.5, full_resolution=0.5)
+    end = flod._ends[0]
+    factors = [flod.shrink(step) for step in range(end)]
+    assert factors[0] > 1.4
+    np.testing.assert_array_equal(factors[end // 2 :], 1)
+
+
 def test_refinement_starts_with_small_images(data):
     """Images of each merged level grow from ``first_resolution`` to full size; some remain small."""
     flod = make(data, steps=[400] * 3, refine_steps=300, first_resolution=0.5, full_resolution=0.5)
