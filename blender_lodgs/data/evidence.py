@@ -53,7 +53,7 @@ def hide() -> None:
     extension.redraw()
 
 
-def shares(root: bpy.types.Object) -> np.ndarray | None:
+def grade_shares(root: bpy.types.Object) -> np.ndarray | None:
     """Return the share of the finest level's visible splats of each grade; None without a heat map."""
     levels = cleaning.levels(root)
     if not levels:

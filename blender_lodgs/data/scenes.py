@@ -352,8 +352,8 @@ def attach_ellipsoids(scene: bpy.types.Scene) -> None:
 def _looks(root: bpy.types.Object) -> look.Looks:
     """Return the current looks of a scene."""
     depsgraph = bpy.context.evaluated_depsgraph_get()
-    to_own = axes_of(root).evaluated_get(depsgraph).matrix_world.inverted_safe()
-    return looks.looks_of(root, depsgraph, to_own)
+    from_world = axes_of(root).evaluated_get(depsgraph).matrix_world.inverted_safe()
+    return looks.looks_of(root, depsgraph, from_world)
 
 
 def _require_complete(root: bpy.types.Object, number: int) -> None:
@@ -454,7 +454,7 @@ def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
                 levels_changed(root)
     if depsgraph.id_type_updated("OBJECT"):
         for root in editable:
-            if crops.outdated(root) or looks.outdated(root):
+            if crops.is_outdated(root) or looks.is_outdated(root):
                 selection.follow_crops(root)
     if any(update.is_updated_geometry for update in depsgraph.updates):
         for root in editable:

@@ -49,7 +49,7 @@ class LODGS_OT_show_evidence(_ViewsOperator, bpy.types.Operator):
     @report_errors
     def execute(self, context):
         root = roots.active_root(context)
-        if evidence.shares(root) is None:
+        if evidence.grade_shares(root) is None:
             evidence.show(root)
         else:
             evidence.hide()

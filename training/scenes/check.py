@@ -76,7 +76,7 @@ def check_folder(
 
 
 def check_scene(scene: Scene, image_scale: float = 1.0) -> list[Finding]:
-    """Return the findings of which reading the scene does not warn, without decoding its photos."""
+    """Return the findings besides the scene's own warnings, without decoding its photos."""
     observed = observations(scene, [camera.name for camera in scene.cameras])
     return [
         *_views(scene), *_sizes(scene, image_scale), *_origin(scene),
