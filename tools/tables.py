@@ -194,7 +194,9 @@ _DEFAULT = re.compile(r" ?\(default:? ([^()]+)\)")
 
 def _sentence(text: str) -> str:
     """Return a text with a capital and a full stop."""
-    start = text[:1].upper() if re.match("[a-z]+[ ;,:-]", text) else text[:1]  # not γ, s_v or a file name
+    start = (
+        text[:1].upper() if re.match(r"[a-z]+([ ;,:-]|\.?$|\. )", text) else text[:1]
+    )  # not γ, s_v or a file name
     return start + text[1:].rstrip(".") + "."
 
 

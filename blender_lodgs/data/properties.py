@@ -45,7 +45,7 @@ class ViewportSettings(bpy.types.PropertyGroup):
     )
     drawn_by: bpy.props.EnumProperty(
         name="Drawn By",
-        description="Program part that draws splats in the 3D viewport",
+        description="Choose whether LODGS or Blender draws splats in 3D viewports",
         items=[
             (
                 "LODGS", "LODGS",

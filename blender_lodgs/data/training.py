@@ -220,7 +220,7 @@ class TrainingSettings(viewpoints.ViewsSettings, bpy.types.PropertyGroup):
     )
     cell_memory: bpy.props.FloatProperty(
         name="Max Memory (GB)",
-        description="Maximum memory for training one cell, estimated, in gigabytes",
+        description="Maximum estimated memory for training one cell",
         default=8.0,
         min=0.5,
         soft_max=64.0,

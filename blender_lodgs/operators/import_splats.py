@@ -40,7 +40,8 @@ class LODGS_OT_import_splats(BackgroundOperator, bpy.types.Operator):
     )
     upright: bpy.props.BoolProperty(
         name="Upright",
-        description="Rotate the scene so that the file's -Y axis, up in most splat files, becomes Z",
+        description="Rotate the scene upright by the file's up axis or by its ground, else by -Y, the up "
+        "axis of most splat files. Disable it if the scene lies on its side",
         default=True,
     )
 
