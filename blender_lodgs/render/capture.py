@@ -88,7 +88,7 @@ def render_views(
         on_view(number, len(shots))
         if bpy.ops.render.render() != {"FINISHED"}:
             raise LodgsError(
-                f"The rendering of view {number} was cancelled.", "Start the capture again to continue."
+                f"Cannot capture view {number}: its render was cancelled.", "Start the capture again."
             )
         _save(context.scene, folder, name, (width, height))
         write_camera(file, camera.moved(place.origin), near)  # last, as it marks the view as complete

@@ -287,7 +287,7 @@ def holdout_file(scene: bpy.types.Scene, frame: int) -> Path | None:
         return None
     if scene.render.use_multiview:
         raise LodgsError(
-            "Cannot hold out meshes in a stereo or multi-view render.",
+            "Cannot hold out meshes in a stereo or multi-view render: depth files have one view.",
             "Clear Hold Out, and use Combine with Meshes.",
         )
     if problem := holdout_problem(scene):
@@ -397,7 +397,7 @@ def _motion_of(
 
 
 def _is_selected_by_rule(instance: shown.SplatInstance, depsgraph: bpy.types.Depsgraph) -> bool:
-    """Return whether an instance shows the splats of its object, selected by nothing but a rule.
+    """Return True if an instance shows the splats of its object, selected by a rule alone.
 
     Objects that are hidden in the viewport do not count, because Blender does not report their changes.
     """

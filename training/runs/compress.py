@@ -70,7 +70,7 @@ def compress(
     """
     path = find_splats(source)
     if out.resolve() == path.resolve():
-        raise LodgsError(f"Cannot overwrite the source {out}.", "Choose another output file.")
+        raise LodgsError(f"Cannot write {out}: it is the source.", "Choose another output file.")
     if out.suffix.lower() != ".ply":
         raise LodgsError(f"Cannot write {out}: compressed bundles are PLY files.", "End its name with .ply.")
     bundle = read_folder(path, warn) if path.is_dir() else read_bundle(path, warn)
