@@ -99,7 +99,7 @@ def set_level(root: bpy.types.Object, level: Level) -> bpy.types.Object:
     if level.number == root.lodgs.levels[-1].number:
         root.lodgs.single_level = level.number
         root.lodgs.active_level = len(root.lodgs.levels) - 1
-    if first and root.lodgs.points:  # the splats stand where the points were
+    if first and root.lodgs.points:  # the splats replace the points
         root.lodgs.points.hide_viewport = root.lodgs.points.hide_render = True
     return obj
 
@@ -152,7 +152,7 @@ def read_levels(root: bpy.types.Object, placed: bool = False, looked: bool = Fal
 
     Args:
         placed: apply the scene's placement in Blender, so that the result is upright; otherwise use the
-            splats' own world. Transforms of single level objects are ignored.
+            splats' space. Transforms of single level objects are ignored.
         looked: apply paint and looks (``looks``); otherwise return trained colours, with paint in separate
             columns.
 

@@ -69,8 +69,8 @@ def render_views(
     existing = {file.stem for file in (folder / CAMERAS).glob("*.json")}
     if existing - set(names):
         raise _different_views(folder)
-    others = ("sparse",) if (folder / CAMERAS).is_dir() else ("sparse", CAMERAS, IMAGES, DEPTHS)
-    if not existing and any((folder / kind).exists() for kind in others):
+    foreign = ("sparse",) if (folder / CAMERAS).is_dir() else ("sparse", CAMERAS, IMAGES, DEPTHS)
+    if not existing and any((folder / kind).exists() for kind in foreign):
         raise LodgsError(f"Cannot capture to {folder}: it contains another scene.", "Choose another folder.")
     _mark(folder)
     _prepare(context.scene, width, height)

@@ -197,8 +197,8 @@ def _groups(view: np.ndarray, point: np.ndarray, members: np.ndarray) -> list[li
     """
     order = np.lexsort((view, point))
     view, point = view[order], point[order]
-    kept = np.isin(view, members)
-    view, point = view[kept], point[kept]
+    is_member = np.isin(view, members)
+    view, point = view[is_member], point[is_member]
     pairs = np.unique(np.stack([view[:-1], view[1:]], axis=1)[point[:-1] == point[1:]], axis=0)
     parent = list(range(int(members.max(initial=0)) + 1))
 

@@ -60,9 +60,9 @@ def central_ball(means: np.ndarray) -> tuple[np.ndarray, float]:
     means = means.astype(np.float64)
     center = np.median(means, axis=0)
     distances = np.linalg.norm(means - center, axis=1)
-    median, most = np.percentile(distances, (50, 90))
+    median, ninth_decile = np.percentile(distances, (50, 90))
     near = means[distances <= _FAR_FACTOR * median]
-    return np.median(near, axis=0), float(max(min(most, _FAR_FACTOR * median), 1e-9))
+    return np.median(near, axis=0), float(max(min(ninth_decile, _FAR_FACTOR * median), 1e-9))
 
 
 def guess_up_rotation(splats: Splats) -> np.ndarray | None:
