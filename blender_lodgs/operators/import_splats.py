@@ -47,8 +47,8 @@ class LODGS_OT_import_splats(BackgroundOperator, bpy.types.Operator):
 
     budget: bpy.props.IntProperty(
         name="Memory Budget",
-        description="Maximum number of splats of a tree in memory; finer splats are streamed from the file "
-        "when the camera comes near. 0 imports the whole tree, as for other files",
+        description="Maximum number of splats of a tree in memory; set it to stream a file that is larger "
+        "than memory. 0 imports the whole file",
         default=0,
         min=0,
         step=100_000,
