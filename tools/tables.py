@@ -75,7 +75,7 @@ def controls_page() -> str:
         + "\nControls select the level of detail for a camera. They are sliders in Blender "
         "(**By Distance**), options of `render` and `evaluate`, and values in a bundle, which replace the "
         "defaults. Each method has one rule; controls of other rules are rejected. The formulas are in "
-        "[Bundle](bundle.md#choosing-by-distance).",
+        "[Rules of a bundle](bundle-rules.md).",
     ]
     for rule in rules().values():
         users = [method.label for method in METHODS.values() if method.rule == rule.name]
