@@ -274,8 +274,10 @@ def _capture(args: argparse.Namespace) -> int:
     if args.curve:
         settings.curve = bpy.data.objects.get(args.curve)
         if settings.curve is None or settings.curve.type != "CURVE":
+            curves = ", ".join(obj.name for obj in bpy.data.objects if obj.type == "CURVE")
             raise LodgsError(
-                f"Cannot capture: {args.blend} has no curve '{args.curve}'.", "Name a curve of the file."
+                f"Cannot capture: {args.blend} has no curve '{args.curve}'.",
+                f"Use one of its curves: {curves}." if curves else "Use another placement, such as --around.",
             )
     width, height = args.size or viewpoints.image_size(scene, settings)
     views = settings.views if args.views is None else args.views
@@ -308,7 +310,7 @@ def _capture(args: argparse.Namespace) -> int:
 def _frames(args: argparse.Namespace) -> int:
     if args.most < 2:
         raise LodgsError(
-            f"Cannot make a scene of {args.most} frames.", "Set --most to at least 2, better to some dozens."
+            f"Cannot make a scene of {args.most} frames: it needs at least 2.", "Set --most to 24 or more."
         )
     if not args.video.is_file():
         raise LodgsError(f"Cannot read video: {args.video} does not exist.", "Choose a video file.")

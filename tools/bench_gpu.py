@@ -309,7 +309,7 @@ def training(backend: str, options: list[str]) -> dict:
 
 def measure_all(seconds: float, tiny: bool, out: Path) -> dict:
     """Measure all parts of ``--all``, and write the results so far after each."""
-    backends = ["gpu"] if cuda.problem() else ["gpu", "cuda"]
+    backends = ["gpu"] if cuda.find_problem() else ["gpu", "cuda"]
     jobs = {
         "flod draft, half size": ["--method", "flod"],
         "3dgs draft, full size": ["--method", "3dgs", "--image-scale", "1"],

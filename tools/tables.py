@@ -75,7 +75,7 @@ def controls_page() -> str:
         + "\nControls select the level of detail for a camera. They are sliders in Blender "
         "(**By Distance**), options of `render` and `evaluate`, and values in a bundle, which replace the "
         "defaults. Each method has one rule; controls of other rules are rejected. The formulas are in "
-        "[Bundle](bundle.md#choosing-by-distance).",
+        "[Rules of a bundle](bundle-rules.md).",
     ]
     for rule in rules().values():
         users = [method.label for method in METHODS.values() if method.rule == rule.name]
@@ -194,7 +194,9 @@ _DEFAULT = re.compile(r" ?\(default:? ([^()]+)\)")
 
 def _sentence(text: str) -> str:
     """Return a text with a capital and a full stop."""
-    start = text[:1].upper() if re.match("[a-z]+[ ;,:-]", text) else text[:1]  # not γ, s_v or a file name
+    start = (
+        text[:1].upper() if re.match(r"[a-z]+([ ;,:-]|\.?$|\. )", text) else text[:1]
+    )  # not γ, s_v or a file name
     return start + text[1:].rstrip(".") + "."
 
 

@@ -208,7 +208,7 @@ def detail() -> Steps:
 def place_and_clean() -> Steps:
     yield from show_panels("placement")
     overview()
-    press("lodgs.set_ground", by="FOUND")
+    press("lodgs.set_ground", by="DETECT")
     for number, x in enumerate((-0.95, 0.95)):
         press("object.empty_add", mode="EXEC_DEFAULT", radius=0.1, location=world_position(x, 0, 0.78))
         bpy.context.active_object.name = f"Table {number + 1}"

@@ -109,7 +109,7 @@ def search() -> Steps:
 def edit() -> Steps:
     """Place, crop and clean the splats; return the number of undo steps."""
     look_from(world_position(-1.7, -2.5, 1.15), world_position(0.0, 0.3, 0.8))
-    press("lodgs.set_ground", by="FOUND")
+    press("lodgs.set_ground", by="DETECT")
     for number, (x, y) in enumerate(TABLE_ENDS):
         press("object.empty_add", mode="EXEC_DEFAULT", radius=0.1, location=world_position(x, y, TABLE_TOP))
         bpy.context.active_object.name = f"Table {number + 1}"

@@ -257,9 +257,11 @@ def check_folder(folder: Path, remedy: str) -> None:
     """Raise LodgsError, with the given remedy, unless the folder exists."""
     if folder.is_file():
         is_archive = folder.suffix.lower() in (".zip", ".r3d", ".7z", ".rar", ".tar", ".gz")
-        raise LodgsError(f"{folder} is a file, not a folder.", "Unpack it first." if is_archive else remedy)
+        raise LodgsError(
+            f"Cannot open {folder}: it is a file, not a folder.", "Unpack it first." if is_archive else remedy
+        )
     if not folder.is_dir():
-        raise LodgsError(f"The folder {folder} does not exist.", remedy)
+        raise LodgsError(f"Cannot open {folder}: the folder does not exist.", remedy)
 
 
 def create_folder(folder: Path) -> None:

@@ -36,10 +36,10 @@ def without_cuda(lock: str) -> str:
     Args:
         lock: text of a requirements file with one entry per package, its hashes on indented lines.
     """
-    kept, keep = [], True
+    lines, keep = [], True
     for line in lock.splitlines(keepends=True):
         if not line[:1].isspace():
             keep = not CUDA_PACKAGES.fullmatch(re.split(r"[\s=<>;@\[]", line, maxsplit=1)[0])
         if keep:
-            kept.append(line)
-    return "".join(kept)
+            lines.append(line)
+    return "".join(lines)

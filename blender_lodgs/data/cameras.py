@@ -90,7 +90,7 @@ class RenderView:
         """Convert the view to a camera in Blender's world for an image of this size.
 
         Returns:
-            The camera, and the (4, 4) float64 transform of the world that makes it see what this view sees:
+            The camera, and the (4, 4) float64 transform of the world under which the camera shows this view:
             a shear or a mirroring, if the scale of parents or of the camera has this effect. None otherwise.
 
         Raises:

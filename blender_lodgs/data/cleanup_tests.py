@@ -175,7 +175,7 @@ def find_clutter(
     )
 
 
-def union(masks: Mapping[str, Masks], root: bpy.types.Object) -> Masks:
+def unite_masks(masks: Mapping[str, Masks], root: bpy.types.Object) -> Masks:
     """Return the splats that match any test."""
     result = {item.number: np.zeros(len(item.object.data.points), bool) for item in cleaning.levels(root)}
     for by_level in masks.values():
@@ -218,7 +218,7 @@ def suggest_clutter_limits(root: bpy.types.Object) -> dict[str, float]:
 
 
 def subject_of(root: bpy.types.Object) -> clutter.SceneSubject:
-    """Return the subject of the finest level, in the scene's own space; the last result is cached."""
+    """Return the subject of the finest level, in the scene's coordinates; the last result is cached."""
     cloud = cleaning.levels(root)[-1].object.data
     up = placement_of(root).rotation.T @ (0.0, 0.0, 1.0)
     key = cloud.session_uid, len(cloud.points), changes.version(cloud), tuple(up)

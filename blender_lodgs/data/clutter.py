@@ -94,7 +94,7 @@ def refresh(context: bpy.types.Context, root: bpy.types.Object) -> dict[str, Mas
     return {name: masks for name, (_, masks) in current.items()}
 
 
-def counts(root: bpy.types.Object) -> dict[str, int] | None:
+def count_by_kind(root: bpy.types.Object) -> dict[str, int] | None:
     """Return the number of splats of each enabled test in all levels; None if splats or limits changed."""
     current = _matches.get(root.session_uid, {})
     enabled = {test for test in CLUTTER_TESTS if getattr(root.lodgs_clutter, use_property(test))}
@@ -105,7 +105,7 @@ def counts(root: bpy.types.Object) -> dict[str, int] | None:
     return {name: sum(int(mask.sum()) for mask in masks.values()) for name, (_, masks) in current.items()}
 
 
-def total(root: bpy.types.Object) -> int:
+def count_clutter(root: bpy.types.Object) -> int:
     """Return the number of coloured splats in all levels."""
     marks = [cleaning.displayed_marks(item.object.data) for item in cleaning.levels(root)]
     return sum(int(np.count_nonzero((mark > 1) & (mark != cleaning.mark_of("")))) for mark in marks)

@@ -53,33 +53,35 @@ def new_crop(root: bpy.types.Object, shape: str, matrix: Matrix, keep: str = "IN
 
 
 def region_object(root: bpy.types.Object, region: Crop) -> bpy.types.Object:
-    """Create the object of a job's region, which is given in the splats' own space."""
+    """Create the object of a job's region, which is given in the splats' space."""
     bpy.context.view_layer.update()
-    to_own = Matrix((*region.to_own, (0.0, 0.0, 0.0, 1.0)))
-    return new_crop(root, region.shape, axes_of(root).matrix_world @ to_own.inverted_safe(), "ALL")
+    to_local = Matrix((*region.to_local, (0.0, 0.0, 0.0, 1.0)))
+    return new_crop(root, region.shape, axes_of(root).matrix_world @ to_local.inverted_safe(), "ALL")
 
 
 def evaluated_crops(root: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> tuple[Crop, ...]:
-    """Return the enabled crops in the splats' own space, as evaluated in the depsgraph."""
-    to_own = axes_of(root).evaluated_get(depsgraph).matrix_world.inverted_safe()
-    return tuple(evaluated_crop(obj, to_own, depsgraph) for obj in removing_crops(root) if obj.lodgs_crop.use)
+    """Return the enabled crops in the splats' space, as evaluated in the depsgraph."""
+    from_world = axes_of(root).evaluated_get(depsgraph).matrix_world.inverted_safe()
+    return tuple(
+        evaluated_crop(obj, from_world, depsgraph) for obj in removing_crops(root) if obj.lodgs_crop.use
+    )
 
 
-def evaluated_crop(obj: bpy.types.Object, to_own: Matrix, depsgraph: bpy.types.Depsgraph) -> Crop:
+def evaluated_crop(obj: bpy.types.Object, from_world: Matrix, depsgraph: bpy.types.Depsgraph) -> Crop:
     """Return the box or sphere of a crop, as evaluated in the depsgraph.
 
     Args:
-        to_own: matrix from the world to the space of the result.
+        from_world: matrix from the world to the space of the result.
     """
     sphere = obj.empty_display_type == DISPLAY_TYPES["SPHERE"]
-    return _crop(to_own, obj, depsgraph, obj.empty_display_size, sphere, obj.lodgs_crop.keep == "OUTSIDE")
+    return _crop(from_world, obj, depsgraph, obj.empty_display_size, sphere, obj.lodgs_crop.keep == "OUTSIDE")
 
 
 def crop_text(root: bpy.types.Object, obj: bpy.types.Object) -> str:
-    """Return a crop as text for the region of a job (``Crop.from_text``), in the splats' own space."""
+    """Return a crop as text for the region of a job (``Crop.from_text``), in the splats' space."""
     depsgraph = bpy.context.evaluated_depsgraph_get()
-    to_own = axes_of(root).evaluated_get(depsgraph).matrix_world.inverted_safe()
-    return evaluated_crop(obj, to_own, depsgraph).as_text()
+    from_world = axes_of(root).evaluated_get(depsgraph).matrix_world.inverted_safe()
+    return evaluated_crop(obj, from_world, depsgraph).as_text()
 
 
 def modifier_crops(
@@ -94,14 +96,14 @@ def modifier_crops(
     count = groups.crop_count(modifier.node_group) if modifier is not None else None
     if count is None or not is_on(modifier):
         return None
-    to_own, crops = evaluated.matrix_world.inverted_safe(), []
+    from_world, crops = evaluated.matrix_world.inverted_safe(), []
     for number in range(1, count + 1):
         obj, size, sphere, outside, use = (
             compat.get_input(modifier, name.format(number))
             for name in (groups.OBJECT, groups.SIZE, groups.SPHERE, groups.OUTSIDE, groups.USE)
         )
         if use and obj is not None:
-            crops.append(_crop(to_own, obj, depsgraph, size, sphere > 0.5, outside > 0.5))
+            crops.append(_crop(from_world, obj, depsgraph, size, sphere > 0.5, outside > 0.5))
     return tuple(crops)
 
 
@@ -116,12 +118,12 @@ def attach(root: bpy.types.Object) -> None:
                 detach(item.object)
 
 
-def outdated(root: bpy.types.Object) -> bool:
+def is_outdated(root: bpy.types.Object) -> bool:
     """Return True if modifiers do not match the current crops, or were made by an older version."""
     crops = removing_crops(root)
     levels = [item.object for item in root.lodgs.levels if item.exists]
     node_groups = [modifier.node_group for obj in levels if (modifier := modifier_of(obj))]
-    return any(followed_by(obj) != crops for obj in levels) or not all(
+    return any(followed_objects(obj) != crops for obj in levels) or not all(
         groups.is_current(group, len(crops)) for group in node_groups
     )
 
@@ -131,7 +133,7 @@ def modifier_of(obj: bpy.types.Object) -> bpy.types.NodesModifier | None:
     return find_modifier(obj, groups.COUNT)
 
 
-def followed_by(obj: bpy.types.Object, count_key: str = groups.COUNT) -> list[bpy.types.Object | None]:
+def followed_objects(obj: bpy.types.Object, count_key: str = groups.COUNT) -> list[bpy.types.Object | None]:
     """Return the objects that a level's modifier follows.
 
     Args:
@@ -159,11 +161,11 @@ def _is_under(obj: bpy.types.Object | None, root: bpy.types.Object) -> bool:
 
 
 def _crop(
-    to_own: Matrix, obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph,
+    from_world: Matrix, obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph,
     size: float, sphere: bool, outside: bool,
 ) -> Crop:  # fmt: skip
-    """Return a crop in the space that ``to_own`` leads to from the world."""
-    matrix = np.array(to_own @ obj.evaluated_get(depsgraph).matrix_world, np.float64)
+    """Return a crop in the space to which ``from_world`` transforms."""
+    matrix = np.array(from_world @ obj.evaluated_get(depsgraph).matrix_world, np.float64)
     matrix[:, :3] *= size
     return Crop.from_matrix("SPHERE" if sphere else "BOX", matrix, outside)
 
@@ -173,7 +175,7 @@ def _attach(obj: bpy.types.Object, crops: list[bpy.types.Object]) -> None:
     if (
         modifier is not None
         and groups.is_current(modifier.node_group, len(crops))
-        and followed_by(obj) == crops
+        and followed_objects(obj) == crops
     ):
         return
     detach(obj)

@@ -17,7 +17,7 @@ _MARKS = np.array([
     next(cleaning.mark_of(name) for name, kind in KINDS.items() if kind.tint == tint) for tint in TINTS
 ], np.uint8)  # fmt: skip
 
-_shown: dict[int, tuple[tuple, np.ndarray]] = {}
+_heat_maps: dict[int, tuple[tuple, np.ndarray]] = {}
 """Key and marks of each point cloud with a heat map, by its ``session_uid``."""
 
 
@@ -32,7 +32,7 @@ def show(root: bpy.types.Object) -> None:
     held_out = photographs.held_out(root)
     views = [view for view in photographs.views_with_photo(root) if view not in held_out]
     cameras = [photographs.camera_of(view) for view in views]
-    _shown.clear()
+    _heat_maps.clear()
     for item in cleaning.levels(root):
         cloud = item.object.data
         evidence = measure_splat_evidence(
@@ -41,25 +41,25 @@ def show(root: bpy.types.Object) -> None:
             cleaning.splat_attribute(cloud, SCALE).max(axis=1, initial=0),
             cleaning.splat_attribute(cloud, BASE)[:, 3],
         )
-        _shown[cloud.session_uid] = _key(cloud), _MARKS[evidence.grades]
-    cleaning.show_marks({uid: marks for uid, (_, marks) in _shown.items()})
+        _heat_maps[cloud.session_uid] = _key(cloud), _MARKS[evidence.grades]
+    cleaning.show_marks({uid: marks for uid, (_, marks) in _heat_maps.items()})
     extension.redraw()
 
 
 def hide() -> None:
     """Show the splats' own colours."""
-    _shown.clear()
+    _heat_maps.clear()
     cleaning.show_marks({})
     extension.redraw()
 
 
-def shares(root: bpy.types.Object) -> np.ndarray | None:
+def grade_shares(root: bpy.types.Object) -> np.ndarray | None:
     """Return the share of the finest level's visible splats of each grade; None without a heat map."""
     levels = cleaning.levels(root)
     if not levels:
         return None
     cloud = levels[-1].object.data
-    key, marks = _shown.get(cloud.session_uid, ((), None))
+    key, marks = _heat_maps.get(cloud.session_uid, ((), None))
     if marks is None or key != _key(cloud) or not cleaning.shows_marks(cloud, marks):
         return None
     visible = marks[~cleaning.hidden_mask(cloud)]

@@ -26,8 +26,8 @@ def align_to_ground(root: bpy.types.Object, positions: np.ndarray | None = None,
     """Move a splat scene so that its ground is z = 0 of Blender's world, with the normal up.
 
     Args:
-        places: (P, 3) three or more points of the ground in Blender's world; None detects the plane below the
-            scene.
+        positions: (P, 3) three or more points of the ground in Blender's world; None detects the plane below
+            the scene.
         flip: turn the other side of the ground up.
 
     Returns:
@@ -122,7 +122,7 @@ def measure_distance(positions: np.ndarray) -> float:
 
 
 def ground_points(root: bpy.types.Object) -> np.ndarray:
-    """Return the points (P, 3) for ground detection, in the scene's own space.
+    """Return the points (P, 3) for ground detection, in the scene's coordinates.
 
     These are COLMAP's points, or the means of the finest level's opaque splats. If the median depth is known,
     only points near the cameras are returned.

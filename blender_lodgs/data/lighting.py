@@ -20,7 +20,7 @@ def has_lamps(context: bpy.types.Context) -> bool:
 def mean_light(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph, position: Vector) -> np.ndarray:
     """Return the mean irradiance of a small sphere at a position, (3,) linear, without shadows.
 
-    Light from one direction reaches a quarter of what a surface across it receives.
+    Light from one direction gives the sphere a quarter of the irradiance of a surface that faces the light.
     """
     total = np.pi * _world_radiance(scene.world)
     for instance in depsgraph.object_instances:

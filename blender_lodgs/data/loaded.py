@@ -66,8 +66,8 @@ def reduce_detail(context: bpy.types.Context, root: bpy.types.Object, share: flo
     if rule is None:
         raise LodgsError(*unknown_rule_error(root.lodgs.rule))
     numbers = [item.number for item in root.lodgs.levels if item.exists]
-    before = {control.name: getattr(root.lodgs.controls, control.name) for control in rule.controls}
-    values: Values | None = before
+    initial = {control.name: getattr(root.lodgs.controls, control.name) for control in rule.controls}
+    values: Values | None = initial
     saved = first = saved_share(context, root)
     while saved < share and (values := rule.less_detail(values, numbers)) is not None:
         for name, value in values.items():
@@ -75,7 +75,7 @@ def reduce_detail(context: bpy.types.Context, root: bpy.types.Object, share: flo
         context.view_layer.update()
         saved = saved_share(context, root)
     if saved < share and saved <= first:
-        for name, value in before.items():
+        for name, value in initial.items():
             setattr(root.lodgs.controls, name, value)
         raise LodgsError(
             "Cannot save splats: coarser levels draw as many at this camera.",

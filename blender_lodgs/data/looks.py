@@ -38,7 +38,7 @@ _DISPLAY: dict[str, dict[str, Any]] = {
 
 
 class PlacedLook(NamedTuple):
-    """A look and the crop that limits it, in the splats' own space; None for the entire scene."""
+    """A look and the crop that limits it, in the splats' space; None for the entire scene."""
 
     crop: Crop | None
     look: Look
@@ -82,12 +82,12 @@ LookSettings.__annotations__ |= {
 
 
 def looks_of(
-    root: bpy.types.Object, depsgraph: bpy.types.Depsgraph, to_own: Matrix
+    root: bpy.types.Object, depsgraph: bpy.types.Depsgraph, from_world: Matrix
 ) -> tuple[PlacedLook, ...]:
     """Return the looks of a scene that change anything, as evaluated in the depsgraph, the root's first.
 
     Args:
-        to_own: matrix from the world to the splats' own space.
+        from_world: matrix from the world to the splats' space.
     """
     root_look, placed_looks = _read_look(root.evaluated_get(depsgraph).lodgs_look), []
     if root_look != NEUTRAL:
@@ -96,7 +96,7 @@ def looks_of(
         settings = obj.evaluated_get(depsgraph).lodgs_look
         look = _read_look(settings)
         if obj.lodgs_crop.use and look != NEUTRAL:
-            crop = crops.evaluated_crop(obj, to_own, depsgraph)
+            crop = crops.evaluated_crop(obj, from_world, depsgraph)
             placed_looks.append(PlacedLook(replace(crop, outside=settings.outside), look))
     return tuple(placed_looks)
 
@@ -136,11 +136,11 @@ def modifier_of(obj: bpy.types.Object) -> bpy.types.NodesModifier | None:
     return find_modifier(obj, groups.COUNT)
 
 
-def outdated(root: bpy.types.Object) -> bool:
+def is_outdated(root: bpy.types.Object) -> bool:
     """Return True if a level's modifier is of another version or does not match the current regions."""
     regions = regions_of(root)
     levels = [item.object for item in root.lodgs.levels if item.exists]
-    return any(crops.followed_by(obj, groups.COUNT) != regions for obj in levels) or not all(
+    return any(crops.followed_objects(obj, groups.COUNT) != regions for obj in levels) or not all(
         groups.is_current(modifier.node_group, len(regions), len(sh_names(obj.data)))
         for obj in levels
         if (modifier := modifier_of(obj)) is not None
@@ -167,7 +167,7 @@ def _attach(obj: bpy.types.Object, root: bpy.types.Object, regions: list[bpy.typ
     if (
         modifier is not None
         and groups.is_current(modifier.node_group, len(regions), len(sh_names(obj.data)))
-        and crops.followed_by(obj, groups.COUNT) == regions
+        and crops.followed_objects(obj, groups.COUNT) == regions
     ):
         return
     detach(obj)

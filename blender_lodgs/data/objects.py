@@ -72,7 +72,7 @@ def new_points(name: str, positions: np.ndarray, colors: np.ndarray, radius: flo
     """Create an object of coloured points, not yet in a collection.
 
     Args:
-        positions: (P, 3), in the object's own space.
+        positions: (P, 3), in the object's local space.
         colors: (P, 3) uint8, sRGB.
         radius: display radius in the object's units.
     """

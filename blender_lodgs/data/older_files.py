@@ -44,7 +44,7 @@ def upgrade_scene(root: bpy.types.Object) -> None:
     """Upgrade a splat scene of an older version; scenes of this version stay unchanged."""
     repair_references(root.lodgs)
     repair_levels(root)
-    if selection.outdated(root) or looks.outdated(root):
+    if selection.is_outdated(root) or looks.is_outdated(root):
         selection.attach(root)
 
 

@@ -66,7 +66,8 @@ def blend(
     """Blend a colour over the paint (N, 4) of each level.
 
     Args:
-        share: opacity (N,) of the colour by level number.
+        painted: paint (N, 4) by level number.
+        opacities: opacity (N,) of the colour by level number.
         color: display-coded colour; None for the splats' own colours, which erases paint.
     """
     result = {}

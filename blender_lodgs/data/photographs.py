@@ -318,7 +318,7 @@ def _reach(root: bpy.types.Object) -> float:
 
 
 def _central_points(root: bpy.types.Object) -> np.ndarray:
-    """Return positions (N, 3) of the finest level or of the points, in the scene's own space.
+    """Return positions (N, 3) of the finest level or of the points, in the scene's coordinates.
 
     Cropped and hidden splats are excluded unless none would remain.
     """
@@ -333,7 +333,7 @@ def _central_points(root: bpy.types.Object) -> np.ndarray:
 
 
 def _positions(obj: bpy.types.Object | None) -> np.ndarray:
-    """Return the positions (N, 3) of an object's points, in its own space."""
+    """Return the positions (N, 3) of an object's points, in its local space."""
     values = None if obj is None else read_attribute(obj.data, "position")
     return np.zeros((0, 3), np.float32) if values is None else values
 

@@ -45,7 +45,7 @@ class ViewportSettings(bpy.types.PropertyGroup):
     )
     drawn_by: bpy.props.EnumProperty(
         name="Drawn By",
-        description="Program part that draws splats in the 3D viewport",
+        description="Choose whether LODGS or Blender draws splats in 3D viewports",
         items=[
             (
                 "LODGS", "LODGS",
@@ -79,7 +79,7 @@ class ViewportSettings(bpy.types.PropertyGroup):
     budget: bpy.props.IntProperty(
         name="Splat Budget",
         description="Maximum number of splats that a viewport draws. Beyond it, coarser levels replace finer "
-        "ones, and a single level shows its most visible splats. The default depends on the memory",
+        "ones. Lower it if the viewport is slow",
         default=default_budget(),
         min=1000,
         max=16_000_000,
@@ -103,8 +103,8 @@ class CaptureSettings(ViewsSettings, bpy.types.PropertyGroup):
 
     folder: bpy.props.StringProperty(
         name="Folder",
-        description="Folder for the images and the COLMAP model. If empty, lodgs_capture next to the .blend "
-        "file. Existing images are not rendered again",
+        description="Folder for the images and the COLMAP model; empty for lodgs_capture next to the .blend "
+        "file",
         subtype="DIR_PATH",
         options={"PATH_SUPPORTS_BLEND_RELATIVE"},
     )
@@ -242,8 +242,8 @@ class RenderSettings(bpy.types.PropertyGroup):
     )
     holdout: bpy.props.StringProperty(
         name="Hold Out",
-        description="OpenEXR files with the Depth pass of the meshes, #### for the frame number. Splats "
-        "behind that depth are not rendered, and the film is transparent there",
+        description="OpenEXR files with the Depth pass of the meshes, to leave out the splats behind them; "
+        "#### is the frame number",
         subtype="FILE_PATH",
         options={"PATH_SUPPORTS_BLEND_RELATIVE"},
     )

@@ -59,7 +59,7 @@ def _detach(obj: bpy.types.Object, root: bpy.types.Object, cropping: list[bpy.ty
         matrix = obj.matrix_world.copy()
         obj.parent = None
         obj.matrix_world = matrix
-    if any(crop in crops.followed_by(obj) for crop in cropping):
+    if any(crop in crops.followed_objects(obj) for crop in cropping):
         crops.detach(obj)
     for curve in list(obj.animation_data.drivers if obj.animation_data else ()):
         if any(target.id == root for variable in curve.driver.variables for target in variable.targets):

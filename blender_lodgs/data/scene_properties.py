@@ -317,8 +317,7 @@ class SplatScene(bpy.types.PropertyGroup):
     )
     single_level: bpy.props.IntProperty(
         name="Level",
-        description="Level to show; 1 is the coarsest. If levels are cumulative, all coarser levels are "
-        "shown with it",
+        description="Level to show, with all coarser ones if levels add up; 1 is the coarsest",
         default=1,
         min=1,
         update=_single_changed,

@@ -99,7 +99,7 @@ def set_level(root: bpy.types.Object, level: Level) -> bpy.types.Object:
     if level.number == root.lodgs.levels[-1].number:
         root.lodgs.single_level = level.number
         root.lodgs.active_level = len(root.lodgs.levels) - 1
-    if first and root.lodgs.points:  # the splats stand where the points were
+    if first and root.lodgs.points:  # the splats replace the points
         root.lodgs.points.hide_viewport = root.lodgs.points.hide_render = True
     return obj
 
@@ -152,7 +152,7 @@ def read_levels(root: bpy.types.Object, placed: bool = False, looked: bool = Fal
 
     Args:
         placed: apply the scene's placement in Blender, so that the result is upright; otherwise use the
-            splats' own world. Transforms of single level objects are ignored.
+            splats' space. Transforms of single level objects are ignored.
         looked: apply paint and looks (``looks``); otherwise return trained colours, with paint in separate
             columns.
 
@@ -352,8 +352,8 @@ def attach_ellipsoids(scene: bpy.types.Scene) -> None:
 def _looks(root: bpy.types.Object) -> look.Looks:
     """Return the current looks of a scene."""
     depsgraph = bpy.context.evaluated_depsgraph_get()
-    to_own = axes_of(root).evaluated_get(depsgraph).matrix_world.inverted_safe()
-    return looks.looks_of(root, depsgraph, to_own)
+    from_world = axes_of(root).evaluated_get(depsgraph).matrix_world.inverted_safe()
+    return looks.looks_of(root, depsgraph, from_world)
 
 
 def _require_complete(root: bpy.types.Object, number: int) -> None:
@@ -454,7 +454,7 @@ def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
                 levels_changed(root)
     if depsgraph.id_type_updated("OBJECT"):
         for root in editable:
-            if crops.outdated(root) or looks.outdated(root):
+            if crops.is_outdated(root) or looks.is_outdated(root):
                 selection.follow_crops(root)
     if any(update.is_updated_geometry for update in depsgraph.updates):
         for root in editable:

@@ -133,7 +133,7 @@ def camera_position(root: bpy.types.Object, scene: bpy.types.Scene) -> tuple[flo
 
 
 def store_camera(root: bpy.types.Object, position: tuple[float, float, float], focal_px: float) -> None:
-    """Set the position, in the splats' own space, for Freeze and for the viewport as camera.
+    """Set the position, in the splats' space, for Freeze and for the viewport as camera.
 
     Equal values are not set: setting causes an evaluation.
     """
@@ -204,7 +204,7 @@ def _order(root: bpy.types.Object) -> None:
                 modifiers.move(crop_index, rule_index)
 
 
-def outdated(root: bpy.types.Object) -> bool:
+def is_outdated(root: bpy.types.Object) -> bool:
     """Return True if a level's modifier was made by an older version."""
     rule = find_rule(root.lodgs.rule)
     modifiers = [rule_modifier(item.object) for item in root.lodgs.levels if item.exists]

@@ -167,7 +167,7 @@ class TrainingSettings(viewpoints.ViewsSettings, bpy.types.PropertyGroup):
     distances: bpy.props.FloatVectorProperty(
         name="Level Distances",
         description="Distance from which each level is shown, in multiples of the scene's median depth. "
-        "Increase it for coarser levels. 0 lets training choose",
+        "Coarser levels need larger distances. 0 lets training choose",
         size=MAX_LEVELS - 1,
         default=[3.0 * 2.0**index for index in range(MAX_LEVELS - 1)],
         min=0.0,
@@ -185,8 +185,8 @@ class TrainingSettings(viewpoints.ViewsSettings, bpy.types.PropertyGroup):
     region: bpy.props.PointerProperty(
         type=bpy.types.Object,
         name="Region",
-        description="Box or sphere of this scene to train in detail; the rest is trained coarsely. If empty, "
-        "everything is trained in detail",
+        description="Box or sphere of this scene to train in detail, and the rest coarsely. Empty to train "
+        "everything in detail",
         poll=lambda settings, obj: obj in crops.crops_of(settings.id_data),
     )
     use_test_every: _use(
@@ -220,7 +220,7 @@ class TrainingSettings(viewpoints.ViewsSettings, bpy.types.PropertyGroup):
     )
     cell_memory: bpy.props.FloatProperty(
         name="Max Memory (GB)",
-        description="Maximum memory for training one cell, estimated, in gigabytes",
+        description="Maximum estimated memory for training one cell",
         default=8.0,
         min=0.5,
         soft_max=64.0,
@@ -248,8 +248,8 @@ class TrainingSettings(viewpoints.ViewsSettings, bpy.types.PropertyGroup):
     )
     at_once: bpy.props.IntProperty(
         name="Cells at Once",
-        description="Number of cells that train at the same time on this computer. Each needs its own "
-        "memory. More than 1 requires Dask",
+        description="Number of cells that train at the same time, each with its own memory. More than 1 "
+        "requires Dask",
         default=1,
         min=1,
         soft_max=8,

@@ -489,7 +489,7 @@ def _curve_points(curve: bpy.types.Object | None) -> np.ndarray:
 
 
 def _tessellate(curve: bpy.types.Object) -> np.ndarray:
-    """Return the points (P, 3) of a curve in its own space, without bevel and extrusion."""
+    """Return the points (P, 3) of a curve in its local space, without bevel and extrusion."""
     copy = bpy.data.objects.new(curve.name, curve.data.copy())
     try:
         copy.data.bevel_depth = copy.data.extrude = 0

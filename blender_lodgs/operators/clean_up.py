@@ -175,10 +175,10 @@ class LODGS_OT_show_hidden_splats(EditLevelsOperator, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LODGS_OT_delete_left_out(EditLevelsOperator, bpy.types.Operator):
+class LODGS_OT_delete_hidden_splats(EditLevelsOperator, bpy.types.Operator):
     """Delete all hidden and cropped splats of every level, and remove the crops"""
 
-    bl_idname = "lodgs.delete_left_out"
+    bl_idname = "lodgs.delete_hidden_splats"
     bl_label = "Delete Hidden Splats"
     bl_options = {"REGISTER", "UNDO"}
 
@@ -217,7 +217,7 @@ class LODGS_MT_clean_up(bpy.types.Menu):
             layout.operator("lodgs.select_all_splats", text=name).action = action
         layout.separator()
         layout.operator("lodgs.show_hidden_splats")
-        layout.operator("lodgs.delete_left_out")
+        layout.operator("lodgs.delete_hidden_splats")
 
 
 def _menu(self, context):
@@ -228,7 +228,7 @@ def _menu(self, context):
 
 CLASSES = (
     LODGS_OT_add_crop, LODGS_OT_add_region, LODGS_OT_remove_crop, LODGS_OT_hide_splats,
-    LODGS_OT_show_hidden_splats, LODGS_OT_delete_left_out, LODGS_MT_clean_up,
+    LODGS_OT_show_hidden_splats, LODGS_OT_delete_hidden_splats, LODGS_MT_clean_up,
 )  # fmt: skip
 
 _MENUS = (bpy.types.VIEW3D_MT_object, bpy.types.VIEW3D_MT_edit_pointcloud)

@@ -49,7 +49,7 @@ class LODGS_OT_show_evidence(_ViewsOperator, bpy.types.Operator):
     @report_errors
     def execute(self, context):
         root = roots.active_root(context)
-        if evidence.shares(root) is None:
+        if evidence.grade_shares(root) is None:
             evidence.show(root)
         else:
             evidence.hide()
@@ -130,7 +130,7 @@ class LODGS_OT_compare_methods(SceneOperator, bpy.types.Operator):
     bl_label = "Compare Methods…"
     bl_description = (
         "Train several methods on the photos in the background, and open a page that compares their quality, "
-        "splats, speed and images; the same comparison resumes after a cancel"
+        "splats, speed and images"
     )
 
     methods: bpy.props.EnumProperty(

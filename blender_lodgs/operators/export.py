@@ -111,7 +111,7 @@ class _ConvertingExport(BackgroundOperator):
 
 
 class LODGS_OT_export_bundle(_FileExport, bpy.types.Operator):
-    """Export all levels to one PLY file, of which other viewers show the finest level"""
+    """Export all levels to one PLY file; other viewers show its finest level"""
 
     bl_idname = "lodgs.export_bundle"
     bl_label = "Export Bundle"
@@ -233,8 +233,7 @@ class LODGS_OT_export_plain(_FormatExport, bpy.types.Operator):
             (
                 "SHOWN",
                 "As Shown",
-                "The splats visible in the viewport with modifiers applied, regardless of instances and the "
-                "viewport's splat limit",
+                "Visible splats with modifiers applied, without instances and regardless of the splat budget",
             ),
             ("LEVEL", "One Level", "All splats of one level, without modifiers"),
         ],

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..data import cleaning, clutter, roots
-from ..data.cleanup_tests import CLUTTER_TESTS, union
+from ..data.cleanup_tests import CLUTTER_TESTS, unite_masks
 from .base import EditLevelsOperator, report_errors
 
 
@@ -20,7 +20,7 @@ class LODGS_OT_find_clutter(EditLevelsOperator, bpy.types.Operator):
     def execute(self, context):
         root = roots.active_root(context)
         clutter.start(context, root)
-        self.report({"INFO"}, _text(clutter.counts(root) or {}, "found"))
+        self.report({"INFO"}, _text(clutter.count_by_kind(root) or {}, "found"))
         return {"FINISHED"}
 
 
@@ -45,7 +45,7 @@ class LODGS_OT_hide_clutter(_PreviewOperator, bpy.types.Operator):
         root = roots.active_root(context)
         matches = clutter.refresh(context, root)
         numbers = {name: sum(int(mask.sum()) for mask in masks.values()) for name, masks in matches.items()}
-        count = cleaning.hide(root, union(matches, root))
+        count = cleaning.hide(root, unite_masks(matches, root))
         clutter.stop(root)
         self.report({"INFO"}, f"{count:,} splats hidden. {_text(numbers, 'hidden')}")
         return {"FINISHED"}

@@ -40,14 +40,15 @@ class LODGS_OT_import_splats(BackgroundOperator, bpy.types.Operator):
     )
     upright: bpy.props.BoolProperty(
         name="Upright",
-        description="Rotate the scene so that the file's -Y axis, up in most splat files, becomes Z",
+        description="Rotate the scene upright by the file's up axis or by its ground, else by -Y, the up "
+        "axis of most splat files. Disable it if the scene lies on its side",
         default=True,
     )
 
     budget: bpy.props.IntProperty(
         name="Memory Budget",
-        description="Maximum number of splats of a tree in memory; finer splats are streamed from the file "
-        "when the camera comes near. 0 imports the whole tree, as for other files",
+        description="Maximum number of splats of a tree in memory; set it to stream a file that is larger "
+        "than memory. 0 imports the whole file",
         default=0,
         min=0,
         step=100_000,

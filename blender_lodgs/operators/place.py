@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from ..data import flights, ground, photographs, roots
+from ..data import camera_animation, ground, photographs, roots
 from .base import SceneOperator, report_errors
 
 
@@ -36,7 +36,7 @@ class LODGS_OT_set_ground(SceneOperator, bpy.types.Operator):
                 "Fit the plane to three or more points selected in Edit Mode, or empties selected in Object "
                 "Mode",
             ),
-            ("FOUND", "Detect", "Find the plane that holds many points and has few points below it"),
+            ("DETECT", "Detect", "Find the plane that holds many points and has few points below it"),
         ],
     )
     flip: bpy.props.BoolProperty(
@@ -101,7 +101,7 @@ class LODGS_OT_camera_path(SceneOperator, bpy.types.Operator):
 
     @report_errors
     def execute(self, context):
-        camera = flights.add_path(context, roots.active_root(context))
+        camera = camera_animation.add_path(context, roots.active_root(context))
         self.report({"INFO"}, f"'{camera.name}' is the active camera")
         return {"FINISHED"}
 
@@ -115,7 +115,7 @@ class LODGS_OT_turntable(SceneOperator, bpy.types.Operator):
 
     @report_errors
     def execute(self, context):
-        camera = flights.add_turntable(context, roots.active_root(context))
+        camera = camera_animation.add_turntable(context, roots.active_root(context))
         self.report({"INFO"}, f"'{camera.name}' is the active camera")
         return {"FINISHED"}
 

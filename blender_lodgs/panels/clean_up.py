@@ -59,7 +59,7 @@ class LODGS_PT_clean_up(LevelsPanel):
             say(column, f"These levels were replaced and show their hidden splats again ({counts}).", "INFO")
         column = layout.column(align=True)
         column.operator("lodgs.show_hidden_splats", text="Show All Hidden")
-        column.operator("lodgs.delete_left_out", text="Delete Hidden", icon="TRASH")
+        column.operator("lodgs.delete_hidden_splats", text="Delete Hidden", icon="TRASH")
 
 
 def _draw_clutter(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:
@@ -68,7 +68,7 @@ def _draw_clutter(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:
     if not settings.preview:
         layout.operator("lodgs.find_clutter", icon="VIEWZOOM")
         return
-    counts = clutter.counts(root)
+    counts = clutter.count_by_kind(root)
     if counts is None:
         clutter.refresh_later()
     box = layout.box()
@@ -85,7 +85,7 @@ def _draw_clutter(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:
             for name in test.limits:
                 column.prop(settings, limit_property(name))
     row = box.row(align=True)
-    row.operator("lodgs.hide_clutter", text=f"Hide {clutter.total(root):,}", icon="HIDE_ON")
+    row.operator("lodgs.hide_clutter", text=f"Hide {clutter.count_clutter(root):,}", icon="HIDE_ON")
     row.operator("lodgs.cancel_clutter", text="Keep", icon="X")
 
 

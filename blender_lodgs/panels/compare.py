@@ -92,7 +92,7 @@ class LODGS_PT_compare(Panel):
 
 def _draw_evidence(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:
     """Draw the button of the heat map, and its legend with the share of the splats of each grade."""
-    shares = evidence.shares(root)
+    shares = evidence.grade_shares(root)
     icon = "HIDE_ON" if shares is None else "HIDE_OFF"
     layout.operator("lodgs.show_evidence", icon=icon, depress=shares is not None)
     if shares is None:

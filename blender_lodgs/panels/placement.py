@@ -25,7 +25,7 @@ class LODGS_PT_placement(Panel):
         column.label(text="Ground")
         row = column.row(align=True)
         row.operator("lodgs.set_ground", text="From Selection", icon="SNAP_PERPENDICULAR").by = "SELECTION"
-        row.operator("lodgs.set_ground", text="Detect", icon="VIEWZOOM").by = "FOUND"
+        row.operator("lodgs.set_ground", text="Detect", icon="VIEWZOOM").by = "DETECT"
         column.operator("lodgs.set_scale", text="Set Scale…", icon="DRIVER_DISTANCE")
         column = layout.column(align=True)
         column.label(text="Camera Animation")
@@ -39,7 +39,7 @@ class LODGS_MT_placement(bpy.types.Menu):
     def draw(self, context):
         layout = self.layout
         layout.operator("lodgs.set_ground", text="Set Ground from Selection").by = "SELECTION"
-        layout.operator("lodgs.set_ground", text="Detect Ground").by = "FOUND"
+        layout.operator("lodgs.set_ground", text="Detect Ground").by = "DETECT"
         layout.operator("lodgs.set_scale", text="Set Scale…")
         layout.operator("lodgs.camera_path")
         layout.operator("lodgs.turntable")

@@ -51,7 +51,7 @@ class LODGS_PT_training(Panel):
         resumable = watch is not None and watch.state != "done"
         choices: bpy.types.UILayout | None = self.layout
         if roots.root_with_levels(context) is not None and root.lodgs.training.run:
-            header, choices = self.layout.panel("LODGS_train_anew", default_closed=True)
+            header, choices = self.layout.panel("LODGS_train_again", default_closed=True)
             header.label(text="Train Again")
         if choices is not None:
             _draw_choices(choices, context, root, resumable)

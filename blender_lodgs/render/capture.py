@@ -69,8 +69,8 @@ def render_views(
     existing = {file.stem for file in (folder / CAMERAS).glob("*.json")}
     if existing - set(names):
         raise _different_views(folder)
-    others = ("sparse",) if (folder / CAMERAS).is_dir() else ("sparse", CAMERAS, IMAGES, DEPTHS)
-    if not existing and any((folder / kind).exists() for kind in others):
+    foreign = ("sparse",) if (folder / CAMERAS).is_dir() else ("sparse", CAMERAS, IMAGES, DEPTHS)
+    if not existing and any((folder / kind).exists() for kind in foreign):
         raise LodgsError(f"Cannot capture to {folder}: it contains another scene.", "Choose another folder.")
     _mark(folder)
     _prepare(context.scene, width, height)
@@ -88,7 +88,7 @@ def render_views(
         on_view(number, len(shots))
         if bpy.ops.render.render() != {"FINISHED"}:
             raise LodgsError(
-                f"The rendering of view {number} was cancelled.", "Start the capture again to continue."
+                f"Cannot capture view {number}: its render was cancelled.", "Start the capture again."
             )
         _save(context.scene, folder, name, (width, height))
         write_camera(file, camera.moved(place.origin), near)  # last, as it marks the view as complete

@@ -1,7 +1,7 @@
 """Comparison of photos with renders of the visible splats from the same views.
 
 Images and PSNR come from the renderer, at the size of the training images and with masks, as in
-``training evaluate``.
+``lodgs evaluate``.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def compare_view(
         raise LodgsError(
             f"Cannot compare '{view.name}': its photo has lens distortion, but splats are trained on "
             "undistorted photos.",
-            "Measure the run with training evaluate.",
+            "Measure the run with lodgs evaluate.",
         )
     full_size = Camera(view.name, facts.width, facts.height, facts.fx, facts.fy, 0, 0, np.eye(4))
     # the value as typed, which the job has: Blender stores it rounded to 32 bits
@@ -190,7 +190,9 @@ def measure(context: bpy.types.Context, root: bpy.types.Object) -> Measurement:
     """
     global measurement
     if measurement is not None and measurement.running:
-        raise LodgsError("The views are already being measured.", "Wait for it or cancel it.")
+        raise LodgsError(
+            "Cannot measure the views: they are already being measured.", "Wait for it or cancel it."
+        )
     measurement = Measurement(context, root)
     return measurement
 

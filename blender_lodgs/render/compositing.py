@@ -97,7 +97,10 @@ def separate_meshes(scene: bpy.types.Scene) -> None:
     meshes = scene.lodgs_render.meshes
     tree = compat.compositor_tree(scene)
     if meshes is None:
-        raise LodgsError(f"Cannot separate: the scene '{scene.name}' is not combined with meshes.")
+        raise LodgsError(
+            f"Cannot separate: the scene '{scene.name}' is not combined with meshes.",
+            "Choose the scene of the splats.",
+        )
     if not _is_ours(tree):
         raise LodgsError(
             f"Cannot separate: the scene '{scene.name}' has additional compositor nodes.",
@@ -148,7 +151,7 @@ def render_mesh_depth(scene: bpy.types.Scene, frames: Iterable[int]) -> Iterator
     scene_camera(scene)
     if scene.render.use_multiview:
         raise LodgsError(
-            "Cannot render mesh depth for a stereo or multi-view render.",
+            "Cannot render mesh depth: the scene has a stereo or multi-view render.",
             "Use Combine with Meshes, or disable Stereoscopy.",
         )
     pattern = depth_file_pattern(scene)

@@ -287,7 +287,7 @@ def holdout_file(scene: bpy.types.Scene, frame: int) -> Path | None:
         return None
     if scene.render.use_multiview:
         raise LodgsError(
-            "Cannot hold out meshes in a stereo or multi-view render.",
+            "Cannot hold out meshes in a stereo or multi-view render: depth files have one view.",
             "Clear Hold Out, and use Combine with Meshes.",
         )
     if problem := holdout_problem(scene):
@@ -360,17 +360,17 @@ def placed_splats(
     for identity, instance in zip(_identities(instances), instances, strict=True):
         evaluated, matrix, level = instance.evaluated, instance.matrix_world, instance.level
         placement = (matrix, level, instance.antialias)
-        after = {"looks": instance.looks, "motion": _motion_of(identity, matrix, motion)}
+        options = {"looks": instance.looks, "motion": _motion_of(identity, matrix, motion)}
         is_empty = not len(evaluated.data.points)
         if instance.source is not None and (choice := shown.camera_query(instance, depsgraph)):
             file = instance.source.path, matrix, instance.antialias, choice
-            placed.append(renderer.PlacedFile(*file, **after))
+            placed.append(renderer.PlacedFile(*file, **options))
             continue
         if not _is_selected_by_rule(instance, depsgraph):
             if not is_empty:
                 read = partial(_read_splats, evaluated.data)
                 uid = instance.object.session_uid
-                placed.append(renderer.PlacedSplats(uid, read, *placement, **after))
+                placed.append(renderer.PlacedSplats(uid, read, *placement, **options))
             continue
         cloud = instance.object.data
         read = partial(_read_splats, cloud.evaluated_get(depsgraph), all_rule_columns())
@@ -378,7 +378,7 @@ def placed_splats(
         choice = shown.rule_query(instance, depsgraph)
         is_empty &= np.array_equal(matrix, np.array(evaluated.matrix_world))  # instances have other levels
         placed.append(
-            renderer.PlacedSplats(cloud.session_uid, read, *placement, version, choice, is_empty, **after)
+            renderer.PlacedSplats(cloud.session_uid, read, *placement, version, choice, is_empty, **options)
         )
     return placed
 
@@ -397,7 +397,7 @@ def _motion_of(
 
 
 def _is_selected_by_rule(instance: shown.SplatInstance, depsgraph: bpy.types.Depsgraph) -> bool:
-    """Return whether an instance shows the splats of its object, selected by nothing but a rule.
+    """Return True if an instance shows the splats of its object, selected by a rule alone.
 
     Objects that are hidden in the viewport do not count, because Blender does not report their changes.
     """

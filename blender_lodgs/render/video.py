@@ -105,7 +105,9 @@ def _open_video(video: Path) -> Iterator[tuple[bpy.types.Scene, int]]:
         strip = compat.sequencer_strips(scene).new_movie("video", str(video), channel=1, frame_start=1)
         element = strip.elements[0] if strip.elements else None
         if element is None or not (element.orig_width and element.orig_height) or strip.frame_duration < 2:
-            raise LodgsError(f"Cannot read {video} as a video.", "Choose another file.")
+            raise LodgsError(
+                f"Cannot read {video}: it is not a video that Blender reads.", "Choose another file."
+            )
         render = scene.render
         render.resolution_x, render.resolution_y = element.orig_width, element.orig_height
         render.resolution_percentage = 100

@@ -40,16 +40,16 @@ def render(context: bpy.types.Context) -> bpy.types.Image:
     scene_camera(scene)
     _require_graphics()
     if scene.camera.data.type == "PANO":
-        raise LodgsError("Cannot render a panorama in viewport quality.", "Press Render Image.")
+        raise LodgsError("Cannot render in viewport quality: the camera is panoramic.", "Press Render Image.")
     if scene.lodgs_render.holdout:
         raise LodgsError(
-            "Cannot render a mesh holdout in viewport quality.", "Clear Hold Out, or press Render Image."
+            "Cannot render in viewport quality: Hold Out is set.", "Clear Hold Out, or press Render Image."
         )
     with _engine_only(scene), engine.use_renderer(_render_frame):
         try:
             bpy.ops.render.render(scene=scene.name, layer=context.view_layer.name)
         except RuntimeError as error:
-            raise LodgsError(f"Cannot render: {str(error).strip()}") from error
+            raise LodgsError(f"Cannot render: {str(error).strip()}", "Press Render Image.") from error
     image = bpy.data.images[IMAGE]
     for window in context.window_manager.windows:
         for area in window.screen.areas:
@@ -77,11 +77,12 @@ def render_animation(context: bpy.types.Context, frames: Iterable[int]) -> Itera
     current_frame = scene.frame_current
     if scene.render.is_movie_format:
         raise LodgsError(
-            "Cannot render a video in viewport quality.", "Choose an image format in the Output tab."
+            "Cannot render in viewport quality: the output is a video.",
+            "Choose an image format in the Output tab.",
         )
     if scene.render.use_multiview:
         raise LodgsError(
-            "Cannot render a stereo or multi-view animation in viewport quality.",
+            "Cannot render in viewport quality: the animation is stereo or multi-view.",
             "Render it with F12's animation, or disable Stereoscopy in the Output tab.",
         )
     try:

@@ -109,7 +109,7 @@ def start(context: bpy.types.Context, warn: viewpoints.Warn = print) -> Backgrou
     """
     global current
     if current is not None and current.running:
-        raise LodgsError("A capture is already running.", "Wait for it or cancel it.")
+        raise LodgsError("Cannot capture: a capture is already running.", "Wait for it or cancel it.")
     folder = capture_folder(context.scene)
     size = viewpoints.image_size(context.scene, context.scene.lodgs_capture)
     count = len(viewpoints.capture_shots(context, *size, warn))

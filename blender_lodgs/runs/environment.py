@@ -83,7 +83,7 @@ def trainer_python() -> Path:
     for newest in ready_environments()[:1]:
         return python_of(newest)
     raise LodgsError(
-        "The trainer is not installed.",
+        "Cannot start the trainer: it is not installed.",
         "Press Install Trainer in the preferences of LODGS, or set the environment variable "
         f"{VARIABLE} to a Python with the wheel of LODGS.",
     )

@@ -233,12 +233,17 @@ def start() -> EnvironmentSetup:
             "Turn on Allow Online Access in the preferences, under System.",
         )
     if current is not None and current.running:
-        raise LodgsError("The trainer is already being installed.", "Wait for it or cancel it.")
+        raise LodgsError(
+            "Cannot install the trainer: it is already being installed.", "Wait for it or cancel it."
+        )
     parent = environment.environments_folder()
     try:
         parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise LodgsError(f"Cannot create the folder {parent}: {error.strerror}.") from error
+        raise LodgsError(
+            f"Cannot create the folder {parent}: {error.strerror}.",
+            "Check the permissions and the free space of this disk.",
+        ) from error
     gpu = shutil.which("nvidia-smi") and shutil.which("nvcc")
     current = EnvironmentSetup(find_base_python(), parent, CUDA_REQUIREMENTS if gpu else REQUIREMENTS)
     environment.report = None
@@ -261,7 +266,8 @@ def find_base_python() -> Path:
         if oldest <= environment.python_version(Path(candidate)) <= newest:
             return Path(candidate)
     raise LodgsError(
-        f"No Python from {oldest[0]}.{oldest[1]} to {newest[0]}.{newest[1]} was found.",
+        f"Cannot install the trainer: no Python from {oldest[0]}.{oldest[1]} to {newest[0]}.{newest[1]} was "
+        "found.",
         "Install one from python.org, then press Install Trainer again.",
     )
 

@@ -125,7 +125,7 @@ class Submission:
 
     def _not_a_manager(self) -> LodgsError:
         return LodgsError(
-            f"The server at {self.manager} is not a Flamenco manager.",
+            f"Cannot submit the job: the server at {self.manager} is not a Flamenco manager.",
             "Correct its address in the preferences of LODGS.",
         )
 
@@ -200,7 +200,7 @@ def manager_url(address: str) -> str:
         valid = False
     if not valid or any(character.isspace() for character in url):
         raise LodgsError(
-            f"Invalid address of the Flamenco manager: '{address}'.",
+            f"Cannot use '{address}' as address of the Flamenco manager: it is invalid.",
             "Enter an address such as http://farm:8080.",
         )
     return url.rstrip("/")

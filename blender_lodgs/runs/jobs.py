@@ -50,7 +50,9 @@ def _start(root: bpy.types.Object, run: RunFolder, job: Job) -> Watch:
     watch = watch_of(root)
     state = run_state(run)
     if watch is not None and watch.running:
-        raise LodgsError(f"'{root.name}' is already being trained.", "Wait for the training or cancel it.")
+        raise LodgsError(
+            f"Cannot train '{root.name}': it is already being trained.", "Wait for the training or cancel it."
+        )
     if state == "running":
         raise LodgsError(
             f"Cannot train in {run.path}: another training is running there.",
@@ -126,7 +128,10 @@ def cancel(root: bpy.types.Object) -> None:
     """
     watch = watch_of(root)
     if watch is None or not watch.running:
-        raise LodgsError(f"Cannot cancel the training: no training of '{root.name}' is running.")
+        raise LodgsError(
+            f"Cannot cancel the training: no training of '{root.name}' is running.",
+            "Select the scene that is being trained.",
+        )
     if not watch.cancel_requested:
         watch.cancel_requested = True
         watch.message = "Saving and stopping"
@@ -159,7 +164,10 @@ def cancel_block(root: bpy.types.Object, number: int) -> None:
     watch = watch_of(root)
     part = watch.part(number) if watch is not None and watch.running else None
     if watch is None or part is None or part.state not in {"waiting", "running"}:
-        raise LodgsError(f"Cannot cancel cell {number} of '{root.name}': it is not being trained.")
+        raise LodgsError(
+            f"Cannot cancel cell {number} of '{root.name}': it is not being trained.",
+            "Choose a cell that is being trained.",
+        )
     _request(part.folder.request_cancel)
     watch.stopping.add((part.kind, number))
     extension.redraw()
@@ -178,7 +186,9 @@ def resume_block(root: bpy.types.Object, number: int) -> Watch:
         or part is None
         or part.state in ({"waiting", "running", "done"} if watch.running else {"done"})
     ):
-        raise LodgsError(f"Cannot resume cell {number} of '{root.name}': it is not stopped.")
+        raise LodgsError(
+            f"Cannot resume cell {number} of '{root.name}': it is not stopped.", "Choose a stopped cell."
+        )
     _request(part.folder.request_resume)
     return watch if watch.running else _resume(root, watch.folder)
 

@@ -31,7 +31,10 @@ def compare_methods(root: bpy.types.Object, methods: Collection[str]) -> Program
     """
     global current
     if current is not None and current.running:
-        raise LodgsError("Methods are already being compared.", "Wait for the comparison or cancel it.")
+        raise LodgsError(
+            "Cannot compare methods: a comparison is already running.",
+            "Wait for the comparison or cancel it.",
+        )
     if not root.lodgs.scene_folder:
         raise LodgsError(f"Cannot compare methods: '{root.name}' has no photos.", "Import a COLMAP scene.")
     if not methods:

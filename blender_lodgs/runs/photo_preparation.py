@@ -118,7 +118,9 @@ def _start(
     """Run commands one after the other. Commands that do not start Blender are arguments of the trainer."""
     global current
     if current is not None and current.running:
-        raise LodgsError("Other photos are already being prepared.", "Wait for them or cancel it.")
+        raise LodgsError(
+            "Cannot prepare the photos: other photos are already being prepared.", "Wait for them, or cancel."
+        )
     trainer = [str(environment.trainer_python()), "-m", "training"]
     try:
         log.parent.mkdir(parents=True, exist_ok=True)

@@ -64,7 +64,9 @@ def log_text(root: bpy.types.Object) -> bpy.types.Text:
     run = run_folder(root)
     tail = run.log_tail(200) if run else ""
     if not tail.strip():
-        raise LodgsError("Cannot show the log: the trainer has not written one.")
+        raise LodgsError(
+            "Cannot show the log: the trainer has not written one.", "Wait until the trainer has started."
+        )
     text = bpy.data.texts.get(LOG) or bpy.data.texts.new(LOG)
     text.from_string(tail)
     return text

@@ -107,7 +107,7 @@ def _on_load(*_) -> None:
 
 @bpy.app.handlers.persistent
 def _on_undo(*_) -> None:
-    """Forget what belongs to datablocks. Viewports draw the previous splats until the new ones are read."""
+    """Clear the state of datablocks. Viewports draw the previous splats until the new ones are read."""
     global problem
     problem = ""
     coverage.clear()

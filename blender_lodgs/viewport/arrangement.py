@@ -129,7 +129,7 @@ class DrawnSplats:
     Attributes:
         selection_key: see :attr:`Request.selection_key`.
         table: (M, 4) float32, the rows of :attr:`Arrangement.instances`.
-        means: means of each placement's drawn splats, in its own space.
+        means: means of each placement's drawn splats, in its local space.
         excluded: number of splats excluded by the budget.
         coarsened: see :class:`Arrangement`.
     """

@@ -273,7 +273,7 @@ def _looks_texture(looks_per_placement: Sequence[Looks]) -> gpu.types.GPUTexture
     for number, (crop, look) in enumerate(all_looks):
         rows = data[6 * number : 6 * number + 6]
         if crop is not None:
-            rows[:3], rows[4:, 3] = crop.to_own, (crop.shape == "SPHERE", crop.outside)
+            rows[:3], rows[4:, 3] = crop.to_local, (crop.shape == "SPHERE", crop.outside)
         rows[3:, :3], rows[3, 3] = look.matrix, look.opacity
     buffer = gpu.types.Buffer("FLOAT", data.size, data.reshape(-1))
     return gpu.types.GPUTexture((WIDTH, len(data) // WIDTH), format="RGBA32F", data=buffer)

@@ -68,7 +68,7 @@ class ViewState:
     stated_counts: tuple[int, int] | None = None
 
     def reset(self) -> None:
-        """Draw nothing from now on."""
+        """Stop drawing."""
         self.resident = self.arrangement = self.store = self.instances = None
         self.pending = self.loading = self.missing = None
 

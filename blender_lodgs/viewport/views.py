@@ -208,8 +208,12 @@ def reduced_counts(region: bpy.types.Region | None = None) -> tuple[int, int] | 
     """
     views = _views.values() if region is None else filter(None, [_views.get(region.as_pointer())])
     arrangements = [view.arrangement for view in views if view.arrangement]
-    most = max(arrangements, key=lambda arrangement: arrangement.excluded, default=None)
-    return (most.count, most.count + most.excluded) if most is not None and most.excluded else None
+    largest = max(arrangements, key=lambda arrangement: arrangement.excluded, default=None)
+    return (
+        (largest.count, largest.count + largest.excluded)
+        if largest is not None and largest.excluded
+        else None
+    )
 
 
 def stream(root: bpy.types.Object) -> Stream | None:

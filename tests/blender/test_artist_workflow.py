@@ -144,7 +144,7 @@ class Workflow:
     def ground(self):
         """Detect the ground; if the photos show none, pick a level plane under the remaining splats."""
         try:
-            assert self.bpy.ops.lodgs.set_ground("EXEC_DEFAULT", True, by="FOUND") == {"FINISHED"}
+            assert self.bpy.ops.lodgs.set_ground("EXEC_DEFAULT", True, by="DETECT") == {"FINISHED"}
             return
         except RuntimeError as error:
             assert OWN and "plane" in str(error)

@@ -1,7 +1,10 @@
-"""Docstrings of all public names in ``training``, which `make docs` publishes."""
+"""Docstrings of all public names in ``training``, which `make docs` publishes, and of all arguments."""
 
+import ast
 import inspect
+import re
 from importlib import import_module
+from pathlib import Path
 from pkgutil import walk_packages
 
 import pytest
@@ -35,3 +38,21 @@ def test_public_names_have_docstrings(name):
         if inspect.isclass(value):
             missing += [f"{owner}.{key}" for key, _ in public(value, name) if not has_docstring(value, key)]
     assert missing == [] and module.__doc__
+
+
+def documented_arguments(docstring: str) -> list[str]:
+    """Return the names in the section ``Args`` of a docstring."""
+    section = re.split(r"\n(?:Returns|Raises|Yields):", docstring.partition("Args:\n")[2])[0]
+    lines = re.findall(r"^    (\w+(?:, \w+)*):", section, re.MULTILINE)
+    return [name for line in lines for name in line.split(", ")]
+
+
+def test_documented_arguments_exist():
+    root, unknown = Path(__file__).parents[2], []
+    for path in (*root.glob("training/**/*.py"), *root.glob("blender_lodgs/**/*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FunctionDef):
+                names = {argument.arg for argument in ast.walk(node.args) if isinstance(argument, ast.arg)}
+                documented = documented_arguments(ast.get_docstring(node) or "")
+                unknown += [f"{path.name}: {node.name}: {name}" for name in documented if name not in names]
+    assert unknown == []

@@ -9,8 +9,10 @@ ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PAGES = [
     DOCS / "index.md",
-    *(page for name in ("start", "manual", "methods") for page in (DOCS / name).glob("*.md")),
+    *(page for name in ("start", "manual", "methods", "command-line") for page in (DOCS / name).glob("*.md")),
+    *(DOCS / "reference" / f"{name}.md" for name in ("controls", "formats", "level-formats", "api")),
 ]
+PAGES.remove(DOCS / "command-line" / "commands.md")  # generated
 MAX_WORDS = 900
 
 

@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     plan = actions.add_parser(
-        "plan", help="divide a job into blocks, each a run of its own, and estimate the work for each"
+        "plan", help="divide a scene into cells, each with a run of its own, and estimate the costs of each"
     )
     add_options(plan)
     plan.add_argument(
@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--block-memory", type=parse_positive, default=0, metavar="MB",
         help="instead of --cells: use as few cells as need at most this much memory each (estimated)",
     )  # fmt: skip
-    train = actions.add_parser("run", help="train or resume the blocks of a plan, and merge them")
+    train = actions.add_parser("run", help="train or resume the cells of a plan, and merge them")
     train.add_argument("run", type=Path, help="run folder of the plan")
     train.add_argument(
         "--on", default="here", metavar="WHERE",
@@ -53,9 +53,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     train.add_argument(
         "--takes", action="append", default=[], metavar="NAME=NUMBER",
-        help="Dask resources that each block needs, such as GPU=1",
+        help="Dask resources that each cell needs, such as GPU=1",
     )  # fmt: skip
-    scheduler = actions.add_parser("scheduler", help="distribute blocks to the workers of several computers")
+    scheduler = actions.add_parser("scheduler", help="distribute cells to the workers of several computers")
     scheduler.add_argument("key", type=Path, help="key file to write; every worker needs a copy")
     scheduler.add_argument(
         "--host", metavar="HOST", help="address of this computer for the others (default: its main address)"
@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     scheduler.add_argument(
         "--port", type=parse_positive, default=8786, metavar="N", help="port for connections (default 8786)"
     )
-    worker = actions.add_parser("worker", help="train blocks of a scheduler on this computer")
+    worker = actions.add_parser("worker", help="train cells of a scheduler on this computer")
     worker.add_argument("key", type=Path, help="copy of the scheduler's key file")
     worker.add_argument(
         "--offers", action="append", default=[], metavar="NAME=NUMBER",
@@ -104,7 +104,7 @@ def _plan(options: argparse.Namespace) -> int:
         job = job.with_cells(choose_cells(job, options.block_splats, options.block_memory * 10**6, scene))
     if not job.cells:
         raise LodgsError(
-            "Cannot plan blocks: the number of cells is missing.",
+            "Cannot plan cells: their number is missing.",
             "Add --cells 2x4, for 2 columns of 4 cells, or --block-splats 1000000.",
         )
     planned = plan(job, scene)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ..errors import LodgsError
+from ..errors import LodgsError, printable
 from ..files import check_folder, create_folder
 from ..settings import default_of, settings_of
 from .options import add_lpips, add_setting, lpips_archive, parse_factor, warn
@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
     parser.description = (
         "Measures finished runs of one scene, and writes a page that compares quality, splats, speed and "
-        "images. Of scenes, it first trains each method. The same command resumes."
+        "images. If scenes are named instead, it first trains each method on them. The same command resumes."
     )
     parser.add_argument("sources", type=Path, nargs="+", metavar="SOURCE", help="scenes, or run folders")
     parser.add_argument(
@@ -79,8 +79,11 @@ def _scene_folders(options: argparse.Namespace) -> list[Path]:
     for scene in options.sources:
         check_folder(scene, "Name scenes, or runs.")
     names = [scene.resolve().name for scene in options.sources]
-    if len(set(names)) < len(names):
-        raise LodgsError("Cannot compare scenes of the same name.", "Rename a folder.")
+    for name in names:
+        if names.count(name) > 1:
+            raise LodgsError(
+                f"Cannot compare scenes: several folders are named {printable(name)}.", "Rename one of them."
+            )
     return options.sources
 
 

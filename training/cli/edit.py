@@ -105,7 +105,10 @@ def run(options: argparse.Namespace) -> int:
 
     limits = setting_values(options, Cleaning)
     if options.keep == "all" and (options.crop_box or options.crop_sphere) and _look(options) is None:
-        raise LodgsError("--keep all removes nothing inside the crops.", "Add a look to apply there.")
+        raise LodgsError(
+            "Cannot edit with --keep all: the crops have no effect without a look.",
+            "Add a look to apply in the crops, such as --exposure 1, or omit --keep.",
+        )
     if limits.keys() & {"max_distance", "min_views"} and options.scene is None:
         raise LodgsError(
             "Cannot test splats against photos: their scene is missing.", "Add its folder with --scene."

@@ -22,7 +22,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     camera.add_argument("--view", metavar="IMAGE", help="file name of a training photo")
     parser.add_argument("--scene", type=Path, help="COLMAP folder of the photos, if no run names it")
     parser.add_argument("--out", type=Path, required=True, help="image to write: .png or .exr")
-    parser.add_argument("--size", type=parse_size, metavar="WxH", help="pixels (default: the camera's size)")
+    parser.add_argument(
+        "--size", type=parse_size, metavar="WxH", help="image size in pixels (default: the camera's)"
+    )
     parser.add_argument("--level", type=int, default=0, help="level to render (default: the finest)")
     parser.add_argument(
         "--by-distance", action="store_true",

@@ -110,5 +110,5 @@ def _filter_factor(means: np.ndarray, shapes: np.ndarray, view: Camera) -> np.nd
     along = (view.fy / z)[:, None] * (down - (y / z)[:, None] * ahead)
     first, second = ((axis[:, None] @ shapes)[:, 0] for axis in (across, along))
     a, b, c = ((u * v).sum(1) for u, v in ((first, first), (first, second), (second, second)))
-    before = np.maximum(a * c - b * b, 0)
-    return np.sqrt(before / ((a + MIP_VARIANCE) * (c + MIP_VARIANCE) - b * b))
+    determinant = np.maximum(a * c - b * b, 0)
+    return np.sqrt(determinant / ((a + MIP_VARIANCE) * (c + MIP_VARIANCE) - b * b))

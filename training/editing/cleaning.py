@@ -331,7 +331,7 @@ def keep_splats(bundle: Bundle, masks: Masks, relations: Relations | None = None
         else:
             levels.append(replace(level, on_disk=RowSubset(level.rows, rows, columns)))
     if not any(len(level.rows) for level in levels):
-        raise LodgsError("No splats remain.", "Check the crops and limits.")
+        raise LodgsError("Cannot edit the splats: none remain.", "Check the crops and limits.")
     tables = dict(bundle.tables)
     if BLOCKS in tables and rule is not None:
         tables[BLOCKS] = block_table(rule.block_bounds, _rule_columns(rule, levels, changed))

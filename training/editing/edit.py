@@ -119,7 +119,7 @@ def _check_outputs(
     """Raise an error before minutes of work if an output cannot be written."""
     for path in outputs:
         if path.resolve() == source.resolve():
-            raise LodgsError(f"Cannot overwrite the source {path}.", "Choose another output file.")
+            raise LodgsError(f"Cannot write {path}: it is the source.", "Choose another output file.")
     kinds = [find_format(path) for path in plain] + [find_level_format(path) for path in levels]
     for kind in kinds:
         if kind.require is not None:

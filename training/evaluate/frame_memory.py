@@ -27,12 +27,12 @@ def measure_frame_memory(
     """
     device = tensor_device(backend)
     if device.type == "cuda":
-        before = torch.cuda.memory_allocated(device)
+        initial = torch.cuda.memory_allocated(device)
         draw = prepare()
         draw(cameras[0])
         torch.cuda.reset_peak_memory_stats(device)
         _draw_all(draw, cameras)
-        return torch.cuda.max_memory_allocated(device) - before
+        return torch.cuda.max_memory_allocated(device) - initial
     _return_freed_memory()
     process_before = resident_memory()
     if process_before is None:

@@ -220,8 +220,8 @@ class Evaluation:
             pair = image, target.image, target.mask
             perceptual = [measure(*pair) for measure in self.perceptual.values()]
             rows.append((seconds, psnr(*pair), ssim(*pair), *perceptual))
-        seconds, quality, *others = np.array(rows).T
-        named = zip(("ssim", *self.perceptual), others, strict=True)
+        seconds, quality, *measures = np.array(rows).T
+        named = zip(("ssim", *self.perceptual), measures, strict=True)
         return {
             f"{self.prefix}psnr": round(float(quality.mean()), 3),
             **{f"{self.prefix}{name}": round(float(values.mean()), 4) for name, values in named},

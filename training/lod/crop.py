@@ -12,9 +12,9 @@ from ..errors import LodgsError
 
 SHAPES = ("BOX", "SPHERE")
 FACE_SQUARED = (1 + 1e-5) ** 2
-"""Squared half size of a crop in its own space, with a margin that keeps points on faces inside."""
+"""Squared half size of a crop in its local space, with a margin that keeps points on faces inside."""
 _NOWHERE = ((0.0, 0.0, 0.0, 2.0),) * 3
-"""``to_own`` of a flat crop, which has no inside."""
+"""``to_local`` of a flat crop, which has no inside."""
 
 
 @dataclass(frozen=True)
@@ -22,18 +22,18 @@ class Crop:
     """A box or a sphere in the splats' space. Hashable and JSON-serialisable.
 
     Attributes:
-        shape: "BOX", from -1 to 1 on each axis of its own space, or "SPHERE", of radius 1 there.
-        to_own: rows of the (3, 4) transform from the splats' space to the crop's own.
+        shape: "BOX", from -1 to 1 on each axis of its local space, or "SPHERE", of radius 1 there.
+        to_local: rows of the (3, 4) transform from the splats' space to the crop's local space.
         outside: keep the outside instead of the inside.
     """
 
     shape: str
-    to_own: tuple[tuple[float, ...], ...]
+    to_local: tuple[tuple[float, ...], ...]
     outside: bool = False
 
     @classmethod
     def from_matrix(cls, shape: str, matrix: np.ndarray, outside: bool = False) -> Crop:
-        """Return the crop with the (4, 4) transform from its own space to the splats' space."""
+        """Return the crop with the (4, 4) transform from its local space to the splats' space."""
         matrix = np.asarray(matrix, np.float64)
         if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix[:3, :3])) < 1e-30:
             return cls(shape, _NOWHERE, outside)
@@ -49,9 +49,13 @@ class Crop:
         """
         low, high = np.minimum(corner, opposite), np.maximum(corner, opposite)
         if not np.isfinite([low, high]).all():
-            raise LodgsError(f"The box from {corner} to {opposite} is infinite.", "Use finite corners.")
+            raise LodgsError(
+                f"Cannot use the box from {corner} to {opposite}: it is infinite.", "Use finite corners."
+            )
         if not (high > low).all():
-            raise LodgsError(f"The box from {corner} to {opposite} is flat.", "Use two opposite corners.")
+            raise LodgsError(
+                f"Cannot use the box from {corner} to {opposite}: it is flat.", "Use two opposite corners."
+            )
         matrix = np.diag([*(high - low) / 2, 1])
         matrix[:3, 3] = (low + high) / 2
         return cls.from_matrix("BOX", matrix, outside)
@@ -65,10 +69,13 @@ class Crop:
         """
         if not np.isfinite([*centre, radius]).all():
             raise LodgsError(
-                f"The sphere of radius {radius:g} around {centre} is infinite.", "Use finite numbers."
+                f"Cannot use the sphere of radius {radius:g} around {centre}: it is infinite.",
+                "Use finite numbers.",
             )
         if not radius > 0:
-            raise LodgsError(f"A sphere of radius {radius:g} is empty.", "Use a radius above 0.")
+            raise LodgsError(
+                f"Cannot use a sphere of radius {radius:g}: it is empty.", "Use a radius above 0."
+            )
         matrix = np.diag([radius, radius, radius, 1.0])
         matrix[:3, 3] = centre
         return cls.from_matrix("SPHERE", matrix, outside)
@@ -77,7 +84,7 @@ class Crop:
         """Return a mask (N,) of means (N, 3) inside the crop."""
         x, y, z = means.T
         squares = None
-        for a, b, c, d in np.array(self.to_own, np.float32):
+        for a, b, c, d in np.array(self.to_local, np.float32):
             axis = x * a
             axis += y * b
             axis += z * c
@@ -97,7 +104,7 @@ class Crop:
         """Parse a crop.
 
         Valid are ``box X Y Z X Y Z`` (two opposite corners), ``sphere X Y Z R``, or either name with the 12
-        numbers of ``to_own``, row by row.
+        numbers of ``to_local``, row by row.
 
         Raises:
             LodgsError: invalid text, or an empty crop.
@@ -117,17 +124,21 @@ class Crop:
                     rows = (tuple(numbers[at : at + 4]) for at in (0, 4, 8))
                     return cls(name.upper(), tuple(rows))
         raise LodgsError(
-            f"{quote(text)} is neither a box nor a sphere.",
+            f"Cannot read the region {quote(text)}: it is neither a box nor a sphere.",
             "Use box X Y Z X Y Z (two opposite corners), or sphere X Y Z RADIUS.",
         )
 
     def as_text(self) -> str:
         """Return a text for :meth:`from_text`, which does not store ``outside``."""
-        return " ".join([self.shape.lower(), *(repr(value) for row in self.to_own for value in row)])
+        return " ".join([self.shape.lower(), *(repr(value) for row in self.to_local for value in row)])
 
     def as_dict(self) -> dict:
         """Return the crop as a JSON-serialisable dict."""
-        return {"shape": self.shape, "to_own": [list(row) for row in self.to_own], "outside": self.outside}
+        return {
+            "shape": self.shape,
+            "to_local": [list(row) for row in self.to_local],
+            "outside": self.outside,
+        }
 
 
 def crop_mask(crops: Sequence[Crop], means: np.ndarray) -> np.ndarray:

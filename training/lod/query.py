@@ -206,7 +206,7 @@ class Pager(Protocol):
 
 
 class PagedFile(Protocol):
-    """A bundle of which only the part that a camera needs is in memory, see ``Rule.paged_file``.
+    """A partly loaded bundle: only the splats that a camera needs are in memory, see ``Rule.paged_file``.
 
     Attributes:
         bundle: the bundle without splats.

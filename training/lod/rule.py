@@ -161,8 +161,8 @@ class Rule(ABC):
         block_bounds: columns of the table of blocks (``blocks.BLOCKS``) besides ``level``, for partial reads
             of files: each is the reduction of a column over the rows of a block.
         relations: relations among splats that edits preserve.
-        paged_file: class of files (``query.PagedFile``) of which only a part is in memory; None means that
-            files are read completely.
+        paged_file: class of partly loaded files (``query.PagedFile``); None means that files are read
+            completely.
         plain_values: control values with which weights depend on distance alone.
         fade_factor: ratio of end to begin of the distances over which a level fades; 1 if it switches.
         sweep: a control and values of it that a report measures one by one; None for no such curve.
@@ -369,8 +369,8 @@ class Rule(ABC):
         for name in changes:
             if name not in controls:
                 raise LodgsError(
-                    f"The rule '{self.name}' has no option '{name}'.",
-                    f"It has: {', '.join(controls) or 'none'}.",
+                    f"Cannot set '{name}': the rule '{self.name}' has no such control.",
+                    f"Use one of: {', '.join(controls)}." if controls else "Omit it.",
                 )
         values = self.defaults(levels) | dict(recorded or {}) | dict(changes)
         return {name: control.validate(values[name]) for name, control in controls.items()}

@@ -67,13 +67,13 @@ def choose_switches(errors: np.ndarray, counts: np.ndarray, max_splats: float) -
     """
     bins, levels = errors.shape
     numbers = np.arange(bins)
-    best, least = [0] * (levels - 1), np.inf
+    best, least_error = [0] * (levels - 1), np.inf
     for ascending in combinations_with_replacement(range(bins + 1), levels - 1):
         # a bin shows the coarsest level whose first bin is not after it
         column = levels - 1 - np.searchsorted(ascending, numbers, side="right")
         error = errors[numbers, column].sum()
-        if error < least and counts[numbers, column].sum() <= max_splats:
-            best, least = list(ascending[::-1]), error
+        if error < least_error and counts[numbers, column].sum() <= max_splats:
+            best, least_error = list(ascending[::-1]), error
     return best
 
 

@@ -91,8 +91,8 @@ def merge_pairs(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     mass = first[..., 9] + second[..., 9]
     share = (first[..., 9] / mass)[..., None]
     merged = share * first + (1 - share) * second
-    apart = first[..., :3] - second[..., :3]
-    merged[..., 3:9] += share * (1 - share) * (apart[..., _ROWS] * apart[..., _COLUMNS])
+    offset = first[..., :3] - second[..., :3]
+    merged[..., 3:9] += share * (1 - share) * (offset[..., _ROWS] * offset[..., _COLUMNS])
     merged[..., 9] = mass
     return merged
 
@@ -131,12 +131,12 @@ def cheapest_pairs(moments: np.ndarray, limit: int) -> tuple[np.ndarray, np.ndar
     log_areas = _log_areas(columns[3:9])
     for part in _batches(count, NEIGHBOURS):
         rows = np.arange(count)[part]
-        others = neighbours[part]
-        first, second = np.minimum(rows[:, None], others), np.maximum(rows[:, None], others)
+        candidates = neighbours[part]
+        first, second = np.minimum(rows[:, None], candidates), np.maximum(rows[:, None], candidates)
         pair_costs = _errors(columns, log_areas, first, second)
-        pair_costs[others == rows[:, None]] = np.inf
+        pair_costs[candidates == rows[:, None]] = np.inf
         best = pair_costs.argmin(axis=1)[:, None]
-        partners[part] = np.take_along_axis(others, best, 1)[:, 0]
+        partners[part] = np.take_along_axis(candidates, best, 1)[:, 0]
         costs[part] = np.take_along_axis(pair_costs, best, 1)[:, 0]
     # a pair merges if no cheaper one has a splat in common with it
     rank = np.empty(count, np.int64)
@@ -167,10 +167,10 @@ def _errors(moments: np.ndarray, log_areas: np.ndarray, first: np.ndarray, secon
     mass = a[9] + b[9]
     share = a[9] / mass
     covariances = share * a[3:9] + (1 - share) * b[3:9]
-    apart = a[:3] - b[:3]
+    offset = a[:3] - b[:3]
     spread = share * (1 - share)
     for covariance, row, column in zip(covariances, _ROWS, _COLUMNS, strict=True):
-        covariance += spread * (apart[row] * apart[column])
+        covariance += spread * (offset[row] * offset[column])
     loss = _log_areas(covariances) - share * log_areas[first] - (1 - share) * log_areas[second]
     colors = ((a[10:] - b[10:]) ** 2).sum(0)
     return mass * (loss + COLOR_WEIGHT * share * (1 - share) * colors)

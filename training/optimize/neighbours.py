@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 def query_neighbours(tree: KDTree, positions: np.ndarray, count: int = 1) -> tuple[np.ndarray, np.ndarray]:
     """Return the distances and indices of the nearest points of a tree, (N,), or (N, count) for several.
 
-    An interrupt waits for the query: scipy's threads would go on and write to freed memory.
+    An interrupt waits for the query: scipy's threads would continue and write to freed memory.
     """
     with ThreadPoolExecutor(1) as pool:
         distances, indices = pool.submit(tree.query, positions, count, workers=-1).result()

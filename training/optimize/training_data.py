@@ -56,7 +56,7 @@ class TrainingData:
     """Views of a scene at training size, with a cache of their images.
 
     Args:
-        full_scene: scene of which ``scene`` is a cell, which determines units and held-out views. None if
+        full_scene: undivided scene, if ``scene`` is a cell. It determines units and held-out views. None if
             ``scene`` is complete.
         photo_memory: size of the image cache in bytes; None for ``image_cache.default_budget``. Does not
             affect the result.
@@ -68,7 +68,7 @@ class TrainingData:
 
     Attributes:
         scene: scene to train.
-        full_scene: scene of which it is a cell, or the same.
+        full_scene: undivided scene, or ``scene`` itself.
         full_train: training cameras of the full scene, at training size.
         train, test: cameras at training size. Test views are every n-th by name (see ``Scene.split``).
         images: cache of the images of these views.

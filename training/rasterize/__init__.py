@@ -380,18 +380,18 @@ def resolve_backend(backend: str) -> str:
     from . import cuda
 
     if backend == "auto":
-        return "cpu" if cuda.problem() else "cuda"
+        return "cpu" if cuda.find_problem() else "cuda"
     if backend not in BACKENDS:
         raise LodgsError(
             f'Unknown rasterizer backend "{backend}".', f"Choose auto or one of {', '.join(BACKENDS)}."
         )
-    if backend == "cuda" and (problem := cuda.problem()):
+    if backend == "cuda" and (problem := cuda.find_problem()):
         raise problem
     if backend == "gpu":
         from .gpu.default_device import default_adapter
-        from .self_test import failure
+        from .self_test import find_failure
 
-        return "cpu" if failure(default_adapter()) else "gpu"
+        return "cpu" if find_failure(default_adapter()) else "gpu"
     return backend
 
 
@@ -403,14 +403,14 @@ def cpu_fallback_reason(backend: str) -> str:
     """
     from . import cuda
 
-    if backend == "auto" and torch.cuda.is_available() and (problem := cuda.problem()):
+    if backend == "auto" and torch.cuda.is_available() and (problem := cuda.find_problem()):
         return f"The NVIDIA GPU is not used. {problem}"
     if backend == "gpu" and resolve_backend(backend) == "cpu":
         from .gpu.default_device import default_adapter
-        from .self_test import failure
+        from .self_test import find_failure
 
         adapter = default_adapter()
-        reason = failure(adapter)
+        reason = find_failure(adapter)
         return f"{adapter.name} is not used: {reason}. The CPU is used instead; a newer driver may help."
     return ""
 

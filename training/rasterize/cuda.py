@@ -43,7 +43,7 @@ CHUNK_PAIRS = 1 << 24
 
 
 @cache
-def problem() -> LodgsError | None:
+def find_problem() -> LodgsError | None:
     """Return why this backend cannot work, or None. The first call compiles gsplat, which takes minutes."""
     if not torch.cuda.is_available():
         return LodgsError(

@@ -12,7 +12,7 @@ from . import cuda, trial
 from .cpu.compile import thread_count
 from .gpu import default_device
 from .gpu.device import Adapter, adapters, open_device
-from .self_test import failure, run_self_test
+from .self_test import find_failure, run_self_test
 
 SECONDS = 5.0
 """Approximate duration of a trial of one device."""
@@ -89,7 +89,7 @@ def describe(timed: bool = False) -> str:
     """
     devices = Devices.detect()
     rows = [("cpu", f"{thread_count()} threads")]
-    problem = cuda.problem()
+    problem = cuda.find_problem()
     rows.append(("cuda", str(problem) if problem else f"{devices.card}, through gsplat"))
     working = ["cpu"] if problem else ["cpu", "cuda"]
     for adapter in devices.adapters:
@@ -114,7 +114,7 @@ def describe(timed: bool = False) -> str:
 def _reason_against(adapter: Adapter) -> str:
     """Return why the selected device is not used."""
     try:
-        return f"{adapter.name} is not used: {failure(adapter) or 'its trial failed'}."
+        return f"{adapter.name} is not used: {find_failure(adapter) or 'its trial failed'}."
     except LodgsError as problem:
         return str(problem)
 

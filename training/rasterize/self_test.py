@@ -36,7 +36,7 @@ REASON_LENGTH = 300
 
 
 @cache
-def failure(adapter: Adapter) -> str:
+def find_failure(adapter: Adapter) -> str:
     """Return why the default device fails the self-test; empty if it passes.
 
     The result is stored, so each version of driver and backend is tested once.

@@ -44,7 +44,7 @@ RESULTS = "trials.json"
 def working_backends() -> list[str]:
     """Return the backends of this computer that pass their check. Software devices are no candidates."""
     names = ["cpu"]
-    if not cuda.problem():
+    if not cuda.find_problem():
         names.append("cuda")
     with suppress(LodgsError):
         if not default_adapter().software and resolve_backend("gpu") == "gpu":

@@ -33,7 +33,7 @@ class RenderSource:
     """Levels to render, and the run that trained them.
 
     Attributes:
-        levels: file of which only the header has been read, or the contents of a folder of levels.
+        levels: bundle with only its header in memory, or the contents of a folder of levels.
         rule: name of the rule, see ``Bundle``.
         run: run that contains the file, or None.
         origin: local origin of the levels, (3,).

@@ -27,7 +27,7 @@ from .image import write_image
 
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 _GREY = 0.12, 0.55
-"""Brightness of the remaining splats: of black ones, and what white ones add."""
+"""Brightness of black remaining splats, and the additional brightness of white ones."""
 _SIDE = 1280
 """Longer side of the image in pixels."""
 _MAX_POINTS, _MAX_VIEWS = 20_000, 200

@@ -56,7 +56,7 @@ class SetRequest:
         antialias: see ``scene.Instance``.
         columns: names of the extra columns in the file.
         query: rule and arguments that weight the splats in addition to the file's weights, or None.
-        paged: path of a bundle of which only the splats that the query selects are read; or None.
+        paged: path of a bundle from which only the splats that the query selects are read; or None.
         looks: see ``scene.Instance``.
         motion: see ``scene.Instance``.
     """
@@ -105,7 +105,7 @@ class FrameRequest:
 
     @property
     def is_one_view(self) -> bool:
-        """Return whether the image is what the camera sees as a pinhole at one time."""
+        """True if the image is a single pinhole view, without blur or panorama."""
         moves = self.cameras or any(item.motion for item in self.sets)
         return self.projection == SHARP and self.aperture is None and not moves
 
@@ -275,10 +275,10 @@ def _short_list(values: dict, key: str) -> list:
 def _crop(values: Any) -> Crop:
     if not isinstance(values, dict) or values.get("shape") not in SHAPES:
         raise _invalid("crops", values)
-    rows = _typed(values, "to_own", list)
+    rows = _typed(values, "to_local", list)
     if len(rows) != 3:
-        raise _invalid("to_own", rows)
-    a, b, c = (_numbers({"to_own": row}, "to_own", 4, MAX_NUMBER) for row in rows)
+        raise _invalid("to_local", rows)
+    a, b, c = (_numbers({"to_local": row}, "to_local", 4, MAX_NUMBER) for row in rows)
     return Crop(values["shape"], tuple(map(tuple, (a, b, c))), bool(values.get("outside")))
 
 

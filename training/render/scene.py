@@ -181,7 +181,7 @@ def _check_transforms(instances: Sequence[Instance]) -> None:
         is_flat = not np.isfinite(instance.matrix).all() or np.linalg.cond(linear) > MAX_CONDITION
         if is_flat or not linear.any():
             raise LodgsError(
-                "Cannot draw a set of splats: it is scaled to nothing.", "Give its object a scale above 0."
+                "Cannot draw a set of splats: its scale is 0.", "Give its object a scale above 0."
             )
 
 

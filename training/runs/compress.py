@@ -70,7 +70,7 @@ def compress(
     """
     path = find_splats(source)
     if out.resolve() == path.resolve():
-        raise LodgsError(f"Cannot overwrite the source {out}.", "Choose another output file.")
+        raise LodgsError(f"Cannot write {out}: it is the source.", "Choose another output file.")
     if out.suffix.lower() != ".ply":
         raise LodgsError(f"Cannot write {out}: compressed bundles are PLY files.", "End its name with .ply.")
     bundle = read_folder(path, warn) if path.is_dir() else read_bundle(path, warn)
@@ -129,13 +129,13 @@ def shrink_levels(
         masks[level.number][np.argsort(column, kind="stable")[: int(settings.prune * len(column))]] = False
         extras = level.splats.extras | {_SIGNIFICANCE: column.astype(np.float32)}
         levels.append(replace(level, splats=replace(level.splats, extras=extras)))
-    kept = keep_splats(replace(bundle, levels=levels), masks)
-    kept = limit_degree(kept, settings.sh_degree)
+    pruned = keep_splats(replace(bundle, levels=levels), masks)
+    pruned = limit_degree(pruned, settings.sh_degree)
     views = [*data.train, *midpoint_views(data.train)]
-    for level, original in zip(kept.levels, bundle.levels, strict=True):
+    for level, original in zip(pruned.levels, bundle.levels, strict=True):
         if settings.distill_steps and len(level.splats):
             level.splats = distill(level.splats, original.splats, views, settings.distill_steps, **options)
-    return kept
+    return pruned
 
 
 def limit_degree(bundle: Bundle, degree: int) -> Bundle:
@@ -174,8 +174,8 @@ def distill(
     device = tensor_device(backend)
     original, student = Gaussians.of(teacher, device), vars(Gaussians.of(splats, device))
     trained = {name: student[name].clone().requires_grad_() for name in RATES}
-    rest = splats.sh.shape[1] - 1
-    rates = RATES | {"sh": torch.tensor([[RATES["sh"]], *[[RATES["sh"] / 20]] * rest])}
+    higher_terms = splats.sh.shape[1] - 1
+    rates = RATES | {"sh": torch.tensor([[RATES["sh"]], *[[RATES["sh"] / 20]] * higher_terms])}
     adam = Adam(trained, rates)
     rounds = np.tile(np.arange(len(views)), (steps // len(views) + 1, 1))
     order = np.random.default_rng(0).permuted(rounds, axis=1)
@@ -200,8 +200,8 @@ def make_codebook(bundle: Bundle, size: int, weights: np.ndarray | None = None) 
         size: maximum number of sets; bundles with few splats get fewer.
         weights: (N,) relative probabilities that k-means samples a splat, for the splats of all levels.
     """
-    rest = np.concatenate([level.splats.sh[:, 1:] for level in bundle.levels])
-    rows = rest.reshape(len(rest), -1)
+    harmonics = np.concatenate([level.splats.sh[:, 1:] for level in bundle.levels])
+    rows = harmonics.reshape(len(harmonics), -1)
     if weights is None or not weights.any():
         weights = np.ones(len(rows))
     size = min(size, len(rows) // MIN_SHARED, np.count_nonzero(weights))

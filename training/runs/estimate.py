@@ -27,19 +27,19 @@ from .backend import choose_backend
 from .blocks.plan import PROGRAM_BYTES, SPLAT_BYTES, choose_cells
 from .job import Job
 
-UNLIMITED = 1_000_000
+ASSUMED_SPLATS = 1_000_000
 """Assumed number of splats of a run without a limit."""
 START_SECONDS = 4.0
 """Seconds to start the trainer and to measure its result."""
-SECONDS = 2.0
+MEASURED_SECONDS = 2.0
 """Approximate seconds of measured steps per size."""
 ROUND_GROWTH = 0.1
 """Splats that a densification adds, as a share of the initial points. Measured: 0.04 to 0.25."""
-GROWTH = 0.5
+GROWTH_SHARE = 0.5
 """Share of the first level's steps in which the number of splats grows."""
-FULL = 0.8
+MAX_USE = 0.8
 """Share of the free memory or disk that a training may use."""
-LONG = 2 * 3600
+LONG_SECONDS = 2 * 3600
 """Seconds from which a preset of less effort is suggested."""
 LARGE_SIDE, SMALL_SIDE = 1600, 640
 """Longer sides of training images in pixels: above the first, papers reduce photos; below the second, details
@@ -88,7 +88,7 @@ def estimate_findings(job: Job) -> list[Finding]:
     try:
         with tempfile.TemporaryDirectory(prefix="lodgs-") as scratch:
             costs = estimate(job, Path(scratch))
-        return [Finding(ESTIMATE, str(costs)), *suggestions(job.resolved(), costs)]
+        return [Finding(ESTIMATE, str(costs)), *suggest_settings(job.resolved(), costs)]
     except LodgsError as error:
         return [Finding(ESTIMATE, f"No estimate: {error.what}", error.remedy)]
 
@@ -126,42 +126,42 @@ def estimate(job: Job, scratch: Path) -> Estimate:
         memory = (peak_memory() or round(PROGRAM_BYTES + SPLAT_BYTES * splats)) + photos
         available = free_memory()
     steps = parameters.total_steps
-    seconds = start + steps * (GROWTH * (early + late) / 2 + (1 - GROWTH) * late)
+    seconds = start + steps * (GROWTH_SHARE * (early + late) / 2 + (1 - GROWTH_SHARE) * late)
     return Estimate(
-        seconds, memory, available, _disk(parameters, splats), _free_disk(Path(job.out)), splats, steps,
+        seconds, memory, available, _disk_bytes(parameters, splats), _free_disk(Path(job.out)), splats, steps,
         len(data.train), (width, height),
     )  # fmt: skip
 
 
-def suggestions(job: Job, costs: Estimate) -> list[Finding]:
+def suggest_settings(job: Job, costs: Estimate) -> list[Finding]:
     """Return settings to change, with their reason."""
-    lines = []
+    findings = []
     longer = max(costs.size)
-    if costs.memory > FULL * costs.free_memory:
-        what = f"Training needs more than {FULL:.0%} of the free memory."
-        lines.append(Finding(ESTIMATE, what, _less_memory(job, costs)))
-    if costs.disk > FULL * costs.free_disk:
-        what = f"The run may need more than {FULL:.0%} of the free disk space."
-        lines.append(Finding(ESTIMATE, what, "Choose a run folder on another disk."))
+    if costs.memory > MAX_USE * costs.free_memory:
+        problem = f"Training needs more than {MAX_USE:.0%} of the free memory."
+        findings.append(Finding(ESTIMATE, problem, _memory_remedy(job, costs)))
+    if costs.disk > MAX_USE * costs.free_disk:
+        problem = f"The run may need more than {MAX_USE:.0%} of the free disk space."
+        findings.append(Finding(ESTIMATE, problem, "Choose a run folder on another disk."))
     if longer > LARGE_SIDE:
         scale = job.image_scale * LARGE_SIDE / longer
-        what = f"Training images are {longer} pixels wide; the papers use at most {LARGE_SIDE}."
-        lines.append(Finding(ESTIMATE, what, f"Set image_scale to {scale:.2g} to train faster."))
+        problem = f"Training images are {longer} pixels wide; the papers use at most {LARGE_SIDE}."
+        findings.append(Finding(ESTIMATE, problem, f"Set image_scale to {scale:.2g} to train faster."))
     elif longer < SMALL_SIDE and job.image_scale < 1:
         scale = min(job.image_scale * SMALL_SIDE / longer, 1.0)
-        what = f"Training images are only {longer} pixels wide, which loses details."
-        lines.append(Finding(ESTIMATE, what, f"Set image_scale to {scale:.2g}."))
-    if costs.seconds > LONG and job.preset != "draft":
-        what = f"Training takes more than {LONG // 3600} hours on this computer."
-        lines.append(Finding(ESTIMATE, what, "Train the preset draft first to check the scene."))
-    return lines
+        problem = f"Training images are only {longer} pixels wide, which loses details."
+        findings.append(Finding(ESTIMATE, problem, f"Set image_scale to {scale:.2g}."))
+    if costs.seconds > LONG_SECONDS and job.preset != "draft":
+        problem = f"Training takes more than {LONG_SECONDS // 3600} hours on this computer."
+        findings.append(Finding(ESTIMATE, problem, "Train the preset draft first to check the scene."))
+    return findings
 
 
-def _less_memory(job: Job, costs: Estimate) -> str:
+def _memory_remedy(job: Job, costs: Estimate) -> str:
     """Return the remedy for too little memory: cells if the method has them, else fewer splats."""
     if METHODS[job.method].cell_method:
         try:
-            grid = choose_cells(job, memory=int(FULL * costs.free_memory))
+            grid = choose_cells(job, memory=int(MAX_USE * costs.free_memory))
             if grid != "1x1":
                 return f"Train in {grid} cells, which need memory one after the other."
         except LodgsError:
@@ -172,7 +172,7 @@ def _less_memory(job: Job, costs: Estimate) -> str:
 def _expected_splats(parameters: Parameters, points: int) -> int:
     """Return the number of splats of the finest level, at most its limit, from that of the initial points."""
     if parameters.growth_rounds is None:
-        return parameters.max_splats or max(UNLIMITED, points)
+        return parameters.max_splats or max(ASSUMED_SPLATS, points)
     return min(parameters.splat_limit, round(points * (1 + ROUND_GROWTH * parameters.growth_rounds)))
 
 
@@ -204,7 +204,7 @@ def _time_steps(method: Method, last: bool) -> float:
     step = max(end - 50, 0) if last else 0
     method.train_step(step)
     begin, times = time.monotonic(), []
-    while len(times) < 2 or time.monotonic() - begin < SECONDS:
+    while len(times) < 2 or time.monotonic() - begin < MEASURED_SECONDS:
         step = min(step + 1, max(end - 2, 0))
         started = time.monotonic()
         method.train_step(step)
@@ -224,7 +224,7 @@ def _with_points(scene: Scene, count: int) -> Scene:
     )  # fmt: skip
 
 
-def _disk(parameters: Parameters, splats: int) -> int:
+def _disk_bytes(parameters: Parameters, splats: int) -> int:
     """Return the bytes of a run: its levels as files and in the bundle, and two checkpoints with moments."""
     row = 4 * (11 + 3 * (parameters.sh_degree + 1) ** 2)
     levels = 1 if parameters.levels == 1 else 2  # coarser levels have at most as many splats together

@@ -100,9 +100,9 @@ class RunFolder:
     def points_cache(self) -> Path:
         """Cache of triangulated points if the scene folder is read-only; parts share the divided run's."""
         for parent in self.path.parents[:2]:
-            whole = RunFolder(parent.parent)
-            if parent == whole.blocks and whole.job.exists():
-                return whole.triangulated
+            divided = RunFolder(parent.parent)
+            if parent == divided.blocks and divided.job.exists():
+                return divided.triangulated
         return self.triangulated
 
     def reject_links(self) -> None:

@@ -77,14 +77,14 @@ class Job:
     seed: int = setting(0, "Seed of random choices. Runs with the same seed are equal.", panel="Advanced")
     backend: str = setting(
         "auto",
-        "Rasterizer. The choice auto is the fastest device that can train the job alone.",
+        "Device that trains and renders. The choice auto is the fastest device that can train the job alone.",
         choices=BACKENDS,
         changeable=True,
     )
     image_scale: float = setting(
         0.5,
-        "Scale of the photos for training. Increase it for finer detail and longer training. Jobs of preset "
-        "paper that omit it use 1.",
+        "Scale of the photos for training. Increase it for finer detail at the cost of time. The default of "
+        "the preset paper is 1.",
         above=0,
         high=1,
         soft=(0.1, None),

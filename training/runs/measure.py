@@ -304,9 +304,9 @@ def format_report(report: dict) -> str:
     """Format the report of :func:`evaluate_run` as text."""
     prefix = "" if report["test_views"] else "train_"
     titles = {f"{prefix}{name}": title for name, title in _TITLES.items()}
-    shown = [name for name in titles if name in report["levels"][-1]]
-    measures = ("splats", "drawn", *shown, "frame_s", "veil", "by_size", "merged")
-    heads = "".join(f" {titles[name]:>7}" for name in shown)
+    quality_names = [name for name in titles if name in report["levels"][-1]]
+    measures = ("splats", "drawn", *quality_names, "frame_s", "veil", "by_size", "merged")
+    heads = "".join(f" {titles[name]:>7}" for name in quality_names)
     lines = [f"{'':>28} {'splats':>9}{heads} {'ms/frame':>8} {'veiled':>7}"]
     rows = []
     for row in report["levels"]:
@@ -327,7 +327,7 @@ def format_report(report: dict) -> str:
             lines.append(name)
             continue
         quality = "".join(f" {row[key]:>7.{2 if key.endswith('psnr') else 4}f}" if key in row else f" {'':>7}"
-                          for key in shown)  # fmt: skip
+                          for key in quality_names)  # fmt: skip
         veil = f" {row['veil']['mean']:>7.1%}" if "veil" in row else ""
         lines.append(f"{name:<28} {row['splats']:>9,}{quality} {1e3 * row['frame_s']:>8.1f}{veil}")
     lines += [*size_lines(report["levels"]), *summary_lines(report)]

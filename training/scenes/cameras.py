@@ -248,7 +248,8 @@ def read_camera(path: Path) -> tuple[Camera, float]:
     try:
         return camera_from_dict(values)
     except LodgsError as error:
-        raise LodgsError(f"Cannot read camera {path}: {error.what}", error.remedy) from error
+        reason = error.what[:1].lower() + error.what[1:]
+        raise LodgsError(f"Cannot read camera {path}: {reason}", error.remedy) from error
 
 
 def read_camera_folder(folder: Path) -> tuple[list[Camera], float]:

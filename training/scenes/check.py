@@ -76,7 +76,7 @@ def check_folder(
 
 
 def check_scene(scene: Scene, image_scale: float = 1.0) -> list[Finding]:
-    """Return the findings of which reading the scene does not warn, without decoding its photos."""
+    """Return the findings besides the scene's own warnings, without decoding its photos."""
     observed = observations(scene, [camera.name for camera in scene.cameras])
     return [
         *_views(scene), *_sizes(scene, image_scale), *_origin(scene),
@@ -197,8 +197,8 @@ def _groups(view: np.ndarray, point: np.ndarray, members: np.ndarray) -> list[li
     """
     order = np.lexsort((view, point))
     view, point = view[order], point[order]
-    kept = np.isin(view, members)
-    view, point = view[kept], point[kept]
+    is_member = np.isin(view, members)
+    view, point = view[is_member], point[is_member]
     pairs = np.unique(np.stack([view[:-1], view[1:]], axis=1)[point[:-1] == point[1:]], axis=0)
     parent = list(range(int(members.max(initial=0)) + 1))
 

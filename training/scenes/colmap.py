@@ -253,7 +253,7 @@ def read_scene(
     views.cameras = [camera.moved(-origin) for camera in views.cameras]
     with np.errstate(over="ignore"):  # infinite positions are dropped
         points = (points - origin).astype(np.float32)
-    kept, inliers = _inliers(model, points, views.cameras, warnings)
+    has_inliers, inliers = _inliers(model, points, views.cameras, warnings)
     views.drop_outliers(inliers)
     if progress:
         progress(1.0)
@@ -262,9 +262,9 @@ def read_scene(
         model=model,
         images_folder=images,
         cameras=views.cameras,
-        points=points[kept],
-        point_colors=colors[kept],
-        point_ids=ids[kept] if len(ids) else ids,
+        points=points[has_inliers],
+        point_colors=colors[has_inliers],
+        point_ids=ids[has_inliers] if len(ids) else ids,
         origin=origin,
         georeference=read_georeference(folder, warnings.append),
         names=list(dict.fromkeys(pose.name.replace("\\", "/") for pose in poses)),

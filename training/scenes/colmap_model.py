@@ -296,10 +296,10 @@ def _parse_observations_txt(file: IO[bytes], names: Collection[str]) -> dict[str
     return point_ids
 
 
-def _record_count(data: mmap.mmap, least: int) -> int:
+def _record_count(data: mmap.mmap, min_bytes: int) -> int:
     """Return the declared number of records, of at least the given bytes each."""
     (count,) = struct.unpack_from("<Q", data)
-    if 8 + count * least > len(data):
+    if 8 + count * min_bytes > len(data):
         raise ValueError(f"it is too short for {count} records")
     return count
 

@@ -287,7 +287,7 @@ def _read_numpy(path: Path) -> np.ndarray:
 def resample_known(values: np.ndarray, width: int, height: int) -> np.ndarray:
     """Resample values (H, W) to (height, width) float32 by averaging finite values.
 
-    Pixels of which less than half is known become NaN.
+    A pixel becomes NaN if less than half of its area is known.
     """
     finite = np.isfinite(values)
     channels = np.stack([np.where(finite, values, 0), finite], axis=-1)

@@ -82,7 +82,7 @@ def exposure_gains(scene: Scene, cameras: Sequence[Camera], exposure: float = 0.
     stops = [np.nan if camera.image is None else stated_stops(camera.image) for camera in cameras]
     gains = complete_gains(gains, np.array(stops))
     compared = np.isfinite(gains[:, 0])
-    compared_views = [camera for camera, known in zip(cameras, compared, strict=True) if known]
+    compared_views = [camera for camera, has_gain in zip(cameras, compared, strict=True) if has_gain]
     if len(compared_views) < 3:
         return {}
     gains = gains[compared]
@@ -124,8 +124,8 @@ def complete_gains(gains: np.ndarray, stops: np.ndarray) -> np.ndarray:
     """Fill in missing log gains (V, 3), NaN, from stated exposures (V,), NaN if unknown."""
     stated = CODED_STOP * stops[:, None]
     missing = np.isnan(gains[:, 0])
-    both = ~missing & np.isfinite(stops)
-    reference = stated[both] - gains[both] if both.any() else stated[missing & np.isfinite(stops)]
+    has_both = ~missing & np.isfinite(stops)
+    reference = stated[has_both] - gains[has_both] if has_both.any() else stated[missing & np.isfinite(stops)]
     offset = np.median(reference, axis=0) if len(reference) else 0.0
     return np.where(np.isnan(gains), stated - offset, gains)
 

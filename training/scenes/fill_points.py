@@ -94,19 +94,19 @@ def fill_cells(
             break
         report(number)
         empty = np.isfinite(view.colors[..., 0])
-        known, depths = [], []
+        occupied, depths = [], []
         for positions in (points[view.observed], new):
             cells, z, inside = _project(view, positions)
             x, y = np.floor(cells[inside]).astype(int).T
             visible = empty[y, x]  # not a new point behind a feature
-            known.append(cells[inside][visible])
+            occupied.append(cells[inside][visible])
             depths.append(z[inside][visible])
             empty[y, x] = False
-        known, depths = np.concatenate(known), np.concatenate(depths)
+        occupied, depths = np.concatenate(occupied), np.concatenate(depths)
         y, x = np.nonzero(empty)
-        if not len(x) or len(known) < NEIGHBOURS:
+        if not len(x) or len(occupied) < NEIGHBOURS:
             continue
-        nearest = KDTree(known).query(np.stack([x, y], axis=1) + 0.5, k=NEIGHBOURS)[1]
+        nearest = KDTree(occupied).query(np.stack([x, y], axis=1) + 0.5, k=NEIGHBOURS)[1]
         candidates = _lift(view, np.stack([x, y], axis=1) + 0.5, np.sort(depths[nearest], axis=1))
         costs = _color_costs(candidates, view.colors[y, x], _close_views(view, views))
         similar = costs <= costs.min(axis=1, keepdims=True) + TOLERANCE
@@ -160,7 +160,7 @@ def _color_costs(candidates: np.ndarray, colors: np.ndarray, views: Sequence[Cel
         cells, _, inside = _project(view, candidates.reshape(-1, 3))
         x, y = np.floor(cells[inside]).astype(int).T
         row[inside] = np.abs(view.colors[y, x] - expected[inside]).mean(axis=1)
-    seen = np.isfinite(differences).any(axis=0)
+    is_compared = np.isfinite(differences).any(axis=0)
     costs = np.full(count * choices, np.inf)
-    costs[seen] = np.nanmedian(differences[:, seen], axis=0)
+    costs[is_compared] = np.nanmedian(differences[:, is_compared], axis=0)
     return costs.reshape(count, choices)

@@ -15,34 +15,35 @@ _MAX_SPLATS = 40_000
 """Number of splats used; larger sets are sampled at random."""
 _MIN_LOGIT = -2.2
 """Minimum opacity of a visible splat, 0.1, before the sigmoid."""
-_HOLLOW = 0.35, 0.06
-"""A scene is hollow, such as a room around the viewer, if less than this share of its splats (second) is
-within this fraction of the radius from its center (first)."""
+_HOLLOW_RADIUS, _HOLLOW_SHARE = 0.35, 0.06
+"""A scene is hollow, such as a room around the viewer, if its center is almost empty: less than this share of
+its splats is within this fraction of its radius."""
 _MIN_FLATNESS, _MAX_OBLONG, _MIN_GROUND = 2.2, 1.4, 0.05
-"""A ground across another axis than the convention's: the scene is at least this flat (mean spread over the
-spread along the axis), at most this oblong (a wall is wider than high), and has this score as a ground."""
+"""Minimum flatness, maximum ratio of length to width, and minimum score of a ground that is not across -y.
+Flatness is the mean spread of the splats, relative to the spread along the axis. A wall is more oblong."""
 _MIN_ROOM_FLATNESS, _MAX_ROOM_OBLONG = 1.3, 2.0
-"""Flatness and oblong shape of hollow scenes with such a ground: rooms are higher than gardens."""
+"""The same limits for hollow scenes: rooms are higher than gardens."""
 _MAX_SLOPE = 20.0
 """Maximum slope of such a ground in degrees."""
-_CONVENTION = 2.0
-"""Factor by which the ground of an opposite direction must beat that of the usual one."""
+_OPPOSITE_FACTOR = 2.0
+"""Minimum ratio of scores to prefer a ground that faces against the usual direction of its axis."""
 _FAR_FACTOR = 2.5
 """Splats beyond this multiple of the median distance from the center are background."""
-_TANGENT = 0.7
-"""Half width of an overview at depth 1: the default lens of Blender's viewports."""
 _NEAR_DEPTH = 0.01
 """Near depth of an overview, relative to the distance of its target."""
 LARGE, NEAR, FAR = 0.5, 2.0, 20.0
-"""Splats larger than the first multiple of the radius, within the second of the center, veil the subject.
-Splats beyond the third are outliers."""
+"""Multiples of the radius: splats larger than LARGE and within NEAR of the center veil the subject. Splats
+beyond FAR are outliers."""
 _MAX_LARGE = 0.05
-"""Share of large splats from which a scene consists of them."""
+"""Maximum share of large splats to report; a scene with more consists of them."""
 _AROUND, _INSIDE = (1.2, 1.6, 2.2), (0.15, 0.4, 0.7)
 """Distances of candidate viewpoints from the center in radii, outside an object and inside a hollow scene."""
 _ELEVATIONS = np.radians([12.0, 25.0]), np.radians([0.0, 8.0])
+"""Elevations of candidate viewpoints, outside an object and inside a hollow scene."""
 _AZIMUTHS = 24
+"""Number of directions of candidate viewpoints."""
 _GRID = 32, 18
+"""Columns and rows of the grid in which the depths of a candidate view are compared."""
 _TANGENT = 0.7
 """Half width of the view at depth 1: the default lens of Blender's viewports."""
 
@@ -59,9 +60,9 @@ def central_ball(means: np.ndarray) -> tuple[np.ndarray, float]:
     means = means.astype(np.float64)
     center = np.median(means, axis=0)
     distances = np.linalg.norm(means - center, axis=1)
-    median, most = np.percentile(distances, (50, 90))
+    median, ninth_decile = np.percentile(distances, (50, 90))
     near = means[distances <= _FAR_FACTOR * median]
-    return np.median(near, axis=0), float(max(min(most, _FAR_FACTOR * median), 1e-9))
+    return np.median(near, axis=0), float(max(min(ninth_decile, _FAR_FACTOR * median), 1e-9))
 
 
 def guess_up_rotation(splats: Splats) -> np.ndarray | None:
@@ -88,7 +89,7 @@ def guess_up_rotation(splats: Splats) -> np.ndarray | None:
     scores = [ground[2] if ground else 0.0 for ground in grounds]
     if max(scores) < _MIN_GROUND:
         return None
-    is_usual = scores[1] < _CONVENTION * scores[0]
+    is_usual = scores[1] < _OPPOSITE_FACTOR * scores[0]
     if axis == 1:
         return None if is_usual else np.array([(1, 0, 0), (0, 0, -1), (0, 1, 0)], np.float64)
     return np.eye(3) if is_usual else np.diag([1.0, -1.0, -1.0])
@@ -184,8 +185,8 @@ def overview_camera(bundle: Bundle, width: int) -> tuple[Camera, float]:
 
 
 def _is_hollow(means: np.ndarray, center: np.ndarray, radius: float) -> bool:
-    """Return whether a scene has few splats (N, 3) near its center."""
-    return bool((np.linalg.norm(means - center, axis=1) < _HOLLOW[0] * radius).mean() < _HOLLOW[1])
+    """Return True if a scene has few splats near its center, given their means (N, 3)."""
+    return bool((np.linalg.norm(means - center, axis=1) < _HOLLOW_RADIUS * radius).mean() < _HOLLOW_SHARE)
 
 
 def _clarity(
@@ -193,8 +194,8 @@ def _clarity(
 ) -> float:
     """Return the mean depth of the nearest splats over the view, relative to ``distance`` and at most 1.5.
 
-    Splats near the camera reduce it by the share of the view that they cover. Pixels without splats count
-    0.3.
+    Splats near the camera reduce it by the share of the view that they cover. Cells of the grid without
+    splats count 0.3.
     """
     local = means @ pose[:3, :3].T + pose[:3, 3]
     x, y, z = local.T

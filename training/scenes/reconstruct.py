@@ -132,8 +132,8 @@ def reconstruct(
         }  # fmt: skip
         result = _run_colmap(request, work, report)
         if len(result["placed"]) < MIN_PHOTOS:
-            what, remedy = _explain_failure(image_names, result, work)
-            raise LodgsError(" ".join([what, *exclusion_messages(excluded)]), remedy)
+            problem, remedy = _explain_failure(image_names, result, work)
+            raise LodgsError(" ".join([problem, *exclusion_messages(excluded)]), remedy)
         _install_model(work, out)
     except OSError as error:
         raise LodgsError(

@@ -184,21 +184,26 @@ def _match(work: Path, deadline: float) -> bool:
     import pycolmap
 
     model = pycolmap.Reconstruction(work / "poses")
-    known = {image.name: image for image in model.images.values()}
+    known_images = {image.name: image for image in model.images.values()}
     with pycolmap.Database.open(work / DATABASE) as database:
         images = database.read_all_images()
         for image in images:  # replace the cameras that feature extraction guessed
             camera = database.read_camera(image.camera_id)
-            camera.model, camera.params = known[image.name].camera.model, known[image.name].camera.params
+            camera.model, camera.params = (
+                known_images[image.name].camera.model,
+                known_images[image.name].camera.params,
+            )
             database.update_camera(camera)
-        poses = np.array([known[image.name].cam_from_world().matrix() for image in images]).reshape(-1, 3, 4)
+        poses = np.array([known_images[image.name].cam_from_world().matrix() for image in images]).reshape(
+            -1, 3, 4
+        )
 
         @lru_cache(CACHED_PHOTOS)
         def features(view: int) -> tuple[np.ndarray, np.ndarray]:
             """Return the rays (N, 2) and descriptors (N, 128) of a view."""
             number = images[view].image_id
             pixels = database.read_keypoints(number)[:, :2].astype(np.float64)
-            rays = known[images[view].name].camera.cam_from_img(pixels)
+            rays = known_images[images[view].name].camera.cam_from_img(pixels)
             return rays, database.read_descriptors(number).data
 
         centers = -np.einsum("vji,vj->vi", poses[:, :, :3], poses[:, :, 3])
@@ -212,7 +217,9 @@ def _match(work: Path, deadline: float) -> bool:
             errors = epipolar_errors(
                 rays[matches[:, 0]], other_rays[matches[:, 1]], relative_pose(poses[first], poses[second])
             )
-            focal = min(known[images[view].name].camera.mean_focal_length() for view in (first, second))
+            focal = min(
+                known_images[images[view].name].camera.mean_focal_length() for view in (first, second)
+            )
             matches = matches[errors * focal < MAX_ERROR]  # not rays outside of the lens, which are NaN
             if len(matches) >= MIN_MATCHES:
                 geometry = pycolmap.TwoViewGeometry()
@@ -233,7 +240,7 @@ def _triangulate(work: Path) -> pycolmap.Reconstruction | None:
     import pycolmap
 
     send(stage="points", done=0, total=1)
-    known = {image.name: image for image in pycolmap.Reconstruction(work / "poses").images.values()}
+    known_images = {image.name: image for image in pycolmap.Reconstruction(work / "poses").images.values()}
     model = pycolmap.Reconstruction()  # with the ids of the database
     with pycolmap.Database.open(work / DATABASE) as database:
         if not database.num_verified_image_pairs():
@@ -242,7 +249,7 @@ def _triangulate(work: Path) -> pycolmap.Reconstruction | None:
             camera = database.read_camera(image.camera_id)
             model.add_camera_with_trivial_rig(camera)
             view = pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id)
-            model.add_image_with_trivial_frame(view, known[image.name].cam_from_world())
+            model.add_image_with_trivial_frame(view, known_images[image.name].cam_from_world())
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = 1  # deterministic
     options.random_seed = 0

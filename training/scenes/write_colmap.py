@@ -97,8 +97,8 @@ def write_colmap(
         points,
         np.round(colors).astype(np.uint8),
         [
-            (np.flatnonzero(seen), view.project(points[seen])[0])
-            for view, seen in zip(cameras, visible, strict=True)
+            (np.flatnonzero(is_visible), view.project(points[is_visible])[0])
+            for view, is_visible in zip(cameras, visible, strict=True)
         ],
     )
 
@@ -128,15 +128,17 @@ def write_model(
     observations = observations or [(np.zeros(0, np.int64), np.zeros((0, 2)))] * len(poses)
     camera_ids: dict[bytes, int] = {}
     images = []
-    for image_id, (lens, (name, pose), seen) in enumerate(zip(lenses, poses, observations, strict=True), 1):
+    for image_id, (lens, (name, pose), observed) in enumerate(
+        zip(lenses, poses, observations, strict=True), 1
+    ):
         model_id = next(number for number, known_lens in LENSES.items() if known_lens is lens.lens)
         camera = (
             struct.pack("<iQQ", model_id, lens.width, lens.height) + lens.parameters.astype("<f8").tobytes()
         )
         camera_id = camera_ids.setdefault(camera, len(camera_ids) + 1)
         values = *Similarity(pose[:3, :3], 1.0, pose[:3, 3]).quat, *pose[:3, 3]
-        pixels = np.zeros(len(seen[0]), POINT2D)
-        pixels["point"], pixels["xy"] = seen[0] + 1, seen[1]
+        pixels = np.zeros(len(observed[0]), POINT2D)
+        pixels["point"], pixels["xy"] = observed[0] + 1, observed[1]
         images += [
             struct.pack("<i7di", image_id, *values, camera_id),
             name.encode("utf-8", "surrogateescape") + b"\0",
@@ -168,8 +170,8 @@ def _point_records(
     """Return the records of points3D.bin; see :func:`write_model`. Points have the ids 1, 2, ..."""
     tracked = np.concatenate([np.zeros(0, np.int64), *(indices for indices, _ in observations)])
     entries = [
-        np.column_stack([np.full(len(seen), n), np.arange(len(seen))])
-        for n, (seen, _) in enumerate(observations, 1)
+        np.column_stack([np.full(len(indices), n), np.arange(len(indices))])
+        for n, (indices, _) in enumerate(observations, 1)
     ]
     track = np.concatenate([np.zeros((0, 2), np.int64), *entries]).astype("<i4")
     by_point = np.argsort(tracked, kind="stable")
@@ -179,9 +181,9 @@ def _point_records(
     rows["xyz"] = points
     rows["rgb"] = colors
     rows["track"] = lengths
-    before = np.concatenate([[0], np.cumsum(lengths)])[:-1]  # entries of all earlier points
+    entries_before = np.concatenate([[0], np.cumsum(lengths)])[:-1]  # entries of all earlier points
     data = np.zeros(rows.nbytes + track.nbytes, np.uint8)
-    starts = np.arange(len(points)) * POINT.itemsize + before * 8
+    starts = np.arange(len(points)) * POINT.itemsize + entries_before * 8
     data[starts[:, None] + np.arange(POINT.itemsize)] = rows.view(np.uint8).reshape(-1, POINT.itemsize)
     ends = (tracked[by_point] + 1) * POINT.itemsize + np.arange(len(track)) * 8
     data[ends[:, None] + np.arange(8)] = track[by_point].view(np.uint8).reshape(-1, 8)

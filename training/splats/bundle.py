@@ -15,7 +15,7 @@ from .bundle_header import (
     INCONSISTENCIES,
     bundle_line,
     format_comment,
-    inconsistent,
+    inconsistency_error,
     level_line,
     parse_comments,
     pop_tables,
@@ -152,7 +152,7 @@ def read_bundle(path: str | Path, warn: Warn = ignore, select_rows: RowSelector 
             level.splats = drop_undrawable(rows.select(index), path, warn)
         return bundle
     except INCONSISTENCIES as error:
-        raise inconsistent(path, error) from error
+        raise inconsistency_error(path, error) from error
 
 
 def open_bundle(path: str | Path) -> tuple[Bundle, dict[int, FileRows]]:
@@ -200,7 +200,7 @@ def read_tables(path: str | Path) -> dict[str, Columns]:
     try:
         return pop_tables([line for line in parse_comments(comments, path)[1] if "table" in line], elements)
     except INCONSISTENCIES as error:
-        raise inconsistent(path, error) from error
+        raise inconsistency_error(path, error) from error
 
 
 def _plain_meta(rows: np.ndarray, comments: list[str]) -> tuple[dict, np.ndarray]:
@@ -246,4 +246,4 @@ def _find_rows(
                 raise ValueError(f"{name} has more splats than its levels")
         return level_rows
     except INCONSISTENCIES as error:
-        raise inconsistent(path, error) from error
+        raise inconsistency_error(path, error) from error

@@ -97,7 +97,7 @@ def parse_comments(comments: list[str], path: str | Path) -> tuple[Bundle | None
         meta = next((line["meta"] for line in lines if "meta" in line), {})
         return parse_bundle(head, [line for line in lines if "level" in line], meta, path), lines
     except INCONSISTENCIES as error:
-        raise inconsistent(path, error) from error
+        raise inconsistency_error(path, error) from error
 
 
 def parse_bundle(head: dict, lines: list[dict], meta: dict, path: str | Path) -> Bundle:
@@ -144,7 +144,7 @@ def parse_bundle(head: dict, lines: list[dict], meta: dict, path: str | Path) ->
     )
 
 
-def inconsistent(path: str | Path, error: Exception) -> LodgsError:
+def inconsistency_error(path: str | Path, error: Exception) -> LodgsError:
     """Return the error for a file whose description of its levels is inconsistent."""
     return LodgsError(
         f"Cannot read {path}: its description of the levels is inconsistent "

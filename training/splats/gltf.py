@@ -101,7 +101,7 @@ def write_glb(path: Path, levels: PortableLevels) -> None:
 
 
 def write_compressed_glb(path: Path, levels: PortableLevels) -> None:
-    """Write a ``.glb`` file of one level with its splats as SPZ, which is what CesiumJS reads.
+    """Write a ``.glb`` file of one level with its splats as SPZ, the only form that CesiumJS reads.
 
     Raises:
         LodgsError: the file cannot be written.

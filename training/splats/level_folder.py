@@ -18,7 +18,7 @@ from .bundle_header import (
     INCONSISTENCIES,
     bundle_line,
     check_type,
-    inconsistent,
+    inconsistency_error,
     json_default,
     level_line,
     parse_bundle,
@@ -208,7 +208,7 @@ def _read_manifest(folder: Path, warn: Warn) -> Bundle:
             bundle.tables = pop_tables(tables, read_elements(folder / TABLES_FILE)[0])
         return bundle
     except INCONSISTENCIES as error:
-        raise inconsistent(manifest_file, error) from error
+        raise inconsistency_error(manifest_file, error) from error
 
 
 def _parse_manifest(folder: Path) -> tuple[Bundle, dict]:
@@ -222,4 +222,4 @@ def _parse_manifest(folder: Path) -> tuple[Bundle, dict]:
         manifest = read_json(file)
         return parse_bundle(manifest, manifest["levels"], manifest["meta"], file), manifest
     except INCONSISTENCIES as error:
-        raise inconsistent(file, error) from error
+        raise inconsistency_error(file, error) from error

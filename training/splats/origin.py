@@ -34,11 +34,11 @@ def choose_origin(
         points: (P, 3) further positions that count for the size.
         far: minimum distance from 0, in multiples of the size.
     """
-    positions, *others = [_sample(values) for values in (positions, points) if values is not None]
+    positions, *point_sets = [_sample(values) for values in (positions, points) if values is not None]
     if not len(positions):
         return NO_ORIGIN
     middle = np.median(positions, axis=0)
-    distances = [np.median(np.linalg.norm(s - middle, axis=1)) for s in (positions, *others) if len(s)]
+    distances = [np.median(np.linalg.norm(s - middle, axis=1)) for s in (positions, *point_sets) if len(s)]
     size, distance = float(max(distances)), float(np.linalg.norm(middle))
     if not max(far * size, 1e-30) < distance < 1e12 * size:
         return NO_ORIGIN

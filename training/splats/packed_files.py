@@ -71,7 +71,7 @@ def _check_spz(file: IO[bytes], size: int) -> None:
         return
     file.seek(0)
     unpacker = zlib.decompressobj(wbits=31)
-    unpacked, head, least, limit = 0, b"", _SPZ.size, _SPZ.size
+    unpacked, head, min_size, limit = 0, b"", _SPZ.size, _SPZ.size
     while block := unpacker.unconsumed_tail or file.read(_BLOCK):
         data = unpacker.decompress(block, _BLOCK)
         unpacked += len(data)
@@ -79,16 +79,16 @@ def _check_spz(file: IO[bytes], size: int) -> None:
             magic, _, count, degree = _SPZ.unpack(head[: _SPZ.size])
             if magic != _SPZ_MAGIC:
                 raise ValueError("it is not an SPZ file")
-            least, limit = (
+            min_size, limit = (
                 _SPZ.size + count * (splat + 3 * _SPZ_COEFFICIENTS[degree]) for splat in _SPZ_SPLAT
             )
-            if least > _MAX_DEFLATION * size:
+            if min_size > _MAX_DEFLATION * size:
                 raise ValueError(f"it is too short for {count:,} splats")
         if unpacked > limit + _BLOCK:
             raise ValueError(f"it unpacks to more than {limit:,} bytes")
         if unpacker.eof:
             break
-    if not unpacker.eof or unpacked < least:
+    if not unpacker.eof or unpacked < min_size:
         raise ValueError("it is truncated")
     if unpacker.unused_data or file.read(1):
         raise ValueError("it has data after its end")

@@ -433,8 +433,10 @@ def _read_text(
         size: remaining bytes of the file.
     """
     try:
-        least = sum(count * 2 * len(row.names or ()) for _, row, count in layout)  # a digit and a space each
-        if least > size + 1:
+        min_size = sum(
+            count * 2 * len(row.names or ()) for _, row, count in layout
+        )  # a digit and a space each
+        if min_size > size + 1:
             raise ValueError("it is too short for its rows")
         elements: dict[str, np.ndarray] = {}
         lines = read_lines(io.TextIOWrapper(file, "ascii", "replace"), _MAX_LINE)

@@ -11,7 +11,14 @@ import numpy as np
 
 from ..documents import parse_json
 from ..errors import LodgsError
-from .bundle_header import INCONSISTENCIES, bundle_line, inconsistent, json_default, level_line, parse_bundle
+from .bundle_header import (
+    INCONSISTENCIES,
+    bundle_line,
+    inconsistency_error,
+    json_default,
+    level_line,
+    parse_bundle,
+)
 from .gaussians import SplatRows, Splats
 from .levels import Bundle, Level
 from .origin import FAR_SPLATS, NO_ORIGIN, ORIGIN_SAMPLE, choose_origin
@@ -145,7 +152,7 @@ def parse_description(text: object, path: Path) -> tuple[Bundle, np.ndarray]:
         placement = np.array(values["placement"], np.float64).reshape(4, 4)
         return parse_bundle(values["bundle"], values["levels"], values["meta"], path), placement
     except INCONSISTENCIES as error:
-        raise inconsistent(path, error) from error
+        raise inconsistency_error(path, error) from error
 
 
 def batches(rows: SplatRows, size: int = BATCH_ROWS):

@@ -184,9 +184,9 @@ def _file_groups(leaves: Sequence[_Leaf], lod: int) -> Iterator[list[_Leaf]]:
 
 def _read_file(rows: SplatRows, leaves: Sequence[_Leaf], lod: int, file: int, degree: int) -> Splats:
     """Return a level's splats in leaves that share a file, and enter their ranges and bounds."""
-    wanted = np.concatenate([leaf.rows[lod] for leaf in leaves])
-    order = np.argsort(wanted, kind="stable")
-    splats = rows.select(wanted[order]).select(np.argsort(order, kind="stable"))
+    row_numbers = np.concatenate([leaf.rows[lod] for leaf in leaves])
+    order = np.argsort(row_numbers, kind="stable")
+    splats = rows.select(row_numbers[order]).select(np.argsort(order, kind="stable"))
     splats, reach, offset = _with_degree(splats, degree), _radii(splats), 0
     for leaf in leaves:
         count = len(leaf.rows[lod])

@@ -190,7 +190,7 @@ def _split(means: np.ndarray) -> list[tuple[int, int, float]]:
     """Divide cells at the median of their longer axis until each has at most MAX_TILE_SPLATS splats.
 
     Returns:
-        Cell, axis and position of each plane, in order. What lies above the n-th plane becomes cell n + 1.
+        Cell, axis and position of each plane, in order. Splats above the n-th plane become cell n + 1.
     """
     planes: list[tuple[int, int, float]] = []
     cells = [means]

@@ -274,7 +274,7 @@ def test_hidden_splats_survive_undo_saving_and_export(bpy, lodgs, scene_of, tmp_
     assert visible_counts() == [mask.sum() for mask in remaining]
     bpy.ops.lodgs.hide_splats("EXEC_DEFAULT", True, test="FAINT", opacity=0.3)
     counts_after_faint = visible_counts()
-    bpy.ops.lodgs.delete_left_out("EXEC_DEFAULT", True)
+    bpy.ops.lodgs.delete_hidden_splats("EXEC_DEFAULT", True)
     assert (
         visible_counts()
         == counts_after_faint
@@ -342,7 +342,7 @@ def test_cleaned_tree_stays_a_tree(bpy, lodgs, scene_of, tmp_path):
     for focal in (1e6, 100.0, 10.0):
         means, count = drawn_for_each_leaf(exported, (1, 2, 3), focal)
         assert len(means) == remaining.sum() and (count == 1).all()
-    bpy.ops.lodgs.delete_left_out()
+    bpy.ops.lodgs.delete_hidden_splats()
     for item, level in zip(root.lodgs.levels, exported.levels, strict=True):
         np.testing.assert_array_equal(
             lodgs("data.objects").read_splats(item.object).means, level.splats.means
@@ -354,17 +354,17 @@ def test_empty_result_and_partial_tree_are_rejected(bpy, lodgs, scene_of, tmp_pa
     crops = lodgs("data.crops")
     crops.new_crop(root, "BOX", to_blender(transform((900, 0, 0), (0, 0, 0), (1, 1, 1))))
     bpy.context.view_layer.update()
-    with pytest.raises(RuntimeError, match="No splats remain"):
+    with pytest.raises(RuntimeError, match="Cannot edit the splats: none remain"):
         bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "out.ply"))
-    with pytest.raises(RuntimeError, match="No splats remain"):
-        bpy.ops.lodgs.delete_left_out()
+    with pytest.raises(RuntimeError, match="Cannot edit the splats: none remain"):
+        bpy.ops.lodgs.delete_hidden_splats()
     assert not (tmp_path / "out.ply").exists() and len(root.lodgs.levels[0].object.data.points) == 700
 
     write_bundle(tmp_path / "tree.ply", tree_of(random_leaves(3000, np.random.default_rng(9))))
     partial = lodgs("data.importing").import_splats(bpy.context, tmp_path / "tree.ply", budget=2000)
     assert lodgs("data.streams").file_of(partial)
     with pytest.raises(RuntimeError, match="lodgs edit"):
-        bpy.ops.lodgs.delete_left_out()
+        bpy.ops.lodgs.delete_hidden_splats()
 
 
 def test_selected_splats_are_hidden_and_matches_selected(bpy, lodgs, scene_of):
@@ -426,10 +426,10 @@ def test_crops_of_older_files_get_the_current_group(bpy, lodgs, scene_of):
     bpy.context.view_layer.update()
     older = crops.modifier_of(levels[0]).node_group
     current, older[version] = older[version], older[version] - 1
-    assert crops.outdated(root)
+    assert crops.is_outdated(root)
     crop.location.x += 0.1
     bpy.context.view_layer.update()
-    assert not crops.outdated(root)
+    assert not crops.is_outdated(root)
     assert {crops.modifier_of(obj).node_group[version] for obj in levels} == {current}
 
 

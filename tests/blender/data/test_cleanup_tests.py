@@ -56,7 +56,7 @@ def test_all_kinds_of_clutter_are_counted_coloured_and_hidden(bpy, lodgs, root):
     assert bpy.ops.lodgs.find_clutter() == {"FINISHED"}
     cleaning, clutter = lodgs("data.cleaning"), lodgs("data.clutter")
     del counts["BELOW"]  # disabled at first
-    assert clutter.counts(root) == {name: 2 * count for name, count in counts.items()}
+    assert clutter.count_by_kind(root) == {name: 2 * count for name, count in counts.items()}
     cloud = root.lodgs.levels[1].object.data
     marks = cleaning.displayed_marks(cloud)
     names = ("", "max_size", "max_reach", "drop_floaters", "drop_floaters", "halo_opacity")
@@ -75,13 +75,13 @@ def test_limits_are_lengths_in_the_world(bpy, lodgs, root):
     assert bpy.ops.lodgs.find_clutter() == {"FINISHED"}
     for reach, count in ((13, DISTANT + FLOATERS), (16, DISTANT)):
         root.lodgs_clutter.reach = reach
-        assert lodgs("data.clutter").counts(root)["DISTANT"] == 2 * count
+        assert lodgs("data.clutter").count_by_kind(root)["DISTANT"] == 2 * count
 
 
 def test_limits_of_the_user_are_kept_and_cancelling_hides_nothing(bpy, lodgs, root):
     root.lodgs_clutter.size = 1000
     assert bpy.ops.lodgs.find_clutter() == {"FINISHED"}
-    assert root.lodgs_clutter.size == 1000 and lodgs("data.clutter").counts(root)["LARGE"] == 0
+    assert root.lodgs_clutter.size == 1000 and lodgs("data.clutter").count_by_kind(root)["LARGE"] == 0
     assert bpy.ops.lodgs.cancel_clutter() == {"FINISHED"}
     cloud = root.lodgs.levels[1].object.data
     assert not lodgs("data.cleaning").displayed_marks(cloud).any()
@@ -94,9 +94,9 @@ def test_clutter_is_searched_again_after_splats_change(bpy, lodgs, root):
     assert bpy.ops.lodgs.find_clutter() == {"FINISHED"}
     bpy.ops.lodgs.hide_splats(test="LARGE", size=8.0)
     bpy.context.view_layer.update()
-    assert clutter.counts(root) is None
+    assert clutter.count_by_kind(root) is None
     clutter.refresh(bpy.context, root)
-    assert clutter.counts(root)["LARGE"] == 0
+    assert clutter.count_by_kind(root)["LARGE"] == 0
     assert cleaning.displayed_marks(root.lodgs.levels[1].object.data)[REST] == cleaning.mark_of("")
 
 

@@ -221,7 +221,7 @@ def test_look_of_a_crop_survives_deletion(bpy, lodgs, scene_with_look):
     assert crops.removing_crops(root) == [crop] and len(crops.crops_of(root)) == 3
     assert len(crops.evaluated_crops(root, depsgraph)) == 1
     assert len(lodgs("data.looks").looks_of(root, depsgraph, to_blender(np.eye(4)))) == 4
-    bpy.ops.lodgs.delete_left_out()
+    bpy.ops.lodgs.delete_hidden_splats()
     assert crop.lodgs_crop.keep == "ALL" and not crops.removing_crops(root)
     crop.lodgs_crop.use = False
     bpy.context.view_layer.update()

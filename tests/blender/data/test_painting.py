@@ -177,7 +177,7 @@ def test_paint_stays_with_remaining_splats(bpy, lodgs, painted):
     )
 
     bpy.ops.lodgs.hide_splats(test="FAINT", opacity=0.4)
-    bpy.ops.lodgs.delete_left_out()
+    bpy.ops.lodgs.delete_hidden_splats()
     for level, current in zip(
         bundle.levels, lodgs("data.scenes").read_levels(root, looked=True).levels, strict=True
     ):

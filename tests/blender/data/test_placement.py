@@ -176,7 +176,7 @@ def test_ground_is_detected(bpy, lodgs, capfd):
     root.rotation_euler, root.location = (0.2, -0.1, 1.0), (0, 0, 5)
     bpy.context.view_layer.update()
     up = lodgs("data.placement").placement_of(root).rotation[:, 2]
-    bpy.ops.lodgs.set_ground(by="FOUND")
+    bpy.ops.lodgs.set_ground(by="DETECT")
     rotated = re.search(r"rotated by ([\d.]+)°", capfd.readouterr().out)
     assert rotated and float(rotated[1]) == pytest.approx(np.degrees(np.arccos(up[2])), abs=0.6)
     bpy.context.view_layer.update()
@@ -187,7 +187,7 @@ def test_ground_is_detected(bpy, lodgs, capfd):
 
 def test_scale_follows_a_length_between_two_empties(bpy, lodgs):
     root = lodgs("data.importing").import_colmap(bpy.context, GARDEN, photographs=False)
-    bpy.ops.lodgs.set_ground(by="FOUND")
+    bpy.ops.lodgs.set_ground(by="DETECT")
     bpy.context.view_layer.update()
     view = root.lodgs.cameras.objects[0]
     before, near = np.array(root.lodgs.points.matrix_world), view.data.clip_start
@@ -214,7 +214,7 @@ def test_stretched_root_is_rejected(bpy, lodgs, root, tmp_path):
     root.scale = (1, 1, 2)
     bpy.context.view_layer.update()
     for operation in (
-        lambda: bpy.ops.lodgs.set_ground(by="FOUND"),
+        lambda: bpy.ops.lodgs.set_ground(by="DETECT"),
         lambda: bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "no.ply"), placed=True),
     ):
         with pytest.raises(RuntimeError, match="stretched"):

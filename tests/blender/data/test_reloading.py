@@ -83,7 +83,7 @@ def test_replaced_splats_lose_hiding_with_a_note(lodgs, root, path, newer):
 
 def test_deleted_splats_return_with_a_note(bpy, lodgs, root, path):
     hide(lodgs, root, slice(0, 7))
-    bpy.ops.lodgs.delete_left_out()
+    bpy.ops.lodgs.delete_hidden_splats()
     reloading = lodgs("data.reloading")
     notes = reloading.replace_splats(root, reloading.read_source(root)())
     assert notes == [

@@ -162,11 +162,11 @@ def test_older_group_is_replaced_for_all_users(bpy, lodgs, splat_scene, name):
     groups, selection, root = lodgs("nodes.rules"), lodgs("data.selection"), splat_scene(name)
     used = lodgs("data.selection").rule_modifier(root.lodgs.levels[0].object).node_group
     version = used["lodgs_version"]
-    assert not selection.outdated(root)
+    assert not selection.is_outdated(root)
     used["lodgs_version"] = 0
-    assert selection.outdated(root)
+    assert selection.is_outdated(root)
     lodgs("data.older_files").upgrade_scene(root)
-    assert not selection.outdated(root)
+    assert not selection.is_outdated(root)
     for item in root.lodgs.levels:
         groups_of_rules = [m.node_group for m in item.object.modifiers if groups.rule_of_group(m.node_group)]
         assert [group["lodgs_version"] for group in groups_of_rules] == [version]
@@ -261,7 +261,7 @@ def test_edited_group_stays_in_use_and_is_kept_when_replaced(lodgs, splat_scene,
     used = lodgs("data.selection").rule_modifier(root.lodgs.levels[0].object).node_group
     edit_group(used)
     selection.attach(root)
-    assert not selection.outdated(root)
+    assert not selection.is_outdated(root)
     assert {lodgs("data.selection").rule_modifier(item.object).node_group for item in root.lodgs.levels} == {
         used
     }

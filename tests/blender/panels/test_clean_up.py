@@ -11,7 +11,7 @@ def test_panel_shows_crops_selection_and_counts(bpy, lodgs, draw_panel, tmp_path
     root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "in.ply")
     layout = draw_panel("clean_up", "LODGS_PT_clean_up")
     assert "Level 1: 700 of 700 splats" in layout.texts
-    assert layout.buttons.count("Floaters") == 1 and "lodgs.delete_left_out" in layout.operators
+    assert layout.buttons.count("Floaters") == 1 and "lodgs.delete_hidden_splats" in layout.operators
     assert "keep" not in layout.properties
 
     assert {"Brush", "Lasso"} <= set(layout.buttons) and {"radius", "through"} <= set(layout.properties)

@@ -13,7 +13,7 @@ OTHER_MENUS = {
     "lodgs.export_levels", "lodgs.export_tiles", "lodgs.export_page",
     # Object and View menus
     "lodgs.set_ground", "lodgs.set_scale", "lodgs.camera_path", "lodgs.turntable", "lodgs.frame_scene",
-    "lodgs.add_crop", "lodgs.hide_splats", "lodgs.show_hidden_splats", "lodgs.delete_left_out",
+    "lodgs.add_crop", "lodgs.hide_splats", "lodgs.show_hidden_splats", "lodgs.delete_hidden_splats",
     "lodgs.select_all_splats", "lodgs.find_clutter",
     # toolbar tools
     "lodgs.select_splats", "lodgs.paint_splats",
@@ -93,7 +93,7 @@ def test_panels_of_the_current_step_are_open(bpy, lodgs, draw_panel, tmp_path, f
     root.lodgs.training.output = str(tmp_path / "runs")
     assert bpy.ops.lodgs.train() == {"FINISHED"}
     assert open_panels() == {"Scene", "Training", "Levels", "Detail", "Viewport"}
-    assert draw_panel("training", "LODGS_PT_training").collapsed == ["LODGS_train_anew"]
+    assert draw_panel("training", "LODGS_PT_training").collapsed == ["LODGS_train_again"]
     assert draw_panel("scene", "LODGS_PT_scene").collapsed == ["LODGS_import_another"]
 
 

@@ -53,9 +53,9 @@ def test_heat_map_of_evidence_is_shown_and_hidden(bpy, lodgs, root, draw_panel):
     assert len(shares) == 4 and sum(shares) == pytest.approx(100, abs=2)
     root.lodgs_clutter.preview = False
     assert bpy.ops.lodgs.find_clutter() == {"FINISHED"}  # replaces the heat map
-    assert lodgs("data.evidence").shares(root) is None
+    assert lodgs("data.evidence").grade_shares(root) is None
     assert bpy.ops.lodgs.show_evidence() == {"FINISHED"}
-    assert not root.lodgs_clutter.preview and lodgs("data.evidence").shares(root) is not None
+    assert not root.lodgs_clutter.preview and lodgs("data.evidence").grade_shares(root) is not None
     assert bpy.ops.lodgs.show_evidence() == {"FINISHED"}  # hides it
     assert not cleaning.displayed_marks(cloud).any()
 

@@ -155,7 +155,7 @@ def test_without_a_trainer_its_installation_is_offered(root, draw, monkeypatch):
     monkeypatch.delenv("LODGS_TRAINER_PYTHON", raising=False)
     layout = draw()
     assert layout.operators == ["lodgs.make_environment"]
-    assert "The trainer is not installed." in layout.texts
+    assert "Cannot start the trainer: it is not installed." in layout.texts
 
 
 def test_progress_of_the_trainers_installation_is_shown(lodgs, root, draw, monkeypatch):

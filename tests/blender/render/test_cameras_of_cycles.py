@@ -285,7 +285,7 @@ def test_light_is_spread_as_in_cycles(bpy, scene, root, tmp_path, lens, change):
 
 def test_stereo_animation_in_viewport_quality_is_rejected(bpy, lodgs, scene, root):
     stereo(bpy, scene)
-    with pytest.raises(lodgs("training.errors").LodgsError, match="stereo or multi-view animation"):
+    with pytest.raises(lodgs("training.errors").LodgsError, match="animation is stereo or multi-view"):
         next(lodgs("render.viewport_quality").render_animation(bpy.context, [1]))
 
 
@@ -368,5 +368,7 @@ def test_meshes_are_combined_for_the_same_views(bpy, lodgs, scene, root):
     assert meshes.render.use_multiview and meshes.render.views_format == "MULTIVIEW"
     views = [[(view.name, view.camera_suffix, view.use) for view in s.render.views] for s in (scene, meshes)]
     assert views[0] == views[1]
-    with pytest.raises(lodgs("training.errors").LodgsError, match="Cannot render mesh depth for a stereo"):
+    with pytest.raises(
+        lodgs("training.errors").LodgsError, match="Cannot render mesh depth: the scene has a stereo"
+    ):
         next(lodgs("render.compositing").render_mesh_depth(scene, [1]))

@@ -84,7 +84,7 @@ def test_streamed_tree_is_cropped(bpy, lodgs, camera, tmp_path):
             assert isinstance(placed[0], lodgs("render.renderer").PlacedFile)
             assert (crop.shape, crop.outside) == ("BOX", False)
             expected = Crop.from_matrix("BOX", np.array(box.matrix_world))
-            np.testing.assert_allclose(crop.to_own, expected.to_own, rtol=1e-5)
+            np.testing.assert_allclose(crop.to_local, expected.to_local, rtol=1e-5)
         lodgs("data.removal").remove(root)
         assert "Crop Box" not in bpy.data.objects
     np.testing.assert_allclose(*images, atol=1e-4)

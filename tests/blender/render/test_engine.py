@@ -482,7 +482,7 @@ def test_render_without_a_trainer_is_reported(bpy, lodgs, scene, tmp_path, monke
     lodgs("render.renderer").close()
     monkeypatch.delenv("LODGS_TRAINER_PYTHON")
     scene.render.filepath = str(tmp_path / "none.png")
-    with pytest.raises(RuntimeError, match="The trainer is not installed"):
+    with pytest.raises(RuntimeError, match="Cannot start the trainer: it is not installed"):
         bpy.ops.render.render(write_still=True)
     assert not (tmp_path / "none.png").exists()
 

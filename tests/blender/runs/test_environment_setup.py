@@ -291,7 +291,7 @@ def test_oldest_supported_python_is_preferred(lodgs, environment_setup, monkeypa
     versions["/bin/python3.11"] = (3, 11)
     assert environment_setup.find_base_python() == Path("/bin/python3.11")
     versions.clear()
-    with pytest.raises(Exception, match=r"No Python from 3\.11 to 3\.14"):
+    with pytest.raises(Exception, match=r"no Python from 3\.11 to 3\.14"):
         environment_setup.find_base_python()
 
 

@@ -247,7 +247,7 @@ def flamenco_context(root):
 )
 def test_invalid_addresses_are_rejected(bpy, lodgs, flamenco, root, address):
     lodgs("extension").preferences().flamenco = address
-    with pytest.raises(RuntimeError, match="Invalid address of the Flamenco manager"):
+    with pytest.raises(RuntimeError, match="as address of the Flamenco manager: it is invalid"):
         submit(bpy)
 
 

@@ -71,5 +71,5 @@ def test_panel_shows_the_steps_of_a_running_comparison(bpy, lodgs, root, trainer
     work._process.wait()
     assert work.step() and work.message == "Training FLoD (1 of 2), step 30 of 40"
     assert work.fraction == pytest.approx(0.75)
-    with pytest.raises(RuntimeError, match="already being compared"):
+    with pytest.raises(RuntimeError, match="already running"):
         bpy.ops.lodgs.compare_methods(methods={"flod"})

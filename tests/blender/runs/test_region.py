@@ -60,7 +60,7 @@ def test_apply_job_sets_the_region(bpy, lodgs, root, tmp_path, region):
     bpy.context.view_layer.update()
     crop = make_job(lodgs, root, tmp_path).crop
     assert crop.shape == job.crop.shape and settings.region.name.startswith("Region")
-    np.testing.assert_allclose(crop.to_own, job.crop.to_own, atol=1e-4)
+    np.testing.assert_allclose(crop.to_local, job.crop.to_local, atol=1e-4)
     lodgs("runs.job_settings").apply_job(settings, replace(job, region=""))
     assert settings.region is None
 

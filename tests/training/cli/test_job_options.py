@@ -78,8 +78,11 @@ def test_words_need_no_quotation_marks():
     [
         ([], "no job, or no run folder"),
         (["--scene", "a"], "--out RUN"),
-        (["--scene", "a", "--out", "b", "--set", "rho"], "--set rho is not NAME=VALUE"),
-        (["--scene", "a", "--out", "b", "--set", "rho=4 5"], "--set rho=4 5 is not NAME=VALUE"),
+        (["--scene", "a", "--out", "b", "--set", "rho"], "Cannot read --set rho: it is not NAME=VALUE"),
+        (
+            ["--scene", "a", "--out", "b", "--set", "rho=4 5"],
+            "Cannot read --set rho=4 5: it is not NAME=VALUE",
+        ),
         (["--scene", "a", "--out", "b", "--set", "steps=1,2"], r"not NAME=VALUE.*'steps=\[100, 200\]' for a"),
         (["--scene", "a", "--out", "b", "--set", "rho=four"], "rho"),
         (["--scene", "a", "--out", "b", "--set", "depth=deep"], "depth"),

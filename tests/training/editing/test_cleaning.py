@@ -344,10 +344,10 @@ def test_folder_stays_a_folder_and_counts_are_printed(tmp_path, capsys):
     [
         (["--crop-box", *"000001"], "flat"),
         (["--crop-sphere", *"0000"], "radius"),
-        (["--max-size", "0"], "No splats remain"),
+        (["--max-size", "0"], "Cannot edit the splats: none remain"),
         (["--min-opacity", "-1"], "min_opacity = -1.0 is invalid"),
         (["--min-views", "1"], "--scene"),
-        (["--out", "all.ply"], "Cannot overwrite"),
+        (["--out", "all.ply"], "all.ply: it is the source"),
     ],
 )
 def test_invalid_options_are_reported(tmp_path, monkeypatch, capsys, arguments, message):

@@ -1,4 +1,4 @@
-"""A reader written from docs/reference/bundle.md with only numpy and plyfile selects the same splats."""
+"""A reader written from docs/reference/bundle*.md with only numpy and plyfile selects the same splats."""
 
 import json
 from pathlib import Path

@@ -144,7 +144,7 @@ def test_distances_match_float64():
 def test_controls_of_other_rules_are_rejected(name):
     bundle, own_controls = bundle_of(name), {control.name for control in rules()[name].controls}
     for foreign in all_controls().keys() - own_controls | {"nonsense"}:
-        with pytest.raises(LodgsError, match=f"The rule '{name}' has no option '{foreign}'. It has: "):
+        with pytest.raises(LodgsError, match=f"Cannot set '{foreign}': the rule '{name}' has no such"):
             resolve_controls(bundle, {foreign: 1})
 
 

@@ -56,7 +56,7 @@ def device(request) -> str:
     """Device of the cuda backend: the CPU through ``fake_card``, and a GPU with gsplat."""
     if request.param == "cpu":
         request.getfixturevalue("fake_card")
-    elif problem := cuda.problem():
+    elif problem := cuda.find_problem():
         pytest.skip(f"no NVIDIA GPU that gsplat works on: {problem}")
     return request.param
 
@@ -224,9 +224,9 @@ def card(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(cuda, "DEVICE", "cpu")
     monkeypatch.setitem(sys.modules, "gsplat", fake_gsplat)
-    cuda.problem.cache_clear()
+    cuda.find_problem.cache_clear()
     yield
-    cuda.problem.cache_clear()
+    cuda.find_problem.cache_clear()
 
 
 def test_auto_uses_cuda_with_gpu_and_gsplat(card, monkeypatch):
@@ -255,7 +255,7 @@ def test_auto_follows_the_device_of_tensors(card, monkeypatch, make_splats, odd_
 def test_missing_requirements_are_reported_with_remedy(card, monkeypatch):
     def problem_with(gsplat) -> str:
         monkeypatch.setitem(sys.modules, "gsplat", gsplat)
-        cuda.problem.cache_clear()
+        cuda.find_problem.cache_clear()
         assert resolve_backend("auto") == "cpu"
         with pytest.raises(LodgsError) as caught:
             resolve_backend("cuda")
@@ -282,7 +282,7 @@ def test_compilation_does_not_print_to_standard_output(card, monkeypatch, capsys
         return fake_gsplat.spherical_harmonics(*args)
 
     monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(spherical_harmonics=loud))
-    assert cuda.problem() is None
+    assert cuda.find_problem() is None
     printed = capsys.readouterr()
     assert printed.out == "" and "setting up" in printed.err
 
@@ -297,7 +297,7 @@ def test_compilation_holds_a_lock(card, monkeypatch, tmp_path):
         return fake_gsplat.spherical_harmonics(*args)
 
     monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(spherical_harmonics=compiling))
-    assert cuda.problem() is None and locked == [True]
+    assert cuda.find_problem() is None and locked == [True]
 
 
 @pytest.mark.parametrize("name", ["rasterize_to_pixels", "spherical_harmonics"])

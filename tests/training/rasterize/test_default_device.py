@@ -45,11 +45,11 @@ def set_adapters(monkeypatch, tmp_path):
     for name in ("rasterize", "contributions", "photometric_loss"):
         monkeypatch.setattr(gpu, name, getattr(cpu, name), raising=False)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    self_test.failure.cache_clear()
-    cuda.problem.cache_clear()
+    self_test.find_failure.cache_clear()
+    cuda.find_problem.cache_clear()
     yield simulate
-    self_test.failure.cache_clear()
-    cuda.problem.cache_clear()
+    self_test.find_failure.cache_clear()
+    cuda.find_problem.cache_clear()
 
 
 @pytest.fixture
@@ -109,7 +109,7 @@ def test_environment_variable_selects_by_part_of_name(set_adapters, monkeypatch,
 def test_working_device_is_used_and_tested_once(set_adapters, monkeypatch):
     set_adapters(CARD)
     assert resolve_backend("gpu") == "gpu" and cpu_fallback_reason("gpu") == ""
-    self_test.failure.cache_clear()  # simulate a new process
+    self_test.find_failure.cache_clear()  # simulate a new process
 
     def refuse(*_):
         raise AssertionError("tested again")
@@ -127,7 +127,7 @@ def test_wrong_images_disable_the_device(set_adapters, wrong_images):
     assert cpu_fallback_reason("gpu").startswith(
         "GeForce RTX 4070 Laptop is not used: its images are 2% off."
     )
-    self_test.failure.cache_clear()
+    self_test.find_failure.cache_clear()
     assert resolve_backend("gpu") == "cpu", "the stored result"
 
 
@@ -155,7 +155,7 @@ def test_wrong_gradients_disable_the_device(set_adapters, monkeypatch, name):
         return cpu.rasterize(gaussians, weights, features, settings)
 
     monkeypatch.setattr(gpu, "rasterize", wrong, raising=False)
-    assert self_test.failure(CARD) == f"its gradients of {name} are 2% off"
+    assert self_test.find_failure(CARD) == f"its gradients of {name} are 2% off"
 
 
 def test_unstable_or_nan_results_disable_the_device(set_adapters, monkeypatch):
@@ -193,7 +193,7 @@ def test_auto_trains_on_the_fastest_device(set_adapters, set_times, cpu_ms, gpu_
     measured = set_times(cpu=cpu_ms, gpu=gpu_ms)
     assert trial.fastest_backend() == trial.fastest_backend() == expected
     assert measured == ["cpu", "gpu"]
-    self_test.failure.cache_clear()
+    self_test.find_failure.cache_clear()
     set_adapters(CARD._replace(driver="556.0"))
     trial.fastest_backend()
     assert measured == ["cpu", "gpu"] * 2
@@ -229,7 +229,7 @@ def test_corrupt_cache_is_ignored(set_adapters, tmp_path):
     set_adapters(CARD)
     (tmp_path / self_test.RESULTS).write_text("{no json")
     assert resolve_backend("gpu") == "gpu"
-    self_test.failure.cache_clear()
+    self_test.find_failure.cache_clear()
     (tmp_path / self_test.RESULTS).write_text('{"x": 5}')
     assert resolve_backend("gpu") == "gpu"
 
@@ -243,7 +243,7 @@ def test_description_of_devices(set_adapters, set_times, monkeypatch, wrong_imag
     )
     assert describe().endswith("Radeon 780M is not used: its images are 2% off.")
     monkeypatch.setattr(gpu, "rasterize", cpu.rasterize, raising=False)
-    self_test.failure.cache_clear()  # simulate a new process
+    self_test.find_failure.cache_clear()  # simulate a new process
     lines = describe().splitlines()
     assert [line.split()[0] for line in lines[:5]] == ["cpu", "cuda", "gpu", "gpu", "auto"]
     assert lines[2].endswith("2048 MB in one buffer, selected, passed the self-test")

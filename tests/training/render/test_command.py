@@ -187,7 +187,10 @@ def test_holdout_hides_splats_behind_meshes(bundle, camera, tmp_path):
         ),
         (["--first", "2", "--last", "1"], "levels 2 to 1"),
         (["--gamma", "0"], "gamma = 0.0"),
-        (["--offset", "1"], "The rule 'bands' has no option 'offset'. It has: gamma, first, last."),
+        (
+            ["--offset", "1"],
+            "Cannot set 'offset': the rule 'bands' has no such control. Use one of: gamma, first, last.",
+        ),
         (["--gamma", "1", "--level", "1"], "Cannot combine --level"),
         (["--out", "a.gif"], "Cannot write a.gif: unsupported image format"),
         (["--holdout", "gone.exr"], "Cannot read the mesh depth gone.exr"),

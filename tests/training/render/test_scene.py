@@ -221,5 +221,5 @@ def test_drawing_can_be_cancelled(make_splats, camera, monkeypatch):
 
 
 def test_flat_transform_is_refused(make_splats, camera):
-    with pytest.raises(LodgsError, match="scaled to nothing"):
+    with pytest.raises(LodgsError, match="its scale is 0"):
         draw([Instance(SplatSet(make_splats(5)), np.diag([1.0, 1, 0, 1]))], camera)

@@ -10,7 +10,7 @@ import pytest
 from training.__main__ import main
 from training.errors import LodgsError
 from training.methods import METHODS
-from training.runs.comparison.measures import ComparedRun, Point, answers, label_runs, measure_run
+from training.runs.comparison.measures import ComparedRun, Point, label_runs, measure_run, recommend_runs
 from training.runs.comparison.page import build_page, compare
 from training.runs.events import event_line
 from training.runs.folder import RunFolder
@@ -100,7 +100,9 @@ def test_answers_name_the_best_run_and_ignore_baselines():
     def run(label, splats, psnr, seconds, **values):
         return ComparedRun(label, "", [Point("", splats, psnr, 0.9, 0.01)], seconds=seconds, **values)
 
-    rows = answers([run("A", 100, 30, 50), run("B", 200, 31, 60), run("C", 200, 40, None, baseline=True)])
+    rows = recommend_runs(
+        [run("A", 100, 30, 50), run("B", 200, 31, 60), run("C", 200, 40, None, baseline=True)]
+    )
     best = {row["purpose"]: row["best"] for row in rows}
     assert best["Quality at full detail"] == "B" and best["Short training"] == "A"
     assert "Speed from far away" not in best  # neither has levels
@@ -215,7 +217,7 @@ def test_several_scenes_share_a_page_of_results(tiny_scene, runs, tmp_path, monk
 def test_scenes_of_the_same_name_are_refused(tiny_scene, tmp_path, capsys):
     scenes = [shutil.copytree(tiny_scene, tmp_path / name / "scene") for name in ("first", "second")]
     assert main(["compare", *map(str, scenes), "--out", str(tmp_path / "out")]) == 2
-    assert "same name" in capsys.readouterr().err
+    assert "several folders are named scene" in capsys.readouterr().err
 
 
 def test_scene_and_run_together_are_refused(tiny_scene, runs, tmp_path, capsys):
@@ -225,7 +227,7 @@ def test_scene_and_run_together_are_refused(tiny_scene, runs, tmp_path, capsys):
 
 def test_missing_scene_and_unwritable_folder_are_named_before_any_work(runs, tmp_path, capsys):
     assert main(["compare", str(tmp_path / "none"), "--out", str(tmp_path / "out")]) == 2
-    assert f"The folder {tmp_path / 'none'} does not exist." in capsys.readouterr().err
+    assert f"Cannot open {tmp_path / 'none'}: the folder does not exist." in capsys.readouterr().err
     (tmp_path / "file").touch()
     assert main(["compare", str(runs[0]), "--out", str(tmp_path / "file" / "out")]) == 2
     assert f"Cannot write to {tmp_path / 'file' / 'out'}: " in capsys.readouterr().err

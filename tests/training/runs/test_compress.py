@@ -188,7 +188,7 @@ def test_command(run, tmp_path, splats, capsys):
 @pytest.mark.parametrize(
     ("source", "out", "words", "message"),
     [
-        ("run", "run/bundle.ply", (), "Cannot overwrite the source"),
+        ("run", "run/bundle.ply", (), "bundle.ply: it is the source"),
         ("missing", "a.ply", (), "missing"),
         ("run", "a.spz", (), "compressed bundles are PLY files"),
         ("run", "a.ply", ("--prune", "2"), "prune = 2.0 is invalid"),

@@ -8,7 +8,7 @@ import pytest
 
 from tests.training.conftest import write_tiny_scene
 from training.runs import estimate as module
-from training.runs.estimate import Estimate, estimate, estimate_findings, suggestions
+from training.runs.estimate import Estimate, estimate, estimate_findings, suggest_settings
 from training.runs.job import Job
 from training.scenes.colmap import read_scene
 
@@ -17,7 +17,7 @@ COSTS = Estimate(600, 10**9, 8 * 10**9, 10**9, 50 * 10**9, 60_000, 1000, 42, (96
 
 @pytest.fixture
 def job(tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "SECONDS", 0.0)
+    monkeypatch.setattr(module, "MEASURED_SECONDS", 0.0)
     scene = write_tiny_scene(tmp_path / "scene")
     parameters = {"max_splats": 90, "levels": 2, "steps": 40, "densify_interval": [1, 1]}
     return Job(
@@ -97,11 +97,11 @@ def test_cells_have_no_estimate(job):
 )
 def test_settings_are_suggested_with_their_reason(job, changes, text):
     job = replace(job, preset="standard", image_scale=0.5, parameters={}).resolved()
-    texts = " ".join(map(str, suggestions(job, replace(COSTS, **changes))))
+    texts = " ".join(map(str, suggest_settings(job, replace(COSTS, **changes))))
     assert text in texts if text else not texts
 
 
 def test_cells_are_offered_if_memory_is_short(job, monkeypatch):
     monkeypatch.setattr(module, "choose_cells", lambda job, memory: f"2x{memory // 10**9}")
-    (finding,) = suggestions(replace(job, image_scale=1.0), replace(COSTS, memory=20 * 10**9))
+    (finding,) = suggest_settings(replace(job, image_scale=1.0), replace(COSTS, memory=20 * 10**9))
     assert finding.remedy.startswith("Train in 2x6 cells")

@@ -112,7 +112,7 @@ def test_lost_device_or_low_memory_is_reported_and_the_run_can_be_resumed(
 
 
 def test_cpu_replaces_a_device_that_renders_incorrectly(graphics, keys, monkeypatch):
-    monkeypatch.setattr(self_test, "failure", lambda adapter: "its images are 3% off")
+    monkeypatch.setattr(self_test, "find_failure", lambda adapter: "its images are 3% off")
     keys["parameters"]["steps"] = [1, 1, 1]
     code, events = run_in_process(keys)
     assert code == 0

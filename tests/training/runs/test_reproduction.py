@@ -21,7 +21,7 @@ from training.runs.reproduction.run import (
     run_folder,
 )
 from training.runs.reproduction.subject import Subject
-from training.runs.reproduction.tables import PSNR, SPLATS, ascending, format_table, trade
+from training.runs.reproduction.tables import PSNR, SPLATS, format_table, increases, loses_little
 from training.scenes.colmap import read_scene
 from training.splats.bundle import write_bundle
 from training.splats.levels import Bundle, Level
@@ -68,10 +68,10 @@ def test_trends_state_our_numbers():
     def value(label, column):
         return values[label, column.measure]
 
-    assert trade("", "a", "b", 0.6, 0.5).test(value) == (True, "0.50 dB at 40% of the splats")
-    assert trade("", "a", "b", 0.4, 0.5).test(value)[0] is False
-    assert ascending("", ("b", "a"), PSNR).test(value) == (True, "29.50, 30.00")
-    assert ascending("", ("a", "b"), SPLATS).test(value) == (False, "100, 40")
+    assert loses_little("", "a", "b", 0.6, 0.5).test(value) == (True, "0.50 dB at 40% of the splats")
+    assert loses_little("", "a", "b", 0.4, 0.5).test(value)[0] is False
+    assert increases("", ("b", "a"), PSNR).test(value) == (True, "29.50, 30.00")
+    assert increases("", ("a", "b"), SPLATS).test(value) == (False, "100, 40")
 
 
 def test_tables_are_chosen_by_number_or_name():

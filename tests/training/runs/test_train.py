@@ -273,12 +273,12 @@ def test_unused_gpu_is_reported(uninterrupted, tmp_path, monkeypatch):
 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setitem(sys.modules, "gsplat", None)
-    cuda.problem.cache_clear()
+    cuda.find_problem.cache_clear()
     try:
         keys = {**uninterrupted["keys"], "out": str(tmp_path / "run")}
         code, events = run_in_process(with_steps(keys, 3))
     finally:
-        cuda.problem.cache_clear()
+        cuda.find_problem.cache_clear()
     assert code == 0
     warnings = [event["message"] for event in events if event["event"] == "warning"]
     (warning,) = [message for message in warnings if "GPU is not used" in message]

@@ -233,7 +233,7 @@ def test_unsupported_files_are_named(tmp_path, capsys):
 
 def test_invalid_inputs_are_rejected(photos, tmp_path):
     (tmp_path / "photos.zip").write_bytes(b"PK")
-    with pytest.raises(LodgsError, match=r"photos.zip is a file, not a folder\. Unpack it first\."):
+    with pytest.raises(LodgsError, match=r"photos.zip: it is a file, not a folder\. Unpack it first\."):
         reconstruct(tmp_path / "photos.zip", tmp_path / "out")
     with pytest.raises(LodgsError, match="does not exist"):
         reconstruct(tmp_path / "nowhere", tmp_path / "out")

@@ -121,7 +121,7 @@ def parent_index(number: int, columns: Columns) -> BlockIndex:
 
 
 class ResidentTree:
-    """Links between the N splats in memory of a tree, of which others may be missing.
+    """Links between the N splats of a tree in memory; its other splats may be missing.
 
     Children identify their parent by its size and position, bit for bit. (Files have no two nodes of the same
     size and position, see ``shape.UniqueSizes``.) Links are cached and updated only where columns change.

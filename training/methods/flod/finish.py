@@ -136,7 +136,7 @@ def scale_opacities(logits: torch.Tensor, fraction: torch.Tensor) -> torch.Tenso
 
 
 def random_values(rng: np.random.Generator, gamma: float, model: Model, single_share: float) -> Values:
-    """Draw the rule's controls for a step: a single level with probability ``finest_views``, otherwise all
+    """Draw the rule's controls for a step: a single level with probability ``single_share``, else all
     levels.
     """
     numbers = list(_rows(model))

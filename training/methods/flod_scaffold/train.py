@@ -169,7 +169,7 @@ class Method(octree_neural.Method):
 
 
 def smallest_log_scale(s_min: float) -> np.float32:
-    """Return the smallest float32 log scale of which the exponential is not below ``s_min``."""
+    """Return the smallest float32 log scale whose exponential is at least ``s_min``."""
     if not s_min:
         return np.float32(-np.inf)
     log_scale = np.float32(np.log(s_min))

@@ -31,7 +31,7 @@ from ...splats.levels import Level
 from . import NeuralOctreeParameters
 
 DISABLED_LOGIT = -30.0
-"""Opacity of Gaussians that are disabled for good."""
+"""Opacity logit of Gaussians that are disabled until the end."""
 
 
 @dataclass

@@ -243,14 +243,14 @@ def _merge_to_root(moments: np.ndarray, by_error: bool) -> tuple[np.ndarray, Tre
 def _merged_area(first, second):
     """Return the square root of the merged covariance's second invariant; s1 s2 for a flat splat."""
     share = first[9] / (first[9] + second[9])
-    rest, both = 1 - share, share * (1 - share)
+    other_share, product = 1 - share, share * (1 - share)
     x, y, z = first[0] - second[0], first[1] - second[1], first[2] - second[2]
-    xx = share * first[3] + rest * second[3] + both * x * x
-    xy = share * first[4] + rest * second[4] + both * x * y
-    xz = share * first[5] + rest * second[5] + both * x * z
-    yy = share * first[6] + rest * second[6] + both * y * y
-    yz = share * first[7] + rest * second[7] + both * y * z
-    zz = share * first[8] + rest * second[8] + both * z * z
+    xx = share * first[3] + other_share * second[3] + product * x * x
+    xy = share * first[4] + other_share * second[4] + product * x * y
+    xz = share * first[5] + other_share * second[5] + product * x * z
+    yy = share * first[6] + other_share * second[6] + product * y * y
+    yz = share * first[7] + other_share * second[7] + product * y * z
+    zz = share * first[8] + other_share * second[8] + product * z * z
     return np.sqrt(max(xx * yy - xy * xy + xx * zz - xz * xz + yy * zz - yz * yz, 0.0))
 
 

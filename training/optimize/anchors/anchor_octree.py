@@ -76,8 +76,7 @@ def build(
     levels: int = 0,
     coarser: int = 0,
 ) -> AnchorOctree:
-    """Build the octree for a scene's points (P, 3) and views, of which samples of about POINTS and VIEWS are
-    used.
+    """Build the octree for a scene's points (P, 3) and views, from samples of about POINTS and VIEWS.
 
     Args:
         focal_px: focal length in pixels to which distances are normalized.

@@ -14,7 +14,7 @@ def loss_and_gradient(
     """Compute (1 − ssim_weight) L1 + ssim_weight (1 − SSIM) of an image, and its gradient (H, W, 4).
 
     Args:
-        drawn: (H, W, 4), of which three columns are used.
+        drawn: (H, W, 4); the first three channels are used.
         photo: (H, W, 3).
     """
     parts, gradient = record_loss(device, drawn, photo, ssim_weight)

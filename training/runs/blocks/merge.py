@@ -123,7 +123,7 @@ class _FittedBorder:
         self._offset += len(border)
         if not np.array_equal(fitted.means, splats.means[border]):
             raise LodgsError(
-                f"Cannot merge {self._path}: it was not trained from the current blocks.",
+                f"Cannot merge {self._path}: it was not trained from the current cells.",
                 f"Delete its bundle, events and {RunFolder('').base.name}, and resume.",
             )
         opacity_logits, sh = splats.opacity_logits.copy(), splats.sh.copy()
@@ -147,8 +147,8 @@ def _check_compatible(block: Block, bundle: tuple[Bundle, Mapping[int, FileRows]
     if not rows or _kind(head) != _kind(first):
         raise LodgsError(
             f"Cannot merge {block.folder.path}: its method, rule, facts or local origin differ from those of "
-            "other blocks.",
-            "Train all blocks with the jobs of the same plan.",
+            "other cells.",
+            "Train all cells with the jobs of the same plan.",
         )
 
 

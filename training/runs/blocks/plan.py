@@ -74,7 +74,8 @@ class Block:
     @property
     def name(self) -> str:
         """Name for messages."""
-        return "coarse levels" if self.region is None else f"{self.kind} {self.number}"
+        cell = f"cell {self.number}"
+        return {COARSE: "coarse levels", BLOCK: cell, SEAM: f"border of {cell}"}[self.kind]
 
     @cached_property
     def job(self) -> Job:
@@ -187,7 +188,9 @@ def plan(job: Job, scene: Scene | None = None) -> list[PlannedCell]:
         views, points = len(training & set(region.views)), int(region.start_points(scene).sum())
         if views < 2 or not points:
             raise LodgsError(
-                f"Cell {number} is too small to train: {views} views and {points} points.", "Use fewer cells."
+                f"Cannot train cell {number}: it has {views} view(s) and {points} point(s), but needs 2 "
+                "views and 1 point.",
+                "Use fewer cells.",
             )
         share = views / len(training)
         limit = undivided.max_splats
@@ -216,7 +219,7 @@ def choose_cells(job: Job, splats: int = 0, memory: int = 0, scene: Scene | None
     total = _divided(job)[0].max_splats
     if not total and (splats or memory):
         raise LodgsError(
-            "Cannot choose blocks by a limit: the job's number of splats is unlimited.",
+            "Cannot choose cells by a limit: the job's number of splats is unlimited.",
             "Set max_splats, or give the number of cells.",
         )
     failure = None
@@ -230,12 +233,13 @@ def choose_cells(job: Job, splats: int = 0, memory: int = 0, scene: Scene | None
         if largest <= (splats or largest) and peak <= (memory or peak):
             return grid
         failure = LodgsError(
-            f"Blocks are too large: in {grid} cells the largest has {largest:,} splats and needs "
-            f"{peak / 1e9:.1f} GB.",
-            "Raise the limit per block, or lower max_splats.",
+            f"Cannot divide scene within the limit: in {grid} cells the largest has {largest:,} splats and "
+            f"needs {peak / 1e9:.1f} GB.",
+            "Raise the limit per cell, or lower max_splats.",
         )
     raise failure or LodgsError(
-        f"Blocks are too large even in {MAX_CELLS} cells, the maximum.", "Raise the limit per block."
+        f"Cannot divide scene within the limit: {MAX_CELLS} cells, the maximum, are not enough.",
+        "Raise the limit per cell.",
     )
 
 
@@ -277,7 +281,7 @@ def write_plan(
                 shutil.move(temporary.blocks, folder.blocks)
         except OSError as error:
             raise LodgsError(
-                f"Cannot write blocks to {folder.path}: {system_reason(error)}.",
+                f"Cannot write cells to {folder.path}: {system_reason(error)}.",
                 "Choose a writable folder on a disk with free space.",
             ) from error
     return read_plan(folder)
@@ -291,7 +295,10 @@ def read_plan(folder: RunFolder) -> Division:
     """
     blocks = _read_parts(folder.blocks)
     if not blocks:
-        raise LodgsError(f"The run {folder.path} has no blocks.", "Plan them first.")
+        raise LodgsError(
+            f"Cannot train cells of {folder.path}: none are planned.",
+            "Plan them with lodgs blocks plan, or in the panel.",
+        )
     coarse = RunFolder(folder.coarse)
     return Division(
         Block(0, coarse, None) if coarse.job.exists() else None, blocks, _read_parts(folder.seams)
@@ -307,7 +314,8 @@ def read_planned_job(path: Path) -> Job:
     job = Job.from_file(RunFolder(path).job)
     if not job.cells:
         raise LodgsError(
-            f"The run {path} is not divided into cells.", "Train its job directly, or plan it with --cells."
+            f"Cannot train cells of {path}: the run is not divided.",
+            "Train its job directly, or plan it with --cells.",
         )
     return job
 

@@ -69,12 +69,12 @@ def train_blocks(division: Division, path: Path, submit: Submit, report: Report)
             watch.code = CANCELLED
     for stage in stages:
         _train_stage(stage, watches, submit, report)
-    report("status", message=f"Merging {len(division.blocks)} blocks")
+    report("status", message=f"Merging {len(division.blocks)} cells")
     counts = merge(division, path)
     for seam in division.seams:
         seam.folder.base.unlink(missing_ok=True)
     for block, (inside, total) in zip(division.blocks, counts, strict=True):
-        report("status", message=f"Block {block.number}: {inside:,} of {total:,} splats are in its cell")
+        report("status", message=f"Cell {block.number}: keeps {inside:,} of {total:,} splats, those inside")
 
 
 def _train_stage(
@@ -241,7 +241,7 @@ def _progress(watches: Sequence[_BlockWatch]) -> dict:
         return round(sum(report.get(name, 0.0) for report in reports) / max(len(reports), 1), 5)
 
     return {
-        "stage": f"{done} of {len(blocks)} blocks", "level": 1, "levels": 1, "step": step, "of": steps,
+        "stage": f"{done} of {len(blocks)} cells", "level": 1, "levels": 1, "step": step, "of": steps,
         "loss": mean("loss"), "psnr": mean("psnr"),
         "splats": sum(report.get("splats", 0) for report in reports),
         "steps_per_s": round(speed, 2), "eta_s": round((steps - step) / speed, 1) if speed else 0.0,

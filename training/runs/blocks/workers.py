@@ -172,7 +172,7 @@ def _check_scheduler(on: str, tls: bool) -> None:
     if "://" not in on and not is_file(on):
         raise LodgsError(
             f"Unknown workers '{on}'.",
-            "Use here, local:2 (two blocks at a time), or the file that lodgs blocks scheduler has written.",
+            "Use here, local:2 (two cells at a time), or the file that lodgs blocks scheduler has written.",
         )
     if tls and "://" in on and not on.startswith("tls://"):
         raise LodgsError(

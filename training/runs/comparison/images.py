@@ -28,7 +28,7 @@ WIDTH = 960
 FRAME_WIDTH = 320
 """Width of the frames of a fly-out in pixels."""
 FRAMES_PER_IMAGE = 5
-"""Number of frames of a fly-out of which the page shows one."""
+"""Number of measured frames of a fly-out for each frame on the page."""
 QUALITY = 85
 """JPEG quality."""
 

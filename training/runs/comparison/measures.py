@@ -276,8 +276,8 @@ PURPOSES = (
 """Purposes in the order of the page."""
 
 
-def answers(runs: Sequence[ComparedRun]) -> list[dict[str, str]]:
-    """Answer which run is best for a purpose.
+def recommend_runs(runs: Sequence[ComparedRun]) -> list[dict[str, str]]:
+    """Recommend a run for each purpose.
 
     Returns:
         ``purpose``, ``best`` (label) and ``why``, for each purpose with at least two measured runs that are
@@ -295,11 +295,11 @@ def answers(runs: Sequence[ComparedRun]) -> list[dict[str, str]]:
     return result
 
 
-def measures(runs: Sequence[ComparedRun]) -> dict:
+def collect_measures(runs: Sequence[ComparedRun]) -> dict:
     """Return the measures of runs as plain values for JSON."""
     count = compared_count(runs)
     rows = [{**asdict(run), "at_share": run.psnr_at(count)} for run in runs]
-    return {"compared_splats": round(count), "runs": rows, "answers": answers(runs)}
+    return {"compared_splats": round(count), "runs": rows, "answers": recommend_runs(runs)}
 
 
 def label_runs(runs: Sequence[Path]) -> list[str]:

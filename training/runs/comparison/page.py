@@ -21,7 +21,15 @@ from ..finished import open_finished
 from ..folder import RunFolder
 from ..measure import finite
 from .images import RunImages, compared_views, photos, render_merges, render_run
-from .measures import ComparedRun, Notify, compared_count, label_runs, measure_run, measures, merge_baseline
+from .measures import (
+    ComparedRun,
+    Notify,
+    collect_measures,
+    compared_count,
+    label_runs,
+    measure_run,
+    merge_baseline,
+)
 
 TEMPLATE = Path(__file__).with_name("page.html")
 
@@ -66,7 +74,7 @@ def compare(
         "views": [camera.name for camera in cameras],
         "measured_views": len(evaluation.cameras),
         "size": [evaluation.cameras[0].width, evaluation.cameras[0].height],
-        **measures(measured),
+        **collect_measures(measured),
     }
     page = build_page(report, photos(evaluation, cameras), images)
     create_folder(out)

@@ -57,15 +57,15 @@ def format_results(reports: Sequence[dict]) -> str:
             f"N = {report['compared_splats']:,} splats, a quarter of the median finest level.",
             "",
         ]
-        shown = [
+        columns = [
             (head, [text(run) for run in report["runs"]])
             for head, text in _COLUMNS
         ]  # fmt: skip
-        shown = [(head, cells) for head, cells in shown if any(cell != "–" for cell in cells)]
+        columns = [(head, cells) for head, cells in columns if any(cell != "–" for cell in cells)]
         lines += _table(
-            ["method", *(head for head, _ in shown)],
+            ["method", *(head for head, _ in columns)],
             [
-                [run["label"], *(cells[row] for _, cells in shown)]
+                [run["label"], *(cells[row] for _, cells in columns)]
                 for row, run in enumerate(report["runs"])
             ],
         )  # fmt: skip
@@ -126,8 +126,8 @@ def _means(reports: Sequence[dict]) -> list[str]:
 
 
 def _mean(values: Sequence[float | None], decimals: int) -> str:
-    known = [value for value in values if value is not None]
-    return _number(float(np.mean(known)), decimals) if len(known) == len(values) else "–"
+    numbers = [value for value in values if value is not None]
+    return _number(float(np.mean(numbers)), decimals) if len(numbers) == len(values) else "–"
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]], alignment: str = "") -> list[str]:

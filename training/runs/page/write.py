@@ -172,8 +172,8 @@ def _describe(bundle: Bundle) -> dict:
 def _pose(camera: Camera, center: np.ndarray, radius: float) -> dict:
     """Return a camera's position, target and field of view in degrees, in the viewer's axes.
 
-    The viewer applies the field of view to the larger side of its window, whatever its documentation says. In
-    a window of the proportions WINDOW, the whole image is visible.
+    The viewer applies the field of view to the larger side of its window, contrary to its documentation. In a
+    window of the proportions WINDOW, the whole image is visible.
     """
     half_width, half_height = camera.width / camera.fx / 2, camera.height / camera.fy / 2
     forward = camera.world_to_camera[2, :3]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from .subject import Subject
-from .tables import LPIPS, PSNR, SPLATS, SSIM, Paper, Row, Table, Training, Trend, Value, ascending
+from .tables import LPIPS, PSNR, SPLATS, SSIM, Paper, Row, Table, Training, Trend, Value, increases
 
 _PLAIN, _FULL, _THREE, _TEN = "3DGS", "CLoD-GS", "CLoD-GS to scale 3", "CLoD-GS to scale 10"
 _NO_WEIGHT, _NO_LOSS = "without w_s", "without L_reg"
@@ -66,7 +66,7 @@ PAPER = Paper(
             [*_curve("to 3", _THREE), *_curve("to 5", _FULL), *_curve("to 10", _TEN)],
             (
                 Trend("A larger range of scales improves low detail and keeps full detail.", _graceful),
-                ascending("Splats fall with the scale.",
+                increases("Splats fall with the scale.",
                           [f"to 5, s_v = {s_v}" for s_v in reversed(_SCALES)], SPLATS),
                 Trend("Scale 5 draws under 60 % of the splats.", _fades),
             ),
@@ -80,8 +80,8 @@ PAPER = Paper(
                 Row("w/o loss", _NO_LOSS, _scale(5), (27.56, 0.902, 0.123)),
             ),
             (
-                ascending("The weight w_s improves quality (0.2 dB).", ("w/o weight", "Full model"), PSNR),
-                ascending("L_reg does not lower quality (0.03 dB).", ("w/o loss", "Full model"), PSNR),
+                increases("The weight w_s improves quality (0.2 dB).", ("w/o weight", "Full model"), PSNR),
+                increases("L_reg does not lower quality (0.03 dB).", ("w/o loss", "Full model"), PSNR),
             ),
         ),
     ),

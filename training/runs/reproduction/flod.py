@@ -17,8 +17,8 @@ from .tables import (
     Training,
     Trend,
     Value,
-    ascending,
-    trade,
+    increases,
+    loses_little,
 )
 
 _ALL, _OVERLAP, _TOGETHER = "FLoD", "FLoD without overlap pruning", "FLoD without level-by-level training"
@@ -107,7 +107,7 @@ PAPER = Paper(
                 Row("Mip-Splatting", _MIP, _finest, (27.59, 0.831, 0.181)),
                 Row("FLoD-3DGS", _ALL, _finest, (27.75, 0.815, 0.224)),
             ),
-            (ascending("FLoD-3DGS is better than 3DGS (0.39 dB).", ("3DGS", "FLoD-3DGS"), PSNR),),
+            (increases("FLoD-3DGS is better than 3DGS (0.39 dB).", ("3DGS", "FLoD-3DGS"), PSNR),),
         ),
         Table(
             "Table 2", "Quality, speed and splats of levels and ranges", _MIP_NERF,
@@ -121,9 +121,9 @@ PAPER = Paper(
                 Row("3-2-1", _ALL, _range(1, 3), (24.07, 0.632, 0.442, 208, 414_000)),
             ),
             (
-                trade("5-4-3 loses 0.42 dB at 55 % of the splats.", "5", "5-4-3", 0.6, 0.65),
-                ascending("Quality falls from row to row.", ("3-2-1", "3", "4-3-2", "4", "5-4-3", "5"), PSNR),
-                ascending("Splats fall, too.", ("3-2-1", "3", "4-3-2", "4", "5-4-3", "5"), SPLATS),
+                loses_little("5-4-3 loses 0.42 dB at 55 % of the splats.", "5", "5-4-3", 0.6, 0.65),
+                increases("Quality falls from row to row.", ("3-2-1", "3", "4-3-2", "4", "5-4-3", "5"), PSNR),
+                increases("Splats fall, too.", ("3-2-1", "3", "4-3-2", "4", "5-4-3", "5"), SPLATS),
                 Trend("5-4-3 is better than level 4 (0.66 dB).", _range_beats_level),
             ),
         ),
@@ -135,7 +135,7 @@ PAPER = Paper(
                 Row("Scaffold-GS", _SINGLE, Subject.networks, (27.4, 1.3)),
                 Row("Octree-Scaffold", _OCTREE, Subject.networks, (27.2, 1.0)),
             ),
-            (ascending("Quality rises by level.", [f"FLoD-Scaffold, level {n}" for n in _LEVELS], PSNR),),
+            (increases("Quality rises by level.", [f"FLoD-Scaffold, level {n}" for n in _LEVELS], PSNR),),
         ),
         Table(
             "Table 4", "Selection for each view, and once", "Small City", (PSNR, FPS, SPLATS),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from .subject import Subject
-from .tables import LPIPS, PSNR, SPLATS, SSIM, Column, Paper, Row, Table, Training, Trend, Value, ascending
+from .tables import LPIPS, PSNR, SPLATS, SSIM, Column, Paper, Row, Table, Training, Trend, Value, increases
 
 _BIAS, _NEXT, _PROGRESSIVE = {"bias_rate": 0.0}, {"grow_next": False}, {"coarse_share": 0.0}
 _ABLATIONS = {
@@ -62,8 +62,8 @@ PAPER = Paper(
                 Row("Ours", "Octree-GS", _baked_and_networks, (27.73, 0.815, 0.217, 686_000)),
             ),
             (
-                ascending("Octree-GS is better than 3D-GS (0.21 dB).", ("3D-GS", "Ours"), PSNR),
-                ascending("It draws fewer splats than Scaffold-GS (5 %).", ("Ours", "Scaffold-GS"), SPLATS),
+                increases("Octree-GS is better than 3D-GS (0.21 dB).", ("3D-GS", "Ours"), PSNR),
+                increases("It draws fewer splats than Scaffold-GS (5 %).", ("Ours", "Scaffold-GS"), SPLATS),
             ),
         ),
         Table(
@@ -75,7 +75,7 @@ PAPER = Paper(
                 Row("Scaffold-GS", "Scaffold-GS", _baked_and_networks, (29.00, 0.868, 0.210, 357_000)),
                 Row("Ours", "Octree-GS", _baked_and_networks, (29.50, 0.883, 0.177, 473_000)),
             ),
-            (ascending("Octree-GS is better than Scaffold-GS (0.5 dB) and Mip-Splatting (2.4 dB).",
+            (increases("Octree-GS is better than Scaffold-GS (0.5 dB) and Mip-Splatting (2.4 dB).",
                        ("Mip-Splatting", "Scaffold-GS", "Ours"), PSNR),),
         ),
         Table(
@@ -96,7 +96,7 @@ PAPER = Paper(
                 Trend("The level bias improves M1, M4 and M6 (0.47, 0.14 and 0.21 dB).", _bias_helps),
                 Trend("Training from level 2 has 50 % of the splats and less quality than from level 4.",
                       _later_start_is_smaller),
-                ascending("Growth into the next level improves quality (0.21 dB).", ("M2", "M3"), PSNR),
+                increases("Growth into the next level improves quality (0.21 dB).", ("M2", "M3"), PSNR),
             ),
         ),
     ),

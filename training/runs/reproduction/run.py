@@ -38,14 +38,14 @@ def chosen_tables(paper: Paper, names: Collection[str]) -> list[Table]:
     Raises:
         LodgsError: there is no such table.
     """
-    known = {table.name: table for table in paper.tables}
-    wanted = [name if name in known else f"Table {name}" for name in names]
-    wanted = [name if name in known else name.replace("Table", "Figure") for name in wanted]
-    if unknown := [name for name, table in zip(names, wanted, strict=True) if table not in known]:
+    tables = {table.name: table for table in paper.tables}
+    requested = [name if name in tables else f"Table {name}" for name in names]
+    requested = [name if name in tables else name.replace("Table", "Figure") for name in requested]
+    if unknown := [name for name, table in zip(names, requested, strict=True) if table not in tables]:
         raise LodgsError(
-            f"Cannot reproduce table {unknown[0]}: it is not declared.", f"Choose of {', '.join(known)}."
+            f"Cannot reproduce table {unknown[0]}: it is not declared.", f"Choose of {', '.join(tables)}."
         )
-    return [known[name] for name in wanted] if wanted else list(paper.tables)
+    return [tables[name] for name in requested] if requested else list(paper.tables)
 
 
 def make_job(paper: Paper, name: str, scene: Path, out: Path, effort: float, keys: Mapping[str, Any]) -> Job:

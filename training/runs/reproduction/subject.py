@@ -68,9 +68,9 @@ class Subject:
             file = Path(folder, "compressed.ply")
             compress(self.run, file, Compression())
             bundle = read_bundle(file)
-            alone = replace(bundle, levels=bundle.levels[-1:])
-            size = file.stat().st_size * len(alone.levels[0].rows) / sum(len(x.rows) for x in bundle.levels)
-            return {**self._level(alone, 0), "megabytes": size / 1e6}
+            finest = replace(bundle, levels=bundle.levels[-1:])
+            size = file.stat().st_size * len(finest.levels[0].rows) / sum(len(x.rows) for x in bundle.levels)
+            return {**self._level(finest, 0), "megabytes": size / 1e6}
 
     def networks(self) -> dict[str, float]:
         """Measure the images of the networks, before baking."""

@@ -103,7 +103,7 @@ class Paper:
     missing: Sequence[str]
 
 
-def ascending(claim: str, labels: Sequence[str], column: Column) -> Trend:
+def increases(claim: str, labels: Sequence[str], column: Column) -> Trend:
     """Return a trend: the values of rows increase in the order of ``labels``."""
 
     def test(value: Value) -> tuple[bool, str]:
@@ -114,7 +114,7 @@ def ascending(claim: str, labels: Sequence[str], column: Column) -> Trend:
     return Trend(claim, test)
 
 
-def trade(claim: str, full: str, reduced: str, quality: float, share: float) -> Trend:
+def loses_little(claim: str, full: str, reduced: str, quality: float, share: float) -> Trend:
     """Return a trend: ``reduced`` loses little quality to ``full`` with few of its splats.
 
     It holds with at most ``quality`` dB of loss and at most ``share`` of the splats.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 
 from .subject import Subject
-from .tables import FPS, LPIPS, PSNR, SPLATS, SSIM, Paper, Row, Table, Training, Trend, Value, ascending
+from .tables import FPS, LPIPS, PSNR, SPLATS, SSIM, Paper, Row, Table, Training, Trend, Value, increases
 
 _TREE, _BASE, _OCTREE = "A LoD of Gaussians", "3DGS", "OctreeGS"
 _PIXELS = (0.5, 1, 2, 4, 8, 16)
@@ -44,7 +44,7 @@ PAPER = Paper(
                 Row("OctreeGS", _OCTREE, Subject.networks, (19.20, 0.601, 0.498)),
                 Row("Ours", _TREE, lambda subject: subject.level(), (24.61, 0.774, 0.297)),
             ],
-            (ascending("The tree is better than Octree-GS (5.4 dB).", ("OctreeGS", "Ours"), PSNR),),
+            (increases("The tree is better than Octree-GS (5.4 dB).", ("OctreeGS", "Ours"), PSNR),),
         ),
         Table(
             "Figure 18",
@@ -56,8 +56,8 @@ PAPER = Paper(
                 *(Row(_label(pixels), _TREE, _cut(pixels)) for pixels in _PIXELS),
             ],
             (
-                ascending("Finer cuts have more quality.", [_label(p) for p in reversed(_PIXELS)], PSNR),
-                ascending("Frames of coarser cuts are faster.", [_label(p) for p in _PIXELS], FPS),
+                increases("Finer cuts have more quality.", [_label(p) for p in reversed(_PIXELS)], PSNR),
+                increases("Frames of coarser cuts are faster.", [_label(p) for p in _PIXELS], FPS),
                 Trend("Half of the splats lose little quality.", _halves),
             ),
         ),

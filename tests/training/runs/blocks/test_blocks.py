@@ -195,7 +195,7 @@ def test_choose_cells_returns_the_smallest_grid_within_limits(tmp_path):
     assert max(cell.splats for cell in plan(job.with_cells(finer), scene)) <= sizes["2x2"] // 2
     assert Job("s", "o", cells=finer).grid > (2, 2)
     assert choose_cells(job, memory=10**12, scene=scene) == "1x1"
-    with pytest.raises(LodgsError, match=r"too large|too few|too small"):
+    with pytest.raises(LodgsError, match=r"within the limit|too few|needs 2 views"):
         choose_cells(job, splats=3, scene=scene)
     unlimited = replace(job, parameters={"max_splats": 0})
     assert {cell.splats for cell in plan(unlimited.with_cells("2x1"), scene)} == {0}
@@ -393,7 +393,7 @@ def test_lost_block_that_makes_progress_is_restarted_every_time(blocks):
 
 def test_block_without_progress_fails_the_run_after_the_others_have_finished(blocks):
     workers = Workers(block_1=[lost], block_2=[progressing(3, -9), done])
-    with pytest.raises(LodgsError, match=r"trainer of block 1 was lost 3 times at step 0 \(worker lost\)"):
+    with pytest.raises(LodgsError, match=r"trainer of cell 1 was lost 3 times at step 0 \(worker lost\)"):
         train_all(blocks, workers)
     assert blocks[1].folder.bundle.exists() and workers.attempts == {"1": 3, "2": 2}
     second_run = Workers(block_1=[done], block_2=[lost])
@@ -402,13 +402,13 @@ def test_block_without_progress_fails_the_run_after_the_others_have_finished(blo
 
 
 def test_error_of_a_block_is_reported(blocks):
-    with pytest.raises(LodgsError, match="Block 2: The disk is full") as error:
+    with pytest.raises(LodgsError, match="Cell 2: The disk is full") as error:
         train_all(blocks, Workers(block_1=[done], block_2=[failed]))
     assert error.value.remedy == "Free some space."
 
 
 def test_block_that_cannot_write_its_error_is_reported(blocks):
-    with pytest.raises(LodgsError, match=r"Block 2: The trainer could not write to .* disk is full"):
+    with pytest.raises(LodgsError, match=r"Cell 2: The trainer could not write to .* disk is full"):
         train_all(blocks, Workers(block_1=[done], block_2=[lambda _: 2]))
 
 
@@ -441,7 +441,7 @@ def test_lost_scheduler_does_not_count_as_a_lost_block(blocks):
 
 
 def test_single_block_can_be_cancelled_and_resumed(blocks):
-    with pytest.raises(BlocksStopped, match="block 2"):
+    with pytest.raises(BlocksStopped, match="cell 2"):
         train_all(blocks, Workers(block_1=[done], block_2=[cancelled]))
     assert train_all(blocks, Workers(block_1=[lost], block_2=[done])).exists()
 
@@ -476,7 +476,7 @@ def test_cancelled_block_resumes_on_request_while_others_train(blocks):
 def test_resume_request_before_the_start_trains_only_that_block(blocks):
     workers = Workers(block_1=[done], block_2=[done])
     blocks[1].folder.request_resume()
-    with pytest.raises(BlocksStopped, match="block 1"):
+    with pytest.raises(BlocksStopped, match="cell 1"):
         train_all(blocks, workers)
     assert workers.attempts == {"1": 0, "2": 1}
     assert train_all(blocks, workers).exists(), "the request is consumed"

@@ -123,7 +123,7 @@ def test_seam_trained_from_other_blocks_is_rejected(tmp_path):
         write_bundle(
             seam.folder.bundle, Bundle("3dgs", [Level(1, random_splats(np.random.default_rng(5), 40))])
         )
-    with pytest.raises(LodgsError, match="was not trained from the current blocks"):
+    with pytest.raises(LodgsError, match="was not trained from the current cells"):
         merge(division, tmp_path / "merged.ply")
     assert not (tmp_path / "merged.ply").exists()
 
