@@ -109,7 +109,9 @@ class ViewState:
             return
         store, missing = self.missing or (None, None)
         started = store is not None and store is source.store
-        if not started:
+        if started:  # another viewport may have uploaded some of them; second slots would exceed the store
+            missing = missing[store.slots[missing] < 0]
+        else:
             store = source.reserve([rows for view in active_views for rows in view.used_splats(source)])
             missing = store.missing(loading.splats)
         # slow redraws load more, so that loading keeps its speed

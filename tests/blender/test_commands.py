@@ -231,7 +231,7 @@ def _start_command(run: Path) -> subprocess.Popen:
     return process
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.nightly)])
 def test_signals_cancel_the_run(bpy, fake, tmp_path, number):
     """The command receives the signal, cancels the trainer and waits for it."""
     fake("slow")

@@ -119,6 +119,7 @@ def test_zip_installs_and_imports(archive, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.one_blender
 def test_blender_installs_updates_and_removes_from_a_repository(archive, tmp_path):
     dist = tmp_path / "dist"
     dist.mkdir()

@@ -8,10 +8,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from training import __main__
 from training.cli import COMMANDS
+from training.splats.gaussians import Splats
+from training.splats.ply import write_ply
 
 ROOT = Path(__file__).resolve().parents[2]
 MISTAKES = {
@@ -95,6 +98,16 @@ def test_every_command_is_cancelled_by_signals(number):
     assert process.stdout is not None and process.stdout.readline() == "started\n"
     process.send_signal(number)
     assert process.communicate(timeout=200) == ("", "") and process.returncode == 3
+
+
+def test_edits_start_without_torch(tmp_path):
+    """Its import would take most of the time of an export."""
+    rows = np.ones((3, 4), np.float32)
+    write_ply(tmp_path / "a.ply", Splats(rows[:, :3], rows, rows[:, :3], rows[:, 0], rows[:, None, :3]))
+    words = ["edit", str(tmp_path / "a.ply"), "--plain", str(tmp_path / "b.ply")]
+    code = f"import sys; from training import __main__ as m; print(m.main({words}), 'torch' in sys.modules)"
+    process = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert process.stdout.splitlines()[-1] == "0 False", process.stderr
 
 
 @pytest.mark.parametrize(

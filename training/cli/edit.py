@@ -99,7 +99,6 @@ def _add_look(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
-    from ..runs.finished import bake_again
     from ..runs.folder import find_splats
     from ..splats.formats import open_as_ply
 
@@ -118,11 +117,12 @@ def run(options: argparse.Namespace) -> int:
             "Cannot write the edited splats: no output.",
             "Add --out, --plain, --levels, --folder, --streamed, --tiles or --preview.",
         )
-    opened = (
-        bake_again(options.source, options.appearance, warn)
-        if options.appearance
-        else open_as_ply(find_splats(options.source))
-    )
+    if options.appearance:
+        from ..runs.finished import bake_again  # imports torch, which takes seconds
+
+        opened = bake_again(options.source, options.appearance, warn)
+    else:
+        opened = open_as_ply(find_splats(options.source))
     with opened as source:
         _edit(options, source, limits)
     return 0

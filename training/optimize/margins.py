@@ -16,6 +16,7 @@ from scipy.ndimage import gaussian_filter, maximum_filter
 from ..rasterize import Gaussians, rasterize
 from ..scenes.cameras import Camera, pick_evenly
 from ..splats.gaussians import SH_C0
+from .training_data import TrainingData
 
 MAX_VIEWS = 32
 """Maximum number of views to extend, evenly picked."""
@@ -42,18 +43,19 @@ class MarginGenerator:
     """Generator of splats around the photos of training views.
 
     Args:
-        cameras: training views; at most ``MAX_VIEWS`` are used.
-        share: width of the margin on every side, as a share of a view's size.
-        near: near plane, in scene units.
+        data: training data; at most ``MAX_VIEWS`` of its training views are used.
+        share: width of the margin on every side, as a share of a view's size; 0 disables.
         backend: rasterizer backend.
     """
 
-    def __init__(self, cameras: Sequence[Camera], share: float, near: float, backend: str) -> None:
-        self._cameras = pick_evenly(cameras, MAX_VIEWS)
+    def __init__(self, data: TrainingData, share: float, backend: str) -> None:
+        self._data = data
+        self._cameras = pick_evenly(data.train, MAX_VIEWS)
         self._share = share
-        self._near = near
+        self._near = data.near
         self._backend = backend
 
+    @torch.no_grad()
     def extend(self, gaussians: Gaussians, max_splats: int) -> Gaussians:
         """Create splats where widened views are empty, none in front of surfaces that a view shows.
 
@@ -62,9 +64,11 @@ class MarginGenerator:
             max_splats: maximum number of new splats; a lower limit gives larger splats.
 
         Returns:
-            The new splats: round, of constant colour, almost opaque.
+            The new splats: round, of constant colour, almost opaque. None if the photos are transparent.
         """
         gaussians = gaussians.detach()
+        if not self._share or self._data.transparent:
+            return gaussians.select(slice(0))
         cells = CELLS
         depth_maps = [self._depth_map(gaussians, camera) for camera in self._cameras]
         while cells >= MIN_CELLS:

@@ -25,7 +25,7 @@ from .growth_region import GrowthRegion
 from .margins import MarginGenerator
 from .model import Model
 from .parameters import Parameters
-from .schedules import due
+from .schedules import ShSchedule, due
 from .support import INTERVAL, SupportPruning
 from .training_data import TrainingData, TrainingView
 
@@ -123,6 +123,9 @@ class Method(ABC, Generic[P, D]):
 
     Attributes:
         model: trained rows. Set by ``setup``.
+        steps: number of steps of the run.
+        device_steps: number of first steps that the backend may make entirely on its device. They render one
+            image of all splats with ``render_weights`` and use this class's loss. Set by ``setup``.
         levels: number of levels. Set by ``setup`` if there are several.
         facts: scene facts declared by the method's rule, by name. Set by ``setup``.
         controls: initial values of the rule's controls, by name; others keep the rule's defaults. Set by
@@ -131,7 +134,7 @@ class Method(ABC, Generic[P, D]):
         extra_optimizers: optimizers of tensors outside the model. Set by ``setup``.
         device: device of the tensors.
         warn: report a warning about the run, one sentence. Set by the caller.
-        background, depth_loss, dropout, exposure, margins, region, support: components.
+        background, depth_loss, dropout, exposure, margins, region, sh_degree, support: components.
 
     Args:
         backend: rasterizer backend.
@@ -140,6 +143,7 @@ class Method(ABC, Generic[P, D]):
 
     model: Model
     levels: int = 1
+    device_steps: float = 0
     image_model: ImageModel | None = None
 
     def __init__(
@@ -148,6 +152,7 @@ class Method(ABC, Generic[P, D]):
         self.warn: Callable[[str], None] = lambda message: None
         self.data = data
         self.parameters = p = parameters
+        self.steps = p.total_steps
         self.seed = seed
         self.backend = backend
         self.device = tensor_device(backend)
@@ -158,8 +163,9 @@ class Method(ABC, Generic[P, D]):
         self.depth_loss = DepthLoss(*(p.depth_weight, data.median_depth) if data.depths else (0.0, 0.0))
         self.dropout = Dropout(p.dropout, len(data.train), seed, self.device)
         self.exposure = Exposure([view.name for view in data.train], p.lr_exposure, self.device)
-        self.margins = MarginGenerator(data.train, p.margin, data.near, backend)
+        self.margins = MarginGenerator(data, p.margin, backend)
         self.region = GrowthRegion(data.region)
+        self.sh_degree = ShSchedule(p.sh_degree, p.sh_interval)
         self.support = SupportPruning(data.train, data.scene.points, p.free_depth, p.largest)
         self.setup(base)
 
@@ -176,6 +182,8 @@ class Method(ABC, Generic[P, D]):
     @abstractmethod
     def control_density(self, step: int) -> None:
         """Add and remove splats if due, after the optimizers' step.
+
+        It also adds ``margins``, ideally when no more splats are added.
 
         Raises:
             LodgsError: no splats remain.
@@ -194,11 +202,6 @@ class Method(ABC, Generic[P, D]):
         return [cast(D, Drawing(self.rasterize_model(view.camera, step, weights, min_scale)))]
 
     # -- progress and result, to override --------------------------------------------------------------
-
-    @property
-    def steps(self) -> int:
-        """Number of steps of the run."""
-        return self.parameters.total_steps
 
     @property
     def splats(self) -> int:
@@ -254,21 +257,9 @@ class Method(ABC, Generic[P, D]):
         """Return the factor by which the image of a step is reduced."""
         return 1
 
-    def sh_degree(self, step: int) -> int:
-        """Return the active degree of harmonics, which increases during training."""
-        p = self.parameters
-        return min(p.sh_degree, step // max(p.sh_interval, 1))
-
     def render_weights(self, view: TrainingView, step: int) -> tuple[torch.Tensor | None, float]:
         """Return weights (N,) and minimum standard deviation of splats in a step; see ``rasterize``."""
         return None, 0.0
-
-    def allows_device_step(self, step: int) -> bool:
-        """Return True if the backend may make the step entirely on its device, without autograd.
-
-        The step must render one image of all splats with :meth:`render_weights` and use this class's loss.
-        """
-        return False
 
     def loss(self, drawings: Sequence[D], view: TrainingView, step: int) -> torch.Tensor:
         """Return the loss of a step: the sum of the images' photometric losses (3DGS, Eq. 7).
@@ -290,9 +281,6 @@ class Method(ABC, Generic[P, D]):
     def collects_stats(self, view: TrainingView, step: int) -> bool:
         """Return True if :meth:`control_density` uses the statistics of a step."""
         return True
-
-    def add_margins(self, step: int) -> None:
-        """Add splats of ``margins`` to the model if due, ideally when no more splats are added."""
 
     def prune_unsupported(self, step: int) -> None:
         """Remove splats in free space, at intervals and at the ends of levels.
@@ -325,9 +313,6 @@ class Method(ABC, Generic[P, D]):
         view = self.choose_view(step)
         result = self._step_on_device(view, step) or self._step_with_autograd(view, step)
         self.control_density(step)
-        if self.parameters.margin and not self.data.transparent:
-            with torch.no_grad():
-                self.add_margins(step)
         if due(INTERVAL, step + 1) or self.ends_level(step):
             self.exposure.center()
             self.prune_unsupported(step)
@@ -392,7 +377,7 @@ class Method(ABC, Generic[P, D]):
         p = self.parameters
         target = view.target
         needs_autograd = p.lr_exposure or self.depth_loss.outputs or self.data.region
-        if needs_autograd or not self.allows_device_step(step):
+        if needs_autograd or step >= self.device_steps:
             return None
         if target.mask is not None or target.alpha is not None:
             return None

@@ -52,7 +52,7 @@ class MethodInfo:
             which trains the coarser levels, and those of the cells, which continue them. Returns None if
             every cell trains all levels.
         trains_on_device: return whether the backend gpu can make all steps with given parameters
-            (``Method.allows_device_step``). The backend auto then considers it.
+            (``Method.device_steps``). The backend auto then considers it.
         unused: names of inherited parameters that this method ignores.
         package: package of the method as a module name, set at discovery.
     """

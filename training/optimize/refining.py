@@ -86,10 +86,13 @@ class RefiningMethod(SplatMethod):
     def setup(self, base: Splats | None) -> None:
         p = self.parameters
         self.finest_steps = 0 if base is not None else p.steps
+        self.steps = self.finest_steps + p.base_steps
+        self.device_steps = self.sh_degree.full_from = self.support.end = self.finest_steps
         if base is None:
             super().setup(None)
             return
         p = self.parameters = replace(p, sh_degree=min(p.sh_degree, base.sh_degree))  # the base has no more
+        self.sh_degree.degree = p.sh_degree
         tensors = from_splats(base.select(spatial_order(base.means)), p.sh_degree, self.device)
         self.model = self.new_model(tensors)
         self._densify_until = 0
@@ -106,12 +109,6 @@ class RefiningMethod(SplatMethod):
     def shrink(self, step: int) -> float:
         return 1 if self.refines(step) else super().shrink(step)
 
-    def sh_degree(self, step: int) -> int:
-        return self.parameters.sh_degree if self.refines(step) else super().sh_degree(step)
-
-    def allows_device_step(self, step: int) -> bool:
-        return not self.refines(step)
-
     def collects_stats(self, view: TrainingView, step: int) -> bool:
         return not self.refines(step) and super().collects_stats(view, step)
 
@@ -120,10 +117,6 @@ class RefiningMethod(SplatMethod):
             self.model.lr["means"] = self.parameters.lr_means_final * self.data.extent
         else:
             super().set_learning_rates(step)
-
-    def prune_unsupported(self, step: int) -> None:
-        if not self.refines(step):
-            super().prune_unsupported(step)
 
     def control_density(self, step: int) -> None:
         if not self.refines(step):

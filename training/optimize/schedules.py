@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import ceil, sqrt
+from math import ceil, inf, sqrt
 
 import numpy as np
 
@@ -20,6 +20,32 @@ def log_linear(first: float, last: float, share: float) -> float:
 def due(interval: int, step: int) -> bool:
     """Return True every ``interval`` steps, counting from step 1. The interval 0 disables."""
     return interval > 0 and step % interval == 0
+
+
+class ShSchedule:
+    """Active degree of harmonics, which increases during training.
+
+    Args:
+        degree: final degree.
+        interval: steps between two increases.
+
+    Attributes:
+        degree: final degree.
+        completed: steps of an earlier run, which this one continues.
+        full_from: step from which all harmonics are active.
+    """
+
+    def __init__(self, degree: int, interval: int) -> None:
+        self.degree = degree
+        self._interval = max(interval, 1)
+        self.completed = 0
+        self.full_from = inf
+
+    def __call__(self, step: int) -> int:
+        """Return the active degree of a step."""
+        if step >= self.full_from:
+            return self.degree
+        return min(self.degree, (self.completed + step) // self._interval)
 
 
 def random_reduction(seed: int, step: int) -> float:

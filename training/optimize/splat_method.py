@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import inf
 
 import numpy as np
 import torch
@@ -33,10 +34,12 @@ PRUNE_AT = (8 / 30, 16 / 30, 24 / 30)
 class SplatMethod(Method[SplatParameters, Drawing]):
     """Training of a 3DGS model."""
 
+    device_steps = inf
+
     def setup(self, base: Splats | None) -> None:
         p, scene = self.parameters, self.data.scene
-        self._from_base = base is not None
         if base is not None:
+            self.sh_degree.full_from = 0
             tensors = from_splats(base, p.sh_degree, self.device)
         else:
             points, colors = drop_duplicates(scene.points, scene.point_colors)
@@ -64,12 +67,6 @@ class SplatMethod(Method[SplatParameters, Drawing]):
         p = self.parameters
         return shrink_at(step / self.scheduled_steps, p.first_resolution, p.full_resolution)
 
-    def sh_degree(self, step: int) -> int:
-        return self.parameters.sh_degree if self._from_base else super().sh_degree(step)
-
-    def allows_device_step(self, step: int) -> bool:
-        return True
-
     def render_weights(self, view: TrainingView, step: int) -> tuple[torch.Tensor | None, float]:
         return self.dropout.weights(len(self.model), step, step / self.scheduled_steps), 0.0
 
@@ -85,15 +82,15 @@ class SplatMethod(Method[SplatParameters, Drawing]):
         p, model, completed = self.parameters, self.model, step + 1
         if p.least_weight and completed in (round(share * p.steps) for share in PRUNE_AT):
             self.prune_unimportant(step)
-        if completed > self._densify_until:
-            return
-        if due(p.densify_interval, completed) and completed >= p.densify_from:
-            self._densify(step)
-        if due(p.prune_interval, completed) and completed >= p.densify_from:
-            prune(model, p.min_opacity)
-            require_rows(model, step, "min_opacity")
-        if due(p.opacity_reset_interval, completed) and completed < self._densify_until:
-            reset_opacities(model)  # not at the end: nothing would remove splats that stay faint
+        if completed <= self._densify_until:
+            if due(p.densify_interval, completed) and completed >= p.densify_from:
+                self._densify(step)
+            if due(p.prune_interval, completed) and completed >= p.densify_from:
+                prune(model, p.min_opacity)
+                require_rows(model, step, "min_opacity")
+            if due(p.opacity_reset_interval, completed) and completed < self._densify_until:
+                reset_opacities(model)  # not at the end: nothing would remove splats that stay faint
+        self.add_margins(step)
 
     def _densify(self, step: int) -> None:
         """Add splats by the criterion and, if enabled, remove oversized ones."""
@@ -128,7 +125,7 @@ class SplatMethod(Method[SplatParameters, Drawing]):
         require_rows(self.model, step, "least_weight")
 
     def add_margins(self, step: int) -> None:
-        """Add margins when densification ends."""
+        """Add margins if due: when densification ends."""
         if step < self._densify_until <= step + 1:
             self.model.append(self.margin_rows())
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
+from math import inf
 
 import numpy as np
 import torch
@@ -112,6 +113,9 @@ class SupportPruning:
         free_depth: share of the nearest depth that is free space; 0 disables.
         largest: maximum standard deviation of a splat, as a share of its distance from the nearest camera
             or midpoint; 0 disables.
+
+    Attributes:
+        end: step from which nothing is removed or limited.
     """
 
     def __init__(
@@ -121,6 +125,7 @@ class SupportPruning:
         self._points = points
         self._free_depth = free_depth
         self._largest = largest
+        self.end = inf
 
     @cached_property
     def _support(self) -> Support:
@@ -133,7 +138,7 @@ class SupportPruning:
         Raises:
             LodgsError: no splats remain.
         """
-        if not (self._free_depth or self._largest):
+        if step >= self.end or not (self._free_depth or self._largest):
             return
         means = model["means"].detach().cpu().numpy()
         distances, positions = self._support.nearest_positions(means)

@@ -31,7 +31,7 @@ def choose_backend(job: Job, scene: Scene, transparent: Callable[[], bool] = lam
 def trains_on_device(job: Job, scene: Scene) -> bool:
     """Return whether the backend gpu makes all steps of a job on its device, if photos are opaque.
 
-    See ``Method.allows_device_step``.
+    See ``Method.device_steps``.
     """
     parameters = job.resolved_parameters()
     needs_host = parameters.lr_exposure or parameters.depth_weight or job.region or job.cell

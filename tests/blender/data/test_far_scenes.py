@@ -73,6 +73,7 @@ def test_levels_of_another_origin_are_rejected(bpy, lodgs, far):
     scenes.set_bundle_facts(root, Bundle("3dgs", [], meta=META))
 
 
+@pytest.mark.one_blender
 def test_levels_arrive_while_training(bpy, lodgs, far, fake, tmp_path):
     root = lodgs("data.importing").import_colmap(bpy.context, far, photographs=False)
     fake("far")

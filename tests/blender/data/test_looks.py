@@ -74,7 +74,10 @@ def check(bpy, lodgs, obj, splats):
     np.testing.assert_allclose(factor, opacity, rtol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["bands", "octree", "chunks", "decay"])
+@pytest.mark.parametrize(
+    "name",
+    ["bands", "chunks", *(pytest.param(name, marks=pytest.mark.nightly) for name in ("octree", "decay"))],
+)
 def test_node_groups_match_numpy_at_every_level(bpy, lodgs, scene_with_look, name):
     root, bundle = scene_with_look(name)
     bpy.context.scene.lodgs_viewport.splats = False  # points, which Blender draws

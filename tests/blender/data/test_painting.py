@@ -84,7 +84,10 @@ def painted(bpy, lodgs, scene_of, viewport):  # noqa: F811
     return make
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.nightly] * (name in ("octree", "decay"))) for name in NAMES],
+)
 def test_strokes_paint_points_and_exports_of_every_level(bpy, lodgs, painted, tmp_path, name):
     root, bundle, colors = painted(bundle_of(name, np.random.default_rng(0)))
     root.lodgs_look.exposure, root.lodgs_look.tint = 0.3, (1.0, 0.8, 0.9)

@@ -189,6 +189,7 @@ def test_tables_of_earlier_versions_load(bpy, lodgs, tmp_path):
     assert lodgs("data.scenes").read_levels(root).controls == {"distance_scale": 2.0}
 
 
+@pytest.mark.one_blender
 def test_finished_run_adds_chunks_and_the_next_run_removes_them(bpy, lodgs, fake, tmp_path):
     scenes, watch = lodgs("data.scenes"), lodgs("runs.watch")
     with lodgs("data.importing").new_scene(bpy.context, "town") as root:

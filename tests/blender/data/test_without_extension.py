@@ -31,7 +31,7 @@ os._exit(0)
 """
 
 
-@pytest.mark.parametrize("cumulative", [False, True])
+@pytest.mark.parametrize("cumulative", [False, pytest.param(True, marks=pytest.mark.nightly)])
 def test_finest_level_appears_as_points(bpy, lodgs, tmp_path, cumulative):
     s_min = {1: 0.1, 2: 0.05, 3: 0.0}
     levels = [Level(number, splats(count), {"s_min": s_min[number]}) for number, count in COUNTS.items()]

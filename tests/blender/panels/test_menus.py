@@ -137,6 +137,7 @@ def test_new_work_with_a_reused_id_has_no_notice(lodgs, work):
         assert status.visible_work(1.0) == []
 
 
+@pytest.mark.one_blender
 def test_runs_of_a_scene_are_listed_and_opened(bpy, lodgs, tmp_path, fake):
     fake()
     root = lodgs("data.importing").import_colmap(bpy.context, GARDEN, photographs=False)

@@ -116,7 +116,9 @@ def measured(bpy, lodgs, tmp_path):
     return measure
 
 
-@pytest.mark.parametrize(("rendered", "scale"), [((64, 1000), 0.7), ((4000, 100), 0.37)])
+@pytest.mark.parametrize(
+    ("rendered", "scale"), [((64, 1000), 0.7), pytest.param((4000, 100), 0.37, marks=pytest.mark.nightly)]
+)
 def test_psnr_of_levels_by_distance_matches_evaluate(bpy, lodgs, measured, renderer, rendered, scale):
     """Both agree within 0.01 dB for any size of the last render."""
     root, view, psnr = measured(2, scale)

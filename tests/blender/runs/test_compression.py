@@ -42,6 +42,7 @@ def commands(lodgs, monkeypatch):
 
 @pytest.mark.skipif(not TRAINER, reason="no trainer; set LODGS_TRAINER_PYTHON")
 @pytest.mark.slow
+@pytest.mark.one_blender
 def test_trainer_writes_a_file_that_blender_opens(bpy, file, tmp_path):
     out = tmp_path / "small.ply"
     assert bpy.ops.lodgs.export_compressed(filepath=str(out)) == {"FINISHED"}

@@ -94,7 +94,9 @@ def test_float32_properties_give_rounded_numbers(job_settings, root):
     assert job_settings.make_job(root, Path("/run"), {}).image_scale == 0.3
 
 
-@pytest.mark.parametrize("budget", [3 * LEAVES, 2 * LEAVES - 2, 2000])
+@pytest.mark.parametrize(
+    "budget", [3 * LEAVES, pytest.param(2 * LEAVES - 2, marks=pytest.mark.nightly), 2000]
+)
 def test_tree_larger_than_the_budget_is_streamed(bpy, lodgs, jobs, fake, root, tmp_path, budget):
     """A tree larger than the budget appears at the end, like an imported one."""
     fake("tree")
@@ -198,7 +200,9 @@ def test_apply_job_sets_the_distances(lodgs, job_settings, root):
     assert job_settings.changed_parameters(settings) == {}
 
 
-@pytest.mark.parametrize("backend", ["auto", "cpu", "cuda", "gpu"])
+@pytest.mark.parametrize(
+    "backend", ["auto", "cuda", *(pytest.param(name, marks=pytest.mark.nightly) for name in ("cpu", "gpu"))]
+)
 def test_backend_is_a_preference(bpy, lodgs, jobs, fake, root, tmp_path, backend):
     preferences = lodgs("extension").preferences()
     assert preferences.backend == "auto"

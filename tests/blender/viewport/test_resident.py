@@ -169,6 +169,25 @@ def test_each_redraw_uploads_a_batch(bpy, lodgs, draw_from, monkeypatch):
     np.testing.assert_array_equal(images[-1], draw_from(views.ViewState(), 3.0))
 
 
+def test_viewports_that_load_at_once_upload_each_splat_once(lodgs, draw_from, monkeypatch):
+    """A second slot of a splat would take the place of one that is drawn."""
+    views, resident = lodgs("viewport.views"), lodgs("viewport.resident")
+    monkeypatch.setattr(resident, "UPLOAD_BATCH", 100)
+    monkeypatch.setattr(lodgs("viewport.view_state"), "LOADING", (0.0, 0.0))
+    pair, uploaded = [views.ViewState(), views.ViewState()], resident.bytes_uploaded
+    loaded_at_once, end = False, time.monotonic() + 200
+    while not all(view.arrangement and not view.loading for view in pair):
+        assert time.monotonic() < end
+        for view in pair:
+            draw_from(view, 0.0, wait=False)
+        loaded_at_once |= all(view.missing for view in pair)
+        time.sleep(0.002)
+    assert loaded_at_once
+    count, store = pair[0].arrangement.count, pair[0].store
+    assert resident.bytes_uploaded - uploaded == count * 16 * resident.record_texels(3)
+    assert np.count_nonzero(store.owners >= 0) == count == pair[0].count == pair[1].count
+
+
 def test_each_redraw_reads_an_attribute(bpy, lodgs, draw_from, scene, monkeypatch):
     """The old image stays until the pool is complete; another change restarts reading."""
     views, view = lodgs("viewport.views"), lodgs("viewport.views").ViewState()

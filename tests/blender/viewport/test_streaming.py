@@ -132,7 +132,11 @@ def test_streamed_image_matches_the_whole_file(bpy, lodgs, path, root, draw_from
         assert image[..., 3].max() > 0.1
 
 
-def test_two_viewports_draw_complete_cuts(bpy, lodgs, tree, root, draw_from):
+def test_two_viewports_draw_complete_cuts(bpy, lodgs, tree, root, draw_from, monkeypatch):
+    """They upload at once, to a store without room for a second slot of a splat."""
+    monkeypatch.setattr(lodgs("viewport.resident"), "MIN_SLOTS", 1)
+    monkeypatch.setattr(lodgs("viewport.resident"), "UPLOAD_BATCH", 2000)
+    monkeypatch.setattr(lodgs("viewport.view_state"), "LOADING", (0.0, 0.0))
     views, truth = lodgs("viewport.views"), Truth(tree)
     first, second, complete = views.ViewState(), views.ViewState(), set()
     end = time.monotonic() + 200

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 from torch import nn
-from torchmetrics.functional.image import lpips as reference
 
 from training.errors import LodgsError
 from training.evaluate import lpips
@@ -26,6 +25,13 @@ LAYERS = {
 }  # fmt: skip
 """``features`` of AlexNet (Krizhevsky 2014) and VGG-16 (Simonyan and Zisserman 2015), with ReLU after each
 convolution: channels, kernel, stride, padding."""
+
+
+def reference():
+    """Return torchmetrics' module. Its import takes two seconds, so not every worker makes it."""
+    from torchmetrics.functional.image import lpips
+
+    return lpips
 
 
 def random_features(name: str) -> nn.Sequential:
@@ -51,7 +57,7 @@ def weights_of(name: str, features: nn.Sequential) -> dict:
         }
         for number, layer in enumerate(layers)
     }
-    file = Path(reference.__file__).parent / "lpips_models" / f"{name}.pth"
+    file = Path(reference().__file__).parent / "lpips_models" / f"{name}.pth"
     published = torch.load(file, map_location="cpu", weights_only=True)
     linear = {
         f"NetLinLayer_{number}": {"Conv_0": {"kernel": weights.permute(2, 3, 1, 0).numpy().copy()}}
@@ -92,9 +98,11 @@ def images() -> torch.Tensor:
 
 @pytest.mark.parametrize("name", LAYERS)
 def test_distance_equals_that_of_torchmetrics(name, features, networks, monkeypatch):
-    monkeypatch.setattr(reference, "_get_tv_model_features", lambda *_: features[name])
+    monkeypatch.setattr(reference(), "_get_tv_model_features", lambda *_: features[name])
     pair, measure = images(), networks[f"lpips_{name}"]
-    expected = reference._LPIPS(net=name, pnet_rand=True)(*pair.permute(0, 3, 1, 2)[:, None], normalize=True)
+    expected = reference()._LPIPS(net=name, pnet_rand=True)(
+        *pair.permute(0, 3, 1, 2)[:, None], normalize=True
+    )
     assert measure(*pair) == pytest.approx(float(expected), rel=1e-4)
     assert measure(pair[0], pair[0]) == 0 and float(expected) > 0.01
 

@@ -100,7 +100,7 @@ def test_settings_match_methods_and_presets(tmp_path):
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize(
     ("method", "steps"),
-    [("3dgs", 30), pytest.param("flod", [6, 6, 6, 6, 12], marks=pytest.mark.nightly)],
+    [("3dgs", 10), pytest.param("flod", [6, 6, 6, 6, 12], marks=pytest.mark.nightly)],
 )
 @pytest.mark.usefixtures("blocks_in_process")
 def test_commands_of_the_tasks_give_the_same_bundle_as_one_run(tiny_scene, tmp_path, method, steps):

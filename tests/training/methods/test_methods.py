@@ -175,7 +175,7 @@ def test_run_with_base_writes_its_column(tiny, tiny_scene, tmp_path):
     assert training_loop.train(created) == 0, "the same job resumes"
 
 
-@pytest.mark.parametrize("antialias", [False, True])
+@pytest.mark.parametrize("antialias", [pytest.param(False, marks=pytest.mark.nightly), True])
 def test_run_uses_antialiasing_of_its_base(tiny, tiny_scene, tmp_path, antialias):
     """The base overrides the job, with a warning, for the bundle, its levels and its measurements."""
     small = replace(base(), log_scales=base().log_scales - np.float32(2))

@@ -1,6 +1,7 @@
 """Tests of margins, on walls with known positions and colours."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -39,7 +40,8 @@ def draw(gaussians: Gaussians, view: Camera):
 
 
 def margins(*cameras: Camera, share: float = 0.5) -> MarginGenerator:
-    return MarginGenerator(cameras, share, NEAR, "cpu")
+    data = SimpleNamespace(train=cameras, near=NEAR, transparent=False)
+    return MarginGenerator(data, share, "cpu")
 
 
 def test_margins_continue_a_wall_beyond_the_photo():
@@ -96,7 +98,8 @@ def test_margins_scale_with_the_scene():
     scale = 1000.0
     splats = wall(4, -4, 4)
     large = replace(splats, means=scale * splats.means, log_scales=splats.log_scales + np.log(scale))
-    scaled = MarginGenerator([camera(), camera(x=scale)], 0.5, scale * NEAR, "cpu").extend(large, 10_000)
+    data = SimpleNamespace(train=[camera(), camera(x=scale)], near=scale * NEAR, transparent=False)
+    scaled = MarginGenerator(data, 0.5, "cpu").extend(large, 10_000)
     assert scaled.means.numpy() / scale == pytest.approx(small.means.numpy(), rel=1e-3, abs=1e-3)
     assert scaled.log_scales.numpy() - np.log(scale) == pytest.approx(small.log_scales.numpy(), abs=1e-3)
 

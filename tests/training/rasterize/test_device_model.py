@@ -163,7 +163,7 @@ def test_steps_wait_for_the_device_once_in_many(graphics, make_splats, odd_camer
     assert all(np.diff(values) < 0)
 
 
-@pytest.mark.parametrize("capacity", [64, 1000, None])
+@pytest.mark.parametrize("capacity", [64, pytest.param(1000, marks=pytest.mark.nightly), None])
 def test_too_many_pairs_repeat_steps_with_the_same_bits(graphics, make_splats, odd_camera, photo, capacity):
     """The 300 splats have about 1400 pairs. Steps that overflow, and those after them, are repeated."""
     results = []

@@ -49,7 +49,9 @@ def sixteen_threads():
     set_thread_count(original)
 
 
-@pytest.mark.parametrize("name", ["degree 3", "antialiased some", "crowd"])
+@pytest.mark.parametrize(
+    "name", ["degree 3", "antialiased some", pytest.param("crowd", marks=pytest.mark.nightly)]
+)
 def test_results_do_not_depend_on_array_addresses(name, make_splats, odd_camera):
     """Loops that sum and write may be compiled in two versions, for overlapping and separate arrays."""
     random = np.random.default_rng(0)

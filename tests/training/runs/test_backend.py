@@ -1,12 +1,10 @@
 """Choice of the backend that trains a job."""
 
 from dataclasses import replace
-from importlib import import_module
-from types import SimpleNamespace
 
 import pytest
 
-from training.methods import METHODS
+from training.methods import METHODS, create
 from training.runs import backend
 from training.runs.job import Job
 from training.scenes.colmap import read_scene
@@ -50,10 +48,9 @@ def test_auto_trains_masked_and_transparent_photos_on_the_cpu(fast_card, tiny_sc
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_declared_methods_make_all_steps_on_the_device(name):
+def test_declared_methods_make_all_steps_on_the_device(data, name):
     info = METHODS[name]
     for parameters in info.presets.values():
         if info.trains_on_device(parameters):
-            method = import_module(f"{info.package}.train").Method
-            state = SimpleNamespace(parameters=parameters)
-            assert all(method.allows_device_step(state, step) for step in range(0, 30_000, 1000))
+            method = create(name, data, parameters, seed=0, backend="cpu")
+            assert method.device_steps >= method.steps

@@ -16,8 +16,8 @@ from .test_train import TINY, method_of, run_in_process
 
 @pytest.fixture
 def keys(tiny_scene, tmp_path) -> dict:
-    """A job of 18 steps on the graphics device."""
-    parameters = {**TINY["flod"], "steps": [6, 6, 6], "finish_share": 0.0}
+    """A job of 9 steps on the graphics device."""
+    parameters = {**TINY["flod"], "steps": [3, 3, 3], "finish_share": 0.0}
     return {
         "scene": str(tiny_scene), "out": str(tmp_path / "run"), "image_scale": 1.0, "test_every": 4,
         "method": "flod", "parameters": parameters, "backend": "gpu",
@@ -42,14 +42,14 @@ def train_until(keys: dict, last: int, monkeypatch) -> list[dict]:
 
 def test_run_changes_between_backends(graphics, fake_card, keys, monkeypatch):
     """From the device to cuda (simulated on the CPU), back to the device, and to the cpu."""
-    for last, backend in ((3, "gpu"), (7, "cuda"), (12, "gpu")):
+    for last, backend in ((1, "gpu"), (3, "cuda"), (6, "gpu")):
         train_until({**keys, "backend": backend}, last, monkeypatch)
     code, events = run_in_process({**keys, "backend": "cpu"})
     assert code == 0 and {event["level"] for event in RunFolder(keys["out"]).levels()} == {1, 2, 3}
     assert [event["backend"] for event in events if "backend" in event] == ["gpu", "cuda", "gpu", "cpu"]
     assert f"Training on {graphics.adapter.name}" in [event.get("message") for event in events]
     resumed = [event["message"] for event in events if "Resuming at step" in event.get("message", "")]
-    assert [message.split()[3] for message in resumed] == ["4", "8", "13"]
+    assert [message.split()[3] for message in resumed] == ["2", "4", "7"]
 
 
 @pytest.mark.nightly
@@ -57,7 +57,7 @@ def test_stopped_run_on_a_device_gives_the_same_bits_and_measures(graphics, keys
     code, _ = run_in_process(keys)
     assert code == 0
     stopped = {**keys, "out": str(tmp_path / "stopped")}
-    train_until(stopped, 9, monkeypatch)
+    train_until(stopped, 4, monkeypatch)
     assert run_in_process(stopped)[0] == 0
     first, second = (RunFolder(job["out"]) for job in (keys, stopped))
     assert first.bundle.read_bytes() == second.bundle.read_bytes()
@@ -91,7 +91,7 @@ def test_lost_device_or_low_memory_is_reported_and_the_run_can_be_resumed(
     train_step = method_of(keys).train_step
 
     def losing_step(self, step):
-        if step == 8:
+        if step == 4:
             device = default_device.open_default_device()._device
 
             def fail(**_):
@@ -108,7 +108,7 @@ def test_lost_device_or_low_memory_is_reported_and_the_run_can_be_resumed(
     assert RunFolder(keys["out"]).state() == "failed"
     code, events = run_in_process(keys)  # the device works again
     assert code == 0 and Job.from_file(RunFolder(keys["out"]).job).backend == "gpu"
-    assert any("Resuming at step 8 of 18" in event.get("message", "") for event in events)
+    assert any("Resuming at step 4 of 9" in event.get("message", "") for event in events)
 
 
 def test_cpu_replaces_a_device_that_renders_incorrectly(graphics, keys, monkeypatch):

@@ -78,16 +78,9 @@ TINY = {
 """Parameters by method for 70 steps and 3 levels on the tiny scene, which has a black background."""
 
 
-one_method_by_default = pytest.mark.parametrize(
-    "uninterrupted",
-    ["flod", *(pytest.param(name, marks=pytest.mark.nightly) for name in TINY if name != "flod")],
-    indirect=True,
-)
-"""Run a test that starts processes with one method, with the others only nightly."""
-
-
 @pytest.fixture(
-    scope="module", params=["flod", "octree", pytest.param("octree_neural", marks=pytest.mark.nightly)]
+    scope="module",
+    params=["flod", *(pytest.param(name, marks=pytest.mark.nightly) for name in ("octree", "octree_neural"))],
 )
 def uninterrupted(request, tiny_scene, tmp_path_factory) -> dict:
     """Keys, output lines and bundle of an uninterrupted run of the tiny job."""
@@ -197,7 +190,6 @@ run()
 
 
 @pytest.mark.slow
-@one_method_by_default
 @pytest.mark.parametrize("step", [*(pytest.param(n, marks=pytest.mark.nightly) for n in (3, 44, 61)), 23])
 def test_killed_run_resumes_to_the_same_bits(uninterrupted, tmp_path, step):
     keys = {**uninterrupted["keys"], "out": str(tmp_path / "run")}
@@ -285,13 +277,30 @@ def test_unused_gpu_is_reported(uninterrupted, tmp_path, monkeypatch):
     assert "pip install gsplat" in warning
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="Windows cancels with a file")
-@one_method_by_default
-@pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.nightly), signal.SIGTERM])
-def test_stop_signal_saves_a_checkpoint(uninterrupted, tmp_path, number):
-    keys = {**uninterrupted["keys"], "out": str(tmp_path / "run")}
-    keys = with_steps(keys, 30000)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_stop_signal_saves_a_checkpoint(uninterrupted, tmp_path, monkeypatch, number):
+    keys = with_steps({**uninterrupted["keys"], "out": str(tmp_path / "run")}, 30000)
+    method = method_of(keys)
+    train_step = method.train_step
+
+    def signalling_step(self, step):
+        if step == 3:
+            os.kill(os.getpid(), number)
+        return train_step(self, step)
+
+    monkeypatch.setattr(method, "train_step", signalling_step)
+    assert run_in_process(keys)[0] == training_loop.CANCELLED
+    folder = RunFolder(keys["out"])
+    assert folder.state() == "cancelled" and list(folder.checkpoints.glob("*.pt"))
+
+
+@pytest.mark.slow
+@pytest.mark.nightly
+@pytest.mark.skipif(os.name == "nt", reason="Windows cancels with a file")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_stop_signal_ends_the_process(uninterrupted, tmp_path, number):
+    keys = with_steps({**uninterrupted["keys"], "out": str(tmp_path / "run")}, 30000)
     process = subprocess.Popen(
         command(tmp_path / "job.json", keys), cwd=ROOT, stdout=subprocess.PIPE, text=True
     )
@@ -306,7 +315,6 @@ def test_stop_signal_saves_a_checkpoint(uninterrupted, tmp_path, number):
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows cancels with a file")
-@one_method_by_default
 def test_stop_signal_after_the_last_step(uninterrupted, tmp_path, monkeypatch):
     """Commands that train several runs would otherwise go on with the next one."""
     write_levels = training_loop._TrainingRun._write_levels

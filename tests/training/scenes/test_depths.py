@@ -155,7 +155,9 @@ def test_maps_add_points_to_scenes_of_few_points(walls, tmp_path):
     assert add_depth_points(read_scene(walls)).points is not None
 
 
-@pytest.mark.parametrize(("unit", "warned"), [(1, False), (1000, True), (0.001, True)])
+@pytest.mark.parametrize(
+    ("unit", "warned"), [(1, False), (1000, True), pytest.param(0.001, True, marks=pytest.mark.nightly)]
+)
 def test_implausible_unit_of_maps_gives_a_warning(walls, tmp_path, unit, warned):
     def write(folder, number, depth):
         write_npy_map(folder / f"{number}.npy", (unit * depth).astype(np.float32))

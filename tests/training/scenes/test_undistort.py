@@ -28,7 +28,16 @@ def ramps() -> np.ndarray:
     return np.stack([x, y, 0 * x], axis=2).round().astype(np.uint8)
 
 
-@pytest.mark.parametrize("model", synthetic.DISTORTION)
+COMMON = {"SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV"}
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        pytest.param(name, marks=[] if name in COMMON else pytest.mark.nightly)
+        for name in synthetic.DISTORTION
+    ],
+)
 def test_camera_models_become_pinholes(tmp_path, model):
     """Each undistorted pixel shows the distorted image's colour along the same ray."""
     lens = synthetic.camera(model)

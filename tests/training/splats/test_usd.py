@@ -112,7 +112,7 @@ def test_cameras_match_the_views(stage):
     np.testing.assert_allclose([(x + 1) / 2 * 640, (1 - y) / 2 * 480], pixel, atol=1e-2)
 
 
-@pytest.mark.parametrize("ending", [".usdc", ".usdz"])
+@pytest.mark.parametrize("ending", [".usdc", pytest.param(".usdz", marks=pytest.mark.nightly)])
 def test_levels_round_trip(tmp_path, ending):
     bundle = flod(antialias=True)
     export_levels(tmp_path / f"a{ending}", bundle, antialiased=True)
@@ -123,7 +123,7 @@ def test_levels_round_trip(tmp_path, ending):
         assert_equal(level.splats, original.splats)
 
 
-@pytest.mark.parametrize("edited", [False, True])
+@pytest.mark.parametrize("edited", [pytest.param(False, marks=pytest.mark.nightly), True])
 def test_original_place_survives(tmp_path, edited):
     """UTM coordinates return within a tenth of a millimetre, also after another program moved the scene."""
     origin = [448_250.0, 5_411_900.0, 300.0]
@@ -180,7 +180,9 @@ def test_files_of_other_programs_are_read(tmp_path):
     [
         ({"scales": []}, "different lengths"),
         ({"radiance:sphericalHarmonicsDegree": 9}, "SH degree is 9"),
-        ({"radiance:sphericalHarmonicsDegree": 1}, "different lengths"),
+        pytest.param(
+            {"radiance:sphericalHarmonicsDegree": 1}, "different lengths", marks=pytest.mark.nightly
+        ),
     ],
 )
 def test_inconsistent_fields_raise_one_sentence(tmp_path, attributes, reason):
@@ -197,7 +199,7 @@ def test_other_files_are_not_opened(tmp_path):
         read(tmp_path / "b.usdc")
 
 
-@pytest.mark.parametrize("part", [0, 40, 3000, -100])
+@pytest.mark.parametrize("part", [0, 3000, *(pytest.param(n, marks=pytest.mark.nightly) for n in (40, -100))])
 def test_cut_files_raise_one_sentence(tmp_path, part):
     export_levels(tmp_path / "a.usdc", flod())
     (tmp_path / "b.usdc").write_bytes((tmp_path / "a.usdc").read_bytes()[:part])

@@ -71,6 +71,7 @@ class Method(SplatMethod):
         self.decay_start = round(p.begin * p.steps)
         if base is not None:
             self.decay_start = self._densify_until = 0
+        self.device_steps = self.decay_start
         sigma = torch.full((len(tensors["means"]),), p.sigma_init or 1.0, device=self.device)
         rates = splat_rates(p, self.data.extent) | {SIGMA: p.lr_sigma}
         peaks = p.densify_by == "max" or p.prune_oversized
@@ -171,9 +172,6 @@ class Method(SplatMethod):
             drawings.append(ClodDrawing(rendering, s_v, opacities, drawn, in_view))
         return drawings
 
-    def allows_device_step(self, step: int) -> bool:
-        return step < self.decay_start
-
     def random_scale(self, step: int) -> float:
         """Draw a virtual distance scale from 1 to ``s_v_most``."""
         p, share = self.parameters, np.random.default_rng([self.seed, step, 7]).random()
@@ -215,10 +213,10 @@ class Method(SplatMethod):
             require_rows(self.model, step, "tau")
 
     def add_margins(self, step: int) -> None:
-        """Add margins once the decay has begun, which removes splats of low weight in the photos."""
+        """Add margins if due: once the decay has begun, which removes splats of low weight in the photos."""
         if step == self.decay_start > 0:
             rows = self.margin_rows()
-            sigma = self.parameters.sigma_init or float(self.sigma.median())
+            sigma = self.parameters.sigma_init or float(self.sigma.detach().median())
             sigma = torch.full_like(rows["opacity_logits"], sigma)
             self.model.append({**rows, SIGMA: self._encode(sigma)})
 

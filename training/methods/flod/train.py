@@ -10,6 +10,7 @@ from bisect import bisect_right
 from collections.abc import Mapping
 from dataclasses import replace
 from itertools import accumulate
+from math import inf
 from typing import Any
 
 import numpy as np
@@ -50,11 +51,13 @@ class Method(method.Method[FlodParameters, Drawing]):
         completed: completed levels for the end of the run, as tensors by name.
     """
 
+    device_steps = inf
+
     def setup(self, base: Splats | None) -> None:
         p, data = self.parameters, self.data
         s_min_1 = p.s_min_1 or p.footprint * data.median_depth / data.focal
         self.s_min = min_scales(s_min_1, p.rho, p.levels)
-        self._skipped_steps = sum(p.steps[: p.first_level - 1])
+        self._skipped_steps = self.sh_degree.completed = sum(p.steps[: p.first_level - 1])
         self._order = [number for number, _ in p.stages]
         self._ends = list(accumulate(steps for _, steps in p.stages))
         points, colors = drop_duplicates(data.scene.points, data.scene.point_colors)
@@ -131,12 +134,6 @@ class Method(method.Method[FlodParameters, Drawing]):
             progress = self._progress(step)
         return shrink_at(progress, p.first_resolution, p.full_resolution)
 
-    def sh_degree(self, step: int) -> int:
-        return super().sh_degree(self._skipped_steps + step)
-
-    def allows_device_step(self, step: int) -> bool:
-        return True
-
     def render_weights(self, view: TrainingView, step: int) -> tuple[torch.Tensor | None, float]:
         if self.is_finishing(step):
             values = self._finishing_values(step)
@@ -167,9 +164,15 @@ class Method(method.Method[FlodParameters, Drawing]):
         if self.is_finishing(step):
             self._raise_to_min_sizes()
             return
+        completed, end = self._level_step(step) + 1, self._densify_until(step)
+        if completed <= end:
+            self._densify_and_prune(step)
+        if completed - 1 < end <= completed:
+            self._add_margins(self.level_at(step))
+
+    def _densify_and_prune(self, step: int) -> None:
+        """Add, remove and reset splats if due, while the level in training has density control."""
         p, model, level, local = self.parameters, self.model, self.level_at(step), self._level_step(step) + 1
-        if local > self._densify_until(step):
-            return
         old_count, s_min = len(model), self._constraint(level)
         if due(p.densify_interval[level - 1], local) and local >= p.densify_from:
             densify(
@@ -194,12 +197,8 @@ class Method(method.Method[FlodParameters, Drawing]):
                 "Lower 'footprint' (or 's_min_1'), so that coarse levels keep more splats.",
             )
 
-    def add_margins(self, step: int) -> None:
-        """Add margins when the densification of a level ends."""
-        local = self._level_step(step)
-        if self.is_finishing(step) or not local < self._densify_until(step) <= local + 1:
-            return
-        level = self.level_at(step)
+    def _add_margins(self, level: int) -> None:
+        """Add margins to a level."""
         s_min = self._constraint(level)
         log_scales = (self.model["log_scales"].detach().exp() + s_min).log()
         gaussians = replace(self.model.gaussians, log_scales=log_scales)

@@ -67,10 +67,6 @@ class Method(octree_neural.Method):
         """Add the minimum of the current level to the scales of all Gaussians (FLoD, Eq. 4)."""
         self.decoder = replace(self.decoder, min_scale=self.s_min[self.level - 1])
 
-    @property
-    def steps(self) -> int:
-        return self.run_parameters.total_steps
-
     def level_at(self, step: int) -> int:
         return min(bisect_right(self._ends, step) + 1, self.run_parameters.levels)
 

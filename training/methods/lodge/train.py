@@ -74,14 +74,10 @@ class Method(RefiningMethod):
         self.d_l = {p.levels: 0.0}
         self.finished: dict[int, IndexedLevel] = {}
         self.costs: list[dict] = []
-        self.centres, self.radii = np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
+        self._use_chunks(np.zeros((0, 3), np.float32), np.zeros(0, np.float32))
         self.sets: dict[int, list[np.ndarray]] = {}
         self._blocks: BlockIndex | None = None  # blocks of the level in training, as of its last pruning
         self._single_share = p.tune_alone
-
-    @property
-    def steps(self) -> int:
-        return self.tuned_steps + len(self.centres)
 
     @property
     def tuned_steps(self) -> int:
@@ -364,7 +360,12 @@ class Method(RefiningMethod):
         centers = np.array([camera.center for camera in self.data.train])
         count = self.parameters.chunks or chunks.chunk_count(centers, self.d_l[self.levels - 1])
         if count >= (2 if self.parameters.chunks else self.parameters.min_chunks):
-            self.centres, self.radii = chunks.place_chunks(centers, count, self.seed)
+            self._use_chunks(*chunks.place_chunks(centers, count, self.seed))
+
+    def _use_chunks(self, centres: np.ndarray, radii: np.ndarray) -> None:
+        """Set the chunks, (K, 3) and (K,). Each takes a step at the end of the run."""
+        self.centres, self.radii = centres, radii
+        self.steps = self.tuned_steps + len(centres)
 
     @torch.no_grad()
     def _chunk_step(self, step: int) -> StepResult:
@@ -447,7 +448,7 @@ class Method(RefiningMethod):
         if blocks := state["blocks"]:
             bounds = (blocks[name].numpy() for name in ("low", "high", "reach"))
             self._blocks = BlockIndex.from_bounds(blocks["count"], *bounds)
-        self.centres, self.radii = state["centres"].numpy(), state["radii"].numpy()
+        self._use_chunks(state["centres"].numpy(), state["radii"].numpy())
         self.sets = {
             number: [
                 members.astype(bool)

@@ -46,6 +46,7 @@ class Method(SplatMethod):
         self.order_start = round(p.begin * p.steps)
         if base is not None:
             self.order_start = self._densify_until = 0
+        self.device_steps = self.order_start
         self.model = self._new_model({name: self.model[name].detach() for name in NAMES})
 
     def _new_model(self, tensors: Mapping[str, torch.Tensor]) -> Model:
@@ -92,9 +93,6 @@ class Method(SplatMethod):
         return np.where(views > 0, total / np.maximum(views, 1), nearest).astype(np.float32)
 
     # -- steps -----------------------------------------------------------------------------------------
-
-    def allows_device_step(self, step: int) -> bool:
-        return step < self.order_start
 
     def begin_step(self, step: int) -> None:
         """Compute the order if due."""

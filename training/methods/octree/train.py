@@ -8,6 +8,7 @@ rounded in training.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import inf
 
 import numpy as np
 import torch
@@ -51,6 +52,7 @@ class Method(method.Method[OctreeParameters, Drawing]):
         zeros = torch.zeros(len(points), device=self.device)
         levels = torch.from_numpy(level).float().to(self.device)
         columns = {"level": levels, "bias": zeros, MARGIN: torch.zeros_like(levels, dtype=torch.bool)}
+        self.device_steps = 0 if p.volume_weight else inf
         self._rates = splat_rates(p, self.data.extent)
         self.model = Model(tensors, self._rates, columns, stats={"opacity_sum": zeros.clone()})
 
@@ -79,9 +81,6 @@ class Method(method.Method[OctreeParameters, Drawing]):
         dropout = self.dropout.weights(len(weights), step, step / self.parameters.steps)
         return (weights if dropout is None else weights * dropout), 0.0
 
-    def allows_device_step(self, step: int) -> bool:
-        return not self.parameters.volume_weight
-
     def collects_stats(self, view: TrainingView, step: int) -> bool:
         return self.schedule.collects_stats(view, step)
 
@@ -106,14 +105,15 @@ class Method(method.Method[OctreeParameters, Drawing]):
             self.prune_unseen(step)
         if self.schedule.reassigns_after(step):
             self.reassign_levels(step)
-
-    def add_margins(self, step: int) -> None:
-        """Add margins to the coarsest level, for all distances, when growth ends."""
         if self.schedule.is_growing(step) and not self.schedule.is_growing(step + 1):
-            room = self.parameters.margin_room(self.parameters.splat_limit)
-            rows = vars(self.margins.extend(self.model.gaussians, room))
-            ones = torch.ones_like(rows["opacity_logits"])
-            self.model.append({**rows, "level": ones, MARGIN: ones.bool()})
+            self._add_margins()
+
+    def _add_margins(self) -> None:
+        """Add margins to the coarsest level, for all distances."""
+        room = self.parameters.margin_room(self.parameters.splat_limit)
+        rows = vars(self.margins.extend(self.model.gaussians, room))
+        ones = torch.ones_like(rows["opacity_logits"])
+        self.model.append({**rows, "level": ones, MARGIN: ones.bool()})
 
     # -- anchors ---------------------------------------------------------------------------------------
 

@@ -356,8 +356,6 @@ class Method(method.Method[NeuralOctreeParameters, NeuralDrawing]):
 
     def with_margins(self, baked: Splats) -> Splats:
         """Add margin splats to baked splats, in the coarsest level."""
-        if not self.parameters.margin or self.data.transparent:
-            return baked
         room = self.parameters.margin_room(self.parameters.splat_limit)
         margins = self.margins.extend(Gaussians.of(baked, self.device), room)
         level, bias = np.ones(len(margins), np.uint8), np.zeros(len(margins), np.float32)

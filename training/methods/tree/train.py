@@ -141,10 +141,6 @@ class Method(RefiningMethod):
         return self.steps
 
     @property
-    def steps(self) -> int:
-        return self.finest_steps + self.parameters.base_steps
-
-    @property
     def splats(self) -> int:
         if self.store is not None:
             return len(self.store)

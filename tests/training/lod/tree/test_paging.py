@@ -64,7 +64,7 @@ def truth():
     return Truth(tree_of(random_leaves(LEAVES, np.random.default_rng(1), degree=1)))
 
 
-@pytest.fixture(params=["by octaves", "by size", "with a table"])
+@pytest.fixture(params=["by octaves", "with a table", pytest.param("by size", marks=pytest.mark.nightly)])
 def path(request, truth, tmp_path):
     bundle, tables = truth.bundle, {}
     if request.param != "by size":

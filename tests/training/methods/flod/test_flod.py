@@ -278,7 +278,7 @@ def test_enlarged_splats_become_fainter(data):
             assert np.ptp(growth[block == number]) < 0.05 * growth[block == number].max() <= 0.25
 
 
-@pytest.mark.parametrize("drawn", [0.5, 0.8])
+@pytest.mark.parametrize("drawn", [0.5, pytest.param(0.8, marks=pytest.mark.nightly)])
 def test_views_by_distance_respect_drawn_limit(data, drawn):
     flod, completed = train_until_finishing(data, footprint=1.0, drawn=drawn)
     levels = finish.split_levels(flod.model, flod.s_min)

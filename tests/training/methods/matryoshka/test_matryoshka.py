@@ -97,7 +97,7 @@ def test_levels_are_prefixes(data):
     np.testing.assert_array_equal(means, method.model["means"].detach()[method.order()].numpy())
 
 
-@pytest.mark.parametrize("drawn", [0.3, 0.6])
+@pytest.mark.parametrize("drawn", [0.3, pytest.param(0.6, marks=pytest.mark.nightly)])
 def test_fraction_drawn_at_the_view_distance(data, drawn):
     method = make(data, drawn=drawn)
     bundle = bundle_of(method, trained(method))
