@@ -39,7 +39,7 @@ PIP_OPTIONS = ("--progress-bar=raw", "--resume-retries=5")
 """Options that report the progress of downloads and resume interrupted ones."""
 
 MODULES = (
-    "torch", "numba", "scipy", "pycolmap", "OpenEXR", "PIL", "plyfile", "wgpu", "distributed",
+    "torch", "numba", "scipy", "pycolmap", "OpenEXR", "PIL", "plyfile", "torchmetrics", "wgpu", "distributed",
     "cryptography", "pxr",
 )  # fmt: skip
 """Modules that a new environment must import before it is used."""

@@ -15,7 +15,7 @@ def test_lock_without_cuda_keeps_all_other_packages():
     removed = names - remaining
     assert {"torch", "triton", "cuda-toolkit", "nvidia-cublas", "nvidia-nccl-cu13"} <= removed
     assert all(name in ("torch", "triton") or name.startswith(("nvidia-", "cuda-")) for name in removed)
-    assert {"numba", "numpy", "distributed"} <= remaining
+    assert {"torchmetrics", "numba", "numpy", "distributed"} <= remaining
     assert packages.without_cuda(lock).count("numpy==") == lock.count("numpy==")
 
 

@@ -5,16 +5,11 @@ from __future__ import annotations
 import math
 
 import torch
-from torch.nn.functional import conv2d, pad
 
 MAX_PSNR = 100.0
 """PSNR of equal images in dB, which keeps means over views finite."""
 MASK_THRESHOLD = 0.5
 """Pixels count if their mask exceeds this value."""
-WINDOW, SIGMA = 11, 1.5
-"""Side and standard deviation of the windows of SSIM, in pixels."""
-C1, C2 = 0.01**2, 0.03**2
-"""Constants of SSIM that keep its fractions finite."""
 
 
 def to_8_bit(image: torch.Tensor) -> torch.Tensor:
@@ -49,24 +44,17 @@ def fit_exposure(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor |
 
 
 def ssim(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> float:
-    """Return the structural similarity (Wang et al. 2004) of (H, W, 3) images.
+    """Return the structural similarity of (H, W, 3) images, 11x11 Gaussian window of sigma 1.5.
 
-    The Gaussian windows have 11x11 pixels and sigma 1.5. Images are reflected at their edges, as in
-    torchmetrics.
+    Wang et al. 2004.
 
     Args:
         mask: (H, W); pixels up to MASK_THRESHOLD are replaced with the target.
     """
-    x, y = (to_8_bit(i).permute(2, 0, 1) for i in (replace_masked(image, target, mask), target))
-    window = torch.exp(-((torch.arange(WINDOW) - WINDOW // 2) ** 2) / (2 * SIGMA**2)).to(x)
-    window /= window.sum()
-    x, y = (pad(i, 4 * [WINDOW // 2], mode="reflect") for i in (x, y))
-    moments = torch.stack([x, y, x * x, y * y, x * y])[:, :, None].flatten(0, 1)
-    moments = conv2d(conv2d(moments, window[None, None, :, None]), window[None, None, None])
-    mean_x, mean_y, xx, yy, xy = moments.unflatten(0, (5, 3))
-    variances = (xx - mean_x**2).clamp_min(0) + (yy - mean_y**2).clamp_min(0)
-    means = (2 * mean_x * mean_y + C1) / (mean_x**2 + mean_y**2 + C1)
-    return float((means * (2 * (xy - mean_x * mean_y) + C2) / (variances + C2)).mean())
+    from torchmetrics.functional.image import structural_similarity_index_measure
+
+    pair = [to_8_bit(x).permute(2, 0, 1)[None] for x in (replace_masked(image, target, mask), target)]
+    return float(structural_similarity_index_measure(*pair, data_range=1.0))  # type: ignore[arg-type]
 
 
 def replace_masked(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
