@@ -77,10 +77,19 @@ def _table_columns(obj: bpy.types.Object | None) -> tuple[tuple[str, str, bytes]
 def only_lodgs_modifiers(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bool:
     """Return True if no modifiers other than those of :func:`evaluated_query` act on an evaluated object."""
     return all(
-        modifier.type == "NODES" and (modifier.name == display.NAME or _selects(modifier.node_group))
-        for modifier in evaluated.modifiers
-        if _is_on(modifier, depsgraph)
+        _is_lodgs_modifier(modifier) for modifier in evaluated.modifiers if _is_on(modifier, depsgraph)
     )
+
+
+def _is_lodgs_modifier(modifier: bpy.types.Modifier) -> bool:
+    return modifier.type == "NODES" and (
+        modifier.name in (display.NAME, display.VIEWPORT) or _selects(modifier.node_group)
+    )
+
+
+def _has_other_modifiers(obj: bpy.types.Object) -> bool:
+    """Return whether an object has modifiers of artists, which may read every attribute."""
+    return not all(display.is_display(item) or _is_lodgs_modifier(item) for item in obj.modifiers)
 
 
 def _selects(group: bpy.types.NodeTree | None) -> bool:
@@ -187,11 +196,15 @@ def _order(root: bpy.types.Object) -> None:
     """Put the modifiers of levels into the order in which they work.
 
     Crops come before a rule that depends on the number of splats, and otherwise after it, since fewer splats
-    remain there. Weights are applied last.
+    remain there. Weights are applied last. Without modifiers of artists, harmonics are dropped first in
+    viewports that do not need them: removing splats copies all attributes of the others.
     """
     for item in root.lodgs.levels:
         if item.exists:
-            display.keep_last(item.object)
+            copies = crops.modifier_of(item.object) or rule_modifier(item.object)
+            if copies and not _has_other_modifiers(item.object):
+                display.drop_harmonics(item.object)
+            display.keep_order(item.object)
     rule = find_rule(root.lodgs.rule)
     for item in root.lodgs.levels if rule else ():
         cropping, rule_modifiers = (
@@ -215,6 +228,9 @@ def outdated(root: bpy.types.Object) -> bool:
 
 def update_inputs(root: bpy.types.Object) -> None:
     """Set the modifier inputs that cannot be driven: camera object, tables and materials."""
+    for item in root.lodgs.levels:
+        if item.exists and display.VIEWPORT in item.object.modifiers and _has_other_modifiers(item.object):
+            display.keep_harmonics(item.object)
     for modifier, name, value in _object_inputs(root):
         _set(modifier, name, value, lambda current, value: current == value)
 
