@@ -24,7 +24,7 @@ from ..nodes import crops as crop_groups
 from ..nodes import display
 from ..nodes import look as look_groups
 from ..nodes import rules as groups
-from ..nodes.building import remove_modifier, replace_driver
+from ..nodes.building import read_scene, remove_modifier, replace_driver
 from ..nodes.camera_choices import CHOICES, find_choice, position_expression
 from . import crops, looks
 from .placement import axes_of
@@ -321,8 +321,8 @@ def _drive(
     without: Mapping[str, float] | None = None,
     index: int = -1,
     **sources: str,
-) -> None:
-    """Drive a property by an expression of the root's properties.
+) -> bpy.types.Driver:
+    """Drive a property by an expression of the root's properties, and return the driver.
 
     Args:
         index: component of a vector.
@@ -338,12 +338,14 @@ def _drive(
         target.id, target.data_path = root, f"lodgs.{source}"
         if without is not None:
             target.use_fallback_value, target.fallback_value = True, without.get(name, 0)
+    return driver
 
 
 def _drive_visibility(root: bpy.types.Object, index: int, item, rule: Rule | None) -> None:
     """Show a level where its rule uses it, or where it is the single level or adds to it.
 
-    If the extension is missing, the finest level is shown, so that the file does not appear empty.
+    If the extension is missing, the finest level is shown, so that the file does not appear empty. A scene
+    that renders meshes for another one shows no splats to the camera, also in instances.
     """
     number, sources = item.number, {"show": f"levels[{index}].show"}
     sources |= {name: name for name in ("mode", "single_level", "cumulative")}
@@ -356,8 +358,14 @@ def _drive_visibility(root: bpy.types.Object, index: int, item, rule: Rule | Non
     finest = max(level.number for level in root.lodgs.levels if level.exists)
     without = {"show": 1, "single_level": finest, "cumulative": root.lodgs.cumulative}
     for path in ("hide_viewport", "hide_render"):
-        expression = f"0 if show and (({in_use}) or (mode == 0 and ({is_single}))) else 1"
-        _drive(item.object, path, root, expression, without, **sources)
+        hidden = "hidden or " if path == "hide_render" else ""
+        expression = f"{hidden}not (show and (({in_use}) or (mode == 0 and ({is_single}))))"
+        driver = _drive(item.object, path, root, expression, without, **sources)
+        if hidden:
+            read_scene(driver, "hidden", "lodgs_render.hides_splats")
+    read_scene(
+        replace_driver(item.object, "visible_camera", "not hidden"), "hidden", "lodgs_render.is_for_meshes"
+    )
 
 
 def _drive_level(root: bpy.types.Object, obj: bpy.types.Object, rule: Rule, facts: Mapping) -> None:

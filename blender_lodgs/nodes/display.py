@@ -24,6 +24,7 @@ from .building import (
     add_switched_modifier,
     ensure_group,
     is_edited,
+    read_scene,
     remove_modifier,
     replace_driver,
 )
@@ -65,11 +66,7 @@ def attach(obj: bpy.types.Object) -> None:
         if is_native:
             compat.set_input(modifier, MATERIAL, points_material())
             driver = replace_driver(obj, compat.input_path(modifier, _HIDE_POINTS), "on")
-            variable = driver.variables.new()
-            variable.name, variable.type = "on", "CONTEXT_PROP"
-            variable.targets[0].context_property = "ACTIVE_SCENE"
-            variable.targets[0].data_path = "lodgs_viewport.splats"
-            variable.targets[0].use_fallback_value = True
+            read_scene(driver, "on", "lodgs_viewport.splats")
     if is_native and _is_outdated(obj, NATIVE, native_group):
         add_switched_modifier(
             obj,

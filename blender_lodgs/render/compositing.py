@@ -90,6 +90,7 @@ def combine_with_meshes(scene: bpy.types.Scene, mesh_engine: str = "CYCLES") -> 
         meshes.cycles.samples = SAMPLES
         scene.lodgs_render.before_meshes = json.dumps(previous)
     engine.use(scene)
+    meshes.lodgs_render.is_for_meshes = True
     for rendered in (scene, meshes):
         rendered.render.film_transparent = True
         for layer in rendered.view_layers:
