@@ -18,6 +18,8 @@ import numpy as np
 
 BASE, SCALE, ROTATION = "radiance:base", "scale", "rotation"
 _SH = "radiance:sh_{}"
+HIGHER_SH = _SH.format("*")
+"""Pattern of the names of all coefficients above degree 0."""
 LOG_SCALE, OPACITY_LOGIT, QUATERNION = "log_scale", "opacity_logit", "quaternion"
 COLOR, RADIUS, WEIGHT, HIDDEN = "display_color", "radius", "lod_weight", "hidden"
 SELECTION = ".selection"

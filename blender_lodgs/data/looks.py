@@ -178,7 +178,7 @@ def _attach(obj: bpy.types.Object, root: bpy.types.Object, regions: list[bpy.typ
     last = obj.modifiers.find(ellipsoids.NAME)
     if last >= 0:
         obj.modifiers.move(len(obj.modifiers) - 1, last)
-    display.keep_last(obj)
+    display.keep_order(obj)
     for number, source in enumerate((root, *regions)):
         if number:
             crops.follow(obj, modifier, number, source)

@@ -89,15 +89,14 @@ def new_points(name: str, positions: np.ndarray, colors: np.ndarray, radius: flo
 def new_splats(name: str, splats: Splats) -> bpy.types.Object:
     """Create an object of splats, not yet in a collection; its local space is the splats' world."""
     cloud = compat.new_point_cloud(name, len(splats))
-    opacity = _sigmoid(splats.opacity_logits)
-    scale = _exp(splats.log_scales)
     base = np.empty((len(splats), 4), np.float32)
-    base[:, :3], base[:, 3] = splats.sh[:, 0], opacity
+    base[:, :3], base[:, 3] = splats.sh[:, 0], _sigmoid(splats.opacity_logits)
     write_attribute(cloud, "position", "FLOAT_VECTOR", splats.means)
     write_attribute(cloud, BASE, compat.WIDE_TYPE, base)
+    del base  # frees memory before further attributes need it
     for k in range(1, splats.sh.shape[1]):
         write_attribute(cloud, sh_name(k), "FLOAT_VECTOR", splats.sh[:, k])
-    write_attribute(cloud, SCALE, "FLOAT_VECTOR", scale)
+    write_attribute(cloud, SCALE, "FLOAT_VECTOR", _exp(splats.log_scales))
     write_attribute(cloud, ROTATION, "QUATERNION", _unit(splats.quats))
     for column, values in splats.extras.items():
         reserved = column in _OWN or column.startswith((".", _EXTRA, "radiance:"))

@@ -297,7 +297,7 @@ def central_bounds(root: bpy.types.Object) -> tuple[Vector, float] | None:
     points = _central_points(root)
     if not len(points):
         return None
-    low, high = np.percentile(points, (5, 95), axis=0)
+    low, high = np.percentile(points[:: max(len(points) // 100_000, 1)], (5, 95), axis=0)
     size = float(np.linalg.norm(high - low)) * max(matrix_in_parent(root).to_scale())
     return matrix_in_parent(root) @ Vector((low + high) / 2), size
 

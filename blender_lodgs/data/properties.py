@@ -247,6 +247,20 @@ class RenderSettings(bpy.types.PropertyGroup):
         subtype="FILE_PATH",
         options={"PATH_SUPPORTS_BLEND_RELATIVE"},
     )
+    is_for_meshes: bpy.props.BoolProperty(
+        description="This scene renders the meshes for another scene", options={"HIDDEN"}
+    )
+    hides_splats: bpy.props.BoolProperty(
+        description="Renders of this scene show no splats, not even indirectly",
+        get=lambda self: self.is_for_meshes and not self.ellipsoids,
+        options={"HIDDEN"},
+    )
+    shadows: bpy.props.BoolProperty(
+        name="Splat Shadows",
+        description="Let splats shadow and light the meshes: Cycles draws them as ellipsoids that the camera "
+        "does not see. Suits up to some hundred thousand splats",
+        update=look_up("shadows"),
+    )
     samples: bpy.props.IntProperty(
         name="Samples",
         description="Number of images that depth of field and motion blur average. Raise it if blurred edges "

@@ -24,7 +24,7 @@ from ...training.splats.levels import Bundle, Level
 from ...training.splats.origin import describe_origin
 from .. import compat, extension
 from ..attributes import HIDDEN, write_attribute
-from ..nodes import ellipsoids
+from ..nodes import display, ellipsoids
 from . import cleaning, crops, looks, objects, painting, selection, streams, tables
 from .controls import changed_controls, update_controls
 from .photographs import camera_of, is_held_out, views, views_with_photo
@@ -268,7 +268,8 @@ def visible_splats(
         LodgsError: no splats are visible, or the levels differ in their degree of spherical harmonics; for
             placed splats also if the root is scaled differently along its axes.
     """
-    with _without_native_drawing(context):
+    levels = [item.object for item in root.lodgs.levels if item.exists]
+    with _without_native_drawing(context), display.with_harmonics(context, levels):
         depsgraph = context.evaluated_depsgraph_get()
         parts = [
             objects.read_splats(item.object, depsgraph)

@@ -24,7 +24,7 @@ from ..nodes import crops as crop_groups
 from ..nodes import display
 from ..nodes import look as look_groups
 from ..nodes import rules as groups
-from ..nodes.building import remove_modifier, replace_driver
+from ..nodes.building import read_scene, remove_modifier, replace_driver
 from ..nodes.camera_choices import CHOICES, find_choice, position_expression
 from . import crops, looks
 from .placement import axes_of
@@ -77,10 +77,19 @@ def _table_columns(obj: bpy.types.Object | None) -> tuple[tuple[str, str, bytes]
 def only_lodgs_modifiers(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bool:
     """Return True if no modifiers other than those of :func:`evaluated_query` act on an evaluated object."""
     return all(
-        modifier.type == "NODES" and (modifier.name == display.NAME or _selects(modifier.node_group))
-        for modifier in evaluated.modifiers
-        if _is_on(modifier, depsgraph)
+        _is_lodgs_modifier(modifier) for modifier in evaluated.modifiers if _is_on(modifier, depsgraph)
     )
+
+
+def _is_lodgs_modifier(modifier: bpy.types.Modifier) -> bool:
+    return modifier.type == "NODES" and (
+        modifier.name in (display.NAME, display.VIEWPORT) or _selects(modifier.node_group)
+    )
+
+
+def _has_other_modifiers(obj: bpy.types.Object) -> bool:
+    """Return whether an object has modifiers of artists, which may read every attribute."""
+    return not all(display.is_display(item) or _is_lodgs_modifier(item) for item in obj.modifiers)
 
 
 def _selects(group: bpy.types.NodeTree | None) -> bool:
@@ -187,11 +196,15 @@ def _order(root: bpy.types.Object) -> None:
     """Put the modifiers of levels into the order in which they work.
 
     Crops come before a rule that depends on the number of splats, and otherwise after it, since fewer splats
-    remain there. Weights are applied last.
+    remain there. Weights are applied last. Without modifiers of artists, harmonics are dropped first in
+    viewports that do not need them: removing splats copies all attributes of the others.
     """
     for item in root.lodgs.levels:
         if item.exists:
-            display.keep_last(item.object)
+            copies = crops.modifier_of(item.object) or rule_modifier(item.object)
+            if copies and not _has_other_modifiers(item.object):
+                display.drop_harmonics(item.object)
+            display.keep_order(item.object)
     rule = find_rule(root.lodgs.rule)
     for item in root.lodgs.levels if rule else ():
         cropping, rule_modifiers = (
@@ -215,6 +228,9 @@ def is_outdated(root: bpy.types.Object) -> bool:
 
 def update_inputs(root: bpy.types.Object) -> None:
     """Set the modifier inputs that cannot be driven: camera object, tables and materials."""
+    for item in root.lodgs.levels:
+        if item.exists and display.VIEWPORT in item.object.modifiers and _has_other_modifiers(item.object):
+            display.keep_harmonics(item.object)
     for modifier, name, value in _object_inputs(root):
         _set(modifier, name, value, lambda current, value: current == value)
 
@@ -305,8 +321,8 @@ def _drive(
     without: Mapping[str, float] | None = None,
     index: int = -1,
     **sources: str,
-) -> None:
-    """Drive a property by an expression of the root's properties.
+) -> bpy.types.Driver:
+    """Drive a property by an expression of the root's properties, and return the driver.
 
     Args:
         index: component of a vector.
@@ -322,12 +338,14 @@ def _drive(
         target.id, target.data_path = root, f"lodgs.{source}"
         if without is not None:
             target.use_fallback_value, target.fallback_value = True, without.get(name, 0)
+    return driver
 
 
 def _drive_visibility(root: bpy.types.Object, index: int, item, rule: Rule | None) -> None:
     """Show a level where its rule uses it, or where it is the single level or adds to it.
 
-    If the extension is missing, the finest level is shown, so that the file does not appear empty.
+    If the extension is missing, the finest level is shown, so that the file does not appear empty. A scene
+    that renders meshes for another one shows no splats to the camera, also in instances.
     """
     number, sources = item.number, {"show": f"levels[{index}].show"}
     sources |= {name: name for name in ("mode", "single_level", "cumulative")}
@@ -340,8 +358,14 @@ def _drive_visibility(root: bpy.types.Object, index: int, item, rule: Rule | Non
     finest = max(level.number for level in root.lodgs.levels if level.exists)
     without = {"show": 1, "single_level": finest, "cumulative": root.lodgs.cumulative}
     for path in ("hide_viewport", "hide_render"):
-        expression = f"0 if show and (({in_use}) or (mode == 0 and ({is_single}))) else 1"
-        _drive(item.object, path, root, expression, without, **sources)
+        hidden = "hidden or " if path == "hide_render" else ""
+        expression = f"{hidden}not (show and (({in_use}) or (mode == 0 and ({is_single}))))"
+        driver = _drive(item.object, path, root, expression, without, **sources)
+        if hidden:
+            read_scene(driver, "hidden", "lodgs_render.hides_splats")
+    read_scene(
+        replace_driver(item.object, "visible_camera", "not hidden"), "hidden", "lodgs_render.is_for_meshes"
+    )
 
 
 def _drive_level(root: bpy.types.Object, obj: bpy.types.Object, rule: Rule, facts: Mapping) -> None:

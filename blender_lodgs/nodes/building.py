@@ -352,10 +352,14 @@ def add_switched_modifier(
     modifier.node_group, modifier.show_expanded = group, False
     modifier.show_viewport = modifier.show_render = False
     for switch, path in switches.items():
-        driver = replace_driver(obj, f'modifiers["{modifier.name}"].{switch}', "on")
-        variable = driver.variables.new()
-        variable.name, variable.type = "on", "CONTEXT_PROP"
-        target = variable.targets[0]
-        target.context_property, target.data_path = "ACTIVE_SCENE", path
-        target.use_fallback_value, target.fallback_value = True, 0.0
+        read_scene(replace_driver(obj, f'modifiers["{modifier.name}"].{switch}', "on"), "on", path)
     return modifier
+
+
+def read_scene(driver: bpy.types.Driver, name: str, path: str) -> None:
+    """Give a driver a variable with a property of the active scene; 0 if this extension is missing."""
+    variable = driver.variables.new()
+    variable.name, variable.type = name, "CONTEXT_PROP"
+    target = variable.targets[0]
+    target.context_property, target.data_path = "ACTIVE_SCENE", path
+    target.use_fallback_value, target.fallback_value = True, 0.0

@@ -2,7 +2,8 @@
 
 "LODGS Display" hides Blender's drawing in viewports that LODGS draws, and turns splats into coloured points
 there. "LODGS Native Splats" applies the level-of-detail weights and the opacity of looks where Blender 5.3 or
-later draws the splats itself: its own drawing reads opacities from ``radiance:base`` only.
+later draws the splats itself: its own drawing reads opacities from ``radiance:base`` only. "LODGS Viewport"
+drops the harmonics in viewports that LODGS draws, because crops and rules would copy them at every change.
 
 Before Blender 5.3 splat clouds carry the material of points. From 5.3 on they carry none, since a material
 would replace the splats' own colours; the group sets it instead, or the artist's own material.
@@ -10,22 +11,28 @@ would replace the splats' own colours; the group sets it instead, or the artist'
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+
 import bpy
 
 from .. import compat
-from ..attributes import BASE, COLOR, LOOK_OPACITY, WEIGHT
+from ..attributes import BASE, COLOR, HIGHER_SH, LOOK_OPACITY, WEIGHT
 from . import ellipsoids
 from .building import (
     Nodes,
     add_switched_modifier,
     ensure_group,
     is_edited,
+    read_scene,
     remove_modifier,
     replace_driver,
 )
 
 NAME = "LODGS Display"
 NATIVE = "LODGS Native Splats"
+VIEWPORT = "LODGS Viewport"
+_NAMES = NAME, NATIVE, VIEWPORT
 _POINTS = "LODGS Points"
 MATERIAL = "material"
 _HIDE_POINTS = "Hide Points"
@@ -41,6 +48,11 @@ def native_group() -> bpy.types.GeometryNodeTree:
     return ensure_group(NATIVE, 1, _build_native)
 
 
+def viewport_group() -> bpy.types.GeometryNodeTree:
+    """Return the group that drops the spherical harmonics above degree 0."""
+    return ensure_group(VIEWPORT, 1, _build_viewport)
+
+
 def attach(obj: bpy.types.Object) -> None:
     """Give a splat object its display modifiers; those of other Blender versions are replaced.
 
@@ -54,11 +66,7 @@ def attach(obj: bpy.types.Object) -> None:
         if is_native:
             compat.set_input(modifier, MATERIAL, points_material())
             driver = replace_driver(obj, compat.input_path(modifier, _HIDE_POINTS), "on")
-            variable = driver.variables.new()
-            variable.name, variable.type = "on", "CONTEXT_PROP"
-            variable.targets[0].context_property = "ACTIVE_SCENE"
-            variable.targets[0].data_path = "lodgs_viewport.splats"
-            variable.targets[0].use_fallback_value = True
+            read_scene(driver, "on", "lodgs_viewport.splats")
     if is_native and _is_outdated(obj, NATIVE, native_group):
         add_switched_modifier(
             obj,
@@ -68,7 +76,40 @@ def attach(obj: bpy.types.Object) -> None:
         )
     elif not is_native and (modifier := obj.modifiers.get(NATIVE)) is not None:
         remove_modifier(obj, modifier)
-    keep_last(obj)
+    keep_order(obj)
+
+
+def drop_harmonics(obj: bpy.types.Object) -> None:
+    """Give a splat object *LODGS Viewport*, on in viewports that Blender does not draw."""
+    if _is_outdated(obj, VIEWPORT, viewport_group):
+        add_switched_modifier(obj, viewport_group(), show_viewport="lodgs_viewport.hides_blender")
+
+
+def keep_harmonics(obj: bpy.types.Object) -> None:
+    """Remove *LODGS Viewport*, so that other modifiers and Python read complete splats in viewports."""
+    modifier = obj.modifiers.get(VIEWPORT)
+    if modifier is not None:
+        remove_modifier(obj, modifier)
+
+
+@contextmanager
+def with_harmonics(context: bpy.types.Context, objects: Iterable[bpy.types.Object]) -> Iterator[None]:
+    """Evaluate splat objects without *LODGS Viewport* within the block."""
+    changed = [obj for obj in objects if VIEWPORT in obj.modifiers]
+    for obj in changed:
+        keep_harmonics(obj)
+    context.view_layer.update()
+    try:
+        yield
+    finally:
+        for obj in changed:
+            drop_harmonics(obj)
+            keep_order(obj)
+
+
+def is_display(modifier: bpy.types.Modifier) -> bool:
+    """Return whether a modifier is one of this module or that of ellipsoids."""
+    return modifier.name in (*_NAMES, ellipsoids.NAME)
 
 
 def is_drawn_by_blender(evaluated: bpy.types.Object) -> bool:
@@ -80,8 +121,14 @@ def is_drawn_by_blender(evaluated: bpy.types.Object) -> bool:
     return compat.is_native(evaluated.data) and not (modifier is not None and modifier.show_viewport)
 
 
-def keep_last(obj: bpy.types.Object) -> None:
-    """Move the display modifiers behind those whose weights they apply, but before that of ellipsoids."""
+def keep_order(obj: bpy.types.Object) -> None:
+    """Move *LODGS Viewport* before the modifiers that remove splats, and the others behind them.
+
+    Those stay before the modifier of ellipsoids.
+    """
+    index = obj.modifiers.find(VIEWPORT)
+    if index > 0:
+        obj.modifiers.move(index, 0)
     for name in (NAME, NATIVE):
         index = obj.modifiers.find(name)
         end = obj.modifiers.find(ellipsoids.NAME)
@@ -149,6 +196,17 @@ def _build_display(nodes: Nodes) -> None:
     radius.inputs["Radius"].default_value = 0.0
     nodes.link(points, radius, "Points")
     nodes.link(radius.outputs["Points"], nodes.add("NodeGroupOutput"), "Geometry")
+
+
+def _build_viewport(nodes: Nodes) -> None:
+    remove = nodes.add("GeometryNodeRemoveAttribute")
+    if "Pattern Mode" in remove.inputs:
+        remove.inputs["Pattern Mode"].default_value = "Wildcard"
+    else:
+        remove.pattern_mode = "WILDCARD"
+    remove.inputs["Name"].default_value = HIGHER_SH
+    nodes.link(nodes.add("NodeGroupInput").outputs[0], remove, "Geometry")
+    nodes.link(remove.outputs["Geometry"], nodes.add("NodeGroupOutput"), "Geometry")
 
 
 def _build_native(nodes: Nodes) -> None:

@@ -9,7 +9,7 @@ from ...training.scenes.cameras import write_camera
 from ..data import cameras, roots, selection
 from ..data.paths import absolute_path
 from ..render import compositing, engine, viewport_quality
-from .base import report_errors, show_image
+from .base import SceneOperator, report_errors, show_image
 from .modal import FrameOperator
 
 
@@ -56,6 +56,20 @@ class LODGS_OT_separate_meshes(bpy.types.Operator):
     @report_errors
     def execute(self, context):
         compositing.separate_meshes(context.scene)
+        return {"FINISHED"}
+
+
+class LODGS_OT_add_shadow_catcher(SceneOperator, bpy.types.Operator):
+    """Add a plane on the detected ground of the splat scene that shows the shadows of the meshes"""
+
+    bl_idname = "lodgs.add_shadow_catcher"
+    bl_label = "Add Shadow Catcher"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @report_errors
+    def execute(self, context):
+        obj = compositing.add_shadow_catcher(roots.active_root(context), context.scene)
+        self.report({"INFO"}, f"'{obj.name}' added at the detected ground")
         return {"FINISHED"}
 
 
@@ -138,6 +152,7 @@ CLASSES = (
     LODGS_OT_use_engine,
     LODGS_OT_combine_with_meshes,
     LODGS_OT_separate_meshes,
+    LODGS_OT_add_shadow_catcher,
     LODGS_OT_render_mesh_depth,
     LODGS_OT_render_quick,
     LODGS_OT_export_camera,

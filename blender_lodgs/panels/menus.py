@@ -15,7 +15,7 @@ OPERATORS = (
     ("lodgs.look_through", "lodgs.compare_view", "lodgs.compare_worst", "lodgs.measure_views",
      "lodgs.cancel_measuring", "lodgs.show_evidence", "lodgs.compare_methods"),
     ("lodgs.use_engine", "lodgs.render_quick", "lodgs.combine_with_meshes", "lodgs.separate_meshes",
-     "lodgs.render_mesh_depth", "lodgs.export_camera"),
+     "lodgs.add_shadow_catcher", "lodgs.render_mesh_depth", "lodgs.export_camera"),
     ("lodgs.reload_splats", "lodgs.add_to_scene", "lodgs.capture_scene", "lodgs.import_capture",
      "lodgs.reset_look", "lodgs.tint_by_light", "lodgs.remove_paint", "lodgs.remove_scene"),
 )  # fmt: skip

@@ -122,7 +122,10 @@ def _draw_meshes(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
         return
     column.label(text=f"Meshes: '{meshes.name}'", icon="NODE_COMPOSITING")
     if meshes.render.engine == "CYCLES":
-        split_column(column).prop(meshes.cycles, "samples", text="Samples")
+        settings = split_column(column)
+        settings.prop(meshes.cycles, "samples", text="Samples")
+        settings.prop(scene.lodgs_render, "shadows")
+        column.operator("lodgs.add_shadow_catcher", icon="MESH_PLANE")
     row = column.row(align=True)
     row.operator("lodgs.combine_with_meshes", text="Update", icon="FILE_REFRESH")
     row.operator("lodgs.separate_meshes", text="Remove", icon="X")

@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from functools import cache
 from pathlib import Path
 
 import bpy
+import numpy as np
+from mathutils import Matrix, Vector
 
 from ...training.errors import LodgsError
+from ...training.scenes.ground import find_ground
 from .. import compat
-from ..data import roots, selection
+from ..data import cleaning, ground, roots, selection
 from ..data.cameras import scene_camera
+from ..data.placement import placement_of
+from ..data.properties import RenderSettings
+from ..data.property_callbacks import ON_CHANGE
 from . import engine
 
 _COPIED = (
@@ -31,11 +37,17 @@ _NODES = {
     ALPHA_OVER, MIN_DEPTH, "CompositorNodeAntiAliasing", compat.COMPOSITOR_MATH, compat.COMPOSITOR_MIX,
     "CompositorNodeZcombine", "CompositorNodePremulKey",  # of older versions
 }  # fmt: skip
+_CATCHER_REACH = 0.1
+"""Share of the depth of a shadow catcher by which splats in front of it get its shadows: the depth of a splat
+is that of its centre, which is nearer than the surface if the view grazes it."""
 _COVERED = 0.999
 """Minimum alpha of a pixel that a mesh covers completely."""
 
 CENTER_FILTER = "BLACKMAN_HARRIS", 0.01
 """Pixel filter of Cycles with all samples at the pixel centre; the width of its box filter is fixed."""
+CATCHERS = "Shadow Catcher"
+"""Name of Cycles' pass with the light on shadow catchers relative to that without other objects, and of the
+collection, mesh and view layer of catchers."""
 SAMPLES = 128
 """Initial number of Cycles samples for the meshes. Blender's default of 4096 is slow."""
 
@@ -44,7 +56,8 @@ def combine_with_meshes(scene: bpy.types.Scene, mesh_engine: str = "CYCLES") -> 
     """Set a scene up to render splats with LODGS and meshes with another engine, combined by depth.
 
     A second scene renders the meshes: it has the same objects without the splats. With a mesh holdout
-    (:func:`render_mesh_depth`), the splat image is simply placed over the mesh image.
+    (:func:`render_mesh_depth`), the splat image is simply placed over the mesh image. With *Splat Shadows*,
+    the second scene has the splats as ellipsoids that only shadows, reflections and bounced light show.
 
     A repeated call copies the current size, camera, frame range and holdout to the second scene.
 
@@ -77,14 +90,18 @@ def combine_with_meshes(scene: bpy.types.Scene, mesh_engine: str = "CYCLES") -> 
         meshes.cycles.samples = SAMPLES
         scene.lodgs_render.before_meshes = json.dumps(previous)
     engine.use(scene)
+    meshes.lodgs_render.is_for_meshes = True
     for rendered in (scene, meshes):
         rendered.render.film_transparent = True
         for layer in rendered.view_layers:
             layer.use_pass_z = True
-    _copy_settings(scene, meshes)
-    by_depth = not scene.lodgs_render.holdout
-    if is_new or (_is_ours(tree) and by_depth != (MIN_DEPTH in _node_types(tree))):
-        _build_nodes(tree, by_depth, scene, meshes)
+    catchers = _catcher_layer(scene, meshes)
+    _copy_settings(scene, meshes, scene.lodgs_render.shadows)
+    meshes.lodgs_render.ellipsoids = scene.lodgs_render.shadows
+    built = MIN_DEPTH in _node_types(tree), _used_catcher_layer(tree)
+    needed = not scene.lodgs_render.holdout, catchers
+    if is_new or (_is_ours(tree) and built != needed):
+        _build_nodes(tree, *needed, scene, meshes)
     return meshes
 
 
@@ -127,6 +144,26 @@ def _node_types(tree: bpy.types.NodeTree) -> set[str]:
     return {node.bl_idname for node in tree.nodes}
 
 
+def _catcher_layer(scene: bpy.types.Scene, meshes: bpy.types.Scene) -> str:
+    """Return the name of the view layer that renders shadow catchers; "" if there are none.
+
+    It is a layer of its own if another one has the splats, which would shadow the catchers.
+    """
+    has_catchers = any(obj.is_shadow_catcher for obj in scene.objects)
+    layers, needs_own = meshes.view_layers, has_catchers and scene.lodgs_render.shadows
+    if needs_own and CATCHERS not in layers:
+        layers.new(CATCHERS).use_pass_z = True
+    elif not needs_own and CATCHERS in layers:
+        layers.remove(layers[CATCHERS])
+    return CATCHERS if needs_own else layers[0].name if has_catchers else ""
+
+
+def _used_catcher_layer(tree: bpy.types.NodeTree) -> str:
+    """Return the name of the view layer whose shadows on catchers a compositor tree uses; "" if none."""
+    links = [link for link in tree.links if link.from_socket.name == CATCHERS]
+    return links[0].from_node.layer if links else ""
+
+
 def _is_ours(tree: bpy.types.NodeTree) -> bool:
     """Return whether a compositor tree has only default nodes and nodes of :func:`combine_with_meshes`."""
     return _node_types(tree) <= {*compat.COMPOSITOR_START, *_NODES}
@@ -157,7 +194,7 @@ def render_mesh_depth(scene: bpy.types.Scene, frames: Iterable[int]) -> Iterator
     pattern = depth_file_pattern(scene)
     meshes = bpy.data.scenes.new(f"{scene.name} Depth")
     try:
-        _copy_settings(scene, meshes)
+        _copy_settings(scene, meshes, catchers=False)
         _set_depth_only(meshes)
         for frame in frames:
             path = engine.frame_path(str(pattern), scene, frame)
@@ -207,8 +244,15 @@ def _set_depth_only(scene: bpy.types.Scene) -> None:
     settings.pixel_filter_type, settings.filter_width = CENTER_FILTER
 
 
-def _copy_settings(scene: bpy.types.Scene, meshes: bpy.types.Scene) -> None:
-    """Copy objects, camera and render settings of a scene to its mesh scene, without the splats."""
+def _copy_settings(
+    scene: bpy.types.Scene, meshes: bpy.types.Scene, shadows: bool = False, catchers: bool = True
+) -> None:
+    """Copy objects, camera and render settings of a scene to its mesh scene.
+
+    Args:
+        shadows: copy the splats for indirect rays only; otherwise leave them out.
+        catchers: copy collections of shadow catchers.
+    """
     for name in _COPIED:
         setattr(meshes.render, name, getattr(scene.render, name))
     _copy_views(scene.render, meshes.render)
@@ -226,7 +270,7 @@ def _copy_settings(scene: bpy.types.Scene, meshes: bpy.types.Scene) -> None:
     for marker in scene.timeline_markers:
         if marker.camera is not None:
             meshes.timeline_markers.new(marker.name, frame=marker.frame).camera = marker.camera
-    _exclude_splats(scene, meshes)
+    _exclude_collections(scene, meshes, shadows, catchers)
 
 
 def _copy_views(source: bpy.types.RenderSettings, target: bpy.types.RenderSettings) -> None:
@@ -238,26 +282,52 @@ def _copy_views(source: bpy.types.RenderSettings, target: bpy.types.RenderSettin
         target.views.remove(view)
 
 
-def _exclude_splats(scene: bpy.types.Scene, meshes: bpy.types.Scene) -> None:
-    """Exclude the same collections as in the scene, and those of splat scenes."""
+def _exclude_collections(
+    scene: bpy.types.Scene, meshes: bpy.types.Scene, shadows: bool, catchers: bool
+) -> None:
+    """Exclude the same collections as in the scene, and unwanted ones; see :func:`_copy_settings`."""
     splat_collections = {
         collection
         for root in roots.roots(scene)
         for obj in (root, *(item.object for item in root.lodgs.levels if item.exists))
         for collection in obj.users_collection
     }
+    scene.view_layers[0].update()  # creates the layer collections of new collections
     visible = {item.collection: item for item in _included(scene.view_layers[0].layer_collection)}
+
+    has_own = CATCHERS in meshes.view_layers
     for layer in meshes.view_layers:
+        unwanted = set() if shadows and layer.name != CATCHERS else splat_collections
+        if not catchers or (has_own and layer.name != CATCHERS):
+            unwanted = unwanted | {collection for collection in visible if _has_only_catchers(collection)}
         layer.update()  # creates the layer collections of a new scene
-        while unwanted := [
-            item
-            for item in _included(layer.layer_collection)
-            if item.collection in splat_collections or item.collection not in visible
-        ]:
-            unwanted[0].exclude = True  # invalidates all layer collections
+        wanted = visible.keys() - unwanted
+        while wrong := next(_wrongly_excluded(layer.layer_collection, wanted), None):
+            wrong.exclude = not wrong.exclude  # invalidates all layer collections
         for item in _included(layer.layer_collection):
             original = visible[item.collection]
-            item.holdout, item.indirect_only = original.holdout, original.indirect_only
+            item.holdout = original.holdout
+            item.indirect_only = original.indirect_only or item.collection in splat_collections
+
+
+def _has_only_catchers(collection: bpy.types.Collection) -> bool:
+    return bool(collection.objects) and all(obj.is_shadow_catcher for obj in collection.objects)
+
+
+def _wrongly_excluded(
+    collection: bpy.types.LayerCollection, wanted: Collection[bpy.types.Collection], excluded: bool = False
+) -> Iterator[bpy.types.LayerCollection]:
+    """Yield the layer collections below another one that are excluded or included by mistake.
+
+    Args:
+        wanted: collections to include.
+        excluded: exclude all of them, as children of an excluded collection.
+    """
+    for child in collection.children:
+        without = excluded or child.collection not in wanted
+        if child.exclude != without:
+            yield child
+        yield from _wrongly_excluded(child, wanted, without)
 
 
 def _included(collection: bpy.types.LayerCollection) -> Iterator[bpy.types.LayerCollection]:
@@ -269,9 +339,15 @@ def _included(collection: bpy.types.LayerCollection) -> Iterator[bpy.types.Layer
 
 
 def _build_nodes(
-    tree: bpy.types.NodeTree, by_depth: bool, scene: bpy.types.Scene, meshes: bpy.types.Scene
+    tree: bpy.types.NodeTree,
+    by_depth: bool,
+    catchers: str,
+    scene: bpy.types.Scene,
+    meshes: bpy.types.Scene,
 ) -> None:
     """Build compositor nodes that combine two scenes: by depth, or ``scene`` over ``meshes``.
+
+    Shadow catchers, in the layer of this name, darken the splats at them and behind them.
 
     The mesh image gets the samples that fit: soft edges by depth, and otherwise one sample at each pixel
     centre, as in the holdout. Soft edges over a holdout would leave dark seams.
@@ -279,9 +355,17 @@ def _build_nodes(
     tree.nodes.clear()
     nodes = _TreeBuilder(tree)
     scene.view_layers[0].use_pass_z = meshes.view_layers[0].use_pass_z = True  # before nodes with its socket
+    for layer in meshes.view_layers:
+        layer.cycles.use_pass_shadow_catcher = layer.name == catchers
+        layer.update_render_passes()
     splats = nodes.render_layer(scene, scene.view_layers[0].name, 0)
     mesh = nodes.render_layer(meshes, meshes.view_layers[0].name, 1)
     splat_image, mesh_image = splats.outputs["Image"], mesh.outputs["Image"]
+    if catchers:
+        is_own = catchers != meshes.view_layers[0].name
+        catcher = nodes.render_layer(meshes, catchers, 2) if is_own else mesh
+        behind = nodes.is_near_catcher(catcher, splats)
+        splat_image = nodes.mix(behind, splat_image, catcher.outputs[CATCHERS], "MULTIPLY")
     result = nodes.over(splat_image, mesh_image)
     if by_depth:
         near = nodes.nearer(mesh, splats)
@@ -314,12 +398,14 @@ class _TreeBuilder:
 
     def mix(
         self,
-        factor: bpy.types.NodeSocket,
+        factor: bpy.types.NodeSocket | float,
         first: bpy.types.NodeSocket,
         second: bpy.types.NodeSocket,
+        blend: str = "MIX",
     ) -> bpy.types.NodeSocket:
-        """Add a node that mixes two images; the alpha is that of the first."""
+        """Add a node that mixes or multiplies two images; the alpha is that of the first."""
         node = self._add(compat.COMPOSITOR_MIX)
+        node.blend_type = blend
         if hasattr(node, "data_type"):
             node.data_type = "RGBA"
         sockets = [node.inputs[0], *(socket for socket in node.inputs if socket.type == "RGBA")]
@@ -339,6 +425,11 @@ class _TreeBuilder:
         edge_near = self._math("LESS_THAN", smallest.outputs[0], other_depth)
         edge = self._math("LESS_THAN", front.outputs["Alpha"], _COVERED)
         return self._math("MAXIMUM", near.outputs[0], self._math("MULTIPLY", edge_near, edge))
+
+    def is_near_catcher(self, catcher: bpy.types.Node, splats: bpy.types.Node) -> bpy.types.NodeSocket:
+        """Add nodes that return 1 where splats are not far in front of a layer with a shadow catcher."""
+        depth = self._math("MULTIPLY", catcher.outputs["Depth"], 1 - _CATCHER_REACH)
+        return self._math("LESS_THAN", depth, splats.outputs["Depth"])
 
     def _math(self, operation: str, *sources: bpy.types.NodeSocket | float) -> bpy.types.NodeSocket:
         node = self._add(compat.COMPOSITOR_MATH, *sources)
@@ -365,3 +456,41 @@ def _sample_meshes(meshes: bpy.types.Scene, soft: bool) -> None:
     settings = meshes.cycles
     settings.pixel_filter_type, settings.filter_width = ("BLACKMAN_HARRIS", 1.5) if soft else CENTER_FILTER
     meshes.render.filter_size = 1.5 if soft else 0.0
+
+
+def add_shadow_catcher(root: bpy.types.Object, scene: bpy.types.Scene) -> bpy.types.Object:
+    """Add a plane on the ground of a splat scene that shows the shadows of meshes in the combined image.
+
+    Raises:
+        LodgsError: no ground is detected, the root is scaled differently along its axes, or as
+            :func:`combine_with_meshes`.
+    """
+    combine_with_meshes(scene)
+    points = placement_of(root).transform_points(ground.ground_points(root))
+    normal, center = find_ground(points, np.array([0.0, 0.0, 1.0]))
+    low, high = cleaning.bounds(root)
+    center = (low + high) / 2 - ((low + high) / 2 - center) @ normal * normal
+    half = (high - low).max() / 2
+    mesh = bpy.data.meshes.new(CATCHERS)
+    mesh.from_pydata([(-half, -half, 0), (half, -half, 0), (half, half, 0), (-half, half, 0)], [], [range(4)])
+    obj = bpy.data.objects.new(CATCHERS, mesh)
+    obj.matrix_world = Matrix.LocRotScale(
+        Vector(center),
+        Vector((0, 0, 1)).rotation_difference(Vector(normal)), None,
+    )  # fmt: skip
+    obj.is_shadow_catcher, obj.display_type = True, "WIRE"
+    collection = bpy.data.collections.get(CATCHERS) or bpy.data.collections.new(CATCHERS)
+    if collection not in scene.collection.children_recursive:
+        scene.collection.children.link(collection)
+    collection.objects.link(obj)
+    combine_with_meshes(scene)
+    return obj
+
+
+def _shadows_changed(settings: RenderSettings, context: bpy.types.Context) -> None:
+    if settings.meshes is not None and roots.roots(settings.id_data):
+        combine_with_meshes(settings.id_data)
+
+
+def register() -> None:
+    ON_CHANGE["shadows"] = _shadows_changed

@@ -84,8 +84,8 @@ def trainer_python() -> Path:
         return python_of(newest)
     raise LodgsError(
         "Cannot start the trainer: it is not installed.",
-        "Press Install Trainer in the preferences of LODGS, or set the environment variable "
-        f"{VARIABLE} to a Python with the wheel of LODGS.",
+        "Press Install Trainer in the preferences of LODGS. Or set Trainer Python there, or the environment "
+        f"variable {VARIABLE}, to a Python with the wheel of LODGS.",
     )
 
 

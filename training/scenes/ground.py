@@ -15,14 +15,16 @@ TRIES, BATCH = 2000, 100
 """Number of candidate planes, each through three points, and number of planes evaluated at a time."""
 MAX_POINTS = 20_000
 """Maximum number of points used; larger sets are sampled at random."""
-THICKNESS = 0.005
-"""Maximum distance of a plane's points from the plane, as a fraction of the scene's size."""
+THICKNESSES = 0.005, 0.01, 0.015, 0.02
+"""Maximum distances of a plane's points from the plane, as fractions of the scene's size, from first to last
+try: the ground of splats is rougher than that of triangulated points."""
 BELOW_WEIGHT = 2.0
 """Number of points on the plane that one point below it cancels."""
 NEAR_DEPTHS, MIN_NEAR_POINTS = 1.5, 100
 """Search radius around the cameras in median depths, and the number of points that it must contain."""
 MIN_SHARE = 0.02
-"""Minimum score of a ground plane, as a fraction of the points."""
+"""Minimum score of a ground plane of the first thickness, as a fraction of the points. It grows with the
+thickness, as the share of the lowest part of a ball does."""
 
 
 def fit_plane(points: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -72,8 +74,9 @@ def find_ground(points: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndar
     Raises:
         LodgsError: no plane reaches the minimum score.
     """
-    if (ground := ground_plane(points, up)) is not None:
-        return ground[:2]
+    for thickness in THICKNESSES:
+        if (ground := ground_plane(points, up, thickness=thickness)) is not None:
+            return ground[:2]
     raise LodgsError(
         "Cannot find the ground: no plane lies under this scene.",
         "Select points of the ground in Edit Mode, or empties on it.",
@@ -81,7 +84,7 @@ def find_ground(points: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def ground_plane(
-    points: np.ndarray, up: np.ndarray, max_slope: float = MAX_SLOPE
+    points: np.ndarray, up: np.ndarray, max_slope: float = MAX_SLOPE, thickness: float = THICKNESSES[0]
 ) -> tuple[np.ndarray, np.ndarray, float] | None:
     """Return normal, point and score of the ground plane, see :func:`find_ground`; None without one.
 
@@ -89,6 +92,7 @@ def ground_plane(
 
     Args:
         max_slope: maximum angle between the plane and the horizontal, in degrees.
+        thickness: one of THICKNESSES.
     """
     points = np.asarray(points, np.float64).reshape(-1, 3)
     points = points[np.isfinite(points).all(axis=1)]
@@ -101,9 +105,9 @@ def ground_plane(
     low, high = np.percentile(points, (5, 95), axis=0)
     reach = high - low
     points = points[((points >= low - reach) & (points <= high + reach)).all(axis=1)]
-    thickness = THICKNESS * float(np.linalg.norm(reach))
     best = None
-    best_score = MIN_SHARE * len(points)
+    best_score = MIN_SHARE * thickness / THICKNESSES[0] * len(points)
+    thickness *= float(np.linalg.norm(reach))
     for _ in range(TRIES // BATCH):
         a, b, c = points[rng.integers(len(points), size=(3, BATCH))]
         normals = np.cross(b - a, c - a)

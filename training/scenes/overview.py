@@ -155,7 +155,7 @@ def describe_clutter(splats: Splats) -> list[str]:
 def complete_meta(bundle: Bundle) -> None:
     """Estimate ``up_rotation`` and ``view`` of a bundle that lacks them and has no cameras."""
     levels = bundle.drawn_levels(bundle.levels[-1].number)
-    splats = Splats.concatenated([level.splats for level in levels])
+    splats = levels[0].splats if len(levels) == 1 else Splats.concatenated([level.splats for level in levels])
     if "up_rotation" not in bundle.meta and (rotation := guess_up_rotation(splats)) is not None:
         bundle.meta["up_rotation"] = rotation.tolist()
     if "view" not in bundle.meta and (view := choose_view(splats, bundle.up_rotation[2])) is not None:

@@ -112,7 +112,9 @@ def drop_undrawable(splats: Splats, path: str | Path, warn: Warn = ignore) -> Sp
         drawable[block] &= (quats <= MAX_COORDINATE).all(1)
         drawable[block] &= (splats.log_scales[block] <= np.log(MAX_COORDINATE)).all(1)
         drawable[block] &= ~np.isnan(splats.opacity_logits[block])
-        drawable[block] &= (np.abs(splats.sh[block]) <= MAX_COEFFICIENT).all((1, 2))
+        sh = splats.sh[block]
+        if not (sh.max(initial=0) <= MAX_COEFFICIENT and sh.min(initial=0) >= -MAX_COEFFICIENT):
+            drawable[block] &= (np.abs(sh) <= MAX_COEFFICIENT).all((1, 2))
         rotated[block] = (quats > 1 / MAX_COORDINATE).any(1)
     if not (rotated | ~drawable).all():
         quats = np.where((rotated | ~drawable)[:, None], splats.quats, np.array([1, 0, 0, 0], np.float32))

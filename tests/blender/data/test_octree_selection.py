@@ -117,7 +117,7 @@ def test_cumulative_level_is_exported_with_coarser_levels(bpy, lodgs, root):
 
 def is_display(name):
     """Return True for a modifier or driver path that every splat object has."""
-    return "LODGS Display" in name or "LODGS Native Splats" in name
+    return any(own in name for own in ("LODGS Display", "LODGS Native Splats", "LODGS Viewport"))
 
 
 def names_of(obj):

@@ -45,6 +45,7 @@ def visible_sets(bpy, lodgs):
 def test_arrays_have_activated_values_in_scene_space(bpy, lodgs, two_levels):
     root, splats = two_levels
     root.lodgs.single_level = 2
+    lodgs("nodes.display").keep_harmonics(root.lodgs.levels[1].object)
     bpy.context.view_layer.update()
     [(visible, arrays)] = visible_sets(bpy, lodgs)
     truth = splats[1]
@@ -159,3 +160,31 @@ def test_splats_removed_by_modifiers_are_not_read(bpy, lodgs):
     obj.modifiers.new("nothing", "NODES").node_group = group
     bpy.context.view_layer.update()
     assert visible_sets(bpy, lodgs) == []
+
+
+def test_viewports_drop_harmonics_unless_they_are_needed(bpy, lodgs, two_levels):
+    """Crops and rules need not copy them: LODGS draws the original splats.
+
+    Modifiers of artists, exports of visible splats and renders have all coefficients.
+    """
+    root, splats = two_levels
+    root.lodgs.single_level = 2
+    obj, count = root.lodgs.levels[1].object, splats[1].sh.shape[1] - 1
+    sh_names = lodgs("attributes").sh_names
+
+    def evaluated_count():
+        bpy.context.view_layer.update()
+        return len(sh_names(obj.evaluated_get(bpy.context.evaluated_depsgraph_get()).data))
+
+    assert count > 0 and evaluated_count() == 0 and len(sh_names(obj.data)) == count
+    visible = lodgs("data.scenes").visible_splats(bpy.context, root)
+    assert np.array_equal(visible.sh, splats[1].sh) and evaluated_count() == 0
+    settings = bpy.context.scene.lodgs_viewport
+    settings.splats = False  # Blender draws the cloud, from 5.3 on as plain points
+    assert evaluated_count() == (0 if lodgs("compat").NATIVE_SPLATS else count)
+    settings.splats = True
+    viewport = obj.modifiers["LODGS Viewport"]
+    assert not viewport.show_render and obj.modifiers.find(viewport.name) == 0
+    obj.modifiers.new("mine", "NODES")
+    evaluated_count()  # the next update has all attributes
+    assert evaluated_count() == count and "LODGS Viewport" not in obj.modifiers

@@ -104,7 +104,8 @@ def test_combining_with_meshes_is_shown_and_can_be_removed(bpy, lodgs, root, dra
     assert "lodgs.separate_meshes" not in draw_panel("rendering", "LODGS_PT_rendering").operators
     assert bpy.ops.lodgs.combine_with_meshes() == {"FINISHED"}
     layout = draw_panel("rendering", "LODGS_PT_rendering")
-    assert "Meshes: 'Scene Meshes'" in layout.texts and "samples" in layout.properties
+    assert "Meshes: 'Scene Meshes'" in layout.texts and {"samples", "shadows"} <= set(layout.properties)
+    assert "lodgs.add_shadow_catcher" in layout.operators
     assert "lodgs.separate_meshes" in layout.operators
 
 

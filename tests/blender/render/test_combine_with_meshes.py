@@ -101,6 +101,27 @@ def test_splats_of_a_moved_root_are_excluded_from_the_mesh_scene(bpy, lodgs, sce
     assert copied[collection.name].exclude
 
 
+def test_instances_of_splats_are_no_meshes(bpy, lodgs, scene):
+    """Cycles would draw them as points. The original scene still renders them with any engine."""
+    [root] = lodgs("data.roots").roots(scene)
+    empty = bpy.data.objects.new("instance", None)
+    empty.instance_type, empty.instance_collection = "COLLECTION", root.users_collection[0]
+    scene.collection.objects.link(empty)
+    level = root.lodgs.levels[0].object
+    bpy.ops.lodgs.combine_with_meshes()
+
+    def rendered_points(rendered_scene):
+        layer = rendered_scene.view_layers[0]
+        layer.update()
+        copy = level.evaluated_get(layer.depsgraph)
+        return not copy.hide_render, copy.visible_camera
+
+    meshes = scene.lodgs_render.meshes
+    assert rendered_points(meshes) == (False, False) and rendered_points(scene) == (True, True)
+    scene.lodgs_render.shadows = True  # as ellipsoids that the camera does not see
+    assert rendered_points(meshes) == (True, False) and rendered_points(scene) == (True, True)
+
+
 def test_viewport_quality_cannot_render_a_video(bpy, lodgs, scene):
     settings = scene.render.image_settings
     if hasattr(settings, "media_type"):

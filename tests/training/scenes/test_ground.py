@@ -8,20 +8,20 @@ from scipy.spatial.transform import Rotation
 
 from training.errors import LodgsError
 from training.scenes.colmap import read_scene
-from training.scenes.ground import find_ground, fit_plane, ground_placement, scaling_about
+from training.scenes.ground import find_ground, fit_plane, ground_placement, ground_plane, scaling_about
 
 UP = np.array([0.0, 0.0, 1.0])
 GARDEN = Path(__file__).resolve().parents[3] / "examples" / "lantern_garden"
 
 
-def scene(seed: int, size: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def scene(seed: int, size: float = 1.0, roughness: float = 0.01) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return points of a ground with a table, a wall and objects, noise below it and distant floaters.
 
     Returns:
         The points, the ground's normal, tilted by up to 30 degrees, and a point on the ground.
     """
     rng = np.random.default_rng(seed)
-    ground = np.column_stack([rng.uniform(-5, 5, (3000, 2)), rng.normal(0, 0.01, 3000)])
+    ground = np.column_stack([rng.uniform(-5, 5, (3000, 2)), rng.normal(0, roughness, 3000)])
     table = np.column_stack([rng.uniform(-2, 2, (4000, 2)), rng.normal(1, 0.002, 4000)])
     wall = np.column_stack([rng.normal(4, 0.01, 3000), rng.uniform(-5, 5, 3000), rng.uniform(0, 4, 3000)])
     objects = rng.uniform((-3, -3, 0), (3, 3, 2), (2000, 3))
@@ -42,6 +42,14 @@ def test_ground_plane_of_synthetic_scenes(seed, size):
     assert abs((center - point) @ expected) < 0.01 * size
     repeated, _ = find_ground(points, UP)
     np.testing.assert_array_equal(repeated, normal)
+
+
+def test_rough_ground_of_splats_is_found():
+    points, expected, point = scene(0, roughness=0.25)
+    assert ground_plane(points, UP) is None
+    normal, center = find_ground(points, UP)
+    assert np.degrees(np.arccos(normal @ expected)) < 1
+    assert abs((center - point) @ expected) < 0.1
 
 
 def test_ground_plane_of_example():
