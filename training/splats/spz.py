@@ -157,10 +157,10 @@ def _flipped(splats: Splats, signs: np.ndarray) -> Splats:
 
 def _harmonic_signs(degree: int, signs: np.ndarray) -> np.ndarray:
     """Return the sign (K,) float32 of each coefficient of SH after sign changes of two axes."""
-    direction = np.array([0.36, 0.48, 0.8])
+    (x, y, z), (u, v, w) = (0.36, 0.48, 0.8), (0.36, 0.48, 0.8) * signs
     values = [0.0] * coefficient_count(degree), [0.0] * coefficient_count(degree)
-    for point, out in zip((direction, direction * signs), values, strict=True):
-        basis(*point, degree, out)
+    basis(x, y, z, degree, values[0])
+    basis(u, v, w, degree, values[1])
     return np.sign(np.multiply(*values)).astype(np.float32)
 
 
