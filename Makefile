@@ -124,8 +124,8 @@ window: setup
 
 interop: setup
 	$(VENV) tools/interop.py
-	$(VENV) tools/interop_gltf.py
-	$(VENV) tools/interop_tiles.py
+	$(VENV) tools/interop_viewers.py
+	$(VENV) tools/interop_viewers.py --methods
 	$(VENV) tools/shaders.py
 
 attacks: setup

@@ -78,7 +78,7 @@ COMMANDS = {
     "edit ply": Command(("edit", *PLAIN, "DISK/plain.ply")),
     "edit splat": Command(("edit", *PLAIN, "DISK/plain.splat")),
     "edit compressed.ply": Command(("edit", *PLAIN, "DISK/plain.compressed.ply"), converts=True),
-    "edit spz": Command(("edit", *PLAIN, "DISK/plain.spz"), converts=True),
+    "edit spz": Command(("edit", *PLAIN, "DISK/plain.spz")),
     "edit sog": Command(("edit", *PLAIN, "DISK/plain.sog")),
     "edit streamed": Command(("edit", "INPUTS/run", "--streamed", "DISK/streamed")),
     "edit usd": Command(("edit", "INPUTS/run", "--levels", "DISK/levels.usdz")),

@@ -19,12 +19,20 @@ from plyfile import PlyData
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
+from training.evaluate.level_errors import measure_level_errors  # noqa: E402
 from training.splats.bundle import read_bundle, write_bundle  # noqa: E402
 from training.splats.gaussians import Splats  # noqa: E402
 from training.splats.level_folder import write_folder  # noqa: E402
 from training.splats.levels import Bundle, Level  # noqa: E402
 from training.splats.ply import read_ply, write_ply  # noqa: E402
-from training.splats.streamed_levels import STREAMED_FILE, write_streamed_levels  # noqa: E402
+from training.splats.similarity import Similarity  # noqa: E402
+from training.splats.sog import decode_sog, read_sog, write_sog  # noqa: E402
+from training.splats.spz import read_spz, write_spz  # noqa: E402
+from training.splats.streamed_levels import (  # noqa: E402
+    STREAMED_FILE,
+    read_streamed_levels,
+    write_streamed_levels,
+)
 
 PACKAGE = "@playcanvas/splat-transform"
 VERSION = "3.7.0"
@@ -123,20 +131,78 @@ def checks(bundle: Bundle):
     yield "plain: splats, SH", (counts[0], finest.sh_degree), info(path)
     yield "plain: values", "equal", values(path)
 
+    write_spz(FOLDER / "ours.spz", turned(finest), {})  # in the file, axes are then those of PLY
+    yield "SPZ: values that both read", "equal", read_by_both(FOLDER / "ours.spz", True)
+    for version in (3, 4):
+        path = FOLDER / f"theirs{version}.spz"
+        splat_transform("-w", "--spz-version", str(version), str(FOLDER / "plain.ply"), str(path))
+        yield f"their SPZ {version}: values that both read", "equal", read_by_both(path, True)
+    write_sog(FOLDER / "ours.sog", finest, {})
+    yield "SOG: values that both read", "equal", read_by_both(FOLDER / "ours.sog", False)
+
     folder = FOLDER / "folder"
     shutil.rmtree(folder, ignore_errors=True)
     write_folder(folder, bundle)
     web = FOLDER / "web"
     shutil.rmtree(web, ignore_errors=True)
-    write_streamed_levels(web, bundle)
+    write_streamed_levels(web, bundle, measure_level_errors)
+    shutil.rmtree(FOLDER / "read", ignore_errors=True)
+    read_streamed_levels(web / STREAMED_FILE, FOLDER / "read")
+    environment = len(read_environment(web))
+    ours = [len(read_ply(FOLDER / "read" / f"lod{lod}.ply")) - environment for lod in range(len(counts))]
     theirs = []
     for lod in range(len(counts)):
         plain = FOLDER / f"lod{lod}.ply"
         plain.unlink(missing_ok=True)
         result = splat_transform("-w", "-g", "cpu", "-L", str(lod), str(web / STREAMED_FILE), str(plain))
         theirs.append(len(read_ply(plain)) if plain.exists() else failure(result))
-    complete = [sum(counts[lod:]) for lod in range(len(counts))] if bundle.cumulative else counts
-    yield "streamed levels: splats outside the surroundings", complete, theirs
+    declared = json.loads((web / STREAMED_FILE).read_text("utf-8"))["counts"]
+    yield "streamed levels: splats", declared, theirs
+    yield "streamed levels: splats that we read", theirs, ours
+
+
+def read_environment(folder: Path) -> Splats:
+    """Return the surroundings of streamed levels, which splat-transform leaves out."""
+    name = json.loads((folder / STREAMED_FILE).read_text("utf-8")).get("environment")
+    if name is None:
+        return read_ply(FOLDER / "plain.ply").select(slice(0, 0))
+    return decode_sog(lambda file: (folder / name).with_name(file).read_bytes())
+
+
+def read_by_both(path: Path, turns: bool) -> str:
+    """Compare the values of a file that LODGS and splat-transform read, to single precision.
+
+    Args:
+        turns: LODGS turns the axes of the file.
+    """
+    plain = path.with_suffix(".both.ply")
+    plain.unlink(missing_ok=True)
+    result = splat_transform("-w", str(path), str(plain))
+    if result.returncode or not plain.exists():
+        return failure(result)
+    theirs, (ours, _) = read_ply(plain), (read_spz if path.suffix == ".spz" else read_sog)(path)
+    if turns:
+        ours = turned(ours)
+    ours.quats, theirs.quats = (unit_quats(splats.quats) for splats in (ours, theirs))
+    # opacities are left out: those of 0 and 1 have no finite logit, so that each program chooses another one
+    limits = {"means": 1e-5, "quats": 1e-5, "log_scales": 1e-4, "sh": 1e-5}
+    same = {name: np.abs(getattr(ours, name) - getattr(theirs, name)).max() for name in limits}
+    different = [f"{name} {same[name]:.2g}" for name in limits if same[name] > limits[name]]
+    return f"different: {', '.join(different)}" if different else "equal"
+
+
+def turned(splats: Splats) -> Splats:
+    """Return splats turned by half a turn about x; each one's own axes are turned, too."""
+    result = Similarity(np.diag([1.0, -1, -1]), 1.0, np.zeros(3)).transform_splats(splats)
+    result.quats = splats.quats * np.float32([1, 1, -1, -1])
+    return result
+
+
+def unit_quats(quats: np.ndarray) -> np.ndarray:
+    """Return quats (N, 4) of length 1 whose largest component is positive."""
+    unit = quats / np.linalg.norm(quats, axis=1, keepdims=True)
+    largest = np.take_along_axis(unit, np.abs(unit).argmax(axis=1)[:, None], axis=1)
+    return unit * np.sign(largest)
 
 
 def failure(result: subprocess.CompletedProcess[str]) -> str:

@@ -22,7 +22,7 @@ sys.path.insert(0, str(ROOT))
 from PIL import Image  # noqa: E402
 
 from tools import extension, window  # noqa: E402
-from tools.interop_gltf import BROWSERS  # noqa: E402
+from tools.interop_viewers import BROWSERS  # noqa: E402
 
 IMAGES = ROOT / "docs" / "images"
 PAGE = ("page", "--single", "--title", "Lantern garden")

@@ -157,17 +157,22 @@ def quote(value: Any) -> str:
     return printable(_QUOTES.repr(value))
 
 
-def read_json(path: str | Path, label: str = "", max_bytes: int = MAX_JSON_BYTES) -> dict:
+def read_json(
+    path: str | Path, label: str = "", max_bytes: int = MAX_JSON_BYTES, max_nesting: int = MAX_NESTING
+) -> dict:
     """Read the object in a JSON file.
 
     Args:
         label: subject of error messages, such as "The camera view.json"; "" for the path.
         max_bytes: maximum size of the file.
+        max_nesting: maximum nesting depth, at most some hundreds.
 
     Raises:
         LodgsError: the file cannot be read, or as `parse_json`.
     """
-    return parse_json(read_bytes(path, max_bytes), label or printable(path), max_bytes)
+    return parse_json(
+        read_bytes(path, max_bytes), label or printable(path), max_bytes, max_nesting=max_nesting
+    )
 
 
 def read_toml(path: str | Path, label: str = "") -> dict:
@@ -184,7 +189,13 @@ def read_toml(path: str | Path, label: str = "") -> dict:
     return table
 
 
-def parse_json(text: str | bytes, label: str, max_bytes: int = MAX_JSON_BYTES, finite: bool = True) -> dict:
+def parse_json(
+    text: str | bytes,
+    label: str,
+    max_bytes: int = MAX_JSON_BYTES,
+    finite: bool = True,
+    max_nesting: int = MAX_NESTING,
+) -> dict:
     """Parse a JSON object.
 
     Args:
@@ -193,6 +204,7 @@ def parse_json(text: str | bytes, label: str, max_bytes: int = MAX_JSON_BYTES, f
         max_bytes: maximum length of the text.
         finite: refuse NaN and infinity. False for files of other programs, whose numbers are checked one by
             one.
+        max_nesting: maximum nesting depth, at most some hundreds.
 
     Raises:
         LodgsError: the text is not valid JSON, is not an object, or exceeds a limit of this module.
@@ -201,9 +213,9 @@ def parse_json(text: str | bytes, label: str, max_bytes: int = MAX_JSON_BYTES, f
         values = json.loads(_decode(text, max_bytes), parse_int=_parse_int)
         if not isinstance(values, dict):
             raise ValueError("it is not an object")
-        _check(values, MAX_NESTING, finite=finite)
+        _check(values, max_nesting, finite=finite)
     except (ValueError, RecursionError) as error:
-        raise _not_valid(label, error) from error
+        raise _not_valid(label, error, max_nesting) from error
     return values
 
 
@@ -228,6 +240,10 @@ def _decode(text: str | bytes, max_bytes: int) -> str:
     return text.decode(json.detect_encoding(text))
 
 
+class _TooDeepError(ValueError):
+    """A value nests deeper than allowed."""
+
+
 def _check(value: Any, depth: int, key: str = "a value", finite: bool = True) -> None:
     """Raise ValueError unless this module allows a value, nested at most ``depth`` deep.
 
@@ -236,7 +252,7 @@ def _check(value: Any, depth: int, key: str = "a value", finite: bool = True) ->
     """
     match value:
         case dict() | list() if depth == 0:
-            raise ValueError(f"it nests deeper than {MAX_NESTING} levels")
+            raise _TooDeepError
         case dict():
             for name, item in value.items():
                 _check(name, depth - 1, "a key")
@@ -262,6 +278,8 @@ def _parse_int(digits: str) -> int:
     return int(digits)
 
 
-def _not_valid(label: str, error: Exception) -> LodgsError:
+def _not_valid(label: str, error: Exception, max_nesting: int = MAX_NESTING) -> LodgsError:
     reason = "it nests too deep" if isinstance(error, RecursionError) else str(error)
+    if isinstance(error, _TooDeepError):
+        reason = f"it nests deeper than {max_nesting} levels"
     return LodgsError(f"{label} is not valid: {reason}.", "Correct it and try again.")

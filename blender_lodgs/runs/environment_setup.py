@@ -40,7 +40,7 @@ PIP_OPTIONS = ("--progress-bar=raw", "--resume-retries=5")
 
 MODULES = (
     "torch", "numba", "scipy", "pycolmap", "OpenEXR", "PIL", "plyfile", "torchmetrics", "wgpu", "distributed",
-    "cryptography", "pxr",
+    "cryptography", "pxr", "zstandard",
 )  # fmt: skip
 """Modules that a new environment must import before it is used."""
 

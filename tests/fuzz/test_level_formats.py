@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import gzip
+import json
+import shutil
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -14,13 +17,16 @@ from tests.fuzz.mutations import corrupted, corrupted_value
 from tests.training.splats.level_files import flod
 from tests.training.splats.test_formats import random_splats
 from tests.training.splats.test_gltf import assembled, read_parts
-from tests.training.splats.test_packed_files import spz
+from tests.training.splats.test_spz import spz, spz4
 from training.editing.export import export_levels
 from training.splats.bundle import read_bundle
 from training.splats.gltf import read_glb, write_compressed_glb
 from training.splats.levels import Bundle, Level
 from training.splats.portable_levels import PortableLevels
-from training.splats.spz import pack_spz
+from training.splats.sog import encode_sog
+from training.splats.splat_format import NeedsSplatTransform
+from training.splats.spz import pack_spz, read_spz
+from training.splats.streamed_levels import STREAMED_FILE, read_streamed_levels, write_streamed_levels
 from training.splats.usd import read_usd
 
 
@@ -90,6 +96,57 @@ def test_corrupt_spz_in_glb(folder, compressed_glb, data):
     if (folder / "a.ply").exists():
         splats = read_bundle(folder / "a.ply").levels[-1].splats
         assert np.isfinite(splats.means).all() and np.isfinite(splats.sh).all()
+
+
+@pytest.mark.cases(short=120, weight=1)
+@given(data=st.data())
+def test_corrupt_spz_files(folder, data):
+    """Corrupt the stream, or its content before compression, whose checksum then is right."""
+    seeds = [spz(40, 1, bytes(40 * (20 + 9))), pack_spz(random_splats(3, 0))]
+    if data.draw(st.booleans()):
+        content = data.draw(corrupted([*seeds, spz4(40, 1, version=4)]))
+    else:
+        content = gzip.compress(data.draw(corrupted([gzip.decompress(seed) for seed in seeds])), 1)
+    (folder / "a.spz").write_bytes(content)
+    attempt("SPZ", lambda: read_spz(folder / "a.spz"), content)
+
+
+@pytest.fixture(scope="module")
+def streamed(folder) -> dict:
+    """Return the main file of streamed levels in the folder ``web``."""
+    levels = [Level(1, random_splats(30)), Level(2, random_splats(60, 1))]
+    levels[1].splats.means[:5] += 100  # the surroundings
+    write_streamed_levels(folder / "web", Bundle("flod", levels))
+    return json.loads((folder / "web" / STREAMED_FILE).read_text("utf-8"))
+
+
+@pytest.mark.cases(short=60, weight=0.2)
+@given(data=st.data())
+def test_corrupt_streamed_levels(folder, streamed, data):
+    content = json.dumps(data.draw(corrupted_value(streamed)), skipkeys=True)
+    (folder / "web" / STREAMED_FILE).write_text(content, "utf-8", errors="replace")
+    _try_streamed(folder, content)
+
+
+@pytest.mark.cases(short=60, weight=0.2)
+@given(data=st.data(), name=st.sampled_from(["meta.json", "means_l.webp", "sh0.webp", "quats.webp"]))
+def test_corrupt_sog_files(folder, streamed, data, name):
+    (folder / "web" / STREAMED_FILE).write_text(json.dumps(streamed), "utf-8")
+    good = encode_sog(random_splats(60, 1))
+    content = data.draw(corrupted([good[name]]))
+    for file, image in good.items():
+        (folder / "web" / "0_0" / file).write_bytes(content if file == name else image)
+    _try_streamed(folder, content)
+
+
+def _try_streamed(folder, content):
+    shutil.rmtree(folder / "read", ignore_errors=True)
+
+    def read():
+        with suppress(NeedsSplatTransform):  # the version of a SOG
+            read_streamed_levels(folder / "web" / STREAMED_FILE, folder / "read")
+
+    attempt("streamed SOG", read, content)
 
 
 @pytest.mark.cases(short=4, weight=0.02)

@@ -57,6 +57,11 @@ def _add_outputs(parser: argparse.ArgumentParser) -> None:
         "--streamed", type=Path, metavar="DIR", help="folder of levels to write for streaming in browsers"
     )
     parser.add_argument(
+        "--lod-errors", action="store_true",
+        help="measure the errors of streamed levels in rendered images, for viewers that select levels by "
+        "error",
+    )  # fmt: skip
+    parser.add_argument(
         "--tiles", type=Path, metavar="DIR", help="folder of 3D Tiles to write, for Cesium and other globes"
     )
     parser.add_argument(
@@ -155,6 +160,9 @@ def _edit(options: argparse.Namespace, source: Path, limits: dict[str, Any]) -> 
         print(preview(source, cleaning, options.preview, warn, views=views))
     if not _writes_splats(options):
         return
+    measure = None
+    if options.lod_errors:
+        from ..evaluate.level_errors import measure_level_errors as measure
     print(
         edit(
             source, options.out, cleaning, warn,
@@ -163,7 +171,7 @@ def _edit(options: argparse.Namespace, source: Path, limits: dict[str, Any]) -> 
             looks=[(crop, look) for crop in look_crops] if look else (),
             plain=options.plain, levels=options.levels, folder=options.folder,
             streamed=options.streamed, tiles=options.tiles,
-            antialiased=options.antialiased, original_place=options.original_place,
+            antialiased=options.antialiased, original_place=options.original_place, measure=measure,
         )
     )  # fmt: skip
 

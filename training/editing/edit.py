@@ -21,7 +21,7 @@ from ..splats.ply import write_ply
 from ..splats.similarity import Similarity
 from ..splats.sog import load_packages
 from ..splats.splat_transform import find_splat_transform
-from ..splats.streamed_levels import write_streamed_levels
+from ..splats.streamed_levels import MeasureLeaf, write_streamed_levels
 from .bake_filter import bake_filter
 from .cleaning import Cleaning, clean_bundle
 from .export import export_finest_level, export_levels, export_tiles, run_to_end
@@ -47,6 +47,7 @@ def edit(
     tiles: Path | None = None,
     antialiased: bool = False,
     original_place: bool = False,
+    measure: MeasureLeaf | None = None,
 ) -> str:
     """Edit a bundle, a folder of levels or any 3DGS PLY, and write the result.
 
@@ -54,12 +55,11 @@ def edit(
 
     Args:
         out: output in the format of the source; None writes none.
-        warn: see ``read_ply``.
+        warn, measure: see ``read_ply`` and ``write_streamed_levels``.
         looks: applied to the remaining splats.
         placement: applied after upright and ground; crops and lengths of the cleaning are the source's.
         upright, ground, points: see ``placement.upright_placement``.
-        plain: files for the finest level only, in the formats of their names.
-        levels: files for all levels, in the formats of their names.
+        plain, levels: files for the finest level only, and for all levels, in the formats of their names.
         folder, streamed, tiles: output folders of levels, of levels for browsers, and of 3D Tiles.
         antialiased: for all outputs but ``out`` and ``folder``, see :class:`.export.ExportOptions`.
         original_place: for ``plain`` and ``levels``, see :class:`.export.ExportOptions`.
@@ -86,7 +86,7 @@ def edit(
         run_to_end(export_finest_level(path, edited, antialiased, original_place))
     notes = [note for path in levels for note in export_levels(path, edited, antialiased, original_place)]
     notes += [] if tiles is None else export_tiles(tiles, edited, antialiased)
-    _export_levels(edited, folder, streamed, antialiased)
+    _export_levels(edited, folder, streamed, antialiased, measure)
     keeps_place = original_place and outputs == [*plain, *levels]
     return "\n".join([*notes, *_report(bundle, edited, outputs, keeps_place)])
 
@@ -130,14 +130,20 @@ def _check_outputs(
         find_splat_transform()
 
 
-def _export_levels(bundle: Bundle, folder: Path | None, streamed: Path | None, antialiased: bool) -> None:
+def _export_levels(
+    bundle: Bundle,
+    folder: Path | None,
+    streamed: Path | None,
+    antialiased: bool,
+    measure: MeasureLeaf | None,
+) -> None:
     """Write the levels of a bundle for other programs; see :func:`edit`."""
     if folder is not None or streamed is not None:
         levels = resolve_rule(bundle.rule).complete_levels(bundle)
         if folder is not None:
             write_folder(folder, levels)
         if streamed is not None:
-            write_streamed_levels(streamed, levels if antialiased else bake_filter(levels))
+            write_streamed_levels(streamed, levels if antialiased else bake_filter(levels), measure)
 
 
 def open_levels(source: Path, warn: Warn) -> Bundle:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 import struct
 import zipfile
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import IO
@@ -17,27 +16,12 @@ from ..documents import open_file, parse_json
 from ..errors import LodgsError
 from .ply import read_elements
 
-_SPZ = struct.Struct("<IIIB3x")
-_SPZ_MAGIC = 0x5053474E
-_SPZ_COEFFICIENTS = {0: 0, 1: 3, 2: 8, 3: 15, 4: 24}
-_SPZ_SPLAT = 16, 20
-"""Minimum and maximum bytes of a splat without harmonics: position, opacity, colour, scale and rotation."""
-_SPZ_4 = struct.Struct("<IIIB2xBI12x")
-"""Header of version 4: magic, version, splats, SH degree, number of streams, offset of the table."""
-_SPZ_ENTRY = struct.Struct("<QQ")
-"""Packed and unpacked bytes of a stream."""
-_SPZ_4_SPLAT = 9, 1, 3, 3, 4
-"""Bytes of a splat per stream of version 4, before harmonics; empty streams may be missing."""
-_MAX_DEFLATION = 1032
-"""Maximum ratio of Deflate, https://zlib.net/zlib_tech.html."""
 _KSPLAT_HEADER = 4096
 _KSPLAT_SPLAT = 24
 """Bytes of a splat at the highest compression."""
-_SOG_PALETTE = 1 << 23
+MAX_PALETTE_PIXELS = 1 << 23
 """Maximum pixels of a SOG's image of harmonics, which has at most 2^16 sets."""
 _BLOCK = 1 << 20
-_SMALL = 1 << 26
-"""Size up to which unpacked files need no relation to the packed ones."""
 
 
 def check_packed_file(path: Path) -> None:
@@ -64,57 +48,6 @@ def check_packed_file(path: Path) -> None:
         ) from error
 
 
-def _check_spz(file: IO[bytes], size: int) -> None:
-    """Unpack versions 1 to 3, a gzip stream, without storing it; check the table of contents of version 4."""
-    if file.read(2) != b"\x1f\x8b":
-        _check_spz_table(file, size)
-        return
-    file.seek(0)
-    unpacker = zlib.decompressobj(wbits=31)
-    unpacked, head, min_size, limit = 0, b"", _SPZ.size, _SPZ.size
-    while block := unpacker.unconsumed_tail or file.read(_BLOCK):
-        data = unpacker.decompress(block, _BLOCK)
-        unpacked += len(data)
-        if len(head) < _SPZ.size and len(head := head + data[: _SPZ.size]) >= _SPZ.size:
-            magic, _, count, degree = _SPZ.unpack(head[: _SPZ.size])
-            if magic != _SPZ_MAGIC:
-                raise ValueError("it is not an SPZ file")
-            min_size, limit = (
-                _SPZ.size + count * (splat + 3 * _SPZ_COEFFICIENTS[degree]) for splat in _SPZ_SPLAT
-            )
-            if min_size > _MAX_DEFLATION * size:
-                raise ValueError(f"it is too short for {count:,} splats")
-        if unpacked > limit + _BLOCK:
-            raise ValueError(f"it unpacks to more than {limit:,} bytes")
-        if unpacker.eof:
-            break
-    if not unpacker.eof or unpacked < min_size:
-        raise ValueError("it is truncated")
-    if unpacker.unused_data or file.read(1):
-        raise ValueError("it has data after its end")
-
-
-def _check_spz_table(file: IO[bytes], size: int) -> None:
-    """Check the packed and unpacked sizes of the streams of version 4, which Zstandard compresses."""
-    file.seek(0)
-    magic, version, count, degree, streams, offset = _SPZ_4.unpack(file.read(_SPZ_4.size))
-    if magic != _SPZ_MAGIC:
-        raise ValueError("it is not an SPZ file")
-    if version != 4:
-        problem = "must be compressed" if version < 4 else "is not supported"
-        raise ValueError(f"version {version} {problem}")
-    file.seek(offset)
-    table = list(_SPZ_ENTRY.iter_unpack(file.read(streams * _SPZ_ENTRY.size)))
-    begin = offset + streams * _SPZ_ENTRY.size
-    if offset < _SPZ_4.size or len(table) < streams or begin + sum(packed for packed, _ in table) > size:
-        raise ValueError("it is truncated")
-    expected = [count * width for width in (*_SPZ_4_SPLAT, 3 * _SPZ_COEFFICIENTS[degree])]
-    if [unpacked for _, unpacked in table if unpacked] != [length for length in expected if length]:
-        raise ValueError(f"its streams do not unpack to {count:,} splats")
-    if sum(expected) > max(_MAX_DEFLATION * size, _SMALL):  # real positions hardly compress
-        raise ValueError(f"it is too short for {count:,} splats")
-
-
 def _check_ksplat(file: IO[bytes], size: int) -> None:
     (count,) = struct.unpack_from("<I", file.read(20), 16)
     if _KSPLAT_HEADER + count * _KSPLAT_SPLAT > size:
@@ -135,7 +68,7 @@ def _check_sog(file: IO[bytes], size: int) -> None:
             if member.filename.lower().endswith(".webp"):
                 with archive.open(member) as image:
                     width, height = webp_size(image.read(30))
-                if width * height > max(2 * count, _SOG_PALETTE):
+                if width * height > max(2 * count, MAX_PALETTE_PIXELS):
                     raise ValueError(f"{member.filename} has {width}x{height} pixels for {count:,} splats")
 
 
@@ -160,7 +93,6 @@ def webp_size(head: bytes) -> tuple[int, int]:
 
 
 _CHECKS: dict[str, Callable[[IO[bytes], int], None]] = {
-    ".spz": _check_spz,
     ".ksplat": _check_ksplat,
     ".sog": _check_sog,
 }

@@ -1,7 +1,7 @@
 """PlayCanvas' SOG: the values of splats as the pixels of lossless WebP images.
 
-Specification: https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog/ (version 2). Needs
-Pillow and scipy, which Blender lacks; only the process of the trainer or of the command line writes SOG.
+Specification: https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog/ (version 2).
+Reading needs Pillow, writing also scipy. Blender lacks both; the trainer and the command line have them.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import io
 import json
 import warnings
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable
 from math import ceil, sqrt
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,16 +18,22 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import LodgsError
+from ..documents import open_file, parse_json
+from ..errors import LodgsError, printable
 from ..files import atomic_write
 from .coding import MAX_LOGIT
 from .gaussians import SplatRows, Splats
 from .morton import spatial_order
+from .packed_files import MAX_PALETTE_PIXELS, webp_size
+from .sh import coefficient_count, degree_from_count
+from .splat_format import NeedsSplatTransform
 
 META = "meta.json"
 MAX_DEGREE = 3
 MAX_PALETTE = 1 << 16
 """Maximum number of sets of SH coefficients that splats share."""
+_MAX_META = 1 << 20
+"""Maximum bytes of the main file; codebooks take most of them."""
 _MIN_LOG_SCALE = -20.0
 """Minimum of stored scales; smaller ones would widen the steps of all."""
 _ENTRIES = 256
@@ -141,42 +147,79 @@ def encode_sog(splats: Splats) -> dict[str, bytes]:
     return {META: json.dumps(meta).encode(), **files}
 
 
-def decode_sog(files: Mapping[str, bytes]) -> Splats:
-    """Return the splats of the files of a SOG of version 2.
+def read_sog(path: Path) -> tuple[Splats, dict]:
+    """Read a ``.sog`` file; return splats and an empty meta.
 
     Raises:
-        KeyError, ValueError, TypeError, OSError: the files are damaged.
-        LodgsError: a package is missing.
+        LodgsError: the file cannot be read or is damaged.
+        NeedsSplatTransform: see :func:`decode_sog`.
     """
-    packages = load_packages()
-    meta = json.loads(files[META])
+    try:
+        with open_file(path) as file, zipfile.ZipFile(file) as archive:
+            return decode_sog(archive.read), {}
+    except (LodgsError, NeedsSplatTransform):
+        raise
+    except Exception as error:  # zipfile documents no exception types
+        raise sog_error(path, error) from error
+
+
+def sog_error(path: Path, error: Exception) -> LodgsError:
+    """Return the error for a damaged file."""
+    reason = printable(f"{type(error).__name__}: {error}")[:300]
+    return LodgsError(f"Cannot read {path}: it is damaged ({reason}).", "Export it again.")
+
+
+def decode_sog(read: Callable[[str], bytes]) -> Splats:
+    """Return the splats of the files of a SOG of version 2.
+
+    Args:
+        read: function that returns the content of a file by name.
+
+    Raises:
+        KeyError, ValueError, TypeError, IndexError, OSError, LodgsError: the files are damaged.
+        NeedsSplatTransform: Pillow is missing, or the version is 1.
+    """
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise NeedsSplatTransform from error
+    meta = parse_json(read(META), META, _MAX_META)
+    if meta.get("version") != 2:
+        raise NeedsSplatTransform
     count = int(meta["count"])
 
-    def pixels(part: str, index: int = 0) -> np.ndarray:
-        with packages.Image.open(io.BytesIO(files[meta[part]["files"][index]]), formats=["WEBP"]) as image:
-            return np.asarray(image.convert("RGBA")).reshape(-1, 4)
+    def pixels(part: str, index: int = 0, size: int | None = count) -> np.ndarray:
+        data = read(meta[part]["files"][index])
+        width, height = webp_size(data[:30])
+        if width * height > max(2 * count, MAX_PALETTE_PIXELS):
+            raise ValueError(f"an image has {width}x{height} pixels for {count:,} splats")
+        with Image.open(io.BytesIO(data), formats=["WEBP"]) as image:
+            values = np.asarray(image.convert("RGBA")).reshape(-1, 4)[:size]
+        if size is not None and len(values) != size:
+            raise ValueError(f"an image is too small for {count:,} splats")
+        return values
 
     def table(part: str) -> np.ndarray:
         return np.array(meta[part]["codebook"], np.float32)
 
-    low, high = (np.array(meta["means"][end], np.float64) for end in ("mins", "maxs"))
-    codes = pixels("means", 0)[:count, :3] + 256 * pixels("means", 1)[:count, :3].astype(np.int64)
+    low, high = (np.array(meta["means"][end], np.float64).reshape(3) for end in ("mins", "maxs"))
+    codes = pixels("means", 0)[:, :3] + 256 * pixels("means", 1)[:, :3].astype(np.int64)
     stretched = low + codes * ((high - low) / 65535)
-    colors = pixels("sh0")[:count]
+    colors = pixels("sh0")
     sh = table("sh0")[colors[:, :3]][:, None]
     if "shN" in meta:
-        coefficients = (int(meta["shN"]["bands"]) + 1) ** 2 - 1
-        sets = table("shN")[pixels("shN", 0)[:, :3]].reshape(-1, coefficients, 3)
-        labels = pixels("shN", 1)[:count].astype(np.int64)
+        coefficients = coefficient_count(int(meta["shN"]["bands"])) - 1
+        sets = table("shN")[pixels("shN", 0, None)[:, :3]].reshape(-1, coefficients, 3)
+        labels = pixels("shN", 1).astype(np.int64)
         sh = np.concatenate([sh, sets[labels[:, 0] + 256 * labels[:, 1]]], axis=1)
+        degree_from_count(sh.shape[1])
     opacities = (colors[:, 3] / 255).clip(1 / 1024, 1 - 1 / 1024)
+    with np.errstate(over="ignore"):  # such splats cannot be drawn, and are dropped later
+        means = (np.sign(stretched) * np.expm1(np.abs(stretched))).astype(np.float32)
     return Splats(
-        (np.sign(stretched) * np.expm1(np.abs(stretched))).astype(np.float32),
-        _decode_quats(pixels("quats")[:count]),
-        table("scales")[pixels("scales")[:count, :3]],
-        np.log(opacities / (1 - opacities)).astype(np.float32),
-        sh,
-    )
+        means, _decode_quats(pixels("quats")), table("scales")[pixels("scales")[:, :3]],
+        np.log(opacities / (1 - opacities)).astype(np.float32), sh,
+    )  # fmt: skip
 
 
 def _codebook(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

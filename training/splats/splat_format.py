@@ -10,6 +10,10 @@ from .gaussians import SplatRows
 from .portable_levels import PortableLevels
 
 
+class NeedsSplatTransform(Exception):
+    """Raised for files that splat-transform must read: a package is missing, or the version is old."""
+
+
 class SplatFormat(NamedTuple):
     """A file format for the splats of one level.
 
@@ -24,7 +28,8 @@ class SplatFormat(NamedTuple):
             coefficients; else 0.
         antialiased: True if the format stores that splats need Mip-Splatting's 2D filter.
         write: function that writes splats with the meta of their bundle; None for splat-transform.
-        read: function that reads a file; None for splat-transform.
+        read: function that reads splats and meta of a file; None for splat-transform. It may raise
+            :class:`NeedsSplatTransform`.
         write_levels: function that writes all levels for selection by distance; None if the format has none.
             It replaces ``write``.
         read_levels: function that converts a file with levels to a bundle; it replaces ``read``.
@@ -41,7 +46,7 @@ class SplatFormat(NamedTuple):
     palette_size: int = 0
     antialiased: bool = False
     write: Callable[[Path, SplatRows, dict], None] | None = None
-    read: Callable[[Path], SplatRows] | None = None
+    read: Callable[[Path], tuple[SplatRows, dict]] | None = None
     write_levels: Callable[[Path, PortableLevels], None] | None = None
     read_levels: Callable[[Path, Path], None] | None = None
     require: Callable[[], object] | None = None
@@ -55,7 +60,7 @@ class SplatFormat(NamedTuple):
     @property
     def reads_in_trainer(self) -> bool:
         """True if only the trainer reads the format."""
-        return self.require is not None and (self.read is not None or self.read_levels is not None)
+        return self.require is not None and self.read_levels is not None
 
     @property
     def uses_splat_transform(self) -> bool:

@@ -7,23 +7,24 @@ level per leaf. Specification: https://developer.playcanvas.com/user-manual/gaus
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from ..documents import read_json
+from ..documents import read_bytes, read_json
 from ..errors import LodgsError
 from ..files import atomic_folder
 from .gaussians import SplatRows, Splats
 from .levels import MAX_READ_LEVELS, Bundle
 from .morton import spatial_order
-from .ply import BATCH_ROWS
+from .ply import BATCH_ROWS, write_ply
 from .portable_levels import ConcatenatedRows
 from .sh import coefficient_count
-from .sog import MAX_DEGREE, META, encode_sog, load_packages
+from .sog import MAX_DEGREE, META, decode_sog, encode_sog, load_packages, sog_error
+from .splat_format import NeedsSplatTransform
 
 STREAMED_FILE = "lod-meta.json"
 """Main file of streamed levels, in a folder of their own."""
@@ -38,6 +39,10 @@ LEAF_SPLATS = 1 << 14
 """Maximum number of splats of all levels in a leaf."""
 FILE_SPLATS = 1 << 17
 """Maximum number of splats of a SOG; larger levels have several."""
+MeasureLeaf = Callable[[Mapping[int, Splats], np.ndarray], Mapping[int, float]]
+"""Function that returns the error of each level of detail of a leaf from its splats and bounds (2, 3)."""
+_MAX_JSON, _MAX_NESTING, _MAX_FILE = 1 << 26, 200, 1 << 30
+"""Maximum bytes and nesting of the main file, and maximum bytes of another file."""
 _SIGMAS = 3.0
 """Extent of a splat in the bounds of leaves, in standard deviations."""
 
@@ -50,18 +55,23 @@ class _Leaf:
         rows: rows (N,) of its splats by level of detail, 0 the finest, in Morton order.
         ranges: entry of each level of detail in the main file.
         bounds: (2, 3), minimum and maximum of its splats.
+        errors: error of each level of detail, if measured.
     """
 
     rows: dict[int, np.ndarray]
     ranges: dict[int, dict[str, int]] = field(default_factory=dict)
     bounds: np.ndarray = field(default_factory=lambda: np.array([[np.inf] * 3, [-np.inf] * 3]))
+    errors: list[float] = field(default_factory=list)
 
 
-def write_streamed_levels(folder: Path, bundle: Bundle) -> None:
+def write_streamed_levels(folder: Path, bundle: Bundle, measure: MeasureLeaf | None = None) -> None:
     """Write levels that browsers stream by distance: ``lod-meta.json`` and its files.
 
     Levels without splats, which crops can leave, are omitted. An earlier export in the folder is replaced
     after all files are written. Memory holds the means of all levels and the splats of one file.
+
+    Args:
+        measure: function that measures the levels' errors, for viewers that select levels by error.
 
     Raises:
         LodgsError: a package is missing, the folder has other files or cannot be written, no level has
@@ -83,10 +93,10 @@ def write_streamed_levels(folder: Path, bundle: Bundle) -> None:
     if folder.is_dir() and any(folder.iterdir()) and not (folder / STREAMED_FILE).exists():
         raise LodgsError(f"Cannot export to {folder}: it contains other files.", "Choose an empty folder.")
     with atomic_folder(folder) as target:
-        _write_files(target, levels, degree)
+        _write_files(target, levels, degree, measure)
 
 
-def _write_files(folder: Path, levels: Sequence[SplatRows], degree: int) -> None:
+def _write_files(folder: Path, levels: Sequence[SplatRows], degree: int, measure: MeasureLeaf | None) -> None:
     places = np.concatenate([_read_places(rows) for rows in levels])
     begins = np.cumsum([0, *map(len, levels)])
     far = _is_surroundings(places, len(levels[0]))
@@ -103,18 +113,30 @@ def _write_files(folder: Path, levels: Sequence[SplatRows], degree: int) -> None
     if len(surroundings):
         splats = _with_degree(levels[0].select(surroundings), degree)
         _write_sog(folder / SURROUNDINGS, splats.select(spatial_order(splats.means)))
+    if measure is not None:
+        for leaf in leaves:
+            leaf.errors = _measure_errors(leaf, levels, measure)
     meta = {
         "version": 1,
         "asset": {"generator": "LODGS"},
         "count": sum(counts),
         "counts": counts,
         "lodLevels": len(levels),
-        "lodErrors": False,
+        "lodErrors": measure is not None,
         **({"environment": SURROUNDINGS} if len(surroundings) else {}),
         "filenames": names,
         "tree": _describe(tree),
     }
     (folder / STREAMED_FILE).write_text(json.dumps(meta), "utf-8")
+
+
+def _measure_errors(leaf: _Leaf, levels: Sequence[SplatRows], measure: MeasureLeaf) -> list[float]:
+    """Return the error of each level of detail of a leaf; coarser levels have no smaller one."""
+    errors = measure({lod: _read_rows(levels[lod], rows) for lod, rows in leaf.rows.items()}, leaf.bounds)
+    result, largest = [0.0] * len(levels), 0.0
+    for lod in sorted(errors):
+        result[lod] = largest = max(largest, float(errors[lod]))
+    return result
 
 
 def _write_sog(path: Path, splats: Splats) -> None:
@@ -184,9 +206,7 @@ def _file_groups(leaves: Sequence[_Leaf], lod: int) -> Iterator[list[_Leaf]]:
 
 def _read_file(rows: SplatRows, leaves: Sequence[_Leaf], lod: int, file: int, degree: int) -> Splats:
     """Return a level's splats in leaves that share a file, and enter their ranges and bounds."""
-    row_numbers = np.concatenate([leaf.rows[lod] for leaf in leaves])
-    order = np.argsort(row_numbers, kind="stable")
-    splats = rows.select(row_numbers[order]).select(np.argsort(order, kind="stable"))
+    splats = _read_rows(rows, np.concatenate([leaf.rows[lod] for leaf in leaves]))
     splats, reach, offset = _with_degree(splats, degree), _radii(splats), 0
     for leaf in leaves:
         count = len(leaf.rows[lod])
@@ -197,6 +217,12 @@ def _read_file(rows: SplatRows, leaves: Sequence[_Leaf], lod: int, file: int, de
         leaf.bounds = np.array([np.minimum(leaf.bounds[0], low), np.maximum(leaf.bounds[1], high)])
         offset += count
     return splats
+
+
+def _read_rows(rows: SplatRows, wanted: np.ndarray) -> Splats:
+    """Return splats by row, in any order."""
+    order = np.argsort(wanted, kind="stable")
+    return rows.select(wanted[order]).select(np.argsort(order, kind="stable"))
 
 
 def _with_degree(splats: Splats, degree: int) -> Splats:
@@ -212,6 +238,7 @@ def _describe(node: _Node) -> dict:
         return {
             "bound": {"min": low, "max": high},
             "lods": {str(lod): entry for lod, entry in sorted(node.ranges.items())},
+            **({"errors": node.errors} if node.errors else {}),
         }
     children = [_describe(child) for child in node]
     low = np.min([child["bound"]["min"] for child in children], axis=0)
@@ -225,7 +252,86 @@ def count_lods(path: Path) -> int:
     Raises:
         LodgsError: the file is damaged.
     """
-    count = read_json(path).get("lodLevels")
+    count = _read_meta(path).get("lodLevels")
     if type(count) is not int or not 1 <= count <= MAX_READ_LEVELS:
         raise LodgsError(f"Cannot read {path}: it does not describe streamed levels.", "Choose another file.")
     return count
+
+
+def _read_meta(path: Path) -> dict:
+    return read_json(path, max_bytes=_MAX_JSON, max_nesting=_MAX_NESTING)
+
+
+def read_streamed_levels(path: Path, folder: Path) -> None:
+    """Convert streamed levels to a folder of PLYs, each with the surroundings.
+
+    Args:
+        path: a :data:`STREAMED_FILE`.
+
+    Raises:
+        LodgsError: the files cannot be read or are damaged, or refer to files outside their folder.
+        NeedsSplatTransform: see :func:`.sog.decode_sog`.
+    """
+    count, meta = count_lods(path), _read_meta(path)
+    try:
+        names, ranges = list(meta["filenames"]), _collect_ranges(meta["tree"], count)
+        surroundings = [_read_part(path, meta["environment"])] if meta.get("environment") else []
+        folder.mkdir()
+        for lod, files in enumerate(ranges):
+            parts = [_select(_read_part(path, names[file]), files[file]) for file in sorted(files)]
+            parts += surroundings
+            degree = max(part.sh_degree for part in parts)
+            splats = Splats.concatenated([_with_degree(part, degree) for part in parts])
+            write_ply(folder / f"lod{lod}.ply", splats)
+    except (LodgsError, NeedsSplatTransform):
+        raise
+    except (KeyError, ValueError, TypeError, IndexError, AttributeError, OSError) as error:
+        raise sog_error(path, error) from error
+
+
+def _collect_ranges(tree: dict, count: int) -> list[dict[int, list[tuple[int, int]]]]:
+    """Return the first and last row of each part of each level, by the number of its file."""
+    ranges: list[dict[int, list[tuple[int, int]]]] = [{} for _ in range(count)]
+    waiting = [tree]
+    while waiting:
+        node = waiting.pop()
+        waiting += node.get("children", [])
+        for lod, entry in node.get("lods", {}).items():
+            file, offset, length = (entry[name] for name in ("file", "offset", "count"))
+            if not all(type(value) is int and value >= 0 for value in (file, offset, length)):
+                raise ValueError("a range of splats is not valid")
+            ranges[int(lod)].setdefault(file, []).append((offset, offset + length))
+    return ranges
+
+
+def _select(splats: Splats, ranges: Sequence[tuple[int, int]]) -> Splats:
+    """Return the splats in ranges of rows.
+
+    Raises:
+        ValueError: the ranges do not fit the splats.
+    """
+    if sum(end - begin for begin, end in ranges) > len(splats) or max(ranges)[1] > len(splats):
+        raise ValueError("ranges of splats do not fit their file")
+    return splats.select(np.concatenate([np.arange(begin, end) for begin, end in ranges]))
+
+
+def _read_part(path: Path, name: str) -> Splats:
+    """Return the splats of one of the files of streamed levels.
+
+    Args:
+        name: its path relative to the folder of the main file.
+    """
+    main = path.parent.joinpath(*_parts(name))
+    return decode_sog(lambda file: read_bytes(main.with_name(*_parts(file)), _MAX_FILE))
+
+
+def _parts(name: str) -> tuple[str, ...]:
+    """Return the parts of a relative path.
+
+    Raises:
+        ValueError: it leaves the folder.
+    """
+    parts = tuple(name.split("/"))
+    if any(part in ("", ".", "..") or set(part) & set("\\:") for part in parts):
+        raise ValueError(f"{name!r} is not a path in the folder")
+    return parts

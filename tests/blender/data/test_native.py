@@ -303,3 +303,17 @@ def test_blender_draws_looks_paint_and_weights(bpy, lodgs, make, with_splats, tm
     np.testing.assert_allclose(0.5 + SH_C0 * exported.sh[:, 0], base @ matrix.T, atol=1e-5)
     np.testing.assert_allclose(1 / (1 + np.exp(-exported.opacity_logits)), opacity, atol=1e-6)
     assert bpy.context.scene.lodgs_viewport.drawn_by == "BLENDER"
+
+
+def test_blender_imports_our_spz_upright(bpy, lodgs, make, with_splats, tmp_path):
+    """By the specification of SPZ y is up, which Blender turns to z; -y is up in a PLY."""
+    splats = make(60)
+    lodgs("training.splats.spz").write_spz(tmp_path / "a.spz", splats, {})
+    bpy.ops.wm.spz_import(filepath=str(tmp_path / "a.spz"))
+    obj = bpy.context.object
+    turn = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+    means = attribute(lodgs, obj, "position") @ np.array(obj.matrix_world)[:3, :3].T
+    np.testing.assert_allclose(means, splats.means @ turn.T, atol=1e-5)
+    np.testing.assert_allclose(
+        attribute(lodgs, obj, "radiance:base")[:, 3], 1 / (1 + np.exp(-splats.opacity_logits)), atol=0.003
+    )

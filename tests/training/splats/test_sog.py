@@ -11,8 +11,14 @@ from PIL import Image
 from training.errors import LodgsError
 from training.splats.gaussians import Splats
 from training.splats.levels import Bundle, Level
+from training.splats.ply import read_ply
 from training.splats.sog import decode_sog, encode_sog, make_palette, write_sog
-from training.splats.streamed_levels import LEAF_SPLATS, STREAMED_FILE, write_streamed_levels
+from training.splats.streamed_levels import (
+    LEAF_SPLATS,
+    STREAMED_FILE,
+    read_streamed_levels,
+    write_streamed_levels,
+)
 
 
 def random_splats(count: int, degree: int = 0, seed: int = 0, extent: float = 1.0) -> Splats:
@@ -64,7 +70,7 @@ def test_splats_round_trip(tmp_path, degree):
     splats = random_splats(900, degree)
     write_sog(tmp_path / "a.sog", splats, {})
     with zipfile.ZipFile(tmp_path / "a.sog") as archive:
-        decoded = decode_sog({name: archive.read(name) for name in archive.namelist()})
+        decoded = decode_sog(archive.read)
     distances = np.linalg.norm(decoded.means[:, None] - splats.means[None], axis=2)
     splats = splats.select(distances.argmin(axis=1))
     assert np.abs(decoded.means - splats.means).max() < 5e-4
@@ -128,7 +134,7 @@ def test_streamed_levels_hold_every_splat_once(tmp_path):
 
     def read(name: str) -> Splats:
         folder = (tmp_path / "web" / name).parent
-        return decode_sog({path.name: path.read_bytes() for path in folder.iterdir()})
+        return decode_sog(lambda file: (folder / file).read_bytes())
 
     files = [read(name) for name in meta["filenames"]]
     parts: dict[str, list[np.ndarray]] = {"0": [], "1": []}
@@ -150,6 +156,59 @@ def test_streamed_levels_hold_every_splat_once(tmp_path):
     )
 
 
+def test_levels_are_read_with_the_surroundings(tmp_path, monkeypatch):
+    """Many leaves, whose tree is deeper than other JSON may be."""
+    monkeypatch.setattr("training.splats.streamed_levels.LEAF_SPLATS", 8)
+    levels = [Level(1, random_splats(400, 0, 1)), Level(2, random_splats(900, 1, 2))]
+    levels[1].splats.means[:40] += 30
+    write_streamed_levels(tmp_path / "web", Bundle("flod", levels))
+    read_streamed_levels(tmp_path / "web" / STREAMED_FILE, tmp_path / "read")
+    for lod, count in ((0, 900), (1, 440)):
+        splats = read_ply(tmp_path / "read" / f"lod{lod}.ply")
+        assert len(splats) == count and (splats.means > 20).all(axis=1).sum() == 40
+    assert not (tmp_path / "read" / "lod2.ply").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("filenames", ["../secret/meta.json"]),
+        ("filenames", ["C:/meta.json"]),
+        ("environment", "/etc/meta.json"),
+        ("filenames", []),
+        ("tree", {"lods": {"0": {"file": 0, "offset": 3, "count": 7}}}),
+        ("tree", {"lods": {"0": {"file": 0, "offset": 0, "count": 2**40}}}),
+        ("tree", {"children": [{"lods": {"0": {"file": 0, "offset": 0, "count": 9}}}] * 2}),
+        ("tree", []),
+        ("lodLevels", 10**9),
+    ],
+)
+def test_hostile_main_files_are_refused(tmp_path, name, value):
+    write_streamed_levels(tmp_path / "web", Bundle("", [Level(1, random_splats(9))]))
+    meta = json.loads((tmp_path / "web" / STREAMED_FILE).read_text("utf-8"))
+    (tmp_path / "web" / STREAMED_FILE).write_text(json.dumps(meta | {name: value}), "utf-8")
+    with pytest.raises(LodgsError, match="Cannot read"):
+        read_streamed_levels(tmp_path / "web" / STREAMED_FILE, tmp_path / "read")
+
+
+def test_errors_of_leaves_grow_with_the_level(tmp_path, monkeypatch):
+    """The format asks for one number per level in each leaf, no smaller than that of a finer level."""
+    monkeypatch.setattr("training.splats.streamed_levels.LEAF_SPLATS", 200)
+    levels = [Level(number, random_splats(300, 0, number)) for number in (1, 2, 3)]
+    seen = []
+
+    def measure(splats, bounds):
+        seen.append(sum(map(len, splats.values())))
+        low, high = bounds
+        assert all((part.means >= low).all() and (part.means <= high).all() for part in splats.values())
+        return {lod: (0.0, 0.5, 0.25)[lod] for lod in splats}
+
+    write_streamed_levels(tmp_path / "web", Bundle("flod", levels), measure)
+    meta = json.loads((tmp_path / "web" / STREAMED_FILE).read_text("utf-8"))
+    assert meta["lodErrors"] is True and sum(seen) == meta["count"]
+    assert {tuple(leaf["errors"]) for leaf in leaves(meta["tree"])} == {(0.0, 0.5, 0.5)}
+
+
 def test_degree_4_is_refused(tmp_path):
     with pytest.raises(LodgsError, match="degree 4"):
         write_streamed_levels(tmp_path / "web", Bundle("", [Level(1, random_splats(9, 4))]))
@@ -166,7 +225,7 @@ def test_file_is_not_replaced_by_levels(tmp_path):
 def test_infinite_scales_and_opacities_are_limited(tmp_path):
     splats = random_splats(50)
     splats.log_scales[::5, 1], splats.opacity_logits[::7] = -np.inf, np.inf
-    decoded = decode_sog(encode_sog(splats))
+    decoded = decode_sog(encode_sog(splats).__getitem__)
     finite = np.isfinite(splats.log_scales)
     assert np.abs(decoded.log_scales - splats.log_scales)[finite].max() < 0.2
     assert (decoded.log_scales[~finite] < -15).all() and np.isfinite(decoded.opacity_logits).all()

@@ -1,7 +1,7 @@
 """Splat files of other programs. Each module of this package declares one format as ``FORMAT``.
 
-LODGS itself reads and writes PLY, ``.splat``, glTF and, in the trainer's environment, USD; there it also
-writes SOG. splat-transform reads and writes the others.
+LODGS itself reads and writes PLY, ``.splat``, SPZ, glTF and, in the trainer's environment, USD and SOG.
+splat-transform reads and writes the others.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from ..dialects import comments_from_meta
 from ..gaussians import SplatRows
 from ..packed_files import check_packed_file
 from ..ply import write_ply
-from ..splat_format import SplatFormat
+from ..splat_format import NeedsSplatTransform, SplatFormat
 from ..splat_transform import FiniteRows, find_splat_transform, run_splat_transform, splat_transform_steps
-from ..streamed_levels import STREAMED_FILE, count_lods
+from ..streamed_levels import STREAMED_FILE, count_lods, read_streamed_levels
 from .ply import FORMAT as PLY
 
 FORMATS: tuple[SplatFormat, ...] = tuple(
@@ -142,17 +142,37 @@ def open_as_ply(path: Path) -> Iterator[Path]:
         converted = folder / f"{stem or 'splats'}.ply"
         if name == STREAMED_FILE:
             converted = converted.with_suffix("")
-            for lod in range(count_lods(path)):
-                run_splat_transform(["-L", str(lod), str(path), str(converted / f"lod{lod}.ply")])
+            _read_streamed(path, converted)
         elif level_readers := [
             kind.read_levels for kind in FORMATS if kind.read_levels and name.endswith(kind.suffix)
         ]:
             level_readers[0](path, converted)
-        elif readers := [kind.read for kind in FORMATS if kind.read and name.endswith(kind.suffix)]:
-            write_ply(converted, readers[0](path))
-        else:
+        elif not _read_plain(path, converted):
             run_splat_transform([str(path), str(converted)])
         yield converted
+
+
+def _read_plain(path: Path, converted: Path) -> bool:
+    """Convert a file of one level to a PLY; return False if splat-transform must do so."""
+    name = path.name.lower()
+    readers = [kind.read for kind in FORMATS if kind.read and name.endswith(kind.suffix)]
+    if not readers:
+        return False
+    try:
+        splats, meta = readers[0](path)
+    except NeedsSplatTransform:
+        return False
+    write_ply(converted, splats, comments_from_meta(meta))
+    return True
+
+
+def _read_streamed(path: Path, folder: Path) -> None:
+    """Convert streamed levels to a folder of PLYs."""
+    try:
+        read_streamed_levels(path, folder)
+    except NeedsSplatTransform:
+        for lod in range(count_lods(path)):
+            run_splat_transform(["-L", str(lod), str(path), str(folder / f"lod{lod}.ply")])
 
 
 def is_plain_ply(path: Path) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..sog import MAX_DEGREE, MAX_PALETTE, load_packages, write_sog
+from ..sog import MAX_DEGREE, MAX_PALETTE, load_packages, read_sog, write_sog
 from ..splat_format import SplatFormat
 
 FORMAT = SplatFormat(
@@ -13,5 +13,6 @@ FORMAT = SplatFormat(
     max_degree=MAX_DEGREE,
     palette_size=MAX_PALETTE,
     write=write_sog,
+    read=read_sog,
     require=load_packages,
 )

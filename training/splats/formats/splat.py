@@ -78,5 +78,5 @@ FORMAT = SplatFormat(
     (32.0,),
     max_degree=0,
     write=write_splat,
-    read=SplatFile,
+    read=lambda path: (SplatFile(path), {}),
 )

@@ -1,0 +1,332 @@
+"""Check that web viewers draw our files as we do. Part of ``make interop``.
+
+Writes the splats of bundles with views in each format, draws the first view with each viewer in Chromium,
+without a window and without a graphics card, and compares the image with our own.
+``python tools/interop_viewers.py BUNDLE.ply ...`` uses given bundles, or else that of ``make demo``;
+``--methods`` trains each method briefly instead, and draws each format once. Exit code 0: all images agree;
+1: some do not; 2: nothing was checked.
+"""
+
+from __future__ import annotations
+
+import argparse
+import http.server
+import io
+import json
+import math
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+import urllib.parse
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from tools import interop  # noqa: E402
+from training.api import load_bundle, render_image, train  # noqa: E402
+from training.editing.cleaning import Cleaning  # noqa: E402
+from training.editing.edit import edit  # noqa: E402
+from training.scenes.cameras import Camera  # noqa: E402
+from training.scenes.view_tables import read_view_tables  # noqa: E402
+from training.splats.levels import Bundle, Level  # noqa: E402
+from training.splats.ply import read_ply  # noqa: E402
+from training.splats.streamed_levels import STREAMED_FILE  # noqa: E402
+from training.splats.tiles import TILESET_FILE  # noqa: E402
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+PAGE = Path(__file__).with_suffix(".html")
+WIDTH = 320
+SECONDS = 240
+DEMO = ROOT / "build" / "demo" / "bundle.ply"
+SHORT = {"max_splats": 6000}
+METHODS = {
+    "flod": SHORT
+    | {"levels": 3, "steps": [60, 80, 120], "densify_until": [0.5] * 3, "densify_interval": [20] * 3},
+    "lodge": SHORT | {"steps": 160, "tune_steps": 8, "levels": 3},
+    "clod": SHORT | {"steps": 200},
+    "octree": SHORT | {"steps": 200},
+    "tree": SHORT | {"steps": 160, "tune_steps": 40},
+}
+"""Parameters of short trainings."""
+METHOD_CHECKS = {
+    "cesium": ("tiles",),
+    "babylon": ("glb",),
+    "spark": ("ply", "splat", "spz"),
+    "playcanvas": ("sog", "streamed"),
+}
+"""Viewers and formats of short trainings: each format once."""
+SCENE = ROOT / "examples" / "lantern_garden"
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+"""From the axes of OpenCV's cameras to those of OpenGL's, and from those of 3DGS files to those of SPZ."""
+Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format in which viewers open splats.
+
+    Attributes:
+        option: option of ``edit`` that writes it.
+        name: file or folder to write.
+        main: file that viewers open, if the format is a folder.
+        min_psnr: minimum likeness to our image, dB.
+        trained: opacities are as trained, for Mip-Splatting's filter.
+        axes: axes of positions: "3dgs" for those of 3DGS files, "spz", or "y" or "z" for the axis that is up.
+        flat: colours do not depend on the view.
+    """
+
+    option: str
+    name: str
+    main: str = ""
+    min_psnr: float = 28.0
+    trained: bool = False
+    axes: str = "3dgs"
+    flat: bool = False
+
+
+FORMATS = {
+    "ply": Format("plain", "scene.ply", min_psnr=30.0),
+    "splat": Format("plain", "scene.splat", flat=True),
+    "spz": Format("plain", "scene.spz", trained=True, axes="spz"),
+    "sog": Format("plain", "scene.sog"),
+    "streamed": Format("streamed", "streamed", STREAMED_FILE),
+    "glb": Format("levels", "scene.glb", min_psnr=30.0, axes="y"),
+    "tiles": Format("tiles", "tiles", TILESET_FILE, axes="z"),
+}
+
+
+@dataclass(frozen=True)
+class Viewer:
+    """A program that draws splats.
+
+    Attributes:
+        label: its name in the report.
+        packages: packages from npm and their versions.
+        formats: names in FORMATS.
+        filtered: formats that it draws with a filter like Mip-Splatting's.
+        min_psnr: minimum likeness in dB instead of that of the format, for a viewer that draws less exactly.
+    """
+
+    label: str
+    packages: Mapping[str, str]
+    formats: tuple[str, ...]
+    filtered: tuple[str, ...] = ()
+    min_psnr: float = math.inf
+
+    def minimum(self, kind: str) -> float:
+        """Return the minimum likeness of a format in dB."""
+        return min(self.min_psnr, FORMATS[kind].min_psnr)
+
+
+VIEWERS = {
+    "three": Viewer(  # cuts splats at two standard deviations
+        "three.js", {"three": "0.187.0"}, ("glb",), filtered=("glb",), min_psnr=27.0
+    ),
+    "cesium": Viewer("CesiumJS", {"cesium": "1.145.0"}, ("tiles",)),
+    "babylon": Viewer(
+        "Babylon.js",
+        {"babylonjs": "9.35.0", "babylonjs-loaders": "9.28.0", "fflate": "0.8.3"},
+        ("ply", "splat", "spz", "sog", "streamed", "glb"),
+        filtered=("spz",),
+    ),
+    "playcanvas": Viewer("PlayCanvas", {"playcanvas": "2.23.3"}, ("ply", "sog", "streamed")),
+    "spark": Viewer(
+        "Spark", {"@sparkjsdev/spark": "2.2.0", "three": "0.187.0"}, ("ply", "splat", "spz", "sog")
+    ),
+}
+
+
+def main() -> int:
+    options = parse_arguments()
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    problem = interop.node_problem() or ("" if browser else "Chromium is not installed.")
+    sources = options.bundles or ([] if options.methods else [DEMO])
+    missing = [str(path) for path in sources if not path.exists()]
+    problem = problem or (f"{missing[0]} does not exist; run make demo." if missing else "")
+    if problem:
+        print(f"interop: {problem} Viewers are not checked.")
+        return 2
+    sources += [train_method(method) for method in METHODS] if options.methods else []
+    failed = False
+    print(f"{'bundle':<8}  {'viewer':<18}  {'format':<8}  {'dB':>5}  at least")
+    for source in sources:
+        with tempfile.TemporaryDirectory() as folder:
+            scene = Scene(source, Path(folder))
+            for key in options.viewers:
+                if not all(interop.install(*package) for package in VIEWERS[key].packages.items()):
+                    return 2
+                kinds = METHOD_CHECKS.get(key, ()) if options.methods else VIEWERS[key].formats
+                for kind in kinds:
+                    if not options.formats or kind in options.formats:
+                        failed |= not check(str(browser), key, kind, scene, options.images)
+    return int(failed)
+
+
+def parse_arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("bundles", nargs="*", type=Path, metavar="BUNDLE.ply")
+    parser.add_argument("--methods", action="store_true", help="train each method briefly")
+    parser.add_argument("--viewers", nargs="+", choices=list(VIEWERS), default=list(VIEWERS))
+    parser.add_argument("--formats", nargs="+", choices=list(FORMATS), default=[])
+    parser.add_argument("--images", type=Path, metavar="DIR", help="folder for the images of both")
+    return parser.parse_args()
+
+
+class Scene:
+    """A bundle, its files in all formats, and our images of a view.
+
+    Args:
+        folder: empty folder for the files.
+    """
+
+    def __init__(self, source: Path, folder: Path) -> None:
+        self.source, self.folder = source, folder
+        self.bundle: Bundle = load_bundle(source)
+        cameras, self.near, _ = read_view_tables(self.bundle.tables)
+        self.camera: Camera = cameras[0].scaled(WIDTH / cameras[0].width)
+        self._write = cache(self._write_once)
+        self._image = cache(self._image_once)
+
+    def file(self, kind: str, filters: bool) -> Path:
+        """Return the file or folder of a format, for viewers with or without a filter."""
+        return self._write(FORMATS[kind], filters)
+
+    def _write_once(self, kind: Format, antialiased: bool) -> Path:
+        path = self.folder / f"{'trained' if antialiased else 'baked'}-{kind.name}"
+        value = path if kind.option in ("streamed", "tiles") else [path]
+        edit(self.source, None, Cleaning(), antialiased=antialiased, **{kind.option: value})
+        return path
+
+    def image(self, kind: str, filters: bool) -> np.ndarray:
+        """Return our image (H, W, 3) of a format's finest splats, as a viewer should draw them."""
+        return self._image(FORMATS[kind].trained or filters, filters, FORMATS[kind].flat)
+
+    def _image_once(self, trained: bool, filters: bool, flat: bool) -> np.ndarray:
+        splats = read_ply(self._write(FORMATS["ply"], trained))
+        if flat:
+            splats.sh = splats.sh[:, :1]
+        bundle = Bundle("", [Level(1, splats)], meta={"antialias": filters and self.bundle.antialias})
+        return render_image(bundle, self.camera, near=self.near, backend="cpu").clip(0, 1)
+
+    def pose(self, axes: str) -> np.ndarray:
+        """Return the camera's transform (4, 4) to the world of a format, OpenGL axes."""
+        upright = np.eye(4)
+        upright[:3, :3] = self.bundle.up_rotation
+        world = {"3dgs": np.eye(4), "spz": FLIP, "z": upright, "y": Y_UP @ upright}[axes]
+        return world @ np.linalg.inv(self.camera.world_to_camera) @ FLIP
+
+
+def check(browser: str, key: str, kind: str, scene: Scene, images: Path | None) -> bool:
+    """Compare a viewer's image of a format with ours, print the likeness, and return whether it suffices.
+
+    Args:
+        images: folder for both images, or None.
+    """
+    viewer, expected = VIEWERS[key], scene.image(kind, kind in VIEWERS[key].filtered)
+    answer = view(browser, key, kind, scene)
+    if isinstance(answer, str):  # Babylon.js sometimes fails to load levels of glTF
+        answer = view(browser, key, kind, scene)
+    if not isinstance(answer, str) and answer.shape != expected.shape:
+        answer = f"image of {answer.shape[1]}x{answer.shape[0]} pixels"
+    likeness = -math.inf if isinstance(answer, str) else psnr(answer, expected)
+    name, version = scene.source.parent.name, next(iter(viewer.packages.values()))
+    problem = f"  {answer}" if isinstance(answer, str) else ""
+    row = f"{name:<8}  {viewer.label + ' ' + version:<18}  {kind:<8}  {likeness:5.1f}"
+    print(f"{row}  {viewer.minimum(kind):g}{problem}", flush=True)
+    if images is not None and not isinstance(answer, str):
+        images.mkdir(parents=True, exist_ok=True)
+        both = np.rint(255 * np.concatenate([answer, expected], axis=1)).astype(np.uint8)
+        Image.fromarray(both).save(images / f"{name}-{key}-{kind}.png")
+    return likeness >= viewer.minimum(kind)
+
+
+def view(browser: str, key: str, kind: str, scene: Scene) -> np.ndarray | str:
+    """Return a viewer's image (H, W, 3) of a format, or an error message."""
+    viewer, camera, main = VIEWERS[key], scene.camera, FORMATS[kind].main
+    path = scene.file(kind, kind in viewer.filtered)
+    job = {
+        "viewer": key, "file": f"/files/{path.name}{'/' + main if main else ''}",
+        "pose": scene.pose(FORMATS[kind].axes).T.ravel().tolist(), "size": [camera.width, camera.height],
+        "angle": 2 * math.atan(camera.height / 2 / camera.fy),
+    }  # fmt: skip
+    packages = {f"/{name}": interop.FOLDER / "node_modules" / name for name in viewer.packages}
+    query = urllib.parse.quote(json.dumps(job))
+    return draw(browser, PAGE, {"/files": scene.folder, **packages}, query)
+
+
+def psnr(image: np.ndarray, expected: np.ndarray) -> float:
+    """Return the PSNR of two images in dB."""
+    return float(-10 * np.log10(np.square(image - expected).mean()))
+
+
+def train_method(method: str) -> Path:
+    """Train a method on the example scene, unless done before, and return the path of its bundle."""
+    folder = interop.FOLDER / "methods" / method
+    parameters = METHODS[method]
+    scene = {"image_scale": 0.25, "backend": "cpu", "seed": 0, "preset": "draft"}
+    return train(SCENE, folder, method=method, parameters=parameters, **scene).bundle
+
+
+def draw(browser: str, page: Path, mounts: Mapping[str, Path], query: str) -> np.ndarray | str:
+    """Return the image (H, W, 3) that a page sends, or an error message.
+
+    Args:
+        browser: path of Chromium.
+        page: the page; it sends its image to /image, or an error message to /error.
+        mounts: files and folders that the page loads, by the begin of their path on the server.
+        query: query string of the page's address.
+    """
+    answers: list[tuple[str, bytes]] = []
+    arrived = threading.Event()
+
+    class Handler(http.server.SimpleHTTPRequestHandler):
+        def translate_path(self, path: str) -> str:
+            name = path.partition("?")[0]
+            for prefix, target in mounts.items():
+                if name.startswith(prefix):
+                    return f"{target}{name.removeprefix(prefix)}"
+            return str(page)
+
+        def do_POST(self) -> None:
+            answers.append((self.path, self.rfile.read(int(self.headers["Content-Length"]))))
+            self.send_response(204)
+            self.end_headers()
+            arrived.set()
+
+        def log_message(self, *_: object) -> None:
+            return
+
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    address = f"http://127.0.0.1:{server.server_port}/?{query}"
+    with tempfile.TemporaryDirectory() as profile:
+        process = subprocess.Popen(
+            [browser, "--headless=new", "--no-sandbox", "--use-angle=swiftshader",
+             "--enable-unsafe-swiftshader", f"--user-data-dir={profile}", address],
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        arrived.wait(SECONDS)
+        process.kill()
+        process.wait()
+        shutil.rmtree(profile, ignore_errors=True)
+        Path(profile).mkdir(exist_ok=True)
+    server.shutdown()
+    if not answers:
+        return f"no image within {SECONDS} s"
+    path, body = answers[0]
+    if path != "/image":
+        return body.decode("utf-8", "replace")
+    return np.asarray(Image.open(io.BytesIO(body)).convert("RGB"), np.float32) / 255
+
+
+if __name__ == "__main__":
+    sys.exit(main())
