@@ -9,7 +9,9 @@ import pytest
 from training.__main__ import main
 from training.cli import reproduce as command
 from training.errors import LodgsError
+from training.evaluate.views import Evaluation
 from training.methods import METHODS
+from training.runs.estimate import Estimate
 from training.runs.folder import RunFolder
 from training.runs.job import Job
 from training.runs.reproduction.run import (
@@ -82,6 +84,13 @@ def test_tables_are_chosen_by_number_or_name():
         chosen_tables(paper, ["7"])
 
 
+@pytest.fixture(autouse=True)
+def costs(monkeypatch):
+    """Estimates two seconds a step."""
+    costs = Estimate(100.0, 0, 0, 0, 0, 0, steps=50, views=8, size=(64, 48))
+    monkeypatch.setattr("training.runs.several.estimate", lambda job, scratch: costs)
+
+
 @pytest.fixture
 def train(splats):
     """Writes a finished FLoD run of five levels in place of a training, and lists the jobs."""
@@ -89,8 +98,10 @@ def train(splats):
     jobs = []
 
     def write(job: Job, text: str) -> str:
-        jobs.append(text)
         run = RunFolder(job.out)
+        if run.state() == "done":
+            return ""
+        jobs.append(text)
         run.create()
         job.write(run.job)
         run.events_file.write_text('{"event": "done"}\n')
@@ -110,13 +121,31 @@ KEYS = {"image_scale": 1.0, "test_every": 4, "backend": "cpu"}
 
 def test_tables_are_measured_on_each_scene_and_resumed(tiny_scene, train, tmp_path):
     text = reproduce("flod", [tiny_scene], tmp_path, train, tables=["2", "4"], effort=0.1, keys=KEYS)
-    assert len(train.jobs) == 1 and train.jobs[0].endswith("FLoD (1 of 1)")
+    assert len(train.jobs) == 1 and train.jobs[0].endswith("FLoD (1 of 1, about 5 h 33 min left)")
     assert (tmp_path / "tables.md").read_text() == text and "### Table 4" in text
     rows = json.loads((tmp_path / "tables.json").read_text())
     assert rows["Table 2"]["5"]["psnr"] > rows["Table 2"]["3"]["psnr"]
     assert rows["Table 4"]["max level"]["splats"] == len(read_scene(tiny_scene).points)
+    assert "(64x48 pixels), 0.1 times the steps" in text and "| FLoD | 10,000 |" in text
     reproduce("flod", [tiny_scene], tmp_path, train, tables=["2"], effort=0.1, keys=KEYS)
     assert len(train.jobs) == 1
+
+
+def test_tables_share_measures(tiny_scene, train, tmp_path, monkeypatch):
+    """Tables 2 and 4 have the finest level and the range of levels 3 to 5 in common."""
+    counts = {"level": 0, "range": 0}
+
+    def count(name, function):
+        def counted(*arguments):
+            counts[name] += 1
+            return function(*arguments)
+
+        return counted
+
+    monkeypatch.setattr(Evaluation, "measure_level", count("level", Evaluation.measure_level))
+    monkeypatch.setattr(Evaluation, "measure_by_distance", count("range", Evaluation.measure_by_distance))
+    reproduce("flod", [tiny_scene], tmp_path, train, tables=["2", "4"], effort=0.1, keys=KEYS)
+    assert counts == {"level": 3, "range": 3}
 
 
 def test_memory_and_image_sizes_of_a_subject(tiny_scene, train, tmp_path):
