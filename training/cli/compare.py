@@ -96,16 +96,15 @@ def _train_methods(options: argparse.Namespace, scene: Path, out: Path) -> list[
     """
     from ..methods import METHODS
     from ..runs.job import Job
-    from ..runs.several import NamedJob, reduced_image_scale, train_in_turn
+    from ..runs.several import NamedJob, ReducedJobs, train_in_turn
 
     preset = vars(options).get("preset", default_of(settings_of(Job)["preset"]))
-    keys = {"scene": str(scene), "image_scale": reduced_image_scale(scene, preset, options.effort)}
-    keys |= {name: vars(options)[name] for name in _JOB_KEYS if name in options}
-    jobs = []
-    for name in options.methods or METHODS:
-        parameters = METHODS[name].scaled_steps(preset, options.effort, {})
-        keys |= {"method": name, "out": str(out / "runs" / name), "parameters": parameters}
-        jobs.append(NamedJob(f"{METHODS[name].label} on {scene.resolve().name}", Job.from_dict(keys)))
+    keys = {name: vars(options)[name] for name in _JOB_KEYS if name in options}
+    reduced = ReducedJobs(scene, preset, options.effort, keys)
+    jobs = [
+        NamedJob(f"{METHODS[name].label} on {scene.resolve().name}", reduced.job(name, out / "runs" / name))
+        for name in options.methods or METHODS
+    ]
     runs = []
     for (_, job), problem in zip(jobs, train_in_turn(jobs, train, notify), strict=True):
         if problem:

@@ -4,18 +4,24 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from ..errors import LodgsError
 from ..evaluate.messages import format_duration
+from ..methods import method_info
 from ..scenes.check import SMALL_SIDE
 from ..scenes.colmap import read_scene
 from .estimate import estimate
 from .folder import RunFolder
 from .job import Job, default_image_scale
+
+MAX_DENSITY = 2.0
+"""Maximum number of splats per pixel of an image at an effort below 1. FLoD's paper has 2 on Mip-NeRF360."""
 
 Train = Callable[[Job, str], str]
 """Trains or resumes a job, with a text for its progress; returns the reason of a failure, or ""."""
@@ -28,19 +34,52 @@ class NamedJob(NamedTuple):
     job: Job
 
 
-def reduced_image_scale(scene: Path, preset: str, effort: float) -> float:
-    """Return the image scale that multiplies the pixels of a preset's images by an effort below 1.
+class ReducedJobs:
+    """Jobs on a scene that do a fraction of a preset's work.
 
-    The longer side keeps SMALL_SIDE pixels.
+    The effort multiplies the numbers of steps. Below 1, it also multiplies the pixels of an image, but the
+    longer side keeps SMALL_SIDE pixels; gradient thresholds follow the size of the images, and
+    MAX_DENSITY limits the splats. An image scale among the keys remains.
+
+    Args:
+        scene: COLMAP scene.
+        effort: fraction of the work.
+        keys: further keys of the jobs.
 
     Raises:
         LodgsError: the scene cannot be read.
     """
-    scale = default_image_scale(preset)
-    if effort >= 1:
-        return scale
-    side = max(max(camera.width, camera.height) for camera in read_scene(scene).cameras)
-    return round(min(max(scale * effort**0.5, SMALL_SIDE / side), scale), 4)
+
+    def __init__(self, scene: Path, preset: str, effort: float, keys: Mapping[str, Any]) -> None:
+        self.preset, self.effort = preset, effort
+        self._keys = {"scene": str(scene), "preset": preset, **keys}
+        self._keys.setdefault("image_scale", default_image_scale(preset))
+        self._max_splats = 0
+        if effort < 1:
+            sizes = np.array([(camera.width, camera.height) for camera in read_scene(scene).cameras])
+            if "image_scale" not in keys:
+                scale = self._keys["image_scale"]
+                least = min(SMALL_SIDE / sizes.max(), scale)
+                self._keys["image_scale"] = round(max(scale * effort**0.5, least), 4)
+            pixels = np.median(sizes.prod(axis=1)) * self._keys["image_scale"] ** 2
+            self._max_splats = round(MAX_DENSITY * float(pixels))
+
+    def job(self, method: str, out: Path, changes: Mapping[str, Any] | None = None, base: str = "") -> Job:
+        """Return the job of a method.
+
+        Args:
+            changes: parameters that differ from the preset; their steps are multiplied, too.
+
+        Raises:
+            LodgsError: a key or a parameter is invalid.
+        """
+        info = method_info(method)
+        parameters = info.scaled_steps(self.preset, self.effort, changes or {})
+        if self._max_splats:
+            limit = info.preset(self.preset).max_splats or self._max_splats
+            parameters |= {"max_splats": min(limit, self._max_splats), "scale_threshold": True}
+        keys = {"method": method, "out": str(out), "base": base, "parameters": parameters}
+        return Job.from_dict(self._keys | keys)
 
 
 def train_in_turn(jobs: Sequence[NamedJob], train: Train, notify: Callable[[str], object]) -> Iterator[str]:

@@ -18,12 +18,13 @@ from training.runs.reproduction.run import (
     PAPERS,
     chosen_tables,
     load_paper,
-    make_job,
+    make_jobs,
     reproduce,
     run_folder,
 )
 from training.runs.reproduction.subject import Subject
 from training.runs.reproduction.tables import PSNR, SPLATS, ascending, format_table, trade
+from training.runs.several import ReducedJobs
 from training.scenes.colmap import read_scene
 from training.splats.bundle import write_bundle
 from training.splats.levels import Bundle, Level
@@ -47,10 +48,9 @@ def test_tables_are_complete_and_trends_hold_for_the_papers_values(paper, table)
 
 
 @pytest.mark.parametrize("name", PAPERS)
-def test_trainings_are_valid_jobs(name, tmp_path):
+def test_trainings_are_valid_jobs(name, tiny_scene, tmp_path):
     paper = load_paper(name)
-    for training in paper.trainings:
-        job = make_job(paper, training, tmp_path, tmp_path / "out", 0.1, {"image_scale": 0.5})
+    for job in make_jobs(paper, list(paper.trainings), ReducedJobs(tiny_scene, "paper", 0.1, {}), tmp_path):
         full = METHODS[job.method].preset("paper")
         assert job.preset == "paper" and job.resolved_parameters().total_steps < 0.2 * full.total_steps
 
@@ -149,7 +149,7 @@ def test_tables_share_measures(tiny_scene, train, tmp_path, monkeypatch):
 
 
 def test_memory_and_image_sizes_of_a_subject(tiny_scene, train, tmp_path):
-    job = make_job(load_paper("flod"), "FLoD", tiny_scene, tmp_path, 0.1, KEYS)
+    (job,) = make_jobs(load_paper("flod"), ["FLoD"], ReducedJobs(tiny_scene, "paper", 0.1, KEYS), tmp_path)
     train(job, "")
     subject = Subject(Path(job.out))
     sizes = subject.by_size()

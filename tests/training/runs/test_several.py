@@ -11,7 +11,7 @@ from training.runs.estimate import Estimate
 from training.runs.events import event_line
 from training.runs.folder import RunFolder
 from training.runs.job import Job
-from training.runs.several import NamedJob, reduced_image_scale, train_in_turn
+from training.runs.several import NamedJob, ReducedJobs, train_in_turn
 
 COSTS = Estimate(100.0, 0, 0, 0, 0, 0, steps=50, views=8, size=(64, 48))
 """Two seconds a step."""
@@ -31,8 +31,25 @@ COSTS = Estimate(100.0, 0, 0, 0, 0, 0, steps=50, views=8, size=(64, 48))
 def test_effort_multiplies_pixels_down_to_a_minimum(monkeypatch, tmp_path, preset, effort, width, expected):
     camera = SimpleNamespace(width=width, height=width // 2)
     monkeypatch.setattr(several, "read_scene", lambda folder: SimpleNamespace(cameras=[camera]))
-    scale = reduced_image_scale(tmp_path, preset, effort)
-    assert round(scale * width) == expected and 0 < scale <= 1
+    job = ReducedJobs(tmp_path, preset, effort, {}).job("3dgs", tmp_path / "run")
+    assert round(job.image_scale * width) == expected
+    job = ReducedJobs(tmp_path, preset, effort, {"image_scale": 0.5}).job("3dgs", tmp_path / "run")
+    assert job.image_scale == 0.5
+
+
+def test_effort_limits_splats_by_pixels(tiny_scene, tmp_path):
+    """Images of 64x48 pixels have at most 6,144 splats, and the draft's limit remains below it."""
+
+    def parameters(preset, effort, scale):
+        jobs = ReducedJobs(tiny_scene, preset, effort, {"image_scale": scale})
+        return jobs.job("3dgs", tmp_path / "run").resolved_parameters()
+
+    paper = parameters("paper", 0.1, 1.0)
+    assert (paper.max_splats, paper.scale_threshold) == (2 * 64 * 48, True)
+    assert parameters("paper", 0.1, 0.5).max_splats == 2 * 32 * 24
+    assert parameters("draft", 0.1, 1.0).max_splats == 2 * 64 * 48
+    full = parameters("paper", 1.0, 1.0)
+    assert (full.max_splats, full.scale_threshold) == (0, False)
 
 
 @pytest.fixture

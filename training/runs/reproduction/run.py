@@ -13,11 +13,10 @@ import numpy as np
 from ...errors import LodgsError
 from ...evaluate.lpips import missing_line
 from ...files import atomic_write, create_folder
-from ...methods import method_info
 from ...splats.dialects import Warn, ignore
 from ..folder import RunFolder
 from ..job import Job
-from ..several import NamedJob, Train, reduced_image_scale, train_in_turn
+from ..several import NamedJob, ReducedJobs, Train, train_in_turn
 from .subject import Subject
 from .tables import Measured, Paper, Table, format_table
 
@@ -46,20 +45,19 @@ def chosen_tables(paper: Paper, names: Collection[str]) -> list[Table]:
     return [known[name] for name in wanted] if wanted else list(paper.tables)
 
 
-def make_job(paper: Paper, name: str, scene: Path, out: Path, effort: float, keys: Mapping[str, Any]) -> Job:
-    """Return the job of a training of a paper on a scene.
+def make_jobs(paper: Paper, names: Sequence[str], jobs: ReducedJobs, out: Path) -> list[Job]:
+    """Return the jobs of trainings of a paper on a scene.
 
     Args:
+        names: names of the trainings.
         out: folder of the runs of the scene.
-        keys: further keys of the job.
     """
-    training = paper.trainings[name]
-    base = str(run_folder(out, training.base)) if training.base else ""
-    parameters = method_info(training.method).scaled_steps("paper", effort, training.changes)
-    return Job.from_dict({
-        "scene": str(scene), "out": str(run_folder(out, name)), "method": training.method, "base": base,
-        "preset": "paper", "parameters": parameters, **keys,
-    })  # fmt: skip
+    result = []
+    for name in names:
+        training = paper.trainings[name]
+        base = str(run_folder(out, training.base)) if training.base else ""
+        result.append(jobs.job(training.method, run_folder(out, name), training.changes, base))
+    return result
 
 
 def run_folder(out: Path, name: str) -> Path:
@@ -87,7 +85,7 @@ def reproduce(
         out: folder of the runs and of the results. The same call resumes.
         train: trains a job.
         tables: numbers or names of tables; all without any.
-        effort: fraction of the steps and pixels of the preset *paper*, see ``reduced_image_scale``.
+        effort: fraction of the work of the preset *paper*, see ``ReducedJobs``.
         keys: further keys of the jobs, such as ``image_scale``.
         warn, notify: receive warnings, and sentences about progress.
 
@@ -102,11 +100,9 @@ def reproduce(
     needed = _needed_trainings(paper, chosen)
     jobs = []
     for scene in scenes:
-        scene_keys = {"image_scale": reduced_image_scale(scene, "paper", effort), **(keys or {})}
-        folder = out / scene.resolve().name
-        for training in needed:
-            job = make_job(paper, training, scene, folder, effort, scene_keys)
-            jobs.append(NamedJob(f"{scene.resolve().name}, {training}", job))
+        place = scene.resolve().name
+        on_scene = make_jobs(paper, needed, ReducedJobs(scene, "paper", effort, keys or {}), out / place)
+        jobs += [NamedJob(f"{place}, {label}", job) for label, job in zip(needed, on_scene, strict=True)]
     values: dict[tuple[str, str], list[Measured]] = {}
     sizes: dict[str, str] = {}
     problems = train_in_turn(jobs, train, notify)
