@@ -125,11 +125,14 @@ def test_quality_between_sets_is_interpolated_over_the_logarithm():
 
 def test_answers_name_the_best_run_and_ignore_baselines():
     def run(label, splats, psnr, seconds, **values):
-        return ComparedRun(label, "", [Point("", splats, psnr, 0.9, 0.01)], seconds=seconds, **values)
+        return ComparedRun(
+            label, "", [Point("", splats, psnr, 0.9, 0.01)], loaded=splats, seconds=seconds, **values
+        )
 
     rows = answers([run("A", 100, 30, 50), run("B", 200, 31, 60), run("C", 200, 40, None, baseline=True)])
     best = {row["purpose"]: row["best"] for row in rows}
     assert best["Quality at full detail"] == "B" and best["Short training"] == "A"
+    assert best["Few splats to load"] == "A"  # 100 splats, all without levels
     assert "Speed from far away" not in best  # neither has levels
 
 

@@ -213,12 +213,12 @@ def merge_baseline(
     Returns:
         The measures, and the merged splats by their number.
     """
-    merged, sets = splats, {len(splats): splats}
+    merged, sets, names = splats, {len(splats): splats}, {len(splats): "Finest level"}
     for share in MERGED_SHARES:
         merged = merge(merged, max(round(len(splats) * share), 1))
-        sets[len(merged)] = merged
+        sets[len(merged)], names[len(merged)] = merged, f"Merged to {100 * share:g}%"
     points = [
-        Point.of(evaluation.measure_splats(part), f"{count:,} splats", evaluation.prefix)
+        Point.of(evaluation.measure_splats(part), names[count], evaluation.prefix)
         for count, part in sorted(sets.items())
     ]
     about = f"{label} with neighbours merged, for comparison"
@@ -269,7 +269,7 @@ PURPOSES = (
             _describe_reduced),
     Purpose("Speed from far away", lambda run, _: run.farther[-1]["frame_s"] if run.farther else None,
             _describe_far),
-    Purpose("Few splats to load", lambda run, _: run.loaded if run.by_distance else None,
+    Purpose("Few splats to load", lambda run, _: run.loaded,
             lambda run, _: f"{run.loaded:,} splats for a view"),
     Purpose("Smooth changes", lambda run, _: run.largest_jump,
             lambda run, _: f"largest jump between frames {run.largest_jump:.2f} times that of full detail"),
