@@ -53,16 +53,15 @@ class ReducedJobs:
     def __init__(self, scene: Path, preset: str, effort: float, keys: Mapping[str, Any]) -> None:
         self.preset, self.effort = preset, effort
         self._keys = {"scene": str(scene), "preset": preset, **keys}
-        self._keys.setdefault("image_scale", default_image_scale(preset))
+        scale = keys.get("image_scale", default_image_scale(preset))
         self._max_splats = 0
         if effort < 1:
             sizes = np.array([(camera.width, camera.height) for camera in read_scene(scene).cameras])
             if "image_scale" not in keys:
-                scale = self._keys["image_scale"]
                 least = min(SMALL_SIDE / sizes.max(), scale)
-                self._keys["image_scale"] = round(max(scale * effort**0.5, least), 4)
-            pixels = np.median(sizes.prod(axis=1)) * self._keys["image_scale"] ** 2
-            self._max_splats = round(MAX_DENSITY * float(pixels))
+                scale = round(max(scale * effort**0.5, least), 4)
+            self._max_splats = round(MAX_DENSITY * float(np.median(sizes.prod(axis=1))) * scale**2)
+        self._keys["image_scale"] = scale
 
     def job(self, method: str, out: Path, changes: Mapping[str, Any] | None = None, base: str = "") -> Job:
         """Return the job of a method.
