@@ -122,12 +122,16 @@ def reproduce(
     }
     lines = [format_paper(paper, chosen, measured, sizes, effort), *format_trainings(needed, jobs)]
     text = "\n".join(lines) + "\n"
+    _write_results(out, measured, text)
+    return text
+
+
+def _write_results(out: Path, measured: Mapping, text: str) -> None:
     create_folder(out)
     with atomic_write(out / "tables.json") as temporary:
         Path(temporary).write_text(json.dumps(measured, indent=1), encoding="utf-8")
     with atomic_write(out / "tables.md") as temporary:
         Path(temporary).write_text(text, encoding="utf-8")
-    return text
 
 
 def _needed_trainings(paper: Paper, tables: Sequence[Table]) -> list[str]:
