@@ -4,6 +4,8 @@ VENV := .venv/bin/python
 BLENDER_5_3 := .venv-blender-5.3/bin/python
 METHOD ?= flod
 INPUTS ?= 20000
+EFFORT ?= 0.1
+PAPERS ?= flod octree clod lodge tree
 SCENES ?= examples/lantern_garden examples/lantern_walk
 # Lock every dependency in requirements/*.in, for all platforms, with hashes.
 LOCK := .venv/bin/uv pip compile --quiet --universal --generate-hashes --no-build --custom-compile-command "make pins"
@@ -14,7 +16,7 @@ export PYTHONDONTWRITEBYTECODE :=
 quick test test-5.0 test-5.2 nightly fuzz: export OMP_NUM_THREADS := 1  # the workers already use every core
 export LODGS_TRAINER_PYTHON := $(CURDIR)/$(VENV)
 
-.PHONY: help setup demo check quick test test-5.0 test-5.2 nightly fuzz attacks lint docs pictures tables bench bench-quality bench-lod bench-tree bench-blocks extension release pins \
+.PHONY: help setup demo check quick test test-5.0 test-5.2 nightly fuzz attacks lint docs pictures tables bench bench-quality bench-lod bench-tree bench-blocks results extension release pins \
 	window interop clean
 
 help:
@@ -34,6 +36,7 @@ help:
 	@echo "make bench-lod  levels and chunks on a town of 3 million splats (first run: over an hour; STAGES=\"town lodge others table\")"
 	@echo "make bench-tree  cuts of trees with up to 10 million nodes, and training them in 400 MB (first run: an hour, 10 GB)"
 	@echo "make bench-blocks  overhead of distributing blocks, and a plot for 1 to 64 workers (half an hour on an idle machine)"
+	@echo "make results    docs/methods/results.md: methods on SCENES and tables of PAPERS (EFFORT=0.1, METHODS=\"flod ...\"; hours)"
 	@echo "make extension  dist/lodgs-VERSION.zip, validated by Blender"
 	@echo "make release    dist/: extension, its repository, Python package, site, example scene, checksums"
 	@echo "make pins       update requirements/*.txt from requirements/*.in (UPGRADE=1 takes the newest allowed versions)"
@@ -105,6 +108,13 @@ bench-tree: setup
 
 bench-blocks: setup
 	$(VENV) lab/bench_blocks.py
+
+results: setup
+	$(VENV) -m training compare $(SCENES) --out build/results --effort $(EFFORT) $(if $(METHODS),--methods $(METHODS))
+	for paper in $(PAPERS); do $(VENV) -m training reproduce $$paper --out build/results/$$paper --effort $(EFFORT) || exit 1; done
+	{ sed '/^<!-- results -->$$/q' docs/methods/results.md; printf '\nCommit %s, effort %s.\n\n' "$$(git rev-parse --short HEAD)" $(EFFORT); \
+		cat build/results/results.md; for paper in $(PAPERS); do echo; cat build/results/$$paper/tables.md; done; } > build/results/page.md
+	cp build/results/page.md docs/methods/results.md
 
 extension: setup
 	$(VENV) tools/extension.py

@@ -36,7 +36,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--effort", type=parse_factor, default=1.0, metavar="N",
-        help="factor on the numbers of steps of the preset (default 1)",
+        help="fraction of the preset's steps and pixels; images keep 200 pixels on their longer side unless "
+        "--image-scale sets their size (default 1)",
     )  # fmt: skip
     add_lpips(parser)
     for name in _JOB_KEYS:
@@ -98,21 +99,21 @@ def _train_methods(options: argparse.Namespace, scene: Path, out: Path) -> list[
     """
     from ..methods import METHODS
     from ..runs.job import Job
+    from ..runs.several import NamedJob, ReducedJobs, train_in_turn
 
-    keys = {"scene": str(scene)} | {name: vars(options)[name] for name in _JOB_KEYS if name in options}
-    preset = keys.get("preset", default_of(settings_of(Job)["preset"]))
-    names = options.methods or list(METHODS)
+    preset = vars(options).get("preset", default_of(settings_of(Job)["preset"]))
+    keys = {name: vars(options)[name] for name in _JOB_KEYS if name in options}
+    reduced = ReducedJobs(scene, preset, options.effort, keys)
+    jobs = [
+        NamedJob(f"{METHODS[name].label} on {scene.resolve().name}", reduced.job(name, out / "runs" / name))
+        for name in options.methods or METHODS
+    ]
     runs = []
-    for number, name in enumerate(names, 1):
-        label = METHODS[name].label
-        text = f"Training {label} on {scene.resolve().name} ({number} of {len(names)})"
-        folder = out / "runs" / name
-        parameters = METHODS[name].scaled_steps(preset, options.effort, {})
-        job = Job.from_dict({**keys, "method": name, "out": str(folder), "parameters": parameters})
-        if problem := train(job, text):
-            warn(f"{label} is left out: {problem}")
+    for (_, job), problem in zip(jobs, train_in_turn(jobs, train, notify), strict=True):
+        if problem:
+            warn(f"{METHODS[job.method].label} is left out: {problem}")
         else:
-            runs.append(folder)
+            runs.append(Path(job.out))
     if not runs:
         raise LodgsError(f"Cannot compare methods on {scene}: none could be trained.", "Check the scene.")
     return runs

@@ -38,7 +38,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--effort", type=parse_factor, default=1.0, metavar="N",
-        help="factor on the numbers of steps; trends of short trainings are uncertain (default 1)",
+        help="fraction of the paper's steps and pixels; images keep 200 pixels on their longer side unless "
+        "--image-scale sets their size; trends of short trainings are uncertain (default 1)",
     )  # fmt: skip
     for name in _JOB_KEYS:
         add_setting(parser, settings_of(Job)[name])

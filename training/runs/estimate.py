@@ -36,7 +36,7 @@ MEASURED_SECONDS = 2.0
 ROUND_GROWTH = 0.1
 """Splats that a densification adds, as a share of the initial points. Measured: 0.04 to 0.25."""
 GROWTH_SHARE = 0.5
-"""Share of the first level's steps in which the number of splats grows."""
+"""Share of the steps in which the number of splats grows, if the finest level is trained first."""
 MAX_USE = 0.8
 """Share of the free memory or disk that a training may use."""
 LONG_SECONDS = 2 * 3600
@@ -112,11 +112,11 @@ def estimate(job: Job, scratch: Path) -> Estimate:
     warm_up(backend)
     start = START_SECONDS + time.monotonic() - begin
     splats = _expected_splats(parameters, len(scene.points))
-    early, _ = _measure(job, parameters, scene, backend, scratch, last=False)
+    early, _, _ = _measure(job, parameters, scene, backend, scratch, last=False)
     if backend == "cuda":
         torch.cuda.reset_peak_memory_stats()
     reset_peak_memory()
-    late, data = _measure(job, parameters, _with_points(scene, splats), backend, scratch, last=True)
+    late, growing, data = _measure(job, parameters, _with_points(scene, splats), backend, scratch, last=True)
     width, height = data.train[0].width, data.train[0].height
     photos = sum(TARGET_BYTES * camera.width * camera.height for camera in data.train)
     photos = max(min(photos, job.photo_memory * 10**6 or MAX_BYTES) - data.images.held_bytes, 0)
@@ -126,7 +126,8 @@ def estimate(job: Job, scratch: Path) -> Estimate:
         memory = (peak_memory() or round(PROGRAM_BYTES + SPLAT_BYTES * splats)) + photos
         available = free_memory()
     steps = parameters.total_steps
-    seconds = start + steps * (GROWTH_SHARE * (early + late) / 2 + (1 - GROWTH_SHARE) * late)
+    growth = max(growing, GROWTH_SHARE)
+    seconds = start + steps * (growth * (early + late) / 2 + (1 - growth) * late)
     return Estimate(
         seconds, memory, available, _disk_bytes(parameters, splats), _free_disk(Path(job.out)), splats, steps,
         len(data.train), (width, height),
@@ -178,11 +179,12 @@ def _expected_splats(parameters: Parameters, points: int) -> int:
 
 def _measure(
     job: Job, parameters: Parameters, scene: Scene, backend: str, scratch: Path, *, last: bool
-) -> tuple[float, TrainingData]:
-    """Return the median seconds of a step from the points of a scene, and its data.
+) -> tuple[float, float, TrainingData]:
+    """Return the median seconds of a step from the points of a scene, the share of steps before the finest
+    level, and the data.
 
     Args:
-        last: measure the last steps of the first level, else its first ones.
+        last: measure the last steps of the finest level, else the first steps.
     """
     data = TrainingData(
         scene, job.image_scale, job.test_every, job.exposure, job.validation,
@@ -190,20 +192,26 @@ def _measure(
         scratch=scratch,
     )  # fmt: skip
     method = create(job.method, data, parameters, job.seed, backend, None)
+    begin, end = _finest_stage(method)
     try:
-        return _time_steps(method, last), data
+        first = max(end - 50, begin) if last else 0
+        return _time_steps(method, first, end), begin / method.steps, data
     finally:
         method.close()
 
 
-def _time_steps(method: Method, last: bool) -> float:
-    """Return the median seconds of a step after a first one."""
-    end = next(
-        (step for step in range(method.steps) if method.level_at(step) != method.level_at(0)), method.steps
-    )
-    step = max(end - 50, 0) if last else 0
-    method.train_step(step)
-    begin, times = time.monotonic(), []
+def _finest_stage(method: Method) -> tuple[int, int]:
+    """Return the first step of the finest level, and the first step after its first stage."""
+    finest = max(map(method.level_at, range(method.steps)))
+    begin = next(step for step in range(method.steps) if method.level_at(step) == finest)
+    stage = method.stage(begin)
+    return begin, next((n for n in range(begin, method.steps) if method.stage(n) != stage), method.steps)
+
+
+def _time_steps(method: Method, first: int, end: int) -> float:
+    """Return the median seconds of the steps after a first one, before an end."""
+    method.train_step(first)
+    begin, times, step = time.monotonic(), [], first
     while len(times) < 2 or time.monotonic() - begin < MEASURED_SECONDS:
         step = min(step + 1, max(end - 2, 0))
         started = time.monotonic()

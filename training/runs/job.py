@@ -297,6 +297,12 @@ class Job:
         """Return the preset's parameters with this job's changes."""
         return self._parameters
 
+    @property
+    def steps(self) -> int:
+        """Number of training steps, less those that a base replaces."""
+        parameters = self.resolved_parameters()
+        return parameters.base_steps if self.base else parameters.total_steps
+
     @cached_property
     def _parameters(self) -> Parameters:
         captured = method_info(self.method).capture_values if self.capture else {}

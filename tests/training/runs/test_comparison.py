@@ -12,12 +12,22 @@ from training.errors import LodgsError
 from training.methods import METHODS
 from training.runs.comparison.measures import ComparedRun, Point, label_runs, measure_run, recommend_runs
 from training.runs.comparison.page import build_page, compare
+from training.runs.estimate import Estimate
 from training.runs.events import event_line
 from training.runs.folder import RunFolder
 from training.runs.job import Job
 from training.runs.measure import evaluate_run
 from training.splats.bundle import write_bundle
 from training.splats.levels import Bundle, Level
+
+BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+
+
+@pytest.fixture(autouse=True)
+def costs(monkeypatch):
+    """Estimates two seconds a step."""
+    costs = Estimate(100.0, 0, 0, 0, 0, 0, steps=50, views=8, size=(64, 48))
+    monkeypatch.setattr("training.runs.several.estimate", lambda job, scratch: costs)
 
 
 @pytest.fixture(scope="module")
@@ -42,19 +52,36 @@ def report(runs, tmp_path_factory):
     return compare(runs, out), out
 
 
-def test_measures_equal_those_of_evaluate(runs, report):
-    measured = report[0]["runs"][0]
-    expected = evaluate_run(runs[0], far=True)
-    coarse, fine = expected["levels"]
-    assert [point["psnr"] for point in measured["points"]] == [coarse["psnr"], fine["psnr"]]
-    assert [point["ssim"] for point in measured["points"]] == [coarse["ssim"], fine["ssim"]]
-    assert measured["merged"] == [(coarse["splats"], coarse["merged"][0]), (fine["splats"], fine["psnr"])]
-    assert measured["by_distance"]["psnr"] == expected["selective"][0]["psnr"]
-    assert measured["loaded"] == expected["loaded"]
-    assert measured["by_distance"]["drawn"] == expected["selective"][0]["drawn"]
+def page_data(out) -> dict:
+    """Return the data of a page."""
+    return json.loads(re.findall(r"^const data = (.*);$", (out / "index.html").read_text(), re.M)[0])
+
+
+@pytest.mark.parametrize("number", [0, 1], ids=["flod", "3dgs"])
+def test_page_has_the_numbers_of_evaluate(runs, report, number):
+    measured = page_data(report[1])["runs"][number]
+    expected = evaluate_run(runs[number], far=True)
+    for name in ("splats", "drawn", "psnr", "ssim"):
+        assert [point[name] for point in measured["points"]] == [row[name] for row in expected["levels"]]
     assert measured["megabytes"] == expected["bytes"] / 1e6
-    assert (measured["frame_memory"] is None) == (expected["frame_memory"]["by_distance"] is None)
     assert (measured["seconds"], measured["memory"]) == (5.5, 10**9)
+    if number:
+        assert measured["by_distance"] is None and measured["farther"] == [] and measured["merged"] == []
+        return
+    coarse, fine = expected["levels"]
+    assert measured["merged"] == [[coarse["splats"], coarse["merged"][0]], [fine["splats"], fine["psnr"]]]
+    for name in ("splats", "drawn", "psnr", "ssim"):
+        assert measured["by_distance"][name] == expected["selective"][0][name]
+    for name in ("factor", "drawn", "drawn_full", "psnr"):
+        assert [row[name] for row in measured["farther"]] == [row[name] for row in expected["farther"]]
+    assert measured["largest_jump"] == expected["jumps"]["by distance"]
+    assert measured["loaded"] == expected["loaded"]
+    assert (measured["frame_memory"] is None) == (expected["frame_memory"]["by_distance"] is None)
+
+
+def test_page_has_the_numbers_of_its_json_file(report):
+    data, file = page_data(report[1]), json.loads((report[1] / "compare.json").read_text())
+    assert {name: data[name] for name in file} == file
 
 
 def test_single_level_is_also_compared_with_merged_neighbours(report, splats):
@@ -98,13 +125,16 @@ def test_quality_between_sets_is_interpolated_over_the_logarithm():
 
 def test_answers_name_the_best_run_and_ignore_baselines():
     def run(label, splats, psnr, seconds, **values):
-        return ComparedRun(label, "", [Point("", splats, psnr, 0.9, 0.01)], seconds=seconds, **values)
+        return ComparedRun(
+            label, "", [Point("", splats, psnr, 0.9, 0.01)], loaded=splats, seconds=seconds, **values
+        )
 
     rows = recommend_runs(
         [run("A", 100, 30, 50), run("B", 200, 31, 60), run("C", 200, 40, None, baseline=True)]
     )
     best = {row["purpose"]: row["best"] for row in rows}
     assert best["Quality at full detail"] == "B" and best["Short training"] == "A"
+    assert best["Few splats to load"] == "A"  # 100 splats, all without levels
     assert "Speed from far away" not in best  # neither has levels
 
 
@@ -119,7 +149,7 @@ def test_page_loads_nothing_and_escapes_names(report):
 
 def test_page_of_one_run_shows_all_of_its_levels(runs, report, tmp_path):
     compare(runs[:1], tmp_path)
-    data = json.loads(re.findall(r"^const data = (.*);$", (tmp_path / "index.html").read_text(), re.M)[0])
+    data = page_data(tmp_path)
     (images,) = data["images"]
     assert list(images["variants"]) == ["Level 2", "Level 1", "By distance", "Level colours"]
     assert all(len(variant["images"]) == len(data["photos"]) for variant in images["variants"].values())
@@ -233,9 +263,9 @@ def test_missing_scene_and_unwritable_folder_are_named_before_any_work(runs, tmp
     assert f"Cannot write to {tmp_path / 'file' / 'out'}: " in capsys.readouterr().err
 
 
-@pytest.mark.skipif(not shutil.which("chromium"), reason="needs Chromium")
+@pytest.mark.skipif(not BROWSER, reason="needs Chromium")
 def test_page_fills_its_tables_in_a_browser(report):
-    command = ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr"]
+    command = [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr"]
     command += ["--virtual-time-budget=2000", "--dump-dom", (report[1] / "index.html").as_uri()]
     shown = subprocess.run(command, capture_output=True, text=True, timeout=200, check=True)
     assert "CONSOLE" not in shown.stderr

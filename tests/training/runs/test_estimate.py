@@ -29,10 +29,10 @@ def test_estimate_measures_real_steps_at_the_final_size(job, tmp_path, monkeypat
     """Steps take 0.1 s with the scene's points and 0.3 s at the end: their mean is 0.25 s."""
     counts = []
 
-    def time_steps(method, last):
+    def time_steps(method, first, end):
         counts.append(method.splats)
-        method.train_step(0)
-        return 0.3 if last else 0.1
+        method.train_step(first)
+        return 0.3 if len(counts) == 2 else 0.1
 
     monkeypatch.setattr(module, "_time_steps", time_steps)
     costs = estimate(job, tmp_path)
@@ -44,6 +44,36 @@ def test_estimate_measures_real_steps_at_the_final_size(job, tmp_path, monkeypat
     bytes_per_splat = 4 * (3 + 3 + 4 + 1 + 3 * 16)
     assert costs.disk > 90 * 2 * bytes_per_splat and costs.free_disk > 0
     assert not (tmp_path / "run").exists()
+
+
+def test_coarse_levels_before_the_finest_one_count_as_growth(job, tmp_path, monkeypatch):
+    """Levels of 30 and 10 steps, of which the first has 0.1 s and the last 0.3 s a step."""
+    firsts = []
+
+    def time_steps(method, first, end):
+        firsts.append((first, end))
+        method.train_step(first)
+        return 0.3 if first else 0.1
+
+    monkeypatch.setattr(module, "_time_steps", time_steps)
+    parameters = {
+        "max_splats": 90,
+        "levels": 2,
+        "steps": [30, 10],
+        "levels_from": "trained",
+        "finish_share": 0,
+    }
+    parameters |= {"densify_interval": [1, 1]}
+    costs = estimate(replace(job, parameters=parameters), tmp_path)
+    assert firsts == [(0, 40), (30, 40)] and costs.steps == 40
+    expected = 40 * (0.75 * 0.2 + 0.25 * 0.3)
+    assert module.START_SECONDS < costs.seconds - expected < module.START_SECONDS + 60
+
+
+def test_estimate_of_a_tree_measures_its_leaves(job, tmp_path):
+    """Steps on cuts need the tree, which later steps build."""
+    parameters = {"max_splats": 90, "steps": 40, "tune_steps": 400}
+    assert estimate(replace(job, method="tree", parameters=parameters), tmp_path).steps == 441
 
 
 @pytest.mark.parametrize(

@@ -9,19 +9,22 @@ import pytest
 from training.__main__ import main
 from training.cli import reproduce as command
 from training.errors import LodgsError
+from training.evaluate.views import Evaluation
 from training.methods import METHODS
+from training.runs.estimate import Estimate
 from training.runs.folder import RunFolder
 from training.runs.job import Job
 from training.runs.reproduction.run import (
     PAPERS,
     chosen_tables,
     load_paper,
-    make_job,
+    make_jobs,
     reproduce,
     run_folder,
 )
 from training.runs.reproduction.subject import Subject
 from training.runs.reproduction.tables import PSNR, SPLATS, format_table, increases, loses_little
+from training.runs.several import ReducedJobs
 from training.scenes.colmap import read_scene
 from training.splats.bundle import write_bundle
 from training.splats.levels import Bundle, Level
@@ -45,10 +48,9 @@ def test_tables_are_complete_and_trends_hold_for_the_papers_values(paper, table)
 
 
 @pytest.mark.parametrize("name", PAPERS)
-def test_trainings_are_valid_jobs(name, tmp_path):
+def test_trainings_are_valid_jobs(name, tiny_scene, tmp_path):
     paper = load_paper(name)
-    for training in paper.trainings:
-        job = make_job(paper, training, tmp_path, tmp_path / "out", 0.1, {"image_scale": 0.5})
+    for job in make_jobs(paper, list(paper.trainings), ReducedJobs(tiny_scene, "paper", 0.1, {}), tmp_path):
         full = METHODS[job.method].preset("paper")
         assert job.preset == "paper" and job.resolved_parameters().total_steps < 0.2 * full.total_steps
 
@@ -82,6 +84,13 @@ def test_tables_are_chosen_by_number_or_name():
         chosen_tables(paper, ["7"])
 
 
+@pytest.fixture(autouse=True)
+def costs(monkeypatch):
+    """Estimates two seconds a step."""
+    costs = Estimate(100.0, 0, 0, 0, 0, 0, steps=50, views=8, size=(64, 48))
+    monkeypatch.setattr("training.runs.several.estimate", lambda job, scratch: costs)
+
+
 @pytest.fixture
 def train(splats):
     """Writes a finished FLoD run of five levels in place of a training, and lists the jobs."""
@@ -89,8 +98,10 @@ def train(splats):
     jobs = []
 
     def write(job: Job, text: str) -> str:
-        jobs.append(text)
         run = RunFolder(job.out)
+        if run.state() == "done":
+            return ""
+        jobs.append(text)
         run.create()
         job.write(run.job)
         run.events_file.write_text('{"event": "done"}\n')
@@ -110,17 +121,35 @@ KEYS = {"image_scale": 1.0, "test_every": 4, "backend": "cpu"}
 
 def test_tables_are_measured_on_each_scene_and_resumed(tiny_scene, train, tmp_path):
     text = reproduce("flod", [tiny_scene], tmp_path, train, tables=["2", "4"], effort=0.1, keys=KEYS)
-    assert len(train.jobs) == 1 and train.jobs[0].endswith("FLoD (1 of 1)")
+    assert len(train.jobs) == 1 and train.jobs[0].endswith("FLoD (1 of 1, about 5 h 33 min left)")
     assert (tmp_path / "tables.md").read_text() == text and "### Table 4" in text
     rows = json.loads((tmp_path / "tables.json").read_text())
     assert rows["Table 2"]["5"]["psnr"] > rows["Table 2"]["3"]["psnr"]
     assert rows["Table 4"]["max level"]["splats"] == len(read_scene(tiny_scene).points)
+    assert "(64x48 pixels), 0.1 times the steps" in text and "| FLoD | 10,000 |" in text
     reproduce("flod", [tiny_scene], tmp_path, train, tables=["2"], effort=0.1, keys=KEYS)
     assert len(train.jobs) == 1
 
 
+def test_tables_share_measures(tiny_scene, train, tmp_path, monkeypatch):
+    """Tables 2 and 4 have the finest level and the range of levels 3 to 5 in common."""
+    counts = {"level": 0, "range": 0}
+
+    def count(name, function):
+        def counted(*arguments):
+            counts[name] += 1
+            return function(*arguments)
+
+        return counted
+
+    monkeypatch.setattr(Evaluation, "measure_level", count("level", Evaluation.measure_level))
+    monkeypatch.setattr(Evaluation, "measure_by_distance", count("range", Evaluation.measure_by_distance))
+    reproduce("flod", [tiny_scene], tmp_path, train, tables=["2", "4"], effort=0.1, keys=KEYS)
+    assert counts == {"level": 3, "range": 3}
+
+
 def test_memory_and_image_sizes_of_a_subject(tiny_scene, train, tmp_path):
-    job = make_job(load_paper("flod"), "FLoD", tiny_scene, tmp_path, 0.1, KEYS)
+    (job,) = make_jobs(load_paper("flod"), ["FLoD"], ReducedJobs(tiny_scene, "paper", 0.1, KEYS), tmp_path)
     train(job, "")
     subject = Subject(Path(job.out))
     sizes = subject.by_size()

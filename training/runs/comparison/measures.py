@@ -197,7 +197,7 @@ def compared_run(folder: RunFolder, job: Job, report: dict, label: str) -> Compa
         seconds=float(seconds) if isinstance(seconds, (int, float)) else None,
         memory=memory if isinstance(memory, int) else None,
         frame_memory=report["frame_memory"]["by_distance" if report["selective"] else "full"],
-        steps=job.resolved_parameters().total_steps,
+        steps=job.steps,
     )
 
 
@@ -213,12 +213,12 @@ def merge_baseline(
     Returns:
         The measures, and the merged splats by their number.
     """
-    merged, sets = splats, {len(splats): splats}
+    merged, sets, names = splats, {len(splats): splats}, {len(splats): "Finest level"}
     for share in MERGED_SHARES:
         merged = merge(merged, max(round(len(splats) * share), 1))
-        sets[len(merged)] = merged
+        sets[len(merged)], names[len(merged)] = merged, f"Merged to {100 * share:g}%"
     points = [
-        Point.of(evaluation.measure_splats(part), f"{count:,} splats", evaluation.prefix)
+        Point.of(evaluation.measure_splats(part), names[count], evaluation.prefix)
         for count, part in sorted(sets.items())
     ]
     about = f"{label} with neighbours merged, for comparison"
@@ -237,8 +237,9 @@ class Purpose:
     """A purpose for which runs are compared.
 
     Attributes:
-        name: its name in tables. "{count}" is the number of splats at which runs are compared.
-        cost: returns the measure to minimise, from a run and that number; None without a measure.
+        name: its name in tables.
+        cost: returns the measure to minimise, from a run and the number of splats at which runs are compared;
+            None without a measure.
         describe: returns the measure as text.
     """
 
@@ -248,7 +249,8 @@ class Purpose:
 
 
 def _describe_reduced(run: ComparedRun, count: float) -> str:
-    return f"{run.psnr_at(count) or 0:.2f} dB; full detail has {run.finest.psnr:.2f} dB"
+    full = f"full detail has {run.finest.psnr:.2f} dB with {run.finest.splats:,}"
+    return f"{run.psnr_at(count) or 0:.2f} dB with {count:,.0f} splats; {full}"
 
 
 def _describe_far(run: ComparedRun, count: float) -> str:
@@ -262,12 +264,12 @@ def _describe_far(run: ComparedRun, count: float) -> str:
 PURPOSES = (
     Purpose("Quality at full detail", lambda run, _: -run.finest.psnr,
             lambda run, _: f"{run.finest.psnr:.2f} dB with {run.finest.splats:,} splats"),
-    Purpose("Quality with {count} splats",
+    Purpose(f"Quality with {SHARE:.0%} of the splats",
             lambda run, count: None if (quality := run.psnr_at(count)) is None else -quality,
             _describe_reduced),
     Purpose("Speed from far away", lambda run, _: run.farther[-1]["frame_s"] if run.farther else None,
             _describe_far),
-    Purpose("Few splats to load", lambda run, _: run.loaded if run.by_distance else None,
+    Purpose("Few splats to load", lambda run, _: run.loaded,
             lambda run, _: f"{run.loaded:,} splats for a view"),
     Purpose("Smooth changes", lambda run, _: run.largest_jump,
             lambda run, _: f"largest jump between frames {run.largest_jump:.2f} times that of full detail"),
@@ -290,8 +292,8 @@ def recommend_runs(runs: Sequence[ComparedRun]) -> list[dict[str, str]]:
         costs = [(cost, run) for run in runs if (cost := purpose.cost(run, count)) is not None]
         if len(costs) > 1:
             _, best = min(costs, key=lambda pair: pair[0])
-            name, why = purpose.name.format(count=f"{count:,.0f}"), purpose.describe(best, count)
-            result.append({"purpose": name, "best": best.label, "why": why})
+            why = purpose.describe(best, count)
+            result.append({"purpose": purpose.name, "best": best.label, "why": why})
     return result
 
 

@@ -75,15 +75,10 @@ def format_results(reports: Sequence[dict]) -> str:
 
 def _choice(reports: Sequence[dict]) -> list[str]:
     """Return a table of the best method of each scene for each purpose."""
-    names = [purpose.name.format(count="a quarter of the") for purpose in PURPOSES]
-    rows = []
-    for name, purpose in zip(names, PURPOSES, strict=True):
-        start = purpose.name.partition("{")[0]
-        best = []
-        for report in reports:
-            answers = [row for row in report["answers"] if row["purpose"].startswith(start)]
-            best.append(f"{answers[0]['best']} ({answers[0]['why']})" if answers else "–")
-        rows.append([name, *best])
+    answers = [
+        {row["purpose"]: f"{row['best']} ({row['why']})" for row in report["answers"]} for report in reports
+    ]
+    rows = [[purpose.name, *(scene.get(purpose.name, "–") for scene in answers)] for purpose in PURPOSES]
     return _table(["purpose", *(report["scene"] for report in reports)], rows, "|---" * (len(reports) + 1))
 
 

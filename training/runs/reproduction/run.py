@@ -13,18 +13,15 @@ import numpy as np
 from ...errors import LodgsError
 from ...evaluate.lpips import missing_line
 from ...files import atomic_write, create_folder
-from ...methods import method_info
 from ...splats.dialects import Warn, ignore
 from ..folder import RunFolder
 from ..job import Job
+from ..several import NamedJob, ReducedJobs, Train, train_in_turn
 from .subject import Subject
 from .tables import Measured, Paper, Table, format_table
 
 PAPERS = ("flod", "octree", "clod", "lodge", "tree")
 """Names of the papers; each has a module."""
-
-Train = Callable[[Job, str], str]
-"""Trains or resumes a job, with a text for its progress; returns the reason of a failure, or ""."""
 
 
 def load_paper(name: str) -> Paper:
@@ -48,20 +45,19 @@ def chosen_tables(paper: Paper, names: Collection[str]) -> list[Table]:
     return [tables[name] for name in requested] if requested else list(paper.tables)
 
 
-def make_job(paper: Paper, name: str, scene: Path, out: Path, effort: float, keys: Mapping[str, Any]) -> Job:
-    """Return the job of a training of a paper on a scene.
+def make_jobs(paper: Paper, names: Sequence[str], jobs: ReducedJobs, out: Path) -> list[Job]:
+    """Return the jobs of trainings of a paper on a scene.
 
     Args:
+        names: names of the trainings.
         out: folder of the runs of the scene.
-        keys: further keys of the job.
     """
-    training = paper.trainings[name]
-    base = str(run_folder(out, training.base)) if training.base else ""
-    parameters = method_info(training.method).scaled_steps("paper", effort, training.changes)
-    return Job.from_dict({
-        "scene": str(scene), "out": str(run_folder(out, name)), "method": training.method, "base": base,
-        "preset": "paper", "parameters": parameters, **keys,
-    })  # fmt: skip
+    result = []
+    for name in names:
+        training = paper.trainings[name]
+        base = str(run_folder(out, training.base)) if training.base else ""
+        result.append(jobs.job(training.method, run_folder(out, name), training.changes, base))
+    return result
 
 
 def run_folder(out: Path, name: str) -> Path:
@@ -89,7 +85,7 @@ def reproduce(
         out: folder of the runs and of the results. The same call resumes.
         train: trains a job.
         tables: numbers or names of tables; all without any.
-        effort: factor on all numbers of steps of the preset *paper*.
+        effort: fraction of the work of the preset *paper*, see ``ReducedJobs``.
         keys: further keys of the jobs, such as ``image_scale``.
         warn, notify: receive warnings, and sentences about progress.
 
@@ -101,32 +97,41 @@ def reproduce(
     """
     paper = load_paper(name)
     chosen = chosen_tables(paper, tables)
-    measured: dict[str, dict[str, dict[str, float]]] = {}
-    values: dict[tuple[str, str], list[Measured]] = {}
+    needed = _needed_trainings(paper, chosen)
+    jobs = []
     for scene in scenes:
-        folder = out / scene.resolve().name
-        needed = _needed_trainings(paper, chosen)
-        for number, training in enumerate(needed, 1):
-            job = make_job(paper, training, scene, folder, effort, keys or {})
-            text = f"{scene.resolve().name}, {training} ({number} of {len(needed)})"
-            if RunFolder(job.out).state() != "done" and (problem := train(job, f"Training {text}")):
-                raise LodgsError(f"Cannot train {text}: {problem}", f"See {job.out}.")
-            notify(f"Measuring {text}")
-            subject = Subject(Path(job.out), warn)
-            for table in chosen:
-                for row in table.rows:
-                    if row.training == training:
-                        values.setdefault((table.name, row.label), []).append(row.measure(subject))
-    for table in chosen:
-        rows = {row.label: _mean(values[table.name, row.label]) for row in table.rows}
-        measured[table.name] = rows
-    text = format_paper(paper, chosen, measured, scenes, effort)
+        place = scene.resolve().name
+        on_scene = make_jobs(paper, needed, ReducedJobs(scene, "paper", effort, keys or {}), out / place)
+        jobs += [NamedJob(f"{place}, {label}", job) for label, job in zip(needed, on_scene, strict=True)]
+    values: dict[tuple[str, str], list[Measured]] = {}
+    sizes: dict[str, str] = {}
+    problems = train_in_turn(jobs, train, notify)
+    for training, (text, job), problem in zip(needed * len(scenes), jobs, problems, strict=True):
+        if problem:
+            raise LodgsError(f"Cannot train {text}: {problem}", f"See {job.out}.")
+        notify(f"Measuring {text}")
+        subject = Subject(Path(job.out), warn)
+        sizes[Path(job.scene).name] = subject.size
+        for table in chosen:
+            for row in table.rows:
+                if row.training == training:
+                    values.setdefault((table.name, row.label), []).append(row.measure(subject))
+    measured = {
+        table.name: {row.label: _mean(values[table.name, row.label]) for row in table.rows}
+        for table in chosen
+    }
+    lines = [format_paper(paper, chosen, measured, sizes, effort), *format_trainings(needed, jobs)]
+    text = "\n".join(lines) + "\n"
+    _write_results(out, measured, text)
+    return text
+
+
+def _write_results(out: Path, measured: Mapping, text: str) -> None:
     create_folder(out)
     with atomic_write(out / "tables.json") as temporary:
         Path(temporary).write_text(json.dumps(measured, indent=1), encoding="utf-8")
     with atomic_write(out / "tables.md") as temporary:
         Path(temporary).write_text(text, encoding="utf-8")
-    return text
 
 
 def _needed_trainings(paper: Paper, tables: Sequence[Table]) -> list[str]:
@@ -147,11 +152,15 @@ def format_paper(
     paper: Paper,
     tables: Sequence[Table],
     measured: Mapping[str, Mapping[str, Measured]],
-    scenes: Sequence[Path],
+    sizes: Mapping[str, str],
     effort: float,
 ) -> str:
-    """Format tables with their values, and the parts of the paper that are missing, as Markdown."""
-    names = ", ".join(scene.resolve().name for scene in scenes)
+    """Format tables with their values, and the parts of the paper that are missing, as Markdown.
+
+    Args:
+        sizes: size of the images by the name of each scene.
+    """
+    names = ", ".join(f"{name} ({size} pixels)" for name, size in sizes.items())
     lines = [f"## {paper.title}", "", f"Our values: {names}, {effort:g} times the steps of the paper."]
     lines += ["Published values are from other scenes, so only the trends can be compared.", ""]
     lines += [format_table(table, measured[table.name]) for table in tables]
@@ -159,3 +168,19 @@ def format_paper(
     if missing := missing_line(None):
         lines.append(f"- {missing}")
     return "\n".join(lines) + "\n"
+
+
+def format_trainings(names: Sequence[str], jobs: Sequence[NamedJob]) -> list[str]:
+    """Format the steps and seconds of finished trainings, as means over the scenes, as lines of Markdown.
+
+    Args:
+        names: names of the trainings.
+        jobs: jobs in this order, of one scene after the other.
+    """
+    lines = ["", "| training | steps | seconds |", "|---|---:|---:|"]
+    for number, name in enumerate(names):
+        ends = [RunFolder(job.out).end_event() or {} for _, job in jobs[number :: len(names)]]
+        seconds = [end["seconds"] for end in ends if "seconds" in end]
+        cells = f"{jobs[number].job.steps:,} | {np.mean(seconds) if seconds else 0:,.0f}"
+        lines.append(f"| {name} | {cells} |")
+    return lines

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -31,6 +31,8 @@ class Subject:
     ``fps``, ``ms`` per frame, and, except for networks, ``splats`` (number with a weight above 0, in view or
     not) and ``drawn`` (number in the image). Levels count from 1; 0 is the finest.
 
+    Measures of levels, by distance and of networks are made once.
+
     Raises:
         LodgsError: the run is not finished, or its scene cannot be read.
     """
@@ -41,6 +43,13 @@ class Subject:
         self.bundle = open_if_large(self.folder.bundle) or read_bundle(self.folder.bundle)
         networks = load_lpips(None, tensor_device(self.job.backend))
         self.evaluation = Evaluation(data, self.job.backend, self.bundle.antialias, networks)
+        self._measured: dict[Hashable, dict[str, float]] = {}
+
+    @property
+    def size(self) -> str:
+        """Width and height of a measured view in pixels, such as 240x160."""
+        camera = self.evaluation.cameras[0]
+        return f"{camera.width}x{camera.height}"
 
     @cached_property
     def _resident(self) -> ResidentBundle:
@@ -48,12 +57,17 @@ class Subject:
 
     def level(self, number: int = 0) -> dict[str, float]:
         """Measure a complete level."""
-        return self._level(self.bundle, number)
+        number = number or self.bundle.levels[-1].number
+        return self._once(("level", number), lambda: self._level(self.bundle, number))
 
     def by_distance(self, **controls: float) -> dict[str, float]:
         """Measure levels selected for each view, with values of the rule's controls."""
         values = resolve_controls(self.bundle, controls)
-        return self._named(self.evaluation.measure_by_distance(self._resident, values))
+
+        def measure() -> dict[str, float]:
+            return self._named(self.evaluation.measure_by_distance(self._resident, values))
+
+        return self._once(("by_distance", *sorted(values.items())), measure)
 
     def predetermined(self, **controls: float) -> dict[str, float]:
         """Measure the levels that the mean training camera selects, for all views (FLoD, Sec. 5.2)."""
@@ -70,12 +84,16 @@ class Subject:
             bundle = read_bundle(file)
             finest = replace(bundle, levels=bundle.levels[-1:])
             size = file.stat().st_size * len(finest.levels[0].rows) / sum(len(x.rows) for x in bundle.levels)
-            return {**self._level(finest, 0), "megabytes": size / 1e6}
+            return {**self._level(finest, finest.levels[0].number), "megabytes": size / 1e6}
 
     def networks(self) -> dict[str, float]:
         """Measure the images of the networks, before baking."""
-        _, model = load_networks(self.job, self.folder, self.evaluation.data)
-        return self._named(self.evaluation.measure_images(model.render_image))
+
+        def measure() -> dict[str, float]:
+            _, model = load_networks(self.job, self.folder, self.evaluation.data)
+            return self._named(self.evaluation.measure_images(model.render_image))
+
+        return self._once("networks", measure)
 
     def level_with_memory(self, number: int) -> dict[str, float]:
         """Measure a complete level, with the memory to draw it as ``memory`` in GB, if it is known."""
@@ -101,8 +119,14 @@ class Subject:
         return {**self.level(), "megabytes": size / 1e6}
 
     def _level(self, bundle: Bundle, number: int) -> dict[str, float]:
-        numbers = {level.number: level for level in bundle.levels}
-        return self._named(self.evaluation.measure_level(bundle, numbers[number or max(numbers)]))
+        level = next(level for level in bundle.levels if level.number == number)
+        return self._named(self.evaluation.measure_level(bundle, level))
+
+    def _once(self, key: Hashable, measure: Callable[[], dict[str, float]]) -> dict[str, float]:
+        """Return measures that several tables have in common."""
+        if key not in self._measured:
+            self._measured[key] = measure()
+        return self._measured[key]
 
     def _named(self, measures: dict[str, float]) -> dict[str, float]:
         """Add derived measures, and remove the prefix of measures on training views."""
