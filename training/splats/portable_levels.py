@@ -12,6 +12,7 @@ import numpy as np
 from ..documents import parse_json
 from ..errors import LodgsError
 from .bundle_header import INCONSISTENCIES, bundle_line, inconsistent, json_default, level_line, parse_bundle
+from .dialects import MAX_COORDINATE
 from .gaussians import SplatRows, Splats
 from .levels import Bundle, Level
 from .origin import FAR_SPLATS, NO_ORIGIN, ORIGIN_SAMPLE, choose_origin
@@ -182,8 +183,13 @@ def place_splats(splats: Splats, matrix: np.ndarray, path: Path) -> tuple[Splats
     """Return splats that are transformed except for the translation, and the translation (3,) float64.
 
     Raises:
-        LodgsError: the transform stretches, shears or mirrors.
+        LodgsError: the transform stretches, shears or mirrors, or has too large numbers.
     """
+    if not (np.abs(matrix) <= MAX_COORDINATE).all():
+        raise LodgsError(
+            f"Cannot read {path}: a transform has numbers above {MAX_COORDINATE:g}.",
+            "Move the splats closer to 0, and export them again.",
+        )
     try:
         transform = Similarity.from_matrix(matrix)
     except LodgsError as error:
