@@ -10,6 +10,10 @@ MAX_TEXT = 1000
 _UNPRINTABLE = re.compile("[\0\ud800-\udfff]")
 
 
+_LINK_LOOP = "Symlink loop from "
+"""Start of the message of ``Path.resolve`` about an endless link before Python 3.13."""
+
+
 class LodgsError(Exception):
     """A mistake or a limit that a user can act on: shown as one or two sentences, never as a traceback.
 
@@ -32,6 +36,11 @@ def describe_system_error(error: BaseException) -> LodgsError | None:
     """Return a failure of the disk, the memory or another part of the computer as sentences, else None."""
     if is_out_of_memory(error):
         return SystemProblem("Not enough memory.", "Close other programs, or reduce the size of the task.")
+    if isinstance(error, RuntimeError) and str(error).startswith(_LINK_LOOP):
+        path = str(error)[len(_LINK_LOOP) :]
+        return SystemProblem(
+            f"Cannot use {path}: the link leads to itself.", "Remove it, or choose another path."
+        )
     if not isinstance(error, OSError):
         return None
     action = f"Cannot use {printable(error.filename)}" if error.filename else "Cannot continue"
