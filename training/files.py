@@ -63,7 +63,7 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
     Raises:
         LodgsError: the disk is full, the location is not writable, or a folder, pipe or device has the name.
     """
-    path = _target(path, os.path.isfile)
+    path = _target(path, is_file)
     temporary = _temporary_path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -125,7 +125,8 @@ def _target(path: str | Path, is_replaceable: Callable[[Path], bool]) -> Path:
     check_name(path)
     path = Path(os.path.realpath(path)) if os.path.islink(path) else Path(path)
     if os.path.lexists(path) and not is_replaceable(path):
-        kind = "a folder" if os.path.isdir(path) else "a file" if os.path.isfile(path) else "a pipe, device or endless link"
+        others = "a folder" if os.path.isdir(path) else "a pipe, device or endless link"
+        kind = "a file" if is_file(path) else others
         raise LodgsError(f"Cannot write {path}: {kind} has this name.", "Choose another name or folder.")
     return path
 

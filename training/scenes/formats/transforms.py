@@ -10,8 +10,6 @@ from math import tan
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ...errors import LodgsError
 from ..images import image_size
 from ..point_cloud import read_points
