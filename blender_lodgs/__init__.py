@@ -21,7 +21,7 @@ from .data import (
     updates,
 )
 from .nodes import building
-from .render import compare, engine, renderer
+from .render import compare, engine, renderer, written_images
 from .runs import background_capture, jobs, method_comparison, photo_preparation
 from .viewport import wipe
 
@@ -43,6 +43,7 @@ MODULES = (
     viewport,
     renderer,
     engine,
+    written_images,
     wipe,
     compare,
     jobs,
