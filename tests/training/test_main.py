@@ -110,7 +110,7 @@ def test_every_command_is_cancelled_by_signals(number):
             "Cannot use b: No space left on device.",
         ),
         (MemoryError(), "Not enough memory. Close other programs"),
-        (RuntimeError("Symlink loop from 'a'"), "Cannot use 'a': the link leads to itself. Choose"),
+        (RuntimeError("Symlink loop from 'a'"), "Cannot use 'a': the link leads to itself. Remove"),
     ],
 )
 def test_system_errors_are_one_message(monkeypatch, capsys, error, message):
