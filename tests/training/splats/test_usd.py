@@ -219,7 +219,8 @@ def test_reading_process_has_little_memory(tmp_path):
     (tmp_path / "a.usdc").write_bytes(bytes(300_000))
     program = (
         "import sys, pathlib, numpy; from training.splats.usd_process import limit_memory;"
-        "limit_memory(pathlib.Path(sys.argv[1])); numpy.ones(20_000_000); print('small'); numpy.ones(150_000_000)"
+        "limit_memory(pathlib.Path(sys.argv[1]));"
+        "numpy.ones(20_000_000); print('small'); numpy.ones(150_000_000)"
     )
     result = subprocess.run(
         [sys.executable, "-c", program, tmp_path / "a.usdc"], capture_output=True, text=True, check=False
