@@ -102,7 +102,8 @@ COMMANDS = {
     "compare methods": Command(
         ("compare", "INPUTS/scene", "--out", "DISK/page", "--methods", "3dgs", "flod", "--effort", "0.0002",
          "--image-scale", "1", "--test-every", "4", "--backend", "cpu"),
-        timed=("page/index.html", "page/compare.json", "page/results.md"),
+        timed=("page/index.html", "page/compare.json", "page/results.md", "page/runs/3dgs/metrics.json",
+               "page/runs/flod/metrics.json"),
     ),
     "reproduce": Command(
         ("reproduce", "flod", "--scene", "INPUTS/scene", "--out", "DISK/tables", "--effort", "0.0002",
