@@ -5,6 +5,8 @@ import re
 
 DISK_FULL = {errno.ENOSPC, errno.EDQUOT}
 """Error codes of a full disk or an exceeded quota."""
+FREE_SPACE = "Free some space"
+"""First words of the remedy for a full disk."""
 MAX_TEXT = 1000
 """Maximum number of characters of a sentence. Longer ones, which quote foreign text, lose their middle."""
 _UNPRINTABLE = re.compile("[\0\ud800-\udfff]")
@@ -58,7 +60,7 @@ def system_reason(error: OSError) -> str:
 def system_remedy(error: OSError, default: str = "") -> str:
     """Return the remedy for a full disk or an exceeded limit, or else the default."""
     if error.errno in DISK_FULL:
-        return "Free some space on this disk, or choose another folder."
+        return f"{FREE_SPACE} on this disk, or choose another folder."
     if error.errno in (errno.EMFILE, errno.ENFILE):
         return "Raise the limit of open files (ulimit -n), or close other programs."
     if error.errno == errno.EFBIG:
