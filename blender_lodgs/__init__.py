@@ -21,7 +21,7 @@ from .data import (
     updates,
 )
 from .nodes import building
-from .render import compare, compositing, engine, renderer
+from .render import compare, compositing, engine, renderer, written_images
 from .runs import background_capture, jobs, method_comparison, photo_preparation
 from .viewport import wipe
 
@@ -44,6 +44,7 @@ MODULES = (
     renderer,
     engine,
     compositing,
+    written_images,
     wipe,
     compare,
     jobs,

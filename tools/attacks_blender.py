@@ -177,7 +177,9 @@ class Attack:
         scene.render.resolution_x, scene.render.resolution_y = SIZE
         scene.render.filepath = str(self.disk / "frame_")
         scene.frame_end = 3
-        return self._operator(self.bpy.ops.render.render, options)
+        with redirect_stderr(io.StringIO()) as output:  # Blender's operator ends well after its last image
+            problem = self._operator(self.bpy.ops.render.render, options)
+        return problem or output.getvalue()
 
     def _mesh_scene(self, path: Path) -> None:
         """Save a file with a cube, rendered by Cycles with one sample."""

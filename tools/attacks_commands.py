@@ -36,6 +36,7 @@ import psutil  # noqa: E402
 
 import training.runs.train  # noqa: E402, F401 - loaded once, before forking
 from tests.training.conftest import write_tiny_scene  # noqa: E402
+from tests.training.scenes.test_rendered_views import views, write_views  # noqa: E402
 from tools.attacks import exit_code, start_fork  # noqa: E402
 from tools.attacks_blocks import DISK_FULL_MESSAGES, contents, disk_usage, small_disk  # noqa: E402
 from training import __main__  # noqa: E402
@@ -96,20 +97,37 @@ COMMANDS = {
     "page single": Command(("page", "INPUTS/run", "--single", "--out", "DISK/page.html"), viewer=True),
     "compare": Command(
         ("compare", "INPUTS/run", "INPUTS/second", "--out", "DISK/page"),
-        timed=("page/index.html", "page/compare.json"),
+        timed=("page/index.html", "page/compare.json", "page/results.md"),
+    ),
+    "compare methods": Command(
+        ("compare", "INPUTS/scene", "--out", "DISK/page", "--methods", "3dgs", "flod", "--effort", "0.0002",
+         "--image-scale", "1", "--test-every", "4", "--backend", "cpu"),
+        timed=("page/index.html", "page/compare.json", "page/results.md", "page/runs/3dgs/metrics.json",
+               "page/runs/flod/metrics.json"),
     ),
     "reproduce": Command(
         ("reproduce", "flod", "--scene", "INPUTS/scene", "--out", "DISK/tables", "--effort", "0.0002",
          "--image-scale", "1", "--test-every", "4", "--backend", "cpu"),
         timed=("tables/tables.json", "tables/tables.md"),
     ),
-    "evaluate": Command(("evaluate", "DISK/run", "--far", "--picture", "DISK/levels.png"), "run"),
+    "evaluate": Command(
+        ("evaluate", "DISK/run", "--far", "--picture", "DISK/levels.png"), "run", timed=("run/metrics.json",)
+    ),
     "train": Command(("train", "INPUTS/scene", "--out", "DISK/run", *FLOD)),
     "train distorted": Command(("train", "INPUTS/distorted", "--out", "DISK/run", *FLOD)),
     "train without points": Command(("train", "INPUTS/bare", "--out", "DISK/run", *FLOD)),
     "train captured": Command(
         ("train", "--base", "INPUTS/base.ply", "--capture", "dome", *VIEWS, "--method", "lodge",
          "--set", "tune_steps=4", "--set", "levels=2", "--image-scale", "1", "--out", "DISK/run")
+    ),
+    "train refined": Command(
+        ("train", "INPUTS/scene", "--base", "INPUTS/base.ply", "--method", "lodge", "--set", "tune_steps=8",
+         "--set", "levels=2", "--image-scale", "1", "--test-every", "4", "--backend", "cpu",
+         "--out", "DISK/run")
+    ),
+    "train networks": Command(
+        ("train", "INPUTS/scene", "--method", "octree_neural", "--set", "steps=20", "--image-scale", "1",
+         "--test-every", "4", "--backend", "cpu", "--out", "DISK/run")
     ),
     "train cells": Command(("train", "INPUTS/scene", "--out", "DISK/run", "--cells", "2x1", *FLOD)),
     "blocks plan": Command(
@@ -153,12 +171,10 @@ class Attack:
         write_inputs(self.inputs)
         for arguments in (
             ("train", "INPUTS/scene", "--out", "INPUTS/run", *FLOD),
-            ("capture", "INPUTS/base.ply", "--out", "INPUTS/views", *VIEWS),
             ("blocks", "plan", "INPUTS/scene", "--out", "INPUTS/blocks", "--cells", "2x1", *FLOD),
         ):
             if code := exit_code(self._run(arguments)):
                 raise RuntimeError(f"{arguments[0]} ended with {code}: {self._log()}")
-        shutil.rmtree(self.inputs / "views" / "sparse")
         shutil.copytree(self.inputs / "run", self.inputs / "second")
 
     def undisturbed(self, name: str) -> Undisturbed:
@@ -291,7 +307,7 @@ def is_complete(data: bytes) -> bool:
 
 
 def write_inputs(folder: Path) -> None:
-    """Write a scene; the same with a distorted lens, without points and as an export; and splats."""
+    """Write a scene; the same with a distorted lens, without points and as an export; splats; and views."""
     scene = write_tiny_scene(folder / "scene")
     distorted = folder / "distorted"
     shutil.copytree(scene, distorted)
@@ -316,6 +332,8 @@ def write_inputs(folder: Path) -> None:
     lens |= {"w": int(width), "h": int(height)}
     (export / "transforms.json").write_text(json.dumps(lens | {"frames": frames}))
     write_ply(folder / "base.ply", opaque_sphere())
+    (folder / "views").mkdir()
+    write_views(folder / "views", views(4))
 
 
 def opaque_sphere() -> Splats:

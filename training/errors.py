@@ -5,9 +5,15 @@ import re
 
 DISK_FULL = {errno.ENOSPC, errno.EDQUOT}
 """Error codes of a full disk or an exceeded quota."""
+FREE_SPACE = "Free some space"
+"""First words of the remedy for a full disk."""
 MAX_TEXT = 1000
 """Maximum number of characters of a sentence. Longer ones, which quote foreign text, lose their middle."""
 _UNPRINTABLE = re.compile("[\0\ud800-\udfff]")
+
+
+_LINK_LOOP = "Symlink loop from "
+"""Start of the message of ``Path.resolve`` about an endless link before Python 3.13."""
 
 
 class LodgsError(Exception):
@@ -32,6 +38,11 @@ def describe_system_error(error: BaseException) -> LodgsError | None:
     """Return a failure of the disk, the memory or another part of the computer as sentences, else None."""
     if is_out_of_memory(error):
         return SystemProblem("Not enough memory.", "Close other programs, or reduce the size of the task.")
+    if isinstance(error, RuntimeError) and str(error).startswith(_LINK_LOOP):
+        path = str(error)[len(_LINK_LOOP) :]
+        return SystemProblem(
+            f"Cannot use {path}: the link leads to itself.", "Remove it, or choose another path."
+        )
     if not isinstance(error, OSError):
         return None
     action = f"Cannot use {printable(error.filename)}" if error.filename else "Cannot continue"
@@ -49,7 +60,7 @@ def system_reason(error: OSError) -> str:
 def system_remedy(error: OSError, default: str = "") -> str:
     """Return the remedy for a full disk or an exceeded limit, or else the default."""
     if error.errno in DISK_FULL:
-        return "Free some space on this disk, or choose another folder."
+        return f"{FREE_SPACE} on this disk, or choose another folder."
     if error.errno in (errno.EMFILE, errno.ENFILE):
         return "Raise the limit of open files (ulimit -n), or close other programs."
     if error.errno == errno.EFBIG:

@@ -13,7 +13,7 @@ import tempfile
 import time
 import uuid
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path, PureWindowsPath
 from typing import IO, BinaryIO
@@ -61,10 +61,9 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
     missing parent folder is created. If ``path`` is a symbolic link, its target is replaced.
 
     Raises:
-        LodgsError: the disk is full, or the location is not writable.
+        LodgsError: the disk is full, the location is not writable, or a folder, pipe or device has the name.
     """
-    check_name(path)
-    path = Path(os.path.realpath(path)) if os.path.islink(path) else Path(path)
+    path = _target(path, is_file)
     temporary = _temporary_path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -91,10 +90,12 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
 def atomic_folder(folder: Path) -> Iterator[Path]:
     """Yield an empty folder, and rename it to ``folder`` when the block succeeds. It replaces a former one.
 
+    If ``folder`` is a symbolic link, its target is replaced.
+
     Raises:
-        LodgsError: the disk is full, or the location is not writable.
+        LodgsError: the disk is full, the location is not writable, or a file has the name.
     """
-    check_name(folder)
+    folder = _target(folder, os.path.isdir)
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         with temporary_folder(folder.parent) as work:
@@ -113,6 +114,21 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
             f"Cannot write {folder}: {error.strerror or error}.",
             system_remedy(error, "Choose another folder."),
         ) from error
+
+
+def _target(path: str | Path, is_replaceable: Callable[[Path], bool]) -> Path:
+    """Return the path behind links that a write creates or replaces.
+
+    Raises:
+        LodgsError: the name is invalid, or belongs to something that must not be replaced.
+    """
+    check_name(path)
+    path = Path(os.path.realpath(path)) if os.path.islink(path) else Path(path)
+    if os.path.lexists(path) and not is_replaceable(path):
+        others = "a folder" if os.path.isdir(path) else "a pipe, device or endless link"
+        kind = "a file" if is_file(path) else others
+        raise LodgsError(f"Cannot write {path}: {kind} has this name.", "Choose another name or folder.")
+    return path
 
 
 def check_name(path: str | Path) -> None:

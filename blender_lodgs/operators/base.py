@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from typing import cast
 
 import bpy
 
@@ -25,8 +24,9 @@ def report_errors(execute):
             self.report({"ERROR"}, f"{error.what} \n{error.remedy}".strip())
         except MemoryError:
             self.report({"ERROR"}, "Out of memory. Close other files and programs.")
-        except OSError as error:
-            described = cast(LodgsError, describe_system_error(error))
+        except (OSError, RuntimeError) as error:
+            if (described := describe_system_error(error)) is None:
+                raise
             self.report({"ERROR"}, f"{described.what} \n{described.remedy}".strip())
         return {"CANCELLED"}
 

@@ -17,7 +17,6 @@ import numpy as np
 from ...training.errors import LodgsError, system_remedy
 from ...training.files import atomic_write
 from ...training.scenes.cameras import Camera, check_render_size, read_camera, write_camera
-from ...training.scenes.images import image_size
 from ...training.scenes.rendered_views import CAMERAS, DEPTHS, IMAGES
 from .. import compat, extension
 from ..data import photographs, roots, viewpoints
@@ -25,10 +24,10 @@ from ..data.cameras import scene_camera, view_of
 from ..data.original_place import original_place
 from ..runs import environment, processes
 from .engine import LodgsEngine
+from .written_images import is_complete_image
 
 ViewCallback = Callable[[int, int], object]
 """Function that is called before each view is rendered, with its number (from 1) and the number of views."""
-_PNG_END = b"IEND\xaeB`\x82"
 LOW_NOISE_SAMPLES = 256
 """Samples per pixel from which Cycles needs no denoiser."""
 
@@ -217,19 +216,6 @@ def _set_camera(
     context.view_layer.update()
     depsgraph = context.evaluated_depsgraph_get()
     return view_of(camera.evaluated_get(depsgraph), depsgraph, width, height)
-
-
-def is_complete_image(path: Path, size: tuple[int, int]) -> bool:
-    """Return whether an image that Blender has written has this size, and a PNG its last chunk."""
-    try:
-        if image_size(path) != size:
-            return False
-    except LodgsError:  # a full disk
-        return False
-    with path.open("rb") as file:
-        is_png = file.read(4) == b"\x89PNG"
-        file.seek(max(path.stat().st_size - len(_PNG_END), 0))
-        return not is_png or file.read() == _PNG_END
 
 
 def _save(scene: bpy.types.Scene, folder: Path, name: str, size: tuple[int, int]) -> None:

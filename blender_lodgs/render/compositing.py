@@ -21,6 +21,7 @@ from ..data.placement import placement_of
 from ..data.properties import RenderSettings
 from ..data.property_callbacks import ON_CHANGE
 from . import engine
+from .written_images import require_complete_image
 
 _COPIED = (
     "resolution_x", "resolution_y", "resolution_percentage", "pixel_aspect_x", "pixel_aspect_y",
@@ -202,6 +203,7 @@ def render_mesh_depth(scene: bpy.types.Scene, frames: Iterable[int]) -> Iterator
             meshes.frame_start = meshes.frame_end = frame
             meshes.render.filepath = str(path.parent / pattern.name)
             bpy.ops.render.render(scene=meshes.name, animation=True)
+            require_complete_image(path)
             yield path
     except RuntimeError as error:
         raise LodgsError(

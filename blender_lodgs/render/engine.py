@@ -31,7 +31,7 @@ from .. import attributes
 from ..data import changes, objects, roots, selection, shown
 from ..data.cameras import RenderView, aperture_of, scene_camera, unsupported_lens
 from ..data.paths import absolute_path
-from . import renderer
+from . import renderer, written_images
 
 ID = "LODGS"
 MAX_KEYS = 63
@@ -58,6 +58,7 @@ class LodgsEngine(bpy.types.RenderEngine):
 
     def render(self, depsgraph):
         try:
+            written_images.raise_problem()
             self._render_views(depsgraph)
         except Exception as error:
             message = str(error)

@@ -15,6 +15,7 @@ import numpy as np
 
 from ...training.errors import LodgsError
 from .. import compat
+from .written_images import is_complete_image
 
 MAX_FRAMES = 120
 """Default maximum number of extracted frames."""
@@ -80,7 +81,7 @@ def _render(scene: bpy.types.Scene, frame: int, folder: Path) -> Path:
     scene.frame_start = scene.frame_end = frame
     scene.render.filepath = str(folder / "frame_######")
     path = folder / f"frame_{frame:06d}.png"
-    if bpy.ops.render.render(animation=True, scene=scene.name) != {"FINISHED"} or not path.is_file():
+    if bpy.ops.render.render(animation=True, scene=scene.name) != {"FINISHED"} or not is_complete_image(path):
         raise LodgsError(f"Cannot write frame {frame} of the video to {folder}.", "Free some disk space.")
     return path
 

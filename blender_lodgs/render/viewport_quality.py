@@ -19,6 +19,7 @@ from ..data import shown
 from ..data.cameras import RenderView, scene_camera
 from ..viewport import views
 from . import engine, renderer
+from .written_images import require_complete_image
 
 IMAGE = "Render Result"
 """Name of the image with the result."""
@@ -94,6 +95,7 @@ def render_animation(context: bpy.types.Context, frames: Iterable[int]) -> Itera
                 image.save_render(path, scene=scene)
             except RuntimeError as error:
                 raise LodgsError(f"Cannot write {path}.", "Choose another output folder.") from error
+            require_complete_image(Path(path))
             yield Path(path)
     finally:
         scene.frame_set(current_frame)

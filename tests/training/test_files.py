@@ -147,11 +147,46 @@ def test_parent_that_is_a_file_raises_one_sentence(tmp_path):
 def test_path_that_is_a_folder_asks_for_another_name(tmp_path):
     (tmp_path / "a.ply").mkdir()
     with (
-        pytest.raises(LodgsError, match=r"Is a directory\. Choose another name or folder"),
-        atomic_write(tmp_path / "a.ply") as temporary,
+        pytest.raises(LodgsError, match=r"a folder has this name\. Choose another name or folder"),
+        atomic_write(tmp_path / "a.ply"),
     ):
-        temporary.write_text("new")
+        pytest.fail("the work begins before the error")
     assert os.listdir(tmp_path) == ["a.ply"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="no named pipes or links to devices")
+@pytest.mark.parametrize("kind", ["pipe", "loop", "link to a pipe"])
+@pytest.mark.parametrize("write", [atomic_write, atomic_folder])
+def test_pipes_devices_and_endless_links_are_not_replaced(tmp_path, kind, write):
+    path = tmp_path / "a"
+    if kind == "loop":
+        path.symlink_to("a")
+    else:
+        os.mkfifo(tmp_path / "pipe" if kind == "link to a pipe" else path)
+    if kind == "link to a pipe":  # root could replace /dev/null by such a link
+        path.symlink_to("pipe")
+    before = sorted((name, (tmp_path / name).lstat().st_mode) for name in os.listdir(tmp_path))
+    with pytest.raises(LodgsError, match="a pipe, device or endless link has this name"), write(path):
+        pytest.fail("the work begins before the error")
+    assert before == sorted((name, (tmp_path / name).lstat().st_mode) for name in os.listdir(tmp_path))
+
+
+def test_folder_does_not_replace_a_file(tmp_path):
+    (tmp_path / "tiles").write_text("mine")
+    with pytest.raises(LodgsError, match="a file has this name"), atomic_folder(tmp_path / "tiles"):
+        pytest.fail("the work begins before the error")
+    assert (tmp_path / "tiles").read_text() == "mine"
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links need a right on Windows")
+@pytest.mark.parametrize("former", [False, True])
+def test_folder_behind_a_link_is_replaced(tmp_path, former):
+    target = tmp_path / "other disk" / "a"
+    (target if former else target.parent).mkdir(parents=True)
+    (tmp_path / "a").symlink_to(target, target_is_directory=True)
+    with atomic_folder(tmp_path / "a") as folder:
+        (folder / "new").touch()
+    assert (tmp_path / "a").is_symlink() and os.listdir(target) == ["new"]
 
 
 def test_error_about_another_file_passes_through(tmp_path):

@@ -123,6 +123,7 @@ def test_edits_start_without_torch(tmp_path):
             "Cannot use b: No space left on device.",
         ),
         (MemoryError(), "Not enough memory. Close other programs"),
+        (RuntimeError("Symlink loop from 'a'"), "Cannot use 'a': the link leads to itself. Remove"),
     ],
 )
 def test_system_errors_are_one_message(monkeypatch, capsys, error, message):

@@ -7,6 +7,8 @@ import json
 import sys
 from typing import IO, TYPE_CHECKING, Any, cast
 
+from ..errors import FREE_SPACE, SystemProblem
+
 if TYPE_CHECKING:
     from ..runs.job import Job
 
@@ -24,6 +26,7 @@ def train(job: Job, text: str) -> str:
 
     Raises:
         KeyboardInterrupt: training was cancelled.
+        SystemProblem: the disk is full, which would end further trainings, too.
     """
     from ..runs.failures import CANCELLED, DONE
     from ..runs.train import train
@@ -33,7 +36,12 @@ def train(job: Job, text: str) -> str:
     code = train(job, cast("IO[str]", events))
     if code == CANCELLED:
         raise KeyboardInterrupt
-    return "" if code == DONE else str(events.last.get("what", "Training crashed."))
+    if code == DONE:
+        return ""
+    problem, remedy = (str(events.last.get(key, "")) for key in ("what", "remedy"))
+    if remedy.startswith(FREE_SPACE):
+        raise SystemProblem(problem, remedy)
+    return problem or "Training crashed."
 
 
 class _Events(io.TextIOBase):

@@ -9,6 +9,7 @@ import json
 import math
 import os
 import struct
+from collections import deque
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +57,7 @@ _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 _Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """From z up to y up."""
 _DEFECTS = (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError, struct.error)
+_TRANSFORM = {"matrix", "rotation", "scale", "translation"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _COLUMNS = {
@@ -269,6 +271,7 @@ class _GlbReader:
                     self._data = np.memmap(file, np.uint8, "r", file.tell(), length)
         self._splats = 0
 
+    @np.errstate(over="ignore", invalid="ignore")
     def levels(self) -> Bundle:
         """Return the levels of the first node with MSFT_lod, or all splats as one level."""
         nodes = self._world_nodes()
@@ -321,15 +324,15 @@ class _GlbReader:
     def _world_nodes(self) -> list[tuple[dict, np.ndarray]]:
         """Return the nodes of the scene with their transforms (4, 4)."""
         scene = self._item("scenes", self._json.get("scene", 0))
-        waiting = [(index, np.eye(4)) for index in scene["nodes"]]
+        waiting = deque((index, np.eye(4)) for index in scene["nodes"])
         nodes, visited = [], set()
         while waiting:
-            index, parent = waiting.pop(0)
+            index, parent = waiting.popleft()
             node = self._item("nodes", index)
             if index in visited:
                 raise ValueError(f"node {index} occurs twice")
             visited.add(index)
-            matrix = parent @ _matrix(node)
+            matrix = parent @ _matrix(node) if _TRANSFORM & node.keys() else parent
             nodes.append((node, matrix))
             waiting += [(child, matrix) for child in node.get("children", [])]
         return nodes

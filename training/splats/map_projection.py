@@ -21,6 +21,8 @@ _CODES = {326: "north", 327: "south", 258: "north"}
 ETRS89 differs from WGS 84 by less than a metre, and maps usually treat both as equal.
 """
 _DATUMS = "wgs 84", "wgs_1984", "wgs84", "etrs89", "etrs_1989"
+_MIDDLE, _REACH = np.array([5e5, 5e6, 0.0]), np.array([1e6, 6e6, 1e5])
+"""Middle of a zone's coordinates in metres, and distance up to which positions count as near the zone."""
 _LATITUDE_ROUNDS = 6
 """Rounds of the iteration for the latitude; each gains more than two digits."""
 
@@ -45,6 +47,10 @@ class UtmZone:
                 return None
             hemisphere, number, south = match[2], int(match[1]), match[2] == "s"
         return UtmZone(number, south) if hemisphere and 1 <= number <= 60 else None
+
+    def contains(self, position: np.ndarray) -> bool:
+        """Return whether a position (3,) is in the zone or close to it, and less than 100 km high or deep."""
+        return bool((np.abs(np.asarray(position) - _MIDDLE) <= _REACH).all())
 
     def to_ecef(self, positions: np.ndarray) -> np.ndarray:
         """Return the geocentric coordinates (N, 3) float64 of positions (N, 3)."""

@@ -19,6 +19,7 @@ from .bundle_header import (
     level_line,
     parse_bundle,
 )
+from .dialects import MAX_COORDINATE
 from .gaussians import SplatRows, Splats
 from .levels import Bundle, Level
 from .origin import FAR_SPLATS, NO_ORIGIN, ORIGIN_SAMPLE, choose_origin
@@ -189,8 +190,13 @@ def place_splats(splats: Splats, matrix: np.ndarray, path: Path) -> tuple[Splats
     """Return splats that are transformed except for the translation, and the translation (3,) float64.
 
     Raises:
-        LodgsError: the transform stretches, shears or mirrors.
+        LodgsError: the transform stretches, shears or mirrors, or has too large numbers.
     """
+    if not (np.abs(matrix) <= MAX_COORDINATE).all():
+        raise LodgsError(
+            f"Cannot read {path}: a transform has numbers above {MAX_COORDINATE:g}.",
+            "Move the splats closer to 0, and export them again.",
+        )
     try:
         transform = Similarity.from_matrix(matrix)
     except LodgsError as error:

@@ -32,6 +32,8 @@ _CORE = 3.0
 """Radius of the core, in radii of the scene. Splats that extend beyond it share a cell."""
 _DERIVATIVE_STEP = 1.0
 """Half distance in metres of positions that determine the transform of their surroundings."""
+_BENT = 1e6
+"""Distance in metres from the center up to which splats follow the curvature; the sky may be farther."""
 _SIGMAS = 3.0
 """Extent of a splat in boxes, in standard deviations."""
 
@@ -77,9 +79,18 @@ def _earth_transform(
     if place is not None and (zone := place.zone) is not None:
         matrix = place.matrix
 
-        def on_earth(positions: np.ndarray) -> np.ndarray:
-            return zone.to_ecef(positions.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3])
+        def on_map(positions: np.ndarray) -> np.ndarray:
+            return positions.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
 
+        def on_earth(positions: np.ndarray) -> np.ndarray:
+            return zone.to_ecef(on_map(positions))
+
+        if not zone.contains(on_map(center)):
+            place_text = ", ".join(f"{value:.6g}" for value in on_map(center))
+            raise LodgsError(
+                f"Cannot place scene on Earth: ({place_text}) lies outside of the map {place.crs[:60]}.",
+                "Correct the scene's georeference.json, and train again.",
+            )
         step = _DERIVATIVE_STEP / np.cbrt(abs(np.linalg.det(matrix[:3, :3])))
         sides = [on_earth(center + sign * step * np.eye(3)) for sign in (1, -1)]
         linear = (sides[0] - sides[1]).T / (2 * step)
@@ -87,7 +98,14 @@ def _earth_transform(
         transform[:3, :3] = linear
         transform[:3, 3] = on_earth(center[None])[0] - linear @ center
         back = np.linalg.inv(linear)
-        return transform, lambda positions: (on_earth(positions) - transform[:3, 3]) @ back.T
+
+        def bend(positions: np.ndarray) -> np.ndarray:
+            is_near = np.linalg.norm(positions - center, axis=1) < _BENT / _DERIVATIVE_STEP * step
+            bent = positions.astype(np.float64)
+            bent[is_near] = (on_earth(positions[is_near]) - transform[:3, 3]) @ back.T
+            return bent
+
+        return transform, bend
     if not is_geocentric(bundle.origin):
         return None, None
     transform = np.eye(4)

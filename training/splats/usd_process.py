@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -28,6 +29,8 @@ _MEMORY = 1 << 27
 """Bytes that a file of any size may unpack to."""
 _RATIO = 64
 """Bytes that a file may unpack to per byte of its size, in addition to ``_MEMORY``."""
+_COPIES = 4
+"""Memory for reading in multiples of the unpacked size."""
 _SPLAT_BYTES = 56
 """Bytes of a splat of SH degree 0."""
 
@@ -36,6 +39,7 @@ def main() -> int:
     """Read the file and write the bundle; report errors on standard output."""
     source, target = (Path(word) for word in sys.argv[1:])
     usd = load_usd()
+    limit_memory(source)
     try:
         write_bundle(target, read_levels(usd, source))
     except LodgsError as error:
@@ -44,6 +48,17 @@ def main() -> int:
         reason = printable((str(error).strip() or type(error).__name__).splitlines()[-1])[:300]
         report_error(LodgsError(f"Cannot read {source}: it is damaged ({reason}).", "Export it again."))
     return 0
+
+
+def limit_memory(path: Path) -> None:
+    """Limit the memory of this process, because compressed arrays may unpack to any size. Linux only."""
+    with suppress(ImportError, OSError, ValueError):
+        import resource
+
+        status = Path("/proc/self/status").read_text("ascii", "replace")
+        used = int(status.split("VmData:")[1].split()[0]) * 1024
+        _, hard = resource.getrlimit(resource.RLIMIT_DATA)
+        resource.setrlimit(resource.RLIMIT_DATA, (used + _COPIES * _unpacked_limit(path), hard))
 
 
 def read_levels(usd: SimpleNamespace, path: Path) -> Bundle:
@@ -106,13 +121,17 @@ def _open(usd: SimpleNamespace, path: Path):
 
 def _check_size(path: Path, fields: list) -> None:
     """Refuse a file that declares more splats than it can hold."""
-    limit = _MEMORY + _RATIO * path.stat().st_size
     count = 0
     for prim in fields:
         values = prim.GetAttribute("positions").Get() or prim.GetAttribute("positionsh").Get()
         count += len(values) if values is not None else 0
-    if count * _SPLAT_BYTES > limit:
+    if count * _SPLAT_BYTES > _unpacked_limit(path):
         raise LodgsError(f"Cannot read {path}: it is too short for {count:,} splats.", "Export it again.")
+
+
+def _unpacked_limit(path: Path) -> int:
+    """Return the bytes that a file may unpack to."""
+    return _MEMORY + _RATIO * path.stat().st_size
 
 
 def _read_field(prim, path: Path) -> Splats:

@@ -294,7 +294,7 @@ def test_capture_that_ended_in_its_first_view_continues(
 
 
 def test_incomplete_images_are_noticed(lodgs, tmp_path):
-    path, is_complete = tmp_path / "a.png", lodgs("render.capture").is_complete_image
+    path, is_complete = tmp_path / "a.png", lodgs("render.written_images").is_complete_image
     lodgs("training.scenes.images").write_png(path, np.zeros((12, 16, 3), np.uint8))
     assert is_complete(path, (16, 12)) and not is_complete(path, (12, 16))
     path.write_bytes(path.read_bytes()[:-5])

@@ -1,5 +1,6 @@
 """Comparison of runs: measures equal those of evaluate, answers, and the page in a browser."""
 
+import errno
 import json
 import re
 import shutil
@@ -8,12 +9,13 @@ import subprocess
 import pytest
 
 from training.__main__ import main
-from training.errors import LodgsError
+from training.errors import LodgsError, system_remedy
 from training.methods import METHODS
 from training.runs.comparison.measures import ComparedRun, Point, label_runs, measure_run, recommend_runs
 from training.runs.comparison.page import build_page, compare
 from training.runs.estimate import Estimate
 from training.runs.events import event_line
+from training.runs.failures import describe_error
 from training.runs.folder import RunFolder
 from training.runs.job import Job
 from training.runs.measure import evaluate_run
@@ -197,6 +199,24 @@ def test_command_trains_the_methods_of_a_scene(tiny_scene, runs, tmp_path, capsy
     run, merged = json.loads((tmp_path / "compare.json").read_text())["runs"]
     assert Job.from_file(tmp_path / "runs" / "3dgs" / "job.toml").test_every == 4
     assert run["points"][-1]["splats"] == merged["points"][-1]["splats"]
+
+
+NO_SPACE = OSError(errno.ENOSPC, "No space left")
+
+
+@pytest.mark.parametrize("error", [NO_SPACE, LodgsError("Cannot write a.ply.", system_remedy(NO_SPACE))])
+def test_full_disk_ends_the_command(tiny_scene, tmp_path, capsys, monkeypatch, error):
+    """A method is not left out because of the disk: the same command resumes."""
+
+    def train(job, events):
+        what, remedy, code = describe_error(error)
+        events.write(json.dumps({"event": "error", "what": what, "remedy": remedy}) + "\n")
+        return code
+
+    monkeypatch.setattr("training.runs.train.train", train)
+    assert main(["compare", str(tiny_scene), "--out", str(tmp_path), "--methods", "tree", "3dgs"]) == 2
+    output = capsys.readouterr().err
+    assert "left out" not in output and "Training 3DGS" not in output and "Free some space" in output
 
 
 def test_several_scenes_share_a_page_of_results(tiny_scene, runs, tmp_path, monkeypatch):

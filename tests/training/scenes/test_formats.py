@@ -64,6 +64,20 @@ def test_nerfstudio_with_distortion_and_points(tmp_path):
     assert (scene.point_colors == (250, 20, 30)).all() and len(scene.distorted) == 3
 
 
+@pytest.mark.parametrize("key", ["K", "intrinsics", "camera_matrix", "distortion", "dist_coeffs"])
+@pytest.mark.parametrize("value", [[[1, 2], [3]], [1, "a", None, {}], "abc"])
+def test_malformed_lenses_exclude_their_frame(tmp_path, key, value):
+    write_transforms(tmp_path, lambda document: document["frames"][0].update({key: value}))
+    scene = convert_export(tmp_path)
+    assert scene.views == 2 and NAMES[0] in scene.warnings[0]
+
+
+def test_names_of_endless_folders_are_bounded(tmp_path):
+    write_transforms(tmp_path, lambda document: document["frames"][0].update(file_path="a/" * 20_000 + "b"))
+    scene = convert_export(tmp_path)
+    assert scene.views == 2 and len(scene.warnings[0]) < 1500
+
+
 def test_nerfstudio_fisheye(tmp_path):
     k = {"k1": 0.05, "k2": -0.02, "k3": 0.003, "k4": -0.001}
     write_transforms(tmp_path, camera_model="OPENCV_FISHEYE", **k)

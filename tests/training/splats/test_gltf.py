@@ -251,3 +251,14 @@ def test_highly_compressed_level_is_rejected(tmp_path):
     write_compressed_glb(tmp_path / "a.glb", PortableLevels(bundle))
     with pytest.raises(LodgsError, match="20,000 splats"):
         read(tmp_path / "a.glb")
+
+
+def test_transforms_beyond_the_largest_coordinate_are_refused(tmp_path):
+    export_levels(tmp_path / "a.glb", flod())
+    document, data = read_parts(tmp_path / "a.glb")
+    for values in ({"translation": [1e13, 0, 0]}, {"scale": [1e200] * 3}, {"rotation": [1e200] * 4}):
+        node = {key: value for key, value in document["nodes"][0].items() if key != "matrix"} | values
+        nodes = [node, *document["nodes"][1:]]
+        (tmp_path / "b.glb").write_bytes(assembled(document | {"nodes": nodes}, data))
+        with pytest.raises(LodgsError, match=r"a transform has numbers above 1e\+12"):
+            read(tmp_path / "b.glb")

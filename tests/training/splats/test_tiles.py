@@ -149,6 +149,27 @@ def test_splats_on_a_map_are_at_their_places_on_the_globe(tmp_path, bundle):
     assert 0.8 < flat < 1.0
 
 
+@pytest.mark.parametrize("place", [(1e30, 0, 0), (3e8, 0, 0), (5e5, 1e9, 0), (5e5, 5e6, -6.4e6)])
+def test_places_outside_of_the_map_are_refused(tmp_path, bundle, place):
+    matrix = np.eye(4)
+    matrix[:3, 3] = place
+    bundle.meta["georeference"] = {"crs": "EPSG:32632", "matrix": matrix.tolist()}
+    with pytest.raises(LodgsError, match=r"lies outside of the map EPSG:32632\. Correct"):
+        export_tiles(tmp_path / "tiles", bundle)
+    assert not (tmp_path / "tiles").exists()
+
+
+def test_sky_beyond_the_horizon_stays_in_its_direction(tmp_path, bundle):
+    matrix = np.eye(4)
+    matrix[:3, 3] = (448_250.0, 5_411_900.0, 300.0)
+    bundle.meta["georeference"] = {"crs": "EPSG:32632", "matrix": matrix.tolist()}
+    far = np.array([[0, 0, 3e7], [2e9, 0, 0], [0, -1e11, 0]], np.float32)
+    _, bend = tiles._earth_transform(bundle, np.zeros(3))
+    np.testing.assert_array_equal(bend(far), far)
+    bundle.levels[-1].splats.means[-3:] = far
+    export_tiles(tmp_path / "tiles", bundle)  # bounds are finite
+
+
 def test_other_files_are_not_replaced(tmp_path, bundle):
     (tmp_path / "mine.txt").write_text("")
     with pytest.raises(LodgsError, match="contains other files"):

@@ -213,3 +213,18 @@ def test_blender_process_does_not_load_our_usd(tmp_path):
         "try: load_usd()\nexcept Exception as error: print(error, 'pxr' in sys.modules)"  # fmt: skip
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert "Blender's own process" in result.stdout and result.stdout.strip().endswith("False"), result
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not limit a process's memory")
+def test_reading_process_has_little_memory(tmp_path):
+    """A file of 300 KB can declare 300 million opacities of 0."""
+    (tmp_path / "a.usdc").write_bytes(bytes(300_000))
+    program = (
+        "import sys, pathlib, numpy; from training.splats.usd_process import limit_memory;"
+        "limit_memory(pathlib.Path(sys.argv[1]));"
+        "numpy.ones(20_000_000); print('small'); numpy.ones(150_000_000)"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", program, tmp_path / "a.usdc"], capture_output=True, text=True, check=False
+    )
+    assert result.stdout == "small\n" and "Unable to allocate" in result.stderr

@@ -33,6 +33,8 @@ OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _SUFFIXES = *IMAGE_SUFFIXES, ".exr", *(suffix.upper() for suffix in IMAGE_SUFFIXES), ".EXR"
 _OTHER_SUFFIXES = *UNREADABLE_SUFFIXES, *(suffix.upper() for suffix in UNREADABLE_SUFFIXES)
 _NO_POINTS = np.zeros((0, 3))
+_MAX_PARTS = 64
+"""Maximum number of folders in an exported name; further leading ones are dropped."""
 
 
 @dataclass(frozen=True)
@@ -244,12 +246,14 @@ def find_image(folder: Path, name: str) -> Path:
     for spelling in dict.fromkeys(spellings):
         for candidate in _candidates(folder, spelling):
             stem = candidate.stem if _has_photo_suffix(candidate) else candidate.name
-            paths = [candidate.with_name(stem + suffix) for suffix in _SUFFIXES]
+            start = str(candidate)[: -len(candidate.name)] + stem if candidate.name else str(candidate)
+            paths = [start + suffix for suffix in _SUFFIXES]
             # A readable copy precedes the original in a format that LODGS does not read.
-            originals = [candidate.with_name(stem + suffix) for suffix in _OTHER_SUFFIXES]
-            for path in (*[candidate][: candidate.suffix in _SUFFIXES], *paths, candidate, *originals):
+            originals = [start + suffix for suffix in _OTHER_SUFFIXES]
+            own = str(candidate)
+            for path in (*[own][: candidate.suffix in _SUFFIXES], *paths, own, *originals):
                 if is_file(path):
-                    return path
+                    return Path(path)
     return _candidates(folder, name)[0]
 
 
@@ -263,7 +267,7 @@ def _candidates(folder: Path, name: str) -> list[Path]:
         part
         for part in name.replace("\\", "/").split("/")
         if part not in ("", ".", "..") and not Path(part).drive
-    ]
+    ][-_MAX_PARTS:]
     return [folder.joinpath(*parts[start:]) for start in range(len(parts))] or [folder]
 
 
@@ -298,6 +302,7 @@ class PhotoFinder:
         self._roots = roots or (folder,)
         self._by_stem: dict[str, list[Path]] | None = None
         self._moved: list[tuple[Path, Path]] = []
+        self._expected_paths: dict[str, Path] = {}
 
     def find(self, name: str) -> Path:
         """Return a photo at its exported place, else the only photo below the folder with its name.
@@ -315,8 +320,10 @@ class PhotoFinder:
 
     def _expected(self, name: str) -> Path:
         """Return the photo at its exported place, or that place in the preferred folder."""
-        places = [find_image(root, name) for root in self._roots]
-        return next((path for path in places if is_file(path)), places[0])
+        if name not in self._expected_paths:
+            places = [find_image(root, name) for root in self._roots]
+            self._expected_paths[name] = next((path for path in places if is_file(path)), places[0])
+        return self._expected_paths[name]
 
     def locate(self, name: str) -> Path | None:
         """Return the photo below the folder that has most of the name's last parts, or None.

@@ -10,8 +10,6 @@ from math import tan
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ...errors import LodgsError
 from ..images import image_size
 from ..point_cloud import read_points
@@ -133,7 +131,7 @@ def _parse_view(folder: Path, values: Mapping[str, Any], photos: PhotoFinder) ->
         raise LodgsError(flaw)
     if other := next((name for name in _OTHER_LENSES if values.get(name)), ""):
         raise LodgsError(f"lenses with {other} are not supported.")
-    if other := next((name for name in _UNNAMED if np.any(values.get(name, 0))), ""):
+    if other := next((name for name in _UNNAMED if not _is_zero(values.get(name))), ""):
         raise LodgsError(f"the order of its values '{other}' is unknown: name them k1, k2, p1, p2, ...")
     model = str(values.get("camera_model", "")).upper()
     if model not in _SUPPORTED_MODELS:
@@ -172,8 +170,14 @@ def _read_matrix(values: Mapping[str, Any]) -> dict[str, Any]:
     content: Any = next((values[name] for name in _MATRICES if values.get(name) is not None), values)
     if isinstance(content, dict):
         return {name: content[other] for name, other in _ALIASES.items() if content.get(other) is not None}
-    lens = parse_array(content, 4).tolist() if np.shape(content) == (4,) else parse_camera_matrix(content)
+    is_flat = isinstance(content, list) and len(content) == 4 and not isinstance(content[0], list)
+    lens = parse_array(content, 4).tolist() if is_flat else parse_camera_matrix(content)
     return dict(zip(_ALIASES, lens, strict=True))
+
+
+def _is_zero(value: Any) -> bool:
+    """Return True for null, 0, false, empty values and nested lists of them."""
+    return all(map(_is_zero, value)) if isinstance(value, list) else not value
 
 
 def _normalising_sides(fx: float, fy: float, width: float, height: float) -> tuple[float, float]:
