@@ -116,4 +116,4 @@ def fake_card(monkeypatch):
 
     monkeypatch.setitem(sys.modules, "gsplat", fake_gsplat)
     monkeypatch.setattr(cuda, "DEVICE", "cpu")
-    monkeypatch.setattr(cuda, "problem", lambda: None)
+    monkeypatch.setattr(cuda, "find_problem", lambda: None)
