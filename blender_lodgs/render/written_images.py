@@ -11,6 +11,7 @@ import bpy
 
 from ...training.errors import LodgsError
 from ...training.scenes.images import image_size
+from ..data.paths import absolute_path
 
 _PNG_END = b"IEND\xaeB`\x82"
 _CHECKED = ".png", ".exr", ".jpg", ".jpeg", ".tif", ".tiff", ".webp"
@@ -60,7 +61,10 @@ def raise_problem() -> None:
 def _states(scene: bpy.types.Scene) -> dict[str, tuple[int, int]]:
     """Return time and size of each file that a still or an animation may write for the present frame."""
     render = scene.render
-    still = bpy.path.abspath(render.filepath)
+    try:
+        still = str(absolute_path(render.filepath))
+    except LodgsError:  # a device
+        return {}
     if render.use_file_extension and not still.lower().endswith(render.file_extension):
         still += render.file_extension
     names = [view.name for view in render.views] if render.use_multiview else [""]
