@@ -871,7 +871,7 @@ def test_viewport_quality_ignores_the_clip_end(bpy, scene, frame, tmp_path):
 
 def test_viewport_quality_rejects_holdout(bpy, scene, frame, tmp_path):
     scene.lodgs_render.holdout = str(tmp_path / "depth_####.exr")
-    with pytest.raises(RuntimeError, match=r"mesh holdout.*\s+Clear Hold Out"):
+    with pytest.raises(RuntimeError, match=r"Hold Out is set.*\s+Clear Hold Out"):
         bpy.ops.lodgs.render_quick()
     assert bpy.context.scene.render.engine == "LODGS" and bpy.context.scene.render.use_compositing
 
