@@ -125,11 +125,13 @@ def filter_products(image, truth, row, left, lines, ring, place):
 @inlined(ORDERED)
 def filter_derivatives(first, end, lines, row, ring, place):
     """Store the windowed derivatives of a row in a slot of the ring, zero outside columns first to end."""
-    for part in range(row * DERIVATIVES, (row + 1) * DERIVATIVES):
-        for j in range(first):
-            lines[part * LINE + j] = ZERO
-        for j in range(end, WIDE):
-            lines[part * LINE + j] = ZERO
+    for part in range(DERIVATIVES):
+        # limits let LLVM prove that no index is negative: otherwise it scatters single values
+        begin = min(max((row * DERIVATIVES + part) * LINE, 0), 2 * DERIVATIVES * LINE)
+        for j in range(min(first, WIDE)):
+            lines[begin + j] = ZERO
+        for j in range(min(max(end, 0), WIDE), WIDE):
+            lines[begin + j] = ZERO
     along(lines, row * DERIVATIVES * LINE, DERIVATIVES, COLUMNS, ring, place)
 
 
@@ -183,8 +185,9 @@ def finish_rows(image, truth, row, rows, left, right, ring, slots, weights, grad
 def sum_columns(values, first, last):
     """Add the values of some columns."""
     result = ZERO
-    for j in range(first, last):
-        result += values[j]
+    for j in range(WIDE):
+        if first <= j < last:
+            result += values[j]
     return result
 
 
