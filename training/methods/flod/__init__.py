@@ -183,7 +183,7 @@ def divide(parameters: FlodParameters) -> tuple[FlodParameters, FlodParameters] 
     return replace(parameters, last_level=coarse), replace(parameters, first_level=coarse + 1)
 
 
-_DRAFT = FlodParameters(grad_threshold=7e-5)  # few steps for growth
+_DRAFT = FlodParameters(grad_threshold=7e-5)  # reaches max_splats in few steps
 _STANDARD = replace(
     FlodParameters(),
     **STANDARD,
