@@ -3,13 +3,15 @@
 import numpy as np
 
 from training.rasterize.cpu.compile import numba
-from training.rasterize.cpu.fastmath import exp2_lanes
+from training.rasterize.cpu.fastmath import exp2_lanes, exp_lanes, log2_lanes
 from training.rasterize.cpu.lanes import (
     WIDTH,
     any_of,
+    exponent,
     floor,
     larger,
     load,
+    load_row,
     magnitude,
     ramp,
     root,
@@ -64,3 +66,36 @@ def test_totals_of_eight_vectors():
     sum_rows(rows, sums)
     np.testing.assert_allclose(sums[1:9], rows.sum(1, dtype=np.float64), rtol=1e-5, atol=1e-6)
     assert sums[0] == sums[9] == 7
+
+
+@numba.njit
+def apply_to_rows(values, rows):
+    value = load_row(values, 1)
+    rows[0] = exponent(value)
+    rows[1] = log2_lanes(value)
+    rows[2] = exp_lanes(load_row(values, 0))
+    rows[3] = -value
+    rows[4] = np.float32(7)
+
+
+def test_logarithms_exponentials_and_rows():
+    random = np.random.default_rng(1)
+    values = np.stack([random.uniform(-80, 80, WIDTH), 2.0 ** random.uniform(-100, 100, WIDTH)])
+    values[1, :4] = 1, 1 + 2**-20, 1.4999, 1.5
+    values = values.astype(np.float32)
+    rows = np.zeros((5, WIDTH), np.float32)
+    apply_to_rows(values, rows)
+    exponents, positive = values.astype(np.float64)
+    np.testing.assert_array_equal(rows[0], np.floor(np.log2(positive)))
+    np.testing.assert_allclose(rows[1], np.log2(positive), rtol=3e-7, atol=1e-9)
+    np.testing.assert_allclose(rows[2], np.exp(exponents), rtol=1e-5)
+    np.testing.assert_array_equal(rows[3], -values[1])
+    np.testing.assert_array_equal(rows[4], 7)
+
+
+def test_exponentials_are_clamped_to_normal_numbers():
+    values = np.full((2, WIDTH), 1, np.float32)
+    values[0, 0], values[0, 1] = -1000, 1000
+    rows = np.zeros((5, WIDTH), np.float32)
+    apply_to_rows(values, rows)
+    assert rows[2, 0] == 2.0**-126 and rows[2, 1] == 2.0**126

@@ -14,8 +14,10 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from .compile import FAST, f32, inlined
-from .lanes import WIDTH, floor, load, scaled, store
+from .lanes import WIDTH, exponent, floor, larger, load, scaled, smaller, store
 
+LOG2_E, LOG2_TERM = f32(np.log2(np.e)), f32(2 / np.log(2))
+LOWEST_EXPONENT, HIGHEST_EXPONENT = f32(-126), f32(126)
 LOWEST = f32(-30)
 # minimax polynomial of 2^f on [0, 1), exact at both ends: relative error under 1e-7 besides rounding
 P1, P2, P3, P4, P5 = f32(0.6931517), f32(0.24015927), f32(0.055818677), f32(0.008990995), f32(0.0018793186)
@@ -110,6 +112,26 @@ def exp2_lanes(x):
     integer = floor(x)
     f = x - integer
     return scaled(f32(1) + f * (P1 + f * (P2 + f * (P3 + f * (P4 + f * P5)))), integer)
+
+
+@inlined(FAST - {"reassoc"})
+def exp_lanes(x):
+    """Compute e^x, clamped to normal numbers."""
+    return exp2_lanes(smaller(larger(x * LOG2_E, LOWEST_EXPONENT), HIGHEST_EXPONENT))
+
+
+@inlined(FAST - {"reassoc"})
+def log2_lanes(x):
+    """Compute the logarithm of positive normal numbers, with a relative error under 1e-6 besides rounding.
+
+    For m = x / 2^n in [3/4, 3/2) and t = (m - 1) / (m + 1), ln m = 2 (t + t³/3 + t⁵/5 + ...).
+    """
+    n = exponent(x * f32(4 / 3))
+    m = scaled(x, f32(0) - n)
+    t = (m - f32(1)) / (m + f32(1))
+    tt = t * t
+    series = f32(1) + tt * (f32(1 / 3) + tt * (f32(1 / 5) + tt * (f32(1 / 7) + tt * f32(1 / 9))))
+    return n + LOG2_TERM * t * series
 
 
 @inlined(FAST - {"reassoc"})

@@ -61,6 +61,8 @@ class _Model(models.PrimitiveModel):
 LANES = VectorType("Lanes", FLOATS)
 MASK = VectorType("Mask", ir.VectorType(ir.IntType(1), WIDTH))
 NUMBER, INDEX, ARRAY = types.float32, types.intp, types.Array(types.float32, 1, "C")
+ROWS = types.Array(types.float32, 2, "C")
+"""Array (K, WIDTH). ``rows[k] = value`` stores lanes, or copies a number to all lanes."""
 
 
 def _spread(builder: ir.IRBuilder, number: ir.Value) -> ir.Value:
@@ -102,6 +104,7 @@ _define(operator.add, LANES, *_PAIRS)(ir.IRBuilder.fadd)
 _define(operator.sub, LANES, *_PAIRS)(ir.IRBuilder.fsub)
 _define(operator.mul, LANES, *_PAIRS)(ir.IRBuilder.fmul)
 _define(operator.truediv, LANES, *_PAIRS)(ir.IRBuilder.fdiv)
+_define(operator.neg, LANES, (LANES,))(lambda builder, a: builder.fsub(FLOATS([0.0] * WIDTH), a))
 _define(operator.gt, MASK, *_PAIRS)(lambda builder, a, b: builder.fcmp_ordered(">", a, b))
 _define(operator.ge, MASK, *_PAIRS)(lambda builder, a, b: builder.fcmp_ordered(">=", a, b))
 _define(operator.lt, MASK, *_PAIRS)(lambda builder, a, b: builder.fcmp_ordered("<", a, b))
@@ -199,6 +202,16 @@ def _build_scaled(builder, value, exponent):
     return builder.bitcast(builder.add(builder.bitcast(value, INTEGERS), shifted), FLOATS)
 
 
+def exponent(value) -> Any:
+    """Return the integer n of each positive normal number m 2^n with 1 <= m < 2."""
+
+
+@_define(exponent, LANES, (LANES,))
+def _build_exponent(builder, value):
+    bits = builder.lshr(builder.bitcast(value, INTEGERS), INTEGERS([23] * WIDTH))
+    return builder.sitofp(builder.sub(bits, INTEGERS([127] * WIDTH)), FLOATS)
+
+
 def load(array, index) -> Any:
     """Return the elements from ``index`` on. The index is not checked."""
 
@@ -215,6 +228,20 @@ def store(array, index, value):
 @_define(store, types.void, (ARRAY, INDEX, LANES))
 def _build_store(builder, array, index, value):
     builder.store(value, _address(builder, array, index), align=4)
+
+
+def load_row(rows, k) -> Any:
+    """Return row ``k`` of an array (K, WIDTH). The index is not checked."""
+
+
+@_define(load_row, LANES, (ROWS, INDEX))
+def _build_load_row(builder, rows, k):
+    return _build_load(builder, rows, builder.mul(k, k.type(WIDTH)))
+
+
+@_define(operator.setitem, types.void, (ROWS, INDEX, LANES))
+def _build_set_row(builder, rows, k, value):
+    _build_store(builder, rows, builder.mul(k, k.type(WIDTH)), value)
 
 
 def _address(builder: ir.IRBuilder, array: ir.Value, index: ir.Value) -> ir.Value:

@@ -2,7 +2,7 @@
 
 Notation: p = R m + t the mean in camera coordinates, M = R Q diag(s) with covariance M Mᵀ, J the Jacobian of
 (fx x/z, fy y/z) at p (clamped to a frustum a little wider than the image), cov = J M Mᵀ Jᵀ + dilation (EWA
-splatting, Zwicker et al. 2001, as in 3DGS Eq. 5), conic = cov⁻¹.
+splatting, Zwicker et al. 2001, as in 3DGS Eq. 5), conic = cov⁻¹. Blocks of WIDTH splats are computed in lanes.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from ...editing.bake_filter import MIP_VARIANCE
 from ...splats import sh as harmonics
 from ..rendering import ALPHA_MIN, DILATION, KernelCamera
 from .compile import FAST, f32, inlined, kernel
-from .fastmath import prefetch
-from .lanes import larger, root, select, smaller
+from .fastmath import LOWEST_EXPONENT, exp2_lanes, exp_lanes, log2_lanes, prefetch
+from .lanes import WIDTH, larger, load_row, root, select, smaller, spread
 
 # Columns of a projected splat, the input of blending.
 MEAN_X, MEAN_Y = 0, 1
@@ -41,6 +41,11 @@ COLUMNS = 16
 G, G_DX, G_DY, G_DXDX, G_DXDY, G_DYDY, G_RED, G_GREEN, G_BLUE = range(9)
 SUMS = 9
 
+MEAN, QUAT, LOG_SCALE, LOGIT, FILTERED = 0, 3, 7, 10, 11
+"""First rows of a block (PARAMETERS, WIDTH) of splats, one per lane. FILTERED is 1 with Mip-Splatting's
+filter. A block of gradients has the same rows."""
+PARAMETERS = 12
+
 GRAIN = 1024
 """Splats in a thread's unit of work."""
 PREFETCH = 8
@@ -49,6 +54,7 @@ ZERO, HALF, ONE, TWO = f32(0), f32(0.5), f32(1), f32(2)
 MARGIN = f32(1 / 64)
 """Pixels by which the ellipse's rows and columns are extended against rounding."""
 ALPHA_MIN32, DILATION32, MIP_VARIANCE32 = f32(ALPHA_MIN), f32(DILATION), f32(MIP_VARIANCE)
+LOG2_ALPHA_MIN32 = f32(math.log2(ALPHA_MIN))
 LOG2_E, LN2 = f32(math.log2(math.e)), f32(math.log(2))
 
 sh_basis = inlined(FAST)(harmonics.basis)
@@ -63,15 +69,15 @@ def kernel_arguments(view: KernelCamera) -> tuple[np.ndarray, np.ndarray, np.nda
 
 
 @inlined(FAST)
-def to_camera(pose, axis, mean):
+def to_camera(pose, axis, x, y, z):
     """Return a point's coordinate along one axis of a camera."""
-    return pose[axis, 0] * mean[0] + pose[axis, 1] * mean[1] + pose[axis, 2] * mean[2] + pose[axis, 3]
+    return pose[axis, 0] * x + pose[axis, 1] * y + pose[axis, 2] * z + pose[axis, 3]
 
 
 @inlined(FAST)
 def clamp(value, low, high):
     """Clamp a value to a range."""
-    return min(max(value, low), high)
+    return smaller(larger(value, low), high)
 
 
 @inlined(FAST)
@@ -123,26 +129,143 @@ def strip_rows(row, left, across, top, rows):
 
 
 @inlined(FAST)
-def camera_axes(pose, quat, log_scale, min_scale, scale, axes):
-    """Fill scale (3,) and axes M (3, 3); return the normalised quaternion and its inverse length."""
-    inverse = ONE / math.sqrt(quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2] + quat[3] * quat[3])
-    w, x, y, z = quat[0] * inverse, quat[1] * inverse, quat[2] * inverse, quat[3] * inverse
+def read_lane(block, lane, i, means, quats, log_scales, opacity_logits, antialias):
+    """Copy the parameters of splat ``i`` to a lane of ``block``."""
     for k in range(3):
-        scale[k] = math.exp(log_scale[k]) + min_scale
-    for i in range(3):
-        r0, r1, r2 = pose[i, 0], pose[i, 1], pose[i, 2]
-        axes[i, 0] = (
-            r0 * (ONE - TWO * (y * y + z * z)) + r1 * TWO * (x * y + w * z) + r2 * TWO * (x * z - w * y)
-        )
-        axes[i, 1] = (
-            r0 * TWO * (x * y - w * z) + r1 * (ONE - TWO * (x * x + z * z)) + r2 * TWO * (y * z + w * x)
-        )
-        axes[i, 2] = (
-            r0 * TWO * (x * z + w * y) + r1 * TWO * (y * z - w * x) + r2 * (ONE - TWO * (x * x + y * y))
-        )
-        for k in range(3):
-            axes[i, k] *= scale[k]
-    return w, x, y, z, inverse
+        block[MEAN + k, lane] = means[i, k]
+        block[LOG_SCALE + k, lane] = log_scales[i, k]
+    for k in range(4):
+        block[QUAT + k, lane] = quats[i, k]
+    block[LOGIT, lane] = opacity_logits[i]
+    block[FILTERED, lane] = ONE if antialias[min(i, antialias.shape[0] - 1)] else ZERO
+
+
+@inlined(FAST)
+def camera_axes(pose, block, min_scale):
+    """Return the normalised quaternions and their inverse lengths, scales, and axes M, row by row."""
+    w, x, y, z = (
+        load_row(block, QUAT),
+        load_row(block, QUAT + 1),
+        load_row(block, QUAT + 2),
+        load_row(block, QUAT + 3),
+    )
+    inverse = ONE / root(w * w + x * x + y * y + z * z)
+    w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
+    s0 = exp_lanes(load_row(block, LOG_SCALE)) + min_scale
+    s1 = exp_lanes(load_row(block, LOG_SCALE + 1)) + min_scale
+    s2 = exp_lanes(load_row(block, LOG_SCALE + 2)) + min_scale
+    q00, q01, q02 = ONE - TWO * (y * y + z * z), TWO * (x * y - w * z), TWO * (x * z + w * y)
+    q10, q11, q12 = TWO * (x * y + w * z), ONE - TWO * (x * x + z * z), TWO * (y * z - w * x)
+    q20, q21, q22 = TWO * (x * z - w * y), TWO * (y * z + w * x), ONE - TWO * (x * x + y * y)
+    rows = (
+        axes_row(pose, 0, q00, q10, q20, q01, q11, q21, q02, q12, q22, s0, s1, s2),
+        axes_row(pose, 1, q00, q10, q20, q01, q11, q21, q02, q12, q22, s0, s1, s2),
+        axes_row(pose, 2, q00, q10, q20, q01, q11, q21, q02, q12, q22, s0, s1, s2),
+    )
+    return (w, x, y, z, inverse), (s0, s1, s2), rows
+
+
+@inlined(FAST)
+def axes_row(pose, i, q00, q10, q20, q01, q11, q21, q02, q12, q22, s0, s1, s2):
+    """Return a row of M = R Q diag(s)."""
+    r0, r1, r2 = pose[i, 0], pose[i, 1], pose[i, 2]
+    return (
+        (r0 * q00 + r1 * q10 + r2 * q20) * s0,
+        (r0 * q01 + r1 * q11 + r2 * q21) * s1,
+        (r0 * q02 + r1 * q12 + r2 * q22) * s2,
+    )
+
+
+@inlined(FAST)
+def ellipse_axes(axes, j0, j2, k1, k2):
+    """Return the rows u and v of J M, and their cross product."""
+    m0, m1, m2 = axes
+    u = j0 * m0[0] + j2 * m2[0], j0 * m0[1] + j2 * m2[1], j0 * m0[2] + j2 * m2[2]
+    v = k1 * m1[0] + k2 * m2[0], k1 * m1[1] + k2 * m2[1], k1 * m1[2] + k2 * m2[2]
+    return u, v, cross(u, v)
+
+
+@inlined(FAST)
+def dot(a, b):
+    """Return the scalar product of two vectors of three lanes."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@inlined(FAST)
+def cross(a, b):
+    """Return the vector product of two vectors of three lanes."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@inlined(FAST)
+def direction_from(camera_position, x, y, z):
+    """Return the unit vector from the camera to a point, and its inverse length."""
+    dx, dy, dz = x - camera_position[0], y - camera_position[1], z - camera_position[2]
+    per_length = ONE / root(dx * dx + dy * dy + dz * dz)
+    return dx * per_length, dy * per_length, dz * per_length, per_length
+
+
+RADIUS = COLUMNS
+"""Row of a projected block after its columns: radius in pixels."""
+
+
+@inlined(FAST)
+def project_block(
+    block, weight, pose, lens, camera_position, width, height, degree, min_scale, projected, basis
+):  # fmt: skip
+    """Fill projected (COLUMNS + 1, WIDTH), besides colours, and the SH basis (25, WIDTH) from a block.
+
+    DEPTH is 0 if a splat is not drawn.
+    """
+    fx, fy, cx, cy, near = lens[0], lens[1], lens[2], lens[3], lens[8]
+    mean_x, mean_y, mean_z = load_row(block, MEAN), load_row(block, MEAN + 1), load_row(block, MEAN + 2)
+    ahead = to_camera(pose, 2, mean_x, mean_y, mean_z)
+    x, y = to_camera(pose, 0, mean_x, mean_y, mean_z), to_camera(pose, 1, mean_x, mean_y, mean_z)
+    z = larger(ahead, near)
+    opacity = weight / (ONE + exp_lanes(-load_row(block, LOGIT)))
+    _, _, axes = camera_axes(pose, block, min_scale)
+
+    rz = ONE / z
+    j0, j2 = fx * rz, -fx * clamp(x * rz, lens[4], lens[5]) * rz
+    k1, k2 = fy * rz, -fy * clamp(y * rz, lens[6], lens[7]) * rz
+    u, v, normal = ellipse_axes(axes, j0, j2, k1, k2)
+    uu, uv, vv = dot(u, u), dot(u, v), dot(v, v)
+    # |u × v|² = uu vv − uv², without the cancellation that needles suffer
+    undilated = dot(normal, normal)
+    filtered = load_row(block, FILTERED) > HALF
+    dilation = select(filtered, spread(MIP_VARIANCE32), DILATION32)
+    determinant = undilated + dilation * (uu + vv + dilation)
+    xx, yy = uu + dilation, vv + dilation
+    opacity = select(filtered, opacity * root(undilated / determinant), opacity)
+
+    log2_opacity = log2_lanes(larger(opacity, ALPHA_MIN32))
+    reach = root(TWO * LN2 * larger(log2_opacity - LOG2_ALPHA_MIN32, ZERO))
+    image_x, image_y = fx * x * rz + cx, fy * y * rz + cy
+    half_width, half_height = reach * root(xx), reach * root(yy)
+    is_drawn = (ahead > near) & (opacity > ALPHA_MIN32)
+    is_drawn = is_drawn & (image_x + half_width > ZERO) & (image_x - half_width < f32(width))
+    is_drawn = is_drawn & (image_y + half_height > ZERO) & (image_y - half_height < f32(height))
+    half_difference = HALF * (xx - yy)
+    longest = HALF * (xx + yy) + root(half_difference * half_difference + uv * uv)
+    unit = LOG2_E / determinant
+    conic_yy = HALF * unit * xx
+    dx, dy, dz, _ = direction_from(camera_position, mean_x, mean_y, mean_z)
+
+    projected[MEAN_X] = image_x
+    projected[MEAN_Y] = image_y
+    projected[CONIC_XX] = HALF * unit * yy
+    projected[CONIC_XY] = -unit * uv
+    projected[CONIC_YY] = conic_yy
+    projected[LOG2_OPACITY] = log2_opacity
+    projected[HALF_WIDTH] = half_width
+    projected[HALF_HEIGHT] = half_height
+    projected[SLOPE] = uv / xx
+    projected[RISE] = reach * root(determinant / xx)
+    projected[X_OF_TOP] = uv / yy * half_height
+    projected[DEPTH] = select(is_drawn, z, ZERO)
+    projected[FALLOFF] = exp2_lanes(larger(-TWO * conic_yy, LOWEST_EXPONENT))
+    projected[RADIUS] = f32(3) * root(longest)
+    sh_basis(dx, dy, dz, degree, basis)
 
 
 @kernel(FAST)
@@ -156,92 +279,43 @@ def project_forward(
     Fill depths (M,), with 0 for splats that are not drawn, and for drawn splats the rows of projected
     (M, COLUMNS) and radii (N,). ``weights`` is empty if all are 1. ``antialias`` has one entry, or N.
     """
-    fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
-    scale = np.empty(3, np.float32)
-    axes = np.empty((3, 3), np.float32)
-    basis = np.empty(25, np.float32)
-    for k in range(begin, end):
-        i = index[k]
-        ahead = index[min(k + PREFETCH, index.shape[0] - 1)]
-        prefetch(means, ahead, 0)
-        prefetch(quats, ahead, 0)
-        prefetch(log_scales, ahead, 0)
-        for line in range((sh.shape[1] * 3 + 15) // 16):
-            prefetch(sh, ahead, line)
-        depths[k] = ZERO
-        weight = weights[i] if weights.shape[0] > 0 else ONE
-        mean = means[i]
-        z = to_camera(pose, 2, mean)
-        opacity = weight / (ONE + math.exp(-opacity_logits[i]))
-        if z <= lens[8] or opacity <= ALPHA_MIN32:
-            continue
-        x, y = to_camera(pose, 0, mean), to_camera(pose, 1, mean)
-        camera_axes(pose, quats[i], log_scales[i], min_scale, scale, axes)
-
-        rz = ONE / z
-        j0, j2 = fx * rz, -fx * clamp(x * rz, lens[4], lens[5]) * rz
-        k1, k2 = fy * rz, -fy * clamp(y * rz, lens[6], lens[7]) * rz
-        # u and v are the rows of J M
-        u0, u1, u2 = (
-            j0 * axes[0, 0] + j2 * axes[2, 0],
-            j0 * axes[0, 1] + j2 * axes[2, 1],
-            j0 * axes[0, 2] + j2 * axes[2, 2],
-        )
-        v0, v1, v2 = (
-            k1 * axes[1, 0] + k2 * axes[2, 0],
-            k1 * axes[1, 1] + k2 * axes[2, 1],
-            k1 * axes[1, 2] + k2 * axes[2, 2],
-        )
-        uu = u0 * u0 + u1 * u1 + u2 * u2
-        uv = u0 * v0 + u1 * v1 + u2 * v2
-        vv = v0 * v0 + v1 * v1 + v2 * v2
-        # |u × v|² = uu vv − uv², without the cancellation that needles suffer
-        cross0, cross1, cross2 = u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0
-        filtered = antialias[min(i, antialias.shape[0] - 1)]
-        dilation = MIP_VARIANCE32 if filtered else DILATION32
-        undilated = cross0 * cross0 + cross1 * cross1 + cross2 * cross2
-        determinant = undilated + dilation * (uu + vv + dilation)
-        xx, yy = uu + dilation, vv + dilation
-        if filtered:
-            opacity *= math.sqrt(undilated / determinant)
-            if opacity <= ALPHA_MIN32:
+    block = np.empty((PARAMETERS + 1, WIDTH), np.float32)
+    result = np.empty((COLUMNS + 1, WIDTH), np.float32)
+    basis = np.empty((25, WIDTH), np.float32)
+    last = index.shape[0] - 1
+    for start in range(begin, end, WIDTH):
+        for lane in range(WIDTH):
+            ahead = index[min(start + lane + WIDTH, last)]
+            prefetch(means, ahead, 0)
+            prefetch(quats, ahead, 0)
+            prefetch(log_scales, ahead, 0)
+            i = index[min(start + lane, end - 1)]
+            read_lane(block, lane, i, means, quats, log_scales, opacity_logits, antialias)
+            block[PARAMETERS, lane] = weights[i] if weights.shape[0] > 0 else ONE
+        weight = load_row(block, PARAMETERS)
+        project_block(
+            block, weight, pose, lens, camera_position, width, height, degree, min_scale, result, basis
+        )  # fmt: skip
+        for lane in range(min(WIDTH, end - start)):
+            s = start + lane
+            i = index[s]
+            ahead = index[min(s + PREFETCH, last)]
+            for line in range((sh.shape[1] * 3 + 15) // 16):
+                prefetch(sh, ahead, line)
+            depth = result[DEPTH, lane]
+            depths[s] = depth
+            if depth == ZERO:
                 continue
-
-        mean_x, mean_y = fx * x * rz + cx, fy * y * rz + cy
-        reach = math.sqrt(TWO * math.log(opacity / ALPHA_MIN32))
-        half_width, half_height = reach * math.sqrt(xx), reach * math.sqrt(yy)
-        if mean_x + half_width <= ZERO or mean_x - half_width >= width:
-            continue
-        if mean_y + half_height <= ZERO or mean_y - half_height >= height:
-            continue
-        depths[k] = z
-        half_difference = HALF * (xx - yy)
-        longest = HALF * (xx + yy) + math.sqrt(half_difference * half_difference + uv * uv)
-        radii[i] = f32(3) * math.sqrt(longest)
-
-        row = projected[k]
-        row[MEAN_X], row[MEAN_Y] = mean_x, mean_y
-        unit = LOG2_E / determinant
-        row[CONIC_XX], row[CONIC_XY], row[CONIC_YY] = HALF * unit * yy, -unit * uv, HALF * unit * xx
-        row[LOG2_OPACITY] = math.log(opacity) * LOG2_E
-        row[HALF_WIDTH], row[HALF_HEIGHT] = half_width, half_height
-        row[SLOPE], row[RISE], row[X_OF_TOP] = (
-            uv / xx,
-            reach * math.sqrt(determinant / xx),
-            uv / yy * half_height,
-        )
-
-        dx, dy, dz = mean[0] - camera_position[0], mean[1] - camera_position[1], mean[2] - camera_position[2]
-        inverse = ONE / math.sqrt(dx * dx + dy * dy + dz * dz)
-        sh_basis(dx * inverse, dy * inverse, dz * inverse, degree, basis)
-        red, green, blue = HALF, HALF, HALF
-        for k in range((degree + 1) * (degree + 1)):
-            red += basis[k] * sh[i, k, 0]
-            green += basis[k] * sh[i, k, 1]
-            blue += basis[k] * sh[i, k, 2]
-        row[RED], row[GREEN], row[BLUE] = max(red, ZERO), max(green, ZERO), max(blue, ZERO)
-        row[DEPTH] = z
-        row[FALLOFF] = math.exp(-TWO * LN2 * row[CONIC_YY])
+            for k in range(COLUMNS):
+                projected[s, k] = result[k, lane]
+            radii[i] = result[RADIUS, lane]
+            red, green, blue = HALF, HALF, HALF
+            for k in range((degree + 1) * (degree + 1)):
+                red += basis[k, lane] * sh[i, k, 0]
+                green += basis[k, lane] * sh[i, k, 1]
+                blue += basis[k, lane] * sh[i, k, 2]
+            projected[s, RED], projected[s, GREEN] = max(red, ZERO), max(green, ZERO)
+            projected[s, BLUE] = max(blue, ZERO)
 
 
 @kernel(FAST)
@@ -299,38 +373,165 @@ def covariance_gradient(row, sums):
 
 
 @inlined(FAST)
-def area_gradient(axes, j0, j2, k1, k2, by_log, by_area):
-    """Fill by_area (2, 3) with the gradient of ln |u × v| by u and v, times by_log.
+def area_gradient(u, v, normal, by_log):
+    """Return the gradient of ln |u × v| by u and v, times by_log.
 
-    The gradient is (v × c, c × u) / |c|² with c = u × v; u and v are the rows of J M. Computing the cross
-    product first avoids cancellation for needles.
+    The gradient is (v × c, c × u) / |c|² with the normal c = u × v. Computing the cross product first avoids
+    cancellation for needles.
     """
-    u0, v0 = j0 * axes[0, 0] + j2 * axes[2, 0], k1 * axes[1, 0] + k2 * axes[2, 0]
-    u1, v1 = j0 * axes[0, 1] + j2 * axes[2, 1], k1 * axes[1, 1] + k2 * axes[2, 1]
-    u2, v2 = j0 * axes[0, 2] + j2 * axes[2, 2], k1 * axes[1, 2] + k2 * axes[2, 2]
-    c0, c1, c2 = u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0
-    unit = by_log / (c0 * c0 + c1 * c1 + c2 * c2)
-    by_area[0, 0], by_area[1, 0] = (v1 * c2 - v2 * c1) * unit, (c1 * u2 - c2 * u1) * unit
-    by_area[0, 1], by_area[1, 1] = (v2 * c0 - v0 * c2) * unit, (c2 * u0 - c0 * u2) * unit
-    by_area[0, 2], by_area[1, 2] = (v0 * c1 - v1 * c0) * unit, (c0 * u1 - c1 * u0) * unit
+    unit = by_log / dot(normal, normal)
+    a, b = cross(v, normal), cross(normal, u)
+    return (a[0] * unit, a[1] * unit, a[2] * unit), (b[0] * unit, b[1] * unit, b[2] * unit)
 
 
 @inlined(FAST)
-def quat_gradient(w, x, y, z, inverse, by_rotation, gradient):
-    """Compute d loss / d quat (4,) from d loss / d Q (3, 3), including the normalisation."""
-    r = by_rotation
-    by_w = TWO * (x * (r[2, 1] - r[1, 2]) + y * (r[0, 2] - r[2, 0]) + z * (r[1, 0] - r[0, 1]))
-    by_x = -TWO * x * (r[1, 1] + r[2, 2]) + y * (r[0, 1] + r[1, 0]) + z * (r[0, 2] + r[2, 0])
-    by_x = TWO * (by_x + w * (r[2, 1] - r[1, 2]))
-    by_y = x * (r[0, 1] + r[1, 0]) - TWO * y * (r[0, 0] + r[2, 2]) + z * (r[1, 2] + r[2, 1])
-    by_y = TWO * (by_y + w * (r[0, 2] - r[2, 0]))
-    by_z = x * (r[0, 2] + r[2, 0]) + y * (r[1, 2] + r[2, 1]) - TWO * z * (r[0, 0] + r[1, 1])
-    by_z = TWO * (by_z + w * (r[1, 0] - r[0, 1]))
+def quat_gradient(quat, r0, r1, r2):
+    """Compute d loss / d quat from the rows of d loss / d Q, including the normalisation."""
+    w, x, y, z, inverse = quat
+    by_w = TWO * (x * (r2[1] - r1[2]) + y * (r0[2] - r2[0]) + z * (r1[0] - r0[1]))
+    by_x = y * (r0[1] + r1[0]) + z * (r0[2] + r2[0]) - TWO * x * (r1[1] + r2[2])
+    by_x = TWO * (by_x + w * (r2[1] - r1[2]))
+    by_y = x * (r0[1] + r1[0]) - TWO * y * (r0[0] + r2[2]) + z * (r1[2] + r2[1])
+    by_y = TWO * (by_y + w * (r0[2] - r2[0]))
+    by_z = x * (r0[2] + r2[0]) + y * (r1[2] + r2[1]) - TWO * z * (r0[0] + r1[1])
+    by_z = TWO * (by_z + w * (r1[0] - r0[1]))
     along = by_w * w + by_x * x + by_y * y + by_z * z
-    gradient[0] = (by_w - along * w) * inverse
-    gradient[1] = (by_x - along * x) * inverse
-    gradient[2] = (by_y - along * y) * inverse
-    gradient[3] = (by_z - along * z) * inverse
+    return (
+        (by_w - along * w) * inverse,
+        (by_x - along * x) * inverse,
+        (by_y - along * y) * inverse,
+        (by_z - along * z) * inverse,
+    )
+
+
+@inlined(FAST)
+def rotation_row(pose, j, by_m0, by_m1, by_m2, scales):
+    """Return a row of d loss / d Q = Rᵀ (d loss / d M) diag(s)."""
+    p0, p1, p2 = pose[0, j], pose[1, j], pose[2, j]
+    return (
+        (p0 * by_m0[0] + p1 * by_m1[0] + p2 * by_m2[0]) * scales[0],
+        (p0 * by_m0[1] + p1 * by_m1[1] + p2 * by_m2[1]) * scales[1],
+        (p0 * by_m0[2] + p1 * by_m1[2] + p2 * by_m2[2]) * scales[2],
+    )
+
+
+BY_XX, BY_XY, BY_YY, BY_X, BY_Y, BY_LOG = range(6)
+"""Rows of a block of gradients: by cov, the mean in pixels, and ln opacity."""
+CONICS = 6
+"""First of three rows with the conics."""
+
+
+@inlined(FAST)
+def differentiate_block(
+    block, by, by_basis, basis_x, basis_y, basis_z,
+    pose, lens, camera_position, degree, min_scale, result,
+):  # fmt: skip
+    """Fill result (PARAMETERS - 1, WIDTH) with the gradients of a block's splats.
+
+    Their causes are the gradients ``by`` and by_basis (K, WIDTH), of the values of the SH basis.
+    """
+    fx, fy = lens[0], lens[1]
+    mean_x, mean_y, mean_z = load_row(block, MEAN), load_row(block, MEAN + 1), load_row(block, MEAN + 2)
+    x, y = to_camera(pose, 0, mean_x, mean_y, mean_z), to_camera(pose, 1, mean_x, mean_y, mean_z)
+    rz = ONE / to_camera(pose, 2, mean_x, mean_y, mean_z)
+    quat, scales, axes = camera_axes(pose, block, min_scale)
+    unclamped_x, unclamped_y = x * rz, y * rz
+    ratio_x, ratio_y = clamp(unclamped_x, lens[4], lens[5]), clamp(unclamped_y, lens[6], lens[7])
+    j0, j2 = fx * rz, -fx * ratio_x * rz
+    k1, k2 = fy * rz, -fy * ratio_y * rz
+    u, v, normal = ellipse_axes(axes, j0, j2, k1, k2)
+    by_xx, by_xy, by_yy = load_row(by, BY_XX), load_row(by, BY_XY), load_row(by, BY_YY)
+    by_mean_x, by_mean_y, by_log = load_row(by, BY_X), load_row(by, BY_Y), load_row(by, BY_LOG)
+
+    # a filtered opacity has the factor |u × v| / sqrt(det cov): differentiate its logarithm
+    by_area = select(load_row(block, FILTERED) > HALF, by_log, ZERO)
+    area_u, area_v = area_gradient(u, v, normal, by_area)
+    by_xx = by_xx - by_area * LN2 * load_row(by, CONICS)
+    by_xy = by_xy - by_area * LN2 * load_row(by, CONICS + 1)
+    by_yy = by_yy - by_area * LN2 * load_row(by, CONICS + 2)
+
+    # u = row 0 of J M, v = row 1: xx = u·u, xy = u·v, yy = v·v
+    xx2, yy2 = TWO * by_xx, TWO * by_yy
+    by_u = (
+        xx2 * u[0] + by_xy * v[0] + area_u[0],
+        xx2 * u[1] + by_xy * v[1] + area_u[1],
+        xx2 * u[2] + by_xy * v[2] + area_u[2],
+    )
+    by_v = (
+        yy2 * v[0] + by_xy * u[0] + area_v[0],
+        yy2 * v[1] + by_xy * u[1] + area_v[1],
+        yy2 * v[2] + by_xy * u[2] + area_v[2],
+    )
+    by_j0, by_j2 = dot(by_u, axes[0]), dot(by_u, axes[2])
+    by_k1, by_k2 = dot(by_v, axes[1]), dot(by_v, axes[2])
+    by_m0 = j0 * by_u[0], j0 * by_u[1], j0 * by_u[2]
+    by_m1 = k1 * by_v[0], k1 * by_v[1], k1 * by_v[2]
+    by_m2 = j2 * by_u[0] + k2 * by_v[0], j2 * by_u[1] + k2 * by_v[1], j2 * by_u[2] + k2 * by_v[2]
+
+    # the mean affects its projection fx x/z + cx, and j0 = fx/z and j2 = −fx ratio_x/z,
+    by_x, by_y = by_mean_x * j0, by_mean_y * k1
+    by_z = -rz * (by_x * x + by_y * y + by_j0 * j0 + by_j2 * j2 + by_k1 * k1 + by_k2 * k2)
+    # where ratio_x = x/z unless it is clamped
+    is_inside = (unclamped_x > lens[4]) & (unclamped_x < lens[5])
+    by_ratio = select(is_inside, -by_j2 * j0 * rz, ZERO)
+    by_x, by_z = by_x + by_ratio, by_z - by_ratio * ratio_x
+    is_inside = (unclamped_y > lens[6]) & (unclamped_y < lens[7])
+    by_ratio = select(is_inside, -by_k2 * k1 * rz, ZERO)
+    by_y, by_z = by_y + by_ratio, by_z - by_ratio * ratio_y
+    # direction = (mean − camera position) / length: only the perpendicular component changes it
+    dx, dy, dz, per_length = direction_from(camera_position, mean_x, mean_y, mean_z)
+    sh_basis_gradient(dx, dy, dz, degree, basis_x, basis_y, basis_z)
+    by_dx, by_dy, by_dz = spread(ZERO), spread(ZERO), spread(ZERO)
+    for k in range((degree + 1) * (degree + 1)):
+        by_value = load_row(by_basis, k)
+        by_dx = by_dx + by_value * load_row(basis_x, k)
+        by_dy = by_dy + by_value * load_row(basis_y, k)
+        by_dz = by_dz + by_value * load_row(basis_z, k)
+    along = by_dx * dx + by_dy * dy + by_dz * dz
+    by_mean = pose[0, 0] * by_x + pose[1, 0] * by_y + pose[2, 0] * by_z
+    result[MEAN] = by_mean + (by_dx - along * dx) * per_length
+    by_mean = pose[0, 1] * by_x + pose[1, 1] * by_y + pose[2, 1] * by_z
+    result[MEAN + 1] = by_mean + (by_dy - along * dy) * per_length
+    by_mean = pose[0, 2] * by_x + pose[1, 2] * by_y + pose[2, 2] * by_z
+    result[MEAN + 2] = by_mean + (by_dz - along * dz) * per_length
+
+    # M = R Q diag(s), and s = exp(log_scale) + min_scale
+    m0, m1, m2 = axes
+    by_scale = by_m0[0] * m0[0] + by_m1[0] * m1[0] + by_m2[0] * m2[0]
+    result[LOG_SCALE] = by_scale * ((scales[0] - min_scale) / scales[0])
+    by_scale = by_m0[1] * m0[1] + by_m1[1] * m1[1] + by_m2[1] * m2[1]
+    result[LOG_SCALE + 1] = by_scale * ((scales[1] - min_scale) / scales[1])
+    by_scale = by_m0[2] * m0[2] + by_m1[2] * m1[2] + by_m2[2] * m2[2]
+    result[LOG_SCALE + 2] = by_scale * ((scales[2] - min_scale) / scales[2])
+    by_quat = quat_gradient(
+        quat,
+        rotation_row(pose, 0, by_m0, by_m1, by_m2, scales),
+        rotation_row(pose, 1, by_m0, by_m1, by_m2, scales),
+        rotation_row(pose, 2, by_m0, by_m1, by_m2, scales),
+    )
+    result[QUAT] = by_quat[0]
+    result[QUAT + 1] = by_quat[1]
+    result[QUAT + 2] = by_quat[2]
+    result[QUAT + 3] = by_quat[3]
+
+    # opacity = weight · sigmoid
+    sigmoid = ONE / (ONE + exp_lanes(-load_row(block, LOGIT)))
+    result[LOGIT] = by_log * (ONE - sigmoid)
+
+
+@inlined(FAST)
+def clear_gradients(i, by_means, by_quats, by_log_scales, by_logits, by_sh, by_weights, grad2d):
+    """Set the gradients of splat ``i`` to 0."""
+    for k in range(3):
+        by_means[i, k], by_log_scales[i, k] = ZERO, ZERO
+    for k in range(4):
+        by_quats[i, k] = ZERO
+    for k in range(by_sh.shape[1]):
+        by_sh[i, k, 0], by_sh[i, k, 1], by_sh[i, k, 2] = ZERO, ZERO, ZERO
+    by_logits[i] = ZERO
+    grad2d[i, 0], grad2d[i, 1] = ZERO, ZERO
+    if by_weights.shape[0] > 0:
+        by_weights[i] = ZERO
 
 
 @kernel(FAST)
@@ -341,18 +542,18 @@ def project_backward(
     by_means, by_quats, by_log_scales, by_logits, by_sh, by_weights, grad2d,
 ):  # fmt: skip
     """Fill the gradients of the parameters and grad2d of the splats at ``index`` from the pairs' sums."""
-    fx, fy = lens[0], lens[1]
-    scale = np.empty(3, np.float32)
-    axes = np.empty((3, 3), np.float32)
-    by_axes = np.empty((3, 3), np.float32)
-    by_rotation = np.empty((3, 3), np.float32)
-    by_area = np.empty((2, 3), np.float32)
+    block = np.ones((PARAMETERS, WIDTH), np.float32)
+    by = np.zeros((CONICS + 3, WIDTH), np.float32)
+    result = np.empty((LOGIT + 1, WIDTH), np.float32)
+    splats = np.empty(WIDTH, np.int32)
     sums = np.empty(SUMS, np.float32)
     basis = np.empty(25, np.float32)
-    basis_x = np.empty(25, np.float32)
-    basis_y = np.empty(25, np.float32)
-    basis_z = np.empty(25, np.float32)
+    by_basis = np.zeros((25, WIDTH), np.float32)
+    basis_x = np.empty((25, WIDTH), np.float32)
+    basis_y = np.empty((25, WIDTH), np.float32)
+    basis_z = np.empty((25, WIDTH), np.float32)
     count = index.shape[0]
+    lanes = 0
     for s in range(begin, end):
         i = index[s]
         ahead = min(s + 2 * PREFETCH, count - 1)
@@ -362,110 +563,55 @@ def project_backward(
             prefetch(pair_sums, pair_row[pair], 0)
             prefetch(pair_sums, pair_row[pair] + 1, 0)  # a row may end in the next cache line
         if pair_count[s] == 0:
-            for k in range(3):
-                by_means[i, k], by_log_scales[i, k] = ZERO, ZERO
-            for k in range(4):
-                by_quats[i, k] = ZERO
-            for k in range(sh.shape[1]):
-                by_sh[i, k, 0], by_sh[i, k, 1], by_sh[i, k, 2] = ZERO, ZERO, ZERO
-            by_logits[i] = ZERO
-            grad2d[i, 0], grad2d[i, 1] = ZERO, ZERO
-            if by_weights.shape[0] > 0:
-                by_weights[i] = ZERO
-            continue
-        add_pairs(first_pair[s], pair_count[s], pair_row, pair_sums, sums)
-
-        mean, row = means[i], projected[s]
-        x, y, z = to_camera(pose, 0, mean), to_camera(pose, 1, mean), to_camera(pose, 2, mean)
-        w, qx, qy, qz, inverse = camera_axes(pose, quats[i], log_scales[i], min_scale, scale, axes)
-        rz = ONE / z
-        ratio_x, ratio_y = clamp(x * rz, lens[4], lens[5]), clamp(y * rz, lens[6], lens[7])
-        j0, j2 = fx * rz, -fx * ratio_x * rz
-        k1, k2 = fy * rz, -fy * ratio_y * rz
-        by_xx, by_xy, by_yy, by_mean_x, by_mean_y = covariance_gradient(row, sums)
-        ndc_x, ndc_y = by_mean_x * HALF * width, by_mean_y * HALF * height
-        grad2d[i, 0], grad2d[i, 1] = ndc_x, ndc_y
-
-        if antialias[min(i, antialias.shape[0] - 1)]:
-            # opacity has the factor |u × v| / sqrt(det cov): differentiate its logarithm by u, v and det cov
-            by_log = -sums[G]
-            area_gradient(axes, j0, j2, k1, k2, by_log, by_area)
-            by_xx -= by_log * LN2 * row[CONIC_XX]
-            by_xy -= by_log * LN2 * row[CONIC_XY]
-            by_yy -= by_log * LN2 * row[CONIC_YY]
+            clear_gradients(i, by_means, by_quats, by_log_scales, by_logits, by_sh, by_weights, grad2d)
         else:
+            add_pairs(first_pair[s], pair_count[s], pair_row, pair_sums, sums)
+            read_lane(block, lanes, i, means, quats, log_scales, opacity_logits, antialias)
+            row = projected[s]
+            by_xx, by_xy, by_yy, by_mean_x, by_mean_y = covariance_gradient(row, sums)
+            by[BY_XX, lanes], by[BY_XY, lanes] = by_xx, by_xy
+            by[BY_YY, lanes], by[BY_LOG, lanes] = by_yy, -sums[G]
+            by[BY_X, lanes], by[BY_Y, lanes] = by_mean_x, by_mean_y
             for k in range(3):
-                by_area[0, k], by_area[1, k] = ZERO, ZERO
-
-        # u = row 0 of J M, v = row 1: xx = u·u, xy = u·v, yy = v·v
-        by_j0, by_j2, by_k1, by_k2 = ZERO, ZERO, ZERO, ZERO
-        for k in range(3):
-            u, v = j0 * axes[0, k] + j2 * axes[2, k], k1 * axes[1, k] + k2 * axes[2, k]
-            by_u = TWO * by_xx * u + by_xy * v + by_area[0, k]
-            by_v = TWO * by_yy * v + by_xy * u + by_area[1, k]
-            by_j0 += by_u * axes[0, k]
-            by_j2 += by_u * axes[2, k]
-            by_k1 += by_v * axes[1, k]
-            by_k2 += by_v * axes[2, k]
-            by_axes[0, k], by_axes[1, k], by_axes[2, k] = j0 * by_u, k1 * by_v, j2 * by_u + k2 * by_v
-
-        # the mean affects its projection fx x/z + cx, and j0 = fx/z and j2 = −fx ratio_x/z,
-        by_x, by_y = by_mean_x * j0, by_mean_y * k1
-        by_z = -(by_x * x + by_y * y + by_j0 * j0 + by_j2 * j2 + by_k1 * k1 + by_k2 * k2) * rz
-        # where ratio_x = x/z unless it is clamped
-        if lens[4] < x * rz and x * rz < lens[5]:
-            by_ratio = -by_j2 * j0
-            by_x += by_ratio * rz
-            by_z -= by_ratio * ratio_x * rz
-        if lens[6] < y * rz and y * rz < lens[7]:
-            by_ratio = -by_k2 * k1
-            by_y += by_ratio * rz
-            by_z -= by_ratio * ratio_y * rz
-
-        # M = R Q diag(s): d loss / d Q = Rᵀ (d loss / d M) diag(s), and s = exp(log_scale) + min_scale
-        for k in range(3):
-            by_scale = ZERO
-            for j in range(3):
-                by_scale += by_axes[j, k] * axes[j, k]
-                by_entry = (
-                    pose[0, j] * by_axes[0, k] + pose[1, j] * by_axes[1, k] + pose[2, j] * by_axes[2, k]
-                )
-                by_rotation[j, k] = by_entry * scale[k]
-            by_log_scales[i, k] = by_scale * ((scale[k] - min_scale) / scale[k])
-        quat_gradient(w, qx, qy, qz, inverse, by_rotation, by_quats[i])
-
-        # sigma = ln opacity − ln alpha, so d loss / d ln opacity = −g; opacity = weight · sigmoid
-        sigmoid = ONE / (ONE + math.exp(-opacity_logits[i]))
-        by_logits[i] = -sums[G] * (ONE - sigmoid)
-        if by_weights.shape[0] > 0:
-            by_weights[i] = -sums[G] / weights[i]
-
-        red = sums[G_RED] if row[RED] > ZERO else ZERO
-        green = sums[G_GREEN] if row[GREEN] > ZERO else ZERO
-        blue = sums[G_BLUE] if row[BLUE] > ZERO else ZERO
-        dx, dy, dz = mean[0] - camera_position[0], mean[1] - camera_position[1], mean[2] - camera_position[2]
-        per_length = ONE / math.sqrt(dx * dx + dy * dy + dz * dz)
-        dx, dy, dz = dx * per_length, dy * per_length, dz * per_length
-        sh_basis(dx, dy, dz, degree, basis)
-        sh_basis_gradient(dx, dy, dz, degree, basis_x, basis_y, basis_z)
-        by_dx, by_dy, by_dz = ZERO, ZERO, ZERO
-        active = (degree + 1) * (degree + 1)
-        for k in range(active):
-            by_sh[i, k, 0], by_sh[i, k, 1], by_sh[i, k, 2] = (
-                basis[k] * red,
-                basis[k] * green,
-                basis[k] * blue,
+                by[CONICS + k, lanes] = row[CONIC_XX + k]
+            grad2d[i, 0], grad2d[i, 1] = by_mean_x * HALF * width, by_mean_y * HALF * height
+            if by_weights.shape[0] > 0:
+                by_weights[i] = -sums[G] / weights[i]
+            red = sums[G_RED] if row[RED] > ZERO else ZERO
+            green = sums[G_GREEN] if row[GREEN] > ZERO else ZERO
+            blue = sums[G_BLUE] if row[BLUE] > ZERO else ZERO
+            dx, dy, dz = (
+                means[i, 0] - camera_position[0],
+                means[i, 1] - camera_position[1],
+                means[i, 2] - camera_position[2],
             )
-            by_basis = sh[i, k, 0] * red + sh[i, k, 1] * green + sh[i, k, 2] * blue
-            by_dx += by_basis * basis_x[k]
-            by_dy += by_basis * basis_y[k]
-            by_dz += by_basis * basis_z[k]
-        for k in range(active, sh.shape[1]):
-            by_sh[i, k, 0], by_sh[i, k, 1], by_sh[i, k, 2] = ZERO, ZERO, ZERO
-        # direction = (mean − camera position) / length: only the perpendicular component changes it
-        along = by_dx * dx + by_dy * dy + by_dz * dz
-        by_means[i, 0] = (by_dx - along * dx) * per_length
-        by_means[i, 1] = (by_dy - along * dy) * per_length
-        by_means[i, 2] = (by_dz - along * dz) * per_length
-        for k in range(3):
-            by_means[i, k] += pose[0, k] * by_x + pose[1, k] * by_y + pose[2, k] * by_z
+            per_length = ONE / math.sqrt(dx * dx + dy * dy + dz * dz)
+            dx, dy, dz = dx * per_length, dy * per_length, dz * per_length
+            sh_basis(dx, dy, dz, degree, basis)
+            active = (degree + 1) * (degree + 1)
+            for k in range(active):
+                by_sh[i, k, 0], by_sh[i, k, 1], by_sh[i, k, 2] = (
+                    basis[k] * red,
+                    basis[k] * green,
+                    basis[k] * blue,
+                )
+                by_basis[k, lanes] = sh[i, k, 0] * red + sh[i, k, 1] * green + sh[i, k, 2] * blue
+            for k in range(active, sh.shape[1]):
+                by_sh[i, k, 0], by_sh[i, k, 1], by_sh[i, k, 2] = ZERO, ZERO, ZERO
+            splats[lanes] = i
+            lanes += 1
+        if lanes < WIDTH and s + 1 < end:
+            continue
+        differentiate_block(
+            block, by, by_basis, basis_x, basis_y, basis_z,
+            pose, lens, camera_position, degree, min_scale, result,
+        )  # fmt: skip
+        for lane in range(lanes):
+            i = splats[lane]
+            for k in range(3):
+                by_means[i, k] = result[MEAN + k, lane]
+                by_log_scales[i, k] = result[LOG_SCALE + k, lane]
+            for k in range(4):
+                by_quats[i, k] = result[QUAT + k, lane]
+            by_logits[i] = result[LOGIT, lane]
+        lanes = 0
