@@ -38,12 +38,9 @@ def main() -> int:
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
     archive = extension.build(out)
-    os.environ.setdefault("LODGS_TRAINER_PYTHON", sys.executable)
-    os.environ.pop("WAYLAND_DISPLAY", None)
     # panels show paths of the scene, the run and the extension: they name no user
     with tempfile.TemporaryDirectory(prefix="lodgs-") as work:
-        os.environ["BLENDER_USER_RESOURCES"] = str(Path(work, "user"))
-        window.install(blender, archive)
+        window.install(blender, archive, Path(work, "user"))
         scene = Path(work, "lantern_garden")
         shutil.copytree(ROOT / "examples" / "lantern_garden", scene)
         plan = {

@@ -63,10 +63,7 @@ def main() -> int:
     out: Path = options.out.resolve()
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
-    os.environ["BLENDER_USER_RESOURCES"] = str(out / "user")
-    os.environ.setdefault("LODGS_TRAINER_PYTHON", sys.executable)
-    os.environ.pop("WAYLAND_DISPLAY", None)  # otherwise Blender opens its window there
-    install(blender, archive)
+    install(blender, archive, out / "user")
 
     plan = {
         "scene": str(options.scene.resolve()),
@@ -107,8 +104,16 @@ def find_programs() -> tuple[str, str, str]:
     return paths[0], paths[1], paths[2]
 
 
-def install(blender: str, archive: Path) -> None:
-    """Install the zip into Blender's user folder; exit with Blender's message on errors."""
+def install(blender: str, archive: Path, user: Path) -> None:
+    """Install the zip into a new Blender user folder, and prepare the environment of Blender's window.
+
+    Exits with Blender's message on errors.
+    """
+    os.environ["BLENDER_USER_RESOURCES"] = str(user)
+    # Mesa maps its cache of shaders: another program that shares and shortens it ends Blender with SIGBUS
+    os.environ["MESA_SHADER_CACHE_DIR"] = str(user / "shaders")
+    os.environ.setdefault("LODGS_TRAINER_PYTHON", sys.executable)
+    os.environ.pop("WAYLAND_DISPLAY", None)  # otherwise Blender opens its window there
     command = [blender, "--command", "extension", "install-file", "-r", "user_default", "-e", str(archive)]
     process = subprocess.run(command, check=False, capture_output=True, text=True)
     if process.returncode:
