@@ -11,7 +11,7 @@ from ..rasterize.adam import LearningRate
 from ..splats.gaussians import Splats
 from ..splats.morton import spatial_order
 from .initialize import from_splats
-from .model import splat_rates
+from .model import Model, splat_rates
 from .parameters import DensityParameters
 from .schedules import log_linear
 from .splat_method import SplatMethod
@@ -73,6 +73,12 @@ class RowOptimizer:
         """Do nothing; the next image has other rows."""
 
 
+def select_rows(model: Model, rows: torch.Tensor) -> RowOptimizer:
+    """Select (M,) int64 rows of a model for rendering. The drawing with this optimizer updates only them."""
+    leaves = {name: tensor.requires_grad_() for name, tensor in model.read_rows(rows).items()}
+    return RowOptimizer(model.adam, rows, leaves)
+
+
 class RefiningMethod(SplatMethod):
     """3DGS steps, none with a base, followed by steps that refine only the rendered rows.
 
@@ -100,11 +106,6 @@ class RefiningMethod(SplatMethod):
     def refines(self, step: int) -> bool:
         """Return True if a step follows the 3DGS steps."""
         return step >= self.finest_steps
-
-    def select_rows(self, rows: torch.Tensor) -> RowOptimizer:
-        """Select (M,) int64 rows for rendering. The drawing with this optimizer updates only them."""
-        leaves = {name: tensor.requires_grad_() for name, tensor in self.model.read_rows(rows).items()}
-        return RowOptimizer(self.model.adam, rows, leaves)
 
     def shrink(self, step: int) -> float:
         return 1 if self.refines(step) else super().shrink(step)

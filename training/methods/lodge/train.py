@@ -22,7 +22,7 @@ from ...optimize.merging import merge
 from ...optimize.method import Drawing, StepResult
 from ...optimize.model import NAMES
 from ...optimize.pruning import importance_threshold, log_scale_gain
-from ...optimize.refining import MERGED_RATE, RefiningMethod, drop_invisible, refining_rates
+from ...optimize.refining import MERGED_RATE, RefiningMethod, drop_invisible, refining_rates, select_rows
 from ...optimize.schedules import random_reduction
 from ...optimize.training_data import TrainingView
 from ...rasterize import Gaussians, photometric_loss
@@ -176,7 +176,7 @@ class Method(RefiningMethod):
             levels, d_l = {**self.finished, number: level}, self.random_distances(step)
             rows = visible_rows(levels, d_l, view.camera, near, self.random_scale(step))
         trained_rows = torch.from_numpy(rows[number]).long().to(self.device)
-        optimizer = self.select_rows(trained_rows)
+        optimizer = select_rows(self.model, trained_rows)
         parts = [self._smooth(optimizer.gaussians, number)]
         if len(rows) > 1:
             parts.insert(

@@ -7,7 +7,7 @@ import torch
 
 from training.evaluate.views import reduce_view
 from training.lod.selection import resolve_controls, select
-from training.methods.flod import METHOD
+from training.methods.flod import METHOD, finish
 from training.methods.flod.train import Method
 from training.optimize.level_distances import choose_switches
 from training.optimize.merging import merge
@@ -134,6 +134,25 @@ def test_switches_have_least_error_within_the_budget():
         5,
         5,
     ]
+
+
+def test_finishing_step_leaves_other_levels(data):
+    """A finishing step of a single level changes only this level."""
+    flod = make(
+        data, levels=4, steps=[30] * 4, refine_steps=20, finish_share=0.2, finish_alone=1.0,
+        free_depth=0.0, largest=0.0,
+    )  # fmt: skip
+    for step in range(flod.steps):
+        if flod.is_finishing(step):
+            drawn = flod._finishing_values(step)["last"]
+            before = {level.number: level.splats for level in finish.split_levels(flod.model, flod.s_min)}
+        flod.train_step(step)
+        if flod.is_finishing(step):
+            after = {level.number: level.splats for level in finish.split_levels(flod.model, flod.s_min)}
+            changed = [n for n in after if not np.array_equal(before[n].means, after[n].means)]
+            assert changed == [drawn]
+        flod.levels_after(step)
+    assert flod.is_finishing(flod.steps - 2), "a first step has no moments"
 
 
 def test_distances_draw_at_most_the_share_of_splats(data):
