@@ -31,7 +31,7 @@ def measure_distances(
     Args:
         levels: levels in use, coarse to fine.
         drawn: maximum number of splats drawn in the training views, as a fraction of those of the finest
-            level. A smaller number than that of the coarsest level is replaced by the mean of both levels.
+            level; at least the number of the level before it.
 
     Returns:
         The distance of each level but the finest, in scene units.
@@ -48,24 +48,25 @@ def measure_distances(
         for camera in (data.train[view] for view in views):
             visible = np.linalg.norm(means[camera.sees(means, data.near)] - camera.center, axis=1)
             counts[:, column] += _sums(visible, np.ones((len(visible), 1)), edges)[:, 0]
-    coarsest, *_, finest = counts.sum(axis=0)
-    limit = drawn * finest if drawn * finest > coarsest else (coarsest + finest) / 2
-    switches = choose_switches(_sums(distances, errors, edges), counts, limit)
+    switches = choose_switches(_sums(distances, errors, edges), counts, drawn)
     return {number: float(edges[index]) for number, index in zip(list(levels)[:-1], switches, strict=True)}
 
 
-def choose_switches(errors: np.ndarray, counts: np.ndarray, max_splats: float) -> list[int]:
+def choose_switches(errors: np.ndarray, counts: np.ndarray, drawn: float) -> list[int]:
     """Choose the first bin of each level but the finest.
 
     Args:
         errors: (B, L) error of each level in each bin of distances, ascending; levels coarse to fine.
         counts: (B, L) splats of each level in each bin.
-        max_splats: maximum number of splats, at least that of the coarsest level.
+        drawn: maximum number of splats, as a fraction of those of the finest level. The level before the
+            finest may always be drawn everywhere.
 
     Returns:
         Indices of bins, descending, 0 to B: the choice of the least error.
     """
     bins, levels = errors.shape
+    *_, second_finest, finest = counts.sum(axis=0)
+    max_splats = max(drawn * finest, second_finest)
     numbers = np.arange(bins)
     best, least_error = [0] * (levels - 1), np.inf
     for ascending in combinations_with_replacement(range(bins + 1), levels - 1):

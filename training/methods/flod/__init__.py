@@ -17,7 +17,7 @@ from ...settings import setting
 
 BLENDED_LEVELS = 3
 """Number of finest levels that are blended by default (``Bands.defaults``) and that finishing steps train."""
-REFINE_RATIO = 0.8
+REFINE_RATIO = 0.7
 """Steps that refine a merged level relative to those of the next finer one."""
 CELL_LEVELS = 2
 """Number of finest levels that are trained cell by cell in a divided scene."""
@@ -40,7 +40,7 @@ class FlodParameters(FlodLevels, DensityParameters):
         unit="px",
     )
     steps: tuple[int, ...] = setting(
-        (250, 400, 500, 750, 2400), "Training steps of each level.", above=0, unit="steps"
+        (250, 400, 500, 750, 2750), "Training steps of each level.", above=0, unit="steps"
     )
     densify_until: tuple[float, ...] = setting(
         (0.5,) * 5, "Fraction of a level's steps in which splats are added and removed.", high=1
@@ -68,11 +68,15 @@ class FlodParameters(FlodLevels, DensityParameters):
         choices=("merged", "trained"),
     )
     merge_ratio: float = setting(
-        0.5, "Splat count of a merged level, as a fraction of the next finer level's.", above=0, high=1
+        0.5,
+        "Splat count of a merged level, as a fraction of the next finer level's. The level before the finest "
+        "has at most the share that views by distance may draw ('drawn').",
+        above=0,
+        high=1,
     )
     refine_steps: int = setting(
-        450,
-        "Steps that refine the merged level before the finest. Each coarser level gets 80 % of the steps of "
+        680,
+        "Steps that refine the merged level before the finest. Each coarser level gets 70 % of the steps of "
         "the next finer one. They are taken from those of all levels ('steps'), at most half; the finest "
         "level gets the others.",
         unit="steps",
@@ -84,7 +88,7 @@ class FlodParameters(FlodLevels, DensityParameters):
     finish_share: float = setting(
         0.2,
         "Additional steps at the end that train the three finest levels as blended by distance, as a "
-        "fraction of all levels' steps. Merged levels need at most a third of 'refine_steps'. Trained "
+        "fraction of all levels' steps. Merged levels need at most a fifth of 'refine_steps'. Trained "
         "levels with fine detail restart from the most important splats of the finest level. Not in the "
         "paper.",
         high=1,
@@ -92,8 +96,8 @@ class FlodParameters(FlodLevels, DensityParameters):
     drawn: float = setting(
         0.45,
         "Maximum number of splats drawn by distance in the training views, as a fraction of those of "
-        "the finest level. Sets the distances of merged levels, and the size of trained levels that the "
-        "finishing steps restart. Not in the paper.",
+        "the finest level. Limits the size of merged levels, sets their distances, and the size of trained "
+        "levels that the finishing steps restart. Not in the paper.",
         above=0,
         high=1,
     )
@@ -135,7 +139,7 @@ class FlodParameters(FlodLevels, DensityParameters):
     def all_steps(self) -> int:
         """Steps of a run of all levels; schedules are fractions of them."""
         finishing = round(self.finish_share * sum(self.steps)) if self.levels > 1 else 0
-        return sum(self.steps) + (min(finishing, self.stages[1][1] // 3) if self.merges else finishing)
+        return sum(self.steps) + (min(finishing, self.stages[1][1] // 5) if self.merges else finishing)
 
     @property
     def finish_steps(self) -> int:
@@ -151,10 +155,19 @@ class FlodParameters(FlodLevels, DensityParameters):
 
     @property
     def max_trained_splats(self) -> int:
-        ratio = self.merge_ratio if self.merges else self.budget_ratio
-        shares = (ratio**n for n in range(min(BLENDED_LEVELS, self.levels)))
+        blended = range(self.levels, max(self.levels - BLENDED_LEVELS, 0), -1)
+        shares = (
+            self.merged_share(number) if self.merges else self.budget_ratio ** (self.levels - number)
+            for number in blended
+        )
         at_end = self.max_splats * self.budget_ratio ** (self.levels - self.end)
         return round(self.max_splats * sum(shares) if self.finish_steps else at_end)
+
+    def merged_share(self, number: int) -> float:
+        """Return the splat count of a merged level, as a fraction of the finest level's; 1 for the finest."""
+        if number == self.levels:
+            return 1.0
+        return min(self.merge_ratio ** (self.levels - number), self.drawn)
 
     @property
     def growth_rounds(self) -> float | None:
@@ -188,7 +201,7 @@ _STANDARD = replace(
     FlodParameters(),
     **STANDARD,
     steps=STANDARD_STEPS,
-    refine_steps=1_400,
+    refine_steps=2_000,
     densify_interval=(100,) * 5,
 )
 _PAPER = replace(

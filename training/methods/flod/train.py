@@ -115,7 +115,7 @@ class Method(method.Method[FlodParameters, Drawing]):
         number, remainder = divmod((step + 1) * p.levels, self._ends[0])
         if not 0 < number < p.levels or remainder >= p.levels:
             return []
-        count = round(len(self.model) * p.merge_ratio ** (p.levels - number))
+        count = round(len(self.model) * p.merged_share(number))
         return [Level(number, merge(self.model.splats(), count), self._facts(number))]
 
     def meta(self) -> dict:
@@ -275,7 +275,7 @@ class Method(method.Method[FlodParameters, Drawing]):
         """
         p = self.parameters
         if p.merges:
-            count = round(p.merge_ratio * len(self.model))
+            count = round(p.merged_share(level) * len(self.completed[p.levels]["means"]))
             splats = self.model.splats()
             if level == p.levels - 1:
                 splats = drop_invisible(splats, count, self.data, p, self.backend)
