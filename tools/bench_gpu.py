@@ -17,7 +17,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
@@ -70,7 +70,7 @@ TRAINING_SECONDS = 150
 """Time limit of a training of ``--all``."""
 STEPS = 16
 """Steps between two reads of the loss."""
-COUNTS = "dispatches", "buffers", "bind_groups", "submissions", "reads"
+COUNTS = "dispatches", "buffers", "bind_groups", "submissions", "reads", "bytes"
 """Numbers per step that :func:`recording_of` returns."""
 MULTIPLY_ADDS = 4
 """Multiply-adds of four-component vectors per round."""
@@ -144,9 +144,10 @@ def transferred_bytes(device: Device, step: Callable[[], object]) -> int:
 
 
 def recording_of(device: Device, step: Callable[[], object], steps: int = 20) -> dict[str, float]:
-    """Return the counts of a step, and the milliseconds of CPU time that record it.
+    """Return the counts of a step, and the milliseconds of CPU time that record it: median and 95 %.
 
-    Blocking reads wait for the device. Their time is excluded.
+    Blocking reads wait for the device. Their time is excluded. Each step begins after the previous one has
+    ended on the device, because a software device would compete with the recording for the caches.
     """
     read, waited = device.read, 0.0
 
@@ -159,18 +160,20 @@ def recording_of(device: Device, step: Callable[[], object], steps: int = 20) ->
             waited += time.thread_time() - begin
 
     step()
-    counts, transferred, times = device.counts.copy(), device.transferred, []
+    times, counts = [], Counter()
     device.read = timed_read  # type: ignore[method-assign]
     try:
         for _ in range(steps):
+            device.wait()
+            previous = device.counts + Counter(bytes=device.transferred)
             begin, waited = time.thread_time(), 0.0
             step()
             times.append(time.thread_time() - begin - waited)
+            counts += device.counts + Counter(bytes=device.transferred) - previous
     finally:
         del device.read
-    result = {name: round((device.counts[name] - counts[name]) / steps, 2) for name in COUNTS}
-    transferred = (device.transferred - transferred) / steps
-    return result | {"bytes": transferred, "cpu_ms": round(1e3 * float(np.median(times)), 2)}
+    median, high = (round(1e3 * float(np.percentile(times, share)), 2) for share in (50, 95))
+    return {name: round(counts[name] / steps, 2) for name in COUNTS} | {"cpu_ms": median, "cpu_ms_95": high}
 
 
 def stages_of(device: Device, step: Callable[[], object]) -> dict[str, float]:

@@ -1,5 +1,8 @@
 """Compare training in device memory with steps through torch."""
 
+import itertools
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -51,6 +54,28 @@ def torch_step(adam: Adam, stats: dict, camera, target: Target, weights, backend
     adam.step()
     adam.zero_grad()
     return float(loss.detach())
+
+
+def test_steps_use_the_current_camera_of_a_photo(graphics, make_splats, odd_camera, photo):
+    """Views are cached with their photo; another camera, near depth or minimum size replaces them."""
+    nearer = np.eye(4)
+    nearer[2, 3] = -0.5
+    moved = replace(odd_camera, world_to_camera=nearer @ odd_camera.world_to_camera)
+    changes = [
+        (odd_camera, {}),
+        (moved, {}),
+        (moved, {"near": 2.5}),
+        (moved, {"near": 2.5, "min_scale": 0.1}),
+    ]
+    images = []
+    for camera, options in changes:
+        used, fresh = (make_device_model("gpu", adam_of(make_splats(50)), {}) for _ in range(2))
+        assert used is not None and fresh is not None
+        used.step(camera, photo, ssim_weight=0.2, **VIEW | options)
+        fresh.step(camera, Target(photo.image), ssim_weight=0.2, **VIEW | options)
+        images.append(used.last_image()[0])
+        assert torch.equal(images[-1], fresh.last_image()[0])
+    assert all(not torch.equal(*pair) for pair in itertools.pairwise(images))
 
 
 @pytest.mark.parametrize("backend", ["cpu", "gpu"])

@@ -333,7 +333,7 @@ class Device:
                 lambda size: self._device.create_buffer(size=size, usage=usage),
                 self._device.create_bind_group,
             )
-        self.counts["bind_groups"] += len(recording)
+        self.counts["bind_groups"] += recording.count
 
     def replay(self, recording: Recording, copies: Iterable[tuple[Buffer, Buffer]] = ()) -> None:
         """Submit recorded dispatches, after copies of buffers (source, target) of the same size.
@@ -346,7 +346,8 @@ class Device:
         with self._translate_errors():
             recording.replay(self._device, handles)
         self.transferred += recording.uniforms.size
-        self.counts.update(dispatches=len(recording), submissions=len(recording.parts))
+        self.counts["dispatches"] += recording.count
+        self.counts["submissions"] += len(recording.parts)
 
     def read(self, buffer: Buffer, begin: int = 0) -> np.ndarray:
         """Run all recorded dispatches, and copy a buffer's rows from ``begin`` on to the host.

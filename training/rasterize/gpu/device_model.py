@@ -22,7 +22,7 @@ from ..rendering import KernelCamera, RasterSettings, Target
 from .bin import group_count
 from .device import Buffer, Device
 from .loss import combine_loss, record_loss
-from .scene import PAIR_SUMS, SPLAT, TRAINING_NUMBERS, ProjectedScene
+from .scene import PAIR_SUMS, SPLAT, TRAINING_NUMBERS, ProjectedScene, lens_of
 from .steps import LOSSES, Inputs, Step
 
 COLUMNS = {
@@ -140,15 +140,14 @@ class GpuModel:
         Raises:
             LodgsError: the device was lost or has too little memory. The splats are lost with it.
         """
-        settings = RasterSettings(
-            KernelCamera.of(camera, near), min_scale, self._antialias, background, sh_degree
-        )
+        view, lens = _view(target, camera, near, min_scale)
+        settings = RasterSettings(view, min_scale, self._antialias, background, sh_degree)
         array = None if weights is None else weights.numpy().astype(np.float32)
         with self.device.lock:
             if len(self._pending) == PENDING:
                 self._settle()
             photo = _upload_photo(self.device, target)
-            step = Step(settings, photo, ssim_weight, array, self._next_numbers(shrink))
+            step = Step(settings, photo, lens, ssim_weight, array, self._next_numbers(shrink))
             self._start(step)
 
         def loss() -> float:
@@ -393,6 +392,16 @@ def _as_tensor(values: np.ndarray) -> torch.Tensor:
 
 def _width(columns: slice) -> int:
     return columns.stop - columns.start
+
+
+def _view(target: Target, camera: Camera, near: float, min_scale: float) -> tuple[KernelCamera, np.ndarray]:
+    """Return the view of a photo and its :func:`lens_of`; they are cached in its target."""
+    key = near, min_scale
+    cached = target.cache.get("device_view")
+    if cached is None or cached[0] is not camera or cached[1] != key:
+        view = KernelCamera.of(camera, near)
+        cached = target.cache["device_view"] = camera, key, view, lens_of(view, min_scale)
+    return cached[2:]
 
 
 def _upload_photo(device: Device, target: Target) -> Buffer:

@@ -15,6 +15,8 @@ import numpy as np
 
 Copy = tuple[Any, int, Any, int, int]
 """Copy of a buffer: source, its offset, target, its offset, and size in bytes."""
+Pointers = tuple[Any, list[tuple[Any, int]], list[list[tuple[Any, Any, int]]]]
+"""Numbers, cleared buffers with their sizes, and parts of a recording, as wgpu-native's pointers."""
 FUNCTIONS = (
     "QueueWriteBuffer", "DeviceCreateCommandEncoder", "CommandEncoderCopyBufferToBuffer",
     "CommandEncoderClearBuffer", "CommandEncoderBeginComputePass", "ComputePassEncoderSetPipeline",
@@ -50,22 +52,23 @@ class Recording:
     Attributes:
         cleared: wgpu's buffers to clear.
         parts: pipelines, bind groups and numbers of workgroups, by submission.
+        count: number of dispatches.
         uniforms: wgpu's buffer of all numbers.
+        native: pointers of wgpu-native in the form of :data:`Pointers`, once they are needed.
     """
 
     def __init__(self, alignment: int) -> None:
         self.cleared: list[Any] = []
         self.parts: list[list[tuple[Any, Any, int]]] = []
+        self.count = 0
         self.uniforms: Any = None
+        self.native: Pointers | None = None
         self._alignment = alignment
         self._dispatches: list[list[Dispatch]] = [[]]
         self._words: list[np.ndarray] = []
         self._size = 0
         self._arrays: list[tuple[int, np.ndarray]] = []
         self._numbers = np.zeros(0, np.uint32)
-
-    def __len__(self) -> int:
-        return sum(map(len, self.parts))
 
     def add(self, dispatch: Dispatch) -> None:
         """Append a dispatch."""
@@ -100,6 +103,7 @@ class Recording:
                 entries = [{"binding": at, "resource": resource} for at, resource in bound.items()]
                 part.append((pipeline, create_bind_group(layout=layout, entries=entries), groups))
             self.parts.append(part)
+            self.count += len(part)
         self._dispatches, self._words = [], []
 
     def replay(self, device: Any, copies: list[Copy]) -> None:
@@ -146,7 +150,7 @@ def _native_replay() -> Callable[[Recording, Any, list[Copy]], None] | None:
     """
     try:
         wgpu = import_module("wgpu.backends.wgpu_native._api")
-        lib, null, new, cast = wgpu.lib, wgpu.ffi.NULL, wgpu.ffi.new, wgpu.ffi.cast
+        lib, null, new, from_buffer = wgpu.lib, wgpu.ffi.NULL, wgpu.ffi.new, wgpu.ffi.from_buffer
         functions = [getattr(lib, f"wgpu{name}") for name in FUNCTIONS]
         raise_errors = wgpu.libf._make_proxy_func
     except (ImportError, AttributeError):
@@ -156,21 +160,32 @@ def _native_replay() -> Callable[[Recording, Any, list[Copy]], None] | None:
         submit, release_pass, release_commands, release_encoder,
     ) = functions  # fmt: skip
 
+    def pointers(recording: Recording) -> Pointers:
+        return (
+            recording.uniforms._internal,
+            [(buffer._internal, buffer.size) for buffer in recording.cleared],
+            [
+                [(pipeline._internal, group._internal, n) for pipeline, group, n in part]
+                for part in recording.parts
+            ],
+        )
+
     def replay(recording: Recording, device: Any, copies: list[Copy]) -> None:
+        uniforms, cleared, parts = recording.native = recording.native or pointers(recording)
         queue, numbers = device.queue._internal, recording.numbers()
         commands = new("WGPUCommandBuffer[1]")
-        write(queue, recording.uniforms._internal, 0, cast("void *", numbers.ctypes.data), numbers.nbytes)
+        write(queue, uniforms, 0, from_buffer(numbers), numbers.nbytes)
         encoder = create_encoder(device._internal, null)
         for source, source_offset, target, offset, size in copies:
             copy_buffer(encoder, source._internal, source_offset, target._internal, offset, size)
-        for handle in recording.cleared:
-            clear(encoder, handle._internal, 0, handle.size)
-        for part in recording.parts:
+        for handle, size in cleared:
+            clear(encoder, handle, 0, size)
+        for part in parts:
             encoder = encoder or create_encoder(device._internal, null)
             compute_pass = begin(encoder, null)
             for pipeline, group, groups in part:
-                set_pipeline(compute_pass, pipeline._internal)
-                set_group(compute_pass, 0, group._internal, 0, null)
+                set_pipeline(compute_pass, pipeline)
+                set_group(compute_pass, 0, group, 0, null)
                 dispatch(compute_pass, groups, 1, 1)
             end(compute_pass)
             release_pass(compute_pass)

@@ -68,7 +68,7 @@ class ProjectedScene:
         """
         view = settings.view
         count = splats.shape[0]
-        lens = lens_of(settings)
+        lens = lens_of(view, settings.min_scale)
         rows, colours = device.scratch(np.float32, count, ROW), device.scratch(np.float32, count, 4)
         depths, order = device.scratch(np.uint32, count), device.scratch(np.uint32, count)
         radii = device.scratch(np.float32, count)
@@ -186,9 +186,8 @@ def _project(
         first += count
 
 
-def lens_of(settings: RasterSettings) -> np.ndarray:
+def lens_of(view: KernelCamera, min_scale: float) -> np.ndarray:
     """Convert a view to the first numbers of project.wgsl's uniform, up to ``min_scale``."""
-    view = settings.view
     numbers = np.zeros(28, np.float32)
     pose = numbers[:12].reshape(3, 4)
     pose[:, :3] = view.rotation
@@ -197,6 +196,6 @@ def lens_of(settings: RasterSettings) -> np.ndarray:
     (left, right), (top, bottom) = view.x_limits, view.y_limits
     size = view.width, view.height
     numbers[16:] = (
-        view.fx, view.fy, view.cx, view.cy, left, top, right, bottom, *size, view.near, settings.min_scale
+        view.fx, view.fy, view.cx, view.cy, left, top, right, bottom, *size, view.near, min_scale
     )  # fmt: skip
     return numbers

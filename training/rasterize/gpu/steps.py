@@ -9,7 +9,6 @@ import numpy as np
 from ..rendering import RasterSettings
 from .device import Buffer
 from .recording import Recording
-from .scene import lens_of
 
 LOSSES = 2
 """Index of the first loss in the report (common.wgsl)."""
@@ -21,12 +20,14 @@ class Step:
 
     Attributes:
         photo: (H, W), photo on the device.
+        lens: see ``lens_of``.
         training: (TRAINING_NUMBERS,), see ``ProjectedScene.train``.
         loss: None until it is read from the device.
     """
 
     settings: RasterSettings
     photo: Buffer
+    lens: np.ndarray
     ssim_weight: float
     weights: np.ndarray | None
     training: np.ndarray
@@ -52,7 +53,7 @@ class Inputs:
 
     def set(self, step: Step, index: int) -> None:
         """Set the numbers of a step, whose losses have the given index in the report."""
-        self.lens[:] = lens_of(step.settings)
+        self.lens[:] = step.lens
         self.background[:] = step.settings.background
         self.training[:] = step.training
         self.slot[:] = LOSSES + 2 * index
