@@ -4,22 +4,30 @@ Measures in one run: a training step on the device and its stages, a step throug
 cpu; the share of the device's measured peak of multiply-adds and copies; and bytes transferred per step.
 Writes build/bench/gpu.json. Results of a software device are only sanity checks.
 
-``--all`` measures everything in less than ten minutes on a card that is at hand for a short time: the above,
-steps of ``cuda`` and of gsplat where they are installed, the first step in a new process, and trainings of
-``examples/lantern_garden``. The file is written after each part. ``--tiny`` tries the script.
+``--all`` measures everything in less than ten minutes on a card that is at hand for a short time: devices,
+drivers and versions; the first step in a new process; the above; steps of ``cuda``, and of gsplat where it is
+installed; trainings of ``examples/lantern_garden``; and their PSNR with three seeds per backend. The file is
+written after each part. ``--tiny`` tries the script.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
+import platform
+import shutil
 import subprocess
 import sys
 import tempfile
 import time
+import tomllib
 from collections import Counter, defaultdict
 from collections.abc import Callable
+from contextlib import suppress
 from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -66,8 +74,12 @@ WORDS, ROUNDS, GROUPS = 1 << 24, 4096, 1024
 TINY = [(2_000, 160, 120)]
 """Cases of ``--tiny``."""
 EXAMPLE = ROOT / "examples" / "lantern_garden"
-TRAINING_SECONDS = 150
+TRAINING_SECONDS = 120
 """Time limit of a training of ``--all``."""
+TOTAL_SECONDS = 570
+"""Time after which ``--all`` skips its remaining parts."""
+SEEDS = 0, 1, 2
+"""Seeds of the trainings whose PSNR is compared."""
 STEPS = 16
 """Steps between two reads of the loss."""
 COUNTS = "dispatches", "buffers", "bind_groups", "submissions", "reads", "bytes"
@@ -243,12 +255,25 @@ def bench(seconds: float, cases: list[tuple[int, int, int]] | None = None) -> di
 
 
 def cuda_seconds(size: tuple[int, int, int], fastest: Fastest) -> dict[str, float]:
-    """Measure a step of cuda, and one of gsplat with a torch SSIM and torch's fused Adam.
+    """Measure a step of cuda; with gsplat, also its step with a torch SSIM and torch's fused Adam.
 
-    This part has not run yet: it needs an NVIDIA GPU and gsplat.
+    This part has not run yet: it needs an NVIDIA GPU.
     """
-    rasterization = import_module("gsplat").rasterization
     case = Case(*size, device="cuda")
+
+    def step_cuda() -> None:
+        case.through_torch("cuda")
+        torch.cuda.synchronize()
+
+    steps = {"cuda_step_ms": step_cuda}
+    if find_spec("gsplat"):
+        steps["gsplat_step_ms"] = gsplat_step(case)
+    return {name: round(1e3 * fastest(step), 2) for name, step in steps.items()}
+
+
+def gsplat_step(case: Case) -> Callable[[], None]:
+    """Return a training step of gsplat on an NVIDIA GPU."""
+    rasterization = import_module("gsplat").rasterization
     leaves = case.adam.tensors
     adam = torch.optim.Adam(list(leaves.values()), lr=1e-7, fused=True)
     camera = case.camera
@@ -258,22 +283,17 @@ def cuda_seconds(size: tuple[int, int, int], fastest: Fastest) -> dict[str, floa
         for x in (camera.world_to_camera, intrinsics)
     )
 
-    def step_cuda() -> None:
-        case.through_torch("cuda")
-        torch.cuda.synchronize()
-
-    def step_gsplat() -> None:
+    def step() -> None:
         image, _, _ = rasterization(
             leaves["means"], leaves["quats"], leaves["log_scales"].exp(), leaves["opacity_logits"].sigmoid(),
-            leaves["sh"], pose, intrinsics, *size[1:], sh_degree=3,
+            leaves["sh"], pose, intrinsics, *case.size[1:], sh_degree=3,
         )  # fmt: skip
         photometric_loss(image[0], case.target, backend="reference").backward()
         adam.step()
         adam.zero_grad(set_to_none=True)
         torch.cuda.synchronize()
 
-    steps = {"cuda_step_ms": step_cuda, "gsplat_step_ms": step_gsplat}
-    return {name: round(1e3 * fastest(step), 2) for name, step in steps.items()}
+    return step
 
 
 def first_step_seconds(backend: str) -> float:
@@ -284,24 +304,17 @@ def first_step_seconds(backend: str) -> float:
     return round(time.perf_counter() - begin, 1)
 
 
-def training(backend: str, options: list[str]) -> dict:
-    """Train the example; return the last values of its events."""
+def training(backend: str, options: list[str], seconds: float = TRAINING_SECONDS) -> dict:
+    """Train the example; return the last values of its events.
+
+    Raises:
+        subprocess.TimeoutExpired: the training took longer than ``seconds``.
+    """
     with tempfile.TemporaryDirectory() as folder:
-        command = [
-            sys.executable,
-            "-m",
-            "training",
-            "train",
-            "--scene",
-            str(EXAMPLE),
-            "--out",
-            f"{folder}/run",
-        ]
+        files = ["--scene", str(EXAMPLE), "--out", f"{folder}/run"]
+        command = [sys.executable, "-m", "training", "train", *files, "--backend", backend, *options]
         begin = time.perf_counter()
-        ended = subprocess.run(
-            [*command, "--backend", backend, *options], cwd=ROOT, capture_output=True, text=True,
-            timeout=TRAINING_SECONDS,
-        )  # fmt: skip
+        ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=seconds)
     events = [json.loads(line) for line in ended.stdout.splitlines() if line.startswith("{")]
     kinds = {event["event"]: event for event in events}
     progress, done = kinds.get("progress", {}), kinds.get("done", {})
@@ -310,32 +323,79 @@ def training(backend: str, options: list[str]) -> dict:
     return result | ({"error": kinds["error"]} if "error" in kinds else {})
 
 
+def compare_seeds(backends: list[str], options: list[str], left: Callable[[], float]) -> dict:
+    """Train with each seed and backend; return PSNR, and the largest difference of a mean from cpu's.
+
+    Args:
+        left: returns the time limit of the next training in seconds. Seeds beyond it are left out.
+    """
+    psnr: dict[str, list[float]] = {name: [] for name in ("cpu", *backends)}
+    with suppress(subprocess.TimeoutExpired):
+        for seed in SEEDS:
+            for name, values in psnr.items():
+                values.append(training(name, [*options, "--seed", str(seed)], left())["psnr"])
+    count = min(map(len, psnr.values()))
+    means = {name: sum(values[:count]) / max(count, 1) for name, values in psnr.items()}
+    difference = max(abs(mean - means["cpu"]) for mean in means.values())
+    return {"psnr": psnr, "seeds": count, "largest_difference": round(difference, 3)}
+
+
+def versions() -> dict[str, object]:
+    """Return the devices, drivers and versions of this computer."""
+    nvidia = shutil.which("nvidia-smi")
+    query = ["--query-gpu=name,driver_version,memory.total", "--format=csv,noheader"]
+    packages = {}
+    for name in ("torch", "wgpu", "numba", "gsplat"):
+        with suppress(PackageNotFoundError):
+            packages[name] = version(name)
+    return {
+        "lodgs": tomllib.loads((ROOT / "blender_manifest.toml").read_text("utf-8"))["version"],
+        "python": platform.python_version(), "system": platform.platform(), "cores": os.cpu_count(),
+        "packages": packages, "cuda": torch.version.cuda,
+        "nvidia": subprocess.run([nvidia, *query], capture_output=True, text=True).stdout if nvidia else None,
+        "graphics": open_default_device().adapter._asdict(),
+    }  # fmt: skip
+
+
 def measure_all(seconds: float, tiny: bool, out: Path) -> dict:
-    """Measure all parts of ``--all``, and write the results so far after each."""
+    """Measure all parts of ``--all`` within TOTAL_SECONDS, and write the results so far after each.
+
+    The most important parts come first. When the time is over, the remaining parts are skipped.
+    """
+    deadline = time.monotonic() + TOTAL_SECONDS
     backends = ["gpu"] if cuda.find_problem() else ["gpu", "cuda"]
     jobs = {
         "flod draft, half size": ["--method", "flod"],
         "3dgs draft, full size": ["--method", "3dgs", "--image-scale", "1"],
     }
+    seeds = ["--method", "3dgs", "--image-scale", "0.25", "--set", "steps=1500"]
     if tiny:
         jobs = {"3dgs, tiny": ["--method", "3dgs", "--image-scale", "0.1", "--set", "steps=20"]}
-    parts: dict[str, Callable[[], object]] = {
-        f"first step, {name}": lambda name=name: first_step_seconds(name) for name in backends
-    }
-    parts["steps, gpu"] = lambda: bench(seconds, TINY if tiny else None)
+        seeds = jobs["3dgs, tiny"]
+
+    def left() -> float:
+        return max(min(deadline - time.monotonic(), TRAINING_SECONDS), 1.0)
+
+    parts: dict[str, Callable[[], object]] = {"versions": versions}
+    for name in backends:
+        parts[f"first step, {name}"] = lambda name=name: first_step_seconds(name)
     for size in CASES if "cuda" in backends else []:
         label = f"steps, cuda, {size[0]:,} splats, {size[1]}x{size[2]}"
         parts[label] = lambda size=size: cuda_seconds(size, Fastest(seconds))
+    parts["steps, gpu"] = lambda: bench(seconds, TINY if tiny else None)
     for job, options in jobs.items():
         for name in backends:
-            parts[f"training, {name}, {job}"] = lambda name=name, options=options: training(name, options)
-    results: dict[str, object] = {"torch": torch.__version__, "cuda": torch.version.cuda}
+            label = f"training, {name}, {job}"
+            parts[label] = lambda name=name, options=options: training(name, options, left())
+    parts["three seeds, PSNR"] = lambda: compare_seeds(backends, seeds, left)
+    results: dict[str, object] = {}
     for name, measure in parts.items():
+        begin = time.monotonic()
         try:
-            results[name] = measure()
+            results[name] = measure() if begin < deadline else "skipped: the time is over"
         except Exception as error:  # the other parts are measured
             results[name] = f"{type(error).__name__}: {error}"
-        print(f"{name}: {results[name]}", flush=True)
+        print(f"{name}: {results[name]} ({time.monotonic() - begin:.0f} s)", flush=True)
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(json.dumps(results, indent=1) + "\n")
     return results

@@ -31,8 +31,6 @@ from . import environment, processes
 
 REQUIREMENTS = extension.FOLDER / "requirements" / "cluster.txt"
 """Packages for training, and Dask for training several cells of a large scene at once."""
-CUDA_REQUIREMENTS = extension.FOLDER / "requirements" / "cuda.txt"
-"""The same packages and those for NVIDIA GPUs, installed if there are a GPU and nvcc to compile with."""
 PIP_REQUIREMENTS = extension.FOLDER / "requirements" / "pip.txt"
 """A pip that understands PIP_OPTIONS."""
 PIP_OPTIONS = ("--progress-bar=raw", "--resume-retries=5")
@@ -61,13 +59,14 @@ class EnvironmentSetup:
         running: whether the thread is running.
     """
 
-    def __init__(self, base: Path, parent: Path, requirements: Path) -> None:
+    def __init__(self, base: Path, parent: Path, requirements: Path, cuda: bool) -> None:
         self.fraction = 0.0
         self.problem = ""
         self.running = True
         self._base = base
         self._parent = parent
         self._requirements = requirements
+        self._cuda = cuda
         self._process: subprocess.Popen[str] | None = None
         self._inherited: tuple[int, ...] = ()
         self._cancelled = False
@@ -128,7 +127,7 @@ class EnvironmentSetup:
         pip += PIP_OPTIONS
         with tempfile.TemporaryDirectory() as work:
             lock, options = self._requirements, list(packages.HASHED)
-            if lock != CUDA_REQUIREMENTS and packages.has_cpu_build() and self._install_torch(pip):
+            if not self._cuda and packages.has_cpu_build() and self._install_torch(pip):
                 lock = Path(work, lock.name)
                 lock.write_text(packages.without_cuda(self._requirements.read_text("utf-8")), "utf-8")
                 options.append("--no-deps")
@@ -244,8 +243,8 @@ def start() -> EnvironmentSetup:
             f"Cannot create the folder {parent}: {error.strerror}.",
             "Check the permissions and the free space of this disk.",
         ) from error
-    gpu = shutil.which("nvidia-smi") and shutil.which("nvcc")
-    current = EnvironmentSetup(find_base_python(), parent, CUDA_REQUIREMENTS if gpu else REQUIREMENTS)
+    cuda = shutil.which("nvidia-smi") is not None
+    current = EnvironmentSetup(find_base_python(), parent, REQUIREMENTS, cuda)
     environment.report = None
     return current
 

@@ -16,7 +16,7 @@ import pytest
 from tools import extension
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-_LOCKS = "trainer", "cluster", "cuda", "torch-cpu", "pip"
+_LOCKS = "trainer", "cluster", "torch-cpu", "pip"
 
 INSTALL = """
 import os, sys
@@ -92,7 +92,7 @@ def test_zip_contains_only_the_packages_and_their_files(archive):
         names = file.namelist()
     tracked = extension.tracked_files()
     code = {name for name in tracked if name.startswith(("blender_lodgs/", "training/"))}
-    assert {Path(name).suffix for name in code} == {".html", ".py", ".pyi", ".typed", ".wgsl"}
+    assert {Path(name).suffix for name in code} == {".cu", ".html", ".py", ".pyi", ".typed", ".wgsl"}
     data = {"__init__.py", "blender_manifest.toml", "LICENSE"}
     data |= {"pyproject.toml", *(f"requirements/{name}.txt" for name in _LOCKS)}
     data |= {p.relative_to(REPOSITORY).as_posix() for p in (REPOSITORY / "farm").rglob("*.js")}

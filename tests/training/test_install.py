@@ -35,7 +35,8 @@ def lodgs(tmp_path_factory):
     (site / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
     (wheel_file,) = folder.glob("lodgs-*.whl")
     with zipfile.ZipFile(wheel_file) as file:
-        data = {"lodgs/rasterize/gpu/shaders/sort.wgsl", "lodgs/py.typed", "lodgs/__init__.pyi"}
+        data = {"lodgs/rasterize/gpu/shaders/sort.wgsl", "lodgs/rasterize/cuda/kernels.cu"}
+        data |= {"lodgs/py.typed", "lodgs/__init__.pyi"}
         assert data <= set(file.namelist())
     subprocess.run([*pip, "--python", python, "install", *offline, wheel_file], check=True, timeout=600)
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}

@@ -12,7 +12,7 @@ from training import packages
 
 ROOT = Path(__file__).resolve().parents[2]
 REQUIREMENTS = ROOT / "requirements"
-LOCKS = ["pip", "uv", "trainer", "cuda", "cluster", "develop", "blender-5.0", "blender-5.2", "blender-5.3"]
+LOCKS = ["pip", "uv", "trainer", "cluster", "develop", "blender-5.0", "blender-5.2", "blender-5.3"]
 
 PIN = r"(?P<name>[A-Za-z0-9._-]+)==(?P<version>[^\s;]+)(?P<marker> ; [^\\]+?)?"
 
@@ -54,7 +54,7 @@ def test_locks_contain_requested_versions_and_hashes(name):
     assert pins and not pins - locked(REQUIREMENTS / f"{name}.txt"), "run `make pins`"
 
 
-@pytest.mark.parametrize("name", ["cuda", "cluster", "develop"])
+@pytest.mark.parametrize("name", ["cluster", "develop"])
 def test_trainer_versions_are_the_same_everywhere(name):
     """Users and tests have the same versions of all dependencies."""
     trainer, pins = locked(REQUIREMENTS / "trainer.txt"), locked(REQUIREMENTS / f"{name}.txt")

@@ -1,7 +1,7 @@
 """Rasterize Gaussian splats and differentiate the result, with one interface for several backends.
 
 ``reference`` (plain torch) is the definition. ``cpu`` (Numba kernels with analytic gradients) is fast on any
-computer, ``cuda`` (gsplat) on NVIDIA GPUs, and ``gpu`` (compute shaders) runs on GPUs of any vendor. A
+computer, ``cuda`` (CUDA kernels) on NVIDIA GPUs, and ``gpu`` (compute shaders) runs on GPUs of any vendor. A
 backend is a module that implements ``rasterize``, ``contributions`` and ``photometric_loss`` with the
 reference's signatures. It is imported on first use.
 """
@@ -425,8 +425,8 @@ def tensor_device(backend: str) -> torch.device:
 def warm_up(backend: str = "auto") -> None:
     """Compile all kernels by making one step on one splat.
 
-    The first time on a computer this takes some seconds with cpu and some minutes with cuda. Later runs read
-    the kernels from a cache.
+    The first time on a computer this takes some seconds with cpu. Later runs read its kernels from a cache.
+    With cuda it takes some seconds in every process.
     """
     gc_enabled = gc.isenabled()
     gc.disable()  # Numba allocates millions of objects; collecting garbage would take a fifth of the time

@@ -63,6 +63,7 @@ class Adam:
         """Make one step in place with ``grads`` or the tensors' own gradients; skip tensors without a
         gradient."""
         from .cpu.adam import update
+        from .cuda.adam import update as update_on_gpu
 
         for name, tensor in self.tensors.items():
             gradient = tensor.grad if grads is None else grads.get(name)
@@ -74,7 +75,7 @@ class Adam:
             if tensor.device.type == "cpu":
                 update(*(array.numpy() for array in arrays), *constants)
             else:
-                update_in_torch(*arrays, *constants)
+                update_on_gpu(*arrays, *constants)
 
     @torch.no_grad()
     def step_rows(self, rows: torch.Tensor, grads: Mapping[str, torch.Tensor | None]) -> None:

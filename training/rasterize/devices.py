@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib.util import find_spec
 
 import torch
 
@@ -57,23 +56,25 @@ class Devices:
         The trial takes some seconds per device, once per machine and driver.
         """
         cores = f"the CPU ({thread_count()} thread{'s' * (thread_count() > 1)})"
-        if self.card and find_spec("gsplat"):  # its compilation can take minutes
-            return f"Automatic trains on {self.card} if gsplat works and is faster, otherwise on {cores}."
+        names = {"cpu": cores, "cuda": f"{self.card} (CUDA)"}
+        if self.selected is not None:
+            names["gpu"] = self.selected.name
         times = trial.step_times()
-        if "gpu" in times and self.selected is not None:
-            names = {"cpu": cores, "gpu": self.selected.name}
+        if len(times) > 1:
             first, *others = (f"{names[name]}: {times[name]:.1f} ms" for name in sorted(times, key=times.get))
             hint = f"A training step takes {first}, {', '.join(others)} ({SCENE})."
-            if min(times, key=times.get) == "gpu":
-                return f"Automatic trains on {self.selected.name}. {hint} {LIMITS}"
+            fastest = min(times, key=times.get)
+            if fastest != "cpu":
+                limits = f" {LIMITS}" if fastest == "gpu" and "cuda" not in times else ""
+                return f"Automatic trains on {names[fastest]}. {hint}{limits}"
         elif self.selected is not None and not self.selected.software:
             hint = _reason_against(self.selected)
         elif self.adapters or not self.reason:
             hint = "A graphics card may be faster, but none was detected."
         else:
             hint = self.reason
-        if self.card:
-            hint += f" {self.card} may be faster with CUDA: install gsplat."
+        if self.card and (problem := cuda.find_problem()):
+            hint += f" {problem}"
         return f"Automatic trains on {cores}. {hint}"
 
     def as_json(self) -> dict:
@@ -90,7 +91,7 @@ def describe(timed: bool = False) -> str:
     devices = Devices.detect()
     rows = [("cpu", f"{thread_count()} threads")]
     problem = cuda.find_problem()
-    rows.append(("cuda", str(problem) if problem else f"{devices.card}, through gsplat"))
+    rows.append(("cuda", str(problem) if problem else devices.card))
     working = ["cpu"] if problem else ["cpu", "cuda"]
     for adapter in devices.adapters:
         properties = [adapter.kind, adapter.api, adapter.driver]

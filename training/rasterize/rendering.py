@@ -158,7 +158,7 @@ class Contributions:
 
 @dataclass
 class SideOutputs:
-    """Outputs that autograd does not differentiate, see BackendOutput; backends for CPU tensors fill them."""
+    """Outputs that autograd does not differentiate, see BackendOutput; backends fill them."""
 
     radii: torch.Tensor
     grad2d: torch.Tensor
@@ -167,15 +167,20 @@ class SideOutputs:
     tile_counts: torch.Tensor
 
     @classmethod
-    def of(cls, count: int, settings: RasterSettings, tile: int) -> SideOutputs:
+    def of(
+        cls, count: int, settings: RasterSettings, tile: int, device: torch.device | str = "cpu"
+    ) -> SideOutputs:
         """Allocate the outputs of ``count`` splats, for square tiles with sides of ``tile`` pixels."""
         height, width = settings.view.height, settings.view.width
+        rows = count if torch.is_grad_enabled() else 1
         return cls(
-            radii=torch.zeros(count),
-            grad2d=torch.zeros(count, 2) if torch.is_grad_enabled() else torch.zeros(1, 2).expand(count, 2),
-            absgrad2d=torch.zeros(count, 2) if settings.absolute else None,
-            median=torch.full((height, width), -1, dtype=torch.int32) if settings.median else None,
-            tile_counts=torch.empty(-(-height // tile), -(-width // tile), dtype=torch.int64),
+            radii=torch.zeros(count, device=device),
+            grad2d=torch.zeros(rows, 2, device=device).expand(count, 2),
+            absgrad2d=torch.zeros(count, 2, device=device) if settings.absolute else None,
+            median=torch.full((height, width), -1, dtype=torch.int32, device=device)
+            if settings.median
+            else None,
+            tile_counts=torch.empty(-(-height // tile), -(-width // tile), dtype=torch.int64, device=device),
         )
 
 

@@ -234,15 +234,14 @@ def test_environment_of_a_running_program_is_not_removed(
     assert environments() == ["3"] and environment_setup.current.message == "The trainer is ready"
 
 
-def test_gpu_packages_are_installed_if_nvcc_exists(bpy, environment_setup, fake, tmp_path, monkeypatch):
+def test_cuda_build_is_installed_if_a_driver_exists(bpy, environment_setup, fake, tmp_path, monkeypatch):
     fake(pip=f'echo "$@" >> {tmp_path}/arguments')
-    programs = {"nvidia-smi": "/nvidia-smi"}
-    monkeypatch.setattr(environment_setup.shutil, "which", programs.get)
-    for lock in ("cluster.txt", "cuda.txt"):
-        assert bpy.ops.lodgs.make_environment() == {"FINISHED"}
-        arguments = (tmp_path / "arguments").read_text()
-        assert arguments.strip().endswith(lock) and "--require-hashes --only-binary=:all:" in arguments
-        programs["nvcc"] = "/nvcc"
+    monkeypatch.setattr(environment_setup.packages, "has_cpu_build", lambda: True)
+    monkeypatch.setattr(environment_setup.shutil, "which", {"nvidia-smi": "/nvidia-smi"}.get)
+    assert bpy.ops.lodgs.make_environment() == {"FINISHED"}
+    arguments = (tmp_path / "arguments").read_text()
+    assert arguments.strip().endswith(f"{environment_setup.REQUIREMENTS}")
+    assert "--require-hashes --only-binary=:all:" in arguments and "torch-cpu" not in arguments
 
 
 def test_cpu_build_of_torch_replaces_the_cuda_build(bpy, environment_setup, fake, tmp_path, monkeypatch):

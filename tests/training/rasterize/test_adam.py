@@ -8,6 +8,7 @@ import torch
 from training.rasterize import Adam
 from training.rasterize.adam import update_in_torch
 from training.rasterize.cpu.adam import update
+from training.rasterize.cuda.adam import update as update_on_gpu
 
 
 def gradients(step, shape):
@@ -34,7 +35,7 @@ def test_steps_match_torch():
 
 @pytest.mark.parametrize("lr", [1e-2, torch.tensor([[1e-2], [1e-3], [1e-3], [2e-3]])])
 def test_torch_update_matches_kernel_and_formula(lr):
-    """Compare the GPU code path with the CPU kernel, and with Algorithm 1 in float64."""
+    """Compare the code path of rows on a GPU with the CPU kernel, and with Algorithm 1 in float64."""
     start = torch.randn(300, 4, 3, generator=torch.Generator().manual_seed(99))
     in_torch, in_kernel = (
         [start.clone(), torch.zeros_like(start), torch.zeros_like(start)] for _ in range(2)
@@ -50,6 +51,24 @@ def test_torch_update_matches_kernel_and_formula(lr):
     for actual, expected in zip(in_torch, in_kernel, strict=True):
         torch.testing.assert_close(actual, expected, atol=2e-6, rtol=2e-5)
     torch.testing.assert_close(in_torch[0].double(), exact, atol=2e-6, rtol=2e-5)
+
+
+@pytest.mark.parametrize("lr", [1e-2, torch.tensor([[1e-2], [1e-3], [1e-3], [2e-3]])])
+def test_gpu_kernel_matches_cpu_kernel(fake_card, lr):
+    """Compare values and moments, with more numbers than a block of threads has."""
+    start = torch.randn(300, 4, 3, generator=torch.Generator().manual_seed(99))
+    on_gpu, on_cpu = ([start.clone(), torch.zeros_like(start), torch.zeros_like(start)] for _ in range(2))
+    for step in range(1, 31):
+        gradient = gradients(step, start.shape) * (step % 3) * 1e-3
+        update_on_gpu(on_gpu[0], gradient, *on_gpu[1:], lr, (0.9, 0.999), 1e-15, step)
+        arrays = [array.numpy() for array in (on_cpu[0], gradient, *on_cpu[1:])]
+        update(*arrays, lr, (0.9, 0.999), 1e-15, step)
+    for actual, expected in zip(on_gpu, on_cpu, strict=True):
+        torch.testing.assert_close(actual, expected, atol=2e-6, rtol=2e-5)
+    on_gpu[1][:] = 2e-30
+    on_gpu[2][:] = 1e-37
+    update_on_gpu(on_gpu[0], torch.zeros_like(start), *on_gpu[1:], lr, (0.4, 0.999), 1e-15, 31)
+    assert not on_gpu[1].any() and not on_gpu[2].any(), "tiny moments become zero"
 
 
 def test_resumed_optimizer_is_bit_identical():

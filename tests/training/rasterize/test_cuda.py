@@ -1,18 +1,18 @@
-"""Compare the cuda backend with the float64 reference, with a fake gsplat on the CPU and on a GPU if
+"""Compare the cuda backend with the float64 reference, with its kernels on the CPU and on a GPU if
 available.
-
-gsplat caps alpha at 0.999. For comparisons of images and gradients, the reference's cap is raised to this
-value.
 """
 
-import inspect
-import sys
+import ctypes
+import itertools
+import re
+import shutil
+import subprocess
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 import torch
 
-from tests.training.rasterize import fake_gsplat
 from tests.training.rasterize.comparison import (
     CONTRIBUTING,
     SCENES,
@@ -20,24 +20,23 @@ from tests.training.rasterize.comparison import (
     drawn_and_differentiated,
     exact_results,
 )
+from tests.training.rasterize.fake_card import cpu_kernels
 from training import rasterize as rasterizer
 from training.errors import LodgsError
-from training.files import try_lock
 from training.rasterize import (
     Target,
     cuda,
     photometric_loss,
     rasterize,
-    reference,
     resolve_backend,
     tensor_device,
 )
+from training.rasterize.cuda import driver
+from training.rasterize.cuda.source import kernel_source
 from training.rasterize.features import depths
-from training.rasterize.reference import ellipses, squared_reach
+from training.rasterize.reference import ellipses, tile_counts
 from training.rasterize.rendering import KernelCamera, RasterSettings
 from training.scenes.cameras import Camera
-
-GSPLAT_CAP = 0.999
 
 
 @pytest.fixture(
@@ -53,11 +52,11 @@ GSPLAT_CAP = 0.999
     ]
 )
 def device(request) -> str:
-    """Device of the cuda backend: the CPU through ``fake_card``, and a GPU with gsplat."""
+    """Device of the cuda backend: the CPU through ``fake_card``, and a GPU."""
     if request.param == "cpu":
         request.getfixturevalue("fake_card")
     elif problem := cuda.find_problem():
-        pytest.skip(f"no NVIDIA GPU that gsplat works on: {problem}")
+        pytest.skip(f"no NVIDIA GPU that works: {problem}")
     return request.param
 
 
@@ -69,54 +68,30 @@ RARE = ("degree 1", "degree 2", "one", "antialiased some", "screen-filling", "cr
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[pytest.mark.nightly] * (name in RARE)) for name in SCENES]
 )
-def test_results_match_reference(name, device, make_splats, odd_camera, monkeypatch):
-    """Relative L2 errors of all outputs and gradients are at most 5e-4, on GPUs with fast exp 2e-3."""
+def test_results_match_reference(name, device, make_splats, odd_camera):
+    """Relative L2 errors of all outputs and gradients are at most 5e-4."""
     actual = drawn_and_differentiated(name, make_splats, odd_camera, "cuda", torch.float32, device)
-    monkeypatch.setattr(reference, "ALPHA_MAX", GSPLAT_CAP)
     exact = exact_results(name, make_splats, odd_camera)
     assert exact["grad2d"].norm() > 0 and exact["absgrad2d"].norm() > exact["grad2d"].norm()
-    bound = 5e-4 if device == "cpu" else 2e-3
     for output, expected in exact.items():
         error = (actual[output] - expected).norm() / expected.norm().clamp_min(1e-12)
         # rounding decides if an ellipse just touches a tile
-        assert error <= (5e-3 if output == "tile_counts" else bound), f"{output}: {error:.1e}"
-
-
-def test_alpha_cap_is_the_only_difference(device, make_splats, odd_camera):
-    """An opaque splat changes a pixel by at most 0.999 - 0.99; below 0.99 there is no difference."""
-    splats = make_splats(1)
-    splats.means[:] = torch.tensor([0.1, -0.2, 3.0])
-    splats.log_scales[:] = -0.5
-    for logit, limit in ((12.0, GSPLAT_CAP - 0.99), (4.0, 0.0)):
-        splats.opacity_logits[:] = logit
-        actual, exact = (
-            rasterize(splats.to(on, kind), odd_camera, backend=backend).alpha.cpu()
-            for backend, kind, on in (
-                ("cuda", torch.float32, device),
-                ("reference", torch.float64, "cpu"),
-            )
-        )
-        difference = (actual - exact).abs().max().item()
-        assert difference <= limit + 1e-4 and (limit == 0 or difference > 0.5 * limit)
+        assert error <= (5e-3 if output == "tile_counts" else 5e-4), f"{output}: {error:.1e}"
 
 
 @pytest.mark.parametrize("name", CONTRIBUTING)
-def test_contributions_match_reference(name, device, make_splats, odd_camera, monkeypatch):
-    """Contributions use the reference's cap of 0.99. Small chunks give the same results."""
+def test_contributions_match_reference(name, device, make_splats, odd_camera):
     exact, alpha = contributed(name, make_splats, odd_camera, "reference", torch.float64)
-    for pairs in (1 << 24, 20 * 256 * 3):
-        monkeypatch.setattr(cuda, "CHUNK_PAIRS", pairs)
-        actual, _ = contributed(name, make_splats, odd_camera, "cuda", torch.float32, device)
-        torch.testing.assert_close(actual["largest"], exact["largest"], rtol=1e-3, atol=1e-5)
-        torch.testing.assert_close(actual["total"], exact["total"], rtol=1e-3, atol=2e-2)
-        assert (actual["pixels"] - exact["pixels"]).abs().sum() <= 1e-3 * exact["pixels"].sum()
-        assert torch.equal(actual["views"], exact["views"])
-        assert actual["total"].sum().item() == pytest.approx(alpha, rel=1e-4)
+    actual, _ = contributed(name, make_splats, odd_camera, "cuda", torch.float32, device)
+    torch.testing.assert_close(actual["largest"], exact["largest"], rtol=1e-3, atol=1e-5)
+    torch.testing.assert_close(actual["total"], exact["total"], rtol=1e-3, atol=2e-2)
+    assert (actual["pixels"] - exact["pixels"]).abs().sum() <= 1e-3 * exact["pixels"].sum()
+    assert torch.equal(actual["views"], exact["views"])
+    assert actual["total"].sum().item() == pytest.approx(alpha, rel=1e-4)
 
 
-def test_median_depth_matches_reference(device, make_splats, odd_camera, monkeypatch):
+def test_median_depth_matches_reference(device, make_splats, odd_camera):
     """Pixels may differ if rounding decides which splat reaches the median."""
-    monkeypatch.setattr(cuda, "CHUNK_PAIRS", 20 * 256 * 4)
     splats = make_splats(300)
     actual, exact = (
         rasterize(
@@ -128,32 +103,26 @@ def test_median_depth_matches_reference(device, make_splats, odd_camera, monkeyp
     assert 0.2 < (exact > 0).float().mean() < 1
 
 
-def test_tiles_list_all_touching_splats_once_front_to_back(device, make_splats, odd_camera):
-    """Compare with a test of all pixels in float64."""
-    splats, view = make_splats(400, seed=2), KernelCamera.of(odd_camera, 0.2)
+@pytest.mark.parametrize("size", [(75, 50), (4000, 2200)])
+def test_tiles_list_all_touching_splats_once_front_to_back(device, make_splats, odd_camera, size):
+    """Compare with the reference's test of all tiles; the second image has more tiles than a short counts."""
+    across, down = (-(-length // 16) for length in size)
+    camera = replace(odd_camera, width=size[0], height=size[1])
+    splats, view = make_splats(400, seed=2), KernelCamera.of(camera, 0.2)
     settings = RasterSettings(view, min_scale=0.01, antialias=False)
-    visible = cuda.VisibleSplats.of(splats.to(device, torch.float32), None, settings)
-    tiles = cuda.TileLists.of(visible, view)
+    projected = cuda.Projected.of(splats.to(device, torch.float32).select(slice(None)), None, settings)
+    tiles = cuda.TileLists.of(projected, view)
+    starts, pairs = tiles.starts.tolist(), tiles.pairs.cpu().long()
+    assert len(starts) == across * down + 1 and starts[0] == 0 and starts[-1] == len(pairs)
+    depth = depths(splats.means, view)
+    listed = torch.zeros(400, dtype=torch.int64)
+    for start, end in itertools.pairwise(starts):
+        assert (depth[pairs[start:end]].diff() > 0).all()  # so no splat is listed twice
+        listed[pairs[start:end]] += 1
     exact = ellipses(splats, None, settings)
-
-    (xx, xy, yy), mean = (v[:, None, None] for v in exact.covariance), exact.mean2d[:, :, None, None]
-    dx, dy = torch.arange(80) + 0.5 - mean[:, 0], (torch.arange(64) + 0.5)[:, None] - mean[:, 1]
-    distance = (yy * dx**2 - 2 * xy * dx * dy + xx * dy**2) / (xx * yy - xy**2)
-    touched = (distance <= squared_reach(exact.opacity)[:, None, None]) & exact.inside[:, None, None]
-    touched = touched.reshape(-1, 4, 16, 5, 16).any(4).any(2)
-    expected = torch.zeros(400, 4, 5, dtype=torch.bool)
-    expected[exact.drawn] = touched
-
-    listed = torch.zeros(400, 4, 5, dtype=torch.int64)
-    for tile, (start, count) in enumerate(zip(tiles.start.flatten(), tiles.counts.flatten(), strict=True)):
-        rows = tiles.splat[start : start + count].long()
-        assert (rows.diff() > 0).all()  # rows are front to back, so increasing rows are unique and ordered
-        listed[visible.index[rows].cpu(), tile // 5, tile % 5] += 1
-    assert tiles.counts.sum() == len(tiles.splat) and listed.max() == 1
-    depth = depths(splats.means[visible.index.cpu()], view)
-    torch.testing.assert_close(depth, exact.depth[exact.inside].sort().values)
-    assert (listed[expected] == 1).float().mean() > 0.999
-    assert listed.sum() <= 1.15 * expected.sum()
+    counts = tile_counts(exact, view).flatten()
+    assert (torch.tensor(starts).diff() - counts).abs().sum() <= 1e-3 * counts.sum()
+    torch.testing.assert_close(projected.radii.cpu() > 0, exact.radii > 0)
 
 
 def test_loss_and_gradient_match_reference(device):
@@ -171,40 +140,23 @@ def test_loss_and_gradient_match_reference(device):
             gradients.append(image.grad.cpu().double())
         assert losses[0] == pytest.approx(losses[1], rel=2e-5)
         assert (gradients[0] - gradients[1]).norm() <= 1e-4 * gradients[1].norm()
-    assert target.cache["cuda"][0].device.type == device
+    assert target.cache["cuda"].device.type == device
 
 
-def test_repeated_backward_is_consistent_and_frees_memory(device, make_splats, odd_camera):
-    """Deleting a rendering frees its tensors; a reference cycle through autograd's graph would leak."""
-    import gc
-    import weakref
-
+def test_repeated_backward_is_consistent(device, make_splats, odd_camera):
     leaves = make_splats(50).map(lambda t: t.to(device, torch.float32).requires_grad_())
     drawn = rasterize(leaves, odd_camera, outputs=["absgrad2d"], backend="cuda")
     loss = drawn.image.sum()
-    loss.backward(retain_graph=True)
-    first = [leaf.grad.clone() for leaf in vars(leaves).values()] + [
-        drawn.grad2d.clone(),
-        drawn.absgrad2d.clone(),
-    ]
-    for leaf in vars(leaves).values():
-        leaf.grad = None
-    loss.backward()
-    second = [leaf.grad for leaf in vars(leaves).values()] + [drawn.grad2d, drawn.absgrad2d]
+    results = []
+    for _ in range(2):
+        loss.backward(retain_graph=True)
+        gradients = [leaf.grad for leaf in vars(leaves).values()]
+        results.append([tensor.clone() for tensor in (*gradients, drawn.grad2d, drawn.absgrad2d)])
+        for leaf in vars(leaves).values():
+            leaf.grad = None
     rounding = {} if device == "cpu" else {"rtol": 1e-4, "atol": 1e-4}  # a GPU sums in arbitrary order
-    for a, b in zip(first, second, strict=True):
+    for a, b in zip(*results, strict=True):
         torch.testing.assert_close(a, b, **rounding)
-
-    node = loss.grad_fn
-    while type(node).__name__ != "_BlendBackward":
-        node = node.next_functions[0][0]
-    inputs = [weakref.ref(tensor) for tensor in node.inner[0]]
-    gc.disable()
-    try:
-        del node, drawn, loss
-        assert all(ref() is None for ref in inputs)
-    finally:
-        gc.enable()
 
 
 def test_other_dtypes_and_devices_raise(device, make_splats, odd_camera):
@@ -219,17 +171,18 @@ def test_other_dtypes_and_devices_raise(device, make_splats, odd_camera):
 
 
 @pytest.fixture
-def card(monkeypatch):
-    """Simulate a computer with an NVIDIA GPU and gsplat; the GPU computes on the CPU."""
+def card(monkeypatch, fake_card):
+    """Simulate a computer with an NVIDIA GPU, whose kernels run on the CPU."""
+    monkeypatch.undo()
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(cuda, "DEVICE", "cpu")
-    monkeypatch.setitem(sys.modules, "gsplat", fake_gsplat)
+    monkeypatch.setattr(driver, "kernels", cpu_kernels)
     cuda.find_problem.cache_clear()
     yield
     cuda.find_problem.cache_clear()
 
 
-def test_auto_uses_cuda_with_gpu_and_gsplat(card, monkeypatch):
+def test_auto_uses_cuda_with_gpu(card, monkeypatch):
     assert resolve_backend("auto") == resolve_backend("cuda") == "cuda"
     monkeypatch.setattr(cuda, "DEVICE", "cuda")
     assert tensor_device("auto") == torch.device("cuda")
@@ -252,61 +205,100 @@ def test_auto_follows_the_device_of_tensors(card, monkeypatch, make_splats, odd_
     assert rasterizer._backend("auto", SimpleNamespace(is_cuda=True)) is cuda  # type: ignore[arg-type]
 
 
-def test_missing_requirements_are_reported_with_remedy(card, monkeypatch):
-    def problem_with(gsplat) -> str:
-        monkeypatch.setitem(sys.modules, "gsplat", gsplat)
-        cuda.find_problem.cache_clear()
-        assert resolve_backend("auto") == "cpu"
-        with pytest.raises(LodgsError) as caught:
-            resolve_backend("cuda")
-        return str(caught.value)
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (OSError("NVRTC is not installed"), r"backend: NVRTC is not installed\..*built for CUDA"),
+        (
+            RuntimeError("cuModuleLoadData: device kernel image is invalid\nmore"),
+            r"is invalid\..*newer driver",
+        ),
+    ],
+)
+def test_problems_are_reported_with_remedy(card, monkeypatch, error, message):
+    def fail():
+        raise error
 
-    message = problem_with(None)
-    assert "package gsplat is not installed" in message and "pip install gsplat" in message
-
-    def uncompiled(*_):
-        return getattr(None, "spherical_harmonics_fwd")  # noqa: B009, like gsplat without nvcc
-
-    def failing(*_):
-        print("setting up CUDA")
-        raise RuntimeError("Error building extension 'gsplat_cuda': [1/30] nvcc, its options\nand more")
-
-    assert "nvcc is not installed" in problem_with(SimpleNamespace(spherical_harmonics=uncompiled))
-    message = problem_with(SimpleNamespace(spherical_harmonics=failing))
-    assert "Error building extension 'gsplat_cuda'." in message and "nvcc" not in message
+    monkeypatch.setattr(driver, "kernels", fail)
+    assert resolve_backend("auto") == "cpu"
+    with pytest.raises(LodgsError, match=message):
+        resolve_backend("cuda")
 
 
-def test_compilation_does_not_print_to_standard_output(card, monkeypatch, capsys):
-    def loud(*args):
-        print("setting up CUDA")
-        return fake_gsplat.spherical_harmonics(*args)
-
-    monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(spherical_harmonics=loud))
-    assert cuda.find_problem() is None
-    printed = capsys.readouterr()
-    assert printed.out == "" and "setting up" in printed.err
+# -- compilation and launch --------------------------------------------------------------
 
 
-def test_compilation_holds_a_lock(card, monkeypatch, tmp_path):
-    monkeypatch.setattr("training.files.cache_folder", lambda: tmp_path)
-    locked = []
-
-    def compiling(*args):
-        with (tmp_path / "gsplat.lock").open("rb") as lock:
-            locked.append(not try_lock(lock))
-        return fake_gsplat.spherical_harmonics(*args)
-
-    monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(spherical_harmonics=compiling))
-    assert cuda.find_problem() is None and locked == [True]
+@pytest.mark.parametrize("architecture", ["sm_75", "sm_90", "sm_120"])
+def test_nvrtc_compiles_kernels(architecture):
+    """Compile for the oldest and newest cards of torch's CUDA; this needs no GPU."""
+    try:
+        driver.load_nvrtc()
+    except OSError:
+        pytest.skip("NVRTC is not installed")
+    assert driver.compile_kernels(architecture)[:4] == b"\x7fELF"
 
 
-@pytest.mark.parametrize("name", ["rasterize_to_pixels", "spherical_harmonics"])
-def test_fake_signatures_match_gsplat(name):
-    gsplat = pytest.importorskip("gsplat", reason="gsplat is not installed")
-    real, fake = (inspect.signature(getattr(module, name)) for module in (gsplat, fake_gsplat))
-    assert [(p.name, p.default) for p in real.parameters.values()] == [
-        (p.name, p.default) for p in fake.parameters.values()
-    ]
+def test_nvcc_compiles_kernels(tmp_path):
+    if not (nvcc := shutil.which("nvcc")):
+        pytest.skip("nvcc is not installed")
+    (tmp_path / "kernels.cu").write_text(kernel_source())
+    command = [nvcc, "-cubin", "-arch=sm_90", "-Xptxas=-v", "-o", "kernels.cubin", "kernels.cu"]
+    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert ended.returncode == 0, ended.stderr
+    used = [int(count) for count in re.findall(r"Used (\d+) registers", ended.stderr)]
+    assert len(used) == kernel_source().count("__global__") and max(used) <= 255
+
+
+def test_errors_of_the_compiler_include_its_log(monkeypatch):
+    try:
+        driver.load_nvrtc()
+    except OSError:
+        pytest.skip("NVRTC is not installed")
+    monkeypatch.setattr(driver, "kernel_source", lambda: "no kernel")
+    with pytest.raises(RuntimeError, match=r"COMPILATION\n.*error"):
+        driver.compile_kernels("sm_90")
+
+
+def test_launches_check_their_arguments(fake_card):
+    with pytest.raises(ValueError, match="contiguous"):
+        driver.kernels().launch("adam", 1, 32, torch.zeros(4, 2).T)
+    driver.kernels().launch("adam", 0, 32)  # nothing to do
+
+
+def test_driver_calls(monkeypatch):
+    """A fake driver gets the module, the kernel, its grid, torch's stream and pointers to the arguments."""
+    calls = []
+
+    class Driver:
+        def __getattr__(self, name):
+            def call(*arguments):
+                calls.append((name, arguments))
+                if name == "cuLaunchKernel":
+                    number = ctypes.cast(arguments[9][1], ctypes.POINTER(ctypes.c_int)).contents.value
+                    return 0 if number == 7 else 1
+                if name == "cuGetErrorString":
+                    ctypes.cast(arguments[1], ctypes.POINTER(ctypes.c_char_p))[0] = b"invalid argument"
+                return 0
+
+            return call
+
+    monkeypatch.setattr(ctypes, "CDLL", lambda name: Driver())
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda: (9, 0))
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda: SimpleNamespace(cuda_stream=5))
+    zeros = torch.zeros
+    monkeypatch.setattr(torch, "zeros", lambda *shape, device: zeros(*shape))
+    monkeypatch.setattr(driver, "compile_kernels", lambda architecture: architecture.encode())
+    kernels = driver.Kernels(driver._DeviceModule())
+    kernels.launch("blend", 3, 64, zeros(1), 7)
+    kernels.launch("blend", 3, 64, zeros(1), 7)
+    names = [name for name, _ in calls]
+    assert names[:3] == ["cuCtxGetCurrent", "cuModuleLoadData", "cuModuleGetFunction"]
+    assert names[3:] == ["cuCtxSetCurrent", "cuLaunchKernel", "cuLaunchKernel"]
+    assert calls[1][1][1] == b"sm_90" and calls[2][1][2] == b"blend"
+    grid, stream = calls[4][1][1:8], calls[4][1][8]
+    assert grid == (3, 1, 1, 64, 1, 1, 0) and stream.value == 5
+    with pytest.raises(RuntimeError, match="cuLaunchKernel: invalid argument"):
+        kernels.launch("blend", 3, 64, zeros(1), 8)
 
 
 def test_warm_up_makes_one_step(fake_card, monkeypatch):
@@ -318,7 +310,7 @@ def test_warm_up_makes_one_step(fake_card, monkeypatch):
 
 
 def test_empty_view_renders_background(device, make_splats):
-    """Without visible splats, gsplat is not called and gradients are zero."""
+    """Without visible splats, gradients are zero."""
     import numpy as np
 
     camera = Camera("away", 20, 10, 10.0, 10.0, 5.0, 5.0, np.diag([-1.0, 1.0, -1.0, 1.0]))

@@ -263,13 +263,15 @@ def test_summary_names_training_device_and_faster_ones(set_adapters, set_times, 
     assert Devices.detect().summary.endswith("but none was detected.")
     set_adapters(CARD)
     devices = Devices("NVIDIA GeForce RTX 4070 Laptop GPU", [CARD], CARD, "")
-    monkeypatch.setattr("training.rasterize.devices.find_spec", lambda name: None)
-    assert devices.summary.endswith(
-        "NVIDIA GeForce RTX 4070 Laptop GPU may be faster with CUDA: install gsplat."
-    )
+    problem = LodgsError("Cannot use the cuda backend: NVRTC is not installed.", "Install torch.")
+    monkeypatch.setattr("training.rasterize.cuda.find_problem", lambda: problem)
+    assert devices.summary.endswith("NVRTC is not installed. Install torch.")
     assert "Laptop: 6.0 ms (50,000 splats" in devices.summary and "trains on the CPU" in devices.summary
-    monkeypatch.setattr("training.rasterize.devices.find_spec", lambda name: name)
-    assert "trains on NVIDIA GeForce RTX 4070 Laptop GPU if gsplat works" in devices.summary
+    monkeypatch.setattr(trial, "step_times", lambda: {"cpu": 5.0, "cuda": 2.0, "gpu": 3.0})
+    assert devices.summary.startswith(
+        "Automatic trains on NVIDIA GeForce RTX 4070 Laptop GPU (CUDA). A training step takes "
+        "NVIDIA GeForce RTX 4070 Laptop GPU (CUDA): 2.0 ms, "
+    )
 
 
 def test_command_prints_json(set_adapters, set_times, capsys):

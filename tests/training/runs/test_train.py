@@ -262,9 +262,14 @@ def test_cuda_without_a_gpu_is_rejected_and_auto_uses_the_cpu(uninterrupted, tmp
 
 def test_unused_gpu_is_reported(uninterrupted, tmp_path, monkeypatch):
     from training.rasterize import cuda
+    from training.rasterize.cuda import driver
+
+    def fail():
+        raise OSError("NVRTC is not installed")
 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setitem(sys.modules, "gsplat", None)
+    monkeypatch.setattr(cuda, "DEVICE", "cpu")
+    monkeypatch.setattr(driver, "kernels", fail)
     cuda.find_problem.cache_clear()
     try:
         keys = {**uninterrupted["keys"], "out": str(tmp_path / "run")}
@@ -274,7 +279,7 @@ def test_unused_gpu_is_reported(uninterrupted, tmp_path, monkeypatch):
     assert code == 0
     warnings = [event["message"] for event in events if event["event"] == "warning"]
     (warning,) = [message for message in warnings if "GPU is not used" in message]
-    assert "pip install gsplat" in warning
+    assert "NVRTC is not installed. Install torch built for CUDA" in warning
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows cancels with a file")
