@@ -1,4 +1,4 @@
-"""Self-test of a graphics device: compare its results with the reference before its first use."""
+"""Self-tests of graphics devices: compare their results with the reference before their first use."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from ..documents import read_json
 from ..errors import LodgsError
 from ..files import atomic_write, cache_folder
 from ..scenes.cameras import Camera
-from . import gpu, reference
+from . import cuda, gpu, reference
+from .cuda.source import kernel_source
 from .gaussians import Gaussians
 from .gpu.device import Adapter
 from .rendering import KernelCamera, RasterSettings, Target
@@ -37,23 +38,21 @@ REASON_LENGTH = 300
 
 @cache
 def find_failure(adapter: Adapter) -> str:
-    """Return why the default device fails the self-test; empty if it passes.
+    """Return why the default device of the gpu backend fails the self-test; empty if it passes.
 
     The result is stored, so each version of driver and backend is tested once.
 
     Raises:
         LodgsError: the device was lost or is out of memory.
     """
-    with suppress(LodgsError):
-        if isinstance(stored := read_json(cache_folder() / RESULTS).get(result_key(adapter)), str):
-            return stored
-    return run_self_test(adapter)
+    stored = _stored_result(result_key(adapter))
+    return run_self_test(adapter) if stored is None else stored
 
 
 def run_self_test(adapter: Adapter) -> str:
-    """Run the self-test and store its result; see :func:`failure`."""
+    """Run the self-test and store its result; see :func:`find_failure`."""
     try:
-        reason = _compare()
+        reason = _compare(gpu, "cpu", repeatable=True)
     except LodgsError:
         raise
     except Exception as error:  # shader compilers of drivers fail in unpredictable ways
@@ -63,9 +62,36 @@ def run_self_test(adapter: Adapter) -> str:
     return reason
 
 
-def _compare() -> str:
-    """Return the difference between the default device's results and the reference's; empty if acceptable."""
-    first, second = (_results(gpu, torch.float32) for _ in range(2))
+def find_cuda_failure() -> str:
+    """Return why the NVIDIA GPU fails the self-test of the cuda backend; empty if it passes.
+
+    The result is stored per GPU, version of torch, and kernels.
+    """
+    parts = torch.__version__, str(torch.version.cuda), torch.cuda.get_device_name(), kernel_source()
+    key = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:32]
+    stored = _stored_result(key)
+    if stored is None:
+        stored = _compare(cuda, cuda.DEVICE, repeatable=False)
+        store_result(RESULTS, key, stored)
+    return stored
+
+
+def _stored_result(key: str) -> str | None:
+    with suppress(LodgsError):
+        if isinstance(stored := read_json(cache_folder() / RESULTS).get(key), str):
+            return stored
+    return None
+
+
+def _compare(backend: ModuleType, device: str, repeatable: bool) -> str:
+    """Return the difference between a backend's results and the reference's; empty if acceptable.
+
+    Args:
+        device: torch device of the backend's tensors.
+        repeatable: also require equal bits of two runs.
+    """
+    first = _results(backend, torch.float32, device)
+    second = _results(backend, torch.float32, device) if repeatable else first
     for name, truth in _reference_results().items():
         tolerance = IMAGE_TOLERANCE if name == "images" else GRADIENT_TOLERANCE
         error = ((first[name] - truth).norm() / truth.norm()).item()
@@ -81,7 +107,7 @@ def _reference_results() -> dict[str, torch.Tensor]:
     return _results(reference, torch.float64)
 
 
-def _results(backend: ModuleType, kind: torch.dtype) -> dict[str, torch.Tensor]:
+def _results(backend: ModuleType, kind: torch.dtype, device: str = "cpu") -> dict[str, torch.Tensor]:
     """Render random splats and differentiate a loss; return images and gradients by name."""
     random = np.random.default_rng(0)
     count = 200
@@ -96,7 +122,7 @@ def _results(backend: ModuleType, kind: torch.dtype) -> dict[str, torch.Tensor]:
         "features": random.normal(size=(count, 2)),
     }
     leaves = {
-        name: torch.tensor(array, dtype=torch.float32).to(kind).requires_grad_()
+        name: torch.tensor(array, dtype=torch.float32).to(device, kind).requires_grad_()
         for name, array in arrays.items()
     }
     weights, features = leaves["weights"], leaves["features"]
@@ -107,21 +133,22 @@ def _results(backend: ModuleType, kind: torch.dtype) -> dict[str, torch.Tensor]:
         backend.rasterize(splats, weights, features, settings)
         for settings in (view, replace(view, antialias=True, degree=1))
     )
-    target = Target(torch.tensor(random.uniform(0, 1, (*size, 3)), dtype=torch.float32).to(kind))
+    target = Target(torch.tensor(random.uniform(0, 1, (*size, 3)), dtype=torch.float32).to(device, kind))
     loss = backend.photometric_loss(plain.image, target, 0.2) + sharp.image.square().mean()
     (loss + plain.alpha.mean() + (plain.features * sharp.features).mean()).backward()
     images = (plain.image, plain.features, sharp.image, sharp.alpha[..., None])
     results = {"images": torch.cat(images, 2).detach()}
     results |= {f"gradients of {name}": leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
     results["image-plane gradients"] = torch.cat([plain.grad2d, plain.absgrad2d], 1)
-    return {name: tensor.double() for name, tensor in results.items()}
+    return {name: tensor.cpu().double() for name, tensor in results.items()}
 
 
 @cache
 def result_key(adapter: Adapter) -> str:
     """Return a key of a result: a digest of adapter, driver, wgpu and this backend's source."""
     digest = hashlib.sha256("\n".join([*adapter, metadata.version("wgpu")]).encode())
-    for path in sorted((Path(__file__).parent / "gpu").rglob("*.*")):
+    folder = Path(__file__).parent
+    for path in (folder / "source.py", *sorted((folder / "gpu").rglob("*.*"))):
         if path.suffix in (".py", ".wgsl"):
             digest.update(path.read_bytes())
     return digest.hexdigest()[:32]

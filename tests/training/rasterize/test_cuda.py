@@ -177,6 +177,7 @@ def card(monkeypatch, fake_card):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(cuda, "DEVICE", "cpu")
     monkeypatch.setattr(driver, "kernels", cpu_kernels)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "a card")
     cuda.find_problem.cache_clear()
     yield
     cuda.find_problem.cache_clear()
@@ -223,6 +224,26 @@ def test_problems_are_reported_with_remedy(card, monkeypatch, error, message):
     assert resolve_backend("auto") == "cpu"
     with pytest.raises(LodgsError, match=message):
         resolve_backend("cuda")
+
+
+def test_wrong_results_are_reported(card, monkeypatch, tmp_path):
+    """A kernel that does nothing makes gradients wrong. The result is stored per GPU."""
+    launch = driver.Kernels.launch
+
+    def skip(self, name, *arguments):
+        if name != "blend_backward":
+            launch(self, name, *arguments)
+
+    monkeypatch.setattr("training.rasterize.self_test.cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(driver.Kernels, "launch", skip)
+    problem = cuda.find_problem()
+    assert problem and "its gradients of means are" in str(problem)
+    monkeypatch.setattr(driver.Kernels, "launch", launch)
+    cuda.find_problem.cache_clear()
+    assert str(cuda.find_problem()) == str(problem)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "another card")
+    cuda.find_problem.cache_clear()
+    assert cuda.find_problem() is None
 
 
 # -- compilation and launch --------------------------------------------------------------

@@ -7,7 +7,15 @@ import numpy as np
 import pytest
 import torch
 
-from training.rasterize import Adam, Gaussians, Target, make_device_model, photometric_loss, rasterize
+from training.rasterize import (
+    Adam,
+    Gaussians,
+    Target,
+    make_device_model,
+    photometric_loss,
+    rasterize,
+    warm_up,
+)
 from training.rasterize.gpu import device_model, recording
 
 RATES = {
@@ -54,6 +62,16 @@ def torch_step(adam: Adam, stats: dict, camera, target: Target, weights, backend
     adam.step()
     adam.zero_grad()
     return float(loss.detach())
+
+
+def test_warm_up_needs_no_kernels_of_the_cpu(graphics, monkeypatch):
+    """The first step of a training on a card does not wait for Numba."""
+    steps = []
+    original = device_model.GpuModel.step
+    monkeypatch.setattr(device_model.GpuModel, "step", lambda *a, **k: steps.append(1) or original(*a, **k))
+    monkeypatch.setattr("training.rasterize.cpu.adam.update", None)
+    warm_up("gpu")
+    assert steps == [1]
 
 
 def test_steps_use_the_current_camera_of_a_photo(graphics, make_splats, odd_camera, photo):

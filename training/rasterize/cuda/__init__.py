@@ -31,6 +31,8 @@ GROUP = 64
 @cache
 def find_problem() -> LodgsError | None:
     """Return why this backend cannot work, or None. The first call compiles the kernels, for some seconds."""
+    from ..self_test import find_cuda_failure
+
     if not torch.cuda.is_available():
         return LodgsError(
             "Cannot use the cuda backend: torch detects no NVIDIA GPU.",
@@ -39,6 +41,7 @@ def find_problem() -> LodgsError | None:
         )
     try:
         photometric_loss(torch.zeros(1, 1, 3, device=DEVICE), Target(torch.zeros(1, 1, 3)), 0.2).item()
+        reason = find_cuda_failure()
     except OSError as error:
         return LodgsError(
             f"Cannot use the cuda backend: {error}.",
@@ -48,6 +51,10 @@ def find_problem() -> LodgsError | None:
         return LodgsError(
             f"Cannot run the cuda backend's kernels: {str(error).partition(chr(10))[0]}.",
             "Install a newer driver, or choose gpu or cpu.",
+        )
+    if reason:
+        return LodgsError(
+            f"Cannot use the cuda backend: {reason}.", "Install a newer driver, or choose gpu or cpu."
         )
     return None
 
