@@ -19,7 +19,7 @@ from ..training.cli.info import describe
 from ..training.cli.job_options import add_options, job_from_options
 from ..training.cli.methods import describe_method, describe_methods
 from ..training.cli.options import add_setting, parse_size
-from ..training.editing.export import EXPORT_OPTIONS, export_finest_level, run_to_end
+from ..training.editing.export import EXPORT_OPTIONS, export_finest_level
 from ..training.errors import LodgsError, describe_system_error, system_remedy
 from ..training.evaluate.messages import format_duration, summary_lines
 from ..training.runs.folder import RunFolder, find_splats
@@ -257,7 +257,7 @@ def _export(args: argparse.Namespace) -> int:
             if text:
                 _print(text)
     else:
-        run_to_end(export_finest_level(args.bundle, bundle))
+        export_finest_level(args.bundle, bundle)
     _print(f"{args.bundle}: written")
     if origin := describe_origin(bundle.origin):
         _print(origin)

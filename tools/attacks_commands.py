@@ -44,7 +44,6 @@ from training.errors import LodgsError  # noqa: E402
 from training.runs.page.write import VIEWER  # noqa: E402
 from training.splats.gaussians import Splats  # noqa: E402
 from training.splats.ply import read_ply, write_ply  # noqa: E402
-from training.splats.splat_transform import PROGRAM  # noqa: E402
 
 FLOD = (
     "--method", "flod", "--backend", "cpu", "--image-scale", "1", "--test-every", "4", "--set", "levels=2",
@@ -61,14 +60,12 @@ class Command(NamedTuple):
     Attributes:
         arguments: arguments, in which INPUTS and DISK are replaced by folders.
         copied: input that the command changes: it is copied to DISK first.
-        converts: whether the command needs splat-transform.
         timed: names of files whose contents depend on the time; they are only checked for completeness.
         viewer: whether the command needs the viewer of pages.
     """
 
     arguments: tuple[str, ...]
     copied: str = ""
-    converts: bool = False
     timed: tuple[str, ...] = ()
     viewer: bool = False
 
@@ -78,7 +75,7 @@ COMMANDS = {
     "edit folder": Command(("edit", "INPUTS/run", "--folder", "DISK/levels")),
     "edit ply": Command(("edit", *PLAIN, "DISK/plain.ply")),
     "edit splat": Command(("edit", *PLAIN, "DISK/plain.splat")),
-    "edit compressed.ply": Command(("edit", *PLAIN, "DISK/plain.compressed.ply"), converts=True),
+    "edit compressed.ply": Command(("edit", *PLAIN, "DISK/plain.compressed.ply")),
     "edit spz": Command(("edit", *PLAIN, "DISK/plain.spz")),
     "edit sog": Command(("edit", *PLAIN, "DISK/plain.sog")),
     "edit streamed": Command(("edit", "INPUTS/run", "--streamed", "DISK/streamed")),
@@ -385,9 +382,6 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="lodgs-attacks-") as folder:
         attack = Attack(Path(folder), random.Random(options.seed))
         for name in options.only:
-            if COMMANDS[name].converts and not shutil.which(PROGRAM):
-                print(f"Skipping {name}: {PROGRAM} is not installed.")
-                continue
             if COMMANDS[name].viewer and not VIEWER.is_dir():
                 print(f"Skipping {name}: the viewer is not installed (tools/viewer.py).")
                 continue

@@ -21,6 +21,7 @@ sys.path.insert(0, str(ROOT))
 
 from training.evaluate.level_errors import measure_level_errors  # noqa: E402
 from training.splats.bundle import read_bundle, write_bundle  # noqa: E402
+from training.splats.compressed_ply import read_compressed_ply, write_compressed_ply  # noqa: E402
 from training.splats.gaussians import Splats  # noqa: E402
 from training.splats.level_folder import write_folder  # noqa: E402
 from training.splats.levels import Bundle, Level  # noqa: E402
@@ -139,6 +140,11 @@ def checks(bundle: Bundle):
         yield f"their SPZ {version}: values that both read", "equal", read_by_both(path, True)
     write_sog(FOLDER / "ours.sog", finest, {})
     yield "SOG: values that both read", "equal", read_by_both(FOLDER / "ours.sog", False)
+    write_compressed_ply(FOLDER / "ours.compressed.ply", finest, {})
+    splat_transform("-w", str(FOLDER / "plain.ply"), str(FOLDER / "theirs.compressed.ply"))
+    for owner in ("ours", "theirs"):
+        both = read_by_both(FOLDER / f"{owner}.compressed.ply", False)
+        yield f"compressed PLY, {owner}: values", "equal", both
 
     folder = FOLDER / "folder"
     shutil.rmtree(folder, ignore_errors=True)
@@ -180,7 +186,9 @@ def read_by_both(path: Path, turns: bool) -> str:
     result = splat_transform("-w", str(path), str(plain))
     if result.returncode or not plain.exists():
         return failure(result)
-    theirs, (ours, _) = read_ply(plain), (read_spz if path.suffix == ".spz" else read_sog)(path)
+    readers = {".spz": read_spz, ".sog": read_sog, ".ply": read_compressed_ply}
+    theirs, (rows, _) = read_ply(plain), readers[path.suffix](path)
+    ours = rows.select(slice(None))
     if turns:
         ours = turned(ours)
     ours.quats, theirs.quats = (unit_quats(splats.quats) for splats in (ours, theirs))

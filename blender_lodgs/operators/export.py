@@ -92,13 +92,13 @@ class _FileExport(_ExportOperator, ExportHelper):
 
 
 class _ConvertingExport(BackgroundOperator):
-    """Base class of exports that may run splat-transform."""
+    """Base class of exports that may run the trainer."""
 
     written = ""
     progress = ""
 
     def follow(self, messages: Iterable[str]) -> Iterator[None]:
-        """Run the converter step by step and keep its last message for the status bar."""
+        """Run the trainer step by step and keep its last message."""
         for message in messages:
             self.progress = message
             yield
@@ -107,7 +107,7 @@ class _ConvertingExport(BackgroundOperator):
         return self.written
 
     def status_text(self, context, count):
-        return f"splat-transform: {self.progress}, Esc to stop"
+        return "Exporting, Esc to stop"
 
 
 class LODGS_OT_export_bundle(_FileExport, bpy.types.Operator):
@@ -278,7 +278,7 @@ class LODGS_OT_export_plain(_FormatExport, bpy.types.Operator):
         if find_format(path).in_trainer:
             yield from self.follow(convert_steps(bundle, "--plain", path, flags))
         else:
-            yield from self.follow(export_finest_level(path, bundle, **flags))
+            export_finest_level(path, bundle, **flags)
         origin = "" if self.original_place else _origin_text(bundle)
         self.written = f"{len(splats):,} splats written to {path}{origin}"
 

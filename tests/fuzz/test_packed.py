@@ -8,7 +8,10 @@ from hypothesis import strategies as st
 
 from tests.fuzz.entry_points import attempt
 from tests.fuzz.mutations import corrupted
+from tests.training.splats.test_compressed_ply import GOOD as COMPRESSED_PLY
+from tests.training.splats.test_formats import random_splats
 from tests.training.splats.test_packed_files import GOOD
+from training.splats.compressed_ply import read_compressed_ply, write_compressed_ply
 from training.splats.formats.splat import SplatFile
 from training.splats.packed_files import check_packed_file
 
@@ -25,6 +28,20 @@ def test_corrupt_packed_files(folder, data, name):
     (folder / name).write_bytes(content)
     suffix = name[name.index(".") :]
     attempt(f"packed {suffix}", lambda: check_packed_file(folder / name), (name, content))
+
+
+@pytest.fixture(scope="module")
+def compressed_ply(folder):
+    write_compressed_ply(folder / "good.compressed.ply", random_splats(300, 1), {})
+    return (folder / "good.compressed.ply").read_bytes()
+
+
+@pytest.mark.cases(short=120, weight=1)
+@given(data=st.data())
+def test_corrupt_compressed_ply_files(folder, compressed_ply, data):
+    content = data.draw(corrupted([compressed_ply, COMPRESSED_PLY]))
+    (folder / "a.ply").write_bytes(content)
+    attempt("compressed PLY", lambda: read_compressed_ply(folder / "a.ply")[0].select(slice(None)), content)
 
 
 @pytest.mark.cases(short=60, weight=1)

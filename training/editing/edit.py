@@ -20,11 +20,10 @@ from ..splats.origin import describe_origin
 from ..splats.ply import write_ply
 from ..splats.similarity import Similarity
 from ..splats.sog import load_packages
-from ..splats.splat_transform import find_splat_transform
 from ..splats.streamed_levels import MeasureLeaf, write_streamed_levels
 from .bake_filter import bake_filter
 from .cleaning import Cleaning, clean_bundle
-from .export import export_finest_level, export_levels, export_tiles, run_to_end
+from .export import export_finest_level, export_levels, export_tiles
 from .look import Looks, apply_looks_to_levels
 from .placement import transform_bundle, upright_placement
 
@@ -83,7 +82,7 @@ def edit(
     if out is not None:
         _write_like(source, bundle, out, edited)
     for path in plain:
-        run_to_end(export_finest_level(path, edited, antialiased, original_place))
+        export_finest_level(path, edited, antialiased, original_place)
     notes = [note for path in levels for note in export_levels(path, edited, antialiased, original_place)]
     notes += [] if tiles is None else export_tiles(tiles, edited, antialiased)
     _export_levels(edited, folder, streamed, antialiased, measure)
@@ -126,8 +125,6 @@ def _check_outputs(
             kind.require()
     if streamed is not None:
         load_packages()
-    if any(kind.uses_splat_transform for kind in kinds):
-        find_splat_transform()
 
 
 def _export_levels(

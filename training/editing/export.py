@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -83,16 +82,13 @@ COMPRESSION_SETTINGS = settings_of(Compression)
 
 def export_finest_level(
     path: Path, bundle: Bundle, antialiased: bool = False, original_place: bool = False
-) -> Iterator[str]:
+) -> None:
     """Write the finest level of a bundle in the format of the file name.
 
     Args:
         antialiased: keep opacities as trained; otherwise bake the filter into them
             (:func:`.bake_filter.bake_filter`), except in formats that record the filter.
         original_place: add the local origin, see :class:`ExportOptions`.
-
-    Yields:
-        Progress messages, as :func:`..splats.formats.write_splats`.
 
     Raises:
         LodgsError: see :func:`..splats.formats.write_splats`, or the format has no double precision.
@@ -116,7 +112,7 @@ def export_finest_level(
         meta = {name: value for name, value in bundle.meta.items() if name != "origin"}
         write_ply(path, rows, comments_from_meta(meta), origin)
         return
-    yield from write_splats(path, rows, bundle.meta)
+    write_splats(path, rows, bundle.meta)
 
 
 def export_levels(
@@ -153,9 +149,3 @@ def export_tiles(folder: Path, bundle: Bundle, antialiased: bool = False) -> lis
     levels, notes = portable_levels(bundle if antialiased else bake_filter(bundle))
     write_tiles(folder, levels)
     return notes
-
-
-def run_to_end(steps: Iterator[str]) -> None:
-    """Exhaust an iterator of progress messages."""
-    for _ in steps:
-        pass

@@ -193,7 +193,7 @@ def _find_refusal(columns: set[str], comments: Iterable[str], path: Path) -> tup
     if "packed_position" in columns:
         return (
             "it is a compressed PLY of SuperSplat",
-            f"Unpack it: splat-transform {path.name} unpacked.ply",
+            f"Unpack it: lodgs edit {path.name} --out unpacked.ply",
         )
     if any(name.startswith("f_anchor_feat_") for name in columns):
         return (

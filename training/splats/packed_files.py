@@ -14,7 +14,6 @@ from typing import IO
 
 from ..documents import open_file, parse_json
 from ..errors import LodgsError
-from .ply import read_elements
 
 _KSPLAT_HEADER = 4096
 _KSPLAT_SPLAT = 24
@@ -31,8 +30,6 @@ def check_packed_file(path: Path) -> None:
         LodgsError: the file cannot be read, is damaged, or unpacks to more than its splats need.
     """
     name = path.name.lower()
-    if name.endswith(".ply"):
-        read_elements(path, splats=False)
     check = next((check for suffix, check in _CHECKS.items() if name.endswith(suffix)), None)
     if check is None:
         return

@@ -25,6 +25,7 @@ from .coding import MAX_LOGIT
 from .gaussians import SplatRows, Splats
 from .morton import spatial_order
 from .packed_files import MAX_PALETTE_PIXELS, webp_size
+from .quats import join_quats, split_quats
 from .sh import coefficient_count, degree_from_count
 from .splat_format import NeedsSplatTransform
 
@@ -44,8 +45,6 @@ _ROW = 64
 """Sets of coefficients in a row of their image."""
 _LARGEST = 252
 """Alpha of a rotation whose largest component is w; 253 to 255 for x, y and z."""
-_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
-"""Stored components of a rotation by its largest one."""
 
 
 def load_packages() -> SimpleNamespace:
@@ -126,7 +125,9 @@ def encode_sog(splats: Splats) -> dict[str, bytes]:
 
     table, scales = _codebook(splats.log_scales.clip(_MIN_LOG_SCALE))
     meta["scales"] = {"codebook": table.tolist(), "files": [add("scales.webp", *scales.T)]}
-    meta["quats"] = {"files": [add("quats.webp", *_encode_quats(splats.quats).T)]}
+    largest, smaller = split_quats(splats.quats)
+    channels = *np.rint(255 * smaller).T, _LARGEST + largest
+    meta["quats"] = {"files": [add("quats.webp", *channels)]}
     table, colors = _codebook(splats.sh[:, 0])
     opacities = 255 / (1 + np.exp(-splats.opacity_logits.clip(-MAX_LOGIT, MAX_LOGIT).astype(np.float64)))
     meta["sh0"] = {
@@ -213,11 +214,13 @@ def decode_sog(read: Callable[[str], bytes]) -> Splats:
         labels = pixels("shN", 1).astype(np.int64)
         sh = np.concatenate([sh, sets[labels[:, 0] + 256 * labels[:, 1]]], axis=1)
         degree_from_count(sh.shape[1])
+    rotations = pixels("quats")
+    quats = join_quats((rotations[:, 3].astype(np.int64) - _LARGEST).clip(0, 3), rotations[:, :3] / 255.0)
     opacities = (colors[:, 3] / 255).clip(1 / 1024, 1 - 1 / 1024)
     with np.errstate(over="ignore"):  # such splats cannot be drawn, and are dropped later
         means = (np.sign(stretched) * np.expm1(np.abs(stretched))).astype(np.float32)
     return Splats(
-        means, _decode_quats(pixels("quats")), table("scales")[pixels("scales")[:, :3]],
+        means, quats, table("scales")[pixels("scales")[:, :3]],
         np.log(opacities / (1 - opacities)).astype(np.float32), sh,
     )  # fmt: skip
 
@@ -277,25 +280,3 @@ def _cluster(packages: SimpleNamespace, sets: np.ndarray, count: int) -> tuple[n
         warnings.simplefilter("ignore", UserWarning)  # an empty cluster keeps its center
         centers, _ = packages.kmeans2(sets, starts, iter=_ROUNDS, minit="matrix", check_finite=False)
     return centers, packages.vq(sets, centers, check_finite=False)[0]
-
-
-def _encode_quats(quats: np.ndarray) -> np.ndarray:
-    """Return the three smaller components of rotations (N, 4) wxyz and the index of the largest, uint8."""
-    unit = quats / np.maximum(np.linalg.norm(quats.astype(np.float64), axis=1, keepdims=True), 1e-30)
-    largest = np.abs(unit).argmax(axis=1)
-    rows = np.arange(len(unit))
-    unit *= np.where(unit[rows, largest] < 0, -1.0, 1.0)[:, None]
-    smaller = unit[rows[:, None], _OTHERS[largest]]
-    codes = np.rint((smaller / sqrt(2) + 0.5) * 255).clip(0, 255)
-    return np.concatenate([codes, (_LARGEST + largest)[:, None]], axis=1).astype(np.uint8)
-
-
-def _decode_quats(pixels: np.ndarray) -> np.ndarray:
-    """Return the rotations (N, 4) wxyz float32 of pixels (N, 4)."""
-    largest = (pixels[:, 3].astype(np.int64) - _LARGEST).clip(0, 3)
-    smaller = (pixels[:, :3] / 255.0 - 0.5) * sqrt(2)
-    quats = np.empty((len(pixels), 4), np.float32)
-    rows = np.arange(len(pixels))
-    quats[rows[:, None], _OTHERS[largest]] = smaller
-    quats[rows, largest] = np.sqrt((1 - (smaller**2).sum(axis=1)).clip(0))
-    return quats

@@ -27,8 +27,8 @@ class SplatFormat(NamedTuple):
         palette_size: maximum number of coefficient sets, a power of two, if splats share sets of SH
             coefficients; else 0.
         antialiased: True if the format stores that splats need Mip-Splatting's 2D filter.
-        write: function that writes splats with the meta of their bundle; None for splat-transform.
-        read: function that reads splats and meta of a file; None for splat-transform. It may raise
+        write: function that writes splats with the meta of their bundle.
+        read: function that reads splats and meta of a file; None for PLY. It may raise
             :class:`NeedsSplatTransform`.
         write_levels: function that writes all levels for selection by distance; None if the format has none.
             It replaces ``write``.
@@ -61,11 +61,6 @@ class SplatFormat(NamedTuple):
     def reads_in_trainer(self) -> bool:
         """True if only the trainer reads the format."""
         return self.require is not None and self.read_levels is not None
-
-    @property
-    def uses_splat_transform(self) -> bool:
-        """True if splat-transform writes the format."""
-        return self.write is None and self.write_levels is None
 
     def size(self, count: int, degree: int) -> float:
         """Estimate the file size of splats in bytes."""

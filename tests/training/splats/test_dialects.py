@@ -142,7 +142,7 @@ PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 @pytest.mark.parametrize(
     ("columns", "reason", "remedy"),
     [
-        (PACKED, "compressed PLY of SuperSplat", "splat-transform a.ply"),
+        (PACKED, "compressed PLY of SuperSplat", "lodgs edit a.ply"),
         (SCAFFOLD, "anchors of Scaffold-GS or Octree-GS", "Train"),
         (OCTREE, "anchors of Scaffold-GS or Octree-GS", "Train"),
         ([*ANYGS, "f_offset_3", "f_offset_4", "f_offset_5"], "several splats each", "Export"),

@@ -1,12 +1,10 @@
 """Splat files of other programs. Each module of this package declares one format as ``FORMAT``.
 
-LODGS itself reads and writes PLY, ``.splat``, SPZ, glTF and, in the trainer's environment, USD and SOG.
-splat-transform reads and writes the others.
+splat-transform reads ``.ksplat``, and SOG without the packages of the trainer.
 """
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
@@ -15,14 +13,15 @@ from pkgutil import iter_modules
 
 from ...documents import open_file
 from ...errors import LodgsError
-from ...files import atomic_write, temporary_folder
+from ...files import temporary_folder
 from ..dialects import comments_from_meta
 from ..gaussians import SplatRows
 from ..packed_files import check_packed_file
 from ..ply import write_ply
 from ..splat_format import NeedsSplatTransform, SplatFormat
-from ..splat_transform import FiniteRows, find_splat_transform, run_splat_transform, splat_transform_steps
+from ..splat_transform import run_splat_transform
 from ..streamed_levels import STREAMED_FILE, count_lods, read_streamed_levels
+from .compressed_ply import FORMAT as COMPRESSED_PLY
 from .ply import FORMAT as PLY
 
 FORMATS: tuple[SplatFormat, ...] = tuple(
@@ -60,40 +59,18 @@ def find_format(path: Path) -> SplatFormat:
     return max(matches, key=lambda kind: len(kind.suffix))
 
 
-def write_splats(path: Path, splats: SplatRows, meta: dict) -> Iterator[str]:
-    """Write splats in the format of the file name, and yield while splat-transform runs.
-
-    Formats of levels have a function of their own, ``SplatFormat.write_levels``.
-
-    A generator that is closed early leaves no files behind.
+def write_splats(path: Path, splats: SplatRows, meta: dict) -> None:
+    """Write splats in the format of the file name, which is not one of :data:`LEVEL_FORMATS`.
 
     Args:
         meta: meta of the splats' bundle.
 
-    Yields:
-        The program's last line of output.
-
     Raises:
-        LodgsError: the file cannot be written, the format does not support the splats, or splat-transform is
-            missing or fails.
+        LodgsError: the file cannot be written, or the format does not support the splats.
     """
     kind = find_format(path)
-    if kind.write is not None:
-        kind.write(path, splats, meta)
-        return
-    check_degree(kind, splats)
-    find_splat_transform()  # reports a missing program before files are written
-    with temporary_folder() as folder:
-        plain = folder / "splats.ply"
-        converted = folder / f"converted{kind.suffix}"
-        write_ply(plain, FiniteRows(splats), comments_from_meta(meta))
-        yield from splat_transform_steps([str(plain), str(converted)])
-        with (
-            atomic_write(path) as temporary,
-            open(converted, "rb") as source,
-            open(temporary, "wb") as target,
-        ):
-            shutil.copyfileobj(source, target)
+    assert kind.write is not None, "it is a format of levels"
+    kind.write(path, splats, meta)
 
 
 def check_degree(kind: SplatFormat, splats: SplatRows) -> None:
@@ -155,7 +132,10 @@ def open_as_ply(path: Path) -> Iterator[Path]:
 def _read_plain(path: Path, converted: Path) -> bool:
     """Convert a file of one level to a PLY; return False if splat-transform must do so."""
     name = path.name.lower()
-    readers = [kind.read for kind in FORMATS if kind.read and name.endswith(kind.suffix)]
+    kinds = [kind for kind in FORMATS if name.endswith(kind.suffix)]
+    if name.endswith(PLY.suffix):
+        kinds = [COMPRESSED_PLY]
+    readers = [kind.read for kind in kinds if kind.read]
     if not readers:
         return False
     try:
