@@ -343,7 +343,7 @@ class _FolderExport(_ExportOperator):
 
     def draw(self, context):
         self.layout.use_property_split = True
-        for name in ("placed", "looked", "antialiased", "replace"):
+        for name in ("placed", "looked", "antialiased", "lod_errors", "replace"):
             if name in self.bl_rna.properties:
                 self.layout.prop(self, name)
         self.layout.label(text=f"Estimated size: {_size(context, self.kind, -1)}")
@@ -404,9 +404,11 @@ class LODGS_OT_export_streamed(_ForeignExport, _FolderExport, _ConvertingExport,
     bl_label = "Export for Web"
     kind = SOG
 
+    lod_errors: property_of(EXPORT_OPTIONS["lod_errors"])
+
     def work(self, context):
         bundle = scenes.read_levels(roots.active_root(context), self.placed, self.looked)
-        flags = {"antialiased": self.antialiased}
+        flags = {"antialiased": self.antialiased, "lod_errors": self.lod_errors}
         yield from self.follow(convert_steps(bundle, "--streamed", self._folder(), flags))
         self.written = f"{_levels(bundle)} written: {self._folder() / STREAMED_FILE}{_origin_text(bundle)}"
 

@@ -57,11 +57,6 @@ def _add_outputs(parser: argparse.ArgumentParser) -> None:
         "--streamed", type=Path, metavar="DIR", help="folder of levels to write for streaming in browsers"
     )
     parser.add_argument(
-        "--lod-errors", action="store_true",
-        help="measure the errors of streamed levels in rendered images, for viewers that select levels by "
-        "error",
-    )  # fmt: skip
-    parser.add_argument(
         "--tiles", type=Path, metavar="DIR", help="folder of 3D Tiles to write, for Cesium and other globes"
     )
     parser.add_argument(
@@ -69,7 +64,7 @@ def _add_outputs(parser: argparse.ArgumentParser) -> None:
         help="image to write with the splats that the clean-up removes, in one colour for each test; needs "
         "no other output",
     )  # fmt: skip
-    for name in ("antialiased", "original_place"):
+    for name in ("antialiased", "original_place", "lod_errors"):
         add_setting(parser, EXPORT_OPTIONS[name], value=False)
 
 

@@ -46,6 +46,11 @@ class ExportOptions:
         "local origin. PLY, USD and glTF only.",
         label="Original Place",
     )
+    lod_errors: bool = setting(
+        False,
+        "Measure the errors of streamed levels in rendered images, for viewers that select levels by error.",
+        label="Level Errors",
+    )
 
 
 EXPORT_OPTIONS = settings_of(ExportOptions)

@@ -1,5 +1,6 @@
 """Export and import of other file formats by operators."""
 
+import json
 import os
 import shutil
 import subprocess
@@ -64,6 +65,13 @@ def test_streamed_levels_round_trip(bpy, lodgs, root, tmp_path, splat_transform)
         objects = import_levels(bpy, lodgs, path)
         for obj, item in zip(objects, root.lodgs.levels, strict=True):
             np.testing.assert_allclose(means(obj), means(item.object), atol=0.01)
+
+
+@pytest.mark.parametrize("measured", [False, True])
+def test_level_errors_are_written_on_request(bpy, lodgs, root, tmp_path, measured):
+    folder = tmp_path / "web"
+    assert bpy.ops.lodgs.export_streamed(directory=str(folder), lod_errors=measured) == {"FINISHED"}
+    assert json.loads((folder / "lod-meta.json").read_text("utf-8"))["lodErrors"] == measured
 
 
 @pytest.mark.skipif(
