@@ -135,7 +135,6 @@ window: setup
 interop: setup
 	$(VENV) tools/interop.py
 	$(VENV) tools/interop_viewers.py
-	$(VENV) tools/interop_viewers.py --methods
 	$(VENV) tools/shaders.py
 
 attacks: setup

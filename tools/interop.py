@@ -8,6 +8,7 @@ bundle, or five levels of random splats. Exit code 0: all agree; 1: differences;
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -39,6 +40,8 @@ PACKAGE = "@playcanvas/splat-transform"
 VERSION = "3.7.0"
 MIN_NODE = 22
 """Oldest major version of Node.js that splat-transform runs in."""
+NODE_VERSION = "22.23.3"
+"""Version of Node.js that is installed from npm next to an older one."""
 FOLDER = ROOT / "build" / "interop"
 
 
@@ -61,9 +64,21 @@ def main() -> int:
 
 
 def node_problem() -> str:
-    """Return a sentence if Node.js or npm is missing or too old for the programs from npm, else ""."""
+    """Return a sentence if Node.js or npm is missing or too old for the programs from npm, else "".
+
+    A newer Node.js is installed from npm into build/interop, and put first in PATH, if this one is too old.
+    """
     if not shutil.which("node") or not shutil.which("npm"):
         return "Node.js or npm is not installed."
+    if (problem := _version_problem()) and install("node", NODE_VERSION):
+        own = FOLDER / "node_modules" / "node" / "bin"
+        os.environ["PATH"] = f"{own}{os.pathsep}{os.environ['PATH']}"
+        problem = _version_problem()
+    return problem
+
+
+def _version_problem() -> str:
+    """Return a sentence if Node.js is too old, else ""."""
     version = subprocess.run(
         ["node", "--version"], capture_output=True, text=True, check=False
     ).stdout.strip()

@@ -1,15 +1,17 @@
 """Check that web viewers draw our files as we do. Part of ``make interop``.
 
-Writes the splats of bundles with views in each format, draws the first view with each viewer in Chromium,
-without a window and without a graphics card, and compares the image with our own.
-``python tools/interop_viewers.py BUNDLE.ply ...`` uses given bundles, or else that of ``make demo``;
-``--methods`` trains each method briefly instead, and draws each format once. Exit code 0: all images agree;
-1: some do not; 2: nothing was checked.
+Trains each method briefly, writes its splats in each format, draws the first view with each viewer in
+Chromium, without a window and without a graphics card, and compares the image with our own. The splats of
+FLoD are drawn by each viewer in each of its formats, and those of other methods once in each format. Viewers
+that stream walk towards the splats of FLoD (``interop_walk.py``).
+``python tools/interop_viewers.py BUNDLE.ply ...`` checks given bundles as those of FLoD.
+Exit code 0: all checks pass; 1: some do not; 2: nothing was checked.
 """
 
 from __future__ import annotations
 
 import argparse
+import base64
 import http.server
 import io
 import json
@@ -20,7 +22,7 @@ import sys
 import tempfile
 import threading
 import urllib.parse
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -32,6 +34,8 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from tools import interop  # noqa: E402
+from tools.interop_cut import draw_with_cut  # noqa: E402
+from tools.interop_walk import WALKS, Walk  # noqa: E402
 from training.api import load_bundle, render_image, train  # noqa: E402
 from training.editing.cleaning import Cleaning  # noqa: E402
 from training.editing.edit import edit  # noqa: E402
@@ -46,7 +50,6 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 PAGE = Path(__file__).with_suffix(".html")
 WIDTH = 320
 SECONDS = 240
-DEMO = ROOT / "build" / "demo" / "bundle.ply"
 SHORT = {"max_splats": 6000}
 METHODS = {
     "flod": SHORT
@@ -57,13 +60,16 @@ METHODS = {
     "tree": SHORT | {"steps": 160, "tune_steps": 40},
 }
 """Parameters of short trainings."""
+COMPLETE = "flod"
+"""Method whose splats are drawn by each viewer in each format."""
 METHOD_CHECKS = {
+    "three": ("glb",),
     "cesium": ("tiles",),
     "babylon": ("glb",),
     "spark": ("ply", "splat", "spz"),
     "playcanvas": ("sog", "streamed"),
 }
-"""Viewers and formats of short trainings: each format once."""
+"""Viewers and formats of the other methods."""
 SCENE = ROOT / "examples" / "lantern_garden"
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 """From the axes of OpenCV's cameras to those of OpenGL's, and from those of 3DGS files to those of SPZ."""
@@ -113,24 +119,18 @@ class Viewer:
         packages: packages from npm and their versions.
         formats: names in FORMATS.
         filtered: formats that it draws with a filter like Mip-Splatting's.
-        min_psnr: minimum likeness in dB instead of that of the format, for a viewer that draws less exactly.
+        cuts: it cuts splats as :func:`.interop_cut.draw_with_cut` does.
     """
 
     label: str
     packages: Mapping[str, str]
     formats: tuple[str, ...]
     filtered: tuple[str, ...] = ()
-    min_psnr: float = math.inf
-
-    def minimum(self, kind: str) -> float:
-        """Return the minimum likeness of a format in dB."""
-        return min(self.min_psnr, FORMATS[kind].min_psnr)
+    cuts: bool = False
 
 
 VIEWERS = {
-    "three": Viewer(  # cuts splats at two standard deviations
-        "three.js", {"three": "0.187.0"}, ("glb",), filtered=("glb",), min_psnr=27.0
-    ),
+    "three": Viewer("three.js", {"three": "0.187.0"}, ("glb",), filtered=("glb",), cuts=True),
     "cesium": Viewer("CesiumJS", {"cesium": "1.145.0"}, ("tiles",)),
     "babylon": Viewer(
         "Babylon.js",
@@ -149,34 +149,36 @@ def main() -> int:
     options = parse_arguments()
     browser = next(filter(None, map(shutil.which, BROWSERS)), None)
     problem = interop.node_problem() or ("" if browser else "Chromium is not installed.")
-    sources = options.bundles or ([] if options.methods else [DEMO])
-    missing = [str(path) for path in sources if not path.exists()]
-    problem = problem or (f"{missing[0]} does not exist; run make demo." if missing else "")
+    missing = [str(path) for path in options.bundles if not path.exists()]
+    problem = problem or (f"{missing[0]} does not exist." if missing else "")
     if problem:
         print(f"interop: {problem} Viewers are not checked.")
         return 2
-    sources += [train_method(method) for method in METHODS] if options.methods else []
+    sources: Sequence[Path] = options.bundles or [train_method(method) for method in METHODS]
     failed = False
     print(f"{'bundle':<8}  {'viewer':<18}  {'format':<8}  {'dB':>5}  at least")
     for source in sources:
+        complete = source in options.bundles or source.parent.name == COMPLETE
         with tempfile.TemporaryDirectory() as folder:
             scene = Scene(source, Path(folder))
             for key in options.viewers:
-                if not all(interop.install(*package) for package in VIEWERS[key].packages.items()):
+                viewer = VIEWERS[key]
+                if not all(interop.install(*package) for package in viewer.packages.items()):
                     return 2
-                kinds = METHOD_CHECKS.get(key, ()) if options.methods else VIEWERS[key].formats
-                for kind in kinds:
+                for kind in viewer.formats if complete else METHOD_CHECKS.get(key, ()):
                     if not options.formats or kind in options.formats:
                         failed |= not check(str(browser), key, kind, scene, options.images)
+            for key, kind in WALKS.items() if complete else ():
+                if not options.formats or kind in options.formats:
+                    failed |= not check_walk(str(browser), key, scene, options.images)
     return int(failed)
 
 
 def parse_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("bundles", nargs="*", type=Path, metavar="BUNDLE.ply")
-    parser.add_argument("--methods", action="store_true", help="train each method briefly")
-    parser.add_argument("--viewers", nargs="+", choices=list(VIEWERS), default=list(VIEWERS))
-    parser.add_argument("--formats", nargs="+", choices=list(FORMATS), default=[])
+    parser.add_argument("--viewers", nargs="*", choices=list(VIEWERS), default=list(VIEWERS))
+    parser.add_argument("--formats", nargs="+", choices=[*FORMATS, *WALKS.values()], default=[])
     parser.add_argument("--images", type=Path, metavar="DIR", help="folder for the images of both")
     return parser.parse_args()
 
@@ -206,23 +208,29 @@ class Scene:
         edit(self.source, None, Cleaning(), antialiased=antialiased, **{kind.option: value})
         return path
 
-    def image(self, kind: str, filters: bool) -> np.ndarray:
+    def image(self, kind: str, filters: bool, cuts: bool) -> np.ndarray:
         """Return our image (H, W, 3) of a format's finest splats, as a viewer should draw them."""
-        return self._image(FORMATS[kind].trained or filters, filters, FORMATS[kind].flat)
+        return self._image(FORMATS[kind].trained or filters, filters, FORMATS[kind].flat, cuts)
 
-    def _image_once(self, trained: bool, filters: bool, flat: bool) -> np.ndarray:
+    def _image_once(self, trained: bool, filters: bool, flat: bool, cuts: bool) -> np.ndarray:
         splats = read_ply(self._write(FORMATS["ply"], trained))
+        if cuts:
+            return draw_with_cut(splats, self.camera, self.near).clip(0, 1)
         if flat:
             splats.sh = splats.sh[:, :1]
         bundle = Bundle("", [Level(1, splats)], meta={"antialias": filters and self.bundle.antialias})
         return render_image(bundle, self.camera, near=self.near, backend="cpu").clip(0, 1)
 
-    def pose(self, axes: str) -> np.ndarray:
-        """Return the camera's transform (4, 4) to the world of a format, OpenGL axes."""
+    def pose(self, axes: str, camera: Camera | None = None) -> np.ndarray:
+        """Return the transform (4, 4) of a camera to the world of a format, OpenGL axes.
+
+        Args:
+            camera: None for that of the first view.
+        """
         upright = np.eye(4)
         upright[:3, :3] = self.bundle.up_rotation
         world = {"3dgs": np.eye(4), "spz": FLIP, "z": upright, "y": Y_UP @ upright}[axes]
-        return world @ np.linalg.inv(self.camera.world_to_camera) @ FLIP
+        return world @ np.linalg.inv((camera or self.camera).world_to_camera) @ FLIP
 
 
 def check(browser: str, key: str, kind: str, scene: Scene, images: Path | None) -> bool:
@@ -231,7 +239,8 @@ def check(browser: str, key: str, kind: str, scene: Scene, images: Path | None) 
     Args:
         images: folder for both images, or None.
     """
-    viewer, expected = VIEWERS[key], scene.image(kind, kind in VIEWERS[key].filtered)
+    viewer = VIEWERS[key]
+    expected, minimum = scene.image(kind, kind in viewer.filtered, viewer.cuts), FORMATS[kind].min_psnr
     answer = view(browser, key, kind, scene)
     if isinstance(answer, str):  # Babylon.js sometimes fails to load levels of glTF
         answer = view(browser, key, kind, scene)
@@ -241,26 +250,76 @@ def check(browser: str, key: str, kind: str, scene: Scene, images: Path | None) 
     name, version = scene.source.parent.name, next(iter(viewer.packages.values()))
     problem = f"  {answer}" if isinstance(answer, str) else ""
     row = f"{name:<8}  {viewer.label + ' ' + version:<18}  {kind:<8}  {likeness:5.1f}"
-    print(f"{row}  {viewer.minimum(kind):g}{problem}", flush=True)
-    if images is not None and not isinstance(answer, str):
-        images.mkdir(parents=True, exist_ok=True)
-        both = np.rint(255 * np.concatenate([answer, expected], axis=1)).astype(np.uint8)
-        Image.fromarray(both).save(images / f"{name}-{key}-{kind}.png")
-    return likeness >= viewer.minimum(kind)
+    print(f"{row}  {minimum:g}{problem}", flush=True)
+    if not isinstance(answer, str):
+        save(images, f"{name}-{key}-{kind}.png", [answer, expected])
+    return likeness >= minimum
 
 
 def view(browser: str, key: str, kind: str, scene: Scene) -> np.ndarray | str:
     """Return a viewer's image (H, W, 3) of a format, or an error message."""
-    viewer, camera, main = VIEWERS[key], scene.camera, FORMATS[kind].main
+    viewer, main = VIEWERS[key], FORMATS[kind].main
     path = scene.file(kind, kind in viewer.filtered)
     job = {
         "viewer": key, "file": f"/files/{path.name}{'/' + main if main else ''}",
-        "pose": scene.pose(FORMATS[kind].axes).T.ravel().tolist(), "size": [camera.width, camera.height],
-        "angle": 2 * math.atan(camera.height / 2 / camera.fy),
+        "pose": scene.pose(FORMATS[kind].axes).T.ravel().tolist(),
     }  # fmt: skip
-    packages = {f"/{name}": interop.FOLDER / "node_modules" / name for name in viewer.packages}
-    query = urllib.parse.quote(json.dumps(job))
-    return draw(browser, PAGE, {"/files": scene.folder, **packages}, query)
+    answer = send(browser, job, scene.camera, scene.folder)
+    return answer if isinstance(answer, str) else decode_image(answer)
+
+
+def check_walk(browser: str, key: str, scene: Scene, images: Path | None) -> bool:
+    """Walk towards a scene in a viewer, print splats and holes of each step, and return whether it passes.
+
+    Args:
+        images: folder for the images of the steps, or None.
+    """
+    walk = Walk(scene.bundle, scene.camera, scene.near, key, scene.folder / f"walk-{key}")
+    poses = [scene.pose(walk.axes, camera).T.ravel().tolist() for camera in walk.cameras]
+    job = {"viewer": key, **walk.write(poses)}
+    answer = send(browser, job, walk.cameras[0], walk.folder)
+    name = f"{scene.source.parent.name:<8}  {key + ' walk':<18}  {WALKS[key]:<8}"
+    if isinstance(answer, str):
+        print(f"{name}  {answer}", flush=True)
+        return False
+    steps = json.loads(answer)
+    problem = walk.judge(steps)
+    for distance, step in zip(walk.distances, steps, strict=True):
+        row = f"{name}  {distance:5.1f} away: {step['splats']:6,} splats, largest hole {step['hole']:.2%}"
+        print(f"{row} of {step['frames']} frames", flush=True)
+    print(f"{name}  at most {walk.budget:,} splats: {problem or 'no hole, budget kept'}", flush=True)
+    pictures = [decode_image(base64.b64decode(step["image"].partition(",")[2])) for step in steps]
+    save(images, f"{scene.source.parent.name}-{key}-walk.png", pictures)
+    return not problem
+
+
+def send(browser: str, job: Mapping[str, object], camera: Camera, folder: Path) -> bytes | str:
+    """Return a viewer's answer to a job, or an error message.
+
+    Args:
+        job: values for the page, without those of the camera.
+        camera: size and angle of the images.
+        folder: folder with the files of the job.
+    """
+    angle = 2 * math.atan(camera.height / 2 / camera.fy)
+    query = json.dumps({**job, "size": [camera.width, camera.height], "angle": angle})
+    viewer = VIEWERS.get(str(job["viewer"]))
+    packages = viewer.packages if viewer else ()
+    modules = {f"/{name}": interop.FOLDER / "node_modules" / name for name in packages}
+    return ask(browser, PAGE, {"/files": folder, **modules}, urllib.parse.quote(query))
+
+
+def save(images: Path | None, name: str, pictures: Sequence[np.ndarray]) -> None:
+    """Save images (H, W, 3) side by side in a folder, if there is one."""
+    if images is not None:
+        images.mkdir(parents=True, exist_ok=True)
+        both = np.rint(255 * np.concatenate(pictures, axis=1)).astype(np.uint8)
+        Image.fromarray(both).save(images / name)
+
+
+def decode_image(data: bytes) -> np.ndarray:
+    """Return the image (H, W, 3) float32 of a PNG."""
+    return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"), np.float32) / 255
 
 
 def psnr(image: np.ndarray, expected: np.ndarray) -> float:
@@ -276,12 +335,12 @@ def train_method(method: str) -> Path:
     return train(SCENE, folder, method=method, parameters=parameters, **scene).bundle
 
 
-def draw(browser: str, page: Path, mounts: Mapping[str, Path], query: str) -> np.ndarray | str:
-    """Return the image (H, W, 3) that a page sends, or an error message.
+def ask(browser: str, page: Path, mounts: Mapping[str, Path], query: str) -> bytes | str:
+    """Return the answer that a page sends, or an error message.
 
     Args:
         browser: path of Chromium.
-        page: the page; it sends its image to /image, or an error message to /error.
+        page: the page; it sends an answer, or an error message to /error.
         mounts: files and folders that the page loads, by the begin of their path on the server.
         query: query string of the page's address.
     """
@@ -321,11 +380,9 @@ def draw(browser: str, page: Path, mounts: Mapping[str, Path], query: str) -> np
         Path(profile).mkdir(exist_ok=True)
     server.shutdown()
     if not answers:
-        return f"no image within {SECONDS} s"
+        return f"no answer within {SECONDS} s"
     path, body = answers[0]
-    if path != "/image":
-        return body.decode("utf-8", "replace")
-    return np.asarray(Image.open(io.BytesIO(body)).convert("RGB"), np.float32) / 255
+    return body.decode("utf-8", "replace") if path == "/error" else body
 
 
 if __name__ == "__main__":

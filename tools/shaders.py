@@ -8,7 +8,6 @@ shaders are translated; 1: errors; 2: nothing was checked.
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -16,7 +15,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from tools.interop import FOLDER, install  # noqa: E402
+from tools.interop import FOLDER, install, node_problem  # noqa: E402
 from training.rasterize.gpu.source import SHADERS, source_of  # noqa: E402
 
 PACKAGE, VERSION = "naga-wasm", "30.1.0"
@@ -58,8 +57,8 @@ def translate() -> dict:
 
 
 def main() -> int:
-    if not shutil.which("node") or not shutil.which("npm"):
-        print("shaders: Node.js is not installed. Install it with npm and repeat.")
+    if problem := node_problem():
+        print(f"shaders: {problem} Install Node.js with npm and repeat.")
         return 2
     if not install(PACKAGE, VERSION):
         print(f"shaders: npm cannot install {PACKAGE} {VERSION}, see above.")
