@@ -8,6 +8,7 @@ store on the card is slightly larger than the drawn set; a new splat replaces th
 from __future__ import annotations
 
 import time
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import inf
@@ -52,6 +53,7 @@ class Resident:
         higher: largest number of SH coefficients beyond the first, of whole degrees up to 4.
         store: splats on the graphics card; None before the first drawing.
         marks: (N,) uint8, see ``cleaning.displayed_marks``; None if no splat is marked.
+        checksums: checksum by cloud number and attribute name; a stream has its ``id`` and an empty name.
         painted: version and paint (N, 4) of each cloud at the last :meth:`update_paint`, by cloud number.
     """
 
@@ -61,6 +63,7 @@ class Resident:
     higher: int
     store: Store | None = None
     marks: np.ndarray | None = None
+    checksums: dict[tuple[int, str], int] = field(default_factory=dict)
     painted: dict[int, tuple[changes.Version, np.ndarray | None]] = field(default_factory=dict)
     _selection: changes.Version | None = None
 
@@ -260,28 +263,37 @@ def higher_count(cloud: Cloud) -> int:
 class PoolReader:
     """Reader of a pool, one attribute of one point cloud at a time, so that no redraw waits for all of them.
 
-    Streamed splats are copied later, by ``Pool.apply_updates``.
+    Checksums come first: an undo makes Blender report unchanged points as changed. If all are unchanged, the
+    reader returns the previous splats. Streamed splats are copied later, by ``Pool.apply_updates``.
+
+    Args:
+        previous: splats that were read before from the same clouds in the same order, if any.
     """
 
-    def __init__(self, clouds: Sequence[Cloud]) -> None:
+    def __init__(self, clouds: Sequence[Cloud], previous: Resident | None = None) -> None:
         counts = [splat_count(cloud) for cloud in clouds]
         starts = [sum(counts[:i]) for i in range(len(counts))]
-        total = sum(counts)
-        means = np.zeros((total, 3), np.float32)
-        areas = np.zeros(total, np.float32)
-        opacities = np.zeros(total, np.float32)
-        columns = {name: np.zeros(total, np.float32) for name in all_rule_columns()}
-        paged = [
-            (start, cloud) for start, cloud in zip(starts, clouds, strict=True) if isinstance(cloud, Stream)
-        ]
-        pool = Pool(means, areas, opacities, columns, paged)
-        self._resident = Resident(pool, starts, counts, max(map(higher_count, clouds), default=0))
-        names = ("position", attributes.SCALE, attributes.BASE, *columns)
-        self._remaining = [
+        higher = max(map(higher_count, clouds), default=0)
+        if previous is not None and (counts, higher) != (previous.counts, previous.higher):
+            previous = None
+        self._previous = previous
+        self._checksums = {(i, ""): id(cloud) for i, cloud in enumerate(clouds) if isinstance(cloud, Stream)}
+        self._layout = starts, counts, higher
+        self._resident: Resident | None = None
+        names = ("position", attributes.SCALE, attributes.BASE, *all_rule_columns())
+        self._attributes = [
             (number, name)
             for number, cloud in enumerate(clouds)
             for name in names
             if counts[number] and not isinstance(cloud, Stream)
+        ]
+        self._unchecked = [
+            *self._attributes,
+            *(
+                (number, name)
+                for number in dict(self._attributes)
+                for name in (attributes.ROTATION, attributes.WEIGHT, *attributes.sh_names(clouds[number]))
+            ),
         ]
 
     def advance(self, clouds: Sequence[Cloud], until: float = inf) -> Resident | None:
@@ -293,14 +305,43 @@ class PoolReader:
         Returns:
             None if attributes remain.
         """
+        while self._unchecked:
+            number, name = self._unchecked.pop(0)
+            self._checksums[number, name] = _checksum(clouds[number], name)
+            if self._unchecked and time.monotonic() >= until:
+                return None
+        if self._previous is not None and self._checksums == self._previous.checksums:
+            return self._previous
+        if self._resident is None:
+            self._resident = self._allocate(clouds)
         pool, starts, counts = self._resident.pool, self._resident.starts, self._resident.counts
-        while self._remaining:
-            number, name = self._remaining.pop(0)
+        while self._attributes:
+            number, name = self._attributes.pop(0)
             rows = slice(starts[number], starts[number] + counts[number])
             _read_attribute(pool, rows, clouds[number], name)
-            if self._remaining and time.monotonic() >= until:
+            if self._attributes and time.monotonic() >= until:
                 return None
         return self._resident
+
+    def _allocate(self, clouds: Sequence[Cloud]) -> Resident:
+        """Return splats without values."""
+        starts, counts, higher = self._layout
+        total = sum(counts)
+        means = np.zeros((total, 3), np.float32)
+        areas = np.zeros(total, np.float32)
+        opacities = np.zeros(total, np.float32)
+        columns = {name: np.zeros(total, np.float32) for name in all_rule_columns()}
+        paged = [
+            (start, cloud) for start, cloud in zip(starts, clouds, strict=True) if isinstance(cloud, Stream)
+        ]
+        pool = Pool(means, areas, opacities, columns, paged)
+        return Resident(pool, starts, counts, higher, checksums=self._checksums)
+
+
+def _checksum(cloud: bpy.types.PointCloud, name: str) -> int:
+    """Return the checksum of a cloud's attribute; -1 if it is missing."""
+    values = attributes.view_attribute(cloud, name)
+    return -1 if values is None else zlib.crc32(values)
 
 
 def _read_attribute(pool: Pool, rows: slice, cloud: bpy.types.PointCloud, name: str) -> None:

@@ -332,17 +332,18 @@ def _read(
         hidden = {key: all_clouds[key] for key in _versions if key in all_clouds and key not in clouds}
         versions |= {key: changes.version(cloud) for key, cloud in hidden.items()}
         clouds |= hidden
+        clouds = {key: clouds[key] for key in _versions | clouds if key in clouds}
         pool_versions = {key: versions[key] for key in clouds}
         cloud_list = list(clouds.values())
         reader_key = pool_versions, list(pool_versions), list(map(resident.splat_count, cloud_list))
         if _reader is None or _reader[0] != reader_key:
-            _reader = reader_key, PoolReader(cloud_list)
+            _reader = reader_key, PoolReader(cloud_list, _resident if [*_versions] == [*clouds] else None)
         start = time.monotonic()
         pool = _reader[1].advance(cloud_list, inf if wait else start + view_state.LOADING[1])
         if pool is None:
             return None
+        reads += pool is not _resident
         _resident, _versions, _reader = pool, pool_versions, None
-        reads += 1
         close_streams({obj.session_uid for obj in bpy.data.objects if obj.lodgs.is_root})
         if not wait and time.monotonic() > start + view_state.LOADING[0]:
             return None

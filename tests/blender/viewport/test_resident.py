@@ -251,6 +251,35 @@ def test_old_image_stays_after_an_undo(bpy, lodgs, draw_from, scene, monkeypatch
     assert all(np.array_equal(image, before) or np.array_equal(image, expected) for image in images)
 
 
+@pytest.mark.parametrize("name", [None, "rotation", "radiance:sh_2"])
+def test_undo_uploads_only_changed_splats(bpy, lodgs, draw_from, scene, monkeypatch, name):
+    """Blender reports all points after an undo. Splats stay on the graphics card if they are the same."""
+    views, resident, changes = lodgs("viewport.views"), lodgs("viewport.resident"), lodgs("data.changes")
+    view, cloud_name = views.ViewState(), scene.lodgs.levels[1].object.data.name
+    expected = draw_from(view, 0.0)
+    bpy.ops.ed.undo_push(message="before")
+    bpy.data.objects.new("Unrelated", None)
+    if name:
+        cloud = bpy.data.pointclouds[cloud_name]
+        key = "value" if name == "rotation" else "vector"
+        values = np.random.default_rng(1).normal(size=COUNT * (4 if name == "rotation" else 3))
+        cloud.attributes[name].data.foreach_set(key, values.astype(np.float32))
+        cloud.update_tag()
+    changed = draw_from(view, 0.0)
+    assert np.array_equal(changed, expected) == (name is None)
+    bpy.ops.ed.undo_push(message="Change")
+    version, reads, uploaded = (
+        changes.version(bpy.data.pointclouds[cloud_name]),
+        views.reads,
+        resident.bytes_uploaded,
+    )
+    assert bpy.ops.ed.undo() == {"FINISHED"}
+    monkeypatch.setattr(lodgs("data.selection"), "store_camera", lambda *arguments: None)  # undone as well
+    np.testing.assert_array_equal(draw_from(view, 0.0), expected)
+    assert changes.version(bpy.data.pointclouds[cloud_name]) != version
+    assert (views.reads > reads) == (resident.bytes_uploaded > uploaded) == (name is not None)
+
+
 def test_splats_can_be_removed_during_loading(bpy, lodgs, draw_from, scene, monkeypatch):
     views, resident = lodgs("viewport.views"), lodgs("viewport.resident")
     monkeypatch.setattr(resident, "UPLOAD_BATCH", 10)
