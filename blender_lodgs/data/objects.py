@@ -94,8 +94,6 @@ def new_splats(name: str, splats: Splats) -> bpy.types.Object:
     write_attribute(cloud, "position", "FLOAT_VECTOR", splats.means)
     write_attribute(cloud, BASE, compat.WIDE_TYPE, base)
     del base  # frees memory before further attributes need it
-    for k in range(1, splats.sh.shape[1]):
-        write_attribute(cloud, sh_name(k), "FLOAT_VECTOR", splats.sh[:, k])
     write_attribute(cloud, SCALE, "FLOAT_VECTOR", _exp(splats.log_scales))
     write_attribute(cloud, ROTATION, "QUATERNION", _unit(splats.quats))
     for column, values in splats.extras.items():
@@ -103,6 +101,10 @@ def new_splats(name: str, splats: Splats) -> bpy.types.Object:
         write_column(cloud, _EXTRA + column if reserved else column, values)
     obj = bpy.data.objects.new(name, cloud)
     complete_attributes(obj, splats)
+    for k in range(
+        1, splats.sh.shape[1]
+    ):  # last: most of the memory, and the other attributes need more of it
+        write_attribute(cloud, sh_name(k), "FLOAT_VECTOR", splats.sh[:, k])
     return obj
 
 

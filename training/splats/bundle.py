@@ -34,6 +34,7 @@ from .ply import (
     extra_columns,
     read_comments,
     read_elements,
+    release_pages,
     splat_columns,
     splats_from_rows,
     write_elements,
@@ -213,6 +214,7 @@ def _plain_meta(rows: np.ndarray, comments: list[str]) -> tuple[dict, np.ndarray
         return meta, NO_ORIGIN
     sample = rows[:: max(1, len(rows) // ORIGIN_SAMPLE)]
     means = np.stack([np.asarray(sample[axis], np.float64) for axis in "xyz"], axis=1)
+    release_pages(rows)
     origin = choose_origin(means, far=FAR_SPLATS)
     return meta | ({"origin": origin.tolist()} if origin.any() else {}), origin
 

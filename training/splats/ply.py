@@ -235,6 +235,8 @@ def splats_from_rows(
                 splats.means[block, axis] = rows["xyz"[axis]][block].astype(np.float64) - origin[axis]
             if colors:
                 splats.sh[block, 0] = (splats.sh[block, 0] / full - 0.5) / SH_C0
+            if block.stop % BATCH_ROWS == 0:
+                release_pages(rows)
         has_normals = any(extras[name].any() for name in NORMALS if name in extras)
     if not has_normals:
         extras = {name: column for name, column in extras.items() if name not in NORMALS}

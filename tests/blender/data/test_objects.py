@@ -1,5 +1,7 @@
 """Splats round trip through point clouds: unchanged values to the bit, and edits by artists."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -157,3 +159,26 @@ def test_megabytes_match_the_file(bpy, lodgs, make, tmp_path):
     assert lodgs("data.objects").megabytes(
         lodgs("data.objects").new_splats("s", splats).data
     ) == pytest.approx(size, rel=0.01)
+
+
+def test_memory_of_new_splats_is_that_of_their_attributes(bpy, lodgs, make, monkeypatch):
+    """Temporary arrays do not add to complete attributes: SH coefficients come last."""
+    objects, splats = lodgs("data.objects"), make(20_000, 3)
+    written, largest = 0, 0
+
+    def write_attribute(cloud, name, kind, values):
+        nonlocal written, largest
+        layout = lodgs("attributes").LAYOUTS[kind]
+        attributes.write_attribute(cloud, name, kind, values)
+        largest = max(largest, written + tracemalloc.get_traced_memory()[1])
+        written += np.dtype(layout.dtype).itemsize * layout.width * len(values)
+        tracemalloc.reset_peak()
+
+    attributes = lodgs("attributes")
+    monkeypatch.setattr(objects, "write_attribute", write_attribute)
+    tracemalloc.start()
+    try:
+        objects.new_splats("splats", splats)
+    finally:
+        tracemalloc.stop()
+    assert largest < 1.02 * written

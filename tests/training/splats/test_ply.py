@@ -1,13 +1,15 @@
 """Plain PLY files, compared with hand-made bytes and plyfile."""
 
 import struct
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
 
 from training.errors import LodgsError
-from training.splats.ply import read_elements, read_ply, splats_from_rows, write_ply
+from training.splats.ply import BATCH_ROWS, read_elements, read_ply, splats_from_rows, write_ply
 
 # Degree 1, two splats; value = splat / 2 + number of the column.
 GOLDEN_COLUMNS = [
@@ -267,3 +269,23 @@ def test_nerfstudio_splats_with_rgb_colours(tmp_path, kind, full):
     colors = 0.5 + 0.28209479177387814 * splats.sh[:, 0]  # 1 / (2 sqrt(pi)), of degree 0
     assert np.allclose(colors, [[1, 0, 0.2], [0, 0.6, 1]], atol=1e-6)
     assert splats.sh.shape == (2, 1, 3) and not splats.extras
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="counts pages in /proc")
+def test_read_rows_of_a_mapped_file_leave_memory(tmp_path, make_splats):
+    """Mapped pages count as memory of the process, as much as the splats themselves."""
+    path = tmp_path / "a.ply"
+    write_ply(path, make_splats(4 * BATCH_ROWS, degree=0))
+    rows = read_elements(path)[0]["vertex"]
+
+    def resident_bytes():
+        lines = iter(Path("/proc/self/smaps").read_text().splitlines())
+        sizes = [
+            next(text for text in lines if text.startswith("Rss:")) for line in lines if path.name in line
+        ]
+        return sum(int(text.split()[1]) * 1024 for text in sizes)
+
+    np.asarray(rows["x"]).sum()
+    assert resident_bytes() > 0.9 * rows.nbytes
+    splats_from_rows(rows, path)
+    assert resident_bytes() < 0.3 * rows.nbytes
