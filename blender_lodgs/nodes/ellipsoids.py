@@ -1,8 +1,8 @@
 """Node group "LODGS Ellipsoids": splats as meshes that Cycles and EEVEE light, reflect and shadow.
 
-Every splat becomes an instance of one sphere, rotated and scaled to REACH standard deviations. The material
-has the alpha of a projected Gaussian: for a ray that passes the centre at a distance of d standard
-deviations, alpha is opacity * exp(-d²/2). Colours have no view dependence.
+Every splat becomes an instance of one sphere, rotated and scaled to the ellipsoid outside which its alpha is
+below MIN_ALPHA. The material has the alpha of a projected Gaussian: for a ray that passes the centre at a
+distance of d standard deviations, alpha is opacity * exp(-d²/2). Colours have no view dependence.
 """
 
 from __future__ import annotations
@@ -12,13 +12,14 @@ import math
 import bpy
 
 from ..attributes import COLOR, LOOK_OPACITY, OPACITY_LOGIT, ROTATION, SCALE, WEIGHT
-from .building import Nodes, add_switched_modifier, ensure_group, is_edited
+from .building import VERSION, Nodes, add_switched_modifier, ensure_group, is_edited
 
 NAME = "LODGS Ellipsoids"
 MATERIAL = "LODGS Ellipsoids"
+MATERIAL_VERSION = 2
 ALPHA = "splat_opacity"
-REACH = 3.0
-"""Radius of an ellipsoid in standard deviations. Alpha at its surface is 1 % of the opacity."""
+MIN_ALPHA = math.exp(-(3.0**2) / 2)
+"""Alpha at the surface of an ellipsoid, 1 %. An opaque one has a radius of three standard deviations."""
 BOUNCES = 512
 """Transparent bounces of Cycles.
 
@@ -40,7 +41,7 @@ def attach(obj: bpy.types.Object) -> None:
 
 def ellipsoids() -> bpy.types.GeometryNodeTree:
     """Return the node group."""
-    return ensure_group(NAME, 2, _build)
+    return ensure_group(NAME, 3, _build)
 
 
 def _build(nodes: Nodes) -> None:
@@ -73,9 +74,10 @@ def _build(nodes: Nodes) -> None:
     material.inputs["Material"].default_value = falloff()
     scale = add("ShaderNodeVectorMath", operation="SCALE")
     nodes.tree.links.new(value(attribute(SCALE, "FLOAT_VECTOR")), scale.inputs[0])
-    scale.inputs["Scale"].default_value = REACH
+    link(((opacity / MIN_ALPHA).log() * 2.0).sqrt().socket, scale, "Scale")
     instances = add("GeometryNodeInstanceOnPoints")
     link(store.outputs["Geometry"], instances, "Points")
+    link((opacity > MIN_ALPHA).socket, instances, "Selection")
     link(material.outputs["Geometry"], instances, "Instance")
     link(value(attribute(ROTATION, "QUATERNION")), instances, "Rotation")
     link(scale.outputs["Vector"], instances, "Scale")
@@ -86,13 +88,16 @@ def falloff() -> bpy.types.Material:
     """Return the material of the ellipsoids. A ray gets the alpha of the Gaussian once per ellipsoid.
 
     All ellipsoids are images of one unit sphere. There, a ray with direction v that hits the surface at p
-    passes the centre at a distance of sqrt(1 - (p·v)²). Alpha counts at the entry point. A ray that starts
+    passes the centre at a distance of sqrt(p² - (p·v)²). Alpha counts at the entry point. A ray that starts
     inside gets it at the exit point, if it started before the centre.
     """
     material = bpy.data.materials.get((MATERIAL, None))
-    if material is not None:
+    if material is not None and material.get(VERSION) == MATERIAL_VERSION:
         return material
+    if material is not None:  # groups of older files keep it
+        material.name = f"{MATERIAL} (older)"
     material = bpy.data.materials.new(MATERIAL)
+    material[VERSION] = MATERIAL_VERSION
     if material.node_tree is None:
         material.use_nodes = True
     if hasattr(material, "surface_render_method"):
@@ -125,15 +130,16 @@ def _build_falloff(tree: bpy.types.NodeTree) -> None:
     local = add("ShaderNodeVectorTransform", vector_type="VECTOR", convert_from="WORLD", convert_to="OBJECT")
     tree.links.new(geometry.outputs["Incoming"], local.inputs["Vector"])
     direction = math_node("NORMALIZE", local.outputs["Vector"], kind="ShaderNodeVectorMath")
-    surface = math_node("NORMALIZE", add("ShaderNodeTexCoord").outputs["Object"], kind="ShaderNodeVectorMath")
-    cosine = math_node("DOT_PRODUCT", surface, direction, kind="ShaderNodeVectorMath")
-    distance2 = math_node("SUBTRACT", 1.0, math_node("MULTIPLY", cosine, cosine))
-    gaussian = math_node("POWER", math.exp(-REACH * REACH / 2), distance2)
-    opacity = add("ShaderNodeAttribute", attribute_name=ALPHA, attribute_type="INSTANCER")
-    alpha = math_node("MINIMUM", math_node("MULTIPLY", opacity.outputs["Fac"], gaussian), 0.99)
+    surface = add("ShaderNodeTexCoord").outputs["Object"]
+    along = math_node("DOT_PRODUCT", surface, direction, kind="ShaderNodeVectorMath")
+    radius2 = math_node("DOT_PRODUCT", surface, surface, kind="ShaderNodeVectorMath")
+    distance2 = math_node("SUBTRACT", radius2, math_node("MULTIPLY", along, along))
+    opacity = add("ShaderNodeAttribute", attribute_name=ALPHA, attribute_type="INSTANCER").outputs["Fac"]
+    gaussian = math_node("POWER", math_node("DIVIDE", MIN_ALPHA, opacity), distance2)
+    alpha = math_node("MINIMUM", math_node("MULTIPLY", opacity, gaussian), 0.99)
     stretch = math_node("LENGTH", local.outputs["Vector"], kind="ShaderNodeVectorMath")
     length = math_node("MULTIPLY", add("ShaderNodeLightPath").outputs["Ray Length"], stretch)
-    half_chord = math_node("ABSOLUTE", cosine)
+    half_chord = math_node("ABSOLUTE", along)
     starts_inside = math_node("LESS_THAN", length, math_node("MULTIPLY", half_chord, 2.0))
     passed_centre = math_node("GREATER_THAN", length, half_chord)
     exits = math_node(

@@ -126,3 +126,35 @@ def test_ellipsoids_are_on_only_if_enabled(bpy, lodgs, scene):
     lodgs("data.scenes").set_level(bpy.data.objects["one"], Level(2, splats(), 0.0))
     assert "LODGS Ellipsoids" in bpy.data.objects["one level 2"].modifiers
     assert bpy.data.objects["one level 2"].modifiers[-1].name == "LODGS Ellipsoids"
+
+
+def test_ellipsoids_end_at_an_alpha_of_one_percent(bpy, lodgs, scene):
+    """At d standard deviations alpha is opacity * exp(-d²/2); fainter splats have no ellipsoid."""
+    opacities = np.array([0.9, 0.3, 0.05, 0.005])
+    logits = np.log(opacities / (1 - opacities))
+    four = splats(
+        means=[[x, 0, 0] for x in range(4)], quats=np.tile([1.0, 0, 0, 0], (4, 1)),
+        log_scales=np.log(np.tile([0.5, 0.2, 0.1], (4, 1))), opacity_logits=logits,
+        sh=np.zeros((4, 1, 3)),
+    )  # fmt: skip
+    from training.splats.levels import Level
+
+    root = bpy.data.objects["one"]
+    lodgs("data.scenes").set_level(root, Level(1, four, 0.0))
+    scene.lodgs_render.ellipsoids = True
+    root.lodgs.levels[0].object.modifiers["LODGS Ellipsoids"].show_viewport = True
+    instances = bpy.context.evaluated_depsgraph_get().object_instances
+    scales = [
+        np.array(i.matrix_world.to_scale()) for i in instances if i.is_instance and i.object.type == "MESH"
+    ]
+    reach = np.sqrt(2 * np.log(opacities[:3] / 0.0111))
+    np.testing.assert_allclose(scales, reach[:, None] * [0.5, 0.2, 0.1], rtol=2e-3)
+
+
+def test_files_with_an_older_material_keep_it(bpy, lodgs, scene):
+    """Its alpha fits the spheres of older groups only."""
+    older = bpy.data.materials.new("LODGS Ellipsoids")
+    scene.lodgs_render.ellipsoids = True
+    assert older.name == "LODGS Ellipsoids (older)"
+    current = bpy.data.materials["LODGS Ellipsoids"]
+    assert lodgs("nodes.ellipsoids").falloff() == current != older

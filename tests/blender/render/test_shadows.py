@@ -91,6 +91,7 @@ def test_splat_casts_its_transmittance_as_a_shadow(bpy, lodgs, scene, tmp_path):
     use_cycles(meshes, 16)
     lit = rendered(bpy, meshes, tmp_path / "lit.exr")
     scene.lodgs_render.shadows = True
+    assert meshes.cycles.min_transparent_bounces < 10, "bounced light passes all splats, ten times slower"
     shadowed = rendered(bpy, meshes, tmp_path / "shadowed.exr")
 
     offsets = ground_points(bpy, scene) - center
