@@ -27,6 +27,12 @@ _MAX_SLOPE = 20.0
 """Maximum slope of such a ground in degrees."""
 _OPPOSITE_FACTOR = 2.0
 """Minimum ratio of scores to prefer a ground that faces against the usual direction of its axis."""
+_THIN_RATIO, _MIN_THIN = 1.0, 100
+"""Minimum logarithmic ratio of the sizes of flat splats and needles, and minimum number of each."""
+_ALONG = 0.97
+"""Minimum cosine of the angle between an axis and the normal of a flat splat, or a needle, along it."""
+_MIN_FACING, _FACING_FACTOR = 0.3, 3.0
+"""Minimum share of flat splats that face z if z is up, and minimum ratio to the shares of x and y."""
 _FAR_FACTOR = 2.5
 """Splats beyond this multiple of the median distance from the center are background."""
 _NEAR_DEPTH = 0.01
@@ -68,13 +74,15 @@ def central_ball(means: np.ndarray) -> tuple[np.ndarray, float]:
 def guess_up_rotation(splats: Splats) -> np.ndarray | None:
     """Return a rotation (3, 3) float64 to z up; None if -y, the convention of 3DGS, is the best guess.
 
-    Another axis (+y, +z or -z) is up if a clear ground lies across it, see ``ground.ground_plane``.
+    Another axis (+y, +z or -z) is up if a clear ground lies across it, see ``ground.ground_plane``. Without a
+    clear ground, as around a high building, +z is up if most flat splats face it and needles are along it.
     """
     sample = _sample(splats)
     if sample is None:
         return None
     center, radius = central_ball(sample.means)
-    points = sample.means[np.linalg.norm(sample.means - center, axis=1) < 2 * radius].astype(np.float64)
+    sample_near = sample.select(np.linalg.norm(sample.means - center, axis=1) < 2 * radius)
+    points = sample_near.means.astype(np.float64)
     spreads = np.maximum(np.ptp(np.percentile(points, (10, 90), axis=0), axis=0), 1e-12)
     axis = int(spreads.argmin())
     width, depth = np.delete(spreads, axis)
@@ -83,12 +91,12 @@ def guess_up_rotation(splats: Splats) -> np.ndarray | None:
     flatness = _MIN_ROOM_FLATNESS if hollow else _MIN_FLATNESS
     is_ground = spreads.mean() >= flatness * spreads[axis]
     if axis == 0 or not is_ground or oblong > (_MAX_ROOM_OBLONG if hollow else _MAX_OBLONG):
-        return None
+        return np.eye(3) if _is_upright(sample_near) else None
     usual = np.eye(3)[axis] * (-1 if axis == 1 else 1)
     grounds = [ground_plane(points, up, _MAX_SLOPE) for up in (usual, -usual)]
     scores = [ground[2] if ground else 0.0 for ground in grounds]
     if max(scores) < _MIN_GROUND:
-        return None
+        return np.eye(3) if _is_upright(sample_near) else None
     is_usual = scores[1] < _OPPOSITE_FACTOR * scores[0]
     if axis == 1:
         return None if is_usual else np.array([(1, 0, 0), (0, 0, -1), (0, 1, 0)], np.float64)
@@ -187,6 +195,33 @@ def overview_camera(bundle: Bundle, width: int) -> tuple[Camera, float]:
 def _is_hollow(means: np.ndarray, center: np.ndarray, radius: float) -> bool:
     """Return True if a scene has few splats near its center, given their means (N, 3)."""
     return bool((np.linalg.norm(means - center, axis=1) < _HOLLOW_RADIUS * radius).mean() < _HOLLOW_SHARE)
+
+
+def _is_upright(splats: Splats) -> bool:
+    """Return True if most flat splats face z and more needles are along z than along x or y.
+
+    The ground faces the vertical axis, and trunks, posts and edges of buildings are along it. Flat splats
+    of a wall face another axis, but few needles are across the wall.
+    """
+    w, x, y, z = (splats.quats / np.maximum(np.linalg.norm(splats.quats, axis=1, keepdims=True), 1e-12)).T
+    axes = np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ])  # fmt: skip
+    order, sizes = np.argsort(splats.log_scales, axis=1), np.sort(splats.log_scales, axis=1)
+
+    def shares(column: int, thin: np.ndarray) -> np.ndarray:
+        along = np.abs(axes[:, order[thin, column], thin]) > _ALONG
+        return along.mean(axis=1)
+
+    flat = np.flatnonzero(sizes[:, 1] - sizes[:, 0] > _THIN_RATIO)
+    needles = np.flatnonzero(sizes[:, 2] - sizes[:, 1] > _THIN_RATIO)
+    if min(len(flat), len(needles)) < _MIN_THIN:
+        return False
+    facing, along = shares(0, flat), shares(2, needles)
+    is_ground = facing[2] >= max(_MIN_FACING, _FACING_FACTOR * facing[:2].max())
+    return bool(is_ground and along.argmax() == 2)
 
 
 def _clarity(

@@ -1,5 +1,7 @@
 """Up direction, extent and first view of splats without cameras, on scenes of simple shapes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -83,6 +85,26 @@ def test_ground_is_below(points):
 
 def test_wall_is_no_ground():
     assert guess_up_rotation(splats_at(facade() @ Y_DOWN.T)) is None
+
+
+@pytest.mark.parametrize("axes", ["xyz", "xzy"])
+def test_flat_splats_and_needles_show_the_vertical_axis_of_a_high_scene(axes):
+    """A ground of discs and a high tower of vertical needles, in files with z or -y up.
+
+    In the file with -y up, most flat splats face y; a facade that faces z has no needles across it.
+    """
+    rng = np.random.default_rng(7)
+    ground, tower = rng.uniform(-3, 3, (3000, 3)) * (1, 1, 0.1), rng.uniform(-1, 1, (3000, 3)) * (1, 1, 3)
+    splats = splats_at(np.concatenate([ground, tower + np.float64([0, 0, 3])]))
+    splats.log_scales[:3000, 2] -= 2
+    splats.log_scales[3000:, 2] += 2
+    order = ["xyz".index(axis) for axis in axes]
+    turned = replace(splats, means=splats.means[:, order], log_scales=splats.log_scales[:, order])
+    rotation = guess_up_rotation(turned)
+    assert rotation is None if axes == "xzy" else np.array_equal(rotation, np.eye(3))
+    wall = replace(turned, log_scales=turned.log_scales.copy())
+    wall.log_scales[3000:] = wall.log_scales[3000:, [1, 2, 0]]  # needles along another axis
+    assert guess_up_rotation(wall) is None
 
 
 def test_view_shows_the_background_behind_the_subject():
