@@ -14,6 +14,7 @@ import time
 import zipfile
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -109,6 +110,23 @@ def test_printed_lines_are_the_stored_events(uninterrupted):
     assert folder.state() == "done"
     last = folder.last_event("progress")
     assert last is not None and last["step"] == last["of"] == 70
+
+
+def test_time_left_follows_the_speed_of_the_last_steps(monkeypatch):
+    """Steps take 1 s, and 3 s from step 40 of 100 on: the time left is 3 s for each remaining step."""
+    now, events = 0.0, []
+    monkeypatch.setattr(training_loop, "time", SimpleNamespace(monotonic=lambda: now))
+    run = object.__new__(training_loop._TrainingRun)
+    run.method = SimpleNamespace(steps=100, levels=1, splats=5, stage=lambda step: "")
+    run.events = lambda kind, **values: events.append(values)
+    run._started, run._started_step, run.step = 0.0, 0, 0
+    while run.step < 100:
+        now += 1.0 if run.step < 40 else 3.0
+        run.step += 1
+        run._report_progress(1, 0.1, 20.0)
+    left = {event["step"]: event["eta_s"] for event in events}
+    assert left[40] == 60 and left[100] == 0
+    assert [left[step] for step in (50, 60, 80)] == [150, 120, 60]
 
 
 def test_run_without_held_out_views_measures_training_views(tiny_scene, tmp_path):
