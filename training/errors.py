@@ -5,8 +5,9 @@ import re
 
 DISK_FULL = {errno.ENOSPC, errno.EDQUOT}
 """Error codes of a full disk or an exceeded quota."""
-FREE_SPACE = "Free some space"
-"""First words of the remedy for a full disk."""
+INPUT, DISK, MEMORY, SYSTEM, BUG = ERROR_CAUSES = ("input", "disk", "memory", "system", "bug")
+"""Causes of errors: a mistake or limit of the input, a full disk, too little memory, another failure of the
+computer, and an unexpected exception."""
 MAX_TEXT = 1000
 """Maximum number of characters of a sentence. Longer ones, which quote foreign text, lose their middle."""
 _UNPRINTABLE = re.compile("[\0\ud800-\udfff]")
@@ -22,16 +23,34 @@ class LodgsError(Exception):
     Args:
         what: the failed action and its reason, with the file or value concerned.
         remedy: the user's next step, in the imperative.
+        cause: one of ERROR_CAUSES; None for the cause of the exception from which this one is raised.
     """
 
-    def __init__(self, what: str, remedy: str = "") -> None:
+    def __init__(self, what: str, remedy: str = "", cause: str | None = None) -> None:
         self.what = _shorten(printable(what))
         self.remedy = _shorten(printable(remedy))
+        self.cause = cause
         super().__init__(f"{self.what} {self.remedy}".strip())
 
 
 class SystemProblem(LodgsError):
     """A failure of the computer, such as a lost disk or too many open files."""
+
+
+def error_cause(error: BaseException) -> str:
+    """Return the cause of an exception, one of ERROR_CAUSES."""
+    if is_out_of_memory(error):
+        return MEMORY
+    if isinstance(error, OSError):
+        return DISK if error.errno in DISK_FULL else SYSTEM
+    if not isinstance(error, LodgsError):
+        return BUG
+    if error.cause:
+        return error.cause
+    origin = None if error.__cause__ is None else error_cause(error.__cause__)
+    if origin in (DISK, MEMORY):
+        return origin
+    return SYSTEM if isinstance(error, SystemProblem) else INPUT
 
 
 def describe_system_error(error: BaseException) -> LodgsError | None:
@@ -60,7 +79,7 @@ def system_reason(error: OSError) -> str:
 def system_remedy(error: OSError, default: str = "") -> str:
     """Return the remedy for a full disk or an exceeded limit, or else the default."""
     if error.errno in DISK_FULL:
-        return f"{FREE_SPACE} on this disk, or choose another folder."
+        return "Free some space on this disk, or choose another folder."
     if error.errno in (errno.EMFILE, errno.ENFILE):
         return "Raise the limit of open files (ulimit -n), or close other programs."
     if error.errno == errno.EFBIG:

@@ -28,7 +28,7 @@ EVENTS = [
     PROGRESS,
     {"event": "warning", "message": "ü"},
     LEVEL,
-    {"event": "error", "what": "The disk is full.", "remedy": "Free some space."},
+    {"event": "error", "what": "The disk is full.", "remedy": "Free some space.", "cause": "disk"},
     {"event": "cancelled", "step": 3, "message": "Stopped."},
     {"event": "done", "bundle": "bundle.ply", "seconds": 3.5, "train_psnr": 30.0},
 ]

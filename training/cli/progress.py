@@ -7,7 +7,7 @@ import json
 import sys
 from typing import IO, TYPE_CHECKING, Any, cast
 
-from ..errors import FREE_SPACE, SystemProblem
+from ..errors import DISK, SYSTEM, SystemProblem
 
 if TYPE_CHECKING:
     from ..runs.job import Job
@@ -26,7 +26,7 @@ def train(job: Job, text: str) -> str:
 
     Raises:
         KeyboardInterrupt: training was cancelled.
-        SystemProblem: the disk is full, which would end further trainings, too.
+        SystemProblem: the disk is full or the computer failed, which would end further trainings, too.
     """
     from ..runs.failures import CANCELLED, DONE
     from ..runs.train import train
@@ -39,7 +39,7 @@ def train(job: Job, text: str) -> str:
     if code == DONE:
         return ""
     problem, remedy = (str(events.last.get(key, "")) for key in ("what", "remedy"))
-    if remedy.startswith(FREE_SPACE):
+    if events.last.get("cause") in (DISK, SYSTEM):
         raise SystemProblem(problem, remedy)
     return problem or "Training crashed."
 

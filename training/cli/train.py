@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import LodgsError
+from ..errors import LodgsError, error_cause
 from ..scenes.check import ERROR, ESTIMATE, INFO, Finding
 from . import check
 from .job_options import add_options, job_from_options
@@ -88,7 +88,7 @@ def train_job(make_job: Callable[[], Job], **placement: Any) -> int:
             raise LodgsError(problems[0], check.INSTALL)
         from ..runs.train import train
     except LodgsError as error:
-        _print(event_line("error", what=error.what, remedy=error.remedy))
+        _print(event_line("error", what=error.what, remedy=error.remedy, cause=error_cause(error)))
         return 2
     except KeyboardInterrupt:
         _print(event_line("cancelled", message="Stopped before training began."))

@@ -19,7 +19,7 @@ from typing import IO
 
 import numpy as np
 
-from ..errors import LodgsError
+from ..errors import ERROR_CAUSES, LodgsError
 from ..files import name_errors, open_regular
 from ..splats.georeference import Georeference
 from ..splats.levels import MAX_LEVELS, META_SHAPES
@@ -139,6 +139,10 @@ def _is_path(value: object) -> bool:
     )
 
 
+def _is_cause(value: object) -> bool:
+    return isinstance(value, str) and value in ERROR_CAUSES
+
+
 def _are_blocks(value: object) -> bool:
     """Return whether a value is the list of block states of a ``progress`` event."""
     return isinstance(value, list) and all(
@@ -216,6 +220,7 @@ _VALUES: dict[str, Callable[[object], bool]] = {
     **dict.fromkeys(("path", "bundle"), _is_path),
     "meta": _is_meta,
     "blocks": _are_blocks,
+    "cause": _is_cause,
 }
 """Validators by value name; values with other names must be plain JSON (``_is_plain``)."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..errors import DISK_FULL, FREE_SPACE, LodgsError, is_out_of_memory, system_remedy
+from ..errors import DISK_FULL, LodgsError, is_out_of_memory, system_remedy
 
 DONE, CRASHED, BAD_INPUT, CANCELLED = 0, 1, 2, 3
 """Exit codes of ``python -m training train``."""
@@ -18,7 +18,7 @@ def describe_error(error: BaseException) -> tuple[str, str, int]:
     if isinstance(error, OSError):
         path = f" ({error.filename})" if error.filename else ""
         if error.errno in DISK_FULL:
-            remedy = f"{FREE_SPACE} and resume the run."
+            remedy = "Free some space and resume the run."
             return f"Training stopped: the disk is full{path}.", remedy, BAD_INPUT
         return (
             f"Training stopped: {error.strerror or error}{path}.",

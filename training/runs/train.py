@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from .. import VERSION
-from ..errors import LodgsError
+from ..errors import SYSTEM, LodgsError, error_cause
 from ..evaluate.costs import cost_curves, write_cost_plot
 from ..evaluate.level_sheet import write_level_sheet
 from ..evaluate.metrics import psnr
@@ -111,14 +111,16 @@ def _final_event(error: BaseException) -> tuple[int, dict]:
         return CANCELLED, {"kind": "cancelled", "message": str(error)}
     if isinstance(error, KeyboardInterrupt) and processes.parent_ended.is_set():
         problem = "Training stopped: the process that started it has ended."
-        return BAD_INPUT, {"kind": "error", "what": problem, "remedy": "Resume the run."}
+        return BAD_INPUT, {
+            "kind": "error", "what": problem, "remedy": "Resume the run.", "cause": SYSTEM,
+        }  # fmt: skip
     if isinstance(error, KeyboardInterrupt):
         return CANCELLED, {"kind": "cancelled", "message": "Stopped. The run can be resumed."}
     problem, remedy, code = describe_error(error)
     if code == CRASHED:
         with suppress(OSError):
             traceback.print_exc(file=sys.stderr)
-    return code, {"kind": "error", "what": problem, "remedy": remedy}
+    return code, {"kind": "error", "what": problem, "remedy": remedy, "cause": error_cause(error)}
 
 
 def _train(job: Job, folder: RunFolder, events: EventWriter, placement: dict[str, Any]) -> int:

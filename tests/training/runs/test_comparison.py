@@ -9,13 +9,12 @@ import subprocess
 import pytest
 
 from training.__main__ import main
-from training.errors import LodgsError, system_remedy
+from training.errors import DISK, LodgsError, system_remedy
 from training.methods import METHODS
 from training.runs.comparison.measures import ComparedRun, Point, label_runs, measure_run, recommend_runs
 from training.runs.comparison.page import build_page, compare
 from training.runs.estimate import Estimate
 from training.runs.events import event_line
-from training.runs.failures import describe_error
 from training.runs.folder import RunFolder
 from training.runs.job import Job
 from training.runs.measure import evaluate_run
@@ -204,16 +203,16 @@ def test_command_trains_the_methods_of_a_scene(tiny_scene, runs, tmp_path, capsy
 NO_SPACE = OSError(errno.ENOSPC, "No space left")
 
 
-@pytest.mark.parametrize("error", [NO_SPACE, LodgsError("Cannot write a.ply.", system_remedy(NO_SPACE))])
+@pytest.mark.parametrize(
+    "error", [NO_SPACE, LodgsError("Cannot write a.ply.", system_remedy(NO_SPACE), DISK)]
+)
 def test_full_disk_ends_the_command(tiny_scene, tmp_path, capsys, monkeypatch, error):
     """A method is not left out because of the disk: the same command resumes."""
 
-    def train(job, events):
-        what, remedy, code = describe_error(error)
-        events.write(json.dumps({"event": "error", "what": what, "remedy": remedy}) + "\n")
-        return code
+    def fail(*_):
+        raise error
 
-    monkeypatch.setattr("training.runs.train.train", train)
+    monkeypatch.setattr("training.runs.train._train", fail)
     assert main(["compare", str(tiny_scene), "--out", str(tmp_path), "--methods", "tree", "3dgs"]) == 2
     output = capsys.readouterr().err
     assert "left out" not in output and "Training 3DGS" not in output and "Free some space" in output

@@ -397,7 +397,7 @@ def test_full_disk_is_reported_and_the_run_resumes(uninterrupted, tmp_path, monk
     folder = RunFolder(keys["out"])
     assert code == 2 and folder.state() == "failed"
     assert events[-1]["event"] == "error" and "No space left" in events[-1]["what"]
-    assert "Free some space" in events[-1]["remedy"]
+    assert "Free some space" in events[-1]["remedy"] and events[-1]["cause"] == "disk"
     assert not [path for path in folder.path.rglob("*") if ".tmp" in path.name], "no incomplete file remains"
     monkeypatch.undo()
     assert run_in_process(keys)[0] == 0

@@ -215,7 +215,7 @@ class _BlockWatch:
         if self.code == BAD_INPUT:
             end = self.block.folder.end_event()
             if end is not None and end["event"] == "error":
-                return LodgsError(f"{self._name}: {end['what']}", end.get("remedy", ""))
+                return LodgsError(f"{self._name}: {end['what']}", end.get("remedy", ""), end.get("cause"))
             return LodgsError(f"{self._name}: {run_outcome(self.block.folder, self.code)[1]}")
         reason = f" ({self._worker_error})" if self._worker_error else ""
         return LodgsError(

@@ -362,7 +362,7 @@ def lost(_: RunFolder) -> int:
 
 def failed(folder: RunFolder) -> int:
     with folder.events_file.open("a") as file:
-        file.write(event_line("error", what="The disk is full.", remedy="Free some space.") + "\n")
+        file.write(event_line("error", what="Full.", remedy="Free some space.", cause="disk") + "\n")
     return 2
 
 
@@ -402,9 +402,9 @@ def test_block_without_progress_fails_the_run_after_the_others_have_finished(blo
 
 
 def test_error_of_a_block_is_reported(blocks):
-    with pytest.raises(LodgsError, match="Cell 2: The disk is full") as error:
+    with pytest.raises(LodgsError, match="Cell 2: Full") as error:
         train_all(blocks, Workers(block_1=[done], block_2=[failed]))
-    assert error.value.remedy == "Free some space."
+    assert error.value.remedy == "Free some space." and error.value.cause == "disk"
 
 
 def test_block_that_cannot_write_its_error_is_reported(blocks):
