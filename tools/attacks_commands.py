@@ -378,7 +378,7 @@ def main() -> int:
     may_mount = sys.platform == "linux" and os.geteuid() == 0
     if not may_mount:
         print("Skipping full disks: mounting a small tmpfs needs root on Linux.")
-    results = {}
+    results, reported = {}, 0
     with tempfile.TemporaryDirectory(prefix="lodgs-attacks-") as folder:
         attack = Attack(Path(folder), random.Random(options.seed))
         for name in options.only:
@@ -388,7 +388,8 @@ def main() -> int:
             full = attack.fill_disks(name, options.disks) if may_mount else 0
             stopped = attack.send_signals(name, options.signals) if options.signals else 0
             results[name] = {"full disks": full, "stopped": stopped}
-            print(name, results[name], flush=True)
+            print(name, results[name], *attack.wrong[reported:], sep="\n", flush=True)
+            reported = len(attack.wrong)
     report = ROOT / "build" / "attacks_commands.json"
     report.parent.mkdir(exist_ok=True)
     figures = {"commands": results, "messages": attack.messages, "wrong": attack.wrong}

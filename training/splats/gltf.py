@@ -19,7 +19,6 @@ from ..documents import open_file, parse_json
 from ..errors import LodgsError, printable
 from ..files import atomic_write
 from .bundle import write_bundle
-from .dialects import drop_undrawable
 from .gaussians import SH_C0, Splats
 from .levels import MAX_READ_LEVELS, Bundle, Level
 from .portable_levels import (
@@ -306,7 +305,7 @@ class _GlbReader:
         if not same:
             return None
         for level, ((splats, _),) in zip(reversed(bundle.levels), fine_to_coarse, strict=True):
-            level.splats = drop_undrawable(splats, self._path)
+            level.splats = splats
         return bundle
 
     def _foreign(self, fine_to_coarse: list[list[tuple[Splats, np.ndarray]]]) -> Bundle:
@@ -318,7 +317,7 @@ class _GlbReader:
         remaining, levels = iter(splats), []
         for number, parts in enumerate(fine_to_coarse):
             joined = Splats.concatenated([next(remaining) for _ in parts])
-            levels.append(Level(len(fine_to_coarse) - number, drop_undrawable(joined, self._path)))
+            levels.append(Level(len(fine_to_coarse) - number, joined))
         return Bundle("", levels[::-1], meta=meta)
 
     def _world_nodes(self) -> list[tuple[dict, np.ndarray]]:

@@ -32,7 +32,8 @@ class SplatFormat(NamedTuple):
             :class:`NeedsSplatTransform`.
         write_levels: function that writes all levels for selection by distance; None if the format has none.
             It replaces ``write``.
-        read_levels: function that converts a file with levels to a bundle; it replaces ``read``.
+        read_levels: function that converts a file with levels to a bundle, with the splats that cannot be
+            drawn, which readers of bundles drop; it replaces ``read``.
         require: function that raises a LodgsError without the packages of the format, which Blender lacks;
             None if it needs none.
         readable: False if files cannot be imported.

@@ -11,7 +11,6 @@ import numpy as np
 
 from ..errors import LodgsError, printable
 from .bundle import write_bundle
-from .dialects import drop_undrawable
 from .gaussians import Splats
 from .levels import MAX_READ_LEVELS, Bundle, Level
 from .portable_levels import (
@@ -86,7 +85,7 @@ def read_levels(usd: SimpleNamespace, path: Path) -> Bundle:
         same = all(np.allclose(matrix, placement, rtol=1e-9, atol=1e-9) for matrix in matrices)
         if same and len(bundle.levels) == len(below):
             for level, prim in zip(reversed(bundle.levels), below, strict=True):
-                level.splats = drop_undrawable(_read_field(prim, path), path)
+                level.splats = _read_field(prim, path)
             return bundle
     placed = [
         place_splats(_read_field(prim, path), matrix, path)
@@ -94,7 +93,7 @@ def read_levels(usd: SimpleNamespace, path: Path) -> Bundle:
     ]
     meta, placed = upright_meta(placed, "Z" if up == usd.UsdGeom.Tokens.z else "Y")
     degree = min(splats.sh_degree for splats in placed)
-    placed = [drop_undrawable(_limited(splats, degree), path) for splats in placed]
+    placed = [_limited(splats, degree) for splats in placed]
     if not below:
         return Bundle("", [Level(1, Splats.concatenated(placed))], meta=meta)
     distances = _thresholds(usd, root, len(placed))

@@ -1,6 +1,7 @@
 """Levels and comparisons for the tests of formats of levels."""
 
 import numpy as np
+import pytest
 
 from tests.training.splats.test_formats import random_splats
 from training.scenes.cameras import Camera
@@ -28,9 +29,9 @@ def flod(degree=3, **meta):
     return Bundle("flod", levels, "bands", tables=tables, meta={"up_rotation": UP, **meta})
 
 
-def read(path):
+def read(path, warn=pytest.fail):
     with open_as_ply(path) as ply:
-        return read_bundle(ply)
+        return read_bundle(ply, warn)
 
 
 def assert_equal(actual, expected, tolerance=1e-5):

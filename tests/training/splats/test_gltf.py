@@ -114,6 +114,27 @@ def test_levels_round_trip(tmp_path, degree):
         assert_equal(level.splats, original.splats)
 
 
+@pytest.mark.parametrize("foreign", [False, True])
+def test_undrawable_splats_are_dropped_with_a_warning(tmp_path, foreign):
+    bundle = flod(1)
+    export_levels(tmp_path / "a.glb", bundle)
+    document, data = read_parts(tmp_path / "a.glb")
+    finest = document["nodes"][document["scenes"][0]["nodes"][0]]
+    positions = document["meshes"][finest["mesh"]]["primitives"][0]["attributes"]["POSITION"]
+    view = document["bufferViews"][document["accessors"][positions]["bufferView"]]
+    data = bytearray(data)
+    struct.pack_into("<f", data, view["byteOffset"] + 12 * 7, float("nan"))  # x of splat 7
+    if foreign:
+        document["scenes"][0].pop("extras")
+    (tmp_path / "b.glb").write_bytes(assembled(document, bytes(data)))
+    warnings = []
+    reread = read(tmp_path / "b.glb", warnings.append)
+    assert [len(level.splats) for level in reread.levels] == [20, 40, 59]
+    expected = np.delete(bundle.levels[2].splats.opacity_logits, 7)
+    np.testing.assert_allclose(reread.levels[2].splats.opacity_logits, expected, atol=2e-3)
+    assert len(warnings) == 1 and warnings[0].startswith("1 splats of ")
+
+
 def test_original_place_survives(tmp_path):
     origin = [448_250.0, 5_411_900.0, 300.0]
     bundle = flod(origin=origin)

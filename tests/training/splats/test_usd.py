@@ -175,6 +175,13 @@ def test_files_of_other_programs_are_read(tmp_path):
     assert level.splats.sh.tolist()[0] == [[1, 2, 3]] and level.splats.opacity_logits[0] == 0
 
 
+def test_undrawable_splats_are_dropped_with_a_warning(tmp_path):
+    foreign(tmp_path, scales=[(0.1, float("nan"), 0.3)])
+    warnings = []
+    assert not len(read(tmp_path / "b.usdc", warnings.append).levels[0].splats)
+    assert len(warnings) == 1 and warnings[0].startswith("2 splats of ")
+
+
 @pytest.mark.parametrize(
     ("attributes", "reason"),
     [
