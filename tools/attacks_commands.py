@@ -213,7 +213,10 @@ class Attack:
             shutil.rmtree(self.disk, ignore_errors=True)
             self._prepare(name)
             delay = 0.02 + self.rng.uniform(0, seconds)
+            (self.work / "log").unlink()
             process = self._start(name)
+            while not (self.work / "log").exists():  # until it handles signals
+                time.sleep(0.005)
             time.sleep(delay)
             children = descendants(process.pid)
             process.terminate()

@@ -37,6 +37,8 @@ _SIGMAS = 3.0
 _SECONDS = 600
 _MIN_FREE_BYTES = 1 << 16
 """Free space below which a failure is that of a full disk."""
+_PACKAGE_TIME = 946_684_800
+"""Time of the file in a package, 1 January 2000, so that equal levels give equal packages."""
 _INSTALL = "Install it with: pip install usd-core (or lodgs[usd])."
 
 
@@ -84,6 +86,7 @@ def write_usd(path: Path, levels: PortableLevels) -> None:
         try:
             _write_stage(usd, scene, levels)
             if path.suffix.lower() == ".usdz":
+                os.utime(scene, (_PACKAGE_TIME, _PACKAGE_TIME))
                 package = folder / "scene.usdz"
                 if not usd.UsdUtils.CreateNewUsdzPackage(usd.Sdf.AssetPath(str(scene)), str(package)):
                     raise OSError(0, "the package cannot be written")

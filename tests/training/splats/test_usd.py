@@ -1,5 +1,6 @@
 """USD files: valid for usd-core, with the distances of the rules, and read back."""
 
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -14,6 +15,7 @@ from training.editing.portable import level_distances, portable_levels
 from training.errors import LodgsError
 from training.lod.rule import resolve_rule
 from training.lod.selection import select
+from training.splats import usd as usd_module
 from training.splats.levels import Bundle, Level
 from training.splats.usd import load_usd
 
@@ -121,6 +123,19 @@ def test_levels_round_trip(tmp_path, ending):
     for level, original in zip(reread.levels, bundle.levels, strict=True):
         assert level.facts == original.facts
         assert_equal(level.splats, original.splats)
+
+
+def test_packages_do_not_depend_on_the_time(tmp_path, monkeypatch):
+    export_levels(tmp_path / "a.usdz", flod(0))
+    write = usd_module._write_stage
+
+    def write_earlier(usd, path, levels):
+        write(usd, path, levels)
+        os.utime(path, (1e9, 1e9))
+
+    monkeypatch.setattr(usd_module, "_write_stage", write_earlier)
+    export_levels(tmp_path / "b.usdz", flod(0))
+    assert (tmp_path / "a.usdz").read_bytes() == (tmp_path / "b.usdz").read_bytes()
 
 
 @pytest.mark.parametrize("edited", [pytest.param(False, marks=pytest.mark.nightly), True])
