@@ -2,6 +2,8 @@
 PYTHON ?= python3
 VENV := .venv/bin/python
 BLENDER_5_3 := .venv-blender-5.3/bin/python
+# Fuzz tests with Blender in the process, which then cannot open USD files.
+BLENDER_FUZZ := tests/fuzz/test_blender_imports.py
 METHOD ?= flod
 INPUTS ?= 20000
 EFFORT ?= 0.1
@@ -26,7 +28,7 @@ help:
 	@echo "make test       all tests except nightly ones, in Blender 4.5 and, with Python 3.13, in Blender 5.3"
 	@echo "make test-5.2   the Blender tests in Blender 5.2 (test-5.0: in 5.0)"
 	@echo "make nightly    long tests and those of laboratory tools"
-	@echo "make fuzz       20,000 corrupt inputs for every reader (INPUTS=20000, SEED=number), some minutes"
+	@echo "make fuzz       20,000 corrupt inputs for every reader, and 2,000 for Blender (INPUTS=20000, SEED=number), some minutes"
 	@echo "make lint       style and types"
 	@echo "make docs       build/site: the documentation; warnings are errors"
 	@echo "make pictures   retake the pictures of docs/images in a real Blender window (needs Blender, Xvfb, ImageMagick)"
@@ -58,9 +60,9 @@ quick: setup
 	$(VENV) $(PYTEST) -q -m "not slow and not blender and not nightly"
 
 test: setup
-	$(VENV) $(PYTEST) -m "not nightly" tests/training tests/fuzz
-	$(VENV) $(PYTEST) -m "not nightly" tests/blender
-	@if [ -x $(BLENDER_5_3) ]; then set -x; $(BLENDER_5_3) $(PYTEST) -m "not nightly and not one_blender" tests/blender; fi
+	$(VENV) $(PYTEST) -m "not nightly and not blender" tests/training tests/fuzz
+	$(VENV) $(PYTEST) -m "not nightly" tests/blender $(BLENDER_FUZZ)
+	@if [ -x $(BLENDER_5_3) ]; then set -x; $(BLENDER_5_3) $(PYTEST) -m "not nightly and not one_blender" tests/blender $(BLENDER_FUZZ); fi
 
 test-5.0 test-5.2: test-%: setup
 	@$(PYTHON) tools/setup.py $*
@@ -72,7 +74,8 @@ nightly: setup
 	@if [ -x $(BLENDER_5_3) ]; then set -x; $(BLENDER_5_3) $(PYTEST) -m "nightly or one_blender" tests/blender; fi
 
 fuzz: setup
-	LODGS_FUZZ=$(INPUTS) $(VENV) $(PYTEST) tests/fuzz --timeout 0 $(if $(SEED),--hypothesis-seed $(SEED))
+	LODGS_FUZZ=$(INPUTS) $(VENV) $(PYTEST) -m "not blender" tests/fuzz --timeout 0 $(if $(SEED),--hypothesis-seed $(SEED))
+	LODGS_FUZZ=$$(($(INPUTS) / 10)) $(VENV) $(PYTEST) $(BLENDER_FUZZ) --timeout 0 $(if $(SEED),--hypothesis-seed $(SEED))
 
 lint: setup
 	.venv/bin/ruff check .

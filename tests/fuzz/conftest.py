@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, Phase, settings
 
 from tests.fuzz.entry_points import LONG, RECORDS, Record
 
-REPORT = Path(__file__).resolve().parents[2] / "build" / "fuzz.json"
+BUILD = Path(__file__).resolve().parents[2] / "build"
 SHORT = 60
 """Default number of inputs of a test in a short round."""
 
@@ -87,7 +87,8 @@ def _collect(records: dict[str, dict]) -> None:
 
 
 def pytest_terminal_summary(terminalreporter):
-    """Print the table and write ``build/fuzz.json`` with each defect's traceback and input."""
+    """Print the table and write ``build/fuzz.json`` or ``build/fuzz_blender.json`` with each defect's traceback
+    and input."""
     if not LONG or not _entry_points:
         return
     row = "{:<24} {:>8} {:>8} {:>8} {:>8} {:>10} {:>10}"
@@ -101,6 +102,8 @@ def pytest_terminal_summary(terminalreporter):
         terminalreporter.line(
             row.format(name, *counts, f"{totals['slowest']:.2f}", f"{totals['growth'] / 2**20:.0f}")
         )
-    terminalreporter.line(f"{sum(totals['tried'] for totals in _entry_points.values())} inputs; {REPORT}")
-    REPORT.parent.mkdir(exist_ok=True)
-    REPORT.write_text(json.dumps(_entry_points, indent=1) + "\n")
+    in_blender = all(name.startswith("Blender ") for name in _entry_points)
+    report = BUILD / ("fuzz_blender.json" if in_blender else "fuzz.json")
+    terminalreporter.line(f"{sum(totals['tried'] for totals in _entry_points.values())} inputs; {report}")
+    report.parent.mkdir(exist_ok=True)
+    report.write_text(json.dumps(_entry_points, indent=1) + "\n")
