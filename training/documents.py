@@ -34,7 +34,20 @@ MAX_INTEGER = 2**63 - 1
 
 _LINE_HEAD = 1 << 16
 """Bytes at the start of a text that contain the end of a line."""
-_LFS_POINTER = b"version https://git-lfs.github.com/spec/"
+_PAGE = "a web page in place of the file", "Download it again in a browser."
+_STAND_INS = {
+    b"version https://git-lfs.github.com/spec/": (
+        "a Git LFS pointer in place of the file",
+        "Run `git lfs pull` in its repository, or download the file itself.",
+    ),
+    b"/annex/objects/": (
+        "a git-annex pointer in place of the file",
+        "Run `git annex get` in its repository, or download the file itself.",
+    ),
+    b"<!doctype html": _PAGE,
+    b"<html": _PAGE,
+}
+"""Descriptions and remedies of files that stand in for others, by their first characters in small letters."""
 DECIMAL_COMMAS = "its numbers have decimal commas"
 _DECIMAL_COMMA = re.compile(r"(?<![^\s'\"])[-+]?\d*,\d+(?:[eE][-+]?\d+)?(?![^\s'\"])")
 _UNPRINTABLE = re.compile("[\0\ud800-\udfff]")
@@ -46,18 +59,17 @@ def open_file(path: str | Path) -> IO[bytes]:
     """Open a regular file for reading. Pipes and devices, which may have no end, are refused.
 
     Raises:
-        LodgsError: the file does not exist, is not a regular file, may not be read, or is a Git LFS pointer.
+        LodgsError: the file does not exist, is not a regular file, may not be read, or stands in for another.
     """
     try:
         file = open_regular(path)
-        if file.read(len(_LFS_POINTER)) != _LFS_POINTER:
+        head = file.read(64).lstrip().lower()
+        stand_in = next((value for start, value in _STAND_INS.items() if head.startswith(start)), None)
+        if stand_in is None:
             file.seek(0)
             return file
         file.close()
-        raise LodgsError(
-            f"Cannot read {printable(path)}: it is a Git LFS pointer in place of the file.",
-            "Run `git lfs pull` in its repository, or download the file itself.",
-        )
+        raise LodgsError(f"Cannot read {printable(path)}: it is {stand_in[0]}.", stand_in[1])
     except OSError as error:
         raise read_error(path, error, "Check the path and its permissions.") from None
     except ValueError:  # a NUL or half a surrogate pair

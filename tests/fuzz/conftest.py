@@ -87,8 +87,10 @@ def _collect(records: dict[str, dict]) -> None:
 
 
 def pytest_terminal_summary(terminalreporter):
-    """Print the table and write ``build/fuzz.json`` or ``build/fuzz_blender.json`` with each defect's traceback
-    and input."""
+    """Print the table, and write each defect's traceback and input to ``build/fuzz.json``.
+
+    The file of Blender's import operators is ``build/fuzz_blender.json``.
+    """
     if not LONG or not _entry_points:
         return
     row = "{:<24} {:>8} {:>8} {:>8} {:>8} {:>10} {:>10}"

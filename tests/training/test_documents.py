@@ -121,11 +121,27 @@ def test_piped_output_is_utf_8_on_any_console():
     assert process.returncode == 0 and "⁴" in process.stdout.decode("utf-8")
 
 
-def test_git_lfs_pointers_are_named(tmp_path):
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\n",
+            r"Git LFS pointer .* `git lfs pull`",
+        ),
+        ("/annex/objects/SHA256E-s8148--4d7a.bin\n", r"git-annex pointer .* `git annex get`"),
+        ("<!DOCTYPE html><title>Virus scan warning</title>", "web page .* in a browser"),
+        ("\r\n<html><body>Sign in", "web page .* in a browser"),
+    ],
+)
+def test_stand_ins_for_files_are_named(tmp_path, text, message):
     path = tmp_path / "points3D.bin"
-    path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n")
-    with pytest.raises(LodgsError, match=r"Git LFS pointer .* `git lfs pull`"):
+    path.write_text(text)
+    with pytest.raises(LodgsError, match=message):
         open_file(path)
+
+
+def test_starts_of_stand_ins_are_no_stand_ins(tmp_path):
+    path = tmp_path / "points3D.bin"
     path.write_bytes(b"version https")  # shorter than the mark
     with open_file(path) as file:
         assert file.read() == b"version https"

@@ -400,8 +400,6 @@ def _foreign_error(path: Path, start: bytes) -> LodgsError:
     problem, remedy = "it is not a PLY file", "Choose a .ply of Gaussian splats."
     if start.startswith((b"PK\3\4", b"\x1f\x8b", b"7z\xbc\xaf", b"Rar!")):
         problem, remedy = "it is not a PLY file but an archive", "Unpack it."
-    elif start.lstrip()[:5].lower() in (b"<!doc", b"<html"):
-        problem, remedy = "it is not a PLY file but a web page", "Download it again in a browser."
     return LodgsError(f"Cannot read {path}: {problem}.", remedy)
 
 

@@ -167,7 +167,7 @@ def test_selected_splats_are_written_in_order(tmp_path, make_splats):
         (b"", "it is not a PLY file"),
         (b"PK\x03\x04 something else", r"it is not a PLY file but an archive\. Unpack it"),
         (b"\x1f\x8b\x08", "it is not a PLY file but an archive"),
-        (b"\r\n<!DOCTYPE html><p>Sign in", "it is not a PLY file but a web page"),
+        (b"\r\n<!DOCTYPE html><p>Sign in", "it is a web page in place of the file"),
         (
             header(columns=["x", "y", "z", "red"]) + bytes(32),
             r"it has no f_dc_0, f_dc_1, f_dc_2, opacity, scale_0",

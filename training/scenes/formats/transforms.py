@@ -5,6 +5,8 @@ Format: https://docs.nerf.studio/quickstart/data_conventions.html; instant-ngp's
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from collections.abc import Mapping
 from math import tan
 from pathlib import Path
@@ -33,9 +35,16 @@ _SUPPORTED_MODELS = (
     "", "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV_FISHEYE", "FULL_OPENCV",
     "PERSPECTIVE",
 )  # fmt: skip
-_MATRICES = "K", "intrinsics", "intrinsic_matrix", "camera_matrix"
+_MATRICES = (
+    "K", "intrinsics", "intrinsic", "intrinsic_matrix", "intrinsics_matrix", "camera_intrinsics",
+    "camera_matrix",
+)  # fmt: skip
 """Names of camera matrices that some exporters write instead of focal lengths."""
 _ALIASES = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy"}
+_PAIR = ("focal_length", "focal"), "principal_point"
+"""Names of focal lengths in pixels, one or two, and of the centre that belongs to them."""
+_LENS = re.compile(r"focal|fov|field_of_view|intrinsic|principal|lens|^fl_|^f[xy]?$|^K$", re.I)
+"""Names that describe a lens."""
 _MAX_NORMALISED = 10.0
 """Maximum focal length in multiples of the photo's size; focal lengths in pixels are larger."""
 _POINTS = "sparse_pc.ply"
@@ -74,26 +83,53 @@ def read(path: Path) -> ExportedScene:
     if not isinstance(frames, list) or not frames:
         raise LodgsError(f"Cannot read {path}: it has no frames.", "Export it again.")
     common = _with_usual_names({name: value for name, value in document.items() if name != "frames"})
-    views, excluded = [], []
+    views, excluded, unread = [], [], Counter()
     frames = [_with_usual_names(frame) if isinstance(frame, dict) else {} for frame in frames]
     names = [frame.get(_NAMES[0]) for frame in frames]
     photos = PhotoFinder(path.parent, [name for name in names if isinstance(name, str)])
     for number, own in enumerate(frames, 1):
-        # A frame's field of view replaces the common focal length.
-        replaced = ("fl_x", "fl_y") if "camera_angle_x" in own else ()
-        values = {name: value for name, value in common.items() if name not in replaced} | own
-        values = {name: value for name, value in values.items() if value is not None}
+        unread.update(_unread_names(own))
         try:
-            views.append(_parse_view(path.parent, values, photos))
+            views.append(_parse_view(path.parent, _frame_values(common, own), photos))
         except LodgsError as error:
-            excluded.append((str(values.get("file_path", f"frame {number}")), error.what))
+            excluded.append((str(own.get("file_path", f"frame {number}")), error.what))
     warnings = photos.warnings()
+    others = [other.name for other in sorted(path.parent.glob("transforms_*.json")) if other != path]
+    if path.name.lower() in _FILES[1:] and others:
+        warnings.append(f"Read the views of {path} only, without those of {', '.join(others)}.")
+    for name, count in unread.items():
+        warnings.append(
+            f"Ignored '{name}' of {count} frames of {path}: its meaning is unknown. If it is the lens, write "
+            "it as fl_x, fl_y, cx and cy in pixels."
+        )
     if point_cloud := _find_points(path, document.get("ply_file_path"), warnings):
         try:
             return ExportedScene(views, *read_points(point_cloud), excluded, warnings)
         except LodgsError as error:
             warnings.append(error.what)
     return ExportedScene(views, excluded=excluded, warnings=warnings)
+
+
+def _frame_values(common: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of a frame. Its own focal length or field of view replaces all common ones."""
+    own = {name: value for name, value in own.items() if value is not None}
+    replaced = ("fl_x", "fl_y", "camera_angle_y") if "camera_angle_x" in own else ()
+    values = {
+        name: value for name, value in common.items() if name not in replaced and value is not None
+    } | own
+    if "fl_x" in own and "fl_y" not in own:  # with the common proportions of pixels
+        fx, fy = (get_number(common, name, 0) for name in ("fl_x", "fl_y"))
+        values["fl_y"] = get_number(own, "fl_x") * (fy / fx if fx and fy else 1)
+    return values
+
+
+def _unread_names(own: Mapping[str, Any]) -> list[str]:
+    """Return names of a frame that describe a lens, if the frame has none under a known name."""
+    if {"fl_x", "camera_angle_x"} & own.keys():
+        return []
+    return [
+        name for name, value in own.items() if _LENS.search(name) and not isinstance(value, str | bool | None)
+    ]
 
 
 def _find_points(path: Path, name: Any, warnings: list[str]) -> Path | None:
@@ -168,8 +204,17 @@ def _with_usual_names(values: Mapping[str, Any]) -> dict[str, Any]:
 def _read_matrix(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return the lens of a camera matrix, of [fx, fy, cx, cy], or of values such as fx; {} without one."""
     content: Any = next((values[name] for name in _MATRICES if values.get(name) is not None), values)
+    if content is values and isinstance(values.get("camera"), dict):
+        content = values["camera"]
     if isinstance(content, dict):
-        return {name: content[other] for name, other in _ALIASES.items() if content.get(other) is not None}
+        lens = {name: content.get(other, content.get(name)) for name, other in _ALIASES.items()}
+        focal = next((content[name] for name in _PAIR[0] if content.get(name) is not None), None)
+        if focal is not None and content.get(_PAIR[1]) is not None:
+            focals = parse_array(focal if isinstance(focal, list) else [focal, focal], 2)
+            lens = dict(
+                zip(_ALIASES, [*focals.tolist(), *parse_array(content[_PAIR[1]], 2).tolist()], strict=True)
+            )
+        return {name: value for name, value in lens.items() if value is not None}
     is_flat = isinstance(content, list) and len(content) == 4 and not isinstance(content[0], list)
     lens = parse_array(content, 4).tolist() if is_flat else parse_camera_matrix(content)
     return dict(zip(_ALIASES, lens, strict=True))
