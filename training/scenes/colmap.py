@@ -282,15 +282,15 @@ def _view_collector(folder: Path, images: Path) -> ViewCollector:
     base = folder if images == folder else images.parent
     return ViewCollector(
         ImageFiles(images),
-        SidecarFiles(_mask_folder(base), *MASK_SUFFIXES),
-        SidecarFiles(base / DEPTHS, *DEPTH_SUFFIXES),
+        SidecarFiles(_mask_folder(base), "mask", *MASK_SUFFIXES),
+        SidecarFiles(base / DEPTHS, "depth", *DEPTH_SUFFIXES),
     )
 
 
 def _mask_folder(base: Path) -> Path:
-    """Return the folder "masks", or "mask" if only that exists."""
-    masks, singular = base / MASKS, base / "mask"
-    return singular if singular.is_dir() and not masks.is_dir() else masks
+    """Return the folder "masks", or the first of other spellings that exists."""
+    spellings = (base / name for name in (MASKS, "Masks", "MASKS", "mask", "Mask", "MASK"))
+    return next((folder for folder in spellings if folder.is_dir()), base / MASKS)
 
 
 def _read_model_points(

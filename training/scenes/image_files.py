@@ -75,21 +75,26 @@ class ImageFiles:
 
 
 class SidecarFiles:
-    """Masks or depth maps of photos, named as COLMAP or nerfstudio does, in any case.
+    """Masks or depth maps of photos, named as COLMAP, nerfstudio or Metashape does, in any case.
 
     Args:
         folder: folder of the files; it may not exist.
+        kind: word that may follow the photo's name, such as "mask".
         suffixes: accepted suffixes, preferred ones first.
     """
 
-    def __init__(self, folder: Path, *suffixes: str) -> None:
+    def __init__(self, folder: Path, kind: str, *suffixes: str) -> None:
         self.folder = folder
+        self._kinds = f"_{kind}", f".{kind}"
         self._suffixes = suffixes
         self._exists = folder.is_dir()
         self._by_folded_name: dict[str, Path] | None = None
 
     def find(self, name: str) -> Path | None:
-        """Return the file of a photo, or None. Photo ``a/b.jpg`` has ``a/b.jpg.png`` or ``a/b.png``."""
+        """Return the file of a photo, or None.
+
+        Photo ``a/b.jpg`` has ``a/b.jpg.png`` or ``a/b.png``, else ``a/b_mask.png`` or ``a/b.jpg.mask.png``.
+        """
         if not self._exists:
             return None
         for suffix in self._suffixes:
@@ -100,7 +105,8 @@ class SidecarFiles:
             files = walk_files(self.folder, onerror=raise_system_problem)
             self._by_folded_name = {_folded(path.relative_to(self.folder).as_posix()): path for path in files}
         stem = os.path.splitext(name)[0]
-        names = [_folded(start + suffix) for suffix in self._suffixes for start in (name, stem)]
+        starts = [start + kind for kind in ("", *self._kinds) for start in (name, stem)]
+        names = [_folded(start + suffix) for start in starts for suffix in self._suffixes]
         return next((self._by_folded_name[key] for key in names if key in self._by_folded_name), None)
 
     def mismatch_warning(self, name: str) -> str:

@@ -321,7 +321,7 @@ def _link_masks(masks: Path, photos: Path, image_names: Mapping[str, str], out: 
         image_names: image name by photo name.
     """
     folder = out / MASKS
-    sidecars = SidecarFiles(masks, *MASK_SUFFIXES)
+    sidecars = SidecarFiles(masks, "mask", *MASK_SUFFIXES)
     files = {name: sidecars.find(name) for name in image_names}
     if not any(files.values()):
         first = next(iter(image_names))
