@@ -33,6 +33,7 @@ os.environ |= {"LODGS_CHECKPOINT_SECONDS": "0", "OMP_NUM_THREADS": "1", "LODGS_T
 
 import numpy as np  # noqa: E402
 import psutil  # noqa: E402
+import torchmetrics  # noqa: E402, F401 - loaded once, before forking
 
 import training.runs.train  # noqa: E402, F401 - loaded once, before forking
 from tests.training.conftest import write_tiny_scene  # noqa: E402
@@ -41,13 +42,14 @@ from tools.attacks import exit_code, start_fork  # noqa: E402
 from tools.attacks_blocks import DISK_FULL_MESSAGES, contents, disk_usage, small_disk  # noqa: E402
 from training import __main__  # noqa: E402
 from training.errors import LodgsError  # noqa: E402
+from training.rasterize import warm_up  # noqa: E402
 from training.runs.page.write import VIEWER  # noqa: E402
 from training.splats.gaussians import Splats  # noqa: E402
 from training.splats.ply import read_ply, write_ply  # noqa: E402
 
 FLOD = (
     "--method", "flod", "--backend", "cpu", "--image-scale", "1", "--test-every", "4", "--set", "levels=2",
-    "--set", "steps=[10,12]", "--set", "footprint=6", "--set", "max_splats=900",
+    "--set", "steps=[5,6]", "--set", "footprint=6", "--set", "max_splats=900",
 )  # fmt: skip
 PLAIN = "INPUTS/run", "--plain"
 VIEW = "--view", "00.jpg", "--size", "320x240"
@@ -166,6 +168,7 @@ class Attack:
         self.wrong: list[str] = []
         self.messages: dict[str, int] = {}
         write_inputs(self.inputs)
+        warm_up("cpu")  # forks share the loaded kernels
         for arguments in (
             ("train", "INPUTS/scene", "--out", "INPUTS/run", *FLOD),
             ("blocks", "plan", "INPUTS/scene", "--out", "INPUTS/blocks", "--cells", "2x1", *FLOD),

@@ -100,13 +100,15 @@ def estimate(job: Job, scratch: Path) -> Estimate:
         scratch: folder for files of methods with splats on disk.
 
     Raises:
-        LodgsError: the scene cannot be read or trained.
+        LodgsError: the scene cannot be read or trained, or has no points yet.
     """
     begin = time.monotonic()
     job = job.resolved()
     parameters = job.resolved_parameters()
     model, images = (Path(path) if path else None for path in (job.model, job.images))
     scene = cached_points(read_scene(Path(job.scene), model, images))
+    if not len(scene.points):
+        raise LodgsError("the scene has no points yet.", "Training makes them first.")
     backend = choose_backend(job, scene)
     torch.set_num_threads(1)  # as in training
     warm_up(backend)
@@ -146,11 +148,11 @@ def suggest_settings(job: Job, costs: Estimate) -> list[Finding]:
         findings.append(Finding(ESTIMATE, problem, "Choose a run folder on another disk."))
     if longer > LARGE_SIDE:
         scale = job.image_scale * LARGE_SIDE / longer
-        problem = f"Training images are {longer} pixels wide; the papers use at most {LARGE_SIDE}."
+        problem = f"The longer side of training images has {longer} pixels; papers use at most {LARGE_SIDE}."
         findings.append(Finding(ESTIMATE, problem, f"Set image_scale to {scale:.2g} to train faster."))
     elif longer < SMALL_SIDE and job.image_scale < 1:
         scale = min(job.image_scale * SMALL_SIDE / longer, 1.0)
-        problem = f"Training images are only {longer} pixels wide, which loses details."
+        problem = f"The longer side of training images has only {longer} pixels, which loses details."
         findings.append(Finding(ESTIMATE, problem, f"Set image_scale to {scale:.2g}."))
     if costs.seconds > LONG_SECONDS and job.preset != "draft":
         problem = f"Training takes more than {LONG_SECONDS // 3600} hours on this computer."

@@ -109,6 +109,12 @@ def test_finding_has_the_costs_in_one_sentence(job):
     )
 
 
+def test_scenes_without_points_have_no_estimate(job):
+    Path(job.scene, "sparse", "0", "points3D.txt").write_text("")
+    (finding,) = estimate_findings(job)
+    assert str(finding) == "No estimate: the scene has no points yet. Training makes them first."
+
+
 def test_cells_have_no_estimate(job):
     (finding,) = estimate_findings(replace(job, cells="2x1"))
     assert finding.severity == "estimate" and "in cells" in finding.what
@@ -121,7 +127,7 @@ def test_cells_have_no_estimate(job):
         ({"memory": 7 * 10**9}, "more than 80% of the free memory"),
         ({"disk": 45 * 10**9}, "more than 80% of the free disk space"),
         ({"size": (3200, 2400)}, "Set image_scale to 0.25"),
-        ({"size": (320, 200)}, "only 320 pixels wide, which loses details. Set image_scale to 1."),
+        ({"size": (320, 200)}, "only 320 pixels, which loses details. Set image_scale to 1."),
         ({"seconds": 9000}, "more than 2 hours on this computer. Train the preset draft first"),
     ],
 )
