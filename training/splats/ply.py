@@ -49,6 +49,8 @@ _TYPES = {
 # Rows are converted in blocks that fit in the processor's cache.
 _BLOCK = 4096
 _F_DC = ["f_dc_0", "f_dc_1", "f_dc_2"]
+_CLOUDCOMPARE = re.compile(r"scalar_((?:f_dc|f_rest|scale|rot)_\d+|opacity)")
+"""Columns of splats that CloudCompare has saved."""
 BATCH_ROWS = 1 << 15
 """Rows per batch when splats are larger than memory."""
 
@@ -369,6 +371,8 @@ def _read_header(file: IO[bytes], path: Path, splats: bool = True) -> tuple[PlyD
                         raise ValueError(f"{line[:200]!r} contains no number of rows")
                     counts.append(int(count[0]))
                     lines[number] = f"element {name} 0"  # plyfile reads a header only together with rows
+                case ["property", kind, name] if match := _CLOUDCOMPARE.fullmatch(name):
+                    lines[number] = f"property {kind} {match[1]}"
         if sum(line.lstrip().startswith("property") for line in lines) > MAX_COLUMNS:
             raise ValueError(f"it has more than {MAX_COLUMNS:,} columns")
         header = PlyData.read(io.BytesIO("\n".join(lines).encode("ascii", "replace")))

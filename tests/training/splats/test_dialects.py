@@ -59,6 +59,20 @@ def write(tmp_path):
     return make
 
 
+def test_columns_that_cloudcompare_renamed(write):
+    names = [name if name in (*XYZ, *NORMALS) else f"scalar_{name}" for name in [*PLAIN, "mark"]]
+    values = {
+        "scalar_f_dc_1": [1, 2],
+        "scalar_opacity": [3, 4],
+        "scalar_rot_0": [5, 6],
+        "scalar_scale_2": [7, 8],
+    }
+    splats = read_ply(write(names, values | dict.fromkeys(NORMALS, 0)))
+    assert splats.sh[:, 0, 1].tolist() == [1, 2] and splats.opacity_logits.tolist() == [3, 4]
+    assert splats.quats[:, 0].tolist() == [5, 6] and splats.log_scales[:, 2].tolist() == [7, 8]
+    assert list(splats.extras) == ["scalar_mark"], "unknown columns keep their names"
+
+
 def test_3d_filter_is_applied(write):
     """Scales 0.3, 0.4, 1.2 filtered by 0.4: s'² = 0.25, 0.32, 1.6, at constant mass 0.9 · 0.144."""
     values = {f"scale_{i}": [math.log(s), -1] for i, s in enumerate((0.3, 0.4, 1.2))}
