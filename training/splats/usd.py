@@ -12,6 +12,7 @@ import os
 import shutil
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -88,16 +89,33 @@ def write_usd(path: Path, levels: PortableLevels) -> None:
             if path.suffix.lower() == ".usdz":
                 os.utime(scene, (_PACKAGE_TIME, _PACKAGE_TIME))
                 package = folder / "scene.usdz"
-                if not usd.UsdUtils.CreateNewUsdzPackage(usd.Sdf.AssetPath(str(scene)), str(package)):
-                    raise OSError(0, "the package cannot be written")
+                written = usd.UsdUtils.CreateNewUsdzPackage(usd.Sdf.AssetPath(str(scene)), str(package))
+                if not (written and _is_intact(package)):  # usd-core reports no full disk
+                    raise _full_disk(folder) or OSError(0, "the package cannot be written")
                 scene = package
         except usd.Tf.ErrorException as error:
-            if shutil.disk_usage(folder).free < _MIN_FREE_BYTES:
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)) from error
+            if full := _full_disk(folder):
+                raise full from error
             raise LodgsError(
                 f"Cannot write {path}: {_first_line(error)}.", "Check the free space."
             ) from error
         os.replace(scene, temporary)
+
+
+def _is_intact(package: Path) -> bool:
+    """Return whether all files of a package are complete."""
+    try:
+        with zipfile.ZipFile(package) as archive:
+            return archive.testzip() is None
+    except (OSError, zipfile.BadZipFile):
+        return False
+
+
+def _full_disk(folder: Path) -> OSError | None:
+    """Return the error of a full disk if a folder's disk has hardly any space left."""
+    if shutil.disk_usage(folder).free >= _MIN_FREE_BYTES:
+        return None
+    return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def _write_stage(usd: SimpleNamespace, path: Path, levels: PortableLevels) -> None:

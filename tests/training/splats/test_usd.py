@@ -1,6 +1,7 @@
 """USD files: valid for usd-core, with the distances of the rules, and read back."""
 
 import os
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -123,6 +124,26 @@ def test_levels_round_trip(tmp_path, ending):
     for level, original in zip(reread.levels, bundle.levels, strict=True):
         assert level.facts == original.facts
         assert_equal(level.splats, original.splats)
+
+
+def test_truncated_packages_are_reported(tmp_path, monkeypatch):
+    """usd-core returns True after it filled the disk."""
+    usd = load_usd()
+    create = usd.UsdUtils.CreateNewUsdzPackage
+
+    def create_truncated(asset, package):
+        assert create(asset, package)
+        os.truncate(package, 4096)
+        return True
+
+    monkeypatch.setattr(usd.UsdUtils, "CreateNewUsdzPackage", create_truncated)
+    with pytest.raises(LodgsError, match=r"Cannot write .*a\.usdz: the package cannot be written"):
+        export_levels(tmp_path / "a.usdz", flod(0))
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=0))
+    with pytest.raises(LodgsError, match=r"Cannot write .*a\.usdz: No space left"):
+        export_levels(tmp_path / "a.usdz", flod(0))
+    assert not list(tmp_path.iterdir())
 
 
 def test_packages_do_not_depend_on_the_time(tmp_path, monkeypatch):
