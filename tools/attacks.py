@@ -35,7 +35,7 @@ import numpy as np  # noqa: E402
 
 import training.runs.train  # noqa: E402, F401 - loaded once, before forking
 from tests.training.conftest import FOCAL, HEIGHT, WIDTH, write_tiny_scene  # noqa: E402
-from tools.attacks_blocks import DISK_FULL_MESSAGES, contents, small_disk  # noqa: E402
+from tools.small_disk import DISK_FULL_MESSAGES, contents, small_disk  # noqa: E402
 from training import __main__, files  # noqa: E402
 from training.errors import LodgsError  # noqa: E402
 from training.optimize.method import Method  # noqa: E402

@@ -5,8 +5,8 @@
 Each action of ACTIONS runs undisturbed once, in Blender's module. Then it runs on disks that are too small (a
 tmpfs, which needs root on Linux). It must report an error with the name of a file or folder of the disk.
 Every file under its final name must be complete, and the same action must succeed afterwards, with enough
-space. Results are written to build/attacks_blender.json. Exports through the trainer need
-LODGS_TRAINER_PYTHON.
+space. Results are written to build/attacks_blender.json. The trainer's Python, LODGS_TRAINER_PYTHON, makes
+the inputs and some exports.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import importlib
 import io
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -28,13 +29,9 @@ from typing import NamedTuple
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from tests.training.conftest import write_tiny_scene  # noqa: E402
-from tests.training.splats.test_formats import random_splats  # noqa: E402
-from tools.attacks_blocks import DISK_FULL_MESSAGES, contents, disk_usage, small_disk  # noqa: E402
 from tools.blender_module import EXTENSION, start_blender  # noqa: E402
-from training.runs.page.write import VIEWER  # noqa: E402
-from training.splats.bundle import write_bundle  # noqa: E402
-from training.splats.levels import Bundle, Level  # noqa: E402
+from tools.small_disk import DISK_FULL_MESSAGES, contents, disk_usage, small_disk  # noqa: E402
+from tools.viewer import FOLDER as VIEWER  # noqa: E402
 
 COUNTS = 200, 400
 SIZE = 96, 72
@@ -48,17 +45,20 @@ class Action(NamedTuple):
         operator: name of an operator of ``bpy.ops.lodgs``, or "render".
         options: arguments of the operator.
         same: whether equal inputs give equal files; other files are only checked to be complete.
+        copied: input that the action completes: it is copied to DISK first.
     """
 
     words: tuple[str, ...] = ()
     operator: str = ""
     options: dict = {}
     same: bool = True
+    copied: str = ""
 
 
 ACTIONS = {
     "save": Action(("import", "INPUTS/bundle.ply", "--blend", "DISK/scene.blend"), same=False),
     "save photos": Action(("import", "INPUTS/scene", "--blend", "DISK/scene.blend"), same=False),
+    "import export": Action((), "import_colmap", {"directory": "DISK/export"}, copied="export"),
     "export command": Action(("export", "INPUTS/scene.blend", "DISK/bundle.ply")),
     "capture command": Action(
         (
@@ -106,9 +106,8 @@ class Attack:
         ).is_complete_file
         self.wrong: list[str] = []
         self.messages: dict[str, int] = {}
-        write_tiny_scene(self.inputs / "scene")
-        levels = [Level(n, random_splats(count, 1, n)) for n, count in enumerate(COUNTS, 1)]
-        write_bundle(self.inputs / "bundle.ply", Bundle("flod", levels))
+        trainer = os.environ["LODGS_TRAINER_PYTHON"]
+        subprocess.run([trainer, __file__, "--inputs", str(self.inputs)], check=True)
         self._mesh_scene(self.inputs / "mesh.blend")
         problem = self._command(("import", "INPUTS/bundle.ply", "--blend", "INPUTS/scene.blend"))
         assert not problem, problem
@@ -117,15 +116,18 @@ class Attack:
         """Run an action on disks of several sizes; return the number of full disks and the seconds of one."""
         self.disk.mkdir(exist_ok=True)
         with small_disk(self.disk, 1 << 30):
+            self._copy(name)
+            copied = disk_usage(self.disk)
             start = time.monotonic()
             if problem := self._run(name):
                 raise RuntimeError(f"{name}: undisturbed action failed: {problem}")
             seconds = time.monotonic() - start
-            expected, written = contents(self.disk), disk_usage(self.disk)
+            expected, written = contents(self.disk), disk_usage(self.disk) - copied
         full = 0
         for number in range(disks):
-            size = int(written * (number + 0.5) / disks) // 4096 * 4096 + 4096
+            size = copied + int(written * (number + 0.5) / disks) // 4096 * 4096 + 4096
             with small_disk(self.disk, size):
+                self._copy(name)
                 problem = self._run(name)
                 attack = f"{name}, {size} bytes"
                 if problem:
@@ -139,6 +141,10 @@ class Attack:
                     self.wrong.append(f"{attack}: afterwards: {problem}")
                 self._check_files(name, f"{attack}, afterwards", expected, complete=True)
         return {"full disks": full, "seconds": round(seconds, 2)}
+
+    def _copy(self, name: str) -> None:
+        if copied := ACTIONS[name].copied:
+            shutil.copytree(self.inputs / copied, self.disk / copied)
 
     def _run(self, name: str) -> str:
         """Run an action; return its error, or ""."""
@@ -217,12 +223,39 @@ class Attack:
         return abs(len(data) - len(expected)) < 64
 
 
+def write_inputs(folder: Path) -> None:
+    """Write a scene, an export and a bundle. Needs Pillow, which Blender's Python lacks."""
+    from tests.training.conftest import write_tiny_scene
+    from tests.training.splats.test_formats import random_splats
+    from training.splats.bundle import write_bundle
+    from training.splats.levels import Bundle, Level
+
+    write_tiny_scene(folder / "scene")
+    write_export(folder / "export", folder / "scene" / "images")
+    levels = [Level(n, random_splats(count, 1, n)) for n, count in enumerate(COUNTS, 1)]
+    write_bundle(folder / "bundle.ply", Bundle("flod", levels))
+
+
+def write_export(folder: Path, photos: Path) -> None:
+    """Write an export with photos and without points, which an import converts."""
+    shutil.copytree(photos, folder / "images")
+    pose = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    names = sorted(path.name for path in photos.iterdir())
+    frames = [{"file_path": f"images/{name}", "transform_matrix": pose} for name in names]
+    document = {"camera_angle_x": 1.0, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(document), "utf-8")
+
+
 def main() -> int:
     """Run the attacks, print and write results; return 1 if anything went wrong."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--disks", type=int, default=20)
     parser.add_argument("--only", nargs="+", choices=ACTIONS, default=list(ACTIONS))
+    parser.add_argument("--inputs", type=Path, help="write the inputs into a folder, and stop")
     options = parser.parse_args()
+    if options.inputs:
+        write_inputs(options.inputs)
+        return 0
     if sys.platform != "linux" or os.geteuid() != 0:
         print("Skipping full disks: mounting a small tmpfs needs root on Linux.")
         return 0

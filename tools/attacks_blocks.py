@@ -33,6 +33,7 @@ sys.path.insert(0, str(ROOT))
 import psutil  # noqa: E402 - Dask needs it
 
 from tests.training.conftest import write_tiny_scene  # noqa: E402
+from tools.small_disk import DISK_FULL_MESSAGES, contents, small_disk  # noqa: E402
 from training.runs.folder import RunFolder  # noqa: E402
 
 CHECKPOINT_SECONDS = 1.0
@@ -50,7 +51,6 @@ ENVIRONMENT = {
 }  # fmt: skip
 KINDS = ("worker", "trainer", "computer", "shutdown")
 ONCE = ("scheduler", "command")
-DISK_FULL_MESSAGES = ("No space left on device", "disk is full", "Free some disk space")
 
 
 class Cluster:
@@ -294,35 +294,6 @@ def lost_seconds(run: RunFolder) -> Iterator[float]:
             elif event.get("message", "").startswith("Resuming at step ") and last:
                 step = int(event["message"].split()[3])
                 yield max(last["step"] - step, 0) / max(last["steps_per_s"], 1e-6)
-
-
-def contents(run: Path) -> dict[str, bytes]:
-    """Return a run's files by name, without the contents of files with times and paths."""
-    changing = {"events.jsonl", "lock", "job.toml"}
-    excluded = {"trainer.log", "trainer.out"}
-    files = {path.relative_to(run).as_posix(): path for path in run.rglob("*") if path.is_file()}
-    return {
-        name: b"" if path.name in changing else path.read_bytes()
-        for name, path in files.items()
-        if path.name not in excluded
-    }
-
-
-def disk_usage(folder: Path) -> int:
-    """Return the bytes that a folder takes on a tmpfs."""
-    paths = list(folder.rglob("*"))
-    return sum(-(-path.stat().st_size // 4096) * 4096 for path in paths if path.is_file())
-
-
-@contextmanager
-def small_disk(folder: Path, size: int):
-    """Mount a tmpfs of this many bytes at a folder."""
-    folder.mkdir(exist_ok=True)
-    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "lodgs", str(folder)], check=True)
-    try:
-        yield folder
-    finally:
-        subprocess.run(["umount", str(folder)], check=True)
 
 
 @contextmanager

@@ -39,7 +39,7 @@ import training.runs.train  # noqa: E402, F401 - loaded once, before forking
 from tests.training.conftest import write_tiny_scene  # noqa: E402
 from tests.training.scenes.test_rendered_views import views, write_views  # noqa: E402
 from tools.attacks import exit_code, start_fork  # noqa: E402
-from tools.attacks_blocks import DISK_FULL_MESSAGES, contents, disk_usage, small_disk  # noqa: E402
+from tools.small_disk import DISK_FULL_MESSAGES, contents, disk_usage, small_disk  # noqa: E402
 from training import __main__  # noqa: E402
 from training.errors import LodgsError  # noqa: E402
 from training.rasterize import warm_up  # noqa: E402
