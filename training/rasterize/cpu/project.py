@@ -2,7 +2,8 @@
 
 Notation: p = R m + t the mean in camera coordinates, M = R Q diag(s) with covariance M Mᵀ, J the Jacobian of
 (fx x/z, fy y/z) at p (clamped to a frustum a little wider than the image), cov = J M Mᵀ Jᵀ + dilation (EWA
-splatting, Zwicker et al. 2001, as in 3DGS Eq. 5), conic = cov⁻¹. Blocks of WIDTH splats are computed in lanes.
+splatting, Zwicker et al. 2001, as in 3DGS Eq. 5), conic = cov⁻¹. Kernels compute blocks of WIDTH splats in
+lanes.
 """
 
 from __future__ import annotations
