@@ -138,6 +138,7 @@ window: setup
 interop: setup
 	$(VENV) tools/interop.py
 	$(VENV) tools/interop_viewers.py
+	$(VENV) tools/interop_usd.py
 	$(VENV) tools/shaders.py
 
 attacks: setup

@@ -1,6 +1,7 @@
 """The check of other programs."""
 
 import os
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from tests.training.splats.test_formats import random_splats
 from tools import interop
 from tools.interop_cut import draw_with_cut
+from tools.interop_usd import compare
 from tools.interop_walk import Walk
 from training.api import render_image
 from training.scenes.cameras import Camera
@@ -123,3 +125,36 @@ def test_walk_approaches_the_subject(walk):
     depths = [-camera.center[2] for camera in cameras]
     assert depths == sorted(depths, reverse=True)
     np.testing.assert_allclose(cameras[-1].center, (0, 0, -4), atol=1e-6)
+
+
+class FakeAttribute:
+    """An attribute of a splat cloud in Blender."""
+
+    def __init__(self, values):
+        self.values, self.data = values, self
+
+    def foreach_get(self, _kind, target):
+        target[:] = self.values.reshape(-1)
+
+
+@pytest.mark.parametrize(
+    ("name", "fault"),
+    [
+        ("", ""),
+        ("position", "position"),
+        ("scale", "scale"),
+        ("rotation", "rotation"),
+        ("radiance:sh_2", "sh"),
+    ],
+)
+def test_changed_values_of_a_splat_cloud_are_named(name, fault):
+    splats = random_splats(9, 1)
+    turns = splats.quats / np.linalg.norm(splats.quats, axis=1, keepdims=True)
+    expected = {"position": splats.means, "scale": np.exp(splats.log_scales), "rotation": turns}
+    expected["sh"] = splats.sh
+    values = {**expected, **{f"radiance:sh_{i}": splats.sh[:, 1 + i] for i in range(3)}, "rotation": -turns}
+    if name:
+        values[name] = 1.001 * values[name]
+    attributes = {key: FakeAttribute(value) for key, value in values.items()}
+    problems = compare(SimpleNamespace(points=range(9), attributes=attributes), expected, "Level_1")
+    assert [problem.split()[1] for problem in problems] == ([fault] if fault else [])
