@@ -25,6 +25,7 @@ from training import rasterize as rasterizer
 from training.errors import LodgsError
 from training.rasterize import (
     Target,
+    contributions,
     cuda,
     photometric_loss,
     rasterize,
@@ -88,6 +89,25 @@ def test_contributions_match_reference(name, device, make_splats, odd_camera):
     assert (actual["pixels"] - exact["pixels"]).abs().sum() <= 1e-3 * exact["pixels"].sum()
     assert torch.equal(actual["views"], exact["views"])
     assert actual["total"].sum().item() == pytest.approx(alpha, rel=1e-4)
+
+
+def test_strided_tensors_give_the_same_results(device, make_splats, odd_camera):
+    """Networks return columns of one tensor as several tensors."""
+    splats = make_splats(60).to(device, torch.float32)
+    weights = torch.linspace(0, 1, 60, device=device)
+    strided = splats.map(lambda t: torch.stack([t, t], -1)[..., 0])
+    assert not strided.means.is_contiguous()
+    results = []
+    for leaves, factors in ((splats, weights), (strided, torch.stack([weights, weights], 1)[:, 0])):
+        leaves = leaves.map(lambda t: t.detach().requires_grad_())
+        options = {"weights": factors, "backend": "cuda"}
+        drawn = rasterize(leaves, odd_camera, features=leaves.quats, outputs=["depth"], **options)
+        (drawn.image.mT.sum() + drawn.features.mT.square().sum()).backward()
+        measured = contributions(leaves, [odd_camera], **options)
+        gradients = [leaf.grad for leaf in vars(leaves).values()]
+        results.append([drawn.image, drawn.features, *gradients, *vars(measured).values()])
+    for a, b in zip(*results, strict=True):
+        torch.testing.assert_close(a, b)
 
 
 def test_median_depth_matches_reference(device, make_splats, odd_camera):

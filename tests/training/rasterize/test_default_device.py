@@ -1,6 +1,7 @@
 """Test selection, self-test and description of graphics devices."""
 
 import json
+from functools import cache
 
 import pytest
 import torch
@@ -264,7 +265,7 @@ def test_summary_names_training_device_and_faster_ones(set_adapters, set_times, 
     set_adapters(CARD)
     devices = Devices("NVIDIA GeForce RTX 4070 Laptop GPU", [CARD], CARD, "")
     problem = LodgsError("Cannot use the cuda backend: NVRTC is not installed.", "Install torch.")
-    monkeypatch.setattr("training.rasterize.cuda.find_problem", lambda: problem)
+    monkeypatch.setattr(cuda, "find_problem", cache(lambda: problem))
     assert devices.summary.endswith("NVRTC is not installed. Install torch.")
     assert "Laptop: 6.0 ms (50,000 splats" in devices.summary and "trains on the CPU" in devices.summary
     monkeypatch.setattr(trial, "step_times", lambda: {"cpu": 5.0, "cuda": 2.0, "gpu": 3.0})

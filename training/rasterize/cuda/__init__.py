@@ -81,8 +81,9 @@ def contributions(
     count = len(gaussians)
     means = gaussians.means
     _check(*vars(gaussians).values(), weights)
-    gaussians = replace(gaussians, sh=means.new_zeros(count, 1, 3))
-    projected = Projected.of(gaussians, settings.mask_weights(weights, means), settings)
+    gaussians = replace(gaussians, sh=means.new_zeros(count, 1, 3)).map(torch.Tensor.contiguous)
+    weights = settings.mask_weights(weights, means)
+    projected = Projected.of(gaussians, None if weights is None else weights.contiguous(), settings)
     tiles = TileLists.of(projected, settings.view)
     largest, pixels = torch.zeros(2, count, dtype=torch.int32, device=means.device)
     total = means.new_zeros(count)
@@ -137,7 +138,7 @@ class Projected(NamedTuple):
 
     @classmethod
     def of(cls, gaussians: Gaussians, weights: torch.Tensor | None, settings: RasterSettings) -> Projected:
-        """Project splats; ``weights`` (N,) as in ``rasterize``, or None."""
+        """Project splats; ``weights`` (N,) as in ``rasterize``, or None. All tensors are contiguous."""
         v, means, antialias = settings.view, gaussians.means, settings.antialias
         count = len(means)
         pose = np.column_stack([v.rotation, v.translation]).flatten()
