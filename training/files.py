@@ -363,24 +363,6 @@ def try_lock(file: IO[bytes]) -> bool:
     return True
 
 
-@contextmanager
-def exclusive(name: str) -> Iterator[None]:
-    """Run a block while no other process of this user runs a block of the same name.
-
-    Without a writable cache folder, blocks do not wait for one another.
-    """
-    try:
-        cache_folder().mkdir(parents=True, exist_ok=True)
-        lock = (cache_folder() / f"{name}.lock").open("a+b", buffering=0)
-    except OSError:
-        yield
-        return
-    with lock:
-        while not try_lock(lock):
-            time.sleep(0.1)
-        yield
-
-
 def _sync_folder(folder: Path) -> None:
     """Flush a folder, which makes a rename durable. Windows needs no such call."""
     if os.name != "posix":

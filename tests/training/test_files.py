@@ -7,12 +7,10 @@ import subprocess
 import sys
 from contextlib import contextmanager
 from pathlib import Path
-from threading import Thread
 
 import numpy as np
 import pytest
 
-from training import files
 from training.errors import LodgsError, system_reason
 from training.files import (
     atomic_folder,
@@ -230,30 +228,6 @@ def test_long_names_can_be_written(tmp_path):
     with atomic_write(path) as temporary:
         temporary.touch()
     assert os.listdir(tmp_path) == [path.name]
-
-
-def test_blocks_of_one_name_run_in_turn(tmp_path, monkeypatch):
-    monkeypatch.setattr(files, "cache_folder", lambda: tmp_path / "cache")
-    order = []
-
-    def run_second():
-        with files.exclusive("work"):
-            order.append("second")
-
-    with files.exclusive("work"):
-        thread = Thread(target=run_second)
-        thread.start()
-        thread.join(0.3)
-        order.append("first")
-    thread.join(200)
-    assert order == ["first", "second"]
-
-
-def test_blocks_do_not_wait_without_a_writable_cache_folder(tmp_path, monkeypatch):
-    (tmp_path / "file").touch()
-    monkeypatch.setattr(files, "cache_folder", lambda: tmp_path / "file")
-    with files.exclusive("work"), files.exclusive("work"):
-        pass
 
 
 @pytest.mark.parametrize(
