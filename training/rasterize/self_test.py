@@ -6,6 +6,7 @@ import hashlib
 import json
 import sys
 import traceback
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache
@@ -20,8 +21,7 @@ from ..documents import read_json
 from ..errors import LodgsError
 from ..files import atomic_write, cache_folder
 from ..scenes.cameras import Camera
-from . import cuda, gpu, reference
-from .cuda.source import kernel_source
+from . import gpu, reference
 from .gaussians import Gaussians
 from .gpu.device import Adapter
 from .rendering import KernelCamera, RasterSettings, Target
@@ -62,16 +62,17 @@ def run_self_test(adapter: Adapter) -> str:
     return reason
 
 
-def find_cuda_failure() -> str:
-    """Return why the NVIDIA GPU fails the self-test of the cuda backend; empty if it passes.
+def find_difference(backend: ModuleType, device: str, parts: Sequence[str]) -> str:
+    """Return why a backend's results differ from the reference's; empty if they are close.
 
-    The result is stored per GPU, version of torch, and kernels.
+    Args:
+        device: torch device of its tensors.
+        parts: texts that identify the device, its software and the kernels. The result is stored for them.
     """
-    parts = torch.__version__, str(torch.version.cuda), torch.cuda.get_device_name(), kernel_source()
     key = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:32]
     stored = _stored_result(key)
     if stored is None:
-        stored = _compare(cuda, cuda.DEVICE, repeatable=False)
+        stored = _compare(backend, device, repeatable=False)
         store_result(RESULTS, key, stored)
     return stored
 

@@ -8,6 +8,7 @@ the order in which threads finish, so results are not bit-reproducible.
 from __future__ import annotations
 
 import struct
+import sys
 from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
@@ -18,7 +19,9 @@ import torch
 from ...errors import LodgsError
 from ..gaussians import Gaussians
 from ..rendering import BackendOutput, KernelCamera, RasterSettings, SideOutputs, Target
+from ..self_test import find_difference
 from . import driver
+from .source import kernel_source
 
 DEVICE = "cuda"
 TILE, THREADS, STRIPS = 16, 256, 8
@@ -31,8 +34,6 @@ GROUP = 64
 @cache
 def find_problem() -> LodgsError | None:
     """Return why this backend cannot work, or None. The first call compiles the kernels, for some seconds."""
-    from ..self_test import find_cuda_failure
-
     if not torch.cuda.is_available():
         return LodgsError(
             "Cannot use the cuda backend: torch detects no NVIDIA GPU.",
@@ -41,7 +42,8 @@ def find_problem() -> LodgsError | None:
         )
     try:
         photometric_loss(torch.zeros(1, 1, 3, device=DEVICE), Target(torch.zeros(1, 1, 3)), 0.2).item()
-        reason = find_cuda_failure()
+        parts = torch.__version__, str(torch.version.cuda), torch.cuda.get_device_name(), kernel_source()
+        reason = find_difference(sys.modules[__name__], DEVICE, parts)
     except OSError as error:
         return LodgsError(
             f"Cannot use the cuda backend: {error}.",
