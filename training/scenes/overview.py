@@ -50,6 +50,8 @@ _AZIMUTHS = 24
 """Number of directions of candidate viewpoints."""
 _GRID = 32, 18
 """Columns and rows of the grid in which the depths of a candidate view are compared."""
+_MIN_COVERAGE = 0.3
+"""Minimum share of a cell of this grid that its splats cover; sparse outliers do not end a view."""
 _TANGENT = 0.7
 """Half width of the view at depth 1: the default lens of Blender's viewports."""
 
@@ -115,6 +117,7 @@ def choose_view(splats: Splats, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     sample = _sample(splats)
     if sample is None:
         return None
+    share = len(sample) / len(_visible_rows(splats))
     center, radius = central_ball(sample.means)
     log_sizes = np.minimum(np.sort(sample.log_scales, axis=1)[:, 1:], 80).mean(axis=1)
     sizes = np.exp(log_sizes.astype(np.float64))
@@ -129,7 +132,8 @@ def choose_view(splats: Splats, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]
             for angle in np.linspace(0, 2 * np.pi, _AZIMUTHS, endpoint=False):
                 across = np.cos(angle) * east + np.sin(angle) * north
                 position = center + distance * (np.cos(elevation) * across + np.sin(elevation) * up)
-                score = _clarity(sample.means, sizes, opacities, look_at(position, center, up), distance)
+                pose = look_at(position, center, up)
+                score = _clarity(sample.means, sizes, opacities, pose, distance, share)
                 if score > best_score:
                     best, best_score = position, score
     return None if best is None else (best, center)
@@ -225,12 +229,20 @@ def _is_upright(splats: Splats) -> bool:
 
 
 def _clarity(
-    means: np.ndarray, sizes: np.ndarray, opacities: np.ndarray, pose: np.ndarray, distance: float
+    means: np.ndarray,
+    sizes: np.ndarray,
+    opacities: np.ndarray,
+    pose: np.ndarray,
+    distance: float,
+    share: float = 1.0,
 ) -> float:
     """Return the mean depth of the nearest splats over the view, relative to ``distance`` and at most 1.5.
 
-    Splats near the camera reduce it by the share of the view that they cover. Cells of the grid without
-    splats count 0.3.
+    Splats near the camera reduce it by the share of the view that they cover. Cells of the grid that splats
+    hardly cover count 0.3.
+
+    Args:
+        share: number of these splats relative to those of the scene.
     """
     local = means @ pose[:3, :3].T + pose[:3, 3]
     x, y, z = local.T
@@ -242,9 +254,10 @@ def _clarity(
     veil = float(covered[z < 0.4 * distance].sum())
     column = ((x / z / tangents[0] + 1) / 2 * width).astype(int).clip(0, width - 1)
     row = ((y / z / tangents[1] + 1) / 2 * height).astype(int).clip(0, height - 1)
-    nearest = np.full(width * height, np.inf)
-    np.minimum.at(nearest, row * width + column, z)
-    ratios = np.where(np.isfinite(nearest), np.minimum(nearest / distance, 1.5), 0.3)
+    nearest, cell = np.full(width * height, np.inf), row * width + column
+    np.minimum.at(nearest, cell, z)
+    coverage = np.bincount(cell, covered, width * height) * width * height / share
+    ratios = np.where(coverage >= _MIN_COVERAGE, np.minimum(nearest / distance, 1.5), 0.3)
     return float(ratios.mean() * np.exp(-veil))
 
 

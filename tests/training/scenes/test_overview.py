@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from training.scenes.overview import (
+    _clarity,
     central_ball,
     choose_view,
     complete_meta,
@@ -116,6 +117,18 @@ def test_view_shows_the_background_behind_the_subject():
     splats = splats_at(np.concatenate([ball, wall]) + OFFSET, 0.1)
     position, target = choose_view(splats, np.float64([0, 0, 1]))
     assert position[1] < OFFSET[1] - 1 and position[2] > target[2]
+
+
+@pytest.mark.parametrize(("size", "is_background"), [(0.05, False), (3.0, True)])
+def test_small_outliers_are_no_background(size, is_background):
+    """They cover less than a hundredth of a cell of the view. As many large splats fill the cells."""
+    rng = np.random.default_rng(8)
+    depths = rng.uniform(20, 60, 2000)
+    means = np.column_stack([rng.uniform(-1, 1, (2000, 2)) * (0.7, 0.39), np.ones(2000)]) * depths[:, None]
+    empty = _clarity(np.zeros((0, 3)), np.zeros(0), np.zeros(0), np.eye(4), 5.0)
+    score = _clarity(means, np.full(2000, size), np.full(2000, 0.9), np.eye(4), 5.0)
+    assert empty == pytest.approx(0.3)
+    assert score == pytest.approx(1.5 if is_background else 0.3, abs=0.1)
 
 
 def test_view_of_a_room_is_from_inside():
