@@ -11,6 +11,7 @@ from mathutils import Matrix, Vector
 
 from ...training.errors import LodgsError
 from ...training.lod.crop import crop_mask
+from ...training.scenes import overview
 from ...training.scenes.cameras import Camera
 from ...training.scenes.colmap import Scene
 from ...training.splats.dialects import Warn, ignore
@@ -292,12 +293,13 @@ def central_bounds(root: bpy.types.Object) -> tuple[Vector, float] | None:
     """Return center and diagonal of a box around most of a scene, in the space of the root's parent.
 
     The box encloses nine tenths of the remaining finest level along each axis, or of the points, without
-    outliers. None if the scene has neither.
+    far background and outliers. None if the scene has neither.
     """
     points = _central_points(root)
     if not len(points):
         return None
-    low, high = np.percentile(points[:: max(len(points) // 100_000, 1)], (5, 95), axis=0)
+    points = points[:: max(len(points) // 100_000, 1)].astype(np.float64)
+    low, high = np.percentile(points[overview.is_near(points)], (5, 95), axis=0)
     size = float(np.linalg.norm(high - low)) * max(matrix_in_parent(root).to_scale())
     return matrix_in_parent(root) @ Vector((low + high) / 2), size
 

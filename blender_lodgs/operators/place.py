@@ -9,7 +9,7 @@ from .base import SceneOperator, report_errors
 
 
 class LODGS_OT_frame_scene(SceneOperator, bpy.types.Operator):
-    """Move the viewports to show most of the splat scene, without far outliers"""
+    """Move the viewports to show the subject of the splat scene, without far background and outliers"""
 
     bl_idname = "lodgs.frame_scene"
     bl_label = "Frame Splat Scene"

@@ -66,11 +66,19 @@ def central_ball(means: np.ndarray) -> tuple[np.ndarray, float]:
         means: (N, 3) finite positions, N > 0.
     """
     means = means.astype(np.float64)
-    center = np.median(means, axis=0)
-    distances = np.linalg.norm(means - center, axis=1)
+    distances = np.linalg.norm(means - np.median(means, axis=0), axis=1)
     median, ninth_decile = np.percentile(distances, (50, 90))
-    near = means[distances <= _FAR_FACTOR * median]
+    near = means[is_near(means)]
     return np.median(near, axis=0), float(max(min(ninth_decile, _FAR_FACTOR * median), 1e-9))
+
+
+def is_near(means: np.ndarray) -> np.ndarray:
+    """Return a mask (N,) of the positions (N, 3), N > 0, that are not in the far background of a scene.
+
+    They are within 2.5 times the median distance from the median position.
+    """
+    distances = np.linalg.norm(means - np.median(means, axis=0), axis=1)
+    return distances <= _FAR_FACTOR * np.median(distances)
 
 
 def guess_up_rotation(splats: Splats) -> np.ndarray | None:

@@ -46,6 +46,18 @@ def test_framing_ignores_outliers(bpy, lodgs, tmp_path):
     assert lodgs("data.photographs").central_bounds(empty) is None
 
 
+def test_framing_ignores_the_far_background(bpy, lodgs, tmp_path):
+    """A cube of side 2 with a third of the splats on a distant circle, such as buildings around a square."""
+    splats, angles = ball(900, 0), np.linspace(0, 2 * np.pi, 300)
+    circle = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(300)])
+    splats.means[:300] = (10, 20, 30) + 50 * circle
+    write_bundle(tmp_path / "b.ply", Bundle("", [Level(1, splats)]))
+    root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply", upright=False)
+    center, size = lodgs("data.photographs").central_bounds(root)
+    np.testing.assert_allclose(center, (10, 20, 30), atol=0.3)
+    assert size == pytest.approx(2 * 0.9 * 3**0.5, rel=0.1)
+
+
 def test_framing_ignores_cropped_and_hidden_splats(bpy, lodgs, tmp_path):
     from mathutils import Matrix
 
