@@ -8,7 +8,7 @@ from ...training.lod.rule import resolve_rule
 from ...training.splats.level_colors import level_color
 from .. import compat, viewport
 from ..data import roots
-from ..viewport import views
+from ..viewport import view_state, views
 from .parts import Panel, say, short_count, split_column
 
 
@@ -55,6 +55,11 @@ class LODGS_PT_viewport(Panel):
         counts = views.reduced_counts()
         if settings.splats and not settings.native and counts:
             layout.label(text=_budget_text(*counts), icon="INFO")
+        suggestion = view_state.suggest_budget()
+        if settings.splats and not settings.native and suggestion:
+            count, seconds, budget = suggestion
+            text = f"A moving view takes {seconds:.1f} s for {short_count(count)} splats. "
+            say(layout, text + f"For smooth motion, set Splat Budget to {budget:,}.", "INFO")
 
 
 def _header_text(drawn: int, full: int) -> str:

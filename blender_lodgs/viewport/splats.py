@@ -8,6 +8,7 @@ overlays.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from typing import Protocol
 
@@ -138,7 +139,8 @@ def draw(
     resolution: float = 1.0,
     under_overlays: bool = True,
     frame: Frame = FULL_FRAME,
-) -> None:
+    timed: bool = False,
+) -> float:
     """Draw splats into the active framebuffer, tested against its depth.
 
     Args:
@@ -151,6 +153,10 @@ def draw(
             viewport's.
         frame: left, bottom, right, top of the camera's frame in clip space. Splats outside are stretched
             according to their distance from it, as in a render.
+        timed: wait until the splats are drawn.
+
+    Returns:
+        The seconds from the first splat to the last if timed, else 0.
     """
     target = gpu.state.active_framebuffer_get()
     _, _, width, height = gpu.state.viewport_get()
@@ -163,6 +169,7 @@ def draw(
     looks_texture = _looks_texture([placement.looks for placement in placements])  # freed with its last name
     placements_texture = _placements_texture(placements, view, projection)
     canvas.resize((max(1, round(width * resolution)), max(1, round(height * resolution))))
+    begin = time.monotonic()
     with canvas.frame.bind():  # type: ignore[union-attr]
         canvas.frame.clear(color=(0, 0, 0, 0), depth=1.0)
         _write_depth(depth)
@@ -171,7 +178,10 @@ def draw(
             "palette": palette(),
         }  # fmt: skip
         _blend(store, textures, count, projection, canvas.size, frame)
+        if timed:
+            canvas.frame.read_color(0, 0, 1, 1, 4, 0, "FLOAT")  # waits for the graphics card
     _composite(canvas, overlay)
+    return time.monotonic() - begin if timed else 0.0
 
 
 def _write_depth(depth: gpu.types.GPUTexture) -> None:

@@ -24,6 +24,12 @@ from .resident import Cloud, Resident, Store
 LOADING = 0.01, 0.02
 """Minimum and maximum seconds a redraw spends on uploads. A started batch is completed; redraws stay below
 0.05 seconds."""
+SMOOTH = 0.2
+"""Seconds per redraw of a moving view above which a smaller budget is suggested."""
+COST_CHANGE = 0.1
+"""Relative change of the number of splats from which a view is measured again."""
+MIN_BUDGET = 10_000
+"""Smallest suggested budget."""
 GROWTH = 1.5
 """Factor of uploaded splats at which an incomplete arrangement is listed again."""
 
@@ -46,7 +52,8 @@ class ViewState:
         resolution: resolution of the splats relative to the viewport.
         marks: drawn marks, see ``resident.Resident``.
         shows_marks: draw selected splats and previewed clutter in their colours.
-        stated_counts: numbers of splats that header and panel state, see ``views.reduced_counts``.
+        cost: number of drawn splats and seconds to draw them, measured while the view moved.
+        stated: values that header and panel state, see ``views.reduced_counts`` and :func:`suggest_budget`.
     """
 
     canvas: splats.Canvas = field(default_factory=splats.Canvas)
@@ -65,7 +72,12 @@ class ViewState:
     resolution: float = 1.0
     marks: np.ndarray | None = None
     shows_marks: bool = False
-    stated_counts: tuple[int, int] | None = None
+    cost: tuple[int, float] | None = None
+    stated: tuple[tuple[int, int] | None, tuple[int, float] | None] = (None, None)
+
+    def is_cost_outdated(self) -> bool:
+        """Return True if the view should be measured, which waits for the graphics card."""
+        return self.cost is None or abs(self.count - self.cost[0]) > COST_CHANGE * self.cost[0]
 
     def reset(self) -> None:
         """Stop drawing."""
@@ -174,3 +186,16 @@ class ViewState:
 
 active_views: weakref.WeakSet[ViewState] = weakref.WeakSet()
 """Views with splats in the store: viewports, and renders while they last."""
+
+
+def suggest_budget() -> tuple[int, float, int] | None:
+    """Return the splats and seconds of the slowest viewport while it moves, and a budget for smooth motion.
+
+    Returns:
+        None if all viewports are fast enough.
+    """
+    costs = [view.cost for view in active_views if view.cost]
+    count, seconds = max(costs, key=lambda cost: cost[1], default=(0, 0.0))
+    if seconds <= SMOOTH or count <= MIN_BUDGET:
+        return None
+    return count, seconds, max(int(float(f"{count * SMOOTH / seconds:.1g}")), MIN_BUDGET)

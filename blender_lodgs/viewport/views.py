@@ -83,10 +83,10 @@ def draw(context: bpy.types.Context) -> None:
         view, instances, context.evaluated_depsgraph_get(),
         region_data.view_matrix, region_data.window_matrix, settings.budget, moving=True,
         under_overlays=space.overlay.show_overlays and not _shows_photo(camera),
-        frame=frame,
+        frame=frame, timed=now - view.moved < REST and view.is_cost_outdated(),
     )  # fmt: skip
-    if (counts := reduced_counts(region)) != view.stated_counts:
-        view.stated_counts = counts
+    if (stated := (reduced_counts(region), view.cost)) != view.stated:
+        view.stated = stated
         for other in context.area.regions:
             if other.type in ("HEADER", "UI"):
                 other.tag_redraw()
@@ -127,6 +127,7 @@ def draw_splats(
     frame: splats.Frame = splats.FULL_FRAME,
     wait: bool = False,
     moving: bool = False,
+    timed: bool = False,
 ) -> None:
     """Draw splat instances into the active framebuffer.
 
@@ -135,6 +136,7 @@ def draw_splats(
         view_matrix, projection: matrices from the world to camera space, and from there to clip space.
         budget, wait, moving: see :func:`prepare`.
         under_overlays, frame: see ``splats.draw``.
+        timed: measure the cost of the view.
     """
     request = prepare(view, instances, depsgraph, view_matrix, budget, wait, moving)
     if view.arrangement is None or view.store is None or view.instances is None or not view.count:
@@ -142,10 +144,12 @@ def draw_splats(
     placements = view.arrangement.request.placements
     if _same_splats(placements, request.placements):  # objects move at once; their order follows
         placements = request.placements
-    splats.draw(
+    seconds = splats.draw(
         view.store, view.instances, view.count, placements, view_matrix, projection, view.canvas,
-        resolution=view.resolution, under_overlays=under_overlays, frame=frame,
+        resolution=view.resolution, under_overlays=under_overlays, frame=frame, timed=timed,
     )  # fmt: skip
+    if timed:
+        view.cost = view.count, seconds
 
 
 def prepare(

@@ -87,3 +87,17 @@ def test_default_budget_follows_the_memory(lodgs, monkeypatch, gigabytes, budget
     properties = lodgs("data.properties")
     monkeypatch.setattr(properties, "free_memory", lambda: gigabytes << 30)
     assert properties.default_budget() == budget
+
+
+@pytest.mark.parametrize(("seconds", "budget"), [(0.15, None), (0.8, "200,000"), (50.0, "10,000")])
+def test_panel_suggests_a_budget_for_the_measured_speed(bpy, lodgs, viewport, draw_panel, seconds, budget):
+    """1 M splats in 0.8 s are 250,000 in 0.2 s, rounded to one digit."""
+    state = lodgs("viewport.view_state")
+    view = state.ViewState(cost=(1_000_000, seconds))
+    state.active_views.clear()
+    state.active_views.add(view)
+    texts = [text for text in draw_panel("viewport", "LODGS_PT_viewport").texts if "smooth motion" in text]
+    expected = (
+        f"A moving view takes {seconds:.1f} s for 1.0 M splats. For smooth motion, set Splat Budget to "
+    )
+    assert texts == ([expected + f"{budget}."] if budget else [])

@@ -169,6 +169,27 @@ def test_each_redraw_uploads_a_batch(bpy, lodgs, draw_from, monkeypatch):
     np.testing.assert_array_equal(images[-1], draw_from(views.ViewState(), 3.0))
 
 
+def test_cost_is_measured_for_another_number_of_splats(lodgs, draw_from, monkeypatch):
+    """Blending takes half a second of the clock of this test."""
+    splats, views = lodgs("viewport.splats"), lodgs("viewport.views")
+    view, now = views.ViewState(), 0.0
+    monkeypatch.setattr(splats, "time", SimpleNamespace(monotonic=lambda: now))
+    blend, draw_splats = splats._blend, views.draw_splats
+
+    def slow_blend(*arguments):
+        nonlocal now
+        now += 0.5
+        blend(*arguments)
+
+    monkeypatch.setattr(splats, "_blend", slow_blend)
+    assert view.is_cost_outdated()
+    monkeypatch.setattr(views, "draw_splats", lambda *a, **k: draw_splats(*a, **k, timed=True))
+    draw_from(view, 0.0)
+    assert view.cost == (view.count, 0.5) and not view.is_cost_outdated()
+    view.count = round(0.8 * view.count)
+    assert view.is_cost_outdated()
+
+
 def test_viewports_that_load_at_once_upload_each_splat_once(lodgs, draw_from, monkeypatch):
     """A second slot of a splat would take the place of one that is drawn."""
     views, resident = lodgs("viewport.views"), lodgs("viewport.resident")
