@@ -340,21 +340,13 @@ def show_only(root: bpy.types.Object, number: int) -> None:
 
 
 def attach_ellipsoids(scene: bpy.types.Scene) -> None:
-    """Give every level of a Blender scene the ellipsoid modifier, and raise Cycles' transparent bounces.
-
-    A scene of meshes shows ellipsoids only by shadows, which are exact, and by bounced light: rays of bounced
-    light may end at random.
-    """
+    """Give every level of a Blender scene the ellipsoid modifier, and raise Cycles' transparent bounces."""
     for root in roots(scene):
         for item in root.lodgs.levels:
             if item.exists:
                 ellipsoids.attach(item.object)
-    cycles = getattr(scene, "cycles", None)
-    if cycles is None:
-        return
-    cycles.transparent_max_bounces = max(cycles.transparent_max_bounces, ellipsoids.BOUNCES)
-    if not scene.lodgs_render.is_for_meshes:
-        cycles.min_transparent_bounces = max(cycles.min_transparent_bounces, ellipsoids.BOUNCES)
+    if hasattr(scene, "cycles"):
+        ellipsoids.raise_bounces(scene.cycles, bounced_light_only=scene.lodgs_render.is_for_meshes)
 
 
 def _looks(root: bpy.types.Object) -> look.Looks:

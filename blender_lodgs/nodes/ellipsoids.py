@@ -39,6 +39,18 @@ def attach(obj: bpy.types.Object) -> None:
         modifier.node_group = ellipsoids()  # a file of an older version has an older group
 
 
+def raise_bounces(cycles: bpy.types.PropertyGroup, bounced_light_only: bool) -> None:
+    """Raise Cycles' transparent bounces for rays through many ellipsoids.
+
+    Args:
+        cycles: ``Scene.cycles``.
+        bounced_light_only: cameras see no ellipsoids; rays of bounced light may end at random.
+    """
+    cycles.transparent_max_bounces = max(cycles.transparent_max_bounces, BOUNCES)
+    if not bounced_light_only:
+        cycles.min_transparent_bounces = max(cycles.min_transparent_bounces, BOUNCES)
+
+
 def ellipsoids() -> bpy.types.GeometryNodeTree:
     """Return the node group."""
     return ensure_group(NAME, 3, _build)
