@@ -190,7 +190,9 @@ def test_command_can_be_repeated_after_a_full_disk(walls, tmp_path, capsys, monk
     with monkeypatch.context() as patch:
         patch.setattr("training.cli.scene._print_progress", fill_disk)
         assert main(words) == 2
-    assert f"Cannot write COLMAP scene {tmp_path / 'out'}: No space left" in capsys.readouterr().err
+    output = capsys.readouterr().err
+    assert f"Cannot write COLMAP scene {tmp_path / 'out'}: No space left" in output
+    assert "Free some space" in output
     assert not any((tmp_path / "out" / "sparse").iterdir())
     assert main(words) == 0 and len(read_scene(tmp_path / "out").points)
 

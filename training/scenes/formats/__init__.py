@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 
-from ...errors import LodgsError, SystemProblem, system_reason
+from ...errors import LodgsError, SystemProblem, system_reason, system_remedy
 from ...files import check_folder, is_file, link_or_copy, temporary_folder
 from ...splats.georeference import write_georeference
 from ..colmap import DEPTHS, MASKS, NO_POINTS, Scene, find_models, read_scene, scene_lenses, subfolders
@@ -171,7 +171,7 @@ def convert_export(
     except OSError as error:
         raise LodgsError(
             f"Cannot write COLMAP scene {scene}: {system_reason(error)}.",
-            "Choose another output folder (lodgs scene --from DIR --out DIR).",
+            system_remedy(error, "Choose another output folder (lodgs scene --from DIR --out DIR)."),
         ) from error
     if completed is not None:
         warnings, count = [*warnings, *completed.warnings], len(completed.points)
