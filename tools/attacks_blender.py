@@ -261,13 +261,14 @@ def main() -> int:
         return 0
     with tempfile.TemporaryDirectory(prefix="lodgs-attacks-") as folder:
         attack = Attack(Path(folder))
-        results = {}
+        results, reported = {}, 0
         for name in options.only:
             if name == "page" and not VIEWER.is_dir():
                 print(f"Skipping {name}: the viewer is not installed (tools/viewer.py).")
                 continue
             results[name] = attack.fill_disks(name, options.disks)
-            print(name, results[name], flush=True)
+            print(name, results[name], *attack.wrong[reported:], sep="\n", flush=True)
+            reported = len(attack.wrong)
     report = ROOT / "build" / "attacks_blender.json"
     report.parent.mkdir(exist_ok=True)
     figures = {"actions": results, "messages": attack.messages, "wrong": attack.wrong}

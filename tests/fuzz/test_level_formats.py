@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import json
 import shutil
+import zipfile
 from contextlib import suppress
 
 import numpy as np
@@ -20,6 +21,7 @@ from tests.training.splats.test_gltf import assembled, read_parts
 from tests.training.splats.test_spz import spz, spz4
 from training.editing.export import export_levels
 from training.splats.bundle import read_bundle
+from training.splats.formats import open_as_ply
 from training.splats.gltf import read_glb, write_compressed_glb
 from training.splats.levels import Bundle, Level
 from training.splats.portable_levels import PortableLevels
@@ -137,6 +139,34 @@ def test_corrupt_sog_files(folder, streamed, data, name):
     for file, image in good.items():
         (folder / "web" / "0_0" / file).write_bytes(content if file == name else image)
     _try_streamed(folder, content)
+
+
+@pytest.mark.cases(short=60, weight=0.5)
+@given(data=st.data(), degree=st.sampled_from([0, 2]))
+def test_corrupt_sog_archives(folder, data, degree):
+    """Corrupt the archive, or one of its files, whose checksum then is right."""
+    path = folder / "a.sog"
+    files = encode_sog(random_splats(60, degree))
+    name = data.draw(st.sampled_from(["", *files]))
+    if name == "meta.json":
+        values = data.draw(corrupted_value(json.loads(files[name])))
+        files[name] = json.dumps(values, skipkeys=True).encode("utf-8", "surrogatepass")
+    elif name:
+        files[name] = data.draw(corrupted([files[name], *files.values()]))
+    with zipfile.ZipFile(path, "w") as archive:
+        for member, content in files.items():
+            archive.writestr(member, content)
+    content = path.read_bytes()
+    if not name:
+        content = data.draw(corrupted([content]))
+        path.write_bytes(content)
+
+    def read() -> None:
+        with open_as_ply(path) as ply:
+            splats = read_bundle(ply).levels[-1].splats
+        assert np.isfinite(splats.means).all() and np.isfinite(splats.sh).all()
+
+    attempt("SOG", read, (name, content))
 
 
 def _try_streamed(folder, content):
