@@ -142,7 +142,7 @@ class Undisturbed(NamedTuple):
     Attributes:
         files: contents of its files by name.
         copied: bytes of its inputs on the disk.
-        written: bytes that it adds.
+        written: largest number of bytes that it adds, with temporary files.
         seconds: duration.
     """
 
@@ -182,11 +182,17 @@ class Attack:
         shutil.rmtree(self.disk, ignore_errors=True)
         self._prepare(name)
         copied = disk_usage(self.disk)
-        start = time.monotonic()
-        if code := exit_code(self._start(name)):
+        start, peak = time.monotonic(), 0
+        process = self._start(name)
+        while process.is_alive():
+            with suppress(OSError):  # a file was renamed or removed meanwhile
+                peak = max(peak, disk_usage(self.disk))
+            time.sleep(0.01)
+        if code := exit_code(process):
             raise RuntimeError(f"{name}: undisturbed command ended with {code}: {self._log()}")
         seconds = time.monotonic() - start
-        result = Undisturbed(self._contents(name), copied, disk_usage(self.disk) - copied, seconds)
+        peak = max(peak, disk_usage(self.disk))
+        result = Undisturbed(self._contents(name), copied, peak - copied, seconds)
         shutil.rmtree(self.disk)
         return result
 

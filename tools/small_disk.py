@@ -6,7 +6,7 @@ import subprocess
 from contextlib import contextmanager
 from pathlib import Path
 
-DISK_FULL_MESSAGES = ("No space left on device", "disk is full", "Free some disk space")
+DISK_FULL_MESSAGES = "No space left on device", "disk is full", "Free some space", "Free some disk space"
 
 
 def contents(run: Path) -> dict[str, bytes]:
