@@ -62,7 +62,7 @@ def command(path: Path, keys: dict) -> list[str]:
 
 TINY = {
     "flod": {
-        "levels": 3, "steps": [19, 21, 27], "refine_steps": 10, "footprint": 6.0, "densify_interval": 5,
+        "levels": 3, "steps": [19, 21, 27], "refine_steps": 15, "footprint": 6.0, "densify_interval": 5,
         "prune_interval": 10, "overlap_interval": 10, "sh_interval": 15, "grad_threshold": 1e-5,
         "max_splats": 300, "merge_ratio": 0.05, "random_background": False, "margin": 0.0,
     },
