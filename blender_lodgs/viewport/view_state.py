@@ -22,8 +22,11 @@ from .arrangement import Arrangement, Request
 from .resident import Cloud, Resident, Store
 
 LOADING = 0.01, 0.02
-"""Minimum and maximum seconds a redraw spends on uploads. A started batch is completed; redraws stay below
-0.05 seconds."""
+"""Minimum and maximum seconds a redraw spends on uploads. A started batch is completed; fast redraws stay
+below 0.05 seconds."""
+SLOW, SLOW_FACTOR = 0.08, 5.0
+"""Seconds between redraws from which they spend more on uploads, as with software rendering, and at most this
+factor more."""
 SMOOTH = 0.2
 """Seconds per redraw of a moving view above which a smaller budget is suggested."""
 COST_CHANGE = 0.1
@@ -127,7 +130,9 @@ class ViewState:
             store = source.reserve([rows for view in active_views for rows in view.used_splats(source)])
             missing = store.missing(loading.splats)
         # slow redraws load more, so that loading keeps its speed
-        end = now + min(max(now - self.loaded if started else 0, LOADING[0]), LOADING[1])
+        interval = now - self.loaded if started else 0
+        longest = LOADING[1] * min(max(interval / SLOW, 1.0), SLOW_FACTOR)
+        end = now + min(max(interval, LOADING[0]), longest)
         self.loaded = now
         begin = 0
         is_drawn = started and self._show(source, loading, store, missing)  # uploads of earlier redraws

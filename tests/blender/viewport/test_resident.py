@@ -169,6 +169,30 @@ def test_each_redraw_uploads_a_batch(bpy, lodgs, draw_from, monkeypatch):
     np.testing.assert_array_equal(images[-1], draw_from(views.ViewState(), 3.0))
 
 
+@pytest.mark.parametrize(("interval", "batches"), [(0.05, 2), (0.4, 10), (4.0, 10)])
+def test_slow_redraws_upload_more(lodgs, draw_from, monkeypatch, interval, batches):
+    """A batch takes 0.01 s: 2 fit into 0.02 s. Redraws of 0.08 s and more have up to five times as much."""
+    views, resident, state = lodgs("viewport.views"), lodgs("viewport.resident"), lodgs("viewport.view_state")
+    monkeypatch.setattr(resident, "UPLOAD_BATCH", 10)
+    now, inserted, insert = 0.0, 0, resident.Store.insert
+    monkeypatch.setattr(state, "time", SimpleNamespace(monotonic=lambda: now))
+
+    def slow_insert(*arguments):
+        nonlocal now, inserted
+        now, inserted = now + 0.01001, inserted + 1
+        insert(*arguments)
+
+    monkeypatch.setattr(resident.Store, "insert", slow_insert)
+    view, end = views.ViewState(), time.monotonic() + 200
+    while not inserted:
+        assert time.monotonic() < end
+        draw_from(view, 0.0, wait=False)
+        time.sleep(0.01)
+    now, inserted = view.loaded + interval, 0
+    draw_from(view, 0.0, wait=False)
+    assert inserted == batches
+
+
 def test_cost_is_measured_for_another_number_of_splats(lodgs, draw_from, monkeypatch):
     """Blending takes half a second of the clock of this test."""
     splats, views = lodgs("viewport.splats"), lodgs("viewport.views")
