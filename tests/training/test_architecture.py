@@ -165,7 +165,7 @@ def test_imports_inside_a_package_are_few(package, limit):
     assert 0 < len(inside) <= limit, sorted(inside)
 
 
-KERNELS = ("training/rasterize/cpu/blend.py", "training/rasterize/cpu/project.py")
+KERNELS = tuple(f"training/rasterize/cpu/{name}.py" for name in ("blend", "project", "project_backward"))
 """Files with long numerical kernels."""
 
 

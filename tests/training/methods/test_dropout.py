@@ -65,7 +65,7 @@ def test_dropped_splats_get_no_update(data, name):
 
 def test_finishing_has_no_dropout(data):
     """Finishing starts before the last eighth of the steps; levels have to match their rendering."""
-    flod = make(data, "flod", levels=2, steps=[4, 4], finish_share=1.0, dropout=0.5)
+    flod = make(data, "flod", levels=2, levels_from="trained", steps=[4, 4], finish_share=1.0, dropout=0.5)
     view = flod.data.view(0)
     assert (flod.render_weights(view, 0)[0] == 0).any()
     for step in range(8):

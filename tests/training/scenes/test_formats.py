@@ -115,7 +115,8 @@ def test_nerf_synthetic_with_names_without_suffix_and_field_of_view(tmp_path):
         document = {"camera_angle_x": angle, "frames": frames}
         (tmp_path / f"transforms_{name}.json").write_text(json.dumps(document))
     scene = convert_export(tmp_path)
-    assert (scene.points, scene.warnings) == (0, [])
+    (warning,) = scene.warnings
+    assert scene.points == 0 and "without those of transforms_test.json" in warning
     names = "train/r_0.png", "train/r_1.png", "train/r_2.png"
     check(tmp_path, [pixels(*project(p), (80, 80), (WIDTH / 2, HEIGHT / 2)) for p in poses()], names)
 

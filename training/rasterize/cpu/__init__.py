@@ -36,12 +36,10 @@ from .project import (
     LN2,
     RED,
     SUMS,
-    gather_sums,
-    gather_weights,
     kernel_arguments,
-    project_backward,
     project_forward,
 )
+from .project_backward import gather_sums, gather_weights, project_backward
 
 TILES = 16
 """Tiles in a thread's unit of work."""

@@ -88,9 +88,9 @@ def read(path: Path) -> ExportedScene:
     names = [frame.get(_NAMES[0]) for frame in frames]
     photos = PhotoFinder(path.parent, [name for name in names if isinstance(name, str)])
     for number, own in enumerate(frames, 1):
-        unread.update(_unread_names(own))
         try:
             views.append(_parse_view(path.parent, _frame_values(common, own), photos))
+            unread.update(_unread_names(own))
         except LodgsError as error:
             excluded.append((str(own.get("file_path", f"frame {number}")), error.what))
     warnings = photos.warnings()

@@ -123,5 +123,5 @@ def test_encrypted_scheduler_of_dask_needs_its_certificates():
 
 def test_requirements_include_the_package_for_certificates():
     requirements = Path(__file__).parents[4] / "requirements"
-    for name in ("cluster", "cuda", "develop"):
+    for name in ("cluster", "develop"):
         assert "\ncryptography==" in (requirements / f"{name}.txt").read_text("utf-8")
