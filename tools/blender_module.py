@@ -6,6 +6,7 @@ import atexit
 import os
 import shutil
 import tempfile
+from functools import cache
 from pathlib import Path
 
 from training.files import cache_folder
@@ -15,11 +16,12 @@ EXTENSION = "bl_ext.user_default.lodgs"
 """Package name of the installed extension."""
 
 
+@cache
 def start_blender():
     """Import bpy, enable the extension in a temporary Blender user folder, and return the module.
 
-    Call it once per process. The user's Blender settings are neither read nor written. All processes share
-    one folder of compiled code, because compiling takes half a minute.
+    Further calls of the process return the same module. The user's Blender settings are neither read nor
+    written. All processes share one folder of compiled code, because compiling takes half a minute.
     """
     resources = Path(tempfile.mkdtemp(prefix="lodgs-blender-"))
     link = resources / "extensions" / "user_default" / "lodgs"

@@ -35,7 +35,7 @@ def test_settings_before_training(root, draw, fake):
     layout = draw()
     assert (layout.operators, layout.buttons) == (["lodgs.train", "lodgs.check_scene"], ["Train", ""])
     assert layout.properties == ["method", "preset", "image_scale"]
-    assert "4,450 steps in 5 levels" in layout.texts
+    assert "4,786 steps in 5 levels" in layout.texts
     assert NONE_HELD_OUT in layout.texts
     root.lodgs.training.test_every = 8
     assert NONE_HELD_OUT not in draw().texts
@@ -44,7 +44,7 @@ def test_settings_before_training(root, draw, fake):
     assert any("No views are left to train on" in text for text in layout.texts) and not layout.buttons
     root.lodgs.training.test_every = 8
     root.lodgs.training.parameters.levels = 3
-    assert "3,800 steps in 3 levels" in draw().texts
+    assert "4,136 steps in 3 levels" in draw().texts
     root.lodgs.training.method = "3dgs"  # has no levels
     assert "3,000 steps" in draw().texts
 
