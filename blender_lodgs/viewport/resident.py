@@ -17,6 +17,7 @@ import bpy
 import gpu
 import numpy as np
 
+from ...training.editing.paint import COLUMNS as PAINT_COLUMNS
 from ...training.editing.paint import mix_paint
 from ...training.lod.rule import all_rule_columns
 from .. import attributes
@@ -292,7 +293,12 @@ class PoolReader:
             *(
                 (number, name)
                 for number in dict(self._attributes)
-                for name in (attributes.ROTATION, attributes.WEIGHT, *attributes.sh_names(clouds[number]))
+                for name in (
+                    attributes.ROTATION,
+                    attributes.WEIGHT,
+                    *attributes.sh_names(clouds[number]),
+                    *PAINT_COLUMNS,
+                )
             ),
         ]
 
