@@ -101,9 +101,8 @@ def new_splats(name: str, splats: Splats) -> bpy.types.Object:
         write_column(cloud, _EXTRA + column if reserved else column, values)
     obj = bpy.data.objects.new(name, cloud)
     complete_attributes(obj, splats)
-    for k in range(
-        1, splats.sh.shape[1]
-    ):  # last: most of the memory, and the other attributes need more of it
+    # last: harmonics fill most of the memory, and writing the other attributes needs more of it
+    for k in range(1, splats.sh.shape[1]):
         write_attribute(cloud, sh_name(k), "FLOAT_VECTOR", splats.sh[:, k])
     return obj
 

@@ -18,7 +18,7 @@ def _backends(_self: object, _context: object) -> list[tuple[str, str, str, int]
     _items[:] = [
         ("auto", "Automatic", "Use the device with the fastest training step, measured once per computer", 0),
         ("cpu", "CPU", "Train on the processor, which works on every computer", 1),
-        ("cuda", "NVIDIA GPU (CUDA)", "Train with CUDA, the fastest on NVIDIA cards", 2),
+        ("cuda", "NVIDIA GPU (CUDA)", "Train on an NVIDIA card with CUDA kernels", 2),
         (
             "gpu",
             f"GPU ({card})" if card else "GPU",

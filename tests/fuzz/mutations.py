@@ -120,3 +120,14 @@ def _entries(value):
         for key in list(value) if isinstance(value, dict) else range(len(value)):
             yield value, key
             yield from _entries(value[key])
+
+
+@st.composite
+def corrupted_comments(draw, content):
+    """Return a bundle, as bytes, with a corrupted value in one of its JSON comments."""
+    end = content.index(b"end_header")
+    comments = content[:end].split(b"comment lodsplat ")
+    index = draw(st.integers(1, len(comments) - 1))
+    comment, *lines = comments[index].split(b"\n")
+    comments[index] = b"\n".join([json.dumps(draw(corrupted_value(json.loads(comment)))).encode(), *lines])
+    return b"comment lodsplat ".join(comments) + content[end:]

@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.fuzz.entry_points import Defect, attempt
-from tests.fuzz.mutations import corrupted, corrupted_value
+from tests.fuzz.mutations import corrupted, corrupted_comments, corrupted_value
 from tests.fuzz.test_splats import bundles
 from tools.blender_module import EXTENSION, start_blender
 from training.errors import LodgsError
@@ -149,12 +149,7 @@ def test_corrupt_splat_files(bpy, folder, files, data):
 @given(data=st.data())
 def test_corrupt_bundle_headers(bpy, folder, files, data):
     content = files[data.draw(st.sampled_from(["flod.ply", "octree.ply", "clod.ply"]))]
-    comments = content[: content.index(b"end_header")].split(b"comment lodsplat ")
-    index = data.draw(st.integers(1, len(comments) - 1))
-    comment, *lines = comments[index].split(b"\n")
-    replacement = json.dumps(data.draw(corrupted_value(json.loads(comment)))).encode()
-    comments[index] = b"\n".join([replacement, *lines])
-    content = b"comment lodsplat ".join(comments) + content[content.index(b"end_header") :]
+    content = data.draw(corrupted_comments(content))
     (folder / "header.ply").write_bytes(content)
     attempt(
         "Blender bundle header",

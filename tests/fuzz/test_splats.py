@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.fuzz.entry_points import attempt
-from tests.fuzz.mutations import corrupted, corrupted_value
+from tests.fuzz.mutations import corrupted, corrupted_comments, corrupted_value
 from training.cli.info import describe
 from training.splats.bundle import read_bundle, write_bundle
 from training.splats.coding import Codebook
@@ -107,12 +107,7 @@ def test_corrupt_plys_and_bundles(folder, files, data):
 @given(data=st.data())
 def test_corrupt_bundle_headers(folder, files, data):
     content = data.draw(st.sampled_from(files[:6]))
-    comments = content[: content.index(b"end_header")].split(b"comment lodsplat ")
-    index = data.draw(st.integers(1, len(comments) - 1))
-    comment, *lines = comments[index].split(b"\n")
-    replacement = json.dumps(data.draw(corrupted_value(json.loads(comment)))).encode()
-    comments[index] = b"\n".join([replacement, *lines])
-    content = b"comment lodsplat ".join(comments) + content[content.index(b"end_header") :]
+    content = data.draw(corrupted_comments(content))
     path = folder / "header.ply"
     path.write_bytes(content)
     attempt("bundle", lambda: use(read_bundle(path), folder), content)

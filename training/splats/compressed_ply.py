@@ -206,5 +206,4 @@ def _pack(codes: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
 def _unpack(words: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
     """Return codes (N, parts) uint32 of words (N,)."""
     ends = 32 - np.cumsum(bits)
-    masks = (1 << np.array(bits)) - 1
-    return (words[:, None] >> ends.astype(np.uint32)) & masks.astype(np.uint32)
+    return (words[:, None] >> ends.astype(np.uint32)) & _largest(bits).astype(np.uint32)

@@ -166,7 +166,8 @@ def differentiate_block(
 ):  # fmt: skip
     """Fill result (PARAMETERS - 1, WIDTH) with the gradients of a block's splats.
 
-    Their causes are the gradients ``by`` and by_basis (K, WIDTH), of the values of the SH basis.
+    ``by`` (K, WIDTH) has the gradients by the projected ellipses, and their conics. by_basis (25, WIDTH) has
+    the gradients by the SH basis. The other arrays (25, WIDTH) are scratch memory.
     """
     fx, fy = lens[0], lens[1]
     mean_x, mean_y, mean_z = load_row(block, MEAN), load_row(block, MEAN + 1), load_row(block, MEAN + 2)

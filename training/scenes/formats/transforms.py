@@ -99,7 +99,7 @@ def read(path: Path) -> ExportedScene:
         warnings.append(f"Read the views of {path} only, without those of {', '.join(others)}.")
     for name, count in unread.items():
         warnings.append(
-            f"Ignored '{name}' of {count} frames of {path}: its meaning is unknown. If it is the lens, write "
+            f"Ignored '{name}' in {path}, frames: {count}. Its meaning is unknown. If it is the lens, write "
             "it as fl_x, fl_y, cx and cy in pixels."
         )
     if point_cloud := _find_points(path, document.get("ply_file_path"), warnings):
