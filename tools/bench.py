@@ -29,13 +29,13 @@ from training.rasterize import (
     Adam,
     Gaussians,
     Target,
-    cpu,
+    make_step_model,
     photometric_loss,
     rasterize,
     render,
     resolve_backend,
 )
-from training.rasterize.cpu import adam
+from training.rasterize.cpu import adam, frame, host_model
 from training.rasterize.cpu.bin import LOG2_ALPHA_MIN
 from training.rasterize.cpu.blend import CAP, SPAN, T_MIN
 from training.rasterize.cpu.compile import (
@@ -67,7 +67,12 @@ KERNELS = {
     "blend_backward": "blend_backward",
     "project_backward": "project_backward",
 }
-FUNCTIONS = {"bin": (cpu, "bin_splats"), "loss": (cpu, "loss_and_gradient"), "adam": (adam, "update")}
+FUNCTIONS = {
+    "bin": (frame, "bin_splats"),
+    "loss": (host_model, "loss_and_gradient"),
+    "adam": (adam, "update"),
+}
+"""Functions of further stages. The kernel "project_backward" also makes the Adam step of harmonics."""
 STAGES = ("project", "bin", "blend", "loss", "blend_backward", "project_backward", "adam")
 
 
@@ -100,12 +105,17 @@ class Step:
     """A complete training step on the synthetic scene."""
 
     def __init__(self, count: int, width: int, height: int, device: str = "cpu") -> None:
+        self.backend = device
         self.splats = synthetic_splats(count).map(lambda tensor: tensor.to(device).requires_grad_())
         self.camera = synthetic_camera(width, height)
         self.target = Target(np.random.default_rng(1).random((height, width, 3), dtype=np.float32))
         self.adam = Adam(vars(self.splats), dict.fromkeys(vars(self.splats), 1e-7))
 
     def __call__(self) -> None:
+        if model := make_step_model(self.backend, self.adam, {}):
+            options = {"near": 0.01, "sh_degree": 3, "background": (0.0, 0.0, 0.0), "ssim_weight": 0.2}
+            model.step(self.camera, self.target, **options)()
+            return
         self.adam.zero_grad()
         rendering = rasterize(self.splats, self.camera)
         photometric_loss(rendering.image, self.target).backward()
@@ -120,7 +130,7 @@ class StageTimer:
         self.originals = {stage: getattr(module, name) for stage, (module, name) in FUNCTIONS.items()}
         for stage, (module, name) in FUNCTIONS.items():
             setattr(module, name, self._timed(self.originals[stage], lambda *_, stage=stage: stage))
-        cpu.run_parallel = self._timed(run_parallel, lambda kernel, *_: KERNELS[kernel.__name__])
+        frame.run_parallel = self._timed(run_parallel, lambda kernel, *_: KERNELS[kernel.__name__])
         return self
 
     def _timed(self, function: Callable, stage_of: Callable) -> Callable:
@@ -133,7 +143,7 @@ class StageTimer:
         return call
 
     def __exit__(self, *_) -> None:
-        cpu.run_parallel = run_parallel
+        frame.run_parallel = run_parallel
         for stage, (module, name) in FUNCTIONS.items():
             setattr(module, name, self.originals[stage])
 
@@ -211,7 +221,7 @@ def work(step: Step) -> tuple[int, float]:
 
     def spy(kernel, total, grain, *args):
         run_parallel(kernel, total, grain, *args)
-        if kernel is cpu.blend_forward:
+        if kernel is frame.blend_forward:
             projected, splat, tile_start, tiles_x, _, _, _, transmittance, walked, _ = args
             lanes, blends = np.zeros((2, len(walked)), np.int64)
             arguments = projected, splat, tile_start, tiles_x, walked, len(transmittance), lanes, blends
@@ -219,12 +229,12 @@ def work(step: Step) -> tuple[int, float]:
             counts["lanes"] = int(lanes.sum())
             counts["blends"] = int(blends.sum()) / transmittance.size
 
-    cpu.run_parallel = spy
+    frame.run_parallel = spy
     try:
         with torch.no_grad():
             rasterize(step.splats, step.camera)
     finally:
-        cpu.run_parallel = run_parallel
+        frame.run_parallel = run_parallel
     return counts["lanes"], counts["blends"]
 
 

@@ -50,7 +50,7 @@ from training.rasterize import (  # noqa: E402
     Gaussians,
     Target,
     cuda,
-    make_device_model,
+    make_step_model,
     photometric_loss,
     rasterize,
     resolve_backend,
@@ -139,7 +139,7 @@ class Case:
 
     def on_device(self, recorded: bool = True) -> Callable[[], Callable[[], float]]:
         """Return a step that stays on the device and returns its loss on demand."""
-        model = make_device_model("gpu", self.adam, self.stats)
+        model = make_step_model("gpu", self.adam, self.stats)
         assert isinstance(model, GpuModel)
         if not recorded:
             model._capacity = None

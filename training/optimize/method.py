@@ -23,7 +23,7 @@ from .dropout import Dropout
 from .exposure import Exposure
 from .growth_region import GrowthRegion
 from .margins import MarginGenerator
-from .model import Model
+from .model import Model, select_rows
 from .parameters import Parameters
 from .schedules import ShSchedule, due
 from .support import INTERVAL, SupportPruning
@@ -124,7 +124,7 @@ class Method(ABC, Generic[P, D]):
     Attributes:
         model: trained rows. Set by ``setup``.
         steps: number of steps of the run.
-        device_steps: number of first steps that the backend may make entirely on its device. They render one
+        device_steps: number of first steps that the backend may make without autograd. They render one
             image of all splats with ``render_weights`` and use this class's loss. Set by ``setup``.
         levels: number of levels. Set by ``setup`` if there are several.
         facts: scene facts declared by the method's rule, by name. Set by ``setup``.
@@ -199,7 +199,13 @@ class Method(ABC, Generic[P, D]):
         By default, render one image of all splats with :meth:`render_weights`.
         """
         weights, min_scale = self.render_weights(view, step)
-        return [cast(D, Drawing(self.rasterize_model(view.camera, step, weights, min_scale)))]
+        gaussians = optimizer = None
+        if self.trains_drawn_only(step) and weights is not None:
+            rows = torch.nonzero(weights).squeeze(1)
+            optimizer = select_rows(self.model, rows)
+            gaussians, weights = optimizer.gaussians, weights[rows]
+        rendering = self.rasterize_model(view.camera, step, weights, min_scale, gaussians)
+        return [cast(D, Drawing(rendering, optimizer=optimizer))]
 
     # -- progress and result, to override --------------------------------------------------------------
 
@@ -261,6 +267,10 @@ class Method(ABC, Generic[P, D]):
         """Return weights (N,) and minimum standard deviation of splats in a step; see ``rasterize``."""
         return None, 0.0
 
+    def trains_drawn_only(self, step: int) -> bool:
+        """Return True if a step leaves splats of weight 0 unchanged, with their moments."""
+        return False
+
     def loss(self, drawings: Sequence[D], view: TrainingView, step: int) -> torch.Tensor:
         """Return the loss of a step: the sum of the images' photometric losses (3DGS, Eq. 7).
 
@@ -311,7 +321,7 @@ class Method(ABC, Generic[P, D]):
         if result := self.begin_step(step):
             return result
         view = self.choose_view(step)
-        result = self._step_on_device(view, step) or self._step_with_autograd(view, step)
+        result = self._step_without_autograd(view, step) or self._step_with_autograd(view, step)
         self.control_density(step)
         if due(INTERVAL, step + 1) or self.ends_level(step):
             self.exposure.center()
@@ -372,8 +382,8 @@ class Method(ABC, Generic[P, D]):
             lambda: float(loss.detach()), lambda: self.background.remove(image, alpha, step), view.target
         )
 
-    def _step_on_device(self, view: TrainingView, step: int) -> StepResult | None:
-        """Make the step entirely on the backend's device. Return None if it cannot."""
+    def _step_without_autograd(self, view: TrainingView, step: int) -> StepResult | None:
+        """Make the step entirely in the backend, on its device. Return None if it cannot."""
         p = self.parameters
         target = view.target
         needs_autograd = p.lr_exposure or self.depth_loss.outputs or self.data.region
@@ -381,12 +391,12 @@ class Method(ABC, Generic[P, D]):
             return None
         if target.mask is not None or target.alpha is not None:
             return None
-        device_model = self.model.device_model(self.backend, p.antialias)
-        if device_model is None:
+        model = self.model.step_model(self.backend, p.antialias)
+        if model is None:
             return None
         weights, min_scale = self.render_weights(view, step)
         self.set_learning_rates(step)
-        loss = device_model.step(
+        loss = model.step(
             view.camera,
             target,
             near=self.data.near,
@@ -396,5 +406,6 @@ class Method(ABC, Generic[P, D]):
             weights=weights,
             min_scale=min_scale,
             shrink=view.shrink if self.collects_stats(view, step) else None,
+            drawn_only=self.trains_drawn_only(step),
         )
-        return StepResult(loss, lambda: self.background.remove(*device_model.last_image(), step), target)
+        return StepResult(loss, lambda: self.background.remove(*model.last_image(), step), target)

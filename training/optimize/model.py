@@ -10,15 +10,14 @@ from collections.abc import Mapping
 import numpy as np
 import torch
 
-from ..rasterize import Adam, DeviceModel, Gaussians, Rendering, make_device_model
+from ..rasterize import Adam, DeviceModel, Gaussians, Rendering, StepModel, make_step_model
 from ..rasterize.adam import LearningRate
+from ..rasterize.stats import PEAK_STATS, accumulate_stats
 from ..splats.gaussians import Splats
 from .parameters import Parameters
 
 NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh")
 """Tensors of every splat. A model of splats may train further tensors, (N,), under other names."""
-PEAK_STATS = ("gradient_max", "radius_max")
-"""Stats of densification by maxima: gradient as in ``gradient_sum``, and radius in pixels."""
 FROZEN = "held"
 """Column that marks rows excluded from training with 1. Only present if there are any."""
 
@@ -26,7 +25,7 @@ FROZEN = "held"
 class Model:
     """N splats (or anchors of splats) under optimisation.
 
-    The backend can train plain splats on its device (:meth:`device_model`). Access to the optimizer, a tensor
+    The backend can train plain splats on its device (:meth:`step_model`). Access to the optimizer, a tensor
     or ``stats`` copies them to the host first. All other methods (:meth:`read`, :meth:`read_rows`,
     :meth:`keep`, ...) leave them on the device.
 
@@ -92,14 +91,18 @@ class Model:
     def lr(self, rates: dict[str, LearningRate]) -> None:
         self._adam.lr = rates
 
-    def device_model(self, backend: str, antialias: bool) -> DeviceModel | None:
-        """Return the model on the backend's device, or None if it cannot train there.
+    def step_model(self, backend: str, antialias: bool) -> StepModel | None:
+        """Return the model in a form whose steps need no autograd, or None if there is none.
 
-        See ``make_device_model``. It is in use until :attr:`adam`, :attr:`stats` or a tensor is accessed.
+        See ``make_step_model``. A model on a device is in use until :attr:`adam`, :attr:`stats` or a tensor
+        is accessed.
         """
-        if self._device_model is None and FROZEN not in self.columns:
-            self._device_model = make_device_model(backend, self._adam, self._stats, antialias=antialias)
-        return self._device_model
+        if self._device_model is not None or FROZEN in self.columns:
+            return self._device_model
+        model = make_step_model(backend, self._adam, self._stats, antialias=antialias)
+        if isinstance(model, DeviceModel):
+            self._device_model = model
+        return model
 
     def read(self, name: str) -> torch.Tensor:
         """Return a read-only copy or view of a trained tensor or a stat. The model stays on its device."""
@@ -204,16 +207,8 @@ class Model:
             shrink: factor by which the image was reduced, which enlarged gradients by the same factor (see
                 ``TrainingData.threshold_scale``).
         """
-        gradient = rendering.grad2d.norm(dim=1) / shrink
-        self.stats["gradient_sum"] += gradient
-        drawn = rendering.radii > 0
-        self.stats["seen"] += drawn
-        for name, values in zip(PEAK_STATS, (gradient, rendering.radii), strict=True):
-            if name in self.stats:
-                self.stats[name] = torch.maximum(self.stats[name], values)
-        if "opacity_sum" in self.stats:
-            opacities = self["opacity_logits"].detach().sigmoid()
-            self.stats["opacity_sum"] += torch.where(drawn, opacities, 0)
+        logits = self.adam.tensors.get("opacity_logits")
+        accumulate_stats(self.stats, rendering.grad2d, rendering.radii, logits, shrink)
 
     def reset_stats(self) -> None:
         """Set all stats to zero."""
@@ -273,6 +268,36 @@ class Model:
             arrays["log_scales"] = np.log(np.exp(arrays["log_scales"]) + np.float32(min_scale))
         extras = {name: arrays.pop(name) for name in list(arrays) if name not in NAMES}
         return Splats(**arrays, extras=extras)
+
+
+class RowOptimizer:
+    """Apply Adam to the rows that one image was rendered from.
+
+    Args:
+        adam: optimizer of all rows.
+        rows: (M,) int64 indices of the rows.
+        leaves: their values by name, the leaves of the image's gradient graph.
+
+    Attributes:
+        gaussians: the rows as splats, for rendering.
+    """
+
+    def __init__(self, adam: Adam, rows: torch.Tensor, leaves: dict[str, torch.Tensor]) -> None:
+        self._adam, self._rows, self._leaves = adam, rows, leaves
+        self.gaussians = Gaussians(**leaves)
+
+    def step(self) -> None:
+        """Update these rows by one step."""
+        self._adam.step_rows(self._rows, {name: leaf.grad for name, leaf in self._leaves.items()})
+
+    def zero_grad(self) -> None:
+        """Do nothing; the next image has other rows."""
+
+
+def select_rows(model: Model, rows: torch.Tensor) -> RowOptimizer:
+    """Select (M,) int64 rows of a model for rendering. The drawing with this optimizer updates only them."""
+    leaves = {name: tensor.requires_grad_() for name, tensor in model.read_rows(rows).items()}
+    return RowOptimizer(model.adam, rows, leaves)
 
 
 def splat_rates(parameters: Parameters, extent: float) -> dict[str, LearningRate]:

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import torch
 
-from ..rasterize import Adam, Gaussians, contributions, tensor_device
+from ..rasterize import Gaussians, contributions, tensor_device
 from ..rasterize.adam import LearningRate
 from ..splats.gaussians import Splats
 from ..splats.morton import spatial_order
 from .initialize import from_splats
-from .model import Model, splat_rates
+from .model import splat_rates
 from .parameters import DensityParameters
 from .schedules import log_linear
 from .splat_method import SplatMethod
@@ -47,36 +47,6 @@ def drop_invisible(
     largest = contributions(gaussians, wide, near=data.near, antialias=p.antialias, backend=backend).largest
     threshold = min(LEAST_WEIGHT, float(largest.topk(minimum).values[-1]))
     return splats.select((largest >= threshold).cpu().numpy())
-
-
-class RowOptimizer:
-    """Apply Adam to the rows that one image was rendered from.
-
-    Args:
-        adam: optimizer of all rows.
-        rows: (M,) int64 indices of the rows.
-        leaves: their values by name, the leaves of the image's gradient graph.
-
-    Attributes:
-        gaussians: the rows as splats, for rendering.
-    """
-
-    def __init__(self, adam: Adam, rows: torch.Tensor, leaves: dict[str, torch.Tensor]) -> None:
-        self._adam, self._rows, self._leaves = adam, rows, leaves
-        self.gaussians = Gaussians(**leaves)
-
-    def step(self) -> None:
-        """Update these rows by one step."""
-        self._adam.step_rows(self._rows, {name: leaf.grad for name, leaf in self._leaves.items()})
-
-    def zero_grad(self) -> None:
-        """Do nothing; the next image has other rows."""
-
-
-def select_rows(model: Model, rows: torch.Tensor) -> RowOptimizer:
-    """Select (M,) int64 rows of a model for rendering. The drawing with this optimizer updates only them."""
-    leaves = {name: tensor.requires_grad_() for name, tensor in model.read_rows(rows).items()}
-    return RowOptimizer(model.adam, rows, leaves)
 
 
 class RefiningMethod(SplatMethod):

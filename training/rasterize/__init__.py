@@ -14,7 +14,7 @@ from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from types import ModuleType
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -36,8 +36,8 @@ from .rendering import (
 )
 
 __all__ = [
-    "BACKENDS", "OUTPUTS", "Adam", "Contributions", "DeviceModel", "Gaussians", "Rendering", "Target",
-    "contributions", "cpu_fallback_reason", "make_device_model", "photometric_loss", "rasterize",
+    "BACKENDS", "OUTPUTS", "Adam", "Contributions", "DeviceModel", "Gaussians", "Rendering", "StepModel",
+    "Target", "contributions", "cpu_fallback_reason", "make_step_model", "photometric_loss", "rasterize",
     "rasterize_strips", "render", "resolve_backend", "tensor_device", "warm_up",
 ]  # fmt: skip
 
@@ -280,15 +280,8 @@ def photometric_loss(
     return _backend(backend, image).photometric_loss(image, target, float(ssim_weight))
 
 
-class DeviceModel(Protocol):
-    """Splats that a backend trains in device memory.
-
-    The host's tensors are out of date until :meth:`copy_to_host`. Every method raises LodgsError if the
-    device was lost or has too little memory. If the method modifies splats, they are then lost, and training
-    has to continue from the last checkpoint.
-    """
-
-    def __len__(self) -> int: ...
+class StepModel(Protocol):
+    """Splats that a backend trains without autograd."""
 
     def step(
         self,
@@ -302,6 +295,7 @@ class DeviceModel(Protocol):
         weights: torch.Tensor | None = None,
         min_scale: float = 0.0,
         shrink: float | None = None,
+        drawn_only: bool = False,
     ) -> Callable[[], float]:
         """Make one Adam step with :func:`photometric_loss` of one image.
 
@@ -312,6 +306,8 @@ class DeviceModel(Protocol):
             target: opaque photo without a mask.
             shrink: factor by which the photo was downscaled; used to scale the density statistics. None
                 collects no statistics.
+            drawn_only: splats of weight 0 keep their values and moments, instead of a step with zero
+                gradients.
             camera, near, sh_degree, background, weights, min_scale: see :func:`rasterize`.
 
         Raises:
@@ -322,6 +318,18 @@ class DeviceModel(Protocol):
     def last_image(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the last step's image (H, W, 3) and alpha (H, W)."""
         ...
+
+
+@runtime_checkable
+class DeviceModel(StepModel, Protocol):
+    """Splats in device memory.
+
+    The host's tensors are out of date until :meth:`copy_to_host`. Every method raises LodgsError if the
+    device was lost or has too little memory. If the method modifies splats, they are then lost, and training
+    has to continue from the last checkpoint.
+    """
+
+    def __len__(self) -> int: ...
 
     def read(self, name: str) -> torch.Tensor:
         """Return the current values of one tensor or statistic."""
@@ -350,10 +358,13 @@ class DeviceModel(Protocol):
         """Replace the host's tensors, moments and statistics by the device's values."""
 
 
-def make_device_model(
+def make_step_model(
     backend: str, adam: Adam, stats: MutableMapping[str, torch.Tensor], *, antialias: bool = False
-) -> DeviceModel | None:
-    """Copy a model to a backend that trains in device memory; return None if the backend cannot.
+) -> StepModel | None:
+    """Return a model whose steps need no autograd, or None if the backend has none.
+
+    On the CPU it changes the tensors and statistics in place. Other backends copy them to their device and
+    return a :class:`DeviceModel`.
 
     Args:
         adam: optimizer of means, quats, log_scales, opacity_logits and sh. Its other tensors stay unchanged.
@@ -363,7 +374,7 @@ def make_device_model(
     Raises:
         LodgsError: the device was lost or has too little memory.
     """
-    make = getattr(_backend(backend, adam.tensors["means"]), "make_device_model", None)
+    make = getattr(_backend(backend, adam.tensors["means"]), "make_step_model", None)
     return make and make(adam, stats, antialias)
 
 
@@ -448,7 +459,7 @@ def _step(backend: str) -> None:
     camera = Camera("", 16, 16, 16.0, 16.0, 8.0, 8.0, np.eye(4))
     target = Target(torch.zeros(16, 16, 3))
     adam = Adam(vars(gaussians), dict.fromkeys(vars(gaussians), 0.0))
-    if model := make_device_model(backend, adam, {}):  # needs no kernels of the CPU
+    if model := make_step_model(backend, adam, {}):  # needs no kernels of the CPU
         model.step(camera, target, near=0.01, sh_degree=0, background=(0.0, 0.0, 0.0), ssim_weight=0.2)()
         return
     photometric_loss(rasterize(gaussians, camera, backend=backend).image, target, backend=backend).backward()

@@ -58,6 +58,11 @@ class Adam:
         self.tensors[name] = tensor
         self.state[name] = (m, v)
 
+    def count_step(self, name: str) -> tuple[LearningRate, tuple[float, float], float, int]:
+        """Count a step of a tensor; return its rate, betas, eps and number of steps."""
+        self.steps[name] += 1
+        return self.lr[name], self.betas, self.eps, self.steps[name]
+
     @torch.no_grad()
     def step(self, grads: Mapping[str, torch.Tensor] | None = None) -> None:
         """Make one step in place with ``grads`` or the tensors' own gradients; skip tensors without a
@@ -69,9 +74,8 @@ class Adam:
             gradient = tensor.grad if grads is None else grads.get(name)
             if gradient is None:
                 continue
-            self.steps[name] += 1
             arrays = tensor.detach(), gradient.contiguous(), *self.state[name]
-            constants = self.lr[name], self.betas, self.eps, self.steps[name]
+            constants = self.count_step(name)
             if tensor.device.type == "cpu":
                 update(*(array.numpy() for array in arrays), *constants)
             else:
@@ -89,8 +93,7 @@ class Adam:
             gradient = grads.get(name)
             if gradient is None:
                 continue
-            self.steps[name] += 1
-            constants = self.lr[name], self.betas, self.eps, self.steps[name]
+            constants = self.count_step(name)
             if tensor.device.type == "cpu":
                 arrays = tensor.detach(), rows, gradient.contiguous(), *self.state[name]
                 update_rows(*(array.numpy() for array in arrays), *constants)

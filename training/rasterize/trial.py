@@ -20,7 +20,7 @@ from . import (
     Gaussians,
     Target,
     cuda,
-    make_device_model,
+    make_step_model,
     photometric_loss,
     rasterize,
     resolve_backend,
@@ -116,14 +116,14 @@ def step_seconds(backend: str, seconds: float = SECONDS) -> float:
     target = Target(random.uniform(0, 1, (height, width, 3)).astype(np.float32))
     adam = Adam(leaves, dict.fromkeys(leaves, 1e-4))
     warm_up(backend)
-    device_model = make_device_model(backend, adam, {})
+    model = make_step_model(backend, adam, {})
 
     def steps() -> float:
         """Make a batch of steps; return the seconds of one."""
         begin = time.perf_counter()
-        if device_model is not None:
+        if model is not None:
             options = {"near": 0.01, "sh_degree": 3, "background": (0.0, 0.0, 0.0), "ssim_weight": 0.2}
-            [device_model.step(camera, target, **options) for _ in range(STEPS)][-1]()
+            [model.step(camera, target, **options) for _ in range(STEPS)][-1]()
             return (time.perf_counter() - begin) / STEPS
         rendering = rasterize(Gaussians(**leaves), camera, backend=backend)
         photometric_loss(rendering.image, target, backend=backend).backward()

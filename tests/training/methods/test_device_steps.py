@@ -78,7 +78,7 @@ def trained(count: int) -> Model:
     rates = dict.fromkeys(tensors, 1e-3)
     model = Model(tensors, rates, columns={"level": torch.arange(float(count))}, peaks=True)
     device_model, camera = (
-        model.device_model("gpu", False),
+        model.step_model("gpu", False),
         Camera("", 75, 50, 60.0, 60.0, 37.5, 25.0, np.eye(4)),
     )
     assert device_model is not None
@@ -125,7 +125,7 @@ def test_density_control_transfers_little(graphics):
     """Of 750 bytes per splat only the criteria and the new rows are transferred."""
     model, initial = trained(4000), graphics.transferred
     control_density(model)
-    assert model.device_model("gpu", False) is not None and graphics.transferred - initial < 100 * 4000
+    assert model.step_model("gpu", False) is not None and graphics.transferred - initial < 100 * 4000
 
 
 def _flat(state) -> list[torch.Tensor]:

@@ -11,7 +11,7 @@ from training.rasterize import (
     Adam,
     Gaussians,
     Target,
-    make_device_model,
+    make_step_model,
     photometric_loss,
     rasterize,
     warm_up,
@@ -87,7 +87,7 @@ def test_steps_use_the_current_camera_of_a_photo(graphics, make_splats, odd_came
     ]
     images = []
     for camera, options in changes:
-        used, fresh = (make_device_model("gpu", adam_of(make_splats(50)), {}) for _ in range(2))
+        used, fresh = (make_step_model("gpu", adam_of(make_splats(50)), {}) for _ in range(2))
         assert used is not None and fresh is not None
         used.step(camera, photo, ssim_weight=0.2, **VIEW | options)
         fresh.step(camera, Target(photo.image), ssim_weight=0.2, **VIEW | options)
@@ -104,7 +104,7 @@ def test_steps_match_torch(graphics, make_splats, odd_camera, photo, backend):
     weights = torch.from_numpy(np.random.default_rng(1).choice([0.0, 0.5, 1.0], 300)).float()
     torch_step(torch_adam, stats, odd_camera, photo, None, "cpu")
     torch_step(device_adam, device_stats, odd_camera, photo, None, "cpu")
-    model = make_device_model("gpu", device_adam, device_stats, antialias=True)
+    model = make_step_model("gpu", device_adam, device_stats, antialias=True)
     assert model is not None
     for step_weights in (weights, None, weights):
         loss = model.step(odd_camera, photo, ssim_weight=0.2, weights=step_weights, shrink=2, **VIEW)()
@@ -124,13 +124,58 @@ def test_steps_match_torch(graphics, make_splats, odd_camera, photo, backend):
         assert (values - device_stats[name]).norm() < 1e-3 * values.norm(), name
 
 
+@pytest.mark.parametrize("weighted", [False, True])
+def test_steps_on_the_host_equal_steps_through_torch(make_splats, odd_camera, photo, weighted):
+    """The cpu backend gives the same bits with and without autograd, also for splats of weight 0."""
+    results = []
+    weights = torch.from_numpy(np.random.default_rng(1).choice([0.0, 0.5, 1.0], 300)).float()
+    for fused in (False, True):
+        adam, stats = adam_of(make_splats(300)), zero_stats(300)
+        losses = []
+        for step_weights in (None, weights if weighted else None, None):
+            if fused:
+                model = make_step_model("cpu", adam, stats, antialias=True)
+                assert model is not None
+                options = {"ssim_weight": 0.2, "weights": step_weights, "shrink": 2, **VIEW}
+                losses.append(model.step(odd_camera, photo, **options)())
+            else:
+                losses.append(torch_step(adam, stats, odd_camera, photo, step_weights, "cpu"))
+        moments = [moment for state in adam.state.values() for moment in state]
+        tensors = [tensor.detach() for tensor in adam.tensors.values()]
+        results.append([*tensors, *moments, *stats.values(), torch.tensor(losses)])
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+
+
+@pytest.mark.parametrize("backend", ["cpu", "gpu"])
+def test_steps_can_leave_ignored_splats_unchanged(graphics, make_splats, odd_camera, photo, backend):
+    """Moments of splats of weight 0 decay and move them, unless the step trains drawn splats only."""
+    weights = torch.ones(50)
+    weights[:10] = 0
+    for drawn_only in (False, True):
+        adam = adam_of(make_splats(50))
+        model = make_step_model(backend, adam, zero_stats(50))
+        assert model is not None
+        model.step(odd_camera, photo, ssim_weight=0.2, **VIEW)
+        before = {
+            name: model.read(name) if backend == "gpu" else adam.tensors[name].detach().clone()
+            for name in RATES
+        }
+        model.step(odd_camera, photo, ssim_weight=0.2, weights=weights, drawn_only=drawn_only, **VIEW)
+        if backend == "gpu":
+            model.copy_to_host()
+        for name, values in before.items():
+            after = adam.tensors[name].detach()
+            assert torch.equal(after[:10], values[:10]) == drawn_only, name
+            assert not torch.equal(after[10:], values[10:]), name
+
+
 def test_small_bindings_do_not_change_training(graphics, make_splats, odd_camera, photo, monkeypatch):
     """Bindings of 200 KB hold the moments of 512 of 1500 splats, and 4654 of 5700 pairs."""
     results = []
     for binding_bytes in (graphics.binding_bytes, 200 << 10):
         monkeypatch.setattr(graphics, "binding_bytes", binding_bytes)
         adam, stats = adam_of(make_splats(1500)), zero_stats(1500)
-        model = make_device_model("gpu", adam, stats)
+        model = make_step_model("gpu", adam, stats)
         assert model is not None
         weights = torch.linspace(0, 1, 1500)
         losses = [
@@ -152,7 +197,7 @@ def test_unused_data_stays_unchanged(graphics, make_splats, odd_camera, photo):
     initial = {name: tensor.detach().clone() for name, tensor in adam.tensors.items()}
     weights = torch.ones(50)
     weights[:10] = 0
-    model = make_device_model("gpu", adam, stats)
+    model = make_step_model("gpu", adam, stats)
     assert model is not None
     model.step(odd_camera, photo, ssim_weight=0.2, weights=weights, **VIEW)
     model.copy_to_host()
@@ -165,7 +210,7 @@ def test_unused_data_stays_unchanged(graphics, make_splats, odd_camera, photo):
 
 def test_log_scales_are_raised_to_their_minimum(graphics, make_splats):
     adam = adam_of(make_splats(50))
-    model = make_device_model("gpu", adam, {})
+    model = make_step_model("gpu", adam, {})
     initial = adam.tensors["log_scales"].detach().clone()
     assert model is not None
     minimum = torch.linspace(-4, 0, 50)
@@ -179,7 +224,7 @@ def test_steps_transfer_little_data(graphics, make_splats, odd_camera, photo):
     """The transferred bytes per step do not depend on the number of splats."""
     transferred = []
     for count in (100, 4000):
-        model = make_device_model("gpu", adam_of(make_splats(count)), zero_stats(count))
+        model = make_step_model("gpu", adam_of(make_splats(count)), zero_stats(count))
         assert model is not None
         model.step(odd_camera, photo, ssim_weight=0.2, shrink=1, **VIEW)
         start = graphics.transferred
@@ -190,7 +235,7 @@ def test_steps_transfer_little_data(graphics, make_splats, odd_camera, photo):
 
 def test_steps_wait_for_the_device_once_in_many(graphics, make_splats, odd_camera, photo):
     """A step replays its recording; it creates nothing and reads nothing until its loss is read."""
-    model = make_device_model("gpu", adam_of(make_splats(300)), zero_stats(300))
+    model = make_step_model("gpu", adam_of(make_splats(300)), zero_stats(300))
     assert model is not None
     losses = [model.step(odd_camera, photo, ssim_weight=0.2, shrink=1, **VIEW)]
     counts = graphics.counts.copy()
@@ -212,7 +257,7 @@ def test_too_many_pairs_repeat_steps_with_the_same_bits(graphics, make_splats, o
     results = []
     for first_capacity in (1 << 14, capacity):
         adam, stats = adam_of(make_splats(300)), zero_stats(300)
-        model = make_device_model("gpu", adam, stats)
+        model = make_step_model("gpu", adam, stats)
         assert model is not None
         model._capacity = first_capacity
         weights = torch.linspace(0, 1, 300)
@@ -237,7 +282,7 @@ def test_recorded_steps_do_not_depend_on_dispatch_size(graphics, make_splats, od
     results = []
     for max_groups in (graphics.max_groups, 7):
         monkeypatch.setattr(graphics, "max_groups", max_groups)
-        model = make_device_model("gpu", adam_of(make_splats(50)), {})
+        model = make_step_model("gpu", adam_of(make_splats(50)), {})
         assert model is not None
         for _ in range(2):
             model.step(odd_camera, photo, ssim_weight=0.2, **VIEW)
@@ -249,7 +294,7 @@ def test_recorded_steps_need_no_private_functions(graphics, make_splats, odd_cam
     """A version of wgpu-py that hides wgpu-native gives the same bits."""
 
     def trained() -> torch.Tensor:
-        model = make_device_model("gpu", adam_of(make_splats(50)), {})
+        model = make_step_model("gpu", adam_of(make_splats(50)), {})
         assert model is not None
         model.step(odd_camera, photo, ssim_weight=0.2, **VIEW)
         return model.read("means")
@@ -263,7 +308,7 @@ def test_recorded_steps_need_no_private_functions(graphics, make_splats, odd_cam
 def test_lost_losses_are_reported_later(graphics, make_splats, odd_camera, photo):
     """A loss that is not finite is returned by all later steps, whose own loss may be finite again."""
     adam = adam_of(make_splats(50))
-    model = make_device_model("gpu", adam, {})
+    model = make_step_model("gpu", adam, {})
     assert model is not None
     model.step(odd_camera, photo, ssim_weight=float("nan"), **VIEW)
     assert np.isnan(model.step(odd_camera, photo, ssim_weight=0.2, **VIEW)())
@@ -271,7 +316,7 @@ def test_lost_losses_are_reported_later(graphics, make_splats, odd_camera, photo
 
 def test_steps_do_not_depend_on_uniform_buffer_size(graphics, make_splats, odd_camera, photo, monkeypatch):
     def trained() -> torch.Tensor:
-        model = make_device_model("gpu", adam_of(make_splats(300)), zero_stats(300))
+        model = make_step_model("gpu", adam_of(make_splats(300)), zero_stats(300))
         assert model is not None
         model._capacity = None  # steps are not recorded
         for _ in range(2):
@@ -290,7 +335,7 @@ def test_steps_do_not_depend_on_uniform_buffer_size(graphics, make_splats, odd_c
 
 def test_unsupported_models_stay_on_the_host(graphics, make_splats):
     adam = adam_of(make_splats(5))
-    assert make_device_model("cpu", adam, {}) is None
-    assert make_device_model("gpu", adam, {"something": torch.zeros(5)}) is None
-    assert make_device_model("gpu", Adam({"means": torch.zeros(5, 3)}, {"means": 1.0}), {}) is None
-    assert make_device_model("gpu", adam_of(make_splats(5).select(torch.arange(0))), {}) is None
+    assert make_step_model("reference", adam, {}) is None
+    assert make_step_model("gpu", adam, {"something": torch.zeros(5)}) is None
+    assert make_step_model("gpu", Adam({"means": torch.zeros(5, 3)}, {"means": 1.0}), {}) is None
+    assert make_step_model("gpu", adam_of(make_splats(5).select(torch.arange(0))), {}) is None

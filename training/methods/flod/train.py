@@ -7,7 +7,7 @@ finest level first, merge each coarser one from the next finer one, and refine i
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from itertools import accumulate
 from math import inf
@@ -33,7 +33,7 @@ from ...optimize.level_distances import measure_distances
 from ...optimize.merging import merge
 from ...optimize.method import Drawing
 from ...optimize.model import Model, splat_rates
-from ...optimize.refining import MERGED_RATE, drop_invisible, refining_rates, select_rows
+from ...optimize.refining import MERGED_RATE, drop_invisible, refining_rates
 from ...optimize.schedules import due, log_linear, random_reduction, shrink_at
 from ...optimize.training_data import TrainingView
 from ...rasterize import Gaussians
@@ -134,16 +134,6 @@ class Method(method.Method[FlodParameters, Drawing]):
             progress = self._progress(step)
         return shrink_at(progress, p.first_resolution, p.full_resolution)
 
-    def draw(self, view: TrainingView, step: int) -> Sequence[Drawing]:
-        """Render the image of a step; finishing steps update only the splats that the rule draws."""
-        if not self.is_finishing(step):
-            return super().draw(view, step)
-        weights, _ = self.render_weights(view, step)
-        assert weights is not None
-        optimizer = select_rows(self.model, torch.nonzero(weights).squeeze(1))
-        rendering = self.rasterize_model(view.camera, step, gaussians=optimizer.gaussians)
-        return [Drawing(rendering, optimizer=optimizer)]
-
     def render_weights(self, view: TrainingView, step: int) -> tuple[torch.Tensor | None, float]:
         if self.is_finishing(step):
             values = self._finishing_values(step)
@@ -152,6 +142,9 @@ class Method(method.Method[FlodParameters, Drawing]):
             return None, 0.0
         dropout = self.dropout.weights(len(self.model), step, self._progress(step))
         return dropout, self._constraint(self.level_at(step))
+
+    def trains_drawn_only(self, step: int) -> bool:
+        return self.is_finishing(step)
 
     def collects_stats(self, view: TrainingView, step: int) -> bool:
         return not self.is_finishing(step) and self._level_step(step) < self._densify_until(step)

@@ -20,9 +20,9 @@ from ...optimize.density_control import require_rows
 from ...optimize.initialize import from_splats
 from ...optimize.merging import merge
 from ...optimize.method import Drawing, StepResult
-from ...optimize.model import NAMES
+from ...optimize.model import NAMES, select_rows
 from ...optimize.pruning import importance_threshold, log_scale_gain
-from ...optimize.refining import MERGED_RATE, RefiningMethod, drop_invisible, refining_rates, select_rows
+from ...optimize.refining import MERGED_RATE, RefiningMethod, drop_invisible, refining_rates
 from ...optimize.schedules import random_reduction
 from ...optimize.training_data import TrainingView
 from ...rasterize import Gaussians, photometric_loss

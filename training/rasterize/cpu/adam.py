@@ -69,6 +69,16 @@ def _update(begin, end, parameter, gradient, m, v, lr, keep_m, keep_v, scale_v, 
 
 
 @kernel(STRICT)
+def _decay_rows(begin, end, rows, parameter, m, v, lr, keep_m, keep_v, scale_v, eps):
+    """Update ``rows`` of the flat arrays, whose gradients are zero."""
+    width = lr.shape[0]
+    zeros = np.zeros(width, np.float32)
+    for k in range(begin, end):
+        start = rows[k] * width
+        adam_values(parameter, start, width, zeros, 0, m, v, lr, keep_m, keep_v, scale_v, eps)
+
+
+@kernel(STRICT)
 def _update_rows(begin, end, parameter, rows, gradient, m, v, lr, keep_m, keep_v, scale_v, eps):
     """Update ``rows`` of the flat arrays; a row has ``lr.shape[0]`` values."""
     width = lr.shape[0]
@@ -85,6 +95,31 @@ def rate_rows(
     return np.tile(np.broadcast_to(rate, shape).reshape(-1), count)
 
 
+def step_arguments(
+    parameter: np.ndarray,
+    m: ArrayLike,
+    v: ArrayLike,
+    lr: ArrayLike,
+    betas: tuple[float, float],
+    eps: float,
+    step: int,
+) -> tuple:
+    """Return arguments of :func:`adam_values`: flat arrays, the rates of one row, and constants."""
+    flat = [np.asarray(array).reshape(-1) for array in (parameter, m, v)]
+    constants = f32(betas[0]), f32(betas[1]), f32(1 / (1 - betas[1] ** step)), f32(eps)
+    return *flat, rate_rows(lr, parameter.shape[1:], betas, step, 1), *constants
+
+
+@serialised
+def decay_rows(rows: np.ndarray, arguments: tuple) -> None:
+    """Make one Adam step in place for ``rows`` (M,) int64, whose gradients are zero.
+
+    Args:
+        arguments: see :func:`step_arguments`.
+    """
+    run_parallel(_decay_rows, len(rows), max(VALUES // len(arguments[3]), 1), rows, *arguments)
+
+
 @serialised
 def update_rows(
     parameter: np.ndarray,
@@ -99,13 +134,9 @@ def update_rows(
 ) -> None:
     """Make one Adam step in place for ``rows`` (M,) int64; ``lr`` is a number or broadcasts against one
     row."""
-    width = int(np.prod(parameter.shape[1:], dtype=int))
-    row = rate_rows(lr, parameter.shape[1:], betas, step, 1)
-    run_parallel(
-        _update_rows, len(rows), max(VALUES // width, 1),
-        parameter.reshape(-1), rows, gradient.reshape(-1), m.reshape(-1), v.reshape(-1), row,
-        f32(betas[0]), f32(betas[1]), f32(1 / (1 - betas[1] ** step)), f32(eps),
-    )  # fmt: skip
+    values, *arguments = step_arguments(parameter, m, v, lr, betas, eps, step)
+    grain = max(VALUES // len(arguments[2]), 1)
+    run_parallel(_update_rows, len(rows), grain, values, rows, gradient.reshape(-1), *arguments)
 
 
 @serialised

@@ -10,6 +10,7 @@ import math
 import numpy as np
 
 from ...splats import sh as harmonics
+from .adam import adam_values
 from .compile import FAST, f32, inlined, kernel
 from .fastmath import exp_lanes, prefetch
 from .lanes import WIDTH, load_row, select, spread
@@ -259,18 +260,31 @@ def differentiate_block(
 
 
 @inlined(FAST)
-def clear_gradients(i, by_means, by_quats, by_log_scales, by_logits, by_sh, by_weights, grad2d):
+def clear_gradients(i, by_means, by_quats, by_log_scales, by_logits, by_weights, grad2d):
     """Set the gradients of splat ``i`` to 0."""
     for k in range(3):
         by_means[i, k], by_log_scales[i, k] = ZERO, ZERO
     for k in range(4):
         by_quats[i, k] = ZERO
-    for k in range(by_sh.shape[1]):
-        by_sh[i, k, 0], by_sh[i, k, 1], by_sh[i, k, 2] = ZERO, ZERO, ZERO
     by_logits[i] = ZERO
     grad2d[i, 0], grad2d[i, 1] = ZERO, ZERO
     if by_weights.shape[0] > 0:
         by_weights[i] = ZERO
+
+
+@inlined(FAST)
+def set_coefficients(by_coefficients, active, basis, red, green, blue):
+    """Set the gradients (K, 3) of a splat's active coefficients."""
+    for k in range(active):
+        by_coefficients[k, 0], by_coefficients[k, 1] = basis[k] * red, basis[k] * green
+        by_coefficients[k, 2] = basis[k] * blue
+
+
+@inlined(FAST)
+def step_harmonics(i, trained, gradient, sh_step):
+    """Make an Adam step of the first ``trained`` numbers of a splat's harmonics."""
+    values, m, v, rates, keep_m, keep_v, scale_v, eps = sh_step
+    adam_values(values, i * rates.shape[0], trained, gradient, 0, m, v, rates, keep_m, keep_v, scale_v, eps)
 
 
 @kernel(FAST)
@@ -278,9 +292,13 @@ def project_backward(
     begin, end, means, quats, log_scales, opacity_logits, sh, weights,
     pose, lens, camera_position, width, height, degree, min_scale, antialias,
     index, projected, first_pair, pair_count, pair_row, pair_sums,
-    by_means, by_quats, by_log_scales, by_logits, by_sh, by_weights, grad2d,
+    by_means, by_quats, by_log_scales, by_logits, by_sh, by_weights, grad2d, sh_step,
 ):  # fmt: skip
-    """Fill the gradients of the parameters and grad2d of the splats at ``index`` from the pairs' sums."""
+    """Fill the gradients of the parameters and grad2d of the splats at ``index`` from the pairs' sums.
+
+    If ``sh_step`` is not None, it has the arguments of ``adam_values`` besides its position and gradient, and
+    the harmonics make their Adam step instead of filling by_sh. Numba compiles a kernel for each case.
+    """
     block = np.ones((PARAMETERS, WIDTH), np.float32)
     by = np.zeros((CONICS + 3, WIDTH), np.float32)
     result = np.empty((LOGIT + 1, WIDTH), np.float32)
@@ -291,6 +309,10 @@ def project_backward(
     basis_x = np.empty((25, WIDTH), np.float32)
     basis_y = np.empty((25, WIDTH), np.float32)
     basis_z = np.empty((25, WIDTH), np.float32)
+    active = (degree + 1) * (degree + 1)
+    by_coefficients = np.zeros((25 + WIDTH, 3), np.float32)
+    flat_coefficients = by_coefficients.reshape(-1)
+    trained = min(-(-3 * active // WIDTH) * WIDTH, 3 * sh.shape[1])  # whole vectors; others have no moments
     count = index.shape[0]
     lanes = 0
     for s in range(begin, end):
@@ -302,7 +324,12 @@ def project_backward(
             prefetch(pair_sums, pair_row[pair], 0)
             prefetch(pair_sums, pair_row[pair] + 1, 0)  # a row may end in the next cache line
         if pair_count[s] == 0:
-            clear_gradients(i, by_means, by_quats, by_log_scales, by_logits, by_sh, by_weights, grad2d)
+            clear_gradients(i, by_means, by_quats, by_log_scales, by_logits, by_weights, grad2d)
+            if sh_step is None:
+                by_sh[i] = ZERO
+            else:
+                flat_coefficients[:trained] = ZERO
+                step_harmonics(i, trained, flat_coefficients, sh_step)
         else:
             add_pairs(first_pair[s], pair_count[s], pair_row, pair_sums, sums)
             read_lane(block, lanes, i, means, quats, log_scales, opacity_logits, antialias)
@@ -327,16 +354,14 @@ def project_backward(
             per_length = ONE / math.sqrt(dx * dx + dy * dy + dz * dz)
             dx, dy, dz = dx * per_length, dy * per_length, dz * per_length
             sh_basis(dx, dy, dz, degree, basis)
-            active = (degree + 1) * (degree + 1)
             for k in range(active):
-                by_sh[i, k, 0], by_sh[i, k, 1], by_sh[i, k, 2] = (
-                    basis[k] * red,
-                    basis[k] * green,
-                    basis[k] * blue,
-                )
                 by_basis[k, lanes] = sh[i, k, 0] * red + sh[i, k, 1] * green + sh[i, k, 2] * blue
-            for k in range(active, sh.shape[1]):
-                by_sh[i, k, 0], by_sh[i, k, 1], by_sh[i, k, 2] = ZERO, ZERO, ZERO
+            if sh_step is None:
+                set_coefficients(by_sh[i], active, basis, red, green, blue)
+                by_sh[i, active:] = ZERO
+            else:
+                set_coefficients(by_coefficients, active, basis, red, green, blue)
+                step_harmonics(i, trained, flat_coefficients, sh_step)
             splats[lanes] = i
             lanes += 1
         if lanes < WIDTH and s + 1 < end:

@@ -65,10 +65,8 @@ def contributions(
     return largest, total, pixels.long(), torch.from_numpy(radii)
 
 
-def make_device_model(
-    adam: Adam, stats: MutableMapping[str, torch.Tensor], antialias: bool
-) -> GpuModel | None:
-    """See :func:`training.rasterize.make_device_model`."""
+def make_step_model(adam: Adam, stats: MutableMapping[str, torch.Tensor], antialias: bool) -> GpuModel | None:
+    """See :func:`training.rasterize.make_step_model`."""
     if not {*COLUMNS, "sh"} <= set(adam.tensors) or not set(stats) <= set(STATS):
         return None
     return GpuModel(open_default_device(), adam, stats, antialias) if len(adam.tensors["means"]) else None

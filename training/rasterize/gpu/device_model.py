@@ -104,7 +104,7 @@ class GpuModel:
             self._report = device.empty(np.uint32, LOSSES + 2 * PENDING)
         self.drawn = device.empty(np.float32, 0, 0, 4)
         self._numbers = np.zeros(TRAINING_NUMBERS, np.float32)
-        rates = self._numbers[4 : 4 + 2 * self._moments.shape[1]].reshape(-1, 2)
+        rates = self._numbers[8 : 8 + 2 * self._moments.shape[1]].reshape(-1, 2)
         self._rates = {name: rates[columns] for name, columns in COLUMNS.items()}
         self._rates["sh"] = rates[TRAINED:].reshape(-1, 3, 2)
         self._pending: list[Step] = []
@@ -128,12 +128,14 @@ class GpuModel:
         weights: torch.Tensor | None = None,
         min_scale: float = 0.0,
         shrink: float | None = None,
+        drawn_only: bool = False,
     ) -> Callable[[], float]:
         """Make one step with the photometric loss; return a function that reads the loss from the device.
 
         Args:
             target: opaque photo without a mask.
             shrink: factor by which the photo was downscaled, for the statistics; None collects none.
+            drawn_only: splats of weight 0 keep their values and moments.
             camera, near, sh_degree, background, weights, min_scale: see ``rasterize``.
             ssim_weight: see ``photometric_loss``.
 
@@ -147,7 +149,7 @@ class GpuModel:
             if len(self._pending) == PENDING:
                 self._settle()
             photo = _upload_photo(self.device, target)
-            step = Step(settings, photo, lens, ssim_weight, array, self._next_numbers(shrink))
+            step = Step(settings, photo, lens, ssim_weight, array, self._next_numbers(shrink, drawn_only))
             self._start(step)
 
         def loss() -> float:
@@ -363,15 +365,14 @@ class GpuModel:
         columns = slice(TRAINED, TRAINED + 1)
         self._run("write_columns", columns, parts=self.device.upload(array), values=self._splats)
 
-    def _next_numbers(self, shrink: float | None) -> np.ndarray:
+    def _next_numbers(self, shrink: float | None, drawn_only: bool) -> np.ndarray:
         """Count a step of Adam; return the numbers of its ``ProjectedScene.train``."""
         adam = self._adam
         numbers = self._numbers
-        numbers[:4] = *adam.betas, adam.eps, shrink or 0.0
+        numbers[:5] = *adam.betas, adam.eps, shrink or 0.0, drawn_only
         for name, columns in self._rates.items():
-            adam.steps[name] += 1
-            first, second = (1 - beta ** adam.steps[name] for beta in adam.betas)
-            rate = adam.lr[name]
+            rate, betas, _, step = adam.count_step(name)
+            first, second = (1 - beta**step for beta in betas)
             columns[..., 0] = (rate if isinstance(rate, float) else np.asarray(rate)) / first
             columns[..., 1] = 1 / second
         return numbers.copy()

@@ -16,8 +16,8 @@ SPLAT, BY_SPLAT = 13, 16
 """Sizes of a splat and of its gradient on the device (project.wgsl)."""
 PAIR_SUMS = 11
 """Sums per splat and per pair in blending's backward pass (common.wgsl)."""
-TRAINING_NUMBERS = 176
-"""Size of Adam's constants, the factor of the photo and the rates, the end of project.wgsl's uniform."""
+TRAINING_NUMBERS = 180
+"""Size of the end of project.wgsl's uniform: Adam's constants, two numbers of the step, and the rates."""
 TILES = 1024
 """Tiles per dispatch, so that the device can do other work in between."""
 

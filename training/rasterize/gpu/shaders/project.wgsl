@@ -22,6 +22,7 @@ struct View {
     keep_v: f32,
     eps: f32,
     shrink: f32,  // factor by which the photo was downscaled; 0 collects no statistics
+    drawn_only: f32,  // if positive, splats of weight 0 keep their values and moments
     // learning rate and scale of second moments, for the trained numbers of a splat and its coefficients
     rates: array<vec4f, 43>,
 }
@@ -47,6 +48,7 @@ const SPLAT: u32 = 13;
 const BY_SPLAT: u32 = 16;
 const TRAINED: u32 = 11;  // first columns, which Adam changes
 const LOGIT: u32 = 3;
+const WEIGHT: u32 = 11;
 const BY_MEAN2D: u32 = 12;
 // Columns of stats, in the order of STATS in device_model.py.
 const GRADIENT_SUM: u32 = 0;
@@ -329,6 +331,11 @@ fn adam(i: u32, j: u32, g: f32) -> f32 {
     return rate.x * m / (sqrt(v * rate.y) + u.eps);
 }
 
+// Test if a step changes a splat.
+fn is_trained(i: u32) -> bool {
+    return u.drawn_only == 0.0 || splats[i * SPLAT + WEIGHT] > 0.0;
+}
+
 // Train the splats of a workgroup. First each invocation computes the gradient of one splat, then each changes single
 // numbers. Splats that were not drawn have zero gradients. A step that had too many pairs changes nothing.
 @compute @workgroup_size(LANES)
@@ -350,7 +357,9 @@ fn train(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) l
     for (var k = lane; k < count * TRAINED; k += LANES) {
         let row = k / TRAINED;
         let j = k % TRAINED;
-        splats[(first + row) * SPLAT + j] -= adam(first + row, j, splat_gradients[k]);
+        if (is_trained(first + row)) {
+            splats[(first + row) * SPLAT + j] -= adam(first + row, j, splat_gradients[k]);
+        }
     }
     let width = 3u * u.terms;
     for (var k = lane; k < count * width; k += LANES) {
@@ -359,6 +368,6 @@ fn train(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) l
         let term = j / 3u;
         var g = 0.0;
         if (term < active_terms()) { g = bases[row * 25u + term] * colour_gradients[row][j % 3u]; }
-        sh[first * width + k] -= adam(first + row, TRAINED + j, g);
+        if (is_trained(first + row)) { sh[first * width + k] -= adam(first + row, TRAINED + j, g); }
     }
 }

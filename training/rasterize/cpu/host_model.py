@@ -1,0 +1,101 @@
+"""Training steps in the host's memory without autograd, which would store the gradient of all harmonics."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, MutableMapping
+
+import numpy as np
+import torch
+
+from ...scenes.cameras import Camera
+from ..adam import Adam
+from ..rendering import KernelCamera, RasterSettings, Target
+from ..stats import accumulate_stats
+from .adam import decay_rows, step_arguments
+from .compile import Buffers, serialised
+from .frame import Frame
+from .loss import loss_and_gradient
+from .project import SUMS
+
+GEOMETRY = ("means", "quats", "log_scales", "opacity_logits")
+"""Tensors with few values per splat, which make their Adam step from stored gradients."""
+
+
+def image_planes(target: Target) -> np.ndarray:
+    """Return the photo as planes (3, H, W) float32; cached in the target."""
+    if "cpu" not in target.cache:
+        target.cache["cpu"] = np.ascontiguousarray(target.image.permute(2, 0, 1).float().numpy())
+    return target.cache["cpu"]
+
+
+class HostModel:
+    """Trains the tensors of an optimizer in place; see ``StepModel`` of :mod:`training.rasterize`.
+
+    Args:
+        adam: optimizer of means, quats, log_scales, opacity_logits and sh.
+        stats: statistics of density control, updated in place.
+        antialias: see ``rasterize``.
+    """
+
+    def __init__(self, adam: Adam, stats: MutableMapping[str, torch.Tensor], antialias: bool) -> None:
+        self._adam = adam
+        self._stats = stats
+        self._antialias = antialias
+
+    @torch.no_grad()
+    @serialised
+    def step(
+        self,
+        camera: Camera,
+        target: Target,
+        *,
+        near: float,
+        sh_degree: int,
+        background: tuple[float, float, float],
+        ssim_weight: float,
+        weights: torch.Tensor | None = None,
+        min_scale: float = 0.0,
+        shrink: float | None = None,
+        drawn_only: bool = False,
+    ) -> Callable[[], float]:
+        """Make one Adam step; return a function that returns the loss."""
+        adam = self._adam
+        arrays = {name: tensor.detach().numpy() for name, tensor in adam.tensors.items()}
+        count = len(arrays["means"])
+        view = KernelCamera.of(camera, near)
+        settings = RasterSettings(view, float(min_scale), self._antialias, background, sh_degree)
+        factors = np.empty(0, np.float32) if weights is None else weights.numpy()
+        splats = [*(arrays[name] for name in (*GEOMETRY, "sh")), factors]
+        radii, grad2d = torch.zeros(count), torch.zeros(count, 2)
+        frame = Frame(splats, None, settings, radii.numpy())
+        image = np.empty((3, view.height, view.width), np.float32)
+        frame.blend(frame.projected, np.array(background, np.float32), image)
+        loss, by_image = loss_and_gradient(image, image_planes(target), ssim_weight)
+
+        working = Buffers()
+        pair_sums = working.take("pair_sums", np.float32, len(frame.pairs.splat), SUMS)
+        no_alpha = np.zeros_like(frame.transmittance)
+        frame.differentiate(frame.projected, image, by_image, no_alpha, pair_sums)
+        drawn = frame.index
+        empty = np.empty if len(drawn) == count else np.zeros  # the kernel writes rows of drawn splats
+        gradients = {name: empty(arrays[name].shape, np.float32) for name in GEOMETRY}
+        sh_step = step_arguments(arrays["sh"], *adam.state["sh"], *adam.count_step("sh"))
+        unused = np.empty((0, 0, 3), np.float32), np.empty(0, np.float32)
+        frame.project_backward(pair_sums, [*gradients.values(), *unused], grad2d.numpy(), sh_step)
+        if shrink is not None:
+            accumulate_stats(self._stats, grad2d, radii, adam.tensors["opacity_logits"], shrink)
+        tensors = {name: torch.from_numpy(gradient) for name, gradient in gradients.items()}
+        if drawn_only:
+            rows = torch.from_numpy(drawn.astype(np.int64))
+            adam.step_rows(rows, {name: gradient[rows] for name, gradient in tensors.items()})
+        else:
+            adam.step(tensors)
+            if len(drawn) < count:
+                decay_rows(np.setdiff1d(np.arange(count), drawn, assume_unique=True), sh_step)
+        self._image = image, 1 - frame.transmittance
+        return lambda: loss
+
+    def last_image(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the last step's image (H, W, 3) and alpha (H, W)."""
+        planes, alpha = self._image
+        return torch.from_numpy(planes).permute(1, 2, 0), torch.from_numpy(alpha)
