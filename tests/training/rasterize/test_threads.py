@@ -11,7 +11,8 @@ import pytest
 import torch
 
 from tests.training.rasterize.comparison import drawn_and_differentiated
-from training.rasterize import Target, cpu, photometric_loss, rasterize
+from training.rasterize import Target, photometric_loss, rasterize
+from training.rasterize.cpu import frame
 from training.rasterize.cpu.compile import Buffers, _idle, run_parallel, set_thread_count, thread_count
 from training.scenes.cameras import Camera
 
@@ -103,7 +104,7 @@ def test_ranges_balance_sixteen_threads(make_splats, sixteen_threads, monkeypatc
         calls.append((kernel.__name__, total, grain))
         run_parallel(kernel, total, grain, *args)
 
-    monkeypatch.setattr(cpu, "run_parallel", spy)
+    monkeypatch.setattr(frame, "run_parallel", spy)
     drawn = rasterize(leaves, camera)
     drawn.image.sum().backward()
     tiles = drawn.tile_counts.flatten().numpy()
@@ -163,8 +164,8 @@ def record_process(backend):
     step(backend)
 rasterize._step = record_process
 rasterize.warm_up("cpu")
-from training.rasterize.cpu import adam, bin, blend, loss, project
-modules = adam, bin, blend, loss, project
+from training.rasterize.cpu import adam, bin, blend, loss, project, project_backward
+modules = adam, bin, blend, loss, project, project_backward
 kernels = {k for m in modules for k in vars(m).values() if hasattr(k, "stats") and k.stats.cache_path}
 compiled = sum(sum(kernel.stats.cache_misses.values()) for kernel in kernels)
 read = sum(sum(kernel.stats.cache_hits.values()) for kernel in kernels)
