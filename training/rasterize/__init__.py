@@ -303,7 +303,7 @@ class StepModel(Protocol):
         any step was not finite, it returns that loss from then on.
 
         Args:
-            target: opaque photo without a mask.
+            target: photo; a :class:`DeviceModel` requires an opaque one without a mask.
             shrink: factor by which the photo was downscaled; used to scale the density statistics. None
                 collects no statistics.
             drawn_only: splats of weight 0 keep their values and moments, instead of a step with zero

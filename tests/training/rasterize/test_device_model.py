@@ -50,7 +50,7 @@ def torch_step(adam: Adam, stats: dict, camera, target: Target, weights, backend
     drawn = rasterize(
         Gaussians(**adam.tensors), camera, weights=weights, backend=backend, antialias=True, **VIEW
     )
-    loss = photometric_loss(drawn.image, target, backend=backend)
+    loss = photometric_loss(drawn.image, target.over(VIEW["background"]), backend=backend)
     loss.backward()
     norm = drawn.grad2d.norm(dim=1) / 2
     visible = drawn.radii > 0
@@ -125,9 +125,13 @@ def test_steps_match_torch(graphics, make_splats, odd_camera, photo, backend):
 
 
 @pytest.mark.parametrize("weighted", [False, True])
-def test_steps_on_the_host_equal_steps_through_torch(make_splats, odd_camera, photo, weighted):
+@pytest.mark.parametrize("parts", [(), ("mask",), ("mask", "alpha")])
+def test_steps_on_the_host_equal_steps_through_torch(make_splats, odd_camera, photo, weighted, parts):
     """The cpu backend gives the same bits with and without autograd, also for splats of weight 0."""
     results = []
+    random = np.random.default_rng(2)
+    planes = {name: random.random((50, 75), np.float32) for name in parts}
+    photo = Target(photo.image * planes.get("alpha", np.ones((50, 75), np.float32))[..., None], **planes)
     weights = torch.from_numpy(np.random.default_rng(1).choice([0.0, 0.5, 1.0], 300)).float()
     for fused in (False, True):
         adam, stats = adam_of(make_splats(300)), zero_stats(300)

@@ -70,7 +70,7 @@ class HostModel:
         frame = Frame(splats, None, settings, radii.numpy())
         image = np.empty((3, view.height, view.width), np.float32)
         frame.blend(frame.projected, np.array(background, np.float32), image)
-        loss, by_image = loss_and_gradient(image, image_planes(target), ssim_weight)
+        loss, by_image = self._compare(image, target.over(background), ssim_weight)
 
         working = Buffers()
         pair_sums = working.take("pair_sums", np.float32, len(frame.pairs.splat), SUMS)
@@ -94,6 +94,15 @@ class HostModel:
                 decay_rows(np.setdiff1d(np.arange(count), drawn, assume_unique=True), sh_step)
         self._image = image, 1 - frame.transmittance
         return lambda: loss
+
+    def _compare(self, image: np.ndarray, target: Target, ssim_weight: float) -> tuple[float, np.ndarray]:
+        """Return the photometric loss of planes (3, H, W) and its gradient."""
+        truth = image_planes(target)
+        if target.mask is None:
+            return loss_and_gradient(image, truth, ssim_weight)
+        mask = target.mask.numpy().astype(np.float32, copy=False)
+        loss, gradient = loss_and_gradient(truth + mask * (image - truth), truth, ssim_weight)
+        return loss, gradient * mask
 
     def last_image(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the last step's image (H, W, 3) and alpha (H, W)."""
