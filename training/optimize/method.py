@@ -389,7 +389,7 @@ class Method(ABC, Generic[P, D]):
         needs_autograd = p.lr_exposure or self.depth_loss.outputs or self.data.region
         if needs_autograd or step >= self.device_steps:
             return None
-        if self.backend != "cpu" and (target.mask is not None or target.alpha is not None):
+        if self.backend == "gpu" and (target.mask is not None or target.alpha is not None):
             return None
         model = self.model.step_model(self.backend, p.antialias)
         if model is None:

@@ -344,8 +344,8 @@ def test_driver_calls(monkeypatch):
 
 def test_warm_up_makes_one_step(fake_card, monkeypatch):
     called = []
-    original = cuda.rasterize
-    monkeypatch.setattr(cuda, "rasterize", lambda *a, **k: called.append(1) or original(*a, **k))
+    original = cuda.CardModel.step
+    monkeypatch.setattr(cuda.CardModel, "step", lambda *a, **k: called.append(1) or original(*a, **k))
     rasterizer.warm_up("cuda")
     assert called == [1]
 

@@ -45,6 +45,14 @@ def zero_stats(count: int) -> dict[str, torch.Tensor]:
     return {name: torch.zeros(count) for name in STATS}
 
 
+@pytest.fixture(params=["cpu", "cuda"])
+def in_place(request) -> str:
+    """Backend that trains in place; the kernels of cuda run on the CPU."""
+    if request.param == "cuda":
+        request.getfixturevalue("fake_card")
+    return request.param
+
+
 def torch_step(adam: Adam, stats: dict, camera, target: Target, weights, backend: str) -> float:
     """Make one step through torch, as methods do; return the loss."""
     drawn = rasterize(
@@ -126,8 +134,8 @@ def test_steps_match_torch(graphics, make_splats, odd_camera, photo, backend):
 
 @pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize("parts", [(), ("mask",), ("mask", "alpha")])
-def test_steps_on_the_host_equal_steps_through_torch(make_splats, odd_camera, photo, weighted, parts):
-    """The cpu backend gives the same bits with and without autograd, also for splats of weight 0."""
+def test_steps_in_place_equal_steps_through_torch(in_place, make_splats, odd_camera, photo, weighted, parts):
+    """Backends give the same bits with and without autograd, also for splats of weight 0."""
     results = []
     random = np.random.default_rng(2)
     planes = {name: random.random((50, 75), np.float32) for name in parts}
@@ -138,12 +146,12 @@ def test_steps_on_the_host_equal_steps_through_torch(make_splats, odd_camera, ph
         losses = []
         for step_weights in (None, weights if weighted else None, None):
             if fused:
-                model = make_step_model("cpu", adam, stats, antialias=True)
+                model = make_step_model(in_place, adam, stats, antialias=True)
                 assert model is not None
                 options = {"ssim_weight": 0.2, "weights": step_weights, "shrink": 2, **VIEW}
                 losses.append(model.step(odd_camera, photo, **options)())
             else:
-                losses.append(torch_step(adam, stats, odd_camera, photo, step_weights, "cpu"))
+                losses.append(torch_step(adam, stats, odd_camera, photo, step_weights, in_place))
         moments = [moment for state in adam.state.values() for moment in state]
         tensors = [tensor.detach() for tensor in adam.tensors.values()]
         results.append([*tensors, *moments, *stats.values(), torch.tensor(losses)])

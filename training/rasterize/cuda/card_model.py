@@ -1,0 +1,79 @@
+"""Training steps on an NVIDIA GPU without autograd, whose bookkeeping takes longer than the kernels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, MutableMapping
+
+import torch
+
+from ...scenes.cameras import Camera
+from ..adam import Adam
+from ..gaussians import Gaussians
+from ..rendering import KernelCamera, RasterSettings, Target
+from ..stats import accumulate_stats
+from .frame import Frame, PhotometricLoss, upload_photo
+
+TENSORS = ("means", "quats", "log_scales", "opacity_logits", "sh")
+
+
+class CardModel:
+    """Trains the tensors of an optimizer in place; see ``StepModel`` of :mod:`training.rasterize`.
+
+    Args:
+        adam: optimizer of TENSORS, on a GPU.
+        stats: statistics of density control, updated in place.
+        antialias: see ``rasterize``.
+    """
+
+    def __init__(self, adam: Adam, stats: MutableMapping[str, torch.Tensor], antialias: bool) -> None:
+        self._adam = adam
+        self._stats = stats
+        self._antialias = antialias
+
+    @torch.no_grad()
+    def step(
+        self,
+        camera: Camera,
+        target: Target,
+        *,
+        near: float,
+        sh_degree: int,
+        background: tuple[float, float, float],
+        ssim_weight: float,
+        weights: torch.Tensor | None = None,
+        min_scale: float = 0.0,
+        shrink: float | None = None,
+        drawn_only: bool = False,
+    ) -> Callable[[], float]:
+        """Make one Adam step; return a function that waits for the loss."""
+        tensors = {name: self._adam.tensors[name].detach() for name in TENSORS}
+        view = KernelCamera.of(camera, near)
+        settings = RasterSettings(view, float(min_scale), self._antialias, background, sh_degree)
+        frame = Frame(Gaussians(**tensors), weights, settings)
+        image = frame.blend(frame.projected.colours, background)
+        target = target.over(background)
+        photo = upload_photo(target, image)
+        mask = None if target.mask is None else target.mask.to(image)[..., None]
+        loss = PhotometricLoss(image if mask is None else photo + mask * (image - photo), photo, ssim_weight)
+        by_image = loss.gradient(image.new_ones(()))
+        if mask is not None:
+            by_image *= mask
+        sums = frame.new_sums()
+        by_colours = frame.differentiate(frame.projected.colours, image, by_image, None, sums)
+        grad2d = image.new_zeros(len(tensors["means"]), 2)
+        gradients = frame.project_backward(sums, by_colours, grad2d)
+        if shrink is not None:
+            radii = frame.projected.radii
+            accumulate_stats(self._stats, grad2d, radii, tensors["opacity_logits"], shrink)
+        named = dict(zip(TENSORS, gradients, strict=True))
+        if drawn_only and weights is not None:
+            rows = torch.nonzero(weights).squeeze(1)
+            self._adam.step_rows(rows, {name: gradient[rows] for name, gradient in named.items()})
+        else:
+            self._adam.step(named)
+        self._image = image, 1 - frame.light
+        return lambda: float(loss.value)
+
+    def last_image(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the last step's image (H, W, 3) and alpha (H, W)."""
+        return self._image
