@@ -129,7 +129,7 @@ class Case:
         self.target = Target(torch.from_numpy(photograph).to(device))
         splats = synthetic_splats(count).map(lambda tensor: tensor.to(device).requires_grad_())
         self.adam = Adam(vars(splats), dict.fromkeys(vars(splats), 1e-7))
-        self.stats = {name: torch.zeros(count) for name in ("gradient_sum", "seen")}
+        self.stats = {name: torch.zeros(count, device=device) for name in ("gradient_sum", "seen")}
 
     def through_torch(self, backend: str) -> None:
         self.adam.zero_grad()
@@ -137,11 +137,11 @@ class Case:
         photometric_loss(rendering.image, self.target, backend=backend).backward()
         self.adam.step()
 
-    def on_device(self, recorded: bool = True) -> Callable[[], Callable[[], float]]:
-        """Return a step that stays on the device and returns its loss on demand."""
-        model = make_step_model("gpu", self.adam, self.stats)
-        assert isinstance(model, GpuModel)
-        if not recorded:
+    def without_autograd(self, backend: str, recorded: bool = True) -> Callable[[], Callable[[], float]]:
+        """Return a step as in training, which returns its loss on demand."""
+        model = make_step_model(backend, self.adam, self.stats)
+        assert model is not None
+        if isinstance(model, GpuModel) and not recorded:
             model._capacity = None
         options = {"near": 0.01, "sh_degree": 3, "background": (0.0, 0.0, 0.0), "ssim_weight": 0.2}
         return lambda: model.step(self.camera, self.target, shrink=1, **options)
@@ -218,9 +218,9 @@ def bench(seconds: float, cases: list[tuple[int, int, int]] | None = None) -> di
     for size in sizes:
         case = Case(*size)
         copied = fastest(lambda case=case: case.through_torch("gpu"))
-        cpu = fastest(lambda case=case: case.through_torch("cpu"))
+        cpu = fastest(case.without_autograd("cpu"))
         copied_bytes = transferred_bytes(device, lambda case=case: case.through_torch("gpu"))
-        step = case.on_device()
+        step = case.without_autograd("gpu")
 
         def many_steps(step: Callable[[], Callable[[], float]] = step) -> None:
             for loss in [step() for _ in range(STEPS)][-1:]:
@@ -228,7 +228,7 @@ def bench(seconds: float, cases: list[tuple[int, int, int]] | None = None) -> di
 
         device_seconds, bytes_moved = fastest(many_steps) / STEPS, transferred_bytes(device, step)
         recording = recording_of(device, step)
-        stages = stages_of(device, case.on_device(recorded=False))
+        stages = stages_of(device, case.without_autograd("gpu", recorded=False))
         numbers = size[0] * (scene.SPLAT - 2 + 48)
         adam_bandwidth = BYTES_PER_NUMBER * numbers / (stages["adam"] / 1e3) / 1e9
         lanes, _ = work(Step(*size))
@@ -261,8 +261,10 @@ def cuda_seconds(size: tuple[int, int, int], fastest: Fastest) -> dict[str, floa
     """
     case = Case(*size, device="cuda")
 
+    step = case.without_autograd("cuda")
+
     def step_cuda() -> None:
-        case.through_torch("cuda")
+        step()
         torch.cuda.synchronize()
 
     steps = {"cuda_step_ms": step_cuda}
