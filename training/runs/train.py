@@ -291,7 +291,8 @@ class _TrainingRun:
             saves = levels or time.monotonic() - last_checkpoint >= CHECKPOINT_SECONDS
             if saves:
                 require_finite(loss, self.step)
-            self._write_levels(levels)
+            if levels:
+                self._write_levels(levels)
             if saves:
                 self._save()
                 last_checkpoint = time.monotonic()
