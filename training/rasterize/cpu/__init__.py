@@ -22,7 +22,7 @@ from ..rendering import BackendOutput, RasterSettings, SideOutputs, Target, requ
 from .bin import TILE
 from .blend import blend_weights
 from .compile import Buffers, run_parallel, serialised
-from .frame import TILES, Frame
+from .frame import TILES, HostFrame
 from .host_model import GEOMETRY, HostModel, image_planes
 from .loss import loss_and_gradient
 from .project import BLUE, G_RED, LN2, RED, SUMS
@@ -75,7 +75,7 @@ class _Rasterize(torch.autograd.Function):
         ctx, means, quats, log_scales, logits, sh, weights, features, rows, settings, background, limit, side
     ):
         tensors = [tensor.contiguous() for tensor in (means, quats, log_scales, logits, sh, weights)]
-        frame = Frame([t.detach().numpy() for t in tensors], rows, settings, side.radii.numpy())
+        frame = HostFrame([t.detach().numpy() for t in tensors], rows, settings, side.radii.numpy())
         counts = side.tile_counts.numpy()
         counts[:] = np.diff(frame.pairs.tile_start).reshape(counts.shape)
         feature_array = features.detach().numpy()
@@ -160,7 +160,7 @@ def contributions(
     tensors = *vars(gaussians).values(), weights
     splats = [tensor.detach().contiguous().numpy() for tensor in tensors]
     radii = torch.zeros(count)
-    frame = Frame(splats, _rows(settings), settings, radii.numpy())
+    frame = HostFrame(splats, _rows(settings), settings, radii.numpy())
     pairs = frame.pairs
     pair_weights = frame.buffers.take("pair_weights", np.float32, len(pairs.splat), 3)
     row_weights = np.empty((len(frame.index), 3), np.float32)

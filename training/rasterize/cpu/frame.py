@@ -17,7 +17,7 @@ TILES = 16
 """Tiles in a thread's unit of work."""
 
 
-class Frame:
+class HostFrame:
     """Projected splats and their pairs with tiles. The arrays are in use until the object is deleted.
 
     Args:

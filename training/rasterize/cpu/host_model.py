@@ -13,7 +13,7 @@ from ..rendering import KernelCamera, RasterSettings, Target
 from ..stats import accumulate_stats
 from .adam import decay_rows, step_arguments
 from .compile import Buffers, serialised
-from .frame import Frame
+from .frame import HostFrame
 from .loss import loss_and_gradient
 from .project import SUMS
 
@@ -67,7 +67,7 @@ class HostModel:
         factors = np.empty(0, np.float32) if weights is None else weights.numpy()
         splats = [*(arrays[name] for name in (*GEOMETRY, "sh")), factors]
         radii, grad2d = torch.zeros(count), torch.zeros(count, 2)
-        frame = Frame(splats, None, settings, radii.numpy())
+        frame = HostFrame(splats, None, settings, radii.numpy())
         image = np.empty((3, view.height, view.width), np.float32)
         frame.blend(frame.projected, np.array(background, np.float32), image)
         loss, by_image = self._compare(image, target.over(background), ssim_weight)

@@ -21,7 +21,16 @@ from ..rendering import BackendOutput, RasterSettings, SideOutputs, Target
 from ..self_test import find_difference
 from . import driver
 from .card_model import TENSORS, CardModel
-from .frame import THREADS, TILE, Frame, PhotometricLoss, Projected, TileLists, image_structure, upload_photo
+from .frame import (
+    THREADS,
+    TILE,
+    CardFrame,
+    PhotometricLoss,
+    Projected,
+    TileLists,
+    image_structure,
+    upload_photo,
+)
 from .source import kernel_source
 
 DEVICE = "cuda"
@@ -121,7 +130,7 @@ class _Rasterize(torch.autograd.Function):
         ctx.set_materialize_grads(False)
         parameters = [tensor.contiguous() for tensor in (means, quats, log_scales, logits, sh)]
         weights = None if weights is None else weights.contiguous()
-        frame = Frame(Gaussians(*parameters), weights, settings)
+        frame = CardFrame(Gaussians(*parameters), weights, settings)
         padded = torch.nn.functional.pad(features, (0, -features.shape[1] % 3))
         shades = [part.contiguous() for part in padded.split(3, 1) if part.shape[1]]
         limit = None if settings.limit is None else settings.limit.to(means).contiguous()

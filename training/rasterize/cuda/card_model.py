@@ -11,7 +11,7 @@ from ..adam import Adam
 from ..gaussians import Gaussians
 from ..rendering import KernelCamera, RasterSettings, Target
 from ..stats import accumulate_stats
-from .frame import Frame, PhotometricLoss, upload_photo
+from .frame import CardFrame, PhotometricLoss, upload_photo
 
 TENSORS = ("means", "quats", "log_scales", "opacity_logits", "sh")
 
@@ -49,7 +49,7 @@ class CardModel:
         tensors = {name: self._adam.tensors[name].detach() for name in TENSORS}
         view = KernelCamera.of(camera, near)
         settings = RasterSettings(view, float(min_scale), self._antialias, background, sh_degree)
-        frame = Frame(Gaussians(**tensors), weights, settings)
+        frame = CardFrame(Gaussians(**tensors), weights, settings)
         image = frame.blend(frame.projected.colours, background)
         target = target.over(background)
         photo = upload_photo(target, image)

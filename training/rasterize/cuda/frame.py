@@ -118,7 +118,7 @@ class TileLists(NamedTuple):
         return cls(splats[index], torch.searchsorted(sorted_tiles, numbers, out_int32=True))
 
 
-class Frame:
+class CardFrame:
     """Projected splats and their lists of tiles.
 
     Args:
