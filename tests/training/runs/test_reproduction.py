@@ -48,6 +48,14 @@ def test_tables_are_complete_and_trends_hold_for_the_papers_values(paper, table)
 
 
 @pytest.mark.parametrize("name", PAPERS)
+def test_trends_need_a_difference(name):
+    """With equal values everywhere, only claims of an upper bound hold."""
+    trends = [trend for table in load_paper(name).tables for trend in table.trends]
+    held = [trend.claim for trend in trends if trend.test(lambda label, column: 5.0)[0]]
+    assert all("at most" in claim for claim in held)
+
+
+@pytest.mark.parametrize("name", PAPERS)
 def test_trainings_are_valid_jobs(name, tiny_scene, tmp_path):
     paper = load_paper(name)
     for job in make_jobs(paper, list(paper.trainings), ReducedJobs(tiny_scene, "paper", 0.1, {}), tmp_path):
@@ -74,6 +82,14 @@ def test_trends_state_our_numbers():
     assert loses_little("", "a", "b", 0.4, 0.5).test(value)[0] is False
     assert increases("", ("b", "a"), PSNR).test(value) == (True, "29.50, 30.00")
     assert increases("", ("a", "b"), SPLATS).test(value) == (False, "100, 40")
+
+
+def test_frames_of_lodge_must_be_faster():
+    """Values of a small image, where no level was faster."""
+    (table,) = load_paper("lodge").tables
+    times = {"Full representation": 5.2, "LOD (d=10,28,47)": 5.5}
+    holds, text = table.trends[0].test(lambda label, _: times.get(label, 5.1))
+    assert not holds and text == "1.0, 1.0, 0.9, 1.0 times as fast"
 
 
 def test_tables_are_chosen_by_number_or_name():
