@@ -1,6 +1,9 @@
 """Test selection, self-test and description of graphics devices."""
 
 import json
+import os
+import subprocess
+import sys
 from functools import cache
 
 import pytest
@@ -295,3 +298,14 @@ def test_lost_device_is_reported_and_tested_again(set_adapters, monkeypatch):
     assert "stopped responding" in describe()
     monkeypatch.setattr(gpu, "rasterize", cpu.rasterize, raising=False)
     assert resolve_backend("gpu") == "gpu"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a variable of Linux")
+def test_listing_devices_prints_nothing_without_a_window_system(graphics):
+    """Mesa's drivers print errors if XDG_RUNTIME_DIR is not set, as on servers."""
+    code = "from training.rasterize.gpu.device import adapters; adapters()"
+    environment = {name: value for name, value in os.environ.items() if name != "XDG_RUNTIME_DIR"}
+    ended = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert ended.stderr == ended.stdout == ""

@@ -7,8 +7,10 @@ by their names in the shader. Dispatches that repeat are prepared once (:meth:`D
 from __future__ import annotations
 
 import math
+import os
 import re
 import sys
+import tempfile
 import threading
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -116,7 +118,8 @@ def _enumerate() -> dict[Adapter, Any]:
     """Return wgpu's adapters by :class:`Adapter`, best first."""
     wgpu = _wgpu()
     try:
-        handles = wgpu.gpu.enumerate_adapters_sync()
+        with _runtime_folder():
+            handles = wgpu.gpu.enumerate_adapters_sync()
     except Exception as error:
         raise LodgsError(f"Cannot list graphics devices: {_reason(error)}.", REMEDY) from error
     available: dict[str, tuple[Adapter, Any]] = {}
@@ -129,6 +132,19 @@ def _enumerate() -> dict[Adapter, Any]:
         raise LodgsError("Cannot detect a graphics device with Vulkan, Metal or D3D12.", REMEDY)
     ranks = {"discrete": 0, "integrated": 1, "other": 2, "software": 3}
     return dict(sorted(available.values(), key=lambda pair: ranks[pair[0].kind]))
+
+
+@contextmanager
+def _runtime_folder() -> Iterator[None]:
+    """Set XDG_RUNTIME_DIR meanwhile, without which drivers of Linux print errors of a window system."""
+    missing = sys.platform == "linux" and "XDG_RUNTIME_DIR" not in os.environ
+    if missing:
+        os.environ["XDG_RUNTIME_DIR"] = tempfile.gettempdir()
+    try:
+        yield
+    finally:
+        if missing:
+            os.environ.pop("XDG_RUNTIME_DIR", None)
 
 
 @cache
