@@ -38,8 +38,8 @@ class ReducedJobs:
     """Jobs on a scene that do a fraction of a preset's work.
 
     The effort multiplies the numbers of steps. Below 1, it also multiplies the pixels of an image, but the
-    longer side keeps SMALL_SIDE pixels; gradient thresholds follow the size of the images, and
-    MAX_DENSITY limits the splats. An image scale among the keys remains.
+    longer side keeps SMALL_SIDE pixels; gradient thresholds and ``MethodInfo.pixel_parameters`` follow the
+    size of the images, and MAX_DENSITY limits the splats. An image scale among the keys remains.
 
     Args:
         scene: COLMAP scene.
@@ -74,6 +74,14 @@ class ReducedJobs:
         """
         info = method_info(method)
         parameters = info.scaled_steps(self.preset, self.effort, changes or {})
+        ratio = self._keys["image_scale"] / default_image_scale(self.preset)
+        if self.effort < 1 and ratio < 1:
+            preset = info.preset(self.preset)
+            parameters |= {
+                name: ratio * getattr(preset, name)
+                for name in info.pixel_parameters
+                if name not in parameters
+            }
         if self._max_splats:
             limit = info.preset(self.preset).max_splats or self._max_splats
             parameters |= {"max_splats": min(limit, self._max_splats), "scale_threshold": True}

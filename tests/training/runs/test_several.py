@@ -52,6 +52,16 @@ def test_effort_limits_splats_by_pixels(tiny_scene, tmp_path):
     assert (full.max_splats, full.scale_threshold) == (0, False)
 
 
+@pytest.mark.parametrize(
+    ("effort", "scale", "pixels"), [(0.1, 0.25, 0.75), (1.0, 0.25, 3.0), (0.1, 1.0, 3.0)]
+)
+def test_effort_keeps_the_size_of_cuts_in_the_scene(tiny_scene, tmp_path, effort, scale, pixels):
+    jobs = ReducedJobs(tiny_scene, "paper", effort, {"image_scale": scale})
+    assert jobs.job("tree", tmp_path / "run").resolved_parameters().pixels == pixels
+    fixed = jobs.job("tree", tmp_path / "run", {"pixels": 2.0})
+    assert fixed.resolved_parameters().pixels == 2.0
+
+
 @pytest.fixture
 def jobs(tiny_scene, tmp_path):
     keys = {"scene": str(tiny_scene), "method": "3dgs", "image_scale": 1.0, "backend": "cpu"}
