@@ -10,7 +10,7 @@ from pathlib import Path
 import bpy
 
 from ...training.errors import LodgsError
-from ...training.scenes.images import image_size
+from ...training.scenes.image_headers import image_size
 from ..data.paths import absolute_path
 
 _PNG_END = b"IEND\xaeB`\x82"

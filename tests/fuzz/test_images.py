@@ -12,7 +12,8 @@ from PIL import Image
 from tests.fuzz.entry_points import attempt
 from tests.fuzz.mutations import corrupted
 from training.render.image import read_depth
-from training.scenes.images import MAX_PIXELS, check_image, image_size, load_image
+from training.scenes.image_headers import MAX_PIXELS, image_size
+from training.scenes.images import check_image, load_image
 
 
 @pytest.fixture(scope="module")

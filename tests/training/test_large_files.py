@@ -11,7 +11,7 @@ from training.errors import LodgsError
 from training.scenes.colmap_model import read_cameras, read_observations, read_points, read_poses
 from training.scenes.depths import read_depth_map
 from training.scenes.formats import bundler, metashape
-from training.scenes.images import image_size
+from training.scenes.image_headers import image_size
 from training.scenes.point_cloud import read_points as read_point_cloud
 from training.splats.formats.splat import SplatFile
 from training.splats.ply import read_elements

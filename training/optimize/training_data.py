@@ -18,7 +18,8 @@ from ..scenes.cameras import Camera, pick_evenly
 from ..scenes.colmap import Scene
 from ..scenes.depths import DepthPriors
 from ..scenes.exposures import remove_gain
-from ..scenes.images import image_size, load_image, load_mask
+from ..scenes.image_headers import image_size
+from ..scenes.images import load_image, load_mask
 from .image_cache import ImageCache, default_budget
 from .memory import TARGET_BYTES
 

@@ -13,7 +13,8 @@ from ..errors import LodgsError
 from .cameras import MAX_COORDINATE, Camera, pick_evenly
 from .colmap import Scene, observations
 from .exr import MAGIC
-from .images import area_average, check_image_size, load_image, same_proportions
+from .image_headers import check_image_size
+from .images import area_average, load_image, same_proportions
 from .rendered_views import SKY_DEPTH, read_exr_depth, sample_surfaces
 
 DEPTH_KINDS = ("metric", "relative", "inverse", "points")

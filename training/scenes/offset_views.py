@@ -16,7 +16,7 @@ from ..errors import LodgsError, printable
 from ..splats.origin import NO_ORIGIN
 from .cameras import Camera, read_camera
 from .image_files import ImageFiles
-from .images import image_size
+from .image_headers import image_size
 
 
 def read_offset_views(scene: Path, origin: np.ndarray = NO_ORIGIN) -> list[Camera]:

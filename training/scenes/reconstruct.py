@@ -26,7 +26,8 @@ from ..files import atomic_write, check_folder, is_file, link_or_copy
 from . import pycolmap_process
 from .colmap import MASKS, find_models
 from .image_files import MASK_SUFFIXES, SidecarFiles
-from .images import IMAGE_SUFFIXES, check_mask, image_size, load_image, load_mask, write_png
+from .image_headers import image_size
+from .images import IMAGE_SUFFIXES, check_mask, load_image, load_mask, write_png
 from .view_selection import exclusion_messages
 
 PRESETS = {"draft": (1000, 2048), "standard": (1600, 4096)}

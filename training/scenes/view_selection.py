@@ -12,7 +12,8 @@ from ..errors import LodgsError, SystemProblem, printable
 from .cameras import Camera
 from .colmap_model import Pose
 from .image_files import ImageFiles, SidecarFiles
-from .images import exif_orientation, image_size, quarter_turns, same_proportions
+from .image_headers import exif_orientation, image_size, quarter_turns
+from .images import same_proportions
 from .lenses import Intrinsics
 
 OUTLIER_FACTOR = 1000

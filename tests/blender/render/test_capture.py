@@ -13,7 +13,7 @@ import pytest
 
 from training.scenes.cameras import read_camera_folder
 from training.scenes.colmap_model import read_points
-from training.scenes.images import image_size
+from training.scenes.image_headers import image_size
 
 pytestmark = pytest.mark.one_blender
 

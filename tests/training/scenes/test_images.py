@@ -11,7 +11,8 @@ from PIL import Image
 
 from training.errors import LodgsError
 from training.scenes.color import srgb_from_linear
-from training.scenes.images import image_size, load_image
+from training.scenes.image_headers import image_size
+from training.scenes.images import load_image
 
 
 def write_png(path, pixels: np.ndarray) -> None:

@@ -12,7 +12,8 @@ from PIL import Image
 
 from training.errors import LodgsError
 from training.scenes import exr, images
-from training.scenes.images import check_image, image_size, load_image
+from training.scenes.image_headers import image_size
+from training.scenes.images import check_image, load_image
 
 
 def write_flat_png(path, width: int, height: int, rows: int | None = None) -> None:

@@ -8,7 +8,7 @@ from PIL import Image
 
 from training.scenes.cameras import Camera
 from training.scenes.colmap import read_scene
-from training.scenes.images import quarter_turns
+from training.scenes.image_headers import quarter_turns
 from training.scenes.orientation import up_rotation
 
 
@@ -59,7 +59,7 @@ def nadir(headings, tilt: float) -> list[Camera]:
 
 
 @pytest.mark.parametrize(("turns", "orientation"), [(0, 1), (1, 6), (2, 3), (3, 8)])
-@pytest.mark.parametrize("suffix", ["jpg", "tif"])
+@pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "webp"])
 def test_orientation_of_photos_is_used(tmp_path, turns, orientation, suffix):
     path = tmp_path / f"a.{suffix}"
     exif = Image.Exif()

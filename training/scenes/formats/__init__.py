@@ -19,7 +19,7 @@ from ...splats.georeference import write_georeference
 from ..colmap import DEPTHS, MASKS, NO_POINTS, Scene, find_models, read_scene, scene_lenses, subfolders
 from ..colmap_model import model_suffix
 from ..image_files import find_image_folder
-from ..images import exif_orientation, image_size
+from ..image_headers import exif_orientation, image_size
 from ..view_selection import STORE_UPRIGHT, exclusion_messages, fits_upright_photos, photo_turns
 from ..write_colmap import write_model
 from . import (

@@ -16,7 +16,7 @@ import numpy as np
 
 from ...documents import damage_error, decode_text, open_file, open_lines, read_lines
 from ...errors import LodgsError
-from ..images import image_size
+from ..image_headers import image_size
 from ..lenses import make_intrinsics
 from .exported import OPENGL, ExportedScene, ExportedView, PhotoFinder, find_file, invert_pose
 

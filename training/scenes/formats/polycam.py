@@ -13,7 +13,7 @@ import numpy as np
 
 from ...errors import LodgsError
 from ...files import is_file
-from ..images import image_size
+from ..image_headers import image_size
 from .exported import (
     ExportedScene,
     ExportedView,

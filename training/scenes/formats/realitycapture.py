@@ -24,7 +24,7 @@ import numpy as np
 
 from ...documents import decode_text, open_lines, read_bytes
 from ...errors import LodgsError
-from ..images import image_size
+from ..image_headers import image_size
 from ..lenses import Intrinsics
 from ..point_cloud import read_points
 from .exported import (

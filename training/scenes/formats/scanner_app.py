@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ...documents import read_bytes
 from ...errors import LodgsError
-from ..images import image_size
+from ..image_headers import image_size
 from .exported import (
     ExportedScene,
     ExportedView,

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import LodgsError
-from ..images import image_size
+from ..image_headers import image_size
 from ..point_cloud import read_points
 from .exported import (
     ExportedScene,
