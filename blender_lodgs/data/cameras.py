@@ -21,7 +21,7 @@ from ...training.render.lens import (
 )
 from ...training.runs.job import MIN_VIEWS
 from ...training.scenes.cameras import Camera
-from .placement import matrix_of
+from .placement import matrix_of, require_finite
 
 ORTHOGONAL = 1e-5
 """Maximum stretch of a camera's axes without scale that counts as rounding: 0.01 pixels of 1,000."""
@@ -79,9 +79,12 @@ class RenderView:
         projection = self.obj.calc_matrix_camera(
             depsgraph, x=width, y=height, scale_x=render.pixel_aspect_x, scale_y=render.pixel_aspect_y
         )
-        if camera.type == "PERSP" and self.shift_x != camera.shift_x:
+        shift = (self.shift_x - camera.shift_x) * projection[0][0]
+        if camera.type == "PERSP":
             sensor = camera.sensor_height if camera.sensor_fit == "VERTICAL" else camera.sensor_width
-            projection[0][2] += (self.shift_x - camera.shift_x) * projection[0][0] * sensor / camera.lens
+            projection[0][2] += shift * sensor / camera.lens
+        elif camera.type == "ORTHO":
+            projection[0][3] -= shift * camera.ortho_scale
         return projection
 
     def pinhole(
@@ -169,6 +172,16 @@ def aperture_of(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Apertu
     )
 
 
+def require_flat_stereo(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
+    """Raise UnsupportedCameraError if each direction of a camera's image has eyes of its own."""
+    is_stereo = scene.render.use_multiview and scene.render.views_format == "STEREO_3D"
+    if is_stereo and obj.data.type != "ORTHO" and obj.data.stereo.use_spherical_stereo:
+        raise UnsupportedCameraError(
+            f"Cannot render with LODGS: camera '{obj.name}' has Spherical Stereo.",
+            "Clear Spherical Stereo in its settings (Stereoscopy).",
+        )
+
+
 def _require_perspective(obj: bpy.types.Object) -> None:
     """Raise UnsupportedCameraError if an object is not a perspective camera."""
     if obj.type != "CAMERA" or obj.data.type != "PERSP":
@@ -206,9 +219,10 @@ def view_of(
 
 
 def _require_size(obj: bpy.types.Object, matrix: np.ndarray) -> None:
-    """Raise UnsupportedCameraError if the axes of a camera's matrix (4, 4) are in one plane."""
+    """Raise LodgsError if a camera's matrix (4, 4) is not finite or its axes are in one plane."""
+    require_finite(obj, matrix)
     lengths = np.linalg.norm(matrix[:3, :3], axis=0)
-    if not np.isfinite(matrix).all() or lengths.min() == 0 or np.linalg.cond(matrix[:3, :3] / lengths) > 1e5:
+    if lengths.min() == 0 or np.linalg.cond(matrix[:3, :3] / lengths) > 1e5:
         raise UnsupportedCameraError(
             f"Cannot render with LODGS: the scale of camera '{obj.name}' or of a parent is 0.",
             "Give them a scale above 0 along all axes.",

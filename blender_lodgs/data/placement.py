@@ -14,6 +14,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ...training.errors import LodgsError
+from ...training.scenes.cameras import MAX_COORDINATE
 from ...training.splats.similarity import Similarity, is_similarity
 
 DISPLAY_SIZE = 1e-4
@@ -59,17 +60,28 @@ def matrix_of(root: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = No
         depsgraph: use the evaluated transform; None for the original one.
 
     Raises:
-        LodgsError: the root is scaled differently along its axes.
+        LodgsError: the root is scaled differently along its axes, or its transform is not finite.
     """
     axes = axes_of(root)
     evaluated = axes.evaluated_get(depsgraph) if depsgraph else axes
     matrix = np.array(evaluated.matrix_world, np.float64)
+    require_finite(root, matrix)
     if not is_similarity(_orthogonal(matrix)):
         raise LodgsError(
             f"Cannot use the transform of '{root.name}': its scale is stretched or mirrored.",
             "Give it one positive scale for all axes.",
         )
     return matrix
+
+
+def require_finite(obj: bpy.types.Object, matrix: np.ndarray) -> None:
+    """Raise LodgsError if a matrix (4, 4) of an object has numbers that are not finite or too large."""
+    if not (np.abs(matrix) <= MAX_COORDINATE).all():
+        raise LodgsError(
+            f"Cannot use the transform of '{obj.name}': it has numbers that are not finite or above "
+            f"{MAX_COORDINATE:g}.",
+            "Clear it (Object > Clear) and those of its parents, or correct their animation and constraints.",
+        )
 
 
 def placement_of(root: bpy.types.Object) -> Similarity:

@@ -14,7 +14,7 @@ import numpy as np
 
 from .. import attributes
 from . import looks, roots, selection, streams
-from .placement import axes_of
+from .placement import axes_of, require_finite
 
 MIN_SCALE = 1e-9
 """Scale of an instance below which nothing of it is visible."""
@@ -80,7 +80,11 @@ def splat_instances(
     ``depsgraph.mode``.
 
     Args:
-        viewport: exclude objects that this viewport hides by local view or object type.
+        viewport: exclude objects that this viewport hides by local view or object type, and those whose
+            transform is not finite.
+
+    Raises:
+        LodgsError: without a viewport, if the transform of an object is not finite.
     """
     if not any(is_splats(cloud) for cloud in bpy.data.pointclouds):
         return []
@@ -98,7 +102,10 @@ def splat_instances(
         shown_by = (instance.parent if instance.is_instance else obj).original
         if viewport is not None and not shown_by.visible_in_viewport_get(viewport):
             continue
-        matrix = _drawable(np.array(instance.matrix_world, np.float64))
+        matrix = np.array(instance.matrix_world, np.float64)
+        if viewport is None:
+            require_finite(obj.original, matrix)
+        matrix = _drawable(matrix)
         if matrix is None:
             continue
         original = obj.original

@@ -29,7 +29,7 @@ from ...training.scenes.cameras import Camera, camera_to_dict
 from ...training.splats.gaussians import Splats
 from .. import attributes
 from ..data import changes, objects, roots, selection, shown
-from ..data.cameras import RenderView, aperture_of, scene_camera, unsupported_lens
+from ..data.cameras import RenderView, aperture_of, require_flat_stereo, scene_camera, unsupported_lens
 from ..data.paths import absolute_path
 from . import renderer, written_images
 
@@ -125,6 +125,7 @@ class LodgsEngine(bpy.types.RenderEngine):
             return RenderView.of(camera)
         self.active_view_set(name)
         camera = self.camera_override or camera
+        require_flat_stereo(depsgraph.scene, camera)
         return RenderView(camera, self.camera_model_matrix(camera), self.camera_shift_x(camera))
 
 

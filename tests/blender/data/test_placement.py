@@ -142,6 +142,14 @@ def test_ground_through_three_empties_is_at_zero(bpy, root):
     assert flipped[2] < -0.9
 
 
+@pytest.mark.parametrize("operator", ["set_ground", "find_clutter"])
+def test_transform_that_is_not_finite_is_rejected(bpy, root, operator):
+    root.location = (np.nan, 0, 0)
+    bpy.context.view_layer.update()
+    with pytest.raises(RuntimeError, match=r"it has numbers that are not finite .*\s+Clear it"):
+        getattr(bpy.ops.lodgs, operator)()
+
+
 def test_ground_fits_points_selected_in_edit_mode(bpy, lodgs):
     root = lodgs("data.importing").import_colmap(bpy.context, GARDEN, photographs=False)
     bpy.context.view_layer.update()

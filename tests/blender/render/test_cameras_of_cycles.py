@@ -117,6 +117,11 @@ def orthographic(bpy, scene):
     scene.render.pixel_aspect_y = 1.3
 
 
+def stereo_orthographic(bpy, scene):
+    orthographic(bpy, scene)
+    stereo(bpy, scene)
+
+
 def sheared_orthographic(bpy, scene):
     shear(bpy, scene)
     scene.camera.data.type, scene.camera.data.ortho_scale = "ORTHO", 4.5
@@ -166,7 +171,9 @@ def centres(bpy, path: Path) -> dict:
     "change",
     [
         None, shear, mirror, stereo, orthographic, panorama,
-        *one_blender(toe_in, several_cameras, sheared_orthographic, part_of_a_panorama),
+        *one_blender(
+            toe_in, several_cameras, stereo_orthographic, sheared_orthographic, part_of_a_panorama
+        ),
     ],
 )  # fmt: skip
 def test_splats_stand_where_cycles_draws_cubes(bpy, scene, root, tmp_path, change):
@@ -327,6 +334,27 @@ def test_camera_with_scale_0_is_reported(bpy, scene, root, tmp_path, scale):
     with pytest.raises(RuntimeError, match="the scale of camera 'cam' or of a parent is 0"):
         draw(bpy, "LODGS", tmp_path)
     assert not list(tmp_path.glob("*.png"))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e20])
+@pytest.mark.parametrize("obj", ["cam", "marks", "level"])
+def test_transform_that_is_not_finite_is_named(bpy, scene, root, tmp_path, obj, value):
+    moved = bpy.data.objects.get(obj) or root.lodgs.levels[0].object
+    moved.location.x = value
+    splats = root.lodgs.levels[0].object.name
+    with pytest.raises(
+        RuntimeError, match=rf"transform of '{'cam' if obj == 'cam' else splats}'.*\s+Clear it"
+    ):
+        draw(bpy, "LODGS", tmp_path)
+    assert not list(tmp_path.glob("*.png"))
+
+
+def test_spherical_stereo_is_rejected(bpy, scene, root, tmp_path):
+    stereo(bpy, scene)
+    panorama(bpy, scene)
+    scene.camera.data.stereo.use_spherical_stereo = True
+    with pytest.raises(RuntimeError, match="camera 'cam' has Spherical Stereo"):
+        draw(bpy, "LODGS", tmp_path)
 
 
 def test_root_with_scale_0_renders_no_splats(bpy, scene, root, tmp_path):
