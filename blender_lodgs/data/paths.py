@@ -82,10 +82,26 @@ def is_complete_file(path: Path) -> bool:
 def stored_path(path: Path) -> str:
     """Return a path as properties store it: relative to the .blend file if the user prefers that."""
     absolute = str(path.absolute())
-    if bpy.data.filepath and bpy.context.preferences.filepaths.use_relative_paths:
-        with suppress(ValueError):  # on another drive
-            return bpy.path.relpath(absolute)
-    return absolute
+    return relative_path(absolute) if bpy.context.preferences.filepaths.use_relative_paths else absolute
+
+
+def relative_path(path: str, folder: str = "") -> str:
+    """Return an absolute path relative to a folder, with the prefix "//"; unchanged on another drive.
+
+    If the folder's path has symbolic links, ``..`` leads to the parents of their targets.
+
+    Args:
+        folder: absolute path. By default, the folder of the .blend file; without one, paths stay unchanged.
+    """
+    folder = folder or os.path.dirname(bpy.data.filepath)
+    if not folder:
+        return path
+    real_path, real_folder = os.path.realpath(path), os.path.realpath(folder)
+    with suppress(ValueError):  # on another drive
+        values = os.path.relpath(path, folder), os.path.relpath(real_path, real_folder)
+        valid = [value for value in values if os.path.realpath(os.path.join(folder, value)) == real_path]
+        return "//" + min(valid, key=lambda value: value.startswith(os.pardir))
+    return path
 
 
 def scene_paths() -> Iterator[tuple[bpy.types.bpy_struct, str, str]]:
@@ -118,9 +134,12 @@ def _project_folders(folder: str) -> list[str]:
 
 
 def _is_inside(path: str, folder: str) -> bool:
-    """Return whether an absolute path is a folder or below it."""
-    path, folder = (os.path.normcase(os.path.abspath(item)) for item in (path, folder))
-    return path == folder or path.startswith(os.path.join(folder, ""))
+    """Return whether an absolute path is a folder or below it, by name or after following symbolic links."""
+    for resolve in (os.path.abspath, os.path.realpath):
+        inner, outer = (os.path.normcase(resolve(item)) for item in (path, folder))
+        if inner == outer or inner.startswith(os.path.join(outer, "")):
+            return True
+    return False
 
 
 @bpy.app.handlers.persistent
@@ -135,16 +154,14 @@ def _on_save(path: str = "", *_) -> None:
     projects = _project_folders(new_folder)
     for owner, name, value in list(scene_paths()):
         remapped = bpy.path.abspath(value)
-        if not os.path.isabs(remapped):
+        if not os.path.isabs(remapped) or automatic_path(value) is None:
             continue
         if value.startswith("//"):
             if old_folder == new_folder:
                 continue
         elif not any(_is_inside(remapped, folder) for folder in projects):
             continue
-        with suppress(ValueError):  # on another drive
-            remapped = bpy.path.relpath(remapped, start=new_folder)
-        setattr(owner, name, remapped)
+        setattr(owner, name, relative_path(remapped, new_folder))
         _previous.append((owner, name, value))
 
 
@@ -168,7 +185,7 @@ def _on_import(context, *_) -> None:
     for owner, name, value in list(scene_paths()):
         folder = folders.get(owner.id_data)
         if folder and value.startswith("//"):
-            setattr(owner, name, stored_path(Path(os.path.normpath(bpy.path.abspath(value, start=folder)))))
+            setattr(owner, name, stored_path(Path(bpy.path.abspath(value, start=folder))))
 
 
 def register() -> None:

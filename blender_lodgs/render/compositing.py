@@ -17,6 +17,7 @@ from ...training.scenes.ground import find_ground
 from .. import compat
 from ..data import cleaning, ground, roots, selection
 from ..data.cameras import scene_camera
+from ..data.paths import relative_path
 from ..data.placement import placement_of
 from ..data.properties import RenderSettings
 from ..data.property_callbacks import ON_CHANGE
@@ -211,7 +212,7 @@ def render_mesh_depth(scene: bpy.types.Scene, frames: Iterable[int]) -> Iterator
         ) from error
     finally:
         bpy.data.scenes.remove(meshes)
-    scene.lodgs_render.holdout = bpy.path.relpath(str(pattern)) if bpy.data.filepath else str(pattern)
+    scene.lodgs_render.holdout = relative_path(str(pattern))
     if scene.lodgs_render.meshes is not None:
         combine_with_meshes(scene)
 

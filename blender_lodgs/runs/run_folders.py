@@ -12,7 +12,7 @@ import bpy
 from ...training.errors import LodgsError
 from ...training.runs.folder import RunFolder
 from ...training.runs.job import Job
-from ..data.paths import absolute_path, automatic_path
+from ..data.paths import absolute_path, automatic_path, relative_path
 
 LOG = "LODGS trainer log"
 """Name of the text block that shows a trainer's log."""
@@ -88,11 +88,7 @@ def run_state(run: RunFolder) -> str:
 
 def link_run(root: bpy.types.Object, run: RunFolder) -> None:
     """Store a run as the root's newest run, relative to the .blend file if possible."""
-    path = str(run.path)
-    if bpy.data.is_saved:
-        with suppress(ValueError):  # another drive
-            path = bpy.path.relpath(path)
-    root.lodgs.training.run = path
+    root.lodgs.training.run = relative_path(str(run.path.absolute()))
 
 
 def runs_parent(root: bpy.types.Object) -> Path:

@@ -66,6 +66,56 @@ def test_project_can_be_moved(bpy, lodgs, tmp_path, blend_folder):
     assert root.lodgs.training.output == "/elsewhere"
 
 
+@pytest.mark.parametrize("opened_by", ["real", "link"])
+@pytest.mark.parametrize("saved_by", ["real", "link"])
+def test_project_behind_a_symbolic_link_can_be_moved(bpy, lodgs, tmp_path, saved_by, opened_by):
+    """Paths by the link's name and by the real one lead to the same files, before and after a move."""
+    disk, home = tmp_path / "disk" / "a" / "project", tmp_path / "home"
+    for folder in (disk / "runs" / "one", disk / "photos", home):
+        folder.mkdir(parents=True)
+    shutil.copytree("examples/lantern_garden", disk / "scene")
+    (home / "link").symlink_to(disk)
+    projects = {"real": disk, "link": home / "link"}
+    root = lodgs("data.importing").import_colmap(
+        bpy.context, projects[opened_by] / "scene", photographs=False
+    )
+    bpy.ops.wm.save_as_mainfile(filepath=str(projects[saved_by] / "file.blend"))
+    lodgs("runs.run_folders").link_run(root, lodgs("training.runs.folder").RunFolder(disk / "runs" / "one"))
+    capture = bpy.context.scene.lodgs_capture
+    capture.folder = lodgs("data.paths").stored_path(projects[opened_by] / "photos")
+    bpy.ops.wm.save_mainfile()
+    moved = tmp_path / "other" / "b" / "c"
+    moved.parent.mkdir(parents=True)
+    name = root.name
+    for blend in (projects[saved_by] / "file.blend", moved / "file.blend"):
+        if blend.parent == moved:
+            (home / "link").unlink()
+            disk.rename(moved)
+        bpy.ops.wm.open_mainfile(filepath=str(blend))
+        settings, capture = bpy.data.objects[name].lodgs, bpy.context.scene.lodgs_capture
+        for value in (settings.scene_folder, settings.training.run, capture.folder):
+            assert value.startswith("//") and os.path.isdir(bpy.path.abspath(value)), value
+
+
+def test_symbolic_links_of_a_project_stay(bpy, lodgs, tmp_path):
+    """A folder of the project that links to another disk keeps its name."""
+    (tmp_path / "disk" / "runs").mkdir(parents=True)
+    (tmp_path / "project").mkdir()
+    (tmp_path / "project" / "runs").symlink_to(tmp_path / "disk" / "runs")
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "project" / "file.blend"))
+    assert lodgs("data.paths").stored_path(tmp_path / "project" / "runs") == "//runs"
+
+
+def test_folder_beside_a_symbolic_link_is_found(bpy, lodgs, tmp_path):
+    """Parent folders of a link's target differ from those of its name."""
+    (tmp_path / "disk" / "deep" / "project").mkdir(parents=True)
+    (tmp_path / "home" / "runs").mkdir(parents=True)
+    (tmp_path / "home" / "link").symlink_to(tmp_path / "disk" / "deep" / "project")
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "home" / "link" / "file.blend"))
+    value = lodgs("data.paths").stored_path(tmp_path / "home" / "runs")
+    assert value.startswith("//") and os.path.samefile(bpy.path.abspath(value), tmp_path / "home" / "runs")
+
+
 DEVICES = (r"\\.\PhysicalDrive0", "//\\\\.\\pipe" if os.name == "nt" else r"\\?\GLOBALROOT\x")
 
 
