@@ -6,7 +6,8 @@ Each command of COMMANDS runs undisturbed once, on splats of a tiny scene. Then 
 small (a tmpfs, which needs root on Linux), and gets SIGTERM at random times. A full disk must end in exit
 code 2 and a message with the name of the file; a signal in exit code 3 without processes left. Every file
 under its final name must be that of the undisturbed command, and the same command must complete it
-afterwards, with enough space. Results are written to build/attacks_commands.json. Needs fork.
+afterwards, with enough space. Results are written to build/attacks_commands.json. Needs fork: commands and
+the trainers of cells are forks of this process, which saves loading torch.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ from collections.abc import Sequence
 from contextlib import suppress
 from multiprocessing.context import ForkProcess as Process
 from pathlib import Path
-from typing import NamedTuple
+from types import SimpleNamespace
+from typing import IO, NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
@@ -43,6 +45,7 @@ from tools.small_disk import DISK_FULL_MESSAGES, contents, disk_usage, small_dis
 from training import __main__  # noqa: E402
 from training.errors import LodgsError  # noqa: E402
 from training.rasterize import warm_up  # noqa: E402
+from training.runs.blocks import workers  # noqa: E402
 from training.runs.page.write import VIEWER  # noqa: E402
 from training.splats.gaussians import Splats  # noqa: E402
 from training.splats.ply import read_ply, write_ply  # noqa: E402
@@ -363,12 +366,32 @@ def rotation(w: float, x: float, y: float, z: float) -> np.ndarray:
     return np.eye(3) + 2 * w * cross + 2 * cross @ cross
 
 
+class ForkedTrainer:
+    """Fork of this process in place of the ``subprocess.Popen`` of a cell's trainer."""
+
+    def __init__(self, command: list[str], env: dict[str, str], stderr: IO[bytes], **_: object) -> None:
+        self.pid = os.fork()
+        if self.pid == 0:
+            os.environ.update(env)
+            null = os.open(os.devnull, os.O_RDWR)
+            for number, descriptor in enumerate((null, null, stderr.fileno())):
+                os.dup2(descriptor, number)
+            os.closerange(3, 1 << 12)  # such as locks of the parent
+            sys.argv[1:] = command[3:]
+            __main__.run()
+
+    def wait(self) -> int:
+        """Return the exit code."""
+        return os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
+
+
 def run_command(arguments: list[str], log: Path) -> None:
     """Run one command in this process, with its output in a file."""
     descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     os.dup2(descriptor, 1)
     os.dup2(descriptor, 2)
     sys.argv[1:] = arguments
+    workers.subprocess = SimpleNamespace(**vars(subprocess) | {"Popen": ForkedTrainer})
     __main__.run()
 
 
