@@ -15,10 +15,13 @@ from training.scenes.formats import ensure_colmap_scene
 CASES = Path(__file__).parents[2] / "data" / "cases"
 
 
-@pytest.mark.parametrize("name", sorted(path.name for path in CASES.iterdir()))
-def test_case(tmp_path, name):
+NAMES = sorted(path.name for path in CASES.iterdir())
+
+
+def write_case(name: str, parent: Path) -> tuple[Path, dict]:
+    """Copy a case's export with generated photos to a folder; return its folder and ``case.json``."""
     case = json.loads((CASES / name / "case.json").read_text())
-    scene_folder = Path(shutil.copytree(CASES / name / "export", tmp_path / name))
+    scene_folder = Path(shutil.copytree(CASES / name / "export", parent / name))
     for path, (width, height, *orientation) in case["photos"].items():
         (scene_folder / path).parent.mkdir(parents=True, exist_ok=True)
         exif = Image.Exif()
@@ -26,6 +29,12 @@ def test_case(tmp_path, name):
         Image.new("RGB", (width, height)).save(scene_folder / path, exif=exif)
     for link, target in case.get("links", {}).items():
         (scene_folder / link).symlink_to(target, target_is_directory=True)
+    return scene_folder, case
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_case(tmp_path, name):
+    scene_folder, case = write_case(name, tmp_path)
     warnings = []
     try:
         scene = read_scene(ensure_colmap_scene(scene_folder, warnings.append))
