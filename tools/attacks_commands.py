@@ -16,6 +16,7 @@ import argparse
 import json
 import os
 import random
+import re
 import shutil
 import subprocess
 import sys
@@ -269,9 +270,8 @@ class Attack:
         if code != 2 or not reported or "Traceback" in log:
             self.wrong.append(f"{attack}: exit code {code}: {log[-400:]}")
         else:
-            message = (
-                f"{attack.split(',', maxsplit=1)[0]}: {reported[-1].replace(str(self.disk), 'DISK')[:200]}"
-            )
+            text = re.sub(r'"time": [0-9.]+, |step_[0-9]+', "", reported[-1].replace(str(self.disk), "DISK"))
+            message = f"{attack.split(',', maxsplit=1)[0]}: {text[:200]}"
             self.messages[message] = self.messages.get(message, 0) + 1
 
     def _contents(self, name: str) -> dict[str, bytes]:
