@@ -16,6 +16,7 @@ import torch
 from training.methods import create, method_info
 from training.methods.flod import train as flod_train
 from training.optimize import splat_method
+from training.optimize.anchors import growing
 from training.optimize.parameters import override
 
 OCTREE_PAGE = Path(__file__).parents[3] / "docs/methods/octree-gs-paper.md"
@@ -347,6 +348,20 @@ def test_octree_levels_join_as_in_the_program(data, levels, joins):
     first = next(step for step in range(40_000) if schedule.collects_stats(view, step))
     assert first + 1 == 501, "program: iteration > start_stat"
     assert not schedule.prunes_unseen_after(39_999)
+
+
+@pytest.mark.parametrize("name", ["octree", "octree_neural"])
+def test_first_growth_of_octree_is_unlimited(data, name):
+    """Octree-GS limits growth by gradients and free voxels alone."""
+    paper = replace(method_info(name).preset("paper"), levels=6)
+    counts = {}
+    for key, room_exponent in (("paper", paper.room_exponent), ("reserved", 2.0)):
+        method = create(name, data, replace(paper, room_exponent=room_exponent), seed=0, backend="cpu")
+        means = method.model.read("means")[:1] + torch.arange(2000.0)[:, None] * torch.tensor([10.0, 0, 0])
+        rows = {"means": means, "level": torch.ones(len(means), dtype=torch.uint8)}
+        added = growing.limit_growth(method.schedule, method.model, rows, 1_599, 1500)
+        counts[key] = len(added["means"])
+    assert counts["paper"] > counts["reserved"] == 0, counts
 
 
 @pytest.mark.parametrize(("init_level", "at_once"), [(0, 1), (2, 3), (4, 5), (11, 6)])
