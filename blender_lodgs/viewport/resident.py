@@ -31,6 +31,8 @@ UPLOAD_BATCH = 1 << 13
 """Number of splats per upload."""
 MIN_SLOTS = 1 << 16
 """Size of the smallest store."""
+TEXTURE_BYTES = 1 << 29
+"""Size of a texture from which a store has several: some drivers take long to create a large one."""
 SPARE_FACTOR = 1.25
 """Size of a new store relative to the number of drawn splats."""
 SHRINK_FACTOR = 2.0
@@ -161,7 +163,8 @@ class Store:
 
     def __init__(self, total: int, count: int, higher: int) -> None:
         max_texels = gpu.capabilities.max_texture_size_get() * WIDTH
-        self.texture_slots = max(-(-count // MAX_TEXTURES), 1)
+        slots = max(-(-count // MAX_TEXTURES), TEXTURE_BYTES // (16 * record_texels(higher)))
+        self.texture_slots = max(min(slots, count), 1)
         while higher and record_texels(higher) * self.texture_slots > max_texels:  # reduce the SH degree
             higher = {24: 15, 15: 8, 8: 3}.get(higher, 0)
         self.slots = np.full(total, -1, np.int32)

@@ -17,24 +17,14 @@ MARK_COLORS = ((1.0, 0.45, 0.05), *(kind.color for kind in KINDS.values()), (0.5
 """Colours of marked splats, sRGB, see ``cleaning.displayed_marks``: selected ones, clutter, other splats."""
 
 MAX_TEXTURES = 8
-"""Maximum number of textures for records: some drivers take long to create a single large one."""
+"""Maximum number of textures for records."""
+BLOCK = 1024
+"""Number of splats per instance of the quads: drivers draw small instances slowly, software by far."""
 
 _FETCH = """
 vec4 texel(sampler2D data, int i) { return texelFetch(data, ivec2(i % WIDTH, i / WIDTH), 0); }
 """
-_RECORD_TEXEL = (
-    "vec4 record_texel(ivec2 record, int i)\n{\n"
-    + "".join(
-        f"  if (record.x == {part}) {{ return texel(records_{part}, record.y + i); }}\n"
-        for part in range(MAX_TEXTURES)
-    )
-    + "  return vec4(0.0);\n}\n"
-)
-"""Read a texel of a record, which is given by texture number and first texel."""
-_VERTEX = (
-    _FETCH
-    + _RECORD_TEXEL
-    + """
+_PROJECT_FRAGMENT = """
 // SH coefficient k of a record, see ``resident.read_records``.
 vec3 coefficient(int k, ivec2 record)
 {
@@ -87,12 +77,11 @@ vec3 view_color(ivec2 record, vec3 base, vec3 d)
 
 void main()
 {
-  gl_Position = vec4(2.0, 2.0, 2.0, 1.0);  // outside: discarded unless set below
-  position_in_sigmas = vec2(0.0);
-  color_opacity = vec4(0.0);
+  centre_reach = axes = color_opacity = vec4(0.0);  // not drawn unless set below
 
   // slot, weight, placement, level for the colour (0: own colour, below 0: mark)
-  vec4 instance = texel(instances, gl_InstanceID);
+  ivec2 pixel = ivec2(gl_FragCoord.xy);
+  vec4 instance = texel(instances, pixel.y * WIDTH + pixel.x);
   int slot = int(instance.x), row = int(instance.z) * 5;
   ivec2 record = ivec2(slot / part_size, slot % part_size * texels);
   vec4 mean = record_texel(record, 0);
@@ -156,9 +145,8 @@ void main()
                                       : (xx >= yy ? vec2(1.0, 0.0) : vec2(0.0, 1.0));
   float longer = sqrt(middle + spread), shorter = sqrt(max(middle - spread, filtered.x));
   float reach = sqrt(2.0 * log(255.0 * opacity));
-  vec2 offset = corner.x * longer * reach * axis + corner.y * shorter * reach * vec2(-axis.y, axis.x);
-  position_in_sigmas = corner * reach;
-  gl_Position = vec4(ndc.xy + offset * 2.0 / size, ndc.z, 1.0);
+  centre_reach = vec4(ndc, reach);
+  axes = vec4(longer * axis, shorter * vec2(-axis.y, axis.x)) * reach * 2.0 / size.xyxy;
 
   vec3 base = vec3(s.w, record_texel(record, 3).xy);
   vec3 color = max(look * view_color(record, base, normalize(mean.xyz * camera.w - camera.xyz)), 0.0);
@@ -170,8 +158,21 @@ void main()
   color_opacity = vec4(color, opacity);
 }
 """
+"""Project one splat per pixel: its centre, the half axes of its quad, its colour and opacity."""
+_SPLAT_VERTEX = (
+    _FETCH
+    + """
+void main()
+{
+  int splat = gl_InstanceID * BLOCK + int(corner.z);
+  vec4 centre = texel(centres, splat), half_axes = texel(axes, splat);
+  position_in_sigmas = corner.xy * centre.w;
+  color_opacity = texel(colors, splat);
+  gl_Position = vec4(centre.xy + corner.x * half_axes.xy + corner.y * half_axes.zw, centre.z, 1.0);
+}
+"""
 )
-_FRAGMENT = """
+_SPLAT_FRAGMENT = """
 void main()
 {
   float alpha = min(0.99, color_opacity.a * exp(-0.5 * dot(position_in_sigmas, position_in_sigmas)));
@@ -280,8 +281,16 @@ def bind_textures(shader: gpu.types.GPUShader, textures: dict[str, gpu.types.GPU
 
 
 def program(name: str) -> tuple[gpu.types.GPUShader, gpu.types.GPUBatch]:
-    """Return the cached shader "splats", "depth" or "composite" with its quad."""
-    return cached(name, lambda: (_SHADERS[name](), _quad()))
+    """Return the cached shader "splats", "depth" or "composite" with its quad or quads."""
+    return cached(name, lambda: (_SHADERS[name](), _triangles() if name == "splats" else _quad()))
+
+
+def projection_shader(textures: int) -> tuple[gpu.types.GPUShader, gpu.types.GPUBatch]:
+    """Return the cached shader that projects splats from a number of textures, with its quad.
+
+    Each number has a shader, because software rendering samples all textures of a shader for every texel.
+    """
+    return cached(f"project_{textures}", lambda: (_projection_shader(textures), _quad()))
 
 
 def copy_shader() -> gpu.types.GPUShader:
@@ -317,18 +326,25 @@ def _quad() -> gpu.types.GPUBatch:
     return gpu.types.GPUBatch(type="TRI_STRIP", buf=vertices)
 
 
-def _splat_shader() -> gpu.types.GPUShader:
-    info, interface = _shader_info("splats")
-    interface.smooth("VEC2", "position_in_sigmas")
-    interface.flat("VEC4", "color_opacity")
-    names = (
-        "instances",
-        "placements",
-        "looks",
-        "palette",
-        *(f"records_{part}" for part in range(MAX_TEXTURES)),
-    )
-    for slot, name in enumerate(names):
+def _triangles() -> gpu.types.GPUBatch:
+    """Return triangles around the unit circle for BLOCK splats; third values are the splats' numbers."""
+    corners = np.empty((BLOCK, 3, 3), np.float32)
+    corners[..., :2] = (0, 2), (-(3**0.5), -1), (3**0.5, -1)
+    corners[..., 2] = np.arange(BLOCK)[:, None]
+    layout = gpu.types.GPUVertFormat()
+    layout.attr_add(id="corner", comp_type="F32", len=3, fetch_mode="FLOAT")
+    vertices = gpu.types.GPUVertBuf(layout, 3 * BLOCK)
+    vertices.attr_fill("corner", corners.reshape(-1, 3))
+    return gpu.types.GPUBatch(type="TRIS", buf=vertices)
+
+
+def _projection_shader(textures: int) -> gpu.types.GPUShader:
+    info = gpu.types.GPUShaderCreateInfo()
+    info.vertex_in(0, "VEC2", "corner")
+    for slot, name in enumerate(("centre_reach", "axes", "color_opacity")):
+        info.fragment_out(slot, "VEC4", name)
+    parts = [f"records_{part}" for part in range(textures)]
+    for slot, name in enumerate(("instances", "placements", "looks", "palette", *parts)):
         info.sampler(slot, "FLOAT_2D", name)
     info.define("WIDTH", str(WIDTH))
     info.define("PALETTE", str(len(LEVEL_COLORS)))
@@ -339,7 +355,32 @@ def _splat_shader() -> gpu.types.GPUShader:
     info.push_constant("INT", "degree")
     info.push_constant("INT", "texels")
     info.push_constant("INT", "part_size")
-    return _create(info, interface, _VERTEX, _FRAGMENT)
+    read_texel = "".join(
+        f"  if (record.x == {part}) {{ return texel({name}, record.y + i); }}\n"
+        for part, name in enumerate(parts[:-1])
+    )
+    read_texel += f"  return texel({parts[-1]}, record.y + i);\n"
+    interface = gpu.types.GPUStageInterfaceInfo("lodgs_project")
+    interface.smooth("VEC2", "texture_position")
+    return _create(
+        info, interface, _SCREEN_VERTEX,
+        f"{_FETCH}\n// Texel of a record, which is given by texture number and first texel.\n"
+        f"vec4 record_texel(ivec2 record, int i)\n{{\n{read_texel}}}\n{_PROJECT_FRAGMENT}",
+    )  # fmt: skip
+
+
+def _splat_shader() -> gpu.types.GPUShader:
+    interface = gpu.types.GPUStageInterfaceInfo("lodgs_splats")
+    interface.smooth("VEC2", "position_in_sigmas")
+    interface.flat("VEC4", "color_opacity")
+    info = gpu.types.GPUShaderCreateInfo()
+    info.vertex_in(0, "VEC3", "corner")
+    info.fragment_out(0, "VEC4", "result")
+    for slot, name in enumerate(("centres", "axes", "colors")):
+        info.sampler(slot, "FLOAT_2D", name)
+    info.define("WIDTH", str(WIDTH))
+    info.define("BLOCK", str(BLOCK))
+    return _create(info, interface, _SPLAT_VERTEX, _SPLAT_FRAGMENT)
 
 
 def _copy_shader() -> gpu.types.GPUShader:

@@ -18,12 +18,24 @@ from mathutils import Matrix
 
 from ...training.editing.look import Looks
 from .arrangement import WIDTH, Arrangement, Placement
-from .shaders import MAX_TEXTURES, bind_textures, copy_shader, empty_texture, palette, program
+from .shaders import (
+    BLOCK,
+    bind_textures,
+    copy_shader,
+    empty_texture,
+    palette,
+    program,
+    projection_shader,
+)
 
 DILATION = (0.3, 0.0)
 """3DGS's filter: variance added to projected splats in square pixels, and opacity compensation (off)."""
 MIP_FILTER = (0.1, 1.0)
 """Mip-Splatting's 2D filter: added variance, and opacity compensation (on)."""
+
+SHRINK_FACTOR = 2
+"""Size of the textures of projected splats, relative to the drawn ones, above which smaller ones replace
+them."""
 
 Frame = tuple[float, float, float, float]
 FULL_FRAME: Frame = (-1.0, -1.0, 1.0, 1.0)
@@ -109,22 +121,34 @@ def copy_records(
 
 
 class Canvas:
-    """Framebuffer that splats are blended in, one per viewport.
+    """Framebuffer that splats are blended in, one per viewport, and one for their projections.
 
-    It is not a ``GPUOffScreen``: creating one unbinds the framebuffer that is being drawn into.
+    They are no ``GPUOffScreen``: creating one unbinds the framebuffer that is being drawn into.
+
+    Attributes:
+        projections: textures of projected splats, one splat per pixel: centres, axes and colours.
     """
 
     def __init__(self) -> None:
         self.size = (0, 0)
         self.colors: gpu.types.GPUTexture | None = None
         self.frame: gpu.types.GPUFrameBuffer | None = None
+        self.projections: dict[str, gpu.types.GPUTexture] = {}
+        self.projection_frame: gpu.types.GPUFrameBuffer | None = None
 
-    def resize(self, size: tuple[int, int]) -> None:
-        """Set the size (width, height)."""
+    def resize(self, size: tuple[int, int], rows: int) -> None:
+        """Set the size (width, height), and make room for projected splats in rows of WIDTH."""
         if size != self.size:
             self.size, self.colors = size, gpu.types.GPUTexture(size, format="RGBA16F")
             self._depth = gpu.types.GPUTexture(size, format="DEPTH_COMPONENT32F")
             self.frame = gpu.types.GPUFrameBuffer(depth_slot=self._depth, color_slots=self.colors)
+        reserved = self.projections["centres"].height if self.projections else 0
+        if not rows <= reserved <= SHRINK_FACTOR * rows:
+            formats = {"centres": "RGBA32F", "axes": "RGBA32F", "colors": "RGBA16F"}
+            self.projections = {
+                name: gpu.types.GPUTexture((WIDTH, rows), format=kind) for name, kind in formats.items()
+            }
+            self.projection_frame = gpu.types.GPUFrameBuffer(color_slots=tuple(self.projections.values()))
 
 
 def draw(
@@ -168,16 +192,18 @@ def draw(
         )
     looks_texture = _looks_texture([placement.looks for placement in placements])  # freed with its last name
     placements_texture = _placements_texture(placements, view, projection)
-    canvas.resize((max(1, round(width * resolution)), max(1, round(height * resolution))))
+    size = max(1, round(width * resolution)), max(1, round(height * resolution))
+    canvas.resize(size, -(-count // WIDTH))
     begin = time.monotonic()
+    textures = {
+        "instances": instances, "placements": placements_texture, "looks": looks_texture,
+        "palette": palette(),
+    }  # fmt: skip
+    _project(store, textures, count, projection, canvas, frame)
     with canvas.frame.bind():  # type: ignore[union-attr]
         canvas.frame.clear(color=(0, 0, 0, 0), depth=1.0)
         _write_depth(depth)
-        textures = {
-            "instances": instances, "placements": placements_texture, "looks": looks_texture,
-            "palette": palette(),
-        }  # fmt: skip
-        _blend(store, textures, count, projection, canvas.size, frame)
+        _blend(canvas.projections, count)
         if timed:
             canvas.frame.read_color(0, 0, 1, 1, 4, 0, "FLOAT")  # waits for the graphics card
     _composite(canvas, overlay)
@@ -196,33 +222,44 @@ def _write_depth(depth: gpu.types.GPUTexture) -> None:
     gpu.state.color_mask_set(True, True, True, True)
 
 
-def _blend(
+def _project(
     store: UploadedSplats,
     textures: dict[str, gpu.types.GPUTexture],
     count: int,
     projection: Matrix,
-    size: tuple[int, int],
+    canvas: Canvas,
     frame: Frame,
 ) -> None:
-    """Blend splats into the bound framebuffer."""
+    """Project splats to the pixels of a canvas."""
+    # bind the same format everywhere, or drivers would compile the shader again for other formats
+    placeholder = next(texture for texture in store.textures if texture is not None)
+    for number, texture in enumerate(store.textures):
+        textures[f"records_{number}"] = texture or placeholder
+    shader, quad = projection_shader(len(store.textures))
+    with canvas.projection_frame.bind():  # type: ignore[union-attr]
+        canvas.projection_frame.viewport_set(0, 0, WIDTH, -(-count // WIDTH))  # type: ignore[union-attr]
+        gpu.state.depth_test_set("NONE")
+        gpu.state.blend_set("NONE")
+        shader.bind()
+        bind_textures(shader, textures)
+        shader.uniform_float("projection", projection)
+        shader.uniform_float("size", canvas.size)
+        shader.uniform_float("frame", frame)
+        shader.uniform_int("degree", round((store.higher + 1) ** 0.5) - 1)
+        shader.uniform_int("texels", -(-(14 + 3 * store.higher) // 4))
+        shader.uniform_int("part_size", store.texture_slots)
+        quad.draw(shader)
+
+
+def _blend(projections: dict[str, gpu.types.GPUTexture], count: int) -> None:
+    """Blend projected splats into the bound framebuffer."""
     gpu.state.depth_test_set("LESS_EQUAL")
     gpu.state.depth_mask_set(False)
     gpu.state.blend_set("ALPHA_PREMULT")
-    shader, quad = program("splats")
+    shader, quads = program("splats")
     shader.bind()
-    # bind the same format everywhere, or drivers would compile the shader again for other formats
-    placeholder = next(texture for texture in store.textures if texture is not None)
-    for number in range(MAX_TEXTURES):
-        texture = store.textures[number] if number < len(store.textures) else None
-        textures[f"records_{number}"] = texture or placeholder
-    bind_textures(shader, textures)
-    shader.uniform_float("projection", projection)
-    shader.uniform_float("size", size)
-    shader.uniform_float("frame", frame)
-    shader.uniform_int("degree", round((store.higher + 1) ** 0.5) - 1)
-    shader.uniform_int("texels", -(-(14 + 3 * store.higher) // 4))
-    shader.uniform_int("part_size", store.texture_slots)
-    quad.draw_instanced(shader, instance_count=count)
+    bind_textures(shader, projections)
+    quads.draw_instanced(shader, instance_count=-(-count // BLOCK))
 
 
 def _composite(canvas: Canvas, overlay: gpu.types.GPUTexture) -> None:

@@ -200,6 +200,16 @@ def test_single_set_matches_the_rasterizer(bpy, lodgs, add, draw_view, truth, de
     assert psnr(image, expected) > 45
 
 
+def test_splats_of_several_textures_match_the_rasterizer(lodgs, add, draw_view, truth, monkeypatch):
+    splats = make_splats(lodgs, degree=3)
+    monkeypatch.setattr(lodgs("viewport.resident"), "TEXTURE_BYTES", 16 * 17 * 1100)
+    add(splats)
+    view = lodgs("viewport.views").ViewState()
+    image, expected = displayed(draw_view(view=view)), truth([(splats, np.eye(4))])
+    assert len(view.store.textures) == 3
+    assert psnr(image, expected) > 45
+
+
 @pytest.mark.parametrize("degree", [0, 4])
 def test_overlapping_transformed_sets_match_the_rasterizer(bpy, lodgs, add, draw_view, truth, degree):
     from mathutils import Euler, Matrix
