@@ -58,8 +58,12 @@ class LODGS_PT_viewport(Panel):
         suggestion = view_state.suggest_budget()
         if settings.splats and not settings.native and suggestion:
             count, seconds, budget = suggestion
-            text = f"A moving view takes {seconds:.1f} s for {short_count(count)} splats. "
-            say(layout, text + f"For smooth motion, set Splat Budget to {budget:,}.", "INFO")
+            text = f"A redraw at rest takes {seconds:.1f} s for {short_count(count)} splats. "
+            say(layout, text + f"For quick redraws, set Splat Budget to {budget:,}.", "INFO")
+        simplified = view_state.simplified_counts()
+        if settings.splats and not settings.native and simplified:
+            moving, resting = map(short_count, simplified)
+            say(layout, f"A moving view draws {moving} of {resting} splats, the small ones enlarged.", "INFO")
 
 
 def _header_text(drawn: int, full: int) -> str:

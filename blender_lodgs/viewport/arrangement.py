@@ -18,6 +18,7 @@ import numpy as np
 from ...training.editing.look import Looks
 from ...training.lod.query import LodQuery, SplatSelector
 from ...training.lod.rule import OPACITY
+from . import motion
 
 SAMPLE_STEP = 16
 """One splat of this many is sampled to estimate a selection's size."""
@@ -183,6 +184,7 @@ class Request:
         budget: maximum number of splats.
         position: position of the view in the world, from which splats beyond the budget are ranked; None if
             all splats fit.
+        motion: maximum number of splats while the view moves, and its position; None if it draws all.
         coarsened: that of the view's last arrangement, if its detail should remain after a slight motion.
     """
 
@@ -190,6 +192,7 @@ class Request:
     backward: tuple[float, float, float]
     budget: int
     position: tuple[float, float, float] | None = None
+    motion: tuple[int, tuple[float, float, float]] | None = None
     coarsened: Counter[int] = field(default_factory=Counter, compare=False)
 
     @property
@@ -209,6 +212,7 @@ class Arrangement:
         instances: (M, 4) float32, from back to front: pool row, weight, placement number, and the level or
             band that determines the colour (0: own colour).
         splats: (M,) int32, the same pool rows.
+        motion: (K, 4) float32, the instances while the view moves, see ``motion.simplify``; None for all.
         excluded: number of splats excluded by the budget.
         serial: the pool's; later versions have other splats in some rows.
         coarsened: number of coarser queries that the budget demanded, by scene.
@@ -220,6 +224,7 @@ class Arrangement:
     excluded: int
     serial: int
     coarsened: Counter[int] = field(default_factory=Counter)
+    motion: np.ndarray | None = None
 
     @property
     def count(self) -> int:
@@ -246,9 +251,54 @@ def arrange(pool: Pool, request: Request, update: bool = False) -> Arrangement:
         axis = (backward @ placement.world).astype(np.float32)  # grows towards the camera
         np.add(means @ axis[:3], axis[3], out=depths[begin : begin + len(means)])
         begin += len(means)
-    instances = drawn.table[stable_argsort(depths)]
+    order = stable_argsort(depths)
+    instances = drawn.table[order]
     rows = instances[:, 0].astype(np.int32)
-    return Arrangement(request, instances, rows, drawn.excluded, pool.serial, drawn.coarsened)
+    simplified = None
+    if request.motion is not None and request.motion[0] < len(rows):
+        visibility = _visibility_in_motion(pool, request, drawn)[order]
+        simplified = motion.simplify(instances, visibility, request.motion[0])
+    return Arrangement(request, instances, rows, drawn.excluded, pool.serial, drawn.coarsened, simplified)
+
+
+def _visibility_in_motion(pool: Pool, request: Request, drawn: DrawnSplats) -> np.ndarray:
+    """Return the visibility of drawn splats (M,) from the position of a moving view."""
+    assert request.motion is not None
+    parts, begin = [], 0
+    for placement, means in zip(request.placements, drawn.means, strict=True):
+        table = drawn.table[begin : begin + len(means)]
+        begin += len(means)
+        rows = table[:, 0].astype(np.int32)
+        offsets = _offsets(placement, means, request.motion[1])
+        visibility = _visibility(pool, placement, rows, table[:, 1], offsets)
+        motion.dim_beside(visibility, offsets, request.backward)
+        parts.append(visibility)
+    return np.concatenate(parts)
+
+
+def _offsets(placement: Placement, means: np.ndarray, position: tuple[float, float, float]) -> np.ndarray:
+    """Return the offsets (M, 3) in the world from a position there to means (M, 3) of a placement."""
+    world = placement.world
+    offsets = means @ world[:3, :3].T.astype(np.float32)
+    offsets += (world[:3, 3] - position).astype(np.float32)
+    return offsets
+
+
+def _visibility(
+    pool: Pool, placement: Placement, rows: np.ndarray, weight: np.ndarray, offsets: np.ndarray | None
+) -> np.ndarray:
+    """Return the opacity times area of splats (M,) of a placement, in the image or in the world.
+
+    Args:
+        rows: (M,) in the pool.
+        weight: (M,) factors of the opacities.
+        offsets: (M, 3) from the view; None for areas in the world.
+    """
+    areas = pool.areas[rows] * np.float32(abs(np.linalg.det(placement.world[:3, :3])) ** (2 / 3))
+    visibility = pool.opacities[rows] * weight * areas
+    if offsets is not None:
+        visibility /= np.maximum(np.einsum("ij,ij->i", offsets, offsets), areas)
+    return visibility
 
 
 def stable_argsort(values: np.ndarray) -> np.ndarray:
@@ -391,14 +441,8 @@ def _thin(
     for i in numbers:
         index, weight = selections[i]
         rows = index + placements[i].first
-        world = placements[i].world
-        areas = pool.areas[rows] * np.float32(abs(np.linalg.det(world[:3, :3])) ** (2 / 3))
-        visible = pool.opacities[rows] * weight * areas
-        if position is not None:
-            offsets = pool.means[rows] @ world[:3, :3].T.astype(np.float32)
-            offsets += (world[:3, 3] - position).astype(np.float32)
-            visible /= np.maximum(np.einsum("ij,ij->i", offsets, offsets), areas)
-        visibility.append(visible)
+        offsets = None if position is None else _offsets(placements[i], pool.means[rows], position)
+        visibility.append(_visibility(pool, placements[i], rows, weight, offsets))
     values = np.concatenate(visibility)
     stays = np.zeros(len(values), bool)
     if keep:

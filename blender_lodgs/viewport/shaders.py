@@ -79,7 +79,7 @@ void main()
 {
   centre_reach = axes = color_opacity = vec4(0.0);  // not drawn unless set below
 
-  // slot, weight, placement, level for the colour (0: own colour, below 0: mark)
+  // slot, weight, placement plus 1 - 1 / enlargement, level for the colour (0: own colour, below 0: mark)
   ivec2 pixel = ivec2(gl_FragCoord.xy);
   vec4 instance = texel(instances, pixel.y * WIDTH + pixel.x);
   int slot = int(instance.x), row = int(instance.z) * 5;
@@ -121,6 +121,7 @@ void main()
   vec3 by_y = (rows[1].xyz - clamped.y * rows[3].xyz) * (0.5 * size.y / clip.w);
   vec4 q = record_texel(record, 1);  // w, x, y, z
   vec4 s = record_texel(record, 2);  // scales, and the first number of the colour
+  s.xyz /= 1.0 - fract(instance.z);
   mat3 turn = mat3(
     1.0 - 2.0 * (q.z * q.z + q.w * q.w), 2.0 * (q.y * q.z + q.x * q.w), 2.0 * (q.y * q.w - q.x * q.z),
     2.0 * (q.y * q.z - q.x * q.w), 1.0 - 2.0 * (q.y * q.y + q.w * q.w), 2.0 * (q.z * q.w + q.x * q.y),

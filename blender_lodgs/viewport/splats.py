@@ -17,7 +17,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ...training.editing.look import Looks
-from .arrangement import WIDTH, Arrangement, Placement
+from .arrangement import WIDTH, Placement
 from .shaders import (
     BLOCK,
     bind_textures,
@@ -51,27 +51,29 @@ class UploadedSplats(Protocol):
 
 
 def instances_texture(
-    arrangement: Arrangement, slots: np.ndarray, marks: np.ndarray | None = None
+    instances: np.ndarray, slots: np.ndarray, marks: np.ndarray | None = None
 ) -> tuple[gpu.types.GPUTexture, int]:
-    """Upload the list of an arrangement's uploaded splats.
+    """Upload the list of those instances whose splats are uploaded.
 
     Args:
+        instances: (M, 4), see ``arrangement.Arrangement``.
         slots: see ``resident.Store``.
         marks: see ``resident.Resident``; marked splats get the colours of their marks.
 
     Returns:
         The texture, and the number of splats in it.
     """
-    splat_slots = slots[arrangement.splats]
+    pool_rows = instances[:, 0].astype(np.int32)
+    splat_slots = slots[pool_rows]
     uploaded = splat_slots >= 0
-    rows = arrangement.instances if uploaded.all() else arrangement.instances[uploaded]
+    rows = instances if uploaded.all() else instances[uploaded]
     height = max(-(-len(rows) // WIDTH), 1)
     data = gpu.types.Buffer("FLOAT", height * WIDTH * 4)
     table = np.frombuffer(data, np.float32).reshape(-1, 4)[: len(rows)]  # type: ignore[arg-type]
     table[:] = rows
     table[:, 0] = splat_slots[uploaded]
     if marks is not None:
-        drawn = marks[arrangement.splats[uploaded]]
+        drawn = marks[pool_rows[uploaded]]
         marked = drawn > 0
         table[marked, 3] = -drawn[marked].astype(np.float32)
     return gpu.types.GPUTexture((WIDTH, height), format="RGBA32F", data=data), len(rows)

@@ -28,7 +28,11 @@ SLOW, SLOW_FACTOR = 0.08, 5.0
 """Seconds between redraws from which they spend more on uploads, as with software rendering, and at most this
 factor more."""
 SMOOTH = 0.2
-"""Seconds per redraw of a moving view above which a smaller budget is suggested."""
+"""Seconds per redraw above which a smaller budget is suggested, and a moving view is simplified."""
+MOTION = 0.12
+"""Seconds to draw the splats of a simplified view; Blender needs the rest of SMOOTH."""
+MIN_MOTION = 20_000
+"""Smallest number of splats of a simplified view."""
 COST_CHANGE = 0.1
 """Relative change of the number of splats from which a view is measured again."""
 MIN_BUDGET = 10_000
@@ -45,18 +49,22 @@ class ViewState:
         resident, arrangement: splats and arrangement that are drawn, perhaps in part.
         store: store with the drawn splats.
         instances, count: list of drawn splats on the graphics card.
+        uploaded: number of uploaded splats of the arrangement.
         pending: arrangement that is being computed, with its splats and request.
         loading: arrangement whose splats are being uploaded.
         missing: its splats (M,) that are not uploaded yet, with their store.
         loaded: time of the last upload.
         matrix: world to clip space at the last redraw.
         moved: time of the last movement.
+        moving: the view moves.
         arrived: number of updates of streams that the last requested arrangement contains.
         resolution: resolution of the splats relative to the viewport.
         marks: drawn marks, see ``resident.Resident``.
         shows_marks: draw selected splats and previewed clutter in their colours.
-        cost: number of drawn splats and seconds to draw them, measured while the view moved.
-        stated: values that header and panel state, see ``views.reduced_counts`` and :func:`suggest_budget`.
+        cost: number of drawn splats and seconds to draw them, measured at rest.
+        motion_cost: the same while the view moves; zeros before the first motion.
+        stated: values that header and panel state, see ``views.reduced_counts``, :func:`suggest_budget` and
+            :func:`simplified_counts`.
     """
 
     canvas: splats.Canvas = field(default_factory=splats.Canvas)
@@ -65,22 +73,42 @@ class ViewState:
     store: Store | None = None
     instances: gpu.types.GPUTexture | None = None
     count: int = 0
+    uploaded: int = 0
     pending: tuple[Resident, Request, Future[Arrangement]] | None = None
     loading: Arrangement | None = None
     missing: tuple[Store, np.ndarray] | None = None
     loaded: float = 0.0
     matrix: Matrix | None = None
     moved: float = 0.0
+    moving: bool = False
     arrived: int = 0
     resolution: float = 1.0
     marks: np.ndarray | None = None
     shows_marks: bool = False
-    cost: tuple[int, float] | None = None
-    stated: tuple[tuple[int, int] | None, tuple[int, float] | None] = (None, None)
+    cost: tuple[int, float] = (0, 0.0)
+    motion_cost: tuple[int, float] = (0, 0.0)
+    stated: tuple | None = None
+    _lists: dict[bool, tuple[gpu.types.GPUTexture, int]] = field(default_factory=dict)
 
     def is_cost_outdated(self) -> bool:
         """Return True if the view should be measured, which waits for the graphics card."""
-        return self.cost is None or abs(self.count - self.cost[0]) > COST_CHANGE * self.cost[0]
+        measured = (self.motion_cost if self.moving else self.cost)[0]
+        return abs(self.count - measured) > COST_CHANGE * measured
+
+    def set_cost(self, seconds: float) -> None:
+        """Store the time to draw the current list."""
+        if self.moving:
+            self.motion_cost = self.count, seconds
+        else:
+            self.cost = self.count, seconds
+
+    def motion_limit(self) -> int | None:
+        """Return the number of splats that this computer draws smoothly in motion; None if it draws all."""
+        count, seconds = self.motion_cost if self.motion_cost[0] else self.cost
+        if self.arrangement is None or not seconds:
+            return None
+        limit = int(float(f"{count * MOTION / seconds:.1g}"))
+        return max(limit, MIN_MOTION) if limit < self.arrangement.count else None
 
     def reset(self) -> None:
         """Stop drawing."""
@@ -164,12 +192,14 @@ class ViewState:
             True if the arrangement is drawn from now on.
         """
         in_part = self.arrangement is loading and self.store is store
-        has_grown = in_part and len(loading.splats) - len(missing) > GROWTH * self.count
+        uploaded = len(loading.splats) - len(missing)
+        has_grown = in_part and uploaded > GROWTH * self.uploaded
         if len(missing) and not has_grown and self.arrangement is not None:
             return False
         self.resident = source
         self.arrangement = loading
         self.store = store
+        self.uploaded = uploaded
         self.list_instances()
         drawn = [view.arrangement for view in active_views if view.store is store and view.arrangement]
         if all(arrangement.serial == loading.serial for arrangement in drawn):
@@ -179,10 +209,20 @@ class ViewState:
         return True
 
     def list_instances(self) -> None:
-        """Upload the list of drawn splats."""
-        assert self.arrangement is not None and self.store is not None
+        """Upload the list of drawn splats again."""
+        self._lists.clear()
         self.marks = self.displayed_marks()
-        self.instances, self.count = splats.instances_texture(self.arrangement, self.store.slots, self.marks)
+        self.choose_list()
+
+    def choose_list(self) -> None:
+        """Choose the list for the moving or resting view; upload it if needed."""
+        assert self.arrangement is not None and self.store is not None
+        simplified = self.arrangement.motion if self.moving else None
+        key = simplified is not None
+        if key not in self._lists:
+            table = self.arrangement.instances if simplified is None else simplified
+            self._lists[key] = splats.instances_texture(table, self.store.slots, self.marks)
+        self.instances, self.count = self._lists[key]
 
     def displayed_marks(self) -> np.ndarray | None:
         """Return the marks to draw; None if they are hidden or there are none."""
@@ -194,13 +234,23 @@ active_views: weakref.WeakSet[ViewState] = weakref.WeakSet()
 
 
 def suggest_budget() -> tuple[int, float, int] | None:
-    """Return the splats and seconds of the slowest viewport while it moves, and a budget for smooth motion.
+    """Return the splats and seconds of the slowest viewport at rest, and a budget for quick redraws.
 
     Returns:
         None if all viewports are fast enough.
     """
-    costs = [view.cost for view in active_views if view.cost]
+    costs = [view.cost for view in active_views]
     count, seconds = max(costs, key=lambda cost: cost[1], default=(0, 0.0))
     if seconds <= SMOOTH or count <= MIN_BUDGET:
         return None
     return count, seconds, max(int(float(f"{count * SMOOTH / seconds:.1g}")), MIN_BUDGET)
+
+
+def simplified_counts() -> tuple[int, int] | None:
+    """Return the splats in motion and at rest of the viewport that motion simplifies most; None if none."""
+    counts = [
+        (len(arrangement.motion), arrangement.count)
+        for view in active_views
+        if (arrangement := view.arrangement) is not None and arrangement.motion is not None
+    ]
+    return min(counts, key=lambda pair: pair[0] / pair[1], default=None)

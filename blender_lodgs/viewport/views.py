@@ -73,7 +73,8 @@ def draw(context: bpy.types.Context) -> None:
         view.moved = now
     view.matrix = matrix
     settings = context.scene.lodgs_viewport
-    view.resolution = settings.moving / 100 if now - view.moved < REST else 1.0
+    view.moving = context.screen.is_animation_playing or now - view.moved < REST
+    view.resolution = settings.moving / 100 if view.moving else 1.0
     view.shows_marks = space.overlay.show_overlays
     camera = view_camera.active_camera(context)
     frame = splats.FULL_FRAME
@@ -83,14 +84,14 @@ def draw(context: bpy.types.Context) -> None:
         view, instances, context.evaluated_depsgraph_get(),
         region_data.view_matrix, region_data.window_matrix, settings.budget, moving=True,
         under_overlays=space.overlay.show_overlays and not _shows_photo(camera),
-        frame=frame, timed=now - view.moved < REST and view.is_cost_outdated(),
+        frame=frame, timed=True,
     )  # fmt: skip
-    if (stated := (reduced_counts(region), view.cost)) != view.stated:
+    if (stated := (reduced_counts(region), view_state.simplified_counts(), view.cost)) != view.stated:
         view.stated = stated
         for other in context.area.regions:
             if other.type in ("HEADER", "UI"):
                 other.tag_redraw()
-    if _is_loading(view) or view.pending is not None or view.resolution < 1 or _is_streaming():
+    if _is_loading(view) or view.pending is not None or view.moving or _is_streaming():
         _wake_later()
 
 
@@ -136,11 +137,13 @@ def draw_splats(
         view_matrix, projection: matrices from the world to camera space, and from there to clip space.
         budget, wait, moving: see :func:`prepare`.
         under_overlays, frame: see ``splats.draw``.
-        timed: measure the cost of the view.
+        timed: measure the cost of the view if the number of its splats has changed.
     """
     request = prepare(view, instances, depsgraph, view_matrix, budget, wait, moving)
     if view.arrangement is None or view.store is None or view.instances is None or not view.count:
         return
+    view.choose_list()
+    timed = timed and view.loading is None and view.is_cost_outdated()
     placements = view.arrangement.request.placements
     if _same_splats(placements, request.placements):  # objects move at once; their order follows
         placements = request.placements
@@ -149,7 +152,7 @@ def draw_splats(
         resolution=view.resolution, under_overlays=under_overlays, frame=frame, timed=timed,
     )  # fmt: skip
     if timed:
-        view.cost = view.count, seconds
+        view.set_cost(seconds)
 
 
 def prepare(
@@ -188,8 +191,11 @@ def prepare(
     arrived = _arrived()
     placements = _placements(instances, source, depsgraph, moving, update)
     request = replace(empty, placements=placements)
+    position = tuple(view_matrix.inverted().translation)
     if sum(placement.count for placement in placements) > budget:
-        request = replace(request, position=tuple(view_matrix.inverted().translation))
+        request = replace(request, position=position)
+    if not wait and (limit := view.motion_limit()) is not None:
+        request = replace(request, motion=(limit, position))
     is_requested = _arrange(view, source, request, wait, update)
     if view.arrived != NOT_REQUESTED:  # an older value makes the view redraw
         view.arrived = arrived if update and is_requested else previous_arrived
@@ -454,10 +460,10 @@ def _wake() -> float | None:
                 view = _views.get(region.as_pointer())
                 if view is None:
                     continue
-                rests = view.resolution < 1 and now - view.moved >= REST
+                rests = view.moving and now - view.moved >= REST and not window.screen.is_animation_playing
                 if rests or wants_redraw(view):
                     region.tag_redraw()
-                waiting |= _is_loading(view) or view.pending is not None or view.resolution < 1
+                waiting |= _is_loading(view) or view.pending is not None or view.moving
     state = [(stream.splats, stream.busy, stream.short) for stream in _streams.values()]
     if state != _panel_state:
         _panel_state = state

@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 
@@ -96,8 +97,21 @@ def test_panel_suggests_a_budget_for_the_measured_speed(bpy, lodgs, viewport, dr
     view = state.ViewState(cost=(1_000_000, seconds))
     state.active_views.clear()
     state.active_views.add(view)
-    texts = [text for text in draw_panel("viewport", "LODGS_PT_viewport").texts if "smooth motion" in text]
+    texts = [text for text in draw_panel("viewport", "LODGS_PT_viewport").texts if "quick redraws" in text]
     expected = (
-        f"A moving view takes {seconds:.1f} s for 1.0 M splats. For smooth motion, set Splat Budget to "
+        f"A redraw at rest takes {seconds:.1f} s for 1.0 M splats. For quick redraws, set Splat Budget to "
     )
     assert texts == ([expected + f"{budget}."] if budget else [])
+
+
+def test_panel_states_the_splats_of_a_moving_view(lodgs, viewport, draw_panel):
+    state = lodgs("viewport.view_state")
+    arrangement = SimpleNamespace(count=1_000_000, motion=np.zeros((120_000, 4)), excluded=0)
+    view = state.ViewState(arrangement=arrangement)
+    state.active_views.clear()
+    state.active_views.add(view)
+    texts = draw_panel("viewport", "LODGS_PT_viewport").texts
+    assert "A moving view draws 120 k of 1.0 M splats, the small ones enlarged." in texts
+    arrangement.motion = None
+    texts = draw_panel("viewport", "LODGS_PT_viewport").texts
+    assert not any("moving view" in text for text in texts)

@@ -206,12 +206,14 @@ def test_cost_is_measured_for_another_number_of_splats(lodgs, draw_from, monkeyp
         blend(*arguments)
 
     monkeypatch.setattr(splats, "_blend", slow_blend)
-    assert view.is_cost_outdated()
     monkeypatch.setattr(views, "draw_splats", lambda *a, **k: draw_splats(*a, **k, timed=True))
     draw_from(view, 0.0)
     assert view.cost == (view.count, 0.5) and not view.is_cost_outdated()
     view.count = round(0.8 * view.count)
     assert view.is_cost_outdated()
+    view.moving = True
+    draw_from(view, 0.0)
+    assert view.motion_cost == (view.count, 0.5) and not view.is_cost_outdated()
 
 
 def test_viewports_that_load_at_once_upload_each_splat_once(lodgs, draw_from, monkeypatch):

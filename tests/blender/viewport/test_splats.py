@@ -529,6 +529,34 @@ def test_only_rotation_sorts_again(bpy, lodgs, add, draw_view, camera):
     assert view.arrangement is not first
 
 
+def test_moving_views_draw_enlarged_splats_and_resting_views_all(lodgs, add, draw_view, monkeypatch):
+    """A tenth of the splats of a dense ball looks like all of them; without enlarging, it has holes."""
+    state, rng = lodgs("viewport.view_state"), np.random.default_rng(5)
+    splats = make_splats(lodgs, count=40_000, size=-4.8)
+    splats.means /= np.linalg.norm(splats.means, axis=1, keepdims=True)
+    splats.opacity_logits[:] = 3.0
+    splats.sh[:, 0] = 1.2 * splats.means + rng.normal(0, 0.1, splats.means.shape)
+    monkeypatch.setattr(state, "MIN_MOTION", 100)
+    add(splats)
+    view = state.ViewState()
+    complete = draw_view(view=view)
+    view.cost = 40_000, 10 * state.MOTION
+    draw_view(view=view, wait=False)
+    view.pending[2].result()
+    resting = draw_view(view=view, wait=False)
+    assert np.array_equal(resting, complete) and view.count == 40_000
+    view.moving = True
+    moving = draw_view(view=view, wait=False)
+    assert view.count == pytest.approx(4000, rel=0.1)
+    similar = psnr(displayed(moving), displayed(complete))
+    view.arrangement.motion[:, 2] = 0.0
+    view.list_instances()
+    holes = psnr(displayed(draw_view(view=view, wait=False)), displayed(complete))
+    assert similar > 22 and similar > holes + 3, (similar, holes)
+    view.moving = False
+    assert np.array_equal(draw_view(view=view, wait=False), complete)
+
+
 def test_drawing_does_not_wait_for_sorting(bpy, lodgs, add, draw_view, camera, monkeypatch):
     """While the worker thread is slow, splats are drawn in the previous order."""
     import threading

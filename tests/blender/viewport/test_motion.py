@@ -1,0 +1,60 @@
+"""Simplified splats of moving views."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+
+def make_instances(count, seed=0):
+    instances = np.zeros((count, 4), np.float32)
+    instances[:, 0] = np.random.default_rng(seed).permutation(count)
+    instances[:, 1:] = 1.0, 2.0, 3.0
+    return instances
+
+
+@pytest.mark.parametrize("share", [0.5, 0.1, 0.01])
+def test_kept_splats_cover_the_area_of_all(lodgs, share):
+    count = 200_000
+    areas = np.random.default_rng(1).lognormal(0, 1.5, count).astype(np.float32)
+    instances = make_instances(count)
+    kept = lodgs("viewport.motion").simplify(instances, areas, round(share * count))
+    assert len(kept) == pytest.approx(share * count, rel=0.03)
+    positions = {row: position for position, row in enumerate(instances[:, 0].tolist())}
+    order = np.array([positions[row] for row in kept[:, 0].tolist()])
+    assert (np.diff(order) > 0).all()
+    assert np.array_equal(kept[:, [1, 3]], instances[order][:, [1, 3]])
+    shrinking = 1 - (kept[:, 2] - 2)
+    assert ((shrinking > 0) & (shrinking <= 1)).all()
+    assert (areas[order] / shrinking**2).sum(dtype=np.float64) == pytest.approx(
+        areas.sum(dtype=np.float64), rel=0.03
+    )
+    large = areas.sum(dtype=np.float64) / (share * count)  # more than the mean of the kept ones
+    assert (shrinking[areas[order] >= large] == 1).all()
+    assert (areas[order] >= large).sum() == (areas >= large).sum() > 10
+
+
+def test_splats_beside_the_view_count_less(lodgs):
+    visibility = np.ones(3, np.float32)
+    offsets = np.float32([(0, 0, -5), (5, 0, 0), (0, 0, 5)])
+    lodgs("viewport.motion").dim_beside(visibility, offsets, (0.0, 0.0, 1.0))
+    assert visibility[0] == 1 and (visibility[1:] < 0.5).all()
+
+
+@pytest.mark.parametrize(
+    ("cost", "motion_cost", "limit"),
+    [
+        ((0, 0.0), (0, 0.0), None),
+        ((1_000_000, 0.05), (0, 0.0), None),
+        ((1_000_000, 1.2), (0, 0.0), 100_000),
+        ((1_000_000, 1.2), (100_000, 0.04), 300_000),
+        ((1_000_000, 0.2), (600_000, 0.05), None),
+        ((1_000_000, 500.0), (0, 0.0), 20_000),
+    ],
+)
+def test_limit_follows_the_measured_speed(lodgs, cost, motion_cost, limit):
+    """A moving view spends 0.12 seconds on splats; the limit has one digit."""
+    view = lodgs("viewport.view_state").ViewState(
+        cost=cost, motion_cost=motion_cost, arrangement=SimpleNamespace(count=1_000_000)
+    )
+    assert view.motion_limit() == limit
