@@ -43,9 +43,11 @@ def is_linked(context: bpy.types.Context) -> bool:
 
 
 def _instanced_roots(obj: bpy.types.Object) -> list[bpy.types.Object]:
-    """Return the roots in the collection that an object is an instance of."""
+    """Return the roots of the splats in the collection that an object is an instance of."""
     collection = obj.instance_collection if obj.instance_type == "COLLECTION" else None
-    return [] if collection is None else [member for member in collection.all_objects if member.lodgs.is_root]
+    members = () if collection is None else collection.all_objects
+    candidates = [root_of(member) for member in members if member.type in ("EMPTY", "POINTCLOUD")]
+    return list(dict.fromkeys(root for root in candidates if root is not None))
 
 
 def root_with_levels(context: bpy.types.Context) -> bpy.types.Object | None:
@@ -57,3 +59,16 @@ def root_with_levels(context: bpy.types.Context) -> bpy.types.Object | None:
 def collection_of(root: bpy.types.Object) -> bpy.types.Collection:
     """Return the collection of a splat scene's objects."""
     return root.users_collection[0]
+
+
+def levels_collection(root: bpy.types.Object) -> bpy.types.Collection:
+    """Return the collection for levels, which artists instance; create it if there is none."""
+    name = f"{root.name} splats"
+    for item in root.lodgs.levels:
+        if item.exists:
+            return item.object.users_collection[0]
+    children = collection_of(root).children
+    if name not in children:
+        children.link(bpy.data.collections.new(name))
+        return children[-1]
+    return children[name]

@@ -29,7 +29,7 @@ from . import cleaning, crops, looks, objects, painting, selection, streams, tab
 from .controls import changed_controls, update_controls
 from .photographs import camera_of, is_held_out, views, views_with_photo
 from .placement import axes_of, placement_of
-from .roots import collection_of, roots
+from .roots import levels_collection, roots
 
 
 def check_facts(root: bpy.types.Object, bundle: Bundle) -> Rule | None:
@@ -399,7 +399,7 @@ def put_level(
         new_object = obj
     if not new_object.users_collection:  # an existing object keeps its parent, or none after Alt-P
         new_object.parent = axes_of(root)
-        collection_of(root).objects.link(new_object)
+        levels_collection(root).objects.link(new_object)
     item.object = new_object
     item.facts = json.dumps(level.facts)
     return new_object

@@ -118,6 +118,26 @@ def test_instances_are_visible_and_hidden_objects_are_not(bpy, lodgs, two_levels
     assert visible_sets(bpy, lodgs) == []
 
 
+def test_instances_of_the_splats_show_no_cameras(bpy, lodgs, two_levels):
+    root, _ = two_levels
+    importing = lodgs("data.importing")
+    camera = lodgs("training.scenes.cameras").Camera("photo", 640, 480, 500.0, 500.0, 320.0, 240.0, np.eye(4))
+    importing._add_views(bpy.context, root, [camera], 1.0, 0.01)
+    carrier = bpy.data.objects.new("carrier", None)
+    carrier.instance_type = "COLLECTION"
+    carrier.instance_collection = bpy.data.collections[f"{root.name} splats"]
+    bpy.context.scene.collection.objects.link(carrier)
+    bpy.context.view_layer.update()
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    kinds = {item.object.type for item in depsgraph.object_instances if item.is_instance}
+    assert kinds == {"POINTCLOUD"}
+    assert any(item.object.type == "CAMERA" for item in depsgraph.object_instances)
+    sets = visible_sets(bpy, lodgs)
+    assert [(visible.level, len(arrays)) for visible, arrays in sets] == [(2, COUNT), (2, COUNT)]
+    bpy.data.objects.remove(root.lodgs.levels[0].object)
+    assert lodgs("data.roots").levels_collection(root) == carrier.instance_collection
+
+
 def test_renders_and_viewports_have_separate_visibility(bpy, lodgs, two_levels):
     """Renders include objects hidden in viewports only, and exclude objects hidden in renders only."""
     rendered = []

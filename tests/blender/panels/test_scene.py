@@ -109,9 +109,12 @@ def test_combining_with_meshes_is_shown_and_can_be_removed(bpy, lodgs, root, dra
     assert "lodgs.separate_meshes" in layout.operators
 
 
-@pytest.mark.parametrize("instance", [True, False])
-def test_linked_scene_can_be_rendered_but_not_changed(bpy, lodgs, root, draw_panel, tmp_path, instance):
-    name = root.users_collection[0].name
+@pytest.mark.parametrize(("instance", "splats"), [(True, False), (True, True), (False, False)])
+def test_linked_scene_can_be_rendered_but_not_changed(
+    bpy, lodgs, root, draw_panel, tmp_path, instance, splats
+):
+    roots = lodgs("data.roots")
+    name = (roots.levels_collection if splats else roots.collection_of)(root).name
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "garden.blend"))
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     roots, scene = lodgs("data.roots"), bpy.context.scene
