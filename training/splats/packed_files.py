@@ -1,4 +1,4 @@
-"""Checks of compressed splat files before splat-transform unpacks them into memory.
+"""Checks of SOG files before a program unpacks them into memory.
 
 A file must be large enough for the splats that it declares, and must not unpack to more than they need.
 """
@@ -8,34 +8,26 @@ from __future__ import annotations
 import os
 import struct
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import IO
 
 from ..documents import open_file, parse_json
 from ..errors import LodgsError
 
-_KSPLAT_HEADER = 4096
-_KSPLAT_SPLAT = 24
-"""Bytes of a splat at the highest compression."""
 MAX_PALETTE_PIXELS = 1 << 23
 """Maximum pixels of a SOG's image of harmonics, which has at most 2^16 sets."""
 _BLOCK = 1 << 20
 
 
-def check_packed_file(path: Path) -> None:
-    """Check a file by the suffix of its name; other suffixes pass.
+def check_sog_file(path: Path) -> None:
+    """Check the sizes that an archive of SOG declares.
 
     Raises:
         LodgsError: the file cannot be read, is damaged, or unpacks to more than its splats need.
     """
-    name = path.name.lower()
-    check = next((check for suffix, check in _CHECKS.items() if name.endswith(suffix)), None)
-    if check is None:
-        return
     try:
         with open_file(path) as file:
-            check(file, os.fstat(file.fileno()).st_size)
+            _check_sog(file, os.fstat(file.fileno()).st_size)
     except LodgsError:
         raise
     except Exception as error:  # zipfile documents no exception types
@@ -43,12 +35,6 @@ def check_packed_file(path: Path) -> None:
             f"Cannot read {path}: it is damaged or does not hold its splats ({error}).",
             "Export or copy it again.",
         ) from error
-
-
-def _check_ksplat(file: IO[bytes], size: int) -> None:
-    (count,) = struct.unpack_from("<I", file.read(20), 16)
-    if _KSPLAT_HEADER + count * _KSPLAT_SPLAT > size:
-        raise ValueError(f"it is too short for {count:,} splats")
 
 
 def _check_sog(file: IO[bytes], size: int) -> None:
@@ -87,9 +73,3 @@ def webp_size(head: bytes) -> tuple[int, int]:
         (packed,) = struct.unpack("<xI5x", body)
         return (packed & 0x3FFF) + 1, (packed >> 14 & 0x3FFF) + 1
     return int.from_bytes(body[4:7], "little") + 1, int.from_bytes(body[7:10], "little") + 1
-
-
-_CHECKS: dict[str, Callable[[IO[bytes], int], None]] = {
-    ".ksplat": _check_ksplat,
-    ".sog": _check_sog,
-}

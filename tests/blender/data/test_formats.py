@@ -12,6 +12,9 @@ import pytest
 
 from tests.blender.fake_trainer import splats
 from tests.checkout import ROOT, copy_checkout, recipe_code
+from tests.training.splats.ksplat_files import FILES
+from tests.training.splats.ksplat_files import source as splats_of_file
+from tests.training.splats.test_formats import write_old_sog
 from training.splats.bundle import write_bundle
 from training.splats.levels import Bundle, Level
 from training.splats.splat_transform import PROGRAM
@@ -88,10 +91,18 @@ def test_page_has_the_levels(bpy, lodgs, root, tmp_path):
 def test_missing_program_is_reported(bpy, lodgs, root, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setattr(lodgs("training.splats.splat_transform"), "_FOLDERS", ())
-    (tmp_path / "b.ksplat").write_bytes(bytes(4096))
+    write_old_sog(tmp_path / "b.sog")
     with pytest.raises(RuntimeError, match="npm install --global"):
-        bpy.ops.lodgs.import_splats(filepath=str(tmp_path / "b.ksplat"))
-    assert {path.name for path in tmp_path.iterdir()} == {"in.ply", "b.ksplat"}
+        bpy.ops.lodgs.import_splats(filepath=str(tmp_path / "b.sog"))
+    assert {path.name for path in tmp_path.iterdir()} == {"in.ply", "b.sog"}
+
+
+@pytest.mark.parametrize("compression", [0, 1, 2])
+def test_ksplat_is_imported(bpy, lodgs, tmp_path, compression):
+    (tmp_path / "a.ksplat").write_bytes(FILES[compression])
+    (imported,) = import_levels(bpy, lodgs, tmp_path / "a.ksplat")
+    expected = splats_of_file().means
+    np.testing.assert_allclose(means(imported), expected[np.lexsort(expected.round(2).T)], atol=5e-5)
 
 
 SCRIPT = """

@@ -1,9 +1,25 @@
 """Fixtures for tests of splat files."""
 
+import os
+import shutil
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from training.splats.gaussians import Splats
+from training.splats.splat_transform import PROGRAM
+
+NODE_PROGRAMS = Path(__file__).parents[3] / "build" / "interop" / "node_modules" / ".bin"
+"""npm's program folder after ``make interop``."""
+
+
+@pytest.fixture
+def splat_transform(monkeypatch):
+    """Put splat-transform into PATH, or skip the test."""
+    monkeypatch.setenv("PATH", f"{NODE_PROGRAMS}{os.pathsep}{os.environ['PATH']}")
+    if not shutil.which(PROGRAM):
+        pytest.skip("splat-transform is not installed; make interop installs it if Node.js is available")
 
 
 @pytest.fixture

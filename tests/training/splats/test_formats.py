@@ -1,10 +1,10 @@
 """Splat files of other programs, exchanged with splat-transform if it is installed."""
 
 import os
-import shutil
 import struct
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -29,16 +29,6 @@ from training.splats.levels import Bundle, Level
 from training.splats.ply import read_ply
 from training.splats.splat_transform import PROGRAM, run_splat_transform
 from training.splats.streamed_levels import write_streamed_levels
-
-NODE_PROGRAMS = Path(__file__).parents[3] / "build" / "interop" / "node_modules" / ".bin"
-"""npm's program folder after ``make interop``."""
-
-
-@pytest.fixture
-def splat_transform(monkeypatch):
-    monkeypatch.setenv("PATH", f"{NODE_PROGRAMS}{os.pathsep}{os.environ['PATH']}")
-    if not shutil.which(PROGRAM):
-        pytest.skip("splat-transform is not installed; make interop installs it if Node.js is available")
 
 
 def random_splats(count, degree=0, seed=0):
@@ -176,18 +166,24 @@ def test_streamed_levels_replace_no_foreign_files(tmp_path):
     assert (tmp_path / "web" / "thesis.txt").exists()
 
 
+def write_old_sog(path):
+    """Write a SOG of version 1, which only splat-transform reads, without its images."""
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("meta.json", '{"means": {"shape": [16, 3]}}')
+
+
 def test_unreadable_file_raises_one_sentence(tmp_path, splat_transform):
-    (tmp_path / "a.ksplat").write_bytes(bytes(4096))
-    with pytest.raises(LodgsError, match="splat-transform failed"), open_as_ply(tmp_path / "a.ksplat"):
+    write_old_sog(tmp_path / "a.sog")
+    with pytest.raises(LodgsError, match="splat-transform failed"), open_as_ply(tmp_path / "a.sog"):
         pass
 
 
 def test_missing_program_error_tells_how_to_install_it(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setattr("training.splats.splat_transform._FOLDERS", ())
-    (tmp_path / "a.ksplat").write_bytes(bytes(4096))
+    write_old_sog(tmp_path / "a.sog")
     hint = "npm install --global @playcanvas/splat-transform"
-    with pytest.raises(LodgsError, match=hint), open_as_ply(tmp_path / "a.ksplat"):
+    with pytest.raises(LodgsError, match=hint), open_as_ply(tmp_path / "a.sog"):
         pass
 
 

@@ -1,8 +1,7 @@
-"""Compressed splat files whose declared or unpacked size is wrong; layouts follow the formats' documents."""
+"""SOG files whose declared or unpacked size is wrong; layouts follow the formats' documents."""
 
 import io
 import json
-import struct
 import zipfile
 
 import numpy as np
@@ -11,11 +10,7 @@ from PIL import Image
 
 from training.errors import LodgsError
 from training.splats.formats import open_as_ply
-from training.splats.packed_files import check_packed_file, webp_size
-
-
-def ksplat(count: int, size: int) -> bytes:
-    return struct.pack("<BBHIIII", 0, 1, 0, 1, 1, count, count).ljust(size, b"\0")
+from training.splats.packed_files import check_sog_file, webp_size
 
 
 def webp(width: int, height: int, **options) -> bytes:
@@ -33,14 +28,10 @@ def sog(meta: dict, image: bytes, compression: int = zipfile.ZIP_STORED) -> byte
 
 
 GOOD = {
-    "a.ksplat": ksplat(2, 4096 + 1024 + 88),
     "a.sog": sog({"version": 2, "count": 16}, webp(4, 4, lossless=True)),
     "v1.sog": sog({"means": {"shape": [16, 3]}}, webp(4, 4)),
-    "other.xyz": b"",
 }
 BAD = {
-    "many.ksplat": ksplat(2**32 - 1, 8192),
-    "short.ksplat": b"\0" * 19,
     "bomb.sog": sog({"count": 1}, bytes(50_000_000), zipfile.ZIP_DEFLATED),
     "wide.sog": sog({"count": 16}, webp(8192, 2048, lossless=True)),
     "many.sog": sog({"count": 2**40}, webp(4, 4)),
@@ -55,7 +46,7 @@ BAD = {
 @pytest.mark.parametrize("name", GOOD)
 def test_complete_files_pass(tmp_path, name):
     (tmp_path / name).write_bytes(GOOD[name])
-    check_packed_file(tmp_path / name)
+    check_sog_file(tmp_path / name)
 
 
 @pytest.mark.parametrize("name", BAD)

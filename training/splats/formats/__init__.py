@@ -1,6 +1,6 @@
 """Splat files of other programs. Each module of this package declares one format as ``FORMAT``.
 
-splat-transform reads ``.ksplat``, and SOG without the packages of the trainer.
+``.ksplat`` is only read. splat-transform reads SOG without the packages of the trainer.
 """
 
 from __future__ import annotations
@@ -16,13 +16,15 @@ from ...errors import LodgsError
 from ...files import temporary_folder
 from ..dialects import comments_from_meta
 from ..gaussians import SplatRows
-from ..packed_files import check_packed_file
+from ..ksplat import KsplatRows
+from ..packed_files import check_sog_file
 from ..ply import write_ply
 from ..splat_format import NeedsSplatTransform, SplatFormat
 from ..splat_transform import run_splat_transform
 from ..streamed_levels import STREAMED_FILE, count_lods, read_streamed_levels
 from .compressed_ply import FORMAT as COMPRESSED_PLY
 from .ply import FORMAT as PLY
+from .sog import FORMAT as SOG
 
 FORMATS: tuple[SplatFormat, ...] = tuple(
     sorted(
@@ -31,13 +33,14 @@ FORMATS: tuple[SplatFormat, ...] = tuple(
     )
 )
 """Export formats: PLY, then by size, largest first."""
+KSPLAT = ".ksplat"
 FILE_EXTENSIONS = (
     *(
         kind.suffix
         for kind in FORMATS
         if kind.readable and not kind.reads_in_trainer and kind.suffix.rfind(".") == 0
     ),
-    ".ksplat",
+    KSPLAT,
 )
 """Last parts of the names of files that Blender reads."""
 LEVEL_FORMATS = tuple(kind for kind in FORMATS if kind.write_levels)
@@ -113,7 +116,8 @@ def open_as_ply(path: Path) -> Iterator[Path]:
         return
     name = path.name.lower()
     open_file(path).close()  # reports an unreadable file
-    check_packed_file(path)
+    if name.endswith(SOG.suffix):
+        check_sog_file(path)
     stem = path.resolve().parent.name if name == STREAMED_FILE else path.stem.removesuffix(".compressed")
     with temporary_folder() as folder:
         converted = folder / f"{stem or 'splats'}.ply"
@@ -132,14 +136,11 @@ def open_as_ply(path: Path) -> Iterator[Path]:
 def _read_plain(path: Path, converted: Path) -> bool:
     """Convert a file of one level to a PLY; return False if splat-transform must do so."""
     name = path.name.lower()
-    kinds = [kind for kind in FORMATS if name.endswith(kind.suffix)]
-    if name.endswith(PLY.suffix):
-        kinds = [COMPRESSED_PLY]
-    readers = [kind.read for kind in kinds if kind.read]
-    if not readers:
-        return False
+    readers = {kind.suffix: kind.read for kind in FORMATS if kind.read}
+    readers |= {PLY.suffix: COMPRESSED_PLY.read, KSPLAT: lambda path: (KsplatRows(path), {})}
+    read = next(read for suffix, read in readers.items() if read and name.endswith(suffix))
     try:
-        splats, meta = readers[0](path)
+        splats, meta = read(path)
     except NeedsSplatTransform:
         return False
     write_ply(converted, splats, comments_from_meta(meta))
