@@ -1,0 +1,120 @@
+"""Check that Chromium opens pages of ``lodgs page`` in time and without messages. Part of ``make interop``.
+
+Writes the levels of FLoD, as ``interop_viewers.py`` trains them, as one file and as a folder, and opens the
+file from disk and the folder from a server, without a graphics card.
+``python tools/interop_page.py BUNDLE.ply`` uses a given bundle, without a record.
+Exit code 0: all checks pass; 1: some do not; 2: nothing was checked.
+"""
+
+from __future__ import annotations
+
+import functools
+import http.server
+import io
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from tools.interop_results import store_result  # noqa: E402
+from tools.interop_viewers import BROWSERS, PAGE_VIEWER, WALKED, run_browser, train_method  # noqa: E402
+from training.runs.page.write import PAGE, write_page  # noqa: E402
+
+MAX_SECONDS = 3.0
+"""Maximum time from the begin of navigation to the first image of all splats."""
+TIMEOUT = 60
+RUNS = 4
+"""Number of times that a page is opened; the fastest one counts, because other programs use the processor."""
+REPORT = """<head><script>
+const timer = setInterval(() => {
+  if (!document.body?.dataset.loaded) return;
+  clearInterval(timer);
+  console.log(`loaded ${performance.now()}`);
+}, 10);
+</script>"""
+EXPECTED = r"SuperSplat Viewer v.*|Renderer: \w+|No available adapters\."
+"""Messages of a browser without a graphics card, as a regular expression."""
+
+
+def main() -> int:
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if browser is None:
+        print("interop: Chromium is not installed. Pages are not checked.")
+        return 2
+    given = list(map(Path, sys.argv[1:]))
+    source = given[0] if given else train_method(WALKED)
+    failed = False
+    with tempfile.TemporaryDirectory() as work:
+        folder, single = Path(work, "page"), Path(work, "page.html")
+        write_page(source, folder, backend="cpu")
+        write_page(source, single, single=True, backend="cpu")
+        for path in (folder / PAGE, single):
+            path.write_text(path.read_text("utf-8").replace("<head>", REPORT, 1), "utf-8")
+        with serve(folder) as address:
+            for kind, place in (("page in one file", single.as_uri()), ("page in a folder", address)):
+                views = [open_page(browser, place) for _ in range(RUNS)]
+                seconds = min(time for time, _ in views)
+                messages = sorted({text for _, texts in views for text in texts})
+                passed = seconds <= MAX_SECONDS and not messages
+                failed |= not passed
+                print(f"{kind}: loaded after {seconds:.1f} s  {'; '.join(messages)}", flush=True)
+                if not given:
+                    store_result({
+                        "check": "page", "program": PAGE_VIEWER.label, "version": PAGE_VIEWER.version,
+                        "format": kind, "method": WALKED, "passed": passed, "seconds": round(seconds, 1),
+                        "max_seconds": MAX_SECONDS, "messages": messages,
+                    })  # fmt: skip
+    return int(failed)
+
+
+def open_page(browser: str, address: str) -> tuple[float, list[str]]:
+    """Return seconds until a page has loaded all splats, and unexpected messages in the browser's console.
+
+    Args:
+        browser: path of Chromium.
+        address: address of a page with REPORT.
+    """
+    messages = []
+    with run_browser(browser, address, "--enable-logging=stderr", stderr=subprocess.PIPE) as process:
+        timer = threading.Timer(TIMEOUT, process.kill)
+        timer.start()
+        assert process.stderr is not None
+        for line in io.TextIOWrapper(process.stderr, "utf-8", "replace"):
+            text = re.search(r':CONSOLE.*?\] "(.*)", source: ', line)
+            if text and (loaded := re.fullmatch(r"loaded ([\d.]+)", text[1])):
+                timer.cancel()
+                return float(loaded[1]) / 1000, messages
+            if text and not re.fullmatch(EXPECTED, text[1]):
+                messages.append(text[1])
+    return TIMEOUT, messages
+
+
+@contextmanager
+def serve(folder: Path) -> Iterator[str]:
+    """Serve a folder in the block, and yield its address."""
+
+    class Handler(http.server.SimpleHTTPRequestHandler):
+        def log_message(self, *_: object) -> None:
+            return
+
+    server = http.server.ThreadingHTTPServer(
+        ("127.0.0.1", 0), functools.partial(Handler, directory=str(folder))
+    )
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}/{PAGE}"
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
