@@ -14,8 +14,8 @@ from ...training.lod.rule import resolve_rule
 from ...training.runs.folder import RunFolder
 from ...training.splats.bundle import write_bundle
 from ...training.splats.formats import FORMATS, LEVEL_FORMATS, PLY, find_format
-from ...training.splats.formats.glb import FORMAT as GLB
 from ...training.splats.formats.sog import FORMAT as SOG
+from ...training.splats.formats.spz import FORMAT as SPZ
 from ...training.splats.level_folder import write_folder
 from ...training.splats.levels import Bundle, Level
 from ...training.splats.origin import describe_origin
@@ -385,7 +385,7 @@ class LODGS_OT_export_tiles(_ForeignExport, _FolderExport, _ConvertingExport, bp
 
     bl_idname = "lodgs.export_tiles"
     bl_label = "Export 3D Tiles"
-    kind = GLB
+    kind = SPZ
 
     def work(self, context):
         bundle = scenes.read_levels(roots.active_root(context), self.placed, self.looked)

@@ -52,12 +52,14 @@ def _add_outputs(parser: argparse.ArgumentParser) -> None:
         "--levels", type=Path, action="append", default=[], metavar="FILE",
         help="file for all levels, selected by distance: " + ", ".join(kind.suffix for kind in LEVEL_FORMATS),
     )  # fmt: skip
-    parser.add_argument("--folder", type=Path, metavar="DIR", help="folder of levels to write")
     parser.add_argument(
-        "--streamed", type=Path, metavar="DIR", help="folder of levels to write for streaming in browsers"
+        "--folder", type=Path, metavar="DIR", help="folder to write, with a PLY for each level"
     )
     parser.add_argument(
-        "--tiles", type=Path, metavar="DIR", help="folder of 3D Tiles to write, for Cesium and other globes"
+        "--streamed", type=Path, metavar="DIR", help="folder to write, with levels that web viewers stream"
+    )
+    parser.add_argument(
+        "--tiles", type=Path, metavar="DIR", help="folder to write, with 3D Tiles for Cesium and other globes"
     )
     parser.add_argument(
         "--preview", type=Path, metavar="PNG",

@@ -12,7 +12,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.description = (
         "Writes a folder with a viewer, all levels for streaming, a list of cameras and a poster. Upload it, "
-        "or open it with a local server. It makes no other network requests."
+        "or open it with a local server. It makes no requests to other servers."
     )
     parser.add_argument("source", type=Path, help=SOURCE_HELP)
     parser.add_argument(

@@ -37,12 +37,12 @@ class ExportOptions:
     )
     antialiased: bool = setting(
         False,
-        "Keep opacities as trained, for viewers with Mip-Splatting's filter; otherwise bake the filter for "
-        "other viewers, which would draw small splats too bold. SPZ files store this choice themselves.",
+        "Keep opacities as trained, for viewers with Mip-Splatting's filter. Otherwise reduce them for other "
+        "viewers, which draw small splats too bold. SPZ always keeps them.",
     )
     original_place: bool = setting(
         False,
-        "Write a georeferenced scene at its original place, in double precision; otherwise relative to its "
+        "Write positions at the scene's original place, in double precision, instead of relative to its "
         "local origin. PLY, USD and glTF only.",
         label="Original Place",
     )

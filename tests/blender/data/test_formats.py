@@ -77,6 +77,17 @@ def test_level_errors_are_written_on_request(bpy, lodgs, root, tmp_path, measure
     assert json.loads((folder / "lod-meta.json").read_text("utf-8"))["lodErrors"] == measured
 
 
+def test_estimated_size_of_tiles_is_that_of_their_compression(bpy, lodgs, tmp_path):
+    write_bundle(tmp_path / "in.ply", Bundle("made", [Level(1, splats(4000), {"s_min": 0.0})], "bands"))
+    lodgs("data.importing").import_splats(bpy.context, tmp_path / "in.ply")
+    assert bpy.ops.lodgs.export_tiles(directory=str(tmp_path / "tiles")) == {"FINISHED"}
+    export = lodgs("operators.export")
+    number, unit = export._size(bpy.context, export.LODGS_OT_export_tiles.kind, -1).split()
+    estimate = float(number.replace(",", "")) * {"MB": 1e6, "kB": 1e3}[unit]
+    actual = sum(path.stat().st_size for path in (tmp_path / "tiles").iterdir())
+    assert 0.4 < estimate / actual < 2.5
+
+
 @pytest.mark.skipif(
     not (Path(__file__).parents[3] / "training/viewer").is_dir(),
     reason="tools/viewer.py has not downloaded the viewer",
