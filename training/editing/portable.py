@@ -74,12 +74,13 @@ def portable_levels(bundle: Bundle, original_place: bool = False) -> tuple[Porta
 
 
 def _with_splats(levels: list[Level], distances: Sequence[float]) -> tuple[list[Level], tuple[float, ...]]:
-    """Return the levels that have splats and their distances; crops can leave empty levels.
+    """Return the levels that have splats and are used at some distance, and their distances.
 
     Raises:
         LodgsError: no level has splats.
     """
-    remaining = [index for index, level in enumerate(levels) if len(level.rows)]
+    used = np.isfinite(distances) if distances else np.ones(len(levels), bool)
+    remaining = [index for index, level in enumerate(levels) if len(level.rows) and used[index]]
     if not remaining:
         raise LodgsError("Cannot export levels: they contain no splats.", "Make some splats visible.")
     limits = [distances[index] for index in remaining[:-1]] + [0.0] if distances else []

@@ -1,14 +1,18 @@
 """Matryoshka's rule: budgets by counting, distances by hand, order after removals."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from training.editing.cleaning import keep_splats
-from training.lod.rule import rules
+from training.editing.export import export_levels
+from training.editing.portable import portable_levels
+from training.lod.rule import Rule, rules
 from training.lod.selection import resolve_controls, select_levels
 from training.splats.bundle import read_bundle, write_bundle
+from training.splats.formats import open_as_ply
 from training.splats.gaussians import Splats
 from training.splats.levels import Bundle, Level
 from training.splats.ply import read_ply
@@ -115,3 +119,42 @@ def test_rows_of_the_bundle_are_in_order(tmp_path):
     means = np.concatenate([level.splats.means for level in bundle.levels])
     np.testing.assert_array_equal(read_ply(tmp_path / "a.ply").means, means)
     assert [len(level.splats) for level in read_bundle(tmp_path / "a.ply").levels] == [120, 380, 500]
+
+
+@pytest.mark.parametrize(("controls", "counts"), [({}, [500, 2000, 8000]), ({"at_most": 6000}, [1500, 6000])])
+def test_other_programs_get_the_splats_with_the_longest_reach(controls, counts):
+    """A level is used if no other splats are visible, at one distance from the camera."""
+    bundle = replace(ordered((800, 3200, 4000)), controls=controls)
+    bundle.facts["share"] = 0.25
+    levels, notes = portable_levels(bundle)
+    assert [len(level.rows) for level in levels.bundle.levels] == counts
+    assert "single splats" in notes[0] and not levels.bundle.cumulative
+    assert np.isfinite(levels.distances).all() and levels.distances[-1] == 0
+    for level, distance in zip(levels.bundle.levels[:-1], levels.distances[:-1], strict=True):
+        for factor, more in ((0.999, True), (1.001, False)):
+            at = np.float32([distance * factor, 0, 0])
+            moved = [replace(one, splats=moved_to(one.splats, at)) for one in bundle.levels]
+            selected = select_levels(
+                replace(bundle, levels=moved), np.zeros(3), levels.focal, resolve_controls(bundle, {})
+            )
+            assert (sum(len(one.splats) for one in selected) > len(level.rows)) is more
+
+
+def moved_to(splats: Splats, position: np.ndarray) -> Splats:
+    return replace(splats, means=np.zeros_like(splats.means) + position)
+
+
+@pytest.mark.parametrize("ending", ["glb", "usdc"])
+def test_levels_for_other_programs_are_written(tmp_path, ending):
+    if ending == "usdc":
+        pytest.importorskip("pxr.UsdLod", reason="usd-core is not installed")
+    export_levels(tmp_path / f"a.{ending}", ordered((800, 3200, 4000)))
+    with open_as_ply(tmp_path / f"a.{ending}") as path:
+        assert [len(level.rows) for level in read_bundle(path).levels] == [500, 2000, 8000]
+
+
+def test_levels_that_are_never_used_are_left_out(monkeypatch):
+    """Rules of plug-ins may state no distances."""
+    monkeypatch.setattr(type(PREFIX), "nested_levels", Rule.nested_levels)
+    levels, _ = portable_levels(ordered())
+    assert [len(level.rows) for level in levels.bundle.levels] == [1000] and levels.distances == (0.0,)

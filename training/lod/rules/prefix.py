@@ -3,11 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
+from ...splats.gaussians import Splats
+from ...splats.levels import MAX_LEVELS, Bundle, Level
 from ...splats.ply import Columns
-from ..rule import NO_TABLES, Control, Masks, Relations, Rule, Values, distances
+from ..rule import (
+    MIN_SPLATS,
+    NO_TABLES,
+    THINNING,
+    Control,
+    Masks,
+    Relations,
+    Rule,
+    Values,
+    collect_facts,
+    distances,
+)
 
 RANK = "prefix_rank"
 """Column of each splat's position in the order of all levels, from 0 on."""
@@ -75,6 +89,38 @@ class Prefix(Rule):
         nearness = columns[VIEW_DISTANCE] * np.float32(facts["share"] ** 0.5 * scale)
         nearness /= np.maximum(distances(means, position), np.float32(1e-20))
         return np.float32(facts["splats"]) * np.minimum(nearness, np.float32(1)) ** 2
+
+    def nested_levels(self, bundle: Bundle) -> Bundle:
+        """Return the splats with the longest reach as levels of the rule ``bands``.
+
+        Each coarser level has 1 / THINNING of the finer one's splats, down to MIN_SPLATS. It is used from the
+        distance from which on the rule selects no other splats.
+        """
+        values = self.resolve_controls({}, [level.number for level in bundle.levels], bundle.controls)
+        facts = collect_facts(self, bundle.facts, [(1, {})], 1)
+        rows = [level.rows for level in bundle.levels]
+        splats = Splats.concatenated([level.select(slice(0, len(level))) for level in rows])
+        zeros = np.zeros(len(splats))
+        rank, distance = (splats.extras.pop(name, zeros).astype(np.float64) for name in self.columns)
+        if values["at_most"]:
+            first = rank < values["at_most"]
+            splats, rank, distance = splats.select(first), rank[first], distance[first]
+        # rank = splats · nearness², solved for the distance per pixel of focal length
+        scale = facts["share"] ** 0.5 / max(facts["share_focal"], 1e-20) / values["distance_scale"]
+        reach = distance * scale * np.sqrt(facts["splats"] / np.maximum(rank, 0.5))
+        order = np.argsort(-reach, kind="stable")
+        levels, count = [(splats, 0.0)], len(splats) // THINNING
+        while count >= MIN_SPLATS and len(levels) < MAX_LEVELS:
+            part = splats.select(np.sort(order[:count]))
+            levels.append((part, max(float(reach[order[count]]), levels[-1][1])))
+            count //= THINNING
+        return replace(
+            bundle,
+            levels=[
+                Level(number, part, {"s_min": size}) for number, (part, size) in enumerate(levels[::-1], 1)
+            ],
+            rule="bands", facts={}, controls={"gamma": 1.0, "first": 1}, cumulative=False,
+        )  # fmt: skip
 
     def coarser(self, values: Values, levels: Sequence[int]) -> Values | None:
         return self.raise_control(values, "distance_scale")
