@@ -43,7 +43,7 @@ help:
 	@echo "make release    dist/: extension, its repository, Python package, site, example scene, checksums"
 	@echo "make pins       update requirements/*.txt from requirements/*.in (UPGRADE=1 takes the newest allowed versions)"
 	@echo "make window     tour in a real Blender window, with screenshots (METHOD=flod; needs Blender, Xvfb, ImageMagick)"
-	@echo "make interop    other programs read our files; naga translates our shaders (needs Node, Chromium)"
+	@echo "make interop    other programs read our files; naga translates our shaders (half an hour; needs Node, Chromium)"
 	@echo "make attacks    kill and stop every program at random times; fill disks (an hour)"
 
 setup:
@@ -140,6 +140,7 @@ interop: setup
 	$(VENV) tools/interop_viewers.py
 	$(VENV) tools/interop_usd.py
 	$(VENV) tools/shaders.py
+	$(VENV) tools/interop_page.py
 
 attacks: setup
 	$(VENV) tools/attacks.py

@@ -9,9 +9,12 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +23,7 @@ from plyfile import PlyData
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
+from tools.interop_results import store_result  # noqa: E402
 from training.evaluate.level_errors import measure_level_errors  # noqa: E402
 from training.splats.bundle import read_bundle, write_bundle  # noqa: E402
 from training.splats.compressed_ply import read_compressed_ply, write_compressed_ply  # noqa: E402
@@ -57,10 +61,24 @@ def main() -> int:
         print(f"interop: {PACKAGE} only reads spherical harmonics up to degree 3.")
         return 2
     rows = [(check, expected, actual, expected == actual) for check, expected, actual in checks(bundle)]
-    print(f"{'splat-transform ' + VERSION:<34}  {'ours':<34}  {'theirs':<34}")
+    print(f"{'splat-transform ' + VERSION:<50}  {'ours':<34}  {'theirs':<34}")
     for check, expected, actual, same in rows:
-        print(f"{check:<34}  {expected!s:<34}  {actual!s:<34}  {'ok' if same else 'DIFFERENT'}")
+        print(f"{check:<50}  {expected!s:<34}  {actual!s:<34}  {'ok' if same else 'DIFFERENT'}")
+    if len(sys.argv) == 1:
+        store_results(rows)
     return 0 if all(same for *_, same in rows) else 1
+
+
+def store_results(rows: Sequence[tuple[str, object, object, bool]]) -> None:
+    """Store one result for each format, the part of a check's name before ":" or ","."""
+    formats = groupby(rows, lambda row: re.split("[,:]", row[0])[0])
+    for kind, group in formats:
+        checks = [(check.removeprefix(kind).lstrip(",: "), same) for check, *_, same in group]
+        facts = {"format": kind, "method": "", "checks": [check for check, _ in checks]}
+        passed = all(same for _, same in checks)
+        store_result(
+            {"check": "values", "program": "splat-transform", "version": VERSION, "passed": passed, **facts}
+        )
 
 
 def node_problem() -> str:
@@ -144,22 +162,22 @@ def checks(bundle: Bundle):
 
     path = FOLDER / "plain.ply"
     write_ply(path, finest)
-    yield "plain: splats, SH", (counts[0], finest.sh_degree), info(path)
-    yield "plain: values", "equal", values(path)
+    yield "PLY: splats, SH", (counts[0], finest.sh_degree), info(path)
+    yield "PLY: values", "equal", values(path)
 
     write_spz(FOLDER / "ours.spz", turned(finest), {})  # in the file, axes are then those of PLY
     yield "SPZ: values that both read", "equal", read_by_both(FOLDER / "ours.spz", True)
     for version in (3, 4):
         path = FOLDER / f"theirs{version}.spz"
         splat_transform("-w", "--spz-version", str(version), str(FOLDER / "plain.ply"), str(path))
-        yield f"their SPZ {version}: values that both read", "equal", read_by_both(path, True)
+        yield f"SPZ {version} of splat-transform: values that both read", "equal", read_by_both(path, True)
     write_sog(FOLDER / "ours.sog", finest, {})
     yield "SOG: values that both read", "equal", read_by_both(FOLDER / "ours.sog", False)
     write_compressed_ply(FOLDER / "ours.compressed.ply", finest, {})
     splat_transform("-w", str(FOLDER / "plain.ply"), str(FOLDER / "theirs.compressed.ply"))
-    for owner in ("ours", "theirs"):
+    for owner, name in (("ours", ""), ("theirs", " of splat-transform")):
         both = read_by_both(FOLDER / f"{owner}.compressed.ply", False)
-        yield f"compressed PLY, {owner}: values", "equal", both
+        yield f"compressed PLY{name}: values that both read", "equal", both
 
     folder = FOLDER / "folder"
     shutil.rmtree(folder, ignore_errors=True)

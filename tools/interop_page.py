@@ -11,6 +11,7 @@ from __future__ import annotations
 import functools
 import http.server
 import io
+import os
 import re
 import shutil
 import subprocess
@@ -29,10 +30,11 @@ from tools.interop_viewers import BROWSERS, PAGE_VIEWER, WALKED, run_browser, tr
 from training.runs.page.write import PAGE, write_page  # noqa: E402
 
 MAX_SECONDS = 3.0
-"""Maximum time from the begin of navigation to the first image of all splats."""
+"""Maximum time from the begin of navigation to the first image of all splats, on an idle computer. It grows
+with the number of other programs that run on each core."""
 TIMEOUT = 60
-RUNS = 4
-"""Number of times that a page is opened; the fastest one counts, because other programs use the processor."""
+RUNS = 3
+"""Number of times that each page is opened; the fastest one counts."""
 REPORT = """<head><script>
 const timer = setInterval(() => {
   if (!document.body?.dataset.loaded) return;
@@ -60,17 +62,19 @@ def main() -> int:
             path.write_text(path.read_text("utf-8").replace("<head>", REPORT, 1), "utf-8")
         with serve(folder) as address:
             for kind, place in (("page in one file", single.as_uri()), ("page in a folder", address)):
+                load = max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
                 views = [open_page(browser, place) for _ in range(RUNS)]
                 seconds = min(time for time, _ in views)
                 messages = sorted({text for _, texts in views for text in texts})
-                passed = seconds <= MAX_SECONDS and not messages
+                passed = seconds <= MAX_SECONDS * load and not messages
                 failed |= not passed
-                print(f"{kind}: loaded after {seconds:.1f} s  {'; '.join(messages)}", flush=True)
+                row = f"{kind}: loaded after {seconds:.1f} s, with {load:.1f} programs per core"
+                print(f"{row}  {'; '.join(messages)}", flush=True)
                 if not given:
                     store_result({
                         "check": "page", "program": PAGE_VIEWER.label, "version": PAGE_VIEWER.version,
                         "format": kind, "method": WALKED, "passed": passed, "seconds": round(seconds, 1),
-                        "max_seconds": MAX_SECONDS, "messages": messages,
+                        "programs_per_core": round(load, 1), "messages": messages,
                     })  # fmt: skip
     return int(failed)
 

@@ -3,7 +3,7 @@
 Trains each method briefly and writes its levels as ``.usdc`` and ``.usdz``. usd-core's validators must find
 no error. Blender 5.3 must import all levels with the values of their splats and the first view's camera:
 LODGS in Blender must draw the finest of them as our renderer does. Blender's own engines shade or blend
-splats differently. ``python tools/interop_usd.py BUNDLE.ply ...`` uses given bundles.
+splats differently. ``python tools/interop_usd.py BUNDLE.ply ...`` uses given bundles, without a record.
 Exit code 0: all agree; 1: differences; 2: nothing was checked.
 """
 
@@ -16,13 +16,19 @@ import os
 import subprocess
 import sys
 import tempfile
+from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
+
+from tools.interop_results import Record, store_result  # noqa: E402
+
+if TYPE_CHECKING:
+    from training.splats.levels import Level
 
 BLENDER = ROOT / ".venv-blender-5.3" / "bin" / "python"
 ENDINGS = "usdc", "usdz"
@@ -36,6 +42,7 @@ _EXACT = {"position": 0.0, "scale": 1e-6, "rotation": 1e-6, "sh": 1e-6}
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("bundles", nargs="*", type=Path, metavar="BUNDLE.ply")
+    parser.add_argument("--methods", nargs="+", default=[], help="methods to train, all by default")
     parser.add_argument("--blender", type=Path, help="internal: folder of a job for Blender")
     parser.add_argument("--images", type=Path, metavar="DIR", help="folder for the images")
     options = parser.parse_args()
@@ -52,13 +59,16 @@ def main() -> int:
     from tools.interop_viewers import METHODS, train_method
 
     failed = False
-    for source in options.bundles or [train_method(method) for method in METHODS]:
-        failed |= not check(source, options.images)
+    for source in options.bundles or [train_method(method) for method in options.methods or METHODS]:
+        for result in check(source, options.images):
+            failed |= not result["passed"]
+            if not options.bundles:
+                store_result(result)
     return int(failed)
 
 
-def check(source: Path, images: Path | None) -> bool:
-    """Write, validate and import the levels of a bundle, print the results, and return whether all agree."""
+def check(source: Path, images: Path | None) -> list[Record]:
+    """Write, validate and import the levels of a bundle. Print and return the results of both programs."""
     from training.api import load_bundle, render_image
     from training.editing.cleaning import Cleaning
     from training.editing.edit import edit
@@ -70,45 +80,66 @@ def check(source: Path, images: Path | None) -> bool:
     levels = portable_levels(bundle)[0].bundle.levels
     cameras, near, _ = read_view_tables(bundle.tables)
     camera = cameras[0].scaled(WIDTH / cameras[0].width)
-    name = source.parent.name
+    name, antialias = source.parent.name, bundle.antialias
+    finest = Bundle("", [Level(1, levels[-1].rows.select(slice(None)))], meta={"antialias": antialias})
+    pictures = [render_image(finest, camera, near=near, backend="cpu").clip(0, 1)]
+    results = []
     with tempfile.TemporaryDirectory() as folder:
         job = Path(folder)
         files = [job / f"{name}.{ending}" for ending in ENDINGS]
         edit(source, None, Cleaning(), levels=files, antialiased=True)
-        problems = {file.name: validate(file) for file in files}
-        sets = {f"Level_{level.number}": level.rows.select(slice(None)) for level in levels}
-        for key, splats in sets.items():
-            np.savez(job / f"{key}.npz", position=splats.means, sh=splats.sh, **{
-                "scale": np.exp(splats.log_scales),
-                "rotation": splats.quats / np.linalg.norm(splats.quats, axis=1, keepdims=True),
-            })  # fmt: skip
-        size = [camera.width, camera.height]
-        facts = {
-            "files": [file.name for file in files], "levels": list(sets), "size": size,
-            "antialias": bundle.antialias,
-        }  # fmt: skip
-        (job / "job.json").write_text(json.dumps(facts), "utf-8")
-        command = [str(BLENDER), __file__, "--blender", folder]
-        process = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-        if not (job / "answer.json").exists():
-            print(f"{name}: Blender 5.3 failed: {(process.stderr or process.stdout)[-500:]}")
-            return False
-        answer = json.loads((job / "answer.json").read_text("utf-8"))
-        finest = Bundle("", [Level(1, splats)], meta={"antialias": bundle.antialias})
-        expected = render_image(finest, camera, near=near, backend="cpu").clip(0, 1)
-        pictures = [expected]
-        agrees = True
-        for file in (file.name for file in files):
-            problem = "; ".join([*problems[file], *answer[file]])
-            pictures.append(np.load(job / f"{file}.npy"))
-            likeness = float(-10 * np.log10(np.square(pictures[-1] - expected).mean()))
-            agrees &= not problem and likeness >= MIN_PSNR
-            print(f"{file:<12}  {len(sets)} levels  {likeness:.1f} dB  {problem or 'valid'}", flush=True)
+        answer = import_in_blender(job, files, levels, [camera.width, camera.height], antialias)
+        for file in files:
+            faults = validate(file)
+            differences = answer["differences"].get(file.name, [answer["problem"]])
+            likeness = 0.0
+            if (image := job / f"{file.name}.npy").exists():
+                pictures.append(np.load(image))
+                likeness = float(-10 * np.log10(np.square(pictures[-1] - pictures[0]).mean()))
+            problem = "; ".join([*faults, *differences])
+            print(
+                f"{file.name:<16}  {len(levels)} levels  {likeness:.1f} dB  {problem or 'valid'}", flush=True
+            )
+            facts = {"check": "usd", "format": file.suffix, "method": name}
+            passed = not differences and likeness >= MIN_PSNR
+            results += [
+                {**facts, "program": "usd-core", "version": version("usd-core"), "passed": not faults},
+                {**facts, "program": "Blender", "version": answer["version"], "passed": passed,
+                 "levels": len(levels), "psnr": round(likeness, 1), "min_psnr": MIN_PSNR},
+            ]  # fmt: skip
     if images is not None:
         from tools.interop_viewers import save
 
         save(images, f"{name}-usd.png", pictures)
-    return agrees
+    return results
+
+
+def import_in_blender(
+    job: Path, files: list[Path], levels: list[Level], size: list[int], antialias: bool
+) -> dict[str, Any]:
+    """Return Blender's version, a problem, and by file name the differences of the imported levels.
+
+    Args:
+        job: folder for the task and the images.
+        size: width and height of the images.
+    """
+    for level in levels:
+        splats = level.rows.select(slice(None))
+        np.savez(job / f"Level_{level.number}.npz", position=splats.means, sh=splats.sh, **{
+            "scale": np.exp(splats.log_scales),
+            "rotation": splats.quats / np.linalg.norm(splats.quats, axis=1, keepdims=True),
+        })  # fmt: skip
+    facts = {
+        "files": [file.name for file in files], "levels": [f"Level_{level.number}" for level in levels],
+        "size": size, "antialias": antialias,
+    }  # fmt: skip
+    (job / "job.json").write_text(json.dumps(facts), "utf-8")
+    command = [str(BLENDER), __file__, "--blender", str(job)]
+    process = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    if not (job / "answer.json").exists():
+        problem = f"Blender failed: {(process.stderr or process.stdout)[-500:]}"
+        return {"version": "", "problem": problem, "differences": {}}
+    return {"problem": "", **json.loads((job / "answer.json").read_text("utf-8"))}
 
 
 def validate(file: Path) -> list[str]:
@@ -127,7 +158,7 @@ def open_in_blender(folder: Path) -> None:
     bpy = start_blender()
     job = json.loads((folder / "job.json").read_text("utf-8"))
     viewport_quality = importlib.import_module(f"{EXTENSION}.blender_lodgs.render.viewport_quality")
-    answer = {}
+    differences = {}
     for file in job["files"]:
         bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
         bpy.ops.wm.usd_import(filepath=str(folder / file))
@@ -152,7 +183,8 @@ def open_in_blender(folder: Path) -> None:
         scene.render.filepath = str(folder / "lodgs")
         (path,) = viewport_quality.render_animation(bpy.context, [1])
         np.save(folder / f"{file}.npy", pixels(bpy, path))
-        answer[file] = problems
+        differences[file] = problems
+    answer = {"version": bpy.app.version_string, "differences": differences}
     (folder / "answer.json").write_text(json.dumps(answer), "utf-8")
     sys.stdout.flush()
     os._exit(0)  # Blender as a module may crash at exit

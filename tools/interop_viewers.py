@@ -1,10 +1,9 @@
 """Check that web viewers draw our files as we do. Part of ``make interop``.
 
 Trains each method briefly, writes its splats in each format, draws the first view with each viewer in
-Chromium, without a window and without a graphics card, and compares the image with our own. The splats of
-FLoD are drawn by each viewer in each of its formats, and those of other methods once in each format. Viewers
-that stream walk towards the splats of FLoD (``interop_walk.py``).
-``python tools/interop_viewers.py BUNDLE.ply ...`` checks given bundles as those of FLoD.
+Chromium, without a window and without a graphics card, and compares the image with our own. Viewers that
+stream walk towards the splats of FLoD (``interop_walk.py``).
+``python tools/interop_viewers.py BUNDLE.ply ...`` checks given bundles as those of FLoD, without a record.
 Exit code 0: all checks pass; 1: some do not; 2: nothing was checked.
 """
 
@@ -22,7 +21,8 @@ import sys
 import tempfile
 import threading
 import urllib.parse
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -35,7 +35,9 @@ sys.path.insert(0, str(ROOT))
 
 from tools import interop  # noqa: E402
 from tools.interop_cut import draw_with_cut  # noqa: E402
+from tools.interop_results import Record, store_result  # noqa: E402
 from tools.interop_walk import WALKS, Walk  # noqa: E402
+from tools.viewer import VERSION as PAGE_VERSION  # noqa: E402
 from training.api import load_bundle, render_image, train  # noqa: E402
 from training.editing.cleaning import Cleaning  # noqa: E402
 from training.editing.edit import edit  # noqa: E402
@@ -58,18 +60,11 @@ METHODS = {
     "clod": SHORT | {"steps": 200},
     "octree": SHORT | {"steps": 200},
     "tree": SHORT | {"steps": 160, "tune_steps": 40},
+    "matryoshka": SHORT | {"steps": 200},
 }
 """Parameters of short trainings."""
-COMPLETE = "flod"
-"""Method whose splats are drawn by each viewer in each format."""
-METHOD_CHECKS = {
-    "three": ("glb",),
-    "cesium": ("tiles",),
-    "babylon": ("glb",),
-    "spark": ("ply", "splat", "spz"),
-    "playcanvas": ("sog", "streamed"),
-}
-"""Viewers and formats of the other methods."""
+WALKED = "flod"
+"""Method whose levels are streamed in walks."""
 SCENE = ROOT / "examples" / "lantern_garden"
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 """From the axes of OpenCV's cameras to those of OpenGL's, and from those of 3DGS files to those of SPZ."""
@@ -81,6 +76,7 @@ class Format:
     """A format in which viewers open splats.
 
     Attributes:
+        label: its name in the report.
         option: option of ``edit`` that writes it.
         name: file or folder to write.
         main: file that viewers open, if the format is a folder.
@@ -90,6 +86,7 @@ class Format:
         flat: colours do not depend on the view.
     """
 
+    label: str
     option: str
     name: str
     main: str = ""
@@ -100,13 +97,13 @@ class Format:
 
 
 FORMATS = {
-    "ply": Format("plain", "scene.ply", min_psnr=30.0),
-    "splat": Format("plain", "scene.splat", flat=True),
-    "spz": Format("plain", "scene.spz", trained=True, axes="spz"),
-    "sog": Format("plain", "scene.sog"),
-    "streamed": Format("streamed", "streamed", STREAMED_FILE),
-    "glb": Format("levels", "scene.glb", min_psnr=30.0, axes="y"),
-    "tiles": Format("tiles", "tiles", TILESET_FILE, axes="z"),
+    "ply": Format("PLY", "plain", "scene.ply", min_psnr=30.0),
+    "splat": Format(".splat", "plain", "scene.splat", flat=True),
+    "spz": Format("SPZ", "plain", "scene.spz", trained=True, axes="spz"),
+    "sog": Format("SOG", "plain", "scene.sog"),
+    "streamed": Format("streamed levels", "streamed", "streamed", STREAMED_FILE),
+    "glb": Format("glTF", "levels", "scene.glb", min_psnr=30.0, axes="y"),
+    "tiles": Format("3D Tiles", "tiles", "tiles", TILESET_FILE, axes="z"),
 }
 
 
@@ -128,6 +125,10 @@ class Viewer:
     filtered: tuple[str, ...] = ()
     cuts: bool = False
 
+    @property
+    def version(self) -> str:
+        return next(iter(self.packages.values()))
+
 
 VIEWERS = {
     "three": Viewer("three.js", {"three": "0.187.0"}, ("glb",), filtered=("glb",), cuts=True),
@@ -143,6 +144,8 @@ VIEWERS = {
         "Spark", {"@sparkjsdev/spark": "2.2.0", "three": "0.187.0"}, ("ply", "splat", "spz", "sog")
     ),
 }
+PAGE_VIEWER = Viewer("SuperSplat Viewer", {"@playcanvas/supersplat-viewer": PAGE_VERSION}, ())
+"""Viewer in the pages of ``lodgs page``."""
 
 
 def main() -> int:
@@ -154,29 +157,38 @@ def main() -> int:
     if problem:
         print(f"interop: {problem} Viewers are not checked.")
         return 2
-    sources: Sequence[Path] = options.bundles or [train_method(method) for method in METHODS]
+    sources: Sequence[Path] = options.bundles or [train_method(method) for method in options.methods]
     failed = False
-    print(f"{'bundle':<8}  {'viewer':<18}  {'format':<8}  {'dB':>5}  at least")
+    print(f"{'bundle':<10}  {'viewer':<18}  {'format':<8}  {'dB':>5}  at least")
     for source in sources:
-        complete = source in options.bundles or source.parent.name == COMPLETE
+        walks = source in options.bundles or source.parent.name == WALKED
         with tempfile.TemporaryDirectory() as folder:
             scene = Scene(source, Path(folder))
             for key in options.viewers:
                 viewer = VIEWERS[key]
                 if not all(interop.install(*package) for package in viewer.packages.items()):
                     return 2
-                for kind in viewer.formats if complete else METHOD_CHECKS.get(key, ()):
+                for kind in viewer.formats:
                     if not options.formats or kind in options.formats:
-                        failed |= not check(str(browser), key, kind, scene, options.images)
-            for key, kind in WALKS.items() if complete else ():
+                        result = check(str(browser), key, kind, scene, options.images)
+                        failed |= keep(result, options)
+            for key, kind in WALKS.items() if walks else ():
                 if not options.formats or kind in options.formats:
-                    failed |= not check_walk(str(browser), key, scene, options.images)
+                    failed |= keep(check_walk(str(browser), key, scene, options.images), options)
     return int(failed)
+
+
+def keep(result: Record, options: argparse.Namespace) -> bool:
+    """Store a result of a trained method, and return whether its check failed."""
+    if not options.bundles:
+        store_result(result)
+    return not result["passed"]
 
 
 def parse_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("bundles", nargs="*", type=Path, metavar="BUNDLE.ply")
+    parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS))
     parser.add_argument("--viewers", nargs="*", choices=list(VIEWERS), default=list(VIEWERS))
     parser.add_argument("--formats", nargs="+", choices=[*FORMATS, *WALKS.values()], default=[])
     parser.add_argument("--images", type=Path, metavar="DIR", help="folder for the images of both")
@@ -233,8 +245,8 @@ class Scene:
         return world @ np.linalg.inv((camera or self.camera).world_to_camera) @ FLIP
 
 
-def check(browser: str, key: str, kind: str, scene: Scene, images: Path | None) -> bool:
-    """Compare a viewer's image of a format with ours, print the likeness, and return whether it suffices.
+def check(browser: str, key: str, kind: str, scene: Scene, images: Path | None) -> Record:
+    """Compare a viewer's image of a format with ours, print the likeness, and return the result.
 
     Args:
         images: folder for both images, or None.
@@ -247,13 +259,17 @@ def check(browser: str, key: str, kind: str, scene: Scene, images: Path | None) 
     if not isinstance(answer, str) and answer.shape != expected.shape:
         answer = f"image of {answer.shape[1]}x{answer.shape[0]} pixels"
     likeness = -math.inf if isinstance(answer, str) else psnr(answer, expected)
-    name, version = scene.source.parent.name, next(iter(viewer.packages.values()))
+    name = scene.source.parent.name
     problem = f"  {answer}" if isinstance(answer, str) else ""
-    row = f"{name:<8}  {viewer.label + ' ' + version:<18}  {kind:<8}  {likeness:5.1f}"
+    row = f"{name:<10}  {viewer.label + ' ' + viewer.version:<18}  {kind:<8}  {likeness:5.1f}"
     print(f"{row}  {minimum:g}{problem}", flush=True)
     if not isinstance(answer, str):
         save(images, f"{name}-{key}-{kind}.png", [answer, expected])
-    return likeness >= minimum
+    return {
+        "check": "image", "program": viewer.label, "version": viewer.version, "format": FORMATS[kind].label,
+        "method": name, "passed": likeness >= minimum, "psnr": round(max(likeness, 0.0), 1),
+        "min_psnr": minimum,
+    }  # fmt: skip
 
 
 def view(browser: str, key: str, kind: str, scene: Scene) -> np.ndarray | str:
@@ -268,8 +284,8 @@ def view(browser: str, key: str, kind: str, scene: Scene) -> np.ndarray | str:
     return answer if isinstance(answer, str) else decode_image(answer)
 
 
-def check_walk(browser: str, key: str, scene: Scene, images: Path | None) -> bool:
-    """Walk towards a scene in a viewer, print splats and holes of each step, and return whether it passes.
+def check_walk(browser: str, key: str, scene: Scene, images: Path | None) -> Record:
+    """Walk towards a scene in a viewer, print splats and holes of each step, and return the result.
 
     Args:
         images: folder for the images of the steps, or None.
@@ -278,10 +294,16 @@ def check_walk(browser: str, key: str, scene: Scene, images: Path | None) -> boo
     poses = [scene.pose(walk.axes, camera).T.ravel().tolist() for camera in walk.cameras]
     job = {"viewer": key, **walk.write(poses)}
     answer = send(browser, job, walk.cameras[0], walk.folder)
-    name = f"{scene.source.parent.name:<8}  {key + ' walk':<18}  {WALKS[key]:<8}"
+    name = f"{scene.source.parent.name:<10}  {key + ' walk':<18}  {WALKS[key]:<8}"
+    viewer = VIEWERS.get(key, PAGE_VIEWER)
+    kind = FORMATS[WALKS[key]].label if WALKS[key] in FORMATS else WALKS[key]
+    result = {
+        "check": "walk", "program": viewer.label, "version": viewer.version, "format": kind,
+        "method": scene.source.parent.name, "passed": False, "splats": [], "budget": walk.budget,
+    }  # fmt: skip
     if isinstance(answer, str):
         print(f"{name}  {answer}", flush=True)
-        return False
+        return result
     steps = json.loads(answer)
     problem = walk.judge(steps)
     for distance, step in zip(walk.distances, steps, strict=True):
@@ -290,7 +312,10 @@ def check_walk(browser: str, key: str, scene: Scene, images: Path | None) -> boo
     print(f"{name}  at most {walk.budget:,} splats: {problem or 'no hole, budget kept'}", flush=True)
     pictures = [decode_image(base64.b64decode(step["image"].partition(",")[2])) for step in steps]
     save(images, f"{scene.source.parent.name}-{key}-walk.png", pictures)
-    return not problem
+    return result | {
+        "passed": not problem, "splats": [step["splats"] for step in steps],
+        "hole": round(max(step["hole"] for step in steps), 5),
+    }  # fmt: skip
 
 
 def send(browser: str, job: Mapping[str, object], camera: Camera, folder: Path) -> bytes | str:
@@ -335,6 +360,24 @@ def train_method(method: str) -> Path:
     return train(SCENE, folder, method=method, parameters=parameters, **scene).bundle
 
 
+@contextmanager
+def run_browser(
+    browser: str, address: str, *options: str, stderr: int = subprocess.DEVNULL
+) -> Iterator[subprocess.Popen[bytes]]:
+    """Open a page in Chromium, without a window and a graphics card, during the block."""
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
+        process = subprocess.Popen(
+            [browser, "--headless=new", "--no-sandbox", "--use-angle=swiftshader",
+             "--enable-unsafe-swiftshader", f"--user-data-dir={profile}", *options, address],
+            stdout=subprocess.DEVNULL, stderr=stderr,
+        )  # fmt: skip
+        try:
+            yield process
+        finally:
+            process.kill()
+            process.wait()
+
+
 def ask(browser: str, page: Path, mounts: Mapping[str, Path], query: str) -> bytes | str:
     """Return the answer that a page sends, or an error message.
 
@@ -367,17 +410,8 @@ def ask(browser: str, page: Path, mounts: Mapping[str, Path], query: str) -> byt
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     address = f"http://127.0.0.1:{server.server_port}/?{query}"
-    with tempfile.TemporaryDirectory() as profile:
-        process = subprocess.Popen(
-            [browser, "--headless=new", "--no-sandbox", "--use-angle=swiftshader",
-             "--enable-unsafe-swiftshader", f"--user-data-dir={profile}", address],
-            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-        )  # fmt: skip
+    with run_browser(browser, address):
         arrived.wait(SECONDS)
-        process.kill()
-        process.wait()
-        shutil.rmtree(profile, ignore_errors=True)
-        Path(profile).mkdir(exist_ok=True)
     server.shutdown()
     if not answers:
         return f"no answer within {SECONDS} s"

@@ -37,6 +37,7 @@ class SplatFormat(NamedTuple):
         require: function that raises a LodgsError without the packages of the format, which Blender lacks;
             None if it needs none.
         readable: False if files cannot be imported.
+        georeferenced: True if the format stores the scene's georeference.
     """
 
     suffix: str
@@ -52,6 +53,7 @@ class SplatFormat(NamedTuple):
     read_levels: Callable[[Path, Path], None] | None = None
     require: Callable[[], object] | None = None
     readable: bool = True
+    georeferenced: bool = False
 
     @property
     def in_trainer(self) -> bool:

@@ -12,7 +12,7 @@ from tests.training.splats.test_gltf import read_parts
 from training.editing.cleaning import Cleaning
 from training.editing.edit import edit
 from training.splats.bundle import read_bundle, write_bundle
-from training.splats.formats import open_as_ply
+from training.splats.formats import FORMATS, find_format, open_as_ply
 from training.splats.level_folder import read_folder
 from training.splats.levels import Bundle, Level
 from training.splats.map_projection import UtmZone
@@ -67,7 +67,7 @@ def globe_places(folder: Path) -> np.ndarray:
 
 
 # option of edit, name, the options that place it, whether the file states the system, precision in metres
-FORMATS = [
+EXPORTS = [
     ("out", "out.ply", {}, True, 1e-3),
     ("folder", "folder", {}, True, 1e-3),
     ("plain", "a.ply", {}, True, 1e-3),
@@ -85,7 +85,13 @@ FORMATS = [
 ]
 
 
-@pytest.mark.parametrize(("option", "name", "options", "stated", "precision"), FORMATS)
+def test_declared_formats_are_those_that_state_the_system():
+    stated = {kind.suffix for kind in FORMATS if kind.georeferenced}
+    files = {find_format(Path(name)).suffix: states for _, name, _, states, _ in EXPORTS if "." in name}
+    assert files == {kind.suffix: kind.suffix in stated for kind in FORMATS}
+
+
+@pytest.mark.parametrize(("option", "name", "options", "stated", "precision"), EXPORTS)
 def test_scene_keeps_its_place(source, tmp_path, option, name, options, stated, precision):
     if ".usd" in name:
         pytest.importorskip("pxr.UsdLod", reason="usd-core is not installed")

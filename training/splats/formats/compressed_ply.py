@@ -13,4 +13,5 @@ FORMAT = SplatFormat(
     max_degree=MAX_DEGREE,
     write=write_compressed_ply,
     read=read_compressed_ply,
+    georeferenced=True,
 )

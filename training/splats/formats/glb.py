@@ -13,4 +13,5 @@ FORMAT = SplatFormat(
     max_degree=MAX_DEGREE,
     write_levels=write_glb,
     read_levels=read_glb,
+    georeferenced=True,
 )

@@ -26,4 +26,5 @@ FORMAT = SplatFormat(
     tuple(4.0 * (17 + higher_coefficients(degree)) for degree in range(5)),
     max_degree=4,
     write=write,
+    georeferenced=True,
 )

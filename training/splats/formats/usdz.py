@@ -14,4 +14,5 @@ FORMAT = SplatFormat(
     write_levels=write_usd,
     read_levels=read_usd,
     require=load_usd,
+    georeferenced=True,
 )
