@@ -54,12 +54,13 @@ class ReducedJobs:
         self.preset, self.effort = preset, effort
         self._keys = {"scene": str(scene), "preset": preset, **keys}
         scale = keys.get("image_scale", default_image_scale(preset))
-        self._max_splats = 0
+        self._max_splats, self._pixel_ratio = 0, 1.0
         if effort < 1:
             sizes = np.array([(camera.width, camera.height) for camera in read_scene(scene).cameras])
             if "image_scale" not in keys:
                 least = min(SMALL_SIDE / sizes.max(), scale)
                 scale = round(max(scale * effort**0.5, least), 4)
+            self._pixel_ratio = scale / default_image_scale(preset)
             self._max_splats = round(MAX_DENSITY * float(np.median(sizes.prod(axis=1))) * scale**2)
         self._keys["image_scale"] = scale
 
@@ -74,11 +75,10 @@ class ReducedJobs:
         """
         info = method_info(method)
         parameters = info.scaled_steps(self.preset, self.effort, changes or {})
-        ratio = self._keys["image_scale"] / default_image_scale(self.preset)
-        if self.effort < 1 and ratio < 1:
+        if self._pixel_ratio < 1:
             preset = info.preset(self.preset)
             parameters |= {
-                name: ratio * getattr(preset, name)
+                name: self._pixel_ratio * getattr(preset, name)
                 for name in info.pixel_parameters
                 if name not in parameters
             }

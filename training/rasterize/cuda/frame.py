@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -143,7 +142,7 @@ class CardFrame:
     def blend(
         self,
         colours: torch.Tensor,
-        background: Sequence[float] = (0.0, 0.0, 0.0),
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
         limit: torch.Tensor | None = None,
         median: torch.Tensor | None = None,
     ) -> torch.Tensor:
