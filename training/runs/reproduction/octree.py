@@ -41,7 +41,7 @@ def _bias_helps(value: Value) -> tuple[bool, str]:
 
 def _later_start_is_smaller(value: Value) -> tuple[bool, str]:
     share = value("M5", SPLATS) / value("M7", SPLATS)
-    return share < 1 and value("M7", PSNR) > value("M5", PSNR), f"{share:.0%} of the splats"
+    return share <= 0.75 and value("M7", PSNR) > value("M5", PSNR), f"{share:.0%} of the splats"
 
 
 PAPER = Paper(
@@ -75,8 +75,10 @@ PAPER = Paper(
                 Row("Scaffold-GS", "Scaffold-GS", _baked_and_networks, (29.00, 0.868, 0.210, 357_000)),
                 Row("Ours", "Octree-GS", _baked_and_networks, (29.50, 0.883, 0.177, 473_000)),
             ),
-            (increases("Octree-GS is better than Scaffold-GS (0.5 dB) and Mip-Splatting (2.4 dB).",
-                       ("Mip-Splatting", "Scaffold-GS", "Ours"), PSNR),),
+            (
+                increases("Octree-GS is better than Scaffold-GS (0.5 dB).", ("Scaffold-GS", "Ours"), PSNR),
+                increases("Octree-GS is better than Mip-Splatting (2.4 dB).", ("Mip-Splatting", "Ours"), PSNR),
+            ),
         ),
         Table(
             "Table 4", "Quality by image size", "multi-resolution Mip-NeRF360", _SIZES,
