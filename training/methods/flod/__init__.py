@@ -40,7 +40,7 @@ class FlodParameters(FlodLevels, DensityParameters):
         unit="px",
     )
     steps: tuple[int, ...] = setting(
-        (250, 400, 500, 750, 2750), "Training steps of each level.", above=0, unit="steps"
+        (250, 400, 500, 750, 3561), "Training steps of each level.", above=0, unit="steps"
     )
     densify_until: tuple[float, ...] = setting(
         (0.5,) * 5, "Fraction of a level's steps in which splats are added and removed.", high=1
@@ -75,7 +75,7 @@ class FlodParameters(FlodLevels, DensityParameters):
         high=1,
     )
     refine_steps: int = setting(
-        680,
+        1000,
         "Steps that refine the merged level before the finest. Each coarser level gets 70 % of the steps of "
         "the next finer one. They are taken from those of all levels ('steps'), at most half; the finest "
         "level gets the others.",

@@ -77,7 +77,8 @@ PAPER = Paper(
             ),
             (
                 increases("Octree-GS is better than Scaffold-GS (0.5 dB).", ("Scaffold-GS", "Ours"), PSNR),
-                increases("Octree-GS is better than Mip-Splatting (2.4 dB).", ("Mip-Splatting", "Ours"), PSNR),
+                increases("Octree-GS is better than Mip-Splatting (2.4 dB).", ("Mip-Splatting", "Ours"),
+                          PSNR),
             ),
         ),
         Table(
