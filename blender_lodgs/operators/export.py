@@ -344,7 +344,7 @@ class _FolderExport(_ExportOperator):
     def draw(self, context):
         self.layout.use_property_split = True
         for name in ("placed", "looked", "antialiased", "lod_errors", "replace"):
-            if name in self.bl_rna.properties:
+            if hasattr(self, name):
                 self.layout.prop(self, name)
         self.layout.label(text=f"Estimated size: {_size(context, self.kind, -1)}")
 

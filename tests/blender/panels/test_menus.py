@@ -5,6 +5,8 @@ from types import SimpleNamespace
 
 import pytest
 
+from tests.blender.panels.conftest import RecordingLayout
+
 GARDEN = Path(__file__).resolve().parents[3] / "examples" / "lantern_garden"
 OTHER_MENUS = {
     # File menu
@@ -163,3 +165,23 @@ def test_runs_of_a_scene_are_listed_and_opened(bpy, lodgs, tmp_path, fake):
     assert run_folders.run_folder(root).path == first.folder.path and any(
         item.exists for item in root.lodgs.levels
     )
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("folder", ["placed", "looked", "replace"]),
+        ("tiles", ["placed", "looked", "antialiased"]),
+        ("streamed", ["placed", "looked", "antialiased", "lod_errors"]),
+        ("page", ["placed", "looked"]),
+    ],
+)
+def test_exports_to_folders_show_their_options(bpy, lodgs, monkeypatch, name, options):
+    export, layout = lodgs("operators.export"), RecordingLayout()
+    operator = getattr(export, f"LODGS_OT_export_{name}")
+    monkeypatch.setattr(export, "_size", lambda *arguments: "8.6 MB")
+    values = dict.fromkeys(getattr(bpy.ops.lodgs, f"export_{name}").get_rna_type().properties.keys(), False)
+    dialog = SimpleNamespace(layout=layout, bl_rna=operator.bl_rna, kind=operator.kind, **values)
+    operator.draw(dialog, bpy.context)
+    assert layout.properties == options
+    assert layout.texts == ["Estimated size: 8.6 MB"]
