@@ -272,6 +272,11 @@ def cached(name: str, create: Callable[[], Any]) -> Any:
     return _cache[name]
 
 
+def is_cached(name: str) -> bool:
+    """Return True if a resource exists."""
+    return name in _cache
+
+
 def bind_textures(shader: gpu.types.GPUShader, textures: dict[str, gpu.types.GPUTexture]) -> None:
     """Bind textures to samplers, given in the order of their slots.
 

@@ -23,6 +23,7 @@ from .shaders import (
     bind_textures,
     copy_shader,
     empty_texture,
+    is_cached,
     palette,
     program,
     projection_shader,
@@ -210,6 +211,11 @@ def draw(
             canvas.frame.read_color(0, 0, 1, 1, 4, 0, "FLOAT")  # waits for the graphics card
     _composite(canvas, overlay)
     return time.monotonic() - begin if timed else 0.0
+
+
+def is_compiled(store: UploadedSplats) -> bool:
+    """Return True if the shader for a store exists, so that a redraw does not wait for it."""
+    return is_cached(f"project_{len(store.textures)}")
 
 
 def _write_depth(depth: gpu.types.GPUTexture) -> None:

@@ -35,6 +35,8 @@ MIN_MOTION = 20_000
 """Smallest number of splats of a simplified view."""
 COST_CHANGE = 0.1
 """Relative change of the number of splats from which a view is measured again."""
+COST_AGE = 3.0
+"""Seconds after which a view is measured again."""
 MIN_BUDGET = 10_000
 """Smallest suggested budget."""
 GROWTH = 1.5
@@ -63,6 +65,7 @@ class ViewState:
         shows_marks: draw selected splats and previewed clutter in their colours.
         cost: number of drawn splats and seconds to draw them, measured at rest.
         motion_cost: the same while the view moves; zeros before the first motion.
+        measured: time of the last of these measurements.
         stated: values that header and panel state, see ``views.reduced_counts``, :func:`suggest_budget` and
             :func:`simplified_counts`.
     """
@@ -87,16 +90,19 @@ class ViewState:
     shows_marks: bool = False
     cost: tuple[int, float] = (0, 0.0)
     motion_cost: tuple[int, float] = (0, 0.0)
+    measured: float = 0.0
     stated: tuple | None = None
     _lists: dict[bool, tuple[gpu.types.GPUTexture, int]] = field(default_factory=dict)
 
     def is_cost_outdated(self) -> bool:
         """Return True if the view should be measured, which waits for the graphics card."""
-        measured = (self.motion_cost if self.moving else self.cost)[0]
-        return abs(self.count - measured) > COST_CHANGE * measured
+        count = (self.motion_cost if self.moving else self.cost)[0]
+        has_changed = abs(self.count - count) > COST_CHANGE * count
+        return has_changed or time.monotonic() > self.measured + COST_AGE
 
     def set_cost(self, seconds: float) -> None:
         """Store the time to draw the current list."""
+        self.measured = time.monotonic()
         if self.moving:
             self.motion_cost = self.count, seconds
         else:

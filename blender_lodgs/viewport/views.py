@@ -137,13 +137,13 @@ def draw_splats(
         view_matrix, projection: matrices from the world to camera space, and from there to clip space.
         budget, wait, moving: see :func:`prepare`.
         under_overlays, frame: see ``splats.draw``.
-        timed: measure the cost of the view if the number of its splats has changed.
+        timed: measure the cost of the view if it is outdated.
     """
     request = prepare(view, instances, depsgraph, view_matrix, budget, wait, moving)
     if view.arrangement is None or view.store is None or view.instances is None or not view.count:
         return
     view.choose_list()
-    timed = timed and view.loading is None and view.is_cost_outdated()
+    timed &= view.loading is None and splats.is_compiled(view.store) and view.is_cost_outdated()
     placements = view.arrangement.request.placements
     if _same_splats(placements, request.placements):  # objects move at once; their order follows
         placements = request.placements

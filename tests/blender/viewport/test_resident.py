@@ -207,6 +207,10 @@ def test_cost_is_measured_for_another_number_of_splats(lodgs, draw_from, monkeyp
 
     monkeypatch.setattr(splats, "_blend", slow_blend)
     monkeypatch.setattr(views, "draw_splats", lambda *a, **k: draw_splats(*a, **k, timed=True))
+    monkeypatch.setattr(splats, "is_compiled", lambda store: False)
+    draw_from(view, 0.0)
+    assert view.cost == (0, 0.0), "the first redraw waits for the shader"
+    monkeypatch.setattr(splats, "is_compiled", lambda store: True)
     draw_from(view, 0.0)
     assert view.cost == (view.count, 0.5) and not view.is_cost_outdated()
     view.count = round(0.8 * view.count)
@@ -214,6 +218,8 @@ def test_cost_is_measured_for_another_number_of_splats(lodgs, draw_from, monkeyp
     view.moving = True
     draw_from(view, 0.0)
     assert view.motion_cost == (view.count, 0.5) and not view.is_cost_outdated()
+    view.measured -= 1 + lodgs("viewport.view_state").COST_AGE
+    assert view.is_cost_outdated()
 
 
 def test_viewports_that_load_at_once_upload_each_splat_once(lodgs, draw_from, monkeypatch):
