@@ -21,6 +21,7 @@ from ...training.render.lens import (
 )
 from ...training.runs.job import MIN_VIEWS
 from ...training.scenes.cameras import Camera
+from .objects import root_of
 from .placement import matrix_of, require_finite
 
 ORTHOGONAL = 1e-5
@@ -42,6 +43,22 @@ def scene_camera(scene: bpy.types.Scene) -> bpy.types.Object:
             "Cannot render: the scene has no camera.", "Add a camera, or look through one of the views."
         )
     return scene.camera
+
+
+def enabled_cameras(scene: bpy.types.Scene, root: bpy.types.Object | None = None) -> list[bpy.types.Object]:
+    """Return the cameras of a scene that are enabled in renders, in the order of their names.
+
+    Args:
+        root: root of a splat scene, to exclude cameras of other ones.
+    """
+    cameras = [
+        obj
+        for obj in scene.objects
+        if obj.type == "CAMERA"
+        and not (obj.hide_render or all(part.hide_render for part in obj.users_collection))
+        and (root is None or root_of(obj) in (None, root))
+    ]
+    return sorted(cameras, key=lambda obj: obj.name)
 
 
 @dataclass(frozen=True)

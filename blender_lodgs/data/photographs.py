@@ -181,14 +181,14 @@ def look_at_scene(context: bpy.types.Context, root: bpy.types.Object, warn: Warn
     """Show a splat scene in the window's viewports and extend their clip range to its sky.
 
     The viewports take the pose of the photos if it is known; otherwise they keep their direction and frame
-    the scene. In a file that only has the objects of Blender's startup file, its cube and light are moved to
-    a hidden collection.
+    the scene. In a file that only has the objects of Blender's startup file, they are moved to a hidden
+    collection; its camera only if the scene has photos, the first of which becomes the active camera.
 
     Args:
         warn: function that receives a sentence for each mesh that is hidden because it blocks the view from
             the photos.
     """
-    _put_startup_objects_away(context)
+    _put_startup_objects_away(context, root)
     viewpoint = photo_viewpoint(root)
     for obj in _blocking_meshes(context, *viewpoint) if viewpoint is not None else ():
         obj.hide_set(True)
@@ -202,20 +202,24 @@ def look_at_scene(context: bpy.types.Context, root: bpy.types.Object, warn: Warn
         region.view_location, region.view_distance = target, (position - target).length
 
 
-def _put_startup_objects_away(context: bpy.types.Context) -> None:
-    """Move the cube and light of an unchanged startup file to a hidden collection.
+def _put_startup_objects_away(context: bpy.types.Context, root: bpy.types.Object) -> None:
+    """Move the objects of an unchanged startup file to a hidden collection; see :func:`look_at_scene`.
 
     The file may be saved: users save it first, because runs are written next to it.
     """
     names = {obj.name for obj in bpy.data.objects if root_of(obj) is None}
     if names != {"Camera", "Cube", "Light"}:
         return
-    cube, light = bpy.data.objects["Cube"], bpy.data.objects["Light"]
-    if not _is_startup_cube(cube):
+    unused = [bpy.data.objects[name] for name in ("Cube", "Light", "Camera")]
+    if not _is_startup_cube(unused[0]):
         return
+    if photos := views(root):
+        use_view(context, photos[0])
+    else:
+        unused.pop()
     collection = bpy.data.collections.new("Startup Objects")
     context.scene.collection.children.link(collection)
-    for obj in (cube, light):
+    for obj in unused:
         for previous in obj.users_collection:
             previous.objects.unlink(obj)
         collection.objects.link(obj)

@@ -27,7 +27,7 @@ from ...training.scenes.viewpoints import (
 from ...training.splats.gaussians import Splats
 from .. import attributes
 from . import changes
-from .cameras import scene_camera, supported_views, view_from, view_of
+from .cameras import enabled_cameras, scene_camera, supported_views, view_from, view_of
 from .objects import root_of
 from .placement import matrix_of
 from .setting_properties import property_of
@@ -91,7 +91,7 @@ VIEW_PATTERNS = (
         "above",
         setting="height",
     ),
-    ViewPattern("CAMERAS", "Cameras", "All cameras of the Blender scene", "cameras"),
+    ViewPattern("CAMERAS", "Cameras", "Cameras enabled in renders, without other splat scenes", "cameras"),
     ViewPattern(
         "ANIMATION", "Animation", "Scene camera at frames spread evenly over the frame range", "animation"
     ),
@@ -144,7 +144,9 @@ def has_only_splats(root: bpy.types.Object) -> bool:
 
 def view_count(settings: bpy.types.PropertyGroup) -> int:
     """Return the number of views of the settings."""
-    return _count(_cameras(bpy.context.scene)) if settings.views_from == "CAMERAS" else settings.views
+    if settings.views_from != "CAMERAS":
+        return settings.views
+    return _count(enabled_cameras(bpy.context.scene, settings.id_data))
 
 
 def training_views(
@@ -166,7 +168,7 @@ def training_views(
     width, height = image_size(context.scene, settings)
     match settings.views_from:
         case "CAMERAS":
-            cameras = _require_two(_cameras(context.scene))
+            cameras = _require_two(enabled_cameras(context.scene, root))
             depsgraph = context.evaluated_depsgraph_get()
             views = supported_views(
                 cameras, lambda camera: view_from(root, depsgraph, width, height, camera), warn
@@ -220,7 +222,7 @@ def _shots_with_views(
     scene, settings = context.scene, context.scene.lodgs_capture
     match settings.views_from:
         case "CAMERAS":
-            cameras = _require_two([obj for obj in _cameras(scene) if root_of(obj) is None])
+            cameras = _require_two([obj for obj in enabled_cameras(scene) if root_of(obj) is None])
             depsgraph = context.evaluated_depsgraph_get()
             return supported_views(cameras, lambda camera: evaluated_view(depsgraph, camera), warn)
         case "ANIMATION":
@@ -262,7 +264,7 @@ def capture_view_count(scene: bpy.types.Scene) -> int:
     """Return the number of views of a Blender scene's capture settings."""
     match scene.lodgs_capture.views_from:
         case "CAMERAS":
-            return _count(obj for obj in _cameras(scene) if root_of(obj) is None)
+            return _count(obj for obj in enabled_cameras(scene) if root_of(obj) is None)
         case "ANIMATION":
             return len(_frames(scene, scene.lodgs_capture.views))
     return scene.lodgs_capture.views
@@ -402,10 +404,6 @@ def image_size(scene: bpy.types.Scene, settings: bpy.types.PropertyGroup) -> tup
     return settings.view_width, max(round(settings.view_width * render.resolution_y / render.resolution_x), 1)
 
 
-def _cameras(scene: bpy.types.Scene) -> list[bpy.types.Object]:
-    return sorted((obj for obj in scene.objects if obj.type == "CAMERA"), key=lambda obj: obj.name)
-
-
 def _count(cameras: Iterable[bpy.types.Object]) -> int:
     """Return the number of perspective cameras."""
     return sum(camera.data.type == "PERSP" for camera in cameras)
@@ -413,7 +411,7 @@ def _count(cameras: Iterable[bpy.types.Object]) -> int:
 
 def has_cameras(scene: bpy.types.Scene) -> bool:
     """Return True if a scene has enough perspective cameras to train on their views."""
-    return _count(_cameras(scene)) >= MIN_VIEWS
+    return _count(enabled_cameras(scene)) >= MIN_VIEWS
 
 
 def _require_two(cameras: list[bpy.types.Object]) -> list[bpy.types.Object]:

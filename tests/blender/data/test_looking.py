@@ -155,6 +155,26 @@ def test_unchanged_startup_objects_are_hidden(bpy, lodgs, tmp_path, edited, save
     assert ("Startup Objects" in bpy.data.collections) != edited
 
 
+def test_photo_camera_replaces_the_startup_camera(bpy, lodgs):
+    """Training on the cameras of the file uses the photos of this scene only."""
+    bpy.ops.wm.read_homefile(use_factory_startup=True)
+    bpy.ops.lodgs.import_colmap(directory=str(GARDEN), photographs=False)
+    (root,) = lodgs("data.roots").roots(bpy.context.scene)
+    photos, viewpoints = lodgs("data.photographs").views(root), lodgs("data.viewpoints")
+    assert bpy.context.scene.camera == photos[0] and not bpy.data.objects["Camera"].visible_get()
+    root.lodgs.training.views_from = "CAMERAS"
+    assert viewpoints.view_count(root.lodgs.training) == len(photos)
+    bpy.ops.lodgs.import_colmap(directory=str(GARDEN), photographs=False)
+    other = next(other for other in lodgs("data.roots").roots(bpy.context.scene) if other != root)
+    assert viewpoints.view_count(root.lodgs.training) == len(photos)
+    assert viewpoints.enabled_cameras(bpy.context.scene, other) == lodgs("data.photographs").views(other)
+    loose = bpy.data.objects.new("loose", bpy.data.cameras.new("loose"))
+    bpy.context.scene.collection.objects.link(loose)
+    assert viewpoints.view_count(root.lodgs.training) == len(photos) + 1
+    loose.hide_render = True
+    assert viewpoints.view_count(root.lodgs.training) == len(photos)
+
+
 def test_invalid_control_changes_nothing(bpy, lodgs, tmp_path):
     write_bundle(tmp_path / "b.ply", Bundle("mine", [Level(1, ball(5, 0))]))
     root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply")
