@@ -184,16 +184,16 @@ class Request:
         budget: maximum number of splats.
         position: position of the view in the world, from which splats beyond the budget are ranked; None if
             all splats fit.
-        motion: maximum number of splats while the view moves, and its position; None if it draws all.
         coarsened: that of the view's last arrangement, if its detail should remain after a slight motion.
+        motion: maximum number of splats while the view moves, and its position; None if it draws all.
     """
 
     placements: tuple[Placement, ...]
     backward: tuple[float, float, float]
     budget: int
     position: tuple[float, float, float] | None = None
-    motion: tuple[int, tuple[float, float, float]] | None = None
     coarsened: Counter[int] = field(default_factory=Counter, compare=False)
+    motion: tuple[int, tuple[float, float, float]] | None = None
 
     @property
     def selection_key(self) -> tuple:
