@@ -98,14 +98,16 @@ def test_splats_of_a_moved_root_are_excluded_from_the_mesh_scene(bpy, lodgs, sce
     collection.objects.unlink(root)
     bpy.ops.lodgs.combine_with_meshes()
     copied = scene.lodgs_render.meshes.view_layers[0].layer_collection.children
-    assert copied[collection.name].exclude
+    splats = lodgs("data.roots").levels_collection(root)
+    assert copied[collection.name].children[splats.name].exclude
 
 
-def test_instances_of_splats_are_no_meshes(bpy, lodgs, scene):
+@pytest.mark.parametrize("name", ["collection_of", "levels_collection"])
+def test_instances_of_splats_are_no_meshes(bpy, lodgs, scene, name):
     """Cycles would draw them as points. The original scene still renders them with any engine."""
     [root] = lodgs("data.roots").roots(scene)
     empty = bpy.data.objects.new("instance", None)
-    empty.instance_type, empty.instance_collection = "COLLECTION", root.users_collection[0]
+    empty.instance_type, empty.instance_collection = "COLLECTION", getattr(lodgs("data.roots"), name)(root)
     scene.collection.objects.link(empty)
     level = root.lodgs.levels[0].object
     bpy.ops.lodgs.combine_with_meshes()
