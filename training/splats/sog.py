@@ -201,7 +201,8 @@ def decode_sog(read: Callable[[str], bytes]) -> Splats:
         return values
 
     def table(part: str) -> np.ndarray:
-        return np.array(meta[part]["codebook"], np.float32)
+        with np.errstate(over="ignore"):  # infinities are dropped later
+            return np.array(meta[part]["codebook"], np.float32)
 
     low, high = (np.array(meta["means"][end], np.float64).reshape(3) for end in ("mins", "maxs"))
     codes = pixels("means", 0)[:, :3] + 256 * pixels("means", 1)[:, :3].astype(np.int64)

@@ -402,7 +402,13 @@ def test_folders_without_export_are_rejected(tmp_path):
         convert_export(tmp_path)
 
 
-@pytest.mark.parametrize("content", ["[]", "{}", '[{"shots": 1}]', '[{"shots": {"a.jpg": 1}}]', "7", ""])
+@pytest.mark.parametrize(
+    "content",
+    [
+        "[]", "{}", '[{"shots": 1}]', '[{"shots": {"a.jpg": 1}}]', "7", "",
+        '[{"cameras": {}, "shots": {"a.jpg": {}}, "points": {"1": {"coordinates": [0, 0, 5], "color": []}}}]',
+    ],
+)  # fmt: skip
 def test_damaged_reconstructions_of_opensfm_are_rejected(tmp_path, content):
     (tmp_path / "reconstruction.json").write_text(content)
     with pytest.raises(LodgsError, match=r"reconstruction\.json"):

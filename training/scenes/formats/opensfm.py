@@ -31,7 +31,6 @@ from .exported import (
 NAME = "OpenSfM"
 MAX_BYTES = 1 << 28
 """Maximum size of the file, which holds all points as text."""
-_NO_POINTS = np.zeros((0, 3))
 _REFERENCE = "latitude", "longitude", "altitude"
 _FISHEYES = "fisheye", "fisheye_opencv"
 _LENSES = "perspective", "simple_radial", "radial", "brown", *_FISHEYES
@@ -58,7 +57,7 @@ def read(path: Path) -> ExportedScene:
     try:
         cameras, shots, points = part["cameras"], part["shots"].items(), part.get("points") or {}
         positions, colors = (
-            parse_array([point[key] for point in points.values()] or _NO_POINTS, -1, 3, finite=False)
+            parse_array([point[key] for point in points.values()], len(points), 3, finite=False)
             for key in ("coordinates", "color")
         )
     except (KeyError, TypeError, AttributeError, LodgsError) as error:
