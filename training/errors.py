@@ -1,6 +1,7 @@
 """The exception for mistakes and limits that a user can act on."""
 
 import errno
+import os
 import re
 
 DISK_FULL = {errno.ENOSPC, errno.EDQUOT}
@@ -103,7 +104,17 @@ def is_system_problem(error: BaseException) -> bool:
 def read_error(path: object, error: OSError, remedy: str) -> LodgsError:
     """Return the error of a file that cannot be read; a SystemProblem if the file is not to blame."""
     kind = SystemProblem if is_system_problem(error) else LodgsError
-    return kind(f"Cannot read {printable(path)}: {error.strerror or error}.", system_remedy(error, remedy))
+    reason = error.strerror or error
+    if isinstance(error, FileNotFoundError) and os.path.islink(str(path)):
+        reason = f"it {missing_clause(path)}"
+    return kind(f"Cannot read {printable(path)}: {reason}.", system_remedy(error, remedy))
+
+
+def missing_clause(path: object) -> str:
+    """Return "does not exist", with the target if a path is a symbolic link."""
+    name = str(path)
+    target = f"links to {printable(os.readlink(name))}, which " if os.path.islink(name) else ""
+    return f"{target}does not exist"
 
 
 def printable(text: object) -> str:

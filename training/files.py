@@ -18,7 +18,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path, PureWindowsPath
 from typing import IO, BinaryIO
 
-from .errors import LodgsError, is_system_problem, printable, read_error, system_remedy
+from .errors import LodgsError, is_system_problem, missing_clause, printable, read_error, system_remedy
 
 _DEVICE = re.compile(r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9\xb9\xb2\xb3])\s*([.:].*)?", re.I)
 
@@ -277,7 +277,7 @@ def check_folder(folder: Path, remedy: str) -> None:
             f"Cannot open {folder}: it is a file, not a folder.", "Unpack it first." if is_archive else remedy
         )
     if not folder.is_dir():
-        raise LodgsError(f"Cannot open {folder}: the folder does not exist.", remedy)
+        raise LodgsError(f"Cannot open {folder}: the folder {missing_clause(folder)}.", remedy)
 
 
 def create_folder(folder: Path) -> None:

@@ -20,6 +20,7 @@ from training.documents import (
     read_toml,
 )
 from training.errors import LodgsError
+from training.files import check_folder
 
 
 def nested(depth: int, inner: str = "1") -> str:
@@ -87,6 +88,15 @@ def test_invalid_toml_raises_one_sentence(tmp_path, text, reason):
     with pytest.raises(LodgsError, match=r"^The job is not valid: ") as caught:
         read_toml(path, "The job")
     assert reason in caught.value.what
+
+
+def test_link_that_leads_nowhere_is_named(tmp_path):
+    (tmp_path / "link").symlink_to(tmp_path / "unplugged")
+    sentence = rf"link:? (it |the folder )?links to {tmp_path / 'unplugged'}, which does not exist"
+    with pytest.raises(LodgsError, match=sentence):
+        open_file(tmp_path / "link")
+    with pytest.raises(LodgsError, match=sentence):
+        check_folder(tmp_path / "link", "Choose another.")
 
 
 def test_only_regular_files_are_opened(tmp_path):

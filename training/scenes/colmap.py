@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import LodgsError, printable
+from ..errors import LodgsError, missing_clause, printable
 from ..files import check_folder, is_file
 from ..splats.georeference import Georeference, read_georeference
 from ..splats.origin import NO_ORIGIN, choose_origin
@@ -276,9 +276,8 @@ def read_scene(
 def _view_collector(folder: Path, images: Path) -> ViewCollector:
     """Return an empty collector for the photos, masks and depth maps of a scene."""
     if not images.is_dir():
-        raise LodgsError(
-            f"Cannot read scene: image folder {images} does not exist.", "Choose the folder of the photos."
-        )
+        what = f"Cannot read scene: image folder {images} {missing_clause(images)}."
+        raise LodgsError(what, "Choose the folder of the photos.")
     base = folder if images == folder else images.parent
     return ViewCollector(
         ImageFiles(images),
