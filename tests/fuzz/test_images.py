@@ -12,7 +12,7 @@ from PIL import Image
 from tests.fuzz.entry_points import attempt
 from tests.fuzz.mutations import corrupted
 from training.render.image import read_depth
-from training.scenes.image_headers import MAX_PIXELS, image_size
+from training.scenes.image_headers import MAX_PIXELS, exif_orientation, image_size
 from training.scenes.images import check_image, load_image
 
 
@@ -27,17 +27,19 @@ def seeds(folder) -> list[bytes]:
     noise = np.random.default_rng(0).integers(0, 256, (24, 40, 3)).astype(np.uint8)
     image = Image.fromarray(noise)
     contents = []
+    exif = Image.Exif()
+    exif[274] = 6
     for name, variant, options in (
         ("a.jpg", image, {}),
         ("b.jpg", image, {"progressive": True, "exif": b"Exif\0\0" + bytes(99)}),
-        ("c.jpg", image.convert("CMYK"), {}),
-        ("a.png", image, {}),
+        ("c.jpg", image.convert("CMYK"), {"exif": exif}),
+        ("a.png", image, {"exif": exif}),
         ("b.png", image.convert("P"), {}),
         ("c.png", image.convert("I;16"), {}),
         ("d.png", image.convert("LA"), {}),
-        ("a.tif", image, {}),
+        ("a.tif", image, {"exif": exif}),
         ("b.tif", image, {"compression": "tiff_lzw", "big_tiff": False}),
-        ("a.webp", image, {}),
+        ("a.webp", image, {"exif": exif}),
         ("b.webp", image, {"lossless": True}),
         ("c.webp", image.convert("RGBA"), {}),
     ):
@@ -66,6 +68,8 @@ def test_corrupt_images(folder, seeds, data, size):
     path.write_bytes(content)
     dimensions = attempt("image size", lambda: image_size(path), content)
     assert dimensions is None or 1 <= dimensions[0] * dimensions[1] <= MAX_PIXELS
+    orientation = attempt("EXIF orientation", lambda: exif_orientation(path), content)
+    assert orientation in range(1, 9)
     attempt("image", lambda: check_image(path), content)
     pixels = attempt("image", lambda: load_image(path, *size), content)
     if pixels is not None:
