@@ -44,7 +44,7 @@ help:
 	@echo "make pins       update requirements/*.txt from requirements/*.in (UPGRADE=1 takes the newest allowed versions)"
 	@echo "make window     tour in a real Blender window, with screenshots (METHOD=flod; needs Blender, Xvfb, ImageMagick)"
 	@echo "make interop    other programs read our files; naga translates our shaders (half an hour; needs Node, Chromium)"
-	@echo "make attacks    kill and stop every program at random times; fill disks (an hour)"
+	@echo "make attacks    kill and stop every program at random times; fill disks (two hours)"
 
 setup:
 	@command -v $(PYTHON) >/dev/null || { echo "setup: Python is missing; install Python 3.11 with pip." >&2; exit 1; }
@@ -147,6 +147,7 @@ attacks: setup
 	$(VENV) tools/attacks_commands.py
 	$(VENV) tools/attacks_blocks.py
 	$(VENV) tools/attacks_blender.py
+	@if [ -x $(BLENDER_5_3) ]; then set -x; $(BLENDER_5_3) tools/attacks_blender.py; fi
 
 clean:
 	rm -rf build dist .venv .venv-blender-*

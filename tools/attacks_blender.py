@@ -5,8 +5,8 @@
 Each action of ACTIONS runs undisturbed once, in Blender's module. Then it runs on disks that are too small (a
 tmpfs, which needs root on Linux). It must report an error with the name of a file or folder of the disk.
 Every file under its final name must be complete, and the same action must succeed afterwards, with enough
-space. Results are written to build/attacks_blender.json. The trainer's Python, LODGS_TRAINER_PYTHON, makes
-the inputs and some exports.
+space. Results are written to build/attacks_blender_VERSION.json. The trainer's Python, LODGS_TRAINER_PYTHON,
+makes the inputs and some exports.
 """
 
 from __future__ import annotations
@@ -269,7 +269,8 @@ def main() -> int:
             results[name] = attack.fill_disks(name, options.disks)
             print(name, results[name], *attack.wrong[reported:], sep="\n", flush=True)
             reported = len(attack.wrong)
-    report = ROOT / "build" / "attacks_blender.json"
+    version = ".".join(map(str, attack.bpy.app.version[:2]))
+    report = ROOT / "build" / f"attacks_blender_{version}.json"
     report.parent.mkdir(exist_ok=True)
     figures = {"actions": results, "messages": attack.messages, "wrong": attack.wrong}
     report.write_text(json.dumps(figures, indent=1))
