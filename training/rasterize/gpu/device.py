@@ -137,14 +137,13 @@ def _enumerate() -> dict[Adapter, Any]:
 @contextmanager
 def _runtime_folder() -> Iterator[None]:
     """Set XDG_RUNTIME_DIR meanwhile, without which drivers of Linux print errors of a window system."""
-    missing = sys.platform == "linux" and "XDG_RUNTIME_DIR" not in os.environ
-    if missing:
-        os.environ["XDG_RUNTIME_DIR"] = tempfile.gettempdir()
+    missing = {"XDG_RUNTIME_DIR"} - os.environ.keys() if sys.platform == "linux" else set()
+    os.environ |= dict.fromkeys(missing, tempfile.gettempdir())
     try:
         yield
     finally:
-        if missing:
-            os.environ.pop("XDG_RUNTIME_DIR", None)
+        for name in missing:
+            os.environ.pop(name, None)
 
 
 @cache
