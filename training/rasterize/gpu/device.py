@@ -98,13 +98,12 @@ def open_device(name: str = "") -> Device:
     Raises:
         LodgsError: no device has this name, or it cannot be opened.
     """
-    available = _enumerate()
-    matches = [adapter for adapter in available if name.casefold() in adapter.name.casefold()]
+    matches = [adapter for adapter in adapters() if name.casefold() in adapter.name.casefold()]
     matches.sort(key=lambda adapter: adapter.name != name)  # a name may be a prefix of another
     if not matches:
         raise LodgsError(
             f'Cannot open graphics device "{name}": it does not exist.',
-            f"Choose from: {', '.join(adapter.name for adapter in available)}.",
+            f"Choose from: {', '.join(adapter.name for adapter in adapters())}.",
         )
     device = _open(matches[0])
     if device.lost:
