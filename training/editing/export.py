@@ -62,8 +62,9 @@ class Compression:
     """Settings of a compression."""
 
     prune: float = setting(
-        0.1,
-        "Fraction of each level's splats to remove: those of least significance in the training views.",
+        0.0,
+        "Fraction of each level's splats to remove: those of least significance in the training views. "
+        "Levels of drafts have few splats that can be spared.",
         high=0.99,
     )
     distill_steps: int = setting(
