@@ -299,8 +299,8 @@ class StepModel(Protocol):
     ) -> Callable[[], float]:
         """Make one Adam step with :func:`photometric_loss` of one image.
 
-        Return a function that returns the loss. It waits for the device, so call it rarely. If the loss of
-        any step was not finite, it returns that loss from then on.
+        Return a function that returns the loss. It waits for the device, so call it rarely. A
+        :class:`DeviceModel` returns the first loss that was not finite from then on.
 
         Args:
             target: photo; a :class:`DeviceModel` requires an opaque one without a mask.
@@ -363,8 +363,8 @@ def make_step_model(
 ) -> StepModel | None:
     """Return a model whose steps need no autograd, or None if the backend has none.
 
-    On the CPU it changes the tensors and statistics in place. Other backends copy them to their device and
-    return a :class:`DeviceModel`.
+    ``cpu`` and ``cuda`` change the tensors and statistics in place. ``gpu`` copies them to its device and
+    returns a :class:`DeviceModel`.
 
     Args:
         adam: optimizer of means, quats, log_scales, opacity_logits and sh. Its other tensors stay unchanged.

@@ -30,7 +30,6 @@ class HostFrame:
         index: (M,) int32, indices of the considered splats.
         projected: (M, COLUMNS), see ``project``; rows of splats that are not drawn are undefined.
         pairs: pairs of these rows and tiles.
-        tile_grid: number of tiles, down and across.
         visited: (tiles,) int64, number of blended pairs of each tile. Set by :meth:`blend`.
         transmittance: (H, W). Set by :meth:`blend`.
     """
@@ -43,7 +42,6 @@ class HostFrame:
         radii: np.ndarray,
     ) -> None:
         view = settings.view
-        self.view = view
         self._splats = splats
         antialias = np.atleast_1d(np.asarray(settings.antialias))  # one entry, or N
         self._settings = (
@@ -66,8 +64,7 @@ class HostFrame:
         )
         drawn = np.flatnonzero(depths).astype(np.int32)
         self.pairs = bin_splats(self.projected, drawn, depths[drawn], view.width, view.height, buffers)
-        self.tile_grid = -(-view.height // TILE), -(-view.width // TILE)
-        self._tiles = self.pairs.splat, self.pairs.tile_start, self.tile_grid[1]
+        self._tiles = self.pairs.splat, self.pairs.tile_start, -(-view.width // TILE)
         self._pair_rows = self.pairs.first, self.pairs.count, self.pairs.row
         self.visited = np.empty(len(self.pairs.tile_start) - 1, np.int64)
         self.transmittance = buffers.take("transmittance", np.float32, view.height, view.width)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, MutableMapping
+from dataclasses import fields
 
 import torch
 
@@ -13,7 +14,7 @@ from ..rendering import KernelCamera, RasterSettings, Target
 from ..stats import accumulate_stats
 from .frame import CardFrame, PhotometricLoss, upload_photo
 
-TENSORS = ("means", "quats", "log_scales", "opacity_logits", "sh")
+TENSORS = tuple(field.name for field in fields(Gaussians))
 
 
 class CardModel:
