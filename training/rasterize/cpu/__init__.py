@@ -23,7 +23,7 @@ from .bin import TILE
 from .blend import blend_weights
 from .compile import Buffers, run_parallel, serialised
 from .frame import TILES, HostFrame
-from .host_model import GEOMETRY, HostModel, image_planes
+from .host_model import TENSORS, HostModel, image_planes
 from .loss import loss_and_gradient
 from .project import BLUE, G_RED, LN2, RED, SUMS
 from .project_backward import gather_sums, gather_weights
@@ -33,7 +33,7 @@ def make_step_model(
     adam: Adam, stats: MutableMapping[str, torch.Tensor], antialias: bool
 ) -> HostModel | None:
     """See :func:`training.rasterize.make_step_model`."""
-    return HostModel(adam, stats, antialias) if {*GEOMETRY, "sh"} <= set(adam.tensors) else None
+    return HostModel(adam, stats, antialias) if set(TENSORS) <= set(adam.tensors) else None
 
 
 def rasterize(

@@ -110,6 +110,11 @@ def step_arguments(
     return *flat, rate_rows(lr, parameter.shape[1:], betas, step, 1), *constants
 
 
+def repeat_rates(arguments: tuple, count: int) -> tuple:
+    """Return the result of :func:`step_arguments` with rates of ``count`` rows."""
+    return *arguments[:3], np.tile(arguments[3], count), *arguments[4:]
+
+
 @serialised
 def decay_rows(rows: np.ndarray, arguments: tuple) -> None:
     """Make one Adam step in place for ``rows`` (M,) int64, whose gradients are zero.

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from ..rendering import RasterSettings
+from .adam import repeat_rates
 from .bin import TILE, bin_splats
 from .blend import REACHED, blend_backward, blend_backward_absolute, blend_forward, blend_median
 from .compile import Buffers, f32, run_parallel
@@ -116,20 +118,21 @@ class HostFrame:
         run_parallel(kernel, len(self.index), GRAIN, *self._pair_rows, pair_values, values)
 
     def project_backward(
-        self,
-        pair_sums: np.ndarray,
-        gradients: list[np.ndarray],
-        grad2d: np.ndarray,
-        sh_step: tuple | None = None,
-    ) -> None:
+        self, pair_sums: np.ndarray, gradients: Sequence[np.ndarray] | None, grad2d: np.ndarray,
+        steps: Sequence[tuple] | None = None,
+    ) -> None:  # fmt: skip
         """Fill the gradients of the considered splats, and grad2d (N, 2).
 
         Args:
-            gradients: one array for each of the splats' arrays, of the same shape.
-            sh_step: arguments of ``adam.adam_values``; the harmonics then make their Adam step, and their
-                gradient is not stored.
+            gradients: one array for each of the splats' arrays, of the same shape. If None, the parameters
+                make their Adam steps at once, and no gradients are stored.
+            steps: for each parameter, the result of ``adam.step_arguments``.
         """
+        if gradients is None:
+            gradients = [array[:0] for array in self._splats]
+        if steps is not None:
+            steps = (*(repeat_rates(step, GRAIN) for step in steps[:-1]), steps[-1])
         run_parallel(
             project_backward, len(self.index), GRAIN, *self._splats, *self._settings, self.index,
-            self.projected, *self._pair_rows, pair_sums, *gradients, grad2d, sh_step,
+            self.projected, *self._pair_rows, pair_sums, tuple(gradients), grad2d, steps,
         )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Training steps in the host's memory without autograd, which would store the gradient of all harmonics."""
+"""Training steps in the host's memory without autograd, which would store all gradients."""
 
 from __future__ import annotations
 
@@ -17,8 +17,7 @@ from .frame import HostFrame
 from .loss import loss_and_gradient
 from .project import SUMS
 
-GEOMETRY = ("means", "quats", "log_scales", "opacity_logits")
-"""Tensors with few values per splat, which make their Adam step from stored gradients."""
+TENSORS = ("means", "quats", "log_scales", "opacity_logits", "sh")
 
 
 def image_planes(target: Target) -> np.ndarray:
@@ -65,7 +64,7 @@ class HostModel:
         view = KernelCamera.of(camera, near)
         settings = RasterSettings(view, float(min_scale), self._antialias, background, sh_degree)
         factors = np.empty(0, np.float32) if weights is None else weights.numpy()
-        splats = [*(arrays[name] for name in (*GEOMETRY, "sh")), factors]
+        splats = [*(arrays[name] for name in TENSORS), factors]
         radii, grad2d = torch.zeros(count), torch.zeros(count, 2)
         frame = HostFrame(splats, None, settings, radii.numpy())
         image = np.empty((3, view.height, view.width), np.float32)
@@ -76,22 +75,15 @@ class HostModel:
         pair_sums = working.take("pair_sums", np.float32, len(frame.pairs.splat), SUMS)
         no_alpha = np.zeros_like(frame.transmittance)
         frame.differentiate(frame.projected, image, by_image, no_alpha, pair_sums)
-        drawn = frame.index
-        empty = np.empty if len(drawn) == count else np.zeros  # the kernel writes rows of drawn splats
-        gradients = {name: empty(arrays[name].shape, np.float32) for name in GEOMETRY}
-        sh_step = step_arguments(arrays["sh"], *adam.state["sh"], *adam.count_step("sh"))
-        unused = np.empty((0, 0, 3), np.float32), np.empty(0, np.float32)
-        frame.project_backward(pair_sums, [*gradients.values(), *unused], grad2d.numpy(), sh_step)
+        logits = None if shrink is None else adam.tensors["opacity_logits"].detach().clone()
+        steps = [step_arguments(arrays[name], *adam.state[name], *adam.count_step(name)) for name in TENSORS]
+        frame.project_backward(pair_sums, None, grad2d.numpy(), steps)
         if shrink is not None:
-            accumulate_stats(self._stats, grad2d, radii, adam.tensors["opacity_logits"], shrink)
-        tensors = {name: torch.from_numpy(gradient) for name, gradient in gradients.items()}
-        if drawn_only:
-            rows = torch.from_numpy(drawn.astype(np.int64))
-            adam.step_rows(rows, {name: gradient[rows] for name, gradient in tensors.items()})
-        else:
-            adam.step(tensors)
-            if len(drawn) < count:
-                decay_rows(np.setdiff1d(np.arange(count), drawn, assume_unique=True), sh_step)
+            accumulate_stats(self._stats, grad2d, radii, logits, shrink)
+        if not drawn_only and len(frame.index) < count:
+            others = np.setdiff1d(np.arange(count), frame.index, assume_unique=True)
+            for step in steps:
+                decay_rows(others, step)
         self._image = image, 1 - frame.transmittance
         return lambda: loss
 

@@ -260,14 +260,13 @@ def differentiate_block(
 
 
 @inlined(FAST)
-def clear_gradients(i, by_means, by_quats, by_log_scales, by_logits, by_weights, grad2d):
-    """Set the gradients of splat ``i`` to 0."""
+def clear_gradients(i, by_means, by_quats, by_log_scales, by_logits, by_weights):
+    """Set the gradients at row ``i`` to 0."""
     for k in range(3):
         by_means[i, k], by_log_scales[i, k] = ZERO, ZERO
     for k in range(4):
         by_quats[i, k] = ZERO
     by_logits[i] = ZERO
-    grad2d[i, 0], grad2d[i, 1] = ZERO, ZERO
     if by_weights.shape[0] > 0:
         by_weights[i] = ZERO
 
@@ -281,28 +280,51 @@ def set_coefficients(by_coefficients, active, basis, red, green, blue):
 
 
 @inlined(FAST)
-def step_harmonics(i, trained, gradient, sh_step):
+def step_harmonics(i, trained, gradient, step):
     """Make an Adam step of the first ``trained`` numbers of a splat's harmonics."""
-    values, m, v, rates, keep_m, keep_v, scale_v, eps = sh_step
+    values, m, v, rates, keep_m, keep_v, scale_v, eps = step
     adam_values(values, i * rates.shape[0], trained, gradient, 0, m, v, rates, keep_m, keep_v, scale_v, eps)
+
+
+@inlined(FAST)
+def step_range(begin, end, index, width, gradient, step):
+    """Make an Adam step of the rows ``index[begin:end]`` of ``width`` numbers, with gradients by range."""
+    values, m, v, rates, keep_m, keep_v, scale_v, eps = step
+    count, first = end - begin, index[begin]
+    if index[end - 1] - first == count - 1:  # neighbours in memory, in whole vectors
+        count *= width
+        adam_values(values, first * width, count, gradient, 0, m, v, rates, keep_m, keep_v, scale_v, eps)
+        return
+    for k in range(count):
+        first = index[begin + k] * width
+        adam_values(
+            values, first, width, gradient, k * width, m, v, rates, keep_m, keep_v, scale_v, eps
+        )  # fmt: skip
 
 
 @kernel(FAST)
 def project_backward(
     begin, end, means, quats, log_scales, opacity_logits, sh, weights,
     pose, lens, camera_position, width, height, degree, min_scale, antialias,
-    index, projected, first_pair, pair_count, pair_row, pair_sums,
-    by_means, by_quats, by_log_scales, by_logits, by_sh, by_weights, grad2d, sh_step,
+    index, projected, first_pair, pair_count, pair_row, pair_sums, gradients, grad2d, steps,
 ):  # fmt: skip
     """Fill the gradients of the parameters and grad2d of the splats at ``index`` from the pairs' sums.
 
-    If ``sh_step`` is not None, it has the arguments of ``adam_values`` besides its position and gradient, and
-    the harmonics make their Adam step instead of filling by_sh. Numba compiles a kernel for each case.
+    ``gradients`` has one array per parameter. With ``steps``, the parameters make their Adam steps at once
+    instead, and these arrays are empty. ``steps`` has the arguments of ``adam_values`` for each parameter,
+    besides positions and gradients. Rates of harmonics are those of one splat, all others those of GRAIN
+    splats. Numba compiles a kernel for each case.
     """
+    if steps is None:
+        by_means, by_quats, by_log_scales, by_logits, by_sh, by_weights = gradients
+    else:
+        by_means, by_quats = np.empty((end - begin, 3), np.float32), np.empty((end - begin, 4), np.float32)
+        by_log_scales, by_logits = np.empty((end - begin, 3), np.float32), np.empty(end - begin, np.float32)
+        by_weights = np.empty(0, np.float32)
     block = np.ones((PARAMETERS, WIDTH), np.float32)
     by = np.zeros((CONICS + 3, WIDTH), np.float32)
     result = np.empty((LOGIT + 1, WIDTH), np.float32)
-    splats = np.empty(WIDTH, np.int32)
+    places = np.empty(WIDTH, np.int32)
     sums = np.empty(SUMS, np.float32)
     basis = np.empty(25, np.float32)
     by_basis = np.zeros((25, WIDTH), np.float32)
@@ -317,6 +339,7 @@ def project_backward(
     lanes = 0
     for s in range(begin, end):
         i = index[s]
+        place = i if steps is None else s - begin
         ahead = min(s + 2 * PREFETCH, count - 1)
         prefetch(pair_row, first_pair[ahead], 0)
         ahead = min(s + PREFETCH, count - 1)
@@ -324,12 +347,13 @@ def project_backward(
             prefetch(pair_sums, pair_row[pair], 0)
             prefetch(pair_sums, pair_row[pair] + 1, 0)  # a row may end in the next cache line
         if pair_count[s] == 0:
-            clear_gradients(i, by_means, by_quats, by_log_scales, by_logits, by_weights, grad2d)
-            if sh_step is None:
+            clear_gradients(place, by_means, by_quats, by_log_scales, by_logits, by_weights)
+            grad2d[i, 0], grad2d[i, 1] = ZERO, ZERO
+            if steps is None:
                 by_sh[i] = ZERO
             else:
                 flat_coefficients[:trained] = ZERO
-                step_harmonics(i, trained, flat_coefficients, sh_step)
+                step_harmonics(i, trained, flat_coefficients, steps[4])
         else:
             add_pairs(first_pair[s], pair_count[s], pair_row, pair_sums, sums)
             read_lane(block, lanes, i, means, quats, log_scales, opacity_logits, antialias)
@@ -356,13 +380,13 @@ def project_backward(
             sh_basis(dx, dy, dz, degree, basis)
             for k in range(active):
                 by_basis[k, lanes] = sh[i, k, 0] * red + sh[i, k, 1] * green + sh[i, k, 2] * blue
-            if sh_step is None:
+            if steps is None:
                 set_coefficients(by_sh[i], active, basis, red, green, blue)
                 by_sh[i, active:] = ZERO
             else:
                 set_coefficients(by_coefficients, active, basis, red, green, blue)
-                step_harmonics(i, trained, flat_coefficients, sh_step)
-            splats[lanes] = i
+                step_harmonics(i, trained, flat_coefficients, steps[4])
+            places[lanes] = place
             lanes += 1
         if lanes < WIDTH and s + 1 < end:
             continue
@@ -371,7 +395,7 @@ def project_backward(
             pose, lens, camera_position, degree, min_scale, result,
         )  # fmt: skip
         for lane in range(lanes):
-            i = splats[lane]
+            i = places[lane]
             for k in range(3):
                 by_means[i, k] = result[MEAN + k, lane]
                 by_log_scales[i, k] = result[LOG_SCALE + k, lane]
@@ -379,3 +403,8 @@ def project_backward(
                 by_quats[i, k] = result[QUAT + k, lane]
             by_logits[i] = result[LOGIT, lane]
         lanes = 0
+    if steps is not None:
+        step_range(begin, end, index, 3, by_means.reshape(-1), steps[0])
+        step_range(begin, end, index, 4, by_quats.reshape(-1), steps[1])
+        step_range(begin, end, index, 3, by_log_scales.reshape(-1), steps[2])
+        step_range(begin, end, index, 1, by_logits, steps[3])
