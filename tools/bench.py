@@ -35,8 +35,7 @@ from training.rasterize import (
     render,
     resolve_backend,
 )
-from training.rasterize.cpu import adam, frame, host_model
-from training.rasterize.cpu.bin import LOG2_ALPHA_MIN
+from training.rasterize.cpu import frame, host_model
 from training.rasterize.cpu.blend import CAP, SPAN, T_MIN
 from training.rasterize.cpu.compile import (
     FAST,
@@ -49,7 +48,7 @@ from training.rasterize.cpu.compile import (
 )
 from training.rasterize.cpu.fastmath import exp2
 from training.rasterize.cpu.lanes import WIDTH
-from training.rasterize.cpu.project import strip_rows
+from training.rasterize.cpu.project import LOG2_ALPHA_MIN32, strip_rows
 from training.scenes.cameras import Camera
 from training.splats.morton import spatial_order
 
@@ -70,10 +69,9 @@ KERNELS = {
 FUNCTIONS = {
     "bin": (frame, "bin_splats"),
     "loss": (host_model, "loss_and_gradient"),
-    "adam": (adam, "update"),
 }
-"""Functions of further stages. The kernel "project_backward" also makes the Adam step of harmonics."""
-STAGES = ("project", "bin", "blend", "loss", "blend_backward", "project_backward", "adam")
+"""Functions of further stages. The kernel "project_backward" also makes the Adam step."""
+STAGES = ("project", "bin", "blend", "loss", "blend_backward", "project_backward")
 
 
 def synthetic_splats(count: int, seed: int = 0) -> Gaussians:
@@ -209,7 +207,7 @@ def count_work(begin, end, projected, splat, tile_start, tiles_x, walked, height
                     dx, dy = f32(j) + x_left - row[0], f32(r) + y_top - row[1]
                     log2_alpha = row[5] - row[2] * dx * dx - row[3] * dx * dy - row[4] * dy * dy
                     alpha = min(exp2(log2_alpha), CAP)
-                    if log2_alpha >= LOG2_ALPHA_MIN and t[r, j] > 0:
+                    if log2_alpha >= LOG2_ALPHA_MIN32 and t[r, j] > 0:
                         remaining = t[r, j] * (f32(1) - alpha)
                         blends[tile] += remaining > T_MIN
                         t[r, j] = remaining if remaining > T_MIN else -t[r, j]

@@ -51,7 +51,9 @@ def test_tiles_list_all_touching_splats_once_front_to_back():
         unit * xx / 2,
     )
     projected[:, LOG2_OPACITY] = np.log2(opacity)
-    projected[:, 9], projected[:, 10] = reach * np.sqrt(xx), reach * np.sqrt(yy)
+    projected[:, HALF_WIDTH], projected[:, HALF_HEIGHT] = reach * np.sqrt(xx), reach * np.sqrt(yy)
+    projected[:, SLOPE], projected[:, RISE] = xy / xx, reach * np.sqrt((xx * yy - xy**2) / xx)
+    projected[:, X_OF_TOP] = xy / yy * projected[:, HALF_HEIGHT]
     depth = random.uniform(1, 9, count).astype(np.float32)
     radii = np.ones(count, np.float32)
     radii[::9] = 0
@@ -76,7 +78,7 @@ def test_tiles_list_all_touching_splats_once_front_to_back():
         assert (np.diff(depth[splats]) >= 0).all()
     assert listed.max() == 1
     assert (listed[expected] == 1).all()
-    # the test is exact for the rectangle, so additional splats lie between pixel centres
+    # additional splats lie between pixel centres
     assert listed.sum() <= 1.15 * expected.sum()
     assert (listed.sum(1) == pairs.count).all()
     for i in np.flatnonzero(pairs.count):

@@ -7,30 +7,29 @@ not depend on the number of threads.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from ..rendering import ALPHA_MIN
-from .compile import STRICT, Buffers, f32, inlined, kernel, run_parallel, run_serial
+from .compile import FAST, STRICT, Buffers, f32, inlined, kernel, run_parallel, run_serial
 from .fastmath import prefetch
 from .project import (
-    CONIC_XX,
-    CONIC_XY,
-    CONIC_YY,
+    GRAIN,
     HALF_HEIGHT,
     HALF_WIDTH,
-    LOG2_OPACITY,
+    MARGIN,
     MEAN_X,
     MEAN_Y,
     PREFETCH,
+    RISE,
+    SLOPE,
+    X_OF_TOP,
+    strip_bounds,
 )
 
 TILE = 16
 CHUNKS = 32
-LOG2_ALPHA_MIN = f32(math.log2(ALPHA_MIN))
-HALF, TWO, SPAN = f32(0.5), f32(2), f32(TILE - 1)
+HALF, SPAN = f32(0.5), f32(TILE - 1)
 
 
 @dataclass
@@ -84,63 +83,72 @@ def tile_range(middle, reach, tiles):
     return max(0, min(low, tiles)), max(0, min(high, tiles))
 
 
-@inlined(STRICT)
-def touches(row, tile_x, tile_y):
-    """Test if the ellipse alpha = ALPHA_MIN intersects the rectangle of a tile's pixel centres.
-
-    The quadratic form is convex. If the mean is outside the rectangle, the minimum is on an edge that faces
-    it.
-    """
-    left, top = f32(tile_x * TILE) + HALF - row[MEAN_X], f32(tile_y * TILE) + HALF - row[MEAN_Y]
-    right, bottom = left + SPAN, top + SPAN
-    outside_x, outside_y = left > 0 or right < 0, top > 0 or bottom < 0
-    if not outside_x and not outside_y:
-        return True
-    a, b, c = row[CONIC_XX], row[CONIC_XY], row[CONIC_YY]
-    minimum = f32(np.inf)
-    if outside_x:
-        dx = left if left > 0 else right
-        dy = min(max(-b * dx / (TWO * c), top), bottom)
-        minimum = (a * dx + b * dy) * dx + c * dy * dy
-    if outside_y:
-        dy = top if top > 0 else bottom
-        dx = min(max(-b * dy / (TWO * a), left), right)
-        minimum = min(minimum, (a * dx + b * dy) * dx + c * dy * dy)
-    return minimum <= row[LOG2_OPACITY] - LOG2_ALPHA_MIN
-
-
 @kernel(STRICT)
-def box_sizes(begin, end, projected, order, tiles_x, tiles_y, sizes):
-    """Count the tiles in the bounding box of each splat, in depth order."""
+def box_sizes(begin, end, projected, drawn, tiles_x, tiles_y, sizes):
+    """Count the tiles in the bounding box of each splat."""
     for k in range(begin, end):
-        prefetch(projected, order[min(k + PREFETCH, order.shape[0] - 1)], 0)
-        row = projected[order[k]]
+        row = projected[drawn[k]]
         x0, x1 = tile_range(row[MEAN_X], row[HALF_WIDTH], tiles_x)
         y0, y1 = tile_range(row[MEAN_Y], row[HALF_HEIGHT], tiles_y)
         sizes[k] = (x1 - x0) * (y1 - y0)
 
 
+@kernel(FAST)
+def find_tiles(begin, end, projected, drawn, box_start, tiles_x, tiles_y, first, count, hits):
+    """List the tiles whose rectangle of pixel centres intersects the ellipse of each splat.
+
+    An ellipse covers an interval of x in each row of tiles. ``strip_bounds`` is defined for columns of tiles,
+    so x and y are exchanged.
+    """
+    limit = f32((tiles_x + 1) * TILE)  # bounds beyond the last tile stay there
+    for k in range(begin, end):
+        row = projected[drawn[k]]
+        x0, x1 = tile_range(row[MEAN_X], row[HALF_WIDTH], tiles_x)
+        y0, y1 = tile_range(row[MEAN_Y], row[HALF_HEIGHT], tiles_y)
+        first[drawn[k]] = box_start[k]
+        if box_start[k + 1] - box_start[k] == 1:  # most small splats
+            hits[box_start[k]] = y0 * tiles_x + x0
+            count[drawn[k]] = 1
+            continue
+        half_width, half_height = row[HALF_WIDTH], max(row[HALF_HEIGHT], MARGIN)
+        slope = row[X_OF_TOP] / half_height
+        rise = row[RISE] * half_width / half_height
+        y_of_right = row[SLOPE] * half_width
+        place = box_start[k]
+        for tile_y in range(y0, y1):
+            low, high = strip_bounds(
+                row[MEAN_Y], row[MEAN_X], half_height, slope, rise, y_of_right,
+                f32(tile_y * TILE) + HALF, SPAN, HALF, limit, f32(0),
+            )  # fmt: skip
+            # pixel columns of the interval: low - 1 to high - 1
+            begin_x, end_x = int(np.ceil(low / f32(TILE))) - 1, int(np.floor((high + SPAN) / f32(TILE)))
+            for tile_x in range(max(x0, begin_x), min(x1, end_x)):
+                hits[place] = tile_y * tiles_x + tile_x
+                place += 1
+        count[drawn[k]] = place - box_start[k]
+
+
+@inlined(STRICT)
+def prefetch_hits(order, k, first, count, hits):
+    """Prefetch the tiles of splats behind ``order[k]``."""
+    last = order.shape[0] - 1
+    ahead = order[min(k + 2 * PREFETCH, last)]
+    prefetch(first, ahead, 0)
+    prefetch(count, ahead, 0)
+    prefetch(hits, first[order[min(k + PREFETCH, last)]], 0)
+
+
 @kernel(STRICT)
-def find_tiles(begin, end, projected, order, box_start, tiles_x, tiles_y, first, count, hits, histogram):
-    """List the tiles that each splat touches, and count them by chunk."""
+def count_pairs(begin, end, order, first, count, hits, histogram):
+    """Count the pairs of each chunk of the depth order by tile."""
     total = order.shape[0]
     for chunk in range(begin, end):
         tally = histogram[chunk]
         for k in range(total * chunk // CHUNKS, total * (chunk + 1) // CHUNKS):
-            prefetch(projected, order[min(k + PREFETCH, total - 1)], 0)
-            row = projected[order[k]]
-            x0, x1 = tile_range(row[MEAN_X], row[HALF_WIDTH], tiles_x)
-            y0, y1 = tile_range(row[MEAN_Y], row[HALF_HEIGHT], tiles_y)
-            end = box_start[k]
-            for tile_y in range(y0, y1):
-                for tile_x in range(x0, x1):
-                    if touches(row, tile_x, tile_y):
-                        tile = tile_y * tiles_x + tile_x
-                        hits[end] = tile
-                        tally[tile] += 1
-                        end += 1
-            first[order[k]] = box_start[k]
-            count[order[k]] = end - box_start[k]
+            prefetch_hits(order, k, first, count, hits)
+            i = order[k]
+            for hit in range(first[i], first[i] + count[i]):
+                tally[hits[hit]] += 1
 
 
 @kernel(STRICT)
@@ -163,6 +171,7 @@ def place_pairs(begin, end, order, first, count, hits, histogram, splat):
     for chunk in range(begin, end):
         place = histogram[chunk]
         for k in range(total * chunk // CHUNKS, total * (chunk + 1) // CHUNKS):
+            prefetch_hits(order, k, first, count, hits)
             i = order[k]
             for hit in range(first[i], first[i] + count[i]):
                 tile = hits[hit]
@@ -179,22 +188,22 @@ def bin_splats(
     ``drawn`` and ``depths`` are overwritten. The result uses memory of ``buffers``.
     """
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
-    order = np.empty_like(drawn)
-    keys = depths.view(np.uint32)
-    run_serial(sort_by_depth, keys, drawn, np.empty_like(keys), order)
-
-    box_start = np.zeros(len(order) + 1, np.int64)
-    run_parallel(box_sizes, len(order), 4096, projected, order, tiles_x, tiles_y, box_start[1:])
+    box_start = np.zeros(len(drawn) + 1, np.int64)
+    run_parallel(box_sizes, len(drawn), GRAIN, projected, drawn, tiles_x, tiles_y, box_start[1:])
     np.cumsum(box_start, out=box_start)
     first = buffers.take("first", np.int64, len(projected))
     count = buffers.take("count", np.int32, len(projected))
     count[:] = 0
     hits = buffers.take("hits", np.int32, int(box_start[-1]))
-    histogram = np.zeros((CHUNKS, tiles_x * tiles_y), np.int32)
     run_parallel(
-        find_tiles, CHUNKS, 1,
-        projected, order, box_start, tiles_x, tiles_y, first, count, hits, histogram,
-    )  # fmt: skip
+        find_tiles, len(drawn), GRAIN, projected, drawn, box_start, tiles_x, tiles_y, first, count, hits
+    )
+
+    order = np.empty_like(drawn)
+    keys = depths.view(np.uint32)
+    run_serial(sort_by_depth, keys, drawn, np.empty_like(keys), order)
+    histogram = np.zeros((CHUNKS, tiles_x * tiles_y), np.int32)
+    run_parallel(count_pairs, CHUNKS, 1, order, first, count, hits, histogram)
     tile_start = np.zeros(tiles_x * tiles_y + 1, np.int64)
     run_serial(pair_starts, histogram, tile_start)
     splat = buffers.take("splat", np.int32, int(tile_start[-1]))

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..rendering import ALPHA_MAX, TRANSMITTANCE_MIN
-from .bin import LOG2_ALPHA_MIN, TILE
+from .bin import TILE
 from .compile import FAST, f32, inlined, kernel
 from .fastmath import any_positive, exp2, exp2_lanes, prefetch, read_lanes, write_lanes
 from .lanes import (
@@ -41,7 +41,9 @@ from .project import (
     G_DX,
     GREEN,
     HALF_WIDTH,
+    LOG2_ALPHA_MIN32,
     LOG2_OPACITY,
+    MARGIN,
     MEAN_X,
     MEAN_Y,
     PREFETCH,
@@ -102,7 +104,7 @@ def find_rows(projected, splat, begin, end, left, top, rows, spare, reached):
         for part in range(PARTS):
             bounds = strip_bounds(
                 mean_x, mean_y, half_width, slope, rise, x_of_top,
-                left + f32(WIDTH * part), f32(WIDTH - 1), top, rows,
+                left + f32(WIDTH * part), f32(WIDTH - 1), top, rows, MARGIN,
             )  # fmt: skip
             store(spare[0], 0, bounds[0])
             store(spare[1], 0, bounds[1])
@@ -116,7 +118,7 @@ def find_rows(projected, splat, begin, end, left, top, rows, spare, reached):
 def alpha_of(log2_alpha):
     """Compute alpha with its upper and lower limits."""
     alpha = min(exp2(log2_alpha), CAP)
-    return alpha if log2_alpha >= LOG2_ALPHA_MIN else ZERO
+    return alpha if log2_alpha >= LOG2_ALPHA_MIN32 else ZERO
 
 
 @inlined(ORDERED)
@@ -130,7 +132,7 @@ def first_alphas(constant, slope, yy, dy):
     line = slope + yy * dy
     log2_alpha = constant - line * dy
     log2_ratio = ZERO - line - yy * (dy + ONE)
-    invisible = (log2_alpha < FAINTEST) | ((log2_alpha < LOG2_ALPHA_MIN) & (log2_ratio < ZERO))
+    invisible = (log2_alpha < FAINTEST) | ((log2_alpha < LOG2_ALPHA_MIN32) & (log2_ratio < ZERO))
     return (
         exp2_lanes(select(invisible, INVISIBLE, log2_alpha)),
         exp2_lanes(select(invisible, ZERO, log2_ratio)),

@@ -81,14 +81,16 @@ def clamp(value, low, high):
 
 
 @inlined(FAST)
-def strip_bounds(mean_x, mean_y, half_width, slope, rise, x_of_top, left, across, top, rows):
-    """Return the ends of the rows that an ellipse reaches in a strip; see :func:`strip_rows`.
+def strip_bounds(mean_x, mean_y, half_width, slope, rise, x_of_top, left, across, top, rows, margin):
+    """Return the ends of the rows that an ellipse, enlarged by ``margin``, reaches in a strip.
+
+    See :func:`strip_rows`.
 
     Takes the columns of a projected splat as numbers, or those of several splats as lanes. The ellipse is
     convex, so its maximum dy in the strip is at the dx closest to X_OF_TOP, and its minimum at the dx closest
     to −X_OF_TOP.
     """
-    half_width = half_width + MARGIN
+    half_width = half_width + margin
     near = left - mean_x
     far = near + across
     per_width = ONE / half_width
@@ -99,8 +101,8 @@ def strip_bounds(mean_x, mean_y, half_width, slope, rise, x_of_top, left, across
     dy_low = slope * lowest - rise * root(larger(ONE - low * low, ZERO))
     middle = mean_y - top + ONE
     # clamp before conversion to int: mean and size may be millions of pixels
-    first = smaller(larger(middle + dy_low - MARGIN, ZERO), f32(rows))
-    last = smaller(larger(middle + dy_high + MARGIN, ZERO), f32(rows))
+    first = smaller(larger(middle + dy_low - margin, ZERO), f32(rows))
+    last = smaller(larger(middle + dy_high + margin, ZERO), f32(rows))
     outside = (near > half_width) | (far + half_width < ZERO)
     return select(outside, ZERO, first), select(outside, ZERO, last)
 
@@ -123,6 +125,7 @@ def strip_rows(row, left, across, top, rows):
         across,
         top,
         rows,
+        MARGIN,
     )
     first, last = int(bounds[0]), int(bounds[1])
     return first, max(first, last)
