@@ -28,6 +28,7 @@ from training.lod.rules.bands import RULE as BANDS
 from training.rasterize import (
     Adam,
     Gaussians,
+    StepOptions,
     Target,
     make_step_model,
     photometric_loss,
@@ -111,8 +112,8 @@ class Step:
 
     def __call__(self) -> None:
         if model := make_step_model(self.backend, self.adam, {}):
-            options = {"near": 0.01, "sh_degree": 3, "background": (0.0, 0.0, 0.0), "ssim_weight": 0.2}
-            model.step(self.camera, self.target, **options)()
+            options = StepOptions(near=0.01, sh_degree=3, background=(0.0, 0.0, 0.0))
+            model.step(self.camera, self.target, options)()
             return
         self.adam.zero_grad()
         rendering = rasterize(self.splats, self.camera)

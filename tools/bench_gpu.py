@@ -48,6 +48,7 @@ from training.errors import LodgsError  # noqa: E402
 from training.rasterize import (  # noqa: E402
     Adam,
     Gaussians,
+    StepOptions,
     Target,
     cuda,
     make_step_model,
@@ -143,8 +144,8 @@ class Case:
         assert model is not None
         if isinstance(model, GpuModel) and not recorded:
             model._capacity = None
-        options = {"near": 0.01, "sh_degree": 3, "background": (0.0, 0.0, 0.0), "ssim_weight": 0.2}
-        return lambda: model.step(self.camera, self.target, shrink=1, **options)
+        options = StepOptions(near=0.01, sh_degree=3, background=(0.0, 0.0, 0.0), shrink=1)
+        return lambda: model.step(self.camera, self.target, options)
 
 
 def transferred_bytes(device: Device, step: Callable[[], object]) -> int:

@@ -12,7 +12,15 @@ import numpy as np
 import torch
 
 from ..errors import LodgsError
-from ..rasterize import Gaussians, Rendering, Target, photometric_loss, rasterize, tensor_device
+from ..rasterize import (
+    Gaussians,
+    Rendering,
+    StepOptions,
+    Target,
+    photometric_loss,
+    rasterize,
+    tensor_device,
+)
 from ..scenes.cameras import Camera
 from ..splats.gaussians import Splats
 from ..splats.levels import Level
@@ -399,13 +407,15 @@ class Method(ABC, Generic[P, D]):
         loss = model.step(
             view.camera,
             target,
-            near=self.data.near,
-            sh_degree=self.sh_degree(step),
-            background=self.background(step),
-            ssim_weight=p.ssim_weight,
-            weights=weights,
-            min_scale=min_scale,
-            shrink=view.shrink if self.collects_stats(view, step) else None,
-            drawn_only=self.trains_drawn_only(step),
+            StepOptions(
+                near=self.data.near,
+                sh_degree=self.sh_degree(step),
+                background=self.background(step),
+                ssim_weight=p.ssim_weight,
+                weights=weights,
+                min_scale=min_scale,
+                shrink=view.shrink if self.collects_stats(view, step) else None,
+                drawn_only=self.trains_drawn_only(step),
+            ),
         )
         return StepResult(loss, lambda: self.background.remove(*model.last_image(), step), target)

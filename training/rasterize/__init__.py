@@ -32,13 +32,14 @@ from .rendering import (
     KernelCamera,
     RasterSettings,
     Rendering,
+    StepOptions,
     Target,
 )
 
 __all__ = [
     "BACKENDS", "OUTPUTS", "Adam", "Contributions", "DeviceModel", "Gaussians", "Rendering", "StepModel",
-    "Target", "contributions", "cpu_fallback_reason", "make_step_model", "photometric_loss", "rasterize",
-    "rasterize_strips", "render", "resolve_backend", "tensor_device", "warm_up",
+    "StepOptions", "Target", "contributions", "cpu_fallback_reason", "make_step_model", "photometric_loss",
+    "rasterize", "rasterize_strips", "render", "resolve_backend", "tensor_device", "warm_up",
 ]  # fmt: skip
 
 BACKENDS = ("cpu", "cuda", "gpu", "reference")
@@ -283,20 +284,7 @@ def photometric_loss(
 class StepModel(Protocol):
     """Splats that a backend trains without autograd."""
 
-    def step(
-        self,
-        camera: Camera,
-        target: Target,
-        *,
-        near: float,
-        sh_degree: int,
-        background: tuple[float, float, float],
-        ssim_weight: float,
-        weights: torch.Tensor | None = None,
-        min_scale: float = 0.0,
-        shrink: float | None = None,
-        drawn_only: bool = False,
-    ) -> Callable[[], float]:
+    def step(self, camera: Camera, target: Target, options: StepOptions) -> Callable[[], float]:
         """Make one Adam step with :func:`photometric_loss` of one image.
 
         Return a function that returns the loss. It waits for the device, so call it rarely. A
@@ -304,11 +292,6 @@ class StepModel(Protocol):
 
         Args:
             target: photo; a :class:`DeviceModel` requires an opaque one without a mask.
-            shrink: factor by which the photo was downscaled; used to scale the density statistics. None
-                collects no statistics.
-            drawn_only: splats of weight 0 keep their values and moments, instead of a step with zero
-                gradients.
-            camera, near, sh_degree, background, weights, min_scale: see :func:`rasterize`.
 
         Raises:
             LodgsError: the device was lost or has too little memory. The splats are lost with it.
@@ -460,7 +443,7 @@ def _step(backend: str) -> None:
     target = Target(torch.zeros(16, 16, 3))
     adam = Adam(vars(gaussians), dict.fromkeys(vars(gaussians), 0.0))
     if model := make_step_model(backend, adam, {}):  # needs no kernels of the CPU
-        model.step(camera, target, near=0.01, sh_degree=0, background=(0.0, 0.0, 0.0), ssim_weight=0.2)()
+        model.step(camera, target, StepOptions(0.01, 0, (0.0, 0.0, 0.0)))()
         return
     photometric_loss(rasterize(gaussians, camera, backend=backend).image, target, backend=backend).backward()
     adam.step()

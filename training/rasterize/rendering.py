@@ -99,6 +99,28 @@ class RasterSettings:
         return mask if weights is None else weights * mask
 
 
+@dataclass(frozen=True)
+class StepOptions:
+    """Arguments of a training step; see :class:`training.rasterize.StepModel`.
+
+    Attributes:
+        near, sh_degree, background, weights, min_scale: see :func:`training.rasterize.rasterize`.
+        ssim_weight: see :func:`training.rasterize.photometric_loss`.
+        shrink: factor by which the photo was downscaled; used to scale the density statistics. None collects
+            no statistics.
+        drawn_only: splats of weight 0 keep their values and moments, instead of a step with zero gradients.
+    """
+
+    near: float
+    sh_degree: int
+    background: tuple[float, float, float]
+    ssim_weight: float = 0.2
+    weights: torch.Tensor | None = None
+    min_scale: float = 0.0
+    shrink: float | None = None
+    drawn_only: bool = False
+
+
 @dataclass
 class Rendering:
     """Rendered image with its auxiliary outputs.

@@ -18,6 +18,7 @@ from ..scenes.cameras import Camera
 from . import (
     Adam,
     Gaussians,
+    StepOptions,
     Target,
     cuda,
     make_step_model,
@@ -122,8 +123,8 @@ def step_seconds(backend: str, seconds: float = SECONDS) -> float:
         """Make a batch of steps; return the seconds of one."""
         begin = time.perf_counter()
         if model is not None:
-            options = {"near": 0.01, "sh_degree": 3, "background": (0.0, 0.0, 0.0), "ssim_weight": 0.2}
-            [model.step(camera, target, **options) for _ in range(STEPS)][-1]()
+            options = StepOptions(near=0.01, sh_degree=3, background=(0.0, 0.0, 0.0))
+            [model.step(camera, target, options) for _ in range(STEPS)][-1]()
             return (time.perf_counter() - begin) / STEPS
         rendering = rasterize(Gaussians(**leaves), camera, backend=backend)
         photometric_loss(rendering.image, target, backend=backend).backward()

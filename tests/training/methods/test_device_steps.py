@@ -13,7 +13,7 @@ from training.optimize.initialize import from_points
 from training.optimize.method import require_finite
 from training.optimize.model import Model
 from training.optimize.parameters import override
-from training.rasterize import DeviceModel, Target
+from training.rasterize import DeviceModel, StepOptions, Target
 from training.scenes.cameras import Camera
 
 COMMON = {"margin": 0.0, "grad_threshold": 1e-6, "max_splats": 90}
@@ -84,9 +84,7 @@ def trained(count: int) -> Model:
     assert device_model is not None
     target = Target(rng.integers(0, 256, (50, 75, 3)) / np.float32(255))
     for _ in range(2):
-        device_model.step(
-            camera, target, near=0.2, sh_degree=3, background=(0, 0, 0), ssim_weight=0.2, shrink=1
-        )
+        device_model.step(camera, target, StepOptions(0.2, 3, (0.0, 0.0, 0.0), shrink=1))
     return model
 
 

@@ -10,6 +10,7 @@ import torch
 from training.rasterize import (
     Adam,
     Gaussians,
+    StepOptions,
     Target,
     make_step_model,
     photometric_loss,
@@ -97,8 +98,8 @@ def test_steps_use_the_current_camera_of_a_photo(graphics, make_splats, odd_came
     for camera, options in changes:
         used, fresh = (make_step_model("gpu", adam_of(make_splats(50)), {}) for _ in range(2))
         assert used is not None and fresh is not None
-        used.step(camera, photo, ssim_weight=0.2, **VIEW | options)
-        fresh.step(camera, Target(photo.image), ssim_weight=0.2, **VIEW | options)
+        used.step(camera, photo, StepOptions(**VIEW | options))
+        fresh.step(camera, Target(photo.image), StepOptions(**VIEW | options))
         images.append(used.last_image()[0])
         assert torch.equal(images[-1], fresh.last_image()[0])
     assert all(not torch.equal(*pair) for pair in itertools.pairwise(images))
@@ -115,7 +116,7 @@ def test_steps_match_torch(graphics, make_splats, odd_camera, photo, backend):
     model = make_step_model("gpu", device_adam, device_stats, antialias=True)
     assert model is not None
     for step_weights in (weights, None, weights):
-        loss = model.step(odd_camera, photo, ssim_weight=0.2, weights=step_weights, shrink=2, **VIEW)()
+        loss = model.step(odd_camera, photo, StepOptions(weights=step_weights, shrink=2, **VIEW))()
         expected = torch_step(torch_adam, stats, odd_camera, photo, step_weights, backend)
         assert loss == pytest.approx(expected, rel=1e-4)
     torch.testing.assert_close(model.read("means"), torch_adam.tensors["means"].detach(), atol=2e-4, rtol=0)
@@ -148,8 +149,8 @@ def test_steps_in_place_equal_steps_through_torch(in_place, make_splats, odd_cam
             if fused:
                 model = make_step_model(in_place, adam, stats, antialias=True)
                 assert model is not None
-                options = {"ssim_weight": 0.2, "weights": step_weights, "shrink": 2, **VIEW}
-                losses.append(model.step(odd_camera, photo, **options)())
+                options = {"weights": step_weights, "shrink": 2, **VIEW}
+                losses.append(model.step(odd_camera, photo, StepOptions(**options))())
             else:
                 losses.append(torch_step(adam, stats, odd_camera, photo, step_weights, in_place))
         moments = [moment for state in adam.state.values() for moment in state]
@@ -167,12 +168,12 @@ def test_steps_can_leave_ignored_splats_unchanged(graphics, make_splats, odd_cam
         adam = adam_of(make_splats(50))
         model = make_step_model(backend, adam, zero_stats(50))
         assert model is not None
-        model.step(odd_camera, photo, ssim_weight=0.2, **VIEW)
+        model.step(odd_camera, photo, StepOptions(**VIEW))
         before = {
             name: model.read(name) if backend == "gpu" else adam.tensors[name].detach().clone()
             for name in RATES
         }
-        model.step(odd_camera, photo, ssim_weight=0.2, weights=weights, drawn_only=drawn_only, **VIEW)
+        model.step(odd_camera, photo, StepOptions(weights=weights, drawn_only=drawn_only, **VIEW))
         if backend == "gpu":
             model.copy_to_host()
         for name, values in before.items():
@@ -191,8 +192,7 @@ def test_small_bindings_do_not_change_training(graphics, make_splats, odd_camera
         assert model is not None
         weights = torch.linspace(0, 1, 1500)
         losses = [
-            model.step(odd_camera, photo, ssim_weight=0.2, weights=w, shrink=1, **VIEW)()
-            for w in (None, weights)
+            model.step(odd_camera, photo, StepOptions(weights=w, shrink=1, **VIEW))() for w in (None, weights)
         ]
         model.raise_log_scales(torch.linspace(-4, -2, 1500))
         quats = model.read("quats")
@@ -211,7 +211,7 @@ def test_unused_data_stays_unchanged(graphics, make_splats, odd_camera, photo):
     weights[:10] = 0
     model = make_step_model("gpu", adam, stats)
     assert model is not None
-    model.step(odd_camera, photo, ssim_weight=0.2, weights=weights, **VIEW)
+    model.step(odd_camera, photo, StepOptions(weights=weights, **VIEW))
     model.copy_to_host()
     assert all((values == 0).all() for values in stats.values())
     final = {name: tensor.detach() for name, tensor in adam.tensors.items()}
@@ -238,9 +238,9 @@ def test_steps_transfer_little_data(graphics, make_splats, odd_camera, photo):
     for count in (100, 4000):
         model = make_step_model("gpu", adam_of(make_splats(count)), zero_stats(count))
         assert model is not None
-        model.step(odd_camera, photo, ssim_weight=0.2, shrink=1, **VIEW)
+        model.step(odd_camera, photo, StepOptions(shrink=1, **VIEW))
         start = graphics.transferred
-        model.step(odd_camera, photo, ssim_weight=0.2, shrink=1, **VIEW)
+        model.step(odd_camera, photo, StepOptions(shrink=1, **VIEW))
         transferred.append(graphics.transferred - start)
     assert max(transferred) < 20_000
 
@@ -249,10 +249,10 @@ def test_steps_wait_for_the_device_once_in_many(graphics, make_splats, odd_camer
     """A step replays its recording; it creates nothing and reads nothing until its loss is read."""
     model = make_step_model("gpu", adam_of(make_splats(300)), zero_stats(300))
     assert model is not None
-    losses = [model.step(odd_camera, photo, ssim_weight=0.2, shrink=1, **VIEW)]
+    losses = [model.step(odd_camera, photo, StepOptions(shrink=1, **VIEW))]
     counts = graphics.counts.copy()
     losses += [
-        model.step(odd_camera, photo, ssim_weight=0.2, shrink=1, **VIEW) for _ in range(device_model.PENDING)
+        model.step(odd_camera, photo, StepOptions(shrink=1, **VIEW)) for _ in range(device_model.PENDING)
     ]
     difference = graphics.counts - counts
     assert difference["reads"] == 1 and not difference["buffers"] and not difference["bind_groups"]
@@ -277,7 +277,7 @@ def test_too_many_pairs_repeat_steps_with_the_same_bits(graphics, make_splats, o
             {"weights": w, "shrink": s, **VIEW, "background": (0.1 * k, 0.0, 0.0)}
             for k, (w, s) in enumerate([(None, 1), (weights, None), (weights, 2), (None, 1)])
         ]
-        losses = [model.step(odd_camera, photo, ssim_weight=0.2, **option) for option in options]
+        losses = [model.step(odd_camera, photo, StepOptions(**option)) for option in options]
         image, _ = model.last_image()
         if capacity is not None and first_capacity == capacity:
             assert capacity < model._capacity < 1 << 14
@@ -297,7 +297,7 @@ def test_recorded_steps_do_not_depend_on_dispatch_size(graphics, make_splats, od
         model = make_step_model("gpu", adam_of(make_splats(50)), {})
         assert model is not None
         for _ in range(2):
-            model.step(odd_camera, photo, ssim_weight=0.2, **VIEW)
+            model.step(odd_camera, photo, StepOptions(**VIEW))
         results.append(model.read("means"))
     assert torch.equal(*results)
 
@@ -308,7 +308,7 @@ def test_recorded_steps_need_no_private_functions(graphics, make_splats, odd_cam
     def trained() -> torch.Tensor:
         model = make_step_model("gpu", adam_of(make_splats(50)), {})
         assert model is not None
-        model.step(odd_camera, photo, ssim_weight=0.2, **VIEW)
+        model.step(odd_camera, photo, StepOptions(**VIEW))
         return model.read("means")
 
     assert recording._native_replay() is not None
@@ -322,8 +322,8 @@ def test_lost_losses_are_reported_later(graphics, make_splats, odd_camera, photo
     adam = adam_of(make_splats(50))
     model = make_step_model("gpu", adam, {})
     assert model is not None
-    model.step(odd_camera, photo, ssim_weight=float("nan"), **VIEW)
-    assert np.isnan(model.step(odd_camera, photo, ssim_weight=0.2, **VIEW)())
+    model.step(odd_camera, photo, StepOptions(ssim_weight=float("nan"), **VIEW))
+    assert np.isnan(model.step(odd_camera, photo, StepOptions(**VIEW))())
 
 
 def test_steps_do_not_depend_on_uniform_buffer_size(graphics, make_splats, odd_camera, photo, monkeypatch):
@@ -332,7 +332,7 @@ def test_steps_do_not_depend_on_uniform_buffer_size(graphics, make_splats, odd_c
         assert model is not None
         model._capacity = None  # steps are not recorded
         for _ in range(2):
-            model.step(odd_camera, photo, ssim_weight=0.2, shrink=1, **VIEW)
+            model.step(odd_camera, photo, StepOptions(shrink=1, **VIEW))
         return torch.cat([model.read(name).reshape(300, -1) for name in ("means", "sh", "gradient_sum")], 1)
 
     submit = graphics.submit

@@ -9,7 +9,7 @@ import torch
 
 from ...scenes.cameras import Camera
 from ..adam import Adam
-from ..rendering import KernelCamera, RasterSettings, Target
+from ..rendering import KernelCamera, RasterSettings, StepOptions, Target
 from ..stats import accumulate_stats
 from .adam import decay_rows, step_arguments
 from .compile import Buffers, serialised
@@ -43,44 +43,33 @@ class HostModel:
 
     @torch.no_grad()
     @serialised
-    def step(
-        self,
-        camera: Camera,
-        target: Target,
-        *,
-        near: float,
-        sh_degree: int,
-        background: tuple[float, float, float],
-        ssim_weight: float,
-        weights: torch.Tensor | None = None,
-        min_scale: float = 0.0,
-        shrink: float | None = None,
-        drawn_only: bool = False,
-    ) -> Callable[[], float]:
+    def step(self, camera: Camera, target: Target, options: StepOptions) -> Callable[[], float]:
         """Make one Adam step; return a function that returns the loss."""
         adam = self._adam
         arrays = {name: tensor.detach().numpy() for name, tensor in adam.tensors.items()}
         count = len(arrays["means"])
-        view = KernelCamera.of(camera, near)
-        settings = RasterSettings(view, float(min_scale), self._antialias, background, sh_degree)
-        factors = np.empty(0, np.float32) if weights is None else weights.numpy()
+        view = KernelCamera.of(camera, options.near)
+        settings = RasterSettings(
+            view, float(options.min_scale), self._antialias, options.background, options.sh_degree
+        )
+        factors = np.empty(0, np.float32) if options.weights is None else options.weights.numpy()
         splats = [*(arrays[name] for name in TENSORS), factors]
         radii, grad2d = torch.zeros(count), torch.zeros(count, 2)
         frame = HostFrame(splats, None, settings, radii.numpy())
         image = np.empty((3, view.height, view.width), np.float32)
-        frame.blend(frame.projected, np.array(background, np.float32), image)
-        loss, by_image = self._compare(image, target.over(background), ssim_weight)
+        frame.blend(frame.projected, np.array(options.background, np.float32), image)
+        loss, by_image = self._compare(image, target.over(options.background), options.ssim_weight)
 
         working = Buffers()
         pair_sums = working.take("pair_sums", np.float32, len(frame.pairs.splat), SUMS)
         no_alpha = np.zeros_like(frame.transmittance)
         frame.differentiate(frame.projected, image, by_image, no_alpha, pair_sums)
-        logits = None if shrink is None else adam.tensors["opacity_logits"].detach().clone()
+        logits = None if options.shrink is None else adam.tensors["opacity_logits"].detach().clone()
         steps = [step_arguments(arrays[name], *adam.state[name], *adam.count_step(name)) for name in TENSORS]
         frame.project_backward(pair_sums, None, grad2d.numpy(), steps)
-        if shrink is not None:
-            accumulate_stats(self._stats, grad2d, radii, logits, shrink)
-        if not drawn_only and len(frame.index) < count:
+        if options.shrink is not None:
+            accumulate_stats(self._stats, grad2d, radii, logits, options.shrink)
+        if not options.drawn_only and len(frame.index) < count:
             others = np.setdiff1d(np.arange(count), frame.index, assume_unique=True)
             for step in steps:
                 decay_rows(others, step)

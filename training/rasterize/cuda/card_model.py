@@ -10,7 +10,7 @@ import torch
 from ...scenes.cameras import Camera
 from ..adam import Adam
 from ..gaussians import Gaussians
-from ..rendering import KernelCamera, RasterSettings, Target
+from ..rendering import KernelCamera, RasterSettings, StepOptions, Target
 from ..stats import accumulate_stats
 from .frame import CardFrame, PhotometricLoss, upload_photo
 
@@ -32,30 +32,20 @@ class CardModel:
         self._antialias = antialias
 
     @torch.no_grad()
-    def step(
-        self,
-        camera: Camera,
-        target: Target,
-        *,
-        near: float,
-        sh_degree: int,
-        background: tuple[float, float, float],
-        ssim_weight: float,
-        weights: torch.Tensor | None = None,
-        min_scale: float = 0.0,
-        shrink: float | None = None,
-        drawn_only: bool = False,
-    ) -> Callable[[], float]:
+    def step(self, camera: Camera, target: Target, options: StepOptions) -> Callable[[], float]:
         """Make one Adam step; return a function that waits for the loss."""
         tensors = {name: self._adam.tensors[name].detach() for name in TENSORS}
-        view = KernelCamera.of(camera, near)
-        settings = RasterSettings(view, float(min_scale), self._antialias, background, sh_degree)
-        frame = CardFrame(Gaussians(**tensors), weights, settings)
-        image = frame.blend(frame.projected.colours, background)
-        target = target.over(background)
+        view = KernelCamera.of(camera, options.near)
+        settings = RasterSettings(
+            view, float(options.min_scale), self._antialias, options.background, options.sh_degree
+        )
+        frame = CardFrame(Gaussians(**tensors), options.weights, settings)
+        image = frame.blend(frame.projected.colours, options.background)
+        target = target.over(options.background)
         photo = upload_photo(target, image)
         mask = None if target.mask is None else target.mask.to(image)[..., None]
-        loss = PhotometricLoss(image if mask is None else photo + mask * (image - photo), photo, ssim_weight)
+        compared = image if mask is None else photo + mask * (image - photo)
+        loss = PhotometricLoss(compared, photo, options.ssim_weight)
         by_image = loss.gradient(image.new_ones(()))
         if mask is not None:
             by_image *= mask
@@ -63,12 +53,12 @@ class CardModel:
         by_colours = frame.differentiate(frame.projected.colours, image, by_image, None, sums)
         grad2d = image.new_zeros(len(tensors["means"]), 2)
         gradients = frame.project_backward(sums, by_colours, grad2d)
-        if shrink is not None:
+        if options.shrink is not None:
             radii = frame.projected.radii
-            accumulate_stats(self._stats, grad2d, radii, tensors["opacity_logits"], shrink)
+            accumulate_stats(self._stats, grad2d, radii, tensors["opacity_logits"], options.shrink)
         named = dict(zip(TENSORS, gradients, strict=True))
-        if drawn_only and weights is not None:
-            rows = torch.nonzero(weights).squeeze(1)
+        if options.drawn_only and options.weights is not None:
+            rows = torch.nonzero(options.weights).squeeze(1)
             self._adam.step_rows(rows, {name: gradient[rows] for name, gradient in named.items()})
         else:
             self._adam.step(named)

@@ -18,7 +18,7 @@ import torch
 
 from ...scenes.cameras import Camera
 from ..adam import Adam
-from ..rendering import KernelCamera, RasterSettings, Target
+from ..rendering import KernelCamera, RasterSettings, StepOptions, Target
 from .bin import group_count
 from .device import Buffer, Device
 from .loss import combine_loss, record_loss
@@ -116,40 +116,19 @@ class GpuModel:
     def __len__(self) -> int:
         return self._splats.shape[0]
 
-    def step(
-        self,
-        camera: Camera,
-        target: Target,
-        *,
-        near: float,
-        sh_degree: int,
-        background: tuple[float, float, float],
-        ssim_weight: float,
-        weights: torch.Tensor | None = None,
-        min_scale: float = 0.0,
-        shrink: float | None = None,
-        drawn_only: bool = False,
-    ) -> Callable[[], float]:
-        """Make one step with the photometric loss; return a function that reads the loss from the device.
-
-        Args:
-            target: opaque photo without a mask.
-            shrink: factor by which the photo was downscaled, for the statistics; None collects none.
-            drawn_only: splats of weight 0 keep their values and moments.
-            camera, near, sh_degree, background, weights, min_scale: see ``rasterize``.
-            ssim_weight: see ``photometric_loss``.
-
-        Raises:
-            LodgsError: the device was lost or has too little memory. The splats are lost with it.
-        """
-        view, lens = _view(target, camera, near, min_scale)
-        settings = RasterSettings(view, min_scale, self._antialias, background, sh_degree)
-        array = None if weights is None else weights.numpy().astype(np.float32)
+    def step(self, camera: Camera, target: Target, options: StepOptions) -> Callable[[], float]:
+        """Make one step; return a function that reads the loss from the device."""
+        view, lens = _view(target, camera, options.near, options.min_scale)
+        settings = RasterSettings(
+            view, options.min_scale, self._antialias, options.background, options.sh_degree
+        )
+        weights = None if options.weights is None else options.weights.numpy().astype(np.float32)
         with self.device.lock:
             if len(self._pending) == PENDING:
                 self._settle()
             photo = _upload_photo(self.device, target)
-            step = Step(settings, photo, lens, ssim_weight, array, self._next_numbers(shrink, drawn_only))
+            numbers = self._next_numbers(options.shrink, options.drawn_only)
+            step = Step(settings, photo, lens, options.ssim_weight, weights, numbers)
             self._start(step)
 
         def loss() -> float:
