@@ -315,12 +315,10 @@ def project_backward(
     besides positions and gradients. Rates of harmonics are those of one splat, all others those of GRAIN
     splats. Numba compiles a kernel for each case.
     """
-    if steps is None:
-        by_means, by_quats, by_log_scales, by_logits, by_sh, by_weights = gradients
-    else:
+    by_means, by_quats, by_log_scales, by_logits, by_sh, by_weights = gradients
+    if steps is not None:
         by_means, by_quats = np.empty((end - begin, 3), np.float32), np.empty((end - begin, 4), np.float32)
         by_log_scales, by_logits = np.empty((end - begin, 3), np.float32), np.empty(end - begin, np.float32)
-        by_weights = np.empty(0, np.float32)
     block = np.ones((PARAMETERS, WIDTH), np.float32)
     by = np.zeros((CONICS + 3, WIDTH), np.float32)
     result = np.empty((LOGIT + 1, WIDTH), np.float32)
