@@ -313,7 +313,7 @@ def test_random_points_are_visible_in_two_views(tmp_path):
     [
         (lambda d: d.update(frames=[]), "has no frames"),
         (lambda d: d.update(camera_model="EQUIRECTANGULAR"), "camera model EQUIRECTANGULAR"),
-        (lambda d: d.pop("fl_x"), "neither a focal length"),
+        (lambda d: [d.pop("fl_x"), d.pop("fl_y")], "neither a focal length"),
         (lambda d: [f.update(transform_matrix=[[1, 2], [3]]) for f in d["frames"]], "Nx4 finite numbers"),
         (lambda d: [f.update(transform_matrix=[[0, 0, 0, 0]] * 4) for f in d["frames"]], "not a rotation"),
         (lambda d: d.update(k4=0.3), "its k4"),

@@ -31,9 +31,10 @@ from .exported import (
 
 NAME = "nerfstudio (transforms.json)"
 _FILES = "transforms.json", "transforms_train.json", "transforms_val.json", "transforms_test.json"
+_FISHEYES = "OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"
 _SUPPORTED_MODELS = (
-    "", "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV_FISHEYE", "FULL_OPENCV",
-    "PERSPECTIVE",
+    "", "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV",
+    "PERSPECTIVE", *_FISHEYES,
 )  # fmt: skip
 _MATRICES = (
     "K", "intrinsics", "intrinsic", "intrinsic_matrix", "intrinsics_matrix", "camera_intrinsics",
@@ -41,6 +42,8 @@ _MATRICES = (
 )  # fmt: skip
 """Names of camera matrices that some exporters write instead of focal lengths."""
 _ALIASES = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy"}
+_FOCALS, _ANGLES = ("fl_x", "fl_y"), ("camera_angle_x", "camera_angle_y")
+"""Focal lengths in pixels and fields of view in radians along both axes; each may state both."""
 _PAIR = ("focal_length", "focal"), "principal_point"
 """Names of focal lengths in pixels, one or two, and of the centre that belongs to them."""
 _LENS = re.compile(r"focal|fov|field_of_view|intrinsic|principal|lens|^fl_|^f[xy]?$|^K$", re.I)
@@ -113,19 +116,20 @@ def read(path: Path) -> ExportedScene:
 def _frame_values(common: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
     """Return the values of a frame. Its own focal length or field of view replaces all common ones."""
     own = {name: value for name, value in own.items() if value is not None}
-    replaced = ("fl_x", "fl_y", "camera_angle_y") if "camera_angle_x" in own else ()
+    replaced = (*_FOCALS, *_ANGLES) if own.keys() & set(_ANGLES) else ()
     values = {
         name: value for name, value in common.items() if name not in replaced and value is not None
     } | own
-    if "fl_x" in own and "fl_y" not in own:  # with the common proportions of pixels
-        fx, fy = (get_number(common, name, 0) for name in ("fl_x", "fl_y"))
-        values["fl_y"] = get_number(own, "fl_x") * (fy / fx if fx and fy else 1)
+    for name, other in (_FOCALS, _FOCALS[::-1]):
+        if name in own and other not in own:  # with the common proportions of pixels
+            focal, other_focal = (get_number(common, key, 0) for key in (name, other))
+            values[other] = get_number(own, name) * (other_focal / focal if focal and other_focal else 1)
     return values
 
 
 def _unread_names(own: Mapping[str, Any]) -> list[str]:
     """Return names of a frame that describe a lens, if the frame has none under a known name."""
-    if {"fl_x", "camera_angle_x"} & own.keys():
+    if own.keys() & {*_FOCALS, *_ANGLES}:
         return []
     return [
         name for name, value in own.items() if _LENS.search(name) and not isinstance(value, str | bool | None)
@@ -149,13 +153,13 @@ def _parse_view(folder: Path, values: Mapping[str, Any], photos: PhotoFinder) ->
     width, height = get_number(values, "w", 0), get_number(values, "h", 0)
     if not (width > 0 and height > 0):
         width, height = image_size(image)
-    if fx := get_number(values, "fl_x", 0):  # 0 is unknown
-        fy = get_number(values, "fl_y", 0) or fx
-    elif "camera_angle_x" not in values:
+    focals = [get_number(values, name, 0) for name in _FOCALS]  # 0 is unknown
+    if not any(focals):
+        angles = zip(_ANGLES, (width, height), strict=True)
+        focals = [_focal_length(get_number(values, n), side) if n in values else 0.0 for n, side in angles]
+    if not any(focals):
         raise LodgsError("it has neither a focal length (fl_x) nor a field of view (camera_angle_x).")
-    else:
-        fx = _focal_length(get_number(values, "camera_angle_x"), width)
-        fy = _focal_length(get_number(values, "camera_angle_y"), height) if "camera_angle_y" in values else fx
+    fx, fy = focals[0] or focals[1], focals[1] or focals[0]
     center = get_number(values, "cx", width / 2), get_number(values, "cy", height / 2)
     if 0 < center[0] < 1 and 0 < center[1] < 1:  # normalised by the size
         sides = width, height
@@ -173,7 +177,7 @@ def _parse_view(folder: Path, values: Mapping[str, Any], photos: PhotoFinder) ->
     if model not in _SUPPORTED_MODELS:
         raise LodgsError(f"camera model {model} is not supported.")
     is_fisheye = str(values.get("is_fisheye", "")).lower() in ("true", "1", "1.0")
-    fisheye = model == "OPENCV_FISHEYE" or is_fisheye
+    fisheye = model in _FISHEYES or is_fisheye
     radial = tuple(get_number(values, f"k{n}", 0) for n in range(1, 7))
     if not fisheye and model != "FULL_OPENCV" and radial[3] and not any(radial[4:]):
         raise LodgsError("its k4 has no equivalent among COLMAP's lenses.")
