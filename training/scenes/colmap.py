@@ -243,7 +243,7 @@ def read_scene(
     if images is None:
         images = _find_images(folder, model, [pose.name for pose in poses], warnings)
     images = _absolute(images)
-    views = _view_collector(folder, images)
+    views = _view_collector(folder, images, [pose.name for pose in poses])
     views.add_all(poses, intrinsics, lambda share: progress and progress(0.5 * share))
     views.require_cameras(model, images)
     points, colors, ids = _read_model_points(model, views.cameras, warnings)
@@ -273,14 +273,14 @@ def read_scene(
     )
 
 
-def _view_collector(folder: Path, images: Path) -> ViewCollector:
-    """Return an empty collector for the photos, masks and depth maps of a scene."""
+def _view_collector(folder: Path, images: Path, names: Sequence[str]) -> ViewCollector:
+    """Return an empty collector for the named photos, masks and depth maps of a scene."""
     if not images.is_dir():
         what = f"Cannot read scene: image folder {images} {missing_clause(images)}."
         raise LodgsError(what, "Choose the folder of the photos.")
     base = folder if images == folder else images.parent
     return ViewCollector(
-        ImageFiles(images),
+        ImageFiles(images, names),
         SidecarFiles(_mask_folder(base), "mask", *MASK_SUFFIXES),
         SidecarFiles(base / DEPTHS, "depth", *DEPTH_SUFFIXES),
     )
@@ -486,7 +486,7 @@ def _find_images(folder: Path, model: Path, names: Sequence[str], warnings: list
     return moved or images
 
 
-def _require_complete_model(folder: Path) -> None:
+def require_complete_model(folder: Path) -> None:
     """Raise an error that names the missing file, if a folder has a part of a COLMAP model."""
     for root in (folder, folder / "sparse", folder / "sparse" / "0"):
         for suffix in (".bin", ".txt"):

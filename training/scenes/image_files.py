@@ -7,6 +7,7 @@ import unicodedata
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path, PurePosixPath, PureWindowsPath
+from urllib.parse import unquote
 
 from ..errors import LodgsError
 from ..files import is_file, raise_system_problem
@@ -28,50 +29,59 @@ class ImageFiles:
 
     Args:
         folder: folder of the photos. It and its files may be links to other folders.
+        names: names of all photos. One that is unique without its folder matches a photo in another folder.
 
     Attributes:
-        renamed: names that only match a file with another suffix or case, with that file.
+        renamed: names that only match a file with another folder, suffix or case, with that file.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, names: Iterable[str] = ()) -> None:
         self._folder = folder
+        self._base_names = Counter(map(_base_stem, names))
         self._by_normal_name: dict[str, Path] | None = None
         self._by_stem: dict[str, list[Path]] = {}
+        self._by_base_stem: dict[str, list[Path]] = {}
         self.renamed: dict[str, Path] = {}
 
     def find(self, name: str) -> Path | None:
         """Return the file with this name, or None.
 
-        Other Unicode forms (macOS) and backslashes (Windows) match, too. So does another case, else another
-        suffix, if only one file has it; see ``renamed``.
+        Other Unicode forms (macOS), backslashes (Windows) and escapes of URLs match, too. So does another
+        case, else another suffix, else another folder, if only one file has it; see ``renamed``.
 
         Raises:
             LodgsError: if the name is not UTF-8 or leaves the folder. ``what`` continues a sentence such as
                 "Skipped <name>:".
         """
         relative = relative_image_path(name)
-        file: Path | None = self._folder / name
         exists = is_file(self._folder / name)
-        if not exists or relative.suffix.lower() in UNREADABLE_SUFFIXES:
-            original = file if exists else None
-            if self._by_normal_name is None:
-                self._by_normal_name = {
-                    _normalized(path.relative_to(self._folder).as_posix()): path
-                    for path in walk_files(self._folder, onerror=raise_system_problem)
-                }
-                for other, path in self._by_normal_name.items():
-                    if other.lower().endswith((*IMAGE_SUFFIXES, ".exr")):
-                        self._by_stem.setdefault(_stem(other), []).append(path)
-            file = None if exists else self._by_normal_name.get(_normalized(str(relative)))
-            if file is None:
-                similar = self._by_stem.get(_stem(str(relative)), [])
-                same_suffix = [
-                    path for path in similar if path.suffix.lower() == relative.suffix.lower()
-                ] or similar
-                if len(same_suffix) == 1:
-                    file = self.renamed[name] = same_suffix[0]
-            file = file or original
-        return file
+        if exists and relative.suffix.lower() not in UNREADABLE_SUFFIXES:
+            return self._folder / name
+        if self._by_normal_name is None:
+            self._by_normal_name = self._index()
+        if not exists:
+            for spelling in (str(relative), str(relative_image_path(unquote(name)))):
+                if (file := self._by_normal_name.get(_normalized(spelling))) is not None:
+                    return file
+        matches = self._by_stem.get(_stem(str(relative)), [])
+        if not matches and self._base_names[_base_stem(name)] == 1:
+            matches = self._by_base_stem.get(_base_stem(name), [])
+        same_suffix = [path for path in matches if path.suffix.lower() == relative.suffix.lower()] or matches
+        if len(same_suffix) == 1:
+            self.renamed[name] = same_suffix[0]
+            return same_suffix[0]
+        return self._folder / name if exists else None
+
+    def _index(self) -> dict[str, Path]:
+        """Return the files by normalised name, and collect the images by stem."""
+        files = walk_files(self._folder, onerror=raise_system_problem)
+        by_name = {_normalized(path.relative_to(self._folder).as_posix()): path for path in files}
+        for name, path in by_name.items():
+            if _is_image(path):
+                self._by_stem.setdefault(_stem(name), []).append(path)
+                if not any(part.lower().startswith(NO_PHOTOS) for part in name.split("/")):
+                    self._by_base_stem.setdefault(_base_stem(name), []).append(path)
+        return by_name
 
 
 class SidecarFiles:
@@ -115,7 +125,7 @@ class SidecarFiles:
         Args:
             name: a photo, whose file name serves as an example.
         """
-        if not (self._exists and any(is_file(path) for path in self.folder.rglob("*"))):
+        if not (self._exists and any(not is_clutter(path.name) for path in walk_files(self.folder))):
             return ""
         file = name + self._suffixes[0]
         return f"No file in {self.folder} matches a photo: the file of {name} must be named {file}."
@@ -168,7 +178,8 @@ def _file_names(folder: Path) -> list[str]:
 def find_moved_images(folder: Path, names: Iterable[str]) -> Path | None:
     """Return the only folder below a scene that has most of the model's image names, or None.
 
-    Names match with any suffix and case.
+    Names match with any suffix and case. If each folder has other ones of the names, their common parent is
+    returned.
 
     Raises:
         LodgsError: several folders have the same number of names.
@@ -177,12 +188,16 @@ def find_moved_images(folder: Path, names: Iterable[str]) -> Path | None:
     for name in filter(_is_inside, names):
         *parents, stem = PurePosixPath(_stem(name)).parts
         parts_by_stem.setdefault(stem, []).append(tuple(parents))
-    counts: Counter[Path] = Counter()
+    matches: dict[Path, set[str]] = {}
     for path in filter(_is_image, walk_files(folder, NO_PHOTOS)):
         parents = _normalized(path.parent.as_posix()).casefold().split("/")
         for parts in parts_by_stem.get(_stem(path.name), []):
             if not parts or tuple(parents[-len(parts) :]) == parts:
-                counts[path.parents[len(parts)]] += 1
+                matches.setdefault(path.parents[len(parts)], set()).add("/".join((*parts, _stem(path.name))))
+    counts = {place: len(found) for place, found in matches.items()}
+    total = len(set().union(*matches.values()))
+    if len(matches) > 1 and sum(counts.values()) == total:
+        return Path(os.path.commonpath(matches))
     best = [place for place, count in counts.items() if count == max(counts.values())]
     if len(best) > 1:
         raise LodgsError(
@@ -215,6 +230,11 @@ def walk_files(
         yield from (Path(parent, name) for name in sorted(names))
 
 
+def is_clutter(name: str) -> bool:
+    """Return True for names of files that macOS and Windows add to folders."""
+    return name.startswith(".") or name.lower() in ("thumbs.db", "desktop.ini")
+
+
 def _is_image(path: Path) -> bool:
     return path.name.lower().endswith((*IMAGE_SUFFIXES, ".exr"))
 
@@ -226,6 +246,11 @@ def _stems(names: Iterable[str]) -> set[str]:
 def _stem(name: str) -> str:
     """Return a name for comparison without its suffix and without regard to case."""
     return _folded(os.path.splitext(str(PurePosixPath(name.replace("\\", "/"))))[0])
+
+
+def _base_stem(name: str) -> str:
+    """Return a name for comparison without its folder and suffix and without regard to case."""
+    return _stem(name).rpartition("/")[2]
 
 
 def _folded(name: str) -> str:

@@ -140,9 +140,10 @@ class ViewCollector:
                 )
         if renamed := self._files.renamed:
             name, file = next(iter(renamed.items()))
+            place = file.relative_to(folder).as_posix()
             messages.append(
-                f"Matched {len(renamed):,} photos with another suffix or case, such as {file.name} for "
-                f"{quote_name(name)}."
+                f"Matched {len(renamed):,} photos with another folder, suffix or case, such as "
+                f"{quote_name(place)} for {quote_name(name)}."
             )
         for attribute, sidecars in ("mask", self._masks), ("depth", self._depths):
             if all(getattr(camera, attribute) is None for camera in self.cameras):

@@ -55,6 +55,15 @@ def test_mismatched_names_give_a_warning(tmp_path, folder, suffix):
     assert str(tmp_path / folder) in warning and f"a.png.{suffix}" in warning
 
 
+@pytest.mark.parametrize("folder", ["masks", "depths"])
+def test_files_of_operating_systems_are_no_masks(tmp_path, folder):
+    synthetic.write_scene(tmp_path)
+    (tmp_path / folder).mkdir()
+    for name in ".DS_Store", "._a.jpg.png", "Thumbs.db", "desktop.ini":
+        (tmp_path / folder / name).write_bytes(b"x")
+    assert read_scene(tmp_path).warnings == []
+
+
 def test_masks_are_undistorted_like_their_photos(tmp_path):
     """A photo that equals its mask still does."""
     synthetic.write_scene(tmp_path, synthetic.camera("OPENCV"), pixels=halves())

@@ -28,7 +28,7 @@ def test_photos_with_another_suffix_or_case_match(scene):
         photo.rename(photo.with_name(photo.stem.upper() + ".PNG"))
     after = read_scene(scene)
     assert [camera.name for camera in after.cameras] == [camera.name for camera in before.cameras]
-    assert any("another suffix or case" in warning for warning in after.warnings)
+    assert any("another folder, suffix or case" in warning for warning in after.warnings)
 
 
 def test_model_with_photos_is_used_in_a_workspace(scene):
