@@ -183,7 +183,7 @@ def _parse_cameras_bin(data: mmap.mmap) -> _Cameras:
         try:
             cameras[camera_id] = intrinsics_of(lens, width, height, parameters)
         except ValueError as error:
-            flaws[camera_id] = error
+            flaws[camera_id] = ValueError(f"camera {camera_id}: {error}")
     return cameras, flaws
 
 
@@ -197,8 +197,10 @@ def _parse_cameras_txt(file: IO[bytes]) -> _Cameras:
                 raise UnknownLens(f"camera {number} has the unknown lens model {model_name[:40]}")
             size = _side(width), _side(height)
             cameras[number] = intrinsics_of(lens, *size, np.array(parameters, float))
-        except (ValueError, OverflowError) as error:
+        except UnknownLens as error:
             flaws[number] = error
+        except (ValueError, OverflowError) as error:
+            flaws[number] = ValueError(f"camera {number}: {error}")
     _check_count(len(cameras.keys() | flaws.keys()), file, "cameras")
     return cameras, flaws
 
@@ -207,7 +209,7 @@ def _side(text: str) -> int:
     """Return a side in pixels, which other programs may write with a decimal point."""
     number = float(text)
     if not number.is_integer():
-        raise ValueError(f"a camera has an invalid size, {text[:20]}")
+        raise ValueError(f"invalid size {text[:20]}")
     return int(number)
 
 
@@ -233,7 +235,7 @@ def _parse_images_txt(file: IO[bytes]) -> list[Pose]:
     for line, _ in _image_lines(file):
         # The name is the rest of the line: it may contain spaces.
         _, *pose, camera_id, name = line.split(maxsplit=9)
-        poses.append(_pose(name, int(camera_id), [float(number) for number in pose]))
+        poses.append(_pose(_unquoted(name), int(camera_id), [float(number) for number in pose]))
     _check_count(len(poses), file, "images")
     return poses
 
@@ -268,6 +270,11 @@ def _image_lines(file: IO[bytes]) -> Iterator[tuple[bytes, bytes]]:
         yield image, b""
 
 
+def _unquoted(name: bytes) -> bytes:
+    """Return a name without the quotes that some programs write around names with spaces."""
+    return name[1:-1] if len(name) > 2 and name[:1] == name[-1:] == b'"' else name
+
+
 def _is_points_line(line: bytes) -> bool:
     """Return True for numbers in groups of x, y and a point's id, which is an integer."""
     tokens = line.split()
@@ -291,7 +298,7 @@ def _parse_observations_bin(data: mmap.mmap, names: Collection[str]) -> dict[str
 def _parse_observations_txt(file: IO[bytes], names: Collection[str]) -> dict[str, np.ndarray]:
     point_ids = {}
     for line, points2d in _image_lines(file):
-        if (name := _decode_name(line.split(maxsplit=9)[9])) in names:
+        if (name := _decode_name(_unquoted(line.split(maxsplit=9)[9]))) in names:
             point_ids[name] = _valid_ids(np.array(points2d.split()[2::3], np.int64))
     return point_ids
 

@@ -150,7 +150,7 @@ def intrinsics_of(lens: Lens, width: int, height: int, parameters: np.ndarray) -
         raise ValueError(f"{lens.name} has {lens.parameters} parameters, not {len(parameters)}")
     valid_size = 1 <= width < _MAX_SIDE and 1 <= height < _MAX_SIDE
     if not valid_size or not np.isfinite(parameters).all() or (parameters[: lens.focals] <= 0).any():
-        raise ValueError("a camera has an invalid size, focal length or parameter")
+        raise ValueError("invalid size, focal length or parameter")
     return Intrinsics(lens, width, height, parameters)
 
 
