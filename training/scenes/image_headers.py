@@ -21,11 +21,13 @@ ORIENTATION = 274
 _BLOCK = 1 << 20
 _MAX_BLOCKS = 1 << 10
 """Blocks of a file that are searched for its end: a gigabyte."""
+_MAX_TAGS = 1 << 16
 _MAX_CHUNKS = 1 << 20
 """Chunks of a PNG or WebP file that are searched for EXIF data."""
 # JPEG markers with the size: all start-of-frame markers, which excludes DHT (C4), JPG (C8) and DAC (CC).
 _START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-_EXIF, _TIFF = b"Exif\0\0", (b"II*\0", b"MM\0*")
+_EXIF, _TIFF = b"Exif\0\0", (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+"""Start of EXIF data, and of TIFF and BigTIFF files."""
 _WIDTH, _HEIGHT = 256, 257
 _QUARTER_TURNS = {3: 2, 4: 2, 5: 1, 6: 1, 7: 3, 8: 3}
 """Clockwise quarter turns by EXIF orientation; mirroring is ignored."""
@@ -194,15 +196,19 @@ def _read_tiff_tags(file: IO[bytes], start: int = 0) -> dict[int, int]:
         start: position of the TIFF header, to which offsets refer.
     """
     file.seek(start)
-    order = "<" if file.read(4)[:2] == b"II" else ">"
-    (directory,) = struct.unpack(order + "I", file.read(4))
+    head = file.read(4)
+    order = "<" if head[:2] == b"II" else ">"
+    big = b"+" in head  # BigTIFF has 64-bit offsets and counts
+    (directory,) = struct.unpack(order + ("4xQ" if big else "I"), file.read(12 if big else 4))
     file.seek(start + directory)
-    (count,) = struct.unpack(order + "H", file.read(2))
+    (count,) = struct.unpack(order + ("Q" if big else "H"), file.read(8 if big else 2))
     tags = {}
-    for _ in range(count):
-        tag, kind, _, value = struct.unpack(order + "HHI4s", file.read(12))
-        if tag in (_WIDTH, _HEIGHT, ORIENTATION):  # values have 16 or 32 bits
-            tags[tag] = struct.unpack(order + ("H2x" if kind == 3 else "I"), value)[0]
+    for _ in range(min(count, _MAX_TAGS)):
+        tag, kind, value = struct.unpack(
+            order + ("HH8x8s" if big else "HH4x4s"), file.read(20 if big else 12)
+        )
+        if tag in (_WIDTH, _HEIGHT, ORIENTATION):  # values have 16, 32 or 64 bits
+            tags[tag] = struct.unpack_from(order + {3: "H", 16: "Q"}.get(kind, "I"), value)[0]
     return tags
 
 

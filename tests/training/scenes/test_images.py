@@ -11,7 +11,7 @@ from PIL import Image
 
 from training.errors import LodgsError
 from training.scenes.color import srgb_from_linear
-from training.scenes.image_headers import image_size
+from training.scenes.image_headers import exif_orientation, image_size
 from training.scenes.images import load_image
 
 
@@ -124,6 +124,17 @@ def test_orientation_is_not_applied(tmp_path, pixels, orientation, suffix):
     upright, rotated = (tmp_path / f"{name}.{suffix}" for name in ("upright", "rotated"))
     assert image_size(rotated) == (44, 30)
     np.testing.assert_array_equal(load_image(rotated, 44, 30), load_image(upright, 44, 30))
+
+
+@pytest.mark.parametrize("orientation", [1, 6])
+def test_big_tiff(tmp_path, pixels, orientation):
+    exif = Image.Exif()
+    exif[274] = orientation
+    Image.fromarray(pixels).save(tmp_path / "a.tif", big_tiff=True, exif=exif)
+    assert (tmp_path / "a.tif").read_bytes()[2] == 43, "BigTIFF"
+    assert image_size(tmp_path / "a.tif") == (44, 30)
+    assert exif_orientation(tmp_path / "a.tif") == orientation
+    np.testing.assert_array_equal(load_image(tmp_path / "a.tif", 44, 30), pixels / np.float32(255))
 
 
 def test_tiff_with_grey_floats(tmp_path, pixels):
