@@ -51,6 +51,8 @@ _BLOCK = 4096
 _F_DC = ["f_dc_0", "f_dc_1", "f_dc_2"]
 _CLOUDCOMPARE = re.compile(r"scalar_((?:f_dc|f_rest|scale|rot)_\d+|opacity)")
 """Columns of splats that CloudCompare has saved."""
+_WINDOWS_NAN = re.compile(r"-?(nan\(\w+\)|1\.#(IND|[QS]NAN)0*)", re.I)
+"""NaN in text files of Windows programs."""
 BATCH_ROWS = 1 << 15
 """Rows per batch when splats are larger than memory."""
 
@@ -272,7 +274,8 @@ def read_elements(path: str | Path, splats: bool = True) -> tuple[dict[str, np.n
                 layout.append((element.name, np.dtype(kinds), count))
         if "vertex" not in (name for name, _, _ in layout):
             raise LodgsError(
-                f"Cannot read {path}: it has lists before its vertices.", "Choose a .ply of Gaussian splats."
+                f"Cannot read {path}: it has lists before its vertices.",
+                "Export it again with the vertices first.",
             )
         if header.text:
             return decode_elements(_read_text(file, layout, size - begin, path), path), _comments(header)
@@ -424,7 +427,8 @@ def _read_header_lines(file: IO[bytes], path: Path) -> list[str]:
             f"Cannot read {path}: it is truncated, its header has no end.", "Export or copy it again."
         )
     file.seek(end.end())
-    return start[: end.end()].decode("ascii", "replace").split(begin[1].decode())
+    lines = re.split("\r\n|\n|\r", start[: end.end()].decode("ascii", "replace"))
+    return [*filter(str.strip, lines), ""]
 
 
 def _read_text(
@@ -443,7 +447,8 @@ def _read_text(
         if min_size > size + 1:
             raise ValueError("it is too short for its rows")
         elements: dict[str, np.ndarray] = {}
-        lines = read_lines(io.TextIOWrapper(file, "ascii", "replace"), _MAX_LINE)
+        text = read_lines(io.TextIOWrapper(file, "ascii", "replace"), _MAX_LINE)
+        lines = (_WINDOWS_NAN.sub("nan", line) for line in text)
         for name, row, count in layout:
             with warnings.catch_warnings():
                 warnings.simplefilter(

@@ -111,6 +111,24 @@ def test_windows_line_ends_are_read(tmp_path):
     check_golden(read_ply(tmp_path / "a.ply"))
 
 
+def test_mixed_line_ends_and_blank_lines_of_a_header_are_read(tmp_path):
+    head, rows = header(), GOLDEN[len(header()) :]
+    mixed = head.replace(b"\n", b"\r\n", 3).replace(b"end_header\n", b"\nend_header\r\n")
+    (tmp_path / "a.ply").write_bytes(mixed + rows)
+    check_golden(read_ply(tmp_path / "a.ply"))
+
+
+@pytest.mark.parametrize("nan", ["nan", "-nan(ind)", "1.#QNAN0", "-1.#IND"])
+def test_nan_of_windows_programs_is_skipped(tmp_path, nan):
+    rows = [list(map(str, golden_values(i))) for i in range(2)]
+    rows.append([nan, *rows[0][1:]])
+    head = header("ascii").replace(b"element vertex 2", b"element vertex 3")
+    (tmp_path / "a.ply").write_bytes(head + "\n".join(map(" ".join, rows)).encode())
+    warnings = []
+    check_golden(read_ply(tmp_path / "a.ply", warnings.append))
+    assert "1 splats" in warnings[0]
+
+
 def test_reordered_columns_without_normals_before_faces_are_read(tmp_path):
     columns = [name for name in reversed(GOLDEN_COLUMNS) if name not in ("nx", "ny", "nz")]
     rows = np.zeros(2, [(name, "f8") for name in columns])  # doubles are converted
