@@ -38,6 +38,8 @@ _HEAD_BYTES = 4096
 _COMPONENT = "component_id"
 _LOCAL = "LOCAL_CS", "ENGCRS", "Local"
 """First words of WKT for coordinates without a place on Earth."""
+_FISHEYES = "fisheye", "equidistant_fisheye"
+"""Camera types of Metashape 1 and 2 whose x' is the angle; that of an equisolid fisheye is not."""
 _IMAGES = "images", "photos", "Images", "."
 
 
@@ -122,7 +124,7 @@ def read(path: Path) -> ExportedScene:
 def _parse_lens(sensor: Element) -> Intrinsics:
     """Return the adjusted calibration, which follows the initial one if both exist."""
     kind = sensor.get("type", "frame")
-    if kind not in ("frame", "fisheye"):
+    if kind not in ("frame", *_FISHEYES):
         raise LodgsError(f"camera type {kind} is not supported.")
     calibrations = [entry for entry in sensor.iterfind("calibration") if entry.find("f") is not None]
     if not calibrations:
@@ -139,10 +141,11 @@ def _parse_lens(sensor: Element) -> Intrinsics:
         if has_decimal_commas(str(error)):
             raise LodgsError(f"{DECIMAL_COMMAS}.") from error
         raise LodgsError("its calibration has a value that is not a number.") from error
-    fisheye = kind == "fisheye"
+    fisheye = kind in _FISHEYES
     remedy = "has no equivalent among COLMAP's lenses: fix it to 0 in Metashape."
-    if values.get("k4") and not fisheye:
-        raise LodgsError(f"its k4 {remedy}")
+    unsupported = ("p3", "p4") if fisheye else ("k4", "p3", "p4")
+    if name := next((name for name in unsupported if values.get(name)), ""):
+        raise LodgsError(f"its {name} {remedy}")
     if abs(values.get("b2", 0.0)) > MAX_SKEW:
         raise LodgsError(f"its b2 {remedy}")
     focal = get_number(values, "f")
