@@ -448,7 +448,7 @@ def _choose_model(folder: Path, images: Path | None, warnings: list[str]) -> tup
     """Return the first result of :func:`find_models` that has photos, and their folder; warn about others."""
     models = find_models(folder)
     if not models:
-        _require_complete_model(folder)
+        require_complete_model(folder)
         raise LodgsError(
             f"Cannot read scene: {folder} holds no COLMAP model.",
             "Choose a folder with sparse/0/cameras.bin, images.bin and points3D.bin (or .txt), or convert "

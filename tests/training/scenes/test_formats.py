@@ -429,6 +429,11 @@ def test_damaged_reconstructions_of_opensfm_are_rejected(tmp_path, content):
         (["clip.MOV"], "clip.MOV is a video", "lodgs frames"),
         (["poses_bounds.npy", "a.jpg"], "poses_bounds.npy is a file of LLFF", "COLMAP model"),
         (["frames/a.png"], "it has photos, but no cameras", "lodgs scene --photos"),
+        (["blocks.xml", "a.jpg"], "another program than Metashape", "COLMAP or Bundler"),
+        (["sfm_data.bin", "images/a.jpg"], "binary file of OpenMVG", "sfm_data.json"),
+        (["cloud.e57"], "point cloud without cameras", "lodgs scene --photos"),
+        (["images/a.HEIC"], "photos have an unsupported format", "Convert the photos to JPEG"),
+        (["dataparser_transforms.json"], "output of a 3DGS program", "trained from"),
         (["project.psx"], "project.psx is a Metashape project", "Export Cameras"),
         (
             ["database.db", "images/a.jpg"],

@@ -16,7 +16,17 @@ from types import ModuleType
 from ...errors import LodgsError, SystemProblem, system_reason, system_remedy
 from ...files import check_folder, is_file, link_or_copy, temporary_folder
 from ...splats.georeference import write_georeference
-from ..colmap import DEPTHS, MASKS, NO_POINTS, Scene, find_models, read_scene, scene_lenses, subfolders
+from ..colmap import (
+    DEPTHS,
+    MASKS,
+    NO_POINTS,
+    Scene,
+    find_models,
+    read_scene,
+    require_complete_model,
+    scene_lenses,
+    subfolders,
+)
 from ..colmap_model import model_suffix
 from ..image_files import find_image_folder
 from ..image_headers import exif_orientation, image_size
@@ -112,11 +122,17 @@ def ensure_colmap_scene(folder: Path, warn: Callable[[str], object]) -> Path:
     """Convert another program's export in place unless the folder is a COLMAP scene, and return the folder.
 
     Raises:
-        LodgsError: see :func:`convert_export`.
+        LodgsError: see :func:`convert_export`, or the folder has files of an unsupported program.
     """
-    if folder.is_dir() and not find_models(folder) and find_exports(folder):
+    if not folder.is_dir() or find_models(folder):
+        return folder
+    if find_exports(folder):
         for message in convert_export(folder).warnings:
             warn(message)
+        return folder
+    require_complete_model(folder)
+    if foreign := describe_foreign(folder):
+        raise LodgsError(f"Cannot read scene {folder}: {foreign[0]}.", foreign[1])
     return folder
 
 
