@@ -18,7 +18,7 @@ from ...documents import damage_error, decode_text, open_file, open_lines, read_
 from ...errors import LodgsError
 from ..image_headers import image_size
 from ..lenses import make_intrinsics
-from .exported import OPENGL, ExportedScene, ExportedView, PhotoFinder, find_file, invert_pose
+from .exported import OPENGL, ExportedScene, ExportedView, PhotoFinder, find_file, finite_points, invert_pose
 
 NAME = "Bundler"
 _VERSION = b"# Bundle file v0.3"
@@ -63,12 +63,12 @@ def read(path: Path) -> ExportedScene:
             lines = filter(None, map(bytes.strip, read_lines(file, _MAX_LINE)))
             if not next(lines, b"").startswith(_VERSION):
                 raise ValueError("its version is not 0.3")
-            count, points = map(int, next(lines, b"").split())
+            count, rows = map(int, next(lines, b"").split())
             cameras = _parse_numbers(islice(lines, 5 * count), (count, 15))
             # Each point has three lines: position, colour, and the views that see it.
-            rows = (first + b" " + second for first, second, _ in zip(lines, lines, lines, strict=True))
-            table = _parse_numbers(islice(rows, points + 1), (points, 6))
-        positions, colors = table[:, :3], table[:, 3:]
+            records = (first + b" " + second for first, second, _ in zip(lines, lines, lines, strict=True))
+            table = _parse_numbers(islice(records, rows + 1), (rows, 6))
+        points, colors = table[:, :3], np.nan_to_num(table[:, 3:].clip(0, 255)).astype(np.uint8)
     except (ValueError, IndexError, OverflowError) as error:
         raise damage_error(path, error, "Export it again.") from error
     if len(names) < count:
@@ -91,18 +91,17 @@ def read(path: Path) -> ExportedScene:
             views.append(ExportedView(image, lens, invert_pose(np.linalg.inv(OPENGL @ matrix))))
         except (LodgsError, ValueError, np.linalg.LinAlgError) as error:
             excluded.append((name, error.what if isinstance(error, LodgsError) else f"{error}."))
-    return ExportedScene(views, positions, colors.clip(0, 255).astype(np.uint8), excluded, photos.warnings())
+    warnings = photos.warnings()
+    points, colors = finite_points(path, points, colors, warnings)
+    return ExportedScene(views, points, colors, excluded, warnings)
 
 
 def _parse_numbers(lines: Iterable[bytes], shape: tuple[int, int]) -> np.ndarray:
-    """Return the finite numbers of the lines as an array."""
+    """Return the numbers of the lines as an array."""
     values = array("d")
     for line in lines:
         values.extend(map(float, line.split()))
-    numbers = np.array(values).reshape(shape)
-    if not np.isfinite(numbers).all():
-        raise ValueError("a value is not a finite number")
-    return numbers
+    return np.array(values).reshape(shape)
 
 
 def _find_list(path: Path) -> Path | None:

@@ -287,6 +287,16 @@ def visible_files(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if path.name[0] != "." and is_file(path))
 
 
+def finite_points(
+    path: Path, points: np.ndarray, colors: np.ndarray, warnings: list[str]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points (P, 3) with a finite position and their colours, and warn about the others."""
+    valid = np.isfinite(points).all(axis=1)
+    if not valid.all():
+        warnings.append(f"Skipped {np.sum(~valid):,} points of {path}: their position is not finite.")
+    return points[valid], colors[valid]
+
+
 class PhotoFinder:
     """Finds photos below a folder by the last parts of their exported names.
 

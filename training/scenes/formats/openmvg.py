@@ -21,6 +21,7 @@ from .exported import (
     PhotoFinder,
     colmap_lens,
     find_file,
+    finite_points,
     get_number,
     invert_pose,
     parse_array,
@@ -53,7 +54,7 @@ def read(path: Path) -> ExportedScene:
         poses = {entry["key"]: entry["value"] for entry in document["extrinsics"]}
         entries = [entry["value"]["ptr_wrapper"]["data"] for entry in document["views"]]
         positions = [entry["value"]["X"] for entry in document.get(_POINTS) or []]
-        points = parse_array(positions, -1, 3) if positions else np.zeros((0, 3))
+        points = parse_array(positions, -1, 3, finite=False) if positions else np.zeros((0, 3))
         root = str(document.get("root_path", ""))
     except (KeyError, TypeError, AttributeError) as error:
         raise LodgsError(
@@ -78,7 +79,9 @@ def read(path: Path) -> ExportedScene:
             views.append(ExportedView(image, lens, invert_pose(np.column_stack([rotation.T, center]))))
         except (LodgsError, AttributeError, TypeError) as error:
             excluded.append((name, error.what if isinstance(error, LodgsError) else "its entry is damaged."))
-    return ExportedScene(views, points, np.full((len(points), 3), 128, np.uint8), excluded, photos.warnings())
+    warnings = photos.warnings()
+    points, colors = finite_points(path, points, np.full((len(points), 3), 128, np.uint8), warnings)
+    return ExportedScene(views, points, colors, excluded, warnings)
 
 
 def _parse_lens(values: Any) -> Intrinsics:
@@ -86,6 +89,8 @@ def _parse_lens(values: Any) -> Intrinsics:
         raise LodgsError("it has no lens.")
     if "focal_length" not in values:  # distorted lenses nest the pinhole part
         values = {**values.get("value0", {}), **values}
+    if "focal_length" not in values:
+        raise LodgsError("its lens has no focal length, as that of a panorama.")
     center = parse_array(values.get("principal_point"), 2)
     focal = get_number(values, "focal_length")
     size = get_number(values, "width"), get_number(values, "height")

@@ -23,6 +23,7 @@ from .exported import (
     PhotoFinder,
     colmap_lens,
     find_file,
+    finite_points,
     get_number,
     parse_array,
     read_document,
@@ -81,13 +82,9 @@ def read(path: Path) -> ExportedScene:
     if len(parts) > 1:
         others = sum(len(other["shots"]) for other in parts) - len(part["shots"])
         warnings.append(f"Skipped {others:,} photos of {len(parts) - 1} separate reconstructions in {path}.")
-    valid = np.isfinite(positions).all(axis=1)
-    if not valid.all():
-        warnings.append(f"Skipped {np.sum(~valid):,} points of {path}: their position is not finite.")
     colors = np.nan_to_num(colors.clip(0, 255)).astype(np.uint8)
-    return ExportedScene(
-        views, positions[valid], colors[valid], excluded, warnings, _georeference(path, part)
-    )
+    positions, colors = finite_points(path, positions, colors, warnings)
+    return ExportedScene(views, positions, colors, excluded, warnings, _georeference(path, part))
 
 
 def _georeference(path: Path, part: Mapping) -> Georeference | None:
