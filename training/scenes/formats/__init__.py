@@ -1,6 +1,7 @@
 """Conversion of other programs' photos and cameras to COLMAP scenes. Works without pycolmap, inside Blender.
 
-Each format is a module with ``NAME``, ``find`` and ``read``, and independent of the other formats.
+Each format is a module with ``NAME``, ``find`` and ``read``, and independent of the other formats. ``read``
+gets the result of ``find``, and the folder to search for photos that are not where the export states.
 """
 
 from __future__ import annotations
@@ -8,8 +9,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Callable
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 
@@ -44,7 +44,7 @@ from . import (
     splat_cameras,
     transforms,
 )
-from .exported import ExportedScene, ExportedView, PhotoFinder
+from .exported import ExportedScene, ExportedView
 from .foreign import describe_foreign
 
 FORMATS = (
@@ -163,9 +163,7 @@ def convert_export(
         if out is None:
             return ConvertedScene(folder, name, len(exported.views), 0, exported.warnings, is_source=True)
     else:
-        name, path, exported = export[0].NAME, export[1], export[0].read(export[1])
-    if export is not None and path.parent != folder:
-        exported = _find_photos(exported, folder)
+        name, path, exported = export[0].NAME, export[1], export[0].read(export[1], folder)
     views, excluded = _usable_views(exported)
     if not views:
         reason = f" {excluded[0][0]}: {excluded[0][1]}" if excluded else ""
@@ -247,21 +245,6 @@ def _read_model_without_points(folder: Path) -> ExportedScene:
     ]
     warnings = [warning for warning in scene.warnings if not warning.startswith(NO_POINTS)]
     return ExportedScene(views, warnings=warnings)
-
-
-def _find_photos(exported: ExportedScene, folder: Path) -> ExportedScene:
-    """Return an export from a subfolder with photos of the whole folder for those that are missing."""
-    photos = PhotoFinder(folder)
-    views, warnings = [], list(exported.warnings)
-    for view in exported.views:
-        image = None
-        if not is_file(view.image):
-            with suppress(LodgsError):  # several photos match; the missing one is reported
-                image = photos.locate(view.image.as_posix())
-        if image is not None and len(warnings) == len(exported.warnings):
-            warnings.append(f"Found photos in another place, such as {image} instead of {view.image}.")
-        views.append(view if image is None else replace(view, image=image))
-    return replace(exported, views=views, warnings=warnings)
 
 
 def _usable_views(exported: ExportedScene) -> tuple[list[ExportedView], list[tuple[str, str]]]:

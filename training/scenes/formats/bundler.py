@@ -51,7 +51,7 @@ def _is_bundle(path: Path) -> bool:
         return False
 
 
-def read(path: Path) -> ExportedScene:
+def read(path: Path, folder: Path) -> ExportedScene:
     """Read the views and the points.
 
     Raises:
@@ -77,7 +77,8 @@ def read(path: Path) -> ExportedScene:
             "Export both files again.",
         )
     views, excluded = [], []
-    photos = PhotoFinder(_image_root(path), names)
+    root = _image_root(path)
+    photos = PhotoFinder(names, [root], folder if root.is_relative_to(folder) else root)
     for name, (focal, k1, k2, *pose) in zip(names, cameras, strict=False):
         try:
             if not focal > 0:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -242,7 +243,8 @@ def find_image(folder: Path, name: str) -> Path:
         A file in the folder or below it, or the expected path if there is no such file.
     """
     forms = (unicodedata.normalize(form, name) for form in ("NFC", "NFD"))
-    spellings = name, unquote(name), name.strip(), *forms
+    path = re.sub(r"[?#].*", "", name) if "://" in name else name
+    spellings = name, unquote(path), name.strip(), *forms
     for spelling in dict.fromkeys(spellings):
         for candidate in _candidates(folder, spelling):
             stem = candidate.stem if _has_photo_suffix(candidate) else candidate.name
@@ -301,15 +303,15 @@ class PhotoFinder:
     """Finds photos below a folder by the last parts of their exported names.
 
     Args:
-        folder: folder of the export.
         names: exported names of all photos. A photo at the exported place of one is no match for another.
-        roots: folders that the names are relative to, the preferred one first. Default: ``folder``.
+        roots: folders that the names are relative to, the preferred one first.
+        folder: folder that is searched for other photos, with its subfolders.
     """
 
-    def __init__(self, folder: Path, names: Iterable[str] = (), roots: Sequence[Path] = ()) -> None:
+    def __init__(self, names: Iterable[str], roots: Sequence[Path], folder: Path) -> None:
         self._folder = folder
         self._names = names
-        self._roots = roots or (folder,)
+        self._roots = roots
         self._by_stem: dict[str, list[Path]] | None = None
         self._moved: list[tuple[Path, Path]] = []
         self._expected_paths: dict[str, Path] = {}

@@ -59,7 +59,7 @@ def find(folder: Path) -> Path | None:
     return None
 
 
-def read(path: Path) -> ExportedScene:
+def read(path: Path, folder: Path) -> ExportedScene:
     """Read the views of the chunk with most aligned cameras, in metres if known.
 
     The axes are those of the chunk's largest component. Other components, which Metashape aligned separately,
@@ -95,7 +95,7 @@ def read(path: Path) -> ExportedScene:
         chunk_transform = _parse_transform(chunk)
         base = transforms[largest] = np.eye(4) if chunk_transform is None else chunk_transform
     scale = np.cbrt(np.linalg.det(base[:3, :3]))
-    files = _LabelFinder(path.parent, chunk)
+    files = _LabelFinder(path.parent, chunk, folder)
     views, excluded = [], []
     for camera in cameras:
         label = camera.get("label", "")
@@ -217,14 +217,14 @@ def _parse_transform(part: Element) -> np.ndarray | None:
 
 
 class _LabelFinder:
-    """Finds photos by camera label, in the folder or anywhere below it."""
+    """Finds photos by camera label, in the usual folders beside the export or anywhere in another one."""
 
-    def __init__(self, folder: Path, chunk: Element) -> None:
+    def __init__(self, folder: Path, chunk: Element, search: Path) -> None:
         self._folder = folder
         self._groups = {
             camera: group.get("label", "") for group in chunk.iter("group") for camera in group.iter("camera")
         }
-        self._photos = PhotoFinder(folder)
+        self._photos = PhotoFinder((), [folder], search)
 
     def find(self, camera: Element) -> Path:
         """Return a camera's photo, or the expected path if there is no photo.

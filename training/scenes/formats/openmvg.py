@@ -42,7 +42,7 @@ def find(folder: Path) -> Path | None:
     return None
 
 
-def read(path: Path) -> ExportedScene:
+def read(path: Path, folder: Path) -> ExportedScene:
     """Read the views and the points, which have no colours.
 
     Raises:
@@ -66,7 +66,7 @@ def read(path: Path) -> ExportedScene:
     views, excluded = [], []
     # Photos lie next to the file, in images or at OpenMVG's own path.
     roots = path.parent / "images", path.parent, path.parent.parent, *([Path(root)] if root else [])
-    photos = PhotoFinder(path.parent, [_photo_name(entry) for entry in entries], roots)
+    photos = PhotoFinder([_photo_name(entry) for entry in entries], roots, folder)
     for entry in entries:
         name = str(entry.get("filename", "")) if isinstance(entry, dict) else ""
         try:

@@ -42,7 +42,7 @@ def find(folder: Path) -> Path | None:
     return find_file(folder, "reconstruction.json") or find_file(folder / "opensfm", "reconstruction.json")
 
 
-def read(path: Path) -> ExportedScene:
+def read(path: Path, folder: Path) -> ExportedScene:
     """Read the views and points of the reconstruction with most photos.
 
     Raises:
@@ -67,7 +67,9 @@ def read(path: Path) -> ExportedScene:
             "Export it again.",
         ) from error
     project = path.parent.parent if path.parent.name == "opensfm" else path.parent
-    photos = PhotoFinder(project, [name for name, _ in shots], [project / "images", path.parent, project])
+    roots = project / "images", path.parent, project
+    search = folder if project.is_relative_to(folder) else project  # the folder opensfm was chosen
+    photos = PhotoFinder([name for name, _ in shots], roots, search)
     views, excluded = [], []
     for name, shot in shots:
         try:

@@ -40,7 +40,7 @@ def find(folder: Path) -> Path | None:
     return None
 
 
-def read(path: Path) -> ExportedScene:
+def read(path: Path, folder: Path) -> ExportedScene:
     """Read the views and their depth maps in millimetres. Polycam exports no points; unreadable cameras are
     excluded.
     """

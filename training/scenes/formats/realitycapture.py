@@ -73,13 +73,13 @@ def find(folder: Path) -> Path | None:
     return next(tables, None) or (folder if has_sidecars else None)
 
 
-def read(path: Path) -> ExportedScene:
+def read(path: Path, folder: Path) -> ExportedScene:
     """Read the views, and the points of the only PLY next to them that fits.
 
     Raises:
         LodgsError: a file is damaged, or has geographic coordinates.
     """
-    scene = _read_sidecars(path) if path.is_dir() else _read_table(path)
+    scene = _read_sidecars(path) if path.is_dir() else _read_table(path, folder)
     _check_coordinates(path, scene)
     return _with_points(path if path.is_dir() else path.parent, scene)
 
@@ -103,7 +103,7 @@ def _parse_header(line: str) -> tuple[str, list[str]] | None:
     return None
 
 
-def _read_table(path: Path) -> ExportedScene:
+def _read_table(path: Path, folder: Path) -> ExportedScene:
     lines = iter(decode_text(read_bytes(path, MAX_BYTES)).splitlines())
     delimiter, columns = next(filter(None, map(_parse_header, lines)), (",", []))
     rows = [
@@ -111,7 +111,7 @@ def _read_table(path: Path) -> ExportedScene:
         for row in _parse_rows(path, lines, delimiter)
         if any(row) and not row[0].startswith("#")
     ]
-    photos = PhotoFinder(path.parent, [row[0] for row in rows], [path.parent / name for name in _IMAGES])
+    photos = PhotoFinder([row[0] for row in rows], [path.parent / name for name in _IMAGES], folder)
     views, excluded = [], []
     only_k1 = 0
     for row in rows:

@@ -37,7 +37,7 @@ def find(folder: Path) -> Path | None:
     return path if path is not None and _photo_folder(path) else None
 
 
-def read(path: Path) -> ExportedScene:
+def read(path: Path, folder: Path) -> ExportedScene:
     """Read the views. The photos in numeric order match the poses; if photos are missing, their names do.
 
     Raises:

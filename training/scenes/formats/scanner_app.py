@@ -39,7 +39,7 @@ def find(folder: Path) -> Path | None:
     return None
 
 
-def read(path: Path) -> ExportedScene:
+def read(path: Path, folder: Path) -> ExportedScene:
     """Read the views. Frames without a photo, which have depth only, are left out."""
     views, excluded, bare = [], [], 0
     for file in sorted(path.glob(_PATTERN)):

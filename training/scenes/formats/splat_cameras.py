@@ -47,7 +47,7 @@ def find(folder: Path) -> Path | None:
     return None
 
 
-def read(path: Path) -> ExportedScene:
+def read(path: Path, folder: Path) -> ExportedScene:
     """Read the views. The file has no points.
 
     Raises:
@@ -60,7 +60,7 @@ def read(path: Path) -> ExportedScene:
     if not cameras:
         raise LodgsError(f"Cannot read {path}: it has no cameras.", "Choose the scene that was trained.")
     names = [str(camera.get("img_name", "")) for camera in cameras]
-    photos = PhotoFinder(path.parent, names, [path.parent / "images", path.parent])
+    photos = PhotoFinder(names, [path.parent / "images", path.parent], folder)
     views, excluded = [], []
     for name, camera in zip(names, cameras, strict=True):
         try:

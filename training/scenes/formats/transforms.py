@@ -72,7 +72,7 @@ def find(folder: Path) -> Path | None:
     return find_file(folder, *_FILES) or (others[0] if len(others) == 1 else None)
 
 
-def read(path: Path) -> ExportedScene:
+def read(path: Path, folder: Path) -> ExportedScene:
     """Read the views, and the points of a PLY if the file names one.
 
     If a scene has several files (train, val, test), only the training views are read.
@@ -89,7 +89,7 @@ def read(path: Path) -> ExportedScene:
     views, excluded, unread = [], [], Counter()
     frames = [_with_usual_names(frame) if isinstance(frame, dict) else {} for frame in frames]
     names = [frame.get(_NAMES[0]) for frame in frames]
-    photos = PhotoFinder(path.parent, [name for name in names if isinstance(name, str)])
+    photos = PhotoFinder([name for name in names if isinstance(name, str)], [path.parent], folder)
     for number, own in enumerate(frames, 1):
         try:
             views.append(_parse_view(path.parent, _frame_values(common, own), photos))
