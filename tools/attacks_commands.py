@@ -369,12 +369,14 @@ def rotation(w: float, x: float, y: float, z: float) -> np.ndarray:
 class ForkedTrainer:
     """Fork of this process in place of the ``subprocess.Popen`` of a cell's trainer."""
 
-    def __init__(self, command: list[str], env: dict[str, str], stderr: IO[bytes], **_: object) -> None:
+    def __init__(
+        self, command: list[str], env: dict[str, str], stdout: IO[bytes], stderr: IO[bytes], **_: object
+    ) -> None:
         self.pid = os.fork()
         if self.pid == 0:
             os.environ.update(env)
             null = os.open(os.devnull, os.O_RDWR)
-            for number, descriptor in enumerate((null, null, stderr.fileno())):
+            for number, descriptor in enumerate((null, stdout.fileno(), stderr.fileno())):
                 os.dup2(descriptor, number)
             os.closerange(3, 1 << 12)  # such as locks of the parent
             sys.argv[1:] = command[3:]

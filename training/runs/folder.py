@@ -11,7 +11,7 @@
           blocks/ (runs of the parts of a scene in cells, and their merged bundle)
           captured/ (COLMAP scene rendered from splats that have no photos)
           base.ply, cameras/ (splats and views that Blender exported for the run)
-          trainer.log, trainer.out (output of a trainer that Blender started)
+          trainer.log, trainer.out (output of a trainer that Blender or a worker started)
           lock  cancel  resume  reserve
 
 A run folder can be moved. ``events.jsonl`` holds one JSON object per line, the same lines that the trainer

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError
 from pathlib import Path
 
-from ...errors import LodgsError
+from ...errors import LodgsError, error_cause
 from ..failures import BAD_INPUT, CANCELLED, DONE
 from ..outcome import run_outcome
 from .merge import merge, write_surroundings
@@ -146,6 +146,7 @@ class _BlockWatch:
         self._started = False
         self.steps = block.job.resolved_parameters().total_steps
         self._worker_error = ""
+        self._start_error: LodgsError | None = None
 
     def start(self, submit: Submit) -> None:
         """Submit the part unless it is finished."""
@@ -184,6 +185,8 @@ class _BlockWatch:
         except CancelledError:  # the scheduler and its workers were lost; the trainer may still run
             self.start(submit)
             return False
+        except LodgsError as error:  # no worker can start it
+            self._start_error, code = error, BAD_INPUT
         except Exception as error:  # the worker failed, not the trainer
             code = -1
             self._worker_error = str(error)
@@ -212,6 +215,9 @@ class _BlockWatch:
 
     def error(self) -> LodgsError:
         """Return the reason for the failure."""
+        if self._start_error is not None:
+            error = self._start_error
+            return LodgsError(f"{self._name}: {error.what}", error.remedy, error_cause(error))
         if self.code == BAD_INPUT:
             end = self.block.folder.end_event()
             if end is not None and end["event"] == "error":

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 
-from ...errors import LodgsError
+from ...errors import LodgsError, system_reason, system_remedy
 from ...files import is_file
 from .. import processes
 from ..failures import CANCELLED
@@ -80,8 +80,20 @@ def train_block(folder: str, threads: int = 0, cards: Sequence[str] = ()) -> int
 
     Returns:
         The trainer's exit code, negative if it was killed.
+
+    Raises:
+        LodgsError: the trainer cannot be started.
     """
-    run = RunFolder(folder)
+    try:
+        return _train_block(RunFolder(folder), threads, cards)
+    except OSError as error:
+        raise LodgsError(
+            f"Cannot start the trainer of {folder}: {system_reason(error)}.",
+            system_remedy(error, "Check that the worker can read and write this folder."),
+        ) from error
+
+
+def _train_block(run: RunFolder, threads: int, cards: Sequence[str]) -> int:
     was_running = run.running
     while run.running:
         time.sleep(1)
@@ -96,11 +108,12 @@ def train_block(folder: str, threads: int = 0, cards: Sequence[str] = ()) -> int
         environment.setdefault("LODGS_THREADS", str(threads))
     if cards:
         environment["CUDA_VISIBLE_DEVICES"] = cards[int(import_dask().get_worker().name) % len(cards)]
-    with run.log.open("ab") as log:
+    run.output.write_bytes(b"")
+    with run.log.open("ab") as log, run.output.open("ab") as output:
         trainer = subprocess.Popen(
             [sys.executable, "-m", _PACKAGE, "train", str(run.job)],
             env=environment | processes.parent_variable(), stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL, stderr=log,
+            stdout=output, stderr=log,
         )  # fmt: skip
         return trainer.wait()
 

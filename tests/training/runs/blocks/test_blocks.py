@@ -1,5 +1,6 @@
 """Blocks: planning, merging, failures of workers, and whole runs."""
 
+import errno
 import itertools
 import json
 import os
@@ -410,6 +411,17 @@ def test_error_of_a_block_is_reported(blocks):
 def test_block_that_cannot_write_its_error_is_reported(blocks):
     with pytest.raises(LodgsError, match=r"Cell 2: The trainer could not write to .* disk is full"):
         train_all(blocks, Workers(block_1=[done], block_2=[lambda _: 2]))
+
+
+def test_block_that_cannot_start_is_reported_at_once(blocks):
+    def cannot_start(_: RunFolder) -> int:
+        raise LodgsError("Cannot start.", "Check the folder.") from OSError(errno.ENOSPC, "")
+
+    workers = Workers(block_1=[done], block_2=[cannot_start])
+    with pytest.raises(LodgsError, match="Cell 2: Cannot start") as error:
+        train_all(blocks, workers)
+    assert workers.attempts["2"] == 1
+    assert error.value.remedy == "Check the folder." and error.value.cause == "disk"
 
 
 def test_interrupt_withdraws_blocks_that_no_worker_has_started(blocks, monkeypatch):

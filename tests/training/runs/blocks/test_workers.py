@@ -16,6 +16,7 @@ from training.runs.blocks.plan import read_plan, write_plan
 from training.runs.blocks.workers import train_block, workers
 from training.runs.events import event_line
 from training.runs.folder import RunFolder
+from training.runs.outcome import run_outcome
 from training.runs.train import train
 
 from .conftest import train_in_process
@@ -78,6 +79,20 @@ def test_cancelled_block_does_not_start(block):
     block.request_cancel()
     assert train_block(str(block.path)) == 3
     assert not block.events_file.exists()
+
+
+def test_block_whose_log_cannot_be_written_names_its_folder(block):
+    block.log.mkdir()
+    with pytest.raises(LodgsError, match="Cannot start the trainer of") as error:
+        train_block(str(block.path))
+    assert str(block.log) in error.value.what and "Is a directory" in error.value.what
+
+
+@pytest.mark.slow
+def test_reason_why_a_trainer_cannot_open_its_block_is_kept(block):
+    block.job.write_text("method = 3dgs")
+    assert train_block(str(block.path)) == 2
+    assert str(block.job) in run_outcome(block, 2)[1]
 
 
 @pytest.mark.slow
