@@ -25,7 +25,7 @@ from ..errors import LodgsError, SystemProblem, system_reason
 from ..files import atomic_write, check_folder, is_file, link_or_copy
 from . import pycolmap_process
 from .colmap import MASKS, find_models
-from .image_files import MASK_SUFFIXES, SidecarFiles
+from .image_files import MASK_SUFFIXES, UNREADABLE_SUFFIXES, SidecarFiles
 from .image_headers import image_size
 from .images import IMAGE_SUFFIXES, check_mask, load_image, load_mask, write_png
 from .view_selection import exclusion_messages
@@ -48,11 +48,6 @@ STAGES = {
 }
 
 _WEBP = ".webp"
-_UNSUPPORTED = (
-    ".heic", ".heif", ".avif", ".jxl", ".jp2", ".bmp", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf",
-    ".rw2", ".pef",
-)  # fmt: skip
-"""Lower-case suffixes of photo formats that cannot be read."""
 _TABLES = {"features": "descriptors", "pairs": "two_view_geometries"}
 """Tables of COLMAP's database with one row per completed item, by stage."""
 _POLL_SECONDS = 0.5
@@ -244,7 +239,7 @@ def _list_photos(
         candidates = [path for path in files if path.suffix.lower() == ".exr"]
     readable = {path.with_suffix("") for path in candidates}
     for path in files:
-        if path.suffix.lower() in _UNSUPPORTED and path.with_suffix("") not in readable:
+        if path.suffix.lower() in UNREADABLE_SUFFIXES and path.with_suffix("") not in readable:
             kind = path.suffix[1:].upper()
             excluded.append(
                 (path.relative_to(photos).as_posix(), f"format {kind} is not supported. Convert it to JPEG.")
