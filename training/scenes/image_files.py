@@ -197,7 +197,7 @@ def find_moved_images(folder: Path, names: Iterable[str]) -> Path | None:
         for parts in parts_by_stem.get(_stem(path.name), []):
             if not parts or tuple(parents[-len(parts) :]) == parts:
                 matches.setdefault(path.parents[len(parts)], set()).add("/".join((*parts, _stem(path.name))))
-    counts = {place: len(found) for place, found in matches.items()}
+    counts = {place: len(matched) for place, matched in matches.items()}
     total = len(set().union(*matches.values()))
     if len(matches) > 1 and sum(counts.values()) == total:
         return Path(os.path.commonpath(matches))
