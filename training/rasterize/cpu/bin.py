@@ -14,7 +14,6 @@ import numpy as np
 from .compile import FAST, STRICT, Buffers, f32, inlined, kernel, run_parallel, run_serial
 from .fastmath import prefetch
 from .project import (
-    GRAIN,
     HALF_HEIGHT,
     HALF_WIDTH,
     MARGIN,
@@ -28,7 +27,10 @@ from .project import (
 )
 
 TILE = 16
-CHUNKS = 32
+MAX_CHUNKS, CHUNK = 32, 2048
+"""Maximum number of chunks of the depth order, and their smallest size in splats."""
+BOXES = 8192
+"""Splats in a thread's unit of work that takes little time."""
 HALF, SPAN = f32(0.5), f32(TILE - 1)
 
 
@@ -141,10 +143,10 @@ def prefetch_hits(order, k, first, count, hits):
 @kernel(STRICT)
 def count_pairs(begin, end, order, first, count, hits, histogram):
     """Count the pairs of each chunk of the depth order by tile."""
-    total = order.shape[0]
+    total, chunks = order.shape[0], histogram.shape[0]
     for chunk in range(begin, end):
         tally = histogram[chunk]
-        for k in range(total * chunk // CHUNKS, total * (chunk + 1) // CHUNKS):
+        for k in range(total * chunk // chunks, total * (chunk + 1) // chunks):
             prefetch_hits(order, k, first, count, hits)
             i = order[k]
             for hit in range(first[i], first[i] + count[i]):
@@ -157,7 +159,7 @@ def pair_starts(histogram, tile_start):
     place = 0
     for tile in range(histogram.shape[1]):
         tile_start[tile] = place
-        for chunk in range(CHUNKS):
+        for chunk in range(histogram.shape[0]):
             size = histogram[chunk, tile]
             histogram[chunk, tile] = place
             place += size
@@ -167,10 +169,10 @@ def pair_starts(histogram, tile_start):
 @kernel(STRICT)
 def place_pairs(begin, end, order, first, count, hits, histogram, splat):
     """Store every pair at its position, and replace the tiles in ``hits`` by these positions."""
-    total = order.shape[0]
+    total, chunks = order.shape[0], histogram.shape[0]
     for chunk in range(begin, end):
         place = histogram[chunk]
-        for k in range(total * chunk // CHUNKS, total * (chunk + 1) // CHUNKS):
+        for k in range(total * chunk // chunks, total * (chunk + 1) // chunks):
             prefetch_hits(order, k, first, count, hits)
             i = order[k]
             for hit in range(first[i], first[i] + count[i]):
@@ -189,23 +191,24 @@ def bin_splats(
     """
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
     box_start = np.zeros(len(drawn) + 1, np.int64)
-    run_parallel(box_sizes, len(drawn), GRAIN, projected, drawn, tiles_x, tiles_y, box_start[1:])
+    run_parallel(box_sizes, len(drawn), BOXES, projected, drawn, tiles_x, tiles_y, box_start[1:])
     np.cumsum(box_start, out=box_start)
     first = buffers.take("first", np.int64, len(projected))
     count = buffers.take("count", np.int32, len(projected))
     count[:] = 0
     hits = buffers.take("hits", np.int32, int(box_start[-1]))
     run_parallel(
-        find_tiles, len(drawn), GRAIN, projected, drawn, box_start, tiles_x, tiles_y, first, count, hits
+        find_tiles, len(drawn), CHUNK, projected, drawn, box_start, tiles_x, tiles_y, first, count, hits
     )
 
     order = np.empty_like(drawn)
     keys = depths.view(np.uint32)
     run_serial(sort_by_depth, keys, drawn, np.empty_like(keys), order)
-    histogram = np.zeros((CHUNKS, tiles_x * tiles_y), np.int32)
-    run_parallel(count_pairs, CHUNKS, 1, order, first, count, hits, histogram)
+    chunks = min(max(len(drawn) // CHUNK, 1), MAX_CHUNKS)
+    histogram = np.zeros((chunks, tiles_x * tiles_y), np.int32)
+    run_parallel(count_pairs, chunks, 1, order, first, count, hits, histogram)
     tile_start = np.zeros(tiles_x * tiles_y + 1, np.int64)
     run_serial(pair_starts, histogram, tile_start)
     splat = buffers.take("splat", np.int32, int(tile_start[-1]))
-    run_parallel(place_pairs, CHUNKS, 1, order, first, count, hits, histogram, splat)
+    run_parallel(place_pairs, chunks, 1, order, first, count, hits, histogram, splat)
     return Pairs(splat, tile_start, first, count, hits)
