@@ -40,7 +40,8 @@ class ImageFiles:
 
     def __init__(self, folder: Path, names: Iterable[str] = ()) -> None:
         self._folder = folder
-        self._base_names = Counter(map(_base_stem, names))
+        self._names = {_normalized(name.replace("\\", "/")) for name in names}
+        self._base_names = Counter(map(_base_stem, self._names))
         self._by_normal_name: dict[str, Path] | None = None
         self._by_stem: dict[str, list[Path]] = {}
         self._by_base_stem: dict[str, list[Path]] = {}
@@ -66,14 +67,18 @@ class ImageFiles:
             for spelling in (str(relative), str(relative_image_path(unquote(name)))):
                 if (file := self._by_normal_name.get(_normalized(spelling))) is not None:
                     return file
-        matches = self._by_stem.get(_stem(str(relative)), [])
+        matches = [path for path in self._by_stem.get(_stem(str(relative)), []) if self._is_free(path)]
         if not matches and self._base_names[_base_stem(name)] == 1:
-            matches = self._by_base_stem.get(_base_stem(name), [])
+            matches = [path for path in self._by_base_stem.get(_base_stem(name), []) if self._is_free(path)]
         same_suffix = [path for path in matches if path.suffix.lower() == relative.suffix.lower()] or matches
         if len(same_suffix) == 1:
             self.renamed[name] = same_suffix[0]
             return same_suffix[0]
         return self._folder / name if exists else None
+
+    def _is_free(self, path: Path) -> bool:
+        """Return whether no name states a file."""
+        return _normalized(path.relative_to(self._folder).as_posix()) not in self._names
 
     def _index(self) -> dict[str, Path]:
         """Return the files by normalised name, and collect the images by stem."""

@@ -315,6 +315,7 @@ class PhotoFinder:
         self._by_stem: dict[str, list[Path]] | None = None
         self._moved: list[tuple[Path, Path]] = []
         self._expected_paths: dict[str, Path] = {}
+        self._exact_paths: dict[str, Path] | None = None
 
     def find(self, name: str) -> Path:
         """Return a photo at its exported place, else the only photo below the folder with its name.
@@ -333,9 +334,23 @@ class PhotoFinder:
     def _expected(self, name: str) -> Path:
         """Return the photo at its exported place, or that place in the preferred folder."""
         if name not in self._expected_paths:
-            places = [find_image(root, name) for root in self._roots]
-            self._expected_paths[name] = next((path for path in places if is_file(path)), places[0])
+            exact = self._exact()
+            places = [exact[name]] if name in exact else [find_image(root, name) for root in self._roots]
+            others = set() if name in exact else set(exact.values())
+            expected = next((path for path in places if is_file(path) and path not in others), None)
+            self._expected_paths[name] = expected or _candidates(self._roots[0], name)[0]
         return self._expected_paths[name]
+
+    def _exact(self) -> dict[str, Path]:
+        """Return the photos by those of the names that need no other suffix or spelling."""
+        if self._exact_paths is None:
+            self._exact_paths = {}
+            for name in self._names:
+                paths = (path for root in self._roots for path in _candidates(root, name))
+                path = next((path for path in paths if path.suffix in _SUFFIXES and is_file(path)), None)
+                if path is not None:
+                    self._exact_paths[name] = path
+        return self._exact_paths
 
     def locate(self, name: str) -> Path | None:
         """Return the photo below the folder that has most of the name's last parts, or None.
