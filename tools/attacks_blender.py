@@ -1,11 +1,13 @@
-"""Fill disks while Blender saves, exports, captures and renders: no file may be half written.
+"""Fill disks and send SIGTERM while Blender works: no file may be half written, no work lost.
 
-    python tools/attacks_blender.py [--disks 20] [--only NAME ...]
+    python tools/attacks_blender.py [--disks 20] [--signals 20] [--seed 0] [--only NAME ...]
 
 Each action of ACTIONS runs undisturbed once, in Blender's module. Then it runs on disks that are too small (a
 tmpfs, which needs root on Linux). It must report an error with the name of a file or folder of the disk.
 Every file under its final name must be complete, and the same action must succeed afterwards, with enough
-space. Results are written to build/attacks_blender_VERSION.json. The trainer's Python, LODGS_TRAINER_PYTHON,
+space. Each training of TRAININGS gets SIGTERM at random times: it must end with exit code 3 and without
+processes left, and the same command must give the files of the undisturbed training. Results are written to
+build/attacks_blender_VERSION.json. The trainer's Python, LODGS_TRAINER_PYTHON,
 makes the inputs and some exports.
 """
 
@@ -16,13 +18,15 @@ import importlib
 import io
 import json
 import os
+import random
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable
-from contextlib import redirect_stderr
+from contextlib import redirect_stderr, suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -90,14 +94,29 @@ ACTIONS = {
 }
 
 
+FLOD = (
+    "--method", "flod", "--backend", "cpu", "--image-scale", "1", "--test-every", "4", "--set", "levels=2",
+    "--set", "steps=[5,6]", "--set", "footprint=6", "--set", "max_splats=900",
+)  # fmt: skip
+OUTPUTS = "--out", "DISK/run", "--blend", "DISK/scene.blend", "--export", "DISK/bundle.ply"
+TRAININGS = {
+    "train": ("train", "--scene", "INPUTS/scene", *OUTPUTS, *FLOD),
+    "train captured": ("train", "--scene", "INPUTS/captured", *OUTPUTS, *FLOD),
+}
+"""Arguments of ``blender --command lodgs``."""
+PROGRAM = ROOT / "tests" / "blender" / "as_blender.py"
+
+
 class Attack:
     """Blender, inputs in a folder, and a disk.
 
     Args:
         work: working folder.
+        rng: random generator for the times of signals.
     """
 
-    def __init__(self, work: Path) -> None:
+    def __init__(self, work: Path, rng: random.Random) -> None:
+        self.rng = rng
         self.bpy = start_blender()
         self.inputs, self.disk = work / "inputs", work / "disk"
         self.commands = importlib.import_module(f"{EXTENSION}.blender_lodgs.commands")
@@ -109,8 +128,13 @@ class Attack:
         trainer = os.environ["LODGS_TRAINER_PYTHON"]
         subprocess.run([trainer, __file__, "--inputs", str(self.inputs)], check=True)
         self._mesh_scene(self.inputs / "mesh.blend")
-        problem = self._command(("import", "INPUTS/bundle.ply", "--blend", "INPUTS/scene.blend"))
-        assert not problem, problem
+        capture = ACTIONS["capture command"].words
+        for words in (
+            ("import", "INPUTS/bundle.ply", "--blend", "INPUTS/scene.blend"),
+            tuple(word.replace("DISK/scene", "INPUTS/captured") for word in capture),
+        ):
+            if problem := self._command(words):
+                raise RuntimeError(f"{words[0]}: {problem}")
 
     def fill_disks(self, name: str, disks: int) -> dict:
         """Run an action on disks of several sizes; return the number of full disks and the seconds of one."""
@@ -142,6 +166,81 @@ class Attack:
                 self._check_files(name, f"{attack}, afterwards", expected, complete=True)
         return {"full disks": full, "seconds": round(seconds, 2)}
 
+    def send_signals(self, name: str, signals: int) -> dict:
+        """Send SIGTERM to a training at random times; return the number of stopped ones."""
+        seconds, code = self._train(name)
+        if code:
+            raise RuntimeError(f"{name}: undisturbed training ended with {code}: {self._log()}")
+        expected = self._outputs()
+        stopped = 0
+        for _ in range(signals):
+            delay = self.rng.uniform(0, seconds)
+            shutil.rmtree(self.disk)
+            _, code = self._train(name, delay)
+            attack = f"{name}, signal after {delay:.2f} s"
+            if code not in (0, 3) or "Traceback" in self._log():
+                self.wrong.append(f"{attack}: exit code {code}: {self._log()[-400:]}")
+            stopped += code == 3
+            if remaining := self._remaining():
+                self.wrong.append(f"{attack}: processes left: {remaining}")
+            if code and (code := self._train(name)[1]):
+                self.wrong.append(f"{attack}: afterwards: exit code {code}: {self._log()[-400:]}")
+            files = self._outputs()
+            differing = [key for key in expected.keys() | files.keys() if expected.get(key) != files.get(key)]
+            if differing:
+                self.wrong.append(f"{attack}: different: {sorted(differing)[:9]}")
+        shutil.rmtree(self.disk)
+        return {"stopped": stopped, "seconds": round(seconds, 2)}
+
+    def _train(self, name: str, delay: float | None = None) -> tuple[float, int]:
+        """Run a training in a Blender of its own, and send SIGTERM some seconds after it handles signals.
+
+        Returns:
+            Seconds from that moment to its end, and the exit code.
+        """
+        self.disk.mkdir(exist_ok=True)
+        words = [self._word(word) for word in TRAININGS[name]]
+        with open(self.inputs / "log", "wb") as log:
+            process = subprocess.Popen(
+                [sys.executable, str(PROGRAM), "--command", "lodgs", *words], stdout=log, stderr=log
+            )
+        while process.poll() is None and not handles_sigterm(process.pid):
+            time.sleep(0.01)
+        start = time.monotonic()
+        if delay is not None:
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(delay)
+            process.terminate()
+        code = process.wait()
+        return time.monotonic() - start, code
+
+    def _log(self) -> str:
+        return (self.inputs / "log").read_text(errors="replace")
+
+    def _outputs(self) -> dict[str, bytes | bool]:
+        """Return the files of a training by name; for a .blend file, whether it is complete."""
+        files: dict[str, bytes | bool] = dict(contents(self.disk))
+        blends = [file for file in files if file.endswith((".blend", ".blend1"))]
+        return {key: data for key, data in files.items() if key not in blends} | {
+            file: self.is_complete_file(self.disk / file) for file in blends if file.endswith(".blend")
+        }
+
+    def _remaining(self) -> list[str]:
+        """Return the commands of processes that use the disk, after up to ten seconds."""
+        for _ in range(100):
+            commands = []
+            for path in Path("/proc").glob("[0-9]*/cmdline"):
+                with suppress(OSError):
+                    commands.append(path.read_bytes().replace(b"\0", b" ").decode(errors="replace"))
+            if not (remaining := [command for command in commands if str(self.disk) in command]):
+                return []
+            time.sleep(0.1)
+        return remaining
+
+    def _word(self, word: str) -> str:
+        """Return an argument with the folders in place of INPUTS and DISK."""
+        return word.replace("INPUTS", str(self.inputs)).replace("DISK", str(self.disk))
+
     def _copy(self, name: str) -> None:
         if copied := ACTIONS[name].copied:
             shutil.copytree(self.inputs / copied, self.disk / copied)
@@ -154,8 +253,7 @@ class Attack:
         self.bpy.ops.wm.open_mainfile(filepath=str(self.inputs / "scene.blend"))
         if action.operator == "render":
             return self._render(action.options)
-        disk = str(self.disk)
-        options = {key: value.replace("DISK", disk) for key, value in action.options.items()}
+        options = {key: self._word(value) for key, value in action.options.items()}
         if "replace" in getattr(self.bpy.ops.lodgs, action.operator).get_rna_type().properties:
             options["replace"] = True
         return self._operator(getattr(self.bpy.ops.lodgs, action.operator), options)
@@ -167,8 +265,7 @@ class Attack:
             return str(error)
 
     def _command(self, words: tuple[str, ...]) -> str:
-        inputs, disk = str(self.inputs), str(self.disk)
-        words = tuple(word.replace("INPUTS", inputs).replace("DISK", disk) for word in words)
+        words = tuple(map(self._word, words))
         with redirect_stderr(io.StringIO()) as output:
             code = self.commands.main(list(words))
         return output.getvalue() if code else ""
@@ -223,6 +320,15 @@ class Attack:
         return abs(len(data) - len(expected)) < 64
 
 
+def handles_sigterm(pid: int) -> bool:
+    """Return whether a process has a handler of its own for SIGTERM, on Linux."""
+    with suppress(OSError):
+        status = Path(f"/proc/{pid}/status").read_text()
+        caught = next(line for line in status.splitlines() if line.startswith("SigCgt"))
+        return bool(int(caught.split()[1], 16) >> (signal.SIGTERM - 1) & 1)
+    return False
+
+
 def write_inputs(folder: Path) -> None:
     """Write a scene, an export and a bundle. Needs Pillow, which Blender's Python lacks."""
     from tests.training.conftest import write_tiny_scene
@@ -250,7 +356,10 @@ def main() -> int:
     """Run the attacks, print and write results; return 1 if anything went wrong."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--disks", type=int, default=20)
-    parser.add_argument("--only", nargs="+", choices=ACTIONS, default=list(ACTIONS))
+    parser.add_argument("--signals", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=0)
+    names = [*ACTIONS, *TRAININGS]
+    parser.add_argument("--only", nargs="+", choices=names, default=names)
     parser.add_argument("--inputs", type=Path, help="write the inputs into a folder, and stop")
     options = parser.parse_args()
     if options.inputs:
@@ -260,13 +369,16 @@ def main() -> int:
         print("Skipping full disks: mounting a small tmpfs needs root on Linux.")
         return 0
     with tempfile.TemporaryDirectory(prefix="lodgs-attacks-") as folder:
-        attack = Attack(Path(folder))
+        attack = Attack(Path(folder), random.Random(options.seed))
         results, reported = {}, 0
         for name in options.only:
             if name == "page" and not VIEWER.is_dir():
                 print(f"Skipping {name}: the viewer is not installed (tools/viewer.py).")
                 continue
-            results[name] = attack.fill_disks(name, options.disks)
+            if name in TRAININGS:
+                results[name] = attack.send_signals(name, options.signals)
+            else:
+                results[name] = attack.fill_disks(name, options.disks)
             print(name, results[name], *attack.wrong[reported:], sep="\n", flush=True)
             reported = len(attack.wrong)
     version = ".".join(map(str, attack.bpy.app.version[:2]))
