@@ -17,7 +17,8 @@ from ...training.editing import cleaning
 from ...training.editing.clutter import KINDS
 from ...training.errors import LodgsError
 from ...training.lod.crop import crop_mask
-from ...training.lod.rule import Relations, resolve_rule
+from ...training.lod.query import LodQuery, SplatSelector
+from ...training.lod.rule import OPACITY, Relations, resolve_rule
 from ...training.scenes.cameras import Camera
 from ...training.splats.levels import Bundle
 from ..attributes import BASE, HIDDEN, SCALE, SELECTION, read_attribute, view_attribute, write_attribute
@@ -264,6 +265,20 @@ def hidden_mask(cloud: bpy.types.PointCloud) -> np.ndarray:
     """Return the (N,) bool mask of hidden splats."""
     values = read_attribute(cloud, HIDDEN)
     return np.zeros(len(cloud.points), bool) if values is None else values.astype(bool)
+
+
+def visible_opacities(cloud: bpy.types.PointCloud, means: np.ndarray, query: LodQuery | None) -> np.ndarray:
+    """Return the opacities (N,) of the splats that a query selects, and 0 for all others."""
+    opacities = splat_attribute(cloud, BASE)[:, 3]
+    if query is None:
+        return opacities
+    names = {name for name in query.columns if name in cloud.attributes}
+    columns = {name: view_attribute(cloud, name) for name in names - {HIDDEN}}
+    columns |= {OPACITY: opacities, HIDDEN: hidden_mask(cloud)}
+    rows, weights = SplatSelector(means, columns).select(query)
+    visible = np.zeros(len(means), np.float32)
+    visible[rows] = weights * opacities[rows]
+    return visible
 
 
 def cameras(context: bpy.types.Context, root: bpy.types.Object) -> list[Camera]:

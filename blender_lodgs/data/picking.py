@@ -8,8 +8,10 @@ from mathutils import Matrix
 
 from ...training.editing.brush import Projection
 from ..attributes import BASE, SCALE, WEIGHT, read_attribute
+from ..nodes import display
+from .cleaning import visible_opacities
 from .objects import root_of
-from .shown import SplatInstance, splat_instances
+from .shown import SplatInstance, rule_query, splat_instances
 
 MAX_TRANSMITTANCE = 0.5
 """Maximum transmittance at the picked splat; fog is not picked."""
@@ -42,7 +44,9 @@ def scene_at(
         None if the splats at the pixel hide less than half of the background.
     """
     instances = splat_instances(depsgraph, viewport)
-    samples = [_at_pixel(item, np.array(view), np.array(projection), size, at) for item in instances]
+    samples = [
+        _at_pixel(item, depsgraph, np.array(view), np.array(projection), size, at) for item in instances
+    ]
     if not samples:
         return None
     depths, alphas = (np.concatenate(values) for values in zip(*samples, strict=True))
@@ -58,6 +62,7 @@ def scene_at(
 
 def _at_pixel(
     instance: SplatInstance,
+    depsgraph: bpy.types.Depsgraph,
     view: np.ndarray,
     projection: np.ndarray,
     size: tuple[int, int],
@@ -65,16 +70,23 @@ def _at_pixel(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return depths (M,) in the world and opacities (M,) of an instance's splats that cover a pixel."""
     cloud = instance.evaluated.data
+    reduced = display.is_reduced(cloud)
+    if reduced:
+        cloud = instance.object.data
     means, scales, base = (read_attribute(cloud, name) for name in ("position", SCALE, BASE))
     if means is None or scales is None or base is None or not len(means):
         return np.zeros(0), np.zeros(0)
+    opacities, weights = base[:, 3], read_attribute(cloud, WEIGHT)
+    if reduced:
+        opacities = visible_opacities(cloud, means, rule_query(instance, depsgraph))
+    elif weights is not None:
+        opacities = opacities * weights
     projected = Projection.of(view @ instance.matrix_world, projection, size).place(means)
     squared_distances = np.square(projected.x - at[0]) + np.square(projected.y - at[1])
     with np.errstate(divide="ignore"):
         sigma = scales.mean(1) / projected.pixel
-    alphas = base[:, 3] * np.exp(-squared_distances / 2 / (sigma**2 + 0.3))  # 3DGS's dilation
-    weights = read_attribute(cloud, WEIGHT)
-    alphas = np.minimum(alphas if weights is None else alphas * weights, 0.99)
+    alphas = opacities * np.exp(-squared_distances / 2 / (sigma**2 + 0.3))  # 3DGS's dilation
+    alphas = np.minimum(alphas, 0.99)
     visible = alphas > MIN_ALPHA
     scale = np.cbrt(abs(np.linalg.det(instance.matrix_world[:3, :3])))  # instances are compared in the world
     return projected.depth[visible] * scale, alphas[visible]

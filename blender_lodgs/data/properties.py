@@ -24,6 +24,14 @@ def _hides_blender(self) -> bool:
     return self.splats if compat.NATIVE_SPLATS is None else not _is_native(self)
 
 
+def _hides_points(self) -> bool:
+    return self.splats and not _is_native(self) and not self.all_points and draws_viewports
+
+
+draws_viewports = not bpy.app.background and bpy.app.version >= (5, 0)
+"""False if Blender has no windows: scripts then read complete points after evaluation. Blender 4.5 does not
+know the bounds of clouds that Python made."""
+
 BYTES_PER_SPLAT = 8 << 10
 """Free memory for each splat of the default budget; a viewport with Blender's own data needs about 1 kB."""
 
@@ -75,6 +83,16 @@ class ViewportSettings(bpy.types.PropertyGroup):
         description="Blender's own drawing of splat objects is hidden or reduced to points in viewports",
         get=_hides_blender,
         options={"HIDDEN"},
+    )
+    hides_points: bpy.props.BoolProperty(
+        description="Viewports reduce splat objects to their bounds, because LODGS draws the splats",
+        get=_hides_points,
+        options={"HIDDEN"},
+    )
+    all_points: bpy.props.BoolProperty(
+        description="Viewports evaluate all points of splat objects, as for wireframes",
+        update=tag_owner,
+        options={"HIDDEN", "SKIP_SAVE"},
     )
     budget: bpy.props.IntProperty(
         name="Splat Budget",

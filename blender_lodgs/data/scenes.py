@@ -269,7 +269,7 @@ def visible_splats(
             placed splats also if the root is scaled differently along its axes.
     """
     levels = [item.object for item in root.lodgs.levels if item.exists]
-    with _without_native_drawing(context), display.with_harmonics(context, levels):
+    with _without_native_drawing(context), display.with_all_attributes(context, levels):
         depsgraph = context.evaluated_depsgraph_get()
         parts = [
             objects.read_splats(item.object, depsgraph)
@@ -322,7 +322,7 @@ def count_visible(context: bpy.types.Context, root: bpy.types.Object) -> tuple[i
         if item.exists:
             total += len(item.object.data.points)
             if depsgraph is not None and _visible(context, item):
-                visible += len(item.object.evaluated_get(depsgraph).data.points)
+                visible += display.point_count(item.object.evaluated_get(depsgraph).data)
     return visible, total
 
 
@@ -459,6 +459,7 @@ def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     if any(update.is_updated_geometry for update in depsgraph.updates):
         for root in editable:
             selection.update_inputs(root)
+        selection.keep_points_of_copies(scene)
 
 
 @bpy.app.handlers.persistent

@@ -20,6 +20,7 @@ from ...training.lod.query import LodQuery
 from ...training.lod.rule import Rule, collect_facts, fact_names, find_rule
 from ...training.splats.levels import Bundle
 from .. import compat
+from ..attributes import WEIGHT
 from ..nodes import crops as crop_groups
 from ..nodes import display
 from ..nodes import look as look_groups
@@ -227,12 +228,31 @@ def is_outdated(root: bpy.types.Object) -> bool:
 
 
 def update_inputs(root: bpy.types.Object) -> None:
-    """Set the modifier inputs that cannot be driven: camera object, tables and materials."""
+    """Set the modifier inputs that cannot be driven: camera object, tables and materials.
+
+    Levels get all points and attributes if modifiers of artists need them.
+    """
     for item in root.lodgs.levels:
         if item.exists and display.VIEWPORT in item.object.modifiers and _has_other_modifiers(item.object):
             display.keep_harmonics(item.object)
+        if item.exists and _needs_points(item.object):
+            display.keep_points(item.object)
+        elif item.exists:
+            display.reduce_points(item.object)
     for modifier, name, value in _object_inputs(root):
         _set(modifier, name, value, lambda current, value: current == value)
+
+
+def keep_points_of_copies(scene: bpy.types.Scene) -> None:
+    """Keep the points of copies of levels that artists gave modifiers."""
+    for obj in scene.objects:
+        if obj.type == "POINTCLOUD" and obj.is_editable and _needs_points(obj):
+            display.keep_points(obj)
+
+
+def _needs_points(obj: bpy.types.Object) -> bool:
+    """Return whether a splat object is read or edited after its modifiers."""
+    return obj.mode == "EDIT" or WEIGHT in obj.data.attributes or _has_other_modifiers(obj)
 
 
 def detach_references(root: bpy.types.Object) -> None:

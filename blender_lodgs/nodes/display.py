@@ -1,9 +1,10 @@
 """Node groups that switch between Blender's own drawing of splat objects and that of LODGS.
 
 "LODGS Display" hides Blender's drawing in viewports that LODGS draws, and turns splats into coloured points
-there. "LODGS Native Splats" applies the level-of-detail weights and the opacity of looks where Blender 5.3 or
-later draws the splats itself: its own drawing reads opacities from ``radiance:base`` only. "LODGS Viewport"
-drops the harmonics in viewports that LODGS draws, because crops and rules would copy them at every change.
+there. It reduces a level to the corners of its bounds, because Blender would draw every hidden point. "LODGS
+Native Splats" applies the level-of-detail weights and the opacity of looks where Blender 5.3 or later draws
+the splats itself: its own drawing reads opacities from ``radiance:base`` only. "LODGS Viewport" drops the
+harmonics in viewports that LODGS draws, because crops and rules would copy them at every change.
 
 Before Blender 5.3 splat clouds carry the material of points. From 5.3 on they carry none, since a material
 would replace the splats' own colours; the group sets it instead, or the artist's own material.
@@ -36,11 +37,17 @@ _NAMES = NAME, NATIVE, VIEWPORT
 _POINTS = "LODGS Points"
 MATERIAL = "material"
 _HIDE_POINTS = "Hide Points"
+_BOUNDS_ONLY = "Bounds Only"
+_COUNT = "lodgs_count"
+"""Attribute of reduced points: the number of points before."""
 
 
 def display_group() -> bpy.types.GeometryNodeTree:
-    """Return the group that hides Blender's drawing: plain points, of radius 0 where LODGS draws splats."""
-    return ensure_group(NAME, 2 if compat.NATIVE_SPLATS else 1, _build_display)
+    """Return the group that hides Blender's drawing: plain points, of radius 0 where LODGS draws splats.
+
+    With *Bounds Only*, the points are the eight corners of the bounds, which *View Selected* needs.
+    """
+    return ensure_group(NAME, 4 if compat.NATIVE_SPLATS else 3, _build_display)
 
 
 def native_group() -> bpy.types.GeometryNodeTree:
@@ -92,16 +99,59 @@ def keep_harmonics(obj: bpy.types.Object) -> None:
         remove_modifier(obj, modifier)
 
 
+def reduce_points(obj: bpy.types.Object) -> None:
+    """Let viewports that LODGS draws evaluate a splat object to the corners of its bounds.
+
+    Objects with modifiers of artists need all points: LODGS reads their splats after evaluation.
+    """
+    path = _bounds_path(obj)
+    if path and not _has_driver(obj, path):
+        read_scene(replace_driver(obj, path, "on"), "on", "lodgs_viewport.hides_points")
+
+
+def keep_points(obj: bpy.types.Object) -> None:
+    """Revert :func:`reduce_points`."""
+    path = _bounds_path(obj)
+    if path and _has_driver(obj, path):
+        obj.driver_remove(path)
+        compat.set_input(obj.modifiers[NAME], _BOUNDS_ONLY, False)
+
+
+def is_reduced(cloud: bpy.types.PointCloud) -> bool:
+    """Return True if an evaluated cloud has the corners of its bounds instead of its points."""
+    return _COUNT in cloud.attributes
+
+
+def point_count(cloud: bpy.types.PointCloud) -> int:
+    """Return the number of points of an evaluated cloud, before :func:`reduce_points`."""
+    count = cloud.attributes.get(_COUNT)
+    return count.data[0].value if count is not None and len(count.data) else len(cloud.points)
+
+
+def _bounds_path(obj: bpy.types.Object) -> str:
+    """Return the data path of *Bounds Only*; empty without this input."""
+    modifier = obj.modifiers.get(NAME)
+    if modifier is None or modifier.node_group is None or not compat.has_input(modifier, _BOUNDS_ONLY):
+        return ""
+    return compat.input_path(modifier, _BOUNDS_ONLY)
+
+
+def _has_driver(obj: bpy.types.Object, path: str) -> bool:
+    return obj.animation_data is not None and obj.animation_data.drivers.find(path) is not None
+
+
 @contextmanager
-def with_harmonics(context: bpy.types.Context, objects: Iterable[bpy.types.Object]) -> Iterator[None]:
-    """Evaluate splat objects without *LODGS Viewport* within the block."""
-    changed = [obj for obj in objects if VIEWPORT in obj.modifiers]
+def with_all_attributes(context: bpy.types.Context, objects: Iterable[bpy.types.Object]) -> Iterator[None]:
+    """Evaluate splat objects with all points and harmonics within the block."""
+    changed, settings = [obj for obj in objects if VIEWPORT in obj.modifiers], context.scene.lodgs_viewport
+    all_points, settings.all_points = settings.all_points, True
     for obj in changed:
         keep_harmonics(obj)
     context.view_layer.update()
     try:
         yield
     finally:
+        settings.all_points = all_points
         for obj in changed:
             drop_harmonics(obj)
             keep_order(obj)
@@ -178,6 +228,7 @@ def _is_outdated(obj: bpy.types.Object, name: str, current) -> bool:
 
 
 def _build_display(nodes: Nodes) -> None:
+    nodes.tree.interface.new_socket(_BOUNDS_ONLY, in_out="INPUT", socket_type="NodeSocketBool")
     if compat.NATIVE_SPLATS:
         nodes.tree.interface.new_socket(_HIDE_POINTS, in_out="INPUT", socket_type="NodeSocketBool")
         nodes.tree.interface.new_socket(MATERIAL, in_out="INPUT", socket_type="NodeSocketMaterial")
@@ -195,7 +246,28 @@ def _build_display(nodes: Nodes) -> None:
         points = material.outputs["Geometry"]
     radius.inputs["Radius"].default_value = 0.0
     nodes.link(points, radius, "Points")
-    nodes.link(radius.outputs["Points"], nodes.add("NodeGroupOutput"), "Geometry")
+    switch = nodes.add("GeometryNodeSwitch", input_type="GEOMETRY")
+    nodes.link(source.outputs[_BOUNDS_ONLY], switch, "Switch")
+    nodes.link(radius.outputs["Points"], switch, "False")
+    nodes.link(_bounds(nodes, source.outputs[0]), switch, "True")
+    nodes.link(switch.outputs["Output"], nodes.add("NodeGroupOutput"), "Geometry")
+
+
+def _bounds(nodes: Nodes, points: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+    """Return the corners of the bounds as points of radius 0, with the number of points."""
+    box, corners = nodes.add("GeometryNodeBoundBox"), nodes.add("GeometryNodeMeshToPoints")
+    if "Use Radius" in box.inputs:
+        box.inputs["Use Radius"].default_value = False
+    corners.inputs["Radius"].default_value = 0.0
+    size = nodes.add("GeometryNodeAttributeDomainSize", component="POINTCLOUD")
+    store = nodes.add("GeometryNodeStoreNamedAttribute", data_type="INT", domain="POINT")
+    store.inputs["Name"].default_value = _COUNT
+    nodes.link(points, box, "Geometry")
+    nodes.link(box.outputs["Bounding Box"], corners, "Mesh")
+    nodes.link(points, size, "Geometry")
+    nodes.link(corners.outputs[0], store, "Geometry")
+    nodes.link(size.outputs["Point Count"], store, "Value")
+    return store.outputs["Geometry"]
 
 
 def _build_viewport(nodes: Nodes) -> None:

@@ -31,6 +31,7 @@ from .. import attributes
 from ..data import changes, objects, roots, selection, shown
 from ..data.cameras import RenderView, aperture_of, require_flat_stereo, scene_camera, unsupported_lens
 from ..data.paths import absolute_path
+from ..nodes import display
 from . import renderer, written_images
 
 ID = "LODGS"
@@ -363,7 +364,7 @@ def placed_splats(
         evaluated, matrix, level = instance.evaluated, instance.matrix_world, instance.level
         placement = (matrix, level, instance.antialias)
         options = {"looks": instance.looks, "motion": _motion_of(identity, matrix, motion)}
-        is_empty = not len(evaluated.data.points)
+        is_empty = not display.point_count(evaluated.data)
         if instance.source is not None and (choice := shown.camera_query(instance, depsgraph)):
             file = instance.source.path, matrix, instance.antialias, choice
             placed.append(renderer.PlacedFile(*file, **options))
@@ -403,7 +404,7 @@ def _is_selected_by_rule(instance: shown.SplatInstance, depsgraph: bpy.types.Dep
 
     Objects that are hidden in the viewport do not count, because Blender does not report their changes.
     """
-    return (
+    return display.is_reduced(instance.evaluated.data) or (
         selection.only_lodgs_modifiers(instance.evaluated, depsgraph)
         and attributes.WEIGHT not in instance.object.data.attributes
         and instance.object.visible_get(view_layer=depsgraph.view_layer)

@@ -58,6 +58,7 @@ def _draw() -> None:
 def _draw_view(context: bpy.types.Context) -> None:
     space, region, view = context.space_data, context.region, context.region_data
     with_splats = draws_splats(context.scene, space)
+    _follow_shading(context.scene)
     view_camera.track(region, context.scene, view, splats=with_splats)
     if space.shading.type == "SOLID" and space.shading.color_type not in {"OBJECT", "RANDOM", "SINGLE"}:
         points = [
@@ -75,6 +76,31 @@ def _draw_view(context: bpy.types.Context) -> None:
         coverage.draw(context.scene)
         frusta.draw(context)
         cells.draw(context.scene)
+
+
+def _shows_wireframe(scene: bpy.types.Scene) -> bool:
+    """Return True if a viewport of a scene shows wireframes."""
+    return any(
+        area.type == "VIEW_3D" and area.spaces.active.shading.type == "WIREFRAME"
+        for window in bpy.context.window_manager.windows
+        if window.scene == scene
+        for area in window.screen.areas
+    )
+
+
+def _follow_shading(scene: bpy.types.Scene) -> None:
+    """Show all points of splat objects while a viewport of the scene shows wireframes."""
+    if scene.lodgs_viewport.all_points != _shows_wireframe(scene) and not bpy.app.timers.is_registered(
+        _store_shading
+    ):
+        bpy.app.timers.register(_store_shading, first_interval=0)  # properties are not set during a redraw
+
+
+def _store_shading() -> None:
+    for scene in {window.scene for window in bpy.context.window_manager.windows}:
+        wireframe = _shows_wireframe(scene)
+        if scene.lodgs_viewport.all_points != wireframe:
+            scene.lodgs_viewport.all_points = wireframe
 
 
 def _points(

@@ -7,8 +7,6 @@ import numpy as np
 
 from ...training.editing.brush import OcclusionDepth, Projection, hit_strength, middle_scale
 from ...training.lod.crop import crop_mask
-from ...training.lod.query import LodQuery, SplatSelector
-from ...training.lod.rule import HIDDEN, OPACITY
 from .. import attributes
 from ..data import cleaning, crops, shown
 from ..data.placement import axes_of
@@ -52,7 +50,7 @@ class StrokeTarget:
             self._levels[item.number] = projected, reach, editable, middle_scale(scales)
             if (instance := instances.get(obj)) is not None:
                 query = view_camera.view_query(instance, depsgraph)
-                occluders.append((projected, scales, _visible_opacities(cloud, means, query)))
+                occluders.append((projected, scales, cleaning.visible_opacities(cloud, means, query)))
         self._front = OcclusionDepth(occluders)
 
     def hits(
@@ -70,17 +68,3 @@ class StrokeTarget:
             number: hit_strength(covered, projected, reach, front, sigma if footprints else None) * editable
             for number, (projected, reach, editable, sigma) in self._levels.items()
         }
-
-
-def _visible_opacities(cloud: bpy.types.PointCloud, means: np.ndarray, query: LodQuery | None) -> np.ndarray:
-    """Return the opacities (N,) of the splats that a query selects, and 0 for all others."""
-    opacities = cleaning.splat_attribute(cloud, attributes.BASE)[:, 3]
-    if query is None:
-        return opacities
-    names = {name for name in query.columns if name in cloud.attributes}
-    columns = {name: attributes.view_attribute(cloud, name) for name in names - {HIDDEN}}
-    columns |= {OPACITY: opacities, HIDDEN: cleaning.hidden_mask(cloud)}
-    rows, weights = SplatSelector(means, columns).select(query)
-    visible = np.zeros(len(means), np.float32)
-    visible[rows] = weights * opacities[rows]
-    return visible

@@ -249,7 +249,7 @@ def test_drivers_need_no_scripts(bpy, lodgs, root):
         if t.animation_data
         for c in t.animation_data.drivers
     ]
-    drivers_per_level = 20 if compat.NATIVE_SPLATS else 17
+    drivers_per_level = 21 if compat.NATIVE_SPLATS else 18
     assert len(drivers) == 1 + drivers_per_level * len(S_MIN)
     assert all(driver.is_simple_expression and driver.is_valid for driver in drivers)
 

@@ -123,7 +123,7 @@ def render_passes(bpy, lodgs, **settings):
     engine, scene = lodgs("render.engine"), bpy.context.scene
     scene.view_layers[0].use_pass_z = scene.lodgs_render.use_pass_levels = True
     width, height = engine.render_size(scene.render)
-    with lodgs("nodes.display").with_harmonics(bpy.context, scene.objects):  # as when Blender renders
+    with lodgs("nodes.display").with_all_attributes(bpy.context, scene.objects):  # as when Blender renders
         depsgraph = bpy.context.evaluated_depsgraph_get()
         drawn = engine.render_frame(
             depsgraph, width, height, engine.render_border(scene.render, width, height), **settings
