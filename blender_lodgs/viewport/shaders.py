@@ -204,9 +204,18 @@ void main()
 }
 """
 _DEPTH_FRAGMENT = """
+// At a lower resolution, the farthest texel of a pixel: thin lines of the grid would hide whole pixels.
 void main()
 {
-  gl_FragDepth = texelFetch(depth, ivec2(texture_position * vec2(textureSize(depth, 0))), 0).r;
+  vec2 position = texture_position * vec2(textureSize(depth, 0)), step = fwidth(position);
+  ivec2 end = max(ivec2(round(step)), ivec2(1));
+  ivec2 first = ivec2(position - 0.5 * vec2(end - 1));
+  gl_FragDepth = 0.0;
+  for (int y = 0; y < end.y; y++) {
+    for (int x = 0; x < end.x; x++) {
+      gl_FragDepth = max(gl_FragDepth, texelFetch(depth, first + ivec2(x, y), 0).r);
+    }
+  }
   result = vec4(0.0);
 }
 """

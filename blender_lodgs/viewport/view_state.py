@@ -29,9 +29,9 @@ SLOW, SLOW_FACTOR = 0.08, 5.0
 factor more."""
 SMOOTH = 0.2
 """Seconds per redraw above which a smaller budget is suggested, and a moving view is simplified."""
-MOTION = 0.12
-"""Seconds to draw the splats of a simplified view; Blender needs the rest of SMOOTH."""
-MIN_MOTION = 20_000
+MOTION = 0.06
+"""Seconds to draw the splats of a simplified view. Blender itself needs most of SMOOTH on slow graphics."""
+MIN_MOTION = 50_000
 """Smallest number of splats of a simplified view."""
 COST_CHANGE = 0.1
 """Relative change of the number of splats from which a view is measured again."""
@@ -253,10 +253,16 @@ def suggest_budget() -> tuple[int, float, int] | None:
 
 
 def simplified_counts() -> tuple[int, int] | None:
-    """Return the splats in motion and at rest of the viewport that motion simplifies most; None if none."""
+    """Return the splats in motion and at rest of the viewport that motion simplifies most; None if none.
+
+    Those in motion are the requested number. The drawn number differs with each view, and stating it would
+    redraw the panel as often.
+    """
     counts = [
-        (len(arrangement.motion), arrangement.count)
+        (arrangement.request.motion[0], arrangement.count)
         for view in active_views
-        if (arrangement := view.arrangement) is not None and arrangement.motion is not None
+        if (arrangement := view.arrangement) is not None
+        and arrangement.motion is not None
+        and arrangement.request.motion is not None
     ]
     return min(counts, key=lambda pair: pair[0] / pair[1], default=None)

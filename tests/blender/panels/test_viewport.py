@@ -106,12 +106,16 @@ def test_panel_suggests_a_budget_for_the_measured_speed(bpy, lodgs, viewport, dr
 
 def test_panel_states_the_splats_of_a_moving_view(lodgs, viewport, draw_panel):
     state = lodgs("viewport.view_state")
-    arrangement = SimpleNamespace(count=1_000_000, motion=np.zeros((120_000, 4)), excluded=0)
+    request = SimpleNamespace(motion=(120_000, (0.0, 0.0, 0.0)))
+    arrangement = SimpleNamespace(count=1_000_000, motion=np.zeros((119_876, 4)), excluded=0, request=request)
     view = state.ViewState(arrangement=arrangement)
     state.active_views.clear()
     state.active_views.add(view)
     texts = draw_panel("viewport", "LODGS_PT_viewport").texts
     assert "A moving view draws 120 k of 1.0 M splats, the small ones enlarged." in texts
+    stated = state.simplified_counts()
+    arrangement.motion = np.zeros((120_123, 4))  # another view keeps others
+    assert state.simplified_counts() == stated, "the panel is not drawn again for each view"
     arrangement.motion = None
     texts = draw_panel("viewport", "LODGS_PT_viewport").texts
     assert not any("moving view" in text for text in texts)
