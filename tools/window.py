@@ -6,6 +6,7 @@ Installs the built zip into a Blender with separate settings, on a virtual displ
 
 ``--flight BUNDLE --cameras DIR`` runs ``window_flight.py`` instead: fly through a tree of splats along the
 cameras of a folder, and print how long each piece of LODGS' work blocks Blender's main thread.
+``--speed SPLATS --cameras DIR`` runs ``window_speed.py``: measure the redraws of a moving view of a file.
 ``--cells`` runs ``window_cells.py``: train the scene in cells, two at a time.
 ``--walk`` runs ``window_walk.py``: from photos to a rendered shot, as in the artists' guide.
 
@@ -48,16 +49,17 @@ def main() -> int:
     )
     parser.add_argument("--flight", type=Path, help="fly through this tree of splats instead")
     parser.add_argument(
-        "--cameras", type=Path, help="folder of cameras for the flight, as written by examples.town"
+        "--cameras", type=Path, help="folder of cameras for --flight or --speed, from examples.town"
     )
     parser.add_argument(
         "--budget", type=int, default=1_000_000, help="memory budget for the flight, in splats"
     )
+    parser.add_argument("--speed", type=Path, help="measure redraws of a moving view of this file instead")
     parser.add_argument("--cells", action="store_true", help="train the scene in cells instead")
     parser.add_argument("--walk", action="store_true", help="work from photos to a rendered shot instead")
     options = parser.parse_args()
-    if options.flight and not options.cameras:
-        parser.error("--flight requires --cameras")
+    if (options.flight or options.speed) and not options.cameras:
+        parser.error("--flight and --speed require --cameras")
     blender, x_server, camera = find_programs()
     archive = extension.build(ROOT / "dist")
     out: Path = options.out.resolve()
@@ -78,6 +80,8 @@ def main() -> int:
     if options.flight:
         plan |= {"flight": str(options.flight.resolve()), "cameras": str(options.cameras.resolve())}
         plan["budget"] = options.budget
+    if options.speed:
+        plan |= {"speed": str(options.speed.resolve()), "cameras": str(options.cameras.resolve())}
     with display(x_server) as os.environ["DISPLAY"]:
         problem = run_script(blender, plan, out / "blender.log")
     for line in facts(out):
@@ -139,11 +143,11 @@ def display(x_server: str) -> Iterator[str]:
 
 def run_script(blender: str, plan: dict, log: Path) -> str:
     """Run a script in Blender; return the reason for its failure, or an empty string."""
-    name = next((key for key in ("flight", "cells", "walk", "pictures") if plan.get(key)), "tour")
+    name = next((key for key in ("flight", "speed", "cells", "walk", "pictures") if plan.get(key)), "tour")
     script = ROOT / "tools" / f"window_{name}.py"
     command = [
         blender, "--gpu-backend", "opengl", "--window-geometry", "0", "0", *map(str, SIZE),
-        *(["--enable-event-simulate"] if plan.get("walk") or plan.get("pictures") else []),
+        *(["--enable-event-simulate"] if any(map(plan.get, ("walk", "speed", "pictures"))) else []),
         "--python-exit-code", "1", "--python", str(script), "--", json.dumps(plan),
     ]  # fmt: skip
     with open(log, "wb") as output:
