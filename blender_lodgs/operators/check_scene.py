@@ -25,6 +25,13 @@ class LODGS_OT_check_scene(SceneOperator, SteppedOperator, bpy.types.Operator):
 
     _findings: list[Finding] | None = None
 
+    @classmethod
+    def poll(cls, context):
+        if scene_check.running:
+            cls.poll_message_set("A check is running")
+            return False
+        return super().poll(context)
+
     def invoke(self, context, event):
         return self.execute(context) if bpy.app.background else self.start_modal(context)
 
@@ -32,17 +39,20 @@ class LODGS_OT_check_scene(SceneOperator, SteppedOperator, bpy.types.Operator):
         root = roots.active_root(context)
         uid, key = root.session_uid, scene_check.settings_key(root)
         reader = ThreadPoolExecutor(1, "lodgs-check")
+        scene_check.running.add(uid)
+        extension.redraw()
         try:
             reading = reader.submit(scene_check.read_findings(root))
             while wait([reading], 0.01).not_done:
                 yield
         finally:
             reader.shutdown(wait=False)
+            scene_check.running.discard(uid)
+            extension.redraw()
         self._findings = reading.result()
         root = root_by_uid(uid)
         if root is not None:  # undo may have replaced it
             scene_check.store_findings(root, key, self._findings)
-        extension.redraw()
 
     def status_text(self, context, count):
         return "Checking the scene, Esc to stop"

@@ -156,6 +156,8 @@ def _draw_choices(
         row.operator("lodgs.train", text="Train", icon="PLAY")
     if root.lodgs.scene_folder and not estimate:
         row.operator("lodgs.check_scene", text="", icon="TIME")
+    if root.session_uid in scene_check.running:
+        layout.label(text="Estimating time and memory…", icon="TIME")
 
 
 def _draw_views(column: bpy.types.UILayout, context: bpy.types.Context, root: bpy.types.Object) -> None:

@@ -21,6 +21,8 @@ TIMEOUT = 600.0
 
 _findings: dict[int, tuple[str, list[Finding]]] = {}
 """Settings of the training and findings of the last check, by the session uid of the scene root."""
+running: set[int] = set()
+"""Session uids of the scene roots that are being checked."""
 
 
 def read_findings(root: bpy.types.Object) -> Callable[[], list[Finding]]:

@@ -1,5 +1,6 @@
 """The Scene, Compare, Viewport and Rendering panels."""
 
+import threading
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -185,6 +186,27 @@ def test_estimate_is_above_train_until_settings_change(bpy, lodgs, root, draw_pa
     assert "Two photos are missing. Add them." in texts and "About 3 min." not in texts
     root.lodgs.training.preset = "standard"
     assert "About 3 min." not in draw_training().texts and "lodgs.check_scene" in draw_training().operators
+
+
+def test_panel_states_a_running_estimate(bpy, lodgs, root, draw_panel, monkeypatch):
+    """A second press would start a second measurement."""
+    finish = threading.Event()
+
+    def answer(*_, **options):
+        assert finish.wait(20)
+        return SimpleNamespace(returncode=0, stdout="estimate: About 3 min.\n")
+
+    monkeypatch.setattr(lodgs("runs.environment"), "run_module", answer)
+    operator = lodgs("operators.check_scene").LODGS_OT_check_scene
+    steps = operator.work(SimpleNamespace(), bpy.context)
+    next(steps)
+    assert "Estimating time and memory…" in draw_panel("training", "LODGS_PT_training").texts
+    assert not bpy.ops.lodgs.check_scene.poll()
+    finish.set()
+    assert all(step is None for step in steps)
+    texts = draw_panel("training", "LODGS_PT_training").texts
+    assert "Estimating time and memory…" not in texts and "About 3 min." in texts
+    assert bpy.ops.lodgs.check_scene.poll()
 
 
 def test_check_lists_its_findings(bpy, lodgs, root, draw_panel, tmp_path, monkeypatch):
