@@ -18,6 +18,11 @@ _MIN_LOGIT = -2.2
 _HOLLOW_RADIUS, _HOLLOW_SHARE = 0.35, 0.06
 """A scene is hollow, such as a room around the viewer, if its center is almost empty: less than this share of
 its splats is within this fraction of its radius."""
+_FURNISHED_SHARE, _CLOSED = 0.2, 0.95
+"""A furnished room has more splats there, at most _FURNISHED_SHARE, and walls in most directions."""
+_WALL_RADIUS, _WALL_CONE, _WALL_DIRECTIONS = 1.6, 0.995, 300
+"""Maximum distance of walls from the center in radii, cosine of the angle that a splat covers, and number of
+directions."""
 _MIN_FLATNESS, _MAX_OBLONG, _MIN_GROUND = 2.2, 1.4, 0.05
 """Minimum flatness, maximum ratio of length to width, and minimum score of a ground that is not across -y.
 Flatness is the mean spread of the splats, relative to the spread along the axis. A wall is more oblong."""
@@ -205,8 +210,20 @@ def overview_camera(bundle: Bundle, width: int) -> tuple[Camera, float]:
 
 
 def _is_hollow(means: np.ndarray, center: np.ndarray, radius: float) -> bool:
-    """Return True if a scene has few splats near its center, given their means (N, 3)."""
-    return bool((np.linalg.norm(means - center, axis=1) < _HOLLOW_RADIUS * radius).mean() < _HOLLOW_SHARE)
+    """Return True if a scene, given its means (N, 3), is around the viewer.
+
+    It has few splats near its center, or some inside walls in all directions.
+    """
+    offsets = (means - center).astype(np.float64)
+    distances = np.linalg.norm(offsets, axis=1)
+    share = float((distances < _HOLLOW_RADIUS * radius).mean())
+    if not _HOLLOW_SHARE <= share < _FURNISHED_SHARE:
+        return share < _HOLLOW_SHARE
+    walls = (distances > 1e-9) & (distances < _WALL_RADIUS * radius)
+    directions = np.random.default_rng(0).normal(size=(_WALL_DIRECTIONS, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    cosines = (offsets[walls] / distances[walls, None]) @ directions.T
+    return bool((cosines > _WALL_CONE).any(axis=0).mean() > _CLOSED)
 
 
 def _is_upright(splats: Splats) -> bool:

@@ -137,6 +137,19 @@ def test_view_of_a_room_is_from_inside():
     assert (np.abs(position) < half).all()
 
 
+def test_view_of_a_furnished_room_is_from_inside():
+    """A table in the middle has a tenth of the splats."""
+    half = np.float64([3, 2.5, 1.3])
+    walls = box_faces(tuple(half))
+    table = np.random.default_rng(7).uniform(-0.5, 0.5, (len(walls) // 9, 3)) * (1, 0.7, 0.4) - (0, 0, 0.8)
+    means = np.concatenate([walls, table])
+    position, _ = choose_view(splats_at(means, 0.1), np.float64([0, 0, 1]))
+    assert (np.abs(position) < half).all()
+    open_air = means[means[:, 2] < 1.2]  # without a ceiling
+    position, _ = choose_view(splats_at(open_air, 0.1), np.float64([0, 0, 1]))
+    assert not (np.abs(position) < half).all()
+
+
 @pytest.mark.parametrize("case", ["brush", "postshot", "outliers"])
 def test_splats_of_other_programs_open_with_the_same_view(case):
     """A garden as Brush (y down, other scale), Postshot (z up, far from 0) and with far, large outliers."""
