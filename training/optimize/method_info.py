@@ -53,8 +53,6 @@ class MethodInfo:
             every cell trains all levels.
         trains_on_device: return whether the backend gpu can make all steps with given parameters
             (``Method.device_steps``). The backend auto then considers it.
-        pixel_parameters: names of sizes in pixels that stay the same in the scene if a reduced job trains on
-            smaller images than its preset.
         unused: names of inherited parameters that this method ignores.
         package: package of the method as a module name, set at discovery.
     """
@@ -74,7 +72,6 @@ class MethodInfo:
     split_parameters: Callable[[Any], tuple[Parameters, Parameters] | None] = no_split
     capture_values: Mapping[str, Any] = field(default_factory=dict)
     trains_on_device: Callable[[Any], bool] = never
-    pixel_parameters: tuple[str, ...] = ()
     unused: tuple[str, ...] = ()
     package: str = ""
 

@@ -38,8 +38,8 @@ class ReducedJobs:
     """Jobs on a scene that do a fraction of a preset's work.
 
     The effort multiplies the numbers of steps. Below 1, it also multiplies the pixels of an image, but the
-    longer side keeps SMALL_SIDE pixels; gradient thresholds and ``MethodInfo.pixel_parameters`` follow the
-    size of the images, and MAX_DENSITY limits the splats. An image scale among the keys remains.
+    longer side keeps SMALL_SIDE pixels; gradient thresholds and parameters in pixels follow the size of the
+    images, and MAX_DENSITY limits the splats. An image scale among the keys remains.
 
     Args:
         scene: COLMAP scene.
@@ -78,9 +78,9 @@ class ReducedJobs:
         if self._pixel_ratio < 1:
             preset = info.preset(self.preset)
             parameters |= {
-                name: self._pixel_ratio * getattr(preset, name)
-                for name in info.pixel_parameters
-                if name not in parameters
+                f.name: self._pixel_ratio * getattr(preset, f.name)
+                for f in info.fields
+                if f.metadata["unit"] == "px" and f.name not in parameters
             }
         if self._max_splats:
             limit = info.preset(self.preset).max_splats or self._max_splats

@@ -53,13 +53,18 @@ def test_effort_limits_splats_by_pixels(tiny_scene, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("effort", "scale", "pixels"), [(0.1, 0.25, 0.75), (1.0, 0.25, 3.0), (0.1, 1.0, 3.0)]
-)
-def test_effort_keeps_the_size_of_cuts_in_the_scene(tiny_scene, tmp_path, effort, scale, pixels):
-    jobs = ReducedJobs(tiny_scene, "paper", effort, {"image_scale": scale})
-    assert jobs.job("tree", tmp_path / "run").resolved_parameters().pixels == pixels
-    fixed = jobs.job("tree", tmp_path / "run", {"pixels": 2.0})
-    assert fixed.resolved_parameters().pixels == 2.0
+    ("method", "parameter", "size"),
+    [("tree", "pixels", 3.0), ("flod", "footprint", 40.0), ("flod_scaffold", "coarsest", 40.0),
+     ("octree_neural", "footprint", 1.0)],
+)  # fmt: skip
+def test_effort_keeps_sizes_in_pixels_the_same_in_the_scene(tiny_scene, tmp_path, method, parameter, size):
+    def trained(effort, scale, changes=None):
+        jobs = ReducedJobs(tiny_scene, "paper", effort, {"image_scale": scale})
+        return getattr(jobs.job(method, tmp_path / "run", changes).resolved_parameters(), parameter)
+
+    assert trained(0.1, 0.25) == size / 4  # images with a quarter of the side
+    assert trained(1.0, 0.25) == trained(0.1, 1.0) == size
+    assert trained(0.1, 0.25, {parameter: 2.0}) == 2.0
 
 
 @pytest.fixture

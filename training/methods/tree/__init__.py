@@ -141,7 +141,6 @@ METHOD = MethodInfo(
     presets={"draft": _DRAFT, "standard": _STANDARD, "paper": _PAPER},
     rule="cut",
     panel_parameters=("max_splats", "tune_steps", "pixels"),
-    pixel_parameters=("pixels",),
     from_base=True,
     streams_base=True,
     suggested_for_base=True,
