@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import replace
 from itertools import pairwise
 
@@ -72,69 +72,55 @@ def measure_farther_views(evaluation: Evaluation, bundle: Bundle, values: Values
     return rows
 
 
-class FlyOut:
-    """A camera move from a view back to FACTORS[-1] times its distance, in FRAMES equal factors.
+def fly_out(camera: Camera, depth: float, step: int = 1) -> list[Camera]:
+    """Return the views of a camera move back to FACTORS[-1] times the distance, in FRAMES equal factors.
 
-    Attributes:
-        factors: distance of each frame relative to the first, (FRAMES,).
-        moved: whether the image at full detail changes between two frames, (FRAMES - 1,).
+    Args:
+        depth: distance in front of the camera that the factors multiply.
+        step: number of frames from one returned view to the next.
     """
-
-    def __init__(self, evaluation: Evaluation, bundle: Bundle, camera: Camera) -> None:
-        self.factors = np.geomspace(FACTORS[0], FACTORS[-1], FRAMES)
-        depth = evaluation.data.median_depth
-        self._views = [pull_back(camera, factor, depth) for factor in self.factors]
-        self._near = evaluation.data.near
-        self._resident = ResidentBundle(bundle, evaluation.backend)
-        source = full_detail_source(bundle, bundle.levels[-1])
-        splats, weights = source(camera)
-        loaded = evaluation.load(splats)
-
-        def draw_full(view: Camera) -> np.ndarray:
-            splats = source(view)[0] if bundle.on_disk else loaded
-            return evaluation.draw(splats, view, weights).numpy()
-
-        self._full_differences = _differences(map(draw_full, self._views))
-        self.moved = self._full_differences > 0
-
-    def frames(self, values: Values) -> Iterator[np.ndarray]:
-        """Draw the frames (H, W, 3) with levels by distance.
-
-        Args:
-            values: values of the rule's controls.
-        """
-        for view in self._views:
-            yield self._resident.draw(view, values, near=self._near).image.cpu().numpy()
-
-    def jumps(self, frames: Iterable[np.ndarray]) -> np.ndarray:
-        """Return the change between consecutive frames relative to full detail, (FRAMES - 1,).
-
-        A change is the mean absolute difference. It is 0 where full detail does not change.
-        """
-        changes = _differences(frames)
-        return np.divide(changes, self._full_differences, out=np.zeros_like(changes), where=self.moved)
+    factors = np.geomspace(FACTORS[0], FACTORS[-1], FRAMES)[::step]
+    return [pull_back(camera, factor, depth) for factor in factors]
 
 
-def _differences(images: Iterable[np.ndarray]) -> np.ndarray:
-    """Return the mean absolute difference between consecutive images."""
-    return np.array([np.abs(second - first).mean() for first, second in pairwise(images)])
+def measure_popping(
+    evaluation: Evaluation, bundle: Bundle, values: Values, camera: Camera
+) -> dict[str, list[float]]:
+    """Measure the jumps between frames while the camera moves back (:func:`fly_out`).
 
-
-def measure_popping(evaluation: Evaluation, bundle: Bundle, values: Values, camera: Camera) -> dict:
-    """Measure the largest jump between frames while the camera moves back, see :class:`FlyOut`.
+    A jump is the mean absolute difference between consecutive frames, relative to full detail. It is 0 where
+    full detail does not change.
 
     Args:
         values: values of the rule's controls.
 
     Returns:
-        The largest jump as ``by distance``. If the rule can fade levels: the largest jump with fading as
-        ``faded``, and without fading as ``hard``.
+        The FRAMES - 1 jumps as ``by distance``. If the rule can fade levels: those with fading as ``faded``,
+        and without fading as ``hard``.
     """
-    fly_out = FlyOut(evaluation, bundle, camera)
+    views = fly_out(camera, evaluation.data.median_depth)
+    resident = ResidentBundle(bundle, evaluation.backend)
+    source = full_detail_source(bundle, bundle.levels[-1])
+    splats, weights = source(camera)
+    loaded = evaluation.load(splats)
 
-    def largest_jump(values: Values) -> float:
-        return round(float(fly_out.jumps(fly_out.frames(values)).max(initial=0)), 3)
+    def draw_full(view: Camera) -> np.ndarray:
+        splats = source(view)[0] if bundle.on_disk else loaded
+        return evaluation.draw(splats, view, weights).numpy()
+
+    full = _differences(map(draw_full, views))
+
+    def jumps(values: Values) -> list[float]:
+        frames = (resident.draw(view, values, near=evaluation.data.near).image for view in views)
+        changes = _differences(frame.cpu().numpy() for frame in frames)
+        relative = np.divide(changes, full, out=np.zeros_like(changes), where=full > 0)
+        return [round(float(jump), 3) for jump in relative]
 
     if any(control.name == "fade" for control in require_rule(bundle).controls):
-        return {"faded": largest_jump({**values, "fade": 1}), "hard": largest_jump({**values, "fade": 0})}
-    return {"by distance": largest_jump(values)}
+        return {"faded": jumps({**values, "fade": 1}), "hard": jumps({**values, "fade": 0})}
+    return {"by distance": jumps(values)}
+
+
+def _differences(images: Iterable[np.ndarray]) -> np.ndarray:
+    """Return the mean absolute difference between consecutive images."""
+    return np.array([np.abs(second - first).mean() for first, second in pairwise(images)])

@@ -21,7 +21,8 @@ A report has these keys:
 - ``curve``: as ``selective``, for each value of the rule's ``sweep``, without LPIPS; in memory also
   PSNR ``merged``
 - ``networks``: quality of a neural model before baking
-- ``farther`` and ``jumps`` (of the middle view), if ``far``
+- ``farther``, the largest ``jumps`` of the middle view, and all jumps of the first kind as ``flight``, if
+  ``far``
 
 Without held-out views, ``test_views`` is empty, ``worst`` is missing, and quality is measured on
 training views as ``train_psnr`` and ``train_ssim``.
@@ -118,7 +119,9 @@ def evaluate_run(
         report["networks"] = _measure_networks(job, folder, evaluation)
     if far and rule:
         report["farther"] = measure_farther_views(evaluation, bundle, values)
-        report["jumps"] = measure_popping(evaluation, bundle, values, middle)
+        jumps = measure_popping(evaluation, bundle, values, middle)
+        report["jumps"] = {name: max(row) for name, row in jumps.items()}
+        report["flight"] = next(iter(jumps.values()))
     if image is not None:
         write_level_sheet(image, bundle, evaluation, middle, values)
     with atomic_write(folder.metrics) as temporary:

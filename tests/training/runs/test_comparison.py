@@ -75,7 +75,8 @@ def test_page_has_the_numbers_of_evaluate(runs, report, number):
         assert measured["by_distance"][name] == expected["selective"][0][name]
     for name in ("factor", "drawn", "drawn_full", "psnr"):
         assert [row[name] for row in measured["farther"]] == [row[name] for row in expected["farther"]]
-    assert measured["largest_jump"] == expected["jumps"]["by distance"]
+    assert measured["largest_jump"] == expected["jumps"]["by distance"] == max(measured["jumps"])
+    assert measured["jumps"] == expected["flight"]
     assert measured["loaded"] == expected["loaded"]
     assert (measured["frame_memory"] is None) == (expected["frame_memory"]["by_distance"] is None)
 
@@ -103,7 +104,7 @@ def test_report_newer_than_the_bundle_is_not_measured_again(runs, report, monkey
 def test_report_with_other_control_values_is_measured_again(runs, report, tmp_path):
     run = shutil.copytree(runs[0], tmp_path / "run")
     evaluate_run(run, {"gamma": 50.0})
-    measured = measure_run(run, "FLoD", {"gamma": 1.0}, far=False)
+    measured = measure_run(run, "FLoD", {"gamma": 1.0})
     assert measured.by_distance.psnr == report[0]["runs"][0]["by_distance"]["psnr"]
 
 

@@ -11,7 +11,7 @@ from dataclasses import replace as replaced
 import numpy as np
 import torch
 
-from ...evaluate.distance import FlyOut
+from ...evaluate.distance import fly_out
 from ...evaluate.level_sheet import in_level_colors
 from ...evaluate.views import Evaluation
 from ...lod.rule import Values
@@ -54,13 +54,11 @@ class RunImages:
         label: label of the run.
         variants: images by "Full detail", "Reduced", "By distance" and "Level colours", or by names of sets.
         frames: addresses of images of a fly-out, one for FRAMES_PER_IMAGE frames; empty without a rule.
-        jumps: change between consecutive frames relative to full detail.
     """
 
     label: str
     variants: dict[str, Variant]
     frames: list[str] = field(default_factory=list)
-    jumps: list[float] = field(default_factory=list)
 
 
 def compared_views(evaluation: Evaluation) -> list[Camera]:
@@ -126,7 +124,7 @@ def render_run(
         variants["Level colours"] = variant(
             "Levels by distance", lambda camera: colored.draw(camera, values, near=near).image
         )
-    return RunImages(run.label, variants, *_fly_out(evaluation, bundle, values))
+    return RunImages(run.label, variants, _fly_out(evaluation, resident, values))
 
 
 def render_merges(
@@ -141,20 +139,12 @@ def render_merges(
     return RunImages(run.label, variants)
 
 
-def _fly_out(evaluation: Evaluation, bundle: Bundle, values: Values) -> tuple[list[str], list[float]]:
-    """Return images and jumps of a fly-out from the middle view."""
-    middle = evaluation.cameras[len(evaluation.cameras) // 2]
-    fly_out = FlyOut(evaluation, bundle, _narrowed(middle, FRAME_WIDTH))
-    images = []
-
-    def frames():
-        for number, frame in enumerate(fly_out.frames(values)):
-            if number % FRAMES_PER_IMAGE == 0:
-                images.append(encode(torch.from_numpy(frame)))
-            yield frame
-
-    jumps = fly_out.jumps(frames())
-    return images, [round(float(jump), 3) for jump in jumps]
+def _fly_out(evaluation: Evaluation, resident: ResidentBundle, values: Values) -> list[str]:
+    """Return images of a fly-out from the middle view."""
+    data = evaluation.data
+    middle = _narrowed(evaluation.cameras[len(evaluation.cameras) // 2], FRAME_WIDTH)
+    views = fly_out(middle, data.median_depth, FRAMES_PER_IMAGE)
+    return [encode(resident.draw(view, values, near=data.near).image) for view in views]
 
 
 def _narrowed(camera: Camera, width: int) -> Camera:

@@ -80,8 +80,8 @@ class ComparedRun:
         by_distance: quality with the rule's default controls, or None without a rule.
         merged: number of splats and PSNR in dB of the finest level with merged neighbours, the baseline.
         farther: rows of ``evaluate.distance.measure_farther_views``.
-        largest_jump: largest jump of a fly-out relative to full detail, faded if the rule can fade, or None
-            without a rule.
+        jumps: change between consecutive frames of a fly-out relative to full detail, faded if the rule can
+            fade; empty without a rule.
         loaded: mean number of splats that a viewer loads for a view.
         megabytes: size of all levels in one file.
         seconds: seconds of training, or None.
@@ -97,7 +97,7 @@ class ComparedRun:
     by_distance: Point | None = None
     merged: list[tuple[int, float]] = field(default_factory=list)
     farther: list[dict] = field(default_factory=list)
-    largest_jump: float | None = None
+    jumps: list[float] = field(default_factory=list)
     loaded: int = 0
     megabytes: float = 0.0
     seconds: float | None = None
@@ -105,6 +105,11 @@ class ComparedRun:
     frame_memory: int | None = None
     steps: int = 0
     baseline: bool = False
+
+    @property
+    def largest_jump(self) -> float | None:
+        """Largest of the jumps, or None without a rule."""
+        return max(self.jumps, default=None)
 
     @property
     def finest(self) -> Point:
@@ -130,12 +135,11 @@ def measure_run(
     run: Path,
     label: str,
     values: Values,
-    far: bool = True,
     warn: Warn = ignore,
     notify: Notify = ignore,
     lpips: Path | None = None,
 ) -> ComparedRun:
-    """Measure a finished run as ``lodgs evaluate`` does, by default with ``--far``.
+    """Measure a finished run as ``lodgs evaluate --far`` does.
 
     A report that is newer than the run's bundle and has the same values and measures is not measured again.
 
@@ -156,10 +160,10 @@ def measure_run(
         is_same = all(newest[name] == value for name, value in values.items())
         has_lpips = any({"lpips_vgg", "train_lpips_vgg"} & level.keys() for level in report["levels"])
         is_complete = bool(missing_line(lpips)) or has_lpips
-        if is_same and is_complete and (not far or not report["rule"] or "farther" in report):
+        if is_same and is_complete and (not report["rule"] or "flight" in report):
             return compared_run(folder, job, report, label)
     notify(f"Measuring {label}.")
-    return compared_run(folder, job, evaluate_run(run, values, far=far, warn=warn, lpips=lpips), label)
+    return compared_run(folder, job, evaluate_run(run, values, far=True, warn=warn, lpips=lpips), label)
 
 
 def compared_run(folder: RunFolder, job: Job, report: dict, label: str) -> ComparedRun:
@@ -191,7 +195,7 @@ def compared_run(folder: RunFolder, job: Job, report: dict, label: str) -> Compa
         by_distance=Point.of(report["selective"][0], "By distance", prefix) if report["selective"] else None,
         merged=[*merged, (finest.splats, finest.psnr)] if merged else [],
         farther=[dict(row) for row in report.get("farther", [])],
-        largest_jump=float(next(iter(report["jumps"].values()))) if report.get("jumps") else None,
+        jumps=[float(jump) for jump in report.get("flight", [])],
         loaded=int(report.get("loaded", finest.splats)),
         megabytes=report["bytes"] / 1e6,
         seconds=float(seconds) if isinstance(seconds, (int, float)) else None,
@@ -300,7 +304,7 @@ def recommend_runs(runs: Sequence[ComparedRun]) -> list[dict[str, str]]:
 def collect_measures(runs: Sequence[ComparedRun]) -> dict:
     """Return the measures of runs as plain values for JSON."""
     count = compared_count(runs)
-    rows = [{**asdict(run), "at_share": run.psnr_at(count)} for run in runs]
+    rows = [{**asdict(run), "largest_jump": run.largest_jump, "at_share": run.psnr_at(count)} for run in runs]
     return {"compared_splats": round(count), "runs": rows, "answers": recommend_runs(runs)}
 
 

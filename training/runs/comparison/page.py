@@ -59,9 +59,8 @@ def compare(
         LodgsError: a run is not finished, the runs have different scenes, or a file cannot be written.
     """
     labels = label_runs(runs)
-    several = len(runs) > 1
     measured = [
-        measure_run(run, label, _default_values(run), several, warn, notify, lpips)
+        measure_run(run, label, _default_values(run), warn, notify, lpips)
         for run, label in zip(runs, labels, strict=True)
     ]
     _, job, data = open_finished(runs[0], warn)
