@@ -137,6 +137,10 @@ def test_answers_name_the_best_run_and_ignore_baselines():
     best = {row["purpose"]: row["best"] for row in rows}
     assert best["Quality at full detail"] == "B" and best["Short training"] == "A"
     assert best["Few splats to load"] == "A"  # 100 splats, all without levels
+    assert rows[0] == {
+        "purpose": "Quality at full detail", "best": "B", "measure": "31.00 dB",
+        "why": "31.00 dB with 200 splats", "next": "A (30.00 dB)",
+    }  # fmt: skip
     assert "Speed from far away" not in best  # neither has levels
 
 

@@ -242,42 +242,38 @@ class Purpose:
 
     Attributes:
         name: its name in tables.
-        cost: returns the measure to minimise, from a run and the number of splats at which runs are compared;
-            None without a measure.
-        describe: returns the measure as text.
+        measure: return the measure of a run, from the number of splats at which runs are compared; None if
+            there is none.
+        form: format of the measure.
+        detail: return a text that follows the measure.
+        highest: whether a higher measure is better.
     """
 
     name: str
-    cost: Callable[[ComparedRun, float], float | None]
-    describe: Callable[[ComparedRun, float], str]
+    measure: Callable[[ComparedRun, float], float | None]
+    form: str
+    detail: Callable[[ComparedRun, float], str]
+    highest: bool = False
 
 
-def _describe_reduced(run: ComparedRun, count: float) -> str:
-    full = f"full detail has {run.finest.psnr:.2f} dB with {run.finest.splats:,}"
-    return f"{run.psnr_at(count) or 0:.2f} dB with {count:,.0f} splats; {full}"
-
-
-def _describe_far(run: ComparedRun, count: float) -> str:
-    row = run.farther[-1]
-    return (
-        f"{1e3 * row['frame_s']:.1f} ms a frame from {row['factor']} times the distance, with "
-        f"{row['drawn']:,} splats in the image"
-    )
+def _full_detail(run: ComparedRun) -> str:
+    return f"{run.finest.psnr:.2f} dB with {run.finest.splats:,}"
 
 
 PURPOSES = (
-    Purpose("Quality at full detail", lambda run, _: -run.finest.psnr,
-            lambda run, _: f"{run.finest.psnr:.2f} dB with {run.finest.splats:,} splats"),
-    Purpose(f"Quality with {SHARE:.0%} of the splats",
-            lambda run, count: None if (quality := run.psnr_at(count)) is None else -quality,
-            _describe_reduced),
-    Purpose("Speed from far away", lambda run, _: run.farther[-1]["frame_s"] if run.farther else None,
-            _describe_far),
-    Purpose("Few splats to load", lambda run, _: run.loaded,
-            lambda run, _: f"{run.loaded:,} splats for a view"),
-    Purpose("Smooth changes", lambda run, _: run.largest_jump,
-            lambda run, _: f"largest jump between frames {run.largest_jump:.2f} times that of full detail"),
-    Purpose("Short training", lambda run, _: run.seconds, lambda run, _: f"{run.seconds:,.0f} s"),
+    Purpose("Quality at full detail", lambda run, _: run.finest.psnr, "{:.2f} dB",
+            lambda run, _: f" with {run.finest.splats:,} splats", highest=True),
+    Purpose(f"Quality with {SHARE:.0%} of the splats", ComparedRun.psnr_at, "{:.2f} dB",
+            lambda run, count: f" with {count:,.0f} splats; full detail has {_full_detail(run)}",
+            highest=True),
+    Purpose("Speed from far away", lambda run, _: 1e3 * run.farther[-1]["frame_s"] if run.farther else None,
+            "{:.1f} ms a frame",
+            lambda run, _: f" from {run.farther[-1]['factor']} times the distance, with "
+                           f"{run.farther[-1]['drawn']:,} splats in the image"),
+    Purpose("Few splats to load", lambda run, _: run.loaded, "{:,.0f} splats", lambda *_: " for a view"),
+    Purpose("Smooth changes", lambda run, _: run.largest_jump, "{:.2f} times",
+            lambda *_: " the change of full detail between two frames, at most"),
+    Purpose("Short training", lambda run, _: run.seconds, "{:,.0f} s", lambda *_: ""),
 )  # fmt: skip
 """Purposes in the order of the page."""
 
@@ -286,18 +282,25 @@ def recommend_runs(runs: Sequence[ComparedRun]) -> list[dict[str, str]]:
     """Recommend a run for each purpose.
 
     Returns:
-        ``purpose``, ``best`` (label) and ``why``, for each purpose with at least two measured runs that are
-        trained.
+        ``purpose``, ``best`` (label), its ``measure``, ``why`` (the measure in detail) and ``next`` (label
+        and measure of the second), for each purpose with at least two measured runs that are trained.
     """
     runs = [run for run in runs if not run.baseline]
     count = compared_count(runs)
     result = []
     for purpose in PURPOSES:
-        costs = [(cost, run) for run in runs if (cost := purpose.cost(run, count)) is not None]
-        if len(costs) > 1:
-            _, best = min(costs, key=lambda pair: pair[0])
-            why = purpose.describe(best, count)
-            result.append({"purpose": purpose.name, "best": best.label, "why": why})
+        measured = [(value, run) for run in runs if (value := purpose.measure(run, count)) is not None]
+        if len(measured) < 2:
+            continue
+        (value, best), (next_value, second), *_ = sorted(
+            measured, key=lambda pair: pair[0], reverse=purpose.highest
+        )
+        text = purpose.form.format(value)
+        result.append({
+            "purpose": purpose.name, "best": best.label, "measure": text,
+            "why": text + purpose.detail(best, count),
+            "next": f"{second.label} ({purpose.form.format(next_value)})",
+        })  # fmt: skip
     return result
 
 

@@ -76,7 +76,8 @@ def format_results(reports: Sequence[dict]) -> str:
 def _choice(reports: Sequence[dict]) -> list[str]:
     """Return a table of the best method of each scene for each purpose."""
     answers = [
-        {row["purpose"]: f"{row['best']} ({row['why']})" for row in report["answers"]} for report in reports
+        {row["purpose"]: f"{row['best']} ({row['measure']})" for row in report["answers"]}
+        for report in reports
     ]
     rows = [[purpose.name, *(scene.get(purpose.name, "–") for scene in answers)] for purpose in PURPOSES]
     return _table(["purpose", *(report["scene"] for report in reports)], rows, "|---" * (len(reports) + 1))
