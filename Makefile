@@ -38,7 +38,7 @@ help:
 	@echo "make bench-lod  levels and chunks on a town of 3 million splats (first run: over an hour; STAGES=\"town lodge others table\")"
 	@echo "make bench-tree  cuts of trees with up to 10 million nodes, and training them in 400 MB (first run: an hour, 10 GB)"
 	@echo "make bench-blocks  overhead of distributing blocks, and a plot for 1 to 64 workers (half an hour on an idle machine)"
-	@echo "make results    docs/methods/results.md: methods on SCENES and tables of PAPERS (EFFORT=0.1, METHODS=\"flod ...\"; hours)"
+	@echo "make results    docs/methods/results*.md: methods on SCENES and tables of PAPERS (EFFORT=0.1, METHODS=\"flod ...\"; hours)"
 	@echo "make extension  dist/lodgs-VERSION.zip, validated by Blender"
 	@echo "make release    dist/: extension, its repository, Python package, site, example scene, checksums"
 	@echo "make pins       update requirements/*.txt from requirements/*.in (UPGRADE=1 takes the newest allowed versions)"
@@ -113,11 +113,9 @@ bench-blocks: setup
 	$(VENV) lab/bench_blocks.py
 
 results: setup
-	$(VENV) -m training compare $(SCENES) --out build/results --effort $(EFFORT) $(if $(METHODS),--methods $(METHODS))
+	$(VENV) -m training compare $(SCENES) --out build/results --effort $(EFFORT) --lpips download $(if $(METHODS),--methods $(METHODS))
 	for paper in $(PAPERS); do $(VENV) -m training reproduce $$paper --out build/results/$$paper --effort $(EFFORT) || exit 1; done
-	{ sed '/^<!-- results -->$$/q' docs/methods/results.md; printf '\nCommit %s, effort %s.\n\n' "$$(git rev-parse --short HEAD)" $(EFFORT); \
-		cat build/results/results.md; for paper in $(PAPERS); do echo; cat build/results/$$paper/tables.md; done; } > build/results/page.md
-	cp build/results/page.md docs/methods/results.md
+	$(VENV) tools/results.py build/results --effort $(EFFORT)
 
 extension: setup
 	$(VENV) tools/extension.py
