@@ -73,7 +73,7 @@ PAPER = Paper(
         ),
         Table(
             "Table 2", "Ablations of the training, at scale 5", _DATA,
-            (PSNR, SSIM, LPIPS),
+            (PSNR, SSIM, LPIPS, SPLATS),
             (
                 Row("Full model", _FULL, _scale(5), (27.59, 0.902, 0.123)),
                 Row("w/o weight", _NO_WEIGHT, _scale(5), (27.39, 0.894, 0.127)),
