@@ -11,7 +11,14 @@ import pytest
 from training.__main__ import main
 from training.errors import DISK, LodgsError, system_remedy
 from training.methods import METHODS
-from training.runs.comparison.measures import ComparedRun, Point, label_runs, measure_run, recommend_runs
+from training.runs.comparison.measures import (
+    ComparedRun,
+    Point,
+    compared_run,
+    label_runs,
+    measure_run,
+    recommend_runs,
+)
 from training.runs.comparison.page import build_page, compare
 from training.runs.estimate import Estimate
 from training.runs.events import event_line
@@ -115,6 +122,18 @@ def test_damaged_report_is_measured_again(runs, tmp_path, text):
     run = shutil.copytree(runs[1], tmp_path / "run")
     RunFolder(run).metrics.write_text(text)
     assert measure_run(run, "3DGS", {}).finest.psnr > 0
+
+
+def test_finest_set_is_the_level_with_lpips(runs):
+    """The sweep of a rule has the same set without LPIPS."""
+    row = {"splats": 50, "drawn": 40, "psnr": 30.0, "ssim": 0.9, "frame_s": 0.1}
+    report = {
+        "rule": "decay", "test_views": ["a"], "levels": [{**row, "level": 1, "lpips_vgg": 0.2}],
+        "curve": [{**row, "s_v": 1.0}], "selective": [], "bytes": 1, "frame_memory": {"full": None},
+    }  # fmt: skip
+    folder = RunFolder(runs[0])
+    finest = compared_run(folder, Job.from_file(folder.job), report, "CLoD-GS").finest
+    assert (finest.name, finest.lpips_vgg) == ("Level 1", 0.2)
 
 
 def test_quality_between_sets_is_interpolated_over_the_logarithm():

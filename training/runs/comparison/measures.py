@@ -191,7 +191,8 @@ def compared_run(folder: RunFolder, job: Job, report: dict, label: str) -> Compa
     return ComparedRun(
         label=label,
         about=METHODS[job.method].about,
-        points=sorted(points, key=lambda point: (point.splats, point.psnr)),
+        # of equal sets, the level has LPIPS
+        points=sorted(points, key=lambda point: (point.splats, point.psnr, point.level)),
         by_distance=Point.of(report["selective"][0], "By distance", prefix) if report["selective"] else None,
         merged=[*merged, (finest.splats, finest.psnr)] if merged else [],
         farther=[dict(row) for row in report.get("farther", [])],
