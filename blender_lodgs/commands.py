@@ -62,7 +62,7 @@ def main(arguments: list[str]) -> int:
     except SystemExit as stop:  # argparse has printed help or an error
         return int(stop.code or 0)
     try:
-        with _interrupts(patience=None if args.command is _train else PATIENCE):
+        with _interrupts(patience=None if args.command is _train else PATIENCE) as args.interrupted:
             return args.command(args)
     except LodgsError as error:
         _print(f"error: {error}")
@@ -179,8 +179,10 @@ def _train(args: argparse.Namespace) -> int:
     _empty_file()
     root = _import_for(job)
     job_settings.apply_job(root.lodgs.training, job)  # for the panel when the .blend is opened
+    if args.interrupted():
+        raise KeyboardInterrupt
     watch = jobs.start_or_resume(root, job)
-    jobs.follow(watch, _ProgressBar())
+    jobs.follow(watch, _ProgressBar(), args.interrupted)
     for line in summary_lines(watch.summary):
         _print(line)
     for warning in watch.warnings:
@@ -414,12 +416,25 @@ def _interrupts(patience: float | None):
     """Make SIGINT and SIGTERM raise KeyboardInterrupt; by default background Blender exits immediately.
 
     Python handles a signal only between Blender's operations, so a thread ends a process that is still busy.
+    Yields a function that returns whether a signal arrived since its last call, because Blender only prints
+    the exceptions of its callbacks.
 
     Args:
         patience: seconds from a signal until the process ends with exit code 3. None: no limit.
     """
     numbers = signal.SIGINT, signal.SIGTERM
-    previous = [signal.signal(number, signal.default_int_handler) for number in numbers]
+    received: list[int] = []
+
+    def interrupt(number: int, _: object) -> None:
+        received.append(number)
+        raise KeyboardInterrupt
+
+    def interrupted() -> bool:
+        count = len(received)
+        received.clear()
+        return count > 0
+
+    previous = [signal.signal(number, interrupt) for number in numbers]
     receiver, sender = socket.socketpair()
     sender.setblocking(False)
     wakeup = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
@@ -434,7 +449,7 @@ def _interrupts(patience: float | None):
     thread = threading.Thread(target=end_late, daemon=True)
     thread.start()
     try:
-        yield
+        yield interrupted
     finally:
         ended.set()
         signal.set_wakeup_fd(wakeup)

@@ -227,7 +227,11 @@ def attach(root: bpy.types.Object, folder: str, *, reload: bool = True) -> Watch
     return watch
 
 
-def follow(watch: Watch, show: Callable[[Watch], None] | None = None) -> None:
+def follow(
+    watch: Watch,
+    show: Callable[[Watch], None] | None = None,
+    interrupted: Callable[[], bool] = lambda: False,
+) -> None:
     """Read the events of a run until it ends: by a timer with a window, blocking in background.
 
     In background, Ctrl-C asks the trainer to save and stop, and waits for it.
@@ -235,17 +239,22 @@ def follow(watch: Watch, show: Callable[[Watch], None] | None = None) -> None:
     Args:
         watch: result of :func:`start`, :func:`resume` or :func:`attach`.
         show: function called after each step, for example to print progress.
+        interrupted: function that returns whether Ctrl-C was pressed since its last call. Blender hides
+            exceptions of its callbacks.
     """
 
     def step() -> bool:
         unfinished = watch.step()
         if show:
             show(watch)
+        if interrupted():
+            raise KeyboardInterrupt
         return unfinished
 
     try:
         processes.follow(step)
     except KeyboardInterrupt:
+        interrupted()
         root = root_by_uid(watch.root)
         if root is not None and watch.running:
             cancel(root)

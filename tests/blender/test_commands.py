@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -229,6 +230,22 @@ def _start_command(run: Path) -> subprocess.Popen:
         assert time.monotonic() < end and process.poll() is None
         time.sleep(0.05)
     return process
+
+
+def test_signal_in_a_callback_of_blender_cancels(lodgs, lodgs_command, fake, tmp_path, monkeypatch):
+    """Blender prints the exception of a callback and continues."""
+    fake()
+    commands = lodgs("commands")
+    import_photos = commands._import_for
+
+    def import_with_signal(job):
+        with suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGTERM)
+        return import_photos(job)
+
+    monkeypatch.setattr(commands, "_import_for", import_with_signal)
+    assert lodgs_command("train", "--scene", SCENE, "--out", tmp_path / "run") == 3
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.nightly)])
