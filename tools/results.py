@@ -6,7 +6,7 @@ Each page keeps its text up to the line MARK, and gets the tables of a folder af
 from __future__ import annotations
 
 import argparse
-import subprocess
+from datetime import date
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -60,10 +60,7 @@ def main() -> None:
     parser.add_argument("results", type=Path, help="folder of results")
     parser.add_argument("--effort", required=True, help="effort of the trainings")
     options = parser.parse_args()
-    commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=True
-    ).stdout.strip()
-    for page in write_results(options.results, PAGES, f"Commit {commit}, effort {options.effort}."):
+    for page in write_results(options.results, PAGES, f"{date.today()}, effort {options.effort}."):
         print(page)
 
 
