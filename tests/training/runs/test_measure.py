@@ -88,7 +88,7 @@ def test_large_tree_measured_in_parts_gives_the_same_report(finished, splats, tm
     assert (tmp_path / "levels.png").is_file()
     assert [row["set"] for row in report["selective"]] == ["per view"]
     assert report["levels"][0]["splats"] == len(splats)
-    for name in ("train_psnr", "veil", "worst", "oversized", "jumps"):
+    for name in ("train_psnr", "veil", "worst", "oversized", "jumps", "flight"):
         assert report[name] == expected[name]
     for row, expected_row in zip(report["farther"], expected["farther"], strict=True):
         assert {**row, "frame_s": 0} == {**expected_row, "frame_s": 0}
