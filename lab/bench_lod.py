@@ -59,7 +59,7 @@ LODGE = {"levels_from": "pruned", "chunks": 64, "keep": 0.35, "prune_weight": 0.
 """Other parameters of LODGE, for 3 million splats at 11 cm spacing that each cover part of a pixel."""
 OTHER_METHODS = {
     "flod": {"steps": [400, 600, 800, 1200, 2000], "max_splats": 300_000},
-    "octree": {"steps": 5000, "max_splats": 300_000},
+    "octree": {"steps": 5000, "max_splats": 300_000, "levels_from": "anchors"},
 }
 """Parameters of the other methods, trained from points on photos at half size: draft presets with more steps
 and splats, at most about 20 minutes each."""

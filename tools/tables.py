@@ -82,7 +82,9 @@ def controls_page() -> str:
         "[Rules of a bundle](bundle-rules.md).",
     ]
     for rule in rules().values():
-        users = [method.label for method in METHODS.values() if method.rule == rule.name]
+        users = [
+            method.label for method in METHODS.values() if rule.name in (method.rule, method.merged_rule)
+        ]
         about = (getdoc(getmodule(rule)) or "").split("\n\n")[0].replace("\n", " ")
         parts += [f"## {rule.name}", f"{about} Used by: {', '.join(users) or 'no method'}."]
         rows = [
@@ -350,7 +352,8 @@ def _sentence(text: str) -> str:
 
 def _about(method: MethodInfo) -> str:
     start = "the scene's points or a base" if method.from_base else "the scene's points"
-    rule = f"Its rule is [{method.rule}](controls.md#{method.rule})."
+    rules = [f"[{name}](controls.md#{name})" for name in (method.merged_rule, method.rule) if name]
+    rule = f"Its rule is {' with merged levels, else '.join(rules)}."
     return (
         f"`{method.name}`: {method.about}. Training starts from {start}. "
         f"{rule if method.rule else 'It has no levels of detail.'} "

@@ -22,6 +22,29 @@ BINS = 24
 """Number of bins of distances, with about as many pixels each."""
 
 
+def measure_min_sizes(
+    levels: Mapping[int, Gaussians],
+    data: TrainingData,
+    drawn: float,
+    antialias: bool,
+    backend: str,
+    gamma: float,
+    rho: float,
+) -> list[float]:
+    """Choose the distances of the finest levels, as minimum sizes (``s_min``) of all levels, coarse to fine.
+
+    Coarser levels follow at the ratio ``rho``.
+
+    Args:
+        levels, drawn: see :func:`measure_distances`; ``levels`` are numbered up to the finest.
+        gamma: control of the rule (``lod.rules.bands``).
+    """
+    distances = measure_distances(levels, data, drawn, antialias, backend)
+    sizes = [distance * gamma / data.focal for distance in distances.values()]
+    coarser = min(levels) - 1
+    return [sizes[0] * rho**n for n in range(coarser, 0, -1)] + sizes + [0.0]
+
+
 @torch.no_grad()
 def measure_distances(
     levels: Mapping[int, Gaussians], data: TrainingData, drawn: float, antialias: bool, backend: str

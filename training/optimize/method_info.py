@@ -40,10 +40,12 @@ class MethodInfo:
         parameters: class of its parameters.
         presets: parameters of each of PRESETS.
         rule: name of its level-of-detail rule (``training.lod``); "" if none.
+        merged_rule: name of the rule of merged levels (``parameters.merges``); "" if it is ``rule``.
         panel_parameters: parameters shown in panels, in addition to presets.
         from_base: True if training can start from splats (a job's ``base``) instead of the scene's points.
         streams_base: True if a base may stay on disk (``SplatRows``).
         suggested_for_base: True for the default method of imported splats.
+        cell_values: values of parameters, by name, that override the job's in the cells of a large scene.
         capture_values: values of parameters, by name, that override the preset if the images are renders of
             the base.
         cell_method: method that trains the cells of a large scene: the method itself, or one whose merged
@@ -64,12 +66,14 @@ class MethodInfo:
     parameters: type[Parameters]
     presets: Mapping[str, Parameters]
     rule: str = ""
+    merged_rule: str = ""
     panel_parameters: tuple[str, ...] = ()
     from_base: bool = False
     streams_base: bool = False
     suggested_for_base: bool = False
     cell_method: str = ""
     split_parameters: Callable[[Any], tuple[Parameters, Parameters] | None] = no_split
+    cell_values: Mapping[str, Any] = field(default_factory=dict)
     capture_values: Mapping[str, Any] = field(default_factory=dict)
     trains_on_device: Callable[[Any], bool] = never
     unused: tuple[str, ...] = ()
@@ -79,6 +83,10 @@ class MethodInfo:
     def fields(self) -> list[Field]:
         """Parameters that can be set."""
         return [f for f in fields(self.parameters) if f.name not in self.unused]
+
+    def rule_for(self, parameters: Any) -> str:
+        """Return the name of the rule of a run's levels."""
+        return self.merged_rule if self.merged_rule and parameters.merges else self.rule
 
     def preset(self, name: str) -> Parameters:
         """Return the parameters of a preset.

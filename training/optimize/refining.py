@@ -12,7 +12,7 @@ from ..splats.gaussians import Splats
 from ..splats.morton import spatial_order
 from .initialize import from_splats
 from .model import splat_rates
-from .parameters import DensityParameters
+from .parameters import Parameters
 from .schedules import log_linear
 from .splat_method import SplatMethod
 from .training_data import TrainingData, TrainingView
@@ -26,7 +26,7 @@ LEAST_WEIGHT = 0.05
 
 
 def refining_rates(
-    parameters: DensityParameters, extent: float, fraction: float, factor: float = 1.0
+    parameters: Parameters, extent: float, fraction: float, factor: float = 1.0
 ) -> dict[str, LearningRate]:
     """Return the learning rates after a fraction of the steps that refine a level."""
     lr = splat_rates(parameters, extent) | {"means": MEANS_RATE * parameters.lr_means_final * extent}
@@ -35,7 +35,7 @@ def refining_rates(
 
 @torch.no_grad()
 def drop_invisible(
-    splats: Splats, minimum: int, data: TrainingData, parameters: DensityParameters, backend: str
+    splats: Splats, minimum: int, data: TrainingData, parameters: Parameters, backend: str
 ) -> Splats:
     """Drop splats of low weight in all training views and margins, before a merge.
 

@@ -54,6 +54,17 @@ def random_reduction(seed: int, step: int) -> float:
     return float(rng.choice(SMALL_IMAGES)) if rng.random() < SMALL_SHARE else 1.0
 
 
+def refining_reduction(seed: int, step: int, share: float, first: float, full: float) -> float:
+    """Return the factor by which the image of a step that refines a merged level is reduced.
+
+    Args:
+        share: completed share of the level's steps.
+        first, full: see :func:`shrink_at`.
+    """
+    factor = random_reduction(seed, step)
+    return factor if factor > 1 else shrink_at(share, first, full)
+
+
 def shrink_at(share: float, first: float, full: float) -> float:
     """Return the factor by which images are reduced after a share of the steps.
 

@@ -349,18 +349,22 @@ class _TrainingRun:
     def _read_level(self, record: dict) -> Level:
         """Read a stored level; large ones stay on disk."""
         path = self.folder.find_file(record["path"])
-        if record["splats"] > MAX_IN_MEMORY and supports_culled_reads(METHODS[self.job.method].rule):
+        if record["splats"] > MAX_IN_MEMORY and supports_culled_reads(self._rule_name):
             return Level(record["level"], NO_SPLATS, record["facts"], open_ply(path))
         return Level(record["level"], read_ply(path), record["facts"])
 
+    @property
+    def _rule_name(self) -> str:
+        return METHODS[self.job.method].rule_for(self.method.parameters)
+
     def _empty_bundle(self) -> Bundle:
         """Return the method's bundle header without levels."""
-        info, method = METHODS[self.job.method], self.method
-        rule = find_rule(info.rule)
+        method, name = self.method, self._rule_name
+        rule = find_rule(name)
         return Bundle(
             self.job.method,
             [],
-            info.rule,
+            name,
             method.facts,
             method.controls,
             rule is not None and rule.cumulative,

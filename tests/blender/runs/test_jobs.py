@@ -713,7 +713,8 @@ def test_octree_levels_are_cumulative_and_follow_the_distance(bpy, lodgs, jobs, 
     bpy.ops.lodgs.import_colmap(directory=str(REPOSITORY / "examples" / "lantern_garden"), photographs=False)
     (root,) = [obj for obj in bpy.data.objects if obj.lodgs.is_root]
     root.lodgs.training.image_scale, root.lodgs.training.method = 0.1, "octree"
-    watch = jobs.start(root, str(tmp_path / "run"), {"levels": 3, "steps": 12, "coarse_share": 0.5})
+    parameters = {"levels": 3, "steps": 12, "coarse_share": 0.5, "levels_from": "anchors"}
+    watch = jobs.start(root, str(tmp_path / "run"), parameters)
     _wait(watch, lambda: len(watch.levels) == 3)
     finest = root.lodgs.levels[-1].object
     _wait(watch, lambda: not watch.running)

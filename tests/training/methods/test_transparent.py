@@ -80,6 +80,7 @@ def test_photos_are_composited_over_black(scene):
 @pytest.mark.slow
 def test_trained_object_is_as_transparent(scene, tmp_path, method, capsys):
     parameters = {"steps": 400, "max_splats": 1500}
+    parameters |= {"levels_from": "anchors"} if method == "octree" else {}
     keys = {
         "scene": str(scene), "out": str(tmp_path / "run"), "method": method, "backend": "cpu",
         "test_every": 8, "parameters": parameters,

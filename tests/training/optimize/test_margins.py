@@ -140,7 +140,7 @@ def test_every_method_adds_margins(data, name):
     results = {}
     for margin in (0.0, 0.5):
         preset = METHODS[name].preset("draft")
-        tuning = {"tune_steps": 6} if hasattr(preset, "tune_steps") else {}
+        tuning = {key: 6 for key in ("tune_steps", "refine_steps") if hasattr(preset, key)}
         parameters = override(preset, steps | tuning | {"margin": margin, "sh_degree": 0})
         method, levels = create(name, data, parameters, seed=0, backend="cpu"), {}
         for step in range(method.steps):

@@ -69,6 +69,7 @@ TINY = {
     "octree": {
         "levels": 3, "steps": 70, "footprint": 6.0, "grow_interval": 5, "far_share": 0.2, "sh_interval": 15,
         "grad_threshold": 1e-5, "max_splats": 300, "full_share": 0.1, "random_background": False,
+        "levels_from": "anchors",
     },
     "octree_neural": {
         "levels": 3, "steps": 70, "footprint": 6.0, "grow_interval": 5, "far_share": 0.2, "offsets": 3,

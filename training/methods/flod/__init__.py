@@ -11,20 +11,19 @@ from ...optimize.flod_parameters import (
     STANDARD_STEPS,
     FlodLevels,
 )
+from ...optimize.merged_parameters import REFINE_RATIO, MergedParameters, refining_steps
 from ...optimize.method_info import MethodInfo
 from ...optimize.parameters import PAPER, STANDARD, DensityParameters
 from ...settings import setting
 
 BLENDED_LEVELS = 3
 """Number of finest levels that are blended by default (``Bands.defaults``) and that finishing steps train."""
-REFINE_RATIO = 0.7
-"""Steps that refine a merged level relative to those of the next finer one."""
 CELL_LEVELS = 2
 """Number of finest levels that are trained cell by cell in a divided scene."""
 
 
 @dataclass(frozen=True)
-class FlodParameters(FlodLevels, DensityParameters):
+class FlodParameters(MergedParameters, FlodLevels, DensityParameters):
     """Parameters of FLoD.
 
     Tuples have one entry per level, coarse to fine. ``max_splats`` limits the last level.
@@ -67,20 +66,6 @@ class FlodParameters(FlodLevels, DensityParameters):
         "splat sizes, as in the paper, and is always used in runs of only some levels.",
         choices=("merged", "trained"),
     )
-    merge_ratio: float = setting(
-        0.5,
-        "Splat count of a merged level, as a fraction of the next finer level's. The level before the finest "
-        "has at most the share that views by distance may draw ('drawn').",
-        above=0,
-        high=1,
-    )
-    refine_steps: int = setting(
-        1000,
-        "Steps that refine the merged level before the finest. Each coarser level gets 70 % of the steps of "
-        "the next finer one. They are taken from those of all levels ('steps'), at most half; the finest "
-        "level gets the others.",
-        unit="steps",
-    )
     first_level: int = setting(
         1, "First level to train. Above 1 it needs a base: the level before it.", low=1
     )
@@ -91,14 +76,6 @@ class FlodParameters(FlodLevels, DensityParameters):
         "fraction of all levels' steps. Merged levels need at most a fifth of 'refine_steps'. Trained "
         "levels with fine detail restart from the most important splats of the finest level. Not in the "
         "paper.",
-        high=1,
-    )
-    drawn: float = setting(
-        0.45,
-        "Maximum number of splats drawn by distance in the training views, as a fraction of those of "
-        "the finest level. Limits the size of merged levels, sets their distances, and the size of trained "
-        "levels that the finishing steps restart. Not in the paper.",
-        above=0,
         high=1,
     )
     finish_alone: float = setting(
@@ -125,9 +102,9 @@ class FlodParameters(FlodLevels, DensityParameters):
         if not self.merges:
             numbers = range(self.first_level, self.end + 1)
             return [(number, self.steps[number - 1]) for number in numbers]
-        shares = [REFINE_RATIO**n for n in range(self.levels - 1)]
-        steps = min(self.refine_steps, sum(self.steps) / (2 * sum(shares)))
-        refining = [max(int(steps * share), 1) for share in shares]
+        merged = self.levels - 1
+        most = sum(self.steps) / (2 * sum(REFINE_RATIO**n for n in range(merged)))
+        refining = refining_steps(min(self.refine_steps, most), merged)
         coarser = list(zip(range(self.levels - 1, 0, -1), refining, strict=True))
         return [(self.levels, sum(self.steps) - sum(refining)), *coarser]
 
@@ -157,17 +134,13 @@ class FlodParameters(FlodLevels, DensityParameters):
     def max_trained_splats(self) -> int:
         blended = range(self.levels, max(self.levels - BLENDED_LEVELS, 0), -1)
         shares = (
-            self.merged_share(number) if self.merges else self.budget_ratio ** (self.levels - number)
+            self.share_below(self.levels - number)
+            if self.merges
+            else self.budget_ratio ** (self.levels - number)
             for number in blended
         )
         at_end = self.max_splats * self.budget_ratio ** (self.levels - self.end)
         return round(self.max_splats * sum(shares) if self.finish_steps else at_end)
-
-    def merged_share(self, number: int) -> float:
-        """Return the splat count of a merged level, as a fraction of the finest level's; 1 for the finest."""
-        if number == self.levels:
-            return 1.0
-        return min(self.merge_ratio ** (self.levels - number), self.drawn)
 
     @property
     def growth_rounds(self) -> float | None:

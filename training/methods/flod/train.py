@@ -29,12 +29,12 @@ from ...optimize.initialize import (
     neighbour_distances,
     sample_points,
 )
-from ...optimize.level_distances import measure_distances
+from ...optimize.level_distances import measure_min_sizes
 from ...optimize.merging import merge
 from ...optimize.method import Drawing
 from ...optimize.model import Model, splat_rates
 from ...optimize.refining import MERGED_RATE, drop_invisible, refining_rates
-from ...optimize.schedules import due, log_linear, random_reduction, shrink_at
+from ...optimize.schedules import due, log_linear, refining_reduction, shrink_at
 from ...optimize.training_data import TrainingView
 from ...rasterize import Gaussians
 from ...splats.gaussians import Splats
@@ -115,7 +115,7 @@ class Method(method.Method[FlodParameters, Drawing]):
         number, remainder = divmod((step + 1) * p.levels, self._ends[0])
         if not 0 < number < p.levels or remainder >= p.levels:
             return []
-        count = round(len(self.model) * p.merged_share(number))
+        count = round(len(self.model) * p.share_below(p.levels - number))
         return [Level(number, merge(self.model.splats(), count), self._facts(number))]
 
     def meta(self) -> dict:
@@ -126,12 +126,12 @@ class Method(method.Method[FlodParameters, Drawing]):
 
     def shrink(self, step: int) -> float:
         p = self.parameters
-        if self._refines(step) and (factor := random_reduction(self.seed, step)) > 1:
-            return factor
         if p.merges and step < self._ends[-1]:
             progress = self._level_step(step) / p.stages[self._stage(step)][1]
         else:
             progress = self._progress(step)
+        if self._refines(step):
+            return refining_reduction(self.seed, step, progress, p.first_resolution, p.full_resolution)
         return shrink_at(progress, p.first_resolution, p.full_resolution)
 
     def render_weights(self, view: TrainingView, step: int) -> tuple[torch.Tensor | None, float]:
@@ -268,7 +268,7 @@ class Method(method.Method[FlodParameters, Drawing]):
         """
         p = self.parameters
         if p.merges:
-            count = round(p.merged_share(level) * len(self.completed[p.levels]["means"]))
+            count = round(p.share_below(p.levels - level) * len(self.completed[p.levels]["means"]))
             splats = self.model.splats()
             if level == p.levels - 1:
                 splats = drop_invisible(splats, count, self.data, p, self.backend)
@@ -319,11 +319,9 @@ class Method(method.Method[FlodParameters, Drawing]):
         p = self.parameters
         numbers = range(max(p.levels - BLENDED_LEVELS, 0) + 1, p.levels + 1)
         levels = {number: Gaussians(**self.completed[number]) for number in numbers}
-        distances = measure_distances(levels, self.data, p.drawn, p.antialias, self.backend)
-        for number, distance in distances.items():
-            self.s_min[number - 1] = distance * self.controls["gamma"] / self.data.focal
-        for number in range(numbers[0] - 1, 0, -1):
-            self.s_min[number - 1] = p.rho * self.s_min[number]
+        self.s_min = measure_min_sizes(
+            levels, self.data, p.drawn, p.antialias, self.backend, self.controls["gamma"], p.rho
+        )
 
     def start_finishing(self) -> None:
         """Combine the completed levels into one model for the finishing steps; restart those of fine

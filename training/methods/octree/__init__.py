@@ -1,17 +1,18 @@
-"""Octree-GS (Ren et al. 2024) with explicit anchors: octree levels that add up and fade in one by one."""
+"""Octree-GS (Ren et al. 2024) with explicit anchors: the finest of merged levels, or levels that add up."""
 
 from dataclasses import replace
 
-from ...optimize.anchors.parameters import OctreeParameters
+from ...optimize.anchors.parameters import ExplicitOctreeParameters
 from ...optimize.method_info import MethodInfo
 from ...optimize.parameters import AS_PUBLISHED, STANDARD
 
-_DRAFT = OctreeParameters(lr_means=4e-4, lr_sh=5e-3)
+_DRAFT = ExplicitOctreeParameters(lr_means=4e-4, lr_sh=5e-3, refine_steps=2_000)
 _STANDARD = replace(_DRAFT, **STANDARD, steps=30_000, lr_sh=2.5e-3, grow_interval=100)
 _PAPER = replace(
     _STANDARD,
     **AS_PUBLISHED,
     steps=40_000,
+    levels_from="anchors",
     coarser_levels=0,
     narrowest=0.0,
     widest=1e9,
@@ -33,11 +34,13 @@ METHOD = MethodInfo(
     name="octree",
     number=1,
     label="Octree-GS",
-    about="octree levels that add up and fade in as the camera approaches",
-    parameters=OctreeParameters,
+    about="splats of all sizes on an octree, and coarser levels merged from them",
+    parameters=ExplicitOctreeParameters,
     presets={"draft": _DRAFT, "standard": _STANDARD, "paper": _PAPER},
     rule="octree",
+    merged_rule="bands",
     panel_parameters=("levels", "max_splats"),
     cell_method="octree",
+    cell_values={"levels_from": "anchors"},  # cells agree on the distances of these levels
     trains_on_device=lambda parameters: not parameters.volume_weight,
 )

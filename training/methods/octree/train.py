@@ -1,161 +1,159 @@
-"""Octree-GS (Ren et al. 2024) with explicit anchors: octree levels that add up and are selected by distance.
+"""Octree-GS (Ren et al. 2024) with explicit anchors, and coarser levels merged from them.
 
-An anchor is a single Gaussian with its own parameters and without networks. It belongs to a level, and
-starts in a voxel of that level without other anchors. Views select anchors by ``lod.rules.octree``,
-rounded in training.
+Not in the paper: anchors of all levels together are the finest level. Coarser levels are merged from it one
+by one and refined, as FLoD's, and the rule ``bands`` draws one level at each distance. The levels of the
+octree add up instead, so that half of its splats are a worse image than a merge of all of them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from math import inf
+from bisect import bisect_right
+from itertools import accumulate
+from typing import Any
 
-import numpy as np
 import torch
 
-from ...lod.rules.octree import BIAS
 from ...optimize import method
-from ...optimize.anchors import growing
-from ...optimize.anchors.parameters import OctreeParameters
-from ...optimize.density_control import require_rows, sample_gaussians
-from ...optimize.initialize import from_points
-from ...optimize.method import Drawing
-from ...optimize.model import Model, splat_rates
-from ...optimize.schedules import log_linear
+from ...optimize.anchors.explicit import ExplicitAnchors
+from ...optimize.anchors.parameters import ExplicitOctreeParameters
+from ...optimize.initialize import from_splats
+from ...optimize.level_distances import measure_min_sizes
+from ...optimize.merging import merge
+from ...optimize.model import Model
+from ...optimize.parameters import DensityParameters
+from ...optimize.refining import MERGED_RATE, drop_invisible, refining_rates
+from ...optimize.schedules import refining_reduction
 from ...optimize.training_data import TrainingView
-from ...rasterize import contributions
-from ...rasterize.rendering import ALPHA_MIN
-from ...scenes.cameras import Camera
+from ...rasterize import Gaussians
 from ...splats.gaussians import Splats
 from ...splats.levels import Level
 
-MARGIN = "margin"
-"""Column that marks margin splats."""
+FIRST, FULL = DensityParameters.first_resolution, DensityParameters.full_resolution
+"""Sizes of images while a level is refined."""
+MEASURED_LEVELS = 3
+"""Number of finest levels with measured distances."""
+RATIO = 4.0
+"""Ratio of the distances of coarser levels."""
 
 
-class Method(method.Method[OctreeParameters, Drawing]):
+class Method(ExplicitAnchors):
     """Training of Octree-GS.
 
     Attributes:
-        schedule: schedule of levels, with the octree.
+        s_min: minimum size of each level, coarse to fine, in scene units: those of FLoD's rule.
+        completed: completed levels as tensors, by number, once the anchors are trained.
     """
 
+    parameters: ExplicitOctreeParameters
+
     def setup(self, base: Splats | None) -> None:
-        p = self.parameters
-        self.schedule, points, colors, level = growing.create_anchors(
-            self.data, p, self.seed, p.growth_limit(p.splat_limit)
-        )
-        self.levels = self.schedule.tree.levels
-        self.facts = self.schedule.tree.facts()
-        tensors = from_points(points, colors, p.sh_degree, self.device)
-        tensors["log_scales"] = growing.log_spacing(points, level, columns=3).to(self.device)
-        zeros = torch.zeros(len(points), device=self.device)
-        levels = torch.from_numpy(level).float().to(self.device)
-        columns = {"level": levels, "bias": zeros, MARGIN: torch.zeros_like(levels, dtype=torch.bool)}
-        self.device_steps = 0 if p.volume_weight else inf
-        self._rates = splat_rates(p, self.data.extent)
-        self.model = Model(tensors, self._rates, columns, stats={"opacity_sum": zeros.clone()})
+        super().setup(base)
+        p, data = self.parameters, self.data
+        self._ends = list(accumulate([p.steps, *p.refining]))
+        self.completed: dict[int, dict[str, torch.Tensor]] = {}
+        if p.merges:
+            self.facts, self.levels = {}, p.merged_levels + 1
+            # until distances are measured, the finest level ends at the median depth
+            far = data.median_depth / data.focal
+            self.s_min = [far * RATIO**n for n in range(p.merged_levels - 1, -1, -1)] + [0.0]
 
     def level_at(self, step: int) -> int:
-        return self.schedule.level_at(step)
+        return self.levels - self._stage(step) if self.parameters.merges else super().level_at(step)
+
+    def ends_level(self, step: int) -> bool:
+        return step + 1 in self._ends or (not self._refines(step) and super().ends_level(step))
 
     def levels_after(self, step: int) -> list[Level]:
-        """Return all levels when the last one has joined and at the end."""
-        if not self.schedule.completes_levels(step):
+        """Return the finest level when all anchors have joined and when they are trained; each coarser level
+        once it is refined; all levels at the end, with measured distances.
+        """
+        if not self.parameters.merges:
+            return super().levels_after(step)
+        completed = step + 1 in self._ends
+        if not (completed or (not self._refines(step) and self.schedule.completes_levels(step))):
             return []
-        splats, level = self.model.splats(), self.model.columns["level"].cpu().numpy()
-        splats.extras |= {"lod_level": level.astype(np.uint8), BIAS: self.model.columns["bias"].cpu().numpy()}
-        return [Level(number, splats.select(level == number)) for number in range(1, self.levels + 1)]
+        number, splats = self.level_at(step), self.model.splats()
+        if completed:
+            self.completed[number] = from_splats(splats, self.parameters.sh_degree, self.device)
+            if number == 1:
+                self._measure_distances()
+                return [self._level(n, self._completed_splats(n)) for n in sorted(self.completed)]
+            self._start_level(number - 1, splats)
+        return [self._level(number, splats)]
 
     def meta(self) -> dict:
-        tree = self.schedule.tree
-        return {"voxel": tree.voxel, **super().meta()}
+        return method.Method.meta(self) if self.parameters.merges else super().meta()
 
     # -- steps -----------------------------------------------------------------------------------------
 
     def shrink(self, step: int) -> float:
-        return self.schedule.shrink(step)
+        if not self._refines(step):
+            return super().shrink(step)
+        return refining_reduction(self.seed, step, self._share(step), FIRST, FULL)
 
     def render_weights(self, view: TrainingView, step: int) -> tuple[torch.Tensor | None, float]:
-        weights = self.schedule.weights(view.camera, self.model, step, full=view.shrink == 1)
-        dropout = self.dropout.weights(len(weights), step, step / self.parameters.steps)
-        return (weights if dropout is None else weights * dropout), 0.0
+        return (None, 0.0) if self._refines(step) else super().render_weights(view, step)
 
     def collects_stats(self, view: TrainingView, step: int) -> bool:
-        return self.schedule.collects_stats(view, step)
-
-    def loss(self, drawings: Sequence[Drawing], view: TrainingView, step: int) -> torch.Tensor:
-        """Return the loss with volume regularization (Octree-GS, Sec. 7.1)."""
-        loss = super().loss(drawings, view, step)
-        if not self.parameters.volume_weight:
-            return loss
-        drawn = drawings[0].rendering.radii > 0
-        scales = self.model["log_scales"][drawn].exp() / self.data.median_depth
-        return loss + self.parameters.volume_weight * scales.prod(1).mean()
+        return not self._refines(step) and super().collects_stats(view, step)
 
     def set_learning_rates(self, step: int) -> None:
-        p, lr = self.parameters, self.schedule.learning_rates(self._rates, step)
-        lr["means"] = log_linear(p.lr_means, p.lr_means_final, step / p.steps) * self.data.extent
-        self.model.lr = lr
+        if self._refines(step):
+            rates = refining_rates(self.parameters, self.data.extent, self._share(step), MERGED_RATE)
+            self.model.lr = rates
+        else:
+            super().set_learning_rates(step)
 
     def control_density(self, step: int) -> None:
-        if self.schedule.grows_after(step):
-            self.grow(step)
-        if self.schedule.prunes_unseen_after(step):
-            self.prune_unseen(step)
-        if self.schedule.reassigns_after(step):
-            self.reassign_levels(step)
-        if self.schedule.is_growing(step) and not self.schedule.is_growing(step + 1):
-            self._add_margins()
+        if not self._refines(step):
+            super().control_density(step)
 
-    def _add_margins(self) -> None:
-        """Add margins to the coarsest level, for all distances."""
-        room = self.parameters.margin_room(self.parameters.splat_limit)
-        rows = vars(self.margins.extend(self.model.gaussians, room))
-        ones = torch.ones_like(rows["opacity_logits"])
-        self.model.append({**rows, "level": ones, MARGIN: ones.bool()})
+    def _refines(self, step: int) -> bool:
+        """Return whether a step refines a merged level."""
+        return self.parameters.merges and step >= self._ends[0]
 
-    # -- anchors ---------------------------------------------------------------------------------------
+    def _stage(self, step: int) -> int:
+        """Return the number of levels that are complete before a step."""
+        return min(bisect_right(self._ends, step), len(self._ends) - 1)
 
-    @torch.no_grad()
-    def grow(self, step: int) -> None:
-        """Add anchors in free voxels with large gradients (Octree-GS, Sec. 4.2), and remove faint ones.
+    def _share(self, step: int) -> float:
+        """Return the completed share of the steps that refine the current level."""
+        begin, end = self._ends[self._stage(step) - 1 :][:2]
+        return (step - begin) / (end - begin)
 
-        A splat proposes smaller, faint copies of itself at positions sampled from it. A splat is faint if
-        its mean opacity over the views that drew it is too low, or too low to be visible.
-        """
-        p, model = self.parameters, self.model
-        source, _, level = growing.select_growth(self.schedule, model, step)
-        source, level = (column.repeat_interleave(p.candidates) for column in (source, level))
-        rows = model.read_rows(source)
-        rng = np.random.default_rng([self.seed, step, 1])
-        rows["means"] += sample_gaussians(rows["quats"], rows["log_scales"].exp(), rng)
-        rows["log_scales"] -= float(np.log(1.6))
-        rows["opacity_logits"].clamp_max_(growing.MAX_NEW_LOGIT)
-        rows |= {"level": level, "bias": model.columns["bias"][source]}
-        rows = growing.limit_growth(self.schedule, model, rows, step, p.growth_limit(p.splat_limit))
+    # -- levels ----------------------------------------------------------------------------------------
 
-        opacity = model.read("opacity_logits").sigmoid()
-        faint = model.read("opacity_sum") < p.min_opacity * model.read("seen")
-        model.keep(~(faint | (opacity < min(p.min_opacity, ALPHA_MIN))))
-        model.append(rows)
-        model.reset_stats()
-        require_rows(model, step, "min_opacity")
+    def _completed_splats(self, number: int) -> Splats:
+        columns: dict[str, Any] = {
+            name: tensor.cpu().numpy() for name, tensor in self.completed[number].items()
+        }
+        return Splats(**columns)
 
-    def prune_unseen(self, step: int) -> None:
-        """Remove splats of low blending weight in all views, near or far (RadSplat)."""
-        low_weight = growing.find_unseen(self.schedule, self.model, step, self._largest_weights)
-        self.model.keep(~low_weight | self.model.columns[MARGIN])
-        require_rows(self.model, step, "least_weight")
+    def _level(self, number: int, splats: Splats) -> Level:
+        return Level(number, splats, {"s_min": self.s_min[number - 1]})
 
-    def _largest_weights(self, camera: Camera, view: int, weights: torch.Tensor) -> torch.Tensor:
-        return contributions(
-            self.model.gaussians, [camera], weights=weights, near=self.data.near,
-            antialias=self.parameters.antialias, backend=self.backend,
-        ).largest  # fmt: skip
+    def _start_level(self, number: int, finer: Splats) -> None:
+        """Start a level as a merge of the next finer one."""
+        p = self.parameters
+        count = round(p.share_below(self.levels - number) * len(self.completed[self.levels]["means"]))
+        if number == self.levels - 1:
+            finer = drop_invisible(finer, count, self.data, p, self.backend)
+        tensors = from_splats(merge(finer, count), p.sh_degree, self.device)
+        self.model = Model(tensors, self._rates)
 
-    def reassign_levels(self, step: int) -> None:
-        """Move splats that are too wide or too narrow for their level to a matching one."""
-        columns, newest = self.model.columns, self.level_at(step)
-        means, log_scales = self.model.read("means"), self.model.read("log_scales")
-        columns["level"] = growing.matching_levels(self.schedule, columns["level"], means, log_scales, newest)
+    def _measure_distances(self) -> None:
+        """Set the distances of the levels."""
+        p, numbers = self.parameters, sorted(self.completed)[-MEASURED_LEVELS:]
+        levels = {number: Gaussians(**self.completed[number]) for number in numbers}
+        self.s_min = measure_min_sizes(levels, self.data, p.drawn, p.antialias, self.backend, 1.0, RATIO)
+
+    # -- checkpoints -----------------------------------------------------------------------------------
+
+    def state_dict(self) -> dict:
+        return {**super().state_dict(), **({"completed": self.completed} if self.parameters.merges else {})}
+
+    def load_state_dict(self, state: dict) -> None:
+        self.completed = state.get("completed", {})
+        if self.completed:  # the model is that of a merged level
+            self.model = Model(state["model"]["tensors"], self._rates)
+        super().load_state_dict(state)

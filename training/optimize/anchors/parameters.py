@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from ...errors import LodgsError
 from ...settings import setting
 from ...splats.levels import MAX_LEVELS
+from ..merged_parameters import MergedParameters, refining_steps
 from ..parameters import Parameters
 
 
@@ -157,3 +158,33 @@ class OctreeParameters(Parameters):
                 f"'nearest' is {self.nearest}, but must be less than 'farthest', {self.farthest}.",
                 "Give a smaller number.",
             )
+
+
+@dataclass(frozen=True)
+class ExplicitOctreeParameters(MergedParameters, OctreeParameters):
+    """Parameters of Octree-GS with explicit anchors. ``steps`` train the anchors of all levels."""
+
+    levels_from: str = setting(
+        "merged",
+        "Source of the levels. 'merged' takes the anchors of all levels as the finest level, then merges "
+        "each coarser level from the next finer one and refines it; levels replace one another. 'anchors' "
+        "keeps the levels of the octree, which add up, as in the paper, and is always used in cells.",
+        choices=("merged", "anchors"),
+    )
+    merged_levels: int = setting(
+        4, "Number of levels that are merged from the finest.", low=1, high=MAX_LEVELS - 1
+    )
+
+    @property
+    def merges(self) -> bool:
+        """True if coarser levels are merged from the finest."""
+        return self.levels_from == "merged"
+
+    @property
+    def refining(self) -> list[int]:
+        """Steps that refine each merged level, finest first."""
+        return refining_steps(self.refine_steps, self.merged_levels) if self.merges else []
+
+    @property
+    def total_steps(self) -> int:
+        return self.steps + sum(self.refining)

@@ -52,6 +52,10 @@ class Schedule:
         """Return the finest joined level."""
         return sum(step >= join for join in self.join_steps)
 
+    def ends_level(self, step: int) -> bool:
+        """Return whether a level joins after a step, or the step is the last one."""
+        return step + 1 == self.parameters.steps or self.level_at(step + 1) > self.level_at(step)
+
     def completes_levels(self, step: int) -> bool:
         """Return whether levels are complete after a step: when the last one joins, and at the end."""
         return step + 1 in (self.join_steps[-1], self.parameters.steps)

@@ -341,7 +341,8 @@ def _divided(job: Job) -> tuple[Parameters, Parameters | None]:
     method = method_info(method_info(job.method).cell_method)
     values = asdict(job.resolved_parameters())
     names = {field.name for field in fields(method.parameters)}
-    parameters = method.parameters(**{name: value for name, value in values.items() if name in names})
+    values = {name: value for name, value in values.items() if name in names}
+    parameters = method.parameters(**values | dict(method.cell_values))
     coarse, fine = method.split_parameters(parameters) or (None, parameters)
     return fine, coarse
 

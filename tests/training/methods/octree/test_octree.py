@@ -15,7 +15,7 @@ from training.rasterize import Target, photometric_loss, rasterize
 def make(data, **values) -> Method:
     values = {
         "levels": 4, "coarser_levels": 0, "nearest": 0.0, "farthest": 1.0, "footprint": 12.0, "steps": 40,
-        "far_share": 0.0, "full_share": 0.0, "candidates": 1, **values,
+        "far_share": 0.0, "full_share": 0.0, "candidates": 1, "levels_from": "anchors", **values,
     }  # fmt: skip
     return Method(data, override(METHOD.preset("draft"), values), seed=0, backend="cpu")
 

@@ -563,7 +563,7 @@ def test_bundle_of_cells_is_like_that_of_an_undivided_run(tiny_scene, tmp_path, 
     parameters = {
         "3dgs": TINY,
         "flod": {**TINY, "levels": 3, "steps": [15, 15, 15], "footprint": 6.0},
-        "octree": {**FEW, "levels": 3, "steps": 45, "footprint": 6.0},
+        "octree": {**FEW, "levels": 3, "steps": 45, "footprint": 6.0, "levels_from": "anchors"},
     }[method]
     keys = asdict(job_for(tiny_scene, tmp_path / "cells", method, parameters=parameters))
     code, folder = run_all(keys)

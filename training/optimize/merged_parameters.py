@@ -1,0 +1,50 @@
+"""Parameters of coarser levels merged from the finest, shared by methods. Does not import torch."""
+
+from dataclasses import dataclass
+
+from ..settings import setting
+
+REFINE_RATIO = 0.7
+"""Steps that refine a merged level relative to those of the next finer one."""
+
+
+@dataclass(frozen=True)
+class MergedParameters:
+    """Parameters of merged levels."""
+
+    merge_ratio: float = setting(
+        0.5,
+        "Splat count of a merged level, as a fraction of the next finer level's. The level before the finest "
+        "has at most the share that views by distance may draw ('drawn').",
+        above=0,
+        high=1,
+    )
+    refine_steps: int = setting(
+        1000,
+        "Steps that refine the merged level before the finest. Each coarser level gets 70 % of the steps of "
+        "the next finer one. In FLoD they are taken from those of all levels ('steps'), at most half; the "
+        "finest level gets the others.",
+        unit="steps",
+    )
+    drawn: float = setting(
+        0.45,
+        "Maximum number of splats drawn by distance in the training views, as a fraction of those of "
+        "the finest level. Limits the size of merged levels, sets their distances, and the size of trained "
+        "levels that FLoD's finishing steps restart. Not in the paper.",
+        above=0,
+        high=1,
+    )
+
+    def share_below(self, count: int) -> float:
+        """Return the splats of the merged level ``count`` levels below the finest, as a fraction of its."""
+        return min(self.merge_ratio**count, self.drawn) if count else 1.0
+
+
+def refining_steps(first: float, levels: int) -> list[int]:
+    """Return the steps that refine each merged level, finest first.
+
+    Args:
+        first: steps of the level before the finest.
+        levels: number of merged levels.
+    """
+    return [max(int(first * REFINE_RATIO**n), 1) for n in range(levels)]
