@@ -50,7 +50,7 @@ from training.splats.ply import write_ply  # noqa: E402
 
 PARAMETERS: dict[str, dict] = {
     "flod": {"levels": 3, "steps": [11, 12, 14], "finish_share": 0.4, "footprint": 6.0, "max_splats": 300},
-    "octree": {"levels": 3, "steps": 40, "footprint": 6.0, "far_share": 0.2, "max_splats": 300},
+    "octree": {"levels": 3, "steps": 40, "refine_steps": 8, "footprint": 6.0, "max_splats": 300},
     "tree": {"tune_steps": 40, "pixels": 3.0, "resize_interval": 9, "sh_degree": 3},
 }
 BASE_SPLATS = 3000

@@ -58,7 +58,7 @@ METHODS = {
     | {"levels": 3, "steps": [60, 80, 120], "densify_until": [0.5] * 3, "densify_interval": [20] * 3},
     "lodge": SHORT | {"steps": 160, "tune_steps": 8, "levels": 3},
     "clod": SHORT | {"steps": 200},
-    "octree": SHORT | {"steps": 200},
+    "octree": SHORT | {"steps": 200, "levels_from": "anchors"},
     "tree": SHORT | {"steps": 160, "tune_steps": 40},
     "matryoshka": SHORT | {"steps": 200},
 }
