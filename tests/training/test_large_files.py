@@ -113,7 +113,11 @@ def test_large_header_of_a_depth_map(tmp_path, within):
 def test_large_documents(tmp_path, within):
     (tmp_path / "list.txt").write_text("a.jpg\n")
     bundle = sparse(tmp_path / "bundle.out", b"# Bundle file v0.3\n1 100000000000\n")
-    for read in (lambda: read_json(bundle), lambda: bundler.read(bundle), lambda: metashape.read(bundle)):
+    for read in (
+        lambda: read_json(bundle),
+        lambda: bundler.read(bundle, tmp_path),
+        lambda: metashape.read(bundle, tmp_path),
+    ):
         with pytest.raises(LodgsError, match=r"bundle\.out"):
             within(150, read)
 

@@ -16,7 +16,7 @@ from typing import IO, Any
 
 import numpy as np
 import torch
-from torch.nn.functional import conv2d, max_pool2d, relu
+from torch.nn.functional import conv2d, max_pool2d, pad, relu
 
 from ..errors import LodgsError
 from ..files import cache_folder, temporary_folder
@@ -32,6 +32,8 @@ SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 """Mean and standard deviation of the colours in [-1, 1] that the networks were trained with."""
 MIN_NORM = 1e-10
 """Added to the norms of features."""
+MIN_SIDE = 31
+"""Smallest side of an image in pixels that AlexNet can pool."""
 
 
 @dataclass(frozen=True)
@@ -100,8 +102,13 @@ class Lpips:
 
     @torch.no_grad()
     def distance(self, pair: torch.Tensor) -> float:
-        """Return the distance of two images (2, H, W, 3) without rounding."""
-        x = (2 * pair.permute(0, 3, 1, 2).to(self._shift) - 1 - self._shift) / self._scale
+        """Return the distance of two images (2, H, W, 3) without rounding.
+
+        Sides below MIN_SIDE are extended with the pixels of the border.
+        """
+        missing = [max(MIN_SIDE - side, 0) for side in pair.shape[1:3]]
+        planes = pad(pair.permute(0, 3, 1, 2).to(self._shift), (0, missing[1], 0, missing[0]), "replicate")
+        x = (2 * planes - 1 - self._shift) / self._scale
         distance, convolutions = x.new_zeros(()), iter(self._convolutions)
         for stage, pooled, linear in zip(
             self._backbone.stages, self._backbone.pooled, self._linear, strict=True

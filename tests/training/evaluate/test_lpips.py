@@ -115,6 +115,14 @@ def test_masked_pixels_do_not_count(networks):
     assert measure(image, target, mask) == measure(torch.cat([image[:, :40], target[:, 40:]], 1), target)
 
 
+def test_small_images_are_extended_with_their_border(networks):
+    image, target = images()[:, :20, :30]
+    for measure in networks.values():
+        extended = [torch.cat([part, *[part[-1:]] * 11]) for part in (image, target)]
+        extended = [torch.cat([part, part[:, -1:]], 1) for part in extended]
+        assert measure(image, target) == measure(*extended) > 0
+
+
 def test_missing_archive_is_stated(tmp_path):
     assert load_lpips(tmp_path / "none", CPU) == {}
     assert str(tmp_path / "none") in missing_line(tmp_path / "none")
