@@ -29,8 +29,8 @@ SLOW, SLOW_FACTOR = 0.08, 5.0
 factor more."""
 SMOOTH = 0.2
 """Seconds per redraw above which a smaller budget is suggested, and a moving view is simplified."""
-MOTION = 0.06
-"""Seconds to draw the splats of a simplified view. Blender itself needs most of SMOOTH on slow graphics."""
+MOTION = 0.12
+"""Seconds to draw the splats of a simplified view; Blender needs the rest of SMOOTH."""
 MIN_MOTION = 50_000
 """Smallest number of splats of a simplified view."""
 COST_CHANGE = 0.1

@@ -394,6 +394,29 @@ def test_mesh_occludes_with_pixel_accuracy(bpy, lodgs, add, draw_view, camera):
     assert not np.array_equal(image[occluded], no_mesh[occluded])
 
 
+def test_lines_do_not_hide_pixels_of_a_lower_resolution(bpy, lodgs, add, draw_view, camera):
+    """A line in front of all splats is one pixel wide, as those of Blender's grid."""
+    add(make_splats(lodgs, degree=0))
+    view = lodgs("viewport.views").ViewState()
+    depth = 1.2
+    half_width = (
+        depth / camera.calc_matrix_camera(bpy.context.evaluated_depsgraph_get(), x=SIZE, y=SIZE)[0][0]
+    )
+    column = SIZE // 2 + 1
+    left, right = (2 * np.array([column, column + 1]) / SIZE - 1) * half_width
+    corners = np.array([(left, -3), (right, -3), (right, 3), (left, 3)], float)
+    corners = np.c_[corners, np.full(4, -depth), np.ones(4)] @ np.array(camera.matrix_world, float).T
+    line = _plane((0, 0, 1, 1), [tuple(corner) for corner in corners[:, :3]])
+    resting = draw_view(view=view, draw_first=line)
+    (column,) = np.unique(np.nonzero((resting == (0, 0, 1, 1)).all(axis=2))[1])
+    assert column % 2 == 1  # the middle of a pixel of half the resolution is there
+    view.resolution = 0.5
+    moving, without_line = (draw_view(view=view, draw_first=first) for first in (line, None))
+    opaque = without_line[:, column, 3] > 0.9
+    assert opaque.mean() > 0.1
+    assert np.abs(moving - without_line)[opaque, column].max() < 0.1
+
+
 def test_mesh_hides_splats_behind_it(bpy, lodgs, add, draw_view, truth, camera):
     splats = make_splats(lodgs, degree=0)
     add(splats)
