@@ -35,6 +35,8 @@ MIN_MOTION = 50_000
 """Smallest number of splats of a simplified view."""
 COST_CHANGE = 0.1
 """Relative change of the number of splats from which a view is measured again."""
+SLOWER = 1.25
+"""Maximum factor between two measurements of a view."""
 COST_AGE = 3.0
 """Seconds after which a view is measured again."""
 MIN_BUDGET = 10_000
@@ -101,8 +103,11 @@ class ViewState:
         return has_changed or time.monotonic() > self.measured + COST_AGE
 
     def set_cost(self, seconds: float) -> None:
-        """Store the time to draw the current list."""
+        """Store the time to draw the current list. Slow redraws of a busy computer count little by little."""
         self.measured = time.monotonic()
+        count, previous = self.motion_cost if self.moving else self.cost
+        if count:
+            seconds = min(seconds, SLOWER * previous * max(self.count / count, 1.0))
         if self.moving:
             self.motion_cost = self.count, seconds
         else:

@@ -41,6 +41,22 @@ def test_splats_beside_the_view_count_less(lodgs):
     assert visibility[0] == 1 and (visibility[1:] < 0.5).all()
 
 
+def test_a_busy_moment_hardly_changes_the_measured_speed(lodgs):
+    """A slower view counts after some measurements."""
+    view = lodgs("viewport.view_state").ViewState(count=1000)
+    view.set_cost(0.1)
+    view.set_cost(2.0)
+    assert view.cost == (1000, 0.125)
+    for _ in range(20):
+        view.set_cost(2.0)
+    assert view.cost == (1000, 2.0)
+    view.set_cost(0.1)
+    assert view.cost == (1000, 0.1)
+    view.count = 3000
+    view.set_cost(0.3)
+    assert view.cost == (3000, 0.3)
+
+
 @pytest.mark.parametrize(
     ("cost", "motion_cost", "limit"),
     [
