@@ -9,6 +9,7 @@ import subprocess
 import time
 import traceback
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import bpy
@@ -281,6 +282,9 @@ class Watch:
     def _set_end(self) -> None:
         """Set the state, message and problem of a run that has ended."""
         code = None if self.process is None else self.process.poll()
+        if self.cancel_requested:
+            with suppress(OSError):
+                self.folder.take_cancel()  # a request that came too late
         self.state, problem = run_outcome(self.folder, code)
         self.problem = problem or self.problem
         self.message = {

@@ -294,6 +294,16 @@ def test_cancel_is_not_lost_before_the_trainer_is_ready(bpy, jobs, fake, root, t
     assert watch.state == "cancelled"
 
 
+def test_cancel_that_comes_too_late_leaves_no_request(jobs, fake, root, tmp_path):
+    fake()
+    watch = jobs.start(root, str(tmp_path / "run"))
+    watch.process.wait()
+    jobs.cancel(root)
+    assert (tmp_path / "run" / "cancel").exists()
+    _wait(watch, lambda: not watch.running)
+    assert watch.state == "done" and not (tmp_path / "run" / "cancel").exists()
+
+
 def test_only_the_trainer_of_the_run_is_killed(lodgs, jobs, fake, root, tmp_path):
     fake("slow")
     first = jobs.start(root, str(tmp_path / "run"))

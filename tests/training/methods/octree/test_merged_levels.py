@@ -108,6 +108,6 @@ def test_resumed_run_is_identical(data, check_resumed):
 
 
 def test_presets():
-    assert METHOD.preset("draft").total_steps == 3000 + 2000 + 1400 + 979 + 685
+    assert METHOD.preset("draft").total_steps == 3000 + 4000 + 2800 + 1959 + 1371
     paper = METHOD.preset("paper")
     assert not paper.merges and paper.total_steps == paper.steps
