@@ -17,7 +17,6 @@ from pathlib import Path
 
 import bpy
 import numpy as np
-from mathutils import Matrix, Vector
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -28,11 +27,13 @@ from tools.window_actions import (
     Steps,
     log,
     module,
+    pose,
     press,
     press_f12,
     region,
     screenshot,
     scroll,
+    show,
     start,
     training,
     until,
@@ -208,7 +209,7 @@ def fly(timer: CallTimer, space: bpy.types.SpaceView3D) -> Steps:
     yield from until(lambda: bool(roots(bpy.context.scene)), 60)
     imported = time.monotonic() - opened
     space.clip_start, space.clip_end = 0.05, 5000.0
-    look_along(cameras[0])
+    show(pose(cameras[0]))
     yield from loaded()
     timer.report(f"opened: imported after {imported:.1f} s, loaded after {time.monotonic() - opened:.1f}")
     screenshot("opened")
@@ -220,7 +221,7 @@ def fly(timer: CallTimer, space: bpy.types.SpaceView3D) -> Steps:
     legs = list(pairwise(cameras))
     for number, (first, second) in enumerate(legs):
         for share in np.arange(FRAMES) / FRAMES:
-            look_along(first, second, float(share))
+            show(pose(first, second, float(share)))
             frames += 1
             yield 0.01
         if number % max(len(legs) // SCREENSHOTS, 1) == 0:
@@ -292,31 +293,6 @@ def loaded() -> Steps:
         assert time.monotonic() < deadline, "Loading does not finish."
         yield 0.02
     yield 0.6  # modifiers update once the view rests
-
-
-def pose(first, second=None, share: float = 0.0) -> Matrix:
-    """Return a camera's pose in Blender's world, interpolated towards a second camera by ``share``."""
-    position, rotation, _ = _blender_matrix(first).decompose()
-    if second is not None:
-        end_position, end_rotation, _ = _blender_matrix(second).decompose()
-        position = position.lerp(end_position, share)
-        rotation = rotation.slerp(end_rotation, share)
-    return Matrix.Translation(position) @ rotation.to_matrix().to_4x4()  # type: ignore[arg-type]
-
-
-def _blender_matrix(camera) -> Matrix:
-    matrix = np.linalg.inv(np.array(camera.world_to_camera, np.float64)) @ np.diag([1.0, -1, -1, 1])
-    return Matrix(matrix.tolist())
-
-
-def look_along(first, second=None, share: float = 0.0) -> None:
-    """Set the viewport to a camera, interpolated towards a second one by ``share``."""
-    matrix = pose(first, second, share)
-    view = viewport()[1]
-    view.view_perspective, view.view_distance = "PERSP", 3.0
-    view.view_rotation = matrix.to_quaternion()
-    view.view_location = matrix @ Vector((0, 0, -3.0))
-    viewport()[0].tag_redraw()
 
 
 start(flight())

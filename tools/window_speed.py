@@ -15,7 +15,6 @@ from pathlib import Path
 
 import bpy
 import numpy as np
-from mathutils import Matrix, Vector
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -24,10 +23,12 @@ from tools.window_actions import (
     Steps,
     log,
     module,
+    pose,
     press,
     redraw,
     region,
     screenshot,
+    show,
     start,
     training,
     until,
@@ -164,30 +165,6 @@ def drawn() -> str:
     """Return the number of splats of the last redraw."""
     counts = [view.count for view in module("viewport.views")._views.values()]
     return f"{max(counts, default=0):,} splats drawn"
-
-
-def pose(first, second=None, share: float = 0.0) -> Matrix:
-    """Return a camera's pose in Blender's world, interpolated towards a second camera by ``share``."""
-    position, rotation, _ = _blender_matrix(first).decompose()
-    if second is not None:
-        end_position, end_rotation, _ = _blender_matrix(second).decompose()
-        position = position.lerp(end_position, share)
-        rotation = rotation.slerp(end_rotation, share)
-    return Matrix.Translation(position) @ rotation.to_matrix().to_4x4()  # type: ignore[arg-type]
-
-
-def _blender_matrix(camera) -> Matrix:
-    matrix = np.linalg.inv(np.array(camera.world_to_camera, np.float64)) @ np.diag([1.0, -1, -1, 1])
-    return Matrix(matrix.tolist())
-
-
-def show(matrix: Matrix) -> None:
-    """Set the viewport to a pose."""
-    view = viewport()[1]
-    view.view_perspective, view.view_distance = "PERSP", 3.0
-    view.view_rotation = matrix.to_quaternion()
-    view.view_location = matrix @ Vector((0, 0, -3.0))
-    viewport()[0].tag_redraw()
 
 
 start(speed())

@@ -36,7 +36,7 @@ class MergedParameters:
     )
 
     def share_below(self, count: int) -> float:
-        """Return the splats of the merged level ``count`` levels below the finest, as a fraction of its."""
+        """Return the relative number of splats of a level, ``count`` levels below the finest."""
         return min(self.merge_ratio**count, self.drawn) if count else 1.0
 
 

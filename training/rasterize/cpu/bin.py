@@ -30,7 +30,7 @@ TILE = 16
 MAX_CHUNKS, CHUNK = 32, 2048
 """Maximum number of chunks of the depth order, and their smallest size in splats."""
 BOXES = 8192
-"""Splats in a thread's unit of work that takes little time."""
+"""Splats in a thread's unit of work of :func:`box_sizes`."""
 HALF, SPAN = f32(0.5), f32(TILE - 1)
 
 
