@@ -28,7 +28,7 @@ class TreeParameters(SplatParameters):
         choices=("error", "size"),
     )
     tune_steps: int = setting(
-        600,
+        1500,
         "Training steps for cuts of the tree, one view per step. 0 keeps the tree as built.",
         unit="steps",
     )
@@ -53,7 +53,7 @@ class TreeParameters(SplatParameters):
         high=8,
     )
     node_rate: float = setting(
-        4.0,
+        8.0,
         "Learning rates of inner nodes, as multiples of the current 3DGS rates; with a base, of the "
         "final ones.",
         high=100,
@@ -112,6 +112,7 @@ _STANDARD = replace(
     steps=30_000,
     densify_interval=100,
     tune_steps=10_000,
+    node_rate=4.0,
     grow_interval=1000,
     leaf_rate=1.0,  # new leaves have to learn
 )
