@@ -153,9 +153,9 @@ def _build_falloff(tree: bpy.types.NodeTree) -> None:
     length = math_node("MULTIPLY", add("ShaderNodeLightPath").outputs["Ray Length"], stretch)
     half_chord = math_node("ABSOLUTE", along)
     starts_inside = math_node("LESS_THAN", length, math_node("MULTIPLY", half_chord, 2.0))
-    passed_centre = math_node("GREATER_THAN", length, half_chord)
+    passed_center = math_node("GREATER_THAN", length, half_chord)
     exits = math_node(
-        "MULTIPLY", geometry.outputs["Backfacing"], math_node("MULTIPLY", starts_inside, passed_centre)
+        "MULTIPLY", geometry.outputs["Backfacing"], math_node("MULTIPLY", starts_inside, passed_center)
     )
     enters = math_node("SUBTRACT", 1.0, geometry.outputs["Backfacing"])
     factor = math_node("MULTIPLY", alpha, math_node("ADD", enters, exits))

@@ -71,9 +71,9 @@ def extract_frames(
 
 def sharpness(image: np.ndarray) -> float:
     """Return the sharpness of an image (H, W): the variance of its Laplacian (Pech-Pacheco et al. 2000)."""
-    centre = image[1:-1, 1:-1]
-    neighbours = image[:-2, 1:-1] + image[2:, 1:-1] + image[1:-1, :-2] + image[1:-1, 2:]
-    return float(np.var(neighbours - 4 * centre))
+    center = image[1:-1, 1:-1]
+    neighbors = image[:-2, 1:-1] + image[2:, 1:-1] + image[1:-1, :-2] + image[1:-1, 2:]
+    return float(np.var(neighbors - 4 * center))
 
 
 def _render(scene: bpy.types.Scene, frame: int, folder: Path) -> Path:

@@ -77,7 +77,7 @@ vec3 view_color(ivec2 record, vec3 base, vec3 d)
 
 void main()
 {
-  centre_reach = axes = color_opacity = vec4(0.0);  // not drawn unless set below
+  center_reach = axes = color_opacity = vec4(0.0);  // not drawn unless set below
 
   // slot, weight, placement plus 1 - 1 / enlargement, level for the colour (0: own colour, below 0: mark)
   ivec2 pixel = ivec2(gl_FragCoord.xy);
@@ -114,8 +114,8 @@ void main()
 
   // Jacobian of the projection (in pixels) times the root of the covariance: rotation, then scales.
   vec3 ndc = clip.xyz / clip.w;
-  vec2 centre = 0.5 * (frame.xy + frame.zw), limit = 1.3 * (frame.zw - centre);
-  vec2 clamped = clamp(ndc.xy, centre - limit, centre + limit);
+  vec2 center = 0.5 * (frame.xy + frame.zw), limit = 1.3 * (frame.zw - center);
+  vec2 clamped = clamp(ndc.xy, center - limit, center + limit);
   mat4 rows = transpose(projection);
   vec3 by_x = (rows[0].xyz - clamped.x * rows[3].xyz) * (0.5 * size.x / clip.w);
   vec3 by_y = (rows[1].xyz - clamped.y * rows[3].xyz) * (0.5 * size.y / clip.w);
@@ -146,7 +146,7 @@ void main()
                                       : (xx >= yy ? vec2(1.0, 0.0) : vec2(0.0, 1.0));
   float longer = sqrt(middle + spread), shorter = sqrt(max(middle - spread, filtered.x));
   float reach = sqrt(2.0 * log(255.0 * opacity));
-  centre_reach = vec4(ndc, reach);
+  center_reach = vec4(ndc, reach);
   axes = vec4(longer * axis, shorter * vec2(-axis.y, axis.x)) * reach * 2.0 / size.xyxy;
 
   vec3 base = vec3(s.w, record_texel(record, 3).xy);
@@ -166,10 +166,10 @@ _SPLAT_VERTEX = (
 void main()
 {
   int splat = gl_InstanceID * BLOCK + int(corner.z);
-  vec4 centre = texel(centres, splat), half_axes = texel(axes, splat);
-  position_in_sigmas = corner.xy * centre.w;
+  vec4 center = texel(centers, splat), half_axes = texel(axes, splat);
+  position_in_sigmas = corner.xy * center.w;
   color_opacity = texel(colors, splat);
-  gl_Position = vec4(centre.xy + corner.x * half_axes.xy + corner.y * half_axes.zw, centre.z, 1.0);
+  gl_Position = vec4(center.xy + corner.x * half_axes.xy + corner.y * half_axes.zw, center.z, 1.0);
 }
 """
 )
@@ -356,7 +356,7 @@ def _triangles() -> gpu.types.GPUBatch:
 def _projection_shader(textures: int) -> gpu.types.GPUShader:
     info = gpu.types.GPUShaderCreateInfo()
     info.vertex_in(0, "VEC2", "corner")
-    for slot, name in enumerate(("centre_reach", "axes", "color_opacity")):
+    for slot, name in enumerate(("center_reach", "axes", "color_opacity")):
         info.fragment_out(slot, "VEC4", name)
     parts = [f"records_{part}" for part in range(textures)]
     for slot, name in enumerate(("instances", "placements", "looks", "palette", *parts)):
@@ -391,7 +391,7 @@ def _splat_shader() -> gpu.types.GPUShader:
     info = gpu.types.GPUShaderCreateInfo()
     info.vertex_in(0, "VEC3", "corner")
     info.fragment_out(0, "VEC4", "result")
-    for slot, name in enumerate(("centres", "axes", "colors")):
+    for slot, name in enumerate(("centers", "axes", "colors")):
         info.sampler(slot, "FLOAT_2D", name)
     info.define("WIDTH", str(WIDTH))
     info.define("BLOCK", str(BLOCK))

@@ -145,9 +145,9 @@ class Canvas:
             self.size, self.colors = size, gpu.types.GPUTexture(size, format="RGBA16F")
             self._depth = gpu.types.GPUTexture(size, format="DEPTH_COMPONENT32F")
             self.frame = gpu.types.GPUFrameBuffer(depth_slot=self._depth, color_slots=self.colors)
-        reserved = self.projections["centres"].height if self.projections else 0
+        reserved = self.projections["centers"].height if self.projections else 0
         if not rows <= reserved <= SHRINK_FACTOR * rows:
-            formats = {"centres": "RGBA32F", "axes": "RGBA32F", "colors": "RGBA16F"}
+            formats = {"centers": "RGBA32F", "axes": "RGBA32F", "colors": "RGBA16F"}
             self.projections = {
                 name: gpu.types.GPUTexture((WIDTH, rows), format=kind) for name, kind in formats.items()
             }

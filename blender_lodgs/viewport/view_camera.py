@@ -148,8 +148,8 @@ def nearest_streamed(
         if instance.source is None:
             continue
         query = view_query(instance, depsgraph, moving)
-        centre = np.mean(instance.object.bound_box, axis=0)
-        distance = inf if query is None else float(np.linalg.norm(np.subtract(query.position, centre)))
+        center = np.mean(instance.object.bound_box, axis=0)
+        distance = inf if query is None else float(np.linalg.norm(np.subtract(query.position, center)))
         if instance.source.scene not in nearest or distance < nearest[instance.source.scene][0]:
             nearest[instance.source.scene] = distance, instance, query
     return [(instance, query) for _, instance, query in nearest.values()]

@@ -418,9 +418,9 @@ def assign_cells(means: np.ndarray, gap: float) -> tuple[np.ndarray, np.ndarray]
 def _clusters(cells: np.ndarray) -> np.ndarray:
     """Return the cluster (V,) of each cell: the index of one of the cluster's cells."""
     steps = [(x, y, z) for x in (0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)]
-    neighbours = [(x << 42) + (y << 21) + z for x, y, z in steps if (x, y, z) > (0, 0, 0)]
+    neighbors = [(x << 42) + (y << 21) + z for x, y, z in steps if (x, y, z) > (0, 0, 0)]
     pairs = []
-    for step in neighbours:
+    for step in neighbors:
         place = np.searchsorted(cells, cells + step).clip(max=len(cells) - 1)
         touching = np.flatnonzero(cells[place] == cells + step)
         pairs.append(np.stack([touching, place[touching]]).astype(np.int32))

@@ -70,8 +70,8 @@ class Look:
         With saturation 0, the tint therefore tones the image.
         """
         light = 2 ** (self.exposure / GAMMA) * white_balance(self.temperature)
-        grey = np.broadcast_to(LUMA, (3, 3))
-        saturation = self.saturation * np.eye(3) + (1 - self.saturation) * grey
+        gray = np.broadcast_to(LUMA, (3, 3))
+        saturation = self.saturation * np.eye(3) + (1 - self.saturation) * gray
         return np.asarray(self.tint)[:, None] * saturation * light
 
     def as_dict(self) -> dict[str, Any]:

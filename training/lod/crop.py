@@ -61,15 +61,15 @@ class Crop:
         return cls.from_matrix("BOX", matrix, outside)
 
     @classmethod
-    def sphere(cls, centre: Sequence[float], radius: float, outside: bool = False) -> Crop:
+    def sphere(cls, center: Sequence[float], radius: float, outside: bool = False) -> Crop:
         """Return a sphere around a centre (3,).
 
         Raises:
             LodgsError: the sphere is empty or infinite.
         """
-        if not np.isfinite([*centre, radius]).all():
+        if not np.isfinite([*center, radius]).all():
             raise LodgsError(
-                f"Cannot use the sphere of radius {radius:g} around {centre}: it is infinite.",
+                f"Cannot use the sphere of radius {radius:g} around {center}: it is infinite.",
                 "Use finite numbers.",
             )
         if not radius > 0:
@@ -77,7 +77,7 @@ class Crop:
                 f"Cannot use a sphere of radius {radius:g}: it is empty.", "Use a radius above 0."
             )
         matrix = np.diag([radius, radius, radius, 1.0])
-        matrix[:3, 3] = centre
+        matrix[:3, 3] = center
         return cls.from_matrix("SPHERE", matrix, outside)
 
     def contains(self, means: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ from ..errors import LodgsError
 from ..splats.gaussians import SH_C0, Splats
 from .density_control import constrained_log_scales
 from .model import NAMES
-from .neighbours import query_neighbours
+from .neighbors import query_neighbors
 
 MIN_POINTS = 4
 """Minimum number of distinct points to start from."""
@@ -42,17 +42,17 @@ def sample_points(
     return points, colors
 
 
-def neighbour_distances(means: np.ndarray, neighbours: int = 3) -> np.ndarray:
+def neighbor_distances(means: np.ndarray, neighbors: int = 3) -> np.ndarray:
     """Return the distances to the nearest other points, (N, neighbours), in the unit of ``means``.
 
     With fewer points than neighbours, the missing distances are infinite.
     """
-    return query_neighbours(KDTree(means), means, neighbours + 1)[0][:, 1:]
+    return query_neighbors(KDTree(means), means, neighbors + 1)[0][:, 1:]
 
 
-def neighbour_scale(points: np.ndarray) -> np.ndarray:
+def neighbor_scale(points: np.ndarray) -> np.ndarray:
     """Return the root mean square distance (N,) of the three nearest neighbours, above 0."""
-    distances = neighbour_distances(points)
+    distances = neighbor_distances(points)
     finite = np.isfinite(distances)
     squared = np.where(finite, distances, 0) ** 2
     scale = np.sqrt(squared.sum(1) / np.maximum(finite.sum(1), 1))
@@ -78,7 +78,7 @@ def from_points(
     Returns:
         Tensors by name. Scales are the root mean square distance of the three nearest neighbours.
     """
-    scale = neighbour_scale(points)
+    scale = neighbor_scale(points)
     count = len(points)
     sh = np.zeros((count, (sh_degree + 1) ** 2, 3), np.float32)
     sh[:, 0] = (colors.astype(np.float32) / 255 - 0.5) / SH_C0

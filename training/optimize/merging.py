@@ -17,13 +17,13 @@ from scipy.special import expit, logit, spence
 
 from ..splats.gaussians import SH_C0, Splats, splat_area
 from ..splats.morton import spatial_order
-from .neighbours import query_neighbours
+from .neighbors import query_neighbors
 
 MAX_OPACITY = 0.99
 """Maximum opacity of a merged splat, the maximum that a rasterizer draws."""
 MAX_SPREAD = 1.5
 """Maximum area of a merged splat relative to its members' moments. Larger ones blur small images."""
-NEIGHBOURS = 8
+NEIGHBORS = 8
 """Number of candidate partners of a splat."""
 COLOR_WEIGHT = 5.0
 """Weight of a squared colour difference relative to the information loss."""
@@ -125,13 +125,13 @@ def shapes_of_moments(
 def cheapest_pairs(moments: np.ndarray, limit: int) -> tuple[np.ndarray, np.ndarray]:
     """Return rows (M,) and their larger partners (M,): disjoint pairs of least cost, 1 to ``limit``."""
     count = len(moments)
-    _, neighbours = query_neighbours(KDTree(moments[:, :3]), moments[:, :3], min(NEIGHBOURS + 1, count))
+    _, neighbors = query_neighbors(KDTree(moments[:, :3]), moments[:, :3], min(NEIGHBORS + 1, count))
     partners, costs = np.empty(count, np.int64), np.empty(count)
     columns = np.ascontiguousarray(moments.T)
     log_areas = _log_areas(columns[3:9])
-    for part in _batches(count, NEIGHBOURS):
+    for part in _batches(count, NEIGHBORS):
         rows = np.arange(count)[part]
-        candidates = neighbours[part]
+        candidates = neighbors[part]
         first, second = np.minimum(rows[:, None], candidates), np.maximum(rows[:, None], candidates)
         pair_costs = _errors(columns, log_areas, first, second)
         pair_costs[candidates == rows[:, None]] = np.inf

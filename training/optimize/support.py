@@ -14,9 +14,9 @@ from scipy.spatial import KDTree
 from ..scenes.cameras import Camera
 from .density_control import require_rows
 from .model import Model
-from .neighbours import query_neighbours
+from .neighbors import query_neighbors
 
-NEIGHBOURS = (1, 2, 4)
+NEIGHBORS = (1, 2, 4)
 """Ranks of the neighbours of a camera to form midpoints with."""
 INTERVAL = 50
 """Steps between two removals of unsupported splats."""
@@ -37,11 +37,11 @@ def midpoint_views(cameras: Sequence[Camera]) -> list[Camera]:
     """
     centers = np.array([camera.center for camera in cameras])
     views = []
-    order = np.asarray(KDTree(centers).query(centers, k=1 + max(NEIGHBOURS))[1])  # column 0: the camera
-    for camera, neighbours in zip(cameras, order[:, list(NEIGHBOURS)], strict=True):
-        for neighbour in neighbours[neighbours < len(cameras)]:  # scipy numbers missing ones beyond the end
+    order = np.asarray(KDTree(centers).query(centers, k=1 + max(NEIGHBORS))[1])  # column 0: the camera
+    for camera, neighbors in zip(cameras, order[:, list(NEIGHBORS)], strict=True):
+        for neighbor in neighbors[neighbors < len(cameras)]:  # scipy numbers missing ones beyond the end
             pose = camera.world_to_camera.copy()
-            pose[:3, 3] = -pose[:3, :3] @ (camera.center + centers[neighbour]) / 2
+            pose[:3, 3] = -pose[:3, :3] @ (camera.center + centers[neighbor]) / 2
             views.append(replace(camera, world_to_camera=pose, image=None))
     return views
 
@@ -77,7 +77,7 @@ class Support:
         Returns:
             (N,) float64 distances in scene units, and (N,) int indices of the positions.
         """
-        return query_neighbours(self._positions, means)
+        return query_neighbors(self._positions, means)
 
     def find_intruding(
         self, means: np.ndarray, distances: np.ndarray, positions: np.ndarray, share: float

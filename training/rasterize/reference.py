@@ -54,7 +54,7 @@ def rasterize(
     values: list = [None] * harmonics.coefficient_count(settings.degree)
     x, y, z = normalize(means[drawn] - torch.as_tensor(view.position, **kind), dim=1).unbind(1)
     harmonics.basis(x, y, z, settings.degree, values)
-    colour = (
+    color = (
         (torch.stack(values, 1)[:, :, None] * gaussians.sh[drawn, : len(values)]).sum(1).add(0.5).clamp_min(0)
     )
 
@@ -62,7 +62,7 @@ def rasterize(
     offsets = pixel_offsets(mean2d[order], view)
     hidden = None if settings.limit is None else projected.depth[order][:, None, None] > settings.limit
     weight, transmittance = blend(offsets, xx[order], xy[order], yy[order], opacity[order], hidden)
-    image = torch.einsum("nhw,nc->hwc", weight, colour[order])
+    image = torch.einsum("nhw,nc->hwc", weight, color[order])
     image = image + transmittance[..., None] * torch.tensor(settings.background, **kind)
     if settings.absolute:  # features do not affect absgrad2d, so they get separate offsets
         feature_offsets = pixel_offsets(mean2d[order], view)

@@ -95,8 +95,8 @@ class RenderedImage:
         linear = np.empty((*self.alpha.shape, 4), np.float32)
         for rows in self._strips():
             alpha = _avoid_thresholds(self.alpha[rows, :, None].astype(np.float64)).clip(0, 1)
-            colours = _avoid_thresholds(self.straight(rows).astype(np.float64)).clip(0)
-            linear[rows, :, :3], linear[rows, :, 3:] = linear_from_srgb(colours) * alpha, alpha
+            colors = _avoid_thresholds(self.straight(rows).astype(np.float64)).clip(0)
+            linear[rows, :, :3], linear[rows, :, 3:] = linear_from_srgb(colors) * alpha, alpha
         return linear
 
     def passes(self) -> dict[str, np.ndarray]:

@@ -26,7 +26,7 @@ from .command import draw_bundle
 from .image import write_image
 
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-_GREY = 0.12, 0.55
+_GRAY = 0.12, 0.55
 """Brightness of black remaining splats, and the additional brightness of white ones."""
 _SIDE = 1280
 """Longer side of the image in pixels."""
@@ -101,8 +101,8 @@ def _paint(rows: SplatRows, tints: np.ndarray) -> Splats:
         colors = tints[begin : begin + len(splats)]
         begin += len(splats)
         brightness = (0.5 + SH_C0 * splats.sh[:, 0]) @ _LUMINANCE
-        grey = _GREY[0] + _GREY[1] * brightness.clip(0, 1)[:, None]
-        colors = np.where(np.isnan(colors), grey, colors)
+        gray = _GRAY[0] + _GRAY[1] * brightness.clip(0, 1)[:, None]
+        colors = np.where(np.isnan(colors), gray, colors)
         batches.append(replace(splats, sh=((colors - 0.5) / SH_C0).astype(np.float32)[:, None]))
     return Splats.concatenated(batches)
 

@@ -14,7 +14,7 @@ import torch
 from ..errors import LodgsError
 from ..evaluate.messages import format_duration
 from ..methods import METHODS, create
-from ..optimize.initialize import neighbour_scale
+from ..optimize.initialize import neighbor_scale
 from ..optimize.memory import MAX_BYTES, TARGET_BYTES, free_memory, peak_memory, reset_peak_memory
 from ..optimize.method import Method
 from ..optimize.parameters import Parameters
@@ -226,7 +226,7 @@ def _with_points(scene: Scene, count: int) -> Scene:
     """Return a scene with ``count`` points, at random positions near its points."""
     rng = np.random.default_rng(0)
     rows = rng.integers(len(scene.points), size=count)
-    sizes = np.minimum(neighbour_scale(scene.points), np.percentile(neighbour_scale(scene.points), 90))
+    sizes = np.minimum(neighbor_scale(scene.points), np.percentile(neighbor_scale(scene.points), 90))
     points = scene.points[rows] + rng.normal(size=(count, 3)) * sizes[rows, None]
     return replace(
         scene, points=points.astype(scene.points.dtype), point_colors=scene.point_colors[rows],

@@ -10,7 +10,7 @@ import numpy as np
 
 CELLS = 48
 """Number of cells along the longer side of a photo. A cell without points receives one."""
-NEIGHBOURS = 8
+NEIGHBORS = 8
 """Number of nearest points in the photo whose depths a new point may have."""
 COMPARED_VIEWS = 8
 """Number of closest views that compare colours."""
@@ -104,13 +104,13 @@ def fill_cells(
             empty[y, x] = False
         occupied, depths = np.concatenate(occupied), np.concatenate(depths)
         y, x = np.nonzero(empty)
-        if not len(x) or len(occupied) < NEIGHBOURS:
+        if not len(x) or len(occupied) < NEIGHBORS:
             continue
-        nearest = KDTree(occupied).query(np.stack([x, y], axis=1) + 0.5, k=NEIGHBOURS)[1]
+        nearest = KDTree(occupied).query(np.stack([x, y], axis=1) + 0.5, k=NEIGHBORS)[1]
         candidates = _lift(view, np.stack([x, y], axis=1) + 0.5, np.sort(depths[nearest], axis=1))
         costs = _color_costs(candidates, view.colors[y, x], _close_views(view, views))
         similar = costs <= costs.min(axis=1, keepdims=True) + TOLERANCE
-        last = NEIGHBOURS - 1 - similar[:, ::-1].argmax(axis=1)
+        last = NEIGHBORS - 1 - similar[:, ::-1].argmax(axis=1)
         new = np.concatenate([new, candidates[np.arange(len(x)), last]])
         colors = np.concatenate([colors, np.rint(view.colors[y, x]).astype(np.uint8)])
     return new, colors

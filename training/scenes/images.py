@@ -178,8 +178,8 @@ def _pillow_rows(image: Image.Image, top: int, bottom: int, alpha: bool) -> np.n
             codes[..., :3] = _pillow_rows(image, top, bottom, alpha=False)
         return codes
     if rows.mode.startswith("I"):  # convert("RGB") would clip 16-bit grey
-        grey = np.asarray(rows, np.float32) / 65535
-        return np.repeat(grey[..., None], 3, axis=2)
+        gray = np.asarray(rows, np.float32) / 65535
+        return np.repeat(gray[..., None], 3, axis=2)
     if rows.mode == "F":  # convert("RGB") would treat grey from 0 to 1 as 0 to 255
         return np.repeat(np.nan_to_num(np.asarray(rows, np.float32))[..., None], 3, axis=2)
     return np.asarray(rows.convert("RGB"), np.float32) / 255

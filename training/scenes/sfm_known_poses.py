@@ -21,7 +21,7 @@ from .pycolmap_process import ask, send
 if TYPE_CHECKING:
     import pycolmap
 
-NEIGHBOURS = *range(1, 11), 12, 16, 24, 32
+NEIGHBORS = *range(1, 11), 12, 16, 24, 32
 """Ranks of the photos matched with each photo. Higher ranks add wide baselines, as in videos."""
 MAX_ANGLE = np.radians(60)
 """Maximum angle between the view directions of a pair."""
@@ -82,7 +82,7 @@ def choose_pairs(centers: np.ndarray, directions: np.ndarray) -> list[tuple[int,
         cost = np.linalg.norm(centers - center, axis=1) * (1 + angle / ANGLE_SCALE)
         cost[(angle > MAX_ANGLE) | (np.arange(len(centers)) == view)] = np.inf
         order = np.argsort(cost, kind="stable")[: np.isfinite(cost).sum()]
-        for rank in NEIGHBOURS:
+        for rank in NEIGHBORS:
             if rank <= len(order):
                 other = int(order[rank - 1])
                 pair = min(view, other), max(view, other)

@@ -51,9 +51,9 @@ def _by_chunks(inputs: RuleInputs, chunks: bpy.types.NodeSocket) -> Field:
     distance = nodes.field(nodes.vector("DISTANCE", position, inputs.camera))
     beyond = (distance / inputs.table_column("radius").maximum(1e-20) - 1.0) / FADE_SHARE
     nearest = nodes.sort_points(chunks, distance.socket)
-    centre = nodes.sample(nearest, position, 0, kind="FLOAT_VECTOR", clamp=True)
-    to_camera = nodes.vector("SUBTRACT", inputs.camera, centre)
-    to_chunk = nodes.vector("SUBTRACT", position, centre)
+    center = nodes.sample(nearest, position, 0, kind="FLOAT_VECTOR", clamp=True)
+    to_camera = nodes.vector("SUBTRACT", inputs.camera, center)
+    to_chunk = nodes.vector("SUBTRACT", position, center)
     length2 = nodes.field(nodes.vector("DOT_PRODUCT", to_chunk, to_chunk))
     t = nodes.field(nodes.vector("DOT_PRODUCT", to_camera, to_chunk)) / length2  # nearest chunk: 0 / 0 = 0
     ahead = nodes.sort_points(chunks, (t * -1.0).socket)

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 import torch
 
-from training.optimize.initialize import from_points, neighbour_distances
+from training.optimize.initialize import from_points, neighbor_distances
 
 
 def test_neighbour_distances_equal_brute_force():
     points = np.random.default_rng(1).normal(size=(200, 3))
     full = np.linalg.norm(points[:, None] - points[None], axis=2)
     expected = np.sort(full, axis=1)[:, 1:4]
-    np.testing.assert_allclose(neighbour_distances(points), expected, rtol=1e-12)
+    np.testing.assert_allclose(neighbor_distances(points), expected, rtol=1e-12)
 
 
 def test_initial_scale_is_the_rms_neighbour_distance_and_colours_are_preserved():

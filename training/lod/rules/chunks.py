@@ -132,12 +132,12 @@ class Chunks(Rule):
     def part_numbers(self, means, tables: Tables) -> np.ndarray:
         if not _rows(tables):
             return super().part_numbers(means, tables)
-        centres = np.stack([tables[TABLE][axis] for axis in "xyz"]).astype(np.float32)
-        squares = (centres * centres).sum(axis=0)
+        centers = np.stack([tables[TABLE][axis] for axis in "xyz"]).astype(np.float32)
+        squares = (centers * centers).sum(axis=0)
         numbers = np.empty(len(means), np.float32)
         for start in range(0, len(means), _BLOCK):
             block = means[start : start + _BLOCK]
-            numbers[start : start + _BLOCK] = (squares - 2 * block @ centres).argmin(axis=1) + 1
+            numbers[start : start + _BLOCK] = (squares - 2 * block @ centers).argmin(axis=1) + 1
         return numbers
 
     def near_chunks(self, position, values: Values, tables: Tables) -> list[tuple[int, float]]:
@@ -153,13 +153,13 @@ class Chunks(Rule):
         if not values["chunks"] or not _rows(tables):
             return []
         table = tables[TABLE]
-        centres = np.stack([table[axis] for axis in "xyz"], axis=1).astype(np.float64)
+        centers = np.stack([table[axis] for axis in "xyz"], axis=1).astype(np.float64)
         radii = np.asarray(table["radius"], np.float64)
         position = np.asarray(position, np.float64)
-        distance = np.linalg.norm(centres - position, axis=1)
+        distance = np.linalg.norm(centers - position, axis=1)
         first = int(distance.argmin())
-        along = centres - centres[first]
-        t = along @ (position - centres[first]) / np.maximum(np.square(along).sum(axis=1), 1e-40)
+        along = centers - centers[first]
+        t = along @ (position - centers[first]) / np.maximum(np.square(along).sum(axis=1), 1e-40)
         second, *third = np.argsort(-t, kind="stable")[:2] if len(t) > 2 else [int(t.argmax())]
         near, share = [first], 0.0
         if values["fade"] and t[second] > 0:

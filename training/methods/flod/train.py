@@ -26,7 +26,7 @@ from ...optimize.initialize import (
     drop_duplicates,
     from_points,
     from_splats,
-    neighbour_distances,
+    neighbor_distances,
     sample_points,
 )
 from ...optimize.level_distances import measure_min_sizes
@@ -365,4 +365,4 @@ def well_separated(means: torch.Tensor, distance: float) -> torch.Tensor:
     """
     if len(means) <= 3:
         return torch.ones(len(means), dtype=torch.bool)
-    return torch.from_numpy(neighbour_distances(means.numpy()).mean(1) >= distance)
+    return torch.from_numpy(neighbor_distances(means.numpy()).mean(1) >= distance)

@@ -17,18 +17,18 @@ RANDOM_TURNS = 4
 """Number of random orientations per camera for the visibility from a chunk (the paper gives no number)."""
 
 
-def chunk_count(centers: np.ndarray, d_1: float) -> int:
+def chunk_count(positions: np.ndarray, d_1: float) -> int:
     """Return the number of chunks of Eq. 5: 4 / d_1 times the maximum distance of cameras from their mean.
 
     Args:
-        centers: (C, 3) positions of the training cameras.
+        positions: (C, 3) of the training cameras.
         d_1: distance at which the finest level ends, in scene units.
     """
-    reach = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
-    return int(min(np.ceil(4 * reach / max(d_1, 1e-20)), MAX_CHUNKS, len(centers)))
+    reach = np.linalg.norm(positions - positions.mean(axis=0), axis=1).max()
+    return int(min(np.ceil(4 * reach / max(d_1, 1e-20)), MAX_CHUNKS, len(positions)))
 
 
-def place_chunks(centers: np.ndarray, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def place_chunks(positions: np.ndarray, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Place chunks by k-means on camera positions (C, 3).
 
     Returns:
@@ -37,22 +37,22 @@ def place_chunks(centers: np.ndarray, count: int, seed: int) -> tuple[np.ndarray
             ``count``.
     """
     rng = np.random.default_rng([seed, 10])
-    centres, _ = kmeans2(centers, count, minit="++", rng=rng, iter=30, missing="warn")
-    distances = np.linalg.norm(centers[:, None] - centres, axis=2)
-    centres = centres[np.unique(distances.argmin(axis=1))]  # drop chunks without cameras
-    distances = np.linalg.norm(centers[:, None] - centres, axis=2)
+    centers, _ = kmeans2(positions, count, minit="++", rng=rng, iter=30, missing="warn")
+    distances = np.linalg.norm(positions[:, None] - centers, axis=2)
+    centers = centers[np.unique(distances.argmin(axis=1))]  # drop chunks without cameras
+    distances = np.linalg.norm(positions[:, None] - centers, axis=2)
     nearest, own_distance = distances.argmin(axis=1), distances.min(axis=1)
-    radii = np.zeros(len(centres))
+    radii = np.zeros(len(centers))
     np.maximum.at(radii, nearest, own_distance)
-    if len(centres) > 1:
-        between = np.linalg.norm(centres[:, None] - centres, axis=2)
+    if len(centers) > 1:
+        between = np.linalg.norm(centers[:, None] - centers, axis=2)
         np.fill_diagonal(between, np.inf)
         radii = np.maximum(radii, between.min(axis=1))
-    return centres.astype(np.float32), radii.astype(np.float32)
+    return centers.astype(np.float32), radii.astype(np.float32)
 
 
 def chunk_rows(
-    levels: Mapping[int, IndexedLevel], d_l: Mapping[int, float], centre: np.ndarray, radius: float
+    levels: Mapping[int, IndexedLevel], d_l: Mapping[int, float], center: np.ndarray, radius: float
 ) -> Rows:
     """Return the rows of each level in a chunk's set: Eq. 2 at its centre, with distances increased by its
     radius.
@@ -61,25 +61,25 @@ def chunk_rows(
     """
     finest = max(levels)
     offset = {number: d_l[number] + (radius if number != finest else 0.0) for number in levels}
-    return rows_at_distances(levels, offset, centre)
+    return rows_at_distances(levels, offset, center)
 
 
-def cameras_near(cameras: Sequence[Camera], centres: np.ndarray, chunk: int) -> list[Camera]:
+def cameras_near(cameras: Sequence[Camera], centers: np.ndarray, chunk: int) -> list[Camera]:
     """Return the cameras that have this chunk among their two nearest."""
-    distances = np.linalg.norm(np.array([camera.center for camera in cameras])[:, None] - centres, axis=2)
+    distances = np.linalg.norm(np.array([camera.center for camera in cameras])[:, None] - centers, axis=2)
     nearest = np.argsort(distances, axis=1, kind="stable")[:, :2]
     return [camera for camera, near in zip(cameras, nearest, strict=True) if chunk in near]
 
 
 def turn_cameras(cameras: Sequence[Camera], rng: np.random.Generator) -> list[Camera]:
     """Return RANDOM_TURNS randomly oriented copies of each camera, at the same position."""
-    centres = []
+    turned = []
     for camera in cameras:
         for rotation in Rotation.random(RANDOM_TURNS, rng).as_matrix():
             pose = np.eye(4)
             pose[:3, :3], pose[:3, 3] = rotation, -rotation @ camera.center
-            centres.append(replace(camera, world_to_camera=pose, image=None))
-    return centres
+            turned.append(replace(camera, world_to_camera=pose, image=None))
+    return turned
 
 
 def prune_invisible(

@@ -56,7 +56,7 @@ class Method(RefiningMethod):
             training.
         finished: frozen levels as rendered, by number, finest first.
         costs: reports of the choice of distances, see ``Thresholds``.
-        centres, radii: chunks, (K, 3) and (K,) float32, once their number is known.
+        centers, radii: chunks, (K, 3) and (K,) float32, once their number is known.
         sets: which splats of each level (N,) belong to each computed chunk, by level number.
     """
 
@@ -100,7 +100,7 @@ class Method(RefiningMethod):
     def stage(self, step: int) -> str:
         if step < self.tuned_steps:
             return super().stage(step)
-        return f"chunk {step - self.tuned_steps + 1} of {len(self.centres)}"
+        return f"chunk {step - self.tuned_steps + 1} of {len(self.centers)}"
 
     def levels_after(self, step: int) -> list[Level]:
         """Return the finest level once it is trained, each coarser level after tuning, and all after the
@@ -119,9 +119,9 @@ class Method(RefiningMethod):
 
     def tables(self) -> dict[str, Columns]:
         """Return the table of chunks, if any, and the block table."""
-        if not len(self.centres):
+        if not len(self.centers):
             return {}
-        x, y, z = self.centres.T
+        x, y, z = self.centers.T
         levels = ((number, self._make_level(number).splats.extras) for number in sorted(self.sets))
         return {
             TABLE: {"x": x, "y": y, "z": z, "radius": self.radii},
@@ -357,15 +357,15 @@ class Method(RefiningMethod):
 
     def _place_chunks(self) -> None:
         """Place the chunks once the end of the finest level is known (Eq. 5)."""
-        centers = np.array([camera.center for camera in self.data.train])
-        count = self.parameters.chunks or chunks.chunk_count(centers, self.d_l[self.levels - 1])
+        positions = np.array([camera.center for camera in self.data.train])
+        count = self.parameters.chunks or chunks.chunk_count(positions, self.d_l[self.levels - 1])
         if count >= (2 if self.parameters.chunks else self.parameters.min_chunks):
-            self._use_chunks(*chunks.place_chunks(centers, count, self.seed))
+            self._use_chunks(*chunks.place_chunks(positions, count, self.seed))
 
-    def _use_chunks(self, centres: np.ndarray, radii: np.ndarray) -> None:
+    def _use_chunks(self, centers: np.ndarray, radii: np.ndarray) -> None:
         """Set the chunks, (K, 3) and (K,). Each takes a step at the end of the run."""
-        self.centres, self.radii = centres, radii
-        self.steps = self.tuned_steps + len(centres)
+        self.centers, self.radii = centers, radii
+        self.steps = self.tuned_steps + len(centers)
 
     @torch.no_grad()
     def _chunk_step(self, step: int) -> StepResult:
@@ -373,9 +373,9 @@ class Method(RefiningMethod):
         p, data, number = self.parameters, self.data, step - self.tuned_steps
         if number == 0:
             self._finish(1)
-        levels, centre, radius = self.finished, self.centres[number], float(self.radii[number])
-        rows = chunks.chunk_rows(levels, self.d_l, centre, radius)
-        near = chunks.cameras_near(data.train, self.centres, number)
+        levels, center, radius = self.finished, self.centers[number], float(self.radii[number])
+        rows = chunks.chunk_rows(levels, self.d_l, center, radius)
+        near = chunks.cameras_near(data.train, self.centers, number)
         if p.visible_weight:
             rng = np.random.default_rng([self.seed, number, 11])
             views = [*near, *chunks.turn_cameras(near, rng)]
@@ -386,13 +386,13 @@ class Method(RefiningMethod):
             in_set = np.zeros(len(levels[level]), bool)
             in_set[rows_of_level] = True
             self.sets.setdefault(level, []).append(in_set)
-        nearest = min(near or data.train, key=lambda camera: np.linalg.norm(camera.center - centre))
+        nearest = min(near or data.train, key=lambda camera: np.linalg.norm(camera.center - center))
         view = data.view(data.train.index(nearest))
         rendering = self.rasterize_model(view.camera, step, gaussians=gather_rows(levels, rows))
         loss = photometric_loss(rendering.image, view.target, p.ssim_weight, backend=self.backend)
         return StepResult(lambda: float(loss), lambda: rendering.image, view.target)
 
-    # -- levels ----------------------------------------------------------------------------------------
+    # -- results ---------------------------------------------------------------------------------------
 
     def _make_level(self, number: int) -> Level:
         level = self.finished[number] if number in self.finished else self._smoothed_level(number)
@@ -431,7 +431,7 @@ class Method(RefiningMethod):
                 "count": blocks.count, "low": torch.from_numpy(blocks.low),
                 "high": torch.from_numpy(blocks.high), "reach": torch.from_numpy(blocks.columns["reach"]),
             },
-            "centres": torch.from_numpy(self.centres), "radii": torch.from_numpy(self.radii),
+            "centres": torch.from_numpy(self.centers), "radii": torch.from_numpy(self.radii),
             "sets": {
                 number: torch.from_numpy(np.packbits(np.stack(sets), axis=1))
                 for number, sets in self.sets.items()

@@ -14,7 +14,7 @@ import torch
 
 from ...lod.rules.octree import fade_weights, target_level
 from ...scenes.cameras import Camera
-from ..initialize import drop_duplicates, neighbour_scale
+from ..initialize import drop_duplicates, neighbor_scale
 from ..model import Model
 from ..training_data import TrainingData
 from . import anchor_octree
@@ -74,7 +74,7 @@ def log_spacing(points: np.ndarray, level: np.ndarray, columns: int) -> torch.Te
     scale = np.empty(len(points))
     for number in np.unique(level):
         is_coarser = level <= number
-        scale[level == number] = neighbour_scale(points[is_coarser])[level[is_coarser] == number]
+        scale[level == number] = neighbor_scale(points[is_coarser])[level[is_coarser] == number]
     return torch.from_numpy(np.repeat(np.log(scale)[:, None], columns, 1)).float()
 
 

@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.spatial import KDTree
 
-NEIGHBOURS = 100
+NEIGHBORS = 100
 """Number of nearest views that may follow a view, as in the published program."""
 BLOCK = 128
 """Steps between two random views."""
@@ -40,20 +40,20 @@ class ViewOrder:
         self,
         centers: np.ndarray,
         seed: int,
-        neighbours: int = NEIGHBOURS,
+        neighbors: int = NEIGHBORS,
         spread: float = SPREAD,
         block: int = BLOCK,
     ) -> None:
         count = len(centers)
         self._seed = seed
         self._block = block
-        k = min(neighbours, count - 1)
+        k = min(neighbors, count - 1)
         distances, indices = KDTree(centers).query(centers, k + 1)
         indices, distances = indices.reshape(count, k + 1), distances.reshape(count, k + 1)
         # A view is not always its first neighbour if cameras coincide, and not always among k + 1.
         different = indices != np.arange(count)[:, None]
         different[different.all(1), -1] = False
-        self.neighbours = indices[different].reshape(count, k)
+        self.neighbors = indices[different].reshape(count, k)
         distances = distances[different].reshape(count, k)
         median = float(np.median(distances)) if k else 0.0
         weights = 1 / (distances + spread * median) if median > 0 and spread > 0 else _limit(distances)
@@ -68,16 +68,16 @@ class ViewOrder:
 
     def _walk_block(self, block: int) -> np.ndarray:
         """Return the views (block,) of a block of steps."""
-        count = len(self.neighbours)
+        count = len(self.neighbors)
         epoch, position = divmod(block, count)
         views = np.empty(self._block, np.int64)
         views[0] = np.random.default_rng([self._seed, epoch, 21]).permutation(count)[position]
         draws = np.random.default_rng([self._seed, block, 22]).random(self._block)
         for step in range(1, self._block):
             view = views[step - 1]
-            if self.neighbours.shape[1]:
+            if self.neighbors.shape[1]:
                 rank = np.searchsorted(self._ends[view], draws[step] * self._ends[view, -1], side="right")
-                view = self.neighbours[view, min(rank, self.neighbours.shape[1] - 1)]
+                view = self.neighbors[view, min(rank, self.neighbors.shape[1] - 1)]
             views[step] = view
         return views
 

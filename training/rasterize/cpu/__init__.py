@@ -21,7 +21,7 @@ from ..gaussians import Gaussians
 from ..rendering import BackendOutput, RasterSettings, SideOutputs, Target, require_plain
 from .bin import TILE
 from .blend import blend_weights
-from .compile import Buffers, run_parallel, serialised
+from .compile import Buffers, run_parallel, serialized
 from .frame import TILES, HostFrame
 from .host_model import TENSORS, HostModel, image_planes
 from .loss import loss_and_gradient
@@ -70,7 +70,7 @@ class _Rasterize(torch.autograd.Function):
     """Rasterization as an autograd function; extra passes blend features like colours, three at a time."""
 
     @staticmethod
-    @serialised
+    @serialized
     def forward(
         ctx, means, quats, log_scales, logits, sh, weights, features, rows, settings, background, limit, side
     ):
@@ -81,12 +81,12 @@ class _Rasterize(torch.autograd.Function):
         feature_array = features.detach().numpy()
         passes = [frame.projected]
         if feature_array.shape[1]:
-            passes += _as_colours(feature_array[frame.index], frame.projected)
+            passes += _as_colors(feature_array[frame.index], frame.projected)
         height, width = frame.transmittance.shape
         images = np.empty((len(passes), 3, height, width), np.float32)
-        for coloured, image in zip(passes, images, strict=True):
-            pass_background = background if coloured is frame.projected else np.zeros_like(background)
-            frame.blend(coloured, pass_background, image, limit)
+        for colored, image in zip(passes, images, strict=True):
+            pass_background = background if colored is frame.projected else np.zeros_like(background)
+            frame.blend(colored, pass_background, image, limit)
         if side.median is not None:
             frame.blend_median(limit, side.median.numpy())
         ctx.save_for_backward(*tensors)  # autograd then detects changes in place
@@ -95,7 +95,7 @@ class _Rasterize(torch.autograd.Function):
         return tuple(map(torch.from_numpy, (images[0], 1 - frame.transmittance, blended)))
 
     @staticmethod
-    @serialised
+    @serialized
     def backward(ctx, by_planes, by_alpha, by_blended):
         frame, side, passes, images = ctx.saved
         tensors = ctx.saved_tensors
@@ -116,10 +116,10 @@ class _Rasterize(torch.autograd.Function):
         by_images = np.zeros_like(images[1:])
         by_images.reshape(-1, *frame.transmittance.shape)[: len(by_blended)] = by_blended.numpy()
         no_alpha = np.zeros_like(frame.transmittance)
-        for k, coloured in enumerate(passes[1:]):
+        for k, colored in enumerate(passes[1:]):
             feature_sums = working.take(f"feature_sums {k}", np.float32, len(pair_sums), SUMS)
             sums = np.zeros((count, SUMS), np.float32)
-            frame.differentiate(coloured, images[k + 1], by_images[k], no_alpha, feature_sums)
+            frame.differentiate(colored, images[k + 1], by_images[k], no_alpha, feature_sums)
             frame.reduce(gather_sums, feature_sums, sums)
             by_features[frame.index, 3 * k : 3 * k + 3] = sums[:, G_RED:]
             pair_sums[:, :G_RED] += feature_sums[:, :G_RED]
@@ -135,20 +135,20 @@ class _Rasterize(torch.autograd.Function):
         )
 
 
-def _as_colours(features: np.ndarray, projected: np.ndarray) -> list[np.ndarray]:
+def _as_colors(features: np.ndarray, projected: np.ndarray) -> list[np.ndarray]:
     """Return copies of projected splats with their colours replaced by three features each, padded by
     zeros."""
     copies = []
     for first in range(0, features.shape[1], 3):
-        coloured = projected.copy()
+        colored = projected.copy()
         triple = features[:, first : first + 3]
-        coloured[:, RED : BLUE + 1] = 0
-        coloured[:, RED : RED + triple.shape[1]] = triple
-        copies.append(coloured)
+        colored[:, RED : BLUE + 1] = 0
+        colored[:, RED : RED + triple.shape[1]] = triple
+        copies.append(colored)
     return copies
 
 
-@serialised
+@serialized
 def contributions(
     gaussians: Gaussians, weights: torch.Tensor | None, settings: RasterSettings
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -182,7 +182,7 @@ def photometric_loss(image: torch.Tensor, target: Target, ssim_weight: float) ->
 
 class _Photometric(torch.autograd.Function):
     @staticmethod
-    @serialised
+    @serialized
     def forward(ctx, planes, target, ssim_weight):
         image = planes.detach().contiguous().numpy()
         loss, gradient = loss_and_gradient(image, image_planes(target), ssim_weight)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .compile import STRICT, f32, inlined, kernel, run_parallel, serialised
+from .compile import STRICT, f32, inlined, kernel, run_parallel, serialized
 from .lanes import WIDTH, load, magnitude, root, select, store
 
 ROW = 1024
@@ -115,7 +115,7 @@ def repeat_rates(arguments: tuple, count: int) -> tuple:
     return *arguments[:3], np.tile(arguments[3], count), *arguments[4:]
 
 
-@serialised
+@serialized
 def decay_rows(rows: np.ndarray, arguments: tuple) -> None:
     """Make one Adam step in place for ``rows`` (M,) int64, whose gradients are zero.
 
@@ -125,7 +125,7 @@ def decay_rows(rows: np.ndarray, arguments: tuple) -> None:
     run_parallel(_decay_rows, len(rows), max(VALUES // len(arguments[3]), 1), rows, *arguments)
 
 
-@serialised
+@serialized
 def update_rows(
     parameter: np.ndarray,
     rows: np.ndarray,
@@ -144,7 +144,7 @@ def update_rows(
     run_parallel(_update_rows, len(rows), grain, values, rows, gradient.reshape(-1), *arguments)
 
 
-@serialised
+@serialized
 def update(
     parameter: np.ndarray,
     gradient: np.ndarray,

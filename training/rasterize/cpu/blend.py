@@ -159,7 +159,7 @@ def blend_forward(
     Numba compiles a kernel without it.
     """
     height, width = transmittance.shape
-    colours, transmittances = image.reshape(-1), transmittance.reshape(-1)
+    colors, transmittances = image.reshape(-1), transmittance.reshape(-1)
     if limit is not None:
         limits = limit.reshape(-1)
     state, spare = np.empty(STRIPS * FORWARD, np.float32), np.empty(WIDTH, np.float32)
@@ -225,8 +225,8 @@ def blend_forward(
                 t = magnitude(load(state, strip * FORWARD))
                 write_lanes(transmittances, y0 + r, x, width, spare, t)
                 for c in range(3):
-                    colour = load(state, strip * FORWARD + WIDTH * (c + 1))
-                    write_lanes(colours, c * height + y0 + r, x, width, spare, colour + t * background[c])
+                    color = load(state, strip * FORWARD + WIDTH * (c + 1))
+                    write_lanes(colors, c * height + y0 + r, x, width, spare, color + t * background[c])
 
 
 @kernel(FAST)
@@ -349,7 +349,7 @@ def _make_backward(absolute: bool) -> Any:
     ):  # fmt: skip
         """Fill pair_sums; :func:`_make_backward` has the formulas."""
         height, width = transmittance.shape
-        colours, transmittances = image.reshape(-1), transmittance.reshape(-1)
+        colors, transmittances = image.reshape(-1), transmittance.reshape(-1)
         gradients, alpha_gradients = by_image.reshape(-1), by_alpha.reshape(-1)
         state, spare = np.empty(STRIPS * BACKWARD, np.float32), np.empty(WIDTH, np.float32)
         for tile in range(begin, end):
@@ -366,7 +366,7 @@ def _make_backward(absolute: bool) -> Any:
                     for c in range(3):
                         line = c * height + y0 + r
                         h = read_lanes(gradients, line, x, width, spare)
-                        q = q + read_lanes(colours, line, x, width, spare) * h
+                        q = q + read_lanes(colors, line, x, width, spare) * h
                         store(state, place + WIDTH * (2 + c), h)
                     store(state, place + WIDTH, q)
                 else:

@@ -215,7 +215,7 @@ class Buffers:
 _lock = threading.RLock()
 
 
-def serialised(function: Callable) -> Callable:
+def serialized(function: Callable) -> Callable:
     """Serialise calls of a function, because they share the threads."""
 
     @wraps(function)

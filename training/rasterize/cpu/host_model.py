@@ -12,7 +12,7 @@ from ..adam import Adam
 from ..rendering import KernelCamera, RasterSettings, StepOptions, Target
 from ..stats import accumulate_stats
 from .adam import decay_rows, step_arguments
-from .compile import Buffers, serialised
+from .compile import Buffers, serialized
 from .frame import HostFrame
 from .loss import loss_and_gradient
 from .project import SUMS
@@ -42,7 +42,7 @@ class HostModel:
         self._antialias = antialias
 
     @torch.no_grad()
-    @serialised
+    @serialized
     def step(self, camera: Camera, target: Target, options: StepOptions) -> Callable[[], float]:
         """Make one Adam step; return a function that returns the loss."""
         adam = self._adam

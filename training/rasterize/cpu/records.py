@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from .adam import adam_change
-from .compile import STRICT, f32, inlined, kernel, run_parallel, serialised
+from .compile import STRICT, f32, inlined, kernel, run_parallel, serialized
 
 _GRAIN = 1 << 12
 
@@ -83,7 +83,7 @@ def gather(records: np.ndarray, indices: np.ndarray, arrays: Sequence[np.ndarray
     run_parallel(_gather, len(indices), _GRAIN, records.reshape(-1), records.shape[1], indices, *arrays, sh)
 
 
-@serialised
+@serialized
 def step(
     records: np.ndarray,
     indices: np.ndarray,

@@ -103,7 +103,7 @@ def contributions(
     total = means.new_zeros(count)
     driver.kernels().launch(
         "weigh", tiles.count, THREADS, image_structure(settings.view), tiles.starts, tiles.pairs,
-        projected.rows, projected.colours, largest, total, pixels,
+        projected.rows, projected.colors, largest, total, pixels,
     )  # fmt: skip
     return largest.view(torch.float32), total, pixels.long(), projected.radii
 
@@ -134,12 +134,12 @@ class _Rasterize(torch.autograd.Function):
         padded = torch.nn.functional.pad(features, (0, -features.shape[1] % 3))
         shades = [part.contiguous() for part in padded.split(3, 1) if part.shape[1]]
         limit = None if settings.limit is None else settings.limit.to(means).contiguous()
-        image = frame.blend(frame.projected.colours, settings.background, limit, side.median)
+        image = frame.blend(frame.projected.colors, settings.background, limit, side.median)
         images = [frame.blend(shade, limit=limit) for shade in shades]
         side.radii.copy_(frame.projected.radii)
         side.tile_counts.copy_(frame.tiles.starts.diff().view(side.tile_counts.shape))
         ctx.save_for_backward(*parameters, weights, features)
-        ctx.saved = frame, [frame.projected.colours, *shades], [image, *images], settings, side
+        ctx.saved = frame, [frame.projected.colors, *shades], [image, *images], settings, side
         blended = torch.cat([image[..., :0], *images], 2)
         return image, 1 - frame.light, blended[..., : features.shape[1]].contiguous()
 

@@ -40,7 +40,7 @@ class CardModel:
             view, float(options.min_scale), self._antialias, options.background, options.sh_degree
         )
         frame = CardFrame(Gaussians(**tensors), options.weights, settings)
-        image = frame.blend(frame.projected.colours, options.background)
+        image = frame.blend(frame.projected.colors, options.background)
         target = target.over(options.background)
         photo = upload_photo(target, image)
         mask = None if target.mask is None else target.mask.to(image)[..., None]
@@ -50,9 +50,9 @@ class CardModel:
         if mask is not None:
             by_image *= mask
         sums = frame.new_sums()
-        by_colours = frame.differentiate(frame.projected.colours, image, by_image, None, sums)
+        by_colors = frame.differentiate(frame.projected.colors, image, by_image, None, sums)
         grad2d = image.new_zeros(len(tensors["means"]), 2)
-        gradients = frame.project_backward(sums, by_colours, grad2d)
+        gradients = frame.project_backward(sums, by_colors, grad2d)
         if options.shrink is not None:
             radii = frame.projected.radii
             accumulate_stats(self._stats, grad2d, radii, tensors["opacity_logits"], options.shrink)

@@ -47,7 +47,7 @@ class Projected(NamedTuple):
     view: bytes
     filters: torch.Tensor | None
     rows: torch.Tensor
-    colours: torch.Tensor
+    colors: torch.Tensor
     radii: torch.Tensor
     depths: torch.Tensor
     counts: torch.Tensor
@@ -141,7 +141,7 @@ class CardFrame:
 
     def blend(
         self,
-        colours: torch.Tensor,
+        colors: torch.Tensor,
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
         limit: torch.Tensor | None = None,
         median: torch.Tensor | None = None,
@@ -154,7 +154,7 @@ class CardFrame:
         image = self.light.new_empty(*self.light.shape, 3)
         driver.kernels().launch(
             "blend", self.tiles.count, THREADS, image_structure(self.view, background), self.tiles.starts,
-            self.tiles.pairs, self.projected.rows, colours, limit, image, self.light, self._reached, median,
+            self.tiles.pairs, self.projected.rows, colors, limit, image, self.light, self._reached, median,
         )  # fmt: skip
         return image
 
@@ -164,7 +164,7 @@ class CardFrame:
 
     def differentiate(
         self,
-        colours: torch.Tensor,
+        colors: torch.Tensor,
         image: torch.Tensor,
         by_image: torch.Tensor | None,
         by_alpha: torch.Tensor | None,
@@ -172,21 +172,21 @@ class CardFrame:
         absolute: bool = False,
     ) -> torch.Tensor:
         """Add an image's share to the sums; return the gradient by colours (N, 3)."""
-        by_colours = torch.zeros_like(colours)
+        by_colors = torch.zeros_like(colors)
         if by_image is None and by_alpha is None:
-            return by_colours
+            return by_colors
         driver.kernels().launch(
             "blend_backward", self.tiles.count, THREADS, image_structure(self.view), self.tiles.starts,
-            self.tiles.pairs, self.projected.rows, colours, self._reached, image, self.light,
+            self.tiles.pairs, self.projected.rows, colors, self._reached, image, self.light,
             None if by_image is None else by_image.contiguous(),
-            None if by_alpha is None else by_alpha.contiguous(), sums, by_colours, int(absolute),
+            None if by_alpha is None else by_alpha.contiguous(), sums, by_colors, int(absolute),
         )  # fmt: skip
-        return by_colours
+        return by_colors
 
     def project_backward(
         self,
         sums: torch.Tensor,
-        by_colours: torch.Tensor,
+        by_colors: torch.Tensor,
         grad2d: torch.Tensor,
         absgrad2d: torch.Tensor | None = None,
         by_weights: torch.Tensor | None = None,
@@ -197,7 +197,7 @@ class CardFrame:
         driver.kernels().launch(
             "project_backward", -(-len(projected.depths) // GROUP), GROUP, projected.view,
             *self._parameters, self._weights, projected.filters, projected.rows, projected.radii, sums,
-            by_colours, *gradients, by_weights, grad2d, absgrad2d,
+            by_colors, *gradients, by_weights, grad2d, absgrad2d,
         )  # fmt: skip
         return gradients
 

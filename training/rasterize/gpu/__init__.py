@@ -94,12 +94,12 @@ class _Rasterize(torch.autograd.Function):
             limit = device.upload(limit)
             visited = device.empty(np.uint32, *scene.ranges.shape)
             median = device.empty(np.int32, view.height, view.width)
-            shades = [scene.colours, *_as_colours(device, features.detach().numpy()[index])]
+            shades = [scene.colors, *_as_colors(device, features.detach().numpy()[index])]
             images = [device.empty(np.float32, view.height, view.width, 4) for _ in shades]
             for k, (shade, image) in enumerate(zip(shades, images, strict=True)):
                 scene.draw(
                     (0.0, 0.0, 0.0) if k else settings.background, settings.limit is not None,
-                    colours=shade, limit=limit, drawn=image, visited=visited, median=median,
+                    colors=shade, limit=limit, drawn=image, visited=visited, median=median,
                 )  # fmt: skip
             drawn, *blended = (torch.from_numpy(device.read(image)) for image in images)
             side.radii.numpy()[index] = device.read(scene.radii)
@@ -130,7 +130,7 @@ class _Rasterize(torch.autograd.Function):
                     output_gradient[..., :3] = by_image
                     output_gradient[..., 3] = by_alpha
                 scene.differentiate(
-                    sums, visited, settings.absolute and k == 0, by_shade, colours=shade, image=image,
+                    sums, visited, settings.absolute and k == 0, by_shade, colors=shade, image=image,
                     by_image=device.upload(output_gradient),
                 )  # fmt: skip
             by_splats = device.empty(np.float32, count, BY_SPLAT)
@@ -192,7 +192,7 @@ def _upload_scene(
     return ProjectedScene.of(device, device.upload(splats), sh, settings), index
 
 
-def _as_colours(device: Device, features: np.ndarray) -> list[Buffer]:
+def _as_colors(device: Device, features: np.ndarray) -> list[Buffer]:
     """Upload features (M, F) as colours (M, 4), three per buffer, padded by zeros."""
     buffers = []
     for first in range(0, features.shape[1], 3):

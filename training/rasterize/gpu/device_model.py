@@ -184,7 +184,7 @@ class GpuModel:
         inputs.set(step, len(self._pending))
         visited = device.scratch(np.uint32, *scene.ranges.shape)
         scene.draw(
-            inputs.background, False, colours=scene.colours, visited=visited, drawn=inputs.drawn,
+            inputs.background, False, colors=scene.colors, visited=visited, drawn=inputs.drawn,
             limit=device.scratch(np.float32, 1), median=device.scratch(np.int32, *size),
         )  # fmt: skip
         losses, by_image = record_loss(device, inputs.drawn, photo, step.ssim_weight)
@@ -194,7 +194,7 @@ class GpuModel:
             starts=scene.bands[0].starts, report=self._report,
         )  # fmt: skip
         sums = device.scratch(np.float32, count, PAIR_SUMS)
-        scene.differentiate(sums, visited, colours=scene.colours, image=inputs.drawn, by_image=by_image)
+        scene.differentiate(sums, visited, colors=scene.colors, image=inputs.drawn, by_image=by_image)
         scene.train(sums, inputs.training, self._report, moments=self._moments, stats=self._stat_sums)
         return inputs
 

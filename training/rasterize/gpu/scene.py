@@ -47,7 +47,7 @@ class ProjectedScene:
     splats: Buffer
     sh: Buffer
     rows: Buffer
-    colours: Buffer
+    colors: Buffer
     radii: Buffer
     bands: list[Band]
     ranges: Buffer
@@ -69,23 +69,21 @@ class ProjectedScene:
         view = settings.view
         count = splats.shape[0]
         lens = lens_of(view, settings.min_scale)
-        rows, colours = device.scratch(np.float32, count, ROW), device.scratch(np.float32, count, 4)
+        rows, colors = device.scratch(np.float32, count, ROW), device.scratch(np.float32, count, 4)
         depths, order = device.scratch(np.uint32, count), device.scratch(np.uint32, count)
         radii = device.scratch(np.float32, count)
         _project(
-            device, "forward", lens, settings.degree, splats=splats, sh=sh, rows=rows, colours=colours,
+            device, "forward", lens, settings.degree, splats=splats, sh=sh, rows=rows, colors=colors,
             depths=depths, radii=radii, order=order,
         )  # fmt: skip
         max_pairs = device.binding_bytes // (4 * PAIR_SUMS)
         bands, ranges = bin_splats(device, rows, depths, order, view.width, view.height, max_pairs, capacity)
-        return cls(
-            device, view, count, lens, settings.degree, splats, sh, rows, colours, radii, bands, ranges
-        )
+        return cls(device, view, count, lens, settings.degree, splats, sh, rows, colors, radii, bands, ranges)
 
-    def draw(self, background: Background, limited: bool, colours: Buffer, **buffers: Buffer) -> None:
+    def draw(self, background: Background, limited: bool, colors: Buffer, **buffers: Buffer) -> None:
         """Record the function ``forward`` of blend.wgsl."""
         for band in self.bands:
-            self._blend("forward", band, background, limited, colours=colours, ranges=self.ranges, **buffers)
+            self._blend("forward", band, background, limited, colors=colors, ranges=self.ranges, **buffers)
 
     def weigh(self) -> Buffer:
         """Record the weights of splats, (M, 3): largest weight, sum of weights, and number of pixels."""

@@ -48,7 +48,7 @@ _PAIR = ("focal_length", "focal"), "principal_point"
 """Names of focal lengths in pixels, one or two, and of the centre that belongs to them."""
 _LENS = re.compile(r"focal|fov|field_of_view|intrinsic|principal|lens|^fl_|^f[xy]?$|^K$", re.I)
 """Names that describe a lens."""
-_MAX_NORMALISED = 10.0
+_MAX_NORMALIZED = 10.0
 """Maximum focal length in multiples of the photo's size; focal lengths in pixels are larger."""
 _POINTS = "sparse_pc.ply"
 """nerfstudio's name of the point cloud."""
@@ -163,8 +163,8 @@ def _parse_view(folder: Path, values: Mapping[str, Any], photos: PhotoFinder) ->
     center = get_number(values, "cx", width / 2), get_number(values, "cy", height / 2)
     if 0 < center[0] < 1 and 0 < center[1] < 1:  # normalised by the size
         sides = width, height
-        if fx < _MAX_NORMALISED:
-            sides = _normalising_sides(fx, fy, width, height)
+        if fx < _MAX_NORMALIZED:
+            sides = _normalizing_sides(fx, fy, width, height)
             fx, fy = fx * sides[0], fy * sides[1]
         center = center[0] * sides[0], center[1] * sides[1]
     if isinstance(flaw := values.get(_FLAW), str):
@@ -229,7 +229,7 @@ def _is_zero(value: Any) -> bool:
     return all(map(_is_zero, value)) if isinstance(value, list) else not value
 
 
-def _normalising_sides(fx: float, fy: float, width: float, height: float) -> tuple[float, float]:
+def _normalizing_sides(fx: float, fy: float, width: float, height: float) -> tuple[float, float]:
     """Return the sides that normalised focal lengths are relative to: those of the axes, or the longer one.
 
     Of these, the sides with more square pixels are returned.

@@ -139,14 +139,14 @@ def test_published_preset_makes_as_few_chunks_as_equation_5_gives(data):
     trained(lodge, until=9)
     centers = np.array([camera.center for camera in data.train])
     reach = np.linalg.norm(centers - centers.mean(0), axis=1).max()
-    assert len(lodge.centres) == np.ceil(4 / (0.8 * data.median_depth) * reach) < 8
+    assert len(lodge.centers) == np.ceil(4 / (0.8 * data.median_depth) * reach) < 8
 
 
 def test_loaded_splats_belong_to_the_sets_of_near_chunks(data):
     lodge = make(data)
     bundle = Bundle("lodge", trained(lodge)[3:], "chunks", tables=lodge.tables())
     selector, values = BundleSelector(bundle), resolve_controls(bundle, {})
-    between = (lodge.centres[0] + 0.4 * (lodge.centres[1] - lodge.centres[0])).astype(float)
+    between = (lodge.centers[0] + 0.4 * (lodge.centers[1] - lodge.centers[0])).astype(float)
     chunks_near = RULE.region(between, values, bundle.tables)
     assert chunks_near is not None and len(chunks_near) == 2
     bits = sum(1 << chunk for chunk in chunks_near)

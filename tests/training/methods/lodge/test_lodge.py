@@ -321,7 +321,7 @@ def test_few_chunks_of_equation_5_are_made_in_preset_paper(data, base):
         lodge = make(data, base, preset=preset)
         lodge.d_l = {3: 0.0, 2: 4 * reach / 2.9}
         lodge._place_chunks()
-        assert len(lodge.centres) == count
+        assert len(lodge.centers) == count
 
 
 # -- merged levels ----------------------------------------------------------

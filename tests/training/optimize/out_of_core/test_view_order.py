@@ -24,10 +24,10 @@ def expected_probabilities(centers: np.ndarray, k: int, spread: float) -> np.nda
 @pytest.mark.parametrize(("k", "spread"), [(5, 1.0), (100, 0.2), (29, 5.0)])
 def test_successors_follow_the_formula(k, spread):
     """Compare the probabilities, and test the counts of a walk by a chi-squared test at 0.001."""
-    walk = ViewOrder(CENTERS, 3, neighbours=k, spread=spread)
+    walk = ViewOrder(CENTERS, 3, neighbors=k, spread=spread)
     truth = expected_probabilities(CENTERS, min(k, 29), spread)
     dense = np.zeros_like(truth)
-    np.put_along_axis(dense, walk.neighbours, walk.probabilities, 1)
+    np.put_along_axis(dense, walk.neighbors, walk.probabilities, 1)
     np.testing.assert_allclose(dense, truth, atol=1e-12)
     views = np.array([walk(step) for step in range(200 * BLOCK)]).reshape(-1, BLOCK)
     counts = np.zeros_like(truth)
@@ -42,7 +42,7 @@ def test_successors_follow_the_formula(k, spread):
 def test_consecutive_views_are_nearer_than_in_a_shuffle():
     rng = np.random.default_rng(1)
     centers = np.stack([np.linspace(0, 100, 400), rng.random(400), rng.random(400)], 1)
-    walk = ViewOrder(centers, 0, neighbours=20)
+    walk = ViewOrder(centers, 0, neighbors=20)
     views = np.array([walk(step) for step in range(20 * BLOCK)])
     distances = np.linalg.norm(np.diff(centers[views], axis=0), axis=1)
     within = np.arange(1, len(views)) % BLOCK != 0
@@ -50,7 +50,7 @@ def test_consecutive_views_are_nearer_than_in_a_shuffle():
 
 
 def test_every_view_begins_equally_many_blocks():
-    walk = ViewOrder(CENTERS, 1, neighbours=3)
+    walk = ViewOrder(CENTERS, 1, neighbors=3)
     first = [walk(block * BLOCK) for block in range(3 * len(CENTERS))]
     for epoch in range(3):
         assert sorted(first[30 * epoch : 30 * epoch + 30]) == list(range(30))
@@ -78,10 +78,10 @@ def test_coincident_and_few_cameras(spread):
     assert {ViewOrder(np.zeros((1, 3)), 0, spread=spread)(step) for step in range(300)} == {0}
     pair = ViewOrder(np.eye(3)[:2], 0, spread=spread)
     assert [pair(step) for step in range(4)] in ([0, 1, 0, 1], [1, 0, 1, 0])
-    coincident = ViewOrder(np.zeros((40, 3)), 0, neighbours=8, spread=spread)
+    coincident = ViewOrder(np.zeros((40, 3)), 0, neighbors=8, spread=spread)
     np.testing.assert_allclose(coincident.probabilities, 1 / 8)
-    rigs = ViewOrder(np.repeat(CENTERS, 6, axis=0), 0, neighbours=10, spread=spread)
+    rigs = ViewOrder(np.repeat(CENTERS, 6, axis=0), 0, neighbors=10, spread=spread)
     for walk in (coincident, rigs):
-        assert not (walk.neighbours == np.arange(len(walk.neighbours))[:, None]).any()
-        assert all(len(set(row)) == len(row) for row in walk.neighbours.tolist())
+        assert not (walk.neighbors == np.arange(len(walk.neighbors))[:, None]).any()
+        assert all(len(set(row)) == len(row) for row in walk.neighbors.tolist())
         assert np.isfinite(walk.probabilities).all() and len({walk(step) for step in range(2000)}) > 20

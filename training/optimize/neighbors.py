@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 
-def query_neighbours(tree: KDTree, positions: np.ndarray, count: int = 1) -> tuple[np.ndarray, np.ndarray]:
+def query_neighbors(tree: KDTree, positions: np.ndarray, count: int = 1) -> tuple[np.ndarray, np.ndarray]:
     """Return the distances and indices of the nearest points of a tree, (N,), or (N, count) for several.
 
     An interrupt waits for the query: scipy's threads would continue and write to freed memory.

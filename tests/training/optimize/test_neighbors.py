@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from training.optimize.neighbours import query_neighbours
+from training.optimize.neighbors import query_neighbors
 from training.runs import processes
 
 
@@ -17,7 +17,7 @@ def test_neighbours_match_all_distances(count):
     points, positions = np.random.default_rng(0).normal(size=(2, 50, 3))
     distances = np.linalg.norm(positions[:, None] - points, axis=2)
     expected = np.argsort(distances, axis=1)[:, :count].reshape(50, *[count] * (count > 1))
-    found, indices = query_neighbours(KDTree(points), positions, count)
+    found, indices = query_neighbors(KDTree(points), positions, count)
     np.testing.assert_array_equal(indices, expected)
     np.testing.assert_allclose(found, np.sort(distances, axis=1)[:, :count].reshape(expected.shape))
 
@@ -42,5 +42,5 @@ def test_interrupt_waits_for_the_threads_of_the_query():
 
     threading.Timer(0.1, processes.interrupt).start()
     with pytest.raises(KeyboardInterrupt):
-        query_neighbours(SlowTree(), np.zeros((1, 3)))
+        query_neighbors(SlowTree(), np.zeros((1, 3)))
     assert finished.is_set()
