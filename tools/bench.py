@@ -392,16 +392,16 @@ def selection_ms(splats: Gaussians, camera: Camera, seconds: float) -> tuple[flo
     """
     order = spatial_order(splats.means.numpy())
     means, log_scales = splats.means.numpy()[order], splats.log_scales.numpy()[order]
-    chooser, values = SplatSelector(means, {}, log_scales), (("gamma", 1.0), ("first", 1), ("last", 2))
+    selector, values = SplatSelector(means, {}, log_scales), (("gamma", 1.0), ("first", 1), ("last", 2))
     border = float(np.median(np.linalg.norm(means, axis=1))) / camera.focal
     levels = [(1, {"s_min": border}), (2, {"s_min": 0.0})]
-    choices = [
+    queries = [
         LodQuery("bands", (0.0, 0.0, 0.0), camera.focal, tuple(facts.items()), values)
         for facts in (collect_facts(BANDS, {}, levels, number) for number, _ in levels)
     ]
     return (
-        fastest(lambda: [chooser.select(choice, camera, 0.01) for choice in choices], seconds),
-        fastest(lambda: [np.flatnonzero(choice.weights(means, {})) for choice in choices], seconds),
+        fastest(lambda: [selector.select(query, camera, 0.01) for query in queries], seconds),
+        fastest(lambda: [np.flatnonzero(query.weights(means, {})) for query in queries], seconds),
     )
 
 

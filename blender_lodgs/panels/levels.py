@@ -11,6 +11,9 @@ from ..nodes.camera_choices import find_choice
 from ..viewport import views
 from .parts import LevelsPanel, say, split_column
 
+MIN_SAVED = 0.05
+"""Share of splats below which the panel offers a coarser setting."""
+
 
 def _columns(row: bpy.types.UILayout, *texts: str) -> None:
     """Draw four texts in columns."""
@@ -18,10 +21,6 @@ def _columns(row: bpy.types.UILayout, *texts: str) -> None:
         row = row.split(factor=share)
         row.label(text=text)
     row.label(text=texts[-1])
-
-
-MIN_SAVED = 0.05
-"""Share of splats below which the panel offers a coarser setting."""
 
 
 def _short(value: float, digits: int = 0) -> str:
@@ -99,13 +98,13 @@ class LODGS_PT_detail(LevelsPanel):
             row.enabled = settings.complete
             row.prop(settings, "single_level")
         else:
-            choice = loaded.current_query(context, root)
-            idle = choice.inactive_controls() if choice else {}
+            query = loaded.current_query(context, root)
+            inactive = query.inactive_controls() if query else {}
             for control in rule.controls if rule else ():
                 row = column.row()
-                row.active = control.name not in idle
+                row.active = control.name not in inactive
                 row.prop(settings.controls, control.name, slider=control.soft is not None)
-            for reason in dict.fromkeys(idle.values()):
+            for reason in dict.fromkeys(inactive.values()):
                 say(column, reason, "INFO")
             row = column.row(align=True)
             row.prop(settings, "camera_choice")
@@ -126,22 +125,22 @@ class LODGS_PT_detail(LevelsPanel):
 
 def _draw_counts(layout: bpy.types.UILayout, context: bpy.types.Context, root: bpy.types.Object) -> None:
     """Draw the camera's chunk and the numbers of visible and loaded splats."""
-    choice = loaded.current_query(context, root) if root.lodgs.mode == "SELECTIVE" else None
+    query = loaded.current_query(context, root) if root.lodgs.mode == "SELECTIVE" else None
     column = layout.column(align=True)
-    position = choice.region_label() if choice else ""
-    if position:
-        column.label(text=position)
+    region = query.region_label() if query else ""
+    if region:
+        column.label(text=region)
     if not root.lodgs.stream.file:  # when streaming, viewports draw more splats than the levels hold
         visible, total = scenes.count_visible(context, root)
         column.label(text=f"{visible:,} of {total:,} splats shown")
-        if choice:
+        if query:
             saved = loaded.saved_share(context, root)
             column.label(text=f"{saved:.0%} fewer than the finest level")
             if saved < MIN_SAVED and len(root.lodgs.levels) > 1:
                 say(column, "By Distance saves almost nothing at this camera.", "INFO")
                 column.operator("lodgs.reduce_detail")
-    if choice and position:
-        splats, megabytes = loaded.count_loaded(root, choice)
+    if query and region:
+        splats, megabytes = loaded.count_loaded(root, query)
         column.label(text=f"{splats:,} loaded, {megabytes:.1f} MB")
 
 

@@ -365,8 +365,8 @@ def placed_splats(
         placement = (matrix, level, instance.antialias)
         options = {"looks": instance.looks, "motion": _motion_of(identity, matrix, motion)}
         is_empty = not display.point_count(evaluated.data)
-        if instance.source is not None and (choice := shown.camera_query(instance, depsgraph)):
-            file = instance.source.path, matrix, instance.antialias, choice
+        if instance.source is not None and (query := shown.camera_query(instance, depsgraph)):
+            file = instance.source.path, matrix, instance.antialias, query
             placed.append(renderer.PlacedFile(*file, **options))
             continue
         if not _is_selected_by_rule(instance, depsgraph):
@@ -378,10 +378,10 @@ def placed_splats(
         cloud = instance.object.data
         read = partial(_read_splats, cloud.evaluated_get(depsgraph), all_rule_columns())
         version = *changes.version(cloud), *changes.paint_version(cloud)
-        choice = shown.rule_query(instance, depsgraph)
+        query = shown.rule_query(instance, depsgraph)
         is_empty &= np.array_equal(matrix, np.array(evaluated.matrix_world))  # instances have other levels
         placed.append(
-            renderer.PlacedSplats(cloud.session_uid, read, *placement, version, choice, is_empty, **options)
+            renderer.PlacedSplats(cloud.session_uid, read, *placement, version, query, is_empty, **options)
         )
     return placed
 

@@ -70,7 +70,7 @@ class PlacedSplats:
         level: level number, or 0 if the splats are no level.
         antialias: see ``SplatScene.antialias``.
         version: version of the splats with this key: unchanged if equal. None if unknown.
-        choice: arguments of the rule that selects splats, or None to draw all.
+        query: rule and arguments that select splats; None draws all.
         empty: whether no splat is visible. Empty sets are not read before they become visible.
         looks: adjustments of colours and opacities.
         motion: the matrix at equal intervals of the shutter time; empty for splats at rest.
@@ -82,7 +82,7 @@ class PlacedSplats:
     level: int
     antialias: bool = False
     version: Version | None = None
-    choice: LodQuery | None = None
+    query: LodQuery | None = None
     empty: bool = False
     looks: Looks = ()
     motion: tuple[np.ndarray, ...] = ()
@@ -94,17 +94,13 @@ class PlacedFile:
 
     Attributes:
         path: bundle, see ``training.lod.query.PagedFile``.
-        matrix: see :class:`PlacedSplats`.
-        antialias: see :class:`PlacedSplats`.
-        choice: see :class:`PlacedSplats`.
-        looks: see :class:`PlacedSplats`.
-        motion: see :class:`PlacedSplats`.
+        matrix, antialias, query, looks, motion: see :class:`PlacedSplats`.
     """
 
     path: Path
     matrix: np.ndarray
     antialias: bool
-    choice: LodQuery
+    query: LodQuery
     looks: Looks = ()
     motion: tuple[np.ndarray, ...] = ()
 
@@ -291,7 +287,7 @@ class Renderer:
                 described.append(
                     {
                         "paged": str(item.path), "matrix": item.matrix.tolist(), "antialias": item.antialias,
-                        "choice": item.choice.as_dict(), "looks": looks_as_dicts(item.looks),
+                        "query": item.query.as_dict(), "looks": looks_as_dicts(item.looks),
                         "motion": [matrix.tolist() for matrix in item.motion],
                     }
                 )  # fmt: skip
@@ -305,7 +301,7 @@ class Renderer:
                 {
                     "file": file.name, "count": count, "columns": columns,
                     "matrix": item.matrix.tolist(), "level": item.level, "antialias": item.antialias,
-                    "choice": None if item.choice is None else item.choice.as_dict(),
+                    "query": None if item.query is None else item.query.as_dict(),
                     "looks": looks_as_dicts(item.looks),
                     "motion": [matrix.tolist() for matrix in item.motion],
                 }

@@ -51,14 +51,10 @@ class SetRequest:
     Attributes:
         file: file name in the folder of arrays; "" for a paged bundle.
         count: number of splats.
-        matrix: see ``scene.Instance``.
-        level: see ``scene.Instance``.
-        antialias: see ``scene.Instance``.
+        matrix, level, antialias, looks, motion: see ``scene.Instance``.
         columns: names of the extra columns in the file.
         query: rule and arguments that weight the splats in addition to the file's weights, or None.
         paged: path of a bundle from which only the splats that the query selects are read; or None.
-        looks: see ``scene.Instance``.
-        motion: see ``scene.Instance``.
     """
 
     file: str
@@ -206,9 +202,9 @@ def _set(values: Any) -> SetRequest:
     if not isinstance(values, dict):
         raise _invalid("sets", values)
     paged = _path(values, "paged")
-    query = _query(_typed(values, "choice", dict)) if values.get("choice") is not None else None
+    query = _query(_typed(values, "query", dict)) if values.get("query") is not None else None
     if paged is not None and (query is None or query.resolved_rule.paged_file is None):
-        raise _invalid("choice", "given with a paged file")
+        raise _invalid("query", "given with a paged file")
     return SetRequest(
         file="" if paged else _name(values, "file"),
         count=0 if paged else _integer(values, "count", 0, MAX_SPLATS),

@@ -8,8 +8,8 @@ in it shows. The folder is removed when standard input ends, also if the other p
      "depth": true, "levels": true, "window": [left, top, width, height] or null,
      "photograph": PATH or null, "mask": PATH or null, "holdout": PATH or null,
      "sets": [{"file": NAME, "count": N, "matrix": 4x4, "level": 3,
-               "columns": [NAME, ...], "choice": {...} or null, "looks": [...], "motion": [4x4, ...]},
-              {"paged": PATH, "matrix": 4x4, "choice": {...}, "looks": [...]}, ...]}
+               "columns": [NAME, ...], "query": {...} or null, "looks": [...], "motion": [4x4, ...]},
+              {"paged": PATH, "matrix": 4x4, "query": {...}, "looks": [...]}, ...]}
     {"cancel": 7}
 
 Optional keys of a frame blur it or change the lens: ``projection`` and ``aperture`` (``lens``), ``samples``,
@@ -22,7 +22,7 @@ others, and ``psnr`` compares it with the image outside the black parts of the m
 with the depth of objects that hide splats, in the size of the camera or the window.
 
 A set is read when its file is first named, and discarded when a frame does not name it. Its file may be
-removed after an answer ``frame``. A choice (``lod.query``: ``rule``, ``position`` in the set's coordinates,
+removed after an answer ``frame``. A query (``lod.query``: ``rule``, ``position`` in the set's coordinates,
 ``focal_px``, and ``facts``, ``values`` and ``tables`` by name) weights the splats by a rule, in addition to
 the file's weights. The rule's columns are the file's columns of the same names. Of a paged bundle
 (``lod.query.PagedFile``), only the visible part is read. Looks (``editing.look``) change colours and

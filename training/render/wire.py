@@ -20,7 +20,7 @@ from ..errors import LodgsError
 from ..files import name_errors
 from ..splats.gaussians import Splats
 
-PROTOCOL = 4
+PROTOCOL = 5
 """Version of the protocol. Both sides come from one installation, so other versions are refused."""
 
 MARK = ".lodgs-renderer"

@@ -99,11 +99,11 @@ def measured(bpy, lodgs, tmp_path):
         evaluation = Evaluation(TrainingData(read_scene(folder), scale, 8), backend="cpu")
         camera = evaluation.cameras[index]
         bundle.controls["gamma"] = 2.4 * scale
-        choice, values = BundleSelector(bundle), resolve_controls(bundle, {})
-        weights = choice.weights(camera.center, camera.focal, values)
+        selector, values = BundleSelector(bundle), resolve_controls(bundle, {})
+        weights = selector.weights(camera.center, camera.focal, values)
         counts = np.unique(np.repeat([1, 2, 3], 300)[weights > 0], return_counts=True)
         assert min(counts[1]) > 20 and len(counts[0]) == 3  # every level is visible
-        (psnr,) = evaluation.compare_views([camera], lambda camera: (choice.splats, weights))
+        (psnr,) = evaluation.compare_views([camera], lambda camera: (selector.splats, weights))
         root = lodgs("data.importing").import_colmap(bpy.context, folder, photographs=False)
         lodgs("data.scenes").set_bundle_facts(root, bundle)
         for level in levels:

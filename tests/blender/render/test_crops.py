@@ -80,7 +80,7 @@ def test_streamed_tree_is_cropped(bpy, lodgs, camera, tmp_path):
         images.append(frame(root))
         if budget:
             placed = engine.placed_splats(bpy.context.evaluated_depsgraph_get())
-            (crop,) = placed[0].choice.crops
+            (crop,) = placed[0].query.crops
             assert isinstance(placed[0], lodgs("render.renderer").PlacedFile)
             assert (crop.shape, crop.outside) == ("BOX", False)
             expected = Crop.from_matrix("BOX", np.array(box.matrix_world))

@@ -267,7 +267,7 @@ def test_instances_have_the_detail_of_their_own_distance(bpy, lodgs, scene, tmp_
     bpy.context.view_layer.update()
     drawn = render_file(bpy, tmp_path)
     placed = lodgs("render.engine").placed_splats(bpy.context.evaluated_depsgraph_get())
-    assert len({tuple(np.round(item.choice.position, 2)) for item in placed}) == 2
+    assert len({tuple(np.round(item.query.position, 2)) for item in placed}) == 2
     assert to_bytes(expected).max() > 200
     assert np.abs(to_bytes(drawn).astype(int) - to_bytes(expected)).max() <= 2
 

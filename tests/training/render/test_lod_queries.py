@@ -151,7 +151,7 @@ def test_concatenated_sets_share_memory(make_splats):
 def test_query_round_trips_as_json(camera):
     for name in rules():
         query = query_of(name, (0.1, -2, 3))
-        item = {"file": "s", "count": 1, "matrix": np.eye(4).tolist(), "level": 1, "choice": query.as_dict()}
+        item = {"file": "s", "count": 1, "matrix": np.eye(4).tolist(), "level": 1, "query": query.as_dict()}
         request = {"frame": 1, "out": "o", "camera": camera_to_dict(camera, 0.1), "sets": [item]}
         parsed = parse_request(request).sets[0].query
         assert parsed.as_dict() == query.as_dict()
@@ -159,7 +159,7 @@ def test_query_round_trips_as_json(camera):
     crops = (Crop.sphere((1, 2, 3), 4), Crop.box((0, 0, 0), (1, 2, 3), True))
     for query in (query_of("bands", (0.1, -2, 3)), LodQuery.from_crops(())):
         query = replace(query, crops=crops)
-        item = {"file": "s", "count": 1, "matrix": np.eye(4).tolist(), "level": 1, "choice": query.as_dict()}
+        item = {"file": "s", "count": 1, "matrix": np.eye(4).tolist(), "level": 1, "query": query.as_dict()}
         request = json.loads(
             json.dumps({"frame": 1, "out": "o", "camera": camera_to_dict(camera, 0.1), "sets": [item]})
         )
@@ -218,7 +218,7 @@ def too_low(values: dict) -> dict:
 def test_invalid_queries_raise_one_sentence(camera, change):
     values = query_of("chunks", (0, 0, 0)).as_dict()
     values |= change(values) if callable(change) else change
-    item = {"file": "s", "count": 1, "matrix": np.eye(4).tolist(), "level": 1, "choice": values}
+    item = {"file": "s", "count": 1, "matrix": np.eye(4).tolist(), "level": 1, "query": values}
     with pytest.raises(LodgsError, match="Cannot read the request"):
         parse_request({"frame": 1, "out": "o", "camera": camera_to_dict(camera, 0.1), "sets": [item]})
 
@@ -229,6 +229,6 @@ def test_slider_limits_are_valid(camera, name):
     for end in ("low", "high"):
         ends = {control.name: float(np.float32(getattr(control, end))) for control in rules()[name].controls}
         values = query_of(name, (0, 0, 0), **ends).as_dict()
-        item = {"file": "s", "count": 1, "matrix": np.eye(4).tolist(), "level": 1, "choice": values}
+        item = {"file": "s", "count": 1, "matrix": np.eye(4).tolist(), "level": 1, "query": values}
         request = {"frame": 1, "out": "o", "camera": camera_to_dict(camera, 0.1), "sets": [item]}
         assert parse_request(request).sets[0].query.as_dict() == values

@@ -103,9 +103,9 @@ def test_queries_select_splats_of_a_set(client, make_splats, camera):
     facts = {"level": 2.0, "finer": 3.0, "coarser": 1.0, "levels": 3.0, "d_max": 1.2, "d_max_focal": 1.5}
     values = {"offset": 0.25, "fade": 1}
     for frame, position in enumerate(((0.0, 0.0, 0.5), (0.5, 0.25, -1.0))):
-        choice = LodQuery("octree", position, 1.5, tuple(facts.items()), tuple(values.items())).as_dict()
+        query = LodQuery("octree", position, 1.5, tuple(facts.items()), tuple(values.items())).as_dict()
         item = {"file": "queried", "count": 200, "matrix": np.eye(4).tolist(), "level": 2}
-        client.send(**request(camera, [item | {"columns": ["lod_bias"], "choice": choice}], frame))
+        client.send(**request(camera, [item | {"columns": ["lod_bias"], "query": query}], frame))
         answer = client.receive("frame", "error")
         planes = wire.read_planes(client.folder / "frame", len(answer["passes"]), 48, 64)
         (client.folder / "queried").unlink(missing_ok=True)

@@ -114,7 +114,7 @@ def test_invalid_requests_raise_one_sentence(valid, change):
         {"matrix": np.full((4, 4), 1e300).tolist()}, {"matrix": np.ones((4, 4)).tolist()}, {"level": -1},
         {"level": None}, {"file": "/etc/passwd"}, {"file": "a\0"}, {"file": "C:x"},
         {"matrix": [["a"] * 4] * 4}, {"columns": "a"}, {"columns": ["a", "a"]}, {"columns": ["../a"]},
-        {"columns": [1]}, {"columns": [f"a{i}" for i in range(40)]}, {"choice": 1}, {"choice": []},
+        {"columns": [1]}, {"columns": [f"a{i}" for i in range(40)]}, {"query": 1}, {"query": []},
         {"matrix": [[1, 0, 0, [0]], *np.eye(4)[1:].tolist()]},
     ],
 )  # fmt: skip
