@@ -287,15 +287,10 @@ def visible_splats(
             f"Cannot combine the levels of '{root.name}': their degrees of spherical harmonics differ.",
             "Export a single level.",
         )
-    shared = [name for name in parts[0].extras if all(name in part.extras for part in parts)]
-    arrays = ("means", "quats", "log_scales", "opacity_logits", "sh")
-    splats = Splats(
-        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in arrays},
-        extras={name: np.concatenate([part.extras[name] for part in parts]) for name in shared},
-    )
-    rule = find_rule(root.lodgs.rule)
+    splats = Splats.concatenated(parts)
     if not placed:
         return splats
+    rule = find_rule(root.lodgs.rule)
     return placement_of(root).transform_splats(splats, *((rule.lengths, rule.places) if rule else ()))
 
 

@@ -19,6 +19,7 @@ from ...training.editing.look import Looks
 from ...training.lod.query import LodQuery, SplatSelector
 from ...training.lod.rule import OPACITY
 from . import motion
+from .records import MEANS, OPACITIES, SCALES
 
 SAMPLE_STEP = 16
 """One splat of this many is sampled to estimate a selection's size."""
@@ -112,9 +113,9 @@ class Pool:
             self._applied[first] = paged.copied_updates
             records = paged.records[rows]
             targets = rows + np.int32(first)
-            self.means[targets] = records[:, 0:3]
-            self.opacities[targets] = records[:, 3]
-            self.areas[targets] = np.einsum("ij,ij->i", records[:, 8:11], records[:, 8:11])
+            self.means[targets] = records[:, MEANS]
+            self.opacities[targets] = records[:, OPACITIES]
+            self.areas[targets] = np.einsum("ij,ij->i", records[:, SCALES], records[:, SCALES])
             for name, column in paged.columns.items():  # sizes change for resident nodes too
                 self.columns[name][first : first + len(column)] = column
             self._selectors = {key: value for key, value in self._selectors.items() if key[0] != first}

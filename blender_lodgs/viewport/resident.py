@@ -23,9 +23,19 @@ from ...training.lod.rule import all_rule_columns
 from .. import attributes
 from ..data import changes, cleaning, painting
 from .arrangement import WIDTH, Pool
+from .records import (
+    MEANS,
+    OPACITIES,
+    QUATS,
+    SCALES,
+    coefficients_of,
+    empty_records,
+    record_texels,
+    resize_records,
+)
 from .shaders import MAX_TEXTURES
 from .splats import copy_records
-from .streaming import Stream, record_texels
+from .streaming import Stream
 
 UPLOAD_BATCH = 1 << 13
 """Number of splats per upload."""
@@ -142,7 +152,7 @@ class Resident:
             return None
         rows = indices - self.starts[number]
         if isinstance(cloud, Stream):
-            return _resize_records(cloud.records[rows], record_texels(self.store.higher))
+            return resize_records(cloud.records[rows], self.store.higher)
         return read_records(cloud, rows, self.store.higher)
 
     def _cloud(self, indices: np.ndarray) -> int:
@@ -371,34 +381,24 @@ def _read_attribute(pool: Pool, rows: slice, cloud: bpy.types.PointCloud, name: 
 
 
 def read_records(cloud: bpy.types.PointCloud, rows: np.ndarray, higher: int) -> np.ndarray:
-    """Return the shader records (M, 4 * texels) float32 of splats (M,) of a cloud.
+    """Return the records (M, 4 * texels) float32 of splats (M,) of a cloud, see ``records``.
 
-    A record has mean, opacity, quaternion wxyz, standard deviations and SH coefficients, three floats each.
     Opacities are multiplied by the weights that modifiers have set.
     """
     if len(rows) and rows[-1] - rows[0] == len(rows) - 1:
         rows = slice(rows[0], rows[-1] + 1)  # type: ignore[assignment]  # a view, not a copy
     base = attributes.view_attribute(cloud, attributes.BASE)[rows]
-    records = np.zeros((len(base), 4 * record_texels(higher)), np.float32)
-    records[:, 0:3] = attributes.view_attribute(cloud, "position")[rows]
-    records[:, 3] = base[:, 3]
-    records[:, 4:8] = attributes.view_attribute(cloud, attributes.ROTATION)[rows]
-    records[:, 8:11] = attributes.view_attribute(cloud, attributes.SCALE)[rows]
-    records[:, 11:14] = base[:, :3]
-    for k, name in enumerate(attributes.sh_names(cloud)[:higher]):
-        column = 14 + 3 * k
-        records[:, column : column + 3] = attributes.view_attribute(cloud, name)[rows]
+    records = empty_records(len(base), higher)
+    records[:, MEANS] = attributes.view_attribute(cloud, "position")[rows]
+    records[:, OPACITIES] = base[:, 3]
+    records[:, QUATS] = attributes.view_attribute(cloud, attributes.ROTATION)[rows]
+    records[:, SCALES] = attributes.view_attribute(cloud, attributes.SCALE)[rows]
+    coefficients = coefficients_of(records, higher)
+    coefficients[:, 0] = base[:, :3]
+    for k, name in enumerate(attributes.sh_names(cloud)[:higher], 1):
+        coefficients[:, k] = attributes.view_attribute(cloud, name)[rows]
     if (weights := attributes.view_attribute(cloud, attributes.WEIGHT)) is not None:
-        records[:, 3] *= weights[rows]
+        records[:, OPACITIES] *= weights[rows]
     if (paint := painting.displayed_paint(cloud, rows)) is not None:
-        colors = records[:, 11 : 14 + 3 * higher].reshape(len(records), -1, 3)  # a view
-        colors[:] = mix_paint(colors, paint)
+        coefficients[:] = mix_paint(coefficients, paint)
     return records
-
-
-def _resize_records(records: np.ndarray, texels: int) -> np.ndarray:
-    """Return records (M, any) truncated or zero-padded to (M, 4 * texels), for another SH degree."""
-    resized = np.zeros((len(records), 4 * texels), np.float32)
-    width = min(records.shape[1], 4 * texels)
-    resized[:, :width] = records[:, :width]
-    return resized

@@ -25,7 +25,7 @@ _FETCH = """
 vec4 texel(sampler2D data, int i) { return texelFetch(data, ivec2(i % WIDTH, i / WIDTH), 0); }
 """
 _PROJECT_FRAGMENT = """
-// SH coefficient k of a record, see ``resident.read_records``.
+// SH coefficient k of a record, see ``records``.
 vec3 coefficient(int k, ivec2 record)
 {
   int start = 11 + 3 * k;

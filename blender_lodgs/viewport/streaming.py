@@ -19,6 +19,7 @@ from ...training.lod.query import LodQuery, Pager
 from ...training.lod.rule import resolve_rule
 from ...training.splats.gaussians import Splats
 from ..data.streams import Source
+from .records import empty_records, records_of
 
 Direction = tuple[float, float, float]
 
@@ -27,13 +28,13 @@ PAUSE = 0.02
 
 
 class Stream:
-    """The part of a file that the camera needs, in the record layout of ``resident``.
+    """The part of a file that the camera needs, as records (``records``).
 
     Attributes:
         source: the file.
         ready: at least as many splats are in memory as the scene has; until then the scene's are drawn.
         problem: error that ended streaming; empty if there is none.
-        records: (rows, 4 * texels) float32 of all slots in memory, see ``resident.read_records``.
+        records: (rows, 4 * texels) float32 of all slots in memory.
         columns: (rows,) float32 by name, of the rule. Empty slots are never selected.
         higher: number of SH coefficients beyond the first.
         copied_updates: number of copied updates.
@@ -126,7 +127,7 @@ class Stream:
                     "Import the file again.",
                 )
             self.higher = (pager.sh_degree + 1) ** 2 - 1
-            self.records = np.zeros((pager.rows, 4 * record_texels(self.higher)), np.float32)
+            self.records = empty_records(pager.rows, self.higher)
             names = resolve_rule(file.bundle.rule).columns
             self.columns = {name: np.zeros(pager.rows, np.float32) for name in names}
             self._pager = pager
@@ -146,22 +147,3 @@ class Stream:
             and self.copied_updates > 0
             and (pager.idle or pager.splats >= self.source.scene_splats)
         )
-
-
-def record_texels(higher: int) -> int:
-    """Return the number of texels (four floats) in a splat's record, see ``resident.read_records``."""
-    return -(-(14 + 3 * higher) // 4)
-
-
-def records_of(splats: Splats) -> np.ndarray:
-    """Return the records (M, 4 * texels) float32 of splats (M,), see ``resident.read_records``."""
-    higher = splats.sh.shape[1] - 1
-    records = np.zeros((len(splats), 4 * record_texels(higher)), np.float32)
-    records[:, 0:3] = splats.means
-    with np.errstate(over="ignore"):
-        records[:, 3] = 1 / (1 + np.exp(-splats.opacity_logits))
-        records[:, 8:11] = np.exp(splats.log_scales)
-    lengths = np.linalg.norm(splats.quats, axis=1, keepdims=True)
-    records[:, 4:8] = splats.quats / np.maximum(lengths, np.float32(1e-30))
-    records[:, 11 : 14 + 3 * higher] = splats.sh.reshape(len(splats), -1)
-    return records

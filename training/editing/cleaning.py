@@ -185,10 +185,10 @@ class Cleaning:
                 if self.clutter and self.subject is not None:
                     masks["max_size"] &= self.subject.near(splats.means)
             if self.min_opacity > 0:
-                masks["min_opacity"] = find_faint(_opacities(splats), self.min_opacity)
+                masks["min_opacity"] = find_faint(splats.opacities, self.min_opacity)
             if self.halo_opacity > 0 and self.subject is not None:
                 masks["halo_opacity"] = self.subject.find_halos(
-                    splats.means, np.exp(splats.log_scales), _opacities(splats), self.halo_opacity
+                    splats.means, np.exp(splats.log_scales), splats.opacities, self.halo_opacity
                 )
         if self.max_reach < inf and self.subject is not None:
             masks["max_reach"] = self.subject.distances(splats.means) > self.max_reach
@@ -214,10 +214,6 @@ class Cleaning:
                 name: value for name, value in limits.items() if getattr(self, name) == LIMITS[name].default
             }
         return replace(self, subject=subject, **values)
-
-
-def _opacities(splats: Splats) -> np.ndarray:
-    return 1 / (1 + np.exp(-splats.opacity_logits))
 
 
 LIMITS = settings_of(Cleaning)

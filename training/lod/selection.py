@@ -181,8 +181,7 @@ def rule_columns(rule: Rule, splats: Splats) -> dict[str, np.ndarray]:
     zeros = np.broadcast_to(np.float32(0), len(splats))
     columns = {name: splats.extras.get(name, zeros) for name in rule.columns}
     if OPACITY in columns:
-        with np.errstate(over="ignore"):
-            columns[OPACITY] = 1 / (1 + np.exp(-splats.opacity_logits))
+        columns[OPACITY] = splats.opacities
     return columns
 
 

@@ -69,8 +69,7 @@ class SplatSet:
         self._weights = None if weights is None else np.asarray(weights, np.float32)
         # rules select by the trained opacities, which looks may change
         self._columns = {name: splats.extras[name] for name in all_rule_columns() if name in splats.extras}
-        with np.errstate(over="ignore"):
-            self._columns[OPACITY] = 1 / (1 + np.exp(-splats.opacity_logits))
+        self._columns[OPACITY] = splats.opacities
         self._selector: SplatSelector | None = None
         self._transformed: tuple[bytes, Gaussians] | None = None
         self._concatenated: tuple[list[SplatSet], Gaussians] | None = None

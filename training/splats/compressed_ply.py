@@ -17,7 +17,7 @@ from .dialects import comments_from_meta, meta_from_comments
 from .gaussians import SH_C0, SplatRows, Splats
 from .morton import spatial_order
 from .ply import Element, read_elements, release_pages, write_elements
-from .portable_levels import batches, opacities, splats_from_activated
+from .portable_levels import batches, splats_from_activated
 from .quats import join_quats, split_quats
 from .sh import coefficient_count
 
@@ -71,7 +71,7 @@ def write_compressed_ply(path: Path, rows: SplatRows, meta: dict) -> None:
         )
         largest, smaller = split_quats(splats.quats)
         words[1, part] = _pack(np.column_stack([largest, np.rint(1023 * smaller)]), _QUAT_BITS)
-        alphas[part] = np.rint(255 * opacities(splats))
+        alphas[part] = np.rint(255 * splats.opacities)
         coefficients = splats.sh[:, 1:].transpose(0, 2, 1).reshape(len(splats), rest.shape[1])
         rest[part] = np.floor((coefficients / _SH_RANGE + 0.5) * 256).clip(0, 255)
     order = spatial_order(values[0])

@@ -50,6 +50,12 @@ class Splats:
         """Degree of the spherical harmonics, 0 to 4."""
         return int(np.sqrt(self.sh.shape[1])) - 1
 
+    @property
+    def opacities(self) -> np.ndarray:
+        """Opacities (N,) float32 in [0, 1]."""
+        with np.errstate(over="ignore"):
+            return 1 / (1 + np.exp(-self.opacity_logits))
+
     def select(self, index: slice | np.ndarray | list[int]) -> Splats:
         """Return the splats at ``index``: a slice, a boolean mask (N,) or an integer array."""
         columns = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name != "extras"}

@@ -24,7 +24,6 @@ from .levels import MAX_READ_LEVELS, Bundle, Level
 from .portable_levels import (
     PortableLevels,
     batches,
-    opacities,
     parse_description,
     place_splats,
     splats_from_activated,
@@ -218,7 +217,7 @@ def _item_size(name: str) -> int:
 
 def _values(splats: Splats) -> dict[str, np.ndarray]:
     """Return the attributes of splats by name, in the types of :data:`_COLUMNS`."""
-    alphas = opacities(splats)
+    alphas = splats.opacities
     color = np.column_stack([0.5 + SH_C0 * splats.sh[:, 0], alphas])
     values = {
         "POSITION": splats.means,

@@ -166,12 +166,6 @@ def batches(rows: SplatRows, size: int = BATCH_ROWS):
         yield begin, Splats(splats.means, quats, splats.log_scales, splats.opacity_logits, splats.sh)
 
 
-def opacities(splats: Splats) -> np.ndarray:
-    """Return opacities (N,) float32 in [0, 1]."""
-    with np.errstate(over="ignore"):
-        return 1 / (1 + np.exp(-splats.opacity_logits))
-
-
 def splats_from_activated(
     means: np.ndarray, quats: np.ndarray, scales: np.ndarray, alphas: np.ndarray, sh: np.ndarray
 ) -> Splats:

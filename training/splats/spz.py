@@ -22,7 +22,7 @@ from ..documents import open_file
 from ..errors import LodgsError
 from ..files import atomic_write
 from .gaussians import SplatRows, Splats
-from .portable_levels import batches, opacities, splats_from_activated
+from .portable_levels import batches, splats_from_activated
 from .sh import MAX_DEGREE, basis, coefficient_count
 from .similarity import Similarity
 
@@ -171,7 +171,7 @@ def _encode(splats: Splats, header: _Header) -> tuple[np.ndarray, ...]:
     rotations = _first_three_codes(splats.quats) if header.version < 3 else _smallest_codes(splats.quats)
     return (
         fixed.reshape(-1, 1).view(np.uint8)[:, :3],
-        _byte(255 * opacities(splats)),
+        _byte(255 * splats.opacities),
         _byte(255 * (_COLOR_SCALE * splats.sh[:, 0] + 0.5)),
         _byte(16 * (splats.log_scales + 10)),
         rotations,

@@ -22,7 +22,7 @@ from ..documents import open_file, parse_json
 from ..errors import LodgsError, printable
 from ..files import atomic_write, temporary_folder
 from .levels import Level
-from .portable_levels import PortableLevels, PortableView, batches, opacities
+from .portable_levels import PortableLevels, PortableView, batches
 from .sh import coefficient_count
 
 DESCRIPTION = "lodgs"
@@ -201,7 +201,7 @@ def _columns(level: Level) -> dict[str, np.ndarray]:
         batch = (
             splats.means, scales,
             splats.quats[:, [1, 2, 3, 0]],  # the real part is last
-            opacities(splats),
+            splats.opacities,
         )  # fmt: skip
         for column, values in zip(columns.values(), batch, strict=False):
             column[begin:end] = values

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...splats.levels import MAX_LEVELS, Bundle, Level
-from ...splats.portable_levels import DISTANCE, DISTANCE_RULE, opacities
+from ...splats.portable_levels import DISTANCE, DISTANCE_RULE
 from ..rule import (
     MIN_SPLATS,
     NO_TABLES,
@@ -125,7 +125,7 @@ class Decay(Rule):
         facts = collect_facts(self, bundle.facts, [(1, {})], 1)
         s_v = self.resolve_controls({}, [1], bundle.controls)["s_v"]
         sigma = splats.extras.get(SIGMA, np.zeros(len(splats), np.float32))
-        opacity = opacities(splats)
+        opacity = splats.opacities
         reference = facts["reference"] or float(
             distances(splats.means, np.median(splats.means, axis=0)).max(initial=1e-20)
         )
