@@ -108,7 +108,7 @@ def run(mode: str, job: Job, folder: RunFolder, emit: EventWriter) -> int:
     levels, tables = [], {}
     origin = {"origin": ORIGIN} if mode == "far" else {}
     for number, count in COUNTS.items():
-        path = folder.levels_folder / f"level_{number}.ply"
+        path = folder.level_file(number)
         levels.append(Level(number, splats(count), {"s_min": 0.1 if number == 1 else 0.0}))
         write_ply(path, levels[-1].splats)
         emit(
@@ -130,7 +130,7 @@ def run(mode: str, job: Job, folder: RunFolder, emit: EventWriter) -> int:
         for level in levels:
             level.facts = {"d_l": 4.0 if level.number == 1 else 0.0}
             level.splats.extras["chunks_0"] = np.arange(len(level.splats), dtype=np.float32)
-            path = folder.levels_folder / f"level_{level.number}.ply"
+            path = folder.level_file(level.number)
             write_ply(path, level.splats)
             emit(
                 "level", level=level.number, path=f"levels/{path.name}", splats=len(level.splats), again=True,
@@ -206,7 +206,7 @@ def train_tree(folder: RunFolder, emit: EventWriter) -> int:
     for numbers in ((2,), (1, 2)):
         for level in bundle.levels:
             if level.number in numbers:
-                path = folder.levels_folder / f"level_{level.number}.ply"
+                path = folder.level_file(level.number)
                 write_ply(path, level.splats)
                 emit(
                     "level", level=level.number, path=f"levels/{path.name}", splats=len(level.splats),

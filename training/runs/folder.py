@@ -96,6 +96,10 @@ class RunFolder:
                 "Choose a writable folder.",
             ) from error
 
+    def level_file(self, number: int) -> Path:
+        """Return the path of a level's splats."""
+        return self.levels_folder / f"level_{number}.ply"
+
     @property
     def points_cache(self) -> Path:
         """Cache of triangulated points if the scene folder is read-only; parts share the divided run's."""

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import os
-import signal
 import sys
-import threading
 import time
 import traceback
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
@@ -55,6 +53,7 @@ from .events import PROTOCOL, EventWriter, event_line
 from .failures import BAD_INPUT, CANCELLED, CRASHED, DONE, describe_error
 from .folder import RunFolder
 from .job import Job, save_job
+from .stopping import interrupt_on_cancel, stop_signals
 
 CHECKPOINT_SECONDS = float(os.environ.get("LODGS_CHECKPOINT_SECONDS", "60"))
 PROGRESS_SECONDS = 0.5, 10.0
@@ -130,7 +129,7 @@ def _train(job: Job, folder: RunFolder, events: EventWriter, placement: dict[str
         "hello", protocol=PROTOCOL, version=VERSION, method=job.method, preset=job.preset,
         scene=job.scene, out=str(folder.path), pid=os.getpid(),
     )  # fmt: skip
-    with _interrupt_on_cancel(folder):
+    with interrupt_on_cancel(folder):
         merged_is_result = bool(job.cells) and METHODS[job.method].cell_method == job.method
         if job.cells:
             merged = folder.bundle if merged_is_result else folder.merged
@@ -157,7 +156,7 @@ def _train(job: Job, folder: RunFolder, events: EventWriter, placement: dict[str
             _write_merged_levels(folder, events, data, backend, started)
             return DONE
         run = _TrainingRun(job, backend, folder, events, data)
-    with _stop_signals() as received:
+    with stop_signals() as received:
         if not run.run(received):
             return CANCELLED
     _report_done(folder, events, run.evaluation, run.write_bundle(), started)
@@ -187,7 +186,7 @@ def _write_merged_levels(
     evaluation = Evaluation(data, backend, bundle.antialias)
     complete = [level.number for level in standalone_levels(bundle)]
     for position, level in enumerate(bundle.levels, 1):
-        path = folder.levels_folder / f"level_{level.number}.ply"
+        path = folder.level_file(level.number)
         write_ply(path, level.rows, comments_from_meta(bundle.meta))
         quality = evaluation.measure_level(bundle, level) if level.number in complete else {}
         values = quality | _level_values(bundle, level, f"levels/{path.name}")
@@ -268,7 +267,7 @@ class _TrainingRun:
     def _warn(self, message: str) -> None:
         self.events("warning", message=message)
 
-    def run(self, received: list) -> bool:
+    def run(self, received: list[int]) -> bool:
         """Train all remaining steps; save and return False on a stop signal or a cancel request."""
         method = self.method
         self._started, self._started_step = time.monotonic(), self.step
@@ -298,7 +297,7 @@ class _TrainingRun:
                 last_checkpoint = time.monotonic()
         return False
 
-    def _stopped(self, received: list) -> bool:
+    def _stopped(self, received: list[int]) -> bool:
         """Save, report and return True on a stop signal or a cancel request, also after the last step."""
         self.folder.require_lock()
         if not (received or processes.parent_ended.is_set() or self.folder.take_cancel()):
@@ -389,7 +388,7 @@ class _TrainingRun:
         bundle = replace(self._empty_bundle(), levels=levels)
         complete = [level.number for level in standalone_levels(bundle)]
         for position, level in enumerate(levels, 1):
-            path = self.folder.levels_folder / f"level_{level.number}.ply"
+            path = self.folder.level_file(level.number)
             self.folder.require_lock()  # writing would create a folder that was moved
             write_ply(path, level.rows, comments_from_meta(bundle.meta))
             record = {
@@ -441,53 +440,3 @@ def _any_visible(base: SplatRows, data: TrainingData) -> bool:
         if any(camera.sees(means, near=data.near).any() for camera in data.train):
             return True
     return False
-
-
-# -- stopping -----------------------------------------------------------------
-
-
-@contextmanager
-def _interrupt_on_cancel(folder: RunFolder):
-    """Raise KeyboardInterrupt in the block on a cancel request, before the training loop looks for it."""
-    finished = threading.Event()
-
-    def watch() -> None:
-        while not finished.wait(0.1):
-            with suppress(OSError):
-                if processes.parent_ended.is_set() or folder.take_cancel():
-                    processes.interrupt()
-                    return
-
-    previous = None
-    with suppress(ValueError):  # not in the main thread
-        # shells start background programs with SIGINT ignored
-        previous = signal.signal(signal.SIGINT, signal.default_int_handler)
-    watcher = threading.Thread(target=watch, daemon=True)
-    try:
-        watcher.start()
-        yield
-    finally:
-        try:
-            finished.set()
-            watcher.join()
-        finally:  # also if the interruption arrives while this waits
-            if previous is not None:
-                signal.signal(signal.SIGINT, previous)
-
-
-@contextmanager
-def _stop_signals():
-    """Yield a list that receives the numbers of stop signals."""
-    received: list[int] = []
-    names = ("SIGINT", "SIGTERM", "SIGBREAK")  # the last is Windows' CTRL_BREAK_EVENT
-    previous = {}
-    for name in names:
-        if hasattr(signal, name):
-            with suppress(ValueError):  # not in the main thread
-                number = getattr(signal, name)
-                previous[number] = signal.signal(number, lambda number, _: received.append(number))
-    try:
-        yield received
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
