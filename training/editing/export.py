@@ -44,7 +44,6 @@ class ExportOptions:
         False,
         "Write positions at the scene's original place, in double precision, instead of relative to its "
         "local origin. PLY, USD and glTF only.",
-        label="Original Place",
     )
     lod_errors: bool = setting(
         False,

@@ -81,7 +81,6 @@ class Parameters:
         0.0,
         "Initial weight of the depth loss where depth is known (see depth): L1 of inverse depth, in inverse "
         "median depths. It decreases to a hundredth. 0 disables.",
-        label="Depth Weight",
     )
     depth: str = setting(
         "metric",

@@ -20,7 +20,6 @@ class ClodParameters(SplatParameters):
         "that views draw this fraction of their splats. 1 keeps all. Not in the paper.",
         above=0,
         high=1,
-        label="Keep Share",
     )
     by_importance: bool = setting(
         True,
