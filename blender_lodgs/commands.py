@@ -255,7 +255,7 @@ def _export(args: argparse.Namespace) -> int:
     if find_format(args.bundle) is PLY:
         write_bundle(args.bundle, bundle)
     elif find_format(args.bundle).write_levels:
-        for text in convert_steps(bundle, "--levels", args.bundle.resolve(), {}):
+        for text in convert_steps(bundle, "--levels", args.bundle.resolve()):
             if text:
                 _print(text)
     else:

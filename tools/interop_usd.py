@@ -70,8 +70,8 @@ def main() -> int:
 def check(source: Path, images: Path | None) -> list[Record]:
     """Write, validate and import the levels of a bundle. Print and return the results of both programs."""
     from training.api import load_bundle, render_image
-    from training.editing.cleaning import Cleaning
-    from training.editing.edit import edit
+    from training.editing.edit import Outputs, edit
+    from training.editing.export import FileOptions
     from training.editing.portable import portable_levels
     from training.scenes.view_tables import read_view_tables
     from training.splats.levels import Bundle, Level
@@ -87,7 +87,7 @@ def check(source: Path, images: Path | None) -> list[Record]:
     with tempfile.TemporaryDirectory() as folder:
         job = Path(folder)
         files = [job / f"{name}.{ending}" for ending in ENDINGS]
-        edit(source, None, Cleaning(), levels=files, antialiased=True)
+        edit(source, Outputs(levels=files), options=FileOptions(antialiased=True))
         answer = import_in_blender(job, files, levels, [camera.width, camera.height], antialias)
         for file in files:
             faults = validate(file)

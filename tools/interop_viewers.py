@@ -39,8 +39,8 @@ from tools.interop_results import Record, store_result  # noqa: E402
 from tools.interop_walk import WALKS, Walk  # noqa: E402
 from tools.viewer import VERSION as PAGE_VERSION  # noqa: E402
 from training.api import load_bundle, render_image, train  # noqa: E402
-from training.editing.cleaning import Cleaning  # noqa: E402
-from training.editing.edit import edit  # noqa: E402
+from training.editing.edit import Outputs, edit  # noqa: E402
+from training.editing.export import FileOptions  # noqa: E402
 from training.scenes.cameras import Camera  # noqa: E402
 from training.scenes.view_tables import read_view_tables  # noqa: E402
 from training.splats.levels import Bundle, Level  # noqa: E402
@@ -217,7 +217,7 @@ class Scene:
     def _write_once(self, kind: Format, antialiased: bool) -> Path:
         path = self.folder / f"{'trained' if antialiased else 'baked'}-{kind.name}"
         value = path if kind.option in ("streamed", "tiles") else [path]
-        edit(self.source, None, Cleaning(), antialiased=antialiased, **{kind.option: value})
+        edit(self.source, Outputs(**{kind.option: value}), options=FileOptions(antialiased))
         return path
 
     def image(self, kind: str, filters: bool, cuts: bool) -> np.ndarray:

@@ -16,8 +16,7 @@ import numpy as np
 from scipy.ndimage import binary_erosion
 
 from training.api import render_image
-from training.editing.cleaning import Cleaning
-from training.editing.edit import edit
+from training.editing.edit import Outputs, edit
 from training.runs.page.write import PAGE, write_page
 from training.scenes.cameras import Camera, look_at
 from training.scenes.overview import central_ball
@@ -122,11 +121,11 @@ class Walk:
         return binary_erosion(np.min(alphas, axis=0) >= MIN_ALPHA, iterations=2)
 
     def _write_streamed(self, source: Path) -> str:
-        edit(source, None, Cleaning(), streamed=self.folder / "levels")
+        edit(source, Outputs(streamed=self.folder / "levels"))
         return f"levels/{streamed_levels.STREAMED_FILE}"
 
     def _write_tiles(self, source: Path) -> str:
-        edit(source, None, Cleaning(), tiles=self.folder / "tiles")
+        edit(source, Outputs(tiles=self.folder / "tiles"))
         return f"tiles/{tiles.TILESET_FILE}"
 
     def _write_page(self, source: Path) -> str:

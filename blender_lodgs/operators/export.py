@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import fields
 from pathlib import Path
 
 import bpy
 from bpy_extras.io_utils import ExportHelper
 
-from ...training.editing.export import COMPRESSION_SETTINGS, EXPORT_OPTIONS, export_finest_level
+from ...training.editing.export import (
+    COMPRESSION_SETTINGS,
+    EXPORT_OPTIONS,
+    FileOptions,
+    export_finest_level,
+)
 from ...training.errors import LodgsError
 from ...training.lod.rule import resolve_rule
 from ...training.runs.folder import RunFolder
@@ -67,6 +73,11 @@ class _ForeignExport(_ExportOperator):
     """Base class with the options of exports for other programs."""
 
     antialiased: property_of(EXPORT_OPTIONS["antialiased"])
+
+    def file_options(self) -> FileOptions:
+        """Return the options of the dialog; those that it lacks have their defaults."""
+        names = (f.name for f in fields(FileOptions))
+        return FileOptions(**{name: getattr(self, name) for name in names if hasattr(self, name)})
 
 
 def _origin_text(bundle: Bundle) -> str:
@@ -274,11 +285,10 @@ class LODGS_OT_export_plain(_FormatExport, bpy.types.Operator):
         if self.placed:
             meta = {name: value for name, value in meta.items() if name not in ("origin", "georeference")}
         bundle = Bundle("", [Level(1, splats)], meta=meta, tables=scenes.view_tables(root, self.placed))
-        flags = {"antialiased": self.antialiased, "original_place": self.original_place}
         if find_format(path).in_trainer:
-            yield from self.follow(convert_steps(bundle, "--plain", path, flags))
+            yield from self.follow(convert_steps(bundle, "--plain", path, self.file_options()))
         else:
-            export_finest_level(path, bundle, **flags)
+            export_finest_level(path, bundle, self.file_options())
         origin = "" if self.original_place else _origin_text(bundle)
         self.written = f"{len(splats):,} splats written to {path}{origin}"
 
@@ -312,8 +322,7 @@ class LODGS_OT_export_levels(_FormatExport, bpy.types.Operator):
     def work(self, context):
         self.check_place()
         bundle = scenes.read_levels(roots.active_root(context), self.placed, self.looked)
-        flags = {"antialiased": self.antialiased, "original_place": self.original_place}
-        yield from self.follow(convert_steps(bundle, "--levels", self._path(), flags))
+        yield from self.follow(convert_steps(bundle, "--levels", self._path(), self.file_options()))
         self.written = f"{self._path()} written. {self.progress}".rstrip()
 
     def status_text(self, context, count):
@@ -343,7 +352,7 @@ class _FolderExport(_ExportOperator):
 
     def draw(self, context):
         self.layout.use_property_split = True
-        for name in ("placed", "looked", "antialiased", "lod_errors", "replace"):
+        for name in (*EXPORT_OPTIONS, "replace"):
             if hasattr(self, name):
                 self.layout.prop(self, name)
         self.layout.label(text=f"Estimated size: {_size(context, self.kind, -1)}")
@@ -389,8 +398,7 @@ class LODGS_OT_export_tiles(_ForeignExport, _FolderExport, _ConvertingExport, bp
 
     def work(self, context):
         bundle = scenes.read_levels(roots.active_root(context), self.placed, self.looked)
-        flags = {"antialiased": self.antialiased}
-        yield from self.follow(convert_steps(bundle, "--tiles", self._folder(), flags))
+        yield from self.follow(convert_steps(bundle, "--tiles", self._folder(), self.file_options()))
         self.written = f"{self._folder()} written. {self.progress}".rstrip()
 
     def status_text(self, context, count):
@@ -408,8 +416,7 @@ class LODGS_OT_export_streamed(_ForeignExport, _FolderExport, _ConvertingExport,
 
     def work(self, context):
         bundle = scenes.read_levels(roots.active_root(context), self.placed, self.looked)
-        flags = {"antialiased": self.antialiased, "lod_errors": self.lod_errors}
-        yield from self.follow(convert_steps(bundle, "--streamed", self._folder(), flags))
+        yield from self.follow(convert_steps(bundle, "--streamed", self._folder(), self.file_options()))
         self.written = f"{_levels(bundle)} written: {self._folder() / STREAMED_FILE}{_origin_text(bundle)}"
 
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
 
 import bpy
 
+from ...training.cli.options import option_name
+from ...training.editing.export import DEFAULT_OPTIONS, FileOptions
 from ...training.errors import LodgsError
 from ...training.files import temporary_folder
 from ...training.runs.folder import RunFolder
@@ -33,19 +36,20 @@ def compress_steps(
         LodgsError: the trainer is missing or fails.
     """
     options = [  # Blender's numbers have single precision
-        f"--{name.replace('_', '-')}={round(value, 6)}" for name, value in settings.items()
+        f"{option_name(name)}={round(value, 6)}" for name, value in settings.items()
     ]
     options += [f"--run={run.path}"] if run is not None and run.bundle.exists() else []
     for lines in _trainer_steps(bundle, "compress", "--out", str(path), *options):
         yield lines[-1] if lines else ""
 
 
-def convert_steps(bundle: Bundle, option: str, path: Path, flags: Mapping[str, bool]) -> Iterator[str]:
+def convert_steps(
+    bundle: Bundle, option: str, path: Path, file_options: FileOptions = DEFAULT_OPTIONS
+) -> Iterator[str]:
     """Write a bundle with ``lodgs edit``; closing the iterator stops the trainer and writes nothing.
 
     Args:
         option: option of the command that takes the file or folder: ``--plain``, ``--levels``, ``--tiles``.
-        flags: further options by name.
 
     Yields:
         Empty texts while the trainer works, then its sentences about the file.
@@ -53,7 +57,7 @@ def convert_steps(bundle: Bundle, option: str, path: Path, flags: Mapping[str, b
     Raises:
         LodgsError: the trainer is missing or fails.
     """
-    options = [f"--{name.replace('_', '-')}" for name, value in flags.items() if value]
+    options = [option_name(name) for name, value in asdict(file_options).items() if value]
     for lines in _trainer_steps(bundle, "edit", option, str(path), *options):
         yield " ".join(line for line in lines if line.endswith("."))
 

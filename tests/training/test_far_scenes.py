@@ -219,9 +219,11 @@ def test_edits_name_the_origin_or_add_it(tmp_path, capsys):
     assert x.dtype == np.float64
     np.testing.assert_array_equal(np.stack([x, y, z], axis=1), splats().means + OFFSET)
     with pytest.raises(LodgsError, match="no double precision"):
-        from training.editing.edit import Cleaning, edit
+        from training.editing.edit import Outputs, edit
+        from training.editing.export import FileOptions
 
-        edit(tmp_path / "b.ply", None, Cleaning(), plain=[tmp_path / "a.splat"], original_place=True)
+        outputs = Outputs(plain=[tmp_path / "a.splat"])
+        edit(tmp_path / "b.ply", outputs, options=FileOptions(original_place=True))
 
     rotated = tmp_path / "turned.ply"  # other coordinates than the scene's
     assert main(["edit", str(tmp_path / "b.ply"), "--out", str(rotated), "--rotate=90,0,0"]) == 0

@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..editing.cleaning import LIMITS, Cleaning
-from ..editing.export import EXPORT_OPTIONS
+from ..editing.export import FileOptions
 from ..editing.look import LOOK_SETTINGS, Look
 from ..errors import LodgsError
 from ..lod.crop import Crop
+from ..settings import settings_of
 from ..splats.formats import FORMATS, LEVEL_FORMATS, READABLE
 from .options import SOURCE_HELP, add_placement, add_setting, placement_of, setting_values, warn
+
+if TYPE_CHECKING:
+    from ..editing.edit import Outputs
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -66,8 +71,8 @@ def _add_outputs(parser: argparse.ArgumentParser) -> None:
         help="image to write with the splats that the clean-up removes, in one colour for each test; needs "
         "no other output",
     )  # fmt: skip
-    for name in ("antialiased", "original_place", "lod_errors"):
-        add_setting(parser, EXPORT_OPTIONS[name], value=False)
+    for f in settings_of(FileOptions).values():
+        add_setting(parser, f)
 
 
 def _add_cleaning(parser: argparse.ArgumentParser) -> None:
@@ -114,7 +119,8 @@ def run(options: argparse.Namespace) -> int:
         raise LodgsError(
             "Cannot test splats against photos: their scene is missing.", "Add its folder with --scene."
         )
-    if not (options.preview or _writes_splats(options)):
+    outputs = _outputs(options)
+    if not (options.preview or outputs.paths):
         raise LodgsError(
             "Cannot write the edited splats: no output.",
             "Add --out, --plain, --levels, --folder, --streamed, --tiles or --preview.",
@@ -126,17 +132,18 @@ def run(options: argparse.Namespace) -> int:
     else:
         opened = open_as_ply(find_splats(options.source))
     with opened as source:
-        _edit(options, source, limits)
+        _edit(options, source, outputs, limits)
     return 0
 
 
-def _writes_splats(options: argparse.Namespace) -> bool:
-    """Return whether the command has an output other than the preview."""
-    names = ("out", "plain", "levels", "folder", "streamed", "tiles")
-    return any(getattr(options, name) for name in names)
+def _outputs(options: argparse.Namespace) -> Outputs:
+    """Return the outputs other than the preview."""
+    from ..editing.edit import Outputs
+
+    return Outputs(**{f.name: getattr(options, f.name) for f in fields(Outputs)})
 
 
-def _edit(options: argparse.Namespace, source: Path, limits: dict[str, Any]) -> None:
+def _edit(options: argparse.Namespace, source: Path, outputs: Outputs, limits: dict[str, Any]) -> None:
     """Write the preview and the edited splats of a source, whose file may be temporary."""
     from ..editing.edit import edit
     from ..scenes.colmap import read_scene
@@ -155,20 +162,19 @@ def _edit(options: argparse.Namespace, source: Path, limits: dict[str, Any]) -> 
 
         views = None if scene is None else (scene.cameras, scene.near())
         print(preview(source, cleaning, options.preview, warn, views=views))
-    if not _writes_splats(options):
+    if not outputs.paths:
         return
+    file_options = FileOptions(**setting_values(options, FileOptions))
     measure = None
-    if options.lod_errors:
+    if file_options.lod_errors:
         from ..evaluate.level_errors import measure_level_errors as measure
     print(
         edit(
-            source, options.out, cleaning, warn,
+            source, outputs, cleaning, warn,
             placement=placement_of(options), upright=options.upright, ground=options.ground,
             points=None if scene is None else scene.points,
             looks=[(crop, look) for crop in look_crops] if look else (),
-            plain=options.plain, levels=options.levels, folder=options.folder,
-            streamed=options.streamed, tiles=options.tiles,
-            antialiased=options.antialiased, original_place=options.original_place, measure=measure,
+            options=file_options, measure=measure,
         )
     )  # fmt: skip
 

@@ -216,6 +216,7 @@ class Cleaning:
         return replace(self, subject=subject, **values)
 
 
+NO_CLEANING = Cleaning()
 LIMITS = settings_of(Cleaning)
 """The settings of the tests, by name. Blender's tools start with the values ``start``."""
 

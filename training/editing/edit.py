@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -22,16 +23,41 @@ from ..splats.similarity import Similarity
 from ..splats.sog import load_packages
 from ..splats.streamed_levels import MeasureLeaf, write_streamed_levels
 from .bake_filter import bake_filter
-from .cleaning import Cleaning, clean_bundle
-from .export import export_finest_level, export_levels, export_tiles
+from .cleaning import NO_CLEANING, Cleaning, clean_bundle
+from .export import DEFAULT_OPTIONS, FileOptions, export_finest_level, export_levels, export_tiles
 from .look import Looks, apply_looks_to_levels
 from .placement import transform_bundle, upright_placement
 
 
+@dataclass(frozen=True)
+class Outputs:
+    """Files and folders to write.
+
+    Attributes:
+        out: result in the format of the source.
+        plain, levels: files for the finest level only, and for all levels, in the formats of their names.
+        folder, streamed, tiles: folders for a PLY of each level, for levels that browsers stream, and for 3D
+            Tiles.
+    """
+
+    out: Path | None = None
+    plain: Sequence[Path] = ()
+    levels: Sequence[Path] = ()
+    folder: Path | None = None
+    streamed: Path | None = None
+    tiles: Path | None = None
+
+    @property
+    def paths(self) -> list[Path]:
+        """All of them."""
+        paths = (self.out, *self.plain, *self.levels, self.folder, self.streamed, self.tiles)
+        return [path for path in paths if path is not None]
+
+
 def edit(
     source: Path,
-    out: Path | None,
-    cleaning: Cleaning,
+    outputs: Outputs,
+    cleaning: Cleaning = NO_CLEANING,
     warn: Warn = ignore,
     *,
     looks: Looks = (),
@@ -39,13 +65,7 @@ def edit(
     upright: bool = False,
     ground: bool = False,
     points: np.ndarray | None = None,
-    plain: Sequence[Path] = (),
-    levels: Sequence[Path] = (),
-    folder: Path | None = None,
-    streamed: Path | None = None,
-    tiles: Path | None = None,
-    antialiased: bool = False,
-    original_place: bool = False,
+    options: FileOptions = DEFAULT_OPTIONS,
     measure: MeasureLeaf | None = None,
 ) -> str:
     """Edit a bundle, a folder of levels or any 3DGS PLY, and write the result.
@@ -53,15 +73,11 @@ def edit(
     Binary PLYs are processed in batches of rows.
 
     Args:
-        out: output in the format of the source; None writes none.
         warn, measure: see ``read_ply`` and ``write_streamed_levels``.
         looks: applied to the remaining splats.
         placement: applied after upright and ground; crops and lengths of the cleaning are the source's.
         upright, ground, points: see ``placement.upright_placement``.
-        plain, levels: files for the finest level only, and for all levels, in the formats of their names.
-        folder, streamed, tiles: output folders of levels, of levels for browsers, and of 3D Tiles.
-        antialiased: for all outputs but ``out`` and ``folder``, see :class:`.export.ExportOptions`.
-        original_place: for ``plain`` and ``levels``, see :class:`.export.ExportOptions`.
+        options: for all outputs but ``out`` and ``folder``.
 
     Returns:
         A report of the remaining splats of each level, and of the files.
@@ -69,8 +85,7 @@ def edit(
     Raises:
         LodgsError: cannot read or write a file, the source contradicts its rule, or no splats remain.
     """
-    outputs = [path for path in (out, *plain, *levels, folder, streamed, tiles) if path is not None]
-    _check_outputs(source, outputs, plain, levels, streamed)
+    _check_outputs(source, outputs)
     bundle = open_levels(source, warn)
     check_rule(bundle)
     edited = apply_looks_to_levels(clean_bundle(bundle, cleaning), looks)
@@ -79,15 +94,21 @@ def edit(
         edited = transform_bundle(edited, first if placement is None else placement.compose(first))
         if upright or ground:
             edited.meta["up_rotation"] = np.eye(3)
-    if out is not None:
-        _write_like(source, bundle, out, edited)
-    for path in plain:
-        export_finest_level(path, edited, antialiased, original_place)
-    notes = [note for path in levels for note in export_levels(path, edited, antialiased, original_place)]
-    notes += [] if tiles is None else export_tiles(tiles, edited, antialiased)
-    _export_levels(edited, folder, streamed, antialiased, measure)
-    keeps_place = original_place and outputs == [*plain, *levels]
-    return "\n".join([*notes, *_report(bundle, edited, outputs, keeps_place)])
+    if outputs.out is not None:
+        _write_like(source, bundle, outputs.out, edited)
+    for path in outputs.plain:
+        export_finest_level(path, edited, options)
+    notes = [note for path in outputs.levels for note in export_levels(path, edited, options)]
+    notes += [] if outputs.tiles is None else export_tiles(outputs.tiles, edited, options)
+    if outputs.folder is not None or outputs.streamed is not None:
+        complete = resolve_rule(edited.rule).complete_levels(edited)
+        if outputs.folder is not None:
+            write_folder(outputs.folder, complete)
+        if outputs.streamed is not None:
+            complete = complete if options.antialiased else bake_filter(complete)
+            write_streamed_levels(outputs.streamed, complete, measure)
+    keeps_place = options.original_place and outputs.paths == [*outputs.plain, *outputs.levels]
+    return "\n".join([*notes, *_report(bundle, edited, outputs.paths, keeps_place)])
 
 
 def _report(bundle: Bundle, edited: Bundle, outputs: Sequence[Path], keeps_place: bool) -> list[str]:
@@ -108,39 +129,17 @@ def _report(bundle: Bundle, edited: Bundle, outputs: Sequence[Path], keeps_place
     return lines
 
 
-def _check_outputs(
-    source: Path,
-    outputs: Sequence[Path],
-    plain: Sequence[Path],
-    levels: Sequence[Path],
-    streamed: Path | None,
-) -> None:
+def _check_outputs(source: Path, outputs: Outputs) -> None:
     """Raise an error before minutes of work if an output cannot be written."""
-    for path in outputs:
+    for path in outputs.paths:
         if path.resolve() == source.resolve():
             raise LodgsError(f"Cannot write {path}: it is the source.", "Choose another output file.")
-    kinds = [find_format(path) for path in plain] + [find_level_format(path) for path in levels]
+    kinds = [*map(find_format, outputs.plain), *map(find_level_format, outputs.levels)]
     for kind in kinds:
         if kind.require is not None:
             kind.require()
-    if streamed is not None:
+    if outputs.streamed is not None:
         load_packages()
-
-
-def _export_levels(
-    bundle: Bundle,
-    folder: Path | None,
-    streamed: Path | None,
-    antialiased: bool,
-    measure: MeasureLeaf | None,
-) -> None:
-    """Write the levels of a bundle for other programs; see :func:`edit`."""
-    if folder is not None or streamed is not None:
-        levels = resolve_rule(bundle.rule).complete_levels(bundle)
-        if folder is not None:
-            write_folder(folder, levels)
-        if streamed is not None:
-            write_streamed_levels(streamed, levels if antialiased else bake_filter(levels), measure)
 
 
 def open_levels(source: Path, warn: Warn) -> Bundle:

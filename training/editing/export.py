@@ -21,8 +21,8 @@ from .portable import portable_levels
 
 
 @dataclass(frozen=True)
-class ExportOptions:
-    """Options of exports in Blender's dialogs and in both command lines."""
+class SceneOptions:
+    """Options of exports that Blender applies to the splats of a scene."""
 
     placed: bool = setting(
         False,
@@ -35,6 +35,12 @@ class ExportOptions:
         "Apply the colours and opacities of the Look panel; otherwise export the splats as trained.",
         label="With Look",
     )
+
+
+@dataclass(frozen=True)
+class FileOptions:
+    """Options of files for other programs, in Blender's dialogs and of ``lodgs edit``."""
+
     antialiased: bool = setting(
         False,
         "Keep opacities as trained, for viewers with Mip-Splatting's filter. Otherwise reduce them for other "
@@ -52,7 +58,8 @@ class ExportOptions:
     )
 
 
-EXPORT_OPTIONS = settings_of(ExportOptions)
+DEFAULT_OPTIONS = FileOptions()
+EXPORT_OPTIONS = settings_of(SceneOptions) | settings_of(FileOptions)
 """The settings of exports, by name."""
 
 
@@ -85,32 +92,28 @@ COMPRESSION_SETTINGS = settings_of(Compression)
 """The settings of compressed bundles, by name."""
 
 
-def export_finest_level(
-    path: Path, bundle: Bundle, antialiased: bool = False, original_place: bool = False
-) -> None:
+def export_finest_level(path: Path, bundle: Bundle, options: FileOptions = DEFAULT_OPTIONS) -> None:
     """Write the finest level of a bundle in the format of the file name.
 
-    Args:
-        antialiased: keep opacities as trained; otherwise bake the filter into them
-            (:func:`.bake_filter.bake_filter`), except in formats that record the filter.
-        original_place: add the local origin, see :class:`ExportOptions`.
+    Unless ``options.antialiased``, the filter is baked into opacities (:func:`.bake_filter.bake_filter`),
+    except in formats that record the filter.
 
     Raises:
         LodgsError: see :func:`..splats.formats.write_splats`, or the format has no double precision.
     """
-    origin = bundle.origin if original_place else NO_ORIGIN
+    origin = bundle.origin if options.original_place else NO_ORIGIN
     kind = find_format(path)
     if kind.write_levels is not None:
         rows = ConcatenatedRows.of_level(bundle, bundle.levels[-1].number)
         finest = replace(bundle, levels=[Level(1, NO_SPLATS, on_disk=rows)], rule="", cumulative=False)
-        export_levels(path, finest, antialiased, original_place)
+        export_levels(path, finest, options)
         return
     if origin.any() and kind is not PLY:
         raise LodgsError(
             f"Cannot write {path} at the original place: the format has no double precision.",
             "Write a PLY, USD or glTF, or keep the local origin.",
         )
-    if not (antialiased or kind.antialiased):
+    if not (options.antialiased or kind.antialiased):
         bundle = bake_filter(bundle)
     rows = ConcatenatedRows.of_level(bundle, bundle.levels[-1].number)
     if origin.any():
@@ -120,14 +123,8 @@ def export_finest_level(
     write_splats(path, rows, bundle.meta)
 
 
-def export_levels(
-    path: Path, bundle: Bundle, antialiased: bool = False, original_place: bool = False
-) -> list[str]:
+def export_levels(path: Path, bundle: Bundle, options: FileOptions = DEFAULT_OPTIONS) -> list[str]:
     """Write all levels of a bundle, selected by distance, in the format of the file name.
-
-    Args:
-        antialiased: as for :func:`export_finest_level`.
-        original_place: add the local origin, in double precision.
 
     Returns:
         A sentence about each difference from the bundle's own selection.
@@ -138,19 +135,19 @@ def export_levels(
     kind = find_level_format(path)
     assert kind.write_levels is not None, "it is a format of levels"
     check_degree(kind, bundle.levels[-1].rows)
-    bundle = bundle if antialiased else bake_filter(bundle)
-    levels, notes = portable_levels(bundle, original_place)
+    bundle = bundle if options.antialiased else bake_filter(bundle)
+    levels, notes = portable_levels(bundle, options.original_place)
     kind.write_levels(path, levels)
     return notes
 
 
-def export_tiles(folder: Path, bundle: Bundle, antialiased: bool = False) -> list[str]:
-    """Write all levels of a bundle as 3D Tiles; arguments and result as for :func:`export_levels`.
+def export_tiles(folder: Path, bundle: Bundle, options: FileOptions = DEFAULT_OPTIONS) -> list[str]:
+    """Write all levels of a bundle as 3D Tiles, at their place on Earth; see :func:`export_levels`.
 
     Raises:
         LodgsError: the folder has other files or cannot be written, or the degree is not supported.
     """
     check_degree(GLB, bundle.levels[-1].rows)
-    levels, notes = portable_levels(bundle if antialiased else bake_filter(bundle))
+    levels, notes = portable_levels(bundle if options.antialiased else bake_filter(bundle))
     write_tiles(folder, levels)
     return notes

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from training.editing.bake_filter import bake_filter
-from training.editing.cleaning import Cleaning
-from training.editing.edit import edit
+from training.editing.edit import Outputs, edit
+from training.editing.export import FileOptions
 from training.rasterize import Gaussians, rasterize
 from training.scenes.cameras import Camera, look_at
 from training.scenes.view_tables import make_view_tables
@@ -92,7 +92,7 @@ def test_exports_are_baked_and_bundles_are_not(bundle, tmp_path):
     for antialiased in (False, True):
         paths = tmp_path / f"{antialiased}.ply", tmp_path / f"{antialiased}.splat"
         out = tmp_path / f"{antialiased}_bundle.ply"
-        edit(tmp_path / "bundle.ply", out, Cleaning(), plain=paths, antialiased=antialiased)
+        edit(tmp_path / "bundle.ply", Outputs(out, paths), options=FileOptions(antialiased))
         retained = read_bundle(out)
         assert retained.antialias
         np.testing.assert_array_equal(

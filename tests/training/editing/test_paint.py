@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from tests.training.editing.test_cleaning import bundle_of
-from training.editing.cleaning import Cleaning
-from training.editing.edit import edit
+from training.editing.edit import Outputs, edit
 from training.editing.look import Look, apply_looks
 from training.editing.paint import (
     COLUMNS,
@@ -102,7 +101,7 @@ def test_edit_writes_paint_mixed_in(tmp_path):
     write_bundle(tmp_path / "in.ply", bundle)
     written = read_bundle(tmp_path / "in.ply")
     assert all(set(COLUMNS) <= level.splats.extras.keys() for level in written.levels)
-    edit(tmp_path / "in.ply", tmp_path / "out.ply", Cleaning(), plain=[tmp_path / "plain.ply"])
+    edit(tmp_path / "in.ply", Outputs(tmp_path / "out.ply", plain=[tmp_path / "plain.ply"]))
     result = read_bundle(tmp_path / "out.ply")
     for level, original in zip(result.levels, bundle.levels, strict=True):
         assert not set(COLUMNS) & level.splats.extras.keys()

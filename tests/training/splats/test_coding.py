@@ -7,7 +7,7 @@ import pytest
 from plyfile import PlyData
 
 from training.cli.info import describe
-from training.editing.export import export_finest_level
+from training.editing.export import FileOptions, export_finest_level
 from training.errors import LodgsError
 from training.lod.on_disk import open_if_large, read_part
 from training.splats.bundle import open_bundle, read_bundle, write_bundle
@@ -114,7 +114,7 @@ def test_all_readers_decode_the_same_splats(tmp_path, bundle, file, same):
     write_bundle(tmp_path / "copy.ply", result)
     copy = read_bundle(tmp_path / "copy.ply").levels[1].splats
     assert same(replace(copy, extras={}), replace(finest, extras={}))
-    export_finest_level(tmp_path / "plain.ply", result, antialiased=True)
+    export_finest_level(tmp_path / "plain.ply", result, FileOptions(antialiased=True))
     plain = PlyData.read(tmp_path / "plain.ply")["vertex"]
     np.testing.assert_array_equal(plain["scale_1"], finest.log_scales[:, 1])
 

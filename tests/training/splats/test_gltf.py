@@ -9,7 +9,7 @@ import pytest
 
 from tests.training.splats.level_files import UP, assert_equal, camera, flod, read
 from tests.training.splats.test_formats import random_splats
-from training.editing.export import export_finest_level, export_levels
+from training.editing.export import FileOptions, export_finest_level, export_levels
 from training.errors import LodgsError
 from training.splats import gltf
 from training.splats.formats import find_format
@@ -138,7 +138,7 @@ def test_undrawable_splats_are_dropped_with_a_warning(tmp_path, foreign):
 def test_original_place_survives(tmp_path):
     origin = [448_250.0, 5_411_900.0, 300.0]
     bundle = flod(origin=origin)
-    export_levels(tmp_path / "a.glb", bundle, original_place=True)
+    export_levels(tmp_path / "a.glb", bundle, FileOptions(original_place=True))
     reread = read(tmp_path / "a.glb")
     expected = bundle.levels[2].splats.means.astype(np.float64) + origin
     np.testing.assert_allclose(reread.levels[2].splats.means + reread.origin, expected, atol=1e-4)

@@ -9,8 +9,8 @@ from scipy.spatial import KDTree
 
 from tests.training.splats.test_formats import random_splats
 from tests.training.splats.test_gltf import read_parts
-from training.editing.cleaning import Cleaning
-from training.editing.edit import edit
+from training.editing.edit import Outputs, edit
+from training.editing.export import FileOptions
 from training.splats.bundle import read_bundle, write_bundle
 from training.splats.formats import FORMATS, find_format, open_as_ply
 from training.splats.level_folder import read_folder
@@ -96,8 +96,8 @@ def test_scene_keeps_its_place(source, tmp_path, option, name, options, stated, 
     if ".usd" in name:
         pytest.importorskip("pxr.UsdLod", reason="usd-core is not installed")
     path = tmp_path / name
-    outputs = {"out": None} | {option: [path] if option in ("plain", "levels") else path}
-    edit(source, cleaning=Cleaning(), **outputs, **options)
+    outputs = Outputs(**{option: [path] if option in ("plain", "levels") else path})
+    edit(source, outputs, options=FileOptions(**options))
     expected = read_bundle(source).levels[-1].splats.means.astype(np.float64) + ORIGIN
     if option == "tiles":
         actual, expected = globe_places(path), UtmZone.from_crs(CRS).to_ecef(expected)

@@ -11,7 +11,7 @@ import pytest
 
 from tests.training.splats.level_files import UP, assert_equal, camera, flod, read
 from tests.training.splats.test_formats import random_splats
-from training.editing.export import export_levels
+from training.editing.export import FileOptions, export_levels
 from training.editing.portable import level_distances, portable_levels
 from training.errors import LodgsError
 from training.lod.rule import resolve_rule
@@ -118,7 +118,7 @@ def test_cameras_match_the_views(stage):
 @pytest.mark.parametrize("ending", [".usdc", pytest.param(".usdz", marks=pytest.mark.nightly)])
 def test_levels_round_trip(tmp_path, ending):
     bundle = flod(antialias=True)
-    export_levels(tmp_path / f"a{ending}", bundle, antialiased=True)
+    export_levels(tmp_path / f"a{ending}", bundle, FileOptions(antialiased=True))
     reread = read(tmp_path / f"a{ending}")
     assert (reread.method, reread.rule, reread.antialias) == ("flod", "bands", True)
     for level, original in zip(reread.levels, bundle.levels, strict=True):
@@ -164,7 +164,7 @@ def test_original_place_survives(tmp_path, edited):
     """UTM coordinates return within a tenth of a millimetre, also after another program moved the scene."""
     origin = [448_250.0, 5_411_900.0, 300.0]
     bundle = flod(origin=origin)
-    export_levels(tmp_path / "a.usdc", bundle, original_place=True)
+    export_levels(tmp_path / "a.usdc", bundle, FileOptions(original_place=True))
     if edited:
         usd = load_usd()
         stage = usd.Usd.Stage.Open(str(tmp_path / "a.usdc"))

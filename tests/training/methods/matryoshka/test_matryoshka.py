@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from training.editing.export import export_finest_level
+from training.editing.export import FileOptions, export_finest_level
 from training.lod.rule import rules
 from training.lod.selection import resolve_controls, select
 from training.methods import create, method_info
@@ -119,7 +119,7 @@ def test_truncated_plain_ply_is_a_level(data, tmp_path):
     method = make(data)
     bundle = bundle_of(method, trained(method))
     write_bundle(tmp_path / "bundle.ply", bundle)
-    export_finest_level(tmp_path / "plain.ply", bundle, antialiased=True)
+    export_finest_level(tmp_path / "plain.ply", bundle, FileOptions(antialiased=True))
     values = resolve_controls(bundle, {"at_most": 20, "distance_scale": 0.01})
     expected, weights = select(bundle, data.train[0].center, data.train[0].focal, values)
     assert weights is None and len(expected) == 20
