@@ -21,6 +21,7 @@ sys.path.insert(0, str(ROOT))
 
 from tools.interop_results import Record, read_results  # noqa: E402
 from training.cli import COMMANDS  # noqa: E402
+from training.cli.options import option_name  # noqa: E402
 from training.lod.rule import Control, Rule, rules  # noqa: E402
 from training.methods import METHODS, PRESETS, MethodInfo  # noqa: E402
 from training.runs.job import CHANGEABLE, KEYS, Job  # noqa: E402
@@ -88,7 +89,7 @@ def controls_page() -> str:
         about = (getdoc(getmodule(rule)) or "").split("\n\n")[0].replace("\n", " ")
         parts += [f"## {rule.name}", f"{about} Used by: {', '.join(users) or 'no method'}."]
         rows = [
-            [f"`--{control.name.replace('_', '-')}`", control.label, f"{control.about}.",
+            [f"`{option_name(control.name)}`", control.label, f"{control.about}.",
              _range(control), _default(rule, control)]
             for control in rule.controls
         ]  # fmt: skip
@@ -378,7 +379,7 @@ def _range(control: Control) -> str:
     if control.follows:
         return "existing levels"
     text = f"{_value(control.low)} to {_value(control.high)}" + (", whole number" if control.integer else "")
-    return text + (" pixels" if control.unit == "PIXEL" else "")
+    return text + (f" {control.unit}" if control.unit else "")
 
 
 def _default(rule: Rule, control: Control) -> str:

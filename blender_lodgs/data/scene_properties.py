@@ -10,6 +10,7 @@ from ...training.lod.rule import Control, Rule, resolve_rule, rules
 from ..nodes.camera_choices import CHOICES, find_choice
 from .property_callbacks import look_up, tag_owner
 from .selection import read_json
+from .setting_properties import SUBTYPES
 from .training import TrainingSettings
 
 _view_chosen = look_up("active_view")
@@ -187,7 +188,7 @@ def _control_group(rule: Rule) -> type[bpy.types.PropertyGroup]:
         make = bpy.props.IntProperty if control.integer else bpy.props.FloatProperty
         options |= {"step": control.step} if control.integer else {}
         return make(
-            subtype=control.unit, default=number(control.default),
+            subtype=SUBTYPES.get(control.unit, "NONE"), default=number(control.default),
             min=number(control.low), max=number(control.high),
             soft_min=number(soft[0]), soft_max=number(soft[1]), **options,
         )  # fmt: skip

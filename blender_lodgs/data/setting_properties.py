@@ -10,7 +10,7 @@ import bpy
 from ...training.settings import MAX_INTEGER, default_of, label_of
 
 _MAX_FLOAT = 3.4e38
-_SUBTYPES = {"px": "PIXEL", "length": "DISTANCE", "K": "COLOR_TEMPERATURE"}
+SUBTYPES = {"px": "PIXEL", "length": "DISTANCE", "K": "COLOR_TEMPERATURE"}
 """Subtypes of properties by unit."""
 _MIN_STEP = 1e-6
 """Smallest number above 0 that Blender displays."""
@@ -33,7 +33,7 @@ def property_of(f: Field, **options: Any) -> Any:
     if isinstance(default, str):
         return _text_property(f, options)
     bounded = isinstance(default, float) and (f.metadata["low"], f.metadata["high"]) == (0, 1)
-    subtype = _SUBTYPES.get(f.metadata["unit"], "FACTOR" if bounded else "NONE")
+    subtype = SUBTYPES.get(f.metadata["unit"], "FACTOR" if bounded else "NONE")
     options = {"subtype": subtype, **_ranges(f), **options}
     if isinstance(f.default, tuple):
         return bpy.props.FloatVectorProperty(size=len(f.default), **options)

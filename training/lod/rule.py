@@ -63,7 +63,7 @@ class Control:
         low, high: minimum and maximum.
         soft: range of the slider; None shows a checkbox or a number field instead of a slider.
         label, about: label and tooltip.
-        unit: Blender's subtype of the property: "NONE", "PIXEL", "FACTOR".
+        unit: "px", or "" for a pure number.
         integer: only whole numbers are valid; with the range 0 to 1 the control is a checkbox.
         step: step of the arrows of a whole number.
         follows: "coarsest" or "finest" if the value is the number of a level and follows the existing levels
@@ -77,7 +77,7 @@ class Control:
     label: str
     about: str
     soft: tuple[float, float] | None = None
-    unit: str = "NONE"
+    unit: str = ""
     integer: bool = False
     step: int = 1
     follows: str = ""

@@ -43,7 +43,7 @@ class Bands(Rule):
             "gamma", 1.0, 0.01, 1000.0, "Screen Size",
             "γ: switch to a finer level if the smallest detail of the coarser one covers this many pixels. "
             "Smaller is finer",
-            soft=(0.1, 10.0), unit="PIXEL",
+            soft=(0.1, 10.0), unit="px",
         ),
         Control(
             "first", 1, 1, MAX_LEVEL, "Coarsest", "Coarsest level in use, shown at the largest distances",

@@ -192,7 +192,7 @@ class Cut(Rule):
             "pixels", 1.0, 0.1, 100.0, "Granularity",
             "Replace a branch of the tree by its root if that covers at most this many pixels. Smaller is "
             "finer",
-            soft=(0.5, 16.0), unit="PIXEL",
+            soft=(0.5, 16.0), unit="px",
         ),
     )  # fmt: skip
     sweep = ("pixels", (0.5, 1.0, 2.0, 4.0, 8.0, 16.0))
