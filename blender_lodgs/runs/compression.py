@@ -5,12 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import asdict
 from pathlib import Path
 
 import bpy
 
-from ...training.cli.options import option_name
+from ...training.cli.options import option_name, option_words
 from ...training.editing.export import DEFAULT_OPTIONS, FileOptions
 from ...training.errors import LodgsError
 from ...training.files import temporary_folder
@@ -57,8 +56,7 @@ def convert_steps(
     Raises:
         LodgsError: the trainer is missing or fails.
     """
-    options = [option_name(name) for name, value in asdict(file_options).items() if value]
-    for lines in _trainer_steps(bundle, "edit", option, str(path), *options):
+    for lines in _trainer_steps(bundle, "edit", option, str(path), *option_words(file_options)):
         yield " ".join(line for line in lines if line.endswith("."))
 
 

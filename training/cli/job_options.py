@@ -12,7 +12,7 @@ from ..documents import parse_json
 from ..errors import LodgsError, printable
 from ..runs.job import Job
 from ..settings import settings_of
-from .options import add_setting, option_name
+from .options import add_setting, option_words
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -56,12 +56,7 @@ def options_of(job: Job, exclude: Collection[str] = ()) -> list[str]:
     Args:
         exclude: keys to omit.
     """
-    words: list[str] = []
-    for name, f in settings_of(job).items():
-        value = getattr(job, name)
-        if name not in exclude and value != f.default:
-            switch = option_name(name if value else f"no_{name}")
-            words += [switch] if isinstance(value, bool) else [option_name(name), str(value)]
+    words = option_words(job, exclude)
     for name, value in job.parameters.items():
         words += ["--set", f"{name}={json.dumps(value)}"]
     return words

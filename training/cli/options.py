@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import Field
 from math import inf
 from pathlib import Path
@@ -119,6 +119,21 @@ def setting_values(options: argparse.Namespace, declaration: Any) -> dict[str, A
         for entry in value if isinstance(value, list) else [value]:
             check_value(settings_of(declaration)[name], entry)
     return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
+
+
+def option_words(settings: Any, exclude: Collection[str] = ()) -> list[str]:
+    """Return the words that :func:`add_setting` parses to the settings of an instance, without defaults.
+
+    Args:
+        exclude: names of settings to omit.
+    """
+    words: list[str] = []
+    for name, f in settings_of(settings).items():
+        value = getattr(settings, name)
+        if name not in exclude and value != f.default:
+            switch = option_name(name if value else f"no_{name}")
+            words += [switch] if isinstance(value, bool) else [option_name(name), str(value)]
+    return words
 
 
 def _parser_of(f: Field) -> Callable[[str], bool | int | float | str]:
