@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from training.__main__ import main
-from training.runs.measure import format_report
+from training.runs.report_text import format_report
 from training.scenes.cameras import Camera, write_camera
 from training.splats.bundle import write_bundle
 from training.splats.gaussians import Splats

@@ -22,7 +22,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
     from ..evaluate.lpips import missing_line
-    from ..runs.measure import evaluate_run, format_report
+    from ..runs.measure import evaluate_run
+    from ..runs.report_text import format_report
 
     weights = lpips_archive(options)
     report = evaluate_run(options.run, control_values(options), options.picture, options.far, warn, weights)

@@ -22,7 +22,8 @@ from training.optimize.merging import merge
 from training.rasterize import Gaussians, Target, rasterize
 from training.runs.folder import RunFolder
 from training.runs.job import Job
-from training.runs.measure import evaluate_run, format_report, size_lines
+from training.runs.measure import evaluate_run
+from training.runs.report_text import format_report, size_lines
 from training.scenes.cameras import Camera, write_camera
 from training.scenes.colmap import read_scene
 from training.splats.bundle import write_bundle
