@@ -81,7 +81,7 @@ def train(root: bpy.types.Object) -> Steps:
     scroll(4)
     yield from settle()
     screenshot("cells", f"{states()}")
-    press("lodgs.cancel_block", block=number)
+    press("lodgs.cancel_cell", cell=number)
     yield from until(lambda: states()[number - 1] == "cancelled", 120)
     yield from settle()
     screenshot("one-cancelled", f"{states()}")
@@ -98,7 +98,7 @@ def train(root: bpy.types.Object) -> Steps:
         "The run is not found after reopening the file."
     )
     assert states()[number - 1] == "cancelled", f"{states()}"
-    press("lodgs.resume_block", block=number)
+    press("lodgs.resume_cell", cell=number)
     yield from until(lambda: states()[number - 1] in ("waiting", "running"), 60)
     yield from settle()
     screenshot("found-and-resumed", f"{states()}")

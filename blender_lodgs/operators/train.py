@@ -102,23 +102,23 @@ class LODGS_OT_plan_cells(SceneOperator, SteppedOperator, bpy.types.Operator):
 
 
 class _CellOperator(SceneOperator):
-    block: bpy.props.IntProperty(name="Cell", description="Cell number, from 1", min=1, default=1)
+    cell: bpy.props.IntProperty(name="Cell", description="Cell number, from 1", min=1, default=1)
 
 
-class LODGS_OT_cancel_block(_CellOperator, bpy.types.Operator):
-    bl_idname = "lodgs.cancel_block"
+class LODGS_OT_cancel_cell(_CellOperator, bpy.types.Operator):
+    bl_idname = "lodgs.cancel_cell"
     bl_label = "Cancel Cell"
     bl_description = "Save this cell's checkpoint and stop it, while the other cells continue"
     bl_options = {"INTERNAL"}
 
     @report_errors
     def execute(self, context):
-        jobs.cancel_block(roots.active_root(context), self.block)
+        jobs.cancel_cell(roots.active_root(context), self.cell)
         return {"FINISHED"}
 
 
-class LODGS_OT_resume_block(_CellOperator, bpy.types.Operator):
-    bl_idname = "lodgs.resume_block"
+class LODGS_OT_resume_cell(_CellOperator, bpy.types.Operator):
+    bl_idname = "lodgs.resume_cell"
     bl_label = "Resume Cell"
     bl_description = "Continue this cell from its last checkpoint, along with the cells that are running"
     bl_options = {"INTERNAL"}
@@ -127,7 +127,7 @@ class LODGS_OT_resume_block(_CellOperator, bpy.types.Operator):
     def execute(self, context):
         root = roots.active_root(context)
         followed = watch_of(root)
-        watch = jobs.resume_block(root, self.block)
+        watch = jobs.resume_cell(root, self.cell)
         return {"FINISHED"} if watch is followed else _follow(self, watch)
 
 
@@ -223,8 +223,8 @@ CLASSES = (
     LODGS_OT_resume_training,
     LODGS_OT_cancel_training,
     LODGS_OT_plan_cells,
-    LODGS_OT_cancel_block,
-    LODGS_OT_resume_block,
+    LODGS_OT_cancel_cell,
+    LODGS_OT_resume_cell,
     LODGS_OT_open_run,
     LODGS_OT_show_log,
     LODGS_OT_show_costs,

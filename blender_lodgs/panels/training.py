@@ -22,7 +22,7 @@ from ..runs import environment, job_settings, run_folders, scene_check
 from ..runs.messages import measured_on, progress_facts, short_level_line
 from ..runs.watch import Watch, watch_of
 from .parts import Panel, draw_environment, draw_views, say, scene_length, split_column
-from .training_cells import draw_blocks
+from .training_cells import draw_cells
 
 
 class LODGS_PT_training(Panel):
@@ -214,7 +214,7 @@ def _draw_running(layout: bpy.types.UILayout, watch: Watch, root: bpy.types.Obje
         layout.label(text="Cancel again to stop immediately", icon="INFO")
     elif watch.unresponsive:
         say(layout, "The trainer is not responding. Cancel it, then resume.", "ERROR")
-    draw_blocks(layout, root, watch)
+    draw_cells(layout, root, watch)
     facts = progress_facts(watch.progress)
     if facts:
         grid = layout.grid_flow(row_major=True, columns=2, even_columns=True)
@@ -247,7 +247,7 @@ def _draw_ended(layout: bpy.types.UILayout, watch: Watch, root: bpy.types.Object
     for warning in watch.warnings[-3:]:
         say(box, warning, "INFO")
     if watch.state != "done":
-        draw_blocks(box, root, watch)
+        draw_cells(box, root, watch)
         row = box.row()
         row.operator("lodgs.resume_training", text="Resume", icon="PLAY")
         if watch.problem:

@@ -48,9 +48,9 @@ class LODGS_UL_blocks(bpy.types.UIList):
             if watch.running and part.state == "waiting" and stopping:
                 row.label(icon="BLANK1")
             elif watch.running and part.state in ("waiting", "running"):
-                row.operator("lodgs.cancel_block", text="", icon="X", emboss=False).block = number
+                row.operator("lodgs.cancel_cell", text="", icon="X", emboss=False).cell = number
             elif part.state != "done":
-                row.operator("lodgs.resume_block", text="", icon="PLAY", emboss=False).block = number
+                row.operator("lodgs.resume_cell", text="", icon="PLAY", emboss=False).cell = number
 
 
 def _draw_part(layout: bpy.types.UILayout, part: RunPart, stopping: bool = False) -> None:
@@ -124,7 +124,7 @@ def _draw_plan(layout, settings):
     layout.label(text=f"{cell.points:,} initial points, {cell.steps:,} steps")
 
 
-def draw_blocks(layout: bpy.types.UILayout, root: bpy.types.Object, watch: Watch) -> None:
+def draw_cells(layout: bpy.types.UILayout, root: bpy.types.Object, watch: Watch) -> None:
     """Draw the progress of each cell of a run, with a button to cancel or resume it."""
     settings = root.lodgs.training
     coarse = watch.part(0)

@@ -155,7 +155,7 @@ def cancel(root: bpy.types.Object) -> None:
     extension.redraw()
 
 
-def cancel_block(root: bpy.types.Object, number: int) -> None:
+def cancel_cell(root: bpy.types.Object, number: int) -> None:
     """Ask the training of one cell to save and stop. Other cells continue.
 
     Raises:
@@ -173,7 +173,7 @@ def cancel_block(root: bpy.types.Object, number: int) -> None:
     extension.redraw()
 
 
-def resume_block(root: bpy.types.Object, number: int) -> Watch:
+def resume_cell(root: bpy.types.Object, number: int) -> Watch:
     """Resume the training of one cell. If no other cell is running, only this cell is trained.
 
     Raises:

@@ -117,7 +117,7 @@ def test_progress_of_each_cell_is_shown(lodgs, root, draw_panel, draw_line, watc
                               _part(2, "block", "waiting", 0)])  # fmt: skip
     assert {"Coarse levels", "40%"} <= set(panel().texts)
     assert draw_line("blocks", 0).texts == ["1", "Waiting"] and draw_line("blocks", 0).operators == [
-        "lodgs.cancel_block"
+        "lodgs.cancel_cell"
     ]
     watch.stopping = {("block", 1)}
     assert draw_line("blocks", 0).texts[:2] == ["1", "Cancelled"] and not draw_line("blocks", 0).operators
@@ -126,10 +126,10 @@ def test_progress_of_each_cell_is_shown(lodgs, root, draw_panel, draw_line, watc
                               _part(2, "block", "cancelled", 50)])  # fmt: skip
     assert "Coarse levels" not in panel().texts
     assert draw_line("blocks", 0).texts == ["1", "25%"] and draw_line("blocks", 0).operators == [
-        "lodgs.cancel_block"
+        "lodgs.cancel_cell"
     ]
     layout = draw_line("blocks", 1)
-    assert layout.texts == ["2", "Cancelled at 50%"] and layout.operators == ["lodgs.resume_block"]
+    assert layout.texts == ["2", "Cancelled at 50%"] and layout.operators == ["lodgs.resume_cell"]
     watch.stopping = {("block", 1)}
     assert draw_line("blocks", 0).texts == ["1", "Stopping at 25%"]
     blocks = [_part(number, "block", "done", 100) for number in (1, 2)]
@@ -139,7 +139,7 @@ def test_progress_of_each_cell_is_shown(lodgs, root, draw_panel, draw_line, watc
     assert draw_line("blocks", 1).texts == ["2", "Done"] and not draw_line("blocks", 1).operators
     watch.state = "cancelled"
     assert draw_line("blocks", 0).texts == ["1", "Stopped at 92%"]
-    assert draw_line("blocks", 0).operators == ["lodgs.resume_block"]
+    assert draw_line("blocks", 0).operators == ["lodgs.resume_cell"]
 
 
 def test_remaining_time_needs_a_speed(lodgs):

@@ -158,15 +158,15 @@ def test_one_cell_is_cancelled_and_resumed(bpy, jobs, fake, root, tmp_path):
     watch = jobs.start(root, str(tmp_path / "run"))
     _wait(watch, lambda: watch.blocks)
     with pytest.raises(RuntimeError, match="Cannot resume cell 2 of 'lantern_garden'"):
-        bpy.ops.lodgs.resume_block(block=2)
-    assert bpy.ops.lodgs.cancel_block(block=2) == {"FINISHED"}
+        bpy.ops.lodgs.resume_cell(cell=2)
+    assert bpy.ops.lodgs.cancel_cell(cell=2) == {"FINISHED"}
     assert watch.stopping == {("block", 2)}
     _wait(watch, lambda: _states(watch) == ["running", "cancelled"])
     assert not watch.stopping
     for number in (2, 3):
         with pytest.raises(RuntimeError, match=f"cell {number} of 'lantern_garden': it is not being trained"):
-            bpy.ops.lodgs.cancel_block(block=number)
-    assert bpy.ops.lodgs.resume_block(block=2) == {"FINISHED"}
+            bpy.ops.lodgs.cancel_cell(cell=number)
+    assert bpy.ops.lodgs.resume_cell(cell=2) == {"FINISHED"}
     _wait(watch, lambda: _states(watch) == ["running"] * 2)
     (tmp_path / "run" / "go on").touch()
     jobs.follow(watch)
@@ -181,15 +181,15 @@ def test_cancelled_run_resumes_one_or_all_cells(bpy, lodgs, jobs, fake, root, tm
     jobs.follow(watch)
     assert (watch.state, watch.problem) == ("cancelled", "")
     with pytest.raises(RuntimeError, match="it is not being trained"):
-        bpy.ops.lodgs.cancel_block(block=1)
+        bpy.ops.lodgs.cancel_cell(cell=1)
     (tmp_path / "run" / "go on").touch()
     with pytest.raises(RuntimeError, match="cell 3"):
-        bpy.ops.lodgs.resume_block(block=3)
-    bpy.ops.lodgs.resume_block(block=1)
+        bpy.ops.lodgs.resume_cell(cell=3)
+    bpy.ops.lodgs.resume_cell(cell=1)
     watch = lodgs("runs.watch").watch_of(root)
     assert (watch.state, _states(watch)) == ("cancelled", ["done", "cancelled"])
     with pytest.raises(RuntimeError, match="it is not stopped"):
-        bpy.ops.lodgs.resume_block(block=1)
+        bpy.ops.lodgs.resume_cell(cell=1)
     assert bpy.ops.lodgs.resume_training() == {"FINISHED"}
     watch = lodgs("runs.watch").watch_of(root)
     assert (watch.state, _states(watch)) == ("done", ["done"] * 2)
@@ -209,7 +209,7 @@ def test_reopened_file_attaches_to_its_cells(bpy, lodgs, jobs, fake, root, tmp_p
     assert attached is not watch and attached.running
     assert attached.process is None and len(attached.blocks) == 2
     _wait(attached, lambda: len(root.lodgs.training.planned_cells) == 2)
-    jobs.cancel_block(root, 1)
+    jobs.cancel_cell(root, 1)
     _wait(attached, lambda: _states(attached)[0] == "cancelled")
     jobs.cancel(root)
     _wait(attached, lambda: not attached.running)
