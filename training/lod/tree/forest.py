@@ -104,11 +104,6 @@ class ForestShape:
         """First node and end of each subtree."""
         return list(zip(self.begins.tolist(), self.ends.tolist(), strict=True))
 
-    @property
-    def in_upper(self) -> np.ndarray:
-        """Nodes of the upper tree with its leaves, (2G - 1,) int64, in the upper tree's order."""
-        return np.append(self.ends - 1, np.arange(self.ends[-1], len(self)))
-
 
 def forest_shape(tree: Tree, max_leaves: int) -> tuple[np.ndarray, ForestShape]:
     """Split a tree into the largest subtrees of at most ``max_leaves`` leaves, sorted by their first leaves.

@@ -36,7 +36,8 @@ class SequentialPointTree:
         self, tree: Tree, means: np.ndarray, sizes: np.ndarray, log_scales: np.ndarray, longest: int = 0
     ) -> None:
         order, forest = forest_shape(tree, longest or max(math.isqrt(len(tree)) // 6, 1))
-        names = self._names = order[forest.in_upper]
+        in_upper = np.append(forest.ends - 1, np.arange(forest.ends[-1], len(forest)))
+        names = self._names = order[in_upper]
         inside = order[: forest.ends[-1]]
         bounds = node_bounds(means[inside], log_scales[inside], forest.begins)
         self._upper = UpperTree.from_bounds(
