@@ -9,7 +9,7 @@ from ...training.splats.level_colors import level_color
 from ..data import cells, roots, viewpoints
 from ..runs import job_settings, run_folders
 from ..runs.watch import RunPart, Watch, watch_of
-from .parts import Panel, say, split_column
+from .parts import Panel, say, short_count, split_column
 
 _NUMBER_WIDTH = 0.16
 """Fraction of a row's width for the cell's colour and number."""
@@ -29,7 +29,7 @@ class LODGS_UL_cells(bpy.types.UIList):
         self, context, layout, data, item, icon, active_data, active_property, index: int = 0, flt_flag=0
     ):
         row = _numbered(layout, index + 1)
-        _columns(row, str(item.views), _brief(item.splats), _memory(item.megabytes))
+        _columns(row, str(item.views), short_count(item.splats), _memory(item.megabytes))
 
 
 class LODGS_UL_blocks(bpy.types.UIList):
@@ -153,13 +153,6 @@ def _columns(row: bpy.types.UILayout, *texts: str) -> None:
     grid = row.grid_flow(row_major=True, columns=len(texts), even_columns=True, align=True)
     for text in texts:
         grid.label(text=text)
-
-
-def _brief(value: float) -> str:
-    """Format a number for a narrow column: 9,812; 68.3 k; 1.23 M."""
-    if value < 10_000:
-        return f"{value:,.0f}"
-    return f"{value / 1e3:.3g} k" if value < 999_500 else f"{value / 1e6:.3g} M"
 
 
 def _memory(megabytes: float) -> str:

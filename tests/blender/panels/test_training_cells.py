@@ -69,7 +69,7 @@ def test_planning_is_offered_for_several_cells(bpy, root, draw, draw_line):
     assert OUTDATED in draw().texts
     settings.planned_cells[0].points, settings.planned_cells[0].splats = 68_349, 1_234_567
     settings.planned_cells[0].steps, settings.planned_cells[0].megabytes = 9812, 2345.6
-    assert draw_line("cells", 0).texts == ["1", str(settings.planned_cells[0].views), "1.23 M", "2.3 GB"]
+    assert draw_line("cells", 0).texts == ["1", str(settings.planned_cells[0].views), "1.2 M", "2.3 GB"]
     assert "68,349 initial points, 9,812 steps" in draw().texts
     assert draw_line("cells", 1).colors == [(*level_color(2), 1.0)]
 
