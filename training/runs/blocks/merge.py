@@ -22,7 +22,7 @@ from ...splats.levels import NO_SPLATS, Bundle, Level
 from ...splats.ply import BATCH_ROWS, write_ply
 from ...splats.scratch import ScratchFile
 from ..folder import RunFolder
-from .plan import Block, Division
+from .plan import Division, Part
 
 
 def merge(division: Division, path: Path) -> list[tuple[int, int]]:
@@ -73,7 +73,7 @@ def merge(division: Division, path: Path) -> list[tuple[int, int]]:
     return counts
 
 
-def write_surroundings(division: Division, seam: Block) -> None:
+def write_surroundings(division: Division, seam: Part) -> None:
     """Write the base of a seam's training unless it exists.
 
     The base has the splats of full detail: inside the enlarged cell those of each block within its own cell,
@@ -107,7 +107,7 @@ def write_surroundings(division: Division, seam: Block) -> None:
 class _FittedBorder:
     """Splats near a cell's borders as trained by its seam, in the order of the block."""
 
-    def __init__(self, seam: Block) -> None:
+    def __init__(self, seam: Part) -> None:
         assert seam.region is not None
         self._path = seam.folder.path
         self._region = seam.region
@@ -142,7 +142,7 @@ def _batches(rows: FileRows) -> Iterator[Splats]:
         yield drop_undrawable(rows.select(slice(start, start + BATCH_ROWS)), rows.path)
 
 
-def _check_compatible(block: Block, bundle: tuple[Bundle, Mapping[int, FileRows]], first: Bundle) -> None:
+def _check_compatible(block: Part, bundle: tuple[Bundle, Mapping[int, FileRows]], first: Bundle) -> None:
     head, rows = bundle
     if not rows or _kind(head) != _kind(first):
         raise LodgsError(

@@ -53,7 +53,7 @@ SPLAT_BYTES = 2_300
 
 
 @dataclass(frozen=True)
-class Block:
+class Part:
     """Part of a divided run, trained as an ordinary run.
 
     Attributes:
@@ -93,16 +93,16 @@ class Division:
         seams: parts that fit the borders of cells; empty without polishing.
     """
 
-    coarse: Block | None
-    blocks: list[Block]
-    seams: list[Block]
+    coarse: Part | None
+    blocks: list[Part]
+    seams: list[Part]
 
     @property
-    def stages(self) -> list[list[Block]]:
+    def stages(self) -> list[list[Part]]:
         """Parts that can be trained in parallel, stage by stage."""
         return [[self.coarse] if self.coarse else [], self.blocks, self.seams]
 
-    def part(self, name: str) -> Block | None:
+    def part(self, name: str) -> Part | None:
         """Return the part ``coarse``, ``block-3`` or ``seam-3``; None if this division does not need it.
 
         Raises:
@@ -300,9 +300,7 @@ def read_plan(folder: RunFolder) -> Division:
             "Plan them with lodgs blocks plan, or in the panel.",
         )
     coarse = RunFolder(folder.coarse)
-    return Division(
-        Block(0, coarse, None) if coarse.job.exists() else None, blocks, _read_parts(folder.seams)
-    )
+    return Division(Part(0, coarse, None) if coarse.job.exists() else None, blocks, _read_parts(folder.seams))
 
 
 def read_planned_job(path: Path) -> Job:
@@ -377,10 +375,10 @@ def _write_part(job: Job, path: Path, region: Region | None = None, base: Path |
     replace(job, out=str(path), region=region_path, base=base_path).write(path / "job.toml")
 
 
-def _read_parts(folder: Path) -> list[Block]:
+def _read_parts(folder: Path) -> list[Part]:
     numbers = sorted(int(path.name) for path in folder.glob("*") if path.name.isdecimal())
     return [
-        Block(number, RunFolder(path := folder / str(number)), Region.read(path / REGION))
+        Part(number, RunFolder(path := folder / str(number)), Region.read(path / REGION))
         for number in numbers
     ]
 

@@ -11,27 +11,27 @@ from ...errors import LodgsError, error_cause
 from ..failures import BAD_INPUT, CANCELLED, DONE
 from ..outcome import run_outcome
 from .merge import merge, write_surroundings
-from .plan import BLOCK, Block, Division
+from .plan import BLOCK, Division, Part
 from .workers import Pending, Submit
 
 POLL_SECONDS = 0.5
-"""Seconds between checks of the blocks' progress."""
+"""Seconds between checks of the parts' progress."""
 MAX_PROGRESS_SECONDS = 20.0
 """Maximum seconds between ``progress`` events."""
 START_SECONDS = 10.0
 """Seconds in which a worker starts a submitted part and can then be asked to stop."""
 MAX_ATTEMPTS = 3
-"""Number of lost trainers of a block without progress before the run fails."""
+"""Number of lost trainers of a part without progress before the run fails."""
 
 Report = Callable[..., object]
 """Called with an event's kind and values."""
 
 
 class BlocksStopped(Exception):
-    """Some blocks were cancelled, as listed in the message; all others are finished."""
+    """Some parts were cancelled, as listed in the message; all others are finished."""
 
 
-def prepare_part(division: Division, part: Block) -> None:
+def prepare_part(division: Division, part: Part) -> None:
     """Write the base of a part from the finished parts of earlier stages.
 
     Raises:
@@ -60,12 +60,12 @@ def train_blocks(division: Division, path: Path, submit: Submit, report: Report)
     """
     if path.exists():
         return
-    stages = [[_BlockWatch(part, division) for part in stage] for stage in division.stages]
+    stages = [[_PartWatch(part, division) for part in stage] for stage in division.stages]
     watches = [watch for stage in stages for watch in stage]
-    requested = [watch.block for watch in watches if watch.block.folder.take_resume()]
-    kinds = {block.kind for block in requested}
+    requested = [watch.part for watch in watches if watch.part.folder.take_resume()]
+    kinds = {part.kind for part in requested}
     for watch in watches:
-        if watch.code is None and watch.block not in requested and watch.block.kind in kinds:
+        if watch.code is None and watch.part not in requested and watch.part.kind in kinds:
             watch.code = CANCELLED
     for stage in stages:
         _train_stage(stage, watches, submit, report)
@@ -78,7 +78,7 @@ def train_blocks(division: Division, path: Path, submit: Submit, report: Report)
 
 
 def _train_stage(
-    stage: Sequence[_BlockWatch], watches: Sequence[_BlockWatch], submit: Submit, report: Report
+    stage: Sequence[_PartWatch], watches: Sequence[_PartWatch], submit: Submit, report: Report
 ) -> None:
     try:
         for watch in stage:
@@ -105,15 +105,15 @@ def _train_stage(
     for watch in stage:
         if watch.code not in (DONE, CANCELLED):
             raise watch.error()
-    if stopped := [watch.block.name for watch in stage if watch.code == CANCELLED]:
+    if stopped := [watch.part.name for watch in stage if watch.code == CANCELLED]:
         raise BlocksStopped(f"Stopped: {', '.join(stopped)}. The run can be resumed.")
 
 
-def _stop_stage(stage: Sequence[_BlockWatch]) -> None:
+def _stop_stage(stage: Sequence[_PartWatch]) -> None:
     """Cancel all parts: running trainers save first, submitted ones do not start."""
     unfinished = [watch for watch in stage if not watch.finished]
     for watch in unfinished:
-        watch.block.folder.request_cancel()
+        watch.part.folder.request_cancel()
     deadline = time.monotonic() + START_SECONDS
     while not all(watch.finished for watch in unfinished):
         time.sleep(POLL_SECONDS)
@@ -121,39 +121,39 @@ def _stop_stage(stage: Sequence[_BlockWatch]) -> None:
             for watch in unfinished:
                 watch.abandon()
     for watch in unfinished:
-        watch.block.folder.take_cancel()  # no trainer has consumed it
+        watch.part.folder.take_cancel()  # no trainer has consumed it
 
 
-class _BlockWatch:
+class _PartWatch:
     """Submits a part and follows its progress.
 
     Attributes:
         code: exit code of the last trainer; None while training continues or is retried.
     """
 
-    def __init__(self, block: Block, division: Division) -> None:
-        self.block = block
+    def __init__(self, part: Part, division: Division) -> None:
+        self.part = part
         self._division = division
-        block.folder.take_cancel()  # meant for an earlier trainer
+        part.folder.take_cancel()  # meant for an earlier trainer
         self._pending: Pending | None = None
         self.code: int | None = None
-        if block.folder.bundle.exists() and block.folder.state() == "done":
+        if part.folder.bundle.exists() and part.folder.state() == "done":
             self.code = DONE
         self._attempts = 0
         self._last_step = -1
-        self.progress = block.folder.last_event("progress") or {}
-        self._offset = block.folder.events()[1]
+        self.progress = part.folder.last_event("progress") or {}
+        self._offset = part.folder.events()[1]
         self._started = False
-        self.steps = block.job.resolved_parameters().total_steps
+        self.steps = part.job.resolved_parameters().total_steps
         self._worker_error = ""
         self._start_error: LodgsError | None = None
 
     def start(self, submit: Submit) -> None:
         """Submit the part unless it is finished."""
         if self.code is None:
-            prepare_part(self._division, self.block)
+            prepare_part(self._division, self.part)
             self._started = False
-            self._pending = submit(self.block.folder.path)
+            self._pending = submit(self.part.folder.path)
 
     def abandon(self) -> None:
         """Cancel the submission if no worker has started it."""
@@ -163,16 +163,16 @@ class _BlockWatch:
     @property
     def finished(self) -> bool:
         """True if no trainer is running, not even one whose worker was lost."""
-        return self._pending is None or (self._pending.done() and not self.block.folder.running)
+        return self._pending is None or (self._pending.done() and not self.part.folder.running)
 
     def poll(self, submit: Submit) -> bool:
         """Read progress; restart after a lost worker or on a resume request; return whether it has ended."""
-        if self.code == CANCELLED and self.block.folder.take_resume():
+        if self.code == CANCELLED and self.part.folder.take_resume():
             self.code = None
             self.start(submit)
         if self.code is not None:
             return True
-        events, self._offset = self.block.folder.events(self._offset)
+        events, self._offset = self.part.folder.events(self._offset)
         for event in events:
             self._started = True
             if event["event"] == "progress":
@@ -219,28 +219,28 @@ class _BlockWatch:
             error = self._start_error
             return LodgsError(f"{self._name}: {error.what}", error.remedy, error_cause(error))
         if self.code == BAD_INPUT:
-            end = self.block.folder.end_event()
+            end = self.part.folder.end_event()
             if end is not None and end["event"] == "error":
                 return LodgsError(f"{self._name}: {end['what']}", end.get("remedy", ""), end.get("cause"))
-            return LodgsError(f"{self._name}: {run_outcome(self.block.folder, self.code)[1]}")
+            return LodgsError(f"{self._name}: {run_outcome(self.part.folder, self.code)[1]}")
         reason = f" ({self._worker_error})" if self._worker_error else ""
         return LodgsError(
-            f"The trainer of {self.block.name} was lost {MAX_ATTEMPTS} times at step {self.step}{reason}.",
-            f"Read its log, {self.block.folder.log}.",
+            f"The trainer of {self.part.name} was lost {MAX_ATTEMPTS} times at step {self.step}{reason}.",
+            f"Read its log, {self.part.folder.log}.",
         )
 
     @property
     def _name(self) -> str:
-        return self.block.name[0].upper() + self.block.name[1:]
+        return self.part.name[0].upper() + self.part.name[1:]
 
 
-def _progress(watches: Sequence[_BlockWatch]) -> dict:
+def _progress(watches: Sequence[_PartWatch]) -> dict:
     """Return the values of a ``progress`` event for all parts together, with the state of each."""
     reports = [watch.progress for watch in watches if watch.progress]
     step = sum(watch.step for watch in watches)
     steps = sum(watch.steps for watch in watches)
     speed = sum(watch.progress.get("steps_per_s", 0.0) for watch in watches if watch.code is None)
-    blocks = [watch for watch in watches if watch.block.kind == BLOCK]
+    blocks = [watch for watch in watches if watch.part.kind == BLOCK]
     done = sum(watch.code == DONE for watch in blocks)
 
     def mean(name: str) -> float:
@@ -253,7 +253,7 @@ def _progress(watches: Sequence[_BlockWatch]) -> dict:
         "steps_per_s": round(speed, 2), "eta_s": round((steps - step) / speed, 1) if speed else 0.0,
         "blocks": [
             {
-                "block": watch.block.number, "kind": watch.block.kind, "state": watch.state,
+                "block": watch.part.number, "kind": watch.part.kind, "state": watch.state,
                 "step": watch.step, "of": watch.steps,
             }
             for watch in watches

@@ -25,7 +25,7 @@ from training.methods import METHODS
 from training.runs import train as training_loop
 from training.runs.blocks import train as blocks_module
 from training.runs.blocks.merge import merge
-from training.runs.blocks.plan import Block, Division, choose_cells, plan, read_plan, write_plan
+from training.runs.blocks.plan import Division, Part, choose_cells, plan, read_plan, write_plan
 from training.runs.blocks.train import BlocksStopped, train_blocks
 from training.runs.data import training_data
 from training.runs.events import MAX_BYTES, event_line
@@ -51,7 +51,7 @@ def job_for(scene, out, method="3dgs", **keys) -> Job:
     })  # fmt: skip
 
 
-def planned(job: Job) -> list[Block]:
+def planned(job: Job) -> list[Part]:
     folder = RunFolder(job.out)
     folder.create()
     return write_plan(job.resolved(), folder).blocks
@@ -256,14 +256,14 @@ def test_invalid_cells_are_rejected(tiny_scene, tmp_path):
 # -- merging ---------------------------------------------------------------------------------------
 
 
-def finished(folder: Path, number: int, cell, splats: list[Splats], **header) -> Block:
+def finished(folder: Path, number: int, cell, splats: list[Splats], **header) -> Part:
     """Return a finished block whose bundle has these levels."""
     run = RunFolder(folder / str(number))
     run.create()
     levels = [Level(i, level, {"s_min": 1.0 / i}) for i, level in enumerate(splats, 1)]
     write_bundle(run.bundle, Bundle(**({"method": "flod", "rule": "bands"} | header), levels=levels))
     inside = np.array([cell, [-np.inf, np.inf]])
-    return Block(number, run, Region(np.eye(3), inside, inside, ("a",)))
+    return Part(number, run, Region(np.eye(3), inside, inside, ("a",)))
 
 
 def random_splats(rng, count) -> Splats:
@@ -662,7 +662,7 @@ def test_progress_of_many_blocks_does_not_fill_the_event_file(monkeypatch):
         code, progress, step, steps, polls = 0, {}, 0, 9, 0
 
         def __init__(self, number):
-            self.block = SimpleNamespace(kind="block", number=number, name=f"block {number}")
+            self.part = SimpleNamespace(kind="block", number=number, name=f"block {number}")
             self.last = 40 * number
 
         start = staticmethod(lambda submit: None)

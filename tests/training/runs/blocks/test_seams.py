@@ -12,7 +12,7 @@ from training.optimize.parameters import override
 from training.optimize.training_data import TrainingData
 from training.runs.blocks import merge as merge_module
 from training.runs.blocks.merge import merge, write_surroundings
-from training.runs.blocks.plan import SEAM_PARAMETERS, Block, Division
+from training.runs.blocks.plan import SEAM_PARAMETERS, Division, Part
 from training.runs.folder import RunFolder
 from training.scenes.colmap import read_scene
 from training.scenes.regions import Region
@@ -38,7 +38,7 @@ def divided(folder, rng, counts=(20, 50), **header) -> tuple[Division, list[list
         blocks.append(replace(block, region=region))
         run = RunFolder(folder / "seams" / str(number))
         run.create()
-        seams.append(Block(number, run, replace(region, seam=True)))
+        seams.append(Part(number, run, replace(region, seam=True)))
     return Division(None, blocks, seams), sets
 
 
@@ -142,7 +142,7 @@ def test_missing_levels_come_from_the_coarse_part(tmp_path):
     two = [random_splats(rng, 9), random_splats(rng, 11)]
     levels = [Level(number, splats, {"s_min": 7.0 / number}) for number, splats in enumerate(two, 1)]
     write_bundle(coarse.bundle, Bundle("flod", levels, "bands"))
-    merge(Division(Block(0, coarse, None), division.blocks, []), tmp_path / "merged.ply")
+    merge(Division(Part(0, coarse, None), division.blocks, []), tmp_path / "merged.ply")
     merged = read_bundle(tmp_path / "merged.ply")
     assert [(level.number, level.facts["s_min"]) for level in merged.levels] == [
         (1, 7.0),
