@@ -46,7 +46,7 @@ def check_job(options: argparse.Namespace) -> int:
     if job.capture:
         print("Nothing to check: training renders its own views.")
         return 0
-    model, images = (Path(path) if path else None for path in (job.model, job.images))
+    model, images = job.model_and_images
     findings = check_folder(Path(job.scene), model, images, image_scale=job.image_scale)
     for finding in findings:
         print(f"{finding.severity}: {finding}")

@@ -104,7 +104,7 @@ def training_data(
 
 def _read_job_scene(job: Job, folder: RunFolder, report: Callable[..., None], add_depths: bool) -> Scene:
     """Read a job's scene, with points unless depth maps of all views will add them."""
-    model, images = (Path(path) if path else None for path in (job.model, job.images))
+    model, images = job.model_and_images
     scene = read_scene(
         _scene_folder(job, folder, report), model=model, images=images, origin=_origin(job, folder)
     )

@@ -105,7 +105,7 @@ def estimate(job: Job, scratch: Path) -> Estimate:
     begin = time.monotonic()
     job = job.resolved()
     parameters = job.resolved_parameters()
-    model, images = (Path(path) if path else None for path in (job.model, job.images))
+    model, images = job.model_and_images
     scene = cached_points(read_scene(Path(job.scene), model, images))
     if not len(scene.points):
         raise LodgsError("the scene has no points yet.", "Training makes them first.")

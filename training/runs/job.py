@@ -278,6 +278,11 @@ class Job:
         return job
 
     @property
+    def model_and_images(self) -> tuple[Path | None, Path | None]:
+        """Folders of the COLMAP model and of the photos; None to find them in the scene."""
+        return Path(self.model) if self.model else None, Path(self.images) if self.images else None
+
+    @property
     def crop(self) -> Crop | None:
         """Region that is trained in detail; None for the full scene."""
         return Crop.from_text(self.region) if is_crop_text(self.region) else None

@@ -154,7 +154,7 @@ def read_planned_scene(job: Job, add_points: Callable[[Scene], Scene] = cached_p
     Raises:
         LodgsError: the scene cannot be read, or has no points.
     """
-    model, images = (Path(path) if path else None for path in (job.model, job.images))
+    model, images = job.model_and_images
     scene = add_points(read_scene(Path(job.scene), model=model, images=images, origin=base_origin(job)))
     if not len(scene.points):
         raise LodgsError(
