@@ -17,6 +17,7 @@ from ..scenes.cameras import Camera, pick_evenly
 from ..scenes.view_tables import read_view_tables
 from ..splats.gaussians import SplatRows, Splats
 from ..splats.levels import NO_SPLATS, Bundle, Level
+from ..splats.quats import rotation_matrices
 
 MIP_VARIANCE = 0.1
 """Variance in square pixels that the filter adds: about a pixel's extent (Yu et al. 2024, Eq. 10)."""
@@ -93,13 +94,8 @@ class RowsWithBakedFilter:
 def _shapes(splats: Splats) -> np.ndarray:
     """Return (N, 3, 3) matrices M with M M^T = covariance of each splat."""
     lengths = np.linalg.norm(splats.quats, axis=1, keepdims=True)
-    w, x, y, z = (splats.quats / np.where(lengths > 0, lengths, 1)).astype(np.float64).T
-    rows = (
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    )  # fmt: skip
-    return np.stack(rows, axis=1).reshape(-1, 3, 3) * np.exp(splats.log_scales.astype(np.float64))[:, None]
+    unit = (splats.quats / np.where(lengths > 0, lengths, 1)).astype(np.float64)
+    return rotation_matrices(unit) * np.exp(splats.log_scales.astype(np.float64))[:, None]
 
 
 def _filter_factor(means: np.ndarray, shapes: np.ndarray, view: Camera) -> np.ndarray:

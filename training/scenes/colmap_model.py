@@ -23,6 +23,7 @@ import numpy as np
 from ..documents import damage_error, open_file, open_lines, read_lines
 from ..errors import LodgsError, printable
 from ..files import is_file
+from ..splats.quats import rotation_matrices
 from .lenses import LENS_BY_NAME, LENSES, MAX_LENS_ID, Intrinsics, UnknownLens, intrinsics_of
 
 DAMAGED_REMEDY = "Copy the model again, or rewrite it with COLMAP's model_converter."
@@ -351,12 +352,7 @@ def rotation_matrix(quaternion: np.ndarray) -> np.ndarray:
     """Return the rotation matrix (3, 3) of a quaternion wxyz (4,) of any length > 0."""
     # Scaling by a power of two is exact and keeps the squares from overflowing.
     quaternion = np.ldexp(quaternion, -np.frexp(np.abs(quaternion).max())[1])
-    w, x, y, z = quaternion / np.linalg.norm(quaternion)
-    return np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
+    return rotation_matrices(quaternion / np.linalg.norm(quaternion))
 
 
 # A packed record of points3D.bin, followed by `track` pairs of 4-byte integers.

@@ -6,6 +6,7 @@ import numpy as np
 
 from ..splats.gaussians import Splats
 from ..splats.levels import Bundle
+from ..splats.quats import rotation_matrices
 from .cameras import Camera, look_at
 from .ground import ground_plane
 
@@ -232,12 +233,8 @@ def _is_upright(splats: Splats) -> bool:
     The ground faces the vertical axis, and trunks, posts and edges of buildings are along it. Flat splats
     of a wall face another axis, but few needles are across the wall.
     """
-    w, x, y, z = (splats.quats / np.maximum(np.linalg.norm(splats.quats, axis=1, keepdims=True), 1e-12)).T
-    axes = np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
+    unit = splats.quats / np.maximum(np.linalg.norm(splats.quats, axis=1, keepdims=True), 1e-12)
+    axes = np.moveaxis(rotation_matrices(unit), 0, -1)
     order, sizes = np.argsort(splats.log_scales, axis=1), np.sort(splats.log_scales, axis=1)
 
     def shares(column: int, thin: np.ndarray) -> np.ndarray:

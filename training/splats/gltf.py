@@ -29,6 +29,7 @@ from .portable_levels import (
     splats_from_activated,
     upright_meta,
 )
+from .quats import rotation_matrices
 from .sh import coefficient_count
 from .spz import pack_spz, unpack_spz
 
@@ -433,11 +434,7 @@ def _matrix(node: dict) -> np.ndarray:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
     x, y, z, w = np.array(node.get("rotation", (0, 0, 0, 1)), np.float64)
     matrix = np.eye(4)
-    matrix[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
+    matrix[:3, :3] = rotation_matrices(np.array([w, x, y, z]))
     matrix[:3, :3] *= np.array(node.get("scale", (1, 1, 1)), np.float64)
     matrix[:3, 3] = np.array(node.get("translation", (0, 0, 0)), np.float64)
     return matrix

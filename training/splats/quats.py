@@ -1,4 +1,4 @@
-"""Rotations as their three smaller components, which several formats store. numpy only."""
+"""Quaternions: matrices, and the three smaller components that several formats store. numpy only."""
 
 from __future__ import annotations
 
@@ -8,6 +8,17 @@ import numpy as np
 
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 """Smaller components of a rotation by its largest one."""
+
+
+def rotation_matrices(quats: np.ndarray) -> np.ndarray:
+    """Return the rotation matrices (..., 3, 3) of unit quaternions wxyz (..., 4)."""
+    w, x, y, z = np.moveaxis(quats, -1, 0)
+    rows = (
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    )  # fmt: skip
+    return np.stack(rows, axis=-1).reshape(*quats.shape[:-1], 3, 3)
 
 
 def split_quats(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
