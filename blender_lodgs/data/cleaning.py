@@ -25,7 +25,6 @@ from ..attributes import BASE, HIDDEN, SCALE, SELECTION, read_attribute, view_at
 from . import changes, crops, photographs, selection
 from .cameras import UnsupportedCameraError, view_from
 from .placement import axes_of
-from .scene_properties import SplatLevel
 
 Test = Callable[[bpy.types.PointCloud], np.ndarray]
 """Function from a level's point cloud to a mask (N,) bool."""
@@ -85,7 +84,10 @@ def find(root: bpy.types.Object, test: Test) -> dict[int, np.ndarray]:
     Returns:
         Masks (N,) bool by level number.
     """
-    masks = {item.number: test(item.object.data) & ~hidden_mask(item.object.data) for item in levels(root)}
+    masks = {
+        item.number: test(item.object.data) & ~hidden_mask(item.object.data)
+        for item in root.lodgs.existing_levels
+    }
     return _with_dependents(root, masks)
 
 
@@ -101,10 +103,12 @@ def find_floaters(
         Masks (N,) bool by level number.
     """
     cropped = crops.evaluated_crops(root, context.evaluated_depsgraph_get())
-    means = {item.number: splat_attribute(item.object.data, "position") for item in levels(root)}
+    means = {
+        item.number: splat_attribute(item.object.data, "position") for item in root.lodgs.existing_levels
+    }
     visible = {
         item.number: ~hidden_mask(item.object.data) & crop_mask(cropped, means[item.number])
-        for item in levels(root)
+        for item in root.lodgs.existing_levels
     }
     remaining_masks = {number: mask.copy() for number, mask in visible.items()}
     cleaning.exclude_floaters(remaining_masks, means, _relations(root), gap / unit_length(root), share)
@@ -123,7 +127,7 @@ def hide(root: bpy.types.Object, masks: Mapping[int, np.ndarray]) -> int:
         The number of splats that were hidden.
     """
     count = 0
-    for item in levels(root):
+    for item in root.lodgs.existing_levels:
         cloud, mask = item.object.data, masks[item.number]
         if mask.any():
             write_attribute(cloud, HIDDEN, "BOOLEAN", hidden_mask(cloud) | mask)
@@ -144,7 +148,7 @@ def select(root: bpy.types.Object, masks: Mapping[int, np.ndarray]) -> int:
         The number of selected splats.
     """
     with changes.selecting():
-        for item in levels(root):
+        for item in root.lodgs.existing_levels:
             write_attribute(item.object.data, SELECTION, "BOOLEAN", masks[item.number])
             item.object.data.update_tag()
     return sum(int(mask.sum()) for mask in masks.values())
@@ -165,7 +169,7 @@ def extend_selection(
         The number of selected splats.
     """
     masks = {}
-    for item in levels(root):
+    for item in root.lodgs.existing_levels:
         masks[item.number] = mask = selected_mask(item.object.data)
         mask[strengths[item.number] > 0] = not remove
         mask &= ~hidden_mask(item.object.data)
@@ -175,7 +179,7 @@ def extend_selection(
 def preview_selection(root: bpy.types.Object | None, masks: Mapping[int, np.ndarray]) -> None:
     """Display a selection in the viewports during a stroke; an empty mapping ends the preview."""
     _in_stroke.clear()
-    for item in levels(root) if root is not None and masks else ():
+    for item in root.lodgs.existing_levels if root is not None and masks else ():
         _in_stroke[item.object.data.session_uid] = masks[item.number]
     changes.report_selected()
 
@@ -209,7 +213,7 @@ def count_selected(root: bpy.types.Object) -> dict[int, int]:
     """Return the number of selected, visible splats by level number."""
     return {
         item.number: int(np.count_nonzero(selected_mask(item.object.data) & ~hidden_mask(item.object.data)))
-        for item in levels(root)
+        for item in root.lodgs.existing_levels
     }
 
 
@@ -220,7 +224,7 @@ def show_all(root: bpy.types.Object) -> int:
         The number of splats that were hidden.
     """
     count = 0
-    for item in levels(root):
+    for item in root.lodgs.existing_levels:
         cloud = item.object.data
         if HIDDEN in cloud.attributes:
             count += int(hidden_mask(cloud).sum())
@@ -237,7 +241,8 @@ def remaining(root: bpy.types.Object, bundle: Bundle, depsgraph: bpy.types.Depsg
     Raises:
         LodgsError: no splat remains.
     """
-    cropped, clouds = crops.evaluated_crops(root, depsgraph), {item.number: item for item in levels(root)}
+    cropped = crops.evaluated_crops(root, depsgraph)
+    clouds = {item.number: item for item in root.lodgs.existing_levels}
     masks = {
         level.number: crop_mask(cropped, level.splats.means) & ~hidden_mask(clouds[level.number].object.data)
         for level in bundle.levels
@@ -251,7 +256,7 @@ def count_remaining(root: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> d
     Hidden and cropped splats do not remain.
     """
     cropped, counts = crops.evaluated_crops(root, depsgraph), {}
-    for item in levels(root):
+    for item in root.lodgs.existing_levels:
         cloud = item.object.data
         key = changes.version(cloud), len(cloud.points), cropped
         if _counts.get(cloud.session_uid, (None, 0))[0] != key:
@@ -320,7 +325,7 @@ def bounds(root: bpy.types.Object) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         LodgsError: the scene has neither splats nor points.
     """
-    objects = [item.object for item in levels(root)] or [root.lodgs.points]
+    objects = [item.object for item in root.lodgs.existing_levels] or [root.lodgs.points]
     if objects[-1] is None:
         raise LodgsError(
             f"Cannot measure '{root.name}': it has neither splats nor points.",
@@ -334,22 +339,22 @@ def bounds(root: bpy.types.Object) -> tuple[np.ndarray, np.ndarray]:
     return low - margin, high + margin
 
 
-def levels(root: bpy.types.Object) -> list[SplatLevel]:
-    """Return the existing levels, coarse to fine."""
-    return [item for item in root.lodgs.levels if item.exists]
-
-
 def _with_dependents(root: bpy.types.Object, masks: dict[int, np.ndarray]) -> dict[int, np.ndarray]:
     """Add the visible splats that depend on others and do not remain without them."""
-    removed = {item.number: masks[item.number] | hidden_mask(item.object.data) for item in levels(root)}
+    removed = {
+        item.number: masks[item.number] | hidden_mask(item.object.data) for item in root.lodgs.existing_levels
+    }
     remaining = _relations(root).completed({number: ~mask for number, mask in removed.items()})
-    return {item.number: ~remaining[item.number] & ~hidden_mask(item.object.data) for item in levels(root)}
+    return {
+        item.number: ~remaining[item.number] & ~hidden_mask(item.object.data)
+        for item in root.lodgs.existing_levels
+    }
 
 
 def _relations(root: bpy.types.Object) -> Relations:
     """Return the relations among the splats of the levels."""
     related, columns = resolve_rule(root.lodgs.rule).relations, {}
-    for item in levels(root) if related.columns else ():
+    for item in root.lodgs.existing_levels if related.columns else ():
         cloud = item.object.data
         means = dict(zip("xyz", read_attribute(cloud, "position").T, strict=True))
         zeros = np.zeros(len(cloud.points), np.float32)

@@ -166,7 +166,7 @@ def find_clutter(
     if test.kind not in _SPARES_BACKGROUND:
         return masks
     subject = subject_of(root)
-    numbers = {item.object.data.session_uid: item.number for item in cleaning.levels(root)}
+    numbers = {item.object.data.session_uid: item.number for item in root.lodgs.existing_levels}
     return cleaning.find(
         root,
         lambda cloud: (
@@ -177,7 +177,9 @@ def find_clutter(
 
 def unite_masks(masks: Mapping[str, Masks], root: bpy.types.Object) -> Masks:
     """Return the splats that match any test."""
-    result = {item.number: np.zeros(len(item.object.data.points), bool) for item in cleaning.levels(root)}
+    result = {
+        item.number: np.zeros(len(item.object.data.points), bool) for item in root.lodgs.existing_levels
+    }
     for by_level in masks.values():
         for number, mask in by_level.items():
             result[number] |= mask
@@ -190,7 +192,7 @@ def suggest_limits(context: bpy.types.Context, root: bpy.types.Object) -> dict[s
     About one splat in a hundred of the finest level is larger than ``size``, and one in twenty is farther
     from the cameras than ``distance``.
     """
-    cloud, unit = cleaning.levels(root)[-1].object.data, cleaning.unit_length(root)
+    cloud, unit = root.lodgs.existing_levels[-1].object.data, cleaning.unit_length(root)
     means = cleaning.splat_attribute(cloud, "position")
     scales = cleaning.splat_attribute(cloud, SCALE)
     sample = slice(None, None, max(len(means) // 100_000, 1))
@@ -219,7 +221,7 @@ def suggest_clutter_limits(root: bpy.types.Object) -> dict[str, float]:
 
 def subject_of(root: bpy.types.Object) -> clutter.SceneSubject:
     """Return the subject of the finest level, in the scene's coordinates; the last result is cached."""
-    cloud = cleaning.levels(root)[-1].object.data
+    cloud = root.lodgs.existing_levels[-1].object.data
     up = placement_of(root).rotation.T @ (0.0, 0.0, 1.0)
     key = cloud.session_uid, len(cloud.points), changes.version(cloud), tuple(up)
     if not _subject or _subject[0] != key:

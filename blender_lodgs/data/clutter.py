@@ -107,7 +107,7 @@ def count_by_kind(root: bpy.types.Object) -> dict[str, int] | None:
 
 def count_clutter(root: bpy.types.Object) -> int:
     """Return the number of coloured splats in all levels."""
-    marks = [cleaning.displayed_marks(item.object.data) for item in cleaning.levels(root)]
+    marks = [cleaning.displayed_marks(item.object.data) for item in root.lodgs.existing_levels]
     return sum(int(np.count_nonzero((mark > 1) & (mark != cleaning.mark_of("")))) for mark in marks)
 
 
@@ -119,13 +119,13 @@ def refresh_later() -> None:
 
 def _refresh_all() -> None:
     for root in roots.roots(bpy.context.scene):
-        if root.lodgs_clutter.preview and cleaning.levels(root):
+        if root.lodgs_clutter.preview and root.lodgs.existing_levels:
             refresh(bpy.context, root)
 
 
 def _key(root: bpy.types.Object, test: CleanupTest) -> tuple:
     """Return a key that changes with the limits of a test, and the splats and scale of a scene."""
-    clouds = [item.object.data for item in cleaning.levels(root)]
+    clouds = [item.object.data for item in root.lodgs.existing_levels]
     limits = tuple(getattr(root.lodgs_clutter, limit_property(name)) for name in test.limits)
     return (
         limits, cleaning.unit_length(root),
@@ -138,7 +138,7 @@ def _show() -> None:
     marks: dict[int, np.ndarray] = {}
     for root in roots.roots(bpy.context.scene):
         matches = _matches.get(root.session_uid, {}) if root.lodgs_clutter.preview else {}
-        for item in cleaning.levels(root) if matches else ():
+        for item in root.lodgs.existing_levels if matches else ():
             cloud = item.object.data
             mark = marks[cloud.session_uid] = np.full(len(cloud.points), cleaning.mark_of(""), np.uint8)
             for test in reversed(CLUTTER_TESTS):

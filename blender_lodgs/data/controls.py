@@ -15,7 +15,7 @@ def changed_controls(root: bpy.types.Object) -> dict[str, float]:
     rule = find_rule(root.lodgs.rule)
     if rule is None:
         return {}
-    defaults = rule.defaults([item.number for item in root.lodgs.levels if item.exists])
+    defaults = rule.defaults([item.number for item in root.lodgs.existing_levels])
     values = {control.name: control.validate(_value(root, control)) for control in rule.controls}
     return {name: value for name, value in values.items() if value != defaults[name]}
 
@@ -33,7 +33,7 @@ def update_controls(root: bpy.types.Object, recorded: dict[str, float] | None = 
     previous = selection.read_facts(settings.recorded_controls)
     recorded = previous if recorded is None else recorded
     if rule is not None:
-        numbers = [item.number for item in settings.levels if item.exists]
+        numbers = [item.number for item in settings.existing_levels]
         defaults = {control.name: control.default for control in rule.controls}
         old_values = defaults | previous | selection.read_facts(settings.initial_controls)
         new_values = (rule.defaults(numbers) if numbers else defaults) | recorded

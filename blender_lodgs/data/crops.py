@@ -110,18 +110,17 @@ def modifier_crops(
 def attach(root: bpy.types.Object) -> None:
     """Give every level the modifier for the current crops and hidden points; remove it if there are none."""
     crops = removing_crops(root)
-    for item in root.lodgs.levels:
-        if item.exists:
-            if crops or HIDDEN in item.object.data.attributes:
-                _attach(item.object, crops)
-            else:
-                detach(item.object)
+    for item in root.lodgs.existing_levels:
+        if crops or HIDDEN in item.object.data.attributes:
+            _attach(item.object, crops)
+        else:
+            detach(item.object)
 
 
 def is_outdated(root: bpy.types.Object) -> bool:
     """Return True if modifiers do not match the current crops, or were made by an older version."""
     crops = removing_crops(root)
-    levels = [item.object for item in root.lodgs.levels if item.exists]
+    levels = [item.object for item in root.lodgs.existing_levels]
     node_groups = [modifier.node_group for obj in levels if (modifier := modifier_of(obj))]
     return any(followed_objects(obj) != crops for obj in levels) or not all(
         groups.is_current(group, len(crops)) for group in node_groups

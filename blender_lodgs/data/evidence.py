@@ -33,7 +33,7 @@ def show(root: bpy.types.Object) -> None:
     views = [view for view in photographs.views_with_photo(root) if view not in held_out]
     cameras = [photographs.camera_of(view) for view in views]
     _heat_maps.clear()
-    for item in cleaning.levels(root):
+    for item in root.lodgs.existing_levels:
         cloud = item.object.data
         evidence = measure_splat_evidence(
             cameras,
@@ -55,7 +55,7 @@ def hide() -> None:
 
 def grade_shares(root: bpy.types.Object) -> np.ndarray | None:
     """Return the share of the finest level's visible splats of each grade; None without a heat map."""
-    levels = cleaning.levels(root)
+    levels = root.lodgs.existing_levels
     if not levels:
         return None
     cloud = levels[-1].object.data

@@ -127,7 +127,7 @@ def ground_points(root: bpy.types.Object) -> np.ndarray:
     These are COLMAP's points, or the means of the finest level's opaque splats. If the median depth is known,
     only points near the cameras are returned.
     """
-    levels = [item.object for item in root.lodgs.levels if item.exists][-1:]
+    levels = [item.object for item in root.lodgs.existing_levels][-1:]
     obj = root.lodgs.points or (levels[0] if levels else None)
     positions = None if obj is None else read_attribute(obj.data, "position")
     if positions is None:

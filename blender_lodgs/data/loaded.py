@@ -47,7 +47,7 @@ def count_loaded(root: bpy.types.Object, query: selection.LodQuery) -> tuple[int
 def saved_share(context: bpy.types.Context, root: bpy.types.Object) -> float:
     """Return the share of the finest level's splats that By Distance leaves out at the current camera."""
     visible, total = scenes.count_visible(context, root)
-    finest = [item for item in root.lodgs.levels if item.exists][-1:]
+    finest = root.lodgs.existing_levels[-1:]
     full = total if root.lodgs.cumulative else sum(len(item.object.data.points) for item in finest)
     return max(1 - visible / full, 0.0) if full else 0.0
 
@@ -65,7 +65,7 @@ def reduce_detail(context: bpy.types.Context, root: bpy.types.Object, share: flo
     rule = find_rule(root.lodgs.rule)
     if rule is None:
         raise LodgsError(*unknown_rule_error(root.lodgs.rule))
-    numbers = [item.number for item in root.lodgs.levels if item.exists]
+    numbers = [item.number for item in root.lodgs.existing_levels]
     initial = {control.name: getattr(root.lodgs.controls, control.name) for control in rule.controls}
     values: Values | None = initial
     saved = first = saved_share(context, root)

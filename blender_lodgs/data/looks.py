@@ -122,7 +122,7 @@ def reset(root: bpy.types.Object, obj: bpy.types.Object) -> None:
 def attach(root: bpy.types.Object) -> None:
     """Give every level the modifier for paint and the current looks; remove it without paint and looks."""
     regions = regions_of(root)
-    painted = any(PAINT[-1] in item.object.data.attributes for item in root.lodgs.levels if item.exists)
+    painted = any(PAINT[-1] in item.object.data.attributes for item in root.lodgs.existing_levels)
     needs_modifier = bool(regions) or is_set(root) or painted
     for item in root.lodgs.levels:
         if item.exists and needs_modifier:
@@ -139,7 +139,7 @@ def modifier_of(obj: bpy.types.Object) -> bpy.types.NodesModifier | None:
 def is_outdated(root: bpy.types.Object) -> bool:
     """Return True if a level's modifier is of another version or does not match the current regions."""
     regions = regions_of(root)
-    levels = [item.object for item in root.lodgs.levels if item.exists]
+    levels = [item.object for item in root.lodgs.existing_levels]
     return any(crops.followed_objects(obj, groups.COUNT) != regions for obj in levels) or not all(
         groups.is_current(modifier.node_group, len(regions), len(sh_names(obj.data)))
         for obj in levels

@@ -20,7 +20,7 @@ from ...training.errors import LodgsError
 from ...training.splats.levels import Level
 from ..attributes import view_attribute, write_attribute
 from . import changes, selection, streams
-from .cleaning import levels, splat_attribute
+from .cleaning import splat_attribute
 
 Color = tuple[float, float, float]
 
@@ -36,7 +36,7 @@ def paint_of(cloud: bpy.types.PointCloud, rows: slice | np.ndarray = slice(None)
 
 def is_painted(root: bpy.types.Object) -> bool:
     """Return True if a scene's levels have paint."""
-    return any(paint.COLUMNS[-1] in item.object.data.attributes for item in levels(root))
+    return any(paint.COLUMNS[-1] in item.object.data.attributes for item in root.lodgs.existing_levels)
 
 
 def read_paint(root: bpy.types.Object) -> dict[int, np.ndarray]:
@@ -52,7 +52,7 @@ def read_paint(root: bpy.types.Object) -> dict[int, np.ndarray]:
             "Import the file with Memory Budget 0.",
         )
     paint_by_level = {}
-    for item in levels(root):
+    for item in root.lodgs.existing_levels:
         values = paint_of(item.object.data)
         paint_by_level[item.number] = (
             np.zeros((len(item.object.data.points), 4), np.float32) if values is None else values
@@ -80,10 +80,10 @@ def blend(
 
 def preview_paint(root: bpy.types.Object | None, painted: Mapping[int, np.ndarray]) -> None:
     """Display paint in the viewports during a stroke; an empty mapping ends the preview."""
-    for cloud in [item.object.data for item in levels(root)] if root is not None else ():
+    for cloud in [item.object.data for item in root.lodgs.existing_levels] if root is not None else ():
         changes.report_painted(cloud)
     _in_stroke.clear()
-    for item in levels(root) if root is not None and painted else ():
+    for item in root.lodgs.existing_levels if root is not None and painted else ():
         _in_stroke[item.object.data.session_uid] = painted[item.number]
 
 
@@ -101,7 +101,7 @@ def write_paint(root: bpy.types.Object, painted: Mapping[int, np.ndarray]) -> in
     """
     count = sum(int(np.count_nonzero(values[:, 3])) for values in painted.values())
     with changes.painting():
-        for item in levels(root):
+        for item in root.lodgs.existing_levels:
             cloud = item.object.data
             for name, column in paint.paint_columns(painted[item.number]).items():
                 write_attribute(cloud, name, "FLOAT", column)
@@ -121,7 +121,7 @@ def save_paint(root: bpy.types.Object) -> None:
     """
     if root.lodgs.painted is not None or not is_painted(root):
         return
-    root.lodgs.painted = saved = levels(root)[-1].object.data.copy()
+    root.lodgs.painted = saved = root.lodgs.existing_levels[-1].object.data.copy()
     saved.name = f"{root.name} paint"
     for name in [attribute.name for attribute in saved.attributes if not attribute.is_required]:
         if name not in paint.COLUMNS:
@@ -130,7 +130,7 @@ def save_paint(root: bpy.types.Object) -> None:
 
 def transfer(root: bpy.types.Object, level: Level) -> Level:
     """Return a new level with paint from the saved or existing levels, unless it has paint of its own."""
-    existing = levels(root)
+    existing = root.lodgs.existing_levels
     replaced = [item.object.data for item in existing if item.number == level.number]
     sources = [root.lodgs.painted, *replaced, *(item.object.data for item in reversed(existing))]
     source = next((cloud for cloud in sources if cloud and paint_of(cloud) is not None), None)

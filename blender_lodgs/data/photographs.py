@@ -328,7 +328,7 @@ def _central_points(root: bpy.types.Object) -> np.ndarray:
 
     Cropped and hidden splats are excluded unless none would remain.
     """
-    levels = [item.object for item in root.lodgs.levels if item.exists]
+    levels = [item.object for item in root.lodgs.existing_levels]
     if not levels:
         return _positions(root.lodgs.points)
     points, hidden = _positions(levels[-1]), read_attribute(levels[-1].data, HIDDEN)

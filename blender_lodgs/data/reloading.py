@@ -14,7 +14,7 @@ import bpy
 
 from ...training.errors import LodgsError
 from .. import extension
-from . import cleaning, importing, scenes
+from . import importing, scenes
 from .importing import SplatsFile, file_stamp
 from .paths import absolute_path, automatic_path
 
@@ -74,7 +74,7 @@ def replace_splats(root: bpy.types.Object, file: SplatsFile) -> list[str]:
         LodgsError: the file has invalid values. The scene is unchanged in that case.
     """
     settings = root.lodgs
-    existing = cleaning.levels(root)
+    existing = root.lodgs.existing_levels
     previous = sum(len(item.object.data.points) for item in existing)
     finest = max((item.number for item in existing), default=0)
     deleted = 0 if settings.stream.file else settings.source.count - previous

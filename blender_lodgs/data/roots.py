@@ -31,7 +31,7 @@ def shows_splats(scene: bpy.types.Scene) -> bool:
 
 def shows_levels(scene: bpy.types.Scene) -> bool:
     """Return True if a Blender scene has levels of splats, also in collection instances."""
-    has_levels = any(item.exists for root in roots(scene) for item in root.lodgs.levels)
+    has_levels = any(root.lodgs.existing_levels for root in roots(scene))
     return has_levels or any(map(_instanced_roots, scene.objects))
 
 
@@ -53,7 +53,7 @@ def _instanced_roots(obj: bpy.types.Object) -> list[bpy.types.Object]:
 def root_with_levels(context: bpy.types.Context) -> bpy.types.Object | None:
     """Return :func:`active_root` if it has levels, otherwise None."""
     root = active_root(context)
-    return root if root is not None and any(item.exists for item in root.lodgs.levels) else None
+    return root if root is not None and root.lodgs.existing_levels else None
 
 
 def collection_of(root: bpy.types.Object) -> bpy.types.Collection:
@@ -64,9 +64,8 @@ def collection_of(root: bpy.types.Object) -> bpy.types.Collection:
 def levels_collection(root: bpy.types.Object) -> bpy.types.Collection:
     """Return the collection for levels, which artists instance; create it if there is none."""
     name = f"{root.name} splats"
-    for item in root.lodgs.levels:
-        if item.exists:
-            return item.object.users_collection[0]
+    for item in root.lodgs.existing_levels:
+        return item.object.users_collection[0]
     children = collection_of(root).children
     if name not in children:
         children.link(bpy.data.collections.new(name))

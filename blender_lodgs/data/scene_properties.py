@@ -377,6 +377,11 @@ class SplatScene(bpy.types.PropertyGroup):
     training: bpy.props.PointerProperty(type=TrainingSettings)
 
     @property
+    def existing_levels(self) -> list[SplatLevel]:
+        """Levels whose objects exist, coarse to fine; ``levels`` also has those that the artist deleted."""
+        return [item for item in self.levels if item.exists]
+
+    @property
     def by_distance(self) -> bool:
         """True if the scene has a known rule that selects levels by distance."""
         return self.rule in rules()

@@ -106,7 +106,7 @@ def set_level(root: bpy.types.Object, level: Level) -> bpy.types.Object:
 
 def contents(root: bpy.types.Object) -> str:
     """Describe the contents of a splat scene briefly: photos, views, points, levels, splats, local origin."""
-    levels = [item.object for item in root.lodgs.levels if item.exists]
+    levels = [item.object for item in root.lodgs.existing_levels]
     counts = (
         (len(views_with_photo(root)), "photo"),
         (len(views(root)) - len(views_with_photo(root)), "view"),
@@ -130,7 +130,7 @@ def prepare_refill(root: bpy.types.Object, numbers: Collection[int]) -> None:
     streams.stop_streaming(root)
     painting.save_paint(root)
     root.lodgs.source.watch = False
-    existing = [item for item in root.lodgs.levels if item.exists]
+    existing = root.lodgs.existing_levels
     reused = [item for item in existing if item.number in numbers] or existing[-1:]
     for item in existing:
         if item not in reused:
@@ -162,8 +162,7 @@ def read_levels(root: bpy.types.Object, placed: bool = False, looked: bool = Fal
     """
     levels = [
         Level(item.number, objects.read_splats(item.object), selection.read_facts(item.facts))
-        for item in root.lodgs.levels
-        if item.exists
+        for item in root.lodgs.existing_levels
     ]
     if not levels:
         raise LodgsError(
@@ -218,7 +217,7 @@ def delete_excluded(root: bpy.types.Object) -> int:
             f"Cannot delete splats of '{root.name}': most of them are in {file.name}.",
             "Keep the crops, or edit the file with the command lodgs edit and import the result.",
         )
-    count_before = sum(len(item.object.data.points) for item in root.lodgs.levels if item.exists)
+    count_before = sum(len(item.object.data.points) for item in root.lodgs.existing_levels)
     bundle = read_levels(root)
     for level in bundle.levels:
         put_level(root, level)
@@ -268,7 +267,7 @@ def visible_splats(
         LodgsError: no splats are visible, or the levels differ in their degree of spherical harmonics; for
             placed splats also if the root is scaled differently along its axes.
     """
-    levels = [item.object for item in root.lodgs.levels if item.exists]
+    levels = [item.object for item in root.lodgs.existing_levels]
     with _without_native_drawing(context), display.with_all_attributes(context, levels):
         depsgraph = context.evaluated_depsgraph_get()
         parts = [
@@ -313,11 +312,10 @@ def _without_native_drawing(context: bpy.types.Context) -> Iterator[None]:
 def count_visible(context: bpy.types.Context, root: bpy.types.Object) -> tuple[int, int]:
     """Return the number of visible splats as of the last evaluation, and of all splats."""
     depsgraph, visible, total = context.view_layer.depsgraph, 0, 0
-    for item in root.lodgs.levels:
-        if item.exists:
-            total += len(item.object.data.points)
-            if depsgraph is not None and _visible(context, item):
-                visible += display.point_count(item.object.evaluated_get(depsgraph).data)
+    for item in root.lodgs.existing_levels:
+        total += len(item.object.data.points)
+        if depsgraph is not None and _visible(context, item):
+            visible += display.point_count(item.object.evaluated_get(depsgraph).data)
     return visible, total
 
 
@@ -337,9 +335,8 @@ def show_only(root: bpy.types.Object, number: int) -> None:
 def attach_ellipsoids(scene: bpy.types.Scene) -> None:
     """Give every level of a Blender scene the ellipsoid modifier, and raise Cycles' transparent bounces."""
     for root in roots(scene):
-        for item in root.lodgs.levels:
-            if item.exists:
-                ellipsoids.attach(item.object)
+        for item in root.lodgs.existing_levels:
+            ellipsoids.attach(item.object)
     if hasattr(scene, "cycles"):
         ellipsoids.raise_bounces(scene.cycles, bounced_light_only=scene.lodgs_render.is_for_meshes)
 
@@ -352,7 +349,7 @@ def _looks(root: bpy.types.Object) -> look.Looks:
 
 
 def _require_complete(root: bpy.types.Object, number: int) -> None:
-    finest = max((item.number for item in root.lodgs.levels if item.exists), default=number)
+    finest = max((item.number for item in root.lodgs.existing_levels), default=number)
     if number < finest and not root.lodgs.complete:
         raise LodgsError(*standalone_error(number, finest))
 

@@ -165,7 +165,7 @@ def attach(root: bpy.types.Object) -> None:
     looks.attach(root)
     _drive_focal_length(root)
     rule = find_rule(settings.rule)
-    levels = [(item.number, read_facts(item.facts)) for item in settings.levels if item.exists]
+    levels = [(item.number, read_facts(item.facts)) for item in settings.existing_levels]
     scene = read_facts(settings.facts)
     if rule is None:
         settings.mode = "SINGLE"
@@ -200,20 +200,17 @@ def _order(root: bpy.types.Object) -> None:
     remain there. Weights are applied last. Without modifiers of artists, harmonics are dropped first in
     viewports that do not need them: removing splats copies all attributes of the others.
     """
-    for item in root.lodgs.levels:
-        if item.exists:
-            copies = crops.modifier_of(item.object) or rule_modifier(item.object)
-            if copies and not _has_other_modifiers(item.object):
-                display.drop_harmonics(item.object)
-            display.keep_order(item.object)
+    for item in root.lodgs.existing_levels:
+        copies = crops.modifier_of(item.object) or rule_modifier(item.object)
+        if copies and not _has_other_modifiers(item.object):
+            display.drop_harmonics(item.object)
+        display.keep_order(item.object)
     rule = find_rule(root.lodgs.rule)
-    for item in root.lodgs.levels if rule else ():
-        cropping, rule_modifiers = (
-            (crops.modifier_of(item.object), rule_modifier(item.object)) if item.exists else (None, None)
-        )
-        if cropping and rule_modifiers and rule:
+    for item in root.lodgs.existing_levels if rule else ():
+        cropping, selecting = crops.modifier_of(item.object), rule_modifier(item.object)
+        if cropping and selecting and rule:
             modifiers = item.object.modifiers
-            crop_index, rule_index = modifiers.find(cropping.name), modifiers.find(rule_modifiers.name)
+            crop_index, rule_index = modifiers.find(cropping.name), modifiers.find(selecting.name)
             if (crop_index < rule_index) == rule.independent:
                 modifiers.move(crop_index, rule_index)
 
@@ -221,7 +218,7 @@ def _order(root: bpy.types.Object) -> None:
 def is_outdated(root: bpy.types.Object) -> bool:
     """Return True if a level's modifier was made by an older version."""
     rule = find_rule(root.lodgs.rule)
-    modifiers = [rule_modifier(item.object) for item in root.lodgs.levels if item.exists]
+    modifiers = [rule_modifier(item.object) for item in root.lodgs.existing_levels]
     if rule is None:
         return any(modifiers)
     return not all(modifier and groups.is_current(modifier.node_group, rule) for modifier in modifiers)
@@ -232,12 +229,12 @@ def update_inputs(root: bpy.types.Object) -> None:
 
     Levels get all points and attributes if modifiers of artists need them.
     """
-    for item in root.lodgs.levels:
-        if item.exists and display.VIEWPORT in item.object.modifiers and _has_other_modifiers(item.object):
+    for item in root.lodgs.existing_levels:
+        if display.VIEWPORT in item.object.modifiers and _has_other_modifiers(item.object):
             display.keep_harmonics(item.object)
-        if item.exists and _needs_points(item.object):
+        if _needs_points(item.object):
             display.keep_points(item.object)
-        elif item.exists:
+        else:
             display.reduce_points(item.object)
     for modifier, name, value in _object_inputs(root):
         _set(modifier, name, value, lambda current, value: current == value)
@@ -263,10 +260,9 @@ def detach_references(root: bpy.types.Object) -> None:
     """
     for modifier, name, _ in list(_object_inputs(root)):
         _set(modifier, name, None, lambda current, _: current is None)
-    for item in root.lodgs.levels:
-        if item.exists:
-            crops.detach(item.object)
-            looks.detach(item.object)
+    for item in root.lodgs.existing_levels:
+        crops.detach(item.object)
+        looks.detach(item.object)
 
 
 def _object_inputs(
@@ -276,13 +272,13 @@ def _object_inputs(
     tables = {
         groups.table_socket(item.name): item.object if item.exists else None for item in root.lodgs.tables
     }
-    for item in root.lodgs.levels:
-        modifier = rule_modifier(item.object) if item.exists else None
-        slots = item.object.material_slots if item.exists else ()
+    for item in root.lodgs.existing_levels:
+        modifier = rule_modifier(item.object)
+        slots = item.object.material_slots
         material = {groups.MATERIAL: slots[0].material if slots else None}
-        cropping = crops.modifier_of(item.object) if item.exists else None
+        cropping = crops.modifier_of(item.object)
         camera = {choice.object: getattr(root.lodgs, choice.object) for choice in CHOICES if choice.object}
-        display_modifier = item.object.modifiers.get(display.NAME) if item.exists else None
+        display_modifier = item.object.modifiers.get(display.NAME)
         points = {display.MATERIAL: material[groups.MATERIAL] or display.points_material()}
         for owner, inputs in (
             (modifier, camera | tables | material),
@@ -375,7 +371,7 @@ def _drive_visibility(root: bpy.types.Object, index: int, item, rule: Rule | Non
             sources[control.name] = f"{rule.name}.{control.name}"
             in_use += f" and {control.name} {'<=' if control.follows == 'coarsest' else '>='} {number}"
     is_single = f"{number} == single_level or (cumulative and {number} <= single_level)"
-    finest = max(level.number for level in root.lodgs.levels if level.exists)
+    finest = max(level.number for level in root.lodgs.existing_levels)
     without = {"show": 1, "single_level": finest, "cumulative": root.lodgs.cumulative}
     for path in ("hide_viewport", "hide_render"):
         hidden = "hidden or " if path == "hide_render" else ""

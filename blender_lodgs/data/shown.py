@@ -190,14 +190,14 @@ def _with_sources(instances: list[SplatInstance], depsgraph: bpy.types.Depsgraph
     sources = {root: source for root in roots.roots(depsgraph.scene) if (source := streams.source_of(root))}
     if not sources:
         return instances
-    root_of_level = {item.object: root for root in sources for item in root.lodgs.levels if item.exists}
+    root_of_level = {item.object: root for root in sources for item in root.lodgs.existing_levels}
     placed_levels: dict[tuple, set[int]] = {}
     for instance in instances:
         if instance.object in root_of_level and selection.only_lodgs_modifiers(instance.evaluated, depsgraph):
             placed_levels.setdefault(
                 (root_of_level[instance.object], instance.matrix_world.tobytes()), set()
             ).add(instance.level)
-    numbers = {root: {item.number for item in root.lodgs.levels if item.exists} for root in sources}
+    numbers = {root: {item.number for item in root.lodgs.existing_levels} for root in sources}
     return [
         replace(instance, source=sources[root])
         if (root := root_of_level.get(instance.object)) in sources

@@ -83,7 +83,7 @@ def source_of(root: bpy.types.Object) -> Source | None:
     if path is None or settings.mode != "SELECTIVE" or is_edited(root):
         return None
     stream = settings.stream
-    finest = max(item.number for item in settings.levels if item.exists)
+    finest = max(item.number for item in settings.existing_levels)
     budget = max(stream.budget - stream.scene_splats, 0)
     return Source(
         root.session_uid, path, stream.total, budget, stream.scene_splats, finest, stream.file_changes
@@ -92,11 +92,11 @@ def source_of(root: bpy.types.Object) -> Source | None:
 
 def is_edited(root: bpy.types.Object) -> bool:
     """Return True if splats of a scene were added, removed or hidden since it was read from its file."""
-    levels = [item.object.data for item in root.lodgs.levels if item.exists]
+    levels = [item.object.data for item in root.lodgs.existing_levels]
     if any(HIDDEN in cloud.attributes for cloud in levels):
         return True
     return not levels or _count_splats(root) != root.lodgs.stream.scene_splats
 
 
 def _count_splats(root: bpy.types.Object) -> int:
-    return sum(len(item.object.data.points) for item in root.lodgs.levels if item.exists)
+    return sum(len(item.object.data.points) for item in root.lodgs.existing_levels)

@@ -139,7 +139,7 @@ class ViewsSettings:
 
 def has_only_splats(root: bpy.types.Object) -> bool:
     """Return True if a splat scene has splats but no photos."""
-    return not root.lodgs.scene_folder and any(item.exists for item in root.lodgs.levels)
+    return not root.lodgs.scene_folder and bool(root.lodgs.existing_levels)
 
 
 def view_count(settings: bpy.types.PropertyGroup) -> int:
@@ -359,7 +359,7 @@ def preview_dome(root: bpy.types.Object) -> tuple[list[Camera], tuple[float, flo
 
 def _finest_cloud(root: bpy.types.Object) -> tuple[bpy.types.PointCloud, int, changes.Version]:
     """Return the finest point cloud of a root and two values that change with it and its points."""
-    cloud = [item for item in root.lodgs.levels if item.exists][-1].object.data
+    cloud = root.lodgs.existing_levels[-1].object.data
     return cloud, cloud.session_uid, changes.version(cloud)
 
 

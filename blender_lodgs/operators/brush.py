@@ -92,7 +92,7 @@ class StrokeOperator(EditLevelsOperator):
         self.path.clear()
         self._target = stroke_target(context, root)
         self.prepare(root)
-        counts = {item.number: len(item.object.data.points) for item in cleaning.levels(root)}
+        counts = {item.number: len(item.object.data.points) for item in root.lodgs.existing_levels}
         self._hits = {number: np.zeros(count, np.float32) for number, count in counts.items()}
         self._stroke_cover = np.zeros(self._target.size[::-1], np.float32)
         self._lasso_handle = None
@@ -142,7 +142,7 @@ class StrokeOperator(EditLevelsOperator):
             LodgsError: a level was replaced.
         """
         root = roots.active_root(context)
-        counts = {item.number: len(item.object.data.points) for item in cleaning.levels(root)}
+        counts = {item.number: len(item.object.data.points) for item in root.lodgs.existing_levels}
         if counts != {number: len(hit) for number, hit in self._hits.items()}:
             raise LodgsError("Cannot finish the stroke: training replaced the levels.", "Draw it again.")
         return root
@@ -204,7 +204,7 @@ class LODGS_OT_select_splats(StrokeOperator, bpy.types.Operator):
 
     def prepare(self, root):
         self._selected = {
-            item.number: cleaning.selected_mask(item.object.data) for item in cleaning.levels(root)
+            item.number: cleaning.selected_mask(item.object.data) for item in root.lodgs.existing_levels
         }
 
     def show(self, root, hits):

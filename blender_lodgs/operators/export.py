@@ -45,7 +45,7 @@ def _size(context: bpy.types.Context, kind: SplatFormat, level: int = 0) -> str:
             all levels.
     """
     root = roots.active_root(context)
-    items = [item for item in root.lodgs.levels if item.exists]
+    items = root.lodgs.existing_levels
     if not level:
         count = scenes.count_visible(context, root)[0]
     else:

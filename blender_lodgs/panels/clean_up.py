@@ -53,7 +53,7 @@ class LODGS_PT_clean_up(LevelsPanel):
         column = layout.column(align=True)
         for number, (visible, total) in cleaning.count_remaining(root, context.view_layer.depsgraph).items():
             column.label(text=f"Level {number}: {visible:,} of {total:,} splats")
-        lost = {item.number: item.lost for item in cleaning.levels(root) if item.lost}
+        lost = {item.number: item.lost for item in root.lodgs.existing_levels if item.lost}
         if lost:
             counts = ", ".join(f"level {number}: {count:,}" for number, count in lost.items())
             say(column, f"These levels were replaced and show their hidden splats again ({counts}).", "INFO")

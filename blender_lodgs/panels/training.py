@@ -225,7 +225,7 @@ def _draw_running(layout: bpy.types.UILayout, watch: Watch, root: bpy.types.Obje
 
 def _draw_ended(layout: bpy.types.UILayout, watch: Watch, root: bpy.types.Object) -> None:
     box = layout.box()
-    loaded = {item.number for item in root.lodgs.levels if item.exists}
+    loaded = {item.number for item in root.lodgs.existing_levels}
     box.label(text=watch.message, icon="CHECKMARK" if watch.state == "done" else "PAUSE")
     column = box.column(align=True)
     column.scale_y = 0.8

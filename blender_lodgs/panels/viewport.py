@@ -48,7 +48,7 @@ class LODGS_PT_viewport(Panel):
             if root.lodgs.colors in ("LEVELS", "BANDS") and column.active and rule.color_legend:
                 say(layout, rule.color_legend, "COLOR")
             elif root.lodgs.colors in ("LEVELS", "BANDS") and column.active:
-                _legend(layout, [item.number for item in root.lodgs.levels if item.exists])
+                _legend(layout, [item.number for item in root.lodgs.existing_levels])
         if viewport.problem:
             text = f"Cannot draw splats: {viewport.problem}. Disable Gaussian Splats to draw points."
             say(layout, text, "ERROR")

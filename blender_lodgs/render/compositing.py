@@ -292,7 +292,7 @@ def _exclude_collections(
     splat_collections = {
         collection
         for root in roots.roots(scene)
-        for obj in (root, *(item.object for item in root.lodgs.levels if item.exists))
+        for obj in (root, *(item.object for item in root.lodgs.existing_levels))
         for collection in obj.users_collection
     }
     scene.view_layers[0].update()  # creates the layer collections of new collections

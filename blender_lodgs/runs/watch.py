@@ -271,7 +271,7 @@ class Watch:
         head = read_header(self.folder.bundle)
         head.tables = read_tables(self.folder.bundle)
         with extension.in_window():
-            existing = {item.number for item in root.lodgs.levels if item.exists}
+            existing = {item.number for item in root.lodgs.existing_levels}
             for number in {level.number for level in head.levels} & self.levels.keys() - existing:
                 scenes.set_level(root, self._read_level(self.levels[number]))  # removed by an undo
             scenes.set_bundle_facts(root, head)

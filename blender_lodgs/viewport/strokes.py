@@ -41,7 +41,7 @@ class StrokeTarget:
         world = np.array(axes_of(root).evaluated_get(depsgraph).matrix_world, np.float64)
         world_projection = Projection.of(view @ world, projection, size)
         self._levels, occluders = {}, []
-        for item in cleaning.levels(root):
+        for item in root.lodgs.existing_levels:
             obj, cloud = item.object, item.object.data
             means, scales = (cleaning.splat_attribute(cloud, name) for name in ("position", attributes.SCALE))
             projected = world_projection.place(means)

@@ -45,7 +45,7 @@ def test_held_out_views_have_a_separate_mean(bpy, lodgs, root, draw_panel):
 def test_heat_map_of_evidence_is_shown_and_hidden(bpy, lodgs, root, draw_panel):
     """The splats of the levels stand at the origin of the scene, or far outside of every frame."""
     cleaning = lodgs("data.cleaning")
-    cloud = cleaning.levels(root)[-1].object.data
+    cloud = root.lodgs.existing_levels[-1].object.data
     assert bpy.ops.lodgs.show_evidence() == {"FINISHED"}
     marks = cleaning.displayed_marks(cloud)
     assert len(set(marks) - {0, 1}) >= 1 and (marks > 1).all()
