@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 import torch
 from scipy.spatial import KDTree
@@ -104,3 +107,9 @@ def from_splats(
     sh[:, : splats.sh.shape[1]] = splats.sh[:, :terms]
     arrays = {name: getattr(splats, name) for name in NAMES} | {"sh": sh}
     return {name: torch.tensor(array, dtype=torch.float32, device=device) for name, array in arrays.items()}
+
+
+def to_splats(tensors: Mapping[str, torch.Tensor]) -> Splats:
+    """Return the splats of tensors by name, as :func:`from_splats` makes them."""
+    arrays: dict[str, Any] = {name: tensor.cpu().numpy() for name, tensor in tensors.items()}
+    return Splats(**arrays)

@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 from itertools import accumulate
 from math import inf
-from typing import Any
 
 import numpy as np
 import torch
@@ -28,6 +27,7 @@ from ...optimize.initialize import (
     from_splats,
     neighbor_distances,
     sample_points,
+    to_splats,
 )
 from ...optimize.level_distances import measure_min_sizes
 from ...optimize.merging import merge
@@ -308,11 +308,10 @@ class Method(method.Method[FlodParameters, Drawing]):
 
     def _completed_levels(self) -> list[Level]:
         """Return the completed levels that finishing steps do not train, coarse to fine."""
-        arrays: dict[int, dict[str, Any]] = {
-            number: {name: tensor.cpu().numpy() for name, tensor in tensors.items()}
+        return [
+            Level(number, to_splats(tensors), self._facts(number))
             for number, tensors in sorted(self.completed.items())
-        }
-        return [Level(number, Splats(**columns), self._facts(number)) for number, columns in arrays.items()]
+        ]
 
     def _set_distances(self) -> None:
         """Measure the distances of the finest levels. Coarser ones follow at the ratio ``rho``."""

@@ -9,14 +9,13 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from itertools import accumulate
-from typing import Any
 
 import torch
 
 from ...optimize import method
 from ...optimize.anchors.explicit import ExplicitAnchors
 from ...optimize.anchors.parameters import ExplicitOctreeParameters
-from ...optimize.initialize import from_splats
+from ...optimize.initialize import from_splats, to_splats
 from ...optimize.level_distances import measure_min_sizes
 from ...optimize.merging import merge
 from ...optimize.model import Model
@@ -77,7 +76,7 @@ class Method(ExplicitAnchors):
             self.completed[number] = from_splats(splats, self.parameters.sh_degree, self.device)
             if number == 1:
                 self._measure_distances()
-                return [self._level(n, self._completed_splats(n)) for n in sorted(self.completed)]
+                return [self._level(n, to_splats(self.completed[n])) for n in sorted(self.completed)]
             self._start_level(number - 1, splats)
         return [self._level(number, splats)]
 
@@ -122,12 +121,6 @@ class Method(ExplicitAnchors):
         return (step - begin) / (end - begin)
 
     # -- levels ----------------------------------------------------------------------------------------
-
-    def _completed_splats(self, number: int) -> Splats:
-        columns: dict[str, Any] = {
-            name: tensor.cpu().numpy() for name, tensor in self.completed[number].items()
-        }
-        return Splats(**columns)
 
     def _level(self, number: int, splats: Splats) -> Level:
         return Level(number, splats, {"s_min": self.s_min[number - 1]})
