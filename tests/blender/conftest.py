@@ -13,6 +13,10 @@ import pytest
 from tools.blender_module import EXTENSION, start_blender
 from training.files import cache_folder
 
+TRAINER = Path(__file__).parents[2] / ".venv" / "bin" / "python"
+if TRAINER.exists():  # as in the Makefile, so that tests with a trainer also run without it
+    os.environ.setdefault("LODGS_TRAINER_PYTHON", str(TRAINER))
+
 _exit_status: int | None = None
 
 
