@@ -161,7 +161,7 @@ __device__ inline bool touches_tile(const float* row, int x, int y) {
 // Project splats; depths of splats that are not drawn are infinite, their radii and numbers of tiles are 0.
 extern "C" __global__ void project(
     View v, const float* means, const float* quats, const float* log_scales, const float* logits, const float* sh,
-    const float* weights, const unsigned char* filters, float* rows, float* colours, float* radii, float* depths,
+    const float* weights, const unsigned char* filters, float* rows, float* colors, float* radii, float* depths,
     int* counts
 ) {
     int i = blockIdx.x * blockDim.x + threadIdx.x;
@@ -194,14 +194,14 @@ extern "C" __global__ void project(
     float values[BASES];
     Vector offset = mean - load(v.position);
     basis((1.0f / sqrtf(dot(offset, offset))) * offset, v.degree, values);
-    Vector colour = vector(0.5f, 0.5f, 0.5f);
+    Vector color = vector(0.5f, 0.5f, 0.5f);
     for (int k = 0; k < (v.degree + 1) * (v.degree + 1); k++) {
-        colour = colour + values[k] * load(sh + 3 * ((long long)i * v.terms + k));
+        color = color + values[k] * load(sh + 3 * ((long long)i * v.terms + k));
     }
-    int channels = (colour.x > 0.0f) | (colour.y > 0.0f) << 1 | (colour.z > 0.0f) << 2;
-    colours[3 * i] = fmaxf(colour.x, 0.0f);
-    colours[3 * i + 1] = fmaxf(colour.y, 0.0f);
-    colours[3 * i + 2] = fmaxf(colour.z, 0.0f);
+    int channels = (color.x > 0.0f) | (color.y > 0.0f) << 1 | (color.z > 0.0f) << 2;
+    colors[3 * i] = fmaxf(color.x, 0.0f);
+    colors[3 * i + 1] = fmaxf(color.y, 0.0f);
+    colors[3 * i + 2] = fmaxf(color.z, 0.0f);
     row[0] = x;
     row[1] = y;
     row[2] = half_x;
@@ -264,7 +264,7 @@ extern "C" __global__ void list_many_pairs(
 extern "C" __global__ void project_backward(
     View v, const float* means, const float* quats, const float* log_scales, const float* logits, const float* sh,
     const float* weights, const unsigned char* filters, const float* rows, const float* radii, const float* sums,
-    const float* by_colours, float* by_means, float* by_quats, float* by_log_scales, float* by_logits, float* by_sh,
+    const float* by_colors, float* by_means, float* by_quats, float* by_log_scales, float* by_logits, float* by_sh,
     float* by_weights, float* grad2d, float* absgrad2d
 ) {
     __shared__ float bases[64 * BASES];
@@ -334,7 +334,7 @@ extern "C" __global__ void project_backward(
 
         // direction = (mean - position) / length: only the perpendicular component changes it
         int channels = (int)row[9];
-        Vector shade = load(by_colours + 3 * i);
+        Vector shade = load(by_colors + 3 * i);
         shade = vector(channels & 1 ? shade.x : 0.0f, channels & 2 ? shade.y : 0.0f, channels & 4 ? shade.z : 0.0f);
         Vector offset = mean - load(v.position);
         float per_distance = 1.0f / sqrtf(dot(offset, offset));
@@ -402,16 +402,16 @@ __device__ inline Pixel pixel_of(Image m) {
 
 // Fetch the next splats of a tile into shared memory; a thread fetches one.
 __device__ inline void fetch(
-    Image m, Fetched* batch, int first, int end, const int* pairs, const float* rows, const float* colours
+    Image m, Fetched* batch, int first, int end, const int* pairs, const float* rows, const float* colors
 ) {
     int at = first + threadIdx.x;
     if (at < end) {
         Fetched s;
         s.splat = pairs[at];
         for (int k = 0; k < 9; k++) { s.row[k] = rows[ROW * s.splat + k]; }
-        s.red = colours[3 * s.splat];
-        s.green = colours[3 * s.splat + 1];
-        s.blue = colours[3 * s.splat + 2];
+        s.red = colors[3 * s.splat];
+        s.green = colors[3 * s.splat + 1];
+        s.blue = colors[3 * s.splat + 2];
         s.strips = 0;
         for (int strip = 0; strip < STRIPS; strip++) {
             float x = blockIdx.x % m.across * TILE + strip % 2 * STRIP_WIDTH + 0.5f;
@@ -444,7 +444,7 @@ __device__ inline Alpha alpha_of(const Fetched& s, Pixel p) {
 
 // Blend front to back. T becomes negative when a pixel is finished, and is negative outside the image; |T| is preserved.
 extern "C" __global__ void blend(
-    Image m, const int* starts, const int* pairs, const float* rows, const float* colours, const float* limit,
+    Image m, const int* starts, const int* pairs, const float* rows, const float* colors, const float* limit,
     float* image, float* light, int* reached, int* median
 ) {
     __shared__ Fetched batch[THREADS];
@@ -454,7 +454,7 @@ extern "C" __global__ void blend(
     float furthest = limit && p.inside ? limit[p.at] : INFINITE;
     for (int first = begin; first < end; first += THREADS) {
         if (__syncthreads_and(t <= 0.0f)) { break; }
-        fetch(m, batch, first, end, pairs, rows, colours);
+        fetch(m, batch, first, end, pairs, rows, colors);
         int count = end - first < THREADS ? end - first : THREADS;
         for (int group = 0; group < count; group += 32) {
             if (__all_sync(ALL, t <= 0.0f)) { break; }
@@ -505,9 +505,9 @@ __device__ inline float sum_values(float* values, int lane) {
 // Add each splat's share to its sums. With h = d loss / d colour and Q the part of the loss's derivative behind a splat,
 // g = d loss / d sigma = alpha Q / (1 - alpha) - w (c.h), see gpu/shaders/blend.wgsl.
 extern "C" __global__ void blend_backward(
-    Image m, const int* starts, const int* pairs, const float* rows, const float* colours, const int* reached,
+    Image m, const int* starts, const int* pairs, const float* rows, const float* colors, const int* reached,
     const float* image, const float* light, const float* by_image, const float* by_alpha, float* sums,
-    float* by_colours, int absolute
+    float* by_colors, int absolute
 ) {
     __shared__ Fetched batch[THREADS];
     Pixel p = pixel_of(m);
@@ -525,7 +525,7 @@ extern "C" __global__ void blend_backward(
     }
     for (int first = begin; first < end; first += THREADS) {
         __syncthreads();
-        fetch(m, batch, first, end, pairs, rows, colours);
+        fetch(m, batch, first, end, pairs, rows, colors);
         int count = end - first < THREADS ? end - first : THREADS;
         for (int group = 0; group < count && first + group < used; group += 32) {
             unsigned int remaining = touching(batch, group, count, p);
@@ -550,7 +550,7 @@ extern "C" __global__ void blend_backward(
                 if (p.lane % 2 == 0 && column < SUMS && (absolute || column < 6)) {
                     atomicAdd(sums + SUMS * s.splat + column, sum);
                 } else if (p.lane % 2 == 0 && column >= SUMS && column < GRADIENTS) {
-                    atomicAdd(by_colours + 3 * s.splat + column - SUMS, sum);
+                    atomicAdd(by_colors + 3 * s.splat + column - SUMS, sum);
                 }
             }
         }
@@ -559,7 +559,7 @@ extern "C" __global__ void blend_backward(
 
 // Measure each splat's largest weight (as the bits of a positive float), sum of weights, and number of pixels.
 extern "C" __global__ void weigh(
-    Image m, const int* starts, const int* pairs, const float* rows, const float* colours, int* largest, float* total,
+    Image m, const int* starts, const int* pairs, const float* rows, const float* colors, int* largest, float* total,
     int* pixels
 ) {
     __shared__ Fetched batch[THREADS];
@@ -568,7 +568,7 @@ extern "C" __global__ void weigh(
     float t = p.inside ? 1.0f : -1.0f;
     for (int first = begin; first < end; first += THREADS) {
         if (__syncthreads_and(t <= 0.0f)) { break; }
-        fetch(m, batch, first, end, pairs, rows, colours);
+        fetch(m, batch, first, end, pairs, rows, colors);
         int count = end - first < THREADS ? end - first : THREADS;
         for (int group = 0; group < count; group += 32) {
             unsigned int remaining = touching(batch, group, count, p);

@@ -9,7 +9,7 @@
 struct Parameters { background: vec4f, width: u32, height: u32, across: u32, limited: u32, absolute: u32 }
 @group(0) @binding(0) var<uniform> u: Parameters;
 @group(0) @binding(1) var<storage, read> rows: array<Row>;
-@group(0) @binding(2) var<storage, read> colours: array<vec4f>;
+@group(0) @binding(2) var<storage, read> colors: array<vec4f>;
 @group(0) @binding(3) var<storage, read> entries: array<vec2u>;  // splat and index of each pair, tile by tile
 @group(0) @binding(4) var<storage, read> ranges: array<vec2u>;  // range of pairs of each tile
 @group(0) @binding(5) var<storage, read> limit: array<f32>;  // (H, W)
@@ -29,7 +29,7 @@ const BATCH: u32 = 4;  // splats whose shares are summed over the tile together
 const STRIDE: u32 = LANES + 1u;  // from one sum's shares to the next, to avoid bank conflicts
 
 var<workgroup> batch_rows: array<Row, LANES>;
-var<workgroup> batch_colours: array<vec3f, LANES>;
+var<workgroup> batch_colors: array<vec3f, LANES>;
 var<workgroup> strips_of: array<u32, LANES>;  // bit mask of the strips that each splat touches
 var<workgroup> touching: array<atomic<u32>, 2 * STRIPS>;  // bit mask of the splats that touch each strip
 var<workgroup> furthest: atomic<u32>;
@@ -74,7 +74,7 @@ fn fetch(tile: u32, first: u32, count: u32, lane: u32) {
         }
         strips_of[lane] = bits;
         batch_rows[lane] = row;
-        batch_colours[lane] = colours[splat].xyz;
+        batch_colors[lane] = colors[splat].xyz;
     }
     workgroupBarrier();
 }
@@ -131,9 +131,9 @@ fn forward(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index)
                 var takes = t_next > vec4f(TRANSMITTANCE_MIN);
                 if (u.limited != 0u) { takes = takes & (vec4f(batch_rows[k].depth) <= limits); }
                 let w = select(vec4f(0.0), a * t, takes);
-                red += w * batch_colours[k].x;
-                green += w * batch_colours[k].y;
-                blue += w * batch_colours[k].z;
+                red += w * batch_colors[k].x;
+                green += w * batch_colors[k].y;
+                blue += w * batch_colors[k].z;
                 let halves = takes & (t > vec4f(0.5)) & (t_next <= vec4f(0.5));
                 if (any(halves)) { middle = select(middle, vec4i(i32(entries[first + k].x)), halves); }
                 t = select(-abs(t), t_next, takes);
@@ -207,13 +207,13 @@ fn backward(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index
             while (remaining != 0u) {
                 let k = countTrailingZeros(remaining);
                 remaining &= remaining - 1u;
-                let colour = batch_colours[start + k];
+                let color = batch_colors[start + k];
                 let a = alpha_of(batch_rows[start + k], pixels.center);
                 let t_next = t - a.alpha * t;
                 let takes = t_next > vec4f(TRANSMITTANCE_MIN);
                 let w = select(vec4f(0.0), a.alpha * t, takes);
                 t = select(-abs(t), t_next, takes);
-                let received = w * (colour.x * by_red + colour.y * by_green + colour.z * by_blue);
+                let received = w * (color.x * by_red + color.y * by_green + color.z * by_blue);
                 q -= received;
                 let moves = takes & (a.uncapped < vec4f(ALPHA_MAX));
                 let g = select(vec4f(0.0), a.alpha * q / (1.0 - a.alpha) - received, moves);

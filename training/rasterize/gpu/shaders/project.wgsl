@@ -30,7 +30,7 @@ struct View {
 @group(0) @binding(1) var<storage, read_write> splats: array<f32>;  // (M, SPLAT)
 @group(0) @binding(2) var<storage, read_write> sh: array<f32>;  // (M, terms, 3)
 @group(0) @binding(3) var<storage, read_write> rows: array<Row>;
-@group(0) @binding(4) var<storage, read_write> colours: array<vec4f>;
+@group(0) @binding(4) var<storage, read_write> colors: array<vec4f>;
 @group(0) @binding(5) var<storage, read_write> depths: array<u32>;
 @group(0) @binding(6) var<storage, read_write> radii: array<f32>;
 @group(0) @binding(7) var<storage, read_write> order: array<u32>;
@@ -161,13 +161,13 @@ fn forward(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index)
 
     var values: array<f32, 25>;
     basis(normalize(mean - u.position.xyz), u.degree, &values);
-    var colour = vec3f(0.5);
+    var color = vec3f(0.5);
     for (var k = 0u; k < active_terms(); k++) {
         let at = (i * u.terms + k) * 3u;
-        colour += values[k] * vec3f(sh[at], sh[at + 1u], sh[at + 2u]);
+        color += values[k] * vec3f(sh[at], sh[at + 1u], sh[at + 2u]);
     }
-    colours[i] = vec4f(max(colour, vec3f(0.0)), 0.0);
-    let positive = vec3u(colour > vec3f(0.0));
+    colors[i] = vec4f(max(color, vec3f(0.0)), 0.0);
+    let positive = vec3u(color > vec3f(0.0));
     let channels = positive.x | positive.y << 1u | positive.z << 2u;
     rows[i] = Row(middle, half_size, conic, log(opacity) * LOG2_E, p.z, radius, channels);
 }
@@ -194,7 +194,7 @@ fn quat_gradient(q: vec4f, per_length: f32, r: mat3x3f) -> vec4f {
 struct Gradient {
     splat: array<f32, BY_SPLAT>,
     basis: array<f32, 25>,  // the gradient of coefficient k is basis[k] colour
-    colour: vec3f,
+    color: vec3f,
 }
 
 // Compute the gradient of a drawn splat.
@@ -266,7 +266,7 @@ fn gradient_of(i: u32) -> Gradient {
 
     let gradient = vec3f(sums[at + RED], sums[at + RED + 1u], sums[at + RED + 2u]);
     let channels = vec3u(projected[i].channels) & vec3u(1u, 2u, 4u);
-    result.colour = select(vec3f(0.0), gradient, channels != vec3u(0u));
+    result.color = select(vec3f(0.0), gradient, channels != vec3u(0u));
     let offset = mean - u.position.xyz;
     let per_length = 1.0 / length(offset);
     let direction = offset * per_length;
@@ -278,7 +278,7 @@ fn gradient_of(i: u32) -> Gradient {
     var by_direction = vec3f(0.0);
     for (var k = 0u; k < active_terms(); k++) {
         let c = (i * u.terms + k) * 3u;
-        by_direction += dot(vec3f(sh[c], sh[c + 1u], sh[c + 2u]), result.colour) * slopes[k];
+        by_direction += dot(vec3f(sh[c], sh[c + 1u], sh[c + 2u]), result.color) * slopes[k];
     }
     // direction = (mean - position) / length: only the perpendicular component changes it
     let through_colour = (by_direction - dot(by_direction, direction) * direction) * per_length;
@@ -301,7 +301,7 @@ fn backward(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index
     for (var k = 0u; k < active_terms(); k++) {
         let c = (i * u.terms + k) * 3u;
         for (var channel = 0u; channel < 3u; channel++) {
-            by_sh[c + channel] = gradient.basis[k] * gradient.colour[channel];
+            by_sh[c + channel] = gradient.basis[k] * gradient.color[channel];
         }
     }
 }
@@ -350,7 +350,7 @@ fn train(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) l
     }
     for (var k = 0u; k < TRAINED; k++) { splat_gradients[lane * TRAINED + k] = gradient.splat[k]; }
     for (var k = 0u; k < active_terms(); k++) { bases[lane * 25u + k] = gradient.basis[k]; }
-    colour_gradients[lane] = gradient.colour;
+    colour_gradients[lane] = gradient.color;
     workgroupBarrier();
     if (!fits) { return; }
     let count = min(LANES, u.count - first);
