@@ -14,8 +14,8 @@ from contextlib import contextmanager
 import bpy
 import numpy as np
 
+from ...training.color import linear_from_srgb
 from ...training.errors import LodgsError
-from ...training.scenes.color import linear_from_srgb
 from ...training.splats.gaussians import SH_C0, Splats
 from .. import compat
 from ..attributes import (

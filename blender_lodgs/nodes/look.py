@@ -193,5 +193,5 @@ def _changed_harmonics(
 
 
 def _linear_from_srgb(srgb: Field) -> Field:
-    """Convert sRGB to linear, as ``training.scenes.color.linear_from_srgb``."""
+    """Convert sRGB to linear, as ``training.color.linear_from_srgb``."""
     return (srgb > 0.04045).where(((srgb + 0.055) / 1.055).power(2.4), srgb / 12.92)

@@ -12,9 +12,9 @@ from contextlib import contextmanager
 import bpy
 import numpy as np
 
+from ...training.color import srgb_from_linear
 from ...training.errors import LodgsError
 from ...training.scenes.cameras import Camera
-from ...training.scenes.color import srgb_from_linear
 from .. import extension
 from ..data import cameras, photographs
 from ..data.paths import absolute_path

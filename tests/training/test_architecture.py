@@ -50,7 +50,7 @@ LAYERS = {
         ("settings",),
         ("documents",),
         ("files",),
-        ("errors", "packages", "plugins", "__init__"),
+        ("color", "errors", "packages", "plugins", "__init__"),
     ),
 }
 """Layers of both packages, from the top. Each part imports only parts of lower layers, and itself."""

@@ -14,8 +14,8 @@ import numpy as np
 from scipy.linalg import polar
 from scipy.spatial.transform import Rotation, Slerp
 
+from ..color import linear_from_srgb, srgb_from_linear
 from ..scenes.cameras import Camera
-from ..scenes.color import linear_from_srgb, srgb_from_linear
 from . import scene
 from .image import RenderedImage
 from .lens import EQUIRECTANGULAR, ORTHOGRAPHIC, PLASTIC, SHARP, Aperture, LensProjection

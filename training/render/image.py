@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from ..color import linear_from_srgb
 from ..errors import LodgsError
 from ..files import atomic_write
-from ..scenes.color import linear_from_srgb
 from ..scenes.exr import read_parts, write_exr
 from ..scenes.images import write_png
 

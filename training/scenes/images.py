@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..color import srgb_from_linear
 from ..documents import open_file
 from ..errors import LodgsError, is_system_problem, read_error
 from ..files import name_errors
-from .color import srgb_from_linear
 from .exr import MAGIC, read_parts
 from .image_headers import ORIENTATION, check_image_size, image_size
 

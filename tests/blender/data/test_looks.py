@@ -5,8 +5,8 @@ import pytest
 
 from tests.blender.data.test_cleaning import ROOT_MATRIX, inside, scene_of, to_blender, transform  # noqa: F401
 from tests.training.editing.test_cleaning import bundle_of
+from training.color import linear_from_srgb
 from training.editing.look import Look
-from training.scenes.color import linear_from_srgb
 from training.splats.bundle import read_bundle
 from training.splats.gaussians import SH_C0
 from training.splats.ply import read_ply

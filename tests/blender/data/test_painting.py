@@ -13,9 +13,9 @@ from tests.blender.data.test_brush import (
 )
 from tests.training.editing.test_cleaning import bundle_of
 from tests.training.lod.tree.trees import random_leaves, tree_of, write_in_pages
+from training.color import linear_from_srgb
 from training.editing.look import Look
 from training.editing.paint import COLUMNS
-from training.scenes.color import linear_from_srgb
 from training.splats.bundle import read_bundle
 from training.splats.gaussians import SH_C0
 from training.splats.levels import Level

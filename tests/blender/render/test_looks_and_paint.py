@@ -7,8 +7,8 @@ from tests.blender.data.test_looks import apply_look
 from tests.blender.render.test_crops import camera  # noqa: F401
 from tests.training.editing.test_cleaning import bundle_of
 from tests.training.lod.tree.trees import random_leaves, tree_of, write_in_pages
+from training.color import srgb_from_linear
 from training.editing.look import Look
-from training.scenes.color import srgb_from_linear
 from training.splats.bundle import write_bundle
 
 GLOBAL_LOOK = Look(0.4, 5000, (1.0, 0.9, 0.7), 0.6, 0.8)

@@ -8,7 +8,7 @@ def test_wipe_draws_both_images(bpy, lodgs):
     """The photo is on the left, the rendered image on the right, upright and linear."""
     import gpu
 
-    from training.scenes.color import linear_from_srgb
+    from training.color import linear_from_srgb
 
     if not hasattr(gpu, "init"):
         pytest.skip("no graphics in background before Blender 5.2")

@@ -9,11 +9,11 @@ from tests.training.conftest import look_at
 from tests.training.editing.test_cleaning import bundle_of
 from tests.training.splats.test_similarity import random_splats, render
 from training.__main__ import main
+from training.color import linear_from_srgb, srgb_from_linear
 from training.editing.look import LUMA, NEUTRAL, Look, RowsWithLook, apply_looks
 from training.errors import LodgsError
 from training.lod.crop import Crop
 from training.scenes.cameras import Camera
-from training.scenes.color import linear_from_srgb, srgb_from_linear
 from training.splats.bundle import read_bundle, write_bundle
 from training.splats.gaussians import SH_C0
 from training.splats.sh import basis, coefficient_count

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from training.color import linear_from_srgb, srgb_from_linear
 from training.rasterize.rendering import DILATION
 from training.render.blur import Blur, draw_blurred
 from training.render.lens import EQUIRECTANGULAR, ORTHOGRAPHIC, Aperture, LensProjection
 from training.render.scene import Instance, SplatSet, draw
 from training.scenes.cameras import Camera
-from training.scenes.color import linear_from_srgb, srgb_from_linear
 from training.splats.gaussians import Splats
 
 FOCAL = 60.0

@@ -9,8 +9,8 @@ import OpenEXR
 import pytest
 from PIL import Image
 
+from training.color import srgb_from_linear
 from training.errors import LodgsError
-from training.scenes.color import srgb_from_linear
 from training.scenes.image_headers import exif_orientation, image_size
 from training.scenes.images import load_image
 

@@ -14,10 +14,10 @@ import pycolmap
 import pytest
 
 from tests.training.scenes import synthetic
+from training.color import linear_from_srgb
 from training.errors import LodgsError
 from training.scenes import pycolmap_process
 from training.scenes.colmap import read_scene
-from training.scenes.color import linear_from_srgb
 from training.scenes.images import load_image
 from training.scenes.undistort import undistort_scene
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from training.scenes.color import linear_from_srgb, srgb_from_linear
+from training.color import linear_from_srgb, srgb_from_linear
 
 
 def test_reference_values():
