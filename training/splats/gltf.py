@@ -7,58 +7,35 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import struct
-from collections import deque
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..documents import open_file, parse_json
-from ..errors import LodgsError, printable
+from ..errors import LodgsError
 from ..files import atomic_write
-from .bundle import write_bundle
 from .gaussians import SH_C0, Splats
-from .levels import MAX_READ_LEVELS, Bundle, Level
-from .portable_levels import (
-    PortableLevels,
-    batches,
-    parse_description,
-    place_splats,
-    splats_from_activated,
-    upright_meta,
-)
-from .quats import rotation_matrices
-from .sh import coefficient_count
-from .spz import pack_spz, unpack_spz
+from .portable_levels import PortableLevels, batches
+from .spz import pack_spz
 
 MAX_DEGREE = 3
 SPLATS, LOD, COVERAGE = "KHR_gaussian_splatting", "MSFT_lod", "MSFT_screencoverage"
 COMPRESSION = "KHR_gaussian_splatting_compression_spz_2"
 DESCRIPTION = "lodgs"
 """Key of the scene's extras with the levels' rule and meta, as JSON."""
-_HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
+HEADER, CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 _MAX_BYTES = 2**32 - 1
-_MAX_JSON = 1 << 24
 _RESERVE = 256
 """Bytes of JSON for the bounds of a level, which are known after its splats are written."""
-_MIN_SPLAT = 32
-"""Minimum bytes of a splat: position, rotation, scale, opacity and base colour."""
-_SPZ_SPLAT = 19
-"""Minimum bytes of a splat of SPZ before compression."""
-_MAX_RATIO = 20
-"""Maximum ratio of compression that is read; that of trained splats is about 2."""
 _VIEW_ANGLE = math.radians(60)
 """Vertical field of view for which distances are converted to covered shares of the screen."""
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 """From the axes of OpenCV's cameras to those of glTF's."""
-_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """From z up to y up."""
-_DEFECTS = (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError, struct.error)
-_TRANSFORM = {"matrix", "rotation", "scale", "translation"}
-_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
-_COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
+WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _COLUMNS = {
     "POSITION": ("VEC3", 5126),
     "COLOR_0": ("VEC4", 5121),
@@ -77,7 +54,7 @@ def write_glb(path: Path, levels: PortableLevels) -> None:
     document, size = _document(levels)
     text = _padded(document, 0)
     reserved = len(text) + _RESERVE * len(document["meshes"])
-    begin = _HEADER.size + 2 * _CHUNK.size + reserved
+    begin = HEADER.size + 2 * CHUNK.size + reserved
     if begin + size > _MAX_BYTES:
         raise LodgsError(
             f"Cannot write {path}: {(begin + size) / 1e9:.1f} GB exceed the 4 GiB of a .glb file.",
@@ -96,9 +73,9 @@ def write_glb(path: Path, levels: PortableLevels) -> None:
             document["accessors"][attributes["POSITION"]] |= {"min": low.tolist(), "max": high.tolist()}
         file.truncate(begin + size)
         file.seek(0)
-        file.write(_HEADER.pack(b"glTF", 2, begin + size))
-        file.write(_CHUNK.pack(reserved, b"JSON") + _padded(document, reserved))
-        file.write(_CHUNK.pack(size, b"BIN\0"))
+        file.write(HEADER.pack(b"glTF", 2, begin + size))
+        file.write(CHUNK.pack(reserved, b"JSON") + _padded(document, reserved))
+        file.write(CHUNK.pack(size, b"BIN\0"))
 
 
 def write_compressed_glb(path: Path, levels: PortableLevels) -> None:
@@ -124,8 +101,8 @@ def write_compressed_glb(path: Path, levels: PortableLevels) -> None:
     document["buffers"] = [{"byteLength": len(data)}]
     text = _padded(document, 0)
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
-        file.write(_HEADER.pack(b"glTF", 2, _HEADER.size + 2 * _CHUNK.size + len(text) + len(data)))
-        file.write(_CHUNK.pack(len(text), b"JSON") + text + _CHUNK.pack(len(data), b"BIN\0") + data)
+        file.write(HEADER.pack(b"glTF", 2, HEADER.size + 2 * CHUNK.size + len(text) + len(data)))
+        file.write(CHUNK.pack(len(text), b"JSON") + text + CHUNK.pack(len(data), b"BIN\0") + data)
 
 
 def _padded(document: dict, size: int) -> bytes:
@@ -143,7 +120,7 @@ def _document(levels: PortableLevels) -> tuple[dict, int]:
         "scenes": [{"nodes": [0], "extras": {DESCRIPTION: levels.describe()}}],
         "nodes": [], "meshes": [], "accessors": [], "bufferViews": [], "buffers": [],
     }  # fmt: skip
-    matrix = (_Y_UP @ levels.placement).T.ravel().tolist()
+    matrix = (Y_UP @ levels.placement).T.ravel().tolist()
     size = 0
     for level in levels.fine_to_coarse:
         attributes = {}
@@ -195,7 +172,7 @@ def _add_cameras(document: dict, levels: PortableLevels) -> None:
             "aspectRatio": view.width / view.fx * view.fy / view.height,
             "znear": max(view.near, 1e-4),
         }
-        matrix = _Y_UP @ levels.placement @ view.camera_to_world @ _FLIP
+        matrix = Y_UP @ levels.placement @ view.camera_to_world @ _FLIP
         node = {"name": view.name, "camera": len(document["cameras"]), "matrix": matrix.T.ravel().tolist()}
         document["cameras"].append({"name": view.name, "type": "perspective", "perspective": camera})
         document["scenes"][0]["nodes"].append(len(document["nodes"]))
@@ -204,16 +181,17 @@ def _add_cameras(document: dict, levels: PortableLevels) -> None:
 
 def _columns(degree: int) -> dict[str, tuple[str, int]]:
     """Return accessor type and component type of each attribute by name."""
-    return _COLUMNS | {name: ("VEC3", 5126) for name in _harmonics(degree)}
+    return _COLUMNS | {name: ("VEC3", 5126) for name in harmonics(degree)}
 
 
-def _harmonics(degree: int) -> list[str]:
+def harmonics(degree: int) -> list[str]:
+    """Return the names of the attributes of spherical harmonics up to a degree."""
     return [f"{SPLATS}:SH_DEGREE_{n}_COEF_{i}" for n in range(degree + 1) for i in range(2 * n + 1)]
 
 
 def _item_size(name: str) -> int:
     kind, component = _COLUMNS.get(name, ("VEC3", 5126))
-    return _WIDTHS[kind] * np.dtype(_COMPONENTS[component]).itemsize
+    return WIDTHS[kind] * np.dtype(COMPONENTS[component]).itemsize
 
 
 def _values(splats: Splats) -> dict[str, np.ndarray]:
@@ -227,214 +205,5 @@ def _values(splats: Splats) -> dict[str, np.ndarray]:
         f"{SPLATS}:SCALE": np.exp(splats.log_scales),
         f"{SPLATS}:OPACITY": alphas,
     }
-    values |= {name: splats.sh[:, i] for i, name in enumerate(_harmonics(splats.sh_degree))}
+    values |= {name: splats.sh[:, i] for i, name in enumerate(harmonics(splats.sh_degree))}
     return {name: column if name == "COLOR_0" else column.astype("<f4") for name, column in values.items()}
-
-
-def read_glb(path: Path, bundle: Path) -> None:
-    """Convert the splats of a ``.glb`` file to a bundle.
-
-    Raises:
-        LodgsError: the file is damaged, has no splats or refers to other files.
-    """
-    try:
-        levels = _GlbReader(path).levels()
-    except _DEFECTS as error:
-        reason = printable(f"{type(error).__name__}: {error}")[:300]
-        raise LodgsError(f"Cannot read {path}: it is damaged ({reason}).", "Export it again.") from error
-    write_bundle(bundle, levels)
-
-
-class _GlbReader:
-    """Reader of the splats of one file. Defects raise one of ``_DEFECTS``."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        with open_file(path) as file:
-            self._size = os.fstat(file.fileno()).st_size
-            magic, version, _ = _HEADER.unpack(file.read(_HEADER.size))
-            if magic != b"glTF" or version != 2:
-                raise LodgsError(
-                    f"Cannot read {path}: it is not a binary glTF file of version 2.", "Export it as .glb."
-                )
-            length, kind = _CHUNK.unpack(file.read(_CHUNK.size))
-            if kind != b"JSON" or length > min(_MAX_JSON, self._size):
-                raise ValueError("its JSON is missing or too long")
-            self._json = parse_json(file.read(length), f"The JSON of {path}", _MAX_JSON)
-            head, self._data = file.read(_CHUNK.size), np.zeros(0, np.uint8)
-            if head:
-                length, kind = _CHUNK.unpack(head)
-                if kind != b"BIN\0" or file.tell() + length > self._size:
-                    raise ValueError("its binary data are truncated")
-                if length:
-                    self._data = np.memmap(file, np.uint8, "r", file.tell(), length)
-        self._splats = 0
-
-    @np.errstate(over="ignore", invalid="ignore")
-    def levels(self) -> Bundle:
-        """Return the levels of the first node with MSFT_lod, or all splats as one level."""
-        nodes = self._world_nodes()
-        sets = [self._node_splats(node, matrix) for node, matrix in nodes]
-        base = next((i for i, (node, _) in enumerate(nodes) if sets[i] and self._coarser(node)), None)
-        if base is not None:
-            node, matrix = nodes[base]
-            local, ids = _matrix(node), self._coarser(node)
-            if len(ids) >= MAX_READ_LEVELS:
-                raise ValueError(f"{len(ids) + 1} levels")
-            others = [self._item("nodes", index) for index in ids]
-            parent = matrix @ np.linalg.inv(local)
-            fine_to_coarse = [sets[base], *(self._node_splats(n, parent @ _matrix(n)) for n in others)]
-            fine_to_coarse = [parts for parts in fine_to_coarse if parts]
-        else:
-            fine_to_coarse = [[part for parts in sets for part in parts]]
-        if not any(fine_to_coarse):
-            raise LodgsError(f"Cannot read {self._path}: it has no Gaussian splats.", "Choose another file.")
-        return self._own(fine_to_coarse) or self._foreign(fine_to_coarse)
-
-    def _own(self, fine_to_coarse: list[list[tuple[Splats, np.ndarray]]]) -> Bundle | None:
-        """Return the bundle that LODGS has written; None if another program has written or moved it."""
-        scene = self._item("scenes", self._json.get("scene", 0))
-        text = (scene.get("extras") or {}).get(DESCRIPTION)
-        if text is None:
-            return None
-        bundle, placement = parse_description(text, self._path)
-        same = len(bundle.levels) == len(fine_to_coarse) and all(
-            len(parts) == 1 and np.allclose(parts[0][1], _Y_UP @ placement, rtol=1e-9, atol=1e-9)
-            for parts in fine_to_coarse
-        )
-        if not same:
-            return None
-        for level, ((splats, _),) in zip(reversed(bundle.levels), fine_to_coarse, strict=True):
-            level.splats = splats
-        return bundle
-
-    def _foreign(self, fine_to_coarse: list[list[tuple[Splats, np.ndarray]]]) -> Bundle:
-        placed = [place_splats(*part, self._path) for parts in fine_to_coarse for part in parts]
-        meta, splats = upright_meta(placed, "Y")
-        count = coefficient_count(min(part.sh_degree for part in splats))
-        for part in splats:
-            part.sh = np.ascontiguousarray(part.sh[:, :count])
-        remaining, levels = iter(splats), []
-        for number, parts in enumerate(fine_to_coarse):
-            joined = Splats.concatenated([next(remaining) for _ in parts])
-            levels.append(Level(len(fine_to_coarse) - number, joined))
-        return Bundle("", levels[::-1], meta=meta)
-
-    def _world_nodes(self) -> list[tuple[dict, np.ndarray]]:
-        """Return the nodes of the scene with their transforms (4, 4)."""
-        scene = self._item("scenes", self._json.get("scene", 0))
-        waiting = deque((index, np.eye(4)) for index in scene["nodes"])
-        nodes, visited = [], set()
-        while waiting:
-            index, parent = waiting.popleft()
-            node = self._item("nodes", index)
-            if index in visited:
-                raise ValueError(f"node {index} occurs twice")
-            visited.add(index)
-            matrix = parent @ _matrix(node) if _TRANSFORM & node.keys() else parent
-            nodes.append((node, matrix))
-            waiting += [(child, matrix) for child in node.get("children", [])]
-        return nodes
-
-    def _coarser(self, node: dict) -> list[int]:
-        return list(node.get("extensions", {}).get(LOD, {}).get("ids", []))
-
-    def _node_splats(self, node: dict, matrix: np.ndarray) -> list[tuple[Splats, np.ndarray]]:
-        """Return the splats of a node, and its transform."""
-        if "mesh" not in node:
-            return []
-        primitives = self._item("meshes", node["mesh"])["primitives"]
-        return [
-            (self._primitive(primitive), matrix)
-            for primitive in primitives
-            if SPLATS in primitive.get("extensions", {})
-        ]
-
-    def _primitive(self, primitive: dict) -> Splats:
-        extension = primitive["extensions"][SPLATS]
-        inner = list(extension.get("extensions", {}))
-        if inner == [COMPRESSION]:
-            return self._compressed(extension["extensions"][COMPRESSION]["bufferView"])
-        if inner:
-            raise LodgsError(
-                f"Cannot read {self._path}: its splats need the extension {printable(inner[0])}.",
-                "Export it without compression.",
-            )
-        attributes = primitive["attributes"]
-        means = self._accessor(attributes["POSITION"], 3)
-        quats = self._accessor(attributes[f"{SPLATS}:ROTATION"], 4)[:, [3, 0, 1, 2]]
-        scales = self._accessor(attributes[f"{SPLATS}:SCALE"], 3)
-        alphas = self._accessor(attributes[f"{SPLATS}:OPACITY"], 1)[:, 0]
-        degree = max((n for n in range(MAX_DEGREE + 1) if _harmonics(n)[-1] in attributes), default=0)
-        sh = [self._accessor(attributes[name], 3) for name in _harmonics(degree)]
-        if len({len(column) for column in (means, quats, scales, alphas, *sh)}) > 1:
-            raise ValueError("attributes have different lengths")
-        self._splats += len(means)
-        if self._splats * _MIN_SPLAT > self._size:
-            raise ValueError(f"it is too short for {self._splats:,} splats")
-        return splats_from_activated(means, quats, scales, alphas, np.stack(sh, axis=1))
-
-    def _compressed(self, index: object) -> Splats:
-        view = self._view(index)
-        begin = _natural(view.get("byteOffset", 0))
-        data = self._data[begin : begin + _natural(view["byteLength"])].tobytes()
-        splats = unpack_spz(data, len(data) * _MAX_RATIO // _SPZ_SPLAT)
-        self._splats += len(splats)
-        if self._splats * _SPZ_SPLAT > self._size * _MAX_RATIO:
-            raise ValueError(f"it is too short for {self._splats:,} splats")
-        return splats
-
-    def _view(self, index: object) -> dict:
-        """Return a buffer view of the file's own data."""
-        view = self._item("bufferViews", index)
-        buffer = self._item("buffers", view["buffer"])
-        if view["buffer"] != 0 or "uri" in buffer:
-            raise LodgsError(
-                f"Cannot read {self._path}: it refers to other files.", "Export it as one .glb file."
-            )
-        return view
-
-    def _accessor(self, index: object, width: int) -> np.ndarray:
-        """Return the values (N, width) float32 of an accessor."""
-        accessor = self._item("accessors", index)
-        view = self._view(accessor["bufferView"])
-        if _WIDTHS[accessor["type"]] != width or "sparse" in accessor:
-            raise ValueError(f"accessor {index} is not supported")
-        kind = np.dtype(_COMPONENTS[accessor["componentType"]])
-        count = _natural(accessor["count"])
-        begin = _natural(view.get("byteOffset", 0)) + _natural(accessor.get("byteOffset", 0))
-        stride = _natural(view.get("byteStride", 0)) or width * kind.itemsize
-        end = begin + (count - 1) * stride + width * kind.itemsize
-        limit = _natural(view.get("byteOffset", 0)) + _natural(view["byteLength"])
-        if stride < width * kind.itemsize or (count and end > min(limit, len(self._data))):
-            raise ValueError(f"accessor {index} exceeds its data")
-        if not count:
-            return np.zeros((0, width), np.float32)
-        raw = np.ndarray((count, width), kind, self._data, begin, (stride, kind.itemsize))
-        values = raw.astype(np.float32)
-        if accessor.get("normalized") and kind.kind != "f":
-            values = np.maximum(values / np.iinfo(kind).max, -1)
-        return values
-
-    def _item(self, name: str, index: object) -> dict:
-        """Return an entry of a list of the document."""
-        return self._json[name][_natural(index)]
-
-
-def _natural(value: object) -> int:
-    """Return the value, or raise ValueError if it is not an integer of at least 0."""
-    if type(value) is not int or value < 0:
-        raise ValueError(f"{value!r} is not a count")
-    return value
-
-
-def _matrix(node: dict) -> np.ndarray:
-    """Return the transform (4, 4) of a node relative to its parent."""
-    if "matrix" in node:
-        return np.array(node["matrix"], np.float64).reshape(4, 4).T
-    x, y, z, w = np.array(node.get("rotation", (0, 0, 0, 1)), np.float64)
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotation_matrices(np.array([w, x, y, z]))
-    matrix[:3, :3] *= np.array(node.get("scale", (1, 1, 1)), np.float64)
-    matrix[:3, 3] = np.array(node.get("translation", (0, 0, 0)), np.float64)
-    return matrix

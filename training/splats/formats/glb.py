@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from ..gltf import MAX_DEGREE, read_glb, write_glb
+from ..gltf import MAX_DEGREE, write_glb
+from ..gltf_reader import read_glb
 from ..splat_format import SplatFormat
 
 FORMAT = SplatFormat(
