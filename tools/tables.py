@@ -175,6 +175,9 @@ _OTHER_FORMATS = {
         "yes, in Blender by splat-transform", "all", "trainer", "3", "", "as `.sog`",
     ],
     "ksplat": ["`.ksplat`, not written", "mkkellogg's older web viewer", "yes", "one", "", "3", "", ""],
+    "gltf with text": [
+        "`.gltf`, not written", "glTF with its data in other files", "yes", "all", "", "3", "", "",
+    ],
 }  # fmt: skip
 """Cells of formats that are no SplatFormat, by their label in the results of other programs."""
 

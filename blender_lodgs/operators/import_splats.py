@@ -126,7 +126,7 @@ class LODGS_FH_splats(bpy.types.FileHandler):
     bl_label = "Gaussian Splats (LODGS)"
     bl_import_operator = LODGS_OT_import_splats.bl_idname
     # Blender's own importer opens dropped glTF files
-    bl_file_extensions = ";".join(ending for ending in FILE_EXTENSIONS if ending != ".glb")
+    bl_file_extensions = ";".join(ending for ending in FILE_EXTENSIONS if ending not in (".glb", ".gltf"))
 
     @classmethod
     def poll_drop(cls, context):

@@ -1,18 +1,27 @@
-"""Reader of splats in binary glTF, with levels by MSFT_lod; ``gltf`` writes them."""
+"""Reader of splats in glTF, with levels by MSFT_lod; ``gltf`` writes them.
+
+Drafts of KHR_gaussian_splatting are read, too: attributes that start with an underscore, base colour and
+opacity in COLOR_0, and other names of the compression with SPZ.
+"""
 
 from __future__ import annotations
 
+import base64
 import os
+import re
 import struct
 from collections import deque
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+from typing import NoReturn
+from urllib.parse import unquote
 
 import numpy as np
 
+from ..color import srgb_from_linear
 from ..documents import open_file, parse_json
 from ..errors import LodgsError, printable
 from .bundle import write_bundle
-from .gaussians import Splats
+from .gaussians import SH_C0, Splats
 from .gltf import (
     CHUNK,
     COMPONENTS,
@@ -32,7 +41,12 @@ from .quats import rotation_matrices
 from .sh import coefficient_count
 from .spz import unpack_spz
 
-_MAX_JSON = 1 << 24
+_MAX_JSON, _MAX_TEXT = 1 << 24, 1 << 28
+"""Maximum bytes of the JSON of a .glb and of a .gltf, which may contain the data as text."""
+_COMPRESSIONS = COMPRESSION, "KHR_gaussian_splatting_compression_spz", "KHR_spz_gaussian_splats_compression"
+"""Names of the compression with SPZ, the last one in place of ``SPLATS``."""
+_LINEAR = "lin_rec709_display"
+"""Colour space of splats whose colours are linear light."""
 _MIN_SPLAT = 32
 """Minimum bytes of a splat: position, rotation, scale, opacity and base colour."""
 _SPZ_SPLAT = 19
@@ -44,7 +58,7 @@ _TRANSFORM = {"matrix", "rotation", "scale", "translation"}
 
 
 def read_glb(path: Path, bundle: Path) -> None:
-    """Convert the splats of a ``.glb`` file to a bundle.
+    """Convert the splats of a ``.glb`` or ``.gltf`` file to a bundle.
 
     Raises:
         LodgsError: the file is damaged, has no splats or refers to other files.
@@ -62,8 +76,13 @@ class _GlbReader:
 
     def __init__(self, path: Path) -> None:
         self._path = path
+        self._buffers: dict[int, np.ndarray] = {}
+        self._splats = 0
         with open_file(path) as file:
             self._size = os.fstat(file.fileno()).st_size
+            if path.suffix.lower() == ".gltf":
+                self._json = parse_json(file.read(_MAX_TEXT + 1), f"The JSON of {path}", _MAX_TEXT)
+                return
             magic, version, _ = HEADER.unpack(file.read(HEADER.size))
             if magic != b"glTF" or version != 2:
                 raise LodgsError(
@@ -73,14 +92,13 @@ class _GlbReader:
             if kind != b"JSON" or length > min(_MAX_JSON, self._size):
                 raise ValueError("its JSON is missing or too long")
             self._json = parse_json(file.read(length), f"The JSON of {path}", _MAX_JSON)
-            head, self._data = file.read(CHUNK.size), np.zeros(0, np.uint8)
-            if head:
-                length, kind = CHUNK.unpack(head)
-                if kind != b"BIN\0" or file.tell() + length > self._size:
-                    raise ValueError("its binary data are truncated")
-                if length:
-                    self._data = np.memmap(file, np.uint8, "r", file.tell(), length)
-        self._splats = 0
+            if not (head := file.read(CHUNK.size)):
+                return
+            length, kind = CHUNK.unpack(head)
+            if kind != b"BIN\0" or file.tell() + length > self._size:
+                raise ValueError("its binary data are truncated")
+            if length and "uri" not in self._item("buffers", 0):
+                self._buffers[0] = np.memmap(file, np.uint8, "r", file.tell(), length)
 
     @np.errstate(over="ignore", invalid="ignore")
     def levels(self) -> Bundle:
@@ -123,9 +141,9 @@ class _GlbReader:
     def _foreign(self, fine_to_coarse: list[list[tuple[Splats, np.ndarray]]]) -> Bundle:
         placed = [place_splats(*part, self._path) for parts in fine_to_coarse for part in parts]
         meta, splats = upright_meta(placed, "Y")
-        count = coefficient_count(min(part.sh_degree for part in splats))
+        count = coefficient_count(max(part.sh_degree for part in splats))
         for part in splats:
-            part.sh = np.ascontiguousarray(part.sh[:, :count])
+            part.sh = np.pad(part.sh, ((0, 0), (0, count - part.sh.shape[1]), (0, 0)))
         remaining, levels = iter(splats), []
         for number, parts in enumerate(fine_to_coarse):
             joined = Splats.concatenated([next(remaining) for _ in parts])
@@ -159,26 +177,39 @@ class _GlbReader:
         return [
             (self._primitive(primitive), matrix)
             for primitive in primitives
-            if SPLATS in primitive.get("extensions", {})
+            if {SPLATS, _COMPRESSIONS[-1]} & primitive.get("extensions", {}).keys()
         ]
 
     def _primitive(self, primitive: dict) -> Splats:
-        extension = primitive["extensions"][SPLATS]
-        inner = list(extension.get("extensions", {}))
-        if inner == [COMPRESSION]:
-            return self._compressed(extension["extensions"][COMPRESSION]["bufferView"])
-        if inner:
-            raise LodgsError(
-                f"Cannot read {self._path}: its splats need the extension {printable(inner[0])}.",
-                "Export it without compression.",
-            )
-        attributes = primitive["attributes"]
-        means = self._accessor(attributes["POSITION"], 3)
+        extension = primitive["extensions"].get(SPLATS)
+        inner = primitive["extensions"] if extension is None else extension.get("extensions", {})
+        if name := next((name for name in _COMPRESSIONS if name in inner), ""):
+            splats = self._compressed(inner[name]["bufferView"])
+        elif inner:
+            self._refuse_extension(next(iter(inner)))
+        else:
+            splats = self._uncompressed(primitive["attributes"], extension)
+        if extension and extension.get("colorSpace") == _LINEAR:
+            splats.sh = _display_coded(splats.sh)
+        return splats
+
+    def _uncompressed(self, attributes: dict, extension: dict) -> Splats:
+        attributes = {re.sub("^_", f"{SPLATS}:", name): index for name, index in attributes.items()}
+        step = np.float32(extension.get("quantizedPositionScale", 1))  # of the first draft
+        means = self._accessor(attributes["POSITION"], 3) * step
         quats = self._accessor(attributes[f"{SPLATS}:ROTATION"], 4)[:, [3, 0, 1, 2]]
         scales = self._accessor(attributes[f"{SPLATS}:SCALE"], 3)
-        alphas = self._accessor(attributes[f"{SPLATS}:OPACITY"], 1)[:, 0]
+        if f"{SPLATS}:OPACITY" in attributes:
+            alphas = self._accessor(attributes[f"{SPLATS}:OPACITY"], 1)[:, 0]
+        else:
+            alphas = self._accessor(attributes["COLOR_0"], 4)[:, 3]
         degree = max((n for n in range(MAX_DEGREE + 1) if harmonics(n)[-1] in attributes), default=0)
-        sh = [self._accessor(attributes[name], 3) for name in harmonics(degree)]
+        base, *rest = harmonics(degree)
+        if base in attributes:
+            sh = [self._accessor(attributes[base], 3)]
+        else:
+            sh = [(self._accessor(attributes["COLOR_0"], 4)[:, :3] - 0.5) / SH_C0]
+        sh += [self._accessor(attributes[name], 3) for name in rest]
         if len({len(column) for column in (means, quats, scales, alphas, *sh)}) > 1:
             raise ValueError("attributes have different lengths")
         self._splats += len(means)
@@ -186,43 +217,64 @@ class _GlbReader:
             raise ValueError(f"it is too short for {self._splats:,} splats")
         return splats_from_activated(means, quats, scales, alphas, np.stack(sh, axis=1))
 
+    def _refuse_extension(self, name: str) -> NoReturn:
+        raise LodgsError(
+            f"Cannot read {self._path}: its splats need the extension {printable(name)}.",
+            "Export it without compression.",
+        )
+
     def _compressed(self, index: object) -> Splats:
-        view = self._view(index)
-        begin = _natural(view.get("byteOffset", 0))
-        data = self._data[begin : begin + _natural(view["byteLength"])].tobytes()
-        splats = unpack_spz(data, len(data) * _MAX_RATIO // _SPZ_SPLAT)
+        data, _ = self._view(index)
+        splats = unpack_spz(data.tobytes(), len(data) * _MAX_RATIO // _SPZ_SPLAT)
         self._splats += len(splats)
         if self._splats * _SPZ_SPLAT > self._size * _MAX_RATIO:
             raise ValueError(f"it is too short for {self._splats:,} splats")
         return splats
 
-    def _view(self, index: object) -> dict:
-        """Return a buffer view of the file's own data."""
+    def _view(self, index: object) -> tuple[np.ndarray, int]:
+        """Return the bytes of a buffer view, and its stride or 0."""
         view = self._item("bufferViews", index)
-        buffer = self._item("buffers", view["buffer"])
-        if view["buffer"] != 0 or "uri" in buffer:
-            raise LodgsError(
-                f"Cannot read {self._path}: it refers to other files.", "Export it as one .glb file."
-            )
-        return view
+        if extensions := view.get("extensions"):
+            self._refuse_extension(next(iter(extensions)))
+        begin = _natural(view.get("byteOffset", 0))
+        data = self._buffer(_natural(view["buffer"]))[begin : begin + _natural(view["byteLength"])]
+        return data, _natural(view.get("byteStride", 0))
+
+    def _buffer(self, index: int) -> np.ndarray:
+        """Return the bytes of a buffer: in the .glb, as text in the JSON, or in a file below its folder."""
+        if index not in self._buffers:
+            uri = self._item("buffers", index)["uri"]
+            if uri.startswith("data:"):
+                data = np.frombuffer(base64.b64decode(uri.partition(",")[2]), np.uint8)
+            else:
+                name = PurePosixPath(unquote(uri))
+                if ":" in uri or "\\" in uri or name.is_absolute() or ".." in name.parts:
+                    raise LodgsError(
+                        f"Cannot read {self._path}: it refers to other files outside its folder.",
+                        "Export it as one .glb file.",
+                    )
+                with open_file(self._path.parent / name) as file:
+                    data = np.memmap(file, np.uint8, "r")
+            self._buffers[index] = data
+            self._size += len(data)
+        return self._buffers[index]
 
     def _accessor(self, index: object, width: int) -> np.ndarray:
         """Return the values (N, width) float32 of an accessor."""
         accessor = self._item("accessors", index)
-        view = self._view(accessor["bufferView"])
+        data, stride = self._view(accessor["bufferView"])
         if WIDTHS[accessor["type"]] != width or "sparse" in accessor:
             raise ValueError(f"accessor {index} is not supported")
         kind = np.dtype(COMPONENTS[accessor["componentType"]])
         count = _natural(accessor["count"])
-        begin = _natural(view.get("byteOffset", 0)) + _natural(accessor.get("byteOffset", 0))
-        stride = _natural(view.get("byteStride", 0)) or width * kind.itemsize
+        begin = _natural(accessor.get("byteOffset", 0))
+        stride = stride or width * kind.itemsize
         end = begin + (count - 1) * stride + width * kind.itemsize
-        limit = _natural(view.get("byteOffset", 0)) + _natural(view["byteLength"])
-        if stride < width * kind.itemsize or (count and end > min(limit, len(self._data))):
+        if stride < width * kind.itemsize or (count and end > len(data)):
             raise ValueError(f"accessor {index} exceeds its data")
         if not count:
             return np.zeros((0, width), np.float32)
-        raw = np.ndarray((count, width), kind, self._data, begin, (stride, kind.itemsize))
+        raw = np.ndarray((count, width), kind, data, begin, (stride, kind.itemsize))
         values = raw.astype(np.float32)
         if accessor.get("normalized") and kind.kind != "f":
             values = np.maximum(values / np.iinfo(kind).max, -1)
@@ -250,3 +302,14 @@ def _matrix(node: dict) -> np.ndarray:
     matrix[:3, :3] *= np.array(node.get("scale", (1, 1, 1)), np.float64)
     matrix[:3, 3] = np.array(node.get("translation", (0, 0, 0)), np.float64)
     return matrix
+
+
+def _display_coded(sh: np.ndarray) -> np.ndarray:
+    """Convert coefficients (N, C, 3) of linear light to display-coded ones, in the first order."""
+    base = (0.5 + SH_C0 * sh[:, 0]).clip(0)
+    slope = np.where(base <= 0.0031308, 12.92, 1.055 / 2.4 * np.maximum(base, 0.0031308) ** (1 / 2.4 - 1))
+    return np.concatenate(
+        [((srgb_from_linear(base) - 0.5) / SH_C0)[:, None], sh[:, 1:] * slope[:, None]],
+        axis=1,
+        dtype=np.float32,
+    )

@@ -1,5 +1,6 @@
 """glTF files: the attributes of KHR_gaussian_splatting, levels with MSFT_lod, and read back."""
 
+import base64
 import json
 import struct
 from dataclasses import replace
@@ -203,6 +204,107 @@ def test_quantised_attributes_of_other_programs(tmp_path):
     np.testing.assert_allclose(np.abs(level.splats.quats[0]), [0.5**0.5, 0, 0, 0.5**0.5], atol=1e-6)
 
 
+def edited(tmp_path, change, name="b.glb"):
+    """Write one level, change its document as another program, and return the splats that are read again."""
+    bundle = flod(1)
+    del bundle.levels[:-1]
+    export_levels(tmp_path / "a.glb", bundle)
+    document, data = read_parts(tmp_path / "a.glb")
+    (primitive,) = document["meshes"][0]["primitives"]
+    data = change(document, primitive, data) or data
+    if name.endswith(".gltf"):
+        (tmp_path / name).write_text(json.dumps(document))
+    else:
+        (tmp_path / name).write_bytes(assembled(document, data))
+    return read(tmp_path / "a.glb").levels[-1].splats, read(tmp_path / name).levels[-1].splats
+
+
+def first_draft(document, primitive, data):
+    names = {f"{PREFIX}ROTATION": "_ROTATION", f"{PREFIX}SCALE": "_SCALE"}
+    primitive["attributes"] = {
+        names.get(key, key): value
+        for key, value in primitive["attributes"].items()
+        if key in (*names, "POSITION", "COLOR_0")
+    }
+    primitive["extensions"]["KHR_gaussian_splatting"] = {"quantizedPositionScale": 2.0}
+
+
+def second_draft(document, primitive, data):
+    for name in ("OPACITY", "SH_DEGREE_0_COEF_0"):
+        del primitive["attributes"][PREFIX + name]
+
+
+@pytest.mark.parametrize(("draft", "scale", "degree"), [(first_draft, 2, 0), (second_draft, 1, 1)])
+def test_drafts_have_base_colour_and_opacity_in_color_0(tmp_path, draft, scale, degree):
+    """KHR_gaussian_splatting of 2024 (README of CesiumGS/glTF 8417ae0) and of 2025."""
+    expected, splats = edited(tmp_path, draft)
+    assert splats.sh_degree == degree
+    np.testing.assert_allclose(np.abs(splats.means).max(), scale * np.abs(expected.means).max(), rtol=1e-5)
+    colors, stored = (0.5 + SH_C0 * s.sh[:, 0] for s in (splats, expected))
+    np.testing.assert_allclose(colors, stored.clip(0, 1), atol=0.5 / 255 + 1e-6)
+    alphas, stored = (1 / (1 + np.exp(-s.opacity_logits)) for s in (splats, expected))
+    np.testing.assert_allclose(alphas, stored, atol=0.5 / 255 + 1e-6)
+
+
+@pytest.mark.parametrize(
+    "name", ["KHR_gaussian_splatting_compression_spz", "KHR_spz_gaussian_splats_compression"]
+)
+def test_spz_in_drafts(tmp_path, name):
+    bundle = flod(1)
+    del bundle.levels[:-1]
+    write_compressed_glb(tmp_path / "a.glb", PortableLevels(bundle))
+    document, data = read_parts(tmp_path / "a.glb")
+    extensions = document["meshes"][0]["primitives"][0]["extensions"]
+    if name.startswith("KHR_spz"):
+        del extensions["KHR_gaussian_splatting"]
+        extensions[name] = {"bufferView": 0}
+    else:
+        extensions["KHR_gaussian_splatting"]["extensions"] = {name: {"bufferView": 0}}
+    (tmp_path / "b.glb").write_bytes(assembled(document, data))
+    first, second = (read(tmp_path / file).levels[-1].splats for file in ("a.glb", "b.glb"))
+    np.testing.assert_array_equal(first.means, second.means)
+
+
+@pytest.mark.parametrize("uri", ["data:application/octet-stream;base64,", "parts/the%20data.bin"])
+def test_gltf_with_its_data_as_text_or_in_another_file(tmp_path, uri):
+    def change(document, primitive, data):
+        is_text = uri.startswith("data:")
+        document["buffers"][0]["uri"] = uri + base64.b64encode(data).decode() * is_text
+        (tmp_path / "parts").mkdir()
+        (tmp_path / "parts" / "the data.bin").write_bytes(data)
+
+    expected, splats = edited(tmp_path, change, "b.gltf")
+    assert_equal(splats, expected)
+
+
+def test_linear_colours_become_display_coded(tmp_path):
+    """IEC 61966-2-1 for the base colour, and its slope for the others."""
+
+    def change(document, primitive, data):
+        primitive["extensions"]["KHR_gaussian_splatting"]["colorSpace"] = "lin_rec709_display"
+
+    expected, splats = edited(tmp_path, change)
+    linear = 0.5 + SH_C0 * expected.sh[:, 0].astype(np.float64)
+    visible = linear > 0.01
+    coded = 0.5 + SH_C0 * splats.sh[:, 0]
+    np.testing.assert_allclose(coded[visible], 1.055 * linear[visible] ** (1 / 2.4) - 0.055, atol=1e-5)
+    step = 1e-4
+    slope = ((linear[visible] + step) ** (1 / 2.4) - linear[visible] ** (1 / 2.4)) * 1.055 / step
+    ratio = (splats.sh[:, 1] / expected.sh[:, 1])[visible]
+    np.testing.assert_allclose(ratio, slope, rtol=5e-3)
+
+
+def test_splats_of_several_degrees_keep_the_highest(tmp_path):
+    def change(document, primitive, data):
+        lower = {k: v for k, v in primitive["attributes"].items() if "SH_DEGREE_1" not in k}
+        document["meshes"][0]["primitives"].append(primitive | {"attributes": lower})
+
+    expected, splats = edited(tmp_path, change)
+    count = len(expected)
+    assert splats.sh_degree == expected.sh_degree and splats.sh[:count, 1:].any()
+    np.testing.assert_array_equal(splats.sh[count:, 1:], 0)
+
+
 def change_buffer(document):
     document["buffers"][0]["uri"] = "../secret.bin"
 
@@ -210,6 +312,10 @@ def change_buffer(document):
 def change_compression(document):
     extension = document["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]
     extension["extensions"] = {"KHR_gaussian_splatting_compression_other": {"bufferView": 0}}
+
+
+def change_view(document):
+    document["bufferViews"][0] |= {"buffer": 1, "extensions": {"EXT_meshopt_compression": {"buffer": 0}}}
 
 
 def change_count(document):
@@ -230,6 +336,7 @@ def change_index(document):
     [
         (change_buffer, "refers to other files"),
         (change_compression, "needs? the extension KHR_gaussian_splatting_compression_other"),
+        (change_view, "need the extension EXT_meshopt_compression"),
         (change_count, "exceeds its data"),
         (change_node, "occurs twice"),
         (change_index, "-1 is not a count"),

@@ -1,11 +1,11 @@
 """Splat files of other programs. Each module of this package declares one format as ``FORMAT``.
 
-``.ksplat`` is only read. splat-transform reads SOG without the packages of the trainer.
+``.ksplat`` and ``.gltf`` are only read. splat-transform reads SOG without the packages of the trainer.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
@@ -23,6 +23,7 @@ from ..splat_format import NeedsSplatTransform, SplatFormat
 from ..splat_transform import run_splat_transform
 from ..streamed_levels import STREAMED_FILE, count_lods, read_streamed_levels
 from .compressed_ply import FORMAT as COMPRESSED_PLY
+from .glb import FORMAT as GLB
 from .ply import FORMAT as PLY
 from .sog import FORMAT as SOG
 
@@ -33,7 +34,7 @@ FORMATS: tuple[SplatFormat, ...] = tuple(
     )
 )
 """Export formats: PLY, then by size, largest first."""
-KSPLAT = ".ksplat"
+KSPLAT, GLTF = ".ksplat", ".gltf"
 FILE_EXTENSIONS = (
     *(
         kind.suffix
@@ -41,6 +42,7 @@ FILE_EXTENSIONS = (
         if kind.readable and not kind.reads_in_trainer and kind.suffix.rfind(".") == 0
     ),
     KSPLAT,
+    GLTF,
 )
 """Last parts of the names of files that Blender reads."""
 LEVEL_FORMATS = tuple(kind for kind in FORMATS if kind.write_levels)
@@ -124,13 +126,17 @@ def open_as_ply(path: Path) -> Iterator[Path]:
         if name == STREAMED_FILE:
             converted = converted.with_suffix("")
             _read_streamed(path, converted)
-        elif level_readers := [
-            kind.read_levels for kind in FORMATS if kind.read_levels and name.endswith(kind.suffix)
-        ]:
-            level_readers[0](path, converted)
+        elif (read_levels := _level_reader(name)) is not None:
+            read_levels(path, converted)
         elif not _read_plain(path, converted):
             run_splat_transform([str(path), str(converted)])
         yield converted
+
+
+def _level_reader(name: str) -> Callable[[Path, Path], None] | None:
+    """Return the reader of files with levels for a name in lower case, or None."""
+    name = GLB.suffix if name.endswith(GLTF) else name
+    return next((kind.read_levels for kind in LEVEL_FORMATS if name.endswith(kind.suffix)), None)
 
 
 def _read_plain(path: Path, converted: Path) -> bool:
