@@ -202,7 +202,10 @@ def decode_sog(read: Callable[[str], bytes]) -> Splats:
 
     def table(part: str) -> np.ndarray:
         with np.errstate(over="ignore"):  # infinities are dropped later
-            return np.array(meta[part]["codebook"], np.float32)
+            values = np.array(meta[part]["codebook"], np.float32)
+        if np.isnan(values[0]):  # null, which splat-transform wrote for -infinity
+            values[0] = values[1] + (values[1] - values[-1]) / 255
+        return values
 
     low, high = (np.array(meta["means"][end], np.float64).reshape(3) for end in ("mins", "maxs"))
     codes = pixels("means", 0)[:, :3] + 256 * pixels("means", 1)[:, :3].astype(np.int64)

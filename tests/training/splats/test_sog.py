@@ -65,6 +65,19 @@ def test_values_are_stored_as_specified():
     assert values[:, 3].tolist() == [128, 255]
 
 
+def test_null_in_a_codebook_continues_its_steps():
+    """splat-transform wrote null for -infinity; PlayCanvas' engine replaces it since pull request 8056."""
+    files = encode_sog(random_splats(500))
+    meta = json.loads(files["meta.json"])
+    table = meta["scales"]["codebook"]
+    expected = table[1] + (table[1] - table[255]) / 255
+    table[0] = None
+    codes = pixels(files["scales.webp"])[:500, :3]
+    decoded = decode_sog((files | {"meta.json": json.dumps(meta).encode()}).__getitem__)
+    assert (codes == 0).any()
+    np.testing.assert_allclose(decoded.log_scales[codes == 0], expected, rtol=1e-6)
+
+
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_splats_round_trip(tmp_path, degree):
     splats = random_splats(900, degree)
