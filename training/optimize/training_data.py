@@ -117,6 +117,7 @@ class TrainingData:
                     f"{MIN_SIDE} per side are needed.",
                     "Use a larger image_scale.",
                 )
+        _check_masks(self.train)
         budget = default_budget() if photo_memory is None else photo_memory
         if depths:
             budget = budget * TARGET_BYTES // (TARGET_BYTES + DEPTH_BYTES)
@@ -262,6 +263,18 @@ def _check_scene(scene: Scene, train: Sequence[Camera]) -> None:
             "for training after holding out views, 2 are needed.",
             "Set test_every to 0 to hold out no views, or to a larger number.",
         )
+
+
+def _check_masks(train: Sequence[Camera]) -> None:
+    """Raise LodgsError if the masks of all of ``ALPHA_SAMPLES`` cameras ignore all pixels."""
+    sample = pick_evenly(train, ALPHA_SAMPLES)
+    for camera in sample:
+        if camera.mask is None or load_mask(camera.mask, camera.width, camera.height).any():
+            return
+    raise LodgsError(
+        f"Cannot train: masks such as {sample[0].mask} are black, so that all pixels are ignored.",
+        "Make the parts to train white, or remove the masks.",
+    )
 
 
 def _intersection(cameras: Sequence[Camera], selection: Sequence[Camera]) -> list[Camera]:

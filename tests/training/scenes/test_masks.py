@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from training.__main__ import main
 from training.errors import LodgsError
@@ -103,6 +104,32 @@ def test_invalid_mask_is_reported_before_training(tmp_path, capsys, kind):
     )
     out, err = capsys.readouterr()
     assert message in out and mask.name in out and "Traceback" not in out + err and "progress" not in out
+
+
+@pytest.mark.parametrize("kind", ["of 0 and 1", "green", "transparent", "grey with alpha"])
+def test_masks_of_other_kinds_are_black_and_white(tmp_path, kind):
+    """Segmentation programs write class numbers, overlay colours or transparency."""
+    white = halves()[..., 0] > 0
+    pixels = {
+        "of 0 and 1": white.astype(np.uint8),
+        "green": white[..., None] * np.uint8([0, 255, 0]),
+        "transparent": np.dstack([np.full(halves().shape, 255, np.uint8), 255 * white.astype(np.uint8)]),
+        "grey with alpha": np.dstack([255 * white.astype(np.uint8), np.full(white.shape, 255, np.uint8)]),
+    }[kind]
+    Image.fromarray(pixels).save(tmp_path / "mask.png")
+    mask = load_mask(tmp_path / "mask.png", synthetic.WIDTH, synthetic.HEIGHT)
+    np.testing.assert_array_equal(mask, white)
+
+
+def test_black_masks_are_reported(tmp_path):
+    """Training would change nothing. A few black masks are no error: their photos are ignored."""
+    synthetic.write_scene(tmp_path)
+    (tmp_path / "masks").mkdir()
+    for name in ("a.png", "b.png", "c.png"):
+        TrainingData(read_scene(tmp_path), test_every=0)
+        write_png(tmp_path / "masks" / name, 0 * halves())
+    with pytest.raises(LodgsError, match="black, so that all pixels are ignored"):
+        TrainingData(read_scene(tmp_path), test_every=0)
 
 
 def test_damaged_pixels_are_reported(tmp_path):
