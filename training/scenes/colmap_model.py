@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import IO, Any
 
 import numpy as np
@@ -39,7 +39,8 @@ class Pose:
     """One record of images.bin or images.txt, without its 2D points.
 
     Attributes:
-        name: file name, from UTF-8 or Windows-1252. Other bytes become surrogates.
+        name: file name, from UTF-8 or Windows-1252. Other bytes become surrogates. A path that leaves the
+            image folder is reduced to its last part.
         world_to_camera: (4, 4) float64 rigid transform; NaN if the record has no valid one.
     """
 
@@ -329,11 +330,18 @@ def _decode_name(name: bytes) -> str:
 
 
 def _decode(name: bytes) -> str:
-    """Decode a name as UTF-8, else as Windows-1252; other bytes become surrogates."""
+    """Decode a name as UTF-8, else as Windows-1252; other bytes become surrogates.
+
+    Some programs write the path on their computer. Of paths that leave the image folder, only the last part
+    remains.
+    """
+    text = name.decode("utf-8", "surrogateescape")
     for encoding in "utf-8", "cp1252":
         with suppress(UnicodeDecodeError):
-            return name.decode(encoding)
-    return name.decode("utf-8", "surrogateescape")
+            text = name.decode(encoding)
+            break
+    path = PureWindowsPath(text)  # with the separators of all systems
+    return (path.name if path.anchor or ".." in path.parts else "") or text
 
 
 def _pose(name: bytes, camera_id: int, pose: list[float]) -> Pose:

@@ -11,7 +11,7 @@ from tests.training.scenes import synthetic
 from training.errors import LodgsError
 from training.scenes import colmap, colmap_model, image_files
 from training.scenes.cameras import camera_to_dict, write_camera
-from training.scenes.colmap import exclude_views, read_scene
+from training.scenes.colmap import exclude_views, observations, read_scene
 from training.scenes.offset_views import read_offset_views
 
 
@@ -76,10 +76,14 @@ def test_names_that_are_not_utf8_are_escaped_in_warnings(scene):
 
 @pytest.mark.parametrize("name", ["C:/a.png", "c:a.png", "/a.png", "\\\\server\\x\\a.png", "x/../../a.png"])
 def test_names_that_leave_the_folder_on_any_system(scene, name):
-    write_text_model(scene / "sparse", views("b.png", name), grid())
+    """Only their last part is used, as by 3DGS."""
+    folder = write_text_model(scene / "sparse", views("b.png", name), grid())
+    text = (folder / "images.txt").read_text().replace(f"{name}\n\n", f"{name}\n1 1 2\n")
+    (folder / "images.txt").write_text(text)
     result = read_scene(scene)
-    assert [camera.name for camera in result.cameras] == ["b.png"]
-    assert "outside the image folder" in result.warnings[0]
+    assert [camera.name for camera in result.cameras] == ["a.png", "b.png"]
+    assert result.cameras[0].image == scene / "images" / "a.png" and not result.warnings
+    assert observations(result, ["a.png"])["a.png"].tolist() == [2]
 
 
 def test_search_for_image_folder_stays_inside_the_scene(scene, monkeypatch):
