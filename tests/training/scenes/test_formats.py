@@ -336,6 +336,16 @@ def test_rotated_photos_are_skipped(tmp_path):
     assert scene.warnings[0].startswith(f"Skipped {NAMES[0]}: its size 72x96")
 
 
+@pytest.mark.parametrize("others", [[], ["transform_test.json", "transform_val.json"]])
+def test_other_names_of_transforms(tmp_path, others):
+    """As a data set of Brush's issue 41 has them."""
+    write_transforms(tmp_path)
+    (tmp_path / "transforms.json").rename(tmp_path / "transform_train.json")
+    for name in others:
+        (tmp_path / name).write_text("{}")
+    assert convert_export(tmp_path).views == 3
+
+
 def test_missing_files_give_warnings(tmp_path):
     def remove(document):
         document.update(ply_file_path="nowhere.ply", camera_model=None)

@@ -66,9 +66,10 @@ _UNNAMED = "distortion", "distortion_coefficients", "dist_coeffs"
 def find(folder: Path) -> Path | None:
     """Return the path of the file; for NeRF's synthetic scenes, the file of the training views.
 
-    If no file has a usual name, the only file transforms*.json is returned.
+    If no file has a usual name, the only file transform*.json is returned, or that of the training views.
     """
-    others = sorted(folder.glob("transforms*.json"))
+    others = sorted(folder.glob("transform*.json"))
+    others = [path for path in others if "train" in path.stem.lower()] or others
     return find_file(folder, *_FILES) or (others[0] if len(others) == 1 else None)
 
 
