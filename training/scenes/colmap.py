@@ -42,6 +42,8 @@ MASKS, DEPTHS = "masks", "depths"
 """Folders next to the image folder, or in the scene folder if the photos are there."""
 DEPTH_SUFFIXES = ".exr", ".png", ".npy"
 """File name suffixes of depth maps."""
+_POINT_CLOUDS = "init.ply", "points3D.ply", "points3d.ply", "sparse_pc.ply"
+"""Names of point clouds in the scene folder: those of Brush, 3DGS and nerfstudio."""
 MAX_DEPTH_CAMERAS = 500
 """Maximum number of cameras used to compute the median depth."""
 NO_POINTS = "The scene has no points"
@@ -246,7 +248,7 @@ def read_scene(
     views = _view_collector(folder, images, [pose.name for pose in poses])
     views.add_all(poses, intrinsics, lambda share: progress and progress(0.5 * share))
     views.require_cameras(model, images)
-    points, colors, ids = _read_model_points(model, views.cameras, warnings)
+    points, colors, ids = _read_model_points(folder, model, views.cameras, warnings)
     if origin is None:
         centers = np.array([pose.center for pose in poses])
         origin = choose_origin(centers[np.isfinite(centers).all(axis=1)], points)
@@ -293,11 +295,11 @@ def _mask_folder(base: Path) -> Path:
 
 
 def _read_model_points(
-    model: Path, cameras: Sequence[Camera], warnings: list[str]
+    folder: Path, model: Path, cameras: Sequence[Camera], warnings: list[str]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return positions (P, 3) float64, possibly not finite, colours and ids of the points of a model."""
     points, colors, ids = read_points(model)
-    cloud = _point_cloud(model)
+    cloud = _point_cloud(folder, model)
     if not len(points) and cloud is not None:
         points, colors = point_cloud.read_points(cloud)
         ids = np.zeros(0, np.int64)
@@ -325,11 +327,16 @@ def _inliers(
     return valid, inlier_cameras
 
 
-def _point_cloud(model: Path) -> Path | None:
-    """Return the point cloud in place of a model's points: points3D.ply, or the only PLY of the folder."""
+def _point_cloud(folder: Path, model: Path) -> Path | None:
+    """Return the point cloud in place of a model's points.
+
+    It is points3D.ply or the only PLY in the folder of the model, else a file of a usual name in that of the
+    scene.
+    """
     clouds = sorted(path for path in model.iterdir() if path.suffix.lower() == ".ply" and is_file(path))
     named = [path for path in clouds if path.stem.lower() == "points3d"]
-    return named[0] if named else clouds[0] if len(clouds) == 1 else None
+    candidates = (*named, *clouds[: len(clouds) == 1], *(folder / name for name in _POINT_CLOUDS))
+    return next((path for path in candidates if is_file(path)), None)
 
 
 def _read_registered(model: Path, warnings: list[str]) -> tuple[dict[int, Intrinsics], list[Pose]]:

@@ -41,7 +41,7 @@ def test_model_with_photos_is_used_in_a_workspace(scene):
     assert any("are missing" in warning for warning in read.warnings)
 
 
-@pytest.mark.parametrize("name", ["points3D.ply", "cloud.ply"])
+@pytest.mark.parametrize("name", ["points3D.ply", "cloud.ply", "../../init.ply", "../../sparse_pc.ply"])
 def test_points_are_read_from_a_point_cloud(scene, name):
     model = model_of(scene)
     for file in model.glob("points3D.*"):
@@ -49,11 +49,12 @@ def test_points_are_read_from_a_point_cloud(scene, name):
     kinds = [(axis, "f4") for axis in "xyz"] + [(color, "u1") for color in ("red", "green", "blue")]
     rows = np.zeros(3, kinds)
     rows["x"], rows["red"] = [0, 0.5, 1], 200
-    PlyData([PlyElement.describe(rows, "vertex")]).write(model / name)
+    path = (model / name).resolve()
+    PlyData([PlyElement.describe(rows, "vertex")]).write(path)
     read = read_scene(scene)
     assert read.points.dtype == np.float32 and read.points[:, 0].tolist() == [0, 0.5, 1]
     assert (read.point_colors[:, 0] == 200).all() and len(read.point_ids) == 0
-    assert any(f"were read from {model / name}" in warning for warning in read.warnings)
+    assert any(f"were read from {path}" in warning for warning in read.warnings)
 
 
 def test_missing_file_of_a_model_is_named(scene):
