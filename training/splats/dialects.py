@@ -42,15 +42,14 @@ def ignore(message: str) -> None:
     """Discard a warning."""
 
 
-def reject_unsupported(columns: Collection[str], comments: Iterable[str], path: str | Path) -> None:
+def reject_unsupported(columns: Collection[str], path: str | Path) -> None:
     """Raise a LodgsError for a dialect that cannot be drawn as intended.
 
     Args:
         columns: names of the columns of ``vertex``.
-        comments: comments of the header.
         path: path of the file, for the message.
     """
-    if refusal := _find_refusal(set(columns), comments, Path(path)):
+    if refusal := _find_refusal(set(columns), Path(path)):
         reason, remedy = refusal
         raise LodgsError(f"Cannot read {path}: {reason}.", remedy)
 
@@ -176,17 +175,16 @@ def comments_from_meta(meta: dict) -> list[str]:
 
 
 def _render_mode(comments: Iterable[str]) -> str:
-    """Return "default", "mip" or "2dgs" from the last comment of Brush or Postshot."""
+    """Return "default" or "mip" from the last comment of Brush or Postshot."""
     mode = "default"
     for comment in comments:
         match = re.fullmatch(r"\s*(?:splatrendermode:|antialiased\b)\s*(\w+)\s*", comment.lower())
-        mode = {"default": "default", "mip": "mip", "2dgs": "2dgs", "0": "default", "1": "mip"}.get(
-            match[1] if match else "", mode
-        )
+        modes = {"default": "default", "mip": "mip", "0": "default", "1": "mip"}
+        mode = modes.get(match[1] if match else "", mode)
     return mode
 
 
-def _find_refusal(columns: set[str], comments: Iterable[str], path: Path) -> tuple[str, str] | None:
+def _find_refusal(columns: set[str], path: Path) -> tuple[str, str] | None:
     """Return the reason to refuse a file and the remedy, or None for a supported file."""
     offsets = {name for name in columns if name.startswith("f_offset_")}
     raw_flod = re.fullmatch(r"lod_\d+_iteration_\d+", path.absolute().parent.name)  # level 1 has no ancestry
@@ -215,12 +213,6 @@ def _find_refusal(columns: set[str], comments: Iterable[str], path: Path) -> tup
         return (
             "it is a level of the original FLoD program, whose scales lack s_min",
             "Run that program's convert4viewer.py and choose a PLY in its folder point_cloud_viewer.",
-        )
-    splats = {"scale_0", "scale_1", "rot_0", "opacity"} <= columns
-    if _render_mode(comments) == "2dgs" or (splats and "scale_2" not in columns):
-        return (
-            "it holds flat discs of 2D Gaussian Splatting, which need another renderer",
-            "Train the photos with a method of LODGS or another 3DGS trainer.",
         )
     if color_names(columns) and not columns & {"f_dc_0", "scale_0"}:
         return (

@@ -53,6 +53,8 @@ _CLOUDCOMPARE = re.compile(r"scalar_((?:f_dc|f_rest|scale|rot)_\d+|opacity)")
 """Columns of splats that CloudCompare has saved."""
 _WINDOWS_NAN = re.compile(r"-?(nan\(\w+\)|1\.#(IND|[QS]NAN)0*)", re.I)
 """NaN in text files of Windows programs."""
+_FLAT = np.float32(np.log(1e-3))
+"""Logarithm of the thickness of flat splats, relative to the smaller of their other sizes."""
 BATCH_ROWS = 1 << 15
 """Rows per batch when splats are larger than memory."""
 
@@ -213,7 +215,8 @@ def splats_from_rows(
         )
     splats = _empty_splats(len(rows), degree)
     columns = {name: column for name, column in splat_columns(splats).items() if name not in NORMALS}
-    missing = [name for name in columns if name not in names]
+    is_flat = "scale_2" not in names  # 2D Gaussian Splatting
+    missing = [name for name in columns if name not in names and name != "scale_2"]
     colors = color_names(names) if missing == _F_DC else None  # nerfstudio's splats without harmonics
     missing = [] if colors else missing
     if missing:
@@ -229,7 +232,9 @@ def splats_from_rows(
         if name not in columns and name not in sources.values()
     }
     pairs = [
-        (column, np.asarray(rows[sources.get(name, name)])) for name, column in (columns | extras).items()
+        (column, np.asarray(rows[sources.get(name, name)]))
+        for name, column in (columns | extras).items()
+        if name != "scale_2" or not is_flat
     ]
     with np.errstate(over="ignore", invalid="ignore"):  # infinities and NaN are dropped later
         for block in _blocks(len(rows)):
@@ -241,6 +246,8 @@ def splats_from_rows(
                 splats.sh[block, 0] = (splats.sh[block, 0] / full - 0.5) / SH_C0
             if block.stop % BATCH_ROWS == 0:
                 release_pages(rows)
+        if is_flat:
+            splats.log_scales[:, 2] = splats.log_scales[:, :2].min(axis=1) + _FLAT
         has_normals = any(extras[name].any() for name in NORMALS if name in extras)
     if not has_normals:
         extras = {name: column for name, column in extras.items() if name not in NORMALS}
@@ -394,7 +401,7 @@ def _read_header(file: IO[bytes], path: Path, splats: bool = True) -> tuple[PlyD
             f"Cannot read {path}: it has lists in its vertices.", "Choose a .ply of Gaussian splats."
         )
     if splats:
-        reject_unsupported([column.name for column in vertex.properties], _comments(header), path)
+        reject_unsupported([column.name for column in vertex.properties], path)
         rows = vertex.data
         if is_coded(rows):
             rows = declared_rows(rows, header[CODEBOOK].data if CODEBOOK in header else None, path)

@@ -165,7 +165,6 @@ PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
         (SPACETIME, "its splats move in time", "one moment"),
         ([*PLAIN, "t", "scale_t"], "its splats move in time", "one moment"),
         ([*PLAIN, "t", "scale_t_0", "rot_r_0"], "its splats move in time", "one moment"),
-        ([name for name in PLAIN if name != "scale_2"], "2D Gaussian Splatting", "3DGS trainer"),
         ([*XYZ, "red", "green", "blue"], "coloured point cloud or mesh", "3DGS trainer"),
         ([*PLAIN[:-1]], "it has no rot_3", "3DGS trainer"),
     ],
@@ -211,9 +210,14 @@ def test_2d_filter_is_detected(write, comments, mip):
     assert warnings == []
 
 
-def test_2dgs_comment_is_refused(write):
-    with pytest.raises(LodgsError, match="2D Gaussian Splatting"):
-        read_ply(write(PLAIN, comments=["SplatRenderMode: 2dgs"]))
+def test_2dgs_discs_become_thin_splats(write, tmp_path, same):
+    """PlayCanvas' readers also add a third scale that is almost 0."""
+    columns = [name for name in PLAIN if name != "scale_2"]
+    splats = read_ply(write(columns, {"scale_0": [-1, -4], "scale_1": [-2, -3]}))
+    sizes = np.exp(splats.log_scales.astype(np.float64))
+    np.testing.assert_allclose(sizes[:, 2], np.exp([-2, -4]) / 1000, rtol=1e-6)
+    write_ply(tmp_path / "b.ply", splats)
+    same(read_ply(tmp_path / "b.ply"), splats)
 
 
 def test_2d_filter_survives_every_export(tmp_path, make_splats):
