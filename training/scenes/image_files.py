@@ -15,7 +15,7 @@ from .images import IMAGE_SUFFIXES
 
 UNREADABLE_SUFFIXES = (
     ".heic", ".heif", ".avif", ".jxl", ".jp2", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2",
-    ".pef", ".bmp", ".gif",
+    ".pef", ".gif",
 )  # fmt: skip
 """Suffixes of photos that LODGS does not read, lower case. Users convert them and keep the model's names."""
 MASK_SUFFIXES = (".png", *(suffix for suffix in IMAGE_SUFFIXES if suffix != ".png"))

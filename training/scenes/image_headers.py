@@ -36,8 +36,8 @@ _QUARTER_TURNS = {3: 2, 4: 2, 5: 1, 6: 1, 7: 3, 8: 3}
 def image_size(path: Path) -> tuple[int, int]:
     """Return the width and height in pixels from an image's header, without applying its EXIF orientation.
 
-    The format (JPEG, PNG, TIFF, WebP or EXR) is detected from the content, not from the name. The size of an
-    EXR is its display window; the size of a TIFF is that of its first image.
+    The format (JPEG, PNG, TIFF, WebP, BMP or EXR) is detected from the content, not from the name. The size
+    of an EXR is its display window; the size of a TIFF is that of its first image.
 
     Raises:
         LodgsError: the file is missing, not a regular file, empty, in another format or truncated, or has
@@ -69,13 +69,21 @@ def _read_size(path: Path, file: IO[bytes]) -> tuple[int, int]:
         return tags[_WIDTH], tags[_HEIGHT]
     if head[:4] == b"RIFF":
         return _webp_size(file)
+    if head[:2] == b"BM":
+        file.seek(14)
+        (size,) = struct.unpack("<I", file.read(4))
+        width, height = (
+            struct.unpack("<HH", file.read(4)) if size == 12 else struct.unpack("<ii", file.read(8))
+        )
+        return width, abs(height)  # negative if the first row is the upper one
     if head[4:] == b"ftyp":
         raise LodgsError(
             f"Cannot read {path}: it is a HEIC or AVIF photo: convert the photos to JPEG.",
             "Keep their names; the suffix may differ.",
         )
     raise LodgsError(
-        f"Cannot read {path}: it is not a JPEG, PNG, TIFF, WebP or EXR image.", "Convert it to one of these."
+        f"Cannot read {path}: it is not a JPEG, PNG, TIFF, WebP, BMP or EXR image.",
+        "Convert it to one of these.",
     )
 
 

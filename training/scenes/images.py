@@ -23,7 +23,7 @@ from .image_headers import ORIENTATION, check_image_size, image_size
 if TYPE_CHECKING:
     from PIL import Image
 
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 """Lower-case file name suffixes of photos, without ``.exr``, which only renderers write."""
 
 _LARGE = 1 << 25
@@ -144,7 +144,7 @@ def _open_image(path: Path, width: int, height: int, large: int, alpha: bool = F
             from PIL import Image
 
             file.seek(0)
-            with Image.open(file, formats=("JPEG", "PNG", "TIFF", "WEBP")) as image:
+            with Image.open(file, formats=("JPEG", "PNG", "TIFF", "WEBP", "BMP")) as image:
                 if image.format == "TIFF":  # the only format that Pillow transposes by its orientation
                     orientation = image.getexif().get(ORIENTATION, 1)
                     image.load()

@@ -171,6 +171,19 @@ def test_webp(tmp_path, pixels, mode, options):
     assert error.max() <= 1e-6 if "lossless" in options else error.mean() < 0.2
 
 
+def test_bmp(tmp_path, pixels):
+    """COLMAP and Pillow read such photos of industrial cameras."""
+    path = tmp_path / "a.bmp"
+    Image.fromarray(pixels).save(path)
+    assert image_size(path) == (44, 30)
+    np.testing.assert_allclose(load_image(path, 44, 30), pixels / 255, atol=1e-6)
+    data = bytearray(path.read_bytes())
+    data[22:26] = struct.pack("<i", -30)
+    path.write_bytes(data)
+    assert image_size(path) == (44, 30)
+    np.testing.assert_allclose(load_image(path, 44, 30), pixels[::-1] / 255, atol=1e-6)
+
+
 @pytest.mark.parametrize("share", [0.02, 0.3, 0.5, 0.9, 0.999])
 @pytest.mark.parametrize("kind", ["jpg", "png", "webp"])
 def test_truncated_file_is_rejected(tmp_path, pixels, kind, share):

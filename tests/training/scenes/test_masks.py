@@ -85,7 +85,7 @@ INVALID = {
         lambda path: write_png(path, halves()[:, ::2]),
         "does not match the aspect ratio",
     ),
-    "no image": (lambda path: path.write_text("people"), "not a JPEG, PNG, TIFF, WebP or EXR image"),
+    "no image": (lambda path: path.write_text("people"), "not a JPEG, PNG, TIFF, WebP, BMP or EXR image"),
     "truncated": (lambda path: write_damaged(path, slice(-20, None), b""), "is truncated"),
     "empty": (lambda path: path.write_bytes(b""), "is empty"),
 }
