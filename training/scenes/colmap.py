@@ -281,17 +281,21 @@ def _view_collector(folder: Path, images: Path, names: Sequence[str]) -> ViewCol
         what = f"Cannot read scene: image folder {images} {missing_clause(images)}."
         raise LodgsError(what, "Choose the folder of the photos.")
     base = folder if images == folder else images.parent
+    masks = _mask_folder(base)
     return ViewCollector(
         ImageFiles(images, names),
-        SidecarFiles(_mask_folder(base), "mask", *MASK_SUFFIXES),
+        SidecarFiles(masks or images, "mask", *MASK_SUFFIXES, beside=masks is None),
         SidecarFiles(base / DEPTHS, "depth", *DEPTH_SUFFIXES),
     )
 
 
-def _mask_folder(base: Path) -> Path:
-    """Return the folder "masks", or the first of other spellings that exists."""
+def _mask_folder(base: Path) -> Path | None:
+    """Return the folder "masks", or the first of other spellings that exists, or None.
+
+    Without such a folder, masks may be beside the photos, as for RealityScan.
+    """
     spellings = (base / name for name in (MASKS, "Masks", "MASKS", "mask", "Mask", "MASK"))
-    return next((folder for folder in spellings if folder.is_dir()), base / MASKS)
+    return next((folder for folder in spellings if folder.is_dir()), None)
 
 
 def _read_model_points(

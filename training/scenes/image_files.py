@@ -99,10 +99,12 @@ class SidecarFiles:
         folder: folder of the files; it may not exist.
         kind: word that may follow the photo's name, such as "mask".
         suffixes: accepted suffixes, preferred ones first.
+        beside: the folder is that of the photos, so that names need the word.
     """
 
-    def __init__(self, folder: Path, kind: str, *suffixes: str) -> None:
+    def __init__(self, folder: Path, kind: str, *suffixes: str, beside: bool = False) -> None:
         self.folder = folder
+        self._beside = beside
         self._kinds = f"_{kind}", f".{kind}"
         self._suffixes = suffixes
         self._exists = folder.is_dir()
@@ -115,7 +117,7 @@ class SidecarFiles:
         """
         if not self._exists:
             return None
-        for suffix in self._suffixes:
+        for suffix in () if self._beside else self._suffixes:
             for path in (self.folder / f"{name}{suffix}", (self.folder / name).with_suffix(suffix)):
                 if is_file(path):
                     return path
@@ -123,7 +125,8 @@ class SidecarFiles:
             files = walk_files(self.folder, onerror=raise_system_problem)
             self._by_folded_name = {_folded(path.relative_to(self.folder).as_posix()): path for path in files}
         stem = os.path.splitext(name)[0]
-        starts = [start + kind for kind in ("", *self._kinds) for start in (name, stem)]
+        kinds = self._kinds if self._beside else ("", *self._kinds)
+        starts = [start + kind for kind in kinds for start in (name, stem)]
         names = [_folded(start + suffix) for start in starts for suffix in self._suffixes]
         return next((self._by_folded_name[key] for key in names if key in self._by_folded_name), None)
 
@@ -133,7 +136,9 @@ class SidecarFiles:
         Args:
             name: a photo, whose file name serves as an example.
         """
-        if not (self._exists and any(not is_clutter(path.name) for path in walk_files(self.folder))):
+        if self._beside or not (
+            self._exists and any(not is_clutter(path.name) for path in walk_files(self.folder))
+        ):
             return ""
         file = name + self._suffixes[0]
         return f"No file in {self.folder} matches a photo: the file of {name} must be named {file}."

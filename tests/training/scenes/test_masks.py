@@ -45,6 +45,16 @@ def test_mask_names(tmp_path, name):
     np.testing.assert_array_equal(masks[0], expected)
 
 
+@pytest.mark.parametrize("name", ["a.png.mask.png", "a_mask.png", "a.mask.png"])
+def test_masks_beside_the_photos(tmp_path, name):
+    """RealityScan reads and writes them there."""
+    synthetic.write_scene(tmp_path)
+    write_png(tmp_path / "images" / name, halves())
+    scene = read_scene(tmp_path)
+    assert [camera.mask for camera in scene.cameras] == [tmp_path / "images" / name, None, None]
+    assert scene.warnings == []
+
+
 @pytest.mark.parametrize(("folder", "suffix"), [("masks", "png"), ("depths", "exr")])
 def test_mismatched_names_give_a_warning(tmp_path, folder, suffix):
     synthetic.write_scene(tmp_path)
