@@ -42,8 +42,6 @@ MASKS, DEPTHS = "masks", "depths"
 """Folders next to the image folder, or in the scene folder if the photos are there."""
 DEPTH_SUFFIXES = ".exr", ".png", ".npy"
 """File name suffixes of depth maps."""
-_POINT_CLOUDS = "init.ply", "points3D.ply", "points3d.ply", "sparse_pc.ply"
-"""Names of point clouds in the scene folder: those of Brush, 3DGS and nerfstudio."""
 MAX_DEPTH_CAMERAS = 500
 """Maximum number of cameras used to compute the median depth."""
 NO_POINTS = "The scene has no points"
@@ -303,11 +301,11 @@ def _read_model_points(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return positions (P, 3) float64, possibly not finite, colours and ids of the points of a model."""
     points, colors, ids = read_points(model)
-    cloud = _point_cloud(folder, model)
-    if not len(points) and cloud is not None:
+    cloud = point_cloud.find_cloud(folder, model, has_points=len(points) > 0)
+    if cloud is not None:
         points, colors = point_cloud.read_points(cloud)
         ids = np.zeros(0, np.int64)
-        warnings.append(f"The model {model} has no points; {len(points):,} were read from {cloud}.")
+        warnings.append(f"{len(points):,} points were read from {cloud} instead of {model}.")
     if not len(points):
         warnings.append(
             f"{NO_POINTS}: {model} has no points3D{model_suffix(model)} with points. Training creates them "
@@ -329,18 +327,6 @@ def _inliers(
             f"{OUTLIER_FACTOR:,} times the median distance from the cameras."
         )
     return valid, inlier_cameras
-
-
-def _point_cloud(folder: Path, model: Path) -> Path | None:
-    """Return the point cloud in place of a model's points.
-
-    It is points3D.ply or the only PLY in the folder of the model, else a file of a usual name in that of the
-    scene.
-    """
-    clouds = sorted(path for path in model.iterdir() if path.suffix.lower() == ".ply" and is_file(path))
-    named = [path for path in clouds if path.stem.lower() == "points3d"]
-    candidates = (*named, *clouds[: len(clouds) == 1], *(folder / name for name in _POINT_CLOUDS))
-    return next((path for path in candidates if is_file(path)), None)
 
 
 def _read_registered(model: Path, warnings: list[str]) -> tuple[dict[int, Intrinsics], list[Pose]]:

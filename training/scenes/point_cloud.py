@@ -7,8 +7,14 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import LodgsError
+from ..files import is_file
 from ..splats.colors import color_names, full_intensity
 from ..splats.ply import read_elements
+
+_START_POINTS = "init.ply"
+"""Brush's name of a point cloud in the scene folder that replaces the points of the model."""
+_POINT_CLOUDS = "points3D.ply", "points3d.ply", "sparse_pc.ply"
+"""Names of point clouds in the scene folder of models without points: those of 3DGS and nerfstudio."""
 
 
 def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -31,3 +37,18 @@ def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
         colors = np.nan_to_num(values).clip(0, 255).round().astype(np.uint8)
     finite = np.isfinite(points).all(axis=1)
     return points[finite], colors[finite]
+
+
+def find_cloud(folder: Path, model: Path, has_points: bool) -> Path | None:
+    """Return the point cloud in place of a COLMAP model's points, or None.
+
+    It is init.ply of the scene. For a model without points, it may also be points3D.ply or the only PLY in
+    the folder of the model, or a file of a usual name in that of the scene.
+    """
+    candidates = [folder / _START_POINTS]
+    if not has_points:
+        clouds = sorted(path for path in model.iterdir() if path.suffix.lower() == ".ply" and is_file(path))
+        candidates += [path for path in clouds if path.stem.lower() == "points3d"]
+        candidates += clouds[: len(clouds) == 1]
+        candidates += [folder / name for name in _POINT_CLOUDS]
+    return next((path for path in candidates if is_file(path)), None)

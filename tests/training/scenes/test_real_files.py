@@ -57,6 +57,16 @@ def test_points_are_read_from_a_point_cloud(scene, name):
     assert any(f"were read from {path}" in warning for warning in read.warnings)
 
 
+def test_init_ply_replaces_the_points(scene):
+    """As in Brush: laser scans replace the points of COLMAP."""
+    rows = np.zeros(2, [(axis, "f8") for axis in "xyz"])
+    rows["x"] = [0, 0.5]
+    PlyData([PlyElement.describe(rows, "vertex")]).write(scene / "init.ply")
+    read = read_scene(scene)
+    assert read.points[:, 0].tolist() == [0, 0.5] and len(read.point_ids) == 0
+    assert any("init.ply instead of" in warning for warning in read.warnings)
+
+
 def test_missing_file_of_a_model_is_named(scene):
     model = model_of(scene)
     (images,) = model.glob("images.*")
