@@ -360,6 +360,7 @@ def _drive(
 def _drive_visibility(root: bpy.types.Object, index: int, item, rule: Rule | None) -> None:
     """Show a level where its rule uses it, or where it is the single level or adds to it.
 
+    Hiding the root hides all levels, so that artists can hide a scene in the Outliner, also with keyframes.
     If the extension is missing, the finest level is shown, so that the file does not appear empty. A scene
     that renders meshes for another one shows no splats to the camera, also in instances.
     """
@@ -375,8 +376,10 @@ def _drive_visibility(root: bpy.types.Object, index: int, item, rule: Rule | Non
     without = {"show": 1, "single_level": finest, "cumulative": root.lodgs.cumulative}
     for path in ("hide_viewport", "hide_render"):
         hidden = "hidden or " if path == "hide_render" else ""
-        expression = f"{hidden}not (show and (({in_use}) or (mode == 0 and ({is_single}))))"
+        expression = f"root_hidden or {hidden}not (show and (({in_use}) or (mode == 0 and ({is_single}))))"
         driver = _drive(item.object, path, root, expression, without, **sources)
+        variable = driver.variables.new()
+        variable.name, variable.targets[0].id, variable.targets[0].data_path = "root_hidden", root, path
         if hidden:
             read_scene(driver, "hidden", "lodgs_render.hides_splats")
     read_scene(

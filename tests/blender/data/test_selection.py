@@ -240,6 +240,21 @@ def test_unused_levels_are_not_evaluated(bpy, root):
     assert not modifier.show_viewport and not modifier.show_render
 
 
+def test_hidden_roots_hide_their_levels(bpy, root):
+    """Levels have drivers, so that artists key the visibility of the root."""
+    for frame, hidden in ((1, True), (2, False)):
+        root.hide_render = hidden
+        root.keyframe_insert("hide_render", frame=frame)
+    for frame, hidden in ((1, True), (2, False)):
+        bpy.context.scene.frame_set(frame)
+        levels = [item.object for item in root.lodgs.levels]
+        assert all(level.hide_render for level in levels) is hidden
+        assert not all(level.hide_viewport for level in levels)
+    root.hide_viewport = True
+    bpy.context.view_layer.update()
+    assert all(item.object.hide_viewport for item in root.lodgs.levels)
+
+
 def test_drivers_need_no_scripts(bpy, lodgs, root):
     """Blender evaluates simple expressions even if Auto Run Python Scripts is off."""
     compat = lodgs("compat")
