@@ -336,6 +336,15 @@ def test_rotated_photos_are_skipped(tmp_path):
     assert scene.warnings[0].startswith(f"Skipped {NAMES[0]}: its size 72x96")
 
 
+def test_masks_of_instant_ngp_give_a_warning(tmp_path):
+    """Its docs/nerf_dataset_tips.md: non-zero pixels are masked away."""
+    write_transforms(tmp_path)
+    stem = Path(NAMES[0]).stem
+    write_image(tmp_path / "images" / f"dynamic_mask_{stem}.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    (warning,) = convert_export(tmp_path).warnings
+    assert f"dynamic_mask_{stem}.png" in warning and "Invert" in warning
+
+
 @pytest.mark.parametrize("others", [[], ["transform_test.json", "transform_val.json"]])
 def test_other_names_of_transforms(tmp_path, others):
     """As a data set of Brush's issue 41 has them."""

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import LodgsError
+from ...files import is_file
 from ..image_headers import image_size
 from ..point_cloud import read_points
 from .exported import (
@@ -98,6 +99,12 @@ def read(path: Path, folder: Path) -> ExportedScene:
         except LodgsError as error:
             excluded.append((str(own.get("file_path", f"frame {number}")), error.what))
     warnings = photos.warnings()
+    masks = [view.image.with_name(f"dynamic_mask_{view.image.stem}.png") for view in views]
+    if masks := [path for path in masks if is_file(path)]:
+        warnings.append(
+            f"Ignored {len(masks)} masks of instant-ngp, such as {masks[0]}. They are white in "
+            "ignored areas. Invert them, and save them in a folder masks under the names of their photos."
+        )
     others = [other.name for other in sorted(path.parent.glob("transforms_*.json")) if other != path]
     if path.name.lower() in _FILES[1:] and others:
         warnings.append(f"Read the views of {path} only, without those of {', '.join(others)}.")
