@@ -214,9 +214,9 @@ def splats_from_rows(
             "Export the splats again; degree 0 to 4 have 0, 9, 24, 45 or 72 such columns.",
         )
     splats = _empty_splats(len(rows), degree)
-    columns = {name: column for name, column in splat_columns(splats).items() if name not in NORMALS}
-    is_flat = "scale_2" not in names  # 2D Gaussian Splatting
-    missing = [name for name in columns if name not in names and name != "scale_2"]
+    flat = {"scale_2"} - set(names)  # 2D Gaussian Splatting
+    columns = {name: part for name, part in splat_columns(splats).items() if name not in {*NORMALS, *flat}}
+    missing = [name for name in columns if name not in names]
     colors = color_names(names) if missing == _F_DC else None  # nerfstudio's splats without harmonics
     missing = [] if colors else missing
     if missing:
@@ -232,9 +232,7 @@ def splats_from_rows(
         if name not in columns and name not in sources.values()
     }
     pairs = [
-        (column, np.asarray(rows[sources.get(name, name)]))
-        for name, column in (columns | extras).items()
-        if name != "scale_2" or not is_flat
+        (column, np.asarray(rows[sources.get(name, name)])) for name, column in (columns | extras).items()
     ]
     with np.errstate(over="ignore", invalid="ignore"):  # infinities and NaN are dropped later
         for block in _blocks(len(rows)):
@@ -246,7 +244,7 @@ def splats_from_rows(
                 splats.sh[block, 0] = (splats.sh[block, 0] / full - 0.5) / SH_C0
             if block.stop % BATCH_ROWS == 0:
                 release_pages(rows)
-        if is_flat:
+        if flat:
             splats.log_scales[:, 2] = splats.log_scales[:, :2].min(axis=1) + _FLAT
         has_normals = any(extras[name].any() for name in NORMALS if name in extras)
     if not has_normals:
