@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor, wait
+from threading import Event
 
 import bpy
 
@@ -12,10 +12,10 @@ from ..data import roots
 from ..runs import scene_check
 from ..runs.watch import root_by_uid
 from .base import SceneOperator
-from .modal import SteppedOperator
+from .modal import WaitingOperator, wait_for
 
 
-class LODGS_OT_check_scene(SceneOperator, SteppedOperator, bpy.types.Operator):
+class LODGS_OT_check_scene(WaitingOperator, SceneOperator, bpy.types.Operator):
     bl_idname = "lodgs.check_scene"
     bl_label = "Check Scene"
     bl_description = (
@@ -32,24 +32,18 @@ class LODGS_OT_check_scene(SceneOperator, SteppedOperator, bpy.types.Operator):
             return False
         return super().poll(context)
 
-    def invoke(self, context, event):
-        return self.execute(context) if bpy.app.background else self.start_modal(context)
-
     def work(self, context):
         root = roots.active_root(context)
         uid, key = root.session_uid, scene_check.settings_key(root)
-        reader = ThreadPoolExecutor(1, "lodgs-check")
+        stop = Event()
         scene_check.running.add(uid)
         extension.redraw()
         try:
-            reading = reader.submit(scene_check.read_findings(root))
-            while wait([reading], 0.01).not_done:
-                yield
+            self._findings = yield from wait_for(scene_check.read_findings(root, stop))
         finally:
-            reader.shutdown(wait=False)
+            stop.set()
             scene_check.running.discard(uid)
             extension.redraw()
-        self._findings = reading.result()
         root = root_by_uid(uid)
         if root is not None:  # undo may have replaced it
             scene_check.store_findings(root, key, self._findings)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Generator, Iterator
+from concurrent.futures import ThreadPoolExecutor, wait
+from typing import Any
 
 import bpy
 
@@ -14,6 +16,8 @@ class SteppedOperator:
 
     A script waits for all steps. In a window :meth:`start_modal` runs them while Blender stays responsive.
     """
+
+    _steps: Iterator[object] | None = None
 
     def work(self, context: bpy.types.Context) -> Iterator[object]:
         """Do one step after the other and yield after each. Closing the iterator early cleans up.
@@ -50,6 +54,11 @@ class SteppedOperator:
         manager.progress_begin(0, self.step_count(context))
         return {"RUNNING_MODAL"}
 
+    def cancel(self, context):
+        """Stop when Blender closes the window, loads another file or quits; also called by a File Browser."""
+        if self._steps is not None:
+            self._finish(context, {"CANCELLED"}, "")
+
     def modal(self, context, event):
         try:
             if event.type == "ESC":
@@ -81,6 +90,52 @@ class SteppedOperator:
         if message:
             self.report({"INFO"}, message)
         return result
+
+
+class WaitingOperator(SteppedOperator):
+    """Base class of operators that wait for a thread and need none of Blender's data meanwhile.
+
+    In a window the user continues to work; a script waits.
+    """
+
+    _is_waiting = False
+
+    @classmethod
+    def poll(cls, context):
+        if cls._is_waiting:
+            cls.poll_message_set("Already running")
+            return False
+        return super().poll(context)
+
+    def invoke(self, context, event):
+        return self.execute(context) if bpy.app.background else self.start_modal(context)
+
+    def start_modal(self, context):
+        type(self)._is_waiting = True
+        return super().start_modal(context)
+
+    def modal(self, context, event):
+        result = super().modal(context, event)
+        return {"PASS_THROUGH"} if result == {"RUNNING_MODAL"} else result
+
+    def _finish(self, context, result, message):
+        type(self)._is_waiting = False
+        return super()._finish(context, result, message)
+
+
+def wait_for(task: Callable[[], Any]) -> Generator[None, None, Any]:
+    """Run a task in a thread, yield until it ends, and return its result.
+
+    The task continues if the generator is closed earlier.
+    """
+    worker = ThreadPoolExecutor(1, "lodgs-wait")
+    try:
+        result = worker.submit(task)
+        while wait([result], 0.01).not_done:
+            yield
+    finally:
+        worker.shutdown(wait=False)
+    return result.result()
 
 
 class BackgroundOperator(SteppedOperator):

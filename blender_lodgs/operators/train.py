@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor, wait
+from functools import partial
 from pathlib import Path
 
 import bpy
@@ -12,7 +12,7 @@ from ..data import cells, roots
 from ..runs import job_settings, jobs, run_folders
 from ..runs.watch import Watch, root_by_uid, watch_of
 from .base import SceneOperator, report_errors, show_image
-from .modal import SteppedOperator
+from .modal import WaitingOperator, wait_for
 
 
 def _follow(operator: bpy.types.Operator, watch: Watch):
@@ -63,7 +63,7 @@ class LODGS_OT_cancel_training(SceneOperator, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LODGS_OT_plan_cells(SceneOperator, SteppedOperator, bpy.types.Operator):
+class LODGS_OT_plan_cells(WaitingOperator, SceneOperator, bpy.types.Operator):
     bl_idname = "lodgs.plan_cells"
     bl_label = "Plan Cells"
     bl_description = "Divide the scene into cells, and estimate the views, splats and memory of each"
@@ -71,22 +71,12 @@ class LODGS_OT_plan_cells(SceneOperator, SteppedOperator, bpy.types.Operator):
 
     _plan: cells.CellPlan | None = None
 
-    def invoke(self, context, event):
-        return self.execute(context) if bpy.app.background else self.start_modal(context)
-
     def work(self, context):
         root = roots.active_root(context)
         uid = root.session_uid
         limits = root.lodgs.training.limits
         job = job_settings.make_job(root, run_folders.runs_parent(root), {})
-        reader = ThreadPoolExecutor(1, "lodgs-plan")
-        try:
-            reading = reader.submit(cells.plan_cells, job, *limits)
-            while wait([reading], 0.01).not_done:
-                yield
-        finally:
-            reader.shutdown(wait=False)
-        self._plan = reading.result()
+        self._plan = yield from wait_for(partial(cells.plan_cells, job, *limits))
         root = root_by_uid(uid)
         if root is not None:  # undo may have replaced it
             cells.store_plan(root.lodgs.training, self._plan)

@@ -6,9 +6,11 @@ import json
 import os
 import subprocess
 import sys
+import time
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from threading import Event
 
 from ...training.errors import LodgsError
 from .. import extension
@@ -162,29 +164,44 @@ def python_of(environment: Path) -> Path:
     return environment / "bin" / "python"
 
 
-def run_module(python: Path, *arguments: str, timeout: float = TIMEOUT) -> subprocess.CompletedProcess[str]:
+def run_module(
+    python: Path, *arguments: str, timeout: float = TIMEOUT, stop: Event | None = None
+) -> subprocess.CompletedProcess[str]:
     """Run a command of the trainer and return its output.
 
+    Args:
+        stop: event that ends the program.
+
     Raises:
-        OSError, subprocess.TimeoutExpired: the program does not start, or does not end in time.
+        OSError, subprocess.TimeoutExpired: the program does not start, does not end in time, or is stopped.
     """
-    return _run(python, "-m", "training", *arguments, timeout=timeout)
+    return _run(python, "-m", "training", *arguments, timeout=timeout, stop=stop)
 
 
-def _run(python: Path, *arguments: str, timeout: float = TIMEOUT) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
+def _run(
+    python: Path, *arguments: str, timeout: float = TIMEOUT, stop: Event | None = None
+) -> subprocess.CompletedProcess[str]:
+    end = time.monotonic() + timeout
+    with subprocess.Popen(
         [str(python), *arguments],
         cwd=extension.FOLDER,
         env=processes.environment(),
         stdin=subprocess.DEVNULL,
-        capture_output=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
         text=True,
         encoding="utf-8",
         errors="replace",
-        timeout=timeout,
-        check=False,
         creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
-    )
+    ) as process:
+        while True:
+            try:
+                output, log = process.communicate(timeout=processes.INTERVAL)
+                return subprocess.CompletedProcess(process.args, process.returncode, output, log)
+            except subprocess.TimeoutExpired:
+                if time.monotonic() > end or (stop is not None and stop.is_set()):
+                    process.kill()
+                    raise
 
 
 def python_version(python: Path) -> tuple[int, int]:

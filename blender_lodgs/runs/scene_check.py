@@ -7,6 +7,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from threading import Event
 
 import bpy
 
@@ -25,10 +26,13 @@ running: set[int] = set()
 """Session uids of the scene roots that are being checked."""
 
 
-def read_findings(root: bpy.types.Object) -> Callable[[], list[Finding]]:
+def read_findings(root: bpy.types.Object, stop: Event) -> Callable[[], list[Finding]]:
     """Return a function that checks the photos of a scene root and estimates the costs of training them.
 
     It does not use Blender's data. Without a trainer, it only checks the photos.
+
+    Args:
+        stop: event that ends the trainer.
 
     Raises:
         LodgsError: the root has no COLMAP folder.
@@ -43,20 +47,22 @@ def read_findings(root: bpy.types.Object) -> Callable[[], list[Finding]]:
     check = partial(check_folder, folder, model, images, image_scale=settings.training.image_scale)
     try:
         job = job_settings.make_job(root, run_folders.runs_parent(root) / "estimate", {})
-        return partial(_ask_trainer, environment.trainer_python(), job, check)
+        return partial(_ask_trainer, environment.trainer_python(), job, check, stop)
     except LodgsError:
         return check
 
 
-def _ask_trainer(python: Path, job: Job, check: Callable[[], list[Finding]]) -> list[Finding]:
+def _ask_trainer(python: Path, job: Job, check: Callable[[], list[Finding]], stop: Event) -> list[Finding]:
     """Run ``lodgs train --check`` and return the findings that it prints; without an answer, check here."""
     with TemporaryDirectory(prefix="lodgs-") as folder:
         file = Path(folder, "job.toml")
         job.write(file)
         try:
-            answer = environment.run_module(python, "train", str(file), "--check", timeout=TIMEOUT)
+            answer = environment.run_module(python, "train", str(file), "--check", timeout=TIMEOUT, stop=stop)
         except (OSError, subprocess.TimeoutExpired):
             answer = None
+    if stop.is_set():
+        return []
     if answer is None or answer.returncode not in (0, 2):
         return [*check(), Finding(ESTIMATE, "No estimate: the trainer did not answer.")]
     lines = [line.partition(": ") for line in answer.stdout.splitlines()]

@@ -1,9 +1,11 @@
 """The Scene, Compare, Viewport and Rendering panels."""
 
+import sys
 import threading
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -169,7 +171,7 @@ def test_estimate_is_above_train_until_settings_change(bpy, lodgs, root, draw_pa
     lines = "warning: Two photos are missing. Add them.\nestimate: About 3 min.\nestimate: Use draft.\n"
     commands = []
 
-    def answer(python, *arguments, timeout):
+    def answer(python, *arguments, **_):
         commands.append((arguments[0], arguments[2], Path(arguments[1]).read_text()))
         return SimpleNamespace(returncode=0, stdout=lines)
 
@@ -207,6 +209,48 @@ def test_panel_states_a_running_estimate(bpy, lodgs, root, draw_panel, monkeypat
     texts = draw_panel("training", "LODGS_PT_training").texts
     assert "Estimating time and memory…" not in texts and "About 3 min." in texts
     assert bpy.ops.lodgs.check_scene.poll()
+
+
+def test_stopping_the_estimate_ends_the_trainer(bpy, lodgs, root, monkeypatch):
+    """The trainer would otherwise take the computer's cores for minutes, and keep Blender from quitting."""
+    environment, started = lodgs("runs.environment"), []
+    original = environment.subprocess.Popen
+
+    def start(command, **options):
+        started.append(original([command[0], "-c", "import time; time.sleep(60)"], **options))
+        return started[-1]
+
+    monkeypatch.setattr(environment.subprocess, "Popen", start)
+    monkeypatch.setattr(environment, "trainer_python", lambda: Path(sys.executable))
+    steps = lodgs("operators.check_scene").LODGS_OT_check_scene.work(SimpleNamespace(), bpy.context)
+    while not started:
+        next(steps)
+    assert started[0].poll() is None
+    steps.close()
+    started[0].wait(20)
+    assert bpy.ops.lodgs.check_scene.poll()
+
+
+def test_events_pass_to_blender_during_the_estimate(bpy, lodgs, root, monkeypatch):
+    """The user orbits and changes settings meanwhile, but cannot start a second estimate."""
+    modal = lodgs("operators.modal")
+    events = [SimpleNamespace(type=name) for name in ("MIDDLEMOUSE", "TIMER", "TIMER0")]
+
+    def states(base):
+        operator = type("Operator", (base, lodgs("operators.base").SceneOperator), {})()
+        operator.poll_message_set = type(operator).poll_message_set = lambda *_: None
+        operator.cancel(context)  # a cancelled File Browser
+        operator.work = lambda _: (None for _ in events)
+        operator.status_text = lambda *_: "Waiting"
+        operator.start_modal(context)
+        results = [operator.modal(context, event) for event in events]
+        polls = type(operator).poll(bpy.context)
+        operator.cancel(context)
+        return results, polls, type(operator).poll(bpy.context)
+
+    context = MagicMock()
+    assert states(modal.WaitingOperator) == ([{"PASS_THROUGH"}] * 3, False, True)
+    assert states(modal.SteppedOperator)[0] == [{"RUNNING_MODAL"}] * 3
 
 
 def test_check_lists_its_findings(bpy, lodgs, root, draw_panel, tmp_path, monkeypatch):
