@@ -46,7 +46,8 @@ def all_work() -> Iterator[Work]:
     for uid, watch in watches.items():
         root = root_by_uid(uid)
         name = "Splats" if root is None else root.name
-        yield Work(watch, f"{name}: {watch.message}", watch.fraction, watch.running, bool(watch.problem))
+        message = watch.message.partition(" (")[0]  # the bar has room for a few words
+        yield Work(watch, f"{name}: {message}", watch.fraction, watch.running, bool(watch.problem))
     modules = (background_capture, photo_preparation, environment_setup, method_comparison)
     for job in [module.current for module in modules]:
         if job is not None:

@@ -122,6 +122,15 @@ def test_status_bar_shows_work_and_a_notice_of_its_end(bpy, lodgs, work, monkeyp
     assert layout.texts == [("Again", "ERROR")]
 
 
+def test_status_bar_omits_notes_of_the_trainer(lodgs, monkeypatch):
+    """The bar is as wide as a few words."""
+    watch = SimpleNamespace(
+        message="Preparing (up to a minute on first use)", fraction=0, running=True, problem=""
+    )
+    monkeypatch.setattr(lodgs("panels.status"), "watches", {-1: watch})
+    assert [work.text for work in lodgs("panels.status").all_work()] == ["Splats: Preparing"]
+
+
 def test_work_that_ended_unobserved_has_no_notice(lodgs, work):
     work.running = False
     assert lodgs("panels.status").visible_work(0.0) == []
