@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -77,17 +78,20 @@ def _write_tiles(
 ) -> None:
     from PIL import Image, ImageDraw, ImageFont
 
+    font = ImageFont.load_default(size=13)
     height, width = tiles[0][1].shape[:2]
+    widest = max(font.getlength(name) for name, _ in tiles) + 12
+    scale = max(math.ceil(widest / width), 1)  # small images would be narrower than their captions
+    height, width = scale * height, scale * width
     rows = -(-len(tiles) // columns)
     columns = min(columns, len(tiles))
     sheet = Image.new("RGB", (columns * (width + 4) - 4, rows * (height + caption)), (24, 24, 24))
     draw = ImageDraw.Draw(sheet)
-    font = ImageFont.load_default(size=13)
     for number, (name, image) in enumerate(tiles):
         x = number % columns * (width + 4)
         y = number // columns * (height + caption)
         pixels = (image.clamp(0, 1) * 255).round().byte().numpy()
-        sheet.paste(Image.fromarray(pixels), (x, y + caption))
+        sheet.paste(Image.fromarray(pixels.repeat(scale, 0).repeat(scale, 1)), (x, y + caption))
         draw.text((x + 6, y + 3), name, fill=(230, 230, 230), font=font)
     with atomic_write(path) as temporary:
         write_png(temporary, np.asarray(sheet))
