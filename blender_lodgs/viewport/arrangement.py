@@ -131,6 +131,7 @@ class DrawnSplats:
     Attributes:
         selection_key: see :attr:`Request.selection_key`.
         table: (M, 4) float32, the rows of :attr:`Arrangement.instances`.
+        splats: (M,) int32, their pool rows.
         means: means of each placement's drawn splats, in its local space.
         excluded: number of splats excluded by the budget.
         coarsened: see :class:`Arrangement`.
@@ -138,6 +139,7 @@ class DrawnSplats:
 
     selection_key: tuple
     table: np.ndarray
+    splats: np.ndarray
     means: list[np.ndarray]
     excluded: int
     coarsened: Counter[int]
@@ -187,6 +189,7 @@ class Request:
             all splats fit.
         coarsened: that of the view's last arrangement, if its detail should remain after a slight motion.
         motion: maximum number of splats while the view moves, and its position; None if it draws all.
+        moving: sort only the splats that a moving view draws.
     """
 
     placements: tuple[Placement, ...]
@@ -195,6 +198,7 @@ class Request:
     position: tuple[float, float, float] | None = None
     coarsened: Counter[int] = field(default_factory=Counter, compare=False)
     motion: tuple[int, tuple[float, float, float]] | None = None
+    moving: bool = False
 
     @property
     def selection_key(self) -> tuple:
@@ -211,8 +215,9 @@ class Arrangement:
     Attributes:
         request: the answered request.
         instances: (M, 4) float32, from back to front: pool row, weight, placement number, and the level or
-            band that determines the colour (0: own colour).
-        splats: (M,) int32, the same pool rows.
+            band that determines the colour (0: own colour). Those of ``motion`` if the request is for a
+            moving view.
+        splats: (M,) int32, pool rows of all drawn splats, unsorted.
         motion: (K, 4) float32, the instances while the view moves, see ``motion.simplify``; None for all.
         excluded: number of splats excluded by the budget.
         serial: the pool's; later versions have other splats in some rows.
@@ -252,14 +257,18 @@ def arrange(pool: Pool, request: Request, update: bool = False) -> Arrangement:
         axis = (backward @ placement.world).astype(np.float32)  # grows towards the camera
         np.add(means @ axis[:3], axis[3], out=depths[begin : begin + len(means)])
         begin += len(means)
-    order = stable_argsort(depths)
-    instances = drawn.table[order]
-    rows = instances[:, 0].astype(np.int32)
     simplified = None
-    if request.motion is not None and request.motion[0] < len(rows):
-        visibility = _visibility_in_motion(pool, request, drawn)[order]
-        simplified = motion.simplify(instances, visibility, request.motion[0])
-    return Arrangement(request, instances, rows, drawn.excluded, pool.serial, drawn.coarsened, simplified)
+    if request.motion is not None and request.motion[0] < len(drawn.table):
+        visibility = _visibility_in_motion(pool, request, drawn)
+        kept, simplified = motion.simplify(drawn.table, visibility, request.motion[0])
+        simplified = simplified[stable_argsort(depths[kept])]
+    if simplified is not None and request.moving:
+        instances = simplified
+    else:
+        instances = drawn.table[stable_argsort(depths)]
+    return Arrangement(
+        request, instances, drawn.splats, drawn.excluded, pool.serial, drawn.coarsened, simplified
+    )
 
 
 def _visibility_in_motion(pool: Pool, request: Request, drawn: DrawnSplats) -> np.ndarray:
@@ -267,11 +276,10 @@ def _visibility_in_motion(pool: Pool, request: Request, drawn: DrawnSplats) -> n
     assert request.motion is not None
     parts, begin = [], 0
     for placement, means in zip(request.placements, drawn.means, strict=True):
-        table = drawn.table[begin : begin + len(means)]
+        part = slice(begin, begin + len(means))
         begin += len(means)
-        rows = table[:, 0].astype(np.int32)
         offsets = _offsets(placement, means, request.motion[1])
-        visibility = _visibility(pool, placement, rows, table[:, 1], offsets)
+        visibility = _visibility(pool, placement, drawn.splats[part], drawn.table[part, 1], offsets)
         motion.dim_beside(visibility, offsets, request.backward)
         parts.append(visibility)
     return np.concatenate(parts)
@@ -328,7 +336,8 @@ def _collect(pool: Pool, request: Request) -> DrawnSplats:
         rows[:, 3] = _color_levels(pool, placement, index, selected_means)
         means.append(selected_means)
         begin += len(index)
-    return DrawnSplats(request.selection_key, table, means, excluded, coarsened)
+    splats = table[:, 0].astype(np.int32)
+    return DrawnSplats(request.selection_key, table, splats, means, excluded, coarsened)
 
 
 def within_budget(

@@ -9,6 +9,8 @@ import numpy as np
 
 FACTOR_STEPS = 8
 """Steps to find the probabilities whose sum is the wanted number; more change it by less than a percent."""
+SAMPLE = 65_536
+"""Number of splats above which the probabilities are estimated from every second splat, every third, ..."""
 MIN_PROBABILITY = 1e-4
 """Lowest probability; its splats become a hundred times as large."""
 CONE = 0.5
@@ -17,8 +19,8 @@ BESIDE = 0.1
 """Factor of the visibility of splats beside the view, which a turn shows before the next simplification."""
 
 
-def simplify(instances: np.ndarray, visibility: np.ndarray, count: int) -> np.ndarray:
-    """Return about ``count`` splats that look like all of them, in their order.
+def simplify(instances: np.ndarray, visibility: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Choose about ``count`` splats that look like all of them, in their order.
 
     Splats of low visibility are kept with a probability p in proportion to it, and enlarged to 1 / p of their
     area (stochastic simplification, Cook et al. 2007). A splat stays kept while its probability grows.
@@ -28,15 +30,17 @@ def simplify(instances: np.ndarray, visibility: np.ndarray, count: int) -> np.nd
         visibility: (M,) area in the image times opacity.
 
     Returns:
-        (K, 4) instances; the third value is the placement number plus 1 - sqrt(p).
+        Indices (K,) of the kept splats, and their (K, 4) instances; the third value is the placement number
+        plus 1 - sqrt(p).
     """
-    probability = np.minimum(visibility * np.float32(_clipped_factor(visibility, count)), np.float32(1))
-    np.maximum(probability, np.float32(MIN_PROBABILITY), out=probability)
+    step = max(len(visibility) // SAMPLE, 1)
+    factor = _clipped_factor(visibility[::step], count / step)
+    probability = np.clip(visibility * np.float32(factor), np.float32(MIN_PROBABILITY), np.float32(1))
     hashes = instances[:, 0].astype(np.uint32) * np.uint32(0x9E3779B1)  # evenly distributed, Knuth
-    kept = hashes < probability.astype(np.float64) * 2.0**32
+    kept = np.flatnonzero(hashes < probability.astype(np.float64) * 2.0**32)
     simplified = instances[kept]
     simplified[:, 2] += 1 - np.sqrt(probability[kept])
-    return simplified
+    return kept, simplified
 
 
 def dim_beside(visibility: np.ndarray, offsets: np.ndarray, backward: tuple[float, float, float]) -> None:

@@ -98,6 +98,8 @@ class ViewState:
 
     def is_cost_outdated(self) -> bool:
         """Return True if the view should be measured, which waits for the graphics card."""
+        if not self.moving and self.arrangement is not None and self.arrangement.request.moving:
+            return False  # a resting view will draw all splats soon
         count = (self.motion_cost if self.moving else self.cost)[0]
         has_changed = abs(self.count - count) > COST_CHANGE * count
         return has_changed or time.monotonic() > self.measured + COST_AGE
@@ -161,6 +163,9 @@ class ViewState:
         if loading is None or loading.serial != source.pool.serial:
             self.loading = None
             return
+        if self._has_splats_of(source, loading):
+            self._show(source, loading, source.store, loading.splats[:0])
+            return
         store, missing = self.missing or (None, None)
         started = store is not None and store is source.store
         if started:  # another viewport may have uploaded some of them; second slots would exceed the store
@@ -190,6 +195,17 @@ class ViewState:
         self.missing = store, missing
         if wait or (not is_drawn and not len(missing) and time.monotonic() < end):
             self._show(source, loading, store, missing)
+
+    def _has_splats_of(self, source: Resident, loading: Arrangement) -> bool:
+        """Return True if an arrangement has the drawn splats in another order, and all are uploaded."""
+        drawn = self.arrangement
+        return (
+            drawn is not None
+            and drawn.splats is loading.splats
+            and drawn.serial == loading.serial
+            and self.store is source.store
+            and self.uploaded == len(drawn.splats)
+        )
 
     def _show(self, source: Resident, loading: Arrangement, store: Store, missing: np.ndarray) -> bool:
         """Draw an arrangement if its splats are uploaded.

@@ -195,7 +195,7 @@ def prepare(
     if sum(placement.count for placement in placements) > budget:
         request = replace(request, position=position)
     if not wait and (limit := view.motion_limit()) is not None:
-        request = replace(request, motion=(limit, position))
+        request = replace(request, motion=(limit, position), moving=view.moving)
     is_requested = _arrange(view, source, request, wait, update)
     if view.arrived != NOT_REQUESTED:  # an older value makes the view redraw
         view.arrived = arrived if update and is_requested else previous_arrived

@@ -291,6 +291,30 @@ def test_budget_keeps_the_splats_that_are_largest_in_the_image(bpy, lodgs):
     assert len(set(moved.splats) - set(expected)) > 30
 
 
+def test_moving_views_sort_the_splats_that_they_draw(bpy, lodgs):
+    """They are those that a resting view prepares for the next motion, also of two transformed sets."""
+    rng = np.random.default_rng(6)
+    sets = [random_set(rng, n) for n in (3000, 2000)]
+    pool, starts = make_pool(lodgs, sets)
+    arrangement = lodgs("viewport.arrangement")
+    matrices = [np.diag([3.0, 3, 3, 1]), np.eye(4)]
+    matrices[1][:3, 3] = 20, 0, 0
+    placements = tuple(
+        make_placement(lodgs, int(start), len(part[0]), matrix=matrix, scene=int(start))
+        for start, part, matrix in zip(starts, sets, matrices, strict=False)
+    )
+    request = arrangement.Request(placements, (0.6, 0.0, 0.8), 10**6, motion=(500, (1.0, 2.0, 9.0)))
+    resting = arrangement.arrange(pool, request)
+    moving = arrangement.arrange(pool, replace(request, moving=True))
+    assert len(resting.instances) == 5000 and 400 < len(moving.instances) < 600
+    assert np.array_equal(moving.instances, resting.motion)
+    assert set(moving.splats) == set(resting.splats) == set(range(5000)), "all stay uploaded"
+    kept = np.isin(resting.instances[:, 0], moving.instances[:, 0])
+    assert np.array_equal(resting.instances[kept, 0], moving.instances[:, 0]), "from back to front"
+    few = arrangement.arrange(pool, replace(request, motion=(6000, (1.0, 2.0, 9.0)), moving=True))
+    assert np.array_equal(few.instances, resting.instances) and few.motion is None
+
+
 def test_budget_replaces_the_finest_level_by_coarser_ones(bpy, lodgs):
     """Levels that replace each other leave no hole: the next coarser one reaches the camera."""
     rng = np.random.default_rng(3)

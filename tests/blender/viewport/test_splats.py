@@ -555,6 +555,7 @@ def test_only_rotation_sorts_again(bpy, lodgs, add, draw_view, camera):
 def test_moving_views_draw_enlarged_splats_and_resting_views_all(lodgs, add, draw_view, monkeypatch):
     """A tenth of the splats of a dense ball looks like all of them; without enlarging, it has holes."""
     state, rng = lodgs("viewport.view_state"), np.random.default_rng(5)
+    resident = lodgs("viewport.resident")
     splats = make_splats(lodgs, count=40_000, size=-4.8)
     splats.means /= np.linalg.norm(splats.means, axis=1, keepdims=True)
     splats.opacity_logits[:] = 3.0
@@ -572,11 +573,19 @@ def test_moving_views_draw_enlarged_splats_and_resting_views_all(lodgs, add, dra
     moving = draw_view(view=view, wait=False)
     assert view.count == pytest.approx(4000, rel=0.1)
     similar = psnr(displayed(moving), displayed(complete))
+    view.pending[2].result()
+    uploaded, drawn = resident.bytes_uploaded, view.arrangement
+    assert np.array_equal(draw_view(view=view, wait=False), moving)
+    assert view.arrangement is not drawn and view.arrangement.instances is view.arrangement.motion
+    assert view.arrangement.splats is drawn.splats and resident.bytes_uploaded == uploaded
     view.arrangement.motion[:, 2] = 0.0
     view.list_instances()
     holes = psnr(displayed(draw_view(view=view, wait=False)), displayed(complete))
     assert similar > 22 and similar > holes + 3, (similar, holes)
     view.moving = False
+    draw_view(view=view, wait=False)
+    assert not view.is_cost_outdated(), "a few splats say nothing about the resting view"
+    view.pending[2].result()
     assert np.array_equal(draw_view(view=view, wait=False), complete)
 
 
