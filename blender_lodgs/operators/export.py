@@ -161,7 +161,7 @@ class LODGS_OT_export_compressed(_FileExport, _ConvertingExport, bpy.types.Opera
     """Export all levels to a file of a tenth of the size, which only LODGS opens; uses the trainer"""
 
     bl_idname = "lodgs.export_compressed"
-    bl_label = "Export Compressed Bundle"
+    bl_label = "Export Compressed"
     suffix = "_small"
 
     prune: property_of(COMPRESSION_SETTINGS["prune"])
@@ -370,7 +370,7 @@ class LODGS_OT_export_folder(_FolderExport, bpy.types.Operator):
     """Export each level as a complete scene to its own PLY file: lod0.ply (the finest), lod1.ply and so on"""
 
     bl_idname = "lodgs.export_folder"
-    bl_label = "Export Level Folder"
+    bl_label = "Export Folder"
 
     replace: bpy.props.BoolProperty(
         name="Replace", description="Overwrite levels that are already in the folder", options={"SKIP_SAVE"}

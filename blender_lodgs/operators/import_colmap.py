@@ -48,7 +48,7 @@ class LODGS_OT_import_colmap(_PhotoSceneImport, bpy.types.Operator):
     """Import the cameras, photos and points of a COLMAP scene or another photogrammetry export"""
 
     bl_idname = "lodgs.import_colmap"
-    bl_label = "Import COLMAP Scene"
+    bl_label = "Import Scene"
     bl_options = {"REGISTER", "UNDO", "PRESET"}
 
     directory: bpy.props.StringProperty(
@@ -71,7 +71,7 @@ class LODGS_OT_drop_photo_scene(_PhotoSceneImport, bpy.types.Operator):
     """Import the scene of a file that was dropped into the viewport"""
 
     bl_idname = "lodgs.drop_photo_scene"
-    bl_label = "Import Scene of File"
+    bl_label = "Import Scene File"
     bl_options = {"REGISTER", "UNDO", "INTERNAL"}
 
     filepath: bpy.props.StringProperty(

@@ -70,6 +70,19 @@ def work(lodgs, monkeypatch):
     return work
 
 
+def test_labels_fit_the_button_of_the_file_browser(lodgs):
+    """Blender shows the operator's label there, in a button that is as wide as about 18 letters."""
+    modules = lodgs("operators").MODULES
+    operators = [cls for module in modules for cls in getattr(module, "CLASSES", ())]
+    with_browser = [cls for cls in operators if {"filepath", "directory"} & {*dir(cls), *_annotations(cls)}]
+    assert len(with_browser) > 10
+    assert [cls.bl_label for cls in with_browser if len(cls.bl_label) > 18] == []
+
+
+def _annotations(cls):
+    return {name for base in cls.__mro__ for name in vars(base).get("__annotations__", ())}
+
+
 def test_panels_of_the_current_step_are_open(bpy, lodgs, draw_panel, tmp_path, fake):
     """Panels of later and finished steps are collapsed."""
     panels = [
