@@ -20,8 +20,8 @@ def property_of(f: Field, **options: Any) -> Any:
     """Return a Blender property with the label, help, default, bounds and unit of a setting.
 
     Args:
-        options: arguments of ``bpy.props`` that replace the generated ones. With ``get``, the property has no
-            default, and a choice is a text.
+        options: arguments of ``bpy.props`` that replace the generated ones. With ``get``, which returns the
+            name of a choice, the property has no default.
     """
     about = f.metadata["about"].removesuffix(".")  # Blender adds one
     options = {"name": label_of(f), "description": about, "options": set(), **options}
@@ -45,9 +45,13 @@ def _text_property(f: Field, options: dict[str, Any]) -> Any:
         subtype = "DIR_PATH" if path == "folder" else "FILE_PATH"
         path_options = {"subtype": subtype, "options": {"PATH_SUPPORTS_BLEND_RELATIVE"}}
         return bpy.props.StringProperty(**options | path_options)
-    if not f.metadata["choices"] or "get" in options:  # a getter of an enum would have to return integers
+    choices = f.metadata["choices"]
+    if not choices:
         return bpy.props.StringProperty(**options)
-    items = [(name, name.replace("_", " ").title(), text) for name, text in f.metadata["choices"].items()]
+    items = [(name, name.replace("_", " ").title(), text) for name, text in choices.items()]
+    if "get" in options:  # that of an enum returns the item's number
+        name_of, names = options["get"], list(choices)
+        options |= {"get": lambda group: names.index(name_of(group))}
     return bpy.props.EnumProperty(**{"items": items} | options)
 
 

@@ -59,6 +59,7 @@ def test_new_method_has_properties(object_with_method):
     object_with_method.lodgs.training.preset = "standard"
     values = [getattr(group, f"preset_{name}") for name in ("decay", "width", "turns", "fast", "kind")]
     assert values == [0.25, 4.5, 2, True, "near"]
+    assert properties["preset_kind"].enum_items["near"].name == "Near", "panels show labels"
 
 
 def test_override_starts_with_the_presets_value(object_with_method):
