@@ -22,7 +22,8 @@ from tests.training.splats.test_spz import spz, spz4
 from training.editing.export import export_levels
 from training.splats.bundle import read_bundle
 from training.splats.formats import open_as_ply
-from training.splats.gltf import read_glb, write_compressed_glb
+from training.splats.gltf import write_compressed_glb
+from training.splats.gltf_reader import read_glb
 from training.splats.levels import Bundle, Level
 from training.splats.portable_levels import PortableLevels
 from training.splats.sog import encode_sog
