@@ -237,10 +237,10 @@ def test_edited_group_is_used_everywhere(bpy, lodgs, half_visible, edit_group, f
 
     def count_selected(placed):
         splats, _ = placed.read()
-        if placed.choice is None:
+        if placed.query is None:
             return len(splats)
         columns = splats.extras | {"opacity": 1 / (1 + np.exp(-splats.opacity_logits))}
-        return len(lodgs("training.lod.query").SplatSelector(splats.means, columns).select(placed.choice)[0])
+        return len(lodgs("training.lod.query").SplatSelector(splats.means, columns).select(placed.query)[0])
 
     def count_all():
         return sum(len(item.object.data.points) for item in root.lodgs.levels if item.object.visible_get())
