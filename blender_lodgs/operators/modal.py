@@ -111,8 +111,9 @@ class WaitingOperator(SteppedOperator):
         return self.execute(context) if bpy.app.background else self.start_modal(context)
 
     def start_modal(self, context):
+        result = super().start_modal(context)
         type(self)._is_waiting = True
-        return super().start_modal(context)
+        return result
 
     def modal(self, context, event):
         result = super().modal(context, event)

@@ -266,13 +266,12 @@ def _check_scene(scene: Scene, train: Sequence[Camera]) -> None:
 
 
 def _check_masks(train: Sequence[Camera]) -> None:
-    """Raise LodgsError if the masks of all of ``ALPHA_SAMPLES`` cameras ignore all pixels."""
-    sample = pick_evenly(train, ALPHA_SAMPLES)
-    for camera in sample:
+    """Raise LodgsError if all cameras have masks that ignore all pixels."""
+    for camera in train:  # the first mask usually decides
         if camera.mask is None or load_mask(camera.mask, camera.width, camera.height).any():
             return
     raise LodgsError(
-        f"Cannot train: masks such as {sample[0].mask} are black, so that all pixels are ignored.",
+        f"Cannot train: masks such as {train[0].mask} are black, so that all pixels are ignored.",
         "Make the parts to train white, or remove the masks.",
     )
 
