@@ -22,7 +22,7 @@ from .data import (
 )
 from .nodes import building
 from .render import compare, compositing, engine, renderer, written_images
-from .runs import background_capture, jobs, method_comparison, photo_preparation
+from .runs import background_capture, conversion, jobs, method_comparison, photo_preparation
 from .viewport import wipe
 
 MODULES = (
@@ -39,6 +39,7 @@ MODULES = (
     loaded,
     removal,
     reloading,
+    conversion,
     paths,
     viewport,
     renderer,

@@ -36,7 +36,7 @@ from .render import engine
 from .render.capture import noise_warning, render_views, write_model
 from .render.video import MAX_FRAMES, extract_frames
 from .runs import environment, job_settings, jobs, photo_preparation
-from .runs.compression import convert_steps
+from .runs.conversion import convert_steps
 from .runs.messages import level_line
 from .runs.watch import Watch
 

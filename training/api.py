@@ -162,8 +162,8 @@ def load_bundle(path: AnyPath) -> Bundle:
     """Read splats with all levels into memory.
 
     Args:
-        path: folder of a finished run, bundle, folder of levels, or any 3DGS file: PLY, .splat, or a format
-            that splat-transform converts. Plain files become a bundle with one level.
+        path: folder of a finished run, bundle, folder of levels, or any 3DGS file: PLY, or another format
+            of ``docs/reference/formats.md``. Plain files become a bundle with one level.
 
     Returns:
         The bundle. ``levels`` are ordered from coarse to fine, each with ``number``, ``facts`` and

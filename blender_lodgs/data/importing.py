@@ -6,7 +6,9 @@ import json
 from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from threading import Event
 
 import bpy
 from mathutils import Matrix
@@ -23,7 +25,7 @@ from ...training.scenes.triangulate import cached_points
 from ...training.scenes.undistort import cached_undistorted_scene
 from ...training.scenes.view_tables import read_view_tables
 from ...training.splats.bundle import read_bundle, read_header
-from ...training.splats.formats import is_plain_ply, open_as_ply
+from ...training.splats.formats import Convert, is_plain_ply, open_as_ply
 from ...training.splats.level_folder import read_folder
 from ...training.splats.levels import Bundle
 from ...training.splats.streamed_levels import STREAMED_FILE
@@ -172,7 +174,7 @@ def import_splats(
     Raises:
         LodgsError: the file cannot be read or has invalid values. The file is unchanged in that case.
     """
-    steps = place_splats(context, read_splats_file(path, budget), upright, warn)
+    steps = place_splats(context, splats_reader(path, budget)(), upright, warn)
     while True:
         try:
             next(steps)
@@ -210,7 +212,20 @@ def file_stamp(path: Path) -> str:
     return f"{sum(stat.st_size for stat in stats)} {max((stat.st_mtime_ns for stat in stats), default=0)}"
 
 
-def read_splats_file(path: Path | str, budget: int = 0) -> SplatsFile:
+def make_converter(stop: Event | None) -> Convert | None:
+    """Return the conversion of files that Blender cannot read; ``runs.conversion`` replaces this function."""
+
+
+def splats_reader(path: Path | str, budget: int = 0, stop: Event | None = None) -> Callable[[], SplatsFile]:
+    """Return :func:`read_splats_file` for a file and this computer's trainer; it may run in a thread.
+
+    Args:
+        stop: event that stops the trainer.
+    """
+    return partial(read_splats_file, path, budget, make_converter(stop))
+
+
+def read_splats_file(path: Path | str, budget: int = 0, convert: Convert | None = None) -> SplatsFile:
     """Read a bundle, a folder of levels, or another splat file (``training.splats.formats``) as a single
     level.
 
@@ -219,6 +234,7 @@ def read_splats_file(path: Path | str, budget: int = 0) -> SplatsFile:
     Args:
         budget: maximum number of splats of a paged file in memory; 0 for all. Of a larger one, only the
             coarsest splats are read; LODGS streams finer ones as the camera approaches (``streams``).
+        convert: function for files that Blender cannot read.
 
     Raises:
         LodgsError: the file cannot be read.
@@ -239,7 +255,7 @@ def read_splats_file(path: Path | str, budget: int = 0) -> SplatsFile:
             )
         total = total if count < total else 0
     else:
-        with open_as_ply(path) as file:
+        with open_as_ply(path, convert) as file:
             bundle = (read_folder if file.is_dir() else read_bundle)(file, warnings.append)
         if not bundle.method and not bundle.on_disk:  # another program's file
             overview.complete_meta(bundle)

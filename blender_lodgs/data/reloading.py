@@ -58,7 +58,7 @@ def read_source(root: bpy.types.Object) -> Callable[[], SplatsFile]:
         )
     path = absolute_path(settings.source.file, root.library)
     budget = settings.stream.budget if settings.stream.file else 0
-    return lambda: importing.read_splats_file(path, budget)
+    return importing.splats_reader(path, budget)
 
 
 def replace_splats(root: bpy.types.Object, file: SplatsFile) -> list[str]:

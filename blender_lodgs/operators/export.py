@@ -31,7 +31,7 @@ from ..data import roots, scenes, selection
 from ..data.objects import megabytes, sh_degree
 from ..data.paths import absolute_path
 from ..data.setting_properties import property_of
-from ..runs.compression import compress_steps, convert_steps, page_steps
+from ..runs.conversion import compress_steps, convert_steps, page_steps
 from ..runs.run_folders import automatic_run
 from .base import ReadLevelsOperator, report_errors
 from .modal import BackgroundOperator

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from threading import Event
 
 import bpy
 
@@ -70,11 +71,11 @@ class LODGS_OT_import_splats(BackgroundOperator, bpy.types.Operator):
             self.report({"WARNING"}, message)
 
         first = not roots.roots(context.scene)
-        reader = ThreadPoolExecutor(1, "lodgs-import")
+        reader, stop = ThreadPoolExecutor(1, "lodgs-import"), Event()
         self._imported = []
         try:
             for path in self.paths():
-                read = reader.submit(importing.read_splats_file, absolute_path(str(path)), self.budget)
+                read = reader.submit(importing.splats_reader(absolute_path(str(path)), self.budget, stop))
                 while self._modal and not read.done():
                     yield
                 root = yield from importing.place_splats(context, read.result(), self.upright, warn)
@@ -85,6 +86,7 @@ class LODGS_OT_import_splats(BackgroundOperator, bpy.types.Operator):
                 photo_preparation.clear_result()
                 self._imported.append(f"'{root.name}': {scenes.contents(root)}")
         finally:
+            stop.set()
             reader.shutdown(wait=False, cancel_futures=True)
 
     def result_text(self, count):
@@ -125,8 +127,10 @@ class LODGS_FH_splats(bpy.types.FileHandler):
     bl_idname = "LODGS_FH_splats"
     bl_label = "Gaussian Splats (LODGS)"
     bl_import_operator = LODGS_OT_import_splats.bl_idname
-    # Blender's own importer opens dropped glTF files
-    bl_file_extensions = ";".join(ending for ending in FILE_EXTENSIONS if ending not in (".glb", ".gltf"))
+    # Blender's own importers open dropped glTF and USD files
+    bl_file_extensions = ";".join(
+        ending for ending in FILE_EXTENSIONS if ending not in (".glb", ".gltf", ".usdc", ".usdz")
+    )
 
     @classmethod
     def poll_drop(cls, context):

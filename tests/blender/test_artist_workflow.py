@@ -5,7 +5,6 @@ command, and undo step by step.
 """
 
 import os
-import shutil
 import subprocess
 from hashlib import sha256
 from pathlib import Path
@@ -15,7 +14,6 @@ import pytest
 
 from training.splats.bundle import read_bundle
 from training.splats.ply import read_ply
-from training.splats.splat_transform import PROGRAM
 
 ROOT = Path(__file__).resolve().parents[2]
 OWN = os.environ.get("LODGS_WAY", "")
@@ -34,8 +32,6 @@ def test_workflow_from_photos_to_exported_files(bpy, lodgs, tmp_path, monkeypatc
     python = os.environ.get("LODGS_TRAINER_PYTHON")
     if not python:
         pytest.skip("no trainer; set LODGS_TRAINER_PYTHON")
-    monkeypatch.setenv("PATH", f"{ROOT / 'build/interop/node_modules/.bin'}{os.pathsep}{os.environ['PATH']}")
-    streams = shutil.which(PROGRAM) is not None
     workflow = Workflow(bpy, lodgs, tmp_path)
     bpy.ops.ed.undo_push(message="Start")
     states = [workflow.state()]
@@ -47,8 +43,8 @@ def test_workflow_from_photos_to_exported_files(bpy, lodgs, tmp_path, monkeypatc
         states.append(workflow.state())
         assert states[-1] != states[-2], step.__name__
     counts = workflow.assert_cropped()
-    workflow.export(streams)
-    workflow.assert_equal_to_one_command(python, streams, counts)
+    workflow.export()
+    workflow.assert_equal_to_one_command(python, counts)
     assert workflow.state() == states[-1], "exports change nothing"
 
     undo_counts = [workflow.step_until(bpy.ops.ed.undo, state) for state in states[-2::-1]]
@@ -59,7 +55,7 @@ def test_workflow_from_photos_to_exported_files(bpy, lodgs, tmp_path, monkeypatc
     for state in states[1:]:
         workflow.step_until(bpy.ops.ed.redo, state)
     assert workflow.assert_cropped() == counts
-    workflow.assert_reimported(streams, counts)
+    workflow.assert_reimported(counts)
     if OWN:
         with capfd.disabled():
             print(
@@ -246,17 +242,16 @@ class Workflow:
     def trained(self):
         return read_bundle(self.folder / "run" / "bundle.ply")
 
-    def export(self, streams: bool):
+    def export(self):
         settings = {"placed": True, "looked": True}
         finest = self.root.lodgs.levels[-1].number
         operators = self.bpy.ops.lodgs
         assert operators.export_bundle(filepath=str(self.folder / "out.ply"), **settings) == {"FINISHED"}
         plain = {"source": "LEVEL", "level": finest, **settings}
         assert operators.export_plain(filepath=str(self.folder / "plain.ply"), **plain) == {"FINISHED"}
-        if streams:
-            assert operators.export_streamed(directory=str(self.folder / "web"), **settings) == {"FINISHED"}
+        assert operators.export_streamed(directory=str(self.folder / "web"), **settings) == {"FINISHED"}
 
-    def assert_equal_to_one_command(self, python: str, streams: bool, counts: dict):
+    def assert_equal_to_one_command(self, python: str, counts: dict):
         centre, radius = self.sphere
         folder = self.folder
         placed = ["--ground", "--scale", self.factor]
@@ -265,7 +260,7 @@ class Workflow:
         command = [
             python, "-m", "training", "edit", folder / "run" / "bundle.ply",
             "--out", folder / "edited.ply", "--plain", folder / "edited_plain.ply",
-            *(["--streamed", folder / "edited_web"] if streams else []),
+            "--streamed", folder / "edited_web",
             "--crop-sphere", *centre, radius, "--drop-floaters", "--share", SHARE,
             "--scene", SCENE, *placed, "--tint", *TINT,
         ]  # fmt: skip
@@ -287,7 +282,7 @@ class Workflow:
             dots = np.abs((_unit(blender_splats.quats) * _unit(edited_splats.quats)).sum(axis=1))
             assert dots.min() > 1 - 1e-5
 
-    def assert_reimported(self, streams: bool, counts: dict):
+    def assert_reimported(self, counts: dict):
         """Check that exported files import at the scene's location and with its colours."""
         to_world = self.to_world()
         trained = self.trained()
@@ -302,8 +297,6 @@ class Workflow:
             "web/lod-meta.json": list(remaining),
         }
         for name, numbers in files.items():
-            if name.startswith("web") and not streams:
-                continue
             previous = set(self.bpy.data.objects)
             upright = name == "out.ply"  # only bundles store the scene's orientation
             result = self.bpy.ops.lodgs.import_splats(filepath=str(self.folder / name), upright=upright)

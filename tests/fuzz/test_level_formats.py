@@ -6,7 +6,6 @@ import gzip
 import json
 import shutil
 import zipfile
-from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -27,7 +26,6 @@ from training.splats.gltf_reader import read_glb
 from training.splats.levels import Bundle, Level
 from training.splats.portable_levels import PortableLevels
 from training.splats.sog import encode_sog
-from training.splats.splat_format import NeedsSplatTransform
 from training.splats.spz import pack_spz, read_spz
 from training.splats.streamed_levels import STREAMED_FILE, read_streamed_levels, write_streamed_levels
 from training.splats.usd import read_usd
@@ -174,8 +172,7 @@ def _try_streamed(folder, content):
     shutil.rmtree(folder / "read", ignore_errors=True)
 
     def read():
-        with suppress(NeedsSplatTransform):  # the version of a SOG
-            read_streamed_levels(folder / "web" / STREAMED_FILE, folder / "read")
+        read_streamed_levels(folder / "web" / STREAMED_FILE, folder / "read")
 
     attempt("streamed SOG", read, content)
 

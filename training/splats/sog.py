@@ -1,7 +1,8 @@
 """PlayCanvas' SOG: the values of splats as the pixels of lossless WebP images.
 
 Specification: https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog/ (version 2).
-Reading needs Pillow, writing also scipy. Blender lacks both; the trainer and the command line have them.
+Files of version 1 are only read. Reading needs Pillow, writing also scipy. Blender lacks both; the trainer
+and the command line have them.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ from .gaussians import SplatRows, Splats
 from .morton import spatial_order
 from .packed_files import MAX_PALETTE_PIXELS, webp_size
 from .quats import join_quats, split_quats
-from .sh import coefficient_count, degree_from_count
-from .splat_format import NeedsSplatTransform
+from .sh import degree_from_count
+from .splat_format import NeedsTrainer
 
 META = "meta.json"
 MAX_DEGREE = 3
@@ -152,13 +153,12 @@ def read_sog(path: Path) -> tuple[Splats, dict]:
     """Read a ``.sog`` file; return splats and an empty meta.
 
     Raises:
-        LodgsError: the file cannot be read or is damaged.
-        NeedsSplatTransform: see :func:`decode_sog`.
+        LodgsError: the file cannot be read or is damaged, or Pillow is missing.
     """
     try:
         with open_file(path) as file, zipfile.ZipFile(file) as archive:
             return decode_sog(archive.read), {}
-    except (LodgsError, NeedsSplatTransform):
+    except LodgsError:
         raise
     except Exception as error:  # zipfile documents no exception types
         raise sog_error(path, error) from error
@@ -171,23 +171,30 @@ def sog_error(path: Path, error: Exception) -> LodgsError:
 
 
 def decode_sog(read: Callable[[str], bytes]) -> Splats:
-    """Return the splats of the files of a SOG of version 2.
+    """Return the splats of the files of a SOG.
+
+    Version 2 stores values as entries of a codebook. Version 1 has no version number and stores them as
+    fractions of a range, opacities as logits.
 
     Args:
         read: function that returns the content of a file by name.
 
     Raises:
         KeyError, ValueError, TypeError, IndexError, OSError, LodgsError: the files are damaged.
-        NeedsSplatTransform: Pillow is missing, or the version is 1.
+        NeedsTrainer: Pillow is missing.
     """
     try:
         from PIL import Image
     except ImportError as error:
-        raise NeedsSplatTransform from error
+        raise NeedsTrainer(
+            f"Cannot read SOG: a package of the trainer is missing ({error}).", "Install the trainer."
+        ) from error
     meta = parse_json(read(META), META, _MAX_META)
-    if meta.get("version") != 2:
-        raise NeedsSplatTransform
-    count = int(meta["count"])
+    if meta.get("version", 1) not in (1, 2):
+        raise LodgsError(
+            f"Cannot read SOG of version {meta['version']}.", "Export it as version 2 or as PLY."
+        )
+    count = int(meta["count"] if "count" in meta else meta["means"]["shape"][0])
 
     def pixels(part: str, index: int = 0, size: int | None = count) -> np.ndarray:
         data = read(meta[part]["files"][index])
@@ -195,38 +202,52 @@ def decode_sog(read: Callable[[str], bytes]) -> Splats:
         if width * height > max(2 * count, MAX_PALETTE_PIXELS):
             raise ValueError(f"an image has {width}x{height} pixels for {count:,} splats")
         with Image.open(io.BytesIO(data), formats=["WEBP"]) as image:
-            values = np.asarray(image.convert("RGBA")).reshape(-1, 4)[:size]
-        if size is not None and len(values) != size:
+            values = np.asarray(image.convert("RGBA"))
+        if size is None:
+            return values
+        values = values.reshape(-1, 4)[:size]
+        if len(values) != size:
             raise ValueError(f"an image is too small for {count:,} splats")
-        return values
-
-    def table(part: str) -> np.ndarray:
-        with np.errstate(over="ignore"):  # infinities are dropped later
-            values = np.array(meta[part]["codebook"], np.float32)
-        if np.isnan(values[0]):  # null, which splat-transform wrote for -infinity
-            values[0] = values[1] + (values[1] - values[-1]) / 255
         return values
 
     low, high = (np.array(meta["means"][end], np.float64).reshape(3) for end in ("mins", "maxs"))
     codes = pixels("means", 0)[:, :3] + 256 * pixels("means", 1)[:, :3].astype(np.int64)
     stretched = low + codes * ((high - low) / 65535)
     colors = pixels("sh0")
-    sh = table("sh0")[colors[:, :3]][:, None]
+    sh = _decode(meta["sh0"], colors[:, :3])[:, None]
     if "shN" in meta:
-        coefficients = coefficient_count(int(meta["shN"]["bands"])) - 1
-        sets = table("shN")[pixels("shN", 0, None)[:, :3]].reshape(-1, coefficients, 3)
+        palette = pixels("shN", 0, None)
+        sets = _decode(meta["shN"], palette.reshape(-1, 4)[:, :3]).reshape(-1, palette.shape[1] // _ROW, 3)
         labels = pixels("shN", 1).astype(np.int64)
         sh = np.concatenate([sh, sets[labels[:, 0] + 256 * labels[:, 1]]], axis=1)
         degree_from_count(sh.shape[1])
     rotations = pixels("quats")
     quats = join_quats((rotations[:, 3].astype(np.int64) - _LARGEST).clip(0, 3), rotations[:, :3] / 255.0)
-    opacities = (colors[:, 3] / 255).clip(1 / 1024, 1 - 1 / 1024)
+    if "codebook" in meta["sh0"]:
+        opacities = (colors[:, 3] / 255).clip(1 / 1024, 1 - 1 / 1024)
+        logits = np.log(opacities / (1 - opacities)).astype(np.float32)
+    else:
+        logits = _decode(meta["sh0"], colors)[:, 3]
     with np.errstate(over="ignore"):  # such splats cannot be drawn, and are dropped later
         means = (np.sign(stretched) * np.expm1(np.abs(stretched))).astype(np.float32)
-    return Splats(
-        means, quats, table("scales")[pixels("scales")[:, :3]],
-        np.log(opacities / (1 - opacities)).astype(np.float32), sh,
-    )  # fmt: skip
+    return Splats(means, quats, _decode(meta["scales"], pixels("scales")[:, :3]), logits, sh)
+
+
+def _decode(part: dict, codes: np.ndarray) -> np.ndarray:
+    """Return the values (N, C) float32 of codes (N, C) uint8.
+
+    Args:
+        part: description of the values: a codebook, or in version 1 a range for all or each of the channels.
+    """
+    with np.errstate(over="ignore"):  # infinities are dropped later
+        if "codebook" not in part:
+            low, high = (np.atleast_1d(np.array(part[end], np.float64)) for end in ("mins", "maxs"))
+            low, high = low[: codes.shape[1]], high[: codes.shape[1]]
+            return (low + codes * ((high - low) / 255)).astype(np.float32)
+        table = np.array(part["codebook"], np.float32)
+    if np.isnan(table[0]):  # null, which splat-transform wrote for -infinity
+        table[0] = table[1] + (table[1] - table[-1]) / 255
+    return table[codes]
 
 
 def _codebook(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

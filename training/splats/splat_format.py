@@ -6,12 +6,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+from ..errors import LodgsError
 from .gaussians import SplatRows
 from .portable_levels import PortableLevels
 
 
-class NeedsSplatTransform(Exception):
-    """Raised for files that splat-transform must read: a package is missing, or the version is old."""
+class NeedsTrainer(LodgsError):
+    """Raised for files that need a package which this Python lacks and the trainer has."""
 
 
 class SplatFormat(NamedTuple):
@@ -29,7 +30,7 @@ class SplatFormat(NamedTuple):
         antialiased: True if the format stores that splats need Mip-Splatting's 2D filter.
         write: function that writes splats with the meta of their bundle.
         read: function that reads splats and meta of a file; None for PLY. It may raise
-            :class:`NeedsSplatTransform`.
+            :class:`NeedsTrainer`.
         write_levels: function that writes all levels for selection by distance; None if the format has none.
             It replaces ``write``.
         read_levels: function that converts a file with levels to a bundle, with the splats that cannot be
@@ -57,13 +58,8 @@ class SplatFormat(NamedTuple):
 
     @property
     def in_trainer(self) -> bool:
-        """True if only the trainer writes the format."""
+        """True if only the trainer reads and writes the format."""
         return self.require is not None
-
-    @property
-    def reads_in_trainer(self) -> bool:
-        """True if only the trainer reads the format."""
-        return self.require is not None and self.read_levels is not None
 
     def size(self, count: int, degree: int) -> float:
         """Estimate the file size of splats in bytes."""

@@ -24,7 +24,6 @@ from .ply import BATCH_ROWS, write_ply
 from .portable_levels import ConcatenatedRows
 from .sh import coefficient_count
 from .sog import MAX_DEGREE, META, decode_sog, encode_sog, load_packages, sog_error
-from .splat_format import NeedsSplatTransform
 
 STREAMED_FILE = "lod-meta.json"
 """Main file of streamed levels, in a folder of their own."""
@@ -246,22 +245,6 @@ def _describe(node: _Node) -> dict:
     return {"bound": {"min": low.tolist(), "max": high.tolist()}, "children": children}
 
 
-def count_lods(path: Path) -> int:
-    """Return the number of levels in a :data:`STREAMED_FILE`.
-
-    Raises:
-        LodgsError: the file is damaged.
-    """
-    count = _read_meta(path).get("lodLevels")
-    if type(count) is not int or not 1 <= count <= MAX_READ_LEVELS:
-        raise LodgsError(f"Cannot read {path}: it does not describe streamed levels.", "Choose another file.")
-    return count
-
-
-def _read_meta(path: Path) -> dict:
-    return read_json(path, max_bytes=_MAX_JSON, max_nesting=_MAX_NESTING)
-
-
 def read_streamed_levels(path: Path, folder: Path) -> None:
     """Convert streamed levels to a folder of PLYs, each with the surroundings.
 
@@ -269,10 +252,13 @@ def read_streamed_levels(path: Path, folder: Path) -> None:
         path: a :data:`STREAMED_FILE`.
 
     Raises:
-        LodgsError: the files cannot be read or are damaged, or refer to files outside their folder.
-        NeedsSplatTransform: see :func:`.sog.decode_sog`.
+        LodgsError: the files cannot be read or are damaged, refer to files outside their folder, or Pillow is
+            missing.
     """
-    count, meta = count_lods(path), _read_meta(path)
+    meta = read_json(path, max_bytes=_MAX_JSON, max_nesting=_MAX_NESTING)
+    count = meta.get("lodLevels")
+    if type(count) is not int or not 1 <= count <= MAX_READ_LEVELS:
+        raise LodgsError(f"Cannot read {path}: it does not describe streamed levels.", "Choose another file.")
     try:
         names, ranges = list(meta["filenames"]), _collect_ranges(meta["tree"], count)
         surroundings = [_read_part(path, meta["environment"])] if meta.get("environment") else []
@@ -283,7 +269,7 @@ def read_streamed_levels(path: Path, folder: Path) -> None:
             degree = max(part.sh_degree for part in parts)
             splats = Splats.concatenated([_with_degree(part, degree) for part in parts])
             write_ply(folder / f"lod{lod}.ply", splats)
-    except (LodgsError, NeedsSplatTransform):
+    except LodgsError:
         raise
     except (KeyError, ValueError, TypeError, IndexError, AttributeError, OSError) as error:
         raise sog_error(path, error) from error

@@ -24,6 +24,7 @@ from ..files import atomic_write, temporary_folder
 from .levels import Level
 from .portable_levels import PortableLevels, PortableView, batches
 from .sh import coefficient_count
+from .splat_format import NeedsTrainer
 
 DESCRIPTION = "lodgs"
 """Key of the layer's custom data with the levels' rule and meta, as JSON."""
@@ -47,17 +48,17 @@ def load_usd() -> SimpleNamespace:
     """Return the modules of usd-core.
 
     Raises:
-        LodgsError: it is not installed or too old, or this process is Blender's.
+        NeedsTrainer: it is not installed or too old, or this process is Blender's.
     """
     if "bpy" in sys.modules:
-        raise LodgsError(
+        raise NeedsTrainer(
             "Cannot open USD files in Blender's own process, which has another USD library.",
             "Use the command line: lodgs edit SCENE.usdc --out SCENE.ply.",
         )
     try:
         from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdLod, UsdUtils, UsdVol, Vt
     except ImportError as error:
-        raise LodgsError(
+        raise NeedsTrainer(
             f"Cannot open USD files: the package usd-core 26.11 or newer is missing ({error}).", _INSTALL
         ) from error
     return SimpleNamespace(

@@ -2,9 +2,9 @@
 
 import json
 import os
-import shutil
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -14,15 +14,10 @@ from tests.blender.fake_trainer import splats
 from tests.checkout import ROOT, copy_checkout, recipe_code
 from tests.training.splats.ksplat_files import FILES
 from tests.training.splats.ksplat_files import source as splats_of_file
-from tests.training.splats.test_formats import write_old_sog
 from training.splats.bundle import write_bundle
 from training.splats.levels import Bundle, Level
-from training.splats.splat_transform import PROGRAM
 
 pytestmark = pytest.mark.one_blender
-
-
-PROGRAMS = Path(__file__).parents[3] / "build" / "interop" / "node_modules" / ".bin"
 
 
 @pytest.fixture
@@ -32,13 +27,6 @@ def root(bpy, lodgs, tmp_path):
     root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "in.ply")
     bpy.context.view_layer.update()
     return root
-
-
-@pytest.fixture
-def splat_transform(monkeypatch):
-    monkeypatch.setenv("PATH", f"{PROGRAMS}{os.pathsep}{os.environ['PATH']}")
-    if not shutil.which(PROGRAM):
-        pytest.skip("splat-transform is not installed; make interop installs it with Node.js")
 
 
 def means(obj):
@@ -62,7 +50,7 @@ def test_level_round_trip(bpy, lodgs, root, tmp_path, ending):
     assert obj.name.startswith("out level 1")
 
 
-def test_streamed_levels_round_trip(bpy, lodgs, root, tmp_path, splat_transform):
+def test_streamed_levels_round_trip(bpy, lodgs, root, tmp_path):
     assert bpy.ops.lodgs.export_streamed(directory=str(tmp_path / "web")) == {"FINISHED"}
     for path in (tmp_path / "web", tmp_path / "web" / "lod-meta.json"):
         objects = import_levels(bpy, lodgs, path)
@@ -99,11 +87,35 @@ def test_page_has_the_levels(bpy, lodgs, root, tmp_path):
     assert (tmp_path / "page" / "levels" / "lod-meta.json").is_file()
 
 
-def test_missing_program_is_reported(bpy, lodgs, root, tmp_path, monkeypatch):
-    monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setattr(lodgs("training.splats.splat_transform"), "_FOLDERS", ())
-    write_old_sog(tmp_path / "b.sog")
-    with pytest.raises(RuntimeError, match="npm install --global"):
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["out.sog", "out.usdc", "web"])
+def test_trainer_reads_what_blender_cannot(bpy, lodgs, root, tmp_path, monkeypatch, name):
+    python = os.environ.get("LODGS_TRAINER_PYTHON")
+    if not python:
+        pytest.skip("no trainer; set LODGS_TRAINER_PYTHON")
+    levels = root.lodgs.levels
+    if name == "web":
+        assert bpy.ops.lodgs.export_streamed(directory=str(tmp_path / name)) == {"FINISHED"}
+    elif name.endswith(".sog"):
+        bpy.ops.lodgs.export_plain(filepath=str(tmp_path / name), source="LEVEL", level=2)
+        levels = levels[1:]
+    else:
+        bpy.ops.lodgs.export_levels(filepath=str(tmp_path / name))
+    monkeypatch.setitem(sys.modules, "PIL", None)  # as in Blender
+    bpy.ops.lodgs.import_splats(filepath=str(tmp_path / name))
+    imported = lodgs("data.roots").active_root(bpy.context)
+    assert imported != root and Path(imported.lodgs.source.file).name == name
+    for item, original in zip(imported.lodgs.levels, levels, strict=True):
+        np.testing.assert_allclose(means(item.object), means(original.object), atol=0.01)
+
+
+def test_missing_trainer_is_reported(bpy, lodgs, root, tmp_path, monkeypatch):
+    with zipfile.ZipFile(tmp_path / "b.sog", "w") as archive:
+        archive.writestr("meta.json", '{"version": 2, "count": 16}')
+    monkeypatch.setitem(sys.modules, "PIL", None)
+    monkeypatch.delenv("LODGS_TRAINER_PYTHON", raising=False)
+    monkeypatch.setattr(lodgs("runs.environment"), "ready_environments", list)
+    with pytest.raises(RuntimeError, match=r"b.sog without the trainer\.\s+Press Install Trainer"):
         bpy.ops.lodgs.import_splats(filepath=str(tmp_path / "b.sog"))
     assert {path.name for path in tmp_path.iterdir()} == {"in.ply", "b.sog"}
 
@@ -118,6 +130,7 @@ def test_ksplat_is_imported(bpy, lodgs, tmp_path, compression):
 
 SCRIPT = """
 import sys
+import zipfile
 from pathlib import Path
 import numpy as np
 from tools import blender_module

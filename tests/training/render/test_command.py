@@ -1,7 +1,6 @@
 """The render command: images of views, and its errors."""
 
 import json
-import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +10,6 @@ from PIL import Image
 
 from tests.training.conftest import write_tiny_scene
 from tests.training.lod.tree.trees import tree_of
-from tests.training.splats.test_formats import write_old_sog
 from training.__main__ import main
 from training.lod.blocks import BLOCKS, block_table
 from training.lod.rule import rules
@@ -319,21 +317,10 @@ def test_graphics_device_matches_the_cpu(graphics, bundle, camera, tmp_path, opt
     assert images[0][..., :3].std() > 10, "the image is empty"
 
 
-@pytest.mark.parametrize("suffix", [".sog", ".splat"])
-def test_other_formats_are_rendered(make_splats, camera, tmp_path, monkeypatch, suffix):
-    """A copy stands in for splat-transform, which reads SOG of version 1."""
-    splats = make_splats(30)
-    write_ply(tmp_path / "a.ply", splats)
-    if suffix == ".splat":
-        write_splat(tmp_path / "a.splat", splats, {})
-        splats = SplatFile(tmp_path / "a.splat").select(slice(None))
-    else:
-        write_old_sog(tmp_path / "a.sog")
-        monkeypatch.setattr(
-            "training.splats.formats.run_splat_transform",
-            lambda arguments: shutil.copy(tmp_path / "a.ply", arguments[-1]),
-        )
+def test_other_formats_are_rendered(make_splats, camera, tmp_path):
+    write_splat(tmp_path / "a.splat", make_splats(30), {})
+    splats = SplatFile(tmp_path / "a.splat").select(slice(None))
     write_camera(tmp_path / "camera.json", camera, 0.01)
-    source, out = str(tmp_path / f"a{suffix}"), str(tmp_path / "a.png")
+    source, out = str(tmp_path / "a.splat"), str(tmp_path / "a.png")
     assert main(["render", source, "--camera", str(tmp_path / "camera.json"), "--out", out]) == 0
     np.testing.assert_array_equal(pixels(tmp_path / "a.png"), expected(splats, camera))

@@ -2,24 +2,32 @@
 
 import os
 import shutil
+import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from training.splats.gaussians import Splats
-from training.splats.splat_transform import PROGRAM
 
 NODE_PROGRAMS = Path(__file__).parents[3] / "build" / "interop" / "node_modules" / ".bin"
 """npm's program folder after ``make interop``."""
 
 
 @pytest.fixture
-def splat_transform(monkeypatch):
-    """Put splat-transform into PATH, or skip the test."""
-    monkeypatch.setenv("PATH", f"{NODE_PROGRAMS}{os.pathsep}{os.environ['PATH']}")
-    if not shutil.which(PROGRAM):
+def splat_transform():
+    """Return ``splat_transform(source, target)``, which converts a file, or skip the test."""
+    folders = os.pathsep.join([str(NODE_PROGRAMS), os.environ["PATH"]])
+    program = shutil.which("splat-transform", path=folders)
+    if program is None:
         pytest.skip("splat-transform is not installed; make interop installs it if Node.js is available")
+    environment = os.environ | {"PATH": folders}
+
+    def convert(source, target):
+        command = [program, "-w", "--no-tty", "-g", "cpu", str(source), str(target)]
+        subprocess.run(command, env=environment, check=True, capture_output=True)
+
+    return convert
 
 
 @pytest.fixture

@@ -1,10 +1,8 @@
 """Splat files of other programs, exchanged with splat-transform if it is installed."""
 
-import os
 import struct
 import subprocess
 import sys
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +25,7 @@ from training.splats.gaussians import SH_C0, Splats
 from training.splats.level_folder import read_folder
 from training.splats.levels import Bundle, Level
 from training.splats.ply import read_ply
-from training.splats.splat_transform import PROGRAM, run_splat_transform
+from training.splats.splat_format import NeedsTrainer
 from training.splats.streamed_levels import write_streamed_levels
 
 
@@ -90,14 +88,14 @@ def test_truncated_splat_file_raises_one_sentence(tmp_path):
 def test_splat_transform_reads_our_splat(tmp_path, splat_transform):
     splats = random_splats(300)
     write_splat(tmp_path / "a.splat", splats, {})
-    run_splat_transform([str(tmp_path / "a.splat"), str(tmp_path / "b.ply")])
+    splat_transform(tmp_path / "a.splat", tmp_path / "b.ply")
     assert_similar(read_ply(tmp_path / "b.ply"), splats, colours=6)  # colours beyond 0 and 1 are clipped
 
 
 def test_splat_transform_reads_our_compressed_ply(tmp_path, splat_transform):
     splats = random_splats(300, 3)
     write_compressed_ply(tmp_path / "a.compressed.ply", splats, {"antialias": True})
-    run_splat_transform([str(tmp_path / "a.compressed.ply"), str(tmp_path / "b.ply")])
+    splat_transform(tmp_path / "a.compressed.ply", tmp_path / "b.ply")
     theirs, (rows, _) = read_ply(tmp_path / "b.ply"), read_compressed_ply(tmp_path / "a.compressed.ply")
     ours = rows.select(slice(None))
     for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
@@ -166,56 +164,21 @@ def test_streamed_levels_replace_no_foreign_files(tmp_path):
     assert (tmp_path / "web" / "thesis.txt").exists()
 
 
-def write_old_sog(path):
-    """Write a SOG of version 1, which only splat-transform reads, without its images."""
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("meta.json", '{"means": {"shape": [16, 3]}}')
-
-
-def test_unreadable_file_raises_one_sentence(tmp_path, splat_transform):
-    write_old_sog(tmp_path / "a.sog")
-    with pytest.raises(LodgsError, match="splat-transform failed"), open_as_ply(tmp_path / "a.sog"):
+@pytest.mark.parametrize("name", ["a.sog", "web"])
+def test_missing_package_leaves_the_conversion_to_the_trainer(tmp_path, monkeypatch, name):
+    level = Level(1, random_splats(30))
+    write_splats(tmp_path / "a.sog", level.splats, {})
+    write_streamed_levels(tmp_path / "web", Bundle("flod", [level]))
+    monkeypatch.setitem(sys.modules, "PIL", None)
+    with pytest.raises(NeedsTrainer, match=r"Install the trainer\."), open_as_ply(tmp_path / name):
         pass
 
+    def convert(source, target):
+        assert source.name in ("a.sog", STREAMED_FILE)
+        write_bundle(target, Bundle("", [level]))
 
-def test_missing_program_error_tells_how_to_install_it(tmp_path, monkeypatch):
-    monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setattr("training.splats.splat_transform._FOLDERS", ())
-    write_old_sog(tmp_path / "a.sog")
-    hint = "npm install --global @playcanvas/splat-transform"
-    with pytest.raises(LodgsError, match=hint), open_as_ply(tmp_path / "a.sog"):
-        pass
-
-
-@pytest.fixture
-def stand_in(tmp_path, monkeypatch):
-    """Return ``stand_in(lines)``, which replaces the program with a shell script and returns its path."""
-    if os.name == "nt":
-        pytest.skip("the replacement is a shell script")
-
-    def write(lines):
-        program = tmp_path / PROGRAM
-        program.write_text(f"#!/bin/sh\n{lines}\n")
-        program.chmod(0o755)
-        return program
-
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
-    return write
-
-
-def test_failed_runs_are_repeated_on_the_cpu(stand_in):
-    program = stand_in('echo "$*" >> "$0.log"\ncase "$*" in *"-g cpu"*) touch a.ply;; *) exit 1;; esac')
-    run_splat_transform(["a.sog", "a.ply"])
-    first, second = Path(f"{program}.log").read_text().splitlines()
-    assert "-g" not in first and "-g cpu a.sog a.ply" in second
-
-
-def test_program_without_output_file_has_failed(stand_in):
-    """Older versions interpret some options differently and return 0."""
-    stand_in("echo No adapters found")
-    with pytest.raises(LodgsError, match=r"no output\)\. Check that its version is 3"):
-        run_splat_transform(["-L", "0", "lod-meta.json", "lod0.ply"])
+    with open_as_ply(tmp_path / name, convert) as path:
+        assert len(read_bundle(path).levels[0].splats) == 30
 
 
 def test_formats_are_found_by_name():

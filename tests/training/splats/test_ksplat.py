@@ -12,7 +12,6 @@ from training.splats.formats import open_as_ply
 from training.splats.gaussians import Splats
 from training.splats.ksplat import KsplatRows
 from training.splats.ply import read_ply
-from training.splats.splat_transform import run_splat_transform
 
 HEADER, SECTION = 4096, 1024
 
@@ -95,7 +94,7 @@ def test_file_is_imported(tmp_path):
 @pytest.mark.parametrize("compression", [0, 1, 2])
 def test_splat_transform_reads_the_same_values(tmp_path, splat_transform, compression):
     (tmp_path / "a.ksplat").write_bytes(FILES[compression])
-    run_splat_transform([str(tmp_path / "a.ksplat"), str(tmp_path / "a.ply")])
+    splat_transform(tmp_path / "a.ksplat", tmp_path / "a.ply")
     assert_close(
         KsplatRows(tmp_path / "a.ksplat").select(slice(None)), read_ply(tmp_path / "a.ply"), 0, 1e-6, 1e-6
     )

@@ -12,7 +12,7 @@ from training.errors import LodgsError
 from training.splats.gaussians import Splats
 from training.splats.levels import Bundle, Level
 from training.splats.ply import read_ply
-from training.splats.sog import decode_sog, encode_sog, make_palette, write_sog
+from training.splats.sog import decode_sog, encode_sog, make_palette, read_sog, write_sog
 from training.splats.streamed_levels import (
     LEAF_SPLATS,
     STREAMED_FILE,
@@ -63,6 +63,71 @@ def test_values_are_stored_as_specified():
     values = pixels(files["sh0.webp"])[:2]
     np.testing.assert_allclose(colors[values[:, 0]], [0.25, 0.5], atol=1e-6)
     assert values[:, 3].tolist() == [128, 255]
+
+
+def write_first_version(path):
+    """Write two splats as SOG of version 1, whose layout is that of PlayCanvas' engine 2.8."""
+
+    def image(rows, width=4):
+        pixels = np.zeros((4, width, 4), np.uint8)
+        pixels.reshape(-1, 4)[: len(rows)] = rows
+        target = io.BytesIO()
+        Image.fromarray(pixels).save(target, "WEBP", lossless=True, exact=True)
+        return target.getvalue()
+
+    palette = np.zeros((64 * 15, 4), np.uint8)
+    palette[15:18, 0] = 51, 102, 255  # the first coefficients of set 1, red
+    files = {
+        "means_l.webp": image([[0, 255, 0, 255], [255, 0, 0, 255]]),
+        "means_u.webp": image([[0, 255, 0, 255], [255, 0, 0, 255]]),
+        "scales.webp": image([[0, 0, 0, 255], [255, 51, 0, 255]]),
+        "quats.webp": image([[128, 128, 128, 252], [128, 128, 128, 254]]),
+        "sh0.webp": image([[0, 0, 0, 0], [255, 51, 0, 255]]),
+        "shN_centroids.webp": image(palette, 64 * 15),
+        "shN_labels.webp": image([[0, 0, 0, 255], [1, 0, 0, 255]]),
+    }
+    meta = {
+        "means": {
+            "shape": [2, 3], "mins": [-1, 0, 0], "maxs": [1, 2, 0], "files": ["means_l.webp", "means_u.webp"],
+        },
+        "scales": {"shape": [2, 3], "mins": [-5, -5, -4], "maxs": [0, 0, 0], "files": ["scales.webp"]},
+        "quats": {"shape": [2, 4], "encoding": "quaternion_packed", "files": ["quats.webp"]},
+        "sh0": {"shape": [2, 1, 4], "mins": [-1, -1, 0, -2], "maxs": [1, 1, 0, 3], "files": ["sh0.webp"]},
+        "shN": {"shape": [2, 15], "mins": -1, "maxs": 1, "files": ["shN_centroids.webp", "shN_labels.webp"]},
+    }  # fmt: skip
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, data in ({"meta.json": json.dumps(meta).encode()} | files).items():
+            archive.writestr(name, data)
+
+
+def test_first_version_is_read(tmp_path):
+    """Values are fractions of ranges, worked by hand; means are stored as sign(x) log(1 + |x|)."""
+    write_first_version(tmp_path / "a.sog")
+    splats, _ = read_sog(tmp_path / "a.sog")
+    e = float(np.e)
+    np.testing.assert_allclose(splats.means, [[1 - e, e**2 - 1, 0], [e - 1, 0, 0]], rtol=1e-6)
+    np.testing.assert_allclose(splats.log_scales, [[-5, -5, -4], [0, -4, -4]], rtol=1e-6)
+    np.testing.assert_allclose(splats.opacity_logits, [-2, 3], rtol=1e-6)
+    np.testing.assert_allclose(splats.sh[:, 0], [[-1, -1, 0], [1, -0.6, 0]], atol=1e-6)
+    assert splats.sh.shape == (2, 16, 3)
+    np.testing.assert_allclose(splats.sh[0, 1:], -1)
+    np.testing.assert_allclose(splats.sh[1, 1:5, 0], [-0.6, -0.2, 1, -1], atol=1e-6)
+    np.testing.assert_allclose(np.abs(splats.quats), [[1, 0, 0, 0], [0, 0, 1, 0]], atol=0.01)
+
+
+def test_splat_transform_reads_the_same_first_version(tmp_path, splat_transform):
+    write_first_version(tmp_path / "a.sog")
+    splat_transform(tmp_path / "a.sog", tmp_path / "a.ply")
+    theirs, (ours, _) = read_ply(tmp_path / "a.ply"), read_sog(tmp_path / "a.sog")
+    for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
+        np.testing.assert_allclose(getattr(ours, name), getattr(theirs, name), atol=1e-5, err_msg=name)
+
+
+def test_unknown_version_is_refused(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.sog", "w") as archive:
+        archive.writestr("meta.json", '{"version": 3, "count": 1}')
+    with pytest.raises(LodgsError, match=r"Cannot read SOG of version 3\. Export it as version 2 or as PLY"):
+        read_sog(tmp_path / "a.sog")
 
 
 def test_null_in_a_codebook_continues_its_steps():

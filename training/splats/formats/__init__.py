@@ -1,6 +1,6 @@
 """Splat files of other programs. Each module of this package declares one format as ``FORMAT``.
 
-``.ksplat`` and ``.gltf`` are only read. splat-transform reads SOG without the packages of the trainer.
+``.ksplat`` and ``.gltf`` are only read.
 """
 
 from __future__ import annotations
@@ -19,9 +19,8 @@ from ..gaussians import SplatRows
 from ..ksplat import KsplatRows
 from ..packed_files import check_sog_file
 from ..ply import write_ply
-from ..splat_format import NeedsSplatTransform, SplatFormat
-from ..splat_transform import run_splat_transform
-from ..streamed_levels import STREAMED_FILE, count_lods, read_streamed_levels
+from ..splat_format import NeedsTrainer, SplatFormat
+from ..streamed_levels import STREAMED_FILE, read_streamed_levels
 from .compressed_ply import FORMAT as COMPRESSED_PLY
 from .glb import FORMAT as GLB
 from .ply import FORMAT as PLY
@@ -36,19 +35,17 @@ FORMATS: tuple[SplatFormat, ...] = tuple(
 """Export formats: PLY, then by size, largest first."""
 KSPLAT, GLTF = ".ksplat", ".gltf"
 FILE_EXTENSIONS = (
-    *(
-        kind.suffix
-        for kind in FORMATS
-        if kind.readable and not kind.reads_in_trainer and kind.suffix.rfind(".") == 0
-    ),
+    *(kind.suffix for kind in FORMATS if kind.readable and kind.suffix.rfind(".") == 0),
     KSPLAT,
     GLTF,
 )
-"""Last parts of the names of files that Blender reads."""
+"""Last parts of the names of readable files."""
 LEVEL_FORMATS = tuple(kind for kind in FORMATS if kind.write_levels)
 """Formats of all levels in one file."""
-READABLE = (*FILE_EXTENSIONS, *(kind.suffix for kind in FORMATS if kind.reads_in_trainer), STREAMED_FILE)
+READABLE = (*FILE_EXTENSIONS, STREAMED_FILE)
 """Ends of the names of readable files; :data:`STREAMED_FILE` is a complete name."""
+Convert = Callable[[Path, Path], None]
+"""Function that converts a splat file to a bundle, whose path is the second argument."""
 
 
 def find_format(path: Path) -> SplatFormat:
@@ -102,14 +99,18 @@ def find_level_format(path: Path) -> SplatFormat:
 
 
 @contextmanager
-def open_as_ply(path: Path) -> Iterator[Path]:
+def open_as_ply(path: Path, convert: Convert | None = None) -> Iterator[Path]:
     """Yield a PLY with the splats of a file, or a folder of PLYs with streamed levels.
 
     A PLY or a folder is yielded unchanged. Other files are converted to a temporary one of the same name:
     a bundle if they have levels.
 
+    Args:
+        convert: function for files that need a package which this Python lacks.
+
     Raises:
-        LodgsError: the file cannot be read, or splat-transform is missing or fails.
+        NeedsTrainer: a package is missing, and there is no ``convert``.
+        LodgsError: the file cannot be read.
     """
     if path.is_dir() and (path / STREAMED_FILE).is_file():
         path = path / STREAMED_FILE
@@ -123,14 +124,26 @@ def open_as_ply(path: Path) -> Iterator[Path]:
     stem = path.resolve().parent.name if name == STREAMED_FILE else path.stem.removesuffix(".compressed")
     with temporary_folder() as folder:
         converted = folder / f"{stem or 'splats'}.ply"
-        if name == STREAMED_FILE:
-            converted = converted.with_suffix("")
-            _read_streamed(path, converted)
-        elif (read_levels := _level_reader(name)) is not None:
-            read_levels(path, converted)
-        elif not _read_plain(path, converted):
-            run_splat_transform([str(path), str(converted)])
+        try:
+            converted = _convert(path, converted)
+        except NeedsTrainer:
+            if convert is None:
+                raise
+            convert(path, converted)
         yield converted
+
+
+def _convert(path: Path, converted: Path) -> Path:
+    """Convert a file to a PLY, or streamed levels to a folder, and return its path."""
+    name = path.name.lower()
+    if name == STREAMED_FILE:
+        converted = converted.with_suffix("")
+        read_streamed_levels(path, converted)
+    elif (read_levels := _level_reader(name)) is not None:
+        read_levels(path, converted)
+    else:
+        _read_plain(path, converted)
+    return converted
 
 
 def _level_reader(name: str) -> Callable[[Path, Path], None] | None:
@@ -139,27 +152,14 @@ def _level_reader(name: str) -> Callable[[Path, Path], None] | None:
     return next((kind.read_levels for kind in LEVEL_FORMATS if name.endswith(kind.suffix)), None)
 
 
-def _read_plain(path: Path, converted: Path) -> bool:
-    """Convert a file of one level to a PLY; return False if splat-transform must do so."""
+def _read_plain(path: Path, converted: Path) -> None:
+    """Convert a file of one level to a PLY."""
     name = path.name.lower()
     readers = {kind.suffix: kind.read for kind in FORMATS if kind.read}
     readers |= {PLY.suffix: COMPRESSED_PLY.read, KSPLAT: lambda path: (KsplatRows(path), {})}
     read = next(read for suffix, read in readers.items() if read and name.endswith(suffix))
-    try:
-        splats, meta = read(path)
-    except NeedsSplatTransform:
-        return False
+    splats, meta = read(path)
     write_ply(converted, splats, comments_from_meta(meta))
-    return True
-
-
-def _read_streamed(path: Path, folder: Path) -> None:
-    """Convert streamed levels to a folder of PLYs."""
-    try:
-        read_streamed_levels(path, folder)
-    except NeedsSplatTransform:
-        for lod in range(count_lods(path)):
-            run_splat_transform(["-L", str(lod), str(path), str(folder / f"lod{lod}.ply")])
 
 
 def is_plain_ply(path: Path) -> bool:

@@ -26,7 +26,7 @@ def file(bpy, lodgs, tmp_path):
 @pytest.fixture
 def commands(lodgs, monkeypatch):
     """Commands of the trainer, which a short program replaces."""
-    module, commands = lodgs("runs.compression"), []
+    module, commands = lodgs("runs.conversion"), []
     start = module.processes.spawn
     monkeypatch.setenv("LODGS_TRAINER_PYTHON", sys.executable)
     monkeypatch.setattr(module.environment, "require", lambda python: None)
@@ -83,7 +83,7 @@ def test_error_of_the_trainer_is_reported(bpy, file, tmp_path, commands, monkeyp
 def test_cancelled_compression_stops_the_trainer(lodgs, file, tmp_path, commands, monkeypatch):
     monkeypatch.setenv("COMPRESSION", "import time; time.sleep(60)")
     bundle = lodgs("training.splats.bundle").read_bundle(file)
-    steps = lodgs("runs.compression").compress_steps(bundle, tmp_path / "small.ply", {}, None)
+    steps = lodgs("runs.conversion").compress_steps(bundle, tmp_path / "small.ply", {}, None)
     assert next(steps) == ""
     folder = Path(commands[0][4]).parent
     steps.close()

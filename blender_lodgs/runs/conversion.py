@@ -1,4 +1,4 @@
-"""Exports that the trainer writes in the background."""
+"""Splat files that the trainer reads or writes for Blender, in the background."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from threading import Event
 
 import bpy
 
@@ -15,7 +16,9 @@ from ...training.errors import LodgsError
 from ...training.files import temporary_folder
 from ...training.runs.folder import RunFolder
 from ...training.splats.bundle import write_bundle
+from ...training.splats.formats import Convert
 from ...training.splats.levels import Bundle
+from ..data import importing
 from . import environment, processes
 
 
@@ -78,19 +81,60 @@ def _trainer_steps(bundle: Bundle, command: str, *arguments: str) -> Iterator[li
     python = environment.trainer_python()
     environment.require(python)
     with temporary_folder() as folder:
-        source, log, output = folder / "levels.ply", folder / "trainer.log", folder / "trainer.out"
+        source = folder / "levels.ply"
         write_bundle(source, bundle)
-        command_line = [python, "-m", "training", command, source, *arguments]
-        process = processes.spawn([str(word) for word in command_line], log, output)
-        try:
-            while (code := process.poll()) is None:
-                if bpy.app.background:
-                    time.sleep(processes.INTERVAL)
-                yield []
-        finally:
-            with suppress(OSError):
-                process.kill()
-                process.wait()
-        if code:
-            raise LodgsError(processes.failure_reason(log, code))
-        yield processes.last_lines(output)
+        for lines in _command_steps(python, folder, command, str(source), *arguments):
+            if not lines and bpy.app.background:
+                time.sleep(processes.INTERVAL)
+            yield lines
+
+
+def _command_steps(python: Path, folder: Path, *arguments: str) -> Iterator[list[str]]:
+    """Run a command of LODGS, and yield the lines of its report, at first none.
+
+    Args:
+        folder: folder for its log.
+    """
+    log, output = folder / "trainer.log", folder / "trainer.out"
+    process = processes.spawn([str(python), "-m", "training", *arguments], log, output)
+    try:
+        while (code := process.poll()) is None:
+            yield []
+    finally:
+        with suppress(OSError):
+            process.kill()
+            process.wait()
+    if code:
+        raise LodgsError(processes.failure_reason(log, code))
+    yield processes.last_lines(output)
+
+
+def make_converter(stop: Event | None = None) -> Convert:
+    """Return a function that converts a splat file to a bundle with the trainer; it may run in a thread.
+
+    The function raises a LodgsError if the trainer is missing, fails, or is stopped.
+
+    Args:
+        stop: event that stops the trainer.
+    """
+    stop = stop or Event()
+    python: Path | LodgsError
+    try:
+        python = environment.trainer_python()  # reads Blender's preferences: not in a thread
+    except LodgsError as error:
+        python = error
+
+    def convert(source: Path, target: Path) -> None:
+        if isinstance(python, LodgsError):
+            raise LodgsError(f"Cannot read {source.name} without the trainer.", python.remedy)
+        environment.require(python)
+        with temporary_folder() as folder:
+            for _ in _command_steps(python, folder, "edit", str(source.resolve()), "--out", str(target)):
+                if stop.wait(processes.INTERVAL):
+                    raise LodgsError(f"Reading {source.name} was stopped.")
+
+    return convert
+
+
+def register() -> None:
+    importing.make_converter = make_converter
