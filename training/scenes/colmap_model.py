@@ -333,7 +333,7 @@ def _decode(name: bytes) -> str:
     """Decode a name as UTF-8, else as Windows-1252; other bytes become surrogates.
 
     Some programs write the path on their computer. Of paths that leave the image folder, only the last part
-    remains.
+    remains. A letter and a colon without a slash are part of a file's name.
     """
     text = name.decode("utf-8", "surrogateescape")
     for encoding in "utf-8", "cp1252":
@@ -341,7 +341,7 @@ def _decode(name: bytes) -> str:
             text = name.decode(encoding)
             break
     path = PureWindowsPath(text)  # with the separators of all systems
-    return (path.name if path.anchor or ".." in path.parts else "") or text
+    return (path.name if path.root or ".." in path.parts else "") or text
 
 
 def _pose(name: bytes, camera_id: int, pose: list[float]) -> Pose:

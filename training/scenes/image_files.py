@@ -152,7 +152,8 @@ def relative_image_path(name: str) -> PurePosixPath:
     """
     path = PurePosixPath(name.replace("\\", "/"))
     windows_path = PureWindowsPath(name)
-    if path.is_absolute() or windows_path.drive or windows_path.root or ".." in path.parts:
+    has_drive = windows_path.drive and os.name == "nt"  # elsewhere, file names may contain colons
+    if path.is_absolute() or has_drive or windows_path.root or ".." in path.parts:
         raise LodgsError("its name points outside the image folder.")
     try:
         name.encode()

@@ -74,7 +74,7 @@ def test_names_that_are_not_utf8_are_escaped_in_warnings(scene):
     assert "oto.png: its name is not UTF-8." in warning and warning.encode()
 
 
-@pytest.mark.parametrize("name", ["C:/a.png", "c:a.png", "/a.png", "\\\\server\\x\\a.png", "x/../../a.png"])
+@pytest.mark.parametrize("name", ["C:/a.png", "c:\\a.png", "/a.png", "\\\\server\\x\\a.png", "x/../../a.png"])
 def test_names_that_leave_the_folder_on_any_system(scene, name):
     """Only their last part is used, as by 3DGS."""
     folder = write_text_model(scene / "sparse", views("b.png", name), grid())
@@ -84,6 +84,18 @@ def test_names_that_leave_the_folder_on_any_system(scene, name):
     assert [camera.name for camera in result.cameras] == ["a.png", "b.png"]
     assert result.cameras[0].image == scene / "images" / "a.png" and not result.warnings
     assert observations(result, ["a.png"])["a.png"].tolist() == [2]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows reserves the colon for drives")
+def test_names_with_a_colon(scene):
+    """A letter before a colon is no drive without a slash."""
+    write_text_model(scene / "sparse", views("a:1.png", "b:left/2.png"), grid())
+    (scene / "images" / "b:left").mkdir()
+    for name in "a:1.png", "b:left/2.png":
+        (scene / "images" / name).write_bytes((scene / "images" / "a.png").read_bytes())
+    result = read_scene(scene)
+    assert [camera.name for camera in result.cameras] == ["a:1.png", "b:left/2.png"]
+    assert result.images_folder == scene / "images" and not result.warnings
 
 
 def test_search_for_image_folder_stays_inside_the_scene(scene, monkeypatch):
