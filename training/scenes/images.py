@@ -82,15 +82,17 @@ def load_image(path: Path, width: int, height: int, exposure: float = 0.0, alpha
 def load_mask(path: Path, width: int, height: int) -> np.ndarray:
     """Load a photo's mask at the given size, (height, width) float32; 0 marks ignored pixels.
 
-    Pixels are ignored if they are black or transparent. Values 0 and 1 of 255 count as black and white.
+    Pixels are ignored if they are black or transparent. The values 0 and 1 of 8 or 16 bits count as black and
+    white.
 
     Raises:
         LodgsError: the file cannot be read, or its aspect ratio differs from the given size.
     """
     check_mask(path, width, height)
     mask = load_image(path, width, height, alpha=True)[..., :3].max(axis=-1)
-    if 0 < 255 * mask.max() < 1.5:
-        mask *= 255
+    for white in 65535, 255:
+        if 0 < white * mask.max() < 1.5:
+            mask *= white
     lossy = path.suffix.lower() in (".jpg", ".jpeg", ".webp")  # nearly black and nearly white
     return (mask >= 0.5).astype(np.float32) if lossy else mask
 

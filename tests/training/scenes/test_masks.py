@@ -116,12 +116,13 @@ def test_invalid_mask_is_reported_before_training(tmp_path, capsys, kind):
     assert message in out and mask.name in out and "Traceback" not in out + err and "progress" not in out
 
 
-@pytest.mark.parametrize("kind", ["of 0 and 1", "green", "transparent", "grey with alpha"])
+@pytest.mark.parametrize("kind", ["of 0 and 1", "0 and 1, 16 bit", "green", "transparent", "grey with alpha"])
 def test_masks_of_other_kinds_are_black_and_white(tmp_path, kind):
     """Segmentation programs write class numbers, overlay colours or transparency."""
     white = halves()[..., 0] > 0
     pixels = {
         "of 0 and 1": white.astype(np.uint8),
+        "0 and 1, 16 bit": white.astype(np.uint16),
         "green": white[..., None] * np.uint8([0, 255, 0]),
         "transparent": np.dstack([np.full(halves().shape, 255, np.uint8), 255 * white.astype(np.uint8)]),
         "grey with alpha": np.dstack([255 * white.astype(np.uint8), np.full(white.shape, 255, np.uint8)]),
