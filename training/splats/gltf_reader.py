@@ -225,7 +225,7 @@ class _GlbReader:
 
     def _compressed(self, index: object) -> Splats:
         data, _ = self._view(index)
-        splats = unpack_spz(data.tobytes(), len(data) * _MAX_RATIO // _SPZ_SPLAT)
+        splats = unpack_spz(data.tobytes(), len(data) * _MAX_RATIO // _SPZ_SPLAT, self._path)
         self._splats += len(splats)
         if self._splats * _SPZ_SPLAT > self._size * _MAX_RATIO:
             raise ValueError(f"it is too short for {self._splats:,} splats")

@@ -188,10 +188,7 @@ def read_spz(path: Path) -> tuple[Splats, dict]:
     with open_file(path) as file:
         data = file.read()
     try:
-        if data[:4] == _MAGIC.to_bytes(4, "little"):
-            header, arrays, extensions = _unpack_zstandard(data, path)
-        else:
-            header, arrays, extensions = _unpack_gzip(data)
+        header, arrays, extensions = _unpack(data, path)
         splats = _decode(header, arrays)
         axes = _SYSTEMS[_read_axes(extensions)] if header.flags & _EXTENDED else _SYSTEMS[0]
     except (ValueError, IndexError, struct.error, zlib.error) as error:
@@ -199,14 +196,18 @@ def read_spz(path: Path) -> tuple[Splats, dict]:
     return _with_3dgs_axes(splats, axes), {"antialias": True} if header.flags & _ANTIALIASED else {}
 
 
-def unpack_spz(data: bytes, max_splats: int) -> Splats:
+def unpack_spz(data: bytes, max_splats: int, path: Path | None = None) -> Splats:
     """Return the splats of an SPZ file's content inside glTF, with the coordinates of the file.
 
+    Args:
+        path: path of the glTF file, for messages.
+
     Raises:
-        ValueError: the data are damaged, have another version, or more splats than ``max_splats``.
+        ValueError: the data are damaged, or have more splats than ``max_splats``.
+        LodgsError: the data have an unknown version, or need a missing package.
     """
     try:
-        header, arrays, _ = _unpack_gzip(data, max_splats)
+        header, arrays, _ = _unpack(data, path or Path("SPZ data"), max_splats)
     except (zlib.error, struct.error) as error:
         raise ValueError(f"its SPZ data are damaged ({error})") from error
     return _decode(header, arrays)
@@ -226,6 +227,15 @@ def _check(header: _Header, size: int, max_splats: int | None = None) -> list[in
     if too_many or sum(sizes) > max(_MAX_RATIO * size, _SMALL) or header.bits > _FIXED_BITS:
         raise ValueError(f"its SPZ data are too short for {header.count:,} splats")
     return sizes
+
+
+def _unpack(
+    data: bytes, path: Path, max_splats: int | None = None
+) -> tuple[_Header, list[np.ndarray], bytes]:
+    """Return header, arrays and extensions of any version; see the functions of the versions."""
+    if data[:4] == _MAGIC.to_bytes(4, "little"):
+        return _unpack_zstandard(data, path, max_splats)
+    return _unpack_gzip(data, max_splats)
 
 
 def _unpack_gzip(data: bytes, max_splats: int | None = None) -> tuple[_Header, list[np.ndarray], bytes]:
@@ -249,12 +259,14 @@ def _unpack_gzip(data: bytes, max_splats: int | None = None) -> tuple[_Header, l
     return header, np.split(np.frombuffer(body, np.uint8), np.cumsum(sizes)[:-1]), rest
 
 
-def _unpack_zstandard(data: bytes, path: Path) -> tuple[_Header, list[np.ndarray], bytes]:
+def _unpack_zstandard(
+    data: bytes, path: Path, max_splats: int | None = None
+) -> tuple[_Header, list[np.ndarray], bytes]:
     """Return header, arrays and extensions of version 4. Empty arrays may be missing.
 
     Raises:
         ValueError, struct.error: the data are damaged.
-        LodgsError: the package for Zstandard is missing.
+        LodgsError: the version is newer, or the package for Zstandard is missing.
     """
     try:
         import zstandard
@@ -265,9 +277,13 @@ def _unpack_zstandard(data: bytes, path: Path) -> tuple[_Header, list[np.ndarray
         ) from error
     _, version, count, degree, bits, flags, streams, offset = _HEADER_4.unpack_from(data)
     header = _Header(version, count, degree, bits, flags)
+    if version > 4:
+        raise LodgsError(
+            f"Cannot read {path}: SPZ version {version} is not supported.", "Save the file as SPZ 4 or 3."
+        )
     if version != 4 or degree > MAX_DEGREE or offset < _HEADER_4.size:
         raise ValueError(f"its version is {version} and its SH degree {degree}")
-    sizes = _check(header, len(data))
+    sizes = _check(header, len(data), max_splats)
     begin, arrays = offset + streams * _ENTRY_4.size, []
     table = [entry for entry in _ENTRY_4.iter_unpack(data[offset:begin]) if entry[1]]
     if [unpacked for _, unpacked in table] != [size for size in sizes if size]:

@@ -10,6 +10,7 @@ import pytest
 
 from tests.training.splats.level_files import UP, assert_equal, camera, flod, read
 from tests.training.splats.test_formats import random_splats
+from tests.training.splats.test_spz import spz, spz4
 from training.editing.export import FileOptions, export_finest_level, export_levels
 from training.errors import LodgsError
 from training.splats import gltf
@@ -263,6 +264,26 @@ def test_spz_in_drafts(tmp_path, name):
     (tmp_path / "b.glb").write_bytes(assembled(document, data))
     first, second = (read(tmp_path / file).levels[-1].splats for file in ("a.glb", "b.glb"))
     np.testing.assert_array_equal(first.means, second.means)
+
+
+@pytest.mark.parametrize("version", [3, 4, 5])
+def test_newer_versions_of_spz(tmp_path, version):
+    """Programs put the SPZ that they write by default into glTF."""
+    data = spz4(30, 1, version) if version > 3 else spz(30, 1, bytes(30 * (20 + 9)))
+    data += bytes(-len(data) % 4)
+    bundle = flod(1)
+    del bundle.levels[:-1]
+    write_compressed_glb(tmp_path / "a.glb", PortableLevels(bundle))
+    document, _ = read_parts(tmp_path / "a.glb")
+    document["bufferViews"][0]["byteLength"] = document["buffers"][0]["byteLength"] = len(data)
+    del document["scenes"][0]["extras"]
+    (tmp_path / "a.glb").write_bytes(assembled(document, data))
+    if version == 5:
+        with pytest.raises(LodgsError, match=r"a\.glb: SPZ version 5 is not supported"):
+            read(tmp_path / "a.glb")
+    else:
+        splats = read(tmp_path / "a.glb").levels[-1].splats
+        assert len(splats) == 30 and splats.sh_degree == 1
 
 
 @pytest.mark.parametrize("uri", ["data:application/octet-stream;base64,", "parts/the%20data.bin"])
