@@ -412,6 +412,8 @@ def _foreign_error(path: Path, start: bytes) -> LodgsError:
     problem, remedy = "it is not a PLY file", "Choose a .ply of Gaussian splats."
     if start.startswith((b"PK\3\4", b"\x1f\x8b", b"7z\xbc\xaf", b"Rar!")):
         problem, remedy = "it is not a PLY file but an archive", "Unpack it."
+    elif path.suffix.lower() != ".ply":
+        remedy = "Convert it to PLY, for example with splat-transform, or choose another file."
     return LodgsError(f"Cannot read {path}: {problem}.", remedy)
 
 

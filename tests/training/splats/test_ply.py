@@ -177,6 +177,13 @@ def test_selected_splats_are_written_in_order(tmp_path, make_splats):
     np.testing.assert_array_equal(back.extras["mark"], np.flatnonzero(splats.means[:, 0] > 0))
 
 
+def test_other_formats_name_a_converter(tmp_path):
+    (tmp_path / "a.lcc").write_bytes(b"{}")
+    with pytest.raises(LodgsError, match=r"a\.lcc: it is not a PLY file") as caught:
+        read_ply(tmp_path / "a.lcc")
+    assert "splat-transform" in caught.value.remedy
+
+
 @pytest.mark.parametrize(
     ("content", "sentence"),
     [
