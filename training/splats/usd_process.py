@@ -76,8 +76,10 @@ def read_levels(usd: SimpleNamespace, path: Path) -> Bundle:
     items = below or fields
     if len(below) > MAX_READ_LEVELS:
         raise LodgsError(f"Cannot read {path}: it has {len(below)} levels.", "Export fewer levels.")
-    cache = usd.UsdGeom.XformCache()
-    matrices = [np.array(cache.GetLocalToWorldTransform(prim)).T for prim in items]
+    cache = usd.UsdGeom.XformCache(usd.Usd.TimeCode.EarliestTime())
+    unit = usd.UsdGeom.GetStageMetersPerUnit(stage) if usd.UsdGeom.StageHasAuthoredMetersPerUnit(stage) else 1
+    metres = np.diag([unit] * 3 + [1.0])
+    matrices = [metres @ np.array(cache.GetLocalToWorldTransform(prim)).T for prim in items]
     up = usd.UsdGeom.GetStageUpAxis(stage)
     data = stage.GetRootLayer().customLayerData
     if DESCRIPTION in data and below:
@@ -96,7 +98,7 @@ def read_levels(usd: SimpleNamespace, path: Path) -> Bundle:
     placed = [_limited(splats, degree) for splats in placed]
     if not below:
         return Bundle("", [Level(1, Splats.concatenated(placed))], meta=meta)
-    distances = _thresholds(usd, root, len(placed))
+    distances = [unit * distance for distance in _thresholds(usd, root, len(placed))]
     levels = [
         Level(number, splats, {DISTANCE: distance} if distances else {})
         for number, (splats, distance) in enumerate(
@@ -122,7 +124,7 @@ def _check_size(path: Path, fields: list) -> None:
     """Refuse a file that declares more splats than it can hold."""
     count = 0
     for prim in fields:
-        values = prim.GetAttribute("positions").Get() or prim.GetAttribute("positionsh").Get()
+        values = _first_value(prim.GetAttribute("positions")) or _first_value(prim.GetAttribute("positionsh"))
         count += len(values) if values is not None else 0
     if count * _SPLAT_BYTES > _unpacked_limit(path):
         raise LodgsError(f"Cannot read {path}: it is too short for {count:,} splats.", "Export it again.")
@@ -138,14 +140,14 @@ def _read_field(prim, path: Path) -> Splats:
 
     def values(name: str, width: int) -> np.ndarray:
         for attribute in (prim.GetAttribute(name), prim.GetAttribute(f"{name}h")):
-            value = attribute.Get() if attribute else None
+            value = _first_value(attribute) if attribute else None
             if value is not None and len(value):
                 return np.array(value, np.float32).reshape(-1, width)
         return np.zeros((0, width), np.float32)
 
     means, quats = values("positions", 3), values("orientations", 4)[:, [3, 0, 1, 2]]
     scales, alphas = values("scales", 3), values("opacities", 1)[:, 0]
-    degree = prim.GetAttribute("radiance:sphericalHarmonicsDegree").Get()
+    degree = _first_value(prim.GetAttribute("radiance:sphericalHarmonicsDegree"))
     sh = values("radiance:sphericalHarmonicsCoefficients", 3)
     counts = {len(means), len(quats), len(scales), len(alphas)}
     if type(degree) is not int or not 0 <= degree <= MAX_DEGREE:
@@ -156,6 +158,12 @@ def _read_field(prim, path: Path) -> Splats:
             "Export it again.",
         )
     return splats_from_activated(means, quats, scales, alphas, sh.reshape(len(means), -1, 3))
+
+
+def _first_value(attribute):
+    """Return the value of an attribute, or its value at the first time if it is animated."""
+    times = attribute.GetTimeSamples()
+    return attribute.Get(times[0]) if times else attribute.Get()
 
 
 def _limited(splats: Splats, degree: int) -> Splats:

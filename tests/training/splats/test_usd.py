@@ -211,6 +211,29 @@ def test_files_of_other_programs_are_read(tmp_path):
     assert level.splats.sh.tolist()[0] == [[1, 2, 3]] and level.splats.opacity_logits[0] == 0
 
 
+def test_first_frame_of_animated_splats(tmp_path):
+    """Houdini and Omniverse write time samples without a default value."""
+    stage = foreign(tmp_path)
+    for prim in stage.Traverse():
+        for attribute in prim.GetAuthoredAttributes():
+            value = attribute.Get()
+            attribute.Clear()
+            attribute.Set(value, 1.0)
+            attribute.Set(value, 24.0)
+    stage.GetRootLayer().Save()
+    np.testing.assert_array_equal(read(tmp_path / "b.usdc").levels[0].splats.means, [[0, 1, 0]] * 2)
+
+
+def test_units_are_converted_to_metres(tmp_path):
+    usd = load_usd()
+    stage = foreign(tmp_path)
+    usd.UsdGeom.SetStageMetersPerUnit(stage, 0.01)
+    stage.GetRootLayer().Save()
+    splats = read(tmp_path / "b.usdc").levels[0].splats
+    np.testing.assert_allclose(splats.means[0], [0, 0.01, 0], rtol=1e-6)
+    np.testing.assert_allclose(np.exp(splats.log_scales[0]), [0.001, 0.002, 0.003], rtol=1e-5)
+
+
 def test_undrawable_splats_are_dropped_with_a_warning(tmp_path):
     foreign(tmp_path, scales=[(0.1, float("nan"), 0.3)])
     warnings = []
