@@ -174,9 +174,17 @@ _OTHER_FORMATS = {
         "`lod-meta.json`, a folder", "Streamed levels for PlayCanvas and SuperSplat",
         "yes", "all", "trainer", "3", "", "as `.sog`",
     ],
+    "sog in a folder": [
+        "`meta.json`, a folder, not written", "SOG as separate images", "yes", "one", "trainer",
+        "3", "", "",
+    ],
     "ksplat": ["`.ksplat`, not written", "mkkellogg's older web viewer", "yes", "one", "", "3", "", ""],
     "gltf with text": [
         "`.gltf`, not written", "glTF with its data in other files", "yes", "all", "", "3", "", "",
+    ],
+    "usd in other forms": [
+        "`.usd`, `.usda`, not written", "USD under its general name or as text", "yes", "all",
+        "trainer", "3", "", "",
     ],
 }  # fmt: skip
 """Cells of formats that are no SplatFormat, by their label in the results of other programs."""

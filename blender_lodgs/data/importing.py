@@ -25,10 +25,9 @@ from ...training.scenes.triangulate import cached_points
 from ...training.scenes.undistort import cached_undistorted_scene
 from ...training.scenes.view_tables import read_view_tables
 from ...training.splats.bundle import read_bundle, read_header
-from ...training.splats.formats import Convert, is_plain_ply, open_as_ply
+from ...training.splats.formats import MAIN_FILES, Convert, is_plain_ply, open_as_ply
 from ...training.splats.level_folder import read_folder
 from ...training.splats.levels import Bundle
-from ...training.splats.streamed_levels import STREAMED_FILE
 from ..nodes.camera_choices import VIEWPORT
 from . import objects, scenes, streams, viewpoints
 from .paths import stored_path
@@ -240,7 +239,7 @@ def read_splats_file(path: Path | str, budget: int = 0, convert: Convert | None 
         LodgsError: the file cannot be read.
     """
     path, warnings, total = Path(path), [], 0
-    if path.name == STREAMED_FILE:
+    if path.name in MAIN_FILES:
         path = path.resolve().parent
     stamp = file_stamp(path)  # before reading, so that a later change is noticed
     if budget and not path.is_dir() and is_plain_ply(path) and _is_paged(path):

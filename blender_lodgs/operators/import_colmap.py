@@ -7,7 +7,7 @@ from pathlib import Path
 import bpy
 
 from ...training.scenes.formats import FORMAT_NAMES, scene_of_file
-from ...training.splats.streamed_levels import STREAMED_FILE
+from ...training.splats.formats import MAIN_FILES
 from ..data import importing, photographs, roots, scenes
 from ..data.paths import absolute_path
 from ..runs import photo_preparation
@@ -84,7 +84,7 @@ class LODGS_OT_drop_photo_scene(_PhotoSceneImport, bpy.types.Operator):
     @report_errors
     def execute(self, context):
         path = absolute_path(self.filepath)
-        if path.name == STREAMED_FILE:
+        if path.name in MAIN_FILES:
             return bpy.ops.lodgs.import_splats("INVOKE_DEFAULT", filepath=str(path))
         return self.import_folder(context, *scene_of_file(path))
 

@@ -8,15 +8,14 @@ from threading import Event
 
 import bpy
 
-from ...training.splats.formats import FILE_EXTENSIONS
-from ...training.splats.streamed_levels import STREAMED_FILE
+from ...training.splats.formats import FILE_EXTENSIONS, MAIN_FILES
 from ..data import importing, photographs, reloading, roots, scenes
 from ..data.paths import absolute_path
 from ..runs import photo_preparation
 from .base import SceneOperator
 from .modal import BackgroundOperator
 
-_READABLE = (*FILE_EXTENSIONS, STREAMED_FILE)
+_READABLE = (*FILE_EXTENSIONS, *MAIN_FILES)
 
 
 class LODGS_OT_import_splats(BackgroundOperator, bpy.types.Operator):
@@ -129,7 +128,7 @@ class LODGS_FH_splats(bpy.types.FileHandler):
     bl_import_operator = LODGS_OT_import_splats.bl_idname
     # Blender's own importers open dropped glTF and USD files
     bl_file_extensions = ";".join(
-        ending for ending in FILE_EXTENSIONS if ending not in (".glb", ".gltf", ".usdc", ".usdz")
+        ending for ending in FILE_EXTENSIONS if not ending.startswith((".gl", ".usd"))
     )
 
     @classmethod

@@ -19,23 +19,24 @@ from typing import Any
 
 import numpy as np
 
-from ..documents import open_file, parse_json
+from ..documents import open_file, parse_json, read_bytes
 from ..errors import LodgsError, printable
 from ..files import atomic_write
 from .coding import MAX_LOGIT
 from .gaussians import SplatRows, Splats
 from .morton import spatial_order
-from .packed_files import MAX_PALETTE_PIXELS, webp_size
+from .packed_files import MAX_PALETTE_PIXELS, check_sog_file, webp_size
 from .quats import join_quats, split_quats
 from .sh import degree_from_count
 from .splat_format import NeedsTrainer
 
 META = "meta.json"
+"""Main file of a SOG, in an archive or in a folder with its images."""
 MAX_DEGREE = 3
 MAX_PALETTE = 1 << 16
 """Maximum number of sets of SH coefficients that splats share."""
-_MAX_META = 1 << 20
-"""Maximum bytes of the main file; codebooks take most of them."""
+_MAX_META, _MAX_FILE = 1 << 20, 1 << 30
+"""Maximum bytes of the main file, whose codebooks take most of them, and of another file in a folder."""
 _MIN_LOG_SCALE = -20.0
 """Minimum of stored scales; smaller ones would widen the steps of all."""
 _ENTRIES = 256
@@ -150,18 +151,39 @@ def encode_sog(splats: Splats) -> dict[str, bytes]:
 
 
 def read_sog(path: Path) -> tuple[Splats, dict]:
-    """Read a ``.sog`` file; return splats and an empty meta.
+    """Read a ``.sog`` file, or a :data:`META` with its images beside it; return splats and an empty meta.
 
     Raises:
-        LodgsError: the file cannot be read or is damaged, or Pillow is missing.
+        LodgsError: the file cannot be read, is damaged, or refers to files outside its folder, or Pillow is
+            missing.
     """
     try:
+        if path.suffix.lower() == ".json":
+            return decode_sog(lambda name: read_bytes(_sibling(path, name), _MAX_FILE)), {}
+        check_sog_file(path)
         with open_file(path) as file, zipfile.ZipFile(file) as archive:
             return decode_sog(archive.read), {}
     except LodgsError:
         raise
     except Exception as error:  # zipfile documents no exception types
         raise sog_error(path, error) from error
+
+
+def _sibling(main: Path, name: str) -> Path:
+    """Return the path of a file of a SOG in a folder."""
+    return main if name == META else main.with_name(*relative_parts(name))
+
+
+def relative_parts(name: str) -> tuple[str, ...]:
+    """Return the parts of a relative path.
+
+    Raises:
+        ValueError: it leaves the folder.
+    """
+    parts = tuple(name.split("/"))
+    if any(part in ("", ".", "..") or set(part) & set("\\:") for part in parts):
+        raise ValueError(f"{name!r} is not a path in the folder")
+    return parts
 
 
 def sog_error(path: Path, error: Exception) -> LodgsError:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..documents import read_bytes, read_json
+from ..documents import read_json
 from ..errors import LodgsError
 from ..files import atomic_folder
 from .gaussians import SplatRows, Splats
@@ -23,7 +23,7 @@ from .morton import spatial_order
 from .ply import BATCH_ROWS, write_ply
 from .portable_levels import ConcatenatedRows
 from .sh import coefficient_count
-from .sog import MAX_DEGREE, META, decode_sog, encode_sog, load_packages, sog_error
+from .sog import MAX_DEGREE, META, encode_sog, load_packages, read_sog, relative_parts, sog_error
 
 STREAMED_FILE = "lod-meta.json"
 """Main file of streamed levels, in a folder of their own."""
@@ -40,8 +40,8 @@ FILE_SPLATS = 1 << 17
 """Maximum number of splats of a SOG; larger levels have several."""
 MeasureLeaf = Callable[[Mapping[int, Splats], np.ndarray], Mapping[int, float]]
 """Function that returns the error of each level of detail of a leaf from its splats and bounds (2, 3)."""
-_MAX_JSON, _MAX_NESTING, _MAX_FILE = 1 << 26, 200, 1 << 30
-"""Maximum bytes and nesting of the main file, and maximum bytes of another file."""
+_MAX_JSON, _MAX_NESTING = 1 << 26, 200
+"""Maximum bytes and nesting of the main file."""
 _SIGMAS = 3.0
 """Extent of a splat in the bounds of leaves, in standard deviations."""
 
@@ -259,12 +259,16 @@ def read_streamed_levels(path: Path, folder: Path) -> None:
     count = meta.get("lodLevels")
     if type(count) is not int or not 1 <= count <= MAX_READ_LEVELS:
         raise LodgsError(f"Cannot read {path}: it does not describe streamed levels.", "Choose another file.")
+
+    def read_part(name: str) -> Splats:
+        return read_sog(path.parent.joinpath(*relative_parts(name)))[0]
+
     try:
         names, ranges = list(meta["filenames"]), _collect_ranges(meta["tree"], count)
-        surroundings = [_read_part(path, meta["environment"])] if meta.get("environment") else []
+        surroundings = [read_part(meta["environment"])] if meta.get("environment") else []
         folder.mkdir()
         for lod, files in enumerate(ranges):
-            parts = [_select(_read_part(path, names[file]), files[file]) for file in sorted(files)]
+            parts = [_select(read_part(names[file]), files[file]) for file in sorted(files)]
             parts += surroundings
             degree = max(part.sh_degree for part in parts)
             splats = Splats.concatenated([_with_degree(part, degree) for part in parts])
@@ -299,25 +303,3 @@ def _select(splats: Splats, ranges: Sequence[tuple[int, int]]) -> Splats:
     if sum(end - begin for begin, end in ranges) > len(splats) or max(ranges)[1] > len(splats):
         raise ValueError("ranges of splats do not fit their file")
     return splats.select(np.concatenate([np.arange(begin, end) for begin, end in ranges]))
-
-
-def _read_part(path: Path, name: str) -> Splats:
-    """Return the splats of one of the files of streamed levels.
-
-    Args:
-        name: its path relative to the folder of the main file.
-    """
-    main = path.parent.joinpath(*_parts(name))
-    return decode_sog(lambda file: read_bytes(main.with_name(*_parts(file)), _MAX_FILE))
-
-
-def _parts(name: str) -> tuple[str, ...]:
-    """Return the parts of a relative path.
-
-    Raises:
-        ValueError: it leaves the folder.
-    """
-    parts = tuple(name.split("/"))
-    if any(part in ("", ".", "..") or set(part) & set("\\:") for part in parts):
-        raise ValueError(f"{name!r} is not a path in the folder")
-    return parts

@@ -2,6 +2,7 @@
 
 import io
 import json
+import shutil
 import zipfile
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from PIL import Image
 
 from training.errors import LodgsError
+from training.splats.formats import open_as_ply
 from training.splats.gaussians import Splats
 from training.splats.levels import Bundle, Level
 from training.splats.ply import read_ply
@@ -245,6 +247,47 @@ def test_levels_are_read_with_the_surroundings(tmp_path, monkeypatch):
         splats = read_ply(tmp_path / "read" / f"lod{lod}.ply")
         assert len(splats) == count and (splats.means > 20).all(axis=1).sum() == 40
     assert not (tmp_path / "read" / "lod2.ply").exists()
+
+
+def test_levels_with_one_archive_per_file(tmp_path):
+    """gsbox writes its files so."""
+    splats = random_splats(300)
+    write_streamed_levels(tmp_path / "web", Bundle("", [Level(1, splats)]))
+    meta = json.loads((tmp_path / "web" / STREAMED_FILE).read_text("utf-8"))
+    (name,) = meta["filenames"]
+    folder = (tmp_path / "web" / name).parent
+    with zipfile.ZipFile(tmp_path / "web" / "0_0.sog", "w") as archive:
+        for file in folder.iterdir():
+            archive.write(file, file.name)
+    shutil.rmtree(folder)
+    (tmp_path / "web" / STREAMED_FILE).write_text(json.dumps(meta | {"filenames": ["0_0.sog"]}), "utf-8")
+    read_streamed_levels(tmp_path / "web" / STREAMED_FILE, tmp_path / "read")
+    assert len(read_ply(tmp_path / "read" / "lod0.ply")) == 300
+
+
+@pytest.mark.parametrize("name", ["garden", "garden/meta.json"])
+def test_files_in_a_folder(tmp_path, name):
+    """PlayCanvas writes SOG as one file or as the files of a folder."""
+    splats = random_splats(300, 1)
+    write_sog(tmp_path / "a.sog", splats, {})
+    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
+        archive.extractall(tmp_path / "garden")
+    expected, _ = read_sog(tmp_path / "a.sog")
+    with open_as_ply(tmp_path / name) as path:
+        assert path.name == "garden.ply"
+        np.testing.assert_array_equal(read_ply(path).means, expected.means)
+
+
+@pytest.mark.parametrize("file", ["../secret.webp", "/etc/secret.webp", "C:/secret.webp", "sub/a.webp"])
+def test_files_outside_the_folder_are_refused(tmp_path, file):
+    write_sog(tmp_path / "a.sog", random_splats(9), {})
+    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
+        archive.extractall(tmp_path / "garden")
+    meta = json.loads((tmp_path / "garden" / "meta.json").read_text())
+    meta["quats"]["files"] = [file]
+    (tmp_path / "garden" / "meta.json").write_text(json.dumps(meta))
+    with pytest.raises(LodgsError, match=r"Cannot read .*meta\.json"):
+        read_sog(tmp_path / "garden" / "meta.json")
 
 
 @pytest.mark.parametrize(

@@ -211,6 +211,12 @@ def test_files_of_other_programs_are_read(tmp_path):
     assert level.splats.sh.tolist()[0] == [[1, 2, 3]] and level.splats.opacity_logits[0] == 0
 
 
+@pytest.mark.parametrize("suffix", [".usda", ".usd"])
+def test_other_suffixes(tmp_path, suffix):
+    foreign(tmp_path).Export(str(tmp_path / f"a{suffix}"))
+    assert len(read(tmp_path / f"a{suffix}").levels[0].splats) == 2
+
+
 def test_first_frame_of_animated_splats(tmp_path):
     """Houdini and Omniverse write time samples without a default value."""
     stage = foreign(tmp_path)

@@ -1,6 +1,6 @@
 """Splat files of other programs. Each module of this package declares one format as ``FORMAT``.
 
-``.ksplat`` and ``.gltf`` are only read.
+``.ksplat``, ``.gltf``, ``.usd``, ``.usda`` and SOG in a folder are only read.
 """
 
 from __future__ import annotations
@@ -17,14 +17,15 @@ from ...files import temporary_folder
 from ..dialects import comments_from_meta
 from ..gaussians import SplatRows
 from ..ksplat import KsplatRows
-from ..packed_files import check_sog_file
 from ..ply import write_ply
+from ..sog import META as SOG_FILE
 from ..splat_format import NeedsTrainer, SplatFormat
 from ..streamed_levels import STREAMED_FILE, read_streamed_levels
 from .compressed_ply import FORMAT as COMPRESSED_PLY
 from .glb import FORMAT as GLB
 from .ply import FORMAT as PLY
 from .sog import FORMAT as SOG
+from .usdc import FORMAT as USDC
 
 FORMATS: tuple[SplatFormat, ...] = tuple(
     sorted(
@@ -34,16 +35,20 @@ FORMATS: tuple[SplatFormat, ...] = tuple(
 )
 """Export formats: PLY, then by size, largest first."""
 KSPLAT, GLTF = ".ksplat", ".gltf"
+_ALIASES = {GLTF: GLB, ".usd": USDC, ".usda": USDC}
+"""Formats by further suffixes of their files, which are only read."""
 FILE_EXTENSIONS = (
     *(kind.suffix for kind in FORMATS if kind.readable and kind.suffix.rfind(".") == 0),
     KSPLAT,
-    GLTF,
+    *_ALIASES,
 )
 """Last parts of the names of readable files."""
 LEVEL_FORMATS = tuple(kind for kind in FORMATS if kind.write_levels)
 """Formats of all levels in one file."""
-READABLE = (*FILE_EXTENSIONS, STREAMED_FILE)
-"""Ends of the names of readable files; :data:`STREAMED_FILE` is a complete name."""
+MAIN_FILES = STREAMED_FILE, SOG_FILE
+"""Names of readable files with other files in their folder."""
+READABLE = (*FILE_EXTENSIONS, *MAIN_FILES)
+"""Ends of the names of readable files."""
 Convert = Callable[[Path, Path], None]
 """Function that converts a splat file to a bundle, whose path is the second argument."""
 
@@ -102,8 +107,8 @@ def find_level_format(path: Path) -> SplatFormat:
 def open_as_ply(path: Path, convert: Convert | None = None) -> Iterator[Path]:
     """Yield a PLY with the splats of a file, or a folder of PLYs with streamed levels.
 
-    A PLY or a folder is yielded unchanged. Other files are converted to a temporary one of the same name:
-    a bundle if they have levels.
+    A PLY or a folder without one of :data:`MAIN_FILES` is yielded unchanged. Other files are converted to a
+    temporary one of the same name: a bundle if they have levels.
 
     Args:
         convert: function for files that need a package which this Python lacks.
@@ -112,16 +117,14 @@ def open_as_ply(path: Path, convert: Convert | None = None) -> Iterator[Path]:
         NeedsTrainer: a package is missing, and there is no ``convert``.
         LodgsError: the file cannot be read.
     """
-    if path.is_dir() and (path / STREAMED_FILE).is_file():
-        path = path / STREAMED_FILE
+    if path.is_dir():
+        path = next((path / name for name in MAIN_FILES if (path / name).is_file()), path)
     if path.is_dir() or is_plain_ply(path):
         yield path
         return
     name = path.name.lower()
     open_file(path).close()  # reports an unreadable file
-    if name.endswith(SOG.suffix):
-        check_sog_file(path)
-    stem = path.resolve().parent.name if name == STREAMED_FILE else path.stem.removesuffix(".compressed")
+    stem = path.resolve().parent.name if name in MAIN_FILES else path.stem.removesuffix(".compressed")
     with temporary_folder() as folder:
         converted = folder / f"{stem or 'splats'}.ply"
         try:
@@ -148,8 +151,8 @@ def _convert(path: Path, converted: Path) -> Path:
 
 def _level_reader(name: str) -> Callable[[Path, Path], None] | None:
     """Return the reader of files with levels for a name in lower case, or None."""
-    name = GLB.suffix if name.endswith(GLTF) else name
-    return next((kind.read_levels for kind in LEVEL_FORMATS if name.endswith(kind.suffix)), None)
+    kinds = {kind.suffix: kind for kind in LEVEL_FORMATS} | _ALIASES
+    return next((kind.read_levels for suffix, kind in kinds.items() if name.endswith(suffix)), None)
 
 
 def _read_plain(path: Path, converted: Path) -> None:
@@ -157,6 +160,7 @@ def _read_plain(path: Path, converted: Path) -> None:
     name = path.name.lower()
     readers = {kind.suffix: kind.read for kind in FORMATS if kind.read}
     readers |= {PLY.suffix: COMPRESSED_PLY.read, KSPLAT: lambda path: (KsplatRows(path), {})}
+    readers[SOG_FILE] = SOG.read
     read = next(read for suffix, read in readers.items() if read and name.endswith(suffix))
     splats, meta = read(path)
     write_ply(converted, splats, comments_from_meta(meta))
