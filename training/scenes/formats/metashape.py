@@ -188,13 +188,13 @@ def _sensor_offset(sensor: Element | None) -> np.ndarray:
     part = sensor if sensor is None or sensor.find("rig") is None else sensor.find("rig")
     if part is None:
         return offset
-    rotation, location = part.findtext("rotation"), part.findtext("location")
-    if sensor is not None and sensor.get("master_id") is not None and rotation is None and location is None:
+    rotation, location = (part.findtext(name, "").split() for name in ("rotation", "location"))
+    if sensor is not None and sensor.get("master_id") is not None and not (rotation or location):
         raise LodgsError("its sensor has no position in its rig.")
-    if rotation is not None:
-        offset[:3, :3] = parse_array(rotation.split(), 3, 3)
-    if location is not None:
-        offset[:3, 3] = parse_array(location.split(), 3)
+    if rotation:  # older versions write empty elements
+        offset[:3, :3] = parse_array(rotation, 3, 3)
+    if location:
+        offset[:3, 3] = parse_array(location, 3)
     invert_pose(offset)
     return offset
 
