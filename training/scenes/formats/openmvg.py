@@ -63,6 +63,11 @@ def read(path: Path, folder: Path) -> ExportedScene:
         ) from error
     except LodgsError as error:
         raise LodgsError(f"Cannot read {path}: {error.what}", "Export it again.") from error
+    if not poses:
+        raise LodgsError(
+            f"Cannot read {path}: it has no poses, as before the reconstruction.",
+            "Convert the sfm_data.bin of the reconstruction (openMVG_main_ConvertSfM_DataFormat).",
+        )
     views, excluded = [], []
     # Photos lie next to the file, in images or at OpenMVG's own path.
     roots = path.parent / "images", path.parent, path.parent.parent, *([Path(root)] if root else [])
