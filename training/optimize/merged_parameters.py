@@ -35,6 +35,16 @@ class MergedParameters:
         high=1,
     )
 
+    @property
+    def merges(self) -> bool:
+        """True if coarser levels are merged from the finest."""
+        raise NotImplementedError
+
+    @property
+    def stages(self) -> list[tuple[int, int]]:
+        """Levels in the order of their training, with their numbers of steps."""
+        raise NotImplementedError
+
     def share_below(self, count: int) -> float:
         """Return the relative number of splats of a level, ``count`` levels below the finest."""
         return min(self.merge_ratio**count, self.drawn) if count else 1.0

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
+from collections.abc import Iterable
+from itertools import accumulate
 from math import ceil, inf, sqrt
 
 import numpy as np
@@ -20,6 +23,41 @@ def log_linear(first: float, last: float, share: float) -> float:
 def due(interval: int, step: int) -> bool:
     """Return True every ``interval`` steps, counting from step 1. The interval 0 disables."""
     return interval > 0 and step % interval == 0
+
+
+class LevelStages:
+    """Stages of a run, which train one level each.
+
+    Args:
+        stages: number and steps of each level, in the order of training.
+
+    Attributes:
+        ends: number of completed steps of the run at the end of each level.
+    """
+
+    def __init__(self, stages: Iterable[tuple[int, int]]) -> None:
+        self._stages = list(stages)
+        self.ends = list(accumulate(steps for _, steps in self._stages))
+
+    def level_at(self, step: int) -> int:
+        """Return the level that a step trains; after all levels, the last one."""
+        return self._stages[self._index(step)][0]
+
+    def steps_at(self, step: int) -> int:
+        """Return the number of steps of the level that a step trains."""
+        return self._stages[self._index(step)][1]
+
+    def local_step(self, step: int) -> int:
+        """Return the number of completed steps of the level that a step trains."""
+        index = self._index(step)
+        return step - (self.ends[index - 1] if index else 0)
+
+    def share(self, step: int) -> float:
+        """Return the completed share of the steps of the level that a step trains."""
+        return self.local_step(step) / self.steps_at(step)
+
+    def _index(self, step: int) -> int:
+        return min(bisect_right(self.ends, step), len(self.ends) - 1)
 
 
 class ShSchedule:

@@ -6,10 +6,8 @@ finest level first, merge each coarser one from the next finer one, and refine i
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections.abc import Mapping
 from dataclasses import replace
-from itertools import accumulate
 from math import inf
 
 import numpy as np
@@ -29,14 +27,13 @@ from ...optimize.initialize import (
     sample_points,
     to_splats,
 )
-from ...optimize.level_distances import measure_min_sizes
+from ...optimize.merged_levels import MergedLevels
 from ...optimize.merging import merge
 from ...optimize.method import Drawing
 from ...optimize.model import Model, splat_rates
-from ...optimize.refining import MERGED_RATE, drop_invisible, refining_rates
-from ...optimize.schedules import due, log_linear, refining_reduction, shrink_at
+from ...optimize.refining import refining_rates
+from ...optimize.schedules import LevelStages, due, log_linear, shrink_at
 from ...optimize.training_data import TrainingView
-from ...rasterize import Gaussians
 from ...splats.gaussians import Splats
 from ...splats.levels import Level
 from . import BLENDED_LEVELS, FlodParameters, finish
@@ -47,6 +44,8 @@ class Method(method.Method[FlodParameters, Drawing]):
 
     Attributes:
         s_min: minimum standard deviation of each level, coarse to fine, in scene units.
+        stages: levels in the order of training, before the finishing steps.
+        merged: merging and refinement of the coarser levels, if they are merged.
         points, colors: initial points of the scene, (P, 3) both.
         completed: completed levels for the end of the run, as tensors by name.
     """
@@ -58,8 +57,8 @@ class Method(method.Method[FlodParameters, Drawing]):
         s_min_1 = p.s_min_1 or p.footprint * data.median_depth / data.focal
         self.s_min = min_scales(s_min_1, p.rho, p.levels)
         self._skipped_steps = self.sh_degree.completed = sum(p.steps[: p.first_level - 1])
-        self._order = [number for number, _ in p.stages]
-        self._ends = list(accumulate(steps for _, steps in p.stages))
+        self.stages = LevelStages(p.stages)
+        self.merged = MergedLevels(self.stages, data, p, self.seed, self.backend)
         points, colors = drop_duplicates(data.scene.points, data.scene.point_colors)
         self.points, self.colors = sample_points(points, colors, p.splat_limit, self.seed)
         self.completed: dict[int, Mapping[str, torch.Tensor]] = {}
@@ -67,21 +66,21 @@ class Method(method.Method[FlodParameters, Drawing]):
         if p.levels > 1:
             self.controls = {"gamma": initial_gamma(self.s_min[-2] * data.focal / data.median_depth)}
         if base is None:
-            self.model = self._new_model(self._from_points(self._order[0]))
+            self.model = self._new_model(self._from_points(self.stages.level_at(0)))
         else:
             self._store(p.first_level - 1, base)
             tensors = from_splats(base, p.sh_degree, self.device)
             self.model = self._new_model(self._next_level_tensors(tensors, 0.0, p.first_level))
 
     def level_at(self, step: int) -> int:
-        return self.parameters.end if self.is_finishing(step) else self._order[self._stage(step)]
+        return self.parameters.end if self.is_finishing(step) else self.stages.level_at(step)
 
     def ends_level(self, step: int) -> bool:
-        return step + 1 in self._ends or super().ends_level(step)
+        return step + 1 in self.stages.ends or super().ends_level(step)
 
     def is_finishing(self, step: int) -> bool:
         """Return whether a step is a finishing step, which trains the finest levels blended."""
-        return step >= self._ends[-1]
+        return step >= self.stages.ends[-1]
 
     def levels_after(self, step: int) -> list[Level]:
         """Return the level that the step completes, and start the next one; all merged levels once their
@@ -89,19 +88,19 @@ class Method(method.Method[FlodParameters, Drawing]):
         """
         if self.is_finishing(step) and step + 1 == self.steps:
             return [*self._completed_levels(), *finish.split_levels(self.model, self.s_min)]
-        if step + 1 not in self._ends:
+        if step + 1 not in self.stages.ends:
             return self._previews(step)
-        number = self.level_at(step)
+        p, number = self.parameters, self.level_at(step)
         levels = [Level(number, self.model.splats(self._constraint(number)), self._facts(number))]
         self._store(number, levels[0].splats)
-        if step + 1 < self._ends[-1]:
+        if step + 1 < self.stages.ends[-1]:
             self.start_level(self.level_at(step + 1))
             return levels
-        if self.parameters.merges:
+        if p.merges:
             if self.data.region is None:  # the cells of a scene share the distances of the footprint
-                self._set_distances()
+                self.s_min = self.merged.measure_min_sizes(self.completed, self.controls["gamma"], p.rho)
             levels = self._completed_levels()
-        if self.parameters.finish_steps and self.completed:
+        if p.finish_steps and self.completed:
             self.start_finishing()
         return levels
 
@@ -110,9 +109,9 @@ class Method(method.Method[FlodParameters, Drawing]):
         finished.
         """
         p = self.parameters
-        if not p.merges or step >= self._ends[0]:
+        if not p.merges or step >= self.stages.ends[0]:
             return []
-        number, remainder = divmod((step + 1) * p.levels, self._ends[0])
+        number, remainder = divmod((step + 1) * p.levels, self.stages.ends[0])
         if not 0 < number < p.levels or remainder >= p.levels:
             return []
         count = round(len(self.model) * p.share_below(p.levels - number))
@@ -126,19 +125,19 @@ class Method(method.Method[FlodParameters, Drawing]):
 
     def shrink(self, step: int) -> float:
         p = self.parameters
-        if p.merges and step < self._ends[-1]:
-            progress = self._level_step(step) / p.stages[self._stage(step)][1]
+        if self.merged.refines(step):
+            return self.merged.shrink(step, p.first_resolution, p.full_resolution)
+        if p.merges and step < self.stages.ends[-1]:
+            progress = self.stages.share(step)
         else:
             progress = self._progress(step)
-        if self._refines(step):
-            return refining_reduction(self.seed, step, progress, p.first_resolution, p.full_resolution)
         return shrink_at(progress, p.first_resolution, p.full_resolution)
 
     def render_weights(self, view: TrainingView, step: int) -> tuple[torch.Tensor | None, float]:
         if self.is_finishing(step):
             values = self._finishing_values(step)
             return finish.weights(self.model, self.s_min, view.camera, values), 0.0
-        if self._refines(step):  # dropout would make few splats even fewer
+        if self.merged.refines(step):  # dropout would make few splats even fewer
             return None, 0.0
         dropout = self.dropout.weights(len(self.model), step, self._progress(step))
         return dropout, self._constraint(self.level_at(step))
@@ -147,19 +146,18 @@ class Method(method.Method[FlodParameters, Drawing]):
         return self.is_finishing(step)
 
     def collects_stats(self, view: TrainingView, step: int) -> bool:
-        return not self.is_finishing(step) and self._level_step(step) < self._densify_until(step)
+        return not self.is_finishing(step) and self.stages.local_step(step) < self._densify_until(step)
 
     def set_learning_rates(self, step: int) -> None:
         p = self.parameters
         if self.is_finishing(step):
-            share = (step - self._ends[-1]) / p.finish_steps
+            share = (step - self.stages.ends[-1]) / p.finish_steps
             self.model.lr = refining_rates(p, self.data.extent, share)
             return
-        steps = p.stages[self._stage(step)][1]
-        if self._refines(step):
-            self.model.lr = refining_rates(p, self.data.extent, self._level_step(step) / steps, MERGED_RATE)
+        if self.merged.refines(step):
+            self.model.lr = self.merged.learning_rates(step)
             return
-        share = self._level_step(step) / (p.lr_means_steps or steps)
+        share = self.stages.local_step(step) / (p.lr_means_steps or self.stages.steps_at(step))
         rate = log_linear(p.lr_means, p.lr_means_final, share) * self.data.extent
         self.model.lr["means"] = rate
 
@@ -167,7 +165,7 @@ class Method(method.Method[FlodParameters, Drawing]):
         if self.is_finishing(step):
             self._raise_to_min_sizes()
             return
-        completed, end = self._level_step(step) + 1, self._densify_until(step)
+        completed, end = self.stages.local_step(step) + 1, self._densify_until(step)
         if completed <= end:
             self._densify_and_prune(step)
         if completed - 1 < end <= completed:
@@ -175,7 +173,8 @@ class Method(method.Method[FlodParameters, Drawing]):
 
     def _densify_and_prune(self, step: int) -> None:
         """Add, remove and reset splats if due, while the level in training has density control."""
-        p, model, level, local = self.parameters, self.model, self.level_at(step), self._level_step(step) + 1
+        p, model, level = self.parameters, self.model, self.level_at(step)
+        local = self.stages.local_step(step) + 1
         old_count, s_min = len(model), self._constraint(level)
         if due(p.densify_interval[level - 1], local) and local >= p.densify_from:
             densify(
@@ -218,25 +217,11 @@ class Method(method.Method[FlodParameters, Drawing]):
         """Return the fraction of a run of all levels that is complete before a step."""
         return (self._skipped_steps + step) / self.parameters.all_steps
 
-    def _level_step(self, step: int) -> int:
-        """Return the number of completed steps of the current level."""
-        index = self._stage(step)
-        return step - (self._ends[index - 1] if index else 0)
-
-    def _stage(self, step: int) -> int:
-        """Return the index of a step's level in the order of training; finishing steps have the last."""
-        return min(bisect_right(self._ends, step), len(self._ends) - 1)
-
-    def _refines(self, step: int) -> bool:
-        """Return whether a step refines a merged level."""
-        return self.parameters.merges and self._ends[0] <= step < self._ends[-1]
-
     def _densify_until(self, step: int) -> float:
         """Return the number of steps of the current level with density control."""
-        if self._refines(step):
+        if self.merged.refines(step):
             return 0.0
-        number, steps = self.parameters.stages[self._stage(step)]
-        return self.parameters.densify_until[number - 1] * steps
+        return self.parameters.densify_until[self.stages.level_at(step) - 1] * self.stages.steps_at(step)
 
     def prune_unsupported(self, step: int) -> None:
         super().prune_unsupported(step)
@@ -268,12 +253,8 @@ class Method(method.Method[FlodParameters, Drawing]):
         """
         p = self.parameters
         if p.merges:
-            count = round(p.share_below(p.levels - level) * len(self.completed[p.levels]["means"]))
-            splats = self.model.splats()
-            if level == p.levels - 1:
-                splats = drop_invisible(splats, count, self.data, p, self.backend)
-            merged = merge(splats, count)
-            self.model = self._new_model(from_splats(merged, p.sh_degree, self.device))
+            finest_count = len(self.completed[p.levels]["means"])
+            self.model = self.merged.start(level, self.model.splats(), finest_count)
             return
         tensors = {name: tensor.detach() for name, tensor in self.model.adam.tensors.items()}
         self.model = self._new_model(self._next_level_tensors(tensors, self.s_min[level - 2], level))
@@ -312,15 +293,6 @@ class Method(method.Method[FlodParameters, Drawing]):
             Level(number, to_splats(tensors), self._facts(number))
             for number, tensors in sorted(self.completed.items())
         ]
-
-    def _set_distances(self) -> None:
-        """Measure the distances of the finest levels. Coarser ones follow at the ratio ``rho``."""
-        p = self.parameters
-        numbers = range(max(p.levels - BLENDED_LEVELS, 0) + 1, p.levels + 1)
-        levels = {number: Gaussians(**self.completed[number]) for number in numbers}
-        self.s_min = measure_min_sizes(
-            levels, self.data, p.drawn, p.antialias, self.backend, self.controls["gamma"], p.rho
-        )
 
     def start_finishing(self) -> None:
         """Combine the completed levels into one model for the finishing steps; restart those of fine

@@ -7,9 +7,7 @@ added (FLoD, Eq. 4). Its voxels are at least as large as this minimum, which rep
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from dataclasses import replace
-from itertools import accumulate
 
 import numpy as np
 import torch
@@ -17,6 +15,7 @@ import torch
 from ...lod.rules.bands import initial_gamma, min_scales
 from ...optimize.anchors import growing
 from ...optimize.density_control import constrained_log_scales
+from ...optimize.schedules import LevelStages
 from ...optimize.training_data import TrainingView
 from ...splats.gaussians import Splats
 from ...splats.levels import Level
@@ -31,6 +30,7 @@ class Method(octree_neural.Method):
     Attributes:
         run_parameters: parameters of all levels; ``parameters`` are those of the current one.
         level: number of the current level.
+        stages: levels in the order of training.
         s_min: minimum standard deviation of each level, coarse to fine, in scene units.
     """
 
@@ -41,7 +41,7 @@ class Method(octree_neural.Method):
         self.run_parameters = p = self.parameters
         pixel = self.data.median_depth / self.data.focal
         self.s_min = min_scales(p.s_min_1 or p.coarsest * pixel, p.rho, p.levels)
-        self._ends = list(accumulate(p.steps))
+        self.stages = LevelStages(enumerate(p.steps, 1))
         self._use_level(1)
         super().setup(base)
         self._constrain()
@@ -68,15 +68,11 @@ class Method(octree_neural.Method):
         self.decoder = replace(self.decoder, min_scale=self.s_min[self.level - 1])
 
     def level_at(self, step: int) -> int:
-        return min(bisect_right(self._ends, step) + 1, self.run_parameters.levels)
-
-    def _level_step(self, step: int) -> int:
-        """Return the number of completed steps of the current level."""
-        return step - sum(self.run_parameters.steps[: self.level - 1])
+        return self.stages.level_at(step)
 
     def levels_after(self, step: int) -> list[Level]:
         """Return the level that the step completes, baked, and start the next one."""
-        if step + 1 not in self._ends:
+        if step + 1 not in self.stages.ends:
             return []
         s_min = self.s_min[self.level - 1]
         splats = self.with_margins(self.bake())
@@ -94,13 +90,13 @@ class Method(octree_neural.Method):
     # -- steps -----------------------------------------------------------------------------------------
 
     def collects_stats(self, view: TrainingView, step: int) -> bool:
-        return super().collects_stats(view, self._level_step(step))
+        return super().collects_stats(view, self.stages.local_step(step))
 
     def set_learning_rates(self, step: int) -> None:
-        super().set_learning_rates(self._level_step(step))
+        super().set_learning_rates(self.stages.local_step(step))
 
     def control_density(self, step: int) -> None:
-        super().control_density(self._level_step(step))
+        super().control_density(self.stages.local_step(step))
 
     # -- levels ----------------------------------------------------------------------------------------
 

@@ -23,7 +23,7 @@ from ...optimize.method import Drawing, StepResult
 from ...optimize.model import NAMES, select_rows
 from ...optimize.pruning import importance_threshold, log_scale_gain
 from ...optimize.refining import MERGED_RATE, RefiningMethod, drop_invisible, refining_rates
-from ...optimize.schedules import random_reduction
+from ...optimize.schedules import LevelStages, random_reduction
 from ...optimize.training_data import TrainingView
 from ...rasterize import Gaussians, photometric_loss
 from ...scenes.cameras import pick_evenly
@@ -52,6 +52,7 @@ class Method(RefiningMethod):
     """Training of LODGE levels.
 
     Attributes:
+        stages: levels in the order of training; the finest has no steps if it is a base.
         d_l: distance from which each level is drawn, in scene units, by number; entries are added during
             training.
         finished: frozen levels as rendered, by number, finest first.
@@ -70,6 +71,8 @@ class Method(RefiningMethod):
             )
         super().setup(base)
         self.levels = p.levels
+        coarser = ((number, p.level_steps) for number in range(p.levels - 1, 0, -1))
+        self.stages = LevelStages([(p.levels, self.finest_steps), *coarser])
         self.background.end = self.finest_steps  # the finest level already prevents a fit to the background
         self.d_l = {p.levels: 0.0}
         self.finished: dict[int, IndexedLevel] = {}
@@ -85,17 +88,13 @@ class Method(RefiningMethod):
         return self.finest_steps + self.parameters.base_steps
 
     def level_at(self, step: int) -> int:
-        if step < self.finest_steps:
-            return self.levels
-        return (
-            self.levels - 1 - min((step - self.finest_steps) // self.parameters.level_steps, self.levels - 2)
-        )
+        return self.stages.level_at(step)
 
     def ends_level(self, step: int) -> bool:
         done = step + 1
         if done > self.tuned_steps:
             return done == self.steps
-        return done == self.finest_steps or (done > self.finest_steps and self._level_step(done) == 0)
+        return done in self.stages.ends
 
     def stage(self, step: int) -> str:
         if step < self.tuned_steps:
@@ -113,7 +112,7 @@ class Method(RefiningMethod):
         if done == max(self.finest_steps, 1):
             self._finish(self.levels)
             levels.append(self._make_level(self.levels))
-        if step >= self.finest_steps and self._level_step(done) == 0:
+        if step >= self.finest_steps and done in self.stages.ends:
             levels.insert(0, self._make_level(self.level_at(step)))
         return levels
 
@@ -145,15 +144,14 @@ class Method(RefiningMethod):
         if not (p.merges and self.refines(step)):
             super().set_learning_rates(step)
             return
-        progress = self._level_step(step) / p.level_steps
-        self.model.lr = refining_rates(p, self.data.extent, progress, MERGED_RATE)
+        self.model.lr = refining_rates(p, self.data.extent, self.stages.share(step), MERGED_RATE)
 
     def begin_step(self, step: int) -> StepResult | None:
         """Compute a chunk, or prune the level if a round begins."""
         if step >= self.tuned_steps:
             return self._chunk_step(step)
         if step >= self.finest_steps:
-            local, p = self._level_step(step), self.parameters
+            local, p = self.stages.local_step(step), self.parameters
             if local == 0:
                 self._begin_level(self.level_at(step))
                 if p.merges:
@@ -209,7 +207,7 @@ class Method(RefiningMethod):
 
     def begin_round(self, step: int) -> None:
         """Prune the level before a step."""
-        p, number, local = self.parameters, self.level_at(step), self._level_step(step)
+        p, number, local = self.parameters, self.level_at(step), self.stages.local_step(step)
         importance, previous = self.importance(number), (0.0, *ROUNDS)[local // p.tune_steps]
         keep, thinned = self._select_important(number, importance, previous, ROUNDS[local // p.tune_steps])
         with torch.no_grad():
@@ -400,10 +398,6 @@ class Method(RefiningMethod):
         if number in self.sets:
             splats.extras = member_columns(np.stack(self.sets[number]))
         return Level(number, splats, {"d_l": self.d_l[number]})
-
-    def _level_step(self, step: int) -> int:
-        """Return the number of completed steps of the level in training."""
-        return (step - self.finest_steps) % self.parameters.level_steps
 
     def _std(self, distance: float) -> float:
         """Return the filter's standard deviation for a distance, in scene units (Eq. 3, as in

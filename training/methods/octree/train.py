@@ -7,30 +7,22 @@ octree add up instead, so that half of its splats are a worse image than a merge
 
 from __future__ import annotations
 
-from bisect import bisect_right
-from itertools import accumulate
-
 import torch
 
 from ...optimize import method
 from ...optimize.anchors.explicit import ExplicitAnchors
 from ...optimize.anchors.parameters import ExplicitOctreeParameters
 from ...optimize.initialize import from_splats, to_splats
-from ...optimize.level_distances import measure_min_sizes
-from ...optimize.merging import merge
+from ...optimize.merged_levels import MergedLevels
 from ...optimize.model import Model
 from ...optimize.parameters import DensityParameters
-from ...optimize.refining import MERGED_RATE, drop_invisible, refining_rates
-from ...optimize.schedules import refining_reduction
+from ...optimize.schedules import LevelStages
 from ...optimize.training_data import TrainingView
-from ...rasterize import Gaussians
 from ...splats.gaussians import Splats
 from ...splats.levels import Level
 
 FIRST, FULL = DensityParameters.first_resolution, DensityParameters.full_resolution
 """Sizes of images while a level is refined."""
-MEASURED_LEVELS = 3
-"""Number of finest levels with measured distances."""
 RATIO = 4.0
 """Ratio of the distances of coarser levels."""
 
@@ -39,6 +31,8 @@ class Method(ExplicitAnchors):
     """Training of Octree-GS.
 
     Attributes:
+        stages: the anchors' steps, then the merged levels in the order of training.
+        merged: merging and refinement of the coarser levels, if they are merged.
         s_min: minimum size of each level, coarse to fine, in scene units: those of FLoD's rule.
         completed: completed levels as tensors, by number, once the anchors are trained.
     """
@@ -48,7 +42,8 @@ class Method(ExplicitAnchors):
     def setup(self, base: Splats | None) -> None:
         super().setup(base)
         p, data = self.parameters, self.data
-        self._ends = list(accumulate([p.steps, *p.refining]))
+        self.stages = LevelStages(p.stages)
+        self.merged = MergedLevels(self.stages, data, p, self.seed, self.backend)
         self.completed: dict[int, dict[str, torch.Tensor]] = {}
         if p.merges:
             self.facts, self.levels = {}, p.merged_levels + 1
@@ -57,10 +52,10 @@ class Method(ExplicitAnchors):
             self.s_min = [far * RATIO**n for n in range(p.merged_levels - 1, -1, -1)] + [0.0]
 
     def level_at(self, step: int) -> int:
-        return self.levels - self._stage(step) if self.parameters.merges else super().level_at(step)
+        return self.stages.level_at(step) if self.parameters.merges else super().level_at(step)
 
     def ends_level(self, step: int) -> bool:
-        return step + 1 in self._ends or (not self._refines(step) and super().ends_level(step))
+        return step + 1 in self.stages.ends or (not self.merged.refines(step) and super().ends_level(step))
 
     def levels_after(self, step: int) -> list[Level]:
         """Return the finest level when all anchors have joined and when they are trained; each coarser level
@@ -68,16 +63,17 @@ class Method(ExplicitAnchors):
         """
         if not self.parameters.merges:
             return super().levels_after(step)
-        completed = step + 1 in self._ends
-        if not (completed or (not self._refines(step) and self.schedule.completes_levels(step))):
+        completed = step + 1 in self.stages.ends
+        if not (completed or (not self.merged.refines(step) and self.schedule.completes_levels(step))):
             return []
         number, splats = self.level_at(step), self.model.splats()
         if completed:
             self.completed[number] = from_splats(splats, self.parameters.sh_degree, self.device)
             if number == 1:
-                self._measure_distances()
+                self.s_min = self.merged.measure_min_sizes(self.completed, 1.0, RATIO)
                 return [self._level(n, to_splats(self.completed[n])) for n in sorted(self.completed)]
-            self._start_level(number - 1, splats)
+            finest_count = len(self.completed[self.levels]["means"])
+            self.model = self.merged.start(number - 1, splats, finest_count)
         return [self._level(number, splats)]
 
     def meta(self) -> dict:
@@ -86,59 +82,28 @@ class Method(ExplicitAnchors):
     # -- steps -----------------------------------------------------------------------------------------
 
     def shrink(self, step: int) -> float:
-        if not self._refines(step):
-            return super().shrink(step)
-        return refining_reduction(self.seed, step, self._share(step), FIRST, FULL)
+        return self.merged.shrink(step, FIRST, FULL) if self.merged.refines(step) else super().shrink(step)
 
     def render_weights(self, view: TrainingView, step: int) -> tuple[torch.Tensor | None, float]:
-        return (None, 0.0) if self._refines(step) else super().render_weights(view, step)
+        return (None, 0.0) if self.merged.refines(step) else super().render_weights(view, step)
 
     def collects_stats(self, view: TrainingView, step: int) -> bool:
-        return not self._refines(step) and super().collects_stats(view, step)
+        return not self.merged.refines(step) and super().collects_stats(view, step)
 
     def set_learning_rates(self, step: int) -> None:
-        if self._refines(step):
-            rates = refining_rates(self.parameters, self.data.extent, self._share(step), MERGED_RATE)
-            self.model.lr = rates
+        if self.merged.refines(step):
+            self.model.lr = self.merged.learning_rates(step)
         else:
             super().set_learning_rates(step)
 
     def control_density(self, step: int) -> None:
-        if not self._refines(step):
+        if not self.merged.refines(step):
             super().control_density(step)
-
-    def _refines(self, step: int) -> bool:
-        """Return whether a step refines a merged level."""
-        return self.parameters.merges and step >= self._ends[0]
-
-    def _stage(self, step: int) -> int:
-        """Return the number of levels that are complete before a step."""
-        return min(bisect_right(self._ends, step), len(self._ends) - 1)
-
-    def _share(self, step: int) -> float:
-        """Return the completed share of the steps that refine the current level."""
-        begin, end = self._ends[self._stage(step) - 1 :][:2]
-        return (step - begin) / (end - begin)
 
     # -- levels ----------------------------------------------------------------------------------------
 
     def _level(self, number: int, splats: Splats) -> Level:
         return Level(number, splats, {"s_min": self.s_min[number - 1]})
-
-    def _start_level(self, number: int, finer: Splats) -> None:
-        """Start a level as a merge of the next finer one."""
-        p = self.parameters
-        count = round(p.share_below(self.levels - number) * len(self.completed[self.levels]["means"]))
-        if number == self.levels - 1:
-            finer = drop_invisible(finer, count, self.data, p, self.backend)
-        tensors = from_splats(merge(finer, count), p.sh_degree, self.device)
-        self.model = Model(tensors, self._rates)
-
-    def _measure_distances(self) -> None:
-        """Set the distances of the levels."""
-        p, numbers = self.parameters, sorted(self.completed)[-MEASURED_LEVELS:]
-        levels = {number: Gaussians(**self.completed[number]) for number in numbers}
-        self.s_min = measure_min_sizes(levels, self.data, p.drawn, p.antialias, self.backend, 1.0, RATIO)
 
     # -- checkpoints -----------------------------------------------------------------------------------
 

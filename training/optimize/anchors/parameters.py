@@ -177,14 +177,17 @@ class ExplicitOctreeParameters(MergedParameters, OctreeParameters):
 
     @property
     def merges(self) -> bool:
-        """True if coarser levels are merged from the finest."""
         return self.levels_from == "merged"
 
     @property
-    def refining(self) -> list[int]:
-        """Steps that refine each merged level, finest first."""
-        return refining_steps(self.refine_steps, self.merged_levels) if self.merges else []
+    def stages(self) -> list[tuple[int, int]]:
+        """Levels in the order of their training, with their numbers of steps; one without merged levels."""
+        if not self.merges:
+            return [(1, self.steps)]
+        refining = refining_steps(self.refine_steps, self.merged_levels)
+        coarser = zip(range(self.merged_levels, 0, -1), refining, strict=True)
+        return [(self.merged_levels + 1, self.steps), *coarser]
 
     @property
     def total_steps(self) -> int:
-        return self.steps + sum(self.refining)
+        return sum(steps for _, steps in self.stages)

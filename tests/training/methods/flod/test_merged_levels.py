@@ -84,7 +84,7 @@ def test_finest_level_has_full_images_after_its_own_share(data):
     almost full-size images.
     """
     flod = make(data, steps=[400] * 3, refine_steps=300, first_resolution=0.5, full_resolution=0.5)
-    end = flod._ends[0]
+    end = flod.stages.ends[0]
     factors = [flod.shrink(step) for step in range(end)]
     assert factors[0] > 1.4
     np.testing.assert_array_equal(factors[end // 2 :], 1)
@@ -93,7 +93,7 @@ def test_finest_level_has_full_images_after_its_own_share(data):
 def test_refinement_starts_with_small_images(data):
     """Images of each merged level grow from ``first_resolution`` to full size; some remain small."""
     flod = make(data, steps=[700] * 3, refine_steps=600, first_resolution=0.5, full_resolution=0.5)
-    for begin, end in zip(flod._ends, flod._ends[1:], strict=False):
+    for begin, end in zip(flod.stages.ends, flod.stages.ends[1:], strict=False):
         middle = (begin + end) // 2
         factors, counts = np.unique([flod.shrink(step) for step in range(middle, end)], return_counts=True)
         np.testing.assert_array_equal(factors, [1, 2, 4])
