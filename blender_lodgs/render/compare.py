@@ -70,11 +70,14 @@ def compare_view(
     with _render_settings(scene, view, full_size.scaled(scale)) as (width, height):
         depsgraph = context.evaluated_depsgraph_get()
         camera, near = cameras.view_of(view.evaluated_get(depsgraph), depsgraph, width, height)
-        frame = renderer.draw_frame(
-            engine.placed_splats(depsgraph), camera, near, on_progress, background=(0.0, 0.0, 0.0),
+        frame_view = renderer.FrameView(
+            camera,
+            near,
+            background=(0.0, 0.0, 0.0),
             photograph=absolute_path(facts.photograph),
             mask=absolute_path(facts.mask) if facts.mask else None,
-        )  # fmt: skip
+        )
+        frame = renderer.draw_frame(engine.placed_splats(depsgraph), frame_view, on_progress)
     if frame is None:
         return None
     facts.psnr = frame.psnr

@@ -250,11 +250,9 @@ def render_frame(
     lens = renderer.FrameLens(projection, aperture, cameras, scene.lodgs_render.samples)
     left, bottom, window_width, window_height = window
     settings = scene.lodgs_render
-    return renderer.draw_frame(
-        splats,
+    frame_view = renderer.FrameView(
         camera,
         view.obj.data.clip_start,
-        on_progress,
         background=None if scene.render.film_transparent else tuple(settings.background),
         depth=layer.use_pass_z,
         levels=settings.use_pass_levels,
@@ -262,6 +260,7 @@ def render_frame(
         holdout=holdout_file(scene, scene.frame_current),
         lens=lens,
     )
+    return renderer.draw_frame(splats, frame_view, on_progress)
 
 
 _render_function = render_frame

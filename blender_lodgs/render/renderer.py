@@ -131,6 +131,45 @@ class FrameLens:
         }
 
 
+@dataclass(frozen=True)
+class FrameView:
+    """View and passes of a frame.
+
+    Attributes:
+        camera: camera in world space.
+        near: near clipping distance.
+        background: colour of the background, or None for transparent.
+        depth: whether to render the depth pass.
+        levels: whether to render the level passes.
+        window: left, top, width and height of the rendered region in pixels, or None for the full image.
+        photograph: photo to compare with.
+        mask: image that is black where the comparison ignores pixels.
+        holdout: EXR file with the depth of objects that occlude splats.
+        lens: lens and samples.
+    """
+
+    camera: Camera
+    near: float
+    background: tuple[float, float, float] | None = None
+    depth: bool = False
+    levels: bool = False
+    window: tuple[int, int, int, int] | None = None
+    photograph: Path | None = None
+    mask: Path | None = None
+    holdout: Path | None = None
+    lens: FrameLens = FrameLens()
+
+    def as_dict(self) -> dict:
+        """Return the keys of a request."""
+        files = {name: getattr(self, name) for name in ("photograph", "mask", "holdout")}
+        return {
+            "camera": camera_to_dict(self.camera, self.near),
+            **{name: getattr(self, name) for name in ("background", "depth", "levels", "window")},
+            **{name: str(path) if path else None for name, path in files.items()},
+            **self.lens.as_dict(self.near),
+        }
+
+
 class _SentSet(NamedTuple):
     """A set of splats that the renderer has or can read, with its file, content and version."""
 
@@ -176,36 +215,14 @@ class Renderer:
         threading.Thread(target=self._read_responses, daemon=True).start()
 
     def draw_frame(
-        self,
-        sets: list[PlacedSplats | PlacedFile],
-        camera: Camera,
-        near: float,
-        on_progress: OnProgress,
-        *,
-        background: tuple[float, float, float] | None = None,
-        depth: bool = False,
-        levels: bool = False,
-        window: tuple[int, int, int, int] | None = None,
-        photograph: Path | None = None,
-        mask: Path | None = None,
-        holdout: Path | None = None,
-        lens: FrameLens = FrameLens(),
+        self, sets: list[PlacedSplats | PlacedFile], view: FrameView, on_progress: OnProgress
     ) -> RenderedFrame | None:
         """Render a frame.
 
         Args:
             sets: visible splats.
-            camera: camera in world space.
-            near: near clipping distance.
+            view: view and passes of the frame.
             on_progress: function that receives the progress and may cancel the frame.
-            background: colour of the background, or None for transparent.
-            depth: whether to render the depth pass.
-            levels: whether to render the level passes.
-            window: left, top, width and height of the rendered region, or None for the full image.
-            photograph: photo to compare with.
-            mask: image that is black where the comparison ignores pixels.
-            holdout: EXR file with the depth of objects that occlude splats.
-            lens: lens and samples.
 
         Returns:
             The frame, or None if it was cancelled.
@@ -219,12 +236,7 @@ class Renderer:
         try:
             previous = dict(self._sent)
             described = self._write_sets(sets)
-            self._send(
-                frame=frame, out=out.name, sets=described, camera=camera_to_dict(camera, near),
-                background=background, depth=depth, levels=levels, window=window,
-                photograph=str(photograph) if photograph else None, mask=str(mask) if mask else None,
-                holdout=str(holdout) if holdout else None, **lens.as_dict(near),
-            )  # fmt: skip
+            self._send(frame=frame, out=out.name, sets=described, **view.as_dict())
             response = self._wait(frame, on_progress)
             self._remove_files(previous, all_read=response["event"] == "frame")
             return self._read_frame(out, response)
@@ -373,7 +385,7 @@ _last_use = 0.0
 
 
 def draw_frame(
-    sets: list[PlacedSplats | PlacedFile], camera: Camera, near: float, on_progress: OnProgress, **options
+    sets: list[PlacedSplats | PlacedFile], view: FrameView, on_progress: OnProgress
 ) -> RenderedFrame | None:
     """Call :meth:`Renderer.draw_frame` of the shared renderer. Start it if needed, and once more if it dies.
 
@@ -387,7 +399,7 @@ def draw_frame(
                 on_progress(0.0, "Starting the renderer")
                 _renderer = Renderer()
             try:
-                return _renderer.draw_frame(sets, camera, near, on_progress, **options)
+                return _renderer.draw_frame(sets, view, on_progress)
             except RendererStopped:
                 reason = _renderer.exit_reason()
                 _renderer.close()

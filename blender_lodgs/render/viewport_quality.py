@@ -18,6 +18,7 @@ from ...training.render.image import RenderedImage
 from ..data import shown
 from ..data.cameras import RenderView, scene_camera
 from ..viewport import views
+from ..viewport.splats import DrawTarget
 from . import engine, renderer
 from .written_images import require_complete_image
 
@@ -135,10 +136,9 @@ def _render_frame(
     screen = gpu.types.GPUOffScreen(width, height)
     with screen.bind():  # type: ignore[attr-defined]
         gpu.state.active_framebuffer_get().clear(color=(0, 0, 0, 0), depth=1.0)
-        views.draw_splats(
-            view, shown.splat_instances(depsgraph), depsgraph, camera.world_to_camera, projection,
-            ALL_SPLATS, under_overlays=False, wait=True,
-        )  # fmt: skip
+        target = DrawTarget(camera.world_to_camera, projection, under_overlays=False)
+        instances = shown.splat_instances(depsgraph)
+        views.draw_splats(view, instances, depsgraph, target, ALL_SPLATS, wait=True)
     if view.canvas.frame is not None:
         with view.canvas.frame.bind():  # type: ignore[union-attr]
             buffer = view.canvas.frame.read_color(0, 0, width, height, 4, 0, "FLOAT")

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import gpu
@@ -41,6 +42,24 @@ them."""
 Frame = tuple[float, float, float, float]
 FULL_FRAME: Frame = (-1.0, -1.0, 1.0, 1.0)
 """Left, bottom, right and top of clip space."""
+
+
+@dataclass(frozen=True)
+class DrawTarget:
+    """View of the world in the active framebuffer.
+
+    Attributes:
+        view, projection: matrices from the world to camera space, and from there to clip space.
+        under_overlays: keep contents of the framebuffer with alpha on top; it is stored as sRGB, like a
+            viewport's.
+        frame: left, bottom, right, top of the camera's frame in clip space. Splats outside are stretched
+            according to their distance from it, as in a render.
+    """
+
+    view: Matrix
+    projection: Matrix
+    under_overlays: bool = True
+    frame: Frame = FULL_FRAME
 
 
 class UploadedSplats(Protocol):
@@ -159,13 +178,10 @@ def draw(
     instances: gpu.types.GPUTexture,
     count: int,
     placements: Sequence[Placement],
-    view: Matrix,
-    projection: Matrix,
+    target: DrawTarget,
     canvas: Canvas,
     *,
     resolution: float = 1.0,
-    under_overlays: bool = True,
-    frame: Frame = FULL_FRAME,
     timed: bool = False,
 ) -> float:
     """Draw splats into the active framebuffer, tested against its depth.
@@ -174,27 +190,24 @@ def draw(
         store: uploaded splats.
         instances, count: see :func:`instances_texture`.
         placements: transforms, filters and looks of the splat sets.
-        view, projection: matrices from the world to camera space, and from there to clip space.
+        target: view to draw.
+        canvas: framebuffer to blend the splats in.
         resolution: resolution of the splats relative to the framebuffer.
-        under_overlays: keep contents of the framebuffer with alpha on top; it is stored as sRGB, like a
-            viewport's.
-        frame: left, bottom, right, top of the camera's frame in clip space. Splats outside are stretched
-            according to their distance from it, as in a render.
         timed: wait until the splats are drawn.
 
     Returns:
         The seconds from the first splat to the last if timed, else 0.
     """
-    target = gpu.state.active_framebuffer_get()
+    framebuffer = gpu.state.active_framebuffer_get()
     _, _, width, height = gpu.state.viewport_get()
-    depth = gpu.types.GPUTexture((width, height), format="R32F", data=target.read_depth(0, 0, width, height))
+    region = 0, 0, width, height
+    depth = gpu.types.GPUTexture(region[2:], format="R32F", data=framebuffer.read_depth(*region))
     overlay = empty_texture()
-    if under_overlays:
-        overlay = gpu.types.GPUTexture(
-            (width, height), format="RGBA8", data=target.read_color(0, 0, width, height, 4, 0, "FLOAT")
-        )
+    if target.under_overlays:
+        colors = framebuffer.read_color(*region, 4, 0, "FLOAT")
+        overlay = gpu.types.GPUTexture(region[2:], format="RGBA8", data=colors)
     looks_texture = _looks_texture([placement.looks for placement in placements])  # freed with its last name
-    placements_texture = _placements_texture(placements, view, projection)
+    placements_texture = _placements_texture(placements, target.view, target.projection)
     size = max(1, round(width * resolution)), max(1, round(height * resolution))
     canvas.resize(size, -(-count // WIDTH))
     begin = time.monotonic()
@@ -202,7 +215,7 @@ def draw(
         "instances": instances, "placements": placements_texture, "looks": looks_texture,
         "palette": palette(),
     }  # fmt: skip
-    _project(store, textures, count, projection, canvas, frame)
+    _project(store, textures, count, target, canvas)
     with canvas.frame.bind():  # type: ignore[union-attr]
         canvas.frame.clear(color=(0, 0, 0, 0), depth=1.0)
         _write_depth(depth)
@@ -234,9 +247,8 @@ def _project(
     store: UploadedSplats,
     textures: dict[str, gpu.types.GPUTexture],
     count: int,
-    projection: Matrix,
+    target: DrawTarget,
     canvas: Canvas,
-    frame: Frame,
 ) -> None:
     """Project splats to the pixels of a canvas."""
     # bind the same format everywhere, or drivers would compile the shader again for other formats
@@ -250,9 +262,9 @@ def _project(
         gpu.state.blend_set("NONE")
         shader.bind()
         bind_textures(shader, textures)
-        shader.uniform_float("projection", projection)
+        shader.uniform_float("projection", target.projection)
         shader.uniform_float("size", canvas.size)
-        shader.uniform_float("frame", frame)
+        shader.uniform_float("frame", target.frame)
         shader.uniform_int("degree", round((store.higher + 1) ** 0.5) - 1)
         shader.uniform_int("texels", -(-(14 + 3 * store.higher) // 4))
         shader.uniform_int("part_size", store.texture_slots)

@@ -80,12 +80,10 @@ def draw(context: bpy.types.Context) -> None:
     frame = splats.FULL_FRAME
     if camera is not None:
         frame = view_camera.camera_frame(camera, context.scene, matrix)
-    draw_splats(
-        view, instances, context.evaluated_depsgraph_get(),
-        region_data.view_matrix, region_data.window_matrix, settings.budget, moving=True,
-        under_overlays=space.overlay.show_overlays and not _shows_photo(camera),
-        frame=frame, timed=True,
-    )  # fmt: skip
+    under_overlays = space.overlay.show_overlays and not _shows_photo(camera)
+    target = splats.DrawTarget(region_data.view_matrix, region_data.window_matrix, under_overlays, frame)
+    depsgraph = context.evaluated_depsgraph_get()
+    draw_splats(view, instances, depsgraph, target, settings.budget, moving=True, timed=True)
     if (stated := (reduced_counts(region), view_state.simplified_counts(), view.cost)) != view.stated:
         view.stated = stated
         for other in context.area.regions:
@@ -120,12 +118,9 @@ def draw_splats(
     view: ViewState,
     instances: list[shown.SplatInstance],
     depsgraph: bpy.types.Depsgraph,
-    view_matrix: Matrix,
-    projection: Matrix,
+    target: splats.DrawTarget,
     budget: int,
     *,
-    under_overlays: bool = True,
-    frame: splats.Frame = splats.FULL_FRAME,
     wait: bool = False,
     moving: bool = False,
     timed: bool = False,
@@ -134,12 +129,11 @@ def draw_splats(
 
     Args:
         view: state since the last redraw; updated.
-        view_matrix, projection: matrices from the world to camera space, and from there to clip space.
+        target: view to draw.
         budget, wait, moving: see :func:`prepare`.
-        under_overlays, frame: see ``splats.draw``.
         timed: measure the cost of the view if it is outdated.
     """
-    request = prepare(view, instances, depsgraph, view_matrix, budget, wait, moving)
+    request = prepare(view, instances, depsgraph, target.view, budget, wait, moving)
     if view.arrangement is None or view.store is None or view.instances is None or not view.count:
         return
     view.choose_list()
@@ -148,8 +142,8 @@ def draw_splats(
     if _same_splats(placements, request.placements):  # objects move at once; their order follows
         placements = request.placements
     seconds = splats.draw(
-        view.store, view.instances, view.count, placements, view_matrix, projection, view.canvas,
-        resolution=view.resolution, under_overlays=under_overlays, frame=frame, timed=timed,
+        view.store, view.instances, view.count, placements, target, view.canvas,
+        resolution=view.resolution, timed=timed,
     )  # fmt: skip
     if timed:
         view.set_cost(seconds)

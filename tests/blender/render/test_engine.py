@@ -910,9 +910,9 @@ def test_motion_blur_has_cameras_of_the_shutter_time(bpy, lodgs, scene, monkeypa
     scene.frame_set(1)
     draw_frame = lodgs("render.renderer").draw_frame
 
-    def record(sets, camera, *args, lens, **options):
-        drawn.append((camera.center[1], [key.center[1] for key in lens.cameras]))
-        return draw_frame(sets, camera, *args, lens=lens, **options)
+    def record(sets, view, on_progress):
+        drawn.append((view.camera.center[1], [key.center[1] for key in view.lens.cameras]))
+        return draw_frame(sets, view, on_progress)
 
     monkeypatch.setattr(lodgs("render.renderer"), "draw_frame", record)
     scene.render.resolution_percentage, scene.lodgs_render.samples = 10, 2

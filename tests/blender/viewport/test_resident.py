@@ -43,9 +43,8 @@ def draw_from(bpy, lodgs, frame, scene):
         depsgraph = bpy.context.evaluated_depsgraph_get()
         instances = lodgs("data.shown").splat_instances(depsgraph)
         view_matrix = Matrix.Translation((-x, 0, -6))
-        return frame(96, lambda: views.draw_splats(
-            view, instances, depsgraph, view_matrix, projection, 10**6, wait=wait, under_overlays=False,
-        ))  # fmt: skip
+        target = lodgs("viewport.splats").DrawTarget(view_matrix, projection, under_overlays=False)
+        return frame(96, lambda: views.draw_splats(view, instances, depsgraph, target, 10**6, wait=wait))
 
     yield draw
     views.clear()

@@ -68,7 +68,7 @@ def draw_view(bpy, lodgs, frame, camera):
     """
     from mathutils import Matrix
 
-    views = lodgs("viewport.views")
+    views, splats = lodgs("viewport.views"), lodgs("viewport.splats")
     views.clear()
 
     def draw_splats(
@@ -87,10 +87,8 @@ def draw_view(bpy, lodgs, frame, camera):
         def draw():
             if draw_first is not None:
                 draw_first(projection @ matrix)
-            views.draw_splats(
-                view or views.ViewState(), instances, depsgraph, matrix, projection, budget,
-                under_overlays=under_overlays, wait=wait, **options,
-            )  # fmt: skip
+            target = splats.DrawTarget(matrix, projection, under_overlays, **options)
+            views.draw_splats(view or views.ViewState(), instances, depsgraph, target, budget, wait=wait)
 
         return frame(SIZE, draw, coded)[::-1]
 

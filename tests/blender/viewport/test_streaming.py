@@ -54,10 +54,9 @@ def draw_from(bpy, lodgs, frame):
         bpy.context.view_layer.update()
         depsgraph = bpy.context.evaluated_depsgraph_get()
         instances = lodgs("data.shown").splat_instances(depsgraph)
-        return frame(SIZE, lambda: views.draw_splats(
-            view, instances, depsgraph, Matrix.Translation(-np.array(position)), projection, 10**6, wait=wait,
-            under_overlays=False,
-        ))  # fmt: skip
+        view_matrix = Matrix.Translation(-np.array(position))
+        target = lodgs("viewport.splats").DrawTarget(view_matrix, projection, under_overlays=False)
+        return frame(SIZE, lambda: views.draw_splats(view, instances, depsgraph, target, 10**6, wait=wait))
 
     return draw
 
