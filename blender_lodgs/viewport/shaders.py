@@ -87,7 +87,7 @@ void main()
   vec4 mean = record_texel(record, 0);
   float opacity = mean.w * instance.y;
   mean.w = 1.0;
-  vec4 filtered = texel(placements, row + 4);  // added variance, opacity compensation, range of looks
+  vec4 filtered = texel(placements, row + 4);  // variance, uncompensated part, range of looks
   mat3 look = mat3(1.0);
   for (int i = int(filtered.z); i < int(filtered.w); i++) {  // see ``splats._looks_texture``
     int at = 6 * i;
@@ -130,10 +130,11 @@ void main()
   mat3 half_covariance = to_view * turn * mat3(s.x, 0.0, 0.0, 0.0, s.y, 0.0, 0.0, 0.0, s.z);
   vec3 row_x = by_x * half_covariance, row_y = by_y * half_covariance;
   float xx = dot(row_x, row_x) + filtered.x, xy = dot(row_x, row_y), yy = dot(row_y, row_y) + filtered.x;
-  if (filtered.y > 0.0) {
+  if (filtered.y < filtered.x) {
     vec3 area = cross(row_x, row_y);
-    float squared_area = dot(area, area);
-    opacity *= sqrt(squared_area / (squared_area + filtered.x * (xx + yy - filtered.x)));
+    float squared_area = dot(area, area), trace = xx + yy - 2.0 * filtered.x;
+    opacity *= sqrt((squared_area + filtered.y * (trace + filtered.y))
+                    / (squared_area + filtered.x * (trace + filtered.x)));
     if (opacity <= 1.0 / 255.0) {
       return;
     }

@@ -30,10 +30,10 @@ from .shaders import (
     projection_shader,
 )
 
-DILATION = (0.3, 0.0)
-"""3DGS's filter: variance added to projected splats in square pixels, and opacity compensation (off)."""
-MIP_FILTER = (0.1, 1.0)
-"""Mip-Splatting's 2D filter: added variance, and opacity compensation (on)."""
+DILATION = (0.3, 0.3)
+"""3DGS's filter: variance added to projected splats in square pixels, and its part that adds opacity."""
+MIP_FILTER = (0.1, 0.0)
+"""Mip-Splatting's 2D filter: opacities compensate for all added variance."""
 
 SHRINK_FACTOR = 2
 """Size of the textures of projected splats, relative to the drawn ones, above which smaller ones replace
@@ -207,7 +207,7 @@ def draw(
         colors = framebuffer.read_color(*region, 4, 0, "FLOAT")
         overlay = gpu.types.GPUTexture(region[2:], format="RGBA8", data=colors)
     looks_texture = _looks_texture([placement.looks for placement in placements])  # freed with its last name
-    placements_texture = _placements_texture(placements, target.view, target.projection)
+    placements_texture = _placements_texture(placements, target.view, target.projection, resolution)
     size = max(1, round(width * resolution)), max(1, round(height * resolution))
     canvas.resize(size, -(-count // WIDTH))
     begin = time.monotonic()
@@ -303,12 +303,13 @@ def reset_state() -> None:
 
 
 def _placements_texture(
-    placements: Sequence[Placement], view: Matrix, projection: Matrix
+    placements: Sequence[Placement], view: Matrix, projection: Matrix, resolution: float
 ) -> gpu.types.GPUTexture:
     """Upload five texels per placement: three rows of its matrix to camera space, the camera, and the filter.
 
     The fourth value of the camera is 1; for orthographic views it is 0 and the others are the direction
-    opposite to the view. The filter's texel also has the range of looks.
+    opposite to the view. The filter's texel also has the range of looks. At a lower resolution, the filter adds
+    no more opacity than at rest, so that small splats keep their brightness.
     """
     view_matrix = np.array(view, np.float64)
     perspective = projection[3][3] == 0
@@ -321,7 +322,8 @@ def _placements_texture(
         end_look = first_look + len(placement.looks)
         rows[4, 2:] = first_look, end_look
         first_look = end_look
-        rows[4, :2] = MIP_FILTER if placement.antialias else DILATION
+        variance, uncompensated = MIP_FILTER if placement.antialias else DILATION
+        rows[4, :2] = variance, uncompensated * resolution**2
         rows[:3] = (view_matrix @ placement.world)[:3]
         rows[3, :3] = (np.linalg.pinv(placement.world) @ camera)[:3]
         rows[3, 3] = perspective

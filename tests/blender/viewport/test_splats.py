@@ -415,6 +415,20 @@ def test_lines_do_not_hide_pixels_of_a_lower_resolution(bpy, lodgs, add, draw_vi
     assert np.abs(moving - without_line)[opaque, column].max() < 0.1
 
 
+@pytest.mark.parametrize("antialias", [False, True])
+def test_a_lower_resolution_keeps_the_brightness(bpy, lodgs, draw_view, antialias):
+    """Splats smaller than a pixel cover as much as at rest, or the image changes when a motion ends."""
+    scenes, bundle = lodgs("data.scenes"), lodgs("training.splats.bundle")
+    with lodgs("data.importing").new_scene(bpy.context, "scene") as root:
+        scenes.set_level(root, bundle.Level(1, make_splats(lodgs, size=-6.5)))
+        scenes.set_bundle_facts(root, bundle.Bundle("", [], meta={"antialias": antialias}))
+    bpy.context.view_layer.update()
+    view = lodgs("viewport.views").ViewState()
+    resting = draw_view(view=view)[..., 3].mean()
+    view.resolution = 0.5
+    assert draw_view(view=view)[..., 3].mean() == pytest.approx(resting, rel=0.1)
+
+
 def test_mesh_hides_splats_behind_it(bpy, lodgs, add, draw_view, truth, camera):
     splats = make_splats(lodgs, degree=0)
     add(splats)
