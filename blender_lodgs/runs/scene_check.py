@@ -15,6 +15,7 @@ from ...training.errors import LodgsError
 from ...training.runs.job import Job
 from ...training.scenes.check import ESTIMATE, SEVERITIES, Finding, check_folder
 from ..data.paths import absolute_path
+from ..data.training import hold_out_interval
 from . import environment, job_settings, run_folders
 
 TIMEOUT = 600.0
@@ -96,4 +97,5 @@ def settings_key(root: bpy.types.Object) -> str:
     """Return a text that changes with the settings of the training."""
     settings = root.lodgs.training
     changed = sorted(job_settings.changed_parameters(settings).items())
-    return repr((settings.method, settings.preset, settings.image_scale, settings.start_from, changed))
+    common = settings.method, settings.preset, settings.image_scale, settings.start_from
+    return repr((*common, settings.grid, settings.region, hold_out_interval(root), changed))

@@ -186,8 +186,11 @@ def test_estimate_is_above_train_until_settings_change(bpy, lodgs, root, draw_pa
     assert "About 3 min." in texts and "Use draft." in texts
     texts = " ".join(draw_panel("scene", "LODGS_PT_scene").texts)
     assert "Two photos are missing. Add them." in texts and "About 3 min." not in texts
-    root.lodgs.training.preset = "standard"
-    assert "About 3 min." not in draw_training().texts and "lodgs.check_scene" in draw_training().operators
+    for name, value, restored in (("preset", "standard", "draft"), ("columns", 2, 1)):
+        setattr(root.lodgs.training, name, value)
+        assert "About 3 min." not in draw_training().texts and "lodgs.check_scene" in draw_training().operators
+        setattr(root.lodgs.training, name, restored)
+        assert "About 3 min." in draw_training().texts
 
 
 def test_panel_states_a_running_estimate(bpy, lodgs, root, draw_panel, monkeypatch):
