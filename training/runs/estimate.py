@@ -149,11 +149,11 @@ def suggest_settings(job: Job, costs: Estimate) -> list[Finding]:
     if longer > LARGE_SIDE:
         scale = job.image_scale * LARGE_SIDE / longer
         problem = f"The longer side of training images has {longer} pixels; papers use at most {LARGE_SIDE}."
-        findings.append(Finding(ESTIMATE, problem, f"Set image_scale to {scale:.2g} to train faster."))
+        findings.append(Finding(ESTIMATE, problem, f"Set the image scale to {scale:.2g} to train faster."))
     elif longer < SMALL_SIDE and job.image_scale < 1:
         scale = min(job.image_scale * SMALL_SIDE / longer, 1.0)
         problem = f"The longer side of training images has only {longer} pixels, which loses details."
-        findings.append(Finding(ESTIMATE, problem, f"Set image_scale to {scale:.2g}."))
+        findings.append(Finding(ESTIMATE, problem, f"Set the image scale to {scale:.2g}."))
     if costs.seconds > LONG_SECONDS and job.preset != "draft":
         problem = f"Training takes more than {LONG_SECONDS // 3600} hours on this computer."
         findings.append(Finding(ESTIMATE, problem, "Train the preset draft first to check the scene."))

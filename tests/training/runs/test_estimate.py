@@ -126,8 +126,8 @@ def test_cells_have_no_estimate(job):
         ({}, ""),
         ({"memory": 7 * 10**9}, "more than 80% of the free memory"),
         ({"disk": 45 * 10**9}, "more than 80% of the free disk space"),
-        ({"size": (3200, 2400)}, "Set image_scale to 0.25"),
-        ({"size": (320, 200)}, "only 320 pixels, which loses details. Set image_scale to 1."),
+        ({"size": (3200, 2400)}, "Set the image scale to 0.25"),
+        ({"size": (320, 200)}, "only 320 pixels, which loses details. Set the image scale to 1."),
         ({"seconds": 9000}, "more than 2 hours on this computer. Train the preset draft first"),
     ],
 )
