@@ -34,11 +34,16 @@ def new_axes(root: bpy.types.Object) -> bpy.types.Object:
     """Create the axes of a new root, in its collection."""
     axes = bpy.data.objects.new(f"{root.name} axes", None)
     axes.parent, axes.rotation_mode, axes.empty_display_size = root, "QUATERNION", DISPLAY_SIZE
-    axes.lock_location = axes.lock_rotation = axes.lock_scale = (True, True, True)
-    axes.lock_rotation_w = axes.lock_rotations_4d = True
+    lock_transform(axes)
     root.users_collection[0].objects.link(axes)
     root.lodgs.axes = axes
     return axes
+
+
+def lock_transform(obj: bpy.types.Object) -> None:
+    """Keep Blender's tools from moving, rotating and scaling an object by itself."""
+    obj.lock_location = obj.lock_rotation = obj.lock_scale = (True, True, True)
+    obj.lock_rotation_w = obj.lock_rotations_4d = True
 
 
 def matrix_in_parent(root: bpy.types.Object) -> Matrix:

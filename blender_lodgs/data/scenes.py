@@ -28,7 +28,7 @@ from ..nodes import display, ellipsoids
 from . import cleaning, crops, looks, objects, painting, selection, streams, tables
 from .controls import changed_controls, update_controls
 from .photographs import camera_of, is_held_out, views, views_with_photo
-from .placement import axes_of, placement_of
+from .placement import axes_of, lock_transform, placement_of
 from .roots import levels_collection, roots
 
 
@@ -391,6 +391,7 @@ def put_level(
         new_object = obj
     if not new_object.users_collection:  # an existing object keeps its parent, or none after Alt-P
         new_object.parent = axes_of(root)
+        lock_transform(new_object)  # Blender's Apply would change positions only, and exports ignore it
         levels_collection(root).objects.link(new_object)
     item.object = new_object
     item.facts = json.dumps(level.facts)

@@ -57,6 +57,18 @@ def select(bpy, *objects):
     bpy.context.view_layer.objects.active = objects[-1]
 
 
+@pytest.mark.parametrize("tool", ["translate", "rotate", "resize"])
+def test_tools_do_not_move_single_levels(bpy, root, tool):
+    """Blender's Apply would change the positions of splats, but neither their scales nor their rotations."""
+    level = root.lodgs.levels[-1].object
+    select(bpy, level)
+    getattr(bpy.ops.transform, tool)(value=2.0 if tool == "rotate" else (2.0, 2.0, 2.0))
+    bpy.ops.object.transform_apply()
+    positions = [point.co for point in level.data.points]
+    assert np.array(positions) == pytest.approx(lodge_bundle().levels[-1].splats.means)
+    assert np.array(level.matrix_basis) == pytest.approx(np.eye(4))
+
+
 def select_empties(bpy, root, locations):
     """Select new empties at world locations and the root, which is active."""
     marks = [bpy.data.objects.new("mark", None) for _ in locations]
