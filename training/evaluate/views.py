@@ -186,27 +186,31 @@ class Evaluation:
         means = np.reshape(values, (-1, len(REDUCTIONS))).mean(0)
         return [round(float(value), 3) for value in means]
 
-    def measure(self, render: Callable[[Camera], Rendering], count: Callable[[Camera], int]) -> dict:
+    def measure(
+        self, render: Callable[[Camera], Rendering], count: Callable[[Camera], int] | None = None
+    ) -> dict:
         """Measure quality, number of splats and seconds per frame over ``cameras``.
 
         Args:
             render: selects and draws the splats of a camera.
-            count: returns the number of splats with a weight for a camera, visible or not.
+            count: returns the number of splats with a weight for a camera, visible or not. None counts those
+                given to the rasterizer.
 
         Returns:
             ``splats`` (mean count), ``drawn`` (mean number in the image), ``psnr`` (dB), ``ssim``, the
             perceptual measures and ``frame_s`` (median, with selection). Names on training views are
             ``train_psnr`` and so on.
         """
-        drawn = []
+        drawn, rendered = [], []
 
         def draw_image(camera: Camera) -> torch.Tensor:
             rendering = render(camera)
             drawn.append(int((rendering.radii > 0).sum()))
+            rendered.append(len(rendering.radii))
             return rendering.image.cpu()
 
         quality = self.measure_images(draw_image)
-        splats = np.mean([count(camera) for camera in self.cameras])
+        splats = np.mean([count(camera) for camera in self.cameras] if count else rendered)
         return {"splats": round(float(splats)), "drawn": round(float(np.mean(drawn))), **quality}
 
     def measure_images(self, draw_image: Callable[[Camera], torch.Tensor]) -> dict:

@@ -106,8 +106,8 @@ class ImageModel(Protocol):
             KeyError, ValueError: an array is missing, or has another shape or type.
         """
 
-    def render_image(self, camera: Camera) -> torch.Tensor:
-        """Render the image of a camera, (H, W, 3)."""
+    def render(self, camera: Camera) -> Rendering:
+        """Render the Gaussians that the model decodes for a camera."""
         ...
 
     def use_appearance(self, photos: Sequence[str]) -> None:

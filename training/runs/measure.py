@@ -271,9 +271,9 @@ def _earlier_rows(folder: RunFolder, row: dict, values: Values) -> list[dict]:
 
 
 def _measure_networks(job: Job, folder: RunFolder, evaluation: Evaluation) -> dict:
-    """Return the quality of the run's neural model before baking."""
+    """Return the quality of the run's neural model before baking, and the splats that it decodes."""
     _, model = load_networks(job, folder, evaluation.data)
-    return evaluation.measure_images(model.render_image)
+    return evaluation.measure(model.render)
 
 
 def finite(value):

@@ -41,7 +41,7 @@ def format_report(report: dict) -> str:
         (name, value), *_ = row.items()
         rows.append((f"{name} = {value:g}, {row['drawn']:,} drawn", row))
     if "networks" in report:
-        rows.append(("with networks", {"splats": 0, **report["networks"]}))
+        rows.append(("with networks", report["networks"]))
     for name, row in rows:
         if row is None:
             lines.append(name)

@@ -325,7 +325,7 @@ class _TrainingRun:
             with atomic_write(self.folder.model) as temporary, open(temporary, "wb") as file:
                 np.savez(file, **image_model.arrays())
             if self.data.test:
-                neural_psnr = self.evaluation.measure_images(image_model.render_image)["psnr"]
+                neural_psnr = self.evaluation.measure(image_model.render)["psnr"]
                 resident = ResidentBundle(bundle, self.evaluation.backend)
                 baked_psnr = self.evaluation.measure_by_distance(resident, resolve_controls(bundle, {}))[
                     "psnr"

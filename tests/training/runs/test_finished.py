@@ -1,6 +1,7 @@
 """Finished runs: baking their networks again with the appearance of photos."""
 
 import io
+import json
 import shutil
 
 import numpy as np
@@ -52,3 +53,10 @@ def test_unknown_photos_and_other_runs_raise(run, tmp_path):
     (without / "model.npz").unlink()
     with pytest.raises(LodgsError, match=r"has no networks\. Choose a run of the method octree_neural"):
         bake_again(without, []).__enter__()
+
+
+def test_report_counts_the_splats_of_the_networks(run, capsys):
+    assert main(["evaluate", str(run)]) == 0
+    [line] = [line for line in capsys.readouterr().out.splitlines() if line.startswith("with networks")]
+    measured = json.loads((run / "metrics.json").read_text())["networks"]
+    assert int(line.split()[2].replace(",", "")) == measured["splats"] > 0

@@ -23,7 +23,7 @@ from ...optimize.density_control import require_rows
 from ...optimize.model import Model
 from ...optimize.schedules import log_linear
 from ...optimize.training_data import TrainingView
-from ...rasterize import Adam, Gaussians
+from ...rasterize import Adam, Gaussians, Rendering
 from ...rasterize.adam import LearningRate
 from ...scenes.cameras import Camera
 from ...splats.gaussians import Splats
@@ -260,13 +260,13 @@ class Method(method.Method[NeuralOctreeParameters, NeuralDrawing]):
 
     # -- drawing ---------------------------------------------------------------------------------------
 
-    def render_image(self, camera: Camera) -> torch.Tensor:
-        """Render the networks' image for a camera, (H, W, 3), with levels faded by distance."""
+    def render(self, camera: Camera) -> Rendering:
+        """Render the Gaussians that the networks decode for a camera, with levels faded by distance."""
         with torch.no_grad():
             weights = self._fade_weights(camera)
             anchors = self.decoder.visible_anchors(self.model, camera, weights)
             decoded = self.decoder.decode(self.model, camera, anchors)
-            return self.decoder.rasterize(decoded, camera, weights[decoded.anchor]).image
+            return self.decoder.rasterize(decoded, camera, weights[decoded.anchor])
 
     # -- anchors ---------------------------------------------------------------------------------------
 

@@ -28,8 +28,8 @@ class Subject:
     """A finished run, measured on its held-out views, or on training views if none are held out.
 
     All methods return means over the views: ``psnr`` in dB, ``ssim``, LPIPS if its weights are there,
-    ``fps``, ``ms`` per frame, and, except for networks, ``splats`` (number with a weight above 0, in view or
-    not) and ``drawn`` (number in the image). Levels count from 1; 0 is the finest.
+    ``fps``, ``ms`` per frame, ``splats`` (number with a weight above 0, in view or not; of networks those
+    that they decode) and ``drawn`` (number in the image). Levels count from 1; 0 is the finest.
 
     Measures of levels, by distance and of networks are made once.
 
@@ -87,11 +87,11 @@ class Subject:
             return {**self._level(finest, finest.levels[0].number), "megabytes": size / 1e6}
 
     def networks(self) -> dict[str, float]:
-        """Measure the images of the networks, before baking."""
+        """Measure the networks, before baking."""
 
         def measure() -> dict[str, float]:
             _, model = load_networks(self.job, self.folder, self.evaluation.data)
-            return self._named(self.evaluation.measure_images(model.render_image))
+            return self._named(self.evaluation.measure(model.render))
 
         return self._once("networks", measure)
 

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from training.errors import LodgsError
+from training.evaluate.views import Evaluation
 from training.methods.octree_neural import METHOD
 from training.methods.octree_neural.train import Method
 from training.optimize.anchors import growing
@@ -218,7 +219,7 @@ def test_arrays_restore_the_networks(data, tmp_path):
     arrays = read_arrays(tmp_path / "model.npz")
     second.load_arrays(arrays)
     camera = data.test[0]
-    assert torch.equal(second.render_image(camera), method.render_image(camera))
+    assert torch.equal(second.render(camera).image, method.render(camera).image)
     second.train_step(4)  # training continues
     network = next(name for name in arrays if name.startswith("network."))
     for name, invalid in (
@@ -231,6 +232,22 @@ def test_arrays_restore_the_networks(data, tmp_path):
             second.load_arrays(arrays | {name: invalid})
     with pytest.raises(KeyError, match="means"):
         second.load_arrays({})
+
+
+def test_splats_of_a_view_are_those_that_the_networks_decode(data):
+    """Octree-GS, Sec. 5.1: the mean number of neural Gaussians that a view renders."""
+    method = make(data, direct=False, levels=1)
+    measured = Evaluation(data, "cpu", False, {}).measure(method.render)
+    opacities = []
+    for camera in data.test:
+        anchors = method.decoder.visible_anchors(method.model, camera, torch.ones(len(method.model)))
+        direction = torch.nn.functional.normalize(
+            method.model["means"][anchors] - torch.as_tensor(camera.center).float(), dim=1
+        )
+        inputs = torch.cat([method.model["features"][anchors], direction], 1)
+        opacities.append(method.networks.opacity(inputs).tanh())
+    assert measured["splats"] == round(np.mean([int((opacity > 0).sum()) for opacity in opacities]))
+    assert 0 < measured["drawn"] <= measured["splats"] < sum(opacity.numel() for opacity in opacities)
 
 
 def test_growth_at_large_gradients(data):
