@@ -138,6 +138,7 @@ _PAPER = replace(
     _STANDARD,
     **PAPER | {"antialias": True, "densify_from": 600},
     densify_interval=300,
+    prune_interval=300,
     prune_oversized=True,
     densify_by="max",
     least_weight=0.02,
