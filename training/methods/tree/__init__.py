@@ -63,9 +63,11 @@ class TreeParameters(SplatParameters):
     )
     leaf_rate: float = setting(
         0.5,
-        "Learning rates of leaves, as multiples of the same rates; they fall to 0.03 of this value. 0 "
-        "freezes the leaves.",
+        "Learning rates of leaves, as multiples of the same rates. 0 freezes the leaves.",
         high=100,
+    )
+    leaf_end: float = setting(
+        0.03, "Final learning rates of leaves, as a fraction of the initial ones.", above=0, high=1
     )
     resize_interval: int = setting(
         1000,
@@ -125,6 +127,7 @@ _PAPER = replace(
     octaves=0.0,
     node_rate=1.0,
     node_end=1.0,
+    leaf_end=1.0,
     sh_degree=1,
     tune_steps=150_000,
     max_threshold=0.0075,

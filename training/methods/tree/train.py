@@ -36,8 +36,6 @@ from .build import ForestBuilder
 from .density import TreeDensityControl
 from .store import NodeStore, default_budget
 
-FINAL_LEAF_RATE = 0.03
-"""Learning rate of leaves at the end, as a fraction of the initial one."""
 SKY_RADIUS, FAR_QUANTILE = 10, 0.99
 """Radius of the sky as a multiple of the distance of the far points, and their quantile of distances."""
 
@@ -290,7 +288,7 @@ class Method(RefiningMethod):
         assert self.store is not None
         p = self.parameters
         done = (step - self.finest_steps) / max(p.tune_steps, 1)
-        leaf_rate, node_rate = p.leaf_rate * FINAL_LEAF_RATE**done, p.node_rate * p.node_end**done
+        leaf_rate, node_rate = p.leaf_rate * p.leaf_end**done, p.node_rate * p.node_end**done
         return torch.where(torch.from_numpy(self.store.is_leaf(indices)), leaf_rate, node_rate)
 
     # -- checkpoints -----------------------------------------------------------------------------------

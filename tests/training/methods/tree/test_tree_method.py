@@ -155,14 +155,14 @@ def test_leaf_rate_zero_freezes_leaves(data, base):
 
 
 def test_leaf_rate_decreases(data, base):
-    """The rate of leaves falls to 0.03 of its initial value, that of nodes to ``node_end``."""
-    tree = make(data, base, leaf_rate=0.2, node_rate=3.0, node_end=0.25, tune_steps=400)
+    """The rate of leaves falls to ``leaf_end`` of its initial value, that of nodes to ``node_end``."""
+    tree = make(data, base, leaf_rate=0.2, leaf_end=0.04, node_rate=3.0, node_end=0.25, tune_steps=400)
     trained(tree, until=1)
     camera = data.train[0]
     indices = tree.store.load_cut(camera, 16.0, data.near)
     inner = inner_rows(tree)[tree.store.cache.rows_at(indices)]
     assert inner.any() and not inner.all()
-    for step, leaf_rate, node_rate in ((1, 0.2, 3), (201, 0.2 * 0.03**0.5, 1.5), (401, 0.2 * 0.03, 0.75)):
+    for step, leaf_rate, node_rate in ((1, 0.2, 3), (201, 0.04, 1.5), (401, 0.008, 0.75)):
         actual = tree._rate_factors(indices, step).numpy()
         np.testing.assert_allclose(actual, np.where(inner, node_rate, leaf_rate), rtol=0.01)
 
