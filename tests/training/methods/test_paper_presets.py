@@ -8,16 +8,20 @@ import re
 import tomllib
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
-from training.methods import create, method_info
+from training.lod.rules import decay
+from training.methods import METHODS, create, lodge, method_info
 from training.methods.flod import train as flod_train
-from training.optimize import splat_method
-from training.optimize.anchors import growing
+from training.optimize import density_control, splat_method
+from training.optimize.anchors import growing, networks
+from training.optimize.out_of_core import cut_cache, view_order
 from training.optimize.parameters import override
+from training.rasterize import adam
 
 OCTREE_PAGE = Path(__file__).parents[3] / "docs/methods/octree-gs-paper.md"
 
@@ -27,6 +31,14 @@ SHARED = {
     "ssim_weight": (0.2, "3DGS program: lambda_dssim; Octree-GS, Sec. 7.1"),
     "min_opacity": (0.005, "3DGS program: 0.005 in train.py; FLoD and Octree-GS programs: arguments"),
     "antialias": (False, "3DGS program: dilation"),
+    "free_depth": (0.0, "no paper has it"),
+    "largest": (0.0, "no paper has it"),
+    "random_background": (False, "3DGS program: random_background"),
+    "margin": (0.0, "no paper has it"),
+    "dropout": (0.0, "no paper has it"),
+    "match_exposure": (False, "no paper has it"),
+    "lr_exposure": (0.0, "A LoD of Gaussians, A.4: disabled; other papers: none"),
+    "depth_weight": (0.0, "A LoD of Gaussians, A.4: off without depth maps; other papers: none"),
 }
 RATES = {
     "sh_degree": (3, "3DGS program: sh_degree"),
@@ -48,6 +60,7 @@ SPLATS = (
         "long_axis": (False, "3DGS program: clone and split"),
         "first_resolution": (1.0, "3DGS program: full images from the first step"),
         "opacity_reset_interval": (3000, "3DGS program: opacity_reset_interval"),
+        "prune_interval": (100, "3DGS program: densify_and_prune"),
         "densify_from": (501, "3DGS program: iteration > densify_from_iter = 500"),
     }
 )
@@ -56,6 +69,8 @@ SINGLE = SPLATS | {
     "densify_interval": (100, "3DGS program: densification_interval"),
     "densify_until": (0.499, "3DGS program: iteration < densify_until_iter = 15,000"),
     "prune_oversized": (True, "3DGS program: size_threshold after the first reset"),
+    "densify_by": ("mean", "3DGS program: mean gradient"),
+    "least_weight": (0.0, "3DGS: none"),
 }
 FLOD = {
     "levels": (5, "FLoD, Sec. 6.1.4: L_max"),
@@ -67,6 +82,16 @@ FLOD_UNTIL = (
     (0.499, 0.399, 0.399, 0.399, 0.499),
     "FLoD, Sec. 6.1.4: 5,000, 6,000, 8,000, 10,000, 15,000; program: iteration below it",
 )
+NEURAL_RATES = {
+    "lr_features": (7.5e-3, "Octree-GS program: feature_lr"),
+    "lr_offsets": (1e-2, "Octree-GS program: offset_lr_init"),
+    "lr_offsets_final": (1e-4, "Octree-GS program: offset_lr_final"),
+    "lr_scales": (7e-3, "Octree-GS program: scaling_lr"),
+    "lr_network": (2e-3, "Octree-GS program: mlp_opacity_lr_init"),
+    "lr_network_final": (0.01, "Octree-GS program: mlp_opacity_lr_final = 2e-5"),
+    "lr_appearance": (0.05, "Octree-GS program: appearance_lr_init"),
+    "scale_offset_rate": (True, "Octree-GS program: offset_lr_init * spatial_lr_scale"),
+}
 FLOD_INTERVALS = ((2000, 1000, 500, 500, 200), "FLoD, Sec. 6.1.4")
 OCTREE = SHARED | {
     "steps": (40_000, "Octree-GS, Sec. 7.1: 10,000 and 30,000"),
@@ -78,6 +103,7 @@ OCTREE = SHARED | {
     "coarse_factor": (1.5, "Octree-GS program: coarse_factor"),
     "joins": ("published", "Octree-GS, Sec. 4.3: floor(K/2); program: the last at coarse_iter"),
     "init_level": (-1, "Octree-GS, Sec. 7.1: half of the levels"),
+    "footprint": (1.0, "Octree-GS: epsilon, not published"),
     "stats_from": (500, "Octree-GS program: start_stat"),
     "grow_from": (1500, "Octree-GS program: update_from"),
     "grow_until": (0.6249, "Octree-GS program: iteration < update_until = 25,000"),
@@ -101,6 +127,7 @@ PUBLISHED = {
         "footprint": (40.0, "FLoD, Sec. 6.1.4: lambda = 0.2, about 40 pixels at the median depth"),
         "densify_until": FLOD_UNTIL,
         "densify_interval": FLOD_INTERVALS,
+        "levels_from": ("trained", "FLoD, Sec. 4.2"),
         "overlap_interval": (1000, "FLoD, Sec. 6.1.4"),
         "prune_interval": (100, "FLoD program: pruning_interval"),
         "rejoin_points": (False, "FLoD: none"),
@@ -119,6 +146,9 @@ PUBLISHED = {
         "least_weight": (0.02, "LODGE, A.2: all scenes but Campus"),
         "tune_steps": (1000, "LODGE, A.2"),
         "tune_range": (0.3, "LODGE, A.2: U(0.7 d, 1.3 d)"),
+        "levels_from": ("pruned", "LODGE, Sec. 3: copies of G(0)"),
+        "distances": ((0.0, 0.0, 0.0), "LODGE, Sec. 3: chosen from the scene"),
+        "chunks": (0, "LODGE, Eq. 5"),
         "levels": (3, "LODGE, Sec. 4, performance analysis: two LODs for all experiments"),
         "prune_oversized": (True, "LODGE, A.2: vanilla 3DGS"),
         "tune_each": (True, "LODGE, A.2: each d_l"),
@@ -135,7 +165,13 @@ PUBLISHED = {
         "steps": (60_000, "A LoD of Gaussians, A.5 (A.2: 100k, as MC-small-city+ in A.5)"),
         "densify_until": (0.0, "A LoD of Gaussians, A.2: no densification"),
         "opacity_reset_interval": (0, "A LoD of Gaussians, Sec. 4.2: no opacity resets"),
+        "densify_by": ("mean", "A LoD of Gaussians, A.2: no densification"),
+        "least_weight": (0.0, "A LoD of Gaussians: none"),
+        "prune_oversized": (False, "A LoD of Gaussians, A.2: no densification"),
         "tune_steps": (150_000, "A LoD of Gaussians, A.5"),
+        "merge_by": ("size", "A LoD of Gaussians, Eq. 6"),
+        "octaves": (0.0, "A LoD of Gaussians, A.6: 1 + 5 r^4"),
+        "resize_interval": (1000, "A LoD of Gaussians, Sec. 4.3: after each densification"),
         "sh_degree": (1, "A LoD of Gaussians, A.5"),
         "lod_noise": (5.0, "A LoD of Gaussians, A.6"),
         "max_threshold": (0.0075, "A LoD of Gaussians, A.5: half of H3DGS's 0.015"),
@@ -151,17 +187,20 @@ PUBLISHED = {
     },
     "octree": OCTREE | RATES | {  # explicit anchors are in the program of the successor only
         "sh_degree": (3, "Octree-AnyGS program, 3dgs: max_sh_degree"),
+        "levels_from": ("anchors", "Octree-GS, Sec. 4.1"),
         "lr_means": (1.6e-4, "3DGS program: position_lr_init; anchors have offsets in Octree-AnyGS"),
         "candidates": (1, "Octree-AnyGS program, 3dgs: n_offsets"),
         "volume_weight": (0.0, "Octree-AnyGS program, 3dgs: lambda_dreg"),
     },
-    "flod_scaffold": SHARED | FLOD | {  # settings of FLoD-3DGS; others are not published
+    "flod_scaffold": SHARED | FLOD | NEURAL_RATES | {  # settings of FLoD-3DGS; others are not published
         "coarsest": (40.0, "FLoD, Sec. 6.1.4: lambda = 0.2, about 40 pixels at the median depth"),
         "grow_until": FLOD_UNTIL,
         "grow_interval": FLOD_INTERVALS,
         "grad_threshold": (2e-4, "Octree-GS, Sec. 5.1: tau_g"),
         "stats_from": (500, "Octree-GS program: start_stat"),
         "grow_from": (1500, "Octree-GS program: update_from"),
+        "footprint": (1.0, "FLoD: not published, voxels are at least the minimum size"),
+        "farthest": (0.95, "Octree-GS, Sec. 4.1"),
         "success_threshold": (0.8, "Octree-GS program: success_threshold"),
         "offsets": (10, "Octree-GS program: n_offsets"),
         "features": (32, "Octree-GS program: feat_dim"),
@@ -171,9 +210,8 @@ PUBLISHED = {
         "view_shapes": (True, "Octree-GS program: the view direction is an input of all networks"),
         "least_weight": (0.0, "FLoD: none"),
         "lr_end": (1.0, "Octree-GS program: scaling_lr and feature_lr are constant"),
-        "scale_offset_rate": (True, "Octree-GS program: offset_lr_init * spatial_lr_scale"),
     },
-    "octree_neural": OCTREE | {
+    "octree_neural": OCTREE | NEURAL_RATES | {
         "success_threshold": (0.8, "Octree-GS program: success_threshold"),
         "offsets": (10, "Octree-GS program: n_offsets"),
         "features": (32, "Octree-GS program: feat_dim"),
@@ -181,14 +219,6 @@ PUBLISHED = {
         "volume_weight": (0.01, "Octree-GS, Sec. 7.1"),
         "direct": (False, "Octree-GS: networks alone"),
         "view_shapes": (True, "Octree-GS program: the view direction is an input of all networks"),
-        "lr_features": (7.5e-3, "Octree-GS program: feature_lr"),
-        "lr_offsets": (1e-2, "Octree-GS program: offset_lr_init"),
-        "lr_offsets_final": (1e-4, "Octree-GS program: offset_lr_final"),
-        "lr_scales": (7e-3, "Octree-GS program: scaling_lr"),
-        "lr_network": (2e-3, "Octree-GS program: mlp_opacity_lr_init"),
-        "lr_network_final": (0.01, "Octree-GS program: mlp_opacity_lr_final = 2e-5"),
-        "lr_appearance": (0.05, "Octree-GS program: appearance_lr_init"),
-        "scale_offset_rate": (True, "Octree-GS program: offset_lr_init * spatial_lr_scale"),
     },
     "clod": SINGLE | {
         "begin": (1 / 6, "CLoD-GS, Sec. 4.1: from step 5,000"),
@@ -200,6 +230,7 @@ PUBLISHED = {
         "prune_undrawn": (False, "CLoD-GS: none"),
         "exponent": (1.5, "CLoD-GS, Sec. 3.3"),
         "count_weight": (1.0, "CLoD-GS, Sec. 4.1: lambda_reg"),
+        "count_softness": (0.5, "CLoD-GS: not published"),
         "scale_weight": (True, "CLoD-GS, Eq. 3: w_s"),
         "onset": (1.0, "CLoD-GS, Sec. 3.3: target s_v^-1.5 from 1 on"),
         "log_uniform": (False, "CLoD-GS, Sec. 3.3: U(1, s_v_most)"),
@@ -216,9 +247,39 @@ PUBLISHED = {
         "prefix_weight": (1.0, "Matryoshka, abstract: optimises both the prefix and the full set"),
         "log_uniform": (False, "Matryoshka: distribution not known to us, uniform"),
         "min_prefix": (0.01, "Matryoshka: not known to us"),
+        "order_interval": (1000, "Matryoshka: not known to us"),
         "order_by": ("largest", "Matryoshka: ordering not known to us"),
     },
 }  # fmt: skip
+_DENSITY = ("depth", "full_resolution")  # without depth weight, with full images from the first step
+_MERGED = ("merge_ratio", "refine_steps", "drawn")  # only of merged levels
+_NEURAL = ("depth", "sh_degree", "bake_ridge", "appearance_of", "lr_looks")  # of baking and own looks
+NO_EFFECT = {
+    "3dgs": (*_DENSITY, "max_threshold"),
+    "flod": (*_DENSITY, *_MERGED, "finish_alone", "s_min_1", "first_level", "last_level"),
+    "lodge": _DENSITY,
+    "tree": (*_DENSITY, "densify_interval"),
+    "octree": ("depth", *_MERGED, "merged_levels"),
+    "flod_scaffold": (*_NEURAL, "s_min_1"),
+    "octree_neural": _NEURAL,
+    "clod": (*_DENSITY, "max_threshold"),
+    "matryoshka": (*_DENSITY, "max_threshold", "levels", "level_ratio", "drawn"),  # levels are prefixes
+}
+"""Parameters that have no effect on the training of preset *paper*."""
+CONSTANTS = [
+    (adam.EPS, 1e-15, "3DGS program: Adam's eps"),
+    (density_control.RESET_OPACITY, 0.01, "3DGS program: reset_opacity"),
+    (density_control.OVERSIZED_PIXELS, 20, "3DGS program: size_threshold"),
+    (density_control.OVERSIZED_EXTENT, 0.1, "3DGS program: 0.1 * extent"),
+    (splat_method.PRUNE_AT, (8 / 30, 16 / 30, 24 / 30), "LODGE, A.2: 8,000, 16,000 and 24,000 of 30,000"),
+    (lodge.ROUNDS, (0.2, 0.6, 1.0), "LODGE, A.2: 0.2, 0.6 and 1 times gamma"),
+    (networks.HIDDEN, 32, "Octree-GS program: one hidden layer of feat_dim"),
+    (decay.EPSILON, 1e-8, "CLoD-GS, Eq. 2: not published"),
+    (view_order.BLOCK, 128, "A LoD of Gaussians, Sec. 4.4"),
+    (view_order.NEIGHBORS, 100, "A LoD of Gaussians program: k"),
+    (cut_cache.FLUSH_INTERVAL, 1000, "A LoD of Gaussians, Sec. 4.4"),
+    (cut_cache.REUSE, (0.77, 2.0), "A LoD of Gaussians program: D_min, D_max"),
+]
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
@@ -226,6 +287,17 @@ def test_paper_presets_have_published_numbers(name):
     paper = method_info(name).preset("paper")
     for parameter, (value, source) in PUBLISHED[name].items():
         assert getattr(paper, parameter) == pytest.approx(value), f"{parameter}: {source}"
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_every_parameter_of_presets_paper_has_a_source(name):
+    used = [f.name for f in method_info(name).fields if f.name not in NO_EFFECT[name]]
+    assert set(used) <= set(PUBLISHED[name])
+
+
+@pytest.mark.parametrize(("constant", "value", "source"), CONSTANTS)
+def test_constants_have_published_numbers(constant, value, source):
+    assert constant == pytest.approx(value), source
 
 
 @pytest.fixture
@@ -397,3 +469,58 @@ def test_coarse_stage_of_a_lod_of_gaussians_has_no_density_control(data, events)
     method = create("tree", data, paper, seed=0, backend="cpu")
     assert method.steps == 60_001 and method.finest_steps == 60_000
     assert events(method) == {}
+
+
+def test_steps_of_the_tree(data, monkeypatch):
+    """A LoD of Gaussians: density control every 1,000 steps, in 85 % of the steps on cuts."""
+    method = create("tree", data, method_info("tree").preset("paper"), seed=0, backend="cpu")
+    assert method.steps == 60_000 + 1 + 150_000
+    method.store, grown = SimpleNamespace(cache=SimpleNamespace(end_step=lambda _: None)), []
+    monkeypatch.setattr(method, "_rebuild_store", grown.append)
+    for step in range(method.finest_steps + 100, method.steps, 100):
+        method.control_density(step)
+    assert grown == list(range(1000, 127_501, 1000))
+
+
+def test_steps_of_lodge_levels(data, monkeypatch):
+    """LODGE, A.2: a level is pruned three times, each time before 1,000 steps of tuning."""
+    paper = replace(method_info("lodge").preset("paper"), steps=3)
+    method = create("lodge", data, paper, seed=0, backend="cpu")
+    begun, pruned = [], []
+    monkeypatch.setattr(method, "_begin_level", begun.append)
+    monkeypatch.setattr(method, "begin_round", pruned.append)
+    for step in range(method.steps):
+        method.begin_step(step)
+    assert begun == [2, 1]
+    assert pruned == [3, 1003, 2003, 3003, 4003, 5003] and method.steps == 6003
+
+
+def test_decay_of_clod_gs_begins_at_step_5000(data):
+    method = create("clod", data, method_info("clod").preset("paper"), seed=0, backend="cpu")
+    assert method.decay_start == 5000  # CLoD-GS, Sec. 4.1
+
+
+def test_learning_rates_of_flod_levels(data):
+    """FLoD program: training_setup at each level, position_lr_max_steps = 30,000; 3DGS's rates otherwise."""
+    paper = method_info("flod").preset("paper")
+    method, begin = create("flod", data, paper, seed=0, backend="cpu"), 0
+    for steps in paper.steps:
+        for step in (0, 3000, steps - 1):
+            method.set_learning_rates(begin + step)
+            expected = 1.6e-4 * 0.01 ** (step / 30_000) * data.extent
+            assert method.model.lr["means"] == pytest.approx(expected)
+        begin += steps
+
+
+@pytest.mark.parametrize(("step", "progress"), [(0, 0), (20_000, 0.5), (40_000, 1)])
+def test_learning_rates_of_neural_anchors(data, step, progress):
+    """Octree-GS program: rates of 40,000 iterations. The color network's ends at 5e-5 there."""
+    method = create("octree_neural", data, method_info("octree_neural").preset("paper"), 0, "cpu")
+    method.set_learning_rates(step)
+    fall = 0.01**progress
+    offsets = 0.01 * fall * data.extent
+    constant = {"means": 0.0, "features": 0.0075, "log_scales": 0.007}
+    assert method.model.adam.lr == pytest.approx(constant | {"offsets": offsets})
+    rates = {"opacity": 0.002 * fall, "covariance": 0.004, "color": 0.008 * fall, "appearance": 0.05 * fall}
+    optimizer = method.extra_optimizers[0]
+    assert {name.split(".")[0]: optimizer.lr[name] for name in optimizer.tensors} == pytest.approx(rates)
