@@ -92,6 +92,17 @@ def test_frames_of_lodge_must_be_faster():
     assert not holds and text == "1.0, 1.0, 0.9, 1.0 times as fast"
 
 
+def test_levels_of_lodge_start_from_its_own_base(tiny_scene, tmp_path):
+    """LODGE, Table 3: the full representation includes importance pruning (A.2)."""
+    paper = load_paper("lodge")
+    base, *others = make_jobs(
+        paper, list(paper.trainings), ReducedJobs(tiny_scene, "paper", 0.1, {}), tmp_path
+    )
+    p = base.resolved_parameters()
+    assert (base.method, p.levels, p.least_weight, p.densify_by) == ("lodge", 1, 0.02, "max")
+    assert {job.base for job in others} == {base.out}
+
+
 def test_tables_are_chosen_by_number_or_name():
     paper = load_paper("clod")
     assert [table.name for table in chosen_tables(paper, ["2", "Figure 3"])] == ["Table 2", "Figure 3"]

@@ -44,7 +44,7 @@ def _loses_little(value: Value) -> tuple[bool, str]:
 PAPER = Paper(
     title="LODGE: Level-of-Detail Large-Scale Gaussian Splatting with Efficient Rendering",
     trainings={
-        _BASE: Training("3dgs"),
+        _BASE: Training("lodge", {"levels": 1}),  # with pruning by weight, without levels (Table 3)
         **{
             _label(count): Training("lodge", {"levels": count + 1, "chunks": 1}, base=_BASE)
             for count in _DISTANCES
