@@ -179,6 +179,7 @@ PAPER = Paper(
     missing=(
         "Table 1: Hierarchical-3DGS and Octree-3DGS are not trained. Table 3: memory of the networks. "
         "Table 4: memory.",
+        "Mip-Splatting has its 2D filter only. Scaffold-GS is neural Octree-GS with one level.",
         "Table 7: it needs a laptop with a graphics card. Table 8: its methods are not part of LODGS.",
     ),
 )  # fmt: skip

@@ -99,6 +99,7 @@ PAPER = Paper(
         ),
     ),
     missing=(
+        "Mip-Splatting has its 2D filter only. Scaffold-GS is neural Octree-GS with one level.",
         "Table 2: results are not split by altitude; lodgs evaluate --far counts splats from 2, 4 and 8 "
         "times the distance. Table 3: speed on camera paths.",
         "Table 4: training on several image sizes. Ours trains at one, and PSNR of baked levels is measured.",
