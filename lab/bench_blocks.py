@@ -25,7 +25,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from training.runs.blocks.plan import BLOCK, COARSE, read_plan  # noqa: E402
+from training.runs.cells.plan import CELL, COARSE, read_plan  # noqa: E402
 from training.runs.folder import RunFolder  # noqa: E402
 
 ON = ("here", "local:1", "local:2")
@@ -133,7 +133,7 @@ def plot(path: Path, rows: Sequence[dict]) -> None:
     from matplotlib import pyplot
 
     base = next(row for row in rows if row["on"] == "here")
-    count, counts = len(base["parts_s"][BLOCK]), range(1, MAX_WORKERS + 1)
+    count, counts = len(base["parts_s"][CELL]), range(1, MAX_WORKERS + 1)
     figure, axes = pyplot.subplots(figsize=(7, 4))
     for times, style in ((1, "-"), (-(-MAX_WORKERS // count), "--")):
         single = model(base, 1, times)

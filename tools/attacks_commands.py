@@ -46,7 +46,7 @@ from tools.small_disk import DISK_FULL_MESSAGES, contents, disk_usage, small_dis
 from training import __main__  # noqa: E402
 from training.errors import LodgsError  # noqa: E402
 from training.rasterize import warm_up  # noqa: E402
-from training.runs.blocks import workers  # noqa: E402
+from training.runs.cells import workers  # noqa: E402
 from training.runs.page.write import VIEWER  # noqa: E402
 from training.splats.gaussians import Splats  # noqa: E402
 from training.splats.ply import read_ply, write_ply  # noqa: E402

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import bpy
 import numpy as np
 
-from ...training.runs.blocks.plan import PlannedCell, choose_cells, plan, read_planned_scene
+from ...training.runs.cells.plan import PlannedCell, choose_cells, plan, read_planned_scene
 from ...training.runs.job import Job
 from ...training.scenes.colmap import Scene
 from ...training.scenes.regions import Region

@@ -147,7 +147,7 @@ def cancel(root: bpy.types.Object) -> None:
             watch.process.kill()
         else:
             watch.folder.kill()
-        for number in {block["block"] for block in watch.blocks}:
+        for number in {part["block"] for part in watch.parts}:
             part = watch.part(number)
             with suppress(LodgsError, OSError):
                 if part is not None:
@@ -222,7 +222,7 @@ def attach(root: bpy.types.Object, folder: str, *, reload: bool = True) -> Watch
         root.lodgs.training.read = 0
     link_run(root, run)
     watch = start_watching(Watch(run, root.session_uid, offset=root.lodgs.training.read))
-    if watch.blocks and not root.lodgs.training.planned_for:
+    if watch.parts and not root.lodgs.training.planned_for:
         cells.resize_cells(root.lodgs.training, watch.cells)
     return watch
 

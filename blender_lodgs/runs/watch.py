@@ -39,8 +39,8 @@ class RunPart:
     Attributes:
         folder: run folder of the part.
         number: number of the cell, or 0 for the coarse levels.
-        kind: current kind of training, one of ``BLOCK_KINDS`` of ``progress`` events.
-        state: one of ``BLOCK_STATES``, or ``stopped`` if the run was stopped during this part.
+        kind: current kind of training, one of ``PART_KINDS`` of ``progress`` events.
+        state: one of ``PART_STATES``, or ``stopped`` if the run was stopped during this part.
         fraction: progress including border steps, 0 to 1.
     """
 
@@ -64,7 +64,7 @@ class Watch:
         fraction: progress of the current step, 0 to 1.
         problem: reason of a failure with its remedy. Empty otherwise.
         progress: newest ``progress`` event.
-        blocks: state of each part of a scene in cells, from ``progress`` events. See :meth:`part`.
+        parts: state of each part of a scene in cells, from ``progress`` events. See :meth:`part`.
         levels: newest ``level`` event of each level.
         summary: ``done`` event of a finished run, with its quality.
         warnings: warnings of the run.
@@ -85,7 +85,7 @@ class Watch:
     fraction: float = 0.0
     problem: str = ""
     progress: dict = field(default_factory=dict)
-    blocks: list[dict] = field(default_factory=list)
+    parts: list[dict] = field(default_factory=list)
     levels: dict[int, dict] = field(default_factory=dict)
     summary: dict = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
@@ -109,19 +109,19 @@ class Watch:
     @property
     def cells(self) -> int:
         """Return the number of cells, or 0 if the run has not reported it yet."""
-        return sum(block["kind"] == "block" for block in self.blocks)
+        return sum(part["kind"] == "block" for part in self.parts)
 
     def part(self, number: int) -> RunPart | None:
         """Return the current or last training of a cell, or of the coarse levels (number 0).
 
         None if the run has not reported this part.
         """
-        blocks = [block for block in self.blocks if block["block"] == number]
-        if not blocks:
+        parts = [part for part in self.parts if part["block"] == number]
+        if not parts:
             return None
-        current = next((block for block in blocks if block["state"] != "done"), blocks[-1])
+        current = next((part for part in parts if part["state"] != "done"), parts[-1])
         state = "stopped" if current["state"] == "running" and not self.running else current["state"]
-        fraction = sum(block["step"] for block in blocks) / max(sum(block["of"] for block in blocks), 1)
+        fraction = sum(part["step"] for part in parts) / max(sum(part["of"] for part in parts), 1)
         run = self.folder
         paths = {"coarse": run.coarse, "block": run.blocks / str(number), "seam": run.seams / str(number)}
         path = paths[current["kind"]]
@@ -194,12 +194,12 @@ class Watch:
                 self.message = event["message"]
                 self.fraction = _fraction(event)
             case "progress":
-                event = _with_blocks(event, self.blocks)
+                event = _with_parts(event, self.parts)
                 self.progress = event
                 self.message = event.get("stage", "").capitalize()
                 self.fraction = _fraction(event)
                 if "blocks" in event:
-                    self._set_blocks(root, event["blocks"])
+                    self._set_parts(root, event["blocks"])
             case "warning":
                 self.warnings.append(event["message"])
             case "level":
@@ -208,10 +208,10 @@ class Watch:
                 self.summary = event
                 self._finish(root)
 
-    def _set_blocks(self, root: bpy.types.Object, blocks: list[dict]) -> None:
-        self.blocks = blocks
+    def _set_parts(self, root: bpy.types.Object, parts: list[dict]) -> None:
+        self.parts = parts
         self.stopping &= {
-            (block["kind"], block["block"]) for block in blocks if block["state"] in ("waiting", "running")
+            (part["kind"], part["block"]) for part in parts if part["state"] in ("waiting", "running")
         }
         cells.resize_cells(root.lodgs.training, self.cells)
 
@@ -306,17 +306,17 @@ def watch_of(root: bpy.types.Object | None) -> Watch | None:
     return None if root is None else watches.get(root.session_uid)
 
 
-def _with_blocks(event: dict, blocks: list[dict]) -> dict:
+def _with_parts(event: dict, parts: list[dict]) -> dict:
     """Add the last known state of each part to a ``progress`` event without it."""
-    return {"blocks": blocks, **event} if blocks else event
+    return {"blocks": parts, **event} if parts else event
 
 
 def start_watching(watch: Watch) -> Watch:
     """Register a watch for its root, with the progress, levels and summary from past events."""
     for event in watch.folder.events()[0]:
         if event["event"] == "progress":
-            watch.progress = _with_blocks(event, watch.blocks)
-            watch.blocks = watch.progress.get("blocks", watch.blocks)
+            watch.progress = _with_parts(event, watch.parts)
+            watch.parts = watch.progress.get("blocks", watch.parts)
         elif event["event"] == "level":
             watch.levels[event["level"]] = event
         elif event["event"] == "done":

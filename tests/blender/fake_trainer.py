@@ -172,30 +172,29 @@ class Cell:
 
 
 def train_cells(job: Job, folder: RunFolder, emit: EventWriter, options: list[str]) -> bool:
-    """Train cells like ``train_blocks``; return True if all are done."""
+    """Train cells as ``lodgs train`` does; return True if all are done."""
     print(*options, file=sys.stderr)  # for the log
     columns, rows = job.grid
-    blocks = [Cell(n, RunFolder(folder.blocks / str(n))) for n in range(1, columns * rows + 1)]
-    for block in blocks:
-        block.folder.path.mkdir(parents=True, exist_ok=True)
-        block.folder.take_cancel()
-    if resumed := [block for block in blocks if block.folder.take_resume()]:
-        for block in blocks:
-            block.state = "running" if block in resumed else "cancelled"
-    while any(block.state == "running" for block in blocks):
+    cells = [Cell(n, RunFolder(folder.blocks / str(n))) for n in range(1, columns * rows + 1)]
+    for cell in cells:
+        cell.folder.path.mkdir(parents=True, exist_ok=True)
+        cell.folder.take_cancel()
+    if resumed := [cell for cell in cells if cell.folder.take_resume()]:
+        for cell in cells:
+            cell.state = "running" if cell in resumed else "cancelled"
+    while any(cell.state == "running" for cell in cells):
         if folder.take_cancel():
             return False
-        for block in blocks:
-            block.update(STEPS if (folder.path / "go on").exists() else STEPS // 2)
+        for cell in cells:
+            cell.update(STEPS if (folder.path / "go on").exists() else STEPS // 2)
         states = [
-            {"block": b.number, "kind": "block", "state": b.state, "step": b.step, "of": STEPS}
-            for b in blocks
+            {"block": b.number, "kind": "block", "state": b.state, "step": b.step, "of": STEPS} for b in cells
         ]
-        emit("progress", stage="training blocks", level=1, levels=1, step=sum(b.step for b in blocks),
-            of=STEPS * len(blocks), loss=0.5, psnr=20.0, splats=5, steps_per_s=20.0, eta_s=60.0,
+        emit("progress", stage="training cells", level=1, levels=1, step=sum(b.step for b in cells),
+            of=STEPS * len(cells), loss=0.5, psnr=20.0, splats=5, steps_per_s=20.0, eta_s=60.0,
             blocks=states)  # fmt: skip
         time.sleep(0.02)
-    return all(block.state == "done" for block in blocks)
+    return all(cell.state == "done" for cell in cells)
 
 
 def train_tree(folder: RunFolder, emit: EventWriter) -> int:

@@ -312,7 +312,7 @@ def test_cells_are_trained_by_one_command(bpy, lodgs, lodgs_command, fake, tmp_p
     (run / "go on").touch()
     command = ["train", "--scene", SCENE, "--cells", "2x1", "--out", run, "--blend", blend]
     assert lodgs_command(*command) == 0
-    assert "Training blocks" in capfd.readouterr().err.splitlines()
+    assert "Training cells" in capfd.readouterr().err.splitlines()
     assert lodgs("training.runs.job").Job.from_file(run / "job.toml").cells == "2x1"
     bpy.ops.wm.open_mainfile(filepath=str(blend))
     (root,) = [obj for obj in bpy.data.objects if obj.lodgs.is_root]

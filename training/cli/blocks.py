@@ -78,7 +78,7 @@ def run(options: argparse.Namespace) -> int:
             return _plan(options)
         case "run":
             return _train(options)
-    from ..runs.blocks import cluster
+    from ..runs.cells import cluster
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     if options.action == "scheduler":
@@ -89,7 +89,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _plan(options: argparse.Namespace) -> int:
-    from ..runs.blocks.plan import choose_cells, plan, plan_table, read_planned_scene, write_plan
+    from ..runs.cells.plan import choose_cells, plan, plan_table, read_planned_scene, write_plan
     from ..runs.folder import RunFolder
     from ..runs.job import save_job
 
@@ -130,8 +130,8 @@ def _ensure_points(scene: Scene, job: Job, folder: RunFolder) -> Scene:
 
 
 def _train(options: argparse.Namespace) -> int:
-    from ..runs.blocks.plan import read_plan, read_planned_job
-    from ..runs.blocks.train import prepare_part
+    from ..runs.cells.plan import read_plan, read_planned_job
+    from ..runs.cells.train import prepare_part
     from ..runs.folder import RunFolder
 
     if not options.only:

@@ -52,7 +52,7 @@ def training_data(
     """Read the job's scene; capture and undistort it first where needed, once per scene.
 
     For a scene in cells, units and held-out views come from the model as read, regardless of undecodable
-    photos, so that they are the same in all blocks and in the merged result.
+    photos, so that they are the same in all cells and in the merged result.
 
     Args:
         job: the job.

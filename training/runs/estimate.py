@@ -24,7 +24,7 @@ from ..scenes.check import ESTIMATE, Finding
 from ..scenes.colmap import Scene, read_scene
 from ..scenes.triangulate import cached_points
 from .backend import choose_backend
-from .blocks.plan import PROGRAM_BYTES, SPLAT_BYTES, choose_cells
+from .cells.plan import PROGRAM_BYTES, SPLAT_BYTES, choose_cells
 from .job import Job
 
 ASSUMED_SPLATS = 1_000_000

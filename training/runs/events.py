@@ -30,9 +30,9 @@ PROTOCOL = 1
 MAX_BYTES, MAX_LINE, MAX_EVENTS = 1 << 26, 1 << 18, 300_000
 """Limits of file size, line length and number of events; a month of training stays below them."""
 
-BLOCK_KINDS = ("coarse", "block", "seam")
+PART_KINDS = ("coarse", "block", "seam")
 """Parts of a scene in cells: coarse levels of the full scene, a cell, the borders of a cell."""
-BLOCK_STATES = ("waiting", "running", "done", "cancelled", "failed")
+PART_STATES = ("waiting", "running", "done", "cancelled", "failed")
 """Training states of a part."""
 
 _MAX_TEXT, _MAX_NUMBER, _MAX_DEPTH = 10_000, 1e30, 8
@@ -143,14 +143,14 @@ def _is_cause(value: object) -> bool:
     return isinstance(value, str) and value in ERROR_CAUSES
 
 
-def _are_blocks(value: object) -> bool:
-    """Return whether a value is the list of block states of a ``progress`` event."""
+def _are_parts(value: object) -> bool:
+    """Return whether a value is the list of part states of a ``progress`` event."""
     return isinstance(value, list) and all(
-        isinstance(block, dict)
-        and block.get("kind") in BLOCK_KINDS
-        and block.get("state") in BLOCK_STATES
-        and all(_is_count(block.get(name)) for name in ("block", "step", "of"))
-        for block in value
+        isinstance(part, dict)
+        and part.get("kind") in PART_KINDS
+        and part.get("state") in PART_STATES
+        and all(_is_count(part.get(name)) for name in ("block", "step", "of"))
+        for part in value
     )
 
 
@@ -219,7 +219,7 @@ _VALUES: dict[str, Callable[[object], bool]] = {
     **dict.fromkeys(("facts", "scene_facts", "controls"), _are_numbers),
     **dict.fromkeys(("path", "bundle"), _is_path),
     "meta": _is_meta,
-    "blocks": _are_blocks,
+    "blocks": _are_parts,
     "cause": _is_cause,
 }
 """Validators by value name; values with other names must be plain JSON (``_is_plain``)."""

@@ -228,7 +228,7 @@ class RunFolder:
         return _take(self._cancel)
 
     def request_resume(self) -> None:
-        """Ask the trainer of a scene in cells to resume this cancelled block."""
+        """Ask the trainer of a scene in cells to resume this cancelled part."""
         self._resume.touch()
 
     def take_resume(self) -> bool:

@@ -44,9 +44,9 @@ from ..splats.ply import BATCH_ROWS, Columns, read_ply, write_ply
 from . import processes
 from .backend import choose_backend, report_backend
 from .base import open_base
-from .blocks.plan import write_plan
-from .blocks.train import BlocksStopped, train_blocks
-from .blocks.workers import workers
+from .cells.plan import write_plan
+from .cells.train import CellsStopped, train_cells
+from .cells.workers import workers
 from .checkpoints import read_newest, remove_checkpoints, write_checkpoint
 from .data import ensure_points, training_data
 from .events import PROTOCOL, EventWriter, event_line
@@ -66,7 +66,7 @@ def train(job: Job, stream: IO[str] | None = None, **placement: Any) -> int:
     Args:
         job: the job. A run folder that contains another job is rejected.
         stream: additional output for events.
-        placement: arguments of ``blocks.workers.workers``, which train the cells of a scene.
+        placement: arguments of ``cells.workers.workers``, which train the cells of a scene.
 
     Returns:
         An exit code. Errors end in an ``error`` event, never in a traceback on the stream.
@@ -106,7 +106,7 @@ def _start_or_resume(job: Job, folder: RunFolder, stream: IO[str] | None, placem
 
 def _final_event(error: BaseException) -> tuple[int, dict]:
     """Return exit code and final event of a training that ends with an exception."""
-    if isinstance(error, BlocksStopped):
+    if isinstance(error, CellsStopped):
         return CANCELLED, {"kind": "cancelled", "message": str(error)}
     if isinstance(error, KeyboardInterrupt) and processes.parent_ended.is_set():
         problem = "Training stopped: the process that started it has ended."
@@ -137,7 +137,7 @@ def _train(job: Job, folder: RunFolder, events: EventWriter, placement: dict[str
                 job, folder, add_points=lambda scene: ensure_points(scene, job, folder, events)
             )
             with workers(**placement) as submit:
-                train_blocks(division, merged, submit, events)
+                train_cells(division, merged, submit, events)
             job = replace(job, base="" if merged_is_result else str(merged))
         events("status", message="Reading the scene")
         data = training_data(job, folder, events, keep_views=True)
@@ -181,7 +181,7 @@ def _report_done(
 def _write_merged_levels(
     folder: RunFolder, events: EventWriter, data: TrainingData, backend: str, started: float
 ) -> None:
-    """Write the levels of merged blocks, with their quality, and finish the run."""
+    """Write the levels of merged cells, with their quality, and finish the run."""
     bundle = open_if_large(folder.bundle) or read_bundle(folder.bundle)
     evaluation = Evaluation(data, backend, bundle.antialias)
     complete = [level.number for level in standalone_levels(bundle)]

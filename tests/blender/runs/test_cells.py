@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.blender.fake_trainer import COUNTS, STEPS
-from training.runs.blocks.plan import plan
+from training.runs.cells.plan import plan
 from training.scenes.colmap import read_scene
 
 pytestmark = pytest.mark.one_blender
@@ -29,13 +29,13 @@ def _wait(watch, until, seconds=200.0):
     end = time.monotonic() + seconds
     while not until():
         assert watch.running, (watch.message, watch.problem)
-        assert time.monotonic() < end, (watch.state, watch.blocks)
+        assert time.monotonic() < end, (watch.state, watch.parts)
         watch.step()
         time.sleep(0.02)
 
 
 def _states(watch):
-    return [block["state"] for block in watch.blocks]
+    return [part["state"] for part in watch.parts]
 
 
 # -- plan --------------------------------------------------------------------------------------------------
@@ -143,7 +143,7 @@ def test_cells_are_trained(bpy, lodgs, jobs, fake, root, tmp_path):
     settings = root.lodgs.training
     watch = jobs.start(root, str(tmp_path / "run"))
     assert lodgs("training.runs.job").Job.from_file(tmp_path / "run" / "job.toml").cells == "2x1"
-    _wait(watch, lambda: [block["step"] for block in watch.blocks] == [STEPS // 2] * 2)
+    _wait(watch, lambda: [part["step"] for part in watch.parts] == [STEPS // 2] * 2)
     assert _states(watch) == ["running"] * 2 and watch.fraction == 0.5
     assert len(settings.planned_cells) == 2, "the list needs them without a plan"
     (tmp_path / "run" / "go on").touch()
@@ -156,7 +156,7 @@ def test_cells_are_trained(bpy, lodgs, jobs, fake, root, tmp_path):
 def test_one_cell_is_cancelled_and_resumed(bpy, jobs, fake, root, tmp_path):
     fake()
     watch = jobs.start(root, str(tmp_path / "run"))
-    _wait(watch, lambda: watch.blocks)
+    _wait(watch, lambda: watch.parts)
     with pytest.raises(RuntimeError, match="Cannot resume cell 2 of 'lantern_garden'"):
         bpy.ops.lodgs.resume_cell(cell=2)
     assert bpy.ops.lodgs.cancel_cell(cell=2) == {"FINISHED"}
@@ -176,7 +176,7 @@ def test_one_cell_is_cancelled_and_resumed(bpy, jobs, fake, root, tmp_path):
 def test_cancelled_run_resumes_one_or_all_cells(bpy, lodgs, jobs, fake, root, tmp_path):
     fake()
     watch = jobs.start(root, str(tmp_path / "run"))
-    _wait(watch, lambda: watch.blocks)
+    _wait(watch, lambda: watch.parts)
     assert bpy.ops.lodgs.cancel_training() == {"FINISHED"}
     jobs.follow(watch)
     assert (watch.state, watch.problem) == ("cancelled", "")
@@ -201,13 +201,13 @@ def test_reopened_file_attaches_to_its_cells(bpy, lodgs, jobs, fake, root, tmp_p
     fake()
     watch = jobs.start(root)
     bpy.ops.wm.save_mainfile()  # before the run has reported its cells
-    _wait(watch, lambda: watch.blocks)
+    _wait(watch, lambda: watch.parts)
     bpy.ops.wm.read_homefile(use_empty=True)
     bpy.ops.wm.open_mainfile(filepath=blend)
     root = bpy.data.objects["lantern_garden"]
     attached = lodgs("runs.watch").watch_of(root)
     assert attached is not watch and attached.running
-    assert attached.process is None and len(attached.blocks) == 2
+    assert attached.process is None and len(attached.parts) == 2
     _wait(attached, lambda: len(root.lodgs.training.planned_cells) == 2)
     jobs.cancel_cell(root, 1)
     _wait(attached, lambda: _states(attached)[0] == "cancelled")
@@ -237,7 +237,7 @@ def test_second_cancel_kills_the_trainers_of_all_cells(lodgs, jobs, fake, root, 
     folder = lodgs("training.runs.folder").RunFolder
     killed = []
     watch = jobs.start(root, str(tmp_path / "run"))
-    _wait(watch, lambda: watch.blocks)
+    _wait(watch, lambda: watch.parts)
     monkeypatch.setattr(folder, "kill", lambda run: killed.append(run.path.name))
     watch.cancel_requested = True
     jobs.cancel(root)

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from tests.training.runs.blocks.conftest import blocks_in_process  # noqa: F401 - a fixture
+from tests.training.runs.cells.conftest import cells_in_process  # noqa: F401 - a fixture
 from training.__main__ import main
 from training.methods import METHODS
 from training.optimize.method_info import PRESETS
 from training.runs import train as training_loop
-from training.runs.blocks.plan import read_plan
+from training.runs.cells.plan import read_plan
 from training.runs.folder import RunFolder
 from training.runs.job import Job
 from training.splats.bundle import read_bundle
@@ -102,7 +102,7 @@ def test_settings_match_methods_and_presets(tmp_path):
     ("method", "steps"),
     [("3dgs", 10), pytest.param("flod", [6, 6, 6, 6, 12], marks=pytest.mark.nightly)],
 )
-@pytest.mark.usefixtures("blocks_in_process")
+@pytest.mark.usefixtures("cells_in_process")
 def test_commands_of_the_tasks_give_the_same_bundle_as_one_run(tiny_scene, tmp_path, method, steps):
     tasks = compiled(
         tmp_path, scene=str(tiny_scene), output=str(tmp_path / "farm"), columns=2, rows=1, method=method,

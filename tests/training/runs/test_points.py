@@ -12,7 +12,7 @@ import pytest
 
 from tests.training.scenes.walls import write_walls
 from training.runs import train as training_loop
-from training.runs.blocks.plan import read_planned_scene
+from training.runs.cells.plan import read_planned_scene
 from training.runs.data import ensure_points
 from training.runs.folder import RunFolder
 from training.runs.job import Job

@@ -1,4 +1,4 @@
-"""Workers that train blocks: this process and Dask clusters."""
+"""Workers that train cells: this process and Dask clusters."""
 
 import os
 import socket
@@ -11,24 +11,24 @@ from pathlib import Path
 import pytest
 
 from training.errors import LodgsError
-from training.runs.blocks import workers as workers_module
-from training.runs.blocks.plan import read_plan, write_plan
-from training.runs.blocks.workers import train_block, workers
+from training.runs.cells import workers as workers_module
+from training.runs.cells.plan import read_plan, write_plan
+from training.runs.cells.workers import train_part, workers
 from training.runs.events import event_line
 from training.runs.folder import RunFolder
 from training.runs.outcome import run_outcome
 from training.runs.train import train
 
 from .conftest import train_in_process
-from .test_blocks import TINY, job_for
+from .test_cells import TINY, job_for
 
 
 @pytest.fixture
-def block(tiny_scene, tmp_path):
+def cell(tiny_scene, tmp_path):
     job = job_for(tiny_scene, tmp_path / "run").resolved()
     folder = RunFolder(job.out)
     folder.create()
-    return write_plan(job, folder).blocks[0].folder
+    return write_plan(job, folder).cells[0].folder
 
 
 @pytest.mark.parametrize(
@@ -55,12 +55,12 @@ def test_unreachable_scheduler_is_reported(monkeypatch):
         pass
 
 
-def test_worker_waits_for_the_trainer_of_a_lost_worker(block, monkeypatch):
+def test_worker_waits_for_the_trainer_of_a_lost_worker(cell, monkeypatch):
     """A run that this trainer cancels is not started again."""
     monkeypatch.setattr(workers_module.time, "sleep", lambda _: stop.set())
     stop = threading.Event()
     started = threading.Event()
-    run = RunFolder(block.path)
+    run = RunFolder(cell.path)
 
     def trainer():
         with run.locked():
@@ -71,28 +71,28 @@ def test_worker_waits_for_the_trainer_of_a_lost_worker(block, monkeypatch):
 
     threading.Thread(target=trainer, daemon=True).start()
     assert started.wait(200)
-    assert train_block(str(block.path)) == 3
-    assert not block.log.exists(), "no other trainer was started"
+    assert train_part(str(cell.path)) == 3
+    assert not cell.log.exists(), "no other trainer was started"
 
 
-def test_cancelled_block_does_not_start(block):
-    block.request_cancel()
-    assert train_block(str(block.path)) == 3
-    assert not block.events_file.exists()
+def test_cancelled_cell_does_not_start(cell):
+    cell.request_cancel()
+    assert train_part(str(cell.path)) == 3
+    assert not cell.events_file.exists()
 
 
-def test_block_whose_log_cannot_be_written_names_its_folder(block):
-    block.log.mkdir()
+def test_cell_whose_log_cannot_be_written_names_its_folder(cell):
+    cell.log.mkdir()
     with pytest.raises(LodgsError, match="Cannot start the trainer of") as error:
-        train_block(str(block.path))
-    assert str(block.log) in error.value.what and "Is a directory" in error.value.what
+        train_part(str(cell.path))
+    assert str(cell.log) in error.value.what and "Is a directory" in error.value.what
 
 
 @pytest.mark.slow
-def test_reason_why_a_trainer_cannot_open_its_block_is_kept(block):
-    block.job.write_text("method = 3dgs")
-    assert train_block(str(block.path)) == 2
-    assert str(block.job) in run_outcome(block, 2)[1]
+def test_reason_why_a_trainer_cannot_open_its_cell_is_kept(cell):
+    cell.job.write_text("method = 3dgs")
+    assert train_part(str(cell.path)) == 2
+    assert str(cell.job) in run_outcome(cell, 2)[1]
 
 
 @pytest.mark.slow
@@ -126,7 +126,7 @@ import os, sys, time
 if "train" in sys.orig_argv:
     folder = os.path.dirname(__file__)
     open(os.path.join(folder, "card-" + os.environ["CUDA_VISIBLE_DEVICES"]), "w").close()
-    end = time.monotonic() + 200  # the other worker takes the second block
+    end = time.monotonic() + 200  # the other worker takes the second cell
     while time.monotonic() < end and sum(name.startswith("card-") for name in os.listdir(folder)) < 2:
         time.sleep(0.05)
     os._exit(0)
@@ -135,16 +135,16 @@ if "train" in sys.orig_argv:
 
 @pytest.fixture
 def cards_used(tmp_path, monkeypatch):
-    """``cards_used(block)`` returns the cards visible to two simulated trainers."""
+    """``cards_used(cell)`` returns the cards visible to two simulated trainers."""
     pytest.importorskip("distributed")
     folder = tmp_path / "stand-in"
     folder.mkdir()
     (folder / "sitecustomize.py").write_text(RECORD_CARD)
     monkeypatch.setenv("PYTHONPATH", str(folder))
 
-    def used(block):
+    def used(cell):
         with workers("local:2") as submit:
-            for pending in [submit(block.path) for _ in range(2)]:
+            for pending in [submit(cell.path) for _ in range(2)]:
                 assert pending.result() == 0
         return {path.name.removeprefix("card-") for path in folder.glob("card-*")}
 
@@ -152,9 +152,9 @@ def cards_used(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_each_local_worker_uses_one_of_the_given_cards(block, cards_used, monkeypatch):
+def test_each_local_worker_uses_one_of_the_given_cards(cell, cards_used, monkeypatch):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3, 5,7")
-    assert cards_used(block) == {"3", "5"}
+    assert cards_used(cell) == {"3", "5"}
 
 
 @pytest.mark.skipif(os.name == "nt", reason="the simulated nvidia-smi is a shell script")
@@ -178,7 +178,7 @@ def test_computer_without_cards(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.nightly
 @pytest.mark.timeout(600)
-def test_external_scheduler_trains_a_block_and_its_loss_is_reported(block, tmp_path, monkeypatch):
+def test_external_scheduler_trains_a_cell_and_its_loss_is_reported(cell, tmp_path, monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.setattr(workers_module, "TIMEOUT_SECONDS", 5)
     key, root = tmp_path / "cluster.pem", Path(workers_module.__file__).parents[3]
@@ -197,13 +197,13 @@ def test_external_scheduler_trains_a_block_and_its_loss_is_reported(block, tmp_p
     worker = command("worker", str(key), "--offers", "GPU=1")
     try:
         with pytest.raises(LodgsError, match="Lost the connection"), workers(str(key), {"GPU": 1}) as submit:
-            assert submit(block.path).result() == 0
-            assert block.state() == "done"
+            assert submit(cell.path).result() == 0
+            assert cell.state() == "done"
             scheduler.kill()
             scheduler.wait()
             deadline = time.monotonic() + 200
             while time.monotonic() < deadline:
-                pending = submit(block.path)
+                pending = submit(cell.path)
                 while not pending.done():
                     time.sleep(0.05)
     finally:

@@ -1,4 +1,4 @@
-"""A short version of the attacks on blocks of ``make attacks``; LODGS_KILLS=10 runs all of them."""
+"""A short version of the attacks on cells of ``make attacks``; LODGS_KILLS=10 runs all of them."""
 
 import os
 import random

@@ -10,9 +10,9 @@ from training.errors import LodgsError
 from training.methods import create
 from training.optimize.parameters import override
 from training.optimize.training_data import TrainingData
-from training.runs.blocks import merge as merge_module
-from training.runs.blocks.merge import merge, write_surroundings
-from training.runs.blocks.plan import SEAM_PARAMETERS, Division, Part
+from training.runs.cells import merge as merge_module
+from training.runs.cells.merge import merge, write_surroundings
+from training.runs.cells.plan import SEAM_PARAMETERS, Division, Part
 from training.runs.folder import RunFolder
 from training.scenes.colmap import read_scene
 from training.scenes.regions import Region
@@ -21,32 +21,32 @@ from training.splats.gaussians import Splats
 from training.splats.levels import Bundle, Level
 from training.splats.ply import read_ply
 
-from .test_blocks import finished, random_splats
+from .test_cells import finished, random_splats
 
 FAR = 1e9
 
 
 def divided(folder, rng, counts=(20, 50), **header) -> tuple[Division, list[list[Splats]]]:
-    """Three blocks in a row with borders at -0.3 and 0.4, enlarged by 0.1, and their untrained seams."""
+    """Three cells in a row with borders at -0.3 and 0.4, enlarged by 0.1, and their untrained seams."""
     sets = [[random_splats(rng, n) for n in counts] for _ in range(3)]
     borders = [-np.inf, -0.3, 0.4, np.inf]
-    blocks, seams = [], []
+    cells, seams = [], []
     for number, levels in enumerate(sets, 1):
-        block = finished(folder, number, (0, 1), levels, **header)
-        cell = np.array([borders[number - 1 : number + 1], [-np.inf, np.inf]])
-        region = Region(np.eye(3), cell, cell + 0.1 * np.array([[-1, 1], [0, 0]]), ("a", "b"))
-        blocks.append(replace(block, region=region))
+        cell = finished(folder, number, (0, 1), levels, **header)
+        limits = np.array([borders[number - 1 : number + 1], [-np.inf, np.inf]])
+        region = Region(np.eye(3), limits, limits + 0.1 * np.array([[-1, 1], [0, 0]]), ("a", "b"))
+        cells.append(replace(cell, region=region))
         run = RunFolder(folder / "seams" / str(number))
         run.create()
         seams.append(Part(number, run, replace(region, seam=True)))
-    return Division(None, blocks, seams), sets
+    return Division(None, cells, seams), sets
 
 
 def x_of(splats: Splats) -> np.ndarray:
     return splats.means[:, 0]
 
 
-def test_base_of_a_seam_has_its_cell_its_neighbours_and_distant_splats_of_its_block(tmp_path, monkeypatch):
+def test_base_of_a_seam_has_its_cell_its_neighbours_and_distant_splats_of_its_cell(tmp_path, monkeypatch):
     monkeypatch.setattr(merge_module, "BATCH_ROWS", 7)
     division, sets = divided(tmp_path, np.random.default_rng(0))
     write_surroundings(division, division.seams[1])
@@ -64,7 +64,7 @@ def test_base_of_a_seam_has_its_cell_its_neighbours_and_distant_splats_of_its_bl
     for name in ("means", "sh", "log_scales"):
         np.testing.assert_array_equal(getattr(base, name), getattr(expected, name))
     content = division.seams[1].folder.base.read_bytes()
-    division.blocks[0].folder.bundle.unlink()
+    division.cells[0].folder.bundle.unlink()
     write_surroundings(division, division.seams[1])
     assert division.seams[1].folder.base.read_bytes() == content, "an existing base is kept"
 
@@ -74,11 +74,11 @@ def test_base_of_a_seam_has_all_cumulative_levels(tmp_path):
         tmp_path, np.random.default_rng(0), method="octree", rule="octree", cumulative=True
     )
     write_surroundings(division, division.seams[0])
-    block_splats = Splats.concatenated(sets[0])
+    cell_splats = Splats.concatenated(sets[0])
     base = read_ply(division.seams[0].folder.base)
     np.testing.assert_array_equal(
-        base.means[np.isin(base.means, block_splats.means).all(1)],
-        block_splats.means[(x_of(block_splats) < -0.3) | (x_of(block_splats) >= -0.2)],
+        base.means[np.isin(base.means, cell_splats.means).all(1)],
+        cell_splats.means[(x_of(cell_splats) < -0.3) | (x_of(cell_splats) >= -0.2)],
     )
 
 
@@ -117,7 +117,7 @@ def test_merge_takes_only_colours_and_opacities_near_borders_from_seams(tmp_path
     assert count > 5
 
 
-def test_seam_trained_from_other_blocks_is_rejected(tmp_path):
+def test_seam_trained_from_other_cells_is_rejected(tmp_path):
     division, _ = divided(tmp_path, np.random.default_rng(0))
     for seam in division.seams:
         write_bundle(
@@ -131,18 +131,18 @@ def test_seam_trained_from_other_blocks_is_rejected(tmp_path):
 def test_missing_levels_come_from_the_coarse_part(tmp_path):
     rng = np.random.default_rng(1)
     division, sets = divided(tmp_path, rng)
-    for block, levels_of_block in zip(division.blocks, sets, strict=True):
+    for cell, levels_of_cell in zip(division.cells, sets, strict=True):
         levels = [
             Level(number, splats, {"s_min": 1 / number})
-            for number, splats in zip((2, 3), levels_of_block, strict=True)
+            for number, splats in zip((2, 3), levels_of_cell, strict=True)
         ]
-        write_bundle(block.folder.bundle, Bundle("flod", levels, "bands"))
+        write_bundle(cell.folder.bundle, Bundle("flod", levels, "bands"))
     coarse = RunFolder(tmp_path / "coarse")
     coarse.create()
     two = [random_splats(rng, 9), random_splats(rng, 11)]
     levels = [Level(number, splats, {"s_min": 7.0 / number}) for number, splats in enumerate(two, 1)]
     write_bundle(coarse.bundle, Bundle("flod", levels, "bands"))
-    merge(Division(Part(0, coarse, None), division.blocks, []), tmp_path / "merged.ply")
+    merge(Division(Part(0, coarse, None), division.cells, []), tmp_path / "merged.ply")
     merged = read_bundle(tmp_path / "merged.ply")
     assert [(level.number, level.facts["s_min"]) for level in merged.levels] == [
         (1, 7.0),

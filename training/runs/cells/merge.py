@@ -1,6 +1,6 @@
-"""Merge trained blocks, one batch of splats in memory at a time.
+"""Merge trained cells, one batch of splats in memory at a time.
 
-The result is the bundle of all blocks, or the base from which a seam's training starts.
+The result is the bundle of all cells, or the base from which a seam's training starts.
 """
 
 from __future__ import annotations
@@ -28,35 +28,35 @@ from .plan import Division, Part
 def merge(division: Division, path: Path) -> list[tuple[int, int]]:
     """Write the merged bundle of all parts.
 
-    Each level takes from each block the splats inside its cell. At full detail, their colours and opacities
-    come from the block's seam. Levels that no block has come from the coarse part.
+    Each level takes from each cell's part the splats inside the cell. At full detail, their colours and
+    opacities come from the cell's seam. Levels that no cell has come from the coarse part.
 
     Args:
         division: plan whose parts are all finished.
         path: bundle to write. Temporary files of the same size are created next to it.
 
     Returns:
-        For each block the number of splats inside its cell, and of all its splats.
+        For each cell the number of splats inside it, and of all splats of its part.
 
     Raises:
         LodgsError: a part is not finished, parts do not belong together, or the disk is full.
     """
-    opened = [open_bundle(block.folder.bundle) for block in division.blocks]
+    opened = [open_bundle(cell.folder.bundle) for cell in division.cells]
     first = opened[0][0]
-    for block, bundle in zip(division.blocks, opened, strict=True):
-        _check_compatible(block, bundle, first)
+    for cell, bundle in zip(division.cells, opened, strict=True):
+        _check_compatible(cell, bundle, first)
     facts = {level.number: level.facts for head, _ in opened for level in head.levels}
     seams = {seam.number: seam for seam in division.seams}
     counts = []
     with ExitStack() as stack:
         levels = {number: stack.enter_context(ScratchFile(path.parent)) for number in sorted(facts)}
-        for block, (head, rows) in zip(division.blocks, opened, strict=True):
-            assert block.region is not None
-            fitted = _FittedBorder(seams[block.number]) if block.number in seams else None
+        for cell, (head, rows) in zip(division.cells, opened, strict=True):
+            assert cell.region is not None
+            fitted = _FittedBorder(seams[cell.number]) if cell.number in seams else None
             detail = {level.number for level in head.drawn_levels(max(rows))}
             previous = sum(map(len, levels.values()))
             for number in sorted(rows):
-                for splats in _inside(rows[number], block.region):
+                for splats in _inside(rows[number], cell.region):
                     if fitted is not None and number in detail:
                         splats = fitted.fit(splats)
                     levels[number].append(splats)
@@ -76,11 +76,11 @@ def merge(division: Division, path: Path) -> list[tuple[int, int]]:
 def write_surroundings(division: Division, seam: Part) -> None:
     """Write the base of a seam's training unless it exists.
 
-    The base has the splats of full detail: inside the enlarged cell those of each block within its own cell,
-    outside of it those of the seam's own block.
+    The base has the splats of full detail: inside the enlarged cell those that each cell's part has within
+    its own cell, outside of it those of the seam's own cell.
 
     Raises:
-        LodgsError: a required block is not finished, or the disk is full.
+        LodgsError: a required cell is not finished, or the disk is full.
     """
     path = seam.folder.base
     if path.exists():
@@ -88,24 +88,24 @@ def write_surroundings(division: Division, seam: Part) -> None:
     assert seam.region is not None
     with ScratchFile(path.parent) as base:
         meta = {}
-        for block in division.blocks:
-            assert block.region is not None
-            if not seam.region.overlaps(block.region):
+        for cell in division.cells:
+            assert cell.region is not None
+            if not seam.region.overlaps(cell.region):
                 continue
-            head, rows = open_bundle(block.folder.bundle)
+            head, rows = open_bundle(cell.folder.bundle)
             meta |= head.meta
             for level in head.drawn_levels(max(rows)):
                 for splats in _batches(rows[level.number]):
                     nearby = seam.region.in_enlarged_cell(splats.means)
-                    selected = nearby & block.region.contains(splats.means)
-                    if block.number == seam.number:
+                    selected = nearby & cell.region.contains(splats.means)
+                    if cell.number == seam.number:
                         selected |= ~nearby
                     base.append(replace(splats.select(selected), extras={}))
         write_ply(path, base, comments_from_meta(meta))
 
 
 class _FittedBorder:
-    """Splats near a cell's borders as trained by its seam, in the order of the block."""
+    """Splats near a cell's borders as trained by its seam, in the order of the cell's part."""
 
     def __init__(self, seam: Part) -> None:
         assert seam.region is not None
@@ -142,16 +142,16 @@ def _batches(rows: FileRows) -> Iterator[Splats]:
         yield drop_undrawable(rows.select(slice(start, start + BATCH_ROWS)), rows.path)
 
 
-def _check_compatible(block: Part, bundle: tuple[Bundle, Mapping[int, FileRows]], first: Bundle) -> None:
+def _check_compatible(part: Part, bundle: tuple[Bundle, Mapping[int, FileRows]], first: Bundle) -> None:
     head, rows = bundle
     if not rows or _kind(head) != _kind(first):
         raise LodgsError(
-            f"Cannot merge {block.folder.path}: its method, rule, facts or local origin differ from those of "
+            f"Cannot merge {part.folder.path}: its method, rule, facts or local origin differ from those of "
             "other cells.",
             "Train all cells with the jobs of the same plan.",
         )
 
 
 def _kind(head: Bundle) -> tuple:
-    """Return the parts of a header that all blocks share."""
+    """Return the parts of a header that all parts share."""
     return head.method, head.rule, head.facts, head.origin.tolist()

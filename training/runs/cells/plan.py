@@ -33,8 +33,9 @@ from ..folder import RunFolder
 from ..job import MAX_CELLS, Job
 
 REGION = "region.json"
-COARSE, BLOCK, SEAM = "coarse", "block", "seam"
-"""Kinds of parts: coarse levels of the full scene, a cell, and a cell whose borders are fitted."""
+COARSE, CELL, SEAM = "coarse", "block", "seam"
+"""Kinds of parts: coarse levels of the full scene, a cell, and a cell whose borders are fitted. Files, events
+and commands call a cell a block."""
 SEAM_METHOD = "3dgs"
 """Method that fits a cell's borders. At full detail, the splats of all methods are plain 3DGS splats."""
 SEAM_PARAMETERS = {
@@ -68,14 +69,14 @@ class Part:
 
     @property
     def kind(self) -> str:
-        """COARSE, BLOCK or SEAM."""
-        return COARSE if self.region is None else SEAM if self.region.seam else BLOCK
+        """COARSE, CELL or SEAM."""
+        return COARSE if self.region is None else SEAM if self.region.seam else CELL
 
     @property
     def name(self) -> str:
         """Name for messages."""
         cell = f"cell {self.number}"
-        return {COARSE: "coarse levels", BLOCK: cell, SEAM: f"border of {cell}"}[self.kind]
+        return {COARSE: "coarse levels", CELL: cell, SEAM: f"border of {cell}"}[self.kind]
 
     @cached_property
     def job(self) -> Job:
@@ -88,19 +89,19 @@ class Division:
     """Parts of a divided run, in stages that are trained one after the other.
 
     Attributes:
-        coarse: coarse levels of the full scene; None if the blocks train all levels.
-        blocks: one block per cell, by number.
+        coarse: coarse levels of the full scene; None if the cells train all levels.
+        cells: one part per cell, by number.
         seams: parts that fit the borders of cells; empty without polishing.
     """
 
     coarse: Part | None
-    blocks: list[Part]
+    cells: list[Part]
     seams: list[Part]
 
     @property
     def stages(self) -> list[list[Part]]:
         """Parts that can be trained in parallel, stage by stage."""
-        return [[self.coarse] if self.coarse else [], self.blocks, self.seams]
+        return [[self.coarse] if self.coarse else [], self.cells, self.seams]
 
     def part(self, name: str) -> Part | None:
         """Return the part ``coarse``, ``block-3`` or ``seam-3``; None if this division does not need it.
@@ -109,8 +110,8 @@ class Division:
             LodgsError: the name is not a part's.
         """
         kind, _, number = name.partition("-")
-        numbers = [str(block.number) for block in self.blocks]
-        if name != COARSE and not (kind in (BLOCK, SEAM) and number in numbers):
+        numbers = [str(cell.number) for cell in self.cells]
+        if name != COARSE and not (kind in (CELL, SEAM) and number in numbers):
             last = numbers[-1]
             raise LodgsError(
                 f"Unknown part '{name}'.",
@@ -167,7 +168,7 @@ def read_planned_scene(job: Job, add_points: Callable[[Scene], Scene] = cached_p
 def plan(job: Job, scene: Scene | None = None) -> list[PlannedCell]:
     """Divide a job's scene into cells and estimate the cost of each; write nothing.
 
-    A block's steps are proportional to its views, so that every view is used as often as in a single run; its
+    A cell's steps are proportional to its views, so that every view is used as often as in a single run; its
     splats are proportional to its points.
 
     Args:
@@ -198,18 +199,20 @@ def plan(job: Job, scene: Scene | None = None) -> list[PlannedCell]:
         steps: Any = _scaled(undivided.steps, share)  # a tuple in FLoD
         parameters = replace(undivided, steps=steps, max_splats=splats)
         memory = _memory(parameters, views, pixels, job.photo_memory)
-        part = _part_job(job, parameters)
-        cells.append(PlannedCell(number, region, part, views, points, parameters.total_steps, splats, memory))
+        cell_job = _part_job(job, parameters)
+        cells.append(
+            PlannedCell(number, region, cell_job, views, points, parameters.total_steps, splats, memory)
+        )
     return cells
 
 
 def choose_cells(job: Job, splats: int = 0, memory: int = 0, scene: Scene | None = None) -> str:
-    """Return the smallest grid, as in ``Job.cells``, whose blocks stay within the limits.
+    """Return the smallest grid, as in ``Job.cells``, whose cells stay within the limits.
 
     Args:
         job: the job.
-        splats: maximum number of splats per block; 0 is unlimited.
-        memory: maximum memory per block in bytes, as estimated by ``plan``; 0 is unlimited.
+        splats: maximum number of splats per cell; 0 is unlimited.
+        memory: maximum memory per cell in bytes, as estimated by ``plan``; 0 is unlimited.
         scene: the job's scene, if already read.
 
     Raises:
@@ -293,14 +296,14 @@ def read_plan(folder: RunFolder) -> Division:
     Raises:
         LodgsError: the run has no parts, or one is damaged.
     """
-    blocks = _read_parts(folder.blocks)
-    if not blocks:
+    cells = _read_parts(folder.blocks)
+    if not cells:
         raise LodgsError(
             f"Cannot train cells of {folder.path}: none are planned.",
             "Plan them with lodgs blocks plan, or in the panel.",
         )
     coarse = RunFolder(folder.coarse)
-    return Division(Part(0, coarse, None) if coarse.job.exists() else None, blocks, _read_parts(folder.seams))
+    return Division(Part(0, coarse, None) if coarse.job.exists() else None, cells, _read_parts(folder.seams))
 
 
 def read_planned_job(path: Path) -> Job:
@@ -319,8 +322,8 @@ def read_planned_job(path: Path) -> Job:
 
 
 def plan_table(planned: list[PlannedCell]) -> str:
-    """Format the cost of each block as a table."""
-    lines = ["block   views    points      max splats     steps  approx. memory"]
+    """Format the cost of each cell as a table."""
+    lines = [" cell   views    points      max splats     steps  approx. memory"]
     for cell in planned:
         splats = f"{cell.splats:,}" if cell.splats else "unlimited"
         lines.append(
@@ -335,7 +338,7 @@ def _training_views(job: Job, scene: Scene) -> set[str]:
 
 
 def _divided(job: Job) -> tuple[Parameters, Parameters | None]:
-    """Return the blocks' parameters for an undivided scene, and those of the coarse part or None."""
+    """Return the cells' parameters for an undivided scene, and those of the coarse part or None."""
     method = method_info(method_info(job.method).cell_method)
     values = asdict(job.resolved_parameters())
     names = {field.name for field in fields(method.parameters)}

@@ -1,4 +1,4 @@
-"""Workers that train blocks: this process, one block at a time, or a Dask cluster in parallel."""
+"""Workers that train parts: this process, one part at a time, or a Dask cluster in parallel."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _PACKAGE = (__package__ or "").partition(".")[0]
 
 
 class Pending(Protocol):
-    """Submitted training of a block, as a future of ``concurrent.futures`` or Dask."""
+    """Submitted training of a part, as a future of ``concurrent.futures`` or Dask."""
 
     def done(self) -> bool:
         """Return whether it has ended."""
@@ -67,7 +67,7 @@ class _DaskTask:
         return self._future.cancel()
 
 
-def train_block(folder: str, threads: int = 0, cards: Sequence[str] = ()) -> int:
+def train_part(folder: str, threads: int = 0, cards: Sequence[str] = ()) -> int:
     """Start or resume a run in a separate process, and wait for its end. Called by a worker.
 
     If the trainer of a lost worker still runs, wait for it first. A run with a cancel request does not start.
@@ -85,7 +85,7 @@ def train_block(folder: str, threads: int = 0, cards: Sequence[str] = ()) -> int
         LodgsError: the trainer cannot be started.
     """
     try:
-        return _train_block(RunFolder(folder), threads, cards)
+        return _train_part(RunFolder(folder), threads, cards)
     except OSError as error:
         raise LodgsError(
             f"Cannot start the trainer of {folder}: {system_reason(error)}.",
@@ -93,7 +93,7 @@ def train_block(folder: str, threads: int = 0, cards: Sequence[str] = ()) -> int
         ) from error
 
 
-def _train_block(run: RunFolder, threads: int, cards: Sequence[str]) -> int:
+def _train_part(run: RunFolder, threads: int, cards: Sequence[str]) -> int:
     was_running = run.running
     while run.running:
         time.sleep(1)
@@ -120,14 +120,14 @@ def _train_block(run: RunFolder, threads: int, cards: Sequence[str]) -> int:
 
 @contextmanager
 def workers(on: str = HERE, resources: dict[str, float] | None = None, tls: bool = True) -> Iterator[Submit]:
-    """Start workers and yield a function that submits blocks to them.
+    """Start workers and yield a function that submits parts to them.
 
     Args:
-        on: HERE, one block at a time; "local:N", N blocks at a time on this computer, sharing its cores and
+        on: HERE, one part at a time; "local:N", N parts at a time on this computer, sharing its cores and
             graphics cards; the key file of a scheduler, see ``cluster.run_scheduler``; or the address of a
             Dask scheduler, "tls://HOST:8786", with the certificates of Dask's configuration. The workers
             access run and scene under the same paths.
-        resources: Dask resources that each block requires, such as {"GPU": 1}.
+        resources: Dask resources that each part requires, such as {"GPU": 1}.
         tls: False to permit "tcp://HOST:8786", where everybody who reaches the port can run programs.
 
     Raises:
@@ -135,7 +135,7 @@ def workers(on: str = HERE, resources: dict[str, float] | None = None, tls: bool
     """
     if on == HERE:
         with ThreadPoolExecutor(1) as pool:
-            yield lambda folder: pool.submit(train_block, str(folder))
+            yield lambda folder: pool.submit(train_part, str(folder))
         return
     kind, _, count = on.partition(":")
     local = kind == "local" and count.isdecimal() and int(count) > 0
@@ -164,7 +164,7 @@ def workers(on: str = HERE, resources: dict[str, float] | None = None, tls: bool
 
     def submit(folder: Path) -> Pending:
         try:
-            future = client.submit(train_block, str(folder), threads, cards, pure=False, resources=resources)
+            future = client.submit(train_part, str(folder), threads, cards, pure=False, resources=resources)
             return _DaskTask(future, client)
         except distributed.client.ClosedClientError as error:
             raise LodgsError(

@@ -11,7 +11,7 @@ from ...errors import LodgsError, error_cause
 from ..failures import BAD_INPUT, CANCELLED, DONE
 from ..outcome import run_outcome
 from .merge import merge, write_surroundings
-from .plan import BLOCK, Division, Part
+from .plan import CELL, Division, Part
 from .workers import Pending, Submit
 
 POLL_SECONDS = 0.5
@@ -27,7 +27,7 @@ Report = Callable[..., object]
 """Called with an event's kind and values."""
 
 
-class BlocksStopped(Exception):
+class CellsStopped(Exception):
     """Some parts were cancelled, as listed in the message; all others are finished."""
 
 
@@ -41,7 +41,7 @@ def prepare_part(division: Division, part: Part) -> None:
         write_surroundings(division, part)
 
 
-def train_blocks(division: Division, path: Path, submit: Submit, report: Report) -> None:
+def train_cells(division: Division, path: Path, submit: Submit, report: Report) -> None:
     """Train all unfinished parts, stage by stage, and write the merged bundle.
 
     Progress is read from the run folders of the parts. An interrupt first stops all parts cleanly. A part
@@ -55,7 +55,7 @@ def train_blocks(division: Division, path: Path, submit: Submit, report: Report)
         report: called with events.
 
     Raises:
-        BlocksStopped: single parts were cancelled.
+        CellsStopped: single parts were cancelled.
         LodgsError: a part could not be trained.
     """
     if path.exists():
@@ -69,12 +69,12 @@ def train_blocks(division: Division, path: Path, submit: Submit, report: Report)
             watch.code = CANCELLED
     for stage in stages:
         _train_stage(stage, watches, submit, report)
-    report("status", message=f"Merging {len(division.blocks)} cells")
+    report("status", message=f"Merging {len(division.cells)} cells")
     counts = merge(division, path)
     for seam in division.seams:
         seam.folder.base.unlink(missing_ok=True)
-    for block, (inside, total) in zip(division.blocks, counts, strict=True):
-        report("status", message=f"Cell {block.number}: keeps {inside:,} of {total:,} splats, those inside")
+    for cell, (inside, total) in zip(division.cells, counts, strict=True):
+        report("status", message=f"Cell {cell.number}: keeps {inside:,} of {total:,} splats, those inside")
 
 
 def _train_stage(
@@ -83,7 +83,7 @@ def _train_stage(
     try:
         for watch in stage:
             watch.start(submit)
-        started = last_report = last_block_report = time.monotonic()
+        started = last_report = last_part_report = time.monotonic()
         states: list[str] = []
         while not all([watch.poll(submit) for watch in stage]):
             now = time.monotonic()
@@ -91,8 +91,8 @@ def _train_stage(
                 values = _progress(watches)
                 last_report = now
                 changed = states != (states := [watch.state for watch in watches])
-                if changed or now - last_block_report >= (now - started) / 30:  # many parts are long lines
-                    last_block_report = now
+                if changed or now - last_part_report >= (now - started) / 30:  # many parts are long lines
+                    last_part_report = now
                 else:
                     del values["blocks"]
                 report("progress", **values)
@@ -106,7 +106,7 @@ def _train_stage(
         if watch.code not in (DONE, CANCELLED):
             raise watch.error()
     if stopped := [watch.part.name for watch in stage if watch.code == CANCELLED]:
-        raise BlocksStopped(f"Stopped: {', '.join(stopped)}. The run can be resumed.")
+        raise CellsStopped(f"Stopped: {', '.join(stopped)}. The run can be resumed.")
 
 
 def _stop_stage(stage: Sequence[_PartWatch]) -> None:
@@ -240,14 +240,14 @@ def _progress(watches: Sequence[_PartWatch]) -> dict:
     step = sum(watch.step for watch in watches)
     steps = sum(watch.steps for watch in watches)
     speed = sum(watch.progress.get("steps_per_s", 0.0) for watch in watches if watch.code is None)
-    blocks = [watch for watch in watches if watch.part.kind == BLOCK]
-    done = sum(watch.code == DONE for watch in blocks)
+    cells = [watch for watch in watches if watch.part.kind == CELL]
+    done = sum(watch.code == DONE for watch in cells)
 
     def mean(name: str) -> float:
         return round(sum(report.get(name, 0.0) for report in reports) / max(len(reports), 1), 5)
 
     return {
-        "stage": f"{done} of {len(blocks)} cells", "level": 1, "levels": 1, "step": step, "of": steps,
+        "stage": f"{done} of {len(cells)} cells", "level": 1, "levels": 1, "step": step, "of": steps,
         "loss": mean("loss"), "psnr": mean("psnr"),
         "splats": sum(report.get("splats", 0) for report in reports),
         "steps_per_s": round(speed, 2), "eta_s": round((steps - step) / speed, 1) if speed else 0.0,

@@ -23,10 +23,10 @@ from training.__main__ import main
 from training.errors import LodgsError
 from training.methods import METHODS
 from training.runs import train as training_loop
-from training.runs.blocks import train as blocks_module
-from training.runs.blocks.merge import merge
-from training.runs.blocks.plan import Division, Part, choose_cells, plan, read_plan, write_plan
-from training.runs.blocks.train import BlocksStopped, train_blocks
+from training.runs.cells import train as train_module
+from training.runs.cells.merge import merge
+from training.runs.cells.plan import Division, Part, choose_cells, plan, read_plan, write_plan
+from training.runs.cells.train import CellsStopped, train_cells
 from training.runs.data import training_data
 from training.runs.events import MAX_BYTES, event_line
 from training.runs.folder import RunFolder
@@ -54,42 +54,42 @@ def job_for(scene, out, method="3dgs", **keys) -> Job:
 def planned(job: Job) -> list[Part]:
     folder = RunFolder(job.out)
     folder.create()
-    return write_plan(job.resolved(), folder).blocks
+    return write_plan(job.resolved(), folder).cells
 
 
 # -- planning ---------------------------------------------------------------------------------------------
 
 
-def test_steps_and_splats_of_blocks_are_proportional_to_views_and_points(tiny_scene, tmp_path):
+def test_steps_and_splats_of_cells_are_proportional_to_views_and_points(tiny_scene, tmp_path):
     job = job_for(tiny_scene, tmp_path / "run", parameters={**TINY, "steps": 600, "max_splats": 1000})
     undivided = training_data(replace(job, cells=""), RunFolder(tmp_path))
-    for block in planned(job):
-        data, p = training_data(block.job, block.folder), block.job.resolved_parameters()
+    for cell in planned(job):
+        data, p = training_data(cell.job, cell.folder), cell.job.resolved_parameters()
         assert p.steps / len(data.train) == pytest.approx(600 / len(undivided.train), abs=0.5)
         assert p.max_splats == pytest.approx(
             1000 * len(data.scene.points) / len(undivided.scene.points), abs=0.5
         )
-        assert block.job.method == "3dgs" and block.job.cells == ""
+        assert cell.job.method == "3dgs" and cell.job.cells == ""
 
 
 @pytest.mark.parametrize("method", ["flod", "octree", "clod", "3dgs", "lodge", "tree"])
-def test_blocks_have_the_units_and_held_out_views_of_the_full_scene(tiny_scene, tmp_path, method):
+def test_cells_have_the_units_and_held_out_views_of_the_full_scene(tiny_scene, tmp_path, method):
     job = job_for(tiny_scene, tmp_path / "run", method, parameters={})
     undivided = training_data(replace(job, cells=""), RunFolder(tmp_path))
-    blocks = planned(job)
+    cells = planned(job)
     trained = set()
-    for block in blocks:
-        data = training_data(block.job, block.folder)
+    for cell in cells:
+        data = training_data(cell.job, cell.folder)
         for name in ("extent", "median_depth", "near", "focal", "threshold_scale"):
             assert getattr(data, name) == getattr(undivided, name)
         np.testing.assert_array_equal(data.mean_camera, undivided.mean_camera)
         held_out = {camera.name for camera in undivided.test}
-        assert {camera.name for camera in data.test} == held_out & set(block.region.views)
+        assert {camera.name for camera in data.test} == held_out & set(cell.region.views)
         assert not {camera.name for camera in data.train} & held_out
         trained |= {camera.name for camera in data.train}
         assert 0 < len(data.scene.points) <= len(undivided.scene.points)
     assert trained == {camera.name for camera in undivided.train}
-    assert {block.job.method for block in blocks} == {METHODS[method].cell_method}
+    assert {cell.job.method for cell in cells} == {METHODS[method].cell_method}
 
 
 def test_corrupt_photo_does_not_change_the_held_out_views(tiny_scene, tmp_path):
@@ -101,10 +101,10 @@ def test_corrupt_photo_does_not_change_the_held_out_views(tiny_scene, tmp_path):
     table = data.index(b"\xff\xc4") + 5  # Huffman table: size and end stay readable, pixels do not
     photo.write_bytes(data[:table] + b"\xff" * 16 + data[table + 16 :])
     job = job_for(scene, tmp_path / "run")
-    blocks = planned(job)
+    cells = planned(job)
     held_out = {camera.name for camera in training_data(job, RunFolder(tmp_path)).test}
     assert held_out == {"00.jpg", "04.jpg", "08.jpg"}
-    trained = {camera.name for block in blocks for camera in training_data(block.job, block.folder).train}
+    trained = {camera.name for cell in cells for camera in training_data(cell.job, cell.folder).train}
     assert not trained & {*held_out, "01.jpg"} and len(trained) == 5
 
 
@@ -126,34 +126,34 @@ def test_plan_can_be_moved(tiny_scene, tmp_path):
     (tmp_path / "run").rename(tmp_path / "moved")
     division = read_plan(RunFolder(tmp_path / "moved"))
     assert division.seams and division.coarse
-    for block in division.blocks + division.seams:
-        assert Path(block.job.region) == block.folder.path / "region.json"
-        assert Path(block.job.out) == block.folder.path
-        base = division.coarse.folder.path if block.kind == "block" else block.folder.base
-        assert Path(block.job.base) == base
+    for cell in division.cells + division.seams:
+        assert Path(cell.job.region) == cell.folder.path / "region.json"
+        assert Path(cell.job.out) == cell.folder.path
+        base = division.coarse.folder.path if cell.kind == "block" else cell.folder.base
+        assert Path(cell.job.base) == base
 
 
-def test_plan_predicts_the_cost_of_blocks(tiny_scene, tmp_path):
+def test_plan_predicts_the_cost_of_cells(tiny_scene, tmp_path):
     job = job_for(tiny_scene, tmp_path / "run", "flod", parameters={}).resolved()
     cells = plan(job)
     assert not (tmp_path / "run").exists(), "planning writes nothing"
-    for cell, block in zip(cells, planned(job), strict=True):
-        data, p = training_data(block.job, block.folder), block.job.resolved_parameters()
-        assert (cell.number, cell.region.views) == (block.number, block.region.views)
+    for cell, part in zip(cells, planned(job), strict=True):
+        data, p = training_data(part.job, part.folder), part.job.resolved_parameters()
+        assert (cell.number, cell.region.views) == (part.number, part.region.views)
         assert (cell.views, cell.points) == (len(data.train), len(data.scene.points))
         assert (cell.steps, cell.splats) == (p.total_steps, p.max_splats)
         assert cell.memory > 1000 * cell.splats
 
 
-def test_coarse_part_and_blocks_share_the_levels(tiny_scene, tmp_path):
+def test_coarse_part_and_cells_share_the_levels(tiny_scene, tmp_path):
     job = job_for(tiny_scene, tmp_path / "run", "flod", parameters={})
     planned(job)
     division = read_plan(RunFolder(job.out))
     coarse = division.coarse.job.resolved_parameters()
     assert (coarse.first_level, coarse.last_level) == (1, 3) and not division.coarse.job.base
     assert coarse.steps == job.resolved_parameters().steps
-    for block in division.blocks:
-        p = block.job.resolved_parameters()
+    for cell in division.cells:
+        p = cell.job.resolved_parameters()
         assert (p.first_level, p.last_level) == (4, 0)
         assert (p.footprint, p.rho, p.levels, p.sh_degree) == (
             coarse.footprint,
@@ -161,11 +161,11 @@ def test_coarse_part_and_blocks_share_the_levels(tiny_scene, tmp_path):
             coarse.levels,
             coarse.sh_degree,
         )
-        assert block.job.base == str(division.coarse.folder.path)
+        assert cell.job.base == str(division.coarse.folder.path)
     shallow = job_for(tiny_scene, tmp_path / "few", "flod", parameters={"levels": 2})
     planned(shallow)
     division = read_plan(RunFolder(shallow.out))
-    assert division.coarse is None and division.blocks[0].job.base == ""
+    assert division.coarse is None and division.cells[0].job.base == ""
 
 
 def test_seams_need_polish_steps_and_a_rule_without_weights(tiny_scene, tmp_path):
@@ -222,13 +222,13 @@ def test_parts_are_found_by_name(tiny_scene, tmp_path):
     job = job_for(tiny_scene, tmp_path / "run", test_every=0)
     planned(job)
     division = read_plan(RunFolder(job.out))
-    assert division.part("block-2") == division.blocks[1] and division.part("coarse") is None
+    assert division.part("block-2") == division.cells[1] and division.part("coarse") is None
     assert division.part("seam-1") == division.seams[0]
     for name in ("", "block", "block-3", "block-0", "seam-", "coarse-1", "merge", "2"):
         with pytest.raises(LodgsError, match="Unknown part"):
             division.part(name)
     assert main(["blocks", "run", job.out, "--only", "coarse"]) == 0, "an unneeded part counts as finished"
-    assert main(["blocks", "run", job.out, "--only", "seam-1"]) == 2, "its blocks are unfinished"
+    assert main(["blocks", "run", job.out, "--only", "seam-1"]) == 2, "its cells are unfinished"
 
 
 def test_continuing_levels_requires_a_base(tiny_scene, tmp_path):
@@ -256,13 +256,13 @@ def test_invalid_cells_are_rejected(tiny_scene, tmp_path):
 # -- merging ---------------------------------------------------------------------------------------
 
 
-def finished(folder: Path, number: int, cell, splats: list[Splats], **header) -> Part:
-    """Return a finished block whose bundle has these levels."""
+def finished(folder: Path, number: int, limits, splats: list[Splats], **header) -> Part:
+    """Return a finished cell whose bundle has these levels."""
     run = RunFolder(folder / str(number))
     run.create()
     levels = [Level(i, level, {"s_min": 1.0 / i}) for i, level in enumerate(splats, 1)]
     write_bundle(run.bundle, Bundle(**({"method": "flod", "rule": "bands"} | header), levels=levels))
-    inside = np.array([cell, [-np.inf, np.inf]])
+    inside = np.array([limits, [-np.inf, np.inf]])
     return Part(number, run, Region(np.eye(3), inside, inside, ("a",)))
 
 
@@ -274,18 +274,18 @@ def random_splats(rng, count) -> Splats:
     )  # fmt: skip
 
 
-def test_merged_bundle_has_each_blocks_splats_inside_its_cell(tmp_path, monkeypatch):
-    from training.runs.blocks import merge as merge_module
+def test_merged_bundle_has_each_cells_splats_inside_its_cell(tmp_path, monkeypatch):
+    from training.runs.cells import merge as merge_module
 
     monkeypatch.setattr(merge_module, "BATCH_ROWS", 7)
     rng = np.random.default_rng(0)
     sets = [[random_splats(rng, n) for n in (20, 50)] for _ in range(3)]
-    cells = [(-np.inf, -0.3), (-0.3, 0.4), (0.4, np.inf)]
-    blocks = [
-        finished(tmp_path, i, cell, levels)
-        for i, (cell, levels) in enumerate(zip(cells, sets, strict=True), 1)
+    ranges = [(-np.inf, -0.3), (-0.3, 0.4), (0.4, np.inf)]
+    cells = [
+        finished(tmp_path, i, limits, levels)
+        for i, (limits, levels) in enumerate(zip(ranges, sets, strict=True), 1)
     ]
-    counts = merge(Division(None, blocks, []), tmp_path / "merged.ply")
+    counts = merge(Division(None, cells, []), tmp_path / "merged.ply")
     merged = read_bundle(tmp_path / "merged.ply")
     assert [level.facts for level in merged.levels] == [{"s_min": 1.0}, {"s_min": 0.5}]
     assert sum(inside for inside, _ in counts) == sum(len(level.splats) for level in merged.levels)
@@ -293,7 +293,7 @@ def test_merged_bundle_has_each_blocks_splats_inside_its_cell(tmp_path, monkeypa
     for number, level in enumerate(merged.levels):
         expected = Splats.concatenated([
             levels[number].select((levels[number].means[:, 0] >= low) & (levels[number].means[:, 0] < high))
-            for (low, high), levels in zip(cells, sets, strict=True)
+            for (low, high), levels in zip(ranges, sets, strict=True)
         ])  # fmt: skip
         for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
             np.testing.assert_array_equal(getattr(level.splats, name), getattr(expected, name))
@@ -301,7 +301,7 @@ def test_merged_bundle_has_each_blocks_splats_inside_its_cell(tmp_path, monkeypa
     assert sorted(path.name for path in tmp_path.iterdir()) == ["1", "2", "3", "merged.ply"]
 
 
-def test_incompatible_blocks_are_rejected(tmp_path):
+def test_incompatible_cells_are_rejected(tmp_path):
     rng = np.random.default_rng(0)
     first = finished(tmp_path, 1, (-np.inf, 0), [random_splats(rng, 9)])
     second = finished(tmp_path, 2, (0, np.inf), [random_splats(rng, 9)], method="3dgs", rule="")
@@ -314,10 +314,10 @@ def test_incompatible_blocks_are_rejected(tmp_path):
 
 
 class Workers:
-    """Simulated workers. For each block, a list of functions that stand for the attempts to train it."""
+    """Simulated workers. For each cell, a list of functions that stand for the attempts to train it."""
 
     def __init__(self, **plans) -> None:
-        self.plans = {name.removeprefix("block_"): list(plan) for name, plan in plans.items()}
+        self.plans = {name.removeprefix("cell_"): list(plan) for name, plan in plans.items()}
         self.attempts = dict.fromkeys(self.plans, 0)
 
     def __call__(self, folder: Path) -> Future:
@@ -350,8 +350,8 @@ def progressing(step: int, code: int):
 
 
 def done(folder: RunFolder) -> int:
-    block = finished(folder.path.parent / "finished", int(folder.path.name), (-np.inf, np.inf), [LEVEL])
-    block.folder.bundle.rename(folder.bundle)
+    cell = finished(folder.path.parent / "finished", int(folder.path.name), (-np.inf, np.inf), [LEVEL])
+    cell.folder.bundle.rename(folder.bundle)
     with folder.events_file.open("a") as file:
         file.write(event_line("done", bundle="bundle.ply") + "\n")
     return 0
@@ -375,58 +375,58 @@ LEVEL = random_splats(np.random.default_rng(3), 5)
 
 
 @pytest.fixture
-def blocks(tiny_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(blocks_module, "POLL_SECONDS", 0.005)
+def cells(tiny_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(train_module, "POLL_SECONDS", 0.005)
     return planned(job_for(tiny_scene, tmp_path / "run"))
 
 
-def train_all(blocks, workers, report=lambda *_, **__: None):
-    path = blocks[0].folder.path.parent / "merged.ply"
-    train_blocks(Division(None, blocks, []), path, workers, report)
+def train_all(cells, workers, report=lambda *_, **__: None):
+    path = cells[0].folder.path.parent / "merged.ply"
+    train_cells(Division(None, cells, []), path, workers, report)
     return path
 
 
-def test_lost_block_that_makes_progress_is_restarted_every_time(blocks):
-    workers = Workers(block_1=[*(progressing(i, -9) for i in range(8)), lost, done], block_2=[done])
-    assert train_all(blocks, workers).exists()
+def test_lost_cell_that_makes_progress_is_restarted_every_time(cells):
+    workers = Workers(cell_1=[*(progressing(i, -9) for i in range(8)), lost, done], cell_2=[done])
+    assert train_all(cells, workers).exists()
     assert workers.attempts == {"1": 10, "2": 1}
 
 
-def test_block_without_progress_fails_the_run_after_the_others_have_finished(blocks):
-    workers = Workers(block_1=[lost], block_2=[progressing(3, -9), done])
+def test_cell_without_progress_fails_the_run_after_the_others_have_finished(cells):
+    workers = Workers(cell_1=[lost], cell_2=[progressing(3, -9), done])
     with pytest.raises(LodgsError, match=r"trainer of cell 1 was lost 3 times at step 0 \(worker lost\)"):
-        train_all(blocks, workers)
-    assert blocks[1].folder.bundle.exists() and workers.attempts == {"1": 3, "2": 2}
-    second_run = Workers(block_1=[done], block_2=[lost])
-    assert train_all(blocks, second_run).exists()
-    assert second_run.attempts == {"1": 1, "2": 0}, "finished blocks are not trained again"
+        train_all(cells, workers)
+    assert cells[1].folder.bundle.exists() and workers.attempts == {"1": 3, "2": 2}
+    second_run = Workers(cell_1=[done], cell_2=[lost])
+    assert train_all(cells, second_run).exists()
+    assert second_run.attempts == {"1": 1, "2": 0}, "finished cells are not trained again"
 
 
-def test_error_of_a_block_is_reported(blocks):
+def test_error_of_a_cell_is_reported(cells):
     with pytest.raises(LodgsError, match="Cell 2: Full") as error:
-        train_all(blocks, Workers(block_1=[done], block_2=[failed]))
+        train_all(cells, Workers(cell_1=[done], cell_2=[failed]))
     assert error.value.remedy == "Free some space." and error.value.cause == "disk"
 
 
-def test_block_that_cannot_write_its_error_is_reported(blocks):
+def test_cell_that_cannot_write_its_error_is_reported(cells):
     with pytest.raises(LodgsError, match=r"Cell 2: The trainer could not write to .* disk is full"):
-        train_all(blocks, Workers(block_1=[done], block_2=[lambda _: 2]))
+        train_all(cells, Workers(cell_1=[done], cell_2=[lambda _: 2]))
 
 
-def test_block_that_cannot_start_is_reported_at_once(blocks):
+def test_cell_that_cannot_start_is_reported_at_once(cells):
     def cannot_start(_: RunFolder) -> int:
         raise LodgsError("Cannot start.", "Check the folder.") from OSError(errno.ENOSPC, "")
 
-    workers = Workers(block_1=[done], block_2=[cannot_start])
+    workers = Workers(cell_1=[done], cell_2=[cannot_start])
     with pytest.raises(LodgsError, match="Cell 2: Cannot start") as error:
-        train_all(blocks, workers)
+        train_all(cells, workers)
     assert workers.attempts["2"] == 1
     assert error.value.remedy == "Check the folder." and error.value.cause == "disk"
 
 
-def test_interrupt_withdraws_blocks_that_no_worker_has_started(blocks, monkeypatch):
+def test_interrupt_withdraws_cells_that_no_worker_has_started(cells, monkeypatch):
     """A cluster without workers never starts them, or only later."""
-    monkeypatch.setattr(blocks_module, "START_SECONDS", 0.05)
+    monkeypatch.setattr(train_module, "START_SECONDS", 0.05)
     futures = []
 
     def submit(folder: Path) -> Future:
@@ -437,83 +437,83 @@ def test_interrupt_withdraws_blocks_that_no_worker_has_started(blocks, monkeypat
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train_all(blocks, submit, interrupt)
+        train_all(cells, submit, interrupt)
     assert [future.cancelled() for future in futures] == [True, True]
-    assert not any(block.folder.take_cancel() for block in blocks)
+    assert not any(cell.folder.take_cancel() for cell in cells)
 
 
-def test_lost_scheduler_does_not_count_as_a_lost_block(blocks):
+def test_lost_scheduler_does_not_count_as_a_lost_cell(cells):
     """Blocks are submitted again; if the scheduler stays away, ``submit`` raises an error."""
 
     def scheduler_lost(_: RunFolder) -> int:
         raise CancelledError
 
-    workers = Workers(block_1=[scheduler_lost] * 5 + [done], block_2=[done])
-    assert train_all(blocks, workers).exists() and workers.attempts == {"1": 6, "2": 1}
+    workers = Workers(cell_1=[scheduler_lost] * 5 + [done], cell_2=[done])
+    assert train_all(cells, workers).exists() and workers.attempts == {"1": 6, "2": 1}
 
 
-def test_single_block_can_be_cancelled_and_resumed(blocks):
-    with pytest.raises(BlocksStopped, match="cell 2"):
-        train_all(blocks, Workers(block_1=[done], block_2=[cancelled]))
-    assert train_all(blocks, Workers(block_1=[lost], block_2=[done])).exists()
+def test_single_cell_can_be_cancelled_and_resumed(cells):
+    with pytest.raises(CellsStopped, match="cell 2"):
+        train_all(cells, Workers(cell_1=[done], cell_2=[cancelled]))
+    assert train_all(cells, Workers(cell_1=[lost], cell_2=[done])).exists()
 
 
-def test_cancelled_block_resumes_on_request_while_others_train(blocks):
+def test_cancelled_cell_resumes_on_request_while_others_train(cells):
     """The request is consumed."""
     reports = []
-    folder = blocks[1].folder
+    folder = cells[1].folder
 
-    def wait_for_second_block(_: RunFolder) -> int:
+    def wait_for_second_cell(_: RunFolder) -> int:
         while not folder.bundle.exists():
             time.sleep(0.002)
-        return done(blocks[0].folder)
+        return done(cells[0].folder)
 
     def report(kind, **values):
-        states = [block["state"] for block in values.get("blocks", ())]
+        states = [cell["state"] for cell in values.get("blocks", ())]
         reports.append(states)
         if states == ["running", "cancelled"] and not workers.attempts["2"] > 1:
             folder.request_resume()
 
     def cancel(folder: RunFolder) -> int:
         progressing(5, 3)(folder)
-        progressing(5, 3)(blocks[0].folder)  # makes the first block "running"
+        progressing(5, 3)(cells[0].folder)  # makes the first cell "running"
         return 3
 
-    workers = Workers(block_1=[wait_for_second_block], block_2=[cancel, done])
-    assert train_all(blocks, workers, report).exists()
+    workers = Workers(cell_1=[wait_for_second_cell], cell_2=[cancel, done])
+    assert train_all(cells, workers, report).exists()
     assert workers.attempts == {"1": 1, "2": 2} and not folder.take_resume()
     assert ["running", "cancelled"] in reports and reports[-1] != ["running", "cancelled"]
 
 
-def test_resume_request_before_the_start_trains_only_that_block(blocks):
-    workers = Workers(block_1=[done], block_2=[done])
-    blocks[1].folder.request_resume()
-    with pytest.raises(BlocksStopped, match="cell 1"):
-        train_all(blocks, workers)
+def test_resume_request_before_the_start_trains_only_that_cell(cells):
+    workers = Workers(cell_1=[done], cell_2=[done])
+    cells[1].folder.request_resume()
+    with pytest.raises(CellsStopped, match="cell 1"):
+        train_all(cells, workers)
     assert workers.attempts == {"1": 0, "2": 1}
-    assert train_all(blocks, workers).exists(), "the request is consumed"
+    assert train_all(cells, workers).exists(), "the request is consumed"
     assert workers.attempts == {"1": 1, "2": 1}
 
 
-def test_block_is_running_once_its_trainer_has_written_an_event(blocks):
-    """Events of earlier trainers do not count: blocks wait again when a run resumes."""
+def test_cell_is_running_once_its_trainer_has_written_an_event(cells):
+    """Events of earlier trainers do not count: cells wait again when a run resumes."""
     states = []
 
     def report(kind, **values):
         if kind == "progress":
-            states.append([(block["state"], block["step"]) for block in values["blocks"]])
+            states.append([(cell["state"], cell["step"]) for cell in values["blocks"]])
 
     def waits(folder: RunFolder) -> int:
         while len(states) < 5:
             time.sleep(0.002)
         return done(folder)
 
-    progressing(7, 3)(blocks[0].folder)
-    train_all(blocks, Workers(block_1=[waits], block_2=[done]), report)
+    progressing(7, 3)(cells[0].folder)
+    train_all(cells, Workers(cell_1=[waits], cell_2=[done]), report)
     assert states[0][0] == ("waiting", 7)
 
 
-def test_interrupt_cancels_running_blocks(blocks):
+def test_interrupt_cancels_running_cells(cells):
     def until_cancelled(folder: RunFolder) -> int:
         while not folder.take_cancel():
             time.sleep(0.002)
@@ -523,15 +523,15 @@ def test_interrupt_cancels_running_blocks(blocks):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train_all(blocks, Workers(block_1=[until_cancelled], block_2=[until_cancelled]), interrupt)
+        train_all(cells, Workers(cell_1=[until_cancelled], cell_2=[until_cancelled]), interrupt)
 
 
-def test_progress_event_contains_all_blocks(blocks):
+def test_progress_event_contains_all_cells(cells):
     reports = []
-    workers = Workers(block_1=[progressing(20, -9), done], block_2=[progressing(10, -9), done])
-    train_all(blocks, workers, lambda kind, **values: reports.append((kind, values)))
+    workers = Workers(cell_1=[progressing(20, -9), done], cell_2=[progressing(10, -9), done])
+    train_all(cells, workers, lambda kind, **values: reports.append((kind, values)))
     *_, last = (values for kind, values in reports if kind == "progress")
-    steps = [block.job.resolved_parameters().total_steps for block in blocks]
+    steps = [cell.job.resolved_parameters().total_steps for cell in cells]
     assert last["step"] == last["of"] == sum(steps)
     assert last["blocks"] == [
         {"block": number, "kind": "block", "state": "done", "step": step, "of": step}
@@ -559,7 +559,7 @@ def run_all(keys: dict) -> tuple[int, RunFolder]:
         pytest.param("octree", marks=pytest.mark.nightly),
     ],
 )
-def test_bundle_of_cells_is_like_that_of_an_undivided_run(tiny_scene, tmp_path, blocks_in_process, method):
+def test_bundle_of_cells_is_like_that_of_an_undivided_run(tiny_scene, tmp_path, cells_in_process, method):
     parameters = {
         "3dgs": TINY,
         "flod": {**TINY, "levels": 3, "steps": [15, 15, 15], "footprint": 6.0},
@@ -576,7 +576,7 @@ def test_bundle_of_cells_is_like_that_of_an_undivided_run(tiny_scene, tmp_path, 
     assert [level.number for level in bundle.levels] == [level.number for level in expected.levels]
     facts = [level.facts for level in bundle.levels]
     if method == "flod":  # only undivided runs measure the distances of levels
-        heads = [read_header(block.folder.bundle) for block in read_plan(folder).blocks]
+        heads = [read_header(cell.folder.bundle) for cell in read_plan(folder).cells]
         assert all([level.facts for level in head.levels] == facts for head in heads) and len(heads) > 1
         assert expected.meta.pop("footprint_px") > 0 and bundle.meta["footprint_px"] == pytest.approx(6.0)
     else:
@@ -587,7 +587,7 @@ def test_bundle_of_cells_is_like_that_of_an_undivided_run(tiny_scene, tmp_path, 
 
 
 @pytest.mark.slow
-def test_tree_is_built_from_merged_blocks(tiny_scene, tmp_path, blocks_in_process):
+def test_tree_is_built_from_merged_cells(tiny_scene, tmp_path, cells_in_process):
     parameters = {**TINY, "tune_steps": 5}
     keys = asdict(job_for(tiny_scene, tmp_path / "cells", "tree", parameters=parameters))
     code, folder = run_all(keys)
@@ -614,11 +614,11 @@ def test_killed_trainers_and_an_interrupted_run_give_the_same_bundle(tiny_scene,
         )  # fmt: skip
         deadline = time.monotonic() + 200
         while process.poll() is None and time.monotonic() < deadline:
-            time.sleep(0.02)  # shorter than the training of a block
-            for block in read_plan(attacked).blocks if attacked.blocks.exists() else ():
-                if kills < 4 and block.folder.running and block.folder.last_event("progress"):
+            time.sleep(0.02)  # shorter than the training of a cell
+            for cell in read_plan(attacked).cells if attacked.blocks.exists() else ():
+                if kills < 4 and cell.folder.running and cell.folder.last_event("progress"):
                     with suppress(LodgsError):  # it has just ended
-                        block.folder.kill()
+                        cell.folder.kill()
                         kills += 1
             if attempt == 0 and kills >= 2:
                 process.send_signal(signal.SIGKILL)
@@ -631,7 +631,7 @@ def test_killed_trainers_and_an_interrupted_run_give_the_same_bundle(tiny_scene,
 @pytest.mark.nightly
 @pytest.mark.skipif(os.name == "nt", reason="Windows cancels with a file")
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 3), (signal.SIGKILL, -signal.SIGKILL)])
-def test_block_trainers_save_and_end_with_their_parent(tiny_scene, tmp_path, number, code):
+def test_cell_trainers_save_and_end_with_their_parent(tiny_scene, tmp_path, number, code):
     keys = asdict(job_for(tiny_scene, tmp_path / "run", parameters={**TINY, "steps": 100_000}))
     path = tmp_path / "job.json"
     path.write_text(json.dumps(keys))
@@ -639,30 +639,30 @@ def test_block_trainers_save_and_end_with_their_parent(tiny_scene, tmp_path, num
         [sys.executable, "-m", "training", "train", str(path)], cwd=ROOT, stdout=subprocess.DEVNULL
     )
     run = RunFolder(tmp_path / "run")
-    block = RunFolder(run.blocks / "1")
+    cell = RunFolder(run.blocks / "1")
     deadline = time.monotonic() + 200
-    while not block.last_event("progress") and time.monotonic() < deadline:
+    while not cell.last_event("progress") and time.monotonic() < deadline:
         time.sleep(0.05)
     process.send_signal(number)
     assert process.wait(200) == code
-    while block.running and time.monotonic() < deadline:
+    while cell.running and time.monotonic() < deadline:
         time.sleep(0.05)
-    assert list(block.checkpoints.glob("*.pt")) and not block.running
+    assert list(cell.checkpoints.glob("*.pt")) and not cell.running
     states = {signal.SIGTERM: ("cancelled", "cancelled"), signal.SIGKILL: ("interrupted", "failed")}
-    assert (run.state(), block.state()) == states[number]
+    assert (run.state(), cell.state()) == states[number]
 
 
-def test_progress_of_many_blocks_does_not_fill_the_event_file(monkeypatch):
-    """A hundred blocks for two weeks, polled every five minutes."""
+def test_progress_of_many_cells_does_not_fill_the_event_file(monkeypatch):
+    """A hundred cells for two weeks, polled every five minutes."""
     clock = itertools.count(0, 300)
-    monkeypatch.setattr(blocks_module.time, "monotonic", lambda: next(clock))
-    monkeypatch.setattr(blocks_module.time, "sleep", lambda seconds: None)
+    monkeypatch.setattr(train_module.time, "monotonic", lambda: next(clock))
+    monkeypatch.setattr(train_module.time, "sleep", lambda seconds: None)
 
     class Watch:
         code, progress, step, steps, polls = 0, {}, 0, 9, 0
 
         def __init__(self, number):
-            self.part = SimpleNamespace(kind="block", number=number, name=f"block {number}")
+            self.part = SimpleNamespace(kind="block", number=number, name=f"cell {number}")
             self.last = 40 * number
 
         start = staticmethod(lambda submit: None)
@@ -677,8 +677,8 @@ def test_progress_of_many_blocks_does_not_fill_the_event_file(monkeypatch):
 
     reports = []
     stage = [Watch(number) for number in range(1, 101)]
-    blocks_module._train_stage(stage, stage, None, lambda kind, **values: reports.append(values))
+    train_module._train_stage(stage, stage, None, lambda kind, **values: reports.append(values))
     assert sum(len(event_line("progress", **values)) for values in reports) < MAX_BYTES / 4
     detailed = [values["blocks"] for values in reports if "blocks" in values]
-    counts = [sum(block["state"] == "done" for block in blocks) for blocks in detailed]
+    counts = [sum(cell["state"] == "done" for cell in cells) for cells in detailed]
     assert set(counts) >= set(range(1, 100)) and reports[-1]["blocks"] == detailed[-1] and counts[-1] == 100

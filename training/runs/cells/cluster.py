@@ -135,7 +135,7 @@ def run_scheduler(path: Path, host: str | None = None, port: int = PORT) -> None
 
 
 def run_worker(path: Path, resources: dict[str, float] | None = None) -> None:
-    """Run a worker that trains one block at a time, until it is interrupted.
+    """Run a worker that trains one part at a time, until it is interrupted.
 
     Args:
         path: the scheduler's key file.

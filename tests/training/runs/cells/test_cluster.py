@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from training.errors import LodgsError
-from training.runs.blocks.cluster import import_dask, local_cluster, read_key_file, write_key_file
-from training.runs.blocks.workers import workers
+from training.runs.cells.cluster import import_dask, local_cluster, read_key_file, write_key_file
+from training.runs.cells.workers import workers
 
 distributed = pytest.importorskip("distributed")
 psutil = pytest.importorskip("psutil")
@@ -69,7 +69,7 @@ def test_cluster_with_a_key_file_rejects_clients_without_it(tmp_path):
             pending.cancel()
         write_key_file(path, cluster.scheduler_address, distributed.Security.temporary())
         with pytest.MonkeyPatch.context() as patch, pytest.raises(LodgsError, match="Cannot connect"):
-            patch.setattr("training.runs.blocks.workers.TIMEOUT_SECONDS", 0.3)
+            patch.setattr("training.runs.cells.workers.TIMEOUT_SECONDS", 0.3)
             with workers(str(path)):
                 pass
 
