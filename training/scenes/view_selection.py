@@ -73,7 +73,7 @@ class ViewCollector:
             if not np.isfinite(pose.world_to_camera).all():
                 raise LodgsError("it has no valid pose.")
             if not lens.lens.focals:
-                raise LodgsError(f"camera model {lens.lens.name} is a panorama, not a perspective view.")
+                raise LodgsError(f"{lens.lens.name} is a panorama: cut it into perspective views.")
             if self.cameras and self.cameras[-1].name == name:
                 raise LodgsError("the model has another view of the same name.")
             image = self._files.find(pose.name)
@@ -111,7 +111,9 @@ class ViewCollector:
         raise LodgsError(
             f"Cannot read scene: none of the {count} views of {model} has a usable photo in {images}."
             + "".join(f" {quote_name(name)}: {reason}" for name, reason in self.excluded[:1]),
-            "Choose the folder that holds the images under the names used by the model.",
+            "Choose the folder that holds the images under the names used by the model."
+            if self._missing
+            else "Correct the model or its photos.",
         )
 
     def drop_outliers(self, inliers: np.ndarray) -> None:

@@ -152,6 +152,10 @@ def test_panorama_is_skipped(tmp_path):
     assert len(scene.cameras) == 1
     assert any("panorama" in warning for warning in scene.warnings)
     assert any("points3D" in warning for warning in scene.warnings)
+    (tmp_path / "text" / "images.txt").write_text("2 1 0 0 0 0 0 0 2 a.png\n\n")
+    with pytest.raises(LodgsError, match="cut it into perspective views") as caught:
+        read_scene(tmp_path, model=tmp_path / "text")
+    assert "folder" not in caught.value.remedy
 
 
 def test_text_model_of_other_programs(tmp_path):
