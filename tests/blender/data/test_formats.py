@@ -16,6 +16,7 @@ from tests.training.splats.ksplat_files import FILES
 from tests.training.splats.ksplat_files import source as splats_of_file
 from training.splats.bundle import write_bundle
 from training.splats.levels import Bundle, Level
+from training.splats.sog import encode_sog
 
 pytestmark = pytest.mark.one_blender
 
@@ -63,6 +64,16 @@ def test_level_errors_are_written_on_request(bpy, lodgs, root, tmp_path, measure
     folder = tmp_path / "web"
     assert bpy.ops.lodgs.export_streamed(directory=str(folder), lod_errors=measured) == {"FINISHED"}
     assert json.loads((folder / "lod-meta.json").read_text("utf-8"))["lodErrors"] == measured
+
+
+def test_sog_in_a_folder_is_named_after_it(bpy, lodgs, tmp_path):
+    pytest.importorskip("PIL", reason="Pillow reads WebP")
+    (tmp_path / "garden").mkdir()
+    for name, data in encode_sog(splats(40)).items():
+        (tmp_path / "garden" / name).write_bytes(data)
+    assert bpy.ops.lodgs.import_splats(filepath=str(tmp_path / "garden" / "meta.json")) == {"FINISHED"}
+    (root,) = lodgs("data.roots").roots(bpy.context.scene)
+    assert root.name == "garden" and len(means(root.lodgs.levels[0].object)) == 40
 
 
 def test_estimated_size_of_tiles_is_that_of_their_compression(bpy, lodgs, tmp_path):
