@@ -138,6 +138,18 @@ def test_polycam(tmp_path):
     check(tmp_path, [pixels(*project(pose)) for pose in poses()], names)
 
 
+def test_polycam_with_only_blurred_photos(tmp_path):
+    """All are used: the user may have no better ones."""
+    for name, pose in zip(("11", "12", "13"), poses(), strict=True):
+        camera = {f"t_{row}{column}": pose[row, column] for row in range(3) for column in range(4)}
+        camera |= {"fx": FOCAL[0], "fy": FOCAL[1], "width": WIDTH, "height": HEIGHT, "blur_score": 20.0}
+        (tmp_path / "keyframes" / "cameras").mkdir(parents=True, exist_ok=True)
+        (tmp_path / "keyframes" / "cameras" / f"{name}.json").write_text(json.dumps(camera))
+    write_photos(tmp_path / "keyframes" / "images", ("11.jpg", "12.jpg", "13.jpg"))
+    assert "rates all photos as blurred" in convert_export(tmp_path).warnings[0]
+    assert len(read_scene(tmp_path).cameras) == 3
+
+
 def test_record3d(tmp_path):
     names = "2.jpg", "9.jpg", "10.jpg"  # in numeric order
     write_photos(tmp_path / "rgb", names)

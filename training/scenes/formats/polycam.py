@@ -26,7 +26,7 @@ from .exported import (
 
 NAME = "Polycam raw data"
 MIN_SHARPNESS = 25.0
-"""Minimum blur score of photos, as in nerfstudio."""
+"""Minimum blur score of photos, as in nerfstudio, unless all are below."""
 _FOLDERS = ("corrected_cameras", "corrected_images"), ("cameras", "images")
 
 
@@ -45,12 +45,11 @@ def read(path: Path, folder: Path) -> ExportedScene:
     excluded.
     """
     images = path.parent / dict(_FOLDERS)[path.name]
-    views, excluded = [], []
+    views, blurred, excluded = [], [], []
     for file in sorted(path.glob("[!.]*.json")):
         try:
             values = read_document(file)
-            if get_number(values, "blur_score", MIN_SHARPNESS) < MIN_SHARPNESS:
-                raise LodgsError("Polycam rates it as blurred.")
+            sharp = get_number(values, "blur_score", MIN_SHARPNESS) >= MIN_SHARPNESS
             image = find_image(images, file.stem)
             width, height = _photo_size(values, path.parent / "cameras" / file.name, image)
             lens = colmap_lens(
@@ -60,10 +59,15 @@ def read(path: Path, folder: Path) -> ExportedScene:
             rows = [[get_number(values, f"t_{row}{column}") for column in range(4)] for row in range(3)]
             pose = invert_pose(np.array(rows), opengl=True)
             depth = path.parent / "depth" / f"{file.stem}.png"
-            views.append(ExportedView(image, lens, pose, depth=depth))
+            (views if sharp else blurred).append(ExportedView(image, lens, pose, depth=depth))
         except LodgsError as error:
             excluded.append((file.name, error.what))
     warnings = []
+    if views:
+        excluded += [(f"{view.image.stem}.json", "Polycam rates it as blurred.") for view in blurred]
+    elif blurred:
+        views = blurred
+        warnings.append(f"Polycam rates all photos as blurred, so all are used: {path}.")
     if missing := {file.name for file in (path.parent / "cameras").glob("[!.]*.json")} - {
         file.name for file in path.glob("*.json")
     }:
