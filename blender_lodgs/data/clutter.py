@@ -112,7 +112,7 @@ def count_clutter(root: bpy.types.Object) -> int:
 
 
 def refresh_later() -> None:
-    """Refresh the preview of every scene that has one as soon as possible, for use while drawing."""
+    """Refresh the preview of every scene as soon as possible, for use while drawing."""
     if not bpy.app.timers.is_registered(_refresh_all):
         bpy.app.timers.register(_refresh_all, first_interval=0)
 
@@ -121,6 +121,8 @@ def _refresh_all() -> None:
     for root in roots.roots(bpy.context.scene):
         if root.lodgs_clutter.preview and root.lodgs.existing_levels:
             refresh(bpy.context, root)
+        elif root.session_uid in _matches:  # undo has ended the preview
+            stop(root)
 
 
 def _key(root: bpy.types.Object, test: CleanupTest) -> tuple:

@@ -100,6 +100,19 @@ def test_clutter_is_searched_again_after_splats_change(bpy, lodgs, root):
     assert cleaning.displayed_marks(root.lodgs.levels[1].object.data)[REST] == cleaning.mark_of("")
 
 
+def test_undo_ends_the_preview_in_viewports(bpy, lodgs, root):
+    """The grey splats would remain, without a button that shows their colours."""
+    cleaning, clutter, name = lodgs("data.cleaning"), lodgs("data.clutter"), root.name
+    bpy.ops.ed.undo_push(message="before")
+    assert bpy.ops.lodgs.find_clutter("EXEC_DEFAULT", True) == {"FINISHED"}
+    for step, is_shown in ((bpy.ops.ed.undo, False), (bpy.ops.ed.redo, True)):
+        step()
+        root = bpy.data.objects[name]
+        assert root.lodgs_clutter.preview == is_shown
+        clutter._refresh_all()
+        assert cleaning.displayed_marks(root.lodgs.levels[1].object.data).any() == is_shown
+
+
 def test_scene_without_ground_has_nothing_below(bpy, lodgs, tmp_path):
     rng = np.random.default_rng(1)
     means = rng.normal(size=(3000, 3)).astype(np.float32)
