@@ -213,7 +213,8 @@ def suggest_limits(context: bpy.types.Context, root: bpy.types.Object) -> dict[s
 def suggest_clutter_limits(root: bpy.types.Object) -> dict[str, float]:
     """Suggest limits for *Find Clutter* from the size of the subject, as lengths in the world."""
     unit, limits = cleaning.unit_length(root), subject_of(root).limits()
-    return {
+    means = cleaning.splat_attribute(root.lodgs.existing_levels[-1].object.data, "position")
+    return {"gap": default_gap(means) * unit} | {
         limit_property(name): value * (unit if LIMITS[name].metadata["unit"] == "length" else 1)
         for name, value in limits.items()
     }

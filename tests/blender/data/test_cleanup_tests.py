@@ -42,7 +42,7 @@ def root(bpy, lodgs, tmp_path):
 def clutter_counts(bpy, lodgs, root):
     """Numbers of matching splats of level 1 by test, with suggested limits."""
     cleanup_tests = lodgs("data.cleanup_tests")
-    limits = SimpleNamespace(gap=0.0, share=0.1, **cleanup_tests.suggest_clutter_limits(root))
+    limits = SimpleNamespace(share=0.1, **cleanup_tests.suggest_clutter_limits(root))
     return {
         test.identifier: int(cleanup_tests.find_clutter(test, bpy.context, root, limits)[1].sum())
         for test in cleanup_tests.CLUTTER_TESTS
@@ -55,6 +55,7 @@ def test_all_kinds_of_clutter_are_counted_coloured_and_hidden(bpy, lodgs, root):
     assert clutter_counts(bpy, lodgs, root) == counts
     assert bpy.ops.lodgs.find_clutter() == {"FINISHED"}
     cleaning, clutter = lodgs("data.cleaning"), lodgs("data.clutter")
+    assert root.lodgs_clutter.gap > 0
     del counts["BELOW"]  # disabled at first
     assert clutter.count_by_kind(root) == {name: 2 * count for name, count in counts.items()}
     cloud = root.lodgs.levels[1].object.data
