@@ -308,8 +308,8 @@ def _placements_texture(
     """Upload five texels per placement: three rows of its matrix to camera space, the camera, and the filter.
 
     The fourth value of the camera is 1; for orthographic views it is 0 and the others are the direction
-    opposite to the view. The filter's texel also has the range of looks. At a lower resolution, the filter adds
-    no more opacity than at rest, so that small splats keep their brightness.
+    opposite to the view. The filter's texel also has the range of looks. At a lower resolution, the filter
+    adds no more opacity than at rest, so that small splats keep their brightness.
     """
     view_matrix = np.array(view, np.float64)
     perspective = projection[3][3] == 0
