@@ -1,11 +1,15 @@
 """Parameters of coarser levels merged from the finest, shared by methods. Does not import torch."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 from ..settings import setting
 
 REFINE_RATIO = 0.7
 """Steps that refine a merged level relative to those of the next finer one."""
+MAX_REPEATS = 100
+"""Maximum number of times that each training photo refines the level before the finest. With more steps, the
+levels of scenes with few photos overfit."""
 
 
 @dataclass(frozen=True)
@@ -21,7 +25,8 @@ class MergedParameters:
     )
     refine_steps: int = setting(
         1000,
-        "Steps that refine the merged level before the finest. Each coarser level gets 70 % of the steps of "
+        f"Steps that refine the merged level before the finest, at most {MAX_REPEATS} per training photo. "
+        "Each coarser level gets 70 % of the steps of "
         "the next finer one. In FLoD they are taken from those of all levels ('steps'), at most half; the "
         "finest level gets the others.",
         unit="steps",
@@ -44,6 +49,10 @@ class MergedParameters:
     def stages(self) -> list[tuple[int, int]]:
         """Levels in the order of their training, with their numbers of steps."""
         raise NotImplementedError
+
+    def for_photos(self, count: int) -> Self:
+        """Return the parameters for a number of training photos."""
+        return replace(self, refine_steps=min(self.refine_steps, MAX_REPEATS * count))
 
     def share_below(self, count: int) -> float:
         """Return the relative number of splats of a level, ``count`` levels below the finest."""

@@ -159,7 +159,7 @@ class Method(ABC, Generic[P, D]):
     ) -> None:
         self.warn: Callable[[str], None] = lambda message: None
         self.data = data
-        self.parameters = p = parameters
+        self.parameters = p = parameters.for_photos(len(data.train))
         self.steps = p.total_steps
         self.seed = seed
         self.backend = backend

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import Field, dataclass, replace
-from typing import Any
+from typing import Any, Self
 
 from ..documents import quote
 from ..errors import LodgsError
@@ -117,6 +117,10 @@ class Parameters:
     def levels(self) -> int:
         """Number of levels, a parameter of methods with several; 0 if it depends on the scene."""
         return 1
+
+    def for_photos(self, count: int) -> Self:
+        """Return the parameters for a number of training photos."""
+        return self
 
     @property
     def total_steps(self) -> int:

@@ -127,7 +127,7 @@ def estimate(job: Job, scratch: Path) -> Estimate:
     else:
         memory = (peak_memory() or round(PROGRAM_BYTES + SPLAT_BYTES * splats)) + photos
         available = free_memory()
-    steps = parameters.total_steps
+    steps = parameters.for_photos(len(data.train)).total_steps
     growth = max(growing, GROWTH_SHARE)
     seconds = start + steps * (growth * (early + late) / 2 + (1 - growth) * late)
     return Estimate(

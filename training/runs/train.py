@@ -159,23 +159,28 @@ def _train(job: Job, folder: RunFolder, events: EventWriter, placement: dict[str
     with stop_signals() as received:
         if not run.run(received):
             return CANCELLED
-    _report_done(folder, events, run.evaluation, run.write_bundle(), started)
+    _report_done(folder, events, run.evaluation, run.write_bundle(), started, steps=run.method.steps)
     run.method.close()
     remove_checkpoints(folder)
     return DONE
 
 
 def _report_done(
-    folder: RunFolder, events: EventWriter, evaluation: Evaluation, bundle: Bundle, started: float
+    folder: RunFolder,
+    events: EventWriter,
+    evaluation: Evaluation,
+    bundle: Bundle,
+    started: float,
+    **facts: int,
 ) -> None:
-    """Measure the result and write the ``done`` event."""
+    """Measure the result and write the ``done`` event, which also has ``facts``."""
     seconds = round(time.monotonic() - started, 1)
     events("status", message="Measuring the result")
     measures = summarize(evaluation, bundle)
     middle = evaluation.cameras[len(evaluation.cameras) // 2]
     controls = resolve_controls(bundle, {}) if find_rule(bundle.rule) else {}
     write_level_sheet(folder.sheet, bundle, evaluation, middle, controls)
-    events("done", bundle=folder.bundle.name, seconds=seconds, memory=peak_memory(), **measures)
+    events("done", bundle=folder.bundle.name, seconds=seconds, memory=peak_memory(), **facts, **measures)
 
 
 def _write_merged_levels(

@@ -202,7 +202,7 @@ def compared_run(folder: RunFolder, job: Job, report: dict, label: str) -> Compa
         seconds=float(seconds) if isinstance(seconds, (int, float)) else None,
         memory=memory if isinstance(memory, int) else None,
         frame_memory=report["frame_memory"]["by_distance" if report["selective"] else "full"],
-        steps=job.steps,
+        steps=end.get("steps", job.steps),
     )
 
 

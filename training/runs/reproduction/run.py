@@ -185,6 +185,7 @@ def format_trainings(names: Sequence[str], jobs: Sequence[NamedJob]) -> list[str
     for number, name in enumerate(names):
         ends = [RunFolder(job.out).end_event() or {} for _, job in jobs[number :: len(names)]]
         seconds = [end["seconds"] for end in ends if "seconds" in end]
-        cells = f"{jobs[number].job.steps:,} | {np.mean(seconds) if seconds else 0:,.0f}"
+        steps = np.mean([end.get("steps", jobs[number].job.steps) for end in ends])
+        cells = f"{steps:,.0f} | {np.mean(seconds) if seconds else 0:,.0f}"
         lines.append(f"| {name} | {cells} |")
     return lines

@@ -107,7 +107,16 @@ def test_resumed_run_is_identical(data, check_resumed):
     check_resumed(lambda: make(data), 30, 40, 55)
 
 
+def test_few_photos_refine_levels_in_fewer_steps(data):
+    octree = make(data, refine_steps=3000)
+    steps = 100 * len(data.train)
+    assert steps < 3000 and octree.steps == 40 + steps + int(0.7 * steps)
+
+
 def test_presets():
-    assert METHOD.preset("draft").total_steps == 3000 + 4000 + 2800 + 1959 + 1371
+    draft = METHOD.preset("draft")
+    assert draft.total_steps == 3000 + 4000 + 2800 + 1959 + 1371
+    assert draft.for_photos(40) == draft
+    assert draft.for_photos(20).total_steps == 3000 + 2000 + 1400 + 979 + 685
     paper = METHOD.preset("paper")
     assert not paper.merges and paper.total_steps == paper.steps
