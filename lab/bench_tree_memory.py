@@ -185,7 +185,7 @@ def train(options: argparse.Namespace) -> dict:
     torch.save(method.state_dict(), options.folder / "checkpoint.pt")
     timed = slice(WARM, -AFTER)
     share = store.cache.reused / max(store.cache.reused + store.cache.loaded, 1)
-    cache_mb = (store.cache.capacity * (4 * store.layout.width + SLOT_BYTES) + store.cache.tables) / 1e6
+    cache_mb = (store.cache.capacity * (4 * store.layout.width + SLOT_BYTES) + store.cache.table_bytes) / 1e6
     return {
         "splats": len(store), "cache_mb": cache_mb, "reused": share,
         "step_s": float(np.mean(times[timed])), "cut_ms": float(np.mean(cut_times[timed])),

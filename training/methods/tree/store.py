@@ -84,8 +84,8 @@ class NodeStore:
         shape: row ranges of the pieces of the tree.
         cache: G + 1 groups: the subtrees, and the upper nodes, which are always cached.
         budget: size of the cache in bytes.
-        max_coarsening: maximum factor by which a view's granularity was max_coarsening to fit; 1 if none was.
-        wanted: budget in bytes that avoids coarsening.
+        max_coarsening: maximum factor by which a view's granularity was coarsened to fit; 1 if none was.
+        needed_budget: budget in bytes that avoids coarsening; 0 if no view was coarsened.
     """
 
     shape: ForestShape
@@ -93,7 +93,7 @@ class NodeStore:
 
     def __init__(self, folder: Path, sh_degree: int, budget: int, device: torch.device | str = "cpu") -> None:
         self.layout = record_layout(sh_degree)
-        self._terms = (sh_degree + 1) ** 2
+        self._coefficients = (sh_degree + 1) ** 2
         self.budget, self._device = budget, device
         self.max_coarsening, self.needed_budget = 1.0, 0
         self.rows = RowFile(folder, self.layout)
@@ -128,6 +128,7 @@ class NodeStore:
         self.update_sizes()
 
     def _append(self, subtrees: list[RecordPiece]) -> None:
+        """Append the records and list entries of subtrees to the files."""
         if not subtrees:
             return
         records = torch.cat([records for records, _ in subtrees])
@@ -168,6 +169,7 @@ class NodeStore:
         return sizes
 
     def _records_of(self, splats: Splats) -> torch.Tensor:
+        """Return the records (N, width) of splats, whose moments are zero."""
         records = np.zeros((len(splats), self.layout.width), np.float32)
         begin = 0
         for name in NAMES:
@@ -188,7 +190,7 @@ class NodeStore:
     def load_cut(self, camera: Camera, pixels: float, near: float) -> np.ndarray:
         """Load the cut of a view into the cache.
 
-        The granularity is max_coarsening until the cut fits.
+        The granularity is coarsened until the cut fits.
 
         Args:
             pixels: granularity in pixels.
@@ -278,7 +280,7 @@ class NodeStore:
 
     def gaussians_at(self, indices: np.ndarray) -> Gaussians:
         """Copy the splats at cache indices (M,)."""
-        return gather_gaussians(self.cache.records, indices, self._terms)
+        return gather_gaussians(self.cache.records, indices, self._coefficients)
 
     def is_leaf(self, indices: np.ndarray) -> np.ndarray:
         """Return which records at cache indices (M,) are leaves, (M,) bool."""

@@ -71,22 +71,23 @@ class RecordOptimizer:
         self._rate_factors = rate_factors
         self._number = number
         self.gaussians = store.gaussians_at(indices)
-        for values in vars(self.gaussians).values():
-            values.requires_grad_()
+        for tensor in vars(self.gaussians).values():
+            tensor.requires_grad_()
 
     def step(self) -> None:
         """Update the visible records by one step."""
-        leaves = vars(self.gaussians)
-        gradients = [leaf.grad for leaf in leaves.values() if leaf.grad is not None]
-        if len(gradients) < len(leaves):  # none is visible
+        tensors = vars(self.gaussians)
+        gradients = [tensor.grad for tensor in tensors.values() if tensor.grad is not None]
+        if len(gradients) < len(tensors):  # no splat is visible
             return
         rates = [
-            torch.as_tensor(self._lr[name]).float().expand(leaf.shape[1:]).reshape(-1)
-            for name, leaf in leaves.items()
+            torch.as_tensor(self._lr[name]).float().expand(tensor.shape[1:]).reshape(-1)
+            for name, tensor in tensors.items()
         ]
-        cache = self._store.cache
-        arguments = self.rendering, self._number, torch.cat(rates), self._rate_factors
-        records.adam_step(cache.records, self._indices, gradients, *arguments)
+        cache, rates = self._store.cache, torch.cat(rates)
+        records.adam_step(
+            cache.records, self._indices, gradients, self.rendering, self._number, rates, self._rate_factors
+        )
         cache.mark_changed(self._indices[(self.rendering.radii > 0).numpy(force=True)])
 
     def zero_grad(self) -> None:

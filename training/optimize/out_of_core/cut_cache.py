@@ -104,14 +104,14 @@ class CutCache:
         self._keep_share = keep_share
         self._record_bytes = 4 * self.layout.width
         # Transfers to a device need staging memory in addition.
-        on_host = self._device.type == "cpu"
-        self._batch_rows = BATCH_ROWS if on_host else max(STAGING_BYTES // self._record_bytes, 1)
+        self._on_host = self._device.type == "cpu"
+        self._batch_rows = BATCH_ROWS if self._on_host else max(STAGING_BYTES // self._record_bytes, 1)
         self.records = torch.zeros(0, self.layout.width, device=self._device)
         self.loaded = self.reused = 0
         self._reset(groups)
 
     def _reset(self, groups: int) -> None:
-        limit = max(self.budget - self.tables, 0) // (self._record_bytes + SLOT_BYTES)
+        limit = max(self.budget - self.table_bytes, 0) // (self._record_bytes + SLOT_BYTES)
         self.capacity = min(limit, len(self.rows))
         if self.capacity < len(self.rows):
             keep_freed_memory(MMAP_BYTES)
@@ -135,9 +135,9 @@ class CutCache:
         return self.capacity - self._room
 
     @property
-    def tables(self) -> int:
+    def table_bytes(self) -> int:
         """Bytes of the tables of all rows."""
-        return INDEX_BYTES * len(self.rows) + self.rows.tables
+        return INDEX_BYTES * len(self.rows) + self.rows.table_bytes
 
     # -- a step ----------------------------------------------------------------------------------------
 
@@ -172,7 +172,7 @@ class CutCache:
                 break  # otherwise compute all cuts again, as cached ones may be finer than necessary
         if cached + len(rows) > self.capacity:
             needed = cached + len(rows)
-            budget = needed * (self._record_bytes + SLOT_BYTES) + self.tables
+            budget = needed * (self._record_bytes + SLOT_BYTES) + self.table_bytes
             raise CutTooLarge(needed, self.capacity, budget)
         self._clock += 1
         self._used[groups] = self._clock
@@ -253,7 +253,7 @@ class CutCache:
         new_slots = self._free[self._room : self._room + len(new_rows)].astype(np.int64)
         for first in range(0, len(new_rows), self._batch_rows):
             batch = slice(first, first + self._batch_rows)
-            if self._device.type == "cpu":
+            if self._on_host:
                 self.rows.read(new_rows[batch], self.records, new_slots[batch])
                 continue
             records = self.rows.read(new_rows[batch]).pin_memory().to(self._device, non_blocking=True)
@@ -308,8 +308,7 @@ class CutCache:
         slots = slots[np.argsort(self._row[slots])]
         for first in range(0, len(slots), self._batch_rows):
             batch = slots[first : first + self._batch_rows]
-            on_host = self._device.type == "cpu"
-            source = (self.records, batch) if on_host else (self.get(batch).cpu(), None)
+            source = (self.records, batch) if self._on_host else (self.get(batch).cpu(), None)
             self.rows.write(self._row[batch], *source)
             self._dirty[batch] = False
 

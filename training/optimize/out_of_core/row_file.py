@@ -111,7 +111,7 @@ class RowFile:
     # -- rows ------------------------------------------------------------------------------------------
 
     @property
-    def tables(self) -> int:
+    def table_bytes(self) -> int:
         """Maximum memory of the tables in bytes."""
         return TABLE_BYTES * len(self._slots)
 

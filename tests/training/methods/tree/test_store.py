@@ -163,7 +163,7 @@ def test_small_budget_gives_identical_bits(town, tmp_path):
     views = cameras(np.random.default_rng(1), 40)
     needed = max(len(large_store.load_cut(view, 1.0, 0.3)) for view in views) + len(large_store.shape.counts)
     small_store = without_reuse(
-        create_store(tmp_path / "some", town, budget=needed * RECORD + large_store.cache.tables)
+        create_store(tmp_path / "some", town, budget=needed * RECORD + large_store.cache.table_bytes)
     )
     assert small_store.cache.capacity == needed < len(large_store) / 3
     truth, actual = (
