@@ -26,7 +26,6 @@ from ..training.runs.folder import RunFolder, find_splats
 from ..training.runs.job import KEYS, Job
 from ..training.settings import check_value
 from ..training.splats.bundle import write_bundle
-from ..training.splats.dialects import Warn
 from ..training.splats.formats import FORMATS, PLY, find_format
 from ..training.splats.origin import describe_origin
 from . import extension
@@ -186,7 +185,7 @@ def _train(args: argparse.Namespace) -> int:
     for line in summary_lines(watch.summary):
         _print(line)
     for warning in watch.warnings:
-        _print(f"warning: {warning}")
+        _warn(warning)
     if args.blend:
         _save(args.blend)
     if watch.problem:
@@ -206,20 +205,16 @@ def _train(args: argparse.Namespace) -> int:
 
 def _import_for(job: Job) -> bpy.types.Object:
     """Import a job's photos, or its base splats if it trains on captured views, and return the scene root."""
-
-    def warn(message: str) -> None:
-        _print(f"warning: {message}")
-
     if not job.capture:
-        return _import_photos(Path(job.scene), warn)
+        return _import_photos(Path(job.scene))
     run = RunFolder(job.base)
-    return importing.import_splats(bpy.context, run.bundle if run.bundle.exists() else run.path, warn=warn)
+    return importing.import_splats(bpy.context, run.bundle if run.bundle.exists() else run.path, warn=_warn)
 
 
-def _import_photos(folder: Path, warn: Warn) -> bpy.types.Object:
+def _import_photos(folder: Path) -> bpy.types.Object:
     """Import a COLMAP scene, undistort its photos if needed and return the scene root."""
-    root = importing.import_colmap(bpy.context, folder, warn=warn)
-    photo_preparation.undistort_photos(root, warn)
+    root = importing.import_colmap(bpy.context, folder, warn=_warn)
+    photo_preparation.undistort_photos(root, _warn)
     return root
 
 
@@ -231,11 +226,9 @@ def _methods(args: argparse.Namespace) -> int:
 def _import(args: argparse.Namespace) -> int:
     _empty_file()
     if args.source.is_dir():
-        root = _import_photos(args.source.resolve(), lambda m: _print(f"warning: {m}"))
+        root = _import_photos(args.source.resolve())
     else:
-        root = importing.import_splats(
-            bpy.context, args.source.resolve(), warn=lambda m: _print(f"warning: {m}")
-        )
+        root = importing.import_splats(bpy.context, args.source.resolve(), warn=_warn)
     _print(f"'{root.name}': {scenes.contents(root)}")
     _save(args.blend)
     return DONE
@@ -292,16 +285,13 @@ def _capture(args: argparse.Namespace) -> int:
     def report(number: int, count: int) -> None:
         _print(f"View {number} of {count}")
 
-    def warn(message: str) -> None:
-        _print(f"warning: {message}")
-
     folder = args.out.resolve()
     if scene.render.engine.startswith(("BLENDER_EEVEE", "BLENDER_WORKBENCH")):
         name = "Workbench" if "WORKBENCH" in scene.render.engine else "EEVEE"
         _print(f"{name} needs a GPU, also in background mode. If Blender crashes now, use Cycles.")
     if warning := noise_warning(scene):
-        warn(warning)
-    count = render_views(bpy.context, folder, width, height, args.range, report, warn)
+        _warn(warning)
+    count = render_views(bpy.context, folder, width, height, args.range, report, _warn)
     if args.range:
         _print(f"{folder}: views {args.range[0]} to {min(args.range[1], count)} of {count}")
     else:
@@ -377,6 +367,10 @@ def _save(path: Path) -> None:
 def _print(text: str) -> None:
     with suppress(OSError):  # a full disk
         print(text, file=sys.stderr, flush=True)
+
+
+def _warn(message: str) -> None:
+    _print(f"warning: {message}")
 
 
 class _ProgressBar:

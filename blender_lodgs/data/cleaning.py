@@ -72,8 +72,7 @@ def views_test(context: bpy.types.Context, root: bpy.types.Object, min_views: in
 
 def selected_mask(cloud: bpy.types.PointCloud) -> np.ndarray:
     """Return the (N,) bool mask of splats selected by a stroke or in Edit Mode."""
-    values = read_attribute(cloud, SELECTION)
-    return np.zeros(len(cloud.points), bool) if values is None else values.astype(bool)
+    return _mask(cloud, SELECTION)
 
 
 def find(root: bpy.types.Object, test: Test) -> dict[int, np.ndarray]:
@@ -268,7 +267,12 @@ def count_remaining(root: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> d
 
 def hidden_mask(cloud: bpy.types.PointCloud) -> np.ndarray:
     """Return the (N,) bool mask of hidden splats."""
-    values = read_attribute(cloud, HIDDEN)
+    return _mask(cloud, HIDDEN)
+
+
+def _mask(cloud: bpy.types.PointCloud, name: str) -> np.ndarray:
+    """Return an attribute as (N,) bool; False everywhere without the attribute."""
+    values = read_attribute(cloud, name)
     return np.zeros(len(cloud.points), bool) if values is None else values.astype(bool)
 
 

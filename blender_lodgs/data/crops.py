@@ -148,9 +148,7 @@ def followed_objects(obj: bpy.types.Object, count_key: str = groups.COUNT) -> li
 
 def detach(obj: bpy.types.Object) -> None:
     """Remove the crop modifier of a level or of a copy of one."""
-    modifier = modifier_of(obj)
-    if modifier is not None:
-        remove_modifier(obj, modifier)
+    remove_modifier(obj, modifier_of(obj))
 
 
 def _is_under(obj: bpy.types.Object | None, root: bpy.types.Object) -> bool:

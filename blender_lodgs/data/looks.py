@@ -195,9 +195,7 @@ def _attach(obj: bpy.types.Object, root: bpy.types.Object, regions: list[bpy.typ
 
 def detach(obj: bpy.types.Object) -> None:
     """Remove the look modifier of a level."""
-    modifier = modifier_of(obj)
-    if modifier is not None:
-        remove_modifier(obj, modifier)
+    remove_modifier(obj, modifier_of(obj))
 
 
 CLASSES = (LookSettings,)

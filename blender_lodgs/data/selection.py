@@ -321,12 +321,7 @@ def _drive_focal_length(root: bpy.types.Object) -> None:
         f" else {height} * ay / ax / (sh if fit == 2 else sw))",
     )
     for name, (path, fallback) in variables.items():
-        variable = driver.variables.new()
-        variable.name, variable.type = name, "CONTEXT_PROP"
-        target = variable.targets[0]
-        target.context_property, target.data_path = "ACTIVE_SCENE", path
-        if fallback is not None:
-            target.use_fallback_value, target.fallback_value = True, fallback
+        read_scene(driver, name, path, fallback)
 
 
 def _drive(
@@ -429,9 +424,7 @@ def _ensure_modifier(obj: bpy.types.Object, rule: Rule) -> bpy.types.NodesModifi
 
 def _detach(obj: bpy.types.Object) -> None:
     """Remove the rule's modifier."""
-    modifier = rule_modifier(obj)
-    if modifier is not None:
-        remove_modifier(obj, modifier)
+    remove_modifier(obj, rule_modifier(obj))
 
 
 def rule_modifier(obj: bpy.types.Object) -> bpy.types.NodesModifier | None:

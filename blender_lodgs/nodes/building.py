@@ -308,11 +308,16 @@ def replace_driver(obj: bpy.types.Object, path: str, expression: str, index: int
     return driver
 
 
-def remove_modifier(obj: bpy.types.Object, modifier: bpy.types.NodesModifier) -> None:
+def remove_modifier(obj: bpy.types.Object, modifier: bpy.types.NodesModifier | None) -> None:
     """Remove a modifier, its drivers, and its node group if no other modifier uses it.
 
     An edited group is kept with a fake user.
+
+    Args:
+        modifier: modifier to remove; None does nothing.
     """
+    if modifier is None:
+        return
     for driver in list(obj.animation_data.drivers if obj.animation_data else ()):
         if driver.data_path.startswith(f'modifiers["{modifier.name}"]'):
             obj.animation_data.drivers.remove(driver)
@@ -356,10 +361,18 @@ def add_switched_modifier(
     return modifier
 
 
-def read_scene(driver: bpy.types.Driver, name: str, path: str) -> None:
-    """Give a driver a variable with a property of the active scene; 0 if this extension is missing."""
+def read_scene(driver: bpy.types.Driver, name: str, path: str, fallback: float | None = 0.0) -> None:
+    """Give a driver a variable with a property of the active scene.
+
+    Args:
+        driver: driver that receives the variable.
+        name: name of the variable.
+        path: data path of the property.
+        fallback: value without the property, such as one of this extension if it is missing; None: an error.
+    """
     variable = driver.variables.new()
     variable.name, variable.type = name, "CONTEXT_PROP"
     target = variable.targets[0]
     target.context_property, target.data_path = "ACTIVE_SCENE", path
-    target.use_fallback_value, target.fallback_value = True, 0.0
+    if fallback is not None:
+        target.use_fallback_value, target.fallback_value = True, fallback

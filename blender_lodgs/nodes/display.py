@@ -81,8 +81,8 @@ def attach(obj: bpy.types.Object) -> None:
             show_viewport="lodgs_viewport.native",
             show_render="lodgs_render.draws_points",
         )
-    elif not is_native and (modifier := obj.modifiers.get(NATIVE)) is not None:
-        remove_modifier(obj, modifier)
+    elif not is_native:
+        remove_modifier(obj, obj.modifiers.get(NATIVE))
     keep_order(obj)
 
 
@@ -94,9 +94,7 @@ def drop_harmonics(obj: bpy.types.Object) -> None:
 
 def keep_harmonics(obj: bpy.types.Object) -> None:
     """Remove *LODGS Viewport*, so that other modifiers and Python read complete splats in viewports."""
-    modifier = obj.modifiers.get(VIEWPORT)
-    if modifier is not None:
-        remove_modifier(obj, modifier)
+    remove_modifier(obj, obj.modifiers.get(VIEWPORT))
 
 
 def reduce_points(obj: bpy.types.Object) -> None:

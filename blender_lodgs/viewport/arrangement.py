@@ -77,10 +77,12 @@ class Pool:
         key = placement.first, placement.count
         if key not in self._selectors:
             rows = slice(placement.first, placement.first + placement.count)
-            columns = {name: column[rows] for name, column in self.columns.items()}
-            columns[OPACITY] = self.opacities[rows]
-            self._selectors[key] = SplatSelector(self.means[rows], columns)
+            self._selectors[key] = self._new_selector(rows)
         return self._selectors[key]
+
+    def _new_selector(self, rows: slice | np.ndarray) -> SplatSelector:
+        columns = {name: column[rows] for name, column in self.columns.items()}
+        return SplatSelector(self.means[rows], columns | {OPACITY: self.opacities[rows]})
 
     def estimate_count(self, placement: Placement) -> int:
         """Estimate the number of selected splats of a placement; large sets are sampled."""
@@ -90,15 +92,13 @@ class Pool:
         key = placement.first, -size
         if key not in self._selectors:
             rows = placement.first + np.random.default_rng(0).integers(0, placement.count, size)
-            columns = {name: column[rows] for name, column in self.columns.items()}
-            columns[OPACITY] = self.opacities[rows]
-            self._selectors[key] = SplatSelector(self.means[rows, :3], columns)
+            self._selectors[key] = self._new_selector(rows)
         return len(self._selectors[key].select(placement.query)[0]) * SAMPLE_STEP
 
     def drawn_splats(self, request: Request) -> DrawnSplats:
         """Return the splats that a request draws, unsorted; the last result is cached."""
         if not self._drawn or self._drawn[0].selection_key != request.selection_key:
-            self._drawn[:] = [_collect(self, request)]
+            self._drawn[:] = [_select_drawn(self, request)]
         return self._drawn[0]
 
     def apply_updates(self) -> None:
@@ -321,9 +321,10 @@ def stable_argsort(values: np.ndarray) -> np.ndarray:
     return order[np.argsort((bits >> np.uint32(16)).astype(np.uint16)[order], kind="stable")]
 
 
-def _collect(pool: Pool, request: Request) -> DrawnSplats:
+def _select_drawn(pool: Pool, request: Request) -> DrawnSplats:
+    """Select the splats that a request draws."""
     coarsened = request.coarsened.copy()
-    selections, excluded = within_budget(
+    selections, excluded = select_within_budget(
         pool, request.placements, request.budget, request.position, coarsened
     )
     table = np.empty((sum(len(index) for index, _ in selections), 4), np.float32)
@@ -340,7 +341,7 @@ def _collect(pool: Pool, request: Request) -> DrawnSplats:
     return DrawnSplats(request.selection_key, table, splats, means, excluded, coarsened)
 
 
-def within_budget(
+def select_within_budget(
     pool: Pool,
     placements: Sequence[Placement],
     budget: int,
@@ -443,9 +444,15 @@ def _thin(
     keep: int,
     position: tuple[float, float, float] | None,
 ) -> None:
-    """Keep the ``keep`` most visible splats (opacity times area in the image) of these placements.
+    """Keep the most visible splats (opacity times area in the image) of some placements.
 
     The direction of the view does not count, so that a turned view is complete.
+
+    Args:
+        selections: index and weights of each placement's splats; replaced by those of the kept splats.
+        numbers: indices of the placements to thin.
+        keep: number of splats that remain.
+        position: see :func:`select_within_budget`.
     """
     visibility = []
     for i in numbers:

@@ -195,10 +195,11 @@ def hit_strength(
 
     Args:
         coverage: (H, W) of the stroke, see :func:`brush_coverage` and :func:`lasso_coverage`.
-        sigma: (N,) standard deviations in the splats' units: average the coverage over each splat's round
-            footprint. None: use the coverage at the mean.
+        splats: projections of the splats.
         reach: (N,) extent of splats in their units, to hit only visible ones.
         occlusion: of the same image; a splat is visible if its extent reaches in front of that depth.
+        sigma: (N,) standard deviations in the splats' units: average the coverage over each splat's round
+            footprint. None: use the coverage at the mean.
     """
     strength = np.zeros(len(splats.x), coverage.dtype if sigma is None else np.float32)
     rows = np.flatnonzero(coverage.any(axis=1))

@@ -43,14 +43,14 @@ _COLOR_SCALE = 0.15
 """Coded change of colour per unit of the coefficient of degree 0."""
 _FIRST_BITS, _REST_BITS = 5, 4
 """Bits of the coefficients of degree 1, and of higher degrees."""
-_MAX_RATIO, _SMALL = 20, 1 << 26
+_MAX_RATIO, _ANY_RATIO_BYTES = 20, 1 << 26
 """Maximum ratio of compression that is read, and size up to which any ratio is.
 
 The ratio of trained splats is about 2.
 """
 _MAX_EXTENSIONS = 1 << 16
 """Maximum bytes of extensions that are read."""
-_LEVEL = 6
+_GZIP_LEVEL = 6
 """Compression of gzip. Level 9 takes several times as long for files that are hardly smaller."""
 _FLIP = np.array([1.0, -1, -1])
 """From the axes of 3DGS files to those of the specification, and back."""
@@ -138,7 +138,7 @@ def _write(
         part = slice(begin, begin + len(splats))
         for array, codes in zip(arrays, _encode(_flipped(splats, signs), header), strict=True):
             array[part] = codes.reshape(len(splats), -1)
-    with gzip.GzipFile("", "wb", _LEVEL, file, mtime=0) as stream:
+    with gzip.GzipFile("", "wb", _GZIP_LEVEL, file, mtime=0) as stream:
         stream.write(_HEADER.pack(_MAGIC, *header, 0))
         for array in arrays:
             stream.write(array.data)
@@ -171,9 +171,9 @@ def _encode(splats: Splats, header: _Header) -> tuple[np.ndarray, ...]:
     rotations = _first_three_codes(splats.quats) if header.version < 3 else _smallest_codes(splats.quats)
     return (
         fixed.reshape(-1, 1).view(np.uint8)[:, :3],
-        _byte(255 * splats.opacities),
-        _byte(255 * (_COLOR_SCALE * splats.sh[:, 0] + 0.5)),
-        _byte(16 * (splats.log_scales + 10)),
+        _to_codes(255 * splats.opacities),
+        _to_codes(255 * (_COLOR_SCALE * splats.sh[:, 0] + 0.5)),
+        _to_codes(16 * (splats.log_scales + 10)),
         rotations,
         _coefficient_codes(splats.sh[:, 1:]),
     )
@@ -213,7 +213,7 @@ def unpack_spz(data: bytes, max_splats: int, path: Path | None = None) -> Splats
     return _decode(header, arrays)
 
 
-def _check(header: _Header, size: int, max_splats: int | None = None) -> list[int]:
+def _array_sizes(header: _Header, size: int, max_splats: int | None = None) -> list[int]:
     """Return the bytes of each array of a file.
 
     Args:
@@ -224,7 +224,7 @@ def _check(header: _Header, size: int, max_splats: int | None = None) -> list[in
     """
     sizes = [header.count * width for width in header.widths()]
     too_many = max_splats is not None and header.count > max_splats
-    if too_many or sum(sizes) > max(_MAX_RATIO * size, _SMALL) or header.bits > _FIXED_BITS:
+    if too_many or sum(sizes) > max(_MAX_RATIO * size, _ANY_RATIO_BYTES) or header.bits > _FIXED_BITS:
         raise ValueError(f"its SPZ data are too short for {header.count:,} splats")
     return sizes
 
@@ -251,7 +251,7 @@ def _unpack_gzip(data: bytes, max_splats: int | None = None) -> tuple[_Header, l
         raise ValueError("they are not SPZ data")
     if header.version not in (1, 2, 3):
         raise ValueError(f"SPZ version {header.version} is not supported")
-    sizes = _check(header, len(data), max_splats)
+    sizes = _array_sizes(header, len(data), max_splats)
     body = stream.decompress(stream.unconsumed_tail, sum(sizes) or 1)
     rest = stream.decompress(stream.unconsumed_tail, _MAX_EXTENSIONS)
     if len(body) != sum(sizes) or not stream.eof or (rest and not header.flags & _EXTENDED):
@@ -283,7 +283,7 @@ def _unpack_zstandard(
         )
     if version != 4 or degree > MAX_DEGREE or offset < _HEADER_4.size:
         raise ValueError(f"its version is {version} and its SH degree {degree}")
-    sizes = _check(header, len(data), max_splats)
+    sizes = _array_sizes(header, len(data), max_splats)
     begin, arrays = offset + streams * _ENTRY_4.size, []
     table = [entry for entry in _ENTRY_4.iter_unpack(data[offset:begin]) if entry[1]]
     if [unpacked for _, unpacked in table] != [size for size in sizes if size]:
@@ -360,7 +360,7 @@ def _with_3dgs_axes(splats: Splats, axes: str) -> Splats:
 def _first_three_codes(quats: np.ndarray) -> np.ndarray:
     """Return the codes (N, 3) uint8 of quats (N, 4), wxyz, that :func:`_first_three` reads."""
     unit = quats / np.linalg.norm(quats, axis=1, keepdims=True)
-    return _byte(127.5 * np.where(unit[:, :1] < 0, -1, 1) * unit[:, 1:] + 127.5)
+    return _to_codes(127.5 * np.where(unit[:, :1] < 0, -1, 1) * unit[:, 1:] + 127.5)
 
 
 def _first_three(codes: np.ndarray) -> np.ndarray:
@@ -409,5 +409,6 @@ def _coefficient_codes(rest: np.ndarray) -> np.ndarray:
     return ((codes + buckets // 2) // buckets * buckets).clip(0, 255).astype(np.uint8)
 
 
-def _byte(values: np.ndarray) -> np.ndarray:
+def _to_codes(values: np.ndarray) -> np.ndarray:
+    """Round values to uint8, limited to 0 to 255."""
     return np.rint(values).clip(0, 255).astype(np.uint8)

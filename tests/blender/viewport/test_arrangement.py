@@ -182,8 +182,8 @@ def test_cached_selections_match_the_rule(bpy, lodgs, monkeypatch, name):
     rules = lodgs("training.lod.rule")
     rule, selections = rules.rules()[name], []
     levels = [(n, {fact: ends[n - 1]} if fact else {}) for n in (1, 2, 3)]
-    within_budget = arrangement.within_budget
-    monkeypatch.setattr(arrangement, "within_budget", lambda *a: selections.append(a) or within_budget(*a))
+    select = arrangement.select_within_budget
+    monkeypatch.setattr(arrangement, "select_within_budget", lambda *a: selections.append(a) or select(*a))
 
     def request(position, backward, matrix=None, colors="OWN", budget=10**6, **values):
         placements = []
@@ -258,7 +258,7 @@ def test_budget_excludes_the_finest_additive_level_first(bpy, lodgs):
         (300, (100, 200, 0, 0)),
         (60, (60, 0, 0, 0)),
     ):
-        selections, excluded = arrangement.within_budget(pool, placements, budget)
+        selections, excluded = arrangement.select_within_budget(pool, placements, budget)
         assert tuple(len(index) for index, _ in selections) == counts
         assert excluded == 1500 - sum(counts)
     visible = sets[0][2] * (sets[0][1] ** 2).sum(axis=1)
@@ -330,16 +330,16 @@ def test_budget_replaces_the_finest_level_by_coarser_ones(bpy, lodgs):
         placements.append(make_placement(lodgs, int(start), len(part[0]), level=level, query=query))
     distances = [np.linalg.norm(part[0], axis=1) for part in sets]
     arrangement = lodgs("viewport.arrangement")
-    full, excluded = arrangement.within_budget(pool, placements, 10**6)
+    full, excluded = arrangement.select_within_budget(pool, placements, 10**6)
     assert excluded == 0
     for (index, _), distance, (near, far) in zip(full, distances, bands, strict=True):
         assert np.array_equal(index, np.flatnonzero((distance >= near) & (distance < far)))
     total = sum(len(index) for index, _ in full)
-    selections, _ = arrangement.within_budget(pool, placements, total - 1)
+    selections, _ = arrangement.select_within_budget(pool, placements, total - 1)
     assert len(selections[2][0]) == 0
     assert np.array_equal(selections[1][0], np.flatnonzero(distances[1] < 0.9))
     assert np.array_equal(selections[0][0], full[0][0])
-    selections, _ = arrangement.within_budget(pool, placements, 300)
+    selections, _ = arrangement.select_within_budget(pool, placements, 300)
     assert [len(index) for index, _ in selections] == [300, 0, 0]
 
 
@@ -398,7 +398,7 @@ def test_budget_coarsens_queries_with_estimates(bpy, lodgs, monkeypatch):
     assert dict(truth.values)["pixels"] > 2
     select = arrangement._select
     monkeypatch.setattr(arrangement, "_select", lambda *a: exact_queries.append(a) or select(*a))
-    ((index, _),), excluded = arrangement.within_budget(
+    ((index, _),), excluded = arrangement.select_within_budget(
         pool, [make_placement(lodgs, 0, count, level=2, query=query)], budget
     )
     assert np.array_equal(index, pool.selector(make_placement(lodgs, 0, count, level=2)).select(truth)[0])
