@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from types import ModuleType
 
 import bpy
 
@@ -31,6 +32,34 @@ def report_errors(execute):
         return {"CANCELLED"}
 
     return wrapper
+
+
+def report_result(operator: bpy.types.Operator, problem: str, message: str = "") -> set[str]:
+    """Report a problem, or a message without one, and return the result of ``execute``."""
+    if problem:
+        operator.report({"ERROR"}, problem)
+        return {"CANCELLED"}
+    if message:
+        operator.report({"INFO"}, message)
+    return {"FINISHED"}
+
+
+class CancelOperator:
+    """Base class of operators that cancel the program that a module runs.
+
+    Attributes:
+        module: module of ``runs`` whose ``current`` is the program, or None.
+    """
+
+    module: ModuleType
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return cls.module.current is not None and cls.module.current.running
+
+    def execute(self, context: bpy.types.Context):
+        self.module.current.cancel()
+        return {"FINISHED"}
 
 
 def show_image(context: bpy.types.Context, image: bpy.types.Image) -> None:

@@ -9,7 +9,7 @@ from ..data import importing, scenes
 from ..data.original_place import original_place
 from ..runs import background_capture, processes
 from ..viewport import coverage
-from .base import report_errors
+from .base import CancelOperator, report_errors, report_result
 
 
 class LODGS_OT_capture_scene(bpy.types.Operator):
@@ -24,26 +24,15 @@ class LODGS_OT_capture_scene(bpy.types.Operator):
     def execute(self, context):
         work = background_capture.start(context, lambda message: self.report({"WARNING"}, message))
         processes.follow(work.step)
-        if work.problem:
-            self.report({"ERROR"}, work.problem)
-            return {"CANCELLED"}
-        return {"FINISHED"}
+        return report_result(self, work.problem)
 
 
-class LODGS_OT_cancel_capture(bpy.types.Operator):
+class LODGS_OT_cancel_capture(CancelOperator, bpy.types.Operator):
     bl_idname = "lodgs.cancel_capture"
     bl_label = "Cancel"
     bl_description = "Stop rendering views; Capture resumes with the next view"
     bl_options = {"INTERNAL"}
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return background_capture.current is not None and background_capture.current.running
-
-    def execute(self, context):
-        assert background_capture.current is not None
-        background_capture.current.cancel()
-        return {"FINISHED"}
+    module = background_capture
 
 
 class LODGS_OT_show_coverage(bpy.types.Operator):

@@ -9,7 +9,7 @@ from ...training.methods import METHODS
 from ..data import evidence, photographs, roots
 from ..render import compare
 from ..runs import method_comparison, processes
-from .base import SceneOperator, report_errors
+from .base import CancelOperator, SceneOperator, report_errors, report_result
 
 
 class _ViewsOperator:
@@ -34,10 +34,7 @@ class LODGS_OT_measure_views(_ViewsOperator, bpy.types.Operator):
     def execute(self, context):
         measurement = compare.measure(context, roots.active_root(context))
         processes.follow(measurement.step)
-        if measurement.problem:
-            self.report({"ERROR"}, measurement.problem)
-            return {"CANCELLED"}
-        return {"FINISHED"}
+        return report_result(self, measurement.problem)
 
 
 class LODGS_OT_show_evidence(_ViewsOperator, bpy.types.Operator):
@@ -152,26 +149,15 @@ class LODGS_OT_compare_methods(SceneOperator, bpy.types.Operator):
         names = [name for name in METHODS if name in self.methods]
         work = method_comparison.compare_methods(roots.active_root(context), names)
         processes.follow(work.step)
-        if work.problem:
-            self.report({"ERROR"}, work.problem)
-            return {"CANCELLED"}
-        self.report({"INFO"}, work.message)
-        return {"FINISHED"}
+        return report_result(self, work.problem, work.message)
 
 
-class LODGS_OT_cancel_comparing_methods(bpy.types.Operator):
+class LODGS_OT_cancel_comparing_methods(CancelOperator, bpy.types.Operator):
     bl_idname = "lodgs.cancel_comparing_methods"
     bl_label = "Cancel"
     bl_description = "Stop the comparison; the same comparison resumes it"
     bl_options = {"INTERNAL"}
-
-    @classmethod
-    def poll(cls, context):
-        return method_comparison.current is not None and method_comparison.current.running
-
-    def execute(self, context):
-        method_comparison.current.cancel()
-        return {"FINISHED"}
+    module = method_comparison
 
 
 CLASSES = (

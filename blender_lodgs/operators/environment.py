@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..runs import environment, environment_setup, processes
-from .base import report_errors
+from .base import CancelOperator, report_errors, report_result
 
 
 class LODGS_OT_make_environment(bpy.types.Operator):
@@ -21,26 +21,15 @@ class LODGS_OT_make_environment(bpy.types.Operator):
     def execute(self, context: bpy.types.Context):
         work = environment_setup.start()
         processes.follow(work.step)
-        if work.problem:
-            self.report({"ERROR"}, work.problem)
-            return {"CANCELLED"}
-        return {"FINISHED"}
+        return report_result(self, work.problem)
 
 
-class LODGS_OT_cancel_environment(bpy.types.Operator):
+class LODGS_OT_cancel_environment(CancelOperator, bpy.types.Operator):
     bl_idname = "lodgs.cancel_environment"
     bl_label = "Cancel"
     bl_description = "Stop the installation and remove its files"
     bl_options = {"INTERNAL"}
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return environment_setup.current is not None and environment_setup.current.running
-
-    def execute(self, context: bpy.types.Context):
-        if environment_setup.current is not None:
-            environment_setup.current.cancel()
-        return {"FINISHED"}
+    module = environment_setup
 
 
 class LODGS_OT_check_environment(bpy.types.Operator):

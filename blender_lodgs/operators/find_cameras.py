@@ -7,7 +7,7 @@ import bpy
 from ...training.scenes.reconstruct import PRESETS
 from ..data.paths import absolute_path
 from ..runs import photo_preparation, processes
-from .base import report_errors
+from .base import CancelOperator, report_errors, report_result
 
 _LENSES = (
     ("AUTO", "Automatic", "One lens if all photos have the same size, otherwise one lens per photo"),
@@ -72,27 +72,15 @@ class LODGS_OT_find_cameras(bpy.types.Operator):
         processes.follow(work.step)
         for message in work.warnings:
             self.report({"WARNING"}, message)
-        if work.problem:
-            self.report({"ERROR"}, work.problem)
-            return {"CANCELLED"}
-        self.report({"INFO"}, work.message)
-        return {"FINISHED"}
+        return report_result(self, work.problem, work.message)
 
 
-class LODGS_OT_cancel_find_cameras(bpy.types.Operator):
+class LODGS_OT_cancel_find_cameras(CancelOperator, bpy.types.Operator):
     bl_idname = "lodgs.cancel_find_cameras"
     bl_label = "Cancel"
     bl_description = "Stop the import; importing the same photos resumes it"
     bl_options = {"INTERNAL"}
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return photo_preparation.current is not None and photo_preparation.current.running
-
-    def execute(self, context):
-        assert photo_preparation.current is not None
-        photo_preparation.current.cancel()
-        return {"FINISHED"}
+    module = photo_preparation
 
 
 def _menu(self, context):
