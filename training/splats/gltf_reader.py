@@ -1,7 +1,7 @@
 """Reader of splats in glTF, with levels by MSFT_lod; ``gltf`` writes them.
 
 Drafts of KHR_gaussian_splatting are read, too: attributes that start with an underscore, base colour and
-opacity in COLOR_0, and other names of the compression with SPZ.
+opacity in COLOR_0, logarithmic scales, and other names of the compression with SPZ.
 """
 
 from __future__ import annotations
@@ -199,10 +199,14 @@ class _GlbReader:
         means = self._accessor(attributes["POSITION"], 3) * step
         quats = self._accessor(attributes[f"{SPLATS}:ROTATION"], 4)[:, [3, 0, 1, 2]]
         scales = self._accessor(attributes[f"{SPLATS}:SCALE"], 3)
+        if (scales < 0).any():
+            scales = np.exp(scales)  # logarithms, which SplatTransform wrote until June 2026
         if f"{SPLATS}:OPACITY" in attributes:
             alphas = self._accessor(attributes[f"{SPLATS}:OPACITY"], 1)[:, 0]
         else:
             alphas = self._accessor(attributes["COLOR_0"], 4)[:, 3]
+        if (alphas < 0).any():
+            alphas = 1 / (1 + np.exp(-alphas))  # logits, which JSplat wrote
         degree = max((n for n in range(MAX_DEGREE + 1) if harmonics(n)[-1] in attributes), default=0)
         base, *rest = harmonics(degree)
         if base in attributes:

@@ -247,6 +247,24 @@ def test_drafts_have_base_colour_and_opacity_in_color_0(tmp_path, draft, scale, 
     np.testing.assert_allclose(alphas, stored, atol=0.5 / 255 + 1e-6)
 
 
+def test_logarithmic_scales_and_logits_of_other_programs(tmp_path):
+    """playcanvas/splat-transform#267, javagl/JSplat#8."""
+
+    def change(document, primitive, data):
+        data = bytearray(data)
+        for name, convert in (("SCALE", np.log), ("OPACITY", lambda alphas: np.log(alphas / (1 - alphas)))):
+            accessor = document["accessors"][primitive["attributes"][PREFIX + name]]
+            view = document["bufferViews"][accessor["bufferView"]]
+            begin = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+            count = accessor["count"] * (3 if name == "SCALE" else 1)
+            values = np.frombuffer(data, np.float32, count, begin)
+            values[:] = convert(values)
+        return bytes(data)
+
+    expected, splats = edited(tmp_path, change)
+    assert_equal(splats, expected)
+
+
 @pytest.mark.parametrize(
     "name", ["KHR_gaussian_splatting_compression_spz", "KHR_spz_gaussian_splats_compression"]
 )
