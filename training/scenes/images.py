@@ -31,6 +31,8 @@ _LARGE = 1 << 25
 _STRIP = 1 << 20
 """Approximate number of pixels averaged at a time; each takes about 100 bytes."""
 
+_LAYOUT = 258, 259, 284
+"""TIFF tags: bits per channel; compression, 1 for none; planes, 2 for one per channel."""
 _UNDO_TRANSPOSE = {2: 0, 3: 3, 4: 1, 5: 5, 6: 2, 7: 6, 8: 4}
 """``Image.Transpose`` value that reverts Pillow's transposition, by EXIF orientation."""
 
@@ -148,7 +150,14 @@ def _open_image(path: Path, width: int, height: int, large: int, alpha: bool = F
             file.seek(0)
             with Image.open(file, formats=("JPEG", "PNG", "TIFF", "WEBP", "BMP")) as image:
                 if image.format == "TIFF":  # the only format that Pillow transposes by its orientation
-                    orientation = image.getexif().get(ORIENTATION, 1)
+                    tags = image.getexif()
+                    bits, compression, planes = (tags.get(tag) for tag in _LAYOUT)
+                    if (compression, planes) == (1, 2) and np.max(bits or 1) > 8:  # Pillow 13 misreads them
+                        raise LodgsError(
+                            f"Cannot read {path}: its 16-bit colours are stored per channel.",
+                            "Save it interleaved or compressed.",
+                        )
+                    orientation = tags.get(ORIENTATION, 1)
                     image.load()
                     if orientation in _UNDO_TRANSPOSE:
                         image = image.transpose(Image.Transpose(_UNDO_TRANSPOSE[orientation]))

@@ -156,6 +156,18 @@ def test_big_endian_tiff(tmp_path):
     np.testing.assert_allclose(image[..., 1].ravel(), np.arange(0, 150, 10) / 255, atol=1e-6)
 
 
+def test_16_bit_tiff_with_separate_channels_is_refused(tmp_path):
+    """Pillow would read its bytes as pixels."""
+    tags = [(256, 4, 1, 5), (257, 4, 1, 3), (258, 3, 3, 134), (259, 4, 1, 1), (262, 4, 1, 2),
+            (273, 4, 3, 140), (277, 4, 1, 3), (278, 4, 1, 3), (279, 4, 3, 152), (284, 4, 1, 2)]  # fmt: skip
+    data = b"II*\0" + struct.pack("<IH", 8, len(tags)) + b"".join(struct.pack("<HHII", *tag) for tag in tags)
+    data += bytes(4) + struct.pack("<3H6I", 16, 16, 16, 164, 194, 224, 30, 30, 30) + bytes(90)
+    (tmp_path / "a.tif").write_bytes(data)
+    assert image_size(tmp_path / "a.tif") == (5, 3)
+    with pytest.raises(LodgsError, match=r"16-bit colours are stored per channel"):
+        load_image(tmp_path / "a.tif", 5, 3)
+
+
 @pytest.mark.parametrize(
     ("mode", "options"),
     [("RGB", {"quality": 100}), ("RGB", {"lossless": True}), ("RGBA", {"lossless": True})],
