@@ -309,9 +309,10 @@ def replace_driver(obj: bpy.types.Object, path: str, expression: str, index: int
 
 
 def remove_modifier(obj: bpy.types.Object, modifier: bpy.types.NodesModifier | None) -> None:
-    """Remove a modifier, its drivers, and its node group if no other modifier uses it.
+    """Remove a modifier and its drivers; an edited node group is kept with a fake user.
 
-    An edited group is kept with a fake user.
+    Other groups without users are not saved. Removing them here, in a handler of updates, crashes Blender 5.2
+    and newer if another scene has been evaluated.
 
     Args:
         modifier: modifier to remove; None does nothing.
@@ -325,8 +326,6 @@ def remove_modifier(obj: bpy.types.Object, modifier: bpy.types.NodesModifier | N
     obj.modifiers.remove(modifier)
     if group is not None and is_edited(group):
         group.use_fake_user = True
-    elif group is not None and not group.users:
-        bpy.data.node_groups.remove(group)
 
 
 def find_modifier(obj: bpy.types.Object, key: str) -> bpy.types.NodesModifier | None:

@@ -210,7 +210,7 @@ def test_modifiers_follow_changed_and_deleted_crops(bpy, lodgs, scene_of):
     bpy.context.view_layer.update()
     assert len(shown_rows(bpy, lodgs, item.object)) == len(means)
     assert lodgs("data.crops").modifier_of(item.object) is None
-    assert not [group for group in bpy.data.node_groups if group.name.startswith("LODGS Clean Up")]
+    assert not any(group.users for group in bpy.data.node_groups if group.name.startswith("LODGS Clean Up"))
 
 
 def test_clean_up_tests_hide_matching_splats(bpy, lodgs, scene_of):

@@ -170,7 +170,7 @@ def test_older_group_is_replaced_for_all_users(bpy, lodgs, splat_scene, name):
     for item in root.lodgs.levels:
         groups_of_rules = [m.node_group for m in item.object.modifiers if groups.rule_of_group(m.node_group)]
         assert [group["lodgs_version"] for group in groups_of_rules] == [version]
-    assert sum("lodgs_rule" in group for group in bpy.data.node_groups) == 1
+    assert sum("lodgs_rule" in group and group.users > 0 for group in bpy.data.node_groups) == 1
 
 
 @pytest.fixture

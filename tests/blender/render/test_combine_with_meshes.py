@@ -41,6 +41,16 @@ def test_separating_restores_the_scene(bpy, lodgs, scene, transparent):
     assert not bpy.ops.lodgs.separate_meshes.poll()
 
 
+def test_deleted_crops_do_not_crash_a_combined_scene(bpy, scene):
+    """Blender 5.2 crashes if an update handler removes node groups after the second scene was evaluated."""
+    assert bpy.ops.lodgs.combine_with_meshes() == {"FINISHED"}
+    for _ in range(3):
+        assert bpy.ops.lodgs.add_crop(shape="BOX") == {"FINISHED"}
+        bpy.context.view_layer.update()
+        bpy.ops.object.delete()
+        bpy.context.view_layer.update()
+
+
 def test_undo_combines_again(bpy, lodgs, scene):
     bpy.ops.ed.undo_push(message="before")
     bpy.ops.lodgs.combine_with_meshes("EXEC_DEFAULT", True)  # True: one undo step, as in the interface
