@@ -10,6 +10,7 @@ from pathlib import Path
 
 from ..documents import parse_json
 from ..errors import LodgsError, printable
+from ..runs.folder import RunFolder
 from ..runs.job import Job
 from ..settings import settings_of
 from .options import add_setting, option_words
@@ -19,7 +20,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add a job file and an option for each key of a :class:`Job`; options override the file."""
     parser.add_argument(
         "job", nargs="?", type=Path, metavar="JOB",
-        help="job file (TOML or JSON), or the scene's folder; a run's job.toml resumes the run",
+        help="job file (TOML or JSON), the scene's folder, or the folder of a run to resume",
     )  # fmt: skip
     for f in settings_of(Job).values():
         add_setting(parser, f)
@@ -37,10 +38,13 @@ def job_from_options(options: argparse.Namespace) -> Job:
     """
     changes = {name: value for name, value in vars(options).items() if name in settings_of(Job)}
     values = {}
-    if options.job and options.job.is_dir():
-        changes = {"scene": str(options.job)} | changes
-    elif options.job:
-        values = asdict(Job.from_file(options.job))
+    file = options.job
+    if file and (run_job := RunFolder(file).job).is_file() and not changes.keys() & {"scene", "out"}:
+        file = run_job
+    if file and file.is_dir():
+        changes = {"scene": str(file)} | changes
+    elif file:
+        values = asdict(Job.from_file(file))
     keys = values.keys() | changes.keys()
     if "out" not in keys or not keys & {"scene", "capture"}:
         raise LodgsError(

@@ -51,6 +51,13 @@ def test_options_override_the_file(tmp_path):
     assert changed == Job("/a", "/c", seed=2, parameters={"rho": 2, "footprint": 9})
 
 
+def test_run_folder_resumes_its_run(tmp_path):
+    written = Job("/a", str(tmp_path), method="octree", seed=4)
+    written.write(tmp_path / "job.toml")
+    assert job(tmp_path) == job(tmp_path / "job.toml") == written
+    assert job(tmp_path, "--out", "/b") == Job(str(tmp_path), "/b")
+
+
 @pytest.mark.parametrize(
     "values",
     [
