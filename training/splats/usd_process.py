@@ -109,11 +109,19 @@ def read_levels(usd: SimpleNamespace, path: Path) -> Bundle:
 
 
 def _open(usd: SimpleNamespace, path: Path):
-    """Open a file that needs no other one."""
+    """Open a file that needs no other one. Layers of a package may need each other, as those of 3DGRUT do."""
     layer = usd.Sdf.Layer.FindOrOpen(str(path))
     if layer is None:
         raise LodgsError(f"Cannot read {path}: it is not a USD file.", "Choose another file.")
-    others = [printable(name) for name in layer.GetCompositionAssetDependencies()]
+    layers, others = [layer], []
+    for part in layers:
+        for name in part.GetCompositionAssetDependencies():
+            place = usd.Sdf.ComputeAssetPathRelativeToLayer(part, name)
+            inside = place.startswith(f"{layer.identifier}[") and usd.Sdf.Layer.FindOrOpen(place)
+            if not inside:
+                others.append(printable(name))
+            elif inside not in layers:
+                layers.append(inside)
     if others:
         names = ", ".join(others)[:300]
         raise LodgsError(f"Cannot read {path}: it refers to other files ({names}).", "Flatten it first.")

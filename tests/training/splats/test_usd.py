@@ -271,6 +271,28 @@ def test_other_files_are_not_opened(tmp_path):
         read(tmp_path / "b.usdc")
 
 
+@pytest.mark.parametrize("reference", ["b.usdc", "middle.usda", "../b.usdc", "/absolute/b.usdc", "gone.usdc"])
+def test_layers_of_a_package_refer_only_to_each_other(tmp_path, reference):
+    """3DGRUT packs one layer that refers to the splats; ``middle`` leads out of the package."""
+    usd = load_usd()
+    foreign(tmp_path)
+    for name, target in (("main.usda", reference), ("middle.usda", str(tmp_path / "b.usdc"))):
+        layer = usd.Sdf.Layer.CreateNew(str(tmp_path / name))
+        prim = usd.Sdf.CreatePrimInLayer(layer, "/a")
+        prim.specifier = usd.Sdf.SpecifierDef
+        prim.referenceList.prependedItems.append(usd.Sdf.Reference(target, "/a"))
+        layer.Save()
+    package = usd.Sdf.ZipFileWriter.CreateNew(str(tmp_path / "b.usdz"))
+    for name in ("main.usda", "middle.usda", "b.usdc"):
+        package.AddFile(str(tmp_path / name), name)
+    package.Save()
+    if reference == "b.usdc":
+        assert len(read(tmp_path / "b.usdz").levels[0].splats) == 1
+    else:
+        with pytest.raises(LodgsError, match="refers to other files"):
+            read(tmp_path / "b.usdz")
+
+
 @pytest.mark.parametrize("part", [0, 3000, *(pytest.param(n, marks=pytest.mark.nightly) for n in (40, -100))])
 def test_cut_files_raise_one_sentence(tmp_path, part):
     export_levels(tmp_path / "a.usdc", flod())
