@@ -15,6 +15,7 @@ import numpy as np
 
 from ..scenes.cameras import Camera, pick_evenly
 from ..scenes.view_tables import read_view_tables
+from ..splats.batches import batch_slices
 from ..splats.gaussians import SplatRows, Splats
 from ..splats.levels import NO_SPLATS, Bundle, Level
 from ..splats.quats import rotation_matrices
@@ -71,9 +72,8 @@ class RowsWithBakedFilter:
         """Read a range of rows, or some rows (M,) ascending."""
         splats = self.rows.select(index)
         logits = splats.opacity_logits.copy()
-        for begin in range(0, len(splats), _BATCH):
-            block = slice(begin, begin + _BATCH)
-            logits[block] = self._logits(splats.select(block))
+        for batch in batch_slices(len(splats), _BATCH):
+            logits[batch] = self._logits(splats.select(batch))
         return replace(splats, opacity_logits=logits)
 
     def _logits(self, splats: Splats) -> np.ndarray:

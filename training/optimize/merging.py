@@ -8,13 +8,12 @@ plus the loss of colour.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from scipy.special import expit, logit, spence
 
+from ..splats.batches import batch_slices
 from ..splats.gaussians import SH_C0, Splats, splat_area
 from ..splats.morton import spatial_order
 from .neighbors import query_neighbors
@@ -75,7 +74,7 @@ def optical_depth(opacities: np.ndarray) -> np.ndarray:
 def splat_moments(splats: Splats) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return means (N, 3), covariances (N, 6) and masses (N,), float64."""
     covariances = np.empty((len(splats), 6))
-    for part in _batches(len(splats)):
+    for part in batch_slices(len(splats), _BATCH_ROWS):
         quats = splats.quats[part].astype(np.float64)
         matrices = Rotation.from_quat(quats[:, [1, 2, 3, 0]]).as_matrix()
         matrices *= np.exp(np.minimum(splats.log_scales[part], 40).astype(np.float64))[:, None]
@@ -107,7 +106,7 @@ def shapes_of_moments(
     """
     quats = np.empty((len(moments), 4), np.float32)
     log_scales = np.empty((len(moments), 3), np.float32)
-    for part in _batches(len(moments)):
+    for part in batch_slices(len(moments), _BATCH_ROWS):
         matrices = moments[part, 3:9][:, (0, 1, 2, 1, 3, 4, 2, 4, 5)].reshape(-1, 3, 3)
         variances, axes = np.linalg.eigh(matrices)
         variances = np.maximum(variances, np.maximum(1e-12 * variances[:, 2:], 1e-60))
@@ -129,7 +128,7 @@ def cheapest_pairs(moments: np.ndarray, limit: int) -> tuple[np.ndarray, np.ndar
     partners, costs = np.empty(count, np.int64), np.empty(count)
     columns = np.ascontiguousarray(moments.T)
     log_areas = _log_areas(columns[3:9])
-    for part in _batches(count, NEIGHBORS):
+    for part in batch_slices(count, _BATCH_ROWS // NEIGHBORS):
         rows = np.arange(count)[part]
         candidates = neighbors[part]
         first, second = np.minimum(rows[:, None], candidates), np.maximum(rows[:, None], candidates)
@@ -203,8 +202,3 @@ def _merged_splats(splats: Splats, masses: np.ndarray, members: np.ndarray, mome
     result.opacity_logits[changed] = logits
     result.sh[changed] = harmonics[changed]
     return result
-
-
-def _batches(count: int, columns: int = 1) -> Iterator[slice]:
-    rows = _BATCH_ROWS // columns
-    return (slice(begin, begin + rows) for begin in range(0, count, rows))

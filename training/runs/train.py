@@ -35,6 +35,7 @@ from ..scenes.check import INFO, check_scene
 from ..scenes.orientation import up_rotation
 from ..scenes.regions import Region
 from ..scenes.view_tables import make_view_tables
+from ..splats.batches import batch_slices
 from ..splats.bundle import read_bundle, write_bundle
 from ..splats.dialects import comments_from_meta
 from ..splats.file_rows import open_ply
@@ -440,8 +441,8 @@ class _TrainingRun:
 
 def _any_visible(base: SplatRows, data: TrainingData) -> bool:
     """Return whether a training view sees any of the splats."""
-    for start in range(0, len(base), BATCH_ROWS):
-        means = base.select(slice(start, start + BATCH_ROWS)).means
+    for batch in batch_slices(len(base), BATCH_ROWS):
+        means = base.select(batch).means
         if any(camera.sees(means, near=data.near).any() for camera in data.train):
             return True
     return False

@@ -16,6 +16,7 @@ import numpy as np
 
 from ..documents import parse_json
 from ..errors import LodgsError
+from .batches import batch_slices
 from .colors import color_names
 from .gaussians import Splats
 from .georeference import Georeference
@@ -104,8 +105,7 @@ def drop_undrawable(splats: Splats, path: str | Path, warn: Warn = ignore) -> Sp
         path: path of the file, for the warning.
     """
     drawable, rotated = np.empty((2, len(splats)), bool)
-    for start in range(0, len(splats), _BLOCK):  # blocks keep the temporaries small
-        block = slice(start, start + _BLOCK)
+    for block in batch_slices(len(splats), _BLOCK):
         quats = np.abs(splats.quats[block])
         drawable[block] = (np.abs(splats.means[block]) <= MAX_COORDINATE).all(1)
         drawable[block] &= (quats <= MAX_COORDINATE).all(1)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .batches import batch_slices
 from .coding import CodedRows
 from .dialects import Warn, drop_undrawable, dropped_message, ignore, to_3dgs
 from .gaussians import Splats
@@ -87,9 +88,9 @@ class DrawableRows:
         self._rows = rows
         self._drawable = None
         parts = []
-        for begin in range(0, len(rows), BATCH_ROWS):
-            splats = self._convert(slice(begin, begin + BATCH_ROWS), ignore if begin else warn)
-            splats.extras = {_ROW: begin + np.arange(len(splats))}
+        for batch in batch_slices(len(rows), BATCH_ROWS):
+            splats = self._convert(batch, ignore if batch.start else warn)
+            splats.extras = {_ROW: batch.start + np.arange(len(splats))}
             parts.append(drop_undrawable(splats, rows.path).extras[_ROW])
         missing = len(rows) - sum(map(len, parts))
         if missing:

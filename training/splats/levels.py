@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..errors import LodgsError
+from .batches import batch_slices
 from .gaussians import SplatRows, Splats
 from .georeference import Georeference
 from .origin import NO_ORIGIN
@@ -147,8 +148,8 @@ def bounding_box(sets: Sequence[SplatRows]) -> list[list[float]]:
     """Return the smallest and largest x, y, z of the finite means of all sets; zeros if there are none."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for rows in sets:
-        for begin in range(0, len(rows), BATCH_ROWS):
-            means = rows.select(slice(begin, begin + BATCH_ROWS)).means
+        for batch in batch_slices(len(rows), BATCH_ROWS):
+            means = rows.select(batch).means
             means = means[np.isfinite(means).all(axis=1)]
             low = np.minimum(low, means.min(axis=0, initial=np.inf))
             high = np.maximum(high, means.max(axis=0, initial=-np.inf))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from .batches import batch_slices
+
 AXIS_BITS = 21
 """Bits per axis of a Morton code."""
 _BATCH = 1 << 16
@@ -23,8 +25,7 @@ def morton_codes(means: np.ndarray) -> np.ndarray:
     low, high = low - (high - low) / 4, high + (high - low) / 4  # outliers are clamped to the border
     unit = ((1 << AXIS_BITS) - 1) / max(float((high - low).max()), 1e-30)
     code = np.zeros(len(means), np.uint64)
-    for begin in range(0, len(means), _BATCH):
-        batch = slice(begin, begin + _BATCH)
+    for batch in batch_slices(len(means), _BATCH):
         cells = np.clip((means[batch] - low) * unit, 0, (1 << AXIS_BITS) - 1)
         for axis, cell in enumerate(cells.astype(np.uint64).T):
             for shift, mask in (

@@ -23,6 +23,7 @@ from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 from ..documents import damage_error, has_decimal_commas, open_text, read_lines
 from ..errors import LodgsError
 from ..files import atomic_write
+from .batches import batch_slices
 from .coding import CODEBOOK, CodedRows, declared_rows, decode_elements, is_coded
 from .colors import color_names, full_intensity
 from .dialects import Warn, drawable_3dgs, ignore, reject_unsupported
@@ -186,7 +187,7 @@ def extra_columns(splats: Splats) -> Columns:
 def to_records(columns: Columns) -> np.ndarray:
     """Convert columns (N,) to structured rows (N,) of a file: packed and little-endian."""
     records = np.empty(len(next(iter(columns.values()))), _row_dtype(columns))
-    for block in _blocks(len(records)):
+    for block in batch_slices(len(records), _BLOCK):
         for name, column in columns.items():
             records[name][block] = column[block]
     return records
@@ -235,7 +236,7 @@ def splats_from_rows(
         (column, np.asarray(rows[sources.get(name, name)])) for name, column in (columns | extras).items()
     ]
     with np.errstate(over="ignore", invalid="ignore"):  # infinities and NaN are dropped later
-        for block in _blocks(len(rows)):
+        for block in batch_slices(len(rows), _BLOCK):
             for column, source in pairs:
                 column[block] = source[block]
             for axis in np.flatnonzero(origin):
@@ -339,7 +340,7 @@ def write_elements(path: str | Path, elements: Iterable[Element], comments: Sequ
         file.write("\n".join(lines).encode("ascii"))
         for element in elements:
             for part in element.parts:
-                for batch in _blocks(part.count, BATCH_ROWS):
+                for batch in batch_slices(part.count, BATCH_ROWS):
                     file.write(to_records(part.columns(batch)).data)
 
 
@@ -490,8 +491,3 @@ def _empty_splats(count: int, degree: int) -> Splats:
         opacity_logits=np.empty(count, np.float32),
         sh=np.empty((count, (degree + 1) ** 2, 3), np.float32),
     )
-
-
-def _blocks(count: int, size: int = _BLOCK) -> Iterator[slice]:
-    for start in range(0, count, size):
-        yield slice(start, min(start + size, count))

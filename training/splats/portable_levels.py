@@ -11,6 +11,7 @@ import numpy as np
 
 from ..documents import parse_json
 from ..errors import LodgsError
+from .batches import batch_slices
 from .bundle_header import (
     INCONSISTENCIES,
     bundle_line,
@@ -158,12 +159,12 @@ def parse_description(text: object, path: Path) -> tuple[Bundle, np.ndarray]:
 
 def batches(rows: SplatRows, size: int = BATCH_ROWS):
     """Yield the first row and the splats of each batch, with unit quaternions and without extra columns."""
-    for begin in range(0, len(rows), size):
-        splats = rows.select(slice(begin, begin + size))
+    for batch in batch_slices(len(rows), size):
+        splats = rows.select(batch)
         lengths = np.linalg.norm(splats.quats, axis=1, keepdims=True)
         identity = np.array([1, 0, 0, 0], np.float32)
         quats = np.where(lengths > 0, splats.quats / np.where(lengths > 0, lengths, 1), identity)
-        yield begin, Splats(splats.means, quats, splats.log_scales, splats.opacity_logits, splats.sh)
+        yield batch.start, Splats(splats.means, quats, splats.log_scales, splats.opacity_logits, splats.sh)
 
 
 def splats_from_activated(

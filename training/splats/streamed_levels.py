@@ -17,6 +17,7 @@ import numpy as np
 from ..documents import read_json
 from ..errors import LodgsError
 from ..files import atomic_folder
+from .batches import batch_slices
 from .gaussians import SplatRows, Splats
 from .levels import MAX_READ_LEVELS, Bundle
 from .morton import spatial_order
@@ -147,8 +148,8 @@ def _write_sog(path: Path, splats: Splats) -> None:
 def _read_places(rows: SplatRows) -> np.ndarray:
     """Read the means and the radii of splats in batches, (N, 4) float32."""
     parts = []
-    for begin in range(0, len(rows), BATCH_ROWS):
-        splats = rows.select(slice(begin, begin + BATCH_ROWS))
+    for batch in batch_slices(len(rows), BATCH_ROWS):
+        splats = rows.select(batch)
         parts.append(np.concatenate([splats.means, _radii(splats)], axis=1))
     return np.concatenate(parts)
 

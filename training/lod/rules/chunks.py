@@ -7,6 +7,7 @@ from math import inf
 
 import numpy as np
 
+from ...splats.batches import batch_slices
 from ...splats.dialects import MAX_COORDINATE
 from ..rule import NO_COLUMNS, NO_FINER, NO_TABLES, Control, Region, Rule, Tables, Values, distances
 
@@ -135,9 +136,8 @@ class Chunks(Rule):
         centers = np.stack([tables[TABLE][axis] for axis in "xyz"]).astype(np.float32)
         squares = (centers * centers).sum(axis=0)
         numbers = np.empty(len(means), np.float32)
-        for start in range(0, len(means), _BLOCK):
-            block = means[start : start + _BLOCK]
-            numbers[start : start + _BLOCK] = (squares - 2 * block @ centers).argmin(axis=1) + 1
+        for block in batch_slices(len(means), _BLOCK):
+            numbers[block] = (squares - 2 * means[block] @ centers).argmin(axis=1) + 1
         return numbers
 
     def near_chunks(self, position, values: Values, tables: Tables) -> list[tuple[int, float]]:

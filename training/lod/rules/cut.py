@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from ...scenes.view_tables import VIEW_TABLES
+from ...splats.batches import batch_slices
 from ...splats.gaussians import Splats
 from ...splats.level_colors import LEVEL_COLORS
 from ...splats.levels import MAX_LEVELS, Bundle, Level
@@ -200,8 +201,7 @@ class Cut(Rule):
     def weights(self, means, position, focal_px, columns, facts, values, tables=NO_TABLES) -> np.ndarray:
         k = detail_of(focal_px, values["pixels"])
         weights = np.zeros(len(means), np.float32)
-        for begin in range(0, len(means), _BLOCK):
-            block = slice(begin, begin + _BLOCK)
+        for block in batch_slices(len(means), _BLOCK):
             parents = [columns[name][block] for name in PARENT]
             sizes = columns[NODE_SIZE][block]
             drawn = ~is_fine_enough(parents, columns[PARENT_SIZE][block], position, k)

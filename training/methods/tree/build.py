@@ -25,6 +25,7 @@ from ...lod.tree.shape import Tree
 from ...optimize import merging
 from ...optimize.merging import merge_pairs, shapes_of_moments, splat_moments
 from ...rasterize.cpu.compile import STRICT, inlined, kernel, run_parallel
+from ...splats.batches import batch_slices
 from ...splats.gaussians import SH_C0, SplatRows, Splats
 from ...splats.morton import AXIS_BITS, morton_codes
 from ...splats.scratch import ScratchFile
@@ -133,7 +134,7 @@ class ForestBuilder:
 def _read_cells(leaves: SplatRows, scratch: Path | None, max_leaves: int) -> Iterator[Splats]:
     """Yield the leaves in spatial order, one cell of limited size at a time."""
     means = np.empty((len(leaves), 3), np.float32)
-    for part in _row_batches(len(leaves)):
+    for part in batch_slices(len(leaves), _BATCH_ROWS):
         means[part] = leaves.select(part).means
     codes = morton_codes(means)
     del means
@@ -150,7 +151,7 @@ def _read_cells(leaves: SplatRows, scratch: Path | None, max_leaves: int) -> Ite
         cell_of[order[slice(*cell)]] = number
     filled = np.array(borders[:-1])
     with ScratchFile(scratch) as file:
-        for part in _row_batches(len(leaves)):
+        for part in batch_slices(len(leaves), _BATCH_ROWS):
             splats, cells = _drop_extras(leaves.select(part)), cell_of[part]
             by_cell = np.argsort(cells, kind="stable")
             cell_numbers, begins = np.unique(cells[by_cell], return_index=True)
@@ -181,11 +182,6 @@ def _cell_bounds(codes: np.ndarray, max_leaves: int) -> list[int]:
             middle = begin + int(np.searchsorted(codes[begin:end], half))
         ahead += [part for part in ((middle, end, bit), (begin, middle, bit)) if part[0] < part[1]]
     return borders
-
-
-def _row_batches(count: int) -> Iterator[slice]:
-    for begin in range(0, count, _BATCH_ROWS):
-        yield slice(begin, min(begin + _BATCH_ROWS, count))
 
 
 def _drop_extras(splats: Splats) -> Splats:

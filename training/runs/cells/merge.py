@@ -14,6 +14,7 @@ import numpy as np
 
 from ...errors import LodgsError
 from ...scenes.regions import Region
+from ...splats.batches import batch_slices
 from ...splats.bundle import open_bundle, write_bundle
 from ...splats.dialects import comments_from_meta, drop_undrawable
 from ...splats.file_rows import FileRows
@@ -138,8 +139,8 @@ def _inside(rows: FileRows, region: Region) -> Iterator[Splats]:
 
 
 def _batches(rows: FileRows) -> Iterator[Splats]:
-    for start in range(0, len(rows), BATCH_ROWS):
-        yield drop_undrawable(rows.select(slice(start, start + BATCH_ROWS)), rows.path)
+    for batch in batch_slices(len(rows), BATCH_ROWS):
+        yield drop_undrawable(rows.select(batch), rows.path)
 
 
 def _check_compatible(part: Part, bundle: tuple[Bundle, Mapping[int, FileRows]], first: Bundle) -> None:

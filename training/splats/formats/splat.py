@@ -10,6 +10,7 @@ import numpy as np
 from ...documents import open_file
 from ...errors import LodgsError
 from ...files import atomic_write
+from ..batches import batch_slices
 from ..gaussians import SH_C0, SplatRows, Splats
 from ..ply import BATCH_ROWS, release_pages
 from ..splat_format import SplatFormat
@@ -26,8 +27,8 @@ def write_splat(path: Path, splats: SplatRows, meta: dict) -> None:
         LodgsError: the file cannot be written.
     """
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
-        for begin in range(0, len(splats), BATCH_ROWS):
-            batch = splats.select(slice(begin, begin + BATCH_ROWS))
+        for rows_of_batch in batch_slices(len(splats), BATCH_ROWS):
+            batch = splats.select(rows_of_batch)
             rows = np.empty(len(batch), _ROW)
             rows["mean"], rows["scale"] = batch.means, np.exp(batch.log_scales)
             opacity = 1 / (1 + np.exp(-batch.opacity_logits.astype(np.float64)))
