@@ -7,7 +7,7 @@ import bpy
 from ...training.editing.clutter import KINDS
 from ..data import cleaning, clutter, crops, roots
 from ..data.cleanup_tests import CLUTTER_TESTS, HIDE_TESTS, limit_property
-from .parts import TINT_ICONS, LevelsPanel, say, split_column
+from .parts import TINT_ICONS, LevelsPanel, draw_crop, say, split_column
 
 
 class LODGS_PT_clean_up(LevelsPanel):
@@ -23,9 +23,7 @@ class LODGS_PT_clean_up(LevelsPanel):
         column = layout.column(align=True)
         for crop in crops.crops_of(root):
             row = column.row(align=True)
-            used = "CHECKBOX_HLT" if crop.lodgs_crop.use else "CHECKBOX_DEHLT"
-            row.prop(crop.lodgs_crop, "use", text="", icon=used)
-            row.prop(crop, "name", text="")
+            draw_crop(row, crop)
             row.prop(crop.lodgs_crop, "keep", text="")
             row.operator("lodgs.remove_crop", text="", icon="X").name = crop.name
 

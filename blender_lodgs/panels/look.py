@@ -6,7 +6,7 @@ import bpy
 
 from ...training.editing.look import LOOK_SETTINGS
 from ..data import crops, lighting, looks, roots
-from .parts import LevelsPanel, split_column
+from .parts import LevelsPanel, draw_crop, split_column
 
 
 class LODGS_PT_look(LevelsPanel):
@@ -56,9 +56,7 @@ class LODGS_PT_look_regions(LevelsPanel):
             if crop in regions or crop == context.active_object:
                 box = layout.box()
                 row = box.row(align=True)
-                used = "CHECKBOX_HLT" if crop.lodgs_crop.use else "CHECKBOX_DEHLT"
-                row.prop(crop.lodgs_crop, "use", text="", icon=used)
-                row.prop(crop, "name", text="")
+                draw_crop(row, crop)
                 if lighting.has_lamps(context):
                     row.operator("lodgs.tint_by_light", text="", icon="LIGHT").name = crop.name
                 row.operator("lodgs.reset_look", text="", icon="LOOP_BACK").name = crop.name

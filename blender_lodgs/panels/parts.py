@@ -106,3 +106,10 @@ def draw_environment(layout: bpy.types.UILayout, missing: str = "") -> None:
     elif work is not None:
         say(layout, work.message, "INFO")
     layout.operator("lodgs.make_environment", icon="IMPORT")
+
+
+def draw_crop(row: bpy.types.UILayout, crop: bpy.types.Object) -> None:
+    """Draw the checkbox and the name of a crop."""
+    used = "CHECKBOX_HLT" if crop.lodgs_crop.use else "CHECKBOX_DEHLT"
+    row.prop(crop.lodgs_crop, "use", text="", icon=used)
+    row.prop(crop, "name", text="")

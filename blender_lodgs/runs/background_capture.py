@@ -120,16 +120,8 @@ def start(context: bpy.types.Context, warn: viewpoints.Warn = print) -> Backgrou
         log.unlink(missing_ok=True)
         save_file(copy, copy=True)
         trusted = [] if bpy.app.autoexec_fail else ["--enable-autoexec"]  # as in this Blender
-        command = [
-            bpy.app.binary_path,
-            *trusted,
-            "--command",
-            "lodgs",
-            "capture",
-            str(copy),
-            "--out",
-            str(folder),
-        ]
+        capture = ["--command", "lodgs", "capture", str(copy), "--out", str(folder)]
+        command = [bpy.app.binary_path, *trusted, *capture]
         process = processes.spawn(command, log=log, output=folder / "capture.out")
     except (OSError, RuntimeError) as error:
         reason = system_reason(error) if isinstance(error, OSError) else str(error).strip()

@@ -6,13 +6,14 @@ import io
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
 from ..errors import LodgsError, system_reason
-from ..rasterize import Gaussians, cpu_fallback_reason, rasterize
+from ..rasterize import Gaussians, Rendering, cpu_fallback_reason, rasterize
 from ..scenes.cameras import Camera, pick_evenly, read_camera_folder
 from ..scenes.colmap import read_scene
 from ..scenes.images import check_image
@@ -120,7 +121,11 @@ def write_scene(
         shutil.rmtree(temporary, ignore_errors=True)
         for folder in ("images", "depths"):
             (temporary / folder).mkdir(parents=True)
-        count = _write(temporary, splats, cameras, near, points, backend, antialias, report, origin)
+        render = partial(
+            rasterize, Gaussians.of(splats), near=near, antialias=antialias, outputs=("median_depth",),
+            backend=backend,
+        )  # fmt: skip
+        count = _write(temporary, cameras, render, points, report, origin)
         shutil.rmtree(temporary / "depths")
         temporary.rename(scene)
     except OSError as error:
@@ -147,25 +152,25 @@ def is_complete(scene: Path) -> bool:
 
 def _write(
     scene: Path,
-    splats: Splats,
     cameras: Sequence[Camera],
-    near: float,
+    render: Callable[[Camera], Rendering],
     points: int,
-    backend: str,
-    antialias: bool,
     report: ReportView,
     origin: np.ndarray,
 ) -> int:
-    gaussians = Gaussians.of(splats)
+    """Write images, depth maps and a COLMAP model into existing folders; return the number of points.
+
+    Args:
+        render: function that renders a view with median depths.
+        points, report, origin: see :func:`write_scene`.
+    """
     rng = np.random.default_rng(0)
     views = [replace(camera, name=f"{camera.name}.jpg") for camera in cameras]
     positions = []
     colors = []
     for number, view in enumerate(views):
         report(number + 1, len(views))
-        rendering = rasterize(
-            gaussians, view, near=near, antialias=antialias, outputs=("median_depth",), backend=backend
-        )
+        rendering = render(view)
         assert rendering.median_depth is not None  # requested in outputs
         image = (rendering.image.cpu().numpy().clip(0, 1) * 255).round().astype(np.uint8)
         depth = rendering.median_depth.cpu().numpy()

@@ -27,7 +27,7 @@ from ..lod.rule import find_rule
 from ..lod.selection import resolve_controls, standalone_levels
 from ..methods import METHODS, create
 from ..optimize.memory import keep_freed_memory, peak_memory, reset_peak_memory
-from ..optimize.method import Method, require_finite
+from ..optimize.method import ImageModel, Method, require_finite
 from ..optimize.training_data import TrainingData
 from ..rasterize import Gaussians, contributions, tensor_device, warm_up
 from ..rasterize.resident import ResidentBundle
@@ -331,19 +331,18 @@ class _TrainingRun:
             with atomic_write(self.folder.model) as temporary, open(temporary, "wb") as file:
                 np.savez(file, **image_model.arrays())
             if self.data.test:
-                neural_psnr = self.evaluation.measure(image_model.render)["psnr"]
-                resident = ResidentBundle(bundle, self.evaluation.backend)
-                baked_psnr = self.evaluation.measure_by_distance(resident, resolve_controls(bundle, {}))[
-                    "psnr"
-                ]
-                meta |= {"neural_psnr": neural_psnr, "baked_psnr": baked_psnr}
-                self._warn(
-                    f"Held-out views: {neural_psnr:.2f} dB with networks, "
-                    f"{baked_psnr:.2f} dB baked for Blender."
-                )
+                meta |= self._measure_baking(image_model, bundle)
         self.folder.require_lock()
         write_bundle(self.folder.bundle, bundle)
         return bundle
+
+    def _measure_baking(self, image_model: ImageModel, bundle: Bundle) -> dict[str, float]:
+        """Return the PSNR of held-out views in dB, with networks and baked, as metadata; report both."""
+        neural = self.evaluation.measure(image_model.render)["psnr"]
+        resident = ResidentBundle(bundle, self.evaluation.backend)
+        baked = self.evaluation.measure_by_distance(resident, resolve_controls(bundle, {}))["psnr"]
+        self._warn(f"Held-out views: {neural:.2f} dB with networks, {baked:.2f} dB baked for Blender.")
+        return {"neural_psnr": neural, "baked_psnr": baked}
 
     def _view_tables(self) -> dict[str, Columns]:
         """Return the scene's cameras as bundle tables."""
