@@ -67,10 +67,10 @@ def camera_frame(
     """Return the left, bottom, right and top of a camera's frame in clip space.
 
     Args:
-        projection: matrix from the world to clip space.
+        projection: matrix from camera space to clip space. That from the world would not do: Blender does
+            not update ``matrix_world`` of hidden cameras after an undo.
     """
-    to_clip = projection @ camera.matrix_world.normalized()
-    corners = [to_clip @ corner.to_4d() for corner in camera.data.view_frame(scene=scene)]  # type: ignore[union-attr]
+    corners = [projection @ corner.to_4d() for corner in camera.data.view_frame(scene=scene)]  # type: ignore[union-attr]
     xs, ys = ([corner[axis] / corner.w for corner in corners] for axis in (0, 1))
     return min(xs), min(ys), max(xs), max(ys)
 

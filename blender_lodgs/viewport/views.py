@@ -79,7 +79,7 @@ def draw(context: bpy.types.Context) -> None:
     camera = view_camera.active_camera(context)
     frame = splats.FULL_FRAME
     if camera is not None:
-        frame = view_camera.camera_frame(camera, context.scene, matrix)
+        frame = view_camera.camera_frame(camera, context.scene, region_data.window_matrix)
     under_overlays = space.overlay.show_overlays and not _shows_photo(camera)
     target = splats.DrawTarget(region_data.view_matrix, region_data.window_matrix, under_overlays, frame)
     depsgraph = context.evaluated_depsgraph_get()

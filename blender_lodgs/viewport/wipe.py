@@ -130,7 +130,7 @@ def _draw() -> None:
     if camera is None or view_camera.active_camera(context) != camera or not is_shown(context):
         return
     assert comparison is not None
-    left, bottom, right, top = view_camera.camera_frame(camera, scene, view.window_matrix @ view.view_matrix)
+    left, bottom, right, top = view_camera.camera_frame(camera, scene, view.window_matrix)
     width = region.width * (right - left) / 2
     draw(
         comparison, scene.lodgs_render.wipe, [(left, bottom), (right, top)], 0.75 / max(width, 1)

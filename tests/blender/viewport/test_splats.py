@@ -81,7 +81,7 @@ def draw_view(bpy, lodgs, frame, camera):
         if zoom is not None:
             projection = Matrix.Diagonal((zoom, zoom, 1, 1)) @ projection
             options["frame"] = lodgs("viewport.view_camera").camera_frame(
-                camera, bpy.context.scene, projection @ matrix
+                camera, bpy.context.scene, projection
             )
 
         def draw():
@@ -237,6 +237,13 @@ def test_splats_outside_the_camera_frame_are_drawn_as_in_a_render(lodgs, add, dr
     common = min(size, SIZE)
     image, expected = (_crop_center(image, common) for image in (displayed(draw_view(zoom=zoom)), expected))
     assert psnr(image, expected) > 45
+
+
+def test_camera_frame_needs_no_world_matrix(bpy, lodgs, camera):
+    """Blender does not update ``matrix_world`` of hidden cameras after an undo."""
+    projection = camera.calc_matrix_camera(bpy.context.evaluated_depsgraph_get(), x=SIZE, y=SIZE)
+    frame = lodgs("viewport.view_camera").camera_frame(camera, bpy.context.scene, projection)
+    assert frame == pytest.approx((-1, -1, 1, 1), abs=1e-5)
 
 
 def _crop_center(image, size):
