@@ -96,7 +96,9 @@ def test_image_is_continuous_between_levels(data):
         flod.train_step(step)
     before = render_level(1)
     assert len(flod.levels_after(5)) == 1
-    torch.testing.assert_close(render_level(2), before, atol=2e-5, rtol=0)
+    difference = (render_level(2) - before).abs().amax(-1)
+    assert difference.max() < 1 / 255, "a splat may cross the minimum opacity of a pixel"
+    assert (difference > 2e-5).float().mean() < 1e-3
     # with the constraint of level 1, the changed splats are larger
     assert (render_level(1) - before).abs().max() > 0.01
 
