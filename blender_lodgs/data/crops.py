@@ -16,7 +16,7 @@ from ...training.lod.crop import Crop
 from .. import compat
 from ..attributes import HIDDEN
 from ..nodes import crops as groups
-from ..nodes.building import find_modifier, remove_modifier, replace_driver
+from ..nodes.building import add_modifier, find_modifier, remove_modifier, replace_driver
 from .placement import axes_of
 
 DISPLAY_TYPES = {"BOX": "CUBE", "SPHERE": "SPHERE"}
@@ -176,9 +176,7 @@ def _attach(obj: bpy.types.Object, crops: list[bpy.types.Object]) -> None:
     ):
         return
     detach(obj)
-    modifier = obj.modifiers.new(groups.NAME, "NODES")
-    assert isinstance(modifier, bpy.types.NodesModifier)
-    modifier.node_group, modifier.show_expanded = groups.crops_group(len(crops)), False
+    modifier = add_modifier(obj, groups.crops_group(len(crops)), groups.NAME)
     obj.modifiers.move(len(obj.modifiers) - 1, 0)
     for number, crop in enumerate(crops, 1):
         follow(obj, modifier, number, crop)

@@ -25,7 +25,7 @@ from ..nodes import crops as crop_groups
 from ..nodes import display
 from ..nodes import look as look_groups
 from ..nodes import rules as groups
-from ..nodes.building import read_scene, remove_modifier, replace_driver
+from ..nodes.building import add_modifier, read_scene, remove_modifier, replace_driver
 from ..nodes.camera_choices import CHOICES, find_choice, position_expression
 from . import crops, looks
 from .placement import axes_of
@@ -414,10 +414,7 @@ def _ensure_modifier(obj: bpy.types.Object, rule: Rule) -> bpy.types.NodesModifi
         _detach(obj)
         modifier = None
     if modifier is None:
-        group = groups.rule_group(rule)
-        modifier = obj.modifiers.new(group.name, "NODES")
-        assert isinstance(modifier, bpy.types.NodesModifier)
-        modifier.node_group, modifier.show_expanded = group, False
+        modifier = add_modifier(obj, groups.rule_group(rule))
         obj.modifiers.move(len(obj.modifiers) - 1, min(index, len(obj.modifiers) - 1))
     return modifier
 

@@ -340,6 +340,16 @@ def find_modifier(obj: bpy.types.Object, key: str) -> bpy.types.NodesModifier | 
     return None
 
 
+def add_modifier(
+    obj: bpy.types.Object, group: bpy.types.GeometryNodeTree, name: str = ""
+) -> bpy.types.NodesModifier:
+    """Add a modifier with a node group to an object, with a closed panel and by default the group's name."""
+    modifier = obj.modifiers.new(name or group.name, "NODES")
+    assert isinstance(modifier, bpy.types.NodesModifier)
+    modifier.node_group, modifier.show_expanded = group, False
+    return modifier
+
+
 def add_switched_modifier(
     obj: bpy.types.Object, group: bpy.types.GeometryNodeTree, **switches: str
 ) -> bpy.types.NodesModifier:
@@ -351,9 +361,7 @@ def add_switched_modifier(
         **switches: data path of a scene property for "show_viewport", "show_render" or both. The modifier is
             off if this extension is missing.
     """
-    modifier = obj.modifiers.new(group.name, "NODES")
-    assert isinstance(modifier, bpy.types.NodesModifier)
-    modifier.node_group, modifier.show_expanded = group, False
+    modifier = add_modifier(obj, group)
     modifier.show_viewport = modifier.show_render = False
     for switch, path in switches.items():
         read_scene(replace_driver(obj, f'modifiers["{modifier.name}"].{switch}', "on"), "on", path)

@@ -6,7 +6,16 @@ import pytest
 import torch
 
 from training.methods import METHODS, create
-from training.optimize.schedules import shrink_at
+from training.optimize.schedules import LevelStages, shrink_at
+
+
+def test_stages_train_one_level_each():
+    """A stage without steps is left out, as that of a finest level that is a base."""
+    stages = LevelStages([(3, 0), (2, 4), (1, 2)])
+    assert stages.ends == [0, 4, 6]
+    assert [stages.level_at(step) for step in range(8)] == [2, 2, 2, 2, 1, 1, 1, 1], "the last one remains"
+    assert [stages.local_step(step) for step in range(6)] == [0, 1, 2, 3, 0, 1]
+    assert [stages.share(step) for step in range(6)] == [0, 0.25, 0.5, 0.75, 0, 0.5]
 
 
 def test_pixel_count_grows_linearly():
