@@ -168,6 +168,7 @@ def _crop(
 
 
 def _attach(obj: bpy.types.Object, crops: list[bpy.types.Object]) -> None:
+    """Give a level the crop modifier, which follows the crops, unless it has it."""
     modifier = modifier_of(obj)
     if (
         modifier is not None

@@ -163,6 +163,7 @@ def _read_look(settings: LookSettings) -> Look:
 
 
 def _attach(obj: bpy.types.Object, root: bpy.types.Object, regions: list[bpy.types.Object]) -> None:
+    """Give a level the look modifier, driven by the looks of the scene and its regions, unless it has it."""
     modifier = modifier_of(obj)
     if (
         modifier is not None

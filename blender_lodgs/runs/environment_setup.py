@@ -148,6 +148,15 @@ class EnvironmentSetup:
         return True
 
     def _run(self, task: str, command: list[str]) -> None:
+        """Run a program to its end and follow its output.
+
+        Args:
+            task: name of the step, for errors.
+
+        Raises:
+            LodgsError: the program failed, or the setup was cancelled.
+            OSError: the program cannot be started.
+        """
         lines: list[str] = []
         download = "Downloading"
         with subprocess.Popen(

@@ -306,6 +306,13 @@ class SplatSelector:
     def _select(
         self, query: LodQuery | None, camera: Camera | None, near: float
     ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the rows (M,) int32 and weights (M,) float32 of splats with a weight above 0.
+
+        Args:
+            query: rule and arguments; None gives all splats the weight 1.
+            camera: skip blocks outside of its image; None skips none.
+            near: depth of the near plane.
+        """
         subset, in_region = (self._all, False) if query is None else self._subset(query)
         columns = {} if query is None else {name: subset.columns[name] for name in query.columns}
         if subset.blocks is None:

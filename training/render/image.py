@@ -57,7 +57,14 @@ class RenderedImage:
         depth: bool = False,
         levels: list[int] | None = None,
     ) -> RenderedImage:
-        """Create an image of the background."""
+        """Create an image of the background.
+
+        Args:
+            width, height: size in pixels.
+            background: display-coded colour; None is transparent.
+            depth: whether the image has a depth pass.
+            levels: numbers of the levels with a mask.
+        """
         shape = height, width
         image = np.empty((*shape, 3), np.float32)
         image[:] = background or (0.0, 0.0, 0.0)

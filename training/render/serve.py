@@ -146,6 +146,11 @@ class _Server:
                 self.send("error", frame=request.frame, what=problem, remedy=remedy)
 
     def _answer(self, request: FrameRequest) -> None:
+        """Draw a frame, write its passes and send the result, or that it was cancelled.
+
+        Raises:
+            LodgsError: a file cannot be read, or the frame cannot be drawn.
+        """
         started = time.perf_counter()
         frame, camera, window = request.frame, request.camera, request.window
         limit = None

@@ -124,6 +124,7 @@ def _final_event(error: BaseException) -> tuple[int, dict]:
 
 
 def _train(job: Job, folder: RunFolder, events: EventWriter, placement: dict[str, Any]) -> int:
+    """Train a job in its locked folder, first its cells if it has any; return an exit code."""
     started = time.monotonic()
     reset_peak_memory()
     events(

@@ -55,6 +55,12 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def _read_size(path: Path, file: IO[bytes]) -> tuple[int, int]:
+    """Return width and height as stored in an image file, from its header.
+
+    Raises:
+        LodgsError: the file is empty or of another format.
+        struct.error, IndexError, KeyError, ValueError, Truncated: the header is truncated.
+    """
     head = file.read(8)
     if not head:
         raise LodgsError(f"Cannot read {path}: the file is empty.", "Copy the image again.")

@@ -173,6 +173,12 @@ def splats_from_activated(
     """Return splats from scales and opacities as they are drawn.
 
     Opacities of 0 and 1 become nearby ones with finite logits. Invalid values remain invalid.
+
+    Args:
+        means, scales: (N, 3) each.
+        quats: (N, 4), wxyz.
+        alphas: opacities (N,) in [0, 1].
+        sh: (N, K, 3) float32.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         alphas = alphas.astype(np.float64).clip(1e-7, 1 - 1e-7)

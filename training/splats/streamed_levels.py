@@ -97,6 +97,12 @@ def write_streamed_levels(folder: Path, bundle: Bundle, measure: MeasureLeaf | N
 
 
 def _write_files(folder: Path, levels: Sequence[SplatRows], degree: int, measure: MeasureLeaf | None) -> None:
+    """Write the files of levels, finest first, into an empty folder.
+
+    Args:
+        degree: degree of harmonics of all files.
+        measure: measures the errors of leaves; None writes none.
+    """
     places = np.concatenate([_read_places(rows) for rows in levels])
     begins = np.cumsum([0, *map(len, levels)])
     far = _is_surroundings(places, len(levels[0]))

@@ -120,6 +120,7 @@ def _full_disk(folder: Path) -> OSError | None:
 
 
 def _write_stage(usd: SimpleNamespace, path: Path, levels: PortableLevels) -> None:
+    """Write a stage with the levels as one prim with levels of detail, and the views as cameras."""
     stage = usd.Usd.Stage.CreateNew(str(path))
     usd.UsdGeom.SetStageUpAxis(stage, usd.UsdGeom.Tokens.z)
     usd.UsdGeom.SetStageMetersPerUnit(stage, 1.0)

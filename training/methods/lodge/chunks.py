@@ -91,7 +91,13 @@ def prune_invisible(
     backend: str,
     antialias: bool = False,
 ) -> Rows:
-    """Return the rows of a chunk's set with at least this share of a pixel in the images of the cameras."""
+    """Return the rows of a chunk's set that contribute enough to the images of cameras.
+
+    Args:
+        rows: rows of the set by level.
+        min_share: minimum share of a pixel of a splat, in any image.
+        near: depth of the near plane.
+    """
     chunk_levels = {
         number: IndexedLevel.of(gather_rows({number: level}, {number: rows[number]}))
         for number, level in levels.items()

@@ -120,6 +120,11 @@ def limit_growth(
 
     The budget grows with a power of the steps up to ``max_anchors``, which reserves most of it for finer
     levels.
+
+    Args:
+        rows: tensors (M, ...) by name, with ``means`` and ``level``; the first ones take precedence.
+        step: number of the step, from 0.
+        max_anchors: maximum number of anchors of the model.
     """
     p = schedule.parameters
     share = min((step + 1) / (p.grow_until * p.steps), 1.0) ** p.room_exponent
@@ -182,6 +187,10 @@ def matching_levels(
     drawn where they are too small to see. Narrow splats move at most to ``newest`` and to the first level
     that photos need, and only if a photo needs it, so that images of photos hardly change. Not in the
     paper.
+
+    Args:
+        level: (N,) current levels as floats.
+        newest: finest level that has joined.
     """
     p, tree = schedule.parameters, schedule.tree
     pixel = tree.d_max / tree.focal_px  # at level 1's distance

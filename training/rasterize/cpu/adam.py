@@ -155,7 +155,15 @@ def update(
     eps: float,
     step: int,
 ) -> None:
-    """Make one Adam step in place; ``lr`` is a number or broadcasts against one row of ``parameter``."""
+    """Make one Adam step in place.
+
+    Args:
+        parameter, gradient, m, v: (N, ...) float32 each: values, gradients, and first and second moments.
+        lr: learning rate, a number or an array that broadcasts against one row of ``parameter``.
+        betas: decay of the first and the second moment.
+        eps: number added to the root of the second moment.
+        step: number of the step, from 1, for the correction of bias.
+    """
     if not parameter.size:
         return
     width = parameter.size // len(parameter)

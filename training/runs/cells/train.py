@@ -80,6 +80,12 @@ def train_cells(division: Division, path: Path, submit: Submit, report: Report) 
 def _train_stage(
     stage: Sequence[_PartWatch], watches: Sequence[_PartWatch], submit: Submit, report: Report
 ) -> None:
+    """Train the parts of a stage in parallel and report the progress of all parts.
+
+    Raises:
+        CellsStopped: some parts were cancelled; the others are finished.
+        LodgsError: a part could not be trained.
+    """
     try:
         for watch in stage:
             watch.start(submit)

@@ -104,6 +104,11 @@ def _parse_header(line: str) -> tuple[str, list[str]] | None:
 
 
 def _read_table(path: Path, folder: Path) -> ExportedScene:
+    """Read the views of a table, one per row. Rows without a photo or with invalid values are excluded.
+
+    Args:
+        folder: folder of the export, in which photos are searched.
+    """
     lines = iter(decode_text(read_bytes(path, MAX_BYTES)).splitlines())
     delimiter, columns = next(filter(None, map(_parse_header, lines)), (",", []))
     rows = [

@@ -155,6 +155,16 @@ def _find_points(path: Path, name: Any, warnings: list[str]) -> Path | None:
 
 
 def _parse_view(folder: Path, values: Mapping[str, Any], photos: PhotoFinder) -> ExportedView:
+    """Return the view of a frame.
+
+    Args:
+        folder: folder of masks and depth maps.
+        values: values of the frame, and of the file where the frame has none.
+        photos: finds the photo.
+
+    Raises:
+        LodgsError: a value is missing or invalid, or the lens is not supported; the reason is a clause.
+    """
     if not isinstance(values.get("file_path"), str):
         raise LodgsError("it has no file_path.")
     image = photos.find(values["file_path"])
