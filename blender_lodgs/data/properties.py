@@ -106,7 +106,7 @@ class ViewportSettings(bpy.types.PropertyGroup):
     )
     moving: bpy.props.FloatProperty(
         name="While Moving",
-        description="Resolution of splats while the view moves. Lower it for smoother navigation",
+        description="Resolution of splats while a slow view moves. Lower it for smoother navigation",
         default=50.0,
         min=10.0,
         max=100.0,

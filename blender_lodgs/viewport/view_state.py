@@ -27,6 +27,8 @@ below 0.05 seconds."""
 SLOW, SLOW_FACTOR = 0.08, 5.0
 """Seconds between redraws from which they spend more on uploads, as with software rendering, and at most this
 factor more."""
+FLUENT = 1 / 30
+"""Seconds to draw the splats of a view up to which it keeps its resolution in motion."""
 SMOOTH = 0.2
 """Seconds per redraw above which a smaller budget is suggested, and a moving view is simplified."""
 MOTION = 0.12
@@ -114,6 +116,11 @@ class ViewState:
             self.motion_cost = self.count, seconds
         else:
             self.cost = self.count, seconds
+
+    def motion_resolution(self, lowered: float) -> float:
+        """Return the lowered resolution if the view moves and is slow, else 1: fast views do not change."""
+        slow = max(self.cost[1], self.motion_cost[1]) > FLUENT
+        return lowered if self.moving and slow else 1.0
 
     def motion_limit(self) -> int | None:
         """Return the number of splats that this computer draws smoothly in motion; None if it draws all."""

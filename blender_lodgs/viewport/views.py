@@ -31,7 +31,7 @@ from .streaming import Direction, Stream
 from .view_state import ViewState, active_views
 
 REST = 0.2
-"""Seconds without movement after which a view is drawn at full resolution."""
+"""Seconds without movement after which a view is at rest."""
 ROUNDING = 1e-4
 """Relative difference below which positions count as equal."""
 NOT_REQUESTED = -1
@@ -74,7 +74,7 @@ def draw(context: bpy.types.Context) -> None:
     view.matrix = matrix
     settings = context.scene.lodgs_viewport
     view.moving = context.screen.is_animation_playing or now - view.moved < REST
-    view.resolution = settings.moving / 100 if view.moving else 1.0
+    view.resolution = view.motion_resolution(settings.moving / 100)
     view.shows_marks = space.overlay.show_overlays
     camera = view_camera.active_camera(context)
     frame = splats.FULL_FRAME

@@ -6,6 +6,16 @@ import numpy as np
 import pytest
 
 
+@pytest.mark.parametrize(
+    ("cost", "motion_cost", "expected"), [(0.02, 0.0, 1.0), (0.1, 0.0, 0.5), (0.02, 0.1, 0.5)]
+)
+def test_only_slow_views_move_at_a_lower_resolution(lodgs, cost, motion_cost, expected):
+    view = lodgs("viewport.view_state").ViewState(cost=(9, cost), motion_cost=(9, motion_cost))
+    assert view.motion_resolution(0.5) == 1.0
+    view.moving = True
+    assert view.motion_resolution(0.5) == expected
+
+
 def make_instances(count, seed=0):
     instances = np.zeros((count, 4), np.float32)
     instances[:, 0] = np.random.default_rng(seed).permutation(count)
