@@ -26,6 +26,7 @@ from ..files import atomic_write
 from .batches import batch_slices
 from .coding import CODEBOOK, CodedRows, declared_rows, decode_elements, is_coded
 from .colors import color_names, full_intensity
+from .content import check_name
 from .dialects import Warn, drawable_3dgs, ignore, reject_unsupported
 from .gaussians import SH_C0, SplatRows, Splats
 from .origin import NO_ORIGIN
@@ -409,7 +410,12 @@ def _read_header(file: IO[bytes], path: Path, splats: bool = True) -> tuple[PlyD
 
 
 def _foreign_error(path: Path, start: bytes) -> LodgsError:
-    """Return the error for a file with the first bytes of another format."""
+    """Return the error for a file with the first bytes of another format.
+
+    Raises:
+        LodgsError: it is a format of splats, see :func:`content.check_name`.
+    """
+    check_name(path)
     problem, remedy = "it is not a PLY file", "Choose a .ply of Gaussian splats."
     if start.startswith((b"PK\3\4", b"\x1f\x8b", b"7z\xbc\xaf", b"Rar!")):
         problem, remedy = "it is not a PLY file but an archive", "Unpack it."

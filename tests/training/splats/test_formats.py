@@ -1,5 +1,6 @@
 """Splat files of other programs, exchanged with splat-transform if it is installed."""
 
+import shutil
 import struct
 import subprocess
 import sys
@@ -10,6 +11,7 @@ import pytest
 
 from tests.checkout import copy_checkout, recipe_code
 from training.__main__ import main
+from training.editing.export import export_levels
 from training.errors import LodgsError
 from training.splats.bundle import read_bundle, write_bundle
 from training.splats.compressed_ply import read_compressed_ply, write_compressed_ply
@@ -124,6 +126,38 @@ def test_compressed_ply_is_detected_by_its_contents(tmp_path):
     (tmp_path / "a.compressed.ply").rename(tmp_path / "b.ply")
     with open_as_ply(tmp_path / "b.ply") as ply:
         assert len(read_ply(ply)) == 50
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.splat", "a.spz", "a.sog", "a.glb", "a.zip"])
+def test_wrong_names_are_reported_with_the_right_one(tmp_path, name):
+    level = Level(1, random_splats(50))
+    for kind in (".ply", ".spz", ".sog"):
+        write_splats(tmp_path / f"b{kind}", level.splats, {})
+    export_levels(tmp_path / "b.glb", Bundle("", [level]))
+    for kind in (".ply", ".spz", ".sog", ".glb"):
+        shutil.copy(tmp_path / f"b{kind}", tmp_path / name)
+        if name.endswith(kind) or (kind, name) == (".ply", "a.zip"):  # PLY is read under any unknown name
+            with open_as_ply(tmp_path / name) as ply:
+                assert len(read_bundle(ply).levels[0].splats) == 50
+            continue
+        remedy = rf"{name}: it is a file of \w+\. Rename it to {kind}\."
+        with pytest.raises(LodgsError, match=remedy), open_as_ply(tmp_path / name) as ply:
+            read_bundle(ply)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "remedy"),
+    [
+        ("a.ply", b"NGSP\4\0\0\0", r"SPZ\. Rename it to \.spz\."),
+        ("a.usda", b"PXR-USDC", r"USD\. Rename it to \.usdc\."),
+        ("a.ply", b"#usda 1.0", r"USD\. Rename it to \.usda\."),
+        ("tileset.json", b'{"asset": {}, "geometricError": 9}', r"3D Tiles.* Choose one of its \.glb files"),
+    ],
+)
+def test_contents_are_recognised(tmp_path, name, content, remedy):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(LodgsError, match=remedy), open_as_ply(tmp_path / name) as ply:
+        read_bundle(ply)
 
 
 def test_streamed_levels_round_trip(tmp_path):

@@ -14,6 +14,7 @@ from pkgutil import iter_modules
 from ...documents import open_file
 from ...errors import LodgsError
 from ...files import temporary_folder
+from ..content import check_name
 from ..dialects import comments_from_meta
 from ..gaussians import SplatRows
 from ..ksplat import KsplatRows
@@ -123,7 +124,7 @@ def open_as_ply(path: Path, convert: Convert | None = None) -> Iterator[Path]:
         yield path
         return
     name = path.name.lower()
-    open_file(path).close()  # reports an unreadable file
+    check_name(path)
     stem = path.resolve().parent.name if name in MAIN_FILES else path.stem.removesuffix(".compressed")
     with temporary_folder() as folder:
         converted = folder / f"{stem or 'splats'}.ply"
