@@ -123,8 +123,7 @@ class _GlbReader:
 
     def _own(self, fine_to_coarse: list[list[tuple[Splats, np.ndarray]]]) -> Bundle | None:
         """Return the bundle that LODGS has written; None if another program has written or moved it."""
-        scene = self._item("scenes", self._json.get("scene", 0))
-        text = (scene.get("extras") or {}).get(DESCRIPTION)
+        text = (self._scene().get("extras") or {}).get(DESCRIPTION)
         if text is None:
             return None
         bundle, placement = parse_description(text, self._path)
@@ -150,10 +149,17 @@ class _GlbReader:
             levels.append(Level(len(fine_to_coarse) - number, joined))
         return Bundle("", levels[::-1], meta=meta)
 
+    def _scene(self) -> dict:
+        """Return the scene to read; in a file without scenes, one of all nodes that no other node lists."""
+        if self._json.get("scenes"):
+            return self._item("scenes", self._json.get("scene", 0))
+        nodes = self._json.get("nodes", [])
+        listed = {index for node in nodes for index in [*node.get("children", []), *self._coarser(node)]}
+        return {"nodes": [index for index in range(len(nodes)) if index not in listed]}
+
     def _world_nodes(self) -> list[tuple[dict, np.ndarray]]:
         """Return the nodes of the scene with their transforms (4, 4)."""
-        scene = self._item("scenes", self._json.get("scene", 0))
-        waiting = deque((index, np.eye(4)) for index in scene["nodes"])
+        waiting = deque((index, np.eye(4)) for index in self._scene().get("nodes", []))
         nodes, visited = [], set()
         while waiting:
             index, parent = waiting.popleft()

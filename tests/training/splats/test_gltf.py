@@ -265,6 +265,20 @@ def test_logarithmic_scales_and_logits_of_other_programs(tmp_path):
     assert_equal(splats, expected)
 
 
+def test_document_without_scenes(tmp_path):
+    """The specification allows it. Coarser levels are no roots."""
+    export_levels(tmp_path / "a.glb", flod())
+    document, data = read_parts(tmp_path / "a.glb")
+    document["scenes"][0].pop("extras")  # as from another program
+    (tmp_path / "b.glb").write_bytes(assembled(document, data))
+    del document["scenes"], document["scene"]
+    (tmp_path / "c.glb").write_bytes(assembled(document, data))
+    expected, actual = (read(tmp_path / name).levels for name in ("b.glb", "c.glb"))
+    assert len(actual) == len(expected) == 3
+    for level, original in zip(actual, expected, strict=True):
+        assert_equal(level.splats, original.splats)
+
+
 @pytest.mark.parametrize(
     "name", ["KHR_gaussian_splatting_compression_spz", "KHR_spz_gaussian_splats_compression"]
 )
