@@ -144,7 +144,11 @@ def _unpacked_limit(path: Path) -> int:
 
 
 def _read_field(prim, path: Path) -> Splats:
-    """Return the splats of a particle field in its own coordinates."""
+    """Return the splats of a particle field in its own coordinates.
+
+    As the schema says, attributes without a value for each position have their default, and excess values are
+    ignored.
+    """
 
     def values(name: str, width: int) -> np.ndarray:
         for attribute in (prim.GetAttribute(name), prim.GetAttribute(f"{name}h")):
@@ -153,16 +157,21 @@ def _read_field(prim, path: Path) -> Splats:
                 return np.array(value, np.float32).reshape(-1, width)
         return np.zeros((0, width), np.float32)
 
-    means, quats = values("positions", 3), values("orientations", 4)[:, [3, 0, 1, 2]]
-    scales, alphas = values("scales", 3), values("opacities", 1)[:, 0]
+    def values_or(default: tuple[float, ...], name: str) -> np.ndarray:
+        rows = values(name, len(default))
+        return rows[: len(means)] if len(rows) >= len(means) else np.float32([default] * len(means))
+
+    means = values("positions", 3)
+    quats = values_or((0, 0, 0, 1), "orientations")[:, [3, 0, 1, 2]]
+    scales, alphas = values_or((1, 1, 1), "scales"), values_or((1,), "opacities")[:, 0]
     degree = _first_value(prim.GetAttribute("radiance:sphericalHarmonicsDegree"))
     sh = values("radiance:sphericalHarmonicsCoefficients", 3)
-    counts = {len(means), len(quats), len(scales), len(alphas)}
     if type(degree) is not int or not 0 <= degree <= MAX_DEGREE:
         raise LodgsError(f"Cannot read {path}: its SH degree is {degree}.", "Use degree 0 to 4.")
-    if counts != {len(means)} or len(sh) != len(means) * coefficient_count(degree):
+    if len(sh) != len(means) * coefficient_count(degree):
         raise LodgsError(
-            f"Cannot read {path}: attributes of {printable(prim.GetPath())} have different lengths.",
+            f"Cannot read {path}: {printable(prim.GetPath())} has {len(sh):,} coefficients for "
+            f"{len(means):,} splats of SH degree {degree}.",
             "Export it again.",
         )
     return splats_from_activated(means, quats, scales, alphas, sh.reshape(len(means), -1, 3))
