@@ -290,7 +290,7 @@ def place_splats(
                 _add_views(context, root, cameras, camera_extent(cameras) or 1.0, near)
                 for settings in (view.data.lodgs for view in views(root)):
                     settings.held_out = cameras[settings.model_index].name in held_out
-            if viewpoints.has_cameras(context.scene):
+            if viewpoints.has_cameras(context.scene, root):
                 root.lodgs.training.views_from = "CAMERAS"  # those that the artist uses
             root.lodgs.training.method = next(
                 info.name for info in METHODS.values() if info.suggested_for_base

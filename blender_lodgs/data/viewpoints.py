@@ -409,9 +409,9 @@ def _count(cameras: Iterable[bpy.types.Object]) -> int:
     return sum(camera.data.type == "PERSP" for camera in cameras)
 
 
-def has_cameras(scene: bpy.types.Scene) -> bool:
-    """Return True if a scene has enough perspective cameras to train on their views."""
-    return _count(enabled_cameras(scene)) >= MIN_VIEWS
+def has_cameras(scene: bpy.types.Scene, root: bpy.types.Object) -> bool:
+    """Return True if a scene has enough perspective cameras to train a root on their views."""
+    return _count(enabled_cameras(scene, root)) >= MIN_VIEWS
 
 
 def _require_two(cameras: list[bpy.types.Object]) -> list[bpy.types.Object]:

@@ -110,6 +110,16 @@ def test_views_match_all_cameras(bpy, fake, root, tmp_path):
         assert_matches_blender(bpy, root, camera, view, near)
 
 
+def test_imported_splats_use_cameras_but_not_those_of_other_scenes(bpy, root, tmp_path):
+    assert root.lodgs.training.views_from == "DOME"
+    photos = [new_camera(bpy, (5, -10 * number, 4)) for number in (1, 2)]
+    for parent, expected in ((root, "DOME"), (None, "CAMERAS")):
+        for photo in photos:
+            photo.parent = parent
+        bpy.ops.lodgs.import_splats(filepath=str(tmp_path / "ball.ply"))
+        assert bpy.context.active_object.lodgs.training.views_from == expected
+
+
 def test_views_match_an_animated_camera(bpy, fake, root, tmp_path):
     fake()
     camera = bpy.context.scene.camera = new_camera(bpy, (0, -9, 4))
