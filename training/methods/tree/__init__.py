@@ -11,7 +11,7 @@ from ...settings import setting
 class TreeParameters(SplatParameters):
     """Parameters of A LoD of Gaussians.
 
-    Without a base, the first ``steps`` train the leaves by 3DGS; the schedules of 3DGS span all steps.
+    Without a base, the first ``steps`` train the leaves by 3DGS.
     """
 
     sky_points: int = setting(
@@ -54,8 +54,7 @@ class TreeParameters(SplatParameters):
     )
     node_rate: float = setting(
         8.0,
-        "Learning rates of inner nodes, as multiples of the current 3DGS rates; with a base, of the "
-        "final ones.",
+        "Learning rates of inner nodes, as multiples of the final rates of 3DGS.",
         high=100,
     )
     node_end: float = setting(

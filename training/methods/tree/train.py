@@ -24,7 +24,6 @@ from ...optimize.method import Drawing, StepResult
 from ...optimize.out_of_core.view_order import ViewOrder
 from ...optimize.refining import RefiningMethod
 from ...optimize.schedules import due, random_reduction
-from ...optimize.splat_method import SplatMethod
 from ...optimize.training_data import TrainingView
 from ...rasterize import Rendering, records
 from ...rasterize.adam import LearningRate
@@ -135,11 +134,6 @@ class Method(RefiningMethod):
         return center + SKY_RADIUS * far * directions, np.tile(color, (count, 1))
 
     @property
-    def scheduled_steps(self) -> int:
-        """Total steps: training cuts continues the schedules of 3DGS."""
-        return self.steps
-
-    @property
     def splats(self) -> int:
         if self.store is not None:
             return len(self.store)
@@ -193,12 +187,6 @@ class Method(RefiningMethod):
         if self.store is not None and due(self.parameters.resize_interval, step - self.finest_steps):
             self.store.update_sizes()
         return None
-
-    def set_learning_rates(self, step: int) -> None:
-        if self._base is None:
-            SplatMethod.set_learning_rates(self, step)  # the schedule continues
-        else:
-            super().set_learning_rates(step)
 
     def shrink(self, step: int) -> float:
         small = self.refines(step) and self.parameters.octaves

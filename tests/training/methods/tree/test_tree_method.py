@@ -86,7 +86,7 @@ def test_run_returns_leaves_then_all_nodes(data):
 
 
 def test_first_steps_are_3dgs(data):
-    values = {"steps": 12 + 1 + 8, "densify_until": 0.4, "prune_interval": 6, "margin": 0.0}
+    values = {"steps": 12, "densify_until": 0.4, "prune_interval": 6, "margin": 0.0}
     plain = create("3dgs", data, override(method_info("3dgs").preset("draft"), values), 0, "cpu")
     tree = make(data)
     assert [step for step in range(12) if tree.ends_level(step)] == [11]
@@ -115,13 +115,14 @@ def test_sky_points_lie_evenly_on_a_sphere(data, base):
     assert tree.parameters.max_trained_splats == tree.parameters.max_splats + 200
 
 
-def test_learning_rates_continue_and_start_low_with_base(data, base):
+def test_schedules_of_3dgs_end_before_the_tree(data, base):
     tree, based = make(data), make(data, base)
     p = tree.parameters
-    for step in (0, 11, 13, 20):
+    for step, done in ((0, 0), (6, 0.5), (12, 1), (20, 1)):
         tree.set_learning_rates(step)
-        rate = p.lr_means * (p.lr_means_final / p.lr_means) ** (step / 21) * data.extent
+        rate = p.lr_means * (p.lr_means_final / p.lr_means) ** done * data.extent
         assert tree.model.adam.lr["means"] == pytest.approx(rate)
+    assert [step for step in range(20) if tree.collects_stats(data.view(0), step)] == [0, 1, 2, 3, 4]
     based.set_learning_rates(1)
     assert based.model.adam.lr["means"] == pytest.approx(p.lr_means_final * data.extent)
 
@@ -132,7 +133,7 @@ def test_margins_are_added_before_the_tree_is_built(data, monkeypatch):
     monkeypatch.setattr(tree.model, "append", lambda rows: steps.append(step))
     for step in range(tree.steps):
         tree.add_margins(step)
-    assert steps == [11]
+    assert steps == [10]
 
 
 def test_without_tuning_leaves_equal_the_base(data, base):
