@@ -159,7 +159,9 @@ def _read_field(prim, path: Path) -> Splats:
 
     def values_or(default: tuple[float, ...], name: str) -> np.ndarray:
         rows = values(name, len(default))
-        return rows[: len(means)] if len(rows) >= len(means) else np.float32([default] * len(means))
+        if len(rows) >= len(means):
+            return rows[: len(means)]
+        return np.tile(np.array(default, np.float32), (len(means), 1))
 
     means = values("positions", 3)
     quats = values_or((0, 0, 0, 1), "orientations")[:, [3, 0, 1, 2]]
