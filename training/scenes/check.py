@@ -10,7 +10,8 @@ import numpy as np
 
 from ..errors import LodgsError
 from ..splats.origin import describe_origin
-from .colmap import NO_POINTS, Progress, Scene, observations, read_scene
+from .cameras import pick_evenly
+from .colmap import NO_POINTS, Progress, Scene, observations, read_scene, reprojection_errors
 from .evidence import MIN_PARALLAX, MIN_PHOTOS, measure_evidence
 from .triangulate import cached_points
 
@@ -24,6 +25,10 @@ MIN_SHARED = 20
 """Number of points that a view must share with other views to overlap them."""
 WEAK_SHARE = 0.2
 """Share of a scene with weak evidence that is worth a warning."""
+MAX_REPROJECTION = 0.05
+"""Median reprojection error of a view above which its pose is wrong, as a fraction of the image diagonal."""
+_POSES, _POINTS = 50, 20_000
+"""Maximum numbers of poses and of points that are compared."""
 ERROR, WARNING, INFO = SEVERITIES = "error", "warning", "info"
 ESTIMATE = "estimate"
 """Severity of the expected costs and of suggested settings, see ``runs.estimate``."""
@@ -79,7 +84,7 @@ def check_scene(scene: Scene, image_scale: float = 1.0) -> list[Finding]:
     """Return the findings besides the scene's own warnings, without decoding its photos."""
     observed = observations(scene, [camera.name for camera in scene.cameras])
     return [
-        *_views(scene), *_sizes(scene, image_scale), *_origin(scene),
+        *_views(scene), *_poses(scene), *_sizes(scene, image_scale), *_origin(scene),
         *_overlap(scene, observed), *_coverage(scene, observed),
     ]  # fmt: skip
 
@@ -93,6 +98,25 @@ def _views(scene: Scene) -> Iterator[Finding]:
             WARNING,
             f"The scene has only {count} views, which often causes floaters.",
             f"Add photos that overlap, at least {FEW_VIEWS} and better 100.",
+        )
+
+
+def _poses(scene: Scene) -> Iterator[Finding]:
+    """Find poses that contradict the observations, or without them the positions of the points."""
+    cameras = pick_evenly(scene.cameras, _POSES)
+    errors = reprojection_errors(scene, {camera.name for camera in cameras})
+    if errors:
+        wrong, count = sum(error > MAX_REPROJECTION for error in errors.values()), len(errors)
+        problem = f"a median reprojection error above {MAX_REPROJECTION:.0%} of the image diagonal"
+    else:
+        points = scene.points[:: len(scene.points) // _POINTS + 1]
+        wrong, count = sum(not camera.sees(points).any() for camera in cameras), len(cameras)
+        problem = "no points in front of the camera and inside the image"
+    if len(scene.points) and 2 * wrong > count:
+        yield Finding(
+            WARNING,
+            f"The poses do not fit the points: {wrong} of {count} tested views have {problem}.",
+            "Check the export: the poses may be camera-to-world, but COLMAP needs world-to-camera.",
         )
 
 

@@ -44,6 +44,10 @@ DEPTH_SUFFIXES = ".exr", ".png", ".npy"
 """File name suffixes of depth maps."""
 MAX_DEPTH_CAMERAS = 500
 """Maximum number of cameras used to compute the median depth."""
+_MAX_OBSERVATIONS = 2000
+"""Maximum number of a view's observations whose error is measured."""
+_CENTRAL = 0.25
+"""Distance from the principal point up to which distortion hardly moves points, in image diagonals."""
 NO_POINTS = "The scene has no points"
 """First words of the warning about a scene without points."""
 
@@ -403,15 +407,62 @@ def observations(scene: Scene, names: Collection[str]) -> dict[str, np.ndarray]:
 
     The result is empty if the model has no observations of the scene's points.
     """
+    indices = {name: points for name, (points, _) in observed_pixels(scene, names).items()}
+    return indices if any(map(len, indices.values())) else {}
+
+
+def observed_pixels(
+    scene: Scene, names: Collection[str], limit: int = 0
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Return the points that views observe and their pixels, by view name.
+
+    Args:
+        limit: maximum number of evenly spaced observations of a view; 0 for all.
+
+    Returns:
+        Indices (O,) of scene points, and pixels (O, 2) in the photos of the model.
+    """
     if not len(scene.point_ids):
         return {}
     order = np.argsort(scene.point_ids)
     sorted_ids = scene.point_ids[order]
-    indices = {}
-    for name, ids in read_observations(scene.point_model or scene.model, names).items():
-        slots = np.searchsorted(sorted_ids, ids).clip(max=len(order) - 1)
-        indices[name] = order[slots[sorted_ids[slots] == ids]]
-    return indices if any(map(len, indices.values())) else {}
+    observed = {}
+    for name, records in read_observations(scene.point_model or scene.model, names).items():
+        records = records[:: len(records) // limit + 1 if limit else 1]
+        slots = np.searchsorted(sorted_ids, records["point"]).clip(max=len(order) - 1)
+        known = sorted_ids[slots] == records["point"]
+        observed[name] = order[slots[known]], records["xy"][known]
+    return observed
+
+
+def reprojection_errors(scene: Scene, names: Collection[str]) -> dict[str, float]:
+    """Return the median reprojection error of views, as a fraction of the image diagonal, by name.
+
+    Points behind the camera have an infinite error. Only observations near the principal point count, so that
+    distortion hardly matters. Views without such observations, of fisheye lenses, or with many pixels outside
+    their image are left out.
+    """
+    lenses, poses = _read_registered(scene.point_model or scene.model, [])
+    views = {pose.name.replace("\\", "/"): pose for pose in poses}
+    errors = {}
+    for name, (indices, pixels) in observed_pixels(scene, names, _MAX_OBSERVATIONS).items():
+        lens = lenses[views[name].camera_id]
+        size = np.array([lens.width, lens.height])
+        is_outside = (pixels > size).any(axis=1)
+        if not lens.lens.perspective or 10 * is_outside.sum() > len(pixels):  # pixels of larger photos
+            continue
+        fx, fy, cx, cy = lens.pinhole
+        diagonal = np.hypot(*size)
+        central = np.linalg.norm(pixels - (cx, cy), axis=1) < _CENTRAL * diagonal
+        if not central.any():
+            continue
+        pose = views[name].world_to_camera
+        local = (scene.points[indices[central]] + scene.origin) @ pose[:3, :3].T + pose[:3, 3]
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            offsets = local[:, :2] / local[:, 2:] * (fx, fy) + (cx, cy) - pixels[central]
+        distances = np.where(local[:, 2] > 0, np.linalg.norm(offsets, axis=1), np.inf)
+        errors[name] = float(np.median(distances) / diagonal)
+    return errors
 
 
 def observed_points(scene: Scene, names: Collection[str]) -> np.ndarray:

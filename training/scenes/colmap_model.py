@@ -108,7 +108,10 @@ def read_poses(model: Path) -> list[Pose]:
 
 
 def read_observations(model: Path, names: Collection[str]) -> dict[str, np.ndarray]:
-    """Read the ids (O,) int64 of the points that the named images observe, by image name.
+    """Read the pixels and ids of the points that the named images observe, by image name.
+
+    Returns:
+        Records (O,) of type ``POINT2D``.
 
     Raises:
         LodgsError: the file is missing or damaged.
@@ -287,22 +290,33 @@ def _is_points_line(line: bytes) -> bool:
 def _parse_observations_bin(data: mmap.mmap, names: Collection[str]) -> dict[str, np.ndarray]:
     count = _record_count(data, 73)
     offset = 8
-    point_ids = {}
+    observations = {}
     for _ in range(count):
         end = _name_end(data, offset + 64)
         (points2d,) = struct.unpack_from("<Q", data, end + 1)
         if (name := _decode_name(data[offset + 64 : end])) in names:
-            point_ids[name] = _valid_ids(np.frombuffer(data, POINT2D, points2d, end + 9)["point"])
+            records = np.frombuffer(data, POINT2D, points2d, end + 9)
+            observations[name] = _with_points(records)
         offset = end + 9 + 24 * points2d
-    return point_ids
+    return observations
 
 
 def _parse_observations_txt(file: IO[bytes], names: Collection[str]) -> dict[str, np.ndarray]:
-    point_ids = {}
+    observations = {}
     for line, points2d in _image_lines(file):
         if (name := _decode_name(_unquoted(line.split(maxsplit=9)[9]))) in names:
-            point_ids[name] = _valid_ids(np.array(points2d.split()[2::3], np.int64))
-    return point_ids
+            tokens = points2d.split()
+            records = np.empty(len(tokens) // 3, POINT2D)
+            records["point"] = np.array(tokens[2::3], np.int64)
+            for axis in range(2):
+                records["xy"][:, axis] = np.array(tokens[axis::3], np.float64)
+            observations[name] = _with_points(records)
+    return observations
+
+
+def _with_points(records: np.ndarray) -> np.ndarray:
+    """Drop the 2D points without a 3D point, whose id is -1."""
+    return records[np.asarray(records["point"]) >= 0]
 
 
 def _record_count(data: mmap.mmap, min_bytes: int) -> int:
@@ -317,11 +331,6 @@ def _name_end(data: mmap.mmap, begin: int) -> int:
     if (end := data.find(b"\0", begin, begin + _MAX_NAME)) < 0:
         raise ValueError("a name has no end")
     return end
-
-
-def _valid_ids(ids: np.ndarray) -> np.ndarray:
-    """Drop the id -1 of 2D points without a 3D point."""
-    return ids[ids >= 0]
 
 
 def _decode_name(name: bytes) -> str:

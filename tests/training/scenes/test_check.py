@@ -5,12 +5,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 from PIL import Image
 
 from training.__main__ import main
-from training.scenes.check import check_folder, check_scene
-from training.scenes.colmap import read_scene
+from training.scenes.check import MAX_REPROJECTION, check_folder, check_scene
+from training.scenes.colmap import observed_pixels, read_scene, reprojection_errors, scene_lenses
+from training.scenes.lenses import make_intrinsics
+from training.scenes.write_colmap import write_model
 
 GARDEN = Path(__file__).resolve().parents[3] / "examples" / "lantern_garden"
 
@@ -106,3 +109,75 @@ def test_parts_that_few_photos_see(monkeypatch):
     close = {name: np.arange(count) for name in names[:3]}
     monkeypatch.setattr("training.scenes.check.observations", lambda scene, names: close)
     assert "within 5° only" in texts(check_scene(scene))
+
+
+def rewrite(folder, pose=np.array, pixels=np.array, lens=None, tracks=True):
+    """Write the garden again with other poses, 2D points or lenses, as faulty exports; return the scene."""
+    scene = read_scene(GARDEN)
+    names = [camera.name for camera in scene.cameras]
+    observed = observed_pixels(scene, names)
+    write_model(
+        folder / "sparse" / "0",
+        [lens] * len(names) if lens else scene_lenses(scene),
+        [(camera.name, pose(camera.world_to_camera)) for camera in scene.cameras],
+        scene.points,
+        scene.point_colors,
+        [(observed[name][0], pixels(observed[name][1])) for name in names] if tracks else None,
+    )
+    return read_scene(folder)
+
+
+def center_as_translation(pose):
+    pose = pose.copy()
+    pose[:3, 3] = np.linalg.inv(pose)[:3, 3]
+    return pose
+
+
+def inverse_rotation(pose):
+    pose = pose.copy()
+    pose[:3, :3] = pose[:3, :3].T
+    return pose
+
+
+@pytest.mark.parametrize("pose", [center_as_translation, inverse_rotation, np.linalg.inv])
+def test_poses_that_contradict_observations(copy, pose):
+    (finding,) = [finding for finding in check_scene(rewrite(copy, pose)) if "poses" in finding.what]
+    assert finding.severity == "warning" and "48 of 48 tested views have a median repr" in finding.what
+    assert "camera-to-world" in finding.remedy
+
+
+def test_poses_that_see_no_points(copy):
+    assert "poses" not in texts(check_scene(rewrite(copy, tracks=False)))
+    findings = texts(check_scene(rewrite(copy, np.linalg.inv, tracks=False)))
+    assert "48 of 48 tested views have no points in front of the camera" in findings
+
+
+def test_distortion_is_no_wrong_pose(copy):
+    (lens, *_), radial = scene_lenses(read_scene(GARDEN)), -0.5
+    fx, _, cx, cy = lens.pinhole
+    center = np.array([cx, cy])
+
+    def distort(pixels):
+        rays = (pixels - center) / fx
+        return fx * rays * (1 + radial * np.square(rays).sum(axis=1, keepdims=True)) + center
+
+    distorted = make_intrinsics("SIMPLE_RADIAL", lens.width, lens.height, np.array([fx, cx, cy, radial]))
+    scene = rewrite(copy, pixels=distort, lens=distorted)
+    errors = reprojection_errors(scene, scene.names)
+    assert len(errors) == 48 and max(errors.values()) < MAX_REPROJECTION
+
+
+@pytest.mark.parametrize("factor", [0, 4])
+def test_observations_at_other_pixels_are_ignored(copy, factor):
+    """Programs write zeros, or reduce photos and lenses but not the 2D points."""
+    scene = rewrite(copy, pixels=lambda pixels: factor * pixels)
+    assert not reprojection_errors(scene, scene.names) and "poses" not in texts(check_scene(scene))
+
+
+def test_text_models_have_the_same_errors(copy):
+    scene = rewrite(copy, center_as_translation)
+    pycolmap.Reconstruction(scene.model).write_text(scene.model)
+    expected = reprojection_errors(scene, scene.names)
+    for file in scene.model.glob("*.bin"):
+        file.unlink()
+    assert reprojection_errors(read_scene(copy), scene.names) == pytest.approx(expected, rel=1e-6)
