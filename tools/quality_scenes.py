@@ -21,7 +21,8 @@ sys.path.insert(0, str(HERE))
 from training.color import linear_from_srgb, srgb_from_linear  # noqa: E402
 from training.errors import LodgsError  # noqa: E402
 from training.scenes.cameras import Camera, pick_evenly  # noqa: E402
-from training.scenes.colmap import Scene, observations, read_scene, scene_lenses  # noqa: E402
+from training.scenes.colmap import Scene, read_scene, scene_lenses  # noqa: E402
+from training.scenes.observations import observations  # noqa: E402
 from training.scenes.write_colmap import write_model  # noqa: E402
 
 STOPS = 1.5

@@ -7,7 +7,8 @@ from PIL import Image
 from tests.training.conftest import write_tiny_scene
 from tools import bench_quality, quality_scenes
 from tools.quality_scenes import EXIF, EXPOSURE_TIME, SUBSETS, relight, write_subset
-from training.scenes.colmap import observations, read_scene
+from training.scenes.colmap import read_scene
+from training.scenes.observations import observations
 
 
 @pytest.fixture(scope="module")

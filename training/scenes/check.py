@@ -11,8 +11,9 @@ import numpy as np
 from ..errors import LodgsError
 from ..splats.origin import describe_origin
 from .cameras import pick_evenly
-from .colmap import NO_POINTS, Progress, Scene, observations, read_scene, reprojection_errors
+from .colmap import NO_POINTS, Progress, Scene, read_scene
 from .evidence import MIN_PARALLAX, MIN_PHOTOS, measure_evidence
+from .observations import observations, reprojection_errors
 from .triangulate import cached_points
 
 MIN_VIEWS = 2

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -22,7 +22,6 @@ from .colmap_model import (
     count_images,
     model_suffix,
     read_cameras,
-    read_observations,
     read_points,
     read_poses,
 )
@@ -44,10 +43,6 @@ DEPTH_SUFFIXES = ".exr", ".png", ".npy"
 """File name suffixes of depth maps."""
 MAX_DEPTH_CAMERAS = 500
 """Maximum number of cameras used to compute the median depth."""
-_MAX_OBSERVATIONS = 2000
-"""Maximum number of a view's observations whose error is measured."""
-_CENTRAL = 0.25
-"""Distance from the principal point up to which distortion hardly moves points, in image diagonals."""
 NO_POINTS = "The scene has no points"
 """First words of the warning about a scene without points."""
 
@@ -243,7 +238,7 @@ def read_scene(
     if model is None:
         model, images = _choose_model(folder, images, warnings)
     model = _absolute(model)
-    intrinsics, poses = _read_registered(model, warnings)
+    intrinsics, poses = read_registered(model, warnings)
     if images is None:
         images = _find_images(folder, model, [pose.name for pose in poses], warnings)
     images = _absolute(images)
@@ -333,7 +328,7 @@ def _inliers(
     return valid, inlier_cameras
 
 
-def _read_registered(model: Path, warnings: list[str]) -> tuple[dict[int, Intrinsics], list[Pose]]:
+def read_registered(model: Path, warnings: list[str]) -> tuple[dict[int, Intrinsics], list[Pose]]:
     """Return the lenses by id and the poses sorted by name.
 
     Raises:
@@ -389,7 +384,7 @@ def exclude_views(scene: Scene, reasons: dict[str, str]) -> Scene:
 
 def scene_lenses(scene: Scene) -> list[Intrinsics]:
     """Return the lens of each camera, with its distortion, at the size of its photo."""
-    lenses, poses = _read_registered(scene.model, [])
+    lenses, poses = read_registered(scene.model, [])
     lens_of = {pose.name.replace("\\", "/"): lenses[pose.camera_id] for pose in poses}
     distorted = set(scene.distorted)
     return [
@@ -400,84 +395,6 @@ def scene_lenses(scene: Scene) -> list[Intrinsics]:
         )
         for camera in scene.cameras
     ]
-
-
-def observations(scene: Scene, names: Collection[str]) -> dict[str, np.ndarray]:
-    """Return the indices (O,) of the scene points that the model records as observed, by view name.
-
-    The result is empty if the model has no observations of the scene's points.
-    """
-    indices = {name: points for name, (points, _) in observed_pixels(scene, names).items()}
-    return indices if any(map(len, indices.values())) else {}
-
-
-def observed_pixels(
-    scene: Scene, names: Collection[str], limit: int = 0
-) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Return the points that views observe and their pixels, by view name.
-
-    Args:
-        limit: maximum number of evenly spaced observations of a view; 0 for all.
-
-    Returns:
-        Indices (O,) of scene points, and pixels (O, 2) in the photos of the model.
-    """
-    if not len(scene.point_ids):
-        return {}
-    order = np.argsort(scene.point_ids)
-    sorted_ids = scene.point_ids[order]
-    observed = {}
-    for name, records in read_observations(scene.point_model or scene.model, names).items():
-        records = records[:: len(records) // limit + 1 if limit else 1]
-        slots = np.searchsorted(sorted_ids, records["point"]).clip(max=len(order) - 1)
-        known = sorted_ids[slots] == records["point"]
-        observed[name] = order[slots[known]], records["xy"][known]
-    return observed
-
-
-def reprojection_errors(scene: Scene, names: Collection[str]) -> dict[str, float]:
-    """Return the median reprojection error of views, as a fraction of the image diagonal, by name.
-
-    Points behind the camera have an infinite error. Only observations near the principal point count, so that
-    distortion hardly matters. Views without such observations, of fisheye lenses, or with many pixels outside
-    their image are left out.
-    """
-    lenses, poses = _read_registered(scene.point_model or scene.model, [])
-    views = {pose.name.replace("\\", "/"): pose for pose in poses}
-    errors = {}
-    for name, (indices, pixels) in observed_pixels(scene, names, _MAX_OBSERVATIONS).items():
-        lens = lenses[views[name].camera_id]
-        size = np.array([lens.width, lens.height])
-        is_outside = (pixels > size).any(axis=1)
-        if not lens.lens.perspective or 10 * is_outside.sum() > len(pixels):  # pixels of larger photos
-            continue
-        fx, fy, cx, cy = lens.pinhole
-        diagonal = np.hypot(*size)
-        central = np.linalg.norm(pixels - (cx, cy), axis=1) < _CENTRAL * diagonal
-        if not central.any():
-            continue
-        pose = views[name].world_to_camera
-        local = (scene.points[indices[central]] + scene.origin) @ pose[:3, :3].T + pose[:3, 3]
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            offsets = local[:, :2] / local[:, 2:] * (fx, fy) + (cx, cy) - pixels[central]
-        distances = np.where(local[:, 2] > 0, np.linalg.norm(offsets, axis=1), np.inf)
-        errors[name] = float(np.median(distances) / diagonal)
-    return errors
-
-
-def observed_points(scene: Scene, names: Collection[str]) -> np.ndarray:
-    """Return a mask (P,) of the scene points that the named views observe.
-
-    Without observations in the model, a point counts as observed if it projects into one of the images.
-    """
-    mask = np.zeros(len(scene.points), bool)
-    for indices in observations(scene, names).values():
-        mask[indices] = True
-    if not mask.any():
-        for camera in scene.cameras:
-            if camera.name in names:
-                mask |= camera.sees(scene.points)
-    return mask
 
 
 def _absolute(path: Path | str) -> Path:

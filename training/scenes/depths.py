@@ -11,10 +11,11 @@ import numpy as np
 from ..documents import open_file
 from ..errors import LodgsError
 from .cameras import MAX_COORDINATE, Camera, pick_evenly
-from .colmap import Scene, observations
+from .colmap import Scene
 from .exr import MAGIC
 from .image_headers import check_image_size
 from .images import area_average, load_image, same_proportions
+from .observations import observations
 from .rendered_views import SKY_DEPTH, read_exr_depth, sample_surfaces
 
 DEPTH_KINDS = ("metric", "relative", "inverse", "points")

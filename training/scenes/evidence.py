@@ -63,7 +63,7 @@ def measure_evidence(
     Args:
         cameras: views to count.
         points: (P, 3) scene points.
-        observed: indices of the points that each view observes, by name (``colmap.observations``).
+        observed: indices of the points that each view observes, by name (``observations.observations``).
 
     Returns:
         The regions; none if no point is observed.

@@ -18,8 +18,9 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 
 from .cameras import Camera
-from .colmap import Scene, observations
+from .colmap import Scene
 from .images import load_image
+from .observations import observations
 
 MAX_PHOTOS = 500
 """Number of photos above which nothing is compared: all must be read, and time grows with their cube."""

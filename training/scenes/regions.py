@@ -18,7 +18,8 @@ from ..documents import read_json
 from ..errors import LodgsError
 from ..files import atomic_write
 from .cameras import Camera
-from .colmap import Scene, observed_points
+from .colmap import Scene
+from .observations import observed_points
 
 CELL_MARGIN = 0.2
 """Fraction of a cell's side by which the trained area extends beyond the cell on each side."""

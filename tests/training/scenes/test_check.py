@@ -11,8 +11,9 @@ from PIL import Image
 
 from training.__main__ import main
 from training.scenes.check import MAX_REPROJECTION, check_folder, check_scene
-from training.scenes.colmap import observed_pixels, read_scene, reprojection_errors, scene_lenses
+from training.scenes.colmap import read_scene, scene_lenses
 from training.scenes.lenses import make_intrinsics
+from training.scenes.observations import observed_pixels, reprojection_errors
 from training.scenes.write_colmap import write_model
 
 GARDEN = Path(__file__).resolve().parents[3] / "examples" / "lantern_garden"

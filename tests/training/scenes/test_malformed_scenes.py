@@ -11,7 +11,8 @@ from tests.training.scenes import synthetic
 from training.errors import LodgsError
 from training.scenes import colmap, colmap_model, image_files
 from training.scenes.cameras import camera_to_dict, write_camera
-from training.scenes.colmap import exclude_views, observations, read_scene
+from training.scenes.colmap import exclude_views, read_scene
+from training.scenes.observations import observations
 from training.scenes.offset_views import read_offset_views
 
 

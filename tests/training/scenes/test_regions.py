@@ -8,7 +8,8 @@ import pytest
 
 from training.errors import LodgsError
 from training.scenes.cameras import Camera, look_at
-from training.scenes.colmap import Scene, observed_points, read_scene
+from training.scenes.colmap import Scene, read_scene
+from training.scenes.observations import observed_points
 from training.scenes.regions import CELL_MARGIN, MIN_IMAGE_SHARE, Region, plan_cells
 
 from .synthetic import write_scene

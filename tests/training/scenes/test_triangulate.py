@@ -12,8 +12,9 @@ from PIL import Image
 from training.__main__ import main
 from training.scenes import triangulate
 from training.scenes.cameras import look_at
-from training.scenes.colmap import Scene, observations, read_scene, scene_lenses
+from training.scenes.colmap import Scene, read_scene, scene_lenses
 from training.scenes.images import write_png
+from training.scenes.observations import observations
 from training.scenes.sfm_known_poses import choose_pairs, epipolar_errors, match_descriptors, relative_pose
 from training.scenes.triangulate import cached_points, triangulate_scene
 
