@@ -205,12 +205,6 @@ def decode_sog(read: Callable[[str], bytes]) -> Splats:
         KeyError, ValueError, TypeError, IndexError, OSError, LodgsError: the files are damaged.
         NeedsTrainer: Pillow is missing.
     """
-    try:
-        from PIL import Image
-    except ImportError as error:
-        raise NeedsTrainer(
-            f"Cannot read SOG: a package of the trainer is missing ({error}).", "Install the trainer."
-        ) from error
     meta = parse_json(read(META), META, _MAX_META)
     if meta.get("version", 1) not in (1, 2):
         raise LodgsError(
@@ -219,12 +213,7 @@ def decode_sog(read: Callable[[str], bytes]) -> Splats:
     count = int(meta["count"] if "count" in meta else meta["means"]["shape"][0])
 
     def pixels(part: str, index: int = 0, size: int | None = count) -> np.ndarray:
-        data = read(meta[part]["files"][index])
-        width, height = webp_size(data[:30])
-        if width * height > max(2 * count, MAX_PALETTE_PIXELS):
-            raise ValueError(f"an image has {width}x{height} pixels for {count:,} splats")
-        with Image.open(io.BytesIO(data), formats=["WEBP"]) as image:
-            values = np.asarray(image.convert("RGBA"))
+        values = _read_image(read(meta[part]["files"][index]), count)
         if size is None:
             return values
         values = values.reshape(-1, 4)[:size]
@@ -245,14 +234,38 @@ def decode_sog(read: Callable[[str], bytes]) -> Splats:
         degree_from_count(sh.shape[1])
     rotations = pixels("quats")
     quats = join_quats((rotations[:, 3].astype(np.int64) - _LARGEST).clip(0, 3), rotations[:, :3] / 255.0)
-    if "codebook" in meta["sh0"]:
-        opacities = (colors[:, 3] / 255).clip(1 / 1024, 1 - 1 / 1024)
-        logits = np.log(opacities / (1 - opacities)).astype(np.float32)
-    else:
-        logits = _decode(meta["sh0"], colors)[:, 3]
+    logits = _decode_opacities(meta["sh0"], colors)
     with np.errstate(over="ignore"):  # such splats cannot be drawn, and are dropped later
         means = (np.sign(stretched) * np.expm1(np.abs(stretched))).astype(np.float32)
     return Splats(means, quats, _decode(meta["scales"], pixels("scales")[:, :3]), logits, sh)
+
+
+def _read_image(data: bytes, count: int) -> np.ndarray:
+    """Return the pixels (H, W, 4) uint8 of a WebP image for ``count`` splats.
+
+    Raises:
+        ValueError: the image is too large.
+        NeedsTrainer: Pillow is missing.
+    """
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise NeedsTrainer(
+            f"Cannot read SOG: a package of the trainer is missing ({error}).", "Install the trainer."
+        ) from error
+    width, height = webp_size(data[:30])
+    if width * height > max(2 * count, MAX_PALETTE_PIXELS):
+        raise ValueError(f"an image has {width}x{height} pixels for {count:,} splats")
+    with Image.open(io.BytesIO(data), formats=["WEBP"]) as image:
+        return np.asarray(image.convert("RGBA"))
+
+
+def _decode_opacities(part: dict, codes: np.ndarray) -> np.ndarray:
+    """Return the logits (N,) of opacities, the fourth of the codes (N, 4) of colours."""
+    if "codebook" not in part:
+        return _decode(part, codes)[:, 3]
+    opacities = (codes[:, 3] / 255).clip(1 / 1024, 1 - 1 / 1024)
+    return np.log(opacities / (1 - opacities)).astype(np.float32)
 
 
 def _decode(part: dict, codes: np.ndarray) -> np.ndarray:
