@@ -14,7 +14,7 @@ import zipfile
 from collections.abc import Callable
 from math import ceil, sqrt
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -205,6 +205,7 @@ def decode_sog(read: Callable[[str], bytes]) -> Splats:
         KeyError, ValueError, TypeError, IndexError, OSError, LodgsError: the files are damaged.
         NeedsTrainer: Pillow is missing.
     """
+    image_module = _load_pillow()
     meta = parse_json(read(META), META, _MAX_META)
     if meta.get("version", 1) not in (1, 2):
         raise LodgsError(
@@ -213,7 +214,7 @@ def decode_sog(read: Callable[[str], bytes]) -> Splats:
     count = int(meta["count"] if "count" in meta else meta["means"]["shape"][0])
 
     def pixels(part: str, index: int = 0, size: int | None = count) -> np.ndarray:
-        values = _read_image(read(meta[part]["files"][index]), count)
+        values = _read_image(image_module, read(meta[part]["files"][index]), count)
         if size is None:
             return values
         values = values.reshape(-1, 4)[:size]
@@ -240,11 +241,10 @@ def decode_sog(read: Callable[[str], bytes]) -> Splats:
     return Splats(means, quats, _decode(meta["scales"], pixels("scales")[:, :3]), logits, sh)
 
 
-def _read_image(data: bytes, count: int) -> np.ndarray:
-    """Return the pixels (H, W, 4) uint8 of a WebP image for ``count`` splats.
+def _load_pillow() -> ModuleType:
+    """Return Pillow's image module.
 
     Raises:
-        ValueError: the image is too large.
         NeedsTrainer: Pillow is missing.
     """
     try:
@@ -253,10 +253,19 @@ def _read_image(data: bytes, count: int) -> np.ndarray:
         raise NeedsTrainer(
             f"Cannot read SOG: a package of the trainer is missing ({error}).", "Install the trainer."
         ) from error
+    return Image
+
+
+def _read_image(image_module: ModuleType, data: bytes, count: int) -> np.ndarray:
+    """Return the pixels (H, W, 4) uint8 of a WebP image for ``count`` splats.
+
+    Raises:
+        ValueError: the image is too large.
+    """
     width, height = webp_size(data[:30])
     if width * height > max(2 * count, MAX_PALETTE_PIXELS):
         raise ValueError(f"an image has {width}x{height} pixels for {count:,} splats")
-    with Image.open(io.BytesIO(data), formats=["WEBP"]) as image:
+    with image_module.open(io.BytesIO(data), formats=["WEBP"]) as image:
         return np.asarray(image.convert("RGBA"))
 
 

@@ -64,7 +64,8 @@ def test_blender_imports_each_level_of_usd(bpy, lodgs, file, tmp_path):
         np.testing.assert_allclose(up, [0, 0, 1], atol=1e-6)
 
 
-def test_usd_is_refused_in_blenders_process(bpy, lodgs, tmp_path):
+def test_damaged_usd_is_reported(bpy, lodgs, tmp_path):
+    """The trainer reads it: Blender's own process has another USD library."""
     (Path(tmp_path) / "a.usdc").write_bytes(b"PXR-USDC")
-    with pytest.raises(lodgs("training.errors").LodgsError, match="lodgs edit"):
+    with pytest.raises(lodgs("training.errors").LodgsError, match=r"it is damaged .* Export it again"):
         lodgs("data.importing").import_splats(bpy.context, tmp_path / "a.usdc")

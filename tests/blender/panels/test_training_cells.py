@@ -113,7 +113,7 @@ def test_progress_of_each_cell_is_shown(lodgs, root, draw_panel, draw_line, watc
     def panel():
         return draw_panel("training", "LODGS_PT_training")
 
-    watch._set_blocks(root, [_part(0, "coarse", "running", 40), _part(1, "block", "waiting", 0),
+    watch._set_parts(root, [_part(0, "coarse", "running", 40), _part(1, "block", "waiting", 0),
                               _part(2, "block", "waiting", 0)])  # fmt: skip
     assert {"Coarse levels", "40%"} <= set(panel().texts)
     assert draw_line("blocks", 0).texts == ["1", "Waiting"] and draw_line("blocks", 0).operators == [
@@ -122,7 +122,7 @@ def test_progress_of_each_cell_is_shown(lodgs, root, draw_panel, draw_line, watc
     watch.stopping = {("block", 1)}
     assert draw_line("blocks", 0).texts[:2] == ["1", "Cancelled"] and not draw_line("blocks", 0).operators
     watch.stopping = set()
-    watch._set_blocks(root, [_part(0, "coarse", "done", 100), _part(1, "block", "running", 25),
+    watch._set_parts(root, [_part(0, "coarse", "done", 100), _part(1, "block", "running", 25),
                               _part(2, "block", "cancelled", 50)])  # fmt: skip
     assert "Coarse levels" not in panel().texts
     assert draw_line("blocks", 0).texts == ["1", "25%"] and draw_line("blocks", 0).operators == [
@@ -134,7 +134,7 @@ def test_progress_of_each_cell_is_shown(lodgs, root, draw_panel, draw_line, watc
     assert draw_line("blocks", 0).texts == ["1", "Stopping at 25%"]
     blocks = [_part(number, "block", "done", 100) for number in (1, 2)]
     seams = [_part(1, "seam", "running", 10, 20), _part(2, "seam", "done", 20, 20)]
-    watch._set_blocks(root, [*blocks, *seams])
+    watch._set_parts(root, [*blocks, *seams])
     assert draw_line("blocks", 0).texts == ["1", "Borders, 92%"]
     assert draw_line("blocks", 1).texts == ["2", "Done"] and not draw_line("blocks", 1).operators
     watch.state = "cancelled"
