@@ -1,8 +1,9 @@
-"""Export of compressed bundles by the trainer."""
+"""Exports and imports by the trainer."""
 
 import os
 import sys
 from pathlib import Path
+from threading import Event
 
 import numpy as np
 import pytest
@@ -88,3 +89,13 @@ def test_cancelled_compression_stops_the_trainer(lodgs, file, tmp_path, commands
     folder = Path(commands[0][4]).parent
     steps.close()
     assert not folder.exists() and not (tmp_path / "small.ply").exists()
+
+
+def test_stopped_import_ends_the_trainer(lodgs, tmp_path, commands, monkeypatch):
+    monkeypatch.setenv("COMPRESSION", "import time; time.sleep(60)")
+    stop = Event()
+    convert = lodgs("runs.conversion").make_converter(stop)
+    stop.set()
+    with pytest.raises(lodgs("training.errors").LodgsError, match=r"Reading a\.sog was stopped\."):
+        convert(tmp_path / "a.sog", tmp_path / "a.ply")
+    assert len(commands) == 1 and not (tmp_path / "a.ply").exists()
