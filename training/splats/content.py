@@ -36,7 +36,7 @@ def check_name(path: Path) -> None:
         )
     name, suffixes = _recognise(path, head)
     if suffixes and not path.name.lower().endswith(suffixes):
-        raise LodgsError(f"Cannot read {path}: it is a file of {name}.", f"Rename it to {suffixes[0]}.")
+        raise LodgsError(f"Cannot read {path}: its format is {name}.", f"Rename it to {suffixes[0]}.")
 
 
 def _recognise(path: Path, head: bytes) -> tuple[str, tuple[str, ...]]:

@@ -140,7 +140,7 @@ def test_wrong_names_are_reported_with_the_right_one(tmp_path, name):
             with open_as_ply(tmp_path / name) as ply:
                 assert len(read_bundle(ply).levels[0].splats) == 50
             continue
-        remedy = rf"{name}: it is a file of \w+\. Rename it to {kind}\."
+        remedy = rf"{name}: its format is \w+\. Rename it to {kind}\."
         with pytest.raises(LodgsError, match=remedy), open_as_ply(tmp_path / name) as ply:
             read_bundle(ply)
 
