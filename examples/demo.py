@@ -75,7 +75,7 @@ def main() -> int:
 
 def write_report(scene: Path, run: RunFolder, out: Path) -> int:
     """Measure a finished run, and write its report and pages; return an exit code."""
-    if code := lodgs(["evaluate", str(run.path)]):
+    if code := lodgs(["evaluate", str(run.path), "--far"]):  # compare needs these measures, too
         return code
     measured = json.loads(run.metrics.read_text())
     report = {"scene": str(scene), "method": run.path.name, "levels": measured["levels"]}
