@@ -101,7 +101,7 @@ class Evaluation:
         data: scene at training size.
         backend: rasterizer backend.
         antialias: as ``Bundle.antialias``.
-        perceptual: further measures of images by name, such as LPIPS.
+        measures: measures of images by name, besides PSNR; SSIM if None.
 
     Attributes:
         cameras: held-out views; without any, at most ``MAX_TRAINING_VIEWS`` training views.
@@ -113,20 +113,20 @@ class Evaluation:
         data: TrainingData,
         backend: str = "auto",
         antialias: bool = False,
-        perceptual: Mapping[str, Measure] | None = None,
+        measures: Mapping[str, Measure] | None = None,
     ) -> None:
         self.data = data
         self.backend = backend
         self.device = tensor_device(backend)
         self.antialias = antialias
-        self.perceptual = perceptual or {}
+        self.measures = {"ssim": ssim} if measures is None else measures
         self.cameras = data.test or pick_evenly(data.train, MAX_TRAINING_VIEWS)
         self.prefix = "" if data.test else "train_"
         self._measured: dict[bytes, dict] = {}
 
     def with_filter(self, antialias: bool) -> Evaluation:
         """Return the evaluation for a bundle with or without antialiasing."""
-        return Evaluation(self.data, self.backend, antialias, self.perceptual)
+        return Evaluation(self.data, self.backend, antialias, self.measures)
 
     def target(self, camera: Camera) -> Target:
         """Return the photo of a view, with transparent parts black, and its mask."""
@@ -197,9 +197,8 @@ class Evaluation:
                 given to the rasterizer.
 
         Returns:
-            ``splats`` (mean count), ``drawn`` (mean number in the image), ``psnr`` (dB), ``ssim``, the
-            perceptual measures and ``frame_s`` (median, with selection). Names on training views are
-            ``train_psnr`` and so on.
+            ``splats`` (mean count), ``drawn`` (mean number in the image), ``psnr`` (dB), ``measures`` and
+            ``frame_s`` (median, with selection). Names on training views are ``train_psnr`` and so on.
         """
         drawn, rendered = [], []
 
@@ -222,10 +221,9 @@ class Evaluation:
             seconds = time.perf_counter() - started
             target = self.target(camera)
             pair = image, target.image, target.mask
-            perceptual = [measure(*pair) for measure in self.perceptual.values()]
-            rows.append((seconds, psnr(*pair), ssim(*pair), *perceptual))
-        seconds, quality, *measures = np.array(rows).T
-        named = zip(("ssim", *self.perceptual), measures, strict=True)
+            rows.append((seconds, psnr(*pair), *(measure(*pair) for measure in self.measures.values())))
+        seconds, quality, *columns = np.array(rows).T
+        named = zip(self.measures, columns, strict=True)
         return {
             f"{self.prefix}psnr": round(float(quality.mean()), 3),
             **{f"{self.prefix}{name}": round(float(values.mean()), 4) for name, values in named},

@@ -45,6 +45,7 @@ from ..evaluate.distance import measure_farther_views, measure_popping
 from ..evaluate.frame_memory import measure_frame_memory
 from ..evaluate.level_sheet import write_level_sheet
 from ..evaluate.lpips import load_lpips
+from ..evaluate.metrics import ssim
 from ..evaluate.offset_views import measure_veil
 from ..evaluate.summary import summarize
 from ..evaluate.views import Evaluation, full_detail_source
@@ -103,8 +104,8 @@ def evaluate_run(
     """
     folder, job, data = open_finished(run, warn)
     bundle = open_if_large(folder.bundle) or read_bundle(folder.bundle)
-    networks = load_lpips(lpips, tensor_device(job.backend))
-    evaluation = Evaluation(data, job.backend, bundle.antialias, networks)
+    measures = {"ssim": ssim, **load_lpips(lpips, tensor_device(job.backend))}
+    evaluation = Evaluation(data, job.backend, bundle.antialias, measures)
     rule, values = _resolve_rule(bundle, controls or {})
     report = _measure_levels(job, evaluation, bundle)
     middle = evaluation.cameras[len(evaluation.cameras) // 2]

@@ -190,7 +190,7 @@ def _write_merged_levels(
 ) -> None:
     """Write the levels of merged cells, with their quality, and finish the run."""
     bundle = open_if_large(folder.bundle) or read_bundle(folder.bundle)
-    evaluation = Evaluation(data, backend, bundle.antialias)
+    evaluation = Evaluation(data, backend, bundle.antialias, measures={})
     complete = [level.number for level in standalone_levels(bundle)]
     for position, level in enumerate(bundle.levels, 1):
         path = folder.level_file(level.number)
@@ -227,7 +227,7 @@ class _TrainingRun:
         self.data = data
         self._backend = backend
         self.method = self._new_method()
-        self.evaluation = Evaluation(data, backend, self.method.parameters.antialias)
+        self.evaluation = Evaluation(data, backend, self.method.parameters.antialias, measures={})
         self._device = tensor_device(backend)
         self.step = 0
         self.levels: list[dict] = []

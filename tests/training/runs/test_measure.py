@@ -281,7 +281,7 @@ def test_metrics_are_valid_json_with_undefined_values(finished, monkeypatch):
     run = finished(test_every=4)
     report = evaluate_run(run, far=True)
     assert all(np.isfinite(row["psnr"]) for row in report["farther"])
-    monkeypatch.setattr("training.evaluate.views.ssim", lambda *_: float("nan"))
+    monkeypatch.setattr("training.runs.measure.ssim", lambda *_: float("nan"))
     report = evaluate_run(run)
     assert np.isnan(report["levels"][0]["ssim"]) and "nan" in format_report(report)
 

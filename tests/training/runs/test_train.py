@@ -682,5 +682,5 @@ def test_levels_on_disk_give_the_same_bundle(tiny_scene, tmp_path, monkeypatch):
         [event for event in run if event["event"] in ("level", "done")] for run in (in_memory, on_disk_events)
     ]
     for expected, event in zip(*results, strict=True):
-        for name in ("splats", "drawn", "psnr", "ssim", "train_psnr", "veil", "oversized", "worst"):
+        for name in ("splats", "drawn", "psnr", "train_psnr", "veil", "oversized", "worst"):
             assert event.get(name) == expected.get(name)

@@ -11,6 +11,7 @@ from pathlib import Path
 from ...editing.export import Compression
 from ...evaluate.frame_memory import measure_frame_memory
 from ...evaluate.lpips import load_lpips
+from ...evaluate.metrics import ssim
 from ...evaluate.views import REDUCTIONS, Evaluation, full_detail_source
 from ...lod.on_disk import open_if_large
 from ...lod.selection import resolve_controls, select
@@ -41,8 +42,8 @@ class Subject:
         self.run = run
         self.folder, self.job, data = open_finished(run, warn)
         self.bundle = open_if_large(self.folder.bundle) or read_bundle(self.folder.bundle)
-        networks = load_lpips(None, tensor_device(self.job.backend))
-        self.evaluation = Evaluation(data, self.job.backend, self.bundle.antialias, networks)
+        measures = {"ssim": ssim, **load_lpips(None, tensor_device(self.job.backend))}
+        self.evaluation = Evaluation(data, self.job.backend, self.bundle.antialias, measures)
         self._measured: dict[Hashable, dict[str, float]] = {}
 
     @property
