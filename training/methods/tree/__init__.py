@@ -61,7 +61,7 @@ class TreeParameters(SplatParameters):
         0.1, "Final learning rates of inner nodes, as a fraction of the initial ones.", above=0, high=1
     )
     leaf_rate: float = setting(
-        0.5,
+        0.1,
         "Learning rates of leaves, as multiples of the same rates. 0 freezes the leaves.",
         high=100,
     )
