@@ -53,7 +53,10 @@ def ssim(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = 
     """
     from torchmetrics.functional.image import structural_similarity_index_measure
 
-    pair = [to_8_bit(x).permute(2, 0, 1)[None] for x in (replace_masked(image, target, mask), target)]
+    pair = [  # interleaved channels take half the time
+        to_8_bit(x).permute(2, 0, 1)[None].contiguous(memory_format=torch.channels_last)
+        for x in (replace_masked(image, target, mask), target)
+    ]
     return float(structural_similarity_index_measure(*pair, data_range=1.0))  # type: ignore[arg-type]
 
 
