@@ -197,7 +197,7 @@ def show_marks(marks: Mapping[int, np.ndarray]) -> None:
 
 def shows_marks(cloud: bpy.types.PointCloud, marks: np.ndarray) -> bool:
     """Return whether :func:`show_marks` displays this array for a point cloud."""
-    return _marks.get(cloud.session_uid) is marks
+    return _marks.get(cloud.session_uid) is marks and len(marks) == len(cloud.points)
 
 
 def displayed_marks(cloud: bpy.types.PointCloud) -> np.ndarray:

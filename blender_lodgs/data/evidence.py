@@ -9,7 +9,7 @@ from ...training.editing.clutter import KINDS
 from ...training.scenes.splat_evidence import measure_splat_evidence
 from .. import extension
 from ..attributes import BASE, SCALE
-from . import changes, cleaning, clutter, photographs
+from . import cleaning, clutter, photographs
 
 TINTS = ("red", "orange", "yellow", "green")
 """Colours of the grades of evidence, see ``splat_evidence.GRADES``."""
@@ -17,8 +17,8 @@ _MARKS = np.array([
     next(cleaning.mark_of(name) for name, kind in KINDS.items() if kind.tint == tint) for tint in TINTS
 ], np.uint8)  # fmt: skip
 
-_heat_maps: dict[int, tuple[tuple, np.ndarray]] = {}
-"""Key and marks of each point cloud with a heat map, by its ``session_uid``."""
+_heat_maps: dict[int, np.ndarray] = {}
+"""Marks of each point cloud with a heat map, by its ``session_uid``."""
 
 
 def show(root: bpy.types.Object) -> None:
@@ -41,8 +41,8 @@ def show(root: bpy.types.Object) -> None:
             cleaning.splat_attribute(cloud, SCALE).max(axis=1, initial=0),
             cleaning.splat_attribute(cloud, BASE)[:, 3],
         )
-        _heat_maps[cloud.session_uid] = _key(cloud), _MARKS[evidence.grades]
-    cleaning.show_marks({uid: marks for uid, (_, marks) in _heat_maps.items()})
+        _heat_maps[cloud.session_uid] = _MARKS[evidence.grades]
+    cleaning.show_marks(_heat_maps)
     extension.redraw()
 
 
@@ -59,12 +59,8 @@ def grade_shares(root: bpy.types.Object) -> np.ndarray | None:
     if not levels:
         return None
     cloud = levels[-1].object.data
-    key, marks = _heat_maps.get(cloud.session_uid, ((), None))
-    if marks is None or key != _key(cloud) or not cleaning.shows_marks(cloud, marks):
+    marks = _heat_maps.get(cloud.session_uid)
+    if marks is None or not cleaning.shows_marks(cloud, marks):
         return None
     visible = marks[~cleaning.hidden_mask(cloud)]
     return np.array([np.count_nonzero(visible == mark) for mark in _MARKS]) / max(len(visible), 1)
-
-
-def _key(cloud: bpy.types.PointCloud) -> tuple:
-    return len(cloud.points), changes.version(cloud)

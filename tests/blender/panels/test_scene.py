@@ -63,6 +63,20 @@ def test_heat_map_of_evidence_is_shown_and_hidden(bpy, lodgs, root, draw_panel):
     assert not cleaning.displayed_marks(cloud).any()
 
 
+def test_heat_map_of_evidence_stays_after_undo(bpy, lodgs, root):
+    evidence, cleaning = lodgs("data.evidence"), lodgs("data.cleaning")
+    bpy.ops.lodgs.show_evidence()
+    bpy.ops.ed.undo_push(message="before")
+    bpy.context.scene.frame_end = 7
+    bpy.ops.ed.undo_push(message="Change")
+    assert bpy.ops.ed.undo() == {"FINISHED"}
+    root = bpy.context.view_layer.objects.active
+    cloud = root.lodgs.existing_levels[-1].object.data
+    assert (cleaning.displayed_marks(cloud) > 1).all() and evidence.grade_shares(root) is not None
+    bpy.ops.lodgs.show_evidence()
+    assert not cleaning.displayed_marks(cloud).any()
+
+
 def test_result_of_an_import_is_shown_until_the_next_import(bpy, lodgs, draw_panel, monkeypatch, tmp_path):
     photo_preparation = lodgs("runs.photo_preparation")
     write_bundle(tmp_path / "splats.ply", Bundle("flod", [Level(1, splats(5), {})], "bands"))
