@@ -48,6 +48,7 @@ class LODGS_OT_show_evidence(_ViewsOperator, bpy.types.Operator):
         root = roots.active_root(context)
         if evidence.grade_shares(root) is None:
             evidence.show(root)
+            context.scene.lodgs_render.show_comparison = False  # it covers the colours
         else:
             evidence.hide()
         return {"FINISHED"}

@@ -77,6 +77,12 @@ def test_heat_map_of_evidence_stays_after_undo(bpy, lodgs, root):
     assert not cleaning.displayed_marks(cloud).any()
 
 
+def test_evidence_hides_the_comparison_that_covers_it(bpy, root):
+    bpy.context.scene.lodgs_render.show_comparison = True
+    bpy.ops.lodgs.show_evidence()
+    assert not bpy.context.scene.lodgs_render.show_comparison
+
+
 def test_result_of_an_import_is_shown_until_the_next_import(bpy, lodgs, draw_panel, monkeypatch, tmp_path):
     photo_preparation = lodgs("runs.photo_preparation")
     write_bundle(tmp_path / "splats.ply", Bundle("flod", [Level(1, splats(5), {})], "bands"))
