@@ -158,6 +158,7 @@ class LODGS_PT_stream(LevelsPanel):
         stream = views.stream(root)
         settings = root.lodgs.stream
         resident = settings.scene_splats + (stream.splats if stream is not None and stream.ready else 0)
+        resident = min(resident, settings.total)  # streamed pages repeat the splats of the scene
         layout.label(text=f"{_short(resident)} of {_short(settings.total)} splats in memory")
         if streams.is_edited(root):
             say(layout, "These splats no longer match the file, so streaming is off.", "INFO")

@@ -209,6 +209,9 @@ def test_state_of_streaming_is_shown(bpy, lodgs, draw, draw_panel, tmp_path, mon
     stream = streaming.Stream(lodgs("data.streams").source_of(root))
     monkeypatch.setitem(views._streams, root.session_uid, stream)
     assert texts()[1:] == ["Loading finer splats…"]
+    monkeypatch.setattr(streaming.Stream, "splats", 5999)
+    stream.ready = True
+    assert texts()[0] == "5,999 of 5,999 splats in memory"
     stream.problem = "The disk is gone."
     assert "The disk is gone." in " ".join(texts())
     root.lodgs.mode = "SINGLE"
