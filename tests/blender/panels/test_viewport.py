@@ -119,3 +119,15 @@ def test_panel_states_the_splats_of_a_moving_view(lodgs, viewport, draw_panel):
     arrangement.motion = None
     texts = draw_panel("viewport", "LODGS_PT_viewport").texts
     assert not any("moving view" in text for text in texts)
+
+
+def test_wrapped_texts_keep_units_with_their_numbers(lodgs, monkeypatch):
+    parts, lines = lodgs("panels.parts"), []
+    context = SimpleNamespace(
+        region=SimpleNamespace(width=270), preferences=SimpleNamespace(system=SimpleNamespace(ui_scale=1.0))
+    )
+    monkeypatch.setattr(parts, "bpy", SimpleNamespace(context=context))
+    column = SimpleNamespace(label=lambda text, icon: lines.append(text))
+    layout = SimpleNamespace(column=lambda align: column)
+    parts.say(layout, "Half the views are 44.7 m or 89.4 m from the centre of the splats.", "INFO")
+    assert lines == ["Half the views are 44.7 m or", "89.4 m from the centre of the", "splats."]
