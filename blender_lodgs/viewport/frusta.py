@@ -26,7 +26,7 @@ def draw(context: bpy.types.Context) -> None:
         if root.lodgs.training.show_views and viewpoints.has_only_splats(root):
             with suppress(LodgsError):  # the panel shows it
                 _draw(viewpoints.preview_views(root), axes_of(root).matrix_world)
-    if context.scene.lodgs_capture.show_views:
+    if context.scene.lodgs_capture.show_views and roots.active_root(context) is None:  # as the Capture panel
         with suppress(LodgsError):
             _draw(viewpoints.placed_capture_views(context)[0], Matrix())
 

@@ -85,6 +85,19 @@ def test_frusta_of_previewed_views_are_drawn(bpy, lodgs, root, frame):
     assert not frame(64, draw).any()
 
 
+def test_capture_views_are_hidden_while_a_splat_scene_is_active(bpy, lodgs, monkeypatch):
+    frusta, drawn = lodgs("viewport.frusta"), []
+    monkeypatch.setattr(frusta, "_draw", lambda views, matrix: drawn.append(len(views)))
+    bpy.ops.mesh.primitive_cube_add()
+    bpy.context.scene.lodgs_capture.show_views, bpy.context.scene.lodgs_capture.views = True, 9
+    frusta.draw(bpy.context)
+    assert drawn == [9]
+    with lodgs("data.importing").new_scene(bpy.context, "scene"):
+        pass
+    frusta.draw(bpy.context)
+    assert drawn == [9]
+
+
 @pytest.mark.parametrize("views_from", ["GRID", "CURVE"])
 def test_preview_matches_the_training_views(bpy, lodgs, root, views_from):
     root, splats = root
