@@ -221,6 +221,14 @@ def test_formats_are_found_by_name():
         find_format(Path("a.obj"))
 
 
+def test_only_the_smallest_format_of_large_scenes_claims_to_be_it():
+    sizes = {kind.suffix: kind.size(10_000_000, 3) for kind in FORMATS if kind.max_degree}
+    claims = [kind for kind in FORMATS if "smallest" in kind.about]
+    assert [(kind.suffix, "large scenes" in kind.about) for kind in claims] == [
+        (min(sizes, key=sizes.get), True)
+    ]
+
+
 def test_sizes_of_uncompressed_formats_are_exact(tmp_path):
     for degree in range(5):
         splats = random_splats(256, degree)

@@ -8,7 +8,7 @@ from ..splat_format import SplatFormat
 FORMAT = SplatFormat(
     ".sog",
     "SOG",
-    "PlayCanvas' web format, the smallest",
+    "PlayCanvas' web format, the smallest for large scenes",
     (13.0, 14.6, 14.6, 14.6),
     max_degree=MAX_DEGREE,
     palette_size=MAX_PALETTE,
