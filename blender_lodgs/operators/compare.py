@@ -125,7 +125,7 @@ class LODGS_OT_compare_worst(_CompareOperator, bpy.types.Operator):
 
 class LODGS_OT_compare_methods(SceneOperator, bpy.types.Operator):
     bl_idname = "lodgs.compare_methods"
-    bl_label = "Compare Methods…"
+    bl_label = "Compare Methods"
     bl_description = (
         "Train several methods on the photos in the background, and open a page that compares their quality, "
         "splats, speed and images"

@@ -106,7 +106,7 @@ def _draw_methods(layout: bpy.types.UILayout) -> None:
     """Draw the comparison of methods, or its progress."""
     work = method_comparison.current
     if work is None or not work.running:
-        layout.operator("lodgs.compare_methods", icon="GRAPH")
+        layout.operator("lodgs.compare_methods", text="Compare Methods…", icon="GRAPH")
         if work is not None:
             say(layout, work.problem or work.message, "ERROR" if work.problem else "INFO")
         return

@@ -36,6 +36,7 @@ def test_menus_list_every_operator(bpy, lodgs):
     labels = [label_of(bpy, name) for name in listed]
     assert len(labels) == len(set(labels)), "labels are unique"
     assert all(" " in label for label in labels), "labels have a verb and an object"
+    assert not [label for label in labels if label.endswith("…")], "buttons add it; it is no part of a title"
 
 
 def label_of(bpy, operator):
