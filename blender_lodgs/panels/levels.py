@@ -132,16 +132,16 @@ def _draw_counts(layout: bpy.types.UILayout, context: bpy.types.Context, root: b
         column.label(text=region)
     if not root.lodgs.stream.file:  # when streaming, viewports draw more splats than the levels hold
         visible, total = scenes.count_visible(context, root)
-        column.label(text=f"{visible:,} of {total:,} splats shown")
+        say(column, f"{visible:,} of {total:,} splats shown", "NONE")
         if query:
             saved = loaded.saved_share(context, root)
-            column.label(text=f"{saved:.0%} fewer than the finest level")
+            say(column, f"{saved:.0%} fewer than the finest level", "NONE")
             if saved < MIN_SAVED and len(root.lodgs.levels) > 1:
                 say(column, "By Distance saves almost nothing at this camera.", "INFO")
                 column.operator("lodgs.reduce_detail")
     if query and region:
         splats, megabytes = loaded.count_loaded(root, query)
-        column.label(text=f"{splats:,} loaded, {megabytes:.1f} MB")
+        say(column, f"{splats:,} loaded, {megabytes:.1f} MB", "NONE")
 
 
 class LODGS_PT_stream(LevelsPanel):
@@ -159,7 +159,7 @@ class LODGS_PT_stream(LevelsPanel):
         settings = root.lodgs.stream
         resident = settings.scene_splats + (stream.splats if stream is not None and stream.ready else 0)
         resident = min(resident, settings.total)  # streamed pages repeat the splats of the scene
-        layout.label(text=f"{_short(resident)} of {_short(settings.total)} splats in memory")
+        say(layout, f"{_short(resident)} of {_short(settings.total)} splats in memory", "NONE")
         if streams.is_edited(root):
             say(layout, "These splats no longer match the file, so streaming is off.", "INFO")
         elif root.lodgs.mode != "SELECTIVE":

@@ -56,11 +56,11 @@ def say(layout: bpy.types.UILayout, text: str, icon: str) -> None:
     column = layout.column(align=True)
     column.scale_y = 0.8
     width = bpy.context.region.width / bpy.context.preferences.system.ui_scale
-    columns = max(int((width - 85) / 5.6), 24)  # letters of the default font, without icon and tabs
+    columns = max(int((width - 85) / 5.6), 12)  # letters of the default font, without icon and tabs
     text = re.sub(r"(\d) (?=([kMG]|s|[cmk]?m|[kMGT]B)\b)", "\\1\u00a0", text)  # keep units on the line
     for number, line in enumerate(textwrap.wrap(text, columns, break_on_hyphens=False)):
         line = line.replace("\u00a0", " ")
-        column.label(text=line, icon="BLANK1" if number else icon)  # type: ignore[arg-type]
+        column.label(text=line, icon="BLANK1" if number and icon != "NONE" else icon)  # type: ignore[arg-type]
 
 
 def draw_views(column: bpy.types.UILayout, settings: ViewsSettings, count: int) -> None:

@@ -228,12 +228,11 @@ def _draw_ended(layout: bpy.types.UILayout, watch: Watch, root: bpy.types.Object
     loaded = {item.number for item in root.lodgs.existing_levels}
     box.label(text=watch.message, icon="CHECKMARK" if watch.state == "done" else "PAUSE")
     column = box.column(align=True)
-    column.scale_y = 0.8
     events = [watch.levels[number] for number in sorted(watch.levels.keys() & loaded)]
     if views := next(filter(None, map(measured_on, events)), ""):
-        column.label(text=f"Quality on {views}", icon="BLANK1")
+        say(column, f"Quality on {views}", "BLANK1")
     for event in events:
-        column.label(text=short_level_line(event), icon="BLANK1")
+        say(column, short_level_line(event), "BLANK1")
     if missing := sorted(watch.levels.keys() - loaded):
         say(box, f"Levels not loaded: {', '.join(map(str, missing))}", "INFO")
         load = box.operator("lodgs.open_run", text="Load Levels", icon="IMPORT")

@@ -121,13 +121,30 @@ def test_panel_states_the_splats_of_a_moving_view(lodgs, viewport, draw_panel):
     assert not any("moving view" in text for text in texts)
 
 
-def test_wrapped_texts_keep_units_with_their_numbers(lodgs, monkeypatch):
-    parts, lines = lodgs("panels.parts"), []
-    context = SimpleNamespace(
-        region=SimpleNamespace(width=270), preferences=SimpleNamespace(system=SimpleNamespace(ui_scale=1.0))
-    )
-    monkeypatch.setattr(parts, "bpy", SimpleNamespace(context=context))
-    column = SimpleNamespace(label=lambda text, icon: lines.append(text))
-    layout = SimpleNamespace(column=lambda align: column)
-    parts.say(layout, "Half the views are 44.7 m or 89.4 m from the centre of the splats.", "INFO")
+@pytest.fixture
+def wrap(lodgs, monkeypatch):
+    """``wrap(270, text)``: draw a text in a region with this width and return its lines."""
+    parts = lodgs("panels.parts")
+
+    def draw(width, text, icon="INFO"):
+        lines = []
+        preferences = SimpleNamespace(system=SimpleNamespace(ui_scale=1.5))
+        context = SimpleNamespace(region=SimpleNamespace(width=1.5 * width), preferences=preferences)
+        monkeypatch.setattr(parts, "bpy", SimpleNamespace(context=context))
+        column = SimpleNamespace(label=lambda text, icon: lines.append((text, icon)))
+        parts.say(SimpleNamespace(column=lambda align: column), text, icon)
+        return [text for text, _ in lines], [icon for _, icon in lines]
+
+    return draw
+
+
+def test_wrapped_texts_keep_units_with_their_numbers(wrap):
+    lines, _ = wrap(270, "Half the views are 44.7 m or 89.4 m from the centre of the splats.")
     assert lines == ["Half the views are 44.7 m or", "89.4 m from the centre of the", "splats."]
+
+
+def test_texts_fit_a_narrow_sidebar(wrap):
+    lines, icons = wrap(180, "For quick redraws, set Splat Budget to 20,000.")
+    assert lines == ["For quick", "redraws, set", "Splat Budget to", "20,000."]
+    assert icons == ["INFO", "BLANK1", "BLANK1", "BLANK1"]
+    assert set(wrap(180, "57,644 of 108,804 splats shown", "NONE")[1]) == {"NONE"}
