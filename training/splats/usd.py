@@ -98,7 +98,7 @@ def write_usd(path: Path, levels: PortableLevels) -> None:
             if full := _full_disk(folder):
                 raise full from error
             raise LodgsError(
-                f"Cannot write {path}: {_first_line(error)}.", "Check the free space."
+                f"Cannot write {path}: {error_reason(error)}.", "Check the free space."
             ) from error
         os.replace(scene, temporary)
 
@@ -267,6 +267,8 @@ def report_error(error: LodgsError) -> None:
     print(json.dumps({"what": error.what, "remedy": error.remedy}), flush=True)
 
 
-def _first_line(error: Exception) -> str:
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return printable(lines[-1])[:300] if lines else type(error).__name__
+def error_reason(error: Exception) -> str:
+    """Return the message of an exception, without the lines of usd-core's source that its text contains."""
+    texts = [part.commentary for part in error.args if hasattr(part, "commentary")]
+    text = "; ".join(texts) or str(error)
+    return printable(" ".join(text.split()))[:300] or type(error).__name__

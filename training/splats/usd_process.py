@@ -22,7 +22,7 @@ from .portable_levels import (
     upright_meta,
 )
 from .sh import MAX_DEGREE, coefficient_count
-from .usd import DESCRIPTION, load_usd, report_error
+from .usd import DESCRIPTION, error_reason, load_usd, report_error
 
 _MEMORY = 1 << 27
 """Bytes that a file of any size may unpack to."""
@@ -43,8 +43,12 @@ def main() -> int:
         write_bundle(target, read_levels(usd, source))
     except LodgsError as error:
         report_error(error)
+    except UnicodeEncodeError:
+        report_error(
+            LodgsError(f"Cannot read {source}: its path is not UTF-8, as USD requires.", "Rename it.")
+        )
     except (usd.Tf.ErrorException, MemoryError, ValueError, RuntimeError, OverflowError) as error:
-        reason = printable((str(error).strip() or type(error).__name__).splitlines()[-1])[:300]
+        reason = error_reason(error)
         report_error(LodgsError(f"Cannot read {source}: it is damaged ({reason}).", "Export it again."))
     return 0
 
@@ -61,51 +65,71 @@ def limit_memory(path: Path) -> None:
 
 
 def read_levels(usd: SimpleNamespace, path: Path) -> Bundle:
-    """Return the levels of the first root with splats below it, or all splats as one level.
+    """Return the levels of the roots of levels, each with the fields outside, or all splats as one level.
+
+    A root with fewer levels than others shows its coarsest one at the remaining levels.
 
     Raises:
         LodgsError: the file has no splats or invalid ones, or refers to other files.
     """
     stage = _open(usd, path)
-    fields = [prim for prim in stage.Traverse() if prim.GetTypeName() == "ParticleField3DGaussianSplat"]
+    prims = list(stage.Traverse(usd.Usd.TraverseInstanceProxies()))
+    fields = [prim for prim in prims if prim.GetTypeName() == "ParticleField3DGaussianSplat"]
     if not fields:
         raise LodgsError(f"Cannot read {path}: it has no Gaussian splats.", "Choose another file.")
     _check_size(path, fields)
-    root = next((prim for prim in stage.Traverse() if prim.HasAPI(usd.UsdLod.RootAPI)), None)
-    below = [] if root is None else [f for f in fields if f.GetPath().HasPrefix(root.GetPath())]
-    items = below or fields
-    if len(below) > MAX_READ_LEVELS:
-        raise LodgsError(f"Cannot read {path}: it has {len(below)} levels.", "Export fewer levels.")
+    roots = [prim for prim in prims if prim.HasAPI(usd.UsdLod.RootAPI)]
+    groups = {root: below for root in roots if (below := _take_below(fields, root))}
+    fields = [prim for prim in fields if _is_shown(usd, prim)] or ([] if groups else fields)
+    count = max(map(len, groups.values()), default=1)
+    if count > MAX_READ_LEVELS:
+        raise LodgsError(f"Cannot read {path}: it has {count} levels.", "Export fewer levels.")
     cache = usd.UsdGeom.XformCache(usd.Usd.TimeCode.EarliestTime())
     unit = usd.UsdGeom.GetStageMetersPerUnit(stage) if usd.UsdGeom.StageHasAuthoredMetersPerUnit(stage) else 1
     metres = np.diag([unit] * 3 + [1.0])
+    items = [*fields, *(prim for group in groups.values() for prim in group)]
     matrices = [metres @ np.array(cache.GetLocalToWorldTransform(prim)).T for prim in items]
-    up = usd.UsdGeom.GetStageUpAxis(stage)
     data = stage.GetRootLayer().customLayerData
-    if DESCRIPTION in data and below:
+    if DESCRIPTION in data and len(groups) == 1 and not fields:
         bundle, placement = parse_description(data[DESCRIPTION], path)
         same = all(np.allclose(matrix, placement, rtol=1e-9, atol=1e-9) for matrix in matrices)
-        if same and len(bundle.levels) == len(below):
-            for level, prim in zip(reversed(bundle.levels), below, strict=True):
+        if same and len(bundle.levels) == count:
+            for level, prim in zip(reversed(bundle.levels), items, strict=True):
                 level.splats = _read_field(prim, path)
             return bundle
     placed = [
         place_splats(_read_field(prim, path), matrix, path)
         for prim, matrix in zip(items, matrices, strict=True)
     ]
+    up = usd.UsdGeom.GetStageUpAxis(stage)
     meta, placed = upright_meta(placed, "Z" if up == usd.UsdGeom.Tokens.z else "Y")
     degree = min(splats.sh_degree for splats in placed)
-    placed = [_limited(splats, degree) for splats in placed]
-    if not below:
-        return Bundle("", [Level(1, Splats.concatenated(placed))], meta=meta)
-    distances = [unit * distance for distance in _thresholds(usd, root, len(placed))]
+    splats = {prim: _limited(part, degree) for prim, part in zip(items, placed, strict=True)}
+    shown = [[*fields, *(g[min(i, len(g) - 1)] for g in groups.values())] for i in range(count)]
+    distances = next((d for root in groups if (d := _thresholds(usd, root, count))), [])
     levels = [
-        Level(number, splats, {DISTANCE: distance} if distances else {})
-        for number, (splats, distance) in enumerate(
-            zip(reversed(placed), reversed(distances or [0.0] * len(placed)), strict=True), 1
+        Level(
+            count - i,
+            Splats.concatenated([splats[prim] for prim in prims]),
+            {DISTANCE: unit * distances[i]} if distances else {},
         )
+        for i, prims in reversed(list(enumerate(shown)))
     ]
     return Bundle("", levels, DISTANCE_RULE if distances else "", meta=meta)
+
+
+def _take_below(fields: list, root) -> list:
+    """Return the fields below a prim, and remove them from the list."""
+    below = [prim for prim in fields if prim.GetPath().HasPrefix(root.GetPath())]
+    fields[:] = [prim for prim in fields if not prim.GetPath().HasPrefix(root.GetPath())]
+    return below
+
+
+def _is_shown(usd: SimpleNamespace, prim) -> bool:
+    """Return whether renderers show a prim: it is neither hidden nor a proxy or guide."""
+    imageable, tokens = usd.UsdGeom.Imageable(prim), usd.UsdGeom.Tokens
+    hidden = imageable.ComputeVisibility(usd.Usd.TimeCode.EarliestTime()) == tokens.invisible
+    return not hidden and imageable.ComputePurpose() not in (tokens.proxy, tokens.guide)
 
 
 def _open(usd: SimpleNamespace, path: Path):
@@ -115,7 +139,7 @@ def _open(usd: SimpleNamespace, path: Path):
         raise LodgsError(f"Cannot read {path}: it is not a USD file.", "Choose another file.")
     layers, others = [layer], []
     for part in layers:
-        for name in part.GetCompositionAssetDependencies():
+        for name in filter(None, part.GetCompositionAssetDependencies()):  # "": a reference within the layer
             place = usd.Sdf.ComputeAssetPathRelativeToLayer(part, name)
             inside = place.startswith(f"{layer.identifier}[") and usd.Sdf.Layer.FindOrOpen(place)
             if not inside:
@@ -147,7 +171,7 @@ def _read_field(prim, path: Path) -> Splats:
     """Return the splats of a particle field in its own coordinates.
 
     As the schema says, attributes without a value for each position have their default, and excess values are
-    ignored.
+    ignored. Incomplete coefficients of harmonics are an error, because the default is grey.
     """
 
     def values(name: str, width: int) -> np.ndarray:
@@ -168,15 +192,18 @@ def _read_field(prim, path: Path) -> Splats:
     scales, alphas = values_or((1, 1, 1), "scales"), values_or((1,), "opacities")[:, 0]
     degree = _first_value(prim.GetAttribute("radiance:sphericalHarmonicsDegree"))
     sh = values("radiance:sphericalHarmonicsCoefficients", 3)
+    if not len(sh):
+        sh, degree = np.zeros_like(means), 0
     if type(degree) is not int or not 0 <= degree <= MAX_DEGREE:
         raise LodgsError(f"Cannot read {path}: its SH degree is {degree}.", "Use degree 0 to 4.")
-    if len(sh) != len(means) * coefficient_count(degree):
+    needed = len(means) * coefficient_count(degree)
+    if len(sh) < needed:
         raise LodgsError(
             f"Cannot read {path}: {printable(prim.GetPath())} has {len(sh):,} coefficients for "
             f"{len(means):,} splats of SH degree {degree}.",
             "Export it again.",
         )
-    return splats_from_activated(means, quats, scales, alphas, sh.reshape(len(means), -1, 3))
+    return splats_from_activated(means, quats, scales, alphas, sh[:needed].reshape(len(means), -1, 3))
 
 
 def _first_value(attribute):

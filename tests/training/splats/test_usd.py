@@ -270,6 +270,84 @@ def test_inconsistent_fields_raise_one_sentence(tmp_path, attributes, reason):
         read(tmp_path / "b.usdc")
 
 
+def test_missing_and_excess_harmonics_follow_the_schema(tmp_path):
+    """Fields without coefficients are grey, of degree 0, whatever their degree says (default: 3)."""
+    name = "radiance:sphericalHarmonicsCoefficients"
+    foreign(tmp_path, **{name: [], "radiance:sphericalHarmonicsDegree": 3})
+    assert read(tmp_path / "b.usdc").levels[0].splats.sh.tolist() == [[[0, 0, 0]]] * 2
+    foreign(tmp_path, **{name: [(1, 2, 3), (4, 5, 6)]})
+    assert read(tmp_path / "b.usdc").levels[0].splats.sh.tolist() == [[[1, 2, 3]]] * 2
+
+
+FIELD = """def ParticleField3DGaussianSplat "{}" {{
+    point3f[] positions = [({}, 0, 0)]
+    float3[] radiance:sphericalHarmonicsCoefficients = [(1, 0, 0)]
+    int radiance:sphericalHarmonicsDegree = 0
+    {}
+}}
+"""
+
+
+def write_scene(path, body):
+    path.write_text(f'#usda 1.0\n(upAxis = "Z")\n{body}', encoding="utf-8")
+
+
+def x_positions(path):
+    """Return the sorted positions of each level, coarse to fine."""
+    return [sorted(level.splats.means[:, 0].tolist()) for level in read(path).levels]
+
+
+def test_roots_of_levels_and_fields_outside_are_joined(tmp_path):
+    scene, root = tmp_path / "a.usda", 'def Xform "{}" (prepend apiSchemas = ["LODRootAPI"]) {{\n{}}}\n'
+    fields = [FIELD.format(f"f{x}", x, "") for x in range(7)]
+    write_scene(scene, root.format("A", fields[0] + fields[1] + fields[2]))
+    assert x_positions(scene) == [[2], [1], [0]]
+    parts = root.format("A", "".join(fields[:3])), root.format("B", "".join(fields[3:5])), fields[6]
+    write_scene(scene, "".join(parts))
+    assert x_positions(scene) == [[2, 4, 6], [1, 4, 6], [0, 3, 6]]
+
+
+def test_fields_that_renderers_hide_are_left_out(tmp_path):
+    hidden = (
+        'token visibility = "invisible"',
+        *(f'uniform token purpose = "{p}"' for p in ("proxy", "guide")),
+    )
+    fields = [FIELD.format(f"f{x}", x, line) for x, line in enumerate(["", *hidden])]
+    write_scene(tmp_path / "a.usda", "".join(fields))
+    assert x_positions(tmp_path / "a.usda") == [[0]]
+    write_scene(tmp_path / "a.usda", "".join(fields[1:]))
+    assert x_positions(tmp_path / "a.usda") == [[1, 2, 3]]
+
+
+@pytest.mark.parametrize("instanceable", ["true", "false"])
+def test_references_within_a_file_are_followed(tmp_path, instanceable):
+    copy = f"""def Xform "B" (
+        instanceable = {instanceable}
+        prepend references = </A>
+    ) {{
+        double3 xformOp:translate = (5, 0, 0)
+        uniform token[] xformOpOrder = ["xformOp:translate"]
+    }}"""
+    write_scene(tmp_path / "a.usda", f'def Xform "A" {{\n{FIELD.format("f", 1, "")}}}\n{copy}\n')
+    assert x_positions(tmp_path / "a.usda") == [[1, 6]]
+
+
+def test_syntax_errors_name_the_line(tmp_path):
+    write_scene(tmp_path / "a.usda", "\n\ndef {")
+    with pytest.raises(LodgsError, match=r"it is damaged .*a\.usda:5:1: parse error") as error:
+        read(tmp_path / "a.usda")
+    assert "Error in" not in error.value.what
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
+def test_names_that_are_not_utf8_are_reported(tmp_path):
+    path = tmp_path / "a\udcff.usda"
+    write_scene(path, FIELD.format("f", 1, ""))
+    with pytest.raises(LodgsError, match="not UTF-8") as error:
+        read(path)
+    assert error.value.remedy == "Rename it."
+
+
 def test_other_files_are_not_opened(tmp_path):
     stage = foreign(tmp_path)
     stage.GetRootLayer().subLayerPaths.append("../secret.usdc")
