@@ -205,7 +205,7 @@ def read_environment(folder: Path) -> Splats:
     name = json.loads((folder / STREAMED_FILE).read_text("utf-8")).get("environment")
     if name is None:
         return read_ply(FOLDER / "plain.ply").select(slice(0, 0))
-    return decode_sog(lambda file: (folder / name).with_name(file).read_bytes())
+    return decode_sog(lambda file: (folder / name).with_name(file).read_bytes())[0]
 
 
 def read_by_both(path: Path, turns: bool) -> str:

@@ -25,7 +25,7 @@ from ..files import atomic_write
 from .coding import MAX_LOGIT
 from .gaussians import SplatRows, Splats
 from .morton import spatial_order
-from .packed_files import MAX_PALETTE_PIXELS, check_sog_file, webp_size
+from .packed_files import MAX_PALETTE_PIXELS, check_sog_file
 from .quats import join_quats, split_quats
 from .sh import degree_from_count
 from .splat_format import NeedsTrainer
@@ -69,7 +69,7 @@ def write_sog(path: Path, splats: SplatRows, meta: dict) -> None:
     """Write splats as one SOG file.
 
     Args:
-        meta: meta of the splats' bundle; the format stores none of it.
+        meta: meta of the splats' bundle; the file stores whether it is antialiased.
 
     Raises:
         LodgsError: there are no splats, their SH degree is too high, the file cannot be written, or a package
@@ -84,19 +84,21 @@ def write_sog(path: Path, splats: SplatRows, meta: dict) -> None:
             "Write a PLY instead.",
         )
     values = splats.select(slice(0, len(splats)))
-    files = encode_sog(values.select(spatial_order(values.means)))
+    antialias = bool(meta.get("antialias"))
+    files = encode_sog(values.select(spatial_order(values.means)), antialias)
     with atomic_write(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
         for name, data in files.items():
             archive.writestr(zipfile.ZipInfo(name), data)  # without the time: equal splats give equal files
 
 
-def encode_sog(splats: Splats) -> dict[str, bytes]:
+def encode_sog(splats: Splats, antialias: bool = False) -> dict[str, bytes]:
     """Return the files of a SOG by name; the splats keep their order.
 
     Neighbours in the order should be neighbours in space, because then images are smaller.
 
     Args:
         splats: N >= 1 splats with finite means, of SH degree 0 to :data:`MAX_DEGREE`.
+        antialias: they are drawn with Mip-Splatting's filter.
 
     Raises:
         LodgsError: a package is missing.
@@ -106,7 +108,8 @@ def encode_sog(splats: Splats) -> dict[str, bytes]:
     width = 4 * ceil(sqrt(count) / 4)
     height = 4 * ceil(count / width / 4)
     files: dict[str, bytes] = {}
-    meta: dict[str, Any] = {"version": 2, "asset": {"generator": "LODGS"}, "count": count}
+    asset = {"generator": "LODGS"}
+    meta: dict[str, Any] = {"version": 2, "asset": asset, "count": count, "antialias": antialias}
 
     def add(name: str, *channels: np.ndarray, size: tuple[int, int] = (width, height)) -> str:
         pixels = np.zeros((size[0] * size[1], 4), np.uint8)
@@ -151,7 +154,7 @@ def encode_sog(splats: Splats) -> dict[str, bytes]:
 
 
 def read_sog(path: Path) -> tuple[Splats, dict]:
-    """Read a ``.sog`` file, or a :data:`META` with its images beside it; return splats and an empty meta.
+    """Read a ``.sog`` file, or a :data:`META` with its images beside it; return splats and meta.
 
     Raises:
         LodgsError: the file cannot be read, is damaged, or refers to files outside its folder, or Pillow is
@@ -159,10 +162,10 @@ def read_sog(path: Path) -> tuple[Splats, dict]:
     """
     try:
         if path.suffix.lower() == ".json":
-            return decode_sog(lambda name: read_bytes(_sibling(path, name), _MAX_FILE)), {}
+            return decode_sog(lambda name: read_bytes(_sibling(path, name), _MAX_FILE), path)
         check_sog_file(path)
         with open_file(path) as file, zipfile.ZipFile(file) as archive:
-            return decode_sog(archive.read), {}
+            return decode_sog(archive.read, path)
     except LodgsError:
         raise
     except Exception as error:  # zipfile documents no exception types
@@ -192,24 +195,26 @@ def sog_error(path: Path, error: Exception) -> LodgsError:
     return LodgsError(f"Cannot read {path}: it is damaged ({reason}).", "Export it again.")
 
 
-def decode_sog(read: Callable[[str], bytes]) -> Splats:
-    """Return the splats of the files of a SOG.
+def decode_sog(read: Callable[[str], bytes], path: Path = Path(META)) -> tuple[Splats, dict]:
+    """Return the splats and the meta of the files of a SOG.
 
     Version 2 stores values as entries of a codebook. Version 1 has no version number and stores them as
     fractions of a range, opacities as logits.
 
     Args:
         read: function that returns the content of a file by name.
+        path: path for messages.
 
     Raises:
         KeyError, ValueError, TypeError, IndexError, OSError, LodgsError: the files are damaged.
         NeedsTrainer: Pillow is missing.
     """
     image_module = _load_pillow()
-    meta = parse_json(read(META), META, _MAX_META)
+    meta = parse_json(read(META), f"The file {META} of {path}", _MAX_META)
     if meta.get("version", 1) not in (1, 2):
         raise LodgsError(
-            f"Cannot read SOG of version {meta['version']}.", "Export it as version 2 or as PLY."
+            f"Cannot read {path}: it is SOG of version {printable(meta['version'])}.",
+            "Export it as version 2 or as PLY.",
         )
     count = int(meta["count"] if "count" in meta else meta["means"]["shape"][0])
 
@@ -238,7 +243,8 @@ def decode_sog(read: Callable[[str], bytes]) -> Splats:
     logits = _decode_opacities(meta["sh0"], colors)
     with np.errstate(over="ignore"):  # such splats cannot be drawn, and are dropped later
         means = (np.sign(stretched) * np.expm1(np.abs(stretched))).astype(np.float32)
-    return Splats(means, quats, _decode(meta["scales"], pixels("scales")[:, :3]), logits, sh)
+    splats = Splats(means, quats, _decode(meta["scales"], pixels("scales")[:, :3]), logits, sh)
+    return splats, {"antialias": True} if meta.get("antialias") is True else {}
 
 
 def _load_pillow() -> ModuleType:
@@ -257,15 +263,15 @@ def _load_pillow() -> ModuleType:
 
 
 def _read_image(image_module: ModuleType, data: bytes, count: int) -> np.ndarray:
-    """Return the pixels (H, W, 4) uint8 of a WebP image for ``count`` splats.
+    """Return the pixels (H, W, 4) uint8 of a WebP or PNG image for ``count`` splats.
 
     Raises:
         ValueError: the image is too large.
     """
-    width, height = webp_size(data[:30])
-    if width * height > max(2 * count, MAX_PALETTE_PIXELS):
-        raise ValueError(f"an image has {width}x{height} pixels for {count:,} splats")
-    with image_module.open(io.BytesIO(data), formats=["WEBP"]) as image:
+    with image_module.open(io.BytesIO(data), formats=["WEBP", "PNG"]) as image:
+        width, height = image.size
+        if width * height > max(2 * count, MAX_PALETTE_PIXELS):
+            raise ValueError(f"an image has {width}x{height} pixels for {count:,} splats")
         return np.asarray(image.convert("RGBA"))
 
 

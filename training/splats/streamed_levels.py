@@ -15,9 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from ..documents import read_json
-from ..errors import LodgsError
+from ..errors import LodgsError, printable
 from ..files import atomic_folder
 from .batches import batch_slices
+from .dialects import comments_from_meta
 from .gaussians import SplatRows, Splats
 from .levels import MAX_READ_LEVELS, Bundle
 from .morton import spatial_order
@@ -93,14 +94,17 @@ def write_streamed_levels(folder: Path, bundle: Bundle, measure: MeasureLeaf | N
     if folder.is_dir() and any(folder.iterdir()) and not (folder / STREAMED_FILE).exists():
         raise LodgsError(f"Cannot export to {folder}: it contains other files.", "Choose an empty folder.")
     with atomic_folder(folder) as target:
-        _write_files(target, levels, degree, measure)
+        _write_files(target, levels, degree, bundle.antialias, measure)
 
 
-def _write_files(folder: Path, levels: Sequence[SplatRows], degree: int, measure: MeasureLeaf | None) -> None:
+def _write_files(
+    folder: Path, levels: Sequence[SplatRows], degree: int, antialias: bool, measure: MeasureLeaf | None
+) -> None:
     """Write the files of levels, finest first, into an empty folder.
 
     Args:
         degree: degree of harmonics of all files.
+        antialias: as for `encode_sog`.
         measure: measures the errors of leaves; None writes none.
     """
     places = np.concatenate([_read_places(rows) for rows in levels])
@@ -115,10 +119,10 @@ def _write_files(folder: Path, levels: Sequence[SplatRows], degree: int, measure
     for lod, rows in enumerate(levels):
         for number, group in enumerate(_file_groups(leaves, lod)):
             names.append(f"{lod}_{number}/{META}")
-            _write_sog(folder / names[-1], _read_file(rows, group, lod, len(names) - 1, degree))
+            _write_sog(folder / names[-1], _read_file(rows, group, lod, len(names) - 1, degree), antialias)
     if len(surroundings):
         splats = _with_degree(levels[0].select(surroundings), degree)
-        _write_sog(folder / SURROUNDINGS, splats.select(spatial_order(splats.means)))
+        _write_sog(folder / SURROUNDINGS, splats.select(spatial_order(splats.means)), antialias)
     if measure is not None:
         for leaf in leaves:
             leaf.errors = _measure_errors(leaf, levels, measure)
@@ -145,9 +149,9 @@ def _measure_errors(leaf: _Leaf, levels: Sequence[SplatRows], measure: MeasureLe
     return result
 
 
-def _write_sog(path: Path, splats: Splats) -> None:
+def _write_sog(path: Path, splats: Splats, antialias: bool) -> None:
     path.parent.mkdir()
-    for name, data in encode_sog(splats).items():
+    for name, data in encode_sog(splats, antialias).items():
         path.with_name(name).write_bytes(data)
 
 
@@ -253,7 +257,7 @@ def _describe(node: _Node) -> dict:
 
 
 def read_streamed_levels(path: Path, folder: Path) -> None:
-    """Convert streamed levels to a folder of PLYs, each with the surroundings.
+    """Convert streamed levels to a folder of PLYs, each with the surroundings; omit levels without splats.
 
     Args:
         path: a :data:`STREAMED_FILE`.
@@ -266,20 +270,28 @@ def read_streamed_levels(path: Path, folder: Path) -> None:
     count = meta.get("lodLevels")
     if type(count) is not int or not 1 <= count <= MAX_READ_LEVELS:
         raise LodgsError(f"Cannot read {path}: it does not describe streamed levels.", "Choose another file.")
+    if meta.get("version", 1) != 1:
+        version = printable(meta["version"])
+        raise LodgsError(
+            f"Cannot read {path}: its streamed levels have version {version}.", "Export them as version 1."
+        )
+    meta_of_splats: dict = {}
 
     def read_part(name: str) -> Splats:
-        return read_sog(path.parent.joinpath(*relative_parts(name)))[0]
+        splats, part_meta = read_sog(path.parent.joinpath(*relative_parts(name)))
+        meta_of_splats.update(part_meta)
+        return splats
 
     try:
         names, ranges = list(meta["filenames"]), _collect_ranges(meta["tree"], count)
         surroundings = [read_part(meta["environment"])] if meta.get("environment") else []
         folder.mkdir()
-        for lod, files in enumerate(ranges):
+        for lod, files in enumerate(filter(None, ranges)):
             parts = [_select(read_part(names[file]), files[file]) for file in sorted(files)]
             parts += surroundings
             degree = max(part.sh_degree for part in parts)
             splats = Splats.concatenated([_with_degree(part, degree) for part in parts])
-            write_ply(folder / f"lod{lod}.ply", splats)
+            write_ply(folder / f"lod{lod}.ply", splats, comments_from_meta(meta_of_splats))
     except LodgsError:
         raise
     except (KeyError, ValueError, TypeError, IndexError, AttributeError, OSError) as error:
@@ -287,7 +299,7 @@ def read_streamed_levels(path: Path, folder: Path) -> None:
 
 
 def _collect_ranges(tree: dict, count: int) -> list[dict[int, list[tuple[int, int]]]]:
-    """Return the first and last row of each part of each level, by the number of its file."""
+    """Return the first row and the end of each part with splats of each level, by the number of its file."""
     ranges: list[dict[int, list[tuple[int, int]]]] = [{} for _ in range(count)]
     waiting = [tree]
     while waiting:
@@ -295,9 +307,10 @@ def _collect_ranges(tree: dict, count: int) -> list[dict[int, list[tuple[int, in
         waiting += node.get("children", [])
         for lod, entry in node.get("lods", {}).items():
             file, offset, length = (entry[name] for name in ("file", "offset", "count"))
-            if not all(type(value) is int and value >= 0 for value in (file, offset, length)):
+            if not all(type(value) is int and value >= 0 for value in (int(lod), file, offset, length)):
                 raise ValueError("a range of splats is not valid")
-            ranges[int(lod)].setdefault(file, []).append((offset, offset + length))
+            if length:
+                ranges[int(lod)].setdefault(file, []).append((offset, offset + length))
     return ranges
 
 

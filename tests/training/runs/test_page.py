@@ -107,7 +107,7 @@ def test_single_file_contains_everything(bundle, tmp_path):
     text = (tmp_path / "page.html").read_text("utf-8")
     page = page_of(text)
     with zipfile.ZipFile(io.BytesIO(base64.b64decode(page["content"].split(",")[1]))) as archive:
-        assert len(decode_sog(archive.read)) == 400
+        assert len(decode_sog(archive.read)[0]) == 400
     assert page["poster"].startswith("data:image/png") and not page["streamed"]
     assert "A &amp; B" in text and "export {" not in text and "src=" not in text and "href=" not in text
     assert {path.name for path in tmp_path.iterdir()} == {"garden", "page.html", "viewer"}

@@ -12,6 +12,7 @@ from PIL import Image
 from training.errors import LodgsError
 from training.splats.formats import open_as_ply
 from training.splats.gaussians import Splats
+from training.splats.level_folder import read_folder
 from training.splats.levels import Bundle, Level
 from training.splats.ply import read_ply
 from training.splats.sog import decode_sog, encode_sog, make_palette, read_sog, write_sog
@@ -128,7 +129,9 @@ def test_splat_transform_reads_the_same_first_version(tmp_path, splat_transform)
 def test_unknown_version_is_refused(tmp_path):
     with zipfile.ZipFile(tmp_path / "a.sog", "w") as archive:
         archive.writestr("meta.json", '{"version": 3, "count": 1}')
-    with pytest.raises(LodgsError, match=r"Cannot read SOG of version 3\. Export it as version 2 or as PLY"):
+    with pytest.raises(
+        LodgsError, match=r"a\.sog: it is SOG of version 3\. Export it as version 2 or as PLY"
+    ):
         read_sog(tmp_path / "a.sog")
 
 
@@ -140,7 +143,7 @@ def test_null_in_a_codebook_continues_its_steps():
     expected = table[1] + (table[1] - table[255]) / 255
     table[0] = None
     codes = pixels(files["scales.webp"])[:500, :3]
-    decoded = decode_sog((files | {"meta.json": json.dumps(meta).encode()}).__getitem__)
+    decoded, _ = decode_sog((files | {"meta.json": json.dumps(meta).encode()}).__getitem__)
     assert (codes == 0).any()
     np.testing.assert_allclose(decoded.log_scales[codes == 0], expected, rtol=1e-6)
 
@@ -150,7 +153,7 @@ def test_splats_round_trip(tmp_path, degree):
     splats = random_splats(900, degree)
     write_sog(tmp_path / "a.sog", splats, {})
     with zipfile.ZipFile(tmp_path / "a.sog") as archive:
-        decoded = decode_sog(archive.read)
+        decoded, _ = decode_sog(archive.read)
     distances = np.linalg.norm(decoded.means[:, None] - splats.means[None], axis=2)
     splats = splats.select(distances.argmin(axis=1))
     assert np.abs(decoded.means - splats.means).max() < 5e-4
@@ -214,7 +217,7 @@ def test_streamed_levels_hold_every_splat_once(tmp_path):
 
     def read(name: str) -> Splats:
         folder = (tmp_path / "web" / name).parent
-        return decode_sog(lambda file: (folder / file).read_bytes())
+        return decode_sog(lambda file: (folder / file).read_bytes())[0]
 
     files = [read(name) for name in meta["filenames"]]
     parts: dict[str, list[np.ndarray]] = {"0": [], "1": []}
@@ -265,6 +268,42 @@ def test_levels_with_one_archive_per_file(tmp_path):
     assert len(read_ply(tmp_path / "read" / "lod0.ply")) == 300
 
 
+def test_levels_without_splats_are_omitted(tmp_path):
+    write_streamed_levels(tmp_path / "web", Bundle("", [Level(1, random_splats(9))]))
+    meta = json.loads((tmp_path / "web" / STREAMED_FILE).read_text("utf-8"))
+    meta["tree"]["lods"]["2"] = {"file": 0, "offset": 0, "count": 0}
+    (tmp_path / "web" / STREAMED_FILE).write_text(json.dumps(meta | {"lodLevels": 3}), "utf-8")
+    read_streamed_levels(tmp_path / "web" / STREAMED_FILE, tmp_path / "read")
+    assert [path.name for path in (tmp_path / "read").iterdir()] == ["lod0.ply"]
+
+
+def test_antialiased_splats_stay_antialiased(tmp_path):
+    splats, meta = random_splats(9), {"antialias": True}
+    write_sog(tmp_path / "a.sog", splats, meta)
+    assert read_sog(tmp_path / "a.sog")[1] == meta
+    write_sog(tmp_path / "b.sog", splats, {})
+    assert read_sog(tmp_path / "b.sog")[1] == {}
+    write_streamed_levels(tmp_path / "web", Bundle("", [Level(1, splats)], meta=meta))
+    with open_as_ply(tmp_path / "web") as folder:
+        assert read_folder(folder).antialias
+
+
+def test_images_may_be_png(tmp_path):
+    """The specification permits all formats with 8-bit RGBA."""
+    splats = random_splats(300, 1)
+    files = encode_sog(splats)
+    expected, _ = decode_sog(files.__getitem__)
+    with zipfile.ZipFile(tmp_path / "a.sog", "w") as archive:
+        archive.writestr("meta.json", files.pop("meta.json").replace(b".webp", b".png"))
+        for name, data in files.items():
+            png = io.BytesIO()
+            Image.open(io.BytesIO(data)).save(png, "PNG")
+            archive.writestr(name.replace(".webp", ".png"), png.getvalue())
+    actual, _ = read_sog(tmp_path / "a.sog")
+    np.testing.assert_array_equal(actual.means, expected.means)
+    np.testing.assert_array_equal(actual.sh, expected.sh)
+
+
 @pytest.mark.parametrize("name", ["garden", "garden/meta.json"])
 def test_files_in_a_folder(tmp_path, name):
     """PlayCanvas writes SOG as one file or as the files of a folder."""
@@ -301,7 +340,9 @@ def test_files_outside_the_folder_are_refused(tmp_path, file):
         ("tree", {"lods": {"0": {"file": 0, "offset": 0, "count": 2**40}}}),
         ("tree", {"children": [{"lods": {"0": {"file": 0, "offset": 0, "count": 9}}}] * 2}),
         ("tree", []),
+        ("tree", {"lods": {"-1": {"file": 0, "offset": 0, "count": 9}}}),
         ("lodLevels", 10**9),
+        ("version", 2),
     ],
 )
 def test_hostile_main_files_are_refused(tmp_path, name, value):
@@ -346,7 +387,7 @@ def test_file_is_not_replaced_by_levels(tmp_path):
 def test_infinite_scales_and_opacities_are_limited(tmp_path):
     splats = random_splats(50)
     splats.log_scales[::5, 1], splats.opacity_logits[::7] = -np.inf, np.inf
-    decoded = decode_sog(encode_sog(splats).__getitem__)
+    decoded, _ = decode_sog(encode_sog(splats).__getitem__)
     finite = np.isfinite(splats.log_scales)
     assert np.abs(decoded.log_scales - splats.log_scales)[finite].max() < 0.2
     assert (decoded.log_scales[~finite] < -15).all() and np.isfinite(decoded.opacity_logits).all()
