@@ -36,7 +36,7 @@ from .gltf import (
     harmonics,
 )
 from .levels import MAX_READ_LEVELS, Bundle, Level
-from .portable_levels import parse_description, place_splats, splats_from_activated, upright_meta
+from .portable_levels import join_levels, parse_description, place_splats, splats_from_activated, upright_meta
 from .quats import rotation_matrices
 from .sh import coefficient_count
 from .spz import unpack_spz
@@ -55,6 +55,8 @@ _MAX_RATIO = 20
 """Maximum ratio of compression that is read; that of trained splats is about 2."""
 _DEFECTS = (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError, struct.error)
 _TRANSFORM = {"matrix", "rotation", "scale", "translation"}
+_PlacedParts = list[tuple[Splats, np.ndarray]]
+"""Sets of splats with their transforms (4, 4)."""
 
 
 def read_glb(path: Path, bundle: Path) -> None:
@@ -78,6 +80,7 @@ class _GlbReader:
         self._path = path
         self._buffers: dict[int, np.ndarray] = {}
         self._splats = 0
+        self._meta: dict = {}
         with open_file(path) as file:
             self._size = os.fstat(file.fileno()).st_size
             if path.suffix.lower() == ".gltf":
@@ -102,26 +105,34 @@ class _GlbReader:
 
     @np.errstate(over="ignore", invalid="ignore")
     def levels(self) -> Bundle:
-        """Return the levels of the first node with MSFT_lod, or all splats as one level."""
+        """Return the levels of all nodes with MSFT_lod, each with the other splats, or all as one level."""
         nodes = self._world_nodes()
-        sets = [self._node_splats(node, matrix) for node, matrix in nodes]
-        base = next((i for i, (node, _) in enumerate(nodes) if sets[i] and self._coarser(node)), None)
-        if base is not None:
-            node, matrix = nodes[base]
-            local, ids = _matrix(node), self._coarser(node)
-            if len(ids) >= MAX_READ_LEVELS:
-                raise ValueError(f"{len(ids) + 1} levels")
-            others = [self._item("nodes", index) for index in ids]
-            parent = matrix @ np.linalg.inv(local)
-            fine_to_coarse = [sets[base], *(self._node_splats(n, parent @ _matrix(n)) for n in others)]
-            fine_to_coarse = [parts for parts in fine_to_coarse if parts]
-        else:
-            fine_to_coarse = [[part for parts in sets for part in parts]]
+        coarser = {index for node, _ in nodes.values() for index in self._coarser(node)}
+        groups: list[list[_PlacedParts]] = []
+        outside: list[_PlacedParts] = []
+        for index, (node, matrix) in nodes.items():
+            parts = self._node_splats(node, matrix)
+            if parts and self._coarser(node):
+                groups.append([parts, *self._coarser_splats(node, matrix)])
+            elif parts and index not in coarser:
+                outside.append(parts)
+        fine_to_coarse = [
+            [part for parts in level for part in parts] for level in join_levels(groups, outside)
+        ]
         if not any(fine_to_coarse):
             raise LodgsError(f"Cannot read {self._path}: it has no Gaussian splats.", "Choose another file.")
         return self._own(fine_to_coarse) or self._foreign(fine_to_coarse)
 
-    def _own(self, fine_to_coarse: list[list[tuple[Splats, np.ndarray]]]) -> Bundle | None:
+    def _coarser_splats(self, node: dict, matrix: np.ndarray) -> list[_PlacedParts]:
+        """Return the splats of the levels of a node that are coarser than itself."""
+        ids = self._coarser(node)
+        if len(ids) >= MAX_READ_LEVELS:
+            raise ValueError(f"{len(ids) + 1} levels")
+        parent = matrix @ np.linalg.inv(_matrix(node))
+        others = [self._item("nodes", index) for index in ids]
+        return [parts for n in others if (parts := self._node_splats(n, parent @ _matrix(n)))]
+
+    def _own(self, fine_to_coarse: list[_PlacedParts]) -> Bundle | None:
         """Return the bundle that LODGS has written; None if another program has written or moved it."""
         text = (self._scene().get("extras") or {}).get(DESCRIPTION)
         if text is None:
@@ -137,7 +148,7 @@ class _GlbReader:
             level.splats = splats
         return bundle
 
-    def _foreign(self, fine_to_coarse: list[list[tuple[Splats, np.ndarray]]]) -> Bundle:
+    def _foreign(self, fine_to_coarse: list[_PlacedParts]) -> Bundle:
         placed = [place_splats(*part, self._path) for parts in fine_to_coarse for part in parts]
         meta, splats = upright_meta(placed, "Y")
         count = coefficient_count(max(part.sh_degree for part in splats))
@@ -147,7 +158,7 @@ class _GlbReader:
         for number, parts in enumerate(fine_to_coarse):
             joined = Splats.concatenated([next(remaining) for _ in parts])
             levels.append(Level(len(fine_to_coarse) - number, joined))
-        return Bundle("", levels[::-1], meta=meta)
+        return Bundle("", levels[::-1], meta=self._meta | meta)
 
     def _scene(self) -> dict:
         """Return the scene to read; in a file without scenes, one of all nodes that no other node lists."""
@@ -157,25 +168,24 @@ class _GlbReader:
         listed = {index for node in nodes for index in [*node.get("children", []), *self._coarser(node)]}
         return {"nodes": [index for index in range(len(nodes)) if index not in listed]}
 
-    def _world_nodes(self) -> list[tuple[dict, np.ndarray]]:
-        """Return the nodes of the scene with their transforms (4, 4)."""
+    def _world_nodes(self) -> dict[int, tuple[dict, np.ndarray]]:
+        """Return the nodes of the scene with their transforms (4, 4), by index."""
         waiting = deque((index, np.eye(4)) for index in self._scene().get("nodes", []))
-        nodes, visited = [], set()
+        nodes: dict[int, tuple[dict, np.ndarray]] = {}
         while waiting:
             index, parent = waiting.popleft()
             node = self._item("nodes", index)
-            if index in visited:
+            if index in nodes:
                 raise ValueError(f"node {index} occurs twice")
-            visited.add(index)
             matrix = parent @ _matrix(node) if _TRANSFORM & node.keys() else parent
-            nodes.append((node, matrix))
+            nodes[index] = node, matrix
             waiting += [(child, matrix) for child in node.get("children", [])]
         return nodes
 
     def _coarser(self, node: dict) -> list[int]:
         return list(node.get("extensions", {}).get(LOD, {}).get("ids", []))
 
-    def _node_splats(self, node: dict, matrix: np.ndarray) -> list[tuple[Splats, np.ndarray]]:
+    def _node_splats(self, node: dict, matrix: np.ndarray) -> _PlacedParts:
         """Return the splats of a node, and its transform."""
         if "mesh" not in node:
             return []
@@ -235,7 +245,8 @@ class _GlbReader:
 
     def _compressed(self, index: object) -> Splats:
         data, _ = self._view(index)
-        splats = unpack_spz(data.tobytes(), len(data) * _MAX_RATIO // _SPZ_SPLAT, self._path)
+        splats, meta = unpack_spz(data.tobytes(), len(data) * _MAX_RATIO // _SPZ_SPLAT, self._path)
+        self._meta |= meta
         self._splats += len(splats)
         if self._splats * _SPZ_SPLAT > self._size * _MAX_RATIO:
             raise ValueError(f"it is too short for {self._splats:,} splats")

@@ -6,6 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -31,6 +32,7 @@ DISTANCE_RULE, DISTANCE = "chunks", "d_l"
 """Rule of levels that other programs select by distance, and the fact with a level's distance."""
 DEFAULT_FOCAL = 1000.0
 """Focal length in pixels for which distances are computed if the scene has no views."""
+_Part = TypeVar("_Part")
 _NEAR_SHARE = 0.9
 """Fraction of the finest splats inside the radius of a scene; the others are sky and floaters."""
 
@@ -155,6 +157,18 @@ def parse_description(text: object, path: Path) -> tuple[Bundle, np.ndarray]:
         return parse_bundle(values["bundle"], values["levels"], values["meta"], path), placement
     except INCONSISTENCIES as error:
         raise inconsistency_error(path, error) from error
+
+
+def join_levels(groups: Sequence[Sequence[_Part]], outside: Sequence[_Part]) -> list[list[_Part]]:
+    """Return the parts of each level of a scene whose objects have levels of their own, fine to coarse.
+
+    Args:
+        groups: levels of each object, fine to coarse. Objects with fewer levels than others keep their
+            coarsest one.
+        outside: parts of all levels.
+    """
+    count = max(map(len, groups), default=1)
+    return [[*outside, *(group[min(i, len(group) - 1)] for group in groups)] for i in range(count)]
 
 
 def batches(rows: SplatRows, size: int = BATCH_ROWS):

@@ -193,11 +193,11 @@ def read_spz(path: Path) -> tuple[Splats, dict]:
         axes = _SYSTEMS[_read_axes(extensions)] if header.flags & _EXTENDED else _SYSTEMS[0]
     except (ValueError, IndexError, struct.error, zlib.error) as error:
         raise LodgsError(f"Cannot read {path}: it is damaged ({error}).", "Export it again.") from error
-    return _with_3dgs_axes(splats, axes), {"antialias": True} if header.flags & _ANTIALIASED else {}
+    return _with_3dgs_axes(splats, axes), _meta(header)
 
 
-def unpack_spz(data: bytes, max_splats: int, path: Path | None = None) -> Splats:
-    """Return the splats of an SPZ file's content inside glTF, with the coordinates of the file.
+def unpack_spz(data: bytes, max_splats: int, path: Path | None = None) -> tuple[Splats, dict]:
+    """Return the splats and meta of an SPZ file's content inside glTF, with the coordinates of the file.
 
     Args:
         path: path of the glTF file, for messages.
@@ -210,7 +210,12 @@ def unpack_spz(data: bytes, max_splats: int, path: Path | None = None) -> Splats
         header, arrays, _ = _unpack(data, path or Path("SPZ data"), max_splats)
     except (zlib.error, struct.error) as error:
         raise ValueError(f"its SPZ data are damaged ({error})") from error
-    return _decode(header, arrays)
+    return _decode(header, arrays), _meta(header)
+
+
+def _meta(header: _Header) -> dict:
+    """Return the meta of a bundle with the splats of a file."""
+    return {"antialias": True} if header.flags & _ANTIALIASED else {}
 
 
 def _array_sizes(header: _Header, size: int, max_splats: int | None = None) -> list[int]:

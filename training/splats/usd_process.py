@@ -16,6 +16,7 @@ from .levels import MAX_READ_LEVELS, Bundle, Level
 from .portable_levels import (
     DISTANCE,
     DISTANCE_RULE,
+    join_levels,
     parse_description,
     place_splats,
     splats_from_activated,
@@ -65,9 +66,7 @@ def limit_memory(path: Path) -> None:
 
 
 def read_levels(usd: SimpleNamespace, path: Path) -> Bundle:
-    """Return the levels of the roots of levels, each with the fields outside, or all splats as one level.
-
-    A root with fewer levels than others shows its coarsest one at the remaining levels.
+    """Return the levels of all roots of levels, each with the fields outside, or all splats as one level.
 
     Raises:
         LodgsError: the file has no splats or invalid ones, or refers to other files.
@@ -105,7 +104,6 @@ def read_levels(usd: SimpleNamespace, path: Path) -> Bundle:
     meta, placed = upright_meta(placed, "Z" if up == usd.UsdGeom.Tokens.z else "Y")
     degree = min(splats.sh_degree for splats in placed)
     splats = {prim: _limited(part, degree) for prim, part in zip(items, placed, strict=True)}
-    shown = [[*fields, *(g[min(i, len(g) - 1)] for g in groups.values())] for i in range(count)]
     distances = next((d for root in groups if (d := _thresholds(usd, root, count))), [])
     levels = [
         Level(
@@ -113,7 +111,7 @@ def read_levels(usd: SimpleNamespace, path: Path) -> Bundle:
             Splats.concatenated([splats[prim] for prim in prims]),
             {DISTANCE: unit * distances[i]} if distances else {},
         )
-        for i, prims in reversed(list(enumerate(shown)))
+        for i, prims in reversed(list(enumerate(join_levels(list(groups.values()), fields))))
     ]
     return Bundle("", levels, DISTANCE_RULE if distances else "", meta=meta)
 

@@ -174,6 +174,41 @@ def test_empty_levels_are_left_out(tmp_path):
         export_levels(tmp_path / "a.glb", bundle)
 
 
+def rewrite(path, change):
+    """Change the document of a file as another program, which keeps no description of LODGS."""
+    document, data = read_parts(path)
+    scene = document["scenes"][0]
+    scene.pop("extras", None)
+    change(document["nodes"], scene["nodes"])
+    path.write_bytes(assembled(document, data))
+    return read(path)
+
+
+def test_objects_with_and_without_levels_are_joined(tmp_path):
+    """Copy an object with three levels twice: with two of its levels, and with the finest one."""
+    bundle = flod()
+    export_levels(tmp_path / "a.glb", bundle)
+
+    def copy(nodes, roots):
+        parent = next(node for node in nodes if 0 in node.get("children", [])) if 0 not in roots else None
+        two, one = ({**nodes[0], "extensions": {}} for _ in "ab")
+        two["extensions"] = {"MSFT_lod": {"ids": nodes[0]["extensions"]["MSFT_lod"]["ids"][:1]}}
+        (roots if parent is None else parent["children"]).extend([len(nodes), len(nodes) + 1])
+        nodes += [two, one]
+
+    coarse, middle, fine = (len(level.splats) for level in bundle.levels)
+    joined = rewrite(tmp_path / "a.glb", copy)
+    counts = [len(level.splats) for level in joined.levels]
+    assert counts == [coarse + middle + fine, 2 * middle + fine, 3 * fine]
+
+
+@pytest.mark.parametrize("antialias", [True, False])
+def test_antialiased_spz_stays_antialiased(tmp_path, antialias):
+    bundle = Bundle("", [Level(1, random_splats(9))], meta={"antialias": antialias})
+    write_compressed_glb(tmp_path / "a.glb", PortableLevels(bundle))
+    assert rewrite(tmp_path / "a.glb", lambda nodes, roots: None).antialias == antialias
+
+
 def test_quantised_attributes_of_other_programs(tmp_path):
     """Normalised integers, an interleaved buffer, and a node with rotation and scale."""
     fields = [

@@ -61,7 +61,7 @@ def globe_places(folder: Path) -> np.ndarray:
         description, data = read_parts(path)
         node = np.array(description["nodes"][0]["matrix"]).reshape(4, 4).T
         z_up = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-        means = unpack_spz(data, 1000).means.astype(np.float64)
+        means = unpack_spz(data, 1000)[0].means.astype(np.float64)
         positions.append((transform @ z_up @ node @ np.column_stack([means, np.ones(len(means))]).T).T[:, :3])
     return np.concatenate(positions)
 

@@ -56,7 +56,7 @@ def content(version: int, rotation: bytes, degree: int = 0, rest: bytes = b"") -
     ],
 )
 def test_values_of_one_splat(version, rotation, expected):
-    splats = unpack_spz(content(version, rotation, 1, bytes(range(120, 129))), 1)
+    splats, _ = unpack_spz(content(version, rotation, 1, bytes(range(120, 129))), 1)
     np.testing.assert_array_equal(splats.means, [[1, -2, 0.25]])
     np.testing.assert_allclose(splats.log_scales, -2, rtol=1e-6)
     np.testing.assert_allclose(splats.opacity_logits, np.log(0.25), rtol=1e-5)
@@ -69,7 +69,7 @@ def test_values_of_one_splat(version, rotation, expected):
 def test_errors_are_at_most_half_a_step(degree):
     splats = random_splats(500, degree)
     splats.quats /= np.linalg.norm(splats.quats, axis=1, keepdims=True)
-    reread = unpack_spz(pack_spz(splats), 500)
+    reread, _ = unpack_spz(pack_spz(splats), 500)
     assert np.abs(reread.means - splats.means).max() <= np.abs(splats.means).max() * 2.0**-22
     in_range = splats.log_scales.clip(-10, 5.9)
     assert np.abs(reread.log_scales - in_range).max() <= 0.5 / 16 + 1e-6
@@ -147,7 +147,7 @@ def test_axes_of_files_are_right_up_back(tmp_path, degree):
     splats = random_splats(400, degree)
     splats.sh[:, 1:] = np.rint(splats.sh[:, 1:] * 8).clip(-7, 7) / 8
     write_spz(tmp_path / "a.spz", splats, {})
-    stored = unpack_spz((tmp_path / "a.spz").read_bytes(), 400)
+    stored, _ = unpack_spz((tmp_path / "a.spz").read_bytes(), 400)
     stored.log_scales, stored.sh[:, 0] = splats.log_scales, splats.sh[:, 0]  # their rounding is tested above
     assert_same_scene(stored, splats, np.diag([1.0, -1, -1]))
     reread, meta = read_spz(tmp_path / "a.spz")

@@ -69,7 +69,7 @@ def test_each_splat_is_in_one_cell(tmp_path, bundle):
         means = []
         for path in (tmp_path / "web").glob(f"*_level{level.number}.glb"):
             document, data = read_parts(path)
-            means.append(unpack_spz(data, 1000).means)
+            means.append(unpack_spz(data, 1000)[0].means)
             attributes = document["meshes"][0]["primitives"][0]["attributes"]
             position = document["accessors"][attributes["POSITION"]]
             assert "bufferView" not in position and position["count"] == len(means[-1])
@@ -140,7 +140,7 @@ def test_splats_on_a_map_are_at_their_places_on_the_globe(tmp_path, bundle):
     transform = np.array(load(tmp_path / "web")["root"]["transform"]).reshape(4, 4).T
     places, expected = [], bundle.levels[2].splats.means.astype(np.float64)
     for path in (tmp_path / "web").glob("*_level3.glb"):
-        means = unpack_spz(read_parts(path)[1], 1000).means.astype(np.float64)
+        means = unpack_spz(read_parts(path)[1], 1000)[0].means.astype(np.float64)
         places.append(means @ transform[:3, :3].T + transform[:3, 3])
     expected = UtmZone(32).to_ecef(expected @ turn[:3, :3].T + origin)
     distances, nearest = KDTree(np.concatenate(places)).query(expected)
