@@ -13,6 +13,7 @@ from ..lod.rule import find_rule
 from ..lod.selection import unknown_rule_error
 from ..scenes import view_tables
 from ..scenes.ground import find_ground, ground_placement, points_near_cameras
+from ..splats.dialects import MAX_COORDINATE
 from ..splats.gaussians import SplatRows, Splats
 from ..splats.georeference import Georeference
 from ..splats.levels import META_LENGTHS, NO_SPLATS, Bundle, Level
@@ -28,7 +29,7 @@ def transform_bundle(bundle: Bundle, placement: Similarity) -> Bundle:
     loaded into memory.
 
     Raises:
-        LodgsError: unknown rule, whose lengths are unknown.
+        LodgsError: unknown rule, whose lengths are unknown, or positions that no reader accepts.
     """
     rule = find_rule(bundle.rule)
     if rule is None and bundle.rule:
@@ -38,7 +39,14 @@ def transform_bundle(bundle: Bundle, placement: Similarity) -> Bundle:
     lengths, places = (rule.lengths, rule.places) if rule else ((), ())
 
     def transform(splats: Splats) -> Splats:
-        return placement.transform_splats(splats, lengths, places)
+        with np.errstate(over="ignore"):
+            transformed = placement.transform_splats(splats, lengths, places)
+        if (np.abs(transformed.means) > MAX_COORDINATE).any():
+            raise LodgsError(
+                f"Cannot transform splats: positions would exceed {MAX_COORDINATE:g}.",
+                "Use a smaller scale or translation, or crop distant splats.",
+            )
+        return transformed
 
     def scale(facts: dict[str, float]) -> dict[str, float]:
         return {n: value * placement.scale if n in lengths else value for n, value in facts.items()}

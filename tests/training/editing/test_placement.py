@@ -173,6 +173,15 @@ def test_transformed_tree_can_be_paged(tmp_path):
     assert (streaming_order(bundle.levels[0].splats.extras)[:5] == np.arange(5)).all()
 
 
+@pytest.mark.parametrize("options", [["--translate=1e30,0,0"], ["--scale", "1e13"], ["--scale", "1e39"]])
+def test_positions_that_no_reader_accepts_are_not_written(tmp_path, capfd, options):
+    write_ply(tmp_path / "a.ply", surfaces(20))
+    assert main(["edit", str(tmp_path / "a.ply"), "--out", str(tmp_path / "b.ply"), *options]) == 2
+    error = capfd.readouterr().err
+    assert error.startswith("error: Cannot transform splats: positions would exceed 1e+12.")
+    assert not (tmp_path / "b.ply").exists()
+
+
 def test_unknown_rule_is_rejected():
     bundle = Bundle("new", [Level(1, surfaces(5))], "of tomorrow")
     with pytest.raises(LodgsError, match="of tomorrow"):
