@@ -41,6 +41,10 @@ def job_from_options(options: argparse.Namespace) -> Job:
     file = options.job
     if file and (run_job := RunFolder(file).job).is_file() and not changes.keys() & {"scene", "out"}:
         file = run_job
+    if file and file.is_dir() and "scene" in changes:
+        raise LodgsError(
+            f"Cannot train: {file} and --scene {changes['scene']} are two folders.", "Give one of them."
+        )
     if file and file.is_dir():
         changes = {"scene": str(file)} | changes
     elif file:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import LodgsError, error_cause
+from ..runs.folder import RunFolder
 from ..scenes.check import ERROR, ESTIMATE, INFO, Finding
 from . import check
 from .job_options import add_options, job_from_options
@@ -40,7 +41,7 @@ def check_job(options: argparse.Namespace) -> int:
     """Print the findings about the scene of a job and return the exit code."""
     from ..scenes.check import check_folder
 
-    if not (options.job and options.job.is_file()):
+    if not (options.job and (options.job.is_file() or RunFolder(options.job).job.is_file())):
         vars(options).setdefault("out", "run")  # nothing is written
     job = job_from_options(options)
     if job.capture:

@@ -58,6 +58,18 @@ def test_run_folder_resumes_its_run(tmp_path):
     assert job(tmp_path, "--out", "/b") == Job(str(tmp_path), "/b")
 
 
+def test_two_scenes_are_refused(tmp_path):
+    with pytest.raises(LodgsError, match="and --scene /a are two folders"):
+        job(tmp_path, "--scene", "/a", "--out", "/b")
+
+
+def test_check_of_a_run_checks_its_scene(tmp_path, capsys):
+    (tmp_path / "run").mkdir()
+    Job(str(tmp_path / "scene"), str(tmp_path / "run")).write(tmp_path / "run" / "job.toml")
+    assert main(["train", str(tmp_path / "run"), "--check"]) == 2
+    assert f"Cannot open {tmp_path / 'scene'}" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     "values",
     [
