@@ -54,7 +54,7 @@ def job_from_options(options: argparse.Namespace) -> Job:
         raise LodgsError(
             "Cannot train: no job, or no run folder.", "Give a job file, or the scene's folder and --out RUN."
         )
-    parameters = values.get("parameters", {}) | dict(_assignment(text, "--set") for text in options.set)
+    parameters = values.get("parameters", {}) | dict(map(_assignment, options.set))
     return Job.from_dict(values | changes | {"parameters": parameters})
 
 
@@ -78,29 +78,29 @@ def parse_resources(texts: list[str]) -> dict[str, float] | None:
     """
     resources = {}
     for text in texts:
-        name, value = _assignment(text, "a resource")
-        if not name or not isinstance(value, (int, float)) or not 0 < value < 2**31:
+        name, _, value = text.partition("=")
+        try:
+            number = float(value)
+        except ValueError:
+            number = 0.0
+        if not name.strip() or not 0 < number < 2**31:
             raise LodgsError(
                 f"Cannot read resource {printable(text[:200])}: it is not NAME=NUMBER.",
                 "Use for example GPU=1.",
             )
-        resources[name] = float(value)
+        resources[name.strip()] = number
     return resources or None
 
 
-def _assignment(text: str, kind: str) -> tuple[str, object]:
-    """Parse ``name=value``, where the value is JSON (a number, a list of numbers) or a plain word.
-
-    Args:
-        kind: name of the option, for errors.
-    """
+def _assignment(text: str) -> tuple[str, object]:
+    """Parse ``name=value`` of ``--set``, where the value is JSON (a number, a list) or a plain word."""
     name, _, value = text.partition("=")
     if value.isidentifier() and value not in ("true", "false", "null"):
         return name.strip(), value
     try:
-        return name.strip(), parse_json(f'{{"value": {value}}}', kind)["value"]
+        return name.strip(), parse_json(f'{{"value": {value}}}', "--set")["value"]
     except (LodgsError, KeyError):
         raise LodgsError(
-            f"Cannot read {kind} {printable(text[:200])}: it is not NAME=VALUE.",
+            f"Cannot read --set {printable(text[:200])}: it is not NAME=VALUE.",
             "Use for example max_splats=50000, or 'steps=[100, 200]' for a list.",
         ) from None

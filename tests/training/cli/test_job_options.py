@@ -6,7 +6,7 @@ from dataclasses import fields, replace
 import pytest
 
 from training.__main__ import main
-from training.cli.job_options import add_options, job_from_options, options_of
+from training.cli.job_options import add_options, job_from_options, options_of, parse_resources
 from training.errors import LodgsError
 from training.runs.job import Job
 
@@ -56,6 +56,15 @@ def test_run_folder_resumes_its_run(tmp_path):
     written.write(tmp_path / "job.toml")
     assert job(tmp_path) == job(tmp_path / "job.toml") == written
     assert job(tmp_path, "--out", "/b") == Job(str(tmp_path), "/b")
+
+
+def test_resources_are_names_with_numbers():
+    assert parse_resources(["GPU=1", "memory=1.5e9"]) == {"GPU": 1.0, "memory": 1.5e9}
+    assert parse_resources([]) is None
+    for text in ("GPU", "=1", "GPU=0", "GPU=-1", "GPU=nan", "GPU=inf", "GPU=a"):
+        with pytest.raises(LodgsError, match="Cannot read resource") as error:
+            parse_resources([text])
+        assert error.value.remedy == "Use for example GPU=1."
 
 
 def test_two_scenes_are_refused(tmp_path):

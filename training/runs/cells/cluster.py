@@ -10,6 +10,7 @@ import asyncio
 import logging
 import os
 import re
+import ssl
 import stat
 import sys
 from pathlib import Path
@@ -24,7 +25,7 @@ PORT = 8786
 NO_HTTP = {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
 """Dask configuration without web pages. Dask opens its HTTP servers even without pages."""
 _HTTP_ADDRESS = "127.0.0.1:0"
-_MAX_KEY_BYTES = 1 << 16
+_MAX_KEY_BYTES, _MAX_PORT = 1 << 16, 65535
 _COMMENT = "# Key of a LODGS cluster. Keep it secret: it permits running programs on all its computers."
 _IGNORE_INTERRUPT = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
 """Preload code of local Dask workers: a terminal sends Ctrl-C to all processes, and this one handles it."""
@@ -76,19 +77,25 @@ def read_key_file(path: Path) -> tuple[str, Any]:
             f"Cannot use key file {path}: other users can access it (mode {mode:04o}).",
             f"Run: chmod 600 {path}. If others may have read it, delete it and restart the scheduler.",
         )
+    damaged = LodgsError(
+        f"Cannot use key file {path}: it is incomplete or damaged.", "Copy it from the scheduler again."
+    )
     address = re.search(r"^tls://\S+$", text, re.MULTILINE)
     key, certificate = (
         re.search(rf"^-----BEGIN {kind}-----\n[\w+/=\n]+-----END {kind}-----$", text, re.MULTILINE)
         for kind in ("PRIVATE KEY", "CERTIFICATE")
     )
     if address is None or key is None or certificate is None:
-        raise LodgsError(
-            f"Cannot use key file {path}: it is incomplete or damaged.", "Copy it from the scheduler again."
-        )
+        raise damaged
     parts = {"tls_ca_file": f"{certificate[0]}\n"}
     for role in ("client", "scheduler", "worker"):
         parts |= {f"tls_{role}_key": f"{key[0]}\n", f"tls_{role}_cert": f"{certificate[0]}\n"}
-    return address[0], import_dask().Security(require_encryption=True, **parts)
+    security = import_dask().Security(require_encryption=True, **parts)
+    try:
+        security.get_connection_args("client")
+    except ssl.SSLError as error:
+        raise damaged from error
+    return address[0], security
 
 
 def write_key_file(path: Path, address: str, security: Any) -> None:
@@ -111,6 +118,9 @@ def run_scheduler(path: Path, host: str | None = None, port: int = PORT) -> None
     """
     import dask.config
 
+    if port > _MAX_PORT:
+        raise LodgsError(f"Cannot use port {port}.", f"Choose a port from 1 to {_MAX_PORT}.")
+
     distributed = import_dask()
     security = read_key_file(path)[1] if path.exists() else distributed.Security.temporary()
 
@@ -129,7 +139,8 @@ def run_scheduler(path: Path, host: str | None = None, port: int = PORT) -> None
             asyncio.run(serve())
         except (OSError, RuntimeError, ValueError) as error:
             raise LodgsError(
-                f"Cannot start a scheduler on {printable(host or 'this computer')}, port {port}: {error}.",
+                f"Cannot start a scheduler on {printable(host or 'this computer')}, port {port}: "
+                f"{_reason(error)}.",
                 "Choose another --host or --port, or stop the scheduler that uses it.",
             ) from error
 
@@ -142,7 +153,7 @@ def run_worker(path: Path, resources: dict[str, float] | None = None) -> None:
         resources: Dask resources of this worker, such as {"GPU": 1}.
 
     Raises:
-        LodgsError: the key file is unusable.
+        LodgsError: the key file is unusable, or the scheduler does not answer.
     """
     import dask.config
 
@@ -158,4 +169,17 @@ def run_worker(path: Path, resources: dict[str, float] | None = None) -> None:
             await nanny.finished()
 
     with dask.config.set(NO_HTTP):
-        asyncio.run(serve())
+        try:
+            asyncio.run(serve())
+        except (OSError, RuntimeError, ValueError) as error:
+            raise LodgsError(
+                f"Cannot reach the scheduler at {address}: {_reason(error)}.",
+                f"Start it, copy its key file to {path}, and open its port in the firewall.",
+            ) from error
+
+
+def _reason(error: BaseException) -> str:
+    """Return the first cause of an exception of Dask as a clause."""
+    while error.__cause__ is not None:
+        error = error.__cause__
+    return printable(str(error) or type(error).__name__)[:300].rstrip(".")

@@ -1,7 +1,9 @@
 """Encrypted Dask clusters: using or watching them requires the key."""
 
 import os
+import signal
 import socket
+import subprocess
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -9,9 +11,17 @@ from pathlib import Path
 import pytest
 
 from training.errors import LodgsError
-from training.runs.cells.cluster import import_dask, local_cluster, read_key_file, write_key_file
+from training.runs.cells.cluster import (
+    import_dask,
+    local_cluster,
+    read_key_file,
+    run_scheduler,
+    run_worker,
+    write_key_file,
+)
 from training.runs.cells.workers import workers
 
+dask = pytest.importorskip("dask")
 distributed = pytest.importorskip("distributed")
 psutil = pytest.importorskip("psutil")
 PAGES = ("/", "/status", "/health", "/metrics", "/info/main/workers.html", "/api/v1/get_workers")
@@ -101,6 +111,65 @@ def test_damaged_key_file_is_reported(tmp_path, size):
     path.write_bytes(path.read_bytes().rstrip()[:size])
     with pytest.raises(LodgsError, match="incomplete or damaged"):
         read_key_file(path)
+
+
+@pytest.mark.parametrize("kind", ["PRIVATE KEY", "CERTIFICATE"])
+def test_changed_key_is_reported(tmp_path, kind):
+    path = tmp_path / "cluster.pem"
+    write_key_file(path, "tls://10.0.0.1:8786", distributed.Security.temporary())
+    before, begin, rest = path.read_text().partition(f"BEGIN {kind}-----\n")
+    path.write_text(f"{before}{begin}{'A' * 40}{rest[40:]}")
+    with pytest.raises(LodgsError, match="incomplete or damaged"):
+        read_key_file(path)
+
+
+@pytest.mark.parametrize("address", ["tls://127.0.0.1:1", "tls://127.0.0.1", "tls://127.0.0.1:99999999"])
+def test_worker_without_a_scheduler_reports_it(tmp_path, address):
+    path = tmp_path / "cluster.pem"
+    write_key_file(path, address, distributed.Security.temporary())
+    with (
+        dask.config.set({"distributed.comm.timeouts.connect": "0.3s"}),
+        pytest.raises(LodgsError, match=f"Cannot reach the scheduler at {address}: "),
+    ):
+        run_worker(path)
+
+
+def start_blocks(*words: object) -> tuple[subprocess.Popen[str], str]:
+    """Start an action of ``lodgs blocks``, and return it with its first line of output."""
+    command = [sys.executable, "-m", "training", "blocks", *map(str, words)]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=Path(__file__).parents[4]
+    )
+    assert process.stdout is not None
+    return process, process.stdout.readline()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_stopped_scheduler_prints_no_stacks_of_its_connections(tmp_path, number):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    key = tmp_path / "cluster.pem"
+    scheduler, line = start_blocks("scheduler", key, "--host", "127.0.0.1", "--port", port)
+    try:
+        assert line.startswith("Scheduler at tls://127.0.0.1:")
+        worker, line = start_blocks("worker", key)
+        assert line.startswith("Worker of tls://127.0.0.1:")
+        scheduler.send_signal(number)
+        assert scheduler.wait(60) == 3
+        assert worker.wait(60) == 0
+    finally:
+        scheduler.kill()
+    assert "Traceback" not in scheduler.stdout.read()
+
+
+def test_scheduler_reports_unusable_ports(tmp_path):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        with pytest.raises(LodgsError, match=rf"port {port}: .*in use.*[^.]\.$"):
+            run_scheduler(tmp_path / "cluster.pem", "127.0.0.1", port)
+    with pytest.raises(LodgsError, match="Cannot use port 65536"):
+        run_scheduler(tmp_path / "cluster.pem", "127.0.0.1", 65536)
 
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:8786", "ucx://127.0.0.1:8786"])
