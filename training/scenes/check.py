@@ -28,6 +28,8 @@ WEAK_SHARE = 0.2
 """Share of a scene with weak evidence that is worth a warning."""
 MAX_REPROJECTION = 0.05
 """Median reprojection error of a view above which its pose is wrong, as a fraction of the image diagonal."""
+MAX_OFFSET = 0.2
+"""Unusual distance of a principal point from the image centre, as a fraction of the side."""
 _POSES, _POINTS = 50, 20_000
 """Maximum numbers of poses and of points that are compared."""
 ERROR, WARNING, INFO = SEVERITIES = "error", "warning", "info"
@@ -85,7 +87,7 @@ def check_scene(scene: Scene, image_scale: float = 1.0) -> list[Finding]:
     """Return the findings besides the scene's own warnings, without decoding its photos."""
     observed = observations(scene, [camera.name for camera in scene.cameras])
     return [
-        *_views(scene), *_poses(scene), *_sizes(scene, image_scale), *_origin(scene),
+        *_views(scene), *_poses(scene), *_centers(scene), *_sizes(scene, image_scale), *_origin(scene),
         *_overlap(scene, observed), *_coverage(scene, observed),
     ]  # fmt: skip
 
@@ -118,6 +120,20 @@ def _poses(scene: Scene) -> Iterator[Finding]:
             WARNING,
             f"The poses do not fit the points: {wrong} of {count} tested views have {problem}.",
             "Check the export: the poses may be camera-to-world, but COLMAP needs world-to-camera.",
+        )
+
+
+def _centers(scene: Scene) -> Iterator[Finding]:
+    """Find principal points far from the image centre, as of a focal length for another image size."""
+    places = np.array([(camera.cx / camera.width, camera.cy / camera.height) for camera in scene.cameras])
+    far = places[(np.abs(places - 0.5) > MAX_OFFSET).any(axis=1)]
+    if 2 * len(far) > len(places):
+        x, y = np.median(far, axis=0)
+        yield Finding(
+            WARNING,
+            f"The principal points of {len(far)} of {len(places)} views are far from the image centre, at "
+            f"{x:.0%} of the width and {y:.0%} of the height.",
+            "Check the export: focal length and principal point may be for another image size.",
         )
 
 

@@ -11,6 +11,8 @@ from .colmap_model import read_observations
 
 _MAX_OBSERVATIONS = 2000
 """Maximum number of a view's observations whose error is measured."""
+_SMALLER = 0.75
+"""Fraction of the image sides below which all pixels lie if they are those of a smaller photo."""
 _CENTRAL = 0.25
 """Distance from the principal point up to which distortion hardly moves points, in image diagonals."""
 
@@ -52,8 +54,8 @@ def reprojection_errors(scene: Scene, names: Collection[str]) -> dict[str, float
     """Return the median reprojection error of views, as a fraction of the image diagonal, by name.
 
     Points behind the camera have an infinite error. Only observations near the principal point count, so that
-    distortion hardly matters. Views without such observations, of fisheye lenses, or with many pixels outside
-    their image are left out.
+    distortion hardly matters. Views without such observations, of fisheye lenses, or with pixels of
+    larger or smaller photos are left out.
     """
     lenses, poses = read_registered(scene.point_model or scene.model, [])
     views = {pose.name.replace("\\", "/"): pose for pose in poses}
@@ -61,8 +63,9 @@ def reprojection_errors(scene: Scene, names: Collection[str]) -> dict[str, float
     for name, (indices, pixels) in observed_pixels(scene, names, _MAX_OBSERVATIONS).items():
         lens = lenses[views[name].camera_id]
         size = np.array([lens.width, lens.height])
-        is_outside = (pixels > size).any(axis=1)
-        if not lens.lens.perspective or 10 * is_outside.sum() > len(pixels):  # pixels of larger photos
+        of_larger = 10 * (pixels > size).any(axis=1).sum() > len(pixels)
+        of_smaller = (pixels < _SMALLER * size).all()
+        if not lens.lens.perspective or of_larger or of_smaller:
             continue
         fx, fy, cx, cy = lens.pinhole
         diagonal = np.hypot(*size)

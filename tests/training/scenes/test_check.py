@@ -168,9 +168,18 @@ def test_distortion_is_no_wrong_pose(copy):
     assert len(errors) == 48 and max(errors.values()) < MAX_REPROJECTION
 
 
-@pytest.mark.parametrize("factor", [0, 4])
+@pytest.mark.parametrize("size", [1, 2])
+def test_lenses_for_another_image_size(copy, size):
+    (lens, *_) = scene_lenses(read_scene(GARDEN))
+    other = make_intrinsics("PINHOLE", size * lens.width, size * lens.height, np.array(lens.pinhole))
+    findings = texts(check_scene(rewrite(copy, lens=other, tracks=False)))
+    expected = "48 of 48 views are far from the image centre, at 25% of the width and 25% of the height."
+    assert (expected in findings) == (size == 2)
+
+
+@pytest.mark.parametrize("factor", [0, 0.5, 4])
 def test_observations_at_other_pixels_are_ignored(copy, factor):
-    """Programs write zeros, or reduce photos and lenses but not the 2D points."""
+    """Programs write zeros, or scale photos and lenses but not the 2D points."""
     scene = rewrite(copy, pixels=lambda pixels: factor * pixels)
     assert not reprojection_errors(scene, scene.names) and "poses" not in texts(check_scene(scene))
 
