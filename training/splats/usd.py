@@ -247,13 +247,17 @@ def read_usd(path: Path, bundle: Path) -> None:
     open_file(path).close()  # reports an unreadable file
     package = Path(__file__).resolve().parents[1]  # training, or lodgs after pip install
     command = [sys.executable, "-m", f"{package.name}.splats.usd_process", path.resolve(), bundle.resolve()]
+    read_end, write_end = os.pipe()  # closed when this process ends, and with it the other one
     try:
         result = subprocess.run(
-            [str(word) for word in command], cwd=package.parent, stdin=subprocess.DEVNULL,
+            [str(word) for word in command], cwd=package.parent, stdin=read_end,
             capture_output=True, encoding="utf-8", errors="replace", timeout=_SECONDS, check=False,
         )  # fmt: skip
     except subprocess.TimeoutExpired as error:
         raise LodgsError(f"Cannot read {path}: it takes over {_SECONDS} s.", "Split the file.") from error
+    finally:
+        os.close(read_end)
+        os.close(write_end)
     for line in result.stdout.splitlines():
         if line.startswith("{"):
             answer = parse_json(line, "The report of the USD reader")

@@ -1,10 +1,15 @@
-"""Program that reads the splats of a USD file: ``python -m lodgs.splats.usd_process SCENE BUNDLE``."""
+"""Program that reads the splats of a USD file: ``python -m lodgs.splats.usd_process SCENE BUNDLE``.
+
+It ends early when its standard input is closed.
+"""
 
 from __future__ import annotations
 
+import os
 import sys
 from contextlib import suppress
 from pathlib import Path
+from threading import Thread
 from types import SimpleNamespace
 
 import numpy as np
@@ -38,6 +43,7 @@ _SPLAT_BYTES = 56
 def main() -> int:
     """Read the file and write the bundle; report errors on standard output."""
     source, target = (Path(word) for word in sys.argv[1:])
+    Thread(target=_end_with_parent, daemon=True).start()
     usd = load_usd()
     limit_memory(source)
     try:
@@ -52,6 +58,12 @@ def main() -> int:
         reason = error_reason(error)
         report_error(LodgsError(f"Cannot read {source}: it is damaged ({reason}).", "Export it again."))
     return 0
+
+
+def _end_with_parent() -> None:
+    """End this process when the other end of standard input is closed."""
+    os.read(0, 1)
+    os._exit(1)
 
 
 def limit_memory(path: Path) -> None:

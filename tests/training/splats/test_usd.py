@@ -394,6 +394,15 @@ def test_blender_process_does_not_load_our_usd(tmp_path):
     assert "Blender's own process" in result.stdout and result.stdout.strip().endswith("False"), result
 
 
+def test_reading_process_ends_with_its_parent(tmp_path):
+    foreign(tmp_path)
+    command = [sys.executable, "-m", "training.splats.usd_process", tmp_path / "b.usdc", tmp_path / "b.ply"]
+    with subprocess.Popen([str(word) for word in command], stdin=subprocess.PIPE) as process:
+        process.stdin.close()
+        assert process.wait(30) == 1
+    assert not (tmp_path / "b.ply").exists()
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems do not limit a process's memory")
 def test_reading_process_has_little_memory(tmp_path):
     """A file of 300 KB can declare 300 million opacities of 0."""
