@@ -118,7 +118,8 @@ def _estimate(jobs: Sequence[Job], notify: Callable[[str], object]) -> list[floa
     """
     if not jobs:
         return []
-    notify(f"Estimating the time of {len(jobs)} trainings.")
+    trainings = f"{len(jobs)} training{'s' * (len(jobs) != 1)}"
+    notify(f"Estimating the time of {trainings}.")
     per_step: dict[tuple[str, str], float] = {}
     seconds = []
     try:
@@ -132,5 +133,6 @@ def _estimate(jobs: Sequence[Job], notify: Callable[[str], object]) -> list[floa
     except LodgsError as error:
         notify(f"No estimate: {error.what}")
         return []
-    notify(f"{len(jobs)} trainings take about {format_duration(sum(seconds))}.")
+    verb = "takes" if len(jobs) == 1 else "take"
+    notify(f"{trainings} {verb} about {format_duration(sum(seconds))}.")
     return seconds

@@ -121,6 +121,13 @@ def test_finished_and_unestimated_trainings_have_no_time(jobs, monkeypatch):
     assert texts[0] == "Training 30 steps (1 of 3)"
 
 
+def test_one_training_is_no_plural(jobs, monkeypatch):
+    sentences = []
+    monkeypatch.setattr(several, "estimate", lambda job, scratch: COSTS)
+    assert list(train_in_turn(jobs[:1], lambda job, text: "", sentences.append)) == [""]
+    assert sentences == ["Estimating the time of 1 training.", "1 training takes about 60 s."]
+
+
 def test_steps_of_a_base_are_not_trained_again(jobs, tmp_path):
     job = replace(jobs[0].job, method="lodge", parameters={"steps": 500, "tune_steps": 20, "levels": 3})
     alone = job.steps
