@@ -113,7 +113,8 @@ class LODGS_OT_render_quick(FrameOperator, bpy.types.Operator):
 
     def result_text(self, count):
         if self.animation:
-            return f"{'1 frame' if count == 1 else f'{count} frames'} saved"
+            folder = absolute_path(bpy.context.scene.render.frame_path()).parent
+            return f"{'1 frame' if count == 1 else f'{count} frames'} in {folder}"
         return f"Rendered to image '{viewport_quality.IMAGE}'"
 
 

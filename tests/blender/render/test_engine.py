@@ -779,7 +779,7 @@ def test_compositor_nodes_of_the_user_are_not_changed(bpy, lodgs, scene):
 
 
 @pytest.mark.parametrize("transparent", [False, True])
-def test_viewport_quality_is_similar_to_a_render(bpy, lodgs, scene, tmp_path, frame, transparent):
+def test_viewport_quality_is_similar_to_a_render(bpy, lodgs, scene, tmp_path, frame, transparent, capfd):
     """``frame`` skips without graphics in background mode."""
     scene.render.resolution_percentage = 50
     scene.render.film_transparent = transparent
@@ -790,6 +790,7 @@ def test_viewport_quality_is_similar_to_a_render(bpy, lodgs, scene, tmp_path, fr
     assert bpy.ops.lodgs.render_quick(animation=True) == {"FINISHED"}
     files = sorted(tmp_path.glob("quick_*.png"))
     assert len(files) == 2
+    assert f"2 frames in {tmp_path}" in capfd.readouterr().out
     quick = read_pixels(bpy, files[1])
     covered = image[..., 3:] > 0
     error = (((quick - image)[..., :3] * covered).astype(float) ** 2).mean()
