@@ -111,8 +111,9 @@ def _draw_methods(layout: bpy.types.UILayout) -> None:
             say(layout, work.problem or work.message, "ERROR" if work.problem else "INFO")
         return
     row = layout.row(align=True)
-    row.progress(text=work.message, factor=work.fraction)
+    row.progress(text=f"{work.fraction:.0%}", factor=work.fraction)
     row.operator("lodgs.cancel_comparing_methods", text="", icon="X")
+    say(layout, work.message, "TIME")  # too long for the bar
 
 
 def _draw_means(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:

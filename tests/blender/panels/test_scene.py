@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from tests.blender.fake_trainer import splats
+from tests.blender.panels.conftest import RecordingLayout
 from training.splats.bundle import write_bundle
 from training.splats.level_colors import level_color
 from training.splats.levels import Bundle, Level
@@ -81,6 +82,16 @@ def test_evidence_hides_the_comparison_that_covers_it(bpy, root):
     bpy.context.scene.lodgs_render.show_comparison = True
     bpy.ops.lodgs.show_evidence()
     assert not bpy.context.scene.lodgs_render.show_comparison
+
+
+def test_progress_of_a_comparison_is_shown_in_full(lodgs, monkeypatch):
+    message = "Training FLoD on garden (1 of 2, about 12 min left), step 30 of 40"
+    work = SimpleNamespace(running=True, message=message, fraction=0.75)
+    monkeypatch.setattr(lodgs("runs.method_comparison"), "current", work)
+    said, layout = [], RecordingLayout()
+    monkeypatch.setattr(lodgs("panels.compare"), "say", lambda layout, text, icon: said.append(text))
+    lodgs("panels.compare")._draw_methods(layout)
+    assert said == [message] and layout.texts == ["75%"]
 
 
 def test_result_of_an_import_is_shown_until_the_next_import(bpy, lodgs, draw_panel, monkeypatch, tmp_path):
