@@ -20,13 +20,17 @@ _STARTS = {b"NGSP": _SPZ, b"glTF": _GLB, b"PXR-USDC": _USDC, b"#usda": _USDA}
 
 
 def check_name(path: Path) -> None:
-    """Raise a LodgsError if a file contains splats of another format than its name says.
+    """Raise a LodgsError for checkpoints, and files with splats of another format than their name says.
 
     Formats without a signature, such as ``.splat``, are not recognised.
 
     Raises:
         LodgsError: see above, or the file cannot be read.
     """
+    if path.suffix.lower() in (".pt", ".pth", ".ckpt"):
+        raise LodgsError(
+            f"Cannot read {path}: it is a PyTorch checkpoint.", "Export a PLY with the program that wrote it."
+        )
     with open_file(path) as file:
         head = file.read(_HEAD)
     if head.lstrip()[:1] == b"{" and b'"geometricError"' in head:

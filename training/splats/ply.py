@@ -442,7 +442,7 @@ def _read_header_lines(file: IO[bytes], path: Path) -> list[str]:
         )
     file.seek(end.end())
     lines = re.split("\r\n|\n|\r", start[: end.end()].decode("ascii", "replace"))
-    return [*filter(str.strip, lines), ""]
+    return [*filter(None, map(str.rstrip, lines)), ""]
 
 
 def _read_text(

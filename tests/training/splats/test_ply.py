@@ -184,6 +184,21 @@ def test_other_formats_name_a_converter(tmp_path):
     assert "splat-transform" in caught.value.remedy
 
 
+def test_checkpoints_name_their_program(tmp_path):
+    (tmp_path / "ckpt_29999.pt").write_bytes(b"PK\3\4")
+    with pytest.raises(LodgsError, match="it is a PyTorch checkpoint") as caught:
+        read_ply(tmp_path / "ckpt_29999.pt")
+    assert caught.value.remedy == "Export a PLY with the program that wrote it."
+
+
+@pytest.mark.parametrize("blanks", [b" \n", b"\t\n", b" \r\n"])
+def test_header_lines_may_end_with_blanks(tmp_path, blanks):
+    lines, body = header(), GOLDEN[len(header()) :]
+    (tmp_path / "a.ply").write_bytes(lines.replace(b"\n", blanks) + body)
+    (tmp_path / "b.ply").write_bytes(lines + body)
+    np.testing.assert_array_equal(read_ply(tmp_path / "a.ply").means, read_ply(tmp_path / "b.ply").means)
+
+
 @pytest.mark.parametrize(
     ("content", "sentence"),
     [
