@@ -178,8 +178,17 @@ def thin_outside_region(scene: Scene, region: Crop, limit: int) -> Scene:
 
 
 def _scene_folder(job: Job, folder: RunFolder, report: Callable[..., None]) -> Path:
-    """Return the folder of the job's scene; capture it from the base first if the job asks for it."""
+    """Return the folder of the job's scene; capture it from the base first if the job asks for it.
+
+    Raises:
+        LodgsError: the scene of an existing run does not exist, or see ``capture``.
+    """
     if not job.capture:
+        if folder.job.exists() and not Path(job.scene).is_dir():
+            raise LodgsError(
+                f"Cannot use {folder.path}: its scene {job.scene} does not exist.",
+                f"Restore the scene, or set its new path in {folder.job} (scene = ...).",
+            )
         return Path(job.scene)
     if folder.captured.exists() and not is_complete(folder.captured):
         report("warning", message=f"The views in {folder.captured} are damaged. They are rendered again.")

@@ -34,11 +34,6 @@ def open_finished(run: Path, warn: Warn) -> tuple[RunFolder, Job, TrainingData]:
             "Choose a run folder, and finish training it first.",
         )
     job = Job.from_file(folder.job)
-    if not job.capture and not Path(job.scene).is_dir():
-        raise LodgsError(
-            f"Cannot use {folder.path}: its scene {job.scene} does not exist.",
-            f"Restore the scene, or set its new path in {folder.job} (scene = ...).",
-        )
 
     def report(kind: str, **values) -> None:
         if kind == "warning":

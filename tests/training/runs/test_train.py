@@ -623,6 +623,7 @@ def test_scene_with_too_few_views_or_pixels_is_rejected(tiny_scene, tmp_path, vi
         (lambda scene: [p.unlink() for p in (scene / "images").iterdir()], "view"),
         (lambda scene: (scene / "sparse/0/cameras.txt").unlink(), "cameras.txt is missing"),
         (lambda scene: [p.unlink() for p in sorted((scene / "images").iterdir())[1:]], "1 usable view"),
+        (shutil.rmtree, "its scene"),
     ],
 )
 def test_unusable_scenes_are_rejected_with_a_remedy(tiny_scene, tmp_path, capsys, change, message):
@@ -634,6 +635,7 @@ def test_unusable_scenes_are_rejected_with_a_remedy(tiny_scene, tmp_path, capsys
     output = capsys.readouterr()
     event = json.loads(output.out.splitlines()[-1])
     assert event["event"] == "error" and message in event["what"] and event["remedy"]
+    assert ("job.toml" in event["remedy"]) == (not scene.exists())
     assert "Traceback" not in output.err
 
 
