@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import mmap
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
+from ..errors import LodgsError
 from .batches import batch_slices
 from .coding import CodedRows
 from .dialects import Warn, drop_undrawable, dropped_message, ignore, to_3dgs
@@ -45,11 +47,16 @@ class FileRows:
         return vertices.dtype.itemsize + (0 if self.extras is None else self.extras.dtype.itemsize)
 
     def columns(self, index: slice | np.ndarray, names: Sequence[str]) -> dict[str, np.ndarray]:
-        """Read the existing ones of the named columns, (M,) each, and nothing else."""
+        """Read the existing ones of the named columns, (M,) each, and nothing else.
+
+        Raises:
+            LodgsError: another program has truncated the file.
+        """
         columns = {}
         for rows in (self.vertices, self.extras):
             if rows is None:
                 continue
+            _check_size(rows, self.path)
             available = [name for name in names if name in (rows.dtype.names or ())]
             if isinstance(rows, CodedRows):
                 decoded = np.asarray(rows[index])
@@ -63,8 +70,11 @@ class FileRows:
         """Read splats, drawable or not, and keep nothing of the file in memory.
 
         Raises:
-            LodgsError: see ``splats_from_rows``.
+            LodgsError: another program has truncated the file, or see ``splats_from_rows``.
         """
+        _check_size(self.vertices, self.path)
+        if self.extras is not None:
+            _check_size(self.extras, self.path)
         splats = splats_from_rows(self.vertices[index], self.path, self.origin)
         if self.extras is not None:
             extras = self.extras[index]
@@ -73,6 +83,22 @@ class FileRows:
         if self.extras is not None:
             release_pages(self.extras)
         return splats
+
+
+def _check_size(rows: np.ndarray | CodedRows, path: str | Path) -> None:
+    """Raise a LodgsError if a mapped file has lost rows: the system ends processes that read there."""
+    base: object = rows.codes if isinstance(rows, CodedRows) else rows
+    offset = 0
+    while isinstance(base, np.ndarray):
+        offset = getattr(base, "offset", offset)
+        base = base.base
+    if isinstance(base, mmap.mmap):
+        begin = offset - offset % mmap.ALLOCATIONGRANULARITY
+        if base.size() < begin + len(base):
+            raise LodgsError(
+                f"Cannot read {path}: another program has truncated it.",
+                "Restore the file, and open it again.",
+            )
 
 
 class DrawableRows:

@@ -1,5 +1,6 @@
 """Plain PLY files, compared with hand-made bytes and plyfile."""
 
+import os
 import struct
 import sys
 from pathlib import Path
@@ -8,7 +9,9 @@ import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
 
+from tests.training.splats.test_formats import random_splats
 from training.errors import LodgsError
+from training.splats.file_rows import open_ply
 from training.splats.ply import BATCH_ROWS, read_elements, read_ply, splats_from_rows, write_ply
 
 # Degree 1, two splats; value = splat / 2 + number of the column.
@@ -182,6 +185,18 @@ def test_other_formats_name_a_converter(tmp_path):
     with pytest.raises(LodgsError, match=r"a\.lcc: it is not a PLY file") as caught:
         read_ply(tmp_path / "a.lcc")
     assert "splat-transform" in caught.value.remedy
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows keeps mapped files")
+def test_file_that_another_program_truncates_is_reported(tmp_path):
+    """Reading beyond the end of a mapped file ends the process."""
+    write_ply(tmp_path / "a.ply", random_splats(3000))
+    rows = open_ply(tmp_path / "a.ply")
+    assert len(rows.select(slice(2990, 3000))) == 10
+    os.truncate(tmp_path / "a.ply", 5000)
+    for read in (rows.select, lambda index: rows.columns(index, ["x"])):
+        with pytest.raises(LodgsError, match="another program has truncated it"):
+            read(slice(2990, 3000))
 
 
 def test_checkpoints_name_their_program(tmp_path):
