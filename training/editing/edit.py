@@ -134,6 +134,11 @@ def _check_outputs(source: Path, outputs: Outputs) -> None:
     for path in outputs.paths:
         if path.resolve() == source.resolve():
             raise LodgsError(f"Cannot write {path}: it is the source.", "Choose another output file.")
+    if outputs.out is not None and not source.is_dir() and outputs.out.suffix.lower() != ".ply":
+        raise LodgsError(
+            f"Cannot write {outputs.out}: it would be a PLY, the format of the source.",
+            "End its name with .ply, or use --plain or --levels for other formats.",
+        )
     kinds = [*map(find_format, outputs.plain), *map(find_level_format, outputs.levels)]
     for kind in kinds:
         if kind.require is not None:

@@ -348,6 +348,7 @@ def test_folder_stays_a_folder_and_counts_are_printed(tmp_path, capsys):
         (["--min-opacity", "-1"], "min_opacity = -1.0 is invalid"),
         (["--min-views", "1"], "--scene"),
         (["--out", "all.ply"], "all.ply: it is the source"),
+        (["--out", "all.sog"], "all.sog: it would be a PLY"),
     ],
 )
 def test_invalid_options_are_reported(tmp_path, monkeypatch, capsys, arguments, message):
