@@ -119,7 +119,8 @@ def _poses(scene: Scene) -> Iterator[Finding]:
         yield Finding(
             WARNING,
             f"The poses do not fit the points: {wrong} of {count} tested views have {problem}.",
-            "Check the export: the poses may be camera-to-world, but COLMAP needs world-to-camera.",
+            "Check the export: poses may belong to other photos, or be camera-to-world instead of COLMAP's "
+            "world-to-camera.",
         )
 
 
