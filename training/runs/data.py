@@ -184,7 +184,7 @@ def _scene_folder(job: Job, folder: RunFolder, report: Callable[..., None]) -> P
         LodgsError: the scene of an existing run does not exist, or see ``capture``.
     """
     if not job.capture:
-        if folder.job.exists() and not Path(job.scene).is_dir():
+        if folder.has_results and not Path(job.scene).is_dir():
             raise LodgsError(
                 f"Cannot use {folder.path}: its scene {job.scene} does not exist.",
                 f"Restore the scene, or set its new path in {folder.job} (scene = ...).",

@@ -135,6 +135,13 @@ class RunFolder:
         """True if training has started in this folder."""
         return self.events_file.exists() or any(self.checkpoints.glob("step_*.pt"))
 
+    @property
+    def has_results(self) -> bool:
+        """True if the folder has more than the records of trainings that failed at their start."""
+        records = {self.job, self.events_file, self.log, self.output, self.reserve, self._lock}
+        paths = self.path.iterdir() if self.path.is_dir() else ()
+        return any(path not in records and (not path.is_dir() or any(path.iterdir())) for path in paths)
+
     # -- reading ---------------------------------------------------------------------------------------
 
     def events(self, since: int = 0) -> tuple[list[dict], int]:

@@ -350,17 +350,18 @@ def default_image_scale(preset: str) -> float:
 
 
 def save_job(job: Job, folder: RunFolder) -> None:
-    """Write a resolved job into its run folder. Only CHANGEABLE keys may differ from an existing job.
+    """Write a resolved job into its run folder. Only CHANGEABLE keys may differ from those of an existing job
+    with results.
 
     Raises:
-        LodgsError: the folder belongs to another job.
+        LodgsError: the folder has results of another job.
         OSError: the job cannot be written.
     """
     if folder.job.exists():
         existing = asdict(Job.from_file(folder.job).resolved())
         differing = [key for key, value in asdict(job).items() if existing[key] != value]
         conflicts = [key for key in differing if key not in CHANGEABLE]
-        if conflicts:
+        if conflicts and folder.has_results:
             raise LodgsError(
                 f"The run folder {folder.path} belongs to another job (different: {', '.join(conflicts)}).",
                 "Choose another run folder, or resume the run with its own job.toml.",

@@ -623,7 +623,7 @@ def test_scene_with_too_few_views_or_pixels_is_rejected(tiny_scene, tmp_path, vi
         (lambda scene: [p.unlink() for p in (scene / "images").iterdir()], "view"),
         (lambda scene: (scene / "sparse/0/cameras.txt").unlink(), "cameras.txt is missing"),
         (lambda scene: [p.unlink() for p in sorted((scene / "images").iterdir())[1:]], "1 usable view"),
-        (shutil.rmtree, "its scene"),
+        (shutil.rmtree, "does not exist"),
     ],
 )
 def test_unusable_scenes_are_rejected_with_a_remedy(tiny_scene, tmp_path, capsys, change, message):
@@ -635,8 +635,24 @@ def test_unusable_scenes_are_rejected_with_a_remedy(tiny_scene, tmp_path, capsys
     output = capsys.readouterr()
     event = json.loads(output.out.splitlines()[-1])
     assert event["event"] == "error" and message in event["what"] and event["remedy"]
-    assert ("job.toml" in event["remedy"]) == (not scene.exists())
     assert "Traceback" not in output.err
+
+
+def test_missing_scene_does_not_reserve_the_run_folder(tmp_path, capsys):
+    run = tmp_path / "run"
+
+    def error(name):
+        assert training_loop.train(
+            Job.from_dict({"scene": str(tmp_path / name), "out": str(run)}), sys.stdout
+        )
+        event = json.loads(capsys.readouterr().out.splitlines()[-1])
+        return f"{event['what']} {event['remedy']}"
+
+    assert f"{tmp_path / 'first'}: the folder does not exist" in error("first")
+    assert f"{tmp_path / 'second'}: the folder does not exist" in error("second")
+    RunFolder(run).level_file(1).touch()
+    assert "another job (different: scene)" in error("first")
+    assert "its scene" in error("second") and "job.toml" in error("second")
 
 
 def test_reading_events_continues_at_an_offset_and_leaves_incomplete_lines(tmp_path):
