@@ -80,7 +80,8 @@ def build(
 
     Args:
         focal_px: focal length in pixels to which distances are normalized.
-        footprint: size of a level's voxel in pixels at d_max / 2^(l - 1), where the level appears.
+        footprint: size of a level's voxel in pixels at d_max / 2^(l - 1), where the level appears; that of a
+            single level at d_min.
         quantiles: quantiles of the view distances used as d_min and d_max.
         levels: number of levels; 0 for floor(log2(d_max / d_min)) + 1 (Eq. 3) plus ``coarser``, up to
             MAX_LEVELS.
@@ -100,7 +101,8 @@ def build(
     levels = levels or min(floor(log2(d_max / d_min)) + 1 + coarser, MAX_LEVELS)
     coarser = min(coarser, levels - 1)
     d_max = float(d_max) * 2**coarser
-    return AnchorOctree(levels, d_max, focal_px, footprint * d_max / focal_px, points.min(axis=0) - 1e-6)
+    reach = d_max if levels > 1 else float(d_min)  # a single level is drawn at all distances
+    return AnchorOctree(levels, d_max, focal_px, footprint * reach / focal_px, points.min(axis=0) - 1e-6)
 
 
 def anchors(points: np.ndarray, octree: AnchorOctree) -> np.ndarray:

@@ -42,7 +42,8 @@ class OctreeParameters(Parameters):
     )
     footprint: float = setting(
         1.0,
-        "Voxel size in pixels, at the distance where the voxel's level appears.",
+        "Voxel size in pixels, at the distance where the voxel's level appears; of a single level, at the "
+        "smallest distance.",
         above=0,
         unit="px",
     )

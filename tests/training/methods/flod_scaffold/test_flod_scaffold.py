@@ -7,6 +7,7 @@ import torch
 from training.evaluate.views import Evaluation, full_detail_source
 from training.methods.flod_scaffold import METHOD
 from training.methods.flod_scaffold.train import Method, smallest_log_scale
+from training.optimize.anchors.anchor_octree import visible_distances
 from training.optimize.parameters import override
 from training.splats.levels import Bundle
 
@@ -117,8 +118,9 @@ def test_published_networks_keep_the_mean_scale_of_an_anchor(data):
 
 def test_voxels_are_at_least_the_minimum_size(data):
     method = make(data)
+    distances = np.concatenate(visible_distances(data.full_scene.points, data.full_train, data.focal))
+    base = method.parameters.footprint * np.quantile(distances, method.parameters.nearest) / data.focal
     for number in (1, 2, 3):
-        base = method.parameters.footprint * method.schedule.tree.d_max / data.focal
         assert method.schedule.tree.voxel == pytest.approx(max(base, method.s_min[number - 1]))
         assert method.schedule.tree.levels == 1 and (method.model.columns["level"] == 1).all()
         if number < 3:

@@ -43,6 +43,9 @@ def test_level_count_from_distance_range():
     further = octree.build(points, [camera(0.0)], focal_px=100.0, footprint=2.0, quantiles=(0, 1), coarser=2)
     assert (further.levels, further.d_max) == (6, 36.0)
     assert further.size(3) == pytest.approx(tree.size(1))
+    single = octree.build(points, [camera(0.0)], focal_px=100.0, footprint=2.0, quantiles=(0, 1), levels=1)
+    assert single.d_max == 9.0
+    assert 100.0 * single.size(1) / 1.0 == pytest.approx(2.0), "two pixels at the nearest point"
 
 
 def test_every_voxel_has_one_point():
