@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import logging
-import signal
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING
 
 from ..errors import LodgsError
 from . import PROGRAM
@@ -81,19 +79,11 @@ def run(options: argparse.Namespace) -> int:
             return _train(options)
     from ..runs.cells import cluster
 
-    for number in signal.SIGINT, signal.SIGTERM:
-        signal.signal(number, _stop)
     if options.action == "scheduler":
         cluster.run_scheduler(options.key, options.host, options.port)
     else:
         cluster.run_worker(options.key, parse_resources(options.offers))
     return 0
-
-
-def _stop(number: int, frame: object) -> NoReturn:
-    """Stop without the stacks that Dask logs of all connections that end."""
-    logging.disable()
-    raise KeyboardInterrupt
 
 
 def _plan(options: argparse.Namespace) -> int:

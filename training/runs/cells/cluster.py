@@ -10,9 +10,12 @@ import asyncio
 import logging
 import os
 import re
+import signal
 import ssl
 import stat
 import sys
+import threading
+from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any
 
@@ -136,7 +139,7 @@ def run_scheduler(path: Path, host: str | None = None, port: int = PORT) -> None
     logging.getLogger("distributed").setLevel(logging.WARNING)
     with dask.config.set(NO_HTTP):
         try:
-            asyncio.run(serve())
+            _run(serve)
         except (OSError, RuntimeError, ValueError) as error:
             raise LodgsError(
                 f"Cannot start a scheduler on {printable(host or 'this computer')}, port {port}: "
@@ -170,12 +173,45 @@ def run_worker(path: Path, resources: dict[str, float] | None = None) -> None:
 
     with dask.config.set(NO_HTTP):
         try:
-            asyncio.run(serve())
+            _run(serve)
         except (OSError, RuntimeError, ValueError) as error:
             raise LodgsError(
                 f"Cannot reach the scheduler at {address}: {_reason(error)}.",
                 f"Start it, copy its key file to {path}, and open its port in the firewall.",
             ) from error
+
+
+def _run(serve: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    """Run a coroutine until it ends or a signal stops it.
+
+    A signal only cancels the coroutine: an exception of its handler can end in code that ignores exceptions.
+
+    Raises:
+        KeyboardInterrupt: SIGINT or SIGTERM arrived.
+    """
+
+    async def stoppable() -> None:
+        loop, task = asyncio.get_running_loop(), asyncio.current_task()
+        assert task is not None
+
+        def stop(number: int, frame: object) -> None:
+            logging.disable()  # Dask logs the stacks of all connections that end
+            loop.call_soon_threadsafe(task.cancel)
+
+        for number in signals:
+            signal.signal(number, stop)
+        await serve()
+
+    is_main = threading.current_thread() is threading.main_thread()
+    signals = (signal.SIGINT, signal.SIGTERM) if is_main else ()
+    previous = [signal.getsignal(number) for number in signals]
+    try:
+        asyncio.run(stoppable())
+    except asyncio.CancelledError:
+        raise KeyboardInterrupt from None
+    finally:
+        for number, handler in zip(signals, previous, strict=True):
+            signal.signal(number, handler)
 
 
 def _reason(error: BaseException) -> str:
