@@ -107,7 +107,7 @@ def _plan(options: argparse.Namespace) -> int:
         )
     planned = plan(job, scene)
     folder.create()
-    if folder.job.exists():  # refuses a folder with another job before the plan is written
+    if folder.job.exists():  # refuses results of another job before the plan is written
         save_job(job, folder)
     write_plan(job, folder, scene, planned)
     save_job(job, folder)

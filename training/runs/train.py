@@ -65,7 +65,7 @@ def train(job: Job, stream: IO[str] | None = None, **placement: Any) -> int:
     """Start or resume a job.
 
     Args:
-        job: the job. A run folder that contains another job is rejected.
+        job: the job. A run folder with results of another job is rejected.
         stream: additional output for events.
         placement: arguments of ``cells.workers.workers``, which train the cells of a scene.
 

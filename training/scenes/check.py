@@ -29,7 +29,7 @@ WEAK_SHARE = 0.2
 MAX_REPROJECTION = 0.05
 """Median reprojection error of a view above which its pose is wrong, as a fraction of the image diagonal."""
 MAX_OFFSET = 0.2
-"""Unusual distance of a principal point from the image centre, as a fraction of the side."""
+"""Distance of a principal point from the image centre from which it is unusual, as a fraction of the side."""
 _POSES, _POINTS = 50, 20_000
 """Maximum numbers of poses and of points that are compared."""
 ERROR, WARNING, INFO = SEVERITIES = "error", "warning", "info"
