@@ -96,12 +96,12 @@ class Support:
         for view, nearest in zip(self._views, self._nearest, strict=True):
             depths = points @ view.world_to_camera[2, :3] + view.world_to_camera[2, 3]
             in_front = np.flatnonzero((depths > 0) & (depths < share * nearest))
-            intruding[near[in_front[view.sees(points[in_front], margin=MARGIN)]]] = True
+            if len(in_front):
+                intruding[near[in_front[view.sees(points[in_front], margin=MARGIN)]]] = True
         around = distances[near] < share * self._nearest[positions[near]]
-        photos = np.zeros(int(around.sum()), np.int64)
-        for camera in self._cameras:
-            photos += camera.sees(points[around])
-        intruding[near[around]] |= photos < MIN_PHOTOS
+        if around.any():
+            photos = sum(camera.sees(points[around]).astype(np.int64) for camera in self._cameras)
+            intruding[near[around]] |= photos < MIN_PHOTOS
         return intruding
 
 
