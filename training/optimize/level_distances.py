@@ -1,13 +1,13 @@
 """Distances from which merged levels are drawn, measured on the training views. Not in the paper.
 
-FLoD's levels in the paper have known minimum sizes. A merged level has none. The measured distances are those
-of least error in the photos, among those that draw few enough splats.
+FLoD's levels in the paper have known minimum sizes. A merged level has none. The level before the finest is
+drawn from the distance of least error in the photos, among those that draw few enough splats. Coarser levels
+are drawn farther away than anything in the photos.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from itertools import combinations_with_replacement
 
 import numpy as np
 import torch
@@ -31,39 +31,39 @@ def measure_min_sizes(
     gamma: float,
     rho: float,
 ) -> list[float]:
-    """Choose the distances of the finest levels, as minimum sizes (``s_min``) of all levels, coarse to fine.
+    """Choose the distances of levels, as minimum sizes (``s_min``) of all levels, coarse to fine.
 
-    Coarser levels follow at the ratio ``rho``.
+    The level before the finest has the distance :func:`measure_distances`, the next coarser one the farthest
+    distance in the photos, and the others follow at the ratio ``rho``.
 
     Args:
         levels, drawn: see :func:`measure_distances`; ``levels`` are numbered up to the finest.
         gamma: control of the rule (``lod.rules.bands``).
     """
-    distances = measure_distances(levels, data, drawn, antialias, backend)
-    sizes = [distance * gamma / data.focal for distance in distances.values()]
-    coarser = min(levels) - 1
-    return [sizes[0] * rho**n for n in range(coarser, 0, -1)] + sizes + [0.0]
+    distance, farthest = measure_distances(levels, data, drawn, antialias, backend)
+    coarser = [farthest * rho**n for n in range(min(levels) - 1)]
+    return [size * gamma / data.focal for size in (*reversed(coarser), distance)] + [0.0]
 
 
 @torch.no_grad()
 def measure_distances(
     levels: Mapping[int, Gaussians], data: TrainingData, drawn: float, antialias: bool, backend: str
-) -> dict[int, float]:
-    """Choose the distances from which levels are drawn.
+) -> tuple[float, float]:
+    """Choose the distance from which the level before the finest is drawn.
 
     Args:
-        levels: levels in use, coarse to fine.
+        levels: the level before the finest, and the finest.
         drawn: maximum number of splats drawn in the training views, as a fraction of those of the finest
             level; at least the number of the level before it.
 
     Returns:
-        The distance of each level but the finest, in scene units.
+        The distance, and the farthest distance in the views, in scene units.
     """
     views = pick_evenly(range(len(data.train)), MEASURED_VIEWS)
     samples = [_pixels(levels, view, data, antialias, backend) for view in views]
     distances, errors = (np.concatenate(column) for column in zip(*samples, strict=True))
     if not len(distances):
-        return dict.fromkeys(list(levels)[:-1], data.median_depth)
+        return data.median_depth, data.median_depth
     edges = np.quantile(distances, np.linspace(0, 1, BINS + 1))
     counts = np.zeros((BINS, len(levels)))
     for column, gaussians in enumerate(levels.values()):
@@ -71,34 +71,27 @@ def measure_distances(
         for camera in (data.train[view] for view in views):
             visible = np.linalg.norm(means[camera.sees(means, data.near)] - camera.center, axis=1)
             counts[:, column] += _sums(visible, np.ones((len(visible), 1)), edges)[:, 0]
-    switches = choose_switches(_sums(distances, errors, edges), counts, drawn)
-    return {number: float(edges[index]) for number, index in zip(list(levels)[:-1], switches, strict=True)}
+    return float(edges[choose_switch(_sums(distances, errors, edges), counts, drawn)]), float(edges[-1])
 
 
-def choose_switches(errors: np.ndarray, counts: np.ndarray, drawn: float) -> list[int]:
-    """Choose the first bin of each level but the finest.
+def choose_switch(errors: np.ndarray, counts: np.ndarray, drawn: float) -> int:
+    """Choose the first bin of the level before the finest: the one of least error.
 
     Args:
-        errors: (B, L) error of each level in each bin of distances, ascending; levels coarse to fine.
-        counts: (B, L) splats of each level in each bin.
-        drawn: maximum number of splats, as a fraction of those of the finest level. The level before the
-            finest may always be drawn everywhere.
+        errors: (B, 2) error of both levels in each bin of distances, ascending; the finest is last.
+        counts: (B, 2) splats of both levels in each bin.
+        drawn: maximum number of splats, as a fraction of those of the finest level. The other level may
+            always be drawn everywhere.
 
     Returns:
-        Indices of bins, descending, 0 to B: the choice of the least error.
+        Index of a bin, 0 to B.
     """
-    bins, levels = errors.shape
-    *_, second_finest, finest = counts.sum(axis=0)
-    max_splats = max(drawn * finest, second_finest)
-    numbers = np.arange(bins)
-    best, least_error = [0] * (levels - 1), np.inf
-    for ascending in combinations_with_replacement(range(bins + 1), levels - 1):
-        # a bin shows the coarsest level whose first bin is not after it
-        column = levels - 1 - np.searchsorted(ascending, numbers, side="right")
-        error = errors[numbers, column].sum()
-        if error < least_error and counts[numbers, column].sum() <= max_splats:
-            best, least_error = list(ascending[::-1]), error
-    return best
+    errors_by_switch, splats_by_switch = (
+        np.append(0, np.cumsum(values[:, 1])) + np.append(np.cumsum(values[::-1, 0])[::-1], 0)
+        for values in (errors, counts)
+    )
+    within_limit = splats_by_switch <= max(drawn * counts[:, 1].sum(), splats_by_switch[0])
+    return int(np.where(within_limit, errors_by_switch, np.inf).argmin())
 
 
 def _pixels(

@@ -23,9 +23,6 @@ from .refining import MERGED_RATE, drop_invisible, refining_rates
 from .schedules import LevelStages, refining_reduction
 from .training_data import TrainingData
 
-MEASURED_LEVELS = 3
-"""Number of finest levels with measured distances."""
-
 Tensors = Mapping[str, torch.Tensor]
 """Splats of a level, as tensors by name."""
 
@@ -78,7 +75,7 @@ class MergedLevels:
         return Model(tensors, splat_rates(p, self._data.extent))
 
     def measure_min_sizes(self, completed: Mapping[int, Tensors], gamma: float, ratio: float) -> list[float]:
-        """Measure the distances of the finest levels, as minimum sizes of all levels, coarse to fine.
+        """Measure the distances of the levels, as minimum sizes of all levels, coarse to fine.
 
         Args:
             completed: all levels by number.
@@ -88,6 +85,6 @@ class MergedLevels:
         Returns:
             The fact ``s_min`` of each level, in scene units.
         """
-        p, numbers = self._parameters, sorted(completed)[-MEASURED_LEVELS:]
-        levels = {number: Gaussians(**completed[number]) for number in numbers}
+        p = self._parameters
+        levels = {number: Gaussians(**completed[number]) for number in sorted(completed)[-2:]}
         return measure_min_sizes(levels, self._data, p.drawn, p.antialias, self._backend, gamma, ratio)

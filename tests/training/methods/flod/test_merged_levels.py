@@ -9,7 +9,7 @@ from training.evaluate.views import reduce_view
 from training.lod.selection import resolve_controls, select
 from training.methods.flod import METHOD, finish
 from training.methods.flod.train import Method
-from training.optimize.level_distances import choose_switches
+from training.optimize.level_distances import choose_switch
 from training.optimize.merging import merge
 from training.optimize.parameters import override
 from training.rasterize import Gaussians, rasterize
@@ -116,29 +116,38 @@ def test_finishing_steps_keep_all_merged_splats(data):
     assert {number: count for _, number, count in completed[-3:]} == counts
 
 
-def test_switches_have_least_error_within_the_budget():
+def test_switch_has_least_error_within_the_budget():
     rng = np.random.default_rng(1)
-    errors = np.sort(rng.uniform(1, 2, (5, 3)))[:, ::-1]
-    counts = np.sort(rng.uniform(0, 1, (5, 3)))
-    _, second_finest, finest = counts.sum(0)
-    for limit in np.linspace(second_finest, finest, 6):
+    errors, counts = rng.uniform(1, 2, (5, 2)), np.sort(rng.uniform(0, 1, (5, 2)))
+    coarser, finest = counts.sum(0)
+    for limit in np.linspace(coarser, finest, 6):
         choices = {}
-        for fine in range(6):
-            for coarse in range(fine, 6):
-                levels = [0 if b >= coarse else 1 if b >= fine else 2 for b in range(5)]
-                error, splats = (sum(a[b, level] for b, level in enumerate(levels)) for a in (errors, counts))
-                if splats <= limit + 1e-9:
-                    choices[coarse, fine] = error
+        for switch in range(6):
+            error, splats = (a[:switch, 1].sum() + a[switch:, 0].sum() for a in (errors, counts))
+            if splats <= limit + 1e-9:
+                choices[switch] = error
         best = min(choices, key=choices.__getitem__)
-        assert tuple(choose_switches(errors, counts, (limit + 1e-9) / finest)) == best
-    assert choose_switches(errors, counts, 1) == [5, 5]
+        assert choose_switch(errors, counts, (limit + 1e-9) / finest) == best
+    assert choose_switch(np.array([[2.0, 1.0]] * 5), counts, 1) == 5
 
 
 def test_second_finest_level_may_be_drawn_everywhere():
     """The level has the allowed share of all splats, but the views may see a slightly larger share."""
-    errors, counts = np.array([[9.0, 2.0, 1.0]] * 4), np.array([[10.0, 46.0, 100.0]] * 4)
-    assert choose_switches(errors, counts, 0.45) == [4, 0]
-    assert choose_switches(errors, counts, 0.6) == [4, 1], "one bin of the finest level"
+    errors, counts = np.array([[2.0, 1.0]] * 4), np.array([[46.0, 100.0]] * 4)
+    assert choose_switch(errors, counts, 0.45) == 0
+    assert choose_switch(errors, counts, 0.6) == 1, "one bin of the finest level"
+
+
+def test_coarser_levels_begin_beyond_the_photos(data):
+    """Only the two finest levels are drawn at distances that the training views show."""
+    flod = make(data)
+    for _ in train(flod):
+        pass
+    distances = [size * data.focal / flod.controls["gamma"] for size in flod.s_min]
+    means = flod.completed[3]["means"].numpy()
+    seen = [np.linalg.norm(means[c.sees(means, data.near)] - c.center, axis=1) for c in data.train]
+    assert distances[1] <= np.median(np.concatenate(seen)) < distances[0]
+    assert distances[0] > distances[1] > distances[2] == 0
 
 
 def test_finishing_step_leaves_other_levels(data):
