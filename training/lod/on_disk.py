@@ -136,6 +136,15 @@ def open_if_large(path: str | Path, limit: int = 0) -> Bundle | None:
     return bundle
 
 
+def read_or_open_bundle(path: str | Path) -> Bundle:
+    """Read a bundle, or open it if it is large (see ``open_if_large``).
+
+    Raises:
+        LodgsError: see ``read_bundle``.
+    """
+    return open_if_large(path) or read_bundle(path)
+
+
 class CulledReader:
     """Reads blocks of a level's splats that a camera can see. Reads all splats once to find their bounds.
 

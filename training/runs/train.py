@@ -22,7 +22,7 @@ from ..evaluate.metrics import psnr
 from ..evaluate.summary import summarize
 from ..evaluate.views import Evaluation
 from ..files import atomic_write
-from ..lod.on_disk import MAX_IN_MEMORY, open_if_large, supports_culled_reads
+from ..lod.on_disk import MAX_IN_MEMORY, read_or_open_bundle, supports_culled_reads
 from ..lod.rule import find_rule
 from ..lod.selection import resolve_controls, standalone_levels
 from ..methods import METHODS, create
@@ -36,7 +36,7 @@ from ..scenes.orientation import up_rotation
 from ..scenes.regions import Region
 from ..scenes.view_tables import make_view_tables
 from ..splats.batches import batch_slices
-from ..splats.bundle import read_bundle, write_bundle
+from ..splats.bundle import write_bundle
 from ..splats.dialects import comments_from_meta
 from ..splats.file_rows import open_ply
 from ..splats.gaussians import SplatRows, Splats
@@ -189,7 +189,7 @@ def _write_merged_levels(
     folder: RunFolder, events: EventWriter, data: TrainingData, backend: str, started: float
 ) -> None:
     """Write the levels of merged cells, with their quality, and finish the run."""
-    bundle = open_if_large(folder.bundle) or read_bundle(folder.bundle)
+    bundle = read_or_open_bundle(folder.bundle)
     evaluation = Evaluation(data, backend, bundle.antialias, measures={})
     complete = [level.number for level in standalone_levels(bundle)]
     for position, level in enumerate(bundle.levels, 1):

@@ -10,13 +10,11 @@ from pathlib import Path
 
 from ...evaluate.views import Evaluation
 from ...files import atomic_write, create_folder
-from ...lod.on_disk import open_if_large
+from ...lod.on_disk import read_or_open_bundle
 from ...lod.rule import Values
 from ...lod.selection import complete_splats, resolve_controls
 from ...scenes.cameras import Camera
-from ...splats.bundle import read_bundle
 from ...splats.dialects import Warn, ignore
-from ...splats.levels import Bundle
 from ..finished import open_finished
 from ..folder import RunFolder
 from ..measure import finite
@@ -95,7 +93,7 @@ def _render(
     count, images, has_baseline = compared_count(measured), [], False
     for run, row in zip(runs, list(measured), strict=True):
         notify(f"Rendering {row.label}.")
-        bundle = _read(run)
+        bundle = read_or_open_bundle(RunFolder(run).bundle)
         images.append(render_run(evaluation, bundle, row, cameras, count if len(runs) > 1 else None))
         if len(bundle.levels) == 1 and not bundle.rule and not bundle.on_disk and not has_baseline:
             plain = evaluation.with_filter(bundle.antialias)
@@ -107,14 +105,9 @@ def _render(
     return images
 
 
-def _read(run: Path) -> Bundle:
-    path = RunFolder(run).bundle
-    return open_if_large(path) or read_bundle(path)
-
-
 def _default_values(run: Path) -> Values:
     """Return the values of the controls with which a run's bundle is shown at first."""
-    bundle = _read(run)
+    bundle = read_or_open_bundle(RunFolder(run).bundle)
     return resolve_controls(bundle, {}) if bundle.rule else {}
 
 
