@@ -9,11 +9,17 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from ..errors import LodgsError
+from ..evaluate.lpips import load_lpips
+from ..evaluate.metrics import ssim
+from ..evaluate.views import Evaluation
+from ..lod.on_disk import read_or_open_bundle
 from ..methods import create
 from ..optimize.method import ImageModel, Method
 from ..optimize.training_data import TrainingData
+from ..rasterize import tensor_device
 from ..splats.bundle import read_bundle, write_bundle
 from ..splats.dialects import Warn, ignore
+from ..splats.levels import Bundle
 from .arrays import array_error, read_arrays
 from .data import training_data
 from .folder import RunFolder
@@ -40,6 +46,28 @@ def open_finished(run: Path, warn: Warn) -> tuple[RunFolder, Job, TrainingData]:
             warn(values["message"])
 
     return folder, job, training_data(job, folder, report)
+
+
+def open_evaluation(
+    run: Path, warn: Warn = ignore, lpips: Path | None = None
+) -> tuple[RunFolder, Job, Bundle, Evaluation]:
+    """Open a finished run to measure SSIM, and LPIPS if its weights are there.
+
+    Args:
+        run: run folder.
+        warn: called with warnings about the scene.
+        lpips: archive of the networks' weights, see ``evaluate.lpips.load_lpips``.
+
+    Returns:
+        Its folder, job, bundle and evaluation.
+
+    Raises:
+        LodgsError: see ``open_finished``.
+    """
+    folder, job, data = open_finished(run, warn)
+    bundle = read_or_open_bundle(folder.bundle)
+    measures = {"ssim": ssim, **load_lpips(lpips, tensor_device(job.backend))}
+    return folder, job, bundle, Evaluation(data, job.backend, bundle.antialias, measures)
 
 
 def load_networks(job: Job, folder: RunFolder, data: TrainingData) -> tuple[Method, ImageModel]:

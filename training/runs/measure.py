@@ -44,13 +44,10 @@ from ..errors import LodgsError
 from ..evaluate.distance import measure_farther_views, measure_popping
 from ..evaluate.frame_memory import measure_frame_memory
 from ..evaluate.level_sheet import write_level_sheet
-from ..evaluate.lpips import load_lpips
-from ..evaluate.metrics import ssim
 from ..evaluate.offset_views import measure_veil
 from ..evaluate.summary import summarize
 from ..evaluate.views import Evaluation, full_detail_source
 from ..files import atomic_write
-from ..lod.on_disk import open_if_large
 from ..lod.rule import Rule, Values, find_rule
 from ..lod.selection import (
     BundleSelector,
@@ -62,14 +59,12 @@ from ..lod.selection import (
     unknown_rule_error,
 )
 from ..optimize.merging import merge
-from ..rasterize import tensor_device
 from ..rasterize.resident import ResidentBundle
 from ..scenes.cameras import Camera
 from ..scenes.offset_views import read_offset_views
-from ..splats.bundle import read_bundle
 from ..splats.dialects import Warn, ignore
 from ..splats.levels import Bundle
-from .finished import load_networks, open_finished
+from .finished import load_networks, open_evaluation
 from .folder import RunFolder
 from .job import Job
 
@@ -102,10 +97,7 @@ def evaluate_run(
         LodgsError: the run is not finished or contains a link, the rule has no such control, or a view off
             the path cannot be read.
     """
-    folder, job, data = open_finished(run, warn)
-    bundle = open_if_large(folder.bundle) or read_bundle(folder.bundle)
-    measures = {"ssim": ssim, **load_lpips(lpips, tensor_device(job.backend))}
-    evaluation = Evaluation(data, job.backend, bundle.antialias, measures)
+    folder, job, bundle, evaluation = open_evaluation(run, warn, lpips)
     rule, values = _resolve_rule(bundle, controls or {})
     report = _measure_levels(job, evaluation, bundle)
     middle = evaluation.cameras[len(evaluation.cameras) // 2]

@@ -151,7 +151,7 @@ def test_perceptual_measures_stand_beside_psnr(finished, monkeypatch, tmp_path):
         folders.append(folder)
         return {"lpips_vgg": lambda image, target, mask: float((image - target).abs().mean() / 4)}
 
-    monkeypatch.setattr("training.runs.measure.load_lpips", load)
+    monkeypatch.setattr("training.runs.finished.load_lpips", load)
     report = evaluate_run(finished(test_every=4), lpips=tmp_path)
     coarse, fine = report["levels"]
     assert folders == [tmp_path] and 0 < fine["lpips_vgg"] < coarse["lpips_vgg"] < 0.25
@@ -162,7 +162,7 @@ def test_perceptual_measures_stand_beside_psnr(finished, monkeypatch, tmp_path):
 
 
 def test_curve_has_no_perceptual_measures(finished, splats, monkeypatch):
-    monkeypatch.setattr("training.runs.measure.load_lpips", lambda *_: {"lpips_vgg": lambda *_: 0.125})
+    monkeypatch.setattr("training.runs.finished.load_lpips", lambda *_: {"lpips_vgg": lambda *_: 0.125})
     run = finished(test_every=4)
     write_bundle(RunFolder(run).bundle, tree_of(splats))
     report = evaluate_run(run)
@@ -281,7 +281,7 @@ def test_metrics_are_valid_json_with_undefined_values(finished, monkeypatch):
     run = finished(test_every=4)
     report = evaluate_run(run, far=True)
     assert all(np.isfinite(row["psnr"]) for row in report["farther"])
-    monkeypatch.setattr("training.runs.measure.ssim", lambda *_: float("nan"))
+    monkeypatch.setattr("training.runs.finished.ssim", lambda *_: float("nan"))
     report = evaluate_run(run)
     assert np.isnan(report["levels"][0]["ssim"]) and "nan" in format_report(report)
 

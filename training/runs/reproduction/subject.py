@@ -10,19 +10,15 @@ from pathlib import Path
 
 from ...editing.export import Compression
 from ...evaluate.frame_memory import measure_frame_memory
-from ...evaluate.lpips import load_lpips
-from ...evaluate.metrics import ssim
-from ...evaluate.views import REDUCTIONS, Evaluation, full_detail_source
-from ...lod.on_disk import open_if_large
+from ...evaluate.views import REDUCTIONS, full_detail_source
 from ...lod.selection import resolve_controls, select
-from ...rasterize import tensor_device
 from ...rasterize.resident import ResidentBundle
 from ...scenes.cameras import Camera
 from ...splats.bundle import read_bundle
 from ...splats.dialects import Warn, ignore
 from ...splats.levels import Bundle
 from ..compress import compress
-from ..finished import load_networks, open_finished
+from ..finished import load_networks, open_evaluation
 
 
 class Subject:
@@ -40,10 +36,7 @@ class Subject:
 
     def __init__(self, run: Path, warn: Warn = ignore) -> None:
         self.run = run
-        self.folder, self.job, data = open_finished(run, warn)
-        self.bundle = open_if_large(self.folder.bundle) or read_bundle(self.folder.bundle)
-        measures = {"ssim": ssim, **load_lpips(None, tensor_device(self.job.backend))}
-        self.evaluation = Evaluation(data, self.job.backend, self.bundle.antialias, measures)
+        self.folder, self.job, self.bundle, self.evaluation = open_evaluation(run, warn)
         self._measured: dict[Hashable, dict[str, float]] = {}
 
     @property
