@@ -28,6 +28,8 @@ PORT = 8786
 NO_HTTP = {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
 """Dask configuration without web pages. Dask opens its HTTP servers even without pages."""
 _HTTP_ADDRESS = "127.0.0.1:0"
+_SCHEDULER_CLOSES = "scheduler-close"
+"""Dask's reason to close a worker when its scheduler is stopped."""
 _MAX_KEY_BYTES, _MAX_PORT = 1 << 16, 65535
 _COMMENT = "# Key of a LODGS cluster. Keep it secret: it permits running programs on all its computers."
 _IGNORE_INTERRUPT = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
@@ -156,15 +158,21 @@ def run_worker(path: Path, resources: dict[str, float] | None = None) -> None:
         resources: Dask resources of this worker, such as {"GPU": 1}.
 
     Raises:
-        LodgsError: the key file is unusable, or the scheduler does not answer.
+        LodgsError: the key file is unusable, or the scheduler does not answer or vanishes.
     """
     import dask.config
 
     distributed = import_dask()
     address, security = read_key_file(path)
+    reasons = []
+
+    class Nanny(distributed.Nanny):
+        def close_gracefully(self, reason: str = "") -> None:
+            reasons.append(reason)
+            super().close_gracefully(reason)
 
     async def serve() -> None:
-        async with distributed.Nanny(
+        async with Nanny(
             address, nthreads=1, security=security, resources=resources, dashboard=False,
             dashboard_address=_HTTP_ADDRESS, silence_logs=logging.WARNING,
         ) as nanny:  # fmt: skip
@@ -179,6 +187,10 @@ def run_worker(path: Path, resources: dict[str, float] | None = None) -> None:
                 f"Cannot reach the scheduler at {address}: {_reason(error)}.",
                 f"Start it, copy its key file to {path}, and open its port in the firewall.",
             ) from error
+    if _SCHEDULER_CLOSES not in reasons:
+        raise LodgsError(
+            f"Lost the connection to the scheduler at {address}.", "Restart it, and then this worker."
+        )
 
 
 def _run(serve: Callable[[], Coroutine[Any, Any, None]]) -> None:

@@ -144,23 +144,41 @@ def start_blocks(*words: object) -> tuple[subprocess.Popen[str], str]:
     return process, process.stdout.readline()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_stopped_scheduler_prints_no_stacks_of_its_connections(tmp_path, number):
+def start_cluster(folder: Path) -> tuple[subprocess.Popen[str], subprocess.Popen[str]]:
+    """Start a scheduler and its worker."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
-    key = tmp_path / "cluster.pem"
+    key = folder / "cluster.pem"
     scheduler, line = start_blocks("scheduler", key, "--host", "127.0.0.1", "--port", port)
     try:
         assert line.startswith("Scheduler at tls://127.0.0.1:")
         worker, line = start_blocks("worker", key)
         assert line.startswith("Worker of tls://127.0.0.1:")
+    except BaseException:
+        scheduler.kill()
+        raise
+    return scheduler, worker
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_stopped_scheduler_prints_no_stacks_of_its_connections(tmp_path, number):
+    scheduler, worker = start_cluster(tmp_path)
+    try:
         scheduler.send_signal(number)
         assert scheduler.wait(60) == 3
         assert worker.wait(60) == 0
     finally:
         scheduler.kill()
     assert "Traceback" not in scheduler.stdout.read()
+
+
+@pytest.mark.slow
+def test_worker_reports_a_lost_scheduler(tmp_path):
+    scheduler, worker = start_cluster(tmp_path)
+    scheduler.kill()
+    assert worker.wait(60) == 2
+    assert "error: Lost the connection to the scheduler at tls://127.0.0.1:" in worker.stdout.read()
 
 
 def test_scheduler_reports_unusable_ports(tmp_path):
