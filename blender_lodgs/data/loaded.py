@@ -11,6 +11,8 @@ from ...training.lod.selection import unknown_rule_error
 from ..attributes import read_attribute
 from . import objects, scenes, selection
 
+_HALVINGS = 5
+"""Number of bisections of a control's last step to save a share of the splats."""
 _counts: dict[tuple[int, Region], int] = {}
 """Number of splats by point cloud (``session_uid``) and region; counting large clouds is slow."""
 
@@ -66,22 +68,48 @@ def reduce_detail(context: bpy.types.Context, root: bpy.types.Object, share: flo
     if rule is None:
         raise LodgsError(*unknown_rule_error(root.lodgs.rule))
     numbers = [item.number for item in root.lodgs.existing_levels]
-    initial = {control.name: getattr(root.lodgs.controls, control.name) for control in rule.controls}
-    values: Values | None = initial
+    values = initial = {control.name: getattr(root.lodgs.controls, control.name) for control in rule.controls}
     saved = first = saved_share(context, root)
-    while saved < share and (values := rule.less_detail(values, numbers)) is not None:
-        for name, value in values.items():
-            setattr(root.lodgs.controls, name, value)
-        context.view_layer.update()
-        saved = saved_share(context, root)
+    previous = None
+    while saved < share and (coarser := rule.less_detail(values, numbers)) is not None:
+        previous, values = values, coarser
+        saved = _saved_with(context, root, values)
     if saved < share and saved <= first:
-        for name, value in initial.items():
-            setattr(root.lodgs.controls, name, value)
+        _saved_with(context, root, initial)
         raise LodgsError(
             "Cannot save splats: coarser levels draw as many at this camera.",
             "Move the camera away from the splats, or train more levels.",
         )
+    if previous is not None and saved >= share:
+        saved = _refine(context, root, previous, values, share)
     return saved
+
+
+def _saved_with(context: bpy.types.Context, root: bpy.types.Object, values: Values) -> float:
+    """Set controls of a root's rule; return :func:`saved_share` with them."""
+    for name, value in values.items():
+        setattr(root.lodgs.controls, name, value)
+    context.view_layer.update()
+    return saved_share(context, root)
+
+
+def _refine(
+    context: bpy.types.Context, root: bpy.types.Object, low: Values, high: Values, share: float
+) -> float:
+    """Bisect between controls that save less than a share and others that save more; return the saved share.
+
+    Switches and whole numbers keep their higher value.
+    """
+    for _ in range(_HALVINGS):
+        middle = {
+            name: (low[name] + value) / 2 if isinstance(value, float) else value
+            for name, value in high.items()
+        }
+        if _saved_with(context, root, middle) >= share:
+            high = middle
+        else:
+            low = middle
+    return _saved_with(context, root, high)
 
 
 def _count(cloud: bpy.types.PointCloud, query: selection.LodQuery, region: Region) -> int:
