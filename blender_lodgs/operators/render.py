@@ -8,7 +8,7 @@ from bpy_extras.io_utils import ExportHelper
 from ...training.scenes.cameras import write_camera
 from ..data import cameras, roots, selection
 from ..data.paths import absolute_path
-from ..render import compositing, engine, viewport_quality
+from ..render import compositing, engine, mesh_depth, viewport_quality
 from .base import SceneOperator, report_errors, show_image
 from .modal import FrameOperator
 
@@ -85,10 +85,10 @@ class LODGS_OT_render_mesh_depth(FrameOperator, bpy.types.Operator):
         return f"{cls.__doc__}, for every frame of the range" if properties.animation else cls.__doc__
 
     def work(self, context):
-        return compositing.render_mesh_depth(context.scene, self.frames(context))
+        return mesh_depth.render_mesh_depth(context.scene, self.frames(context))
 
     def result_text(self, count):
-        folder = compositing.depth_file_pattern(bpy.context.scene).parent
+        folder = mesh_depth.depth_file_pattern(bpy.context.scene).parent
         suffix = "" if bpy.data.filepath else " until Blender is closed"
         return f"{'1 depth image' if count == 1 else f'{count} depth images'} in {folder}{suffix}"
 

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import tempfile
-from collections.abc import Collection, Iterable, Iterator
-from functools import cache
-from pathlib import Path
+from collections.abc import Collection, Iterator
 
 import bpy
 import numpy as np
@@ -16,13 +13,10 @@ from ...training.errors import LodgsError
 from ...training.scenes.ground import find_ground
 from .. import compat
 from ..data import cleaning, ground, roots, selection
-from ..data.cameras import scene_camera
-from ..data.paths import relative_path
 from ..data.placement import placement_of
 from ..data.properties import RenderSettings
 from ..data.property_callbacks import ON_CHANGE
 from . import engine
-from .written_images import require_complete_image
 
 _COPIED = (
     "resolution_x", "resolution_y", "resolution_percentage", "pixel_aspect_x", "pixel_aspect_y",
@@ -58,7 +52,7 @@ def combine_with_meshes(scene: bpy.types.Scene, mesh_engine: str = "CYCLES") -> 
     """Set a scene up to render splats with LODGS and meshes with another engine, combined by depth.
 
     A second scene renders the meshes: it has the same objects without the splats. With a mesh holdout
-    (:func:`render_mesh_depth`), the splat image is simply placed over the mesh image. With *Splat Shadows*,
+    (``mesh_depth``), the splat image is simply placed over the mesh image. With *Splat Shadows*,
     the second scene has the splats as ellipsoids that only shadows, reflections and bounced light show.
 
     A repeated call copies the current size, camera, frame range and holdout to the second scene.
@@ -98,7 +92,7 @@ def combine_with_meshes(scene: bpy.types.Scene, mesh_engine: str = "CYCLES") -> 
         for layer in rendered.view_layers:
             layer.use_pass_z = True
     catchers = _catcher_layer(scene, meshes)
-    _copy_settings(scene, meshes, scene.lodgs_render.shadows)
+    copy_settings(scene, meshes, scene.lodgs_render.shadows)
     meshes.lodgs_render.ellipsoids = scene.lodgs_render.shadows
     built = MIN_DEPTH in _node_types(tree), _used_catcher_layer(tree)
     needed = not scene.lodgs_render.holdout, catchers
@@ -171,83 +165,7 @@ def _is_ours(tree: bpy.types.NodeTree) -> bool:
     return _node_types(tree) <= {*compat.COMPOSITOR_START, *_NODES}
 
 
-def render_mesh_depth(scene: bpy.types.Scene, frames: Iterable[int]) -> Iterator[Path]:
-    """Render the depth of a scene's meshes with Cycles, so that meshes occlude splats.
-
-    Each frame is a multilayer EXR file with one ray through each pixel centre, where splats are evaluated
-    too. After the last frame, the files become the holdout of the scene.
-
-    Args:
-        scene: scene with meshes and a camera.
-        frames: frame numbers.
-
-    Yields:
-        The written file of each frame (:func:`depth_file_pattern`).
-
-    Raises:
-        LodgsError: the scene has no camera or several views, or a file cannot be written.
-    """
-    scene_camera(scene)
-    if scene.render.use_multiview:
-        raise LodgsError(
-            "Cannot render mesh depth: the scene has a stereo or multi-view render.",
-            "Use Combine with Meshes, or disable Stereoscopy.",
-        )
-    pattern = depth_file_pattern(scene)
-    meshes = bpy.data.scenes.new(f"{scene.name} Depth")
-    try:
-        _copy_settings(scene, meshes, catchers=False)
-        _set_depth_only(meshes)
-        for frame in frames:
-            path = engine.frame_path(str(pattern), scene, frame)
-            # as an animation, because a still of an inactive scene shows another frame
-            meshes.frame_start = meshes.frame_end = frame
-            meshes.render.filepath = str(path.parent / pattern.name)
-            bpy.ops.render.render(scene=meshes.name, animation=True)
-            require_complete_image(path)
-            yield path
-    except RuntimeError as error:
-        raise LodgsError(
-            f"Cannot render the depth of the meshes: {error}", "Save the .blend file in another folder."
-        ) from error
-    finally:
-        bpy.data.scenes.remove(meshes)
-    scene.lodgs_render.holdout = relative_path(str(pattern))
-    if scene.lodgs_render.meshes is not None:
-        combine_with_meshes(scene)
-
-
-def depth_file_pattern(scene: bpy.types.Scene) -> Path:
-    """Return the path of the depth files with #### for the frame number.
-
-    The folder is next to the .blend file, or a private temporary folder if the file is not saved.
-    """
-    name = f"{bpy.path.clean_name(scene.name)}_####.exr"
-    if bpy.data.filepath:
-        return Path(bpy.path.abspath("//")) / f"{Path(bpy.data.filepath).stem}_depth" / name
-    return Path(bpy.app.tempdir or _temporary_folder()) / "depth" / name
-
-
-@cache
-def _temporary_folder() -> str:
-    """Create a temporary folder for this process, in case Blender has none."""
-    return tempfile.mkdtemp(prefix="lodgs-")
-
-
-def _set_depth_only(scene: bpy.types.Scene) -> None:
-    """Set a scene up to render depth with one ray per pixel to multilayer EXR files."""
-    render, settings = scene.render, scene.cycles
-    render.engine = "CYCLES"
-    render.use_compositing = render.use_sequencer = render.use_motion_blur = False
-    compat.set_multilayer_exr(render.image_settings)
-    for layer in scene.view_layers:
-        layer.use_pass_z, layer.use_pass_combined = True, False
-    settings.samples, settings.max_bounces = 1, 0
-    settings.use_denoising = settings.use_adaptive_sampling = False
-    settings.pixel_filter_type, settings.filter_width = CENTER_FILTER
-
-
-def _copy_settings(
+def copy_settings(
     scene: bpy.types.Scene, meshes: bpy.types.Scene, shadows: bool = False, catchers: bool = True
 ) -> None:
     """Copy objects, camera and render settings of a scene to its mesh scene.
@@ -288,7 +206,7 @@ def _copy_views(source: bpy.types.RenderSettings, target: bpy.types.RenderSettin
 def _exclude_collections(
     scene: bpy.types.Scene, meshes: bpy.types.Scene, shadows: bool, catchers: bool
 ) -> None:
-    """Exclude the same collections as in the scene, and unwanted ones; see :func:`_copy_settings`."""
+    """Exclude the same collections as in the scene, and unwanted ones; see :func:`copy_settings`."""
     splat_collections = {
         collection
         for root in roots.roots(scene)

@@ -408,4 +408,4 @@ def test_meshes_are_combined_for_the_same_views(bpy, lodgs, scene, root):
     with pytest.raises(
         lodgs("training.errors").LodgsError, match="Cannot render mesh depth: the scene has a stereo"
     ):
-        next(lodgs("render.compositing").render_mesh_depth(scene, [1]))
+        next(lodgs("render.mesh_depth").render_mesh_depth(scene, [1]))

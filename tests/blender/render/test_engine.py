@@ -708,7 +708,7 @@ def test_meshes_hold_out_splats_behind_them(bpy, lodgs, fog_and_wall, tmp_path):
 def test_cancelled_mesh_depth_restores_the_scene(bpy, lodgs, fog_and_wall, tmp_path):
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "garden.blend"))
     scene = bpy.context.scene
-    work = lodgs("render.compositing").render_mesh_depth(scene, range(1, 4))
+    work = lodgs("render.mesh_depth").render_mesh_depth(scene, range(1, 4))
     first = next(work)
     assert first.exists() and len(bpy.data.scenes) == 2
     work.close()
