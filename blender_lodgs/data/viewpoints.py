@@ -275,11 +275,13 @@ def selected_subjects(context: bpy.types.Context) -> list[bpy.types.Object]:
     return [
         obj
         for obj in context.view_layer.objects
-        if obj.select_get()
-        and root_of(obj) is None
-        and not obj.hide_render
-        and (obj.type in _SOLID or obj.instance_type == "COLLECTION")
+        if obj.select_get() and not obj.hide_render and is_renderable(obj)
     ]
+
+
+def is_renderable(obj: bpy.types.Object) -> bool:
+    """Return whether an object outside splat scenes has surfaces or volumes, or instances a collection."""
+    return root_of(obj) is None and (obj.type in _SOLID or obj.instance_type == "COLLECTION")
 
 
 def _corners(context: bpy.types.Context) -> np.ndarray:

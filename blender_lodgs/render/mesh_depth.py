@@ -13,6 +13,7 @@ from ...training.errors import LodgsError
 from .. import compat
 from ..data.cameras import scene_camera
 from ..data.paths import relative_path
+from ..data.viewpoints import is_renderable
 from . import compositing, engine
 from .written_images import require_complete_image
 
@@ -31,7 +32,7 @@ def render_mesh_depth(scene: bpy.types.Scene, frames: Iterable[int]) -> Iterator
         The written file of each frame (:func:`depth_file_pattern`).
 
     Raises:
-        LodgsError: the scene has no camera or several views, or a file cannot be written.
+        LodgsError: the scene has no camera, no meshes or several views, or a file cannot be written.
     """
     scene_camera(scene)
     if scene.render.use_multiview:
@@ -43,6 +44,11 @@ def render_mesh_depth(scene: bpy.types.Scene, frames: Iterable[int]) -> Iterator
     meshes = bpy.data.scenes.new(f"{scene.name} Depth")
     try:
         compositing.copy_settings(scene, meshes, catchers=False)
+        if not any(is_renderable(obj) for obj in meshes.view_layers[0].objects):
+            raise LodgsError(
+                f"Cannot render mesh depth: the scene '{scene.name}' has no meshes.",
+                "Add a mesh outside the collections of the splats.",
+            )
         _set_depth_only(meshes)
         for frame in frames:
             path = engine.frame_path(str(pattern), scene, frame)

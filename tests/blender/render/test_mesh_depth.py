@@ -1,7 +1,13 @@
-"""Folder of the mesh depth files."""
+"""Depth of the meshes: folder of its files, and scenes without meshes."""
 
 import stat
 from types import SimpleNamespace
+
+import pytest
+
+from tests.blender.fake_trainer import splats
+from training.splats.bundle import write_bundle
+from training.splats.levels import Bundle, Level
 
 
 def test_depth_of_an_unsaved_file_is_in_a_private_folder(bpy, lodgs, monkeypatch, tmp_path):
@@ -17,3 +23,16 @@ def test_depth_of_an_unsaved_file_is_in_a_private_folder(bpy, lodgs, monkeypatch
     assert pattern.is_relative_to(folder) and pattern == mesh_depth.depth_file_pattern(scene)
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
     mesh_depth._temporary_folder.cache_clear()
+
+
+def test_scene_without_meshes_has_no_depth(bpy, lodgs, tmp_path):
+    write_bundle(tmp_path / "splats.ply", Bundle("", [Level(1, splats(10))]))
+    lodgs("data.importing").import_splats(bpy.context, tmp_path / "splats.ply")
+    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    bpy.context.scene.collection.objects.link(camera)
+    bpy.context.scene.camera = camera
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "garden.blend"))
+    with pytest.raises(RuntimeError, match="Cannot render mesh depth: the scene 'Scene' has no meshes"):
+        bpy.ops.lodgs.render_mesh_depth()
+    assert bpy.context.scene.lodgs_render.holdout == "" and len(bpy.data.scenes) == 1
+    assert not (tmp_path / "garden_depth").exists()
