@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import accumulate
+
 import bpy
 
 from ...training.lod.rule import find_rule
@@ -9,16 +11,22 @@ from ...training.lod.selection import unknown_rule_error
 from ..data import loaded, objects, roots, scenes, selection, streams
 from ..nodes.camera_choices import find_choice
 from ..viewport import views
-from .parts import LevelsPanel, say, split_column
+from .parts import LevelsPanel, say, sidebar_width, split_column
 
 MIN_SAVED = 0.05
 """Share of splats below which the panel offers a coarser setting."""
+_WIDTHS = 34, 52, 34, 46
+"""Widths of the columns of the table of levels in pixels, at an interface scale of 1."""
+_TABLE_MARGIN = 107
+"""Width of a sidebar without these columns."""
 
 
 def _columns(row: bpy.types.UILayout, *texts: str) -> None:
-    """Draw four texts in columns."""
-    for text, share in zip(texts, (0.18, 0.4, 0.4), strict=False):
-        row = row.split(factor=share)
+    """Draw texts in columns: those that fit the sidebar, at least the first one."""
+    fitting = sum(end <= sidebar_width() - _TABLE_MARGIN for end in accumulate(_WIDTHS))
+    texts = texts[: max(fitting, 1)]
+    for number, text in enumerate(texts[:-1]):
+        row = row.split(factor=_WIDTHS[number] / sum(_WIDTHS[number : len(texts)]))
         row.label(text=text)
     row.label(text=texts[-1])
 

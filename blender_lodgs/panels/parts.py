@@ -51,12 +51,17 @@ def short_count(count: int) -> str:
     return str(count)
 
 
+def sidebar_width() -> float:
+    """Return the width of the drawn region in pixels at an interface scale of 1; without a window, any."""
+    region = bpy.context.region
+    return region.width / bpy.context.preferences.system.ui_scale if region else 300.0
+
+
 def say(layout: bpy.types.UILayout, text: str, icon: str) -> None:
     """Draw a text that wraps to the panel's width."""
     column = layout.column(align=True)
     column.scale_y = 0.8
-    width = bpy.context.region.width / bpy.context.preferences.system.ui_scale
-    columns = max(int((width - 85) / 5.6), 12)  # letters of the default font, without icon and tabs
+    columns = max(int((sidebar_width() - 85) / 5.6), 12)  # letters of the default font, without icon and tabs
     text = re.sub(r"(\d) (?=([kMG]|s|[cmk]?m|[kMGT]B)\b)", "\\1\u00a0", text)  # keep units on the line
     for number, line in enumerate(textwrap.wrap(text, columns, break_on_hyphens=False)):
         line = line.replace("\u00a0", " ")

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from tests.blender.panels.conftest import RecordingLayout
 from tests.training.lod.tree.trees import random_leaves, tree_of
 from training.lod.rule import rules
 from training.lod.rules.chunks import member_columns
@@ -218,6 +219,15 @@ def test_state_of_streaming_is_shown(bpy, lodgs, draw, draw_panel, tmp_path, mon
     assert "By Distance" in " ".join(texts())
     bpy.data.objects.remove(root.lodgs.levels[0].object)
     assert "no longer match the file" in " ".join(texts())
+
+
+@pytest.mark.parametrize(("width", "count"), [(292, 4), (240, 3), (200, 2), (132, 1)])
+def test_narrow_table_has_fewer_columns(lodgs, monkeypatch, width, count):
+    levels = lodgs("panels.levels")
+    monkeypatch.setattr(levels, "sidebar_width", lambda: width)
+    layout = RecordingLayout()
+    levels._columns(layout, *"1234")
+    assert layout.texts == [*"1234"][:count]
 
 
 def test_by_distance_shows_its_savings_and_offers_to_reduce_detail(bpy, lodgs, draw):
