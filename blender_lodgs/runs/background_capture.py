@@ -30,7 +30,6 @@ class BackgroundCapture:
 
     def __init__(self, folder: Path, count: int, process: subprocess.Popen, log: Path, copy: Path) -> None:
         self.folder = folder
-        self.message = "Opening the scene"
         self.fraction = 0.0
         self.problem = ""
         self.running = True
@@ -41,6 +40,7 @@ class BackgroundCapture:
         self._cancelled = False
         self._start_time = time.monotonic()
         self._start_count = self._rendered_count()
+        self.message = self._progress_text(self._start_count)
 
     def cancel(self) -> None:
         """Stop the program. Starting the same capture again continues it."""
@@ -53,18 +53,22 @@ class BackgroundCapture:
         rendered = self._rendered_count()
         self.running = code is None
         self.fraction = rendered / self._count
-        if rendered > self._start_count:
-            seconds_per_view = (time.monotonic() - self._start_time) / (rendered - self._start_count)
-            time_left = format_duration(seconds_per_view * (self._count - rendered))
-            self.message = f"View {min(rendered + 1, self._count)} of {self._count}, {time_left} left"
-        if rendered == self._count:
-            self.message = "Finding points"
+        self.message = self._progress_text(rendered)
         if code is not None:
             self._copy.unlink(missing_ok=True)
             self.message = "Captured" if code == 0 else f"Stopped after {rendered} of {self._count} views"
             self.problem = "" if code == 0 or self._cancelled else self._failure_reason(code, rendered)
         extension.redraw()
         return self.running
+
+    def _progress_text(self, rendered: int) -> str:
+        if rendered >= self._count:
+            return "Finding points"
+        text = f"View {rendered + 1} of {self._count}"
+        if rendered == self._start_count:
+            return text
+        seconds_per_view = (time.monotonic() - self._start_time) / (rendered - self._start_count)
+        return f"{text}, {format_duration(seconds_per_view * (self._count - rendered))} left"
 
     def _failure_reason(self, code: int, rendered: int) -> str:
         if rendered == self._start_count and not 0 <= code < 256:  # the system killed the program

@@ -557,7 +557,8 @@ def test_cancelled_capture_is_reported(bpy, lodgs, fake, scene, blender, hanging
     with pytest.raises(RuntimeError, match="already running"):
         bpy.ops.lodgs.capture_scene()
     end = time.monotonic() + 200
-    while work.step() and not work.message.startswith("View"):
+    assert work.message == "View 1 of 30"
+    while work.step() and not work.message.startswith("View 2"):
         assert time.monotonic() < end
         time.sleep(0.02)
     assert bpy.ops.lodgs.cancel_capture() == {"FINISHED"}
