@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import textwrap
 from types import ModuleType
 
 import bpy
@@ -12,32 +13,35 @@ from ..data import roots
 
 
 def report_errors(execute):
-    """Wrap an operator's method to report a LodgsError, MemoryError or OSError and cancel the operator.
-
-    The remedy gets a line of its own, because Blender cuts off messages that are wider than the window.
-    """
+    """Wrap an operator's method to report a LodgsError, MemoryError or OSError and cancel the operator."""
 
     @functools.wraps(execute)
     def wrapper(self, context, *event):
         try:
             return execute(self, context, *event)
         except LodgsError as error:
-            self.report({"ERROR"}, f"{error.what} \n{error.remedy}".strip())
+            report_error(self, f"{error.what}\n{error.remedy}")
         except MemoryError:
-            self.report({"ERROR"}, "Out of memory. Close other files and programs.")
+            report_error(self, "Out of memory. Close other files and programs.")
         except (OSError, RuntimeError) as error:
             if (described := describe_system_error(error)) is None:
                 raise
-            self.report({"ERROR"}, f"{described.what} \n{described.remedy}".strip())
+            report_error(self, f"{described.what}\n{described.remedy}")
         return {"CANCELLED"}
 
     return wrapper
 
 
+def report_error(operator: bpy.types.Operator, text: str) -> None:
+    """Report an error in short lines, because Blender cuts off lines that are wider than the window."""
+    wrap = functools.partial(textwrap.fill, width=180, break_long_words=False, break_on_hyphens=False)
+    operator.report({"ERROR"}, "\n".join(map(wrap, text.splitlines())).replace("\n", " \n"))
+
+
 def report_result(operator: bpy.types.Operator, problem: str, message: str = "") -> set[str]:
     """Report a problem, or a message without one, and return the result of ``execute``."""
     if problem:
-        operator.report({"ERROR"}, problem)
+        report_error(operator, problem)
         return {"CANCELLED"}
     if message:
         operator.report({"INFO"}, message)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..runs import environment, environment_setup, processes
-from .base import CancelOperator, report_errors, report_result
+from .base import CancelOperator, report_error, report_errors, report_result
 
 
 class LODGS_OT_make_environment(bpy.types.Operator):
@@ -42,7 +42,7 @@ class LODGS_OT_check_environment(bpy.types.Operator):
     def execute(self, context: bpy.types.Context):
         report = environment.check_current()
         if not report.ok:
-            self.report({"ERROR"}, "\n".join(report.problems))
+            report_error(self, "\n".join(report.problems))
             return {"CANCELLED"}
         self.report({"INFO"}, f"Ready to train with PyTorch {report.versions['torch']}")
         return {"FINISHED"}

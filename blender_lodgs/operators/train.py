@@ -11,7 +11,7 @@ from ...training.errors import LodgsError
 from ..data import cells, roots
 from ..runs import job_settings, jobs, run_folders
 from ..runs.watch import Watch, root_by_uid, watch_of
-from .base import SceneOperator, report_errors, show_image
+from .base import SceneOperator, report_error, report_errors, show_image
 from .modal import WaitingOperator, wait_for
 
 
@@ -19,7 +19,7 @@ def _follow(operator: bpy.types.Operator, watch: Watch):
     """Follow a run: to its end in background mode, otherwise while Blender stays responsive."""
     jobs.follow(watch)
     if watch.problem:
-        operator.report({"ERROR"}, watch.problem)
+        report_error(operator, watch.problem)
     return {"FINISHED"} if watch.state in {"running", "done"} else {"CANCELLED"}
 
 

@@ -312,5 +312,6 @@ def test_dropped_file_selects_its_model(bpy, tmp_path):
 def test_dropped_file_of_no_scene_is_rejected(bpy, tmp_path):
     write_walls(tmp_path / "scene")  # scenes in subfolders do not count
     (tmp_path / "notes.txt").write_text("notes")
-    with pytest.raises(RuntimeError, match=r"notes.txt: its folder has neither"):
+    with pytest.raises(RuntimeError, match="neither") as error:
         bpy.ops.lodgs.drop_photo_scene(filepath=str(tmp_path / "notes.txt"))
+    assert max(map(len, str(error.value).splitlines())) <= 190, "Windows cut off long lines."
