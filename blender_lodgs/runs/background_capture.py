@@ -56,7 +56,8 @@ class BackgroundCapture:
         self.message = self._progress_text(rendered)
         if code is not None:
             self._copy.unlink(missing_ok=True)
-            self.message = "Captured" if code == 0 else f"Stopped after {rendered} of {self._count} views"
+            success = "Captured" if self._start_count < self._count else "Kept the views in the folder"
+            self.message = success if code == 0 else f"Stopped after {rendered} of {self._count} views"
             self.problem = "" if code == 0 or self._cancelled else self._failure_reason(code, rendered)
         extension.redraw()
         return self.running

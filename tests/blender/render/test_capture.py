@@ -508,6 +508,8 @@ def test_operator_captures_the_current_scene(bpy, lodgs, scene, blender, tmp_pat
     assert bpy.ops.lodgs.capture_scene() == {"FINISHED"}
     work = background_capture.current
     assert (work.message, work.fraction, work.problem) == ("Captured", 1.0, "")
+    assert bpy.ops.lodgs.capture_scene() == {"FINISHED"}
+    assert background_capture.current.message == "Kept the views in the folder"
     assert len(bpy.data.objects) == objects and not bpy.data.filepath, "the open file is unchanged"
     assert not (tmp_path / "out" / "capture.blend").exists()
     assert bpy.ops.lodgs.import_capture() == {"FINISHED"}
